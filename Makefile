@@ -1,0 +1,39 @@
+# make demo: set up and train; make test: set up, check, test; make bench: benchmarks beside their peers.
+PYTHON ?= python3.11
+BIN := .venv/bin
+STAMP := .venv/.installed
+
+.PHONY: demo setup test check unit bench messages clean
+
+demo: setup
+	$(BIN)/brakeline demo
+
+setup: $(STAMP)
+
+$(STAMP): pyproject.toml constraints.txt
+	test -x $(BIN)/python || $(PYTHON) -m venv .venv || python3 -m venv .venv
+	$(BIN)/pip install --quiet --disable-pip-version-check --constraint constraints.txt torch==2.13.0
+	$(BIN)/pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[dev]'
+	touch $(STAMP)
+
+test: check unit
+
+check: setup
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+
+unit: setup
+	$(BIN)/python -m pytest -m "not long"
+
+bench: setup
+	$(BIN)/python -m deploy.bench
+
+# Regenerates messaging/brakeline_pb2.py and its stubs from the schema.
+messages: setup
+	$(BIN)/python -m grpc_tools.protoc -I. --python_out=. --mypy_out=. \
+		--plugin=protoc-gen-mypy=$(BIN)/protoc-gen-mypy messaging/brakeline.proto
+
+clean:
+	rm -rf .venv build *.egg-info

@@ -1,0 +1,1 @@
+"""Processes that drive robots: observe, propose, ask the safety service, act, publish."""

@@ -1,0 +1,129 @@
+"""What every part must agree on about a robot: names, order, units and bounds of its vectors, and its clock.
+
+SI units and ENU throughout. The first `position_dim` coordinates of a state are its position.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from dataclasses import asdict, dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+class UnknownRobot(ValueError):
+    """The name is not in `ROBOTS`."""
+
+
+@dataclass(frozen=True)
+class Robot:
+    """A robot kind.
+
+    A plan has `horizon` inputs, one a period: `free_steps` chosen ones, then a linear ramp of the last of them
+    down to zero in `brake_steps`. After it the robot stands still (`method` of both robots: zero input is a stop).
+    """
+
+    name: str
+    period: float  # s between decisions
+    state: tuple[str, ...]  # name [unit]; the position comes first
+    position_dim: int
+    heading: int | None  # index of the heading in the state; None: displacement is regressed in the world frame
+    action: tuple[str, ...]
+    action_low: tuple[float, ...]
+    action_high: tuple[float, ...]
+    action_slew: tuple[float, ...]  # largest change of the input from one period to the next; inf: none
+    observation: tuple[str, ...]
+    regressor: tuple[int, ...]  # state coordinates that matter for the next step, besides the input in force
+    measurement_bound: tuple[float, ...]  # Z_v: half-widths of |measured - true|, one a state coordinate
+    footprint: float  # m, radius of the disc (sphere) about the position that holds the body in every attitude
+    horizon: int
+    free_steps: int
+    brake_steps: int
+
+    @property
+    def state_dim(self) -> int:
+        return len(self.state)
+
+    @property
+    def action_dim(self) -> int:
+        return len(self.action)
+
+    @property
+    def observation_dim(self) -> int:
+        return len(self.observation)
+
+    @property
+    def regressor_dim(self) -> int:
+        """Length of z_0 = [x_0 (regressor coordinates); input in force], to which a plan's inputs are appended."""
+        return len(self.regressor) + self.action_dim
+
+    def low(self) -> Array:
+        return np.asarray(self.action_low)
+
+    def high(self) -> Array:
+        return np.asarray(self.action_high)
+
+    def schedule(self) -> Array:
+        """S with `plan = S @ free`, plan (horizon·m) and free (free_steps·m) stacked step by step. Shape (N·m, F·m)."""
+        m = self.action_dim
+        fractions = np.zeros((self.horizon, self.free_steps))
+        for k in range(self.horizon):
+            if k < self.free_steps:
+                fractions[k, k] = 1.0
+            else:
+                fractions[k, -1] = max(0.0, 1.0 - (k - self.free_steps + 1) / self.brake_steps)
+        return np.kron(fractions, np.eye(m))
+
+    def layout(self) -> str:
+        """Hash of everything that two processes must share to understand each other's vectors."""
+        return hashlib.sha256(repr(sorted(asdict(self).items())).encode()).hexdigest()[:16]
+
+
+RAYS = 18
+
+GROUND = Robot(
+    name="ground",
+    period=0.2,
+    state=("x [m]", "y [m]", "heading [rad]", "speed [m/s]", "turn rate [rad/s]"),
+    position_dim=2,
+    heading=2,
+    action=("speed [m/s]", "turn rate [rad/s]"),
+    action_low=(0.0, -0.5),
+    action_high=(0.25, 0.5),
+    action_slew=(math.inf, math.inf),
+    observation=(
+        *(f"ray {i} [range/3.5 m]" for i in range(RAYS)),
+        "goal distance [5 m]",
+        "goal bearing sin",
+        "goal bearing cos",
+        "speed [0.25 m/s]",
+        "turn rate [0.5 rad/s]",
+        "last speed input [0.25 m/s]",
+        "last turn input [0.5 rad/s]",
+        "turn memory: low-passed turn rate [0.5 rad/s]",
+    ),
+    regressor=(3, 4),
+    measurement_bound=(0.01, 0.01, 0.02, 0.02, 0.05),
+    footprint=0.105,
+    horizon=3,
+    free_steps=1,
+    brake_steps=1,
+)
+
+ROBOTS: dict[str, Robot] = {robot.name: robot for robot in (GROUND,)}
+
+
+def robot_named(name: str) -> Robot:
+    """The robot of that name.
+
+    Raises:
+        UnknownRobot: with the names there are.
+    """
+    try:
+        return ROBOTS[name]
+    except KeyError:
+        raise UnknownRobot(f"no robot is called {name!r}; there are: {', '.join(sorted(ROBOTS))}") from None

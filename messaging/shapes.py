@@ -1,0 +1,125 @@
+"""Obstacles as rounded boxes, and the distances from points to them, for many obstacles and points at once.
+
+Every shape is `{c + R(yaw)(s + r)}`, s in the box |s_i| <= half_i, r in the disc (in x and y) or ball of radius rho:
+
+    box       half, rho = 0
+    cylinder  vertical; half = (0, 0, h), rho = radius, disc      (in the plane: a disc)
+    sphere    half = 0, rho = radius, ball
+    wall      the half-space behind a plane: a box that reaches WALL_DEPTH beyond its face
+
+so one vectorised formula serves all. Shapes are convex: the closest point gives a supporting half-space.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+WALL_DEPTH = 100.0  # m; how far behind its face a wall is solid
+BOX, CYLINDER, SPHERE, WALL = "box", "cylinder", "sphere", "wall"
+KINDS = (BOX, CYLINDER, SPHERE, WALL)
+
+
+class BadShape(ValueError):
+    """An obstacle that is none: `field` names what is wrong."""
+
+    def __init__(self, field: str, message: str) -> None:
+        super().__init__(message)
+        self.field = field
+
+
+@dataclass(frozen=True)
+class Obstacle:
+    """One obstacle, 2-D or 3-D by the length of `position`.
+
+    size: box: full edge lengths (one per axis); cylinder: (radius,) in the plane, (radius, height) in space;
+    sphere: (radius,); wall: () — a plane through `position` whose free side is the direction `yaw` points to.
+    yaw: rad about the vertical (box and wall).
+    """
+
+    kind: str
+    position: tuple[float, ...]
+    size: tuple[float, ...] = ()
+    yaw: float = 0.0
+
+    def __post_init__(self) -> None:
+        if self.kind not in KINDS:
+            raise BadShape("kind", f"no obstacle is called {self.kind!r}; there are: {', '.join(KINDS)}")
+        dim = len(self.position)
+        if dim not in (2, 3):
+            raise BadShape("position", f"an obstacle's position has 2 or 3 coordinates, not {dim}")
+        if not all(math.isfinite(value) for value in (*self.position, self.yaw)):
+            raise BadShape("position", "an obstacle's position and yaw must be finite")
+        sizes = {BOX: dim, CYLINDER: dim - 1, SPHERE: 1, WALL: 0}[self.kind]
+        if len(self.size) != sizes:
+            raise BadShape("size", f"a {dim}-D {self.kind} has {sizes} sizes, not {len(self.size)}")
+        if not all(math.isfinite(value) and value > 0.0 for value in self.size):
+            raise BadShape("size", f"the sizes of a {self.kind} must be finite and positive, not {list(self.size)}")
+
+
+@dataclass(frozen=True)
+class Shapes:
+    """Obstacles as arrays: center (n, d), axes (n, d, d) world-from-local, half (n, d), rho (n,), round (n, d)."""
+
+    center: Array
+    axes: Array
+    half: Array
+    rho: Array
+    round: Array  # 1 on the axes that the rounding acts on
+
+    def __len__(self) -> int:
+        return len(self.rho)
+
+    @staticmethod
+    def of(obstacles: Sequence[Obstacle], dim: int) -> Shapes:
+        """Stack obstacles of one dimension. Raises BadShape when one has another dimension."""
+        n = len(obstacles)
+        center, half, rho = np.zeros((n, dim)), np.zeros((n, dim)), np.zeros(n)
+        axes, rounded = np.zeros((n, dim, dim)), np.ones((n, dim))
+        for i, obstacle in enumerate(obstacles):
+            if len(obstacle.position) != dim:
+                raise BadShape("position", f"obstacle {i} has {len(obstacle.position)} coordinates, not {dim}")
+            center[i] = obstacle.position
+            cos, sin = math.cos(obstacle.yaw), math.sin(obstacle.yaw)
+            axes[i] = np.eye(dim)
+            axes[i, :2, :2] = (cos, -sin), (sin, cos)
+            if obstacle.kind == BOX:
+                half[i] = 0.5 * np.asarray(obstacle.size)
+            elif obstacle.kind == CYLINDER:
+                rho[i] = obstacle.size[0]
+                if dim == 3:
+                    half[i, 2] = 0.5 * obstacle.size[1]
+                    rounded[i, 2] = 0.0
+            elif obstacle.kind == SPHERE:
+                rho[i] = obstacle.size[0]
+            else:
+                half[i] = WALL_DEPTH
+                center[i] -= WALL_DEPTH * axes[i, :, 0]
+        return Shapes(center, axes, half, rho, rounded)
+
+    def take(self, index: NDArray[np.intp] | NDArray[np.bool_]) -> Shapes:
+        """The chosen obstacles."""
+        return Shapes(self.center[index], self.axes[index], self.half[index], self.rho[index], self.round[index])
+
+    def towards(self, points: Array) -> Array:
+        """Vectors from points (..., d) to the closest points of the n obstacles: (n, ..., d); zero inside."""
+        extra = (slice(None), *([None] * (points.ndim - 1)))
+        local = np.einsum("n...i,nij->n...j", points[None] - self.center[extra], self.axes)
+        half = self.half[extra]
+        rest = local - np.clip(local, -half, half)
+        rounded = rest * self.round[extra]
+        norm = np.sqrt(np.einsum("n...i,n...i->n...", rounded, rounded))
+        cut = np.minimum(self.rho[extra] / np.maximum(norm, 1e-300), 1.0)
+        rest = rest - rounded * cut[..., None]
+        return -np.einsum("n...j,nij->n...i", rest, self.axes)
+
+    def distance(self, points: Array) -> Array:
+        """Distances from points (..., d) to the n obstacles: (n, ...); 0 inside."""
+        vector = self.towards(points)
+        return np.asarray(np.sqrt(np.einsum("n...i,n...i->n...", vector, vector)))

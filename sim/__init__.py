@@ -1,0 +1,1 @@
+"""Physics: arenas, sensors and robots. Knows nothing of the bus."""
