@@ -143,6 +143,7 @@ class Request(_message.Message):
     OBSTACLES_FIELD_NUMBER: _builtins.int
     PREDICTED_CENTER_FIELD_NUMBER: _builtins.int
     PREDICTED_HALF_WIDTH_FIELD_NUMBER: _builtins.int
+    PREDICTED_HEADING_FIELD_NUMBER: _builtins.int
     robot: _builtins.str
     actor: _builtins.str
     episode: _builtins.int
@@ -151,6 +152,8 @@ class Request(_message.Message):
     """s"""
     model: _builtins.str
     """version that verified it; empty: standing still"""
+    predicted_heading: _builtins.float
+    """rad, of the frame in which that set's position part is a box"""
     @_builtins.property
     def state(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]:
         """measured"""
@@ -196,10 +199,11 @@ class Request(_message.Message):
         obstacles: _abc.Iterable[Global___Obstacle] | None = ...,
         predicted_center: _abc.Iterable[_builtins.float] | None = ...,
         predicted_half_width: _abc.Iterable[_builtins.float] | None = ...,
+        predicted_heading: _builtins.float = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["action", b"action", "actor", b"actor", "episode", b"episode", "input_in_force", b"input_in_force", "model", b"model", "observation", b"observation", "obstacles", b"obstacles", "plan", b"plan", "predicted_center", b"predicted_center", "predicted_half_width", b"predicted_half_width", "robot", b"robot", "state", b"state", "step", b"step", "time", b"time"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["action", b"action", "actor", b"actor", "episode", b"episode", "input_in_force", b"input_in_force", "model", b"model", "observation", b"observation", "obstacles", b"obstacles", "plan", b"plan", "predicted_center", b"predicted_center", "predicted_half_width", b"predicted_half_width", "predicted_heading", b"predicted_heading", "robot", b"robot", "state", b"state", "step", b"step", "time", b"time"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 
@@ -235,6 +239,7 @@ class Decision(_message.Message):
     TUBE_HALF_WIDTH_FIELD_NUMBER: _builtins.int
     PREDICTED_CENTER_FIELD_NUMBER: _builtins.int
     PREDICTED_HALF_WIDTH_FIELD_NUMBER: _builtins.int
+    PREDICTED_HEADING_FIELD_NUMBER: _builtins.int
     MARGIN_FIELD_NUMBER: _builtins.int
     MODEL_FIELD_NUMBER: _builtins.int
     REASON_FIELD_NUMBER: _builtins.int
@@ -248,6 +253,8 @@ class Decision(_message.Message):
     SOLVER_FIELD_NUMBER: _builtins.int
     ITERATIONS_FIELD_NUMBER: _builtins.int
     kind: Global___Kind.ValueType
+    predicted_heading: _builtins.float
+    """rad, of the frame in which its position part is a box"""
     margin: _builtins.float
     """m, smallest distance of the tube to a half-space; negative: violated"""
     model: _builtins.str
@@ -296,6 +303,7 @@ class Decision(_message.Message):
         tube_half_width: _abc.Iterable[_builtins.float] | None = ...,
         predicted_center: _abc.Iterable[_builtins.float] | None = ...,
         predicted_half_width: _abc.Iterable[_builtins.float] | None = ...,
+        predicted_heading: _builtins.float = ...,
         margin: _builtins.float = ...,
         model: _builtins.str = ...,
         reason: _builtins.str = ...,
@@ -311,7 +319,7 @@ class Decision(_message.Message):
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["compared", b"compared", "contained", b"contained", "iterations", b"iterations", "kind", b"kind", "margin", b"margin", "model", b"model", "plan", b"plan", "predicted_center", b"predicted_center", "predicted_half_width", b"predicted_half_width", "queue_ms", b"queue_ms", "reason", b"reason", "solve_ms", b"solve_ms", "solver", b"solver", "time_ms", b"time_ms", "tube_center", b"tube_center", "tube_half_width", b"tube_half_width", "verified", b"verified", "verify_ms", b"verify_ms"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["compared", b"compared", "contained", b"contained", "iterations", b"iterations", "kind", b"kind", "margin", b"margin", "model", b"model", "plan", b"plan", "predicted_center", b"predicted_center", "predicted_half_width", b"predicted_half_width", "predicted_heading", b"predicted_heading", "queue_ms", b"queue_ms", "reason", b"reason", "solve_ms", b"solve_ms", "solver", b"solver", "time_ms", b"time_ms", "tube_center", b"tube_center", "tube_half_width", b"tube_half_width", "verified", b"verified", "verify_ms", b"verify_ms"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 
@@ -525,7 +533,7 @@ class Step(_message.Message):
     outside: _builtins.bool
     """the true state was outside the stated bound of the measurement"""
     compared: _builtins.bool
-    """this step's measured state was compared with the predicted set ..."""
+    """the measured state after the step was compared with the predicted set ..."""
     contained: _builtins.bool
     """... and lay in it"""
     decide_ms: _builtins.float

@@ -35,6 +35,7 @@ class Robot:
     action: tuple[str, ...]
     action_low: tuple[float, ...]
     action_high: tuple[float, ...]
+    translates: tuple[bool, ...]  # which inputs move the position; the others can be used while standing
     action_slew: tuple[float, ...]  # largest change of the input from one period to the next; inf: none
     observation: tuple[str, ...]
     regressor: tuple[int, ...]  # state coordinates that matter for the next step, besides the input in force
@@ -94,6 +95,7 @@ GROUND = Robot(
     action=("speed [m/s]", "turn rate [rad/s]"),
     action_low=(0.0, -0.5),
     action_high=(0.25, 0.5),
+    translates=(True, False),
     action_slew=(math.inf, math.inf),
     observation=(
         *(f"ray {i} [range/3.5 m]" for i in range(RAYS)),

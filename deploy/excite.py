@@ -1,0 +1,48 @@
+"""Which inputs to record: every state the robot can be in, then plans as the filter makes them, then standing still."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from messaging.robots import Robot
+
+Array = NDArray[np.float64]
+
+MOST_LEAD = 4  # random inputs before a plan, each held for up to
+MOST_HELD = 3  # periods
+SHORT_STOP, LONG_STOP = 2, 15  # periods of standing still after a plan, mostly short
+LONG_STOPS = 0.1  # share of long stops
+EXTREMES = 0.45  # share of inputs that are at a bound or zero: driving has more of them than a uniform draw
+
+
+def random_input(robot: Robot, rng: np.random.Generator, before: Array) -> Array:
+    """An input within bounds and slew; each coordinate often at a bound or zero."""
+    low, high = robot.low(), robot.high()
+    drawn = rng.uniform(low, high)
+    edge = np.stack([low, high, np.zeros(len(low))])[rng.integers(3, size=len(low)), np.arange(len(low))]
+    chosen = np.where(rng.random(len(low)) < EXTREMES, edge, drawn)
+    slew = np.asarray(robot.action_slew)
+    return np.asarray(np.clip(chosen, np.maximum(low, before - slew), np.minimum(high, before + slew)))
+
+
+def excitation(robot: Robot, rng: np.random.Generator) -> Iterator[Array]:
+    """Inputs without end: lead-in, plan (chosen inputs, then braking), stop, and again."""
+    before = np.zeros(robot.action_dim)
+    schedule = robot.schedule()
+    while True:
+        for _ in range(rng.integers(MOST_LEAD + 1)):
+            before = random_input(robot, rng, before)
+            for _ in range(rng.integers(1, MOST_HELD + 1)):
+                yield before
+        free = []
+        for _ in range(robot.free_steps):
+            before = random_input(robot, rng, before)
+            free.append(before)
+        yield from (schedule @ np.concatenate(free)).reshape(robot.horizon, -1)
+        before = np.zeros(robot.action_dim)
+        longest = LONG_STOP if rng.random() < LONG_STOPS else SHORT_STOP
+        for _ in range(rng.integers(longest + 1)):
+            yield before

@@ -1,0 +1,121 @@
+"""The QP of one decision: the closest input whose tube stays inside the half-spaces (paper, algorithm 2; method §2)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from messaging.robots import Robot
+from safety.solver import Program
+from safety.tube import Tube
+
+Array = NDArray[np.float64]
+
+SHARPEN = 1e-6  # m; the QP's rows are this much tighter, so that its answer's rounding passes the exact check
+REGULAR = 1e-4  # weight of what the objective leaves free; much less and the solver needs thousands of iterations
+
+
+@dataclass(frozen=True)
+class Rows:
+    """A half-space for every end of every period: support of the tube in its normal, `gradient z + spread m(z)`.
+
+    gradient (rows, nz); spread (rows, L+N+1) >= 0; bound (rows,).
+    """
+
+    gradient: Array
+    spread: Array
+    bound: Array
+
+    def support(self, tube: Tube, z: Array) -> Array:
+        return np.asarray(self.gradient @ z + self.spread @ tube.magnitudes(z))
+
+
+class Layout:
+    """The parts of a tube that rows are made from, gathered once.
+
+    Per obstacle there are 2N+1 rows: period k's half-space at the period's start and at its end, both with the bulge
+    of that period, and the last one again with the stop latch.
+    """
+
+    def __init__(self, tube: Tube) -> None:
+        N, d, nz = tube.position.shape
+        L = tube.generators
+        at_start, at_end = np.arange(N), np.arange(1, N + 1)
+        ends = np.concatenate([at_start, at_end, [N]])
+        self.period = np.concatenate([at_start, at_start, [N - 1]])
+        position = np.concatenate([np.zeros((1, d, nz)), tube.position])[ends]
+        directions = np.concatenate([np.zeros((1, d, L)), tube.directions])[ends]
+        self.maps = np.concatenate([position, directions], axis=2)  # (2N+1, d, nz + L)
+        self.extra = np.concatenate([np.eye(N + 1)[at_start], np.eye(N + 1)[at_start], np.eye(N + 1)[[N]]])
+        self.nz = nz
+
+    def rows(self, normals: Array, offsets: Array) -> Rows:
+        """Rows for half-spaces `a·p <= b` in the frame of now, a (n, N, d), b (n, N)."""
+        n = len(normals)
+        spread = normals[:, self.period, None, :] @ self.maps  # (n, 2N+1, 1, nz + L)
+        spread = spread.reshape(n * len(self.period), -1)
+        extra = np.broadcast_to(self.extra, (n, *self.extra.shape)).reshape(len(spread), -1)
+        both = np.hstack([np.abs(spread[:, self.nz :]), extra])
+        return Rows(spread[:, : self.nz], both, offsets[:, self.period].ravel())
+
+
+class Builder:
+    """Builds the QP of a decision; everything that does not change from call to call is kept.
+
+    Variables [free inputs f; t], t the atoms |W z| that depend on f, as epigraphs:
+
+        min ‖f_0 - r‖² + REGULAR (‖f_1 ..‖² + ‖t‖²)      each in units of its range
+        s.t. gradient z + spread (M t + ...) <= bound,   ±(W z) <= t,   low <= f <= high,   |f_k - f_{k-1}| <= slew
+
+    Variables are scaled by `scale` and rows to unit length: unscaled, one problem in a hundred took ten milliseconds.
+    """
+
+    def __init__(self, robot: Robot, tube: Tube) -> None:
+        self.robot = robot
+        self.tube = tube
+        m, free = robot.action_dim, robot.free_steps * robot.action_dim
+        self.known = tube.position.shape[2] - free  # length of z_0
+        self.free = free
+        moving = np.abs(tube.W[:, self.known :]).max(1, initial=0.0) > 0.0
+        self.W_t, self.M_t = tube.W[moving], tube.M[:, moving]
+        self.W_c, self.M_c = tube.W[~moving][:, : self.known], tube.M[:, ~moving]
+        atoms = len(self.W_t)
+        width = np.tile(robot.high() - robot.low(), robot.free_steps)
+        self.scale = np.concatenate([width, np.abs(self.W_t[:, self.known :]) @ width])
+        self.h = np.full(free + atoms, REGULAR)
+        self.h[:m] = 1.0
+        W_f = self.W_t[:, self.known :]
+        above = np.hstack([W_f, -np.eye(atoms)])
+        below = np.hstack([-W_f, -np.eye(atoms)])
+        inputs = np.hstack([np.eye(free), np.zeros((free, atoms))])
+        difference = np.hstack([np.eye(free) - np.eye(free, k=-m), np.zeros((free, atoms))])
+        limited = np.tile(np.isfinite(robot.action_slew), robot.free_steps)
+        difference = difference[limited]
+        fixed = np.vstack([above, below, inputs, -inputs, difference, -difference]) * self.scale
+        self.length = np.linalg.norm(fixed, axis=1)
+        self.fixed = fixed / self.length[:, None]
+        self.limited = limited
+        self.slew = np.tile(robot.action_slew, robot.free_steps)[limited]
+        self.box = np.concatenate([np.tile(robot.high(), robot.free_steps), -np.tile(robot.low(), robot.free_steps)])
+
+    def program(self, rows: Rows, z_0: Array, proposal: Array) -> Program:
+        """The QP for known regressors z_0 (known,) and a proposal r (m,)."""
+        m = self.robot.action_dim
+        constant = self.M_c @ np.abs(self.W_c @ z_0) + self.tube.m_0
+        bound = rows.bound - rows.gradient[:, : self.known] @ z_0 - rows.spread @ constant - SHARPEN
+        A = np.hstack([rows.gradient[:, self.known :], rows.spread @ self.M_t]) * self.scale
+        length = np.maximum(np.sqrt(np.einsum("ri,ri->r", A, A)), SHARPEN)
+        offset = self.W_t[:, : self.known] @ z_0
+        first = np.zeros(self.free)
+        first[:m] = z_0[-m:]
+        first = first[self.limited]
+        g = np.zeros(len(self.h))
+        g[:m] = -proposal / self.scale[:m]
+        fixed = np.concatenate([-offset, offset, self.box, self.slew + first, self.slew - first]) / self.length
+        return Program(self.h, g, np.vstack([A / length[:, None], self.fixed]), np.concatenate([bound / length, fixed]))
+
+    def inputs(self, x: Array) -> Array:
+        """The free inputs (F·m,) in a solution."""
+        return np.asarray(x[: self.free] * self.scale[: self.free])
