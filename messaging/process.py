@@ -1,0 +1,146 @@
+"""What the processes have in common: a place on the bus, log lines, a sign of life each second, an orderly end.
+
+with Process(settings, "safety") as process:
+    process.bus.serve(DECIDE, answer)
+    process.stop.wait()
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import signal
+import sys
+import threading
+from collections.abc import Callable
+from types import FrameType, TracebackType
+from typing import Any, Self
+
+from messaging import brakeline_pb2 as pb
+from messaging.bus import Bus, BusError, BusSettings, Publisher
+from messaging.topics import HEALTH, LOG
+
+log = logging.getLogger("brakeline.process")
+
+LEVELS = {"CRITICAL": "ERROR"}  # names that LogLine does not know
+
+
+class Process:
+    """A process under the name `source`, from `with` to the end of the block.
+
+    `stop` is set by SIGINT and SIGTERM (and by whoever wants the process to end); a second signal kills. `figures` and
+    `notes` go out with the next Health; `refresh`, if set, is called before each to bring them up to date. All that is
+    logged goes to stderr (unless `stderr` is False) and to the LOG topic. An exception that leaves the block is logged,
+    noted in the last Health, and goes on its way.
+
+    Raises:
+        Unreachable: on entering, when there is no bus at `settings`.
+    """
+
+    def __init__(self, settings: BusSettings, source: str, stderr: bool = True) -> None:
+        self.settings = settings
+        self.source = source
+        self.stop = threading.Event()
+        self.figures: dict[str, float] = {}
+        self.notes: dict[str, str] = {}
+        self.refresh: Callable[[], None] | None = None
+        self._stderr = stderr
+        self._handlers: list[logging.Handler] = []
+        self._signals: dict[int, Any] = {}
+        self._ended = threading.Event()
+
+    def __enter__(self) -> Self:
+        self.bus = Bus(self.settings, self.source)
+        self._health = self.bus.publisher(HEALTH)
+        self._start_logging()
+        if threading.current_thread() is threading.main_thread():
+            self._signals = {number: signal.signal(number, self._asked) for number in (signal.SIGINT, signal.SIGTERM)}
+        self._pulse = threading.Thread(target=self._beat, name="health", daemon=True)
+        self._pulse.start()
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None) -> None:
+        if isinstance(error, Exception):
+            log.error("%s ends: %s", self.source, error, exc_info=error)
+            self.notes["died of"] = f"{type(error).__name__}: {error}"
+        self.stop.set()
+        self._ended.set()
+        self._pulse.join(2.0)
+        self._stop_logging()
+        try:
+            self._report(last=True)
+        except Exception:
+            log.exception("no goodbye")
+        self.bus.close()
+        for number, handler in self._signals.items():
+            signal.signal(number, handler)
+
+    def _asked(self, number: int, _: FrameType | None) -> None:
+        if self.stop.is_set():  # asked twice: at once
+            signal.signal(number, signal.SIG_DFL)
+            os.kill(os.getpid(), number)
+        self.stop.set()
+
+    def _beat(self) -> None:
+        while True:
+            try:
+                self._report()
+            except Exception:
+                log.exception("no sign of life")
+            if self._ended.wait(1.0 / (HEALTH.rate or 1.0)):
+                return
+
+    def _report(self, last: bool = False) -> None:
+        if self.refresh is not None:
+            self.refresh()
+        published = self.bus.published()
+        published[self._health.key] += 1  # this one
+        self._health.put(
+            pb.Health(
+                process=self.source,
+                pid=os.getpid(),
+                published=published,
+                figures=dict(self.figures),
+                notes=dict(self.notes),
+                last=last,
+            )
+        )
+
+    def _start_logging(self) -> None:
+        self._handlers = [BusHandler(self.bus.publisher(LOG), self.source)]
+        if self._stderr:
+            stream = logging.StreamHandler(sys.stderr)
+            stream.setFormatter(logging.Formatter(f"%(asctime)s {self.source} %(levelname)s %(message)s"))
+            self._handlers.append(stream)
+        root = logging.getLogger()
+        self._level = root.level
+        root.setLevel(logging.INFO)
+        for handler in self._handlers:
+            root.addHandler(handler)
+
+    def _stop_logging(self) -> None:
+        root = logging.getLogger()
+        root.setLevel(self._level)
+        for handler in self._handlers:
+            root.removeHandler(handler)
+
+
+class BusHandler(logging.Handler):
+    """Publishes what is logged. What happens while it does so is not published again."""
+
+    def __init__(self, publisher: Publisher, process: str) -> None:
+        super().__init__()
+        self._publisher, self._process = publisher, process
+        self._busy = threading.local()
+
+    def emit(self, record: logging.LogRecord) -> None:
+        if getattr(self._busy, "now", False):
+            return
+        self._busy.now = True
+        try:
+            level = LEVELS.get(record.levelname, record.levelname)
+            self._publisher.put(pb.LogLine(process=self._process, level=level, text=self.format(record)))
+        except BusError:
+            pass  # the bus is closing; stderr has the line
+        finally:
+            self._busy.now = False
