@@ -41,6 +41,7 @@ class Robot:
     regressor: tuple[int, ...]  # state coordinates that matter for the next step, besides the input in force
     measurement_bound: tuple[float, ...]  # Z_v: half-widths of |measured - true|, one a state coordinate
     footprint: float  # m, radius of the disc (sphere) about the position that holds the body in every attitude
+    sight: float  # m from the measured position: the obstacles that come with every request
     horizon: int
     free_steps: int
     brake_steps: int
@@ -77,7 +78,7 @@ class Robot:
                 fractions[k, k] = 1.0
             else:
                 fractions[k, -1] = max(0.0, 1.0 - (k - self.free_steps + 1) / self.brake_steps)
-        return np.kron(fractions, np.eye(m))
+        return np.asarray(np.kron(fractions, np.eye(m)), dtype=float)
 
     def layout(self) -> str:
         """Hash of everything that two processes must share to understand each other's vectors."""
@@ -111,6 +112,7 @@ GROUND = Robot(
     regressor=(3, 4),
     measurement_bound=(0.01, 0.01, 0.02, 0.02, 0.05),
     footprint=0.105,
+    sight=1.0,
     horizon=3,
     free_steps=1,
     brake_steps=1,

@@ -17,7 +17,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float64]
 
@@ -117,9 +117,18 @@ class Shapes:
         norm = np.sqrt(np.einsum("n...i,n...i->n...", rounded, rounded))
         cut = np.minimum(self.rho[extra] / np.maximum(norm, 1e-300), 1.0)
         rest = rest - rounded * cut[..., None]
-        return -np.einsum("n...j,nij->n...i", rest, self.axes)
+        return np.asarray(-np.einsum("n...j,nij->n...i", rest, self.axes))
 
     def distance(self, points: Array) -> Array:
         """Distances from points (..., d) to the n obstacles: (n, ...); 0 inside."""
         vector = self.towards(points)
         return np.asarray(np.sqrt(np.einsum("n...i,n...i->n...", vector, vector)))
+
+
+def rotate(vectors: Array, angle: ArrayLike) -> Array:
+    """Turn vectors (..., d >= 2) by `angle` (...) about the vertical."""
+    cos, sin = np.cos(angle), np.sin(angle)
+    turned = np.array(vectors)
+    turned[..., 0] = cos * vectors[..., 0] - sin * vectors[..., 1]
+    turned[..., 1] = sin * vectors[..., 0] + cos * vectors[..., 1]
+    return turned

@@ -120,7 +120,7 @@ def matrix_zonotope(z: Array, y: Array, generators: Array, sizes: Array, kappa: 
         z: (T, nz); y: (T, n), the noise's centre subtracted; generators: (n, g); sizes: (g, T).
         kappa, w: (g, nz) and (g,), the noise of the predicted step.
     """
-    pseudo = np.linalg.pinv(z.T)
+    pseudo = np.asarray(np.linalg.pinv(z.T), dtype=float)
     return Certificate(y.T @ pseudo, pseudo, sizes, kappa, w, generators)
 
 

@@ -18,6 +18,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save_file
 
 from messaging.robots import Robot, robot_named
+from messaging.shapes import rotate
 
 Array = NDArray[np.float64]
 
@@ -159,15 +160,6 @@ class Windows:
 
     def take(self, index: NDArray[np.bool_]) -> Windows:
         return Windows(self.z[index], self.y[index], self.bulge[index], self.latch[index], self.start[index])
-
-
-def rotate(vectors: Array, angle: Array) -> Array:
-    """Turn vectors (..., d >= 2) by `angle` (...) about the vertical."""
-    cos, sin = np.cos(angle), np.sin(angle)
-    turned = vectors.copy()
-    turned[..., 0] = cos * vectors[..., 0] - sin * vectors[..., 1]
-    turned[..., 1] = sin * vectors[..., 0] + cos * vectors[..., 1]
-    return turned
 
 
 def displacement(robot: Robot, start: Array, end: Array) -> Array:

@@ -12,9 +12,8 @@ from time import perf_counter_ns
 import numpy as np
 from numpy.typing import NDArray
 
-from messaging.robots import Robot
-from messaging.shapes import Shapes
-from safety.dataset import displacement, rotate
+from messaging.shapes import Shapes, rotate
+from safety.commitment import Prediction
 from safety.freespace import half_spaces
 from safety.model_set import ModelSet
 from safety.program import SHARPEN, Builder, Layout, Rows
@@ -25,7 +24,6 @@ Array = NDArray[np.float64]
 ALLOWED, ADJUSTED, FAILSAFE = "allowed", "adjusted", "failsafe"
 OUTSIDE_DOMAIN = 0.02  # of the recorded range: how far beyond it a regressor may lie (rounding, not extrapolation)
 SAME_INPUT = 1e-6  # of the input's range: an answer this close to the proposal is the proposal
-SAME_SET = 1e-9  # m, rad, ...: rounding allowed when a measurement is compared with its prediction
 
 
 class BadRequest(ValueError):
@@ -38,27 +36,6 @@ class BadRequest(ValueError):
 
 class StaleModel(BadRequest):
     """The committed plan was verified by a model set that this filter never had."""
-
-
-@dataclass(frozen=True)
-class Prediction:
-    """Where the next measured state must lie: |displacement - center| <= half_width in the frame of `heading`.
-
-    center, half_width: (n,); the position part of the center is in the world, its box turned by heading [rad].
-    """
-
-    center: Array
-    half_width: Array
-    heading: float
-
-    def contains(self, robot: Robot, state: Array) -> bool:
-        """Does the measured state (n,) lie in the set?"""
-        away = state - self.center
-        if robot.heading is not None:
-            d = robot.position_dim
-            away[:d] = rotate(away[:d], np.asarray(-self.heading))
-            away[robot.heading] = (away[robot.heading] + np.pi) % (2.0 * np.pi) - np.pi
-        return bool((np.abs(away) <= self.half_width + SAME_SET).all())
 
 
 @dataclass(frozen=True)
@@ -136,7 +113,9 @@ class Filter:
         self.low, self.high, self.slew = robot.low(), robot.high(), np.asarray(robot.action_slew)
         self.regressor = list(robot.regressor)
         self.comfort = self._comfort()
-        self.reach = self._reach()
+        wanted = self._reach()
+        self.reach = min(wanted, robot.sight)
+        self.far = wanted > robot.sight  # a tube may leave what can be seen: every candidate must be looked at
 
     # --- what is known before any request ---------------------------------------------------------------------
 
@@ -159,16 +138,27 @@ class Filter:
         return float((width + drift).max() + sizes[L:].max())
 
     def _reach(self) -> float:
-        """[m] from the robot's measured position: an obstacle beyond it can't meet any plan's tube."""
-        robot = self.robot
-        largest = np.abs(self.domain).max(0)
-        inputs = np.tile(np.maximum(np.abs(self.low), np.abs(self.high)), robot.free_steps)
-        z = np.concatenate([largest, inputs])
-        W = np.abs(self.tube.W)
-        sizes = self.tube.M @ (W @ z) + self.tube.m_0
-        way = np.abs(self.tube.position) @ z + np.abs(self.tube.directions) @ sizes[: self.tube.generators]
-        body = robot.footprint + np.linalg.norm(self.measured) + sizes[self.tube.generators :].max()
+        """[m] from the robot's measured position: an obstacle beyond it can't meet any plan's tube.
+
+        By interval arithmetic over the box of all regressors, so wide for certificates whose atoms mix them.
+        """
+        robot, tube = self.robot, self.builder.tube
+        F = robot.free_steps
+        low = np.concatenate([self.domain[0], np.tile(self.low, F)])
+        high = np.concatenate([self.domain[1], np.tile(self.high, F)])
+        z = np.maximum(np.abs(low), np.abs(high))
+        sizes = tube.M @ (np.abs(tube.W) @ z) + tube.m_0
+        way = np.abs(tube.position) @ z + np.abs(tube.directions) @ sizes[: tube.generators]
+        body = robot.footprint + np.linalg.norm(self.measured) + sizes[tube.generators :].max()
         return float(np.linalg.norm(way, axis=1).max() + body + self.comfort)
+
+    def _extent(self, z: Array) -> float:
+        """[m] from the measured position to the farthest point that the body may reach under regressors z."""
+        sizes = self.tube.magnitudes(z)
+        L = self.tube.generators
+        way = np.abs(self.tube.centers(z)) + np.abs(self.tube.directions) @ sizes[:L]
+        body = self.robot.footprint + np.linalg.norm(self.measured) + sizes[L:].max()
+        return float(np.linalg.norm(way, axis=1).max() + body)
 
     def half_width(self, speed: Array) -> float:
         """[m] of the full stop's set, largest axis, from driving at inputs `speed` (m,) with that input once more."""
@@ -197,7 +187,7 @@ class Filter:
         kind, free, margin, verified = FAILSAFE, None, self.reach, False
         if not in_domain:
             attempt.reason = "the state is outside the domain that was recorded"
-        elif not len(near):
+        elif not len(near) and not (self.far and self._extent(z) > self.reach):
             kind, free, verified = ALLOWED, z[len(z_0) :], True
         else:
             kind, free, margin, verified = self._search(request, near, z_0, z, proposal, attempt)
@@ -273,6 +263,8 @@ class Filter:
     def _margin(self, rows: Rows, z: Array) -> float:
         """Smallest distance [m] of the exact tube to a half-space; NaN never counts as inside."""
         margin = float((rows.bound - rows.support(self.tube, z)).min(initial=self.reach))
+        if self.far:
+            margin = min(margin, self.reach - self._extent(z))
         return margin if np.isfinite(margin) else -np.inf
 
     def _rows(self, request: Request, near: Shapes, z: Array) -> tuple[Rows, Rows]:
@@ -280,15 +272,13 @@ class Filter:
         d, robot = self.robot.position_dim, self.robot
         start = request.state[:d]
         heading = request.state[robot.heading] if robot.heading is not None else 0.0
-        nominal = start + rotate(self.tube.centers(z), np.asarray(heading))
+        nominal = start + rotate(self.tube.centers(z), heading)
         normals, offsets = half_spaces(near, start, nominal, robot.footprint, self.measured)
-        local = rotate(normals, np.asarray(-heading))
+        local = rotate(normals, -heading)
         rows = self.layout.rows(local, offsets)
         return rows, rows if self.outer_layout is self.layout else self.outer_layout.rows(local, offsets)
 
-    def _committed(
-        self, request: Request, near: Shapes, z_0: Array, trusted: bool
-    ) -> tuple[Array, Array, float, bool]:
+    def _committed(self, request: Request, near: Shapes, z_0: Array, trusted: bool) -> tuple[Array, Array, float, bool]:
         """The committed plan, verified anew if it is not trusted; braking if it can't be. (plan, free, margin, ok)"""
         robot = self.robot
         free = request.plan[: robot.free_steps].ravel()
@@ -308,7 +298,7 @@ class Filter:
     ) -> Decision:
         robot, d = self.robot, self.robot.position_dim
         heading = float(request.state[robot.heading]) if robot.heading is not None else 0.0
-        centers = request.state[:d] + rotate(self.tube.centers(z), np.asarray(heading))
+        centers = request.state[:d] + rotate(self.tube.centers(z), heading)
         turned = self.tube.directions if robot.heading is None else self._turned(heading)
         half = np.abs(turned) @ self.tube.magnitudes(z)[: self.tube.generators] + self.measured
         finished = perf_counter_ns()
@@ -341,7 +331,7 @@ class Filter:
         regressor = self.model.first_regressor(z)
         center = first.C @ regressor
         position = center[: robot.position_dim]
-        center[: robot.position_dim] = request.state[: robot.position_dim] + rotate(position, np.asarray(heading))
+        center[: robot.position_dim] = request.state[: robot.position_dim] + rotate(position, heading)
         if robot.heading is not None:
             center[robot.heading] += heading
         return Prediction(center, first.half_widths(regressor), heading)

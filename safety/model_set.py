@@ -13,6 +13,7 @@ from safetensors import SafetensorError
 from safetensors.numpy import load, save
 
 from messaging.robots import Robot, UnknownRobot, robot_named
+from messaging.shapes import rotate
 from safety.certificates import (
     KINDS,
     MATRIX_ZONOTOPE,
@@ -26,7 +27,7 @@ from safety.certificates import (
     set_membership,
     whitening,
 )
-from safety.dataset import BadData, Dataset, Windows, quality, rotate, windows
+from safety.dataset import BadData, Dataset, Windows, quality, windows
 from safety.tube import Tube, recursion_of, stack_direct, stack_recursive
 
 Array = NDArray[np.float64]

@@ -25,7 +25,10 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Tube:
-    """position (N, d, nz); directions (N, d, L); W (q, nz); M (L+N+1, q); m_0 (L+N+1): L generators, N bulges, latch."""
+    """position (N, d, nz); directions (N, d, L); W (q, nz); M (L+N+1, q); m_0 (L+N+1).
+
+    Magnitudes: of the L generators, of the N bulges, and of the latch.
+    """
 
     position: Array
     directions: Array
@@ -35,11 +38,11 @@ class Tube:
 
     @property
     def horizon(self) -> int:
-        return len(self.position)
+        return int(self.position.shape[0])
 
     @property
     def generators(self) -> int:
-        return self.directions.shape[2]
+        return int(self.directions.shape[2])
 
     def centers(self, z: Array) -> Array:
         """(N, d) for one z (nz,)."""

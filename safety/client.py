@@ -1,0 +1,165 @@
+"""How any program asks the safety service, and what it must keep between two questions.
+
+with SafetyClient.open("tcp/127.0.0.1:7447", "ground") as safety:
+    answer = safety.decide(state=[0, 0, 0, 0, 0], action=[0.25, 0], obstacles=[Obstacle("cylinder", (0.4, 0), (0.1,))])
+    drive(answer.action)          # and next period again; if it raises: drive(safety.fallback())
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from types import TracebackType
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from messaging import brakeline_pb2 as pb
+from messaging.bus import Bus, BusError, BusSettings
+from messaging.robots import Robot, robot_named
+from messaging.shapes import Obstacle
+from messaging.topics import DECIDE
+from safety.commitment import Commitment, Prediction
+
+Array = NDArray[np.float64]
+
+KINDS = {pb.ALLOWED: "allowed", pb.ADJUSTED: "adjusted", pb.FAILSAFE: "failsafe"}
+DEADLINE = 0.1  # s
+
+
+class SafetyError(BusError):
+    """The service answered this request with an error: `type` and the `field` that is wrong."""
+
+    def __init__(self, error: pb.Error) -> None:
+        super().__init__(f"{error.type}: {error.message}")
+        self.type, self.field = error.type, error.field
+
+
+@dataclass(frozen=True)
+class Answer:
+    """A decision as the asker sees it; `message` has everything."""
+
+    kind: str
+    action: Array
+    plan: Array
+    message: pb.Decision
+
+
+def obstacle_messages(obstacles: Iterable[Obstacle]) -> list[pb.Obstacle]:
+    return [pb.Obstacle(kind=o.kind, position=o.position, size=o.size, yaw=o.yaw) for o in obstacles]
+
+
+def request_message(
+    commitment: Commitment, state: ArrayLike, action: ArrayLike, obstacles: Iterable[Obstacle], **more: Any
+) -> pb.Request:
+    """A request; `more`: actor, episode, step, time, observation."""
+    message = pb.Request(
+        robot=commitment.robot.name,
+        state=np.asarray(state, float).tolist(),
+        action=np.asarray(action, float).tolist(),
+        input_in_force=commitment.input_in_force.tolist(),
+        plan=commitment.plan.ravel().tolist(),
+        model=commitment.model,
+        obstacles=obstacle_messages(obstacles),
+        **more,
+    )
+    if commitment.predicted is not None:
+        message.predicted_center.extend(commitment.predicted.center.tolist())
+        message.predicted_half_width.extend(commitment.predicted.half_width.tolist())
+        message.predicted_heading = commitment.predicted.heading
+    return message
+
+
+def read(reply: pb.Reply, robot: Robot) -> Answer:
+    """The decision in a reply.
+
+    Raises:
+        SafetyError: it is an error, or its plan is not one of this robot's.
+    """
+    if reply.WhichOneof("result") != "decision":
+        raise SafetyError(reply.error)
+    decision = reply.decision
+    plan = np.array(decision.plan)
+    if plan.size != robot.horizon * robot.action_dim or decision.kind not in KINDS:
+        raise SafetyError(pb.Error(type="BadReply", field="plan", message=f"a plan of {plan.size} numbers"))
+    plan = plan.reshape(robot.horizon, robot.action_dim)
+    if not ((plan >= robot.low() - 1e-9) & (plan <= robot.high() + 1e-9)).all():  # NaN fails too
+        raise SafetyError(pb.Error(type="BadReply", field="plan", message="an input out of bounds"))
+    return Answer(KINDS[decision.kind], plan[0], plan, decision)
+
+
+def accept(commitment: Commitment, answer: Answer) -> Array:
+    """Commit to an answer's plan; returns the input to execute now."""
+    message = answer.message
+    predicted = Prediction(
+        np.array(message.predicted_center), np.array(message.predicted_half_width), message.predicted_heading
+    )
+    return commitment.accept(answer.plan, message.model, predicted)
+
+
+class SafetyClient:
+    """Asks the safety service about one robot, and keeps its committed plan.
+
+    Not for several threads at once; a program with several robots has a client (or a `Commitment`) for each.
+    """
+
+    def __init__(self, bus: Bus, robot: str, deadline: float = DEADLINE) -> None:
+        self.bus, self.robot, self.deadline = bus, robot_named(robot), deadline
+        self.commitment = Commitment(self.robot)
+        self._owned = False
+
+    @classmethod
+    def open(cls, connect: str | Sequence[str], robot: str, deadline: float = DEADLINE) -> Self:
+        """A client with a bus of its own.
+
+        Raises:
+            Unreachable: no router at these endpoints.
+        """
+        endpoints = (connect,) if isinstance(connect, str) else tuple(connect)
+        client = cls(Bus(BusSettings(connect=endpoints), "client"), robot, deadline)
+        client._owned = True
+        return client
+
+    def decide(self, state: ArrayLike, action: ArrayLike, obstacles: Iterable[Obstacle], **more: Any) -> Answer:
+        """The decision on an action; its plan is committed to, so execute `answer.action`.
+
+        Args:
+            state: measured; action: proposed; obstacles: at least those within reach (1 m is enough for `ground`).
+
+        Raises:
+            NoReply, Late, Refused, SafetyError: no decision; execute `fallback()` instead.
+        """
+        request = request_message(self.commitment, state, action, obstacles, **more)
+        answer = read(ask(self.bus, [request], self.deadline)[0], self.robot)
+        accept(self.commitment, answer)
+        return answer
+
+    def fallback(self) -> Array:
+        """The committed plan's next input, for when there is no decision."""
+        return self.commitment.fallback()
+
+    def close(self) -> None:
+        if self._owned:
+            self.bus.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None) -> None:
+        self.close()
+
+
+def ask(bus: Bus, requests: Sequence[pb.Request], deadline: float) -> list[pb.Reply]:
+    """The replies to requests about robots of one kind, in their order.
+
+    Raises:
+        NoReply, Late, Refused: nobody serves, too late, or not understood at all.
+        SafetyError: not as many replies as requests.
+    """
+    payload = pb.RequestBatch(requests=requests).SerializeToString()
+    batch = pb.ReplyBatch.FromString(bus.ask(DECIDE, payload, deadline, robot=requests[0].robot))
+    if len(batch.replies) != len(requests):
+        message = f"{len(batch.replies)} replies to {len(requests)} requests"
+        raise SafetyError(pb.Error(type="BadReply", message=message))
+    return list(batch.replies)

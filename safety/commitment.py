@@ -1,0 +1,78 @@
+"""What whoever drives a robot keeps between two decisions: the committed plan and what it predicts."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from messaging.robots import Robot
+from messaging.shapes import rotate
+
+Array = NDArray[np.float64]
+
+SAME_SET = 1e-9  # m, rad, ...: rounding allowed when a measurement is compared with its prediction
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """Where the next measured state must lie: |displacement - center| <= half_width in the frame of `heading`.
+
+    center, half_width: (n,); the position part of the center is in the world, its box turned by heading [rad].
+    """
+
+    center: Array
+    half_width: Array
+    heading: float
+
+    def contains(self, robot: Robot, state: Array) -> bool:
+        """Does the measured state (n,) lie in the set?"""
+        away = state - self.center
+        if robot.heading is not None:
+            d = robot.position_dim
+            away[:d] = rotate(away[:d], -self.heading)
+            away[robot.heading] = (away[robot.heading] + np.pi) % (2.0 * np.pi) - np.pi
+        return bool((np.abs(away) <= self.half_width + SAME_SET).all())
+
+
+class Commitment:
+    """The committed plan of one robot: verified when it was made, from then to standstill.
+
+    plan (N, m) is its tail: the first row is what to execute if no better answer comes.
+    """
+
+    def __init__(self, robot: Robot) -> None:
+        self.robot = robot
+        self.reset()
+
+    def reset(self) -> None:
+        """At an episode's start: standing still."""
+        self.plan: Array = np.zeros((self.robot.horizon, self.robot.action_dim))
+        self.input_in_force: Array = np.zeros(self.robot.action_dim)
+        self.model = ""
+        self.predicted: Prediction | None = None
+
+    def accept(self, plan: Array, model: str, predicted: Prediction | None) -> Array:
+        """A decision's plan becomes the committed one; returns the input to execute now."""
+        self.plan, self.model, self.predicted = plan, model, predicted
+        return self._advance()
+
+    def fallback(self) -> Array:
+        """No decision came: the committed plan's next input."""
+        self.predicted = None
+        return self._advance()
+
+    def _advance(self) -> Array:
+        now: Array = self.plan[0].copy()
+        self.plan = np.vstack([self.plan[1:], np.zeros((1, self.robot.action_dim))])
+        self.input_in_force = now
+        if not self.plan.any() and not now.any():
+            self.model = ""  # standing still needs nobody's word
+        return now
+
+
+def correction_penalty(robot: Robot, proposed: ArrayLike, executed: ArrayLike, weight: float) -> float:
+    """weight · ‖executed - proposed‖, each input in units of its range: what leaning on the filter costs."""
+    difference = (np.asarray(executed, float) - np.asarray(proposed, float)) / (robot.high() - robot.low())
+    return weight * float(np.linalg.norm(difference))

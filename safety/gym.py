@@ -1,0 +1,63 @@
+"""The filter in front of any policy, in process, as a Gymnasium wrapper.
+
+env = SafetyWrapper(NavigationEnv(), Filter(ModelSet.load(path)))
+model = AnyLibrary("MlpPolicy", env).learn(...)
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium
+import numpy as np
+from numpy.typing import NDArray
+
+from messaging.shapes import Shapes
+from safety.commitment import Commitment, correction_penalty
+from safety.filter import Decision, Filter, Request
+
+Observation = NDArray[np.float32]
+
+
+class SafetyWrapper(gymnasium.Wrapper[Any, Any, Any, Any]):
+    """Replaces each action by the filter's decision on it.
+
+    The environment's `info` must hold, after `reset` and `step`: `state`, the measured state (n,), and `obstacles`,
+    a list of `messaging.shapes.Obstacle` with at least those within `filter.reach`. The wrapper adds `safety` (the
+    `Decision`), `proposed` and `penalty`; the penalty is subtracted from the reward.
+    """
+
+    def __init__(self, env: gymnasium.Env[Any, Any], filter: Filter, penalty: float = 0.0) -> None:
+        super().__init__(env)
+        self.filter, self.penalty = filter, penalty
+        self.commitment = Commitment(filter.robot)
+        self._info: dict[str, Any] = {}
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        observation, self._info = self.env.reset(seed=seed, options=options)
+        self.commitment.reset()
+        return observation, self._info
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        decision = self.decide(np.asarray(action, dtype=float))
+        executed = self.commitment.accept(decision.plan, decision.model, decision.predicted)
+        observation, reward, terminated, truncated, self._info = self.env.step(executed.astype(np.float32))
+        cost = correction_penalty(self.filter.robot, action, executed, self.penalty)
+        self._info |= {"safety": decision, "proposed": action, "penalty": cost}
+        return observation, float(reward) - cost, terminated, truncated, self._info
+
+    def decide(self, action: NDArray[np.float64]) -> Decision:
+        """The decision on an action in the current state; a proposal that is no number becomes standing still."""
+        kept, robot = self.commitment, self.filter.robot
+        proposal = action if np.isfinite(action).all() else np.zeros(robot.action_dim)
+        return self.filter.decide(
+            Request(
+                state=np.asarray(self._info["state"], dtype=float),
+                action=proposal,
+                input_in_force=kept.input_in_force,
+                plan=kept.plan,
+                obstacles=Shapes.of(self._info["obstacles"], robot.position_dim),
+                model=kept.model,
+                predicted=kept.predicted,
+            )
+        )

@@ -1,0 +1,105 @@
+"""Requests and decisions, between messages and the filter's own types; every field of a request is checked here or
+in `Filter.decide` before it is used."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from google.protobuf.message import DecodeError
+
+from messaging import brakeline_pb2 as pb
+from messaging.robots import Robot
+from messaging.shapes import BadShape, Obstacle, Shapes
+from safety.commitment import Prediction
+from safety.filter import ADJUSTED, ALLOWED, FAILSAFE, BadRequest, Decision, Request
+
+KINDS = {ALLOWED: pb.ALLOWED, ADJUSTED: pb.ADJUSTED, FAILSAFE: pb.FAILSAFE}
+LARGEST = 1 << 20  # bytes of a request batch
+MOST_OBSTACLES = 1000
+
+
+def batch_of(payload: bytes) -> pb.RequestBatch:
+    """Raises BadRequest for anything that is not a batch of a sensible size."""
+    if len(payload) > LARGEST:
+        raise BadRequest("payload", f"{len(payload)} bytes; a request batch has at most {LARGEST}")
+    try:
+        batch = pb.RequestBatch.FromString(payload)
+    except DecodeError as error:
+        raise BadRequest("payload", f"not a request batch: {error}") from error
+    if not batch.requests:
+        raise BadRequest("requests", "the batch holds no request")
+    return batch
+
+
+def request_of(message: pb.Request, robot: Robot) -> Request:
+    """The request in a message.
+
+    Raises:
+        BadRequest: an obstacle, a size or a value is wrong, with the field's name.
+    """
+    predicted = None
+    if message.predicted_center or message.predicted_half_width:
+        center, half = np.array(message.predicted_center), np.array(message.predicted_half_width)
+        predicted = Prediction(center, half, message.predicted_heading)
+    plan = np.array(message.plan)
+    if plan.size != robot.horizon * robot.action_dim:
+        wanted = f"{robot.horizon} x {robot.action_dim}"
+        raise BadRequest("plan", f"plan has {plan.size} numbers, a {robot.name} robot's has {wanted}")
+    return Request(
+        state=np.array(message.state),
+        action=np.array(message.action),
+        input_in_force=np.array(message.input_in_force),
+        plan=plan.reshape(robot.horizon, robot.action_dim),
+        obstacles=shapes_of(message.obstacles, robot.position_dim),
+        model=message.model,
+        predicted=predicted,
+        observation=np.array(message.observation, np.float32),
+    )
+
+
+def shapes_of(messages: Sequence[pb.Obstacle], dim: int) -> Shapes:
+    """Raises BadRequest naming the obstacle and its field."""
+    if len(messages) > MOST_OBSTACLES:
+        raise BadRequest("obstacles", f"{len(messages)} obstacles; at most {MOST_OBSTACLES} can be within reach")
+    obstacles = []
+    for i, o in enumerate(messages):
+        try:
+            obstacles.append(Obstacle(o.kind, tuple(o.position), tuple(o.size), o.yaw))
+        except BadShape as error:
+            raise BadRequest(f"obstacles[{i}].{error.field}", str(error)) from error
+    try:
+        return Shapes.of(obstacles, dim)
+    except BadShape as error:
+        raise BadRequest("obstacles.position", str(error)) from error
+
+
+def message_of(decision: Decision, queue_ms: float) -> pb.Reply:
+    message = pb.Decision(
+        kind=KINDS[decision.kind],
+        plan=decision.plan.ravel().tolist(),
+        tube_center=decision.tube_center.ravel().tolist(),
+        tube_half_width=decision.tube_half_width.ravel().tolist(),
+        predicted_center=decision.predicted.center.tolist(),
+        predicted_half_width=decision.predicted.half_width.tolist(),
+        predicted_heading=decision.predicted.heading,
+        margin=decision.margin,
+        model=decision.model,
+        reason=decision.reason,
+        verified=decision.verified,
+        contained=decision.contained,
+        compared=decision.compared,
+        time_ms=decision.time_ms,
+        solve_ms=decision.solve_ms,
+        verify_ms=decision.verify_ms,
+        queue_ms=queue_ms,
+        solver=decision.solver,
+        iterations=decision.iterations,
+    )
+    return pb.Reply(decision=message)
+
+
+def error_of(error: Exception) -> pb.Reply:
+    """An error reply: type, field if it has one, and what to do."""
+    name = type(error).__name__
+    return pb.Reply(error=pb.Error(type=name, field=str(getattr(error, "field", "")), message=str(error)))
