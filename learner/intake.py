@@ -1,0 +1,57 @@
+"""From a step on the wire to a move to learn from: sizes and values are checked, the action is normalised."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from learner.replay import Vector
+from learner.windows import Move
+from messaging import brakeline_pb2 as pb
+from messaging.robots import Robot
+
+
+class BadStep(ValueError):
+    """A step that cannot be learned from; `field` names what is wrong with it."""
+
+    def __init__(self, field: str, why: str) -> None:
+        super().__init__(f"{field}: {why}")
+        self.field = field
+
+
+class Intake:
+    """Reads the steps of one kind of robot. The reward learned is `reward − penalty`, the action the executed one."""
+
+    def __init__(self, robot: Robot) -> None:
+        self.robot = robot
+        self._centre, self._half = (robot.high() + robot.low()) / 2.0, (robot.high() - robot.low()) / 2.0
+
+    def move(self, step: pb.Step) -> Move:
+        """
+        Raises:
+            BadStep: it cannot be learned from.
+        """
+        if step.robot != self.robot.name:
+            raise BadStep("robot", f"{step.robot!r} where {self.robot.name!r} is learned")
+        if not step.actor:
+            raise BadStep("actor", "empty")
+        if step.index == 0:
+            raise BadStep("index", "counts from 1")
+        reward = step.reward - step.penalty
+        if not np.isfinite(reward):
+            raise BadStep("reward", f"{step.reward} - {step.penalty}")
+        executed = _vector("action", step.action, self.robot.action_dim)
+        action = np.clip((executed - self._centre) / self._half, -1.0, 1.0).astype(np.float32)
+        observation = _vector("observation", step.observation, self.robot.observation_dim)
+        after = _vector("next_observation", step.next_observation, self.robot.observation_dim)
+        return Move(step.episode, step.step, observation, action, reward, after, step.terminated, step.truncated)
+
+
+def _vector(name: str, values: Any, size: int) -> Vector:
+    vector = np.array(values, np.float32)
+    if vector.shape != (size,):
+        raise BadStep(name, f"{len(values)} values where {size} belong")
+    if not np.isfinite(vector).all():
+        raise BadStep(name, "not finite")
+    return vector

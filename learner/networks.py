@@ -1,0 +1,158 @@
+"""Multilayer perceptrons side by side, with the gradients written out.
+
+Training is bound by matrix products, so everything else is kept out of the way: the parameters of a network are one
+flat vector (one Adam step, one Polyak step), twins are one batched product, and every array is allocated once.
+Autograd would be shorter, and slower at these sizes; `tests/learner/test_networks.py` holds it against these gradients.
+"""
+
+from __future__ import annotations
+
+import math
+from itertools import pairwise
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+Precision = Literal["float32", "bfloat16"]
+WIDE = 64  # a product is worth rounding to bfloat16 from this width on
+
+
+class Dense:
+    """`count` affine maps side by side, z_i = x_i W_iᵀ + b_i.
+
+    Shapes: x (count, batch, in), W (count, out, in), b (count, 1, out), z (count, batch, out).
+    """
+
+    def __init__(self, weight: Tensor, bias: Tensor, batch: int) -> None:
+        count, outputs, inputs = weight.shape
+        self.weight, self.bias = weight, bias
+        self.x = torch.zeros(count, batch, inputs)
+        self.z = torch.zeros(count, batch, outputs)
+        self.dx = torch.zeros(count, batch, inputs)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """z for x (count or 1, batch, in); x is kept by reference until the backward pass."""
+        self.x = x.expand(self.weight.shape[0], -1, -1)
+        return torch.baddbmm(self.bias, self.x, self.weight.mT, out=self.z)
+
+    def parameter_gradient(self, dz: Tensor, weight_gradient: Tensor, bias_gradient: Tensor) -> None:
+        torch.bmm(dz.mT, self.x, out=weight_gradient)
+        torch.sum(dz, dim=1, keepdim=True, out=bias_gradient)
+
+    def input_gradient(self, dz: Tensor) -> Tensor:
+        if self.weight.shape[1] == 1:  # an outer product: the batched one takes fifteen times as long
+            return torch.mul(dz, self.weight, out=self.dx)
+        return torch.bmm(dz, self.weight, out=self.dx)
+
+
+class HalfDense(Dense):
+    """A `Dense` whose three products round their factors and results to bfloat16; parameters stay in float32.
+
+    Twice as fast where the processor multiplies bfloat16 (AVX512-BF16, AMX), slower where it does not.
+    """
+
+    def __init__(self, weight: Tensor, bias: Tensor, batch: int) -> None:
+        super().__init__(weight, bias, batch)
+        self.half_weight = weight.bfloat16()
+        self.half_gradient = torch.zeros_like(self.half_weight)
+        self.half_x = self.x.bfloat16()
+        self.half_z = self.z.bfloat16()
+        self.half_dx = self.dx.bfloat16()
+
+    def forward(self, x: Tensor) -> Tensor:
+        self.half_weight.copy_(self.weight)
+        self.half_x.copy_(x)
+        torch.bmm(self.half_x, self.half_weight.mT, out=self.half_z)
+        return torch.add(self.half_z, self.bias, out=self.z)
+
+    def parameter_gradient(self, dz: Tensor, weight_gradient: Tensor, bias_gradient: Tensor) -> None:
+        self.half_z.copy_(dz)
+        torch.bmm(self.half_z.mT, self.half_x, out=self.half_gradient)
+        weight_gradient.copy_(self.half_gradient)
+        torch.sum(dz, dim=1, keepdim=True, out=bias_gradient)
+
+    def input_gradient(self, dz: Tensor) -> Tensor:
+        self.half_z.copy_(dz)
+        torch.bmm(self.half_z, self.half_weight, out=self.half_dx)
+        return self.dx.copy_(self.half_dx)
+
+
+class Network:
+    """`count` perceptrons of one shape: affine, ReLU, affine, …, affine.
+
+    `sizes` is (inputs, hidden…, outputs). A `Network` made by `first()` shares the parameters of its parent's
+    first perceptron and has its own working memory.
+    """
+
+    def __init__(
+        self,
+        sizes: tuple[int, ...],
+        count: int,
+        batch: int,
+        precision: Precision = "float32",
+        parameters: Tensor | None = None,
+    ) -> None:
+        self.sizes, self.count, self.batch, self.precision = sizes, count, batch, precision
+        size = count * sum(o * i + o for i, o in pairwise(sizes))
+        self.parameters = torch.zeros(size) if parameters is None else parameters
+        self.gradients = torch.zeros(size)
+        self._gradient_views = self._views(self.gradients)
+        self._stack(self._views(self.parameters))
+
+    def _stack(self, views: list[tuple[Tensor, Tensor]]) -> None:
+        self.layers: list[Dense] = []
+        for weight, bias in views:
+            wide = min(weight.shape[1:]) >= WIDE
+            kind = HalfDense if self.precision == "bfloat16" and wide else Dense
+            self.layers.append(kind(weight, bias, self.batch))
+
+    def _views(self, flat: Tensor) -> list[tuple[Tensor, Tensor]]:
+        """Weight (count, out, in) and bias (count, 1, out) of every layer, as windows on a flat vector."""
+        views, start = [], 0
+        for inputs, outputs in pairwise(self.sizes):
+            weight = flat[start : start + self.count * outputs * inputs].view(self.count, outputs, inputs)
+            start += weight.numel()
+            bias = flat[start : start + self.count * outputs].view(self.count, 1, outputs)
+            start += bias.numel()
+            views.append((weight, bias))
+        return views
+
+    def initialise(self, generator: torch.Generator) -> None:
+        """Uniform in ±1/√(inputs of the layer), as torch's linear layers start."""
+        for layer in self.layers:
+            bound = 1.0 / math.sqrt(layer.weight.shape[2])
+            layer.weight.uniform_(-bound, bound, generator=generator)
+            layer.bias.uniform_(-bound, bound, generator=generator)
+
+    def first(self) -> Network:
+        other = Network(self.sizes, 1, self.batch, self.precision)
+        other._stack([(layer.weight[:1], layer.bias[:1]) for layer in self.layers])
+        return other
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Outputs (count, batch, out) for x (1 or count, batch, in); valid until the next call."""
+        for layer in self.layers[:-1]:
+            x = layer.forward(x).relu_()
+        return self.layers[-1].forward(x)
+
+    def parameter_gradient(self, dz: Tensor) -> Tensor:
+        """Backward from the outputs' gradient; fills and returns `gradients`."""
+        for depth in range(len(self.layers) - 1, -1, -1):
+            self.layers[depth].parameter_gradient(dz, *self._gradient_views[depth])
+            if depth > 0:
+                dz = self._through_relu(depth, dz)
+        return self.gradients
+
+    def input_gradient(self, dz: Tensor, columns: slice) -> Tensor:
+        """Gradient (count, batch, columns) by some inputs, past the parameters."""
+        for depth in range(len(self.layers) - 1, 0, -1):
+            dz = self._through_relu(depth, dz)
+        return torch.bmm(dz, self.layers[0].weight[:, :, columns])
+
+    def _through_relu(self, depth: int, dz: Tensor) -> Tensor:
+        """The gradient before the ReLU that feeds layer `depth`."""
+        dx = self.layers[depth].input_gradient(dz)
+        active = self.layers[depth - 1].z  # after the ReLU, which worked in place
+        torch.ops.aten.threshold_backward.grad_input(dx, active, 0, grad_input=dx)
+        return dx

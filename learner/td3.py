@@ -1,0 +1,161 @@
+"""TD3 (Fujimoto et al. 2018): twin critics, a smoothed target, a delayed actor.
+
+Actions are normalised to [−1, 1] per coordinate. A transition spans k ≤ n steps (`learner/windows.py`):
+
+    y     = c·R + d · min_i Q̄_i(s', clip(π̄(s') + ε, −1, 1)),   ε = clip(N(0, σ²), −η, η)
+    L_Q   = Σ_i mean (Q_i(s, a) − y)²
+    L_π   = −mean Q_1(s, π(s))                                     every `policy_delay`-th update, then
+    θ̄     ← θ̄ + τ (θ − θ̄)
+
+with R = Σ_j γ^j r_j over the k steps, d = γ^k or 0 at a true end, c the reward scale.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from learner.adam import Adam
+from learner.networks import Network, Precision
+from learner.replay import Batch
+from learner.state import State
+
+
+@dataclass(frozen=True)
+class TD3Config:
+    hidden: tuple[int, ...] = (256, 256)
+    actor_rate: float = 3e-4
+    critic_rate: float = 3e-4
+    batch: int = 256
+    gamma: float = 0.99
+    n_step: int = 3
+    tau: float = 0.005
+    policy_delay: int = 2
+    target_noise: float = 0.2  # σ, of the half range of an action
+    target_noise_clip: float = 0.5  # η
+    exploration_noise: float = 0.1  # of the half range; travels to the actors with the weights
+    reward_scale: float = 0.1  # keeps |Q| near 10 for rewards of ±100, where Adam at 3e-4 is quick
+    updates_per_step: float = 1.0
+    warmup: int = 2000  # steps at random before the first update
+    precision: Precision = "float32"  # of the wide products
+
+    def __post_init__(self) -> None:
+        if min(self.batch, self.n_step, self.policy_delay, self.updates_per_step) <= 0 or not self.hidden:
+            raise ValueError(f"batch, n_step, policy_delay, updates_per_step and hidden must be positive: {self}")
+        if self.warmup < self.n_step:
+            raise ValueError(f"warmup {self.warmup} is shorter than n_step {self.n_step}: nothing to sample from")
+        if not 0.0 <= self.gamma <= 1.0 or not 0.0 < self.tau <= 1.0:
+            raise ValueError(f"gamma must be in [0, 1] and tau in (0, 1]: {self}")
+
+
+@dataclass
+class Losses:
+    """Of the last updates of each kind."""
+
+    critic: float = 0.0
+    actor: float = 0.0
+    mean_q: float = 0.0
+
+
+class TD3:
+    """Networks, their targets and optimisers; one `update` per batch."""
+
+    def __init__(self, observation_dim: int, action_dim: int, config: TD3Config, seed: int) -> None:
+        torch.set_num_threads(1)  # several processes with two threads each on two cores are ten times slower
+        self.config, self.updates, self.losses = config, 0, Losses()
+        self._generator = torch.Generator().manual_seed(seed)
+        batch, joint = config.batch, observation_dim + action_dim
+        actor_sizes = (observation_dim, *config.hidden, action_dim)
+        critic_sizes = (joint, *config.hidden, 1)
+        self.actor = Network(actor_sizes, 1, batch, config.precision)
+        self.critics = Network(critic_sizes, 2, batch, config.precision)
+        self.actor.initialise(self._generator)
+        self.critics.initialise(self._generator)
+        self.target_actor = Network(actor_sizes, 1, batch, config.precision, self.actor.parameters.clone())
+        self.target_critics = Network(critic_sizes, 2, batch, config.precision, self.critics.parameters.clone())
+        self._first_critic = self.critics.first()
+        self.actor_adam = Adam(self.actor.parameters, config.actor_rate)
+        self.critic_adam = Adam(self.critics.parameters, config.critic_rate)
+        self._observation = slice(0, observation_dim)
+        self._action = slice(observation_dim, joint)
+        self._joint = torch.zeros(1, batch, joint)  # working memory: [observation, action]
+        self._noise = torch.zeros(1, batch, action_dim)
+        self._target = torch.zeros(1, batch, 1)
+
+    def update(self, batch: Batch) -> None:
+        torch.set_flush_denormal(
+            True
+        )  # the moments of silent units decay into denormals: up to half the time, for nothing
+        self._update_critics(batch)
+        self.updates += 1
+        if self.updates % self.config.policy_delay == 0:
+            self._update_actor(batch)
+            self.target_actor.parameters.lerp_(self.actor.parameters, self.config.tau)
+            self.target_critics.parameters.lerp_(self.critics.parameters, self.config.tau)
+        torch.set_flush_denormal(False)  # it holds for the whole thread, which is not ours alone
+
+    def target(self, batch: Batch) -> Tensor:
+        """y (1, batch, 1)."""
+        config = self.config
+        noise = self._noise.normal_(0.0, 1.0, generator=self._generator).mul_(config.target_noise)
+        noise.clamp_(-config.target_noise_clip, config.target_noise_clip)
+        action = self.target_actor.forward(batch.next_observation).tanh_().add_(noise).clamp_(-1.0, 1.0)
+        value = self.target_critics.forward(self._pair(batch.next_observation, action)).amin(dim=0, keepdim=True)
+        torch.mul(value, batch.discount, out=self._target)
+        return self._target.add_(batch.reward, alpha=config.reward_scale)
+
+    def _pair(self, observation: Tensor, action: Tensor) -> Tensor:
+        self._joint[:, :, self._observation] = observation
+        self._joint[:, :, self._action] = action
+        return self._joint
+
+    def _update_critics(self, batch: Batch) -> None:
+        target = self.target(batch)
+        value = self.critics.forward(self._pair(batch.observation, batch.action))
+        self.losses.mean_q = float(value.mean())
+        error = value.sub_(target)
+        self.losses.critic = float(error.flatten().dot(error.flatten())) / self.config.batch
+        self.critic_adam.step(self.critics.parameter_gradient(error.mul_(2.0 / self.config.batch)))
+
+    def _update_actor(self, batch: Batch) -> None:
+        action = self.actor.forward(batch.observation).tanh_()
+        value = self._first_critic.forward(self._pair(batch.observation, action))
+        self.losses.actor = -float(value.mean())
+        dvalue = value.fill_(-1.0 / self.config.batch)
+        daction = self._first_critic.input_gradient(dvalue, self._action)
+        self.actor_adam.step(self.actor.parameter_gradient(daction * (1.0 - action * action)))
+
+    def policy_layers(self) -> list[tuple[NDArray[np.float32], NDArray[np.float32]]]:
+        """Weight (out, in) and bias (out,) of the actor's layers, copied."""
+        return [(layer.weight[0].numpy().copy(), layer.bias[0, 0].numpy().copy()) for layer in self.actor.layers]
+
+    def _tensors(self) -> dict[str, Tensor]:
+        return {
+            "actor": self.actor.parameters,
+            "critics": self.critics.parameters,
+            "target_actor": self.target_actor.parameters,
+            "target_critics": self.target_critics.parameters,
+            "actor_mean": self.actor_adam.mean,
+            "actor_square": self.actor_adam.square,
+            "critic_mean": self.critic_adam.mean,
+            "critic_square": self.critic_adam.square,
+        }
+
+    def state(self) -> State:
+        tensors = {name: tensor.numpy() for name, tensor in self._tensors().items()}
+        tensors["generator"] = self._generator.get_state().numpy()
+        counts = {"updates": self.updates, "actor_adam": self.actor_adam.count, "critic_adam": self.critic_adam.count}
+        return State(tensors, counts)
+
+    def restore(self, state: State) -> None:
+        for name, tensor in self._tensors().items():
+            tensor.copy_(torch.from_numpy(state.tensor(name, tuple(tensor.shape), "float32").copy()))
+        generator = state.tensor("generator", tuple(self._generator.get_state().shape), "uint8")
+        self._generator.set_state(torch.from_numpy(generator.copy()))
+        self.updates = state.integer("updates")
+        self.actor_adam.count = state.integer("actor_adam")
+        self.critic_adam.count = state.integer("critic_adam")

@@ -1,0 +1,97 @@
+"""From single steps to n-step transitions, per actor.
+
+A window opens at every step and closes after n steps or, shorter, where the episode ends or a step is missing. Only a
+*terminated* episode has no value beyond its end; truncation and gaps leave one, γ^k Q(s'), with s' as last seen. So
+nothing spans a gap and nothing that arrived is lost.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import NamedTuple
+
+import numpy as np
+
+from learner.replay import Transition, Vector
+from learner.state import State
+
+
+class Move(NamedTuple):
+    """One step of one episode of an actor."""
+
+    episode: int
+    step: int
+    observation: Vector
+    action: Vector
+    reward: float
+    next_observation: Vector
+    terminated: bool
+    truncated: bool
+
+
+class Windows:
+    """Open windows of every actor: at most n − 1 consecutive moves each."""
+
+    def __init__(self, n: int, gamma: float) -> None:
+        self.n, self.gamma = n, gamma
+        self._open: dict[str, deque[Move]] = {}
+        self._last: dict[str, tuple[int, int]] = {}  # newest (episode, step) of an actor
+
+    def push(self, actor: str, move: Move) -> list[Transition]:
+        """The transitions that this move completes, oldest first. Moves are not repeated (`learner/ledger.py`)."""
+        here, last = (move.episode, move.step), self._last.get(actor, (-1, -1))
+        if here < last:  # a straggler: its neighbours are closed, it stands for itself
+            return [self._close([move])]
+        self._last[actor] = here
+        moves = self._open.setdefault(actor, deque())
+        done: list[Transition] = []
+        if here != (last[0], last[1] + 1):
+            done += self._drain(moves)
+        moves.append(move)
+        if move.terminated or move.truncated:
+            done += self._drain(moves)
+        elif len(moves) == self.n:
+            done.append(self._close(moves))
+            moves.popleft()
+        return done
+
+    def _drain(self, moves: deque[Move]) -> list[Transition]:
+        done = []
+        while moves:
+            done.append(self._close(moves))
+            moves.popleft()
+        return done
+
+    def _close(self, moves: deque[Move] | list[Move]) -> Transition:
+        first, last = moves[0], moves[-1]
+        reward = 0.0
+        for move in reversed(moves):
+            reward = move.reward + self.gamma * reward
+        discount = 0.0 if last.terminated else self.gamma ** len(moves)
+        return Transition(first.observation, first.action, reward, discount, last.next_observation)
+
+    def state(self) -> State:
+        """The open windows too: with several actors a checkpoint cuts through the episodes of all but one."""
+        actors = sorted(self._last)
+        moves = [(number, move) for number, actor in enumerate(actors) for move in self._open[actor]]
+        tensors = {
+            "place": np.array([(n, m.episode, m.step) for n, m in moves], np.int64).reshape(len(moves), 3),
+            "reward": np.array([m.reward for _, m in moves], np.float64),
+        }
+        for name in ("observation", "action", "next_observation"):
+            rows = [getattr(move, name) for _, move in moves]
+            tensors[name] = np.array(rows, np.float32) if rows else np.zeros((0, 0), np.float32)
+        return State(tensors, {"actors": actors, "last": [list(self._last[actor]) for actor in actors]})
+
+    def restore(self, state: State) -> None:
+        actors: list[str] = state.value("actors")
+        self._last = {actor: (last[0], last[1]) for actor, last in zip(actors, state.value("last"), strict=True)}
+        self._open = {actor: deque() for actor in actors}
+        place = state.tensor("place", (None, 3), "int64")
+        rewards = state.tensor("reward", (len(place),), "float64")
+        vectors = [
+            state.tensor(name, (len(place), None), "float32") for name in ("observation", "action", "next_observation")
+        ]
+        for (number, episode, step), reward, observation, action, after in zip(place, rewards, *vectors, strict=True):
+            move = Move(int(episode), int(step), observation, action, float(reward), after, False, False)
+            self._open[actors[number]].append(move)

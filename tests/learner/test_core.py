@@ -1,0 +1,253 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from learner.checkpoint import DamagedPart, NoCheckpoint, OtherRun
+from learner.core import Learner
+from learner.intake import BadStep
+from messaging import brakeline_pb2 as pb
+from messaging import weights
+from tests.learner.toy import CONFIG, TOY, ToyActor, run, settle
+
+
+def started(config=CONFIG) -> tuple[Learner, ToyActor]:
+    learner = Learner(TOY, config)
+    actor = ToyActor(learner)
+    actor.join()
+    return learner, actor
+
+
+def finished(config=CONFIG) -> Learner:
+    learner, actor = started(config)
+    run(learner, actor)
+    return learner
+
+
+def step(number: int, **fields) -> pb.Step:
+    values = {
+        "robot": "toy",
+        "actor": "actor-0",
+        "step": number - 1,
+        "index": number,
+        "observation": [0.0, 0.0],
+        "action": [1.0],
+        "next_observation": [0.0, 0.0],
+    }
+    return pb.Step(**(values | fields))
+
+
+def test_lockstep_runs_are_alike_bit_for_bit():
+    one, other = finished(), finished()
+    assert one.weights().SerializeToString(deterministic=True) == other.weights().SerializeToString(deterministic=True)
+    assert one.weights().version > 100
+    assert (one.steps, one.updates) == (600, 540)
+    assert finished(replace(CONFIG, seed=1)).weights().file != one.weights().file
+
+
+@pytest.mark.parametrize("episodes", [1, 3, 11])  # in the warm-up, at its end, in the middle
+@pytest.mark.parametrize("n_step", [1, 3])
+def test_resumed_run_ends_with_the_same_bits(tmp_path, episodes, n_step):
+    config = replace(CONFIG, td3=replace(CONFIG.td3, n_step=n_step), steps=400)
+    learner, actor = started(config)
+    run(learner, actor, episodes)
+    assert learner.may_save()
+    learner.save(tmp_path)
+    run(learner, actor, 2)  # what a crash then loses
+
+    resumed = Learner(TOY, replace(config, checkpoint_every=7), incarnation=1)
+    resumed.restore(tmp_path)
+    newborn = ToyActor(resumed)
+    assert newborn.join().episode == episodes
+    run(resumed, newborn)
+    assert resumed.weights().file == finished(config).weights().file
+    assert (resumed.steps, resumed.metrics().missing) == (400, 0)
+
+
+def test_a_shorter_run_resumed_to_full_length_is_the_full_run(tmp_path):
+    short = finished(replace(CONFIG, steps=150))
+    assert short.steps == 160 and short.may_save()  # the episode in which step 150 falls
+    short.save(tmp_path)
+    learner = Learner(TOY, CONFIG)
+    learner.restore(tmp_path)
+    actor = ToyActor(learner)
+    actor.join()
+    run(learner, actor)
+    assert learner.weights().file == finished().weights().file
+
+
+def test_it_learns():
+    learner, actor = started(replace(CONFIG, steps=2500, capacity=2500))
+    run(learner, actor)
+    assert np.mean(actor.rewards[-20:]) > 0.5 * np.mean(actor.rewards[:5])
+    policy = weights.decode(learner.weights().file, TOY)
+    assert policy(np.array([-1.0, 1.0]))[0] > 1.5 and policy(np.array([1.0, -1.0]))[0] < 0.5
+
+
+def test_reward_learned_is_without_the_penalty_and_actions_are_normalised():
+    learner, _ = started(replace(CONFIG, td3=replace(CONFIG.td3, n_step=1)))
+    learner.insert(step(1, reward=2.0, penalty=0.5, action=[1.5]))
+    state = learner._replay.state()
+    assert state.tensors["reward"][0] == 1.5 and state.tensors["action"][0] == 0.5
+
+
+@pytest.mark.parametrize(
+    ("fields", "wrong"),
+    [
+        ({"robot": "ground"}, "robot"),
+        ({"actor": ""}, "actor"),
+        ({"index": 0}, "index"),
+        ({"observation": [0.0]}, "observation"),
+        ({"next_observation": [0.0, float("nan")]}, "next_observation"),
+        ({"action": [float("inf")]}, "action"),
+        ({"action": [1.0, 1.0]}, "action"),
+        ({"penalty": float("inf")}, "reward"),
+    ],
+)
+def test_bad_steps_name_the_field_and_change_nothing(fields, wrong):
+    learner, _ = started()
+    with pytest.raises(BadStep) as caught:
+        learner.insert(step(1, **fields))
+    assert caught.value.field == wrong
+    assert (learner.rejected, learner.steps, learner.metrics().missing) == (1, 0, 0)
+    assert learner.insert(step(1))
+
+
+def test_duplicates_and_gaps_are_counted():
+    learner, _ = started()
+    assert [learner.insert(step(index)) for index in (1, 2, 2, 5, 1)] == [True, True, False, True, False]
+    metrics = learner.metrics()
+    assert (metrics.steps, metrics.duplicates, metrics.missing) == (3, 2, 2)
+
+
+@pytest.mark.parametrize(
+    ("fields", "wrong"), [({"robot": "ground"}, "robot"), ({"layout": "0123"}, "layout"), ({"actor": ""}, "actor")]
+)
+def test_join_refusals(fields, wrong):
+    join = {"robot": "toy", "actor": "actor-0", "layout": TOY.layout()} | fields
+    reply = Learner(TOY, CONFIG).join(pb.Join(**join))
+    assert (reply.error.type, reply.error.field) == ("Refused", wrong)
+    assert not reply.HasField("weights") and not reply.HasField("flow")
+
+
+def test_lockstep_takes_one_actor():
+    learner, actor = started()
+    assert learner.join(pb.Join(robot="toy", actor="actor-1", layout=TOY.layout())).error.field == "actor"
+    assert not actor.join().HasField("error")
+
+
+def test_a_late_joiner_gets_weights_and_its_place():
+    learner, _ = started(replace(CONFIG, lockstep=False))
+    reply = learner.join(pb.Join(robot="toy", actor="actor-1", layout=TOY.layout(), index=100, episode=4))
+    assert reply.episode == 4
+    assert weights.decode(reply.weights.file, TOY).version == reply.flow.weights_version == 1
+    assert 100 < reply.flow.limit["actor-1"] <= 100 + CONFIG.window
+    assert reply.flow.warmup and not reply.flow.done
+
+
+def asynchronous(**changes) -> Learner:
+    learner = Learner(TOY, replace(CONFIG, lockstep=False, window=8, ahead=20, publish_every=5, **changes))
+    for actor in ("actor-0", "actor-1"):
+        learner.join(pb.Join(robot="toy", actor=actor, layout=TOY.layout()))
+    return learner
+
+
+def push_to_the_limit(learner: Learner) -> int:
+    """Both actors publish all that they may; returns how many steps that was."""
+    pushed, limits = 0, dict(learner.flow().limit)
+    for actor, limit in limits.items():
+        last = learner._ledger.places[actor].last_index
+        for index in range(last + 1, limit + 1):
+            learner.insert(step(index, actor=actor))
+            pushed += 1
+    return pushed
+
+
+def test_flow_holds_actors_back_until_the_updates_are_made():
+    learner = asynchronous()
+    while push_to_the_limit(learner):
+        pass
+    assert 60 + 20 <= learner.steps <= 60 + 20 + 8  # warm-up, ahead, at most an actor's share more
+    assert learner.flow().limit == learner.flow().limit
+    version = learner.weights().version
+    assert learner.work(10) == 10 and learner.weights_due()
+    learner.publish()
+    assert learner.flow().weights_version == version + 1 and not learner.weights_due()
+    assert 0 < push_to_the_limit(learner) <= 20
+
+
+def test_a_silent_actor_holds_up_nobody_and_the_run_ends_at_its_last_step():
+    learner = asynchronous(steps=300)
+    index = 0
+    while not learner.flow().done:
+        before = learner.updates + learner.steps
+        while index < learner.flow().limit["actor-0"]:
+            index += 1
+            learner.insert(step(index))
+        learner.work(1000)
+        assert learner.updates + learner.steps > before
+    assert learner.steps == 300
+    assert learner.weights_due()  # the last updates, however few
+    assert not learner.insert(step(301)) and learner.surplus == 1
+    assert learner.metrics().done
+
+
+def test_asynchronous_resume_keeps_open_windows_and_counts_what_was_lost(tmp_path):
+    learner = asynchronous()
+    for index in range(1, 6):
+        learner.insert(step(index))
+        learner.insert(step(index, actor="actor-1"))
+    learner.save(tmp_path)
+    again = asynchronous()
+    again.restore(tmp_path)
+    again.join(pb.Join(robot="toy", actor="actor-0", layout=TOY.layout(), index=9, episode=1))
+    assert again.metrics().missing == 4
+    assert not again.insert(step(5, actor="actor-1"))
+    assert again.insert(step(6, actor="actor-1"))
+    assert len(again._replay) == len(learner._replay) + 1  # the window that step 5 had left open
+
+
+def test_checkpoints_fall_between_episodes():
+    learner, _ = started(replace(CONFIG, checkpoint_every=30))
+    for index in range(1, 41):
+        learner.insert(step(index, truncated=index == 40))
+        assert learner.checkpoint_due() == (index == 40)
+
+
+def test_restore_refuses_what_is_not_this_run(tmp_path):
+    with pytest.raises(NoCheckpoint):
+        Learner(TOY, CONFIG).restore(tmp_path)
+    learner, actor = started()
+    run(learner, actor, 4)
+    learner.save(tmp_path)
+    with pytest.raises(OtherRun, match="seed"):
+        Learner(TOY, replace(CONFIG, seed=3)).restore(tmp_path)
+    with pytest.raises(OtherRun, match="td3"):
+        Learner(TOY, replace(CONFIG, td3=replace(CONFIG.td3, gamma=0.5))).restore(tmp_path)
+    with pytest.raises(OtherRun, match="layout"):
+        Learner(replace(TOY, period=0.1), CONFIG).restore(tmp_path)
+
+
+def test_restore_names_the_part_whose_shape_is_wrong(tmp_path):
+    learner, actor = started()
+    run(learner, actor, 4)
+    learner.save(tmp_path)
+    other = Learner(TOY, CONFIG)
+    other._replay.capacity += 1
+    with pytest.raises(DamagedPart) as caught:
+        other.restore(tmp_path)
+    assert caught.value.part == "replay"
+
+
+def test_figures():
+    now = [0.0]
+    learner = Learner(TOY, CONFIG, clock=lambda: now[0])
+    actor = ToyActor(learner)
+    actor.join()
+    run(learner, actor, 5)
+    now[0] = 2.0
+    settle(learner)
+    metrics = learner.metrics()
+    assert (metrics.steps, metrics.steps_per_s, metrics.updates, metrics.updates_per_s) == (100, 50.0, 40, 20.0)
+    assert metrics.critic_loss > 0.0 and metrics.staleness == 0.0 and metrics.limiter_error == 0.0
+    assert learner.metrics().steps_per_s == 0.0

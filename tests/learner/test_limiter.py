@@ -1,0 +1,57 @@
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from learner.limiter import Limiter
+
+RATIOS = st.sampled_from([0.5, 1.0, 4.0, 8.0, 16.0, 64.0])
+
+
+@given(st.lists(st.booleans(), max_size=300), RATIOS, st.integers(0, 20), st.sampled_from([0.0, 1.0, 5.0]))
+def test_error_stays_in_its_band_and_someone_may_always_move(wishes, ratio, warmup, ahead):
+    limiter = Limiter(ratio, batch=8, warmup=warmup, ahead=ahead)
+    for wants_insert in wishes:
+        assert limiter.may_insert() or limiter.may_sample()
+        if wants_insert and limiter.may_insert():
+            limiter.insert()
+        elif limiter.may_sample():
+            assert limiter.inserts >= warmup
+            limiter.sample()
+        assert limiter.error < limiter.ceiling
+        assert limiter.error >= (0.0 if limiter.samples else -ratio * warmup)
+
+
+@given(st.lists(st.booleans(), max_size=100), RATIOS, st.integers(0, 20), st.sampled_from([0.0, 1.0, 5.0]))
+def test_room_is_the_number_of_inserts_allowed_in_a_row(wishes, ratio, warmup, ahead):
+    limiter = Limiter(ratio, batch=8, warmup=warmup, ahead=ahead)
+    for wants_insert in wishes:
+        if wants_insert and limiter.may_insert():
+            limiter.insert()
+        elif limiter.may_sample():
+            limiter.sample()
+    room, allowed = limiter.room(), 0
+    while limiter.may_insert():
+        limiter.insert()
+        allowed += 1
+    assert room == allowed
+
+
+@pytest.mark.parametrize("updates_per_step", [0.25, 0.5, 1.0, 2.0, 3.0])
+def test_lockstep_alternates_and_owes_nothing_for_the_warmup(updates_per_step):
+    limiter = Limiter(updates_per_step * 8, batch=8, warmup=10)
+    for step in range(1, 101):
+        assert limiter.may_insert() and not limiter.may_sample()
+        limiter.insert()
+        while limiter.may_sample():
+            assert not limiter.may_insert()
+            limiter.sample()
+        assert limiter.samples // 8 == int(max(0, step - 10) * updates_per_step)
+
+
+def test_state_round_trip():
+    one, other = Limiter(4.0, 8, 3), Limiter(4.0, 8, 3)
+    for _ in range(7):
+        one.insert()
+    one.sample()
+    other.restore(one.state())
+    assert (other.inserts, other.samples, other.error) == (one.inserts, one.samples, one.error)

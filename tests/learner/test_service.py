@@ -1,0 +1,170 @@
+"""The process on a real bus, with an actor that makes its steps up."""
+
+import socket
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from learner import checkpoint
+from learner.config import LearnerConfig
+from learner.core import Learner
+from learner.service import CHECKPOINT, POLICY, LearnerLoop, LearnerSettings, main
+from learner.td3 import TD3Config
+from messaging import brakeline_pb2 as pb
+from messaging.bus import Bus, BusSettings, Refused
+from messaging.robots import GROUND, UnknownRobot
+from messaging.topics import FLOW, JOIN, LEARNER, STEP, WEIGHTS
+from messaging.weights import MLP
+
+CONFIG = LearnerConfig(
+    td3=TD3Config(hidden=(32, 32), batch=32, warmup=50),
+    steps=300,
+    capacity=1000,
+    publish_every=20,
+    checkpoint_every=100,
+)
+
+
+@pytest.fixture
+def bus() -> Iterator[Bus]:
+    """The router, and the actor's place on it."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+    with Bus(BusSettings(listen=(endpoint,)), "actor-0") as bus:
+        yield bus
+
+
+class Actor:
+    """Publishes random steps as far as the flow allows."""
+
+    def __init__(self, bus: Bus) -> None:
+        self.bus, self.index, self.episode = bus, 0, 0
+        self.limit, self.done, self.incarnation = 0, False, 0
+        self.versions: list[int] = []
+        self.metrics: list[pb.LearnerMetrics] = []
+        self._moved = threading.Event()
+        self._steps = bus.publisher(STEP, robot="ground")
+        self._generator = np.random.default_rng(0)
+        bus.subscribe(FLOW, lambda sample: self._heed(sample.message()), robot="ground")
+        bus.subscribe(WEIGHTS, lambda sample: self.versions.append(sample.message().version), robot="ground")
+        bus.subscribe(LEARNER, lambda sample: self.metrics.append(sample.message()), robot="ground")
+
+    def _heed(self, flow: pb.Flow) -> None:
+        self.limit, self.done = max(self.limit, flow.limit["actor-0"]), flow.done
+        self._moved.set()
+
+    def join(self, **fields: object) -> pb.JoinReply:
+        values = {"robot": "ground", "actor": "actor-0", "layout": GROUND.layout(), "index": self.index}
+        join = pb.Join(**(values | {"episode": self.episode} | fields))
+        deadline = time.monotonic() + 20.0
+        while True:  # the learner is still starting
+            try:
+                reply = pb.JoinReply.FromString(self.bus.ask(JOIN, join.SerializeToString(), 5.0, robot="ground"))
+                break
+            except Refused:
+                raise
+            except Exception:
+                assert time.monotonic() < deadline
+                time.sleep(0.05)
+        if not reply.HasField("error"):
+            self._heed(reply.flow)
+            self.episode, self.incarnation = reply.episode, reply.flow.incarnation
+        return reply
+
+    def drive(self, steps: int) -> None:
+        """Up to `steps` more, or the end of the run."""
+        last = self.index + steps
+        deadline = time.monotonic() + 30.0
+        step = 0
+        while self.index < last and not self.done:
+            assert time.monotonic() < deadline, "the flow dried up"
+            if self.index >= self.limit:
+                self._moved.wait(0.5)
+                self._moved.clear()
+                continue
+            self.index += 1
+            message = pb.Step(robot="ground", actor="actor-0", episode=self.episode, step=step, index=self.index)
+            message.observation.extend(self._generator.uniform(-1, 1, 26))
+            message.next_observation.extend(self._generator.uniform(-1, 1, 26))
+            message.action.extend(self._generator.uniform(GROUND.low(), GROUND.high()))
+            message.truncated = step == 19
+            step += 1
+            if message.truncated:
+                self.episode, step = self.episode + 1, 0
+            self._steps.put(message)
+
+
+def start(bus: Bus, out: Path, **changes: object) -> threading.Thread:
+    connect = BusSettings(connect=bus.settings.listen)
+    settings = LearnerSettings(connect, out=out, learner=CONFIG, **changes)
+    thread = threading.Thread(target=main, args=(settings,), daemon=True)
+    thread.start()
+    return thread
+
+
+def test_a_run_from_the_first_step_to_the_last(bus, tmp_path):
+    thread, actor = start(bus, tmp_path), Actor(bus)
+    assert actor.join(layout="0").error.field == "layout"
+    with pytest.raises(Refused):
+        bus.ask(JOIN, b"\xff\xff\xff", 5.0, robot="ground")
+    reply = actor.join()
+    assert (reply.episode, reply.weights.version) == (0, 1)
+    actor._steps.put(pb.Step(robot="ground", actor="actor-0", index=1))  # no observation: refused, and on it goes
+    actor.drive(10**6)
+    thread.join(20.0)
+    assert not thread.is_alive() and actor.done
+    assert actor.versions == sorted(set(actor.versions)) and len(actor.versions) > 5
+    last = actor.metrics[-1]
+    assert last.done and (last.steps, last.updates, last.missing, last.duplicates) == (300, 250, 0, 0)
+    assert MLP.load(tmp_path / POLICY).version == last.weights_version
+    assert checkpoint.exists(tmp_path / CHECKPOINT)
+
+
+def test_stopped_and_resumed(bus, tmp_path, monkeypatch):
+    loops: list[LearnerLoop] = []
+    original = LearnerLoop.run
+    monkeypatch.setattr(LearnerLoop, "run", lambda loop: (loops.append(loop), original(loop))[1])
+    first, actor = start(bus, tmp_path), Actor(bus)
+    before = actor.join().flow.incarnation
+    actor.drive(130)
+    loops[0]._process.stop.set()  # as SIGTERM does
+    first.join(20.0)
+    second = start(bus, tmp_path, resume=True)
+    reply = actor.join()
+    assert reply.flow.incarnation != before and reply.episode == actor.episode
+    actor.drive(10**6)
+    second.join(20.0)
+    assert actor.metrics[-1].done and actor.metrics[-1].steps == 300
+    assert actor.metrics[-1].missing == 0
+
+
+def test_resuming_from_nothing_is_an_error(bus, tmp_path):
+    settings = LearnerSettings(BusSettings(connect=bus.settings.listen), out=tmp_path, resume=True, learner=CONFIG)
+    with pytest.raises(checkpoint.NoCheckpoint):
+        main(settings)
+
+
+def test_a_fresh_start_over_a_checkpoint_is_an_error(bus, tmp_path):
+    Learner(GROUND, CONFIG).save(tmp_path / CHECKPOINT)
+    with pytest.raises(checkpoint.CheckpointError, match="resume"):
+        main(LearnerSettings(BusSettings(connect=bus.settings.listen), out=tmp_path, learner=CONFIG))
+
+
+def test_unknown_robot(tmp_path):
+    with pytest.raises(UnknownRobot, match="submarine"):
+        main(LearnerSettings(BusSettings(connect=("tcp/127.0.0.1:1",)), robot="submarine", out=tmp_path))
+
+
+def test_unwritable_checkpoints_do_not_end_the_run(bus, tmp_path):
+    (tmp_path / CHECKPOINT).write_text("a file where a folder belongs")
+    thread, actor = start(bus, tmp_path), Actor(bus)
+    actor.join()
+    actor.drive(10**6)
+    thread.join(20.0)
+    assert actor.metrics[-1].steps == 300
+    assert MLP.load(tmp_path / POLICY).version == actor.metrics[-1].weights_version

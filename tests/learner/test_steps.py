@@ -1,0 +1,209 @@
+"""What becomes of a stream of steps: ledger, windows, replay."""
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from learner.ledger import Ledger, mark
+from learner.replay import Batch, Replay, Transition
+from learner.state import BadState, State
+from learner.windows import Move, Windows
+
+GAMMA = 0.9
+
+
+def move(episode: int, step: int, reward: float, terminated: bool = False, truncated: bool = False) -> Move:
+    name = np.array([episode, step], np.float32)  # a vector that says which step it is of
+    return Move(episode, step, name, name, reward, name + np.array([0, 1], np.float32), terminated, truncated)
+
+
+@given(st.lists(st.integers(0, 30)))
+def test_ranges_are_the_set_that_was_marked(steps):
+    ranges, seen = [], set()
+    for step in steps:
+        assert mark(ranges, step) == (step not in seen)
+        seen.add(step)
+    assert {s for first, last in ranges for s in range(first, last + 1)} == seen
+    assert all(left[1] + 1 < right[0] for left, right in pairwise(ranges))
+
+
+@st.composite
+def episodes(draw):
+    """Lengths and ends of an actor's episodes, and which of its steps arrive how often."""
+    lengths = draw(st.lists(st.integers(1, 8), min_size=1, max_size=5))
+    ends = draw(st.lists(st.sampled_from(["terminated", "truncated"]), min_size=len(lengths), max_size=len(lengths)))
+    copies = draw(st.lists(st.integers(0, 2), min_size=sum(lengths), max_size=sum(lengths)))
+    moves = []
+    for episode, (length, end) in enumerate(zip(lengths, ends, strict=True)):
+        for step in range(length):
+            last = step == length - 1
+            reward = float(draw(st.integers(-5, 5)))
+            moves.append(move(episode, step, reward, last and end == "terminated", last and end == "truncated"))
+    return moves, copies
+
+
+@given(episodes())
+def test_ledger_counts_duplicates_and_gaps(drawn):
+    moves, copies = drawn
+    ledger = Ledger()
+    assert ledger.join("a", 0, 0) == 0
+    news = 0
+    for index, (m, times) in enumerate(zip(moves, copies, strict=True), start=1):
+        for _ in range(times):
+            news += ledger.record("a", m.episode, m.step, index)
+    arrived = [index for index, times in enumerate(copies, start=1) if times]
+    assert news == ledger.received == len(arrived)
+    assert ledger.duplicates == sum(copies) - len(arrived)
+    assert ledger.missing == max(arrived, default=0) - len(arrived)
+    assert ledger.places["a"].last_index == max(arrived, default=0)
+
+
+@given(episodes(), st.randoms(use_true_random=False))
+def test_ledger_forgives_disorder(drawn, random):
+    moves, _ = drawn
+    steps = [(m.episode, m.step, index) for index, m in enumerate(moves, start=1)]
+    random.shuffle(steps)
+    ledger = Ledger()
+    ledger.join("a", 0, 0)
+    assert all(ledger.record("a", *step) for step in steps)
+    assert (ledger.missing, ledger.duplicates) == (0, 0)
+    assert not any(ledger.record("a", *step) for step in steps)
+
+
+def test_ledger_over_restarts():
+    ledger = Ledger()
+    ledger.join("a", 0, 0)
+    for step in range(5):
+        ledger.record("a", 0, step, step + 1)
+    again = Ledger()
+    again.restore(ledger.state())
+    assert again.join("a", 8, 2) == 2  # the actor lived on: 3 steps went past a dead learner
+    assert again.missing == 3
+    assert ledger.join("a", 0, 0) == 1  # the actor was restarted: a new episode, its index from 0
+    assert not ledger.record("a", 0, 4, 5)
+    assert ledger.record("a", 0, 5, 6)  # one that was on its way; its index is of the actor before
+    assert ledger.record("a", 1, 0, 1)
+    assert (ledger.missing, ledger.places["a"].last_index) == (0, 1)
+
+
+def expected_transitions(arrived: list[Move], n: int) -> list[Transition]:
+    """By definition: from every step as far as n, its episode and the unbroken sequence reach."""
+    by_name = {(m.episode, m.step): m for m in arrived}
+    found = []
+    for m in arrived:
+        window = [m]
+        while len(window) < n and not (window[-1].terminated or window[-1].truncated):
+            after = by_name.get((m.episode, window[-1].step + 1))
+            if after is None:
+                break
+            window.append(after)
+        reward = sum(GAMMA**j * w.reward for j, w in enumerate(window))
+        discount = 0.0 if window[-1].terminated else GAMMA ** len(window)
+        found.append(Transition(m.observation, m.action, reward, discount, window[-1].next_observation))
+    return found
+
+
+def comparable(transitions: list[Transition]) -> list[tuple]:
+    return sorted(
+        (*t.observation.tolist(), round(t.reward, 9), round(t.discount, 12), *t.next_observation.tolist())
+        for t in transitions
+    )
+
+
+@settings(max_examples=200)
+@given(episodes(), st.integers(1, 4), st.booleans())
+def test_windows_against_their_definition(drawn, n, checkpointed):
+    moves, copies = drawn
+    windows, got = Windows(n, GAMMA), []
+    arrived = [m for m, times in zip(moves, copies, strict=True) if times]
+    for m in arrived:
+        if checkpointed:
+            state, windows = windows.state(), Windows(n, GAMMA)
+            windows.restore(state)
+        got += windows.push("a", m)
+    got += windows.push("a", move(99, 0, 0.0, terminated=True))[
+        :-1
+    ]  # what was still open closes before the next episode
+    assert comparable(got) == comparable(expected_transitions(arrived, n))
+
+
+def test_truncation_is_not_termination():
+    for n in (1, 3):
+        ends = {}
+        for kind in ("terminated", "truncated"):
+            windows = Windows(n, GAMMA)
+            steps = [move(0, 0, 1.0), move(0, 1, 1.0, **{kind: True})]
+            ends[kind] = [t.discount for m in steps for t in windows.push("a", m)]
+        assert ends["truncated"] == pytest.approx([GAMMA ** min(n, 2), GAMMA])
+        assert ends["terminated"] == pytest.approx([GAMMA if n == 1 else 0.0, 0.0])
+
+
+def test_actors_do_not_mix():
+    windows = Windows(2, GAMMA)
+    assert windows.push("a", move(0, 0, 1.0)) == []
+    assert windows.push("b", move(0, 1, 9.0)) == []
+    (transition,) = windows.push("a", move(0, 1, 1.0))
+    assert transition.reward == pytest.approx(1.0 + GAMMA)
+
+
+def test_a_straggler_stands_for_itself():
+    windows = Windows(3, GAMMA)
+    windows.push("a", move(0, 0, 1.0))
+    (cut,) = windows.push("a", move(0, 2, 3.0))
+    (late,) = windows.push("a", move(0, 1, 2.0))
+    assert (cut.reward, cut.discount) == (1.0, GAMMA)
+    assert (late.reward, late.discount) == (2.0, GAMMA)
+
+
+def transition(number: float) -> Transition:
+    return Transition(
+        np.full(3, number, np.float32), np.full(1, -number, np.float32), number, 0.5, np.ones(3, np.float32)
+    )
+
+
+@given(st.integers(1, 12), st.integers(1, 40))
+def test_replay_holds_the_newest(capacity, count):
+    replay, batch = Replay(capacity, 3, 1), Batch(256, 3, 1)
+    for number in range(count):
+        replay.insert(transition(number))
+    replay.sample(np.random.default_rng(0), batch)
+    assert len(replay) == min(capacity, count)
+    kept = set(range(max(0, count - capacity), count))
+    assert set(batch.reward.flatten().tolist()) <= kept
+    if len(kept) < 12:
+        assert set(batch.reward.flatten().tolist()) == kept
+    assert (batch.observation[0, :, :1] == batch.reward[0]).all() and (batch.action[0] == -batch.reward[0]).all()
+
+
+@given(st.integers(1, 12), st.integers(1, 40))
+def test_restored_replay_draws_and_goes_on_alike(capacity, count):
+    one, other = Replay(capacity, 3, 1), Replay(capacity, 3, 1)
+    for number in range(count):
+        one.insert(transition(number))
+    other.restore(one.state())
+    for replay in (one, other):
+        replay.insert(transition(77.0))
+    batches = [Batch(64, 3, 1), Batch(64, 3, 1)]
+    for replay, batch in zip((one, other), batches, strict=True):
+        replay.sample(np.random.default_rng(1), batch)
+    assert all((a == b).all() for a, b in zip(*(batch.arrays for batch in batches), strict=True))
+
+
+def test_replay_refuses_what_does_not_fit():
+    replay = Replay(4, 3, 1)
+    replay.insert(transition(1.0))
+    state = replay.state()
+    with pytest.raises(BadState, match="capacity"):
+        Replay(5, 3, 1).restore(state)
+    with pytest.raises(BadState, match="observation"):
+        Replay(4, 2, 1).restore(state)
+    with pytest.raises(BadState, match="action: missing"):
+        tensors = {name: array for name, array in state.tensors.items() if name != "action"}
+        Replay(4, 3, 1).restore(State(tensors, state.values))
+    with pytest.raises(BadState, match="next"):
+        Replay(4, 3, 1).restore(State(state.tensors, state.values | {"next": 3}))
+    with pytest.raises(ValueError, match="nothing"):
+        Replay(4, 3, 1).sample(np.random.default_rng(0), Batch(2, 3, 1))
