@@ -4,6 +4,7 @@ import socket
 import threading
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -49,7 +50,6 @@ class Actor:
         self.metrics: list[pb.LearnerMetrics] = []
         self._moved = threading.Event()
         self._steps = bus.publisher(STEP, robot="ground")
-        self._generator = np.random.default_rng(0)
         bus.subscribe(FLOW, lambda sample: self._heed(sample.message()), robot="ground")
         bus.subscribe(WEIGHTS, lambda sample: self.versions.append(sample.message().version), robot="ground")
         bus.subscribe(LEARNER, lambda sample: self.metrics.append(sample.message()), robot="ground")
@@ -87,11 +87,13 @@ class Actor:
                 self._moved.wait(0.5)
                 self._moved.clear()
                 continue
+            if step == 0:
+                generator = np.random.default_rng([7, self.episode])
             self.index += 1
             message = pb.Step(robot="ground", actor="actor-0", episode=self.episode, step=step, index=self.index)
-            message.observation.extend(self._generator.uniform(-1, 1, 26))
-            message.next_observation.extend(self._generator.uniform(-1, 1, 26))
-            message.action.extend(self._generator.uniform(GROUND.low(), GROUND.high()))
+            message.observation.extend(generator.uniform(-1, 1, 26))
+            message.next_observation.extend(generator.uniform(-1, 1, 26))
+            message.action.extend(generator.uniform(GROUND.low(), GROUND.high()))
             message.truncated = step == 19
             step += 1
             if message.truncated:
@@ -99,9 +101,8 @@ class Actor:
             self._steps.put(message)
 
 
-def start(bus: Bus, out: Path, **changes: object) -> threading.Thread:
-    connect = BusSettings(connect=bus.settings.listen)
-    settings = LearnerSettings(connect, out=out, learner=CONFIG, **changes)
+def start(bus: Bus, out: Path, learner: LearnerConfig = CONFIG, resume: bool = False) -> threading.Thread:
+    settings = LearnerSettings(BusSettings(connect=bus.settings.listen), out=out, learner=learner, resume=resume)
     thread = threading.Thread(target=main, args=(settings,), daemon=True)
     thread.start()
     return thread
@@ -125,14 +126,20 @@ def test_a_run_from_the_first_step_to_the_last(bus, tmp_path):
     assert checkpoint.exists(tmp_path / CHECKPOINT)
 
 
-def test_stopped_and_resumed(bus, tmp_path, monkeypatch):
-    loops: list[LearnerLoop] = []
+@pytest.fixture
+def loops(monkeypatch) -> list[LearnerLoop]:
+    """Those that were started, to be stopped as SIGTERM does."""
+    started: list[LearnerLoop] = []
     original = LearnerLoop.run
-    monkeypatch.setattr(LearnerLoop, "run", lambda loop: (loops.append(loop), original(loop))[1])
+    monkeypatch.setattr(LearnerLoop, "run", lambda loop: (started.append(loop), original(loop))[1])
+    return started
+
+
+def test_stopped_and_resumed(bus, tmp_path, loops):
     first, actor = start(bus, tmp_path), Actor(bus)
     before = actor.join().flow.incarnation
     actor.drive(130)
-    loops[0]._process.stop.set()  # as SIGTERM does
+    loops[0]._process.stop.set()
     first.join(20.0)
     second = start(bus, tmp_path, resume=True)
     reply = actor.join()
@@ -141,6 +148,21 @@ def test_stopped_and_resumed(bus, tmp_path, monkeypatch):
     second.join(20.0)
     assert actor.metrics[-1].done and actor.metrics[-1].steps == 300
     assert actor.metrics[-1].missing == 0
+
+
+def test_lockstep_over_the_bus_is_the_same_bit_for_bit_resumed_or_not(bus, tmp_path, loops):
+    config = replace(CONFIG, lockstep=True, checkpoint_every=40, steps=200)
+    for name in ("one", "other"):
+        thread, actor = start(bus, tmp_path / name, config), Actor(bus)
+        actor.join()
+        actor.drive(10**6 if name == "one" else 130)  # the other is stopped within an episode
+        loops[-1]._process.stop.set()
+        thread.join(20.0)
+    thread, actor = start(bus, tmp_path / "other", config, resume=True), Actor(bus)
+    assert actor.join().episode == 6  # the checkpoint was that of step 120
+    actor.drive(10**6)
+    thread.join(20.0)
+    assert (tmp_path / "one" / POLICY).read_bytes() == (tmp_path / "other" / POLICY).read_bytes()
 
 
 def test_resuming_from_nothing_is_an_error(bus, tmp_path):
