@@ -1,0 +1,188 @@
+"""PROCESS: stores every recorded topic, as the bytes that came from the wire, in the run's MCAP log.
+
+Subscribers only put samples into an inbox; one thread empties it into the file twice a second. So a `kill -9` loses
+less than a second. While the disk is full the inbox fills up; what no longer fits is counted as dropped, and said.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections import Counter, deque
+from collections.abc import Callable
+from pathlib import Path
+
+from logs.segment import Entry, Metadata, Segment, open_segment
+from messaging.bus import BusSettings, Malformed, Sample
+from messaging.process import Process
+from messaging.topics import RECORDED
+
+log = logging.getLogger("brakeline.recorder")
+
+PERIOD = 0.5  # s between flushes
+RETRY = 1.0  # s between attempts to write on a disk that is full
+QUIET = 0.3  # s without a message after which a recorder that was asked to stop has seen the last one
+PATIENCE = 3.0  # s that it waits for this at most
+INBOX = 64 * 2**20  # bytes
+PORTION = 2**20  # bytes saved at once: what fits on a nearly full disk is saved
+
+Open = Callable[[Path, Metadata], Segment]
+
+
+class Inbox:
+    """Samples that are not in the file yet, at most `limit` bytes of them."""
+
+    def __init__(self, limit: int = INBOX) -> None:
+        self.limit = limit
+        self.dropped: Counter[str] = Counter()  # per key
+        self.bytes = 0
+        self._samples: deque[Sample] = deque()
+        self._lock = threading.Lock()
+
+    def put(self, sample: Sample) -> None:
+        """Take the sample, or count it as dropped."""
+        with self._lock:
+            if self.bytes + len(sample.payload) > self.limit:
+                self.dropped[sample.key] += 1
+            else:
+                self.bytes += len(sample.payload)
+                self._samples.append(sample)
+
+    def portion(self, size: int = PORTION) -> list[Sample]:
+        """The oldest samples, about `size` bytes of them; they stay until `forget`."""
+        taken: list[Sample] = []
+        total = 0
+        with self._lock:
+            for sample in self._samples:
+                if taken and total + len(sample.payload) > size:
+                    break
+                taken.append(sample)
+                total += len(sample.payload)
+        return taken
+
+    def forget(self, samples: list[Sample]) -> None:
+        """Remove what `portion` gave: it is saved."""
+        with self._lock:
+            for sample in samples:
+                self._samples.popleft()
+                self.bytes -= len(sample.payload)
+
+
+class Recording:
+    """Empties an inbox into the segments of a run, on a disk that may fill up. For one thread."""
+
+    def __init__(self, run: Path, metadata: Metadata, inbox: Inbox, open_one: Open = open_segment) -> None:
+        self.recorded: Counter[str] = Counter()  # messages in the files, per key
+        self.failure = ""  # why nothing can be written at present
+        self.path: Path | None = None  # of the latest segment
+        self._run, self._metadata, self._inbox, self._open = run, metadata, inbox, open_one
+        self._segment: Segment | None = None
+        self._retry_at = 0.0
+        self._complained_of = 0
+
+    def save(self) -> None:
+        """Bring everything from the inbox to the operating system; what can't be written waits in the inbox."""
+        self._complain_of_drops()
+        if time.monotonic() < self._retry_at:
+            return
+        try:
+            if self._segment is None:
+                self._segment = self._open(self._run, self._metadata)
+                self.path = self._segment.path
+                log.info("recording to %s", self.path)
+            while portion := self._inbox.portion():
+                self._segment.save([entry(sample) for sample in portion])
+                self._inbox.forget(portion)
+                self.recorded.update(sample.key for sample in portion)
+        except OSError as error:
+            self._fail(error)
+        else:
+            if self.failure:
+                log.warning("recording again, to %s", self.path)
+            self.failure = ""
+
+    def finish(self) -> None:
+        """Save what is left, try hard, and close the file with its summary."""
+        self._retry_at = 0.0
+        self.save()
+        if self._segment is not None:
+            try:
+                self._segment.finish()
+            except OSError as error:
+                log.error("no summary for %s: %s; `analyse` reads it all the same", self.path, error)
+        if self._inbox.bytes:
+            log.error("%d bytes of messages could not be recorded: %s", self._inbox.bytes, self.failure)
+
+    def _fail(self, error: OSError) -> None:
+        self._retry_at = time.monotonic() + RETRY
+        if not self.failure:
+            log.error("NOT RECORDING: %s; up to %d MiB wait in memory", error, self._inbox.limit >> 20)
+        self.failure = str(error)
+        if self._segment is not None:
+            self._segment.abandon()
+            self._segment = None
+
+    def _complain_of_drops(self) -> None:
+        dropped = self._inbox.dropped.total()
+        if dropped > self._complained_of:
+            log.error("%d messages were dropped so far: %s", dropped, self.failure or "too many to write")
+            self._complained_of = dropped
+
+
+def entry(sample: Sample) -> Entry:
+    """A sample as it is stored. One that cannot be decoded is kept as it is, published when it was received."""
+    try:
+        header = sample.message().header
+    except Malformed as error:
+        log.warning("recorded as it came: %s", error)
+        return Entry(sample.key, sample.topic.message, sample.payload, sample.received, sample.received, 0)
+    publish_time = round(header.time * 1e9) if header.time > 0.0 else header.wall_time
+    return Entry(sample.key, sample.topic.message, sample.payload, sample.received, publish_time, header.sequence)
+
+
+def record(process: Process, run: Path, metadata: Metadata) -> Recording:
+    """Record until `process.stop` is set and nothing more comes. Its Health has the note `file` once it listens.
+
+    Health figures: `recorded` and `dropped` messages, `waiting` bytes, and `recorded <key>` per channel; the note
+    `failure` says why nothing can be written.
+    """
+    inbox = Inbox()
+    recording = Recording(run, metadata, inbox)
+
+    def refresh() -> None:
+        process.figures.update(
+            {f"recorded {key}": float(count) for key, count in recording.recorded.copy().items()},
+            recorded=float(recording.recorded.total()),
+            dropped=float(inbox.dropped.total()),
+            waiting=float(inbox.bytes),
+        )
+        process.notes.update(file=str(recording.path or ""), failure=recording.failure)
+
+    subscriptions = [process.bus.subscribe(topic, inbox.put) for topic in RECORDED]
+    recording.save()
+    process.refresh = refresh
+    while not process.stop.wait(PERIOD):
+        recording.save()
+    _until_quiet(inbox, recording)
+    for subscription in subscriptions:
+        subscription.close()
+    recording.finish()
+    log.info("recorded %d messages to %s", recording.recorded.total(), recording.path)
+    return recording
+
+
+def _until_quiet(inbox: Inbox, recording: Recording) -> None:
+    """Wait for the last messages of those who stopped just before."""
+    deadline = time.monotonic() + PATIENCE
+    while time.monotonic() < deadline:
+        recording.save()
+        time.sleep(QUIET)
+        if not inbox.bytes:
+            return
+
+
+def main(settings: BusSettings, run: Path, metadata: Metadata, source: str = "recorder") -> None:
+    """The recorder's process: `run` is the log's path, `metadata` what goes into it besides the messages."""
+    with Process(settings, source) as process:
+        record(process, run, metadata)

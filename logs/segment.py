@@ -1,0 +1,189 @@
+"""One MCAP file of a run. A run has several if its recorder was restarted or its disk filled up: files can't be
+appended to, so run.mcap is followed by run.1.mcap, run.2.mcap …
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import mcap.writer
+from google.protobuf.message import Message
+from mcap.well_known import MessageEncoding, SchemaEncoding
+from mcap_protobuf.schema import build_file_descriptor_set
+
+CHUNK = 256 * 1024  # bytes before compression; a flush ends one early
+
+Metadata = Mapping[str, Mapping[str, str]]
+
+TIMES = {
+    "log_time": "ns since the Unix epoch, when the recorder received the message",
+    "publish_time": "ns of simulated (or the robot's) time where the message has one, header.time > 0; "
+    "else ns since the Unix epoch, when it was published, header.wall_time",
+    "topic": "the key on the bus without its prefix",
+    "sequence": "header.sequence: from 1 per topic and process start; gaps are losses",
+}
+
+
+@dataclass(frozen=True)
+class Entry:
+    """What is stored of one message: its bytes as they came from the wire, and when."""
+
+    key: str
+    type: type[Message]
+    payload: bytes
+    log_time: int  # ns
+    publish_time: int  # ns
+    sequence: int
+
+
+def segments(path: Path) -> Iterator[Path]:
+    """The names of a run's segments, without end: run.mcap, run.1.mcap, run.2.mcap …"""
+    yield path
+    number = 1
+    while True:
+        yield path.with_suffix(f".{number}{path.suffix}")
+        number += 1
+
+
+def number_of(path: Path) -> tuple[str, int]:
+    """The name of a segment's run, and which of its segments it is: ("run", 2) for run.2.mcap, 0 for run.mcap."""
+    numbered = re.fullmatch(r"(.+)\.(\d+)", path.stem)
+    return (numbered[1], int(numbered[2])) if numbered else (path.stem, 0)
+
+
+class Spool:
+    """A file whose bytes wait in memory until `flush` writes all of them, or none.
+
+    A disk that is full thus leaves the file as it was after the last flush.
+    """
+
+    def __init__(self, file: BinaryIO) -> None:
+        """`file` is unbuffered: else an error would come late, and again when it is closed."""
+        self._file = file
+        self._waiting = bytearray()
+        self._written = 0
+
+    def write(self, data: bytes) -> int:
+        self._waiting += data
+        return len(data)
+
+    def tell(self) -> int:
+        return self._written + len(self._waiting)
+
+    def flush(self) -> None:
+        """Hand everything to the operating system.
+
+        Raises:
+            OSError: the disk is full, or broken; nothing of what waited is in the file.
+        """
+        waiting = memoryview(self._waiting)
+        try:
+            done = 0
+            while done < len(waiting):
+                done += self._file.write(waiting[done:])
+        except OSError:
+            self._file.truncate(self._written)
+            raise
+        self._written += len(waiting)
+        self._waiting = bytearray()
+
+    def close(self) -> None:
+        """Close the file as it was after the last flush."""
+        self._file.close()
+
+
+class Segment:
+    """Writes one MCAP file: a channel per key, protobuf schemas with all they depend on, zstd chunks."""
+
+    def __init__(self, path: Path, file: BinaryIO, metadata: Metadata) -> None:
+        """`file` is `path` opened for writing, unbuffered. The metadata is written at once.
+
+        Raises:
+            OSError: there is no space for it.
+        """
+        self.path = path
+        self._spool = Spool(file)
+        output: Any = self._spool  # of a file it needs `write`, `tell` and `flush`
+        self._writer: Any = mcap.writer.Writer(output, chunk_size=CHUNK)
+        self._schemas: dict[str, int] = {}
+        self._channels: dict[str, int] = {}
+        self._empty = True
+        self._writer.start(profile="", library="brakeline")
+        for name, values in (("brakeline", TIMES), *metadata.items()):
+            self._writer.add_metadata(name, dict(values))
+        self._writer.flush()  # type: ignore[no-untyped-call]
+
+    @property
+    def size(self) -> int:
+        """Bytes in the file."""
+        return self._spool.tell()
+
+    def save(self, entries: Iterable[Entry]) -> None:
+        """Write the entries and hand them to the operating system: from then on only a power cut can lose them.
+
+        Raises:
+            OSError: as `Spool.flush`; no entry is in the file, which must then be abandoned.
+        """
+        for entry in entries:
+            self._writer.add_message(
+                channel_id=self._channel(entry.key, entry.type),
+                log_time=entry.log_time,
+                data=entry.payload,
+                publish_time=entry.publish_time,
+                sequence=entry.sequence & 0xFFFFFFFF,
+            )
+        self._writer.flush()
+        self._empty = False
+
+    def finish(self) -> None:
+        """Write the summary, and close.
+
+        Raises:
+            OSError: there is no space for the summary; all messages are there.
+        """
+        try:
+            self._writer.finish()
+            self._spool.flush()
+        finally:
+            self._spool.close()
+
+    def abandon(self) -> None:
+        """Close without a summary. A file that holds no message is removed."""
+        self._spool.close()
+        if self._empty:
+            self.path.unlink(missing_ok=True)
+
+    def _channel(self, key: str, kind: type[Message]) -> int:
+        if key not in self._channels:
+            name = kind.DESCRIPTOR.full_name
+            if name not in self._schemas:
+                data = build_file_descriptor_set(kind).SerializeToString()
+                self._schemas[name] = self._writer.register_schema(name, SchemaEncoding.Protobuf, data)
+            self._channels[key] = self._writer.register_channel(key, MessageEncoding.Protobuf, self._schemas[name])
+        return self._channels[key]
+
+
+def open_segment(run: Path, metadata: Metadata) -> Segment:
+    """The first segment of the run that does not exist yet.
+
+    Raises:
+        OSError: it cannot be made, or there is no space for it; then it is not left behind.
+    """
+    run.parent.mkdir(parents=True, exist_ok=True)
+    for path in segments(run):
+        try:
+            file = os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o644), "wb", buffering=0)
+        except FileExistsError:
+            continue
+        try:
+            return Segment(path, file, metadata)
+        except OSError:
+            file.close()
+            path.unlink(missing_ok=True)
+            raise
+    raise AssertionError("unreachable: there is always another name")
