@@ -144,7 +144,8 @@ def set_membership(z: Array, y: Array, sizes: Array, kappa: Array, w: Array) -> 
 
 def _row_box(white: Array, y: Array, size: Array) -> tuple[Array, Array]:
     """Interval hull of the polytope `|y_t - a·white_t| <= size_t`, by 2 nz LPs that share their active samples."""
-    nz = white.shape[1]
+    nz, unit = white.shape[1], float(size.mean())
+    y, size = y / unit, size / unit  # the solver's tolerances are absolute
     active = np.unique(np.concatenate([np.argsort(size)[:ROWS_A_ROUND], np.abs(white).argmax(0)]))
     corners = np.zeros((2, nz))
     for axis in range(nz):
@@ -162,16 +163,18 @@ def _row_box(white: Array, y: Array, size: Array) -> tuple[Array, Array]:
                     if len(active) >= len(y):
                         raise CertificateError("the samples do not bound the matrix")
                     continue
-                if found.status != 0:
+                if found.status == 2:
                     raise CertificateError("no matrix is consistent with all samples: the noise bound is too small")
+                if found.status != 0:
+                    raise CertificateError(f"no bound of the consistent matrices: {found.message}")
                 over = np.abs(y - white @ found.x) - size
                 worst = np.argsort(over)[-ROWS_A_ROUND:]
-                worst = worst[over[worst] > 1e-9]
+                worst = worst[over[worst] > 1e-6]
                 if not len(worst):
                     break
                 active = np.union1d(active, worst)
-            corners[side, axis] = found.x[axis] - sign * 1e-9
-    return corners[0], corners[1]
+            corners[side, axis] = found.x[axis] - sign * 1e-6
+    return unit * corners[0], unit * corners[1]
 
 
 def measured_noise(z: Array, y: Array, w_half: Array, v_half: Array) -> Array:

@@ -49,8 +49,8 @@ class Tube:
         return np.asarray(self.position @ z)
 
     def magnitudes(self, z: Array) -> Array:
-        """(L+N+1,) for one z (nz,)."""
-        return np.asarray(self.M @ np.abs(self.W @ z) + self.m_0)
+        """For regressors z (..., nz): (..., L+N+1)."""
+        return np.asarray(np.abs(z @ self.W.T) @ self.M.T + self.m_0)
 
     def half_widths(self, z: Array) -> Array:
         """Interval hulls of the sets (N, d), the bulge or the latch not included."""

@@ -1,0 +1,150 @@
+"""One robot through its episodes: what it sees, what it asks, what it does, and the step that comes of it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from actors.guard import Outcome, at_rest, next_input
+from messaging import brakeline_pb2 as pb
+from messaging.robots import Robot
+from safety.client import obstacle_messages, request_message
+from safety.commitment import Array, Commitment, Prediction, correction_penalty
+
+EPISODE_STRIDE = 4096  # episodes of different robots of a run never share a seed: seed = episode · stride + number
+
+
+class Environment(Protocol):
+    """A Gymnasium environment whose `info` has the keys of `sim.envs.NavigationEnv`."""
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[NDArray[np.float32], dict[str, Any]]: ...
+
+    def step(self, action: Array) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]: ...
+
+
+@dataclass(frozen=True)
+class Identity:
+    """Who drives: its name on the bus, its number in the run, and the run's seed."""
+
+    actor: str
+    number: int
+    seed: int
+
+    def episode_seed(self, episode: int) -> int:
+        return episode * EPISODE_STRIDE + self.number
+
+    def noise(self, episode: int) -> np.random.Generator:
+        """The generator of an episode's exploration: it follows from the episode alone, so any run can resume."""
+        return np.random.default_rng((self.seed, self.number, episode))
+
+
+class Driver:
+    """Everything about one robot but the bus and the policy."""
+
+    def __init__(
+        self, robot: Robot, env: Environment, identity: Identity, penalty: float = 0.0, filtered: bool = True
+    ) -> None:
+        self.robot, self.env, self.identity, self.penalty, self.filtered = robot, env, identity, penalty, filtered
+        self.commitment = Commitment(robot)
+        self.index = 0  # steps so far
+        self.running = False
+
+    def begin(self, episode: int) -> pb.Episode:
+        """Reset to an episode of that number."""
+        seed = self.identity.episode_seed(episode)
+        self.observation, self.info = self.env.reset(options={"episode_seed": seed})
+        self.commitment.reset()
+        self.episode, self.step, self.running = episode, 0, True
+        self.rng = self.identity.noise(episode)
+        arena = self.info["arena"]
+        message = pb.Episode(
+            robot=self.robot.name,
+            actor=self.identity.actor,
+            episode=episode,
+            arena=arena.name,
+            obstacles=obstacle_messages(arena.obstacles),
+            goal=arena.goal,
+            goal_radius=arena.goal_radius,
+            start=self.info["state"].tolist(),
+            seed=seed,
+        )
+        message.header.time = self.info["time"]
+        return message
+
+    def request(self, proposal: Array) -> pb.Request:
+        """The question about a proposal in the present state."""
+        return request_message(
+            self.commitment,
+            self.info["state"],
+            proposal,
+            self.info["obstacles"],
+            actor=self.identity.actor,
+            episode=self.episode,
+            step=self.step,
+            time=self.info["time"],
+            observation=self.observation.tolist(),
+        )
+
+    def may_wait(self, outcome: Outcome) -> bool:
+        """No answer, and nothing moves: better to ask again than to let the episode pass."""
+        return outcome.answer is None and at_rest(self.commitment)
+
+    def execute(self, proposal: Array, outcome: Outcome | None, weights_version: int = 0) -> pb.Step:
+        """Do what the outcome says (without a filter: the proposal) for one period."""
+        if outcome is None:
+            action = np.clip(proposal, self.robot.low(), self.robot.high())
+        else:
+            action = next_input(self.commitment, outcome)
+        before = self.observation
+        self.observation, reward, terminated, truncated, self.info = self.env.step(action)
+        self.running = not (terminated or truncated)
+        step = self._step(before, proposal, action, reward)
+        step.terminated, step.truncated = terminated, truncated
+        step.goal, step.collision = self.info["at_goal"], self.info["collision"]
+        step.weights_version = weights_version
+        if outcome is not None:
+            self._note(step, outcome)
+        return step
+
+    def _step(self, before: NDArray[np.float32], proposal: Array, action: Array, reward: float) -> pb.Step:
+        info = self.info
+        self.index += 1
+        step = pb.Step(
+            robot=self.robot.name,
+            actor=self.identity.actor,
+            episode=self.episode,
+            step=self.step,
+            index=self.index,
+            observation=before.tolist(),
+            proposed=proposal.tolist(),
+            action=action.tolist(),
+            next_observation=self.observation.tolist(),
+            reward=reward,
+            penalty=correction_penalty(self.robot, proposal, action, self.penalty) if self.filtered else 0.0,
+            speed=info["speed"],
+            clearance=info["clearance"],
+            state=info["state"].tolist(),
+            true_state=info["true_state"].tolist(),
+            outside=info["outside"],
+        )
+        step.header.time = info["time"]
+        self.step += 1
+        return step
+
+    def _note(self, step: pb.Step, outcome: Outcome) -> None:
+        """What the filter did about this step, and whether the state after it is where the filter said."""
+        if outcome.answer is None:
+            step.fallback = True
+            step.decision = pb.FAILSAFE
+            return
+        step.decision = outcome.answer.message.kind
+        step.decide_ms = outcome.answer.message.time_ms
+        predicted: Prediction | None = self.commitment.predicted
+        if predicted is not None:
+            step.compared = True
+            step.contained = predicted.contains(self.robot, self.info["state"])

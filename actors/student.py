@@ -1,0 +1,117 @@
+"""An actor's side of learning: join the learner, hold its newest weights, and go no further ahead than it allows."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections.abc import Callable
+
+from messaging import brakeline_pb2 as pb
+from messaging.bus import Bus, BusError, Sample
+from messaging.robots import Robot
+from messaging.topics import FLOW, JOIN, WEIGHTS
+from messaging.weights import MLP, BadWeights, decode
+
+log = logging.getLogger("brakeline.actor")
+
+JOIN_TIMEOUT = 2.0  # s
+REJOIN_AFTER = 2.0  # s without permission: the learner may have missed our last step
+
+
+class RefusedByLearner(RuntimeError):
+    """The learner does not take this actor: layouts differ, or it has enough."""
+
+
+class Student:
+    """The link of one actor name to the learner. `policy` is the newest, None before the first join."""
+
+    def __init__(self, bus: Bus, robot: Robot, actor: str, lockstep: bool = False) -> None:
+        self.bus, self.robot, self.actor, self.lockstep = bus, robot, actor, lockstep
+        self.policy: MLP | None = None
+        self.flow = pb.Flow()
+        self.joins = 0
+        self._joined = 0  # incarnation
+        self._news = threading.Condition()
+        self._subscriptions = (
+            bus.subscribe(WEIGHTS, self._on_weights, robot=robot.name),
+            bus.subscribe(FLOW, self._on_flow, robot=robot.name),
+        )
+
+    @property
+    def done(self) -> bool:
+        return self.flow.done
+
+    @property
+    def warmup(self) -> bool:
+        return self.flow.warmup
+
+    def join(self, index: int, episode: int, stop: Callable[[], bool]) -> int | None:
+        """Wait until a learner takes us in; returns the episode to go on with, None if told to stop.
+
+        Raises:
+            RefusedByLearner: it says why.
+        """
+        message = pb.Join(
+            robot=self.robot.name, actor=self.actor, layout=self.robot.layout(), index=index, episode=episode
+        )
+        while not stop():
+            try:
+                payload = self.bus.ask(JOIN, message.SerializeToString(), JOIN_TIMEOUT, robot=self.robot.name)
+            except BusError as error:
+                log.info("no learner yet: %s", error)
+                time.sleep(0.2)
+                continue
+            reply = pb.JoinReply.FromString(payload)
+            if reply.error.type:
+                raise RefusedByLearner(f"{reply.error.field}: {reply.error.message}")
+            with self._news:
+                self.flow = reply.flow
+                self._joined = reply.flow.incarnation
+                self._take(reply.weights, joined=True)
+            self.joins += 1
+            return reply.episode
+        return None
+
+    def wait(self, index: int, episode: int, stop: Callable[[], bool]) -> bool:
+        """Wait for permission to take the step of that index; False: the run is done, or told to stop."""
+        asked = time.monotonic()
+        with self._news:
+            while not self._may(index):
+                if stop() or self.flow.done:
+                    return False
+                self._news.wait(0.1)
+                if self.flow.incarnation != self._joined or time.monotonic() - asked > REJOIN_AFTER:
+                    break
+            else:
+                return True
+        if self.join(index - 1, episode, stop) is None:
+            return False
+        return self.wait(index, episode, stop)
+
+    def _may(self, index: int) -> bool:
+        if self.policy is None or self.flow.limit.get(self.actor, 0) < index or self.flow.incarnation != self._joined:
+            return False
+        return not self.lockstep or self.policy.version == self.flow.weights_version
+
+    def _on_flow(self, sample: Sample) -> None:
+        flow = sample.message()
+        with self._news:
+            if flow.incarnation == self._joined or not self._joined or flow.incarnation != self.flow.incarnation:
+                self.flow = flow
+            self._news.notify_all()
+
+    def _on_weights(self, sample: Sample) -> None:
+        with self._news:
+            self._take(sample.message(), joined=False)
+            self._news.notify_all()
+
+    def _take(self, message: pb.Weights, joined: bool) -> None:
+        """Weights that are newer, or, on joining, whatever the learner has; anything else is refused aloud."""
+        try:
+            policy = decode(message.file, self.robot)
+        except BadWeights as error:
+            log.error("weights %d were refused: %s", message.version, error)
+            return
+        if joined or self.policy is None or policy.version > self.policy.version:
+            self.policy = policy

@@ -1,0 +1,102 @@
+"""Where data sets and model sets lie, and how a missing one comes to be.
+
+data/<robot>/record.safetensors                     the recorded trajectories
+data/<robot>/<certificate>-<mode>.safetensors       the model set in use, made from them
+data/<robot>/models/<version>.safetensors           every version a service has used
+"""
+
+from __future__ import annotations
+
+import os
+from dataclasses import replace
+from pathlib import Path
+
+from rich.console import Console
+from rich.progress import track
+
+from deploy import collect
+from deploy.vehicles import Conditions
+from messaging.robots import Robot
+from safety.dataset import BadData, Dataset
+from safety.model_set import BadModel, ModelSet, Recipe, make
+from safety.statement import Statement, state
+
+TRAJECTORIES = 200  # of 300 periods
+HELD_OUT = 0.3  # of the trajectories, for the statement about a model set
+SEED = 20260
+
+console = Console(stderr=True)
+
+
+def data_root() -> Path:
+    """`$BRAKELINE_DATA`, else `data` in the working directory."""
+    return Path(os.environ.get("BRAKELINE_DATA", "data"))
+
+
+def record_path(robot: Robot) -> Path:
+    return data_root() / robot.name / "record.safetensors"
+
+
+def model_path(robot: Robot, recipe: Recipe) -> Path:
+    return data_root() / robot.name / f"{recipe.certificate}-{recipe.mode}.safetensors"
+
+
+def recorded(
+    robot: Robot,
+    path: Path | None = None,
+    trajectories: int = TRAJECTORIES,
+    seed: int = SEED,
+    conditions: Conditions | None = None,
+    again: bool = False,
+) -> Dataset:
+    """The data set at `path`, recorded first if it is not there (or `again`)."""
+    path = path or record_path(robot)
+    if path.exists() and not again:
+        return Dataset.load(path)
+    conditions = conditions or Conditions()
+    driven = track(
+        collect.record(robot, trajectories, seed, conditions),
+        f"recording {trajectories} trajectories of {robot.name}",
+        total=trajectories,
+        console=console,
+    )
+    data = collect.dataset(robot, list(driven), seed, conditions)
+    data.save(path)
+    return data
+
+
+def certified(data: Dataset, recipe: Recipe) -> tuple[ModelSet, Statement]:
+    """A model set from 70 % of the trajectories, with its statement about the others.
+
+    Raises:
+        BadData, CertificateError: the data do not support it; the message says why.
+    """
+    fitted, held_out = data.split((1.0 - HELD_OUT, HELD_OUT))
+    model = make(fitted, recipe)
+    statement = state(model, fitted, held_out)
+    about = model.about | {"bound_step": f"{statement.bound_step:.6g}", "bound_plan": f"{statement.bound_plan:.6g}"}
+    about |= {"windows": str(statement.windows), "violations": str(statement.violations)}
+    return replace(model, about=about), statement
+
+
+def model_for(robot: Robot, recipe: Recipe) -> ModelSet:
+    """The model set in use, made (and its data recorded) if it is not there or not of this layout."""
+    path = model_path(robot, recipe)
+    if path.exists():
+        try:
+            return ModelSet.load(path)
+        except BadModel as error:
+            console.print(f"[yellow]making the model set again:[/] {error}")
+    try:
+        data = recorded(robot)
+    except BadData as error:
+        console.print(f"[yellow]recording again:[/] {error}")
+        data = recorded(robot, again=True)
+    with console.status(f"certifying {robot.name}: {recipe.certificate}, {recipe.mode}"):
+        model, statement = certified(data, recipe)
+    console.print(
+        f"{robot.name}: {recipe.certificate} ({recipe.mode}) {model.version}: {statement.violations} violations in "
+        f"{statement.windows} held-out plans, at most {statement.bound_plan:.2%} of plans (99 % confidence)"
+    )
+    model.save(path)
+    return model
