@@ -1,0 +1,295 @@
+"""The bus between real sessions, and real processes, on loopback."""
+
+import signal
+import subprocess
+import threading
+import time
+from collections.abc import Callable
+
+import pytest
+
+from messaging import brakeline_pb2 as pb
+from messaging.bus import Bus, BusError, BusSettings, Late, Malformed, NoReply, Refused, Sample, Unreachable
+from messaging.topics import DECIDE, HEALTH, LOG, STEP, WEIGHTS
+
+Join = Callable[..., Bus]
+Spawn = Callable[[str], "subprocess.Popen[str]"]
+
+SERVICE = """
+import os, sys, time
+from messaging.bus import Bus, BusSettings
+from messaging.topics import DECIDE
+bus = Bus(BusSettings({place}=("{endpoint}",)), "safety-{name}")
+bus.serve(DECIDE, lambda payload: b"{name}:" + payload)
+print("ready", flush=True)
+time.sleep(60)
+"""
+
+
+def eventually(condition: Callable[[], bool], seconds: float = 8.0) -> None:
+    deadline = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < deadline, "it did not come about"
+        time.sleep(0.02)
+
+
+def answers(bus: Bus, payload: bytes = b"?") -> bytes | None:
+    try:
+        return bus.ask(DECIDE, payload, timeout=0.5, robot="ground")
+    except BusError:
+        return None
+
+
+def test_messages_arrive_numbered_and_as_the_bytes_that_were_sent(join: Join) -> None:
+    router, actor = join("launcher", listen=True), join("actor-0")
+    got: list[Sample] = []
+    router.subscribe(STEP, got.append)
+    publisher = actor.publisher(STEP, robot="ground")
+    sent = pb.Step(index=7, observation=[1.0, 2.0])
+    sent.header.time = 4.2
+    before = time.time_ns()
+    for _ in range(100):
+        publisher.put(sent)
+    eventually(lambda: len(got) == 100)
+    assert [sample.message().header.sequence for sample in got] == list(range(1, 101))
+    last = got[-1]
+    assert last.payload == sent.SerializeToString()
+    assert last.key == "step/ground/actor-0"
+    header = last.message().header
+    assert (header.source, header.run, header.time) == ("actor-0", actor.run, 4.2)
+    assert before <= header.wall_time <= last.received <= time.time_ns()
+    assert actor.published() == {"step/ground/actor-0": 100}
+    assert actor.publisher(STEP, robot="ground") is publisher
+
+
+def test_what_is_published_first_and_last_arrives(join: Join) -> None:
+    router = join("launcher", listen=True)
+    got: list[Sample] = []
+    router.subscribe(STEP, got.append)
+    for number in range(10):  # a process that opens, publishes and closes at once
+        with join(f"actor-{number}") as actor:
+            for _ in range(50):
+                actor.publisher(STEP, robot="ground").put(pb.Step(observation=[0.0] * 1000))
+    eventually(lambda: len(got) == 500)
+
+
+def test_large_telemetry_is_not_dropped_on_an_idle_link(join: Join) -> None:
+    router, learner, actor = join("launcher", listen=True), join("learner"), join("actor-0")
+    got: list[Sample] = []
+    actor.subscribe(WEIGHTS, got.append, robot="ground")
+    publisher = learner.publisher(WEIGHTS, robot="ground")
+    eventually(lambda: bool(router.connected))
+    for _ in range(20):
+        publisher.put(pb.Weights(file=bytes(400_000)))
+        time.sleep(0.02)
+    eventually(lambda: len(got) == 20)
+
+
+def test_a_handler_that_raises_is_logged_and_goes_on(join: Join, caplog: pytest.LogCaptureFixture) -> None:
+    router, actor = join("launcher", listen=True), join("actor-0")
+    got: list[int] = []
+
+    def handler(sample: Sample) -> None:
+        got.append(sample.message().index)
+        raise ZeroDivisionError
+
+    subscription = router.subscribe(STEP, handler)
+    for index in range(5):
+        actor.publisher(STEP, robot="ground").put(pb.Step(index=index))
+    eventually(lambda: len(got) == 5 and subscription.failures == 5)
+    assert "handler of step/*/* failed" in caplog.text
+
+
+def test_what_is_not_a_message_is_malformed() -> None:
+    with pytest.raises(Malformed, match="not a Step"):
+        Sample(STEP, "step/ground/x", b"\xff\xff\xff", 0).message()
+
+
+def test_only_the_topics_type_and_whole_keys_are_published(join: Join) -> None:
+    bus = join("launcher", listen=True)
+    with pytest.raises(TypeError, match="carries Step, not Health"):
+        bus.publisher(STEP, robot="ground").put(pb.Health())
+    with pytest.raises(ValueError, match="every name"):
+        bus.publisher(STEP)
+    with pytest.raises(ValueError, match="has no 'colour'"):
+        bus.publisher(STEP, robot="ground", colour="red")
+    with pytest.raises(ValueError, match="letters"):
+        bus.publisher(STEP, robot="*")
+    with pytest.raises(ValueError, match="use `ask`"):
+        bus.publisher(DECIDE, robot="ground")
+    with pytest.raises(ValueError, match="every name"):
+        bus.ask(DECIDE, b"", timeout=1.0)
+    with pytest.raises(ValueError, match="name of a process"):
+        Bus(bus.settings, "a/b")
+    with pytest.raises(ValueError, match="endpoint"):
+        Bus(BusSettings(), "nowhere")
+
+
+def test_a_question_is_answered_by_another_process(join: Join, spawn: Spawn, endpoint: str) -> None:
+    join("launcher", listen=True)
+    spawn(SERVICE.format(place="connect", endpoint=endpoint, name="a"))
+    assert join("actor-0").ask(DECIDE, b"?", timeout=2.0, robot="ground") == b"a:?"
+
+
+def test_failures_of_a_question_are_typed(join: Join, caplog: pytest.LogCaptureFixture) -> None:
+    join("launcher", listen=True)
+    actor, safety = join("actor-0"), join("safety")
+    start = time.perf_counter()
+    with pytest.raises(NoReply, match="is the service running"):
+        actor.ask(DECIDE, b"?", timeout=5.0, robot="ground")
+    assert time.perf_counter() - start < 1.0, "that nobody answers is known at once"
+
+    class BadRequest(ValueError):
+        field = "state"
+
+    release = threading.Event()
+
+    def handler(payload: bytes) -> bytes:
+        if payload == b"wrong":
+            raise BadRequest("not finite")
+        if payload == b"slow":
+            release.wait(5.0)
+        return payload
+
+    service = safety.serve(DECIDE, handler)
+    eventually(lambda: answers(actor) == b"?")
+    with pytest.raises(Refused, match="BadRequest: not finite") as refused:
+        actor.ask(DECIDE, b"wrong", timeout=2.0, robot="ground")
+    assert (refused.value.type, refused.value.field, refused.value.text) == ("BadRequest", "state", "not finite")
+    assert "not finite" in caplog.text
+    start = time.perf_counter()
+    with pytest.raises(Late, match="within 100 ms"):
+        actor.ask(DECIDE, b"slow", timeout=0.1, robot="ground")
+    assert 0.09 < time.perf_counter() - start < 1.0
+    release.set()
+    noise = bytes(range(256)) * 40_000  # 10 MB
+    assert actor.ask(DECIDE, noise, timeout=5.0, robot="ground") == noise
+    assert actor.ask(DECIDE, b"", timeout=2.0, robot="ground") == b""
+    service.close()
+    with pytest.raises(NoReply):
+        actor.ask(DECIDE, b"?", timeout=2.0, robot="ground")
+
+
+def test_another_replica_answers_when_one_is_killed(join: Join, spawn: Spawn, endpoint: str) -> None:
+    join("launcher", listen=True)
+    replicas = {name: spawn(SERVICE.format(place="connect", endpoint=endpoint, name=name)) for name in "ab"}
+    actor = join("actor-0")
+    eventually(lambda: answers(actor) is not None)
+    first = (answers(actor) or b"").decode()[0]
+    replicas[first].kill()
+    other = "ab".replace(first, "").encode()
+    eventually(lambda: answers(actor) == other + b":?")
+
+
+def test_a_question_does_not_wait_behind_telemetry(join: Join) -> None:
+    router, actor, safety = join("launcher", listen=True), join("actor-0"), join("safety")
+    release = threading.Event()
+    safety.serve(DECIDE, lambda payload: payload)
+    router.subscribe(STEP, lambda _: release.wait(10.0) and None)
+    safety.subscribe(STEP, lambda _: release.wait(10.0) and None)
+    eventually(lambda: answers(actor) == b"?")
+    publisher = actor.publisher(STEP, robot="ground")
+    worst = 0.0
+    for _ in range(300):
+        publisher.put(pb.Step(observation=[0.0] * 100))
+        start = time.perf_counter()
+        actor.ask(DECIDE, b"?", timeout=1.0, robot="ground")
+        worst = max(worst, time.perf_counter() - start)
+    release.set()
+    assert worst < 0.25
+
+
+def test_who_lives_is_known_and_who_is_killed_is_missed(join: Join, spawn: Spawn, endpoint: str) -> None:
+    router = join("launcher", listen=True)
+    seen: list[tuple[str, bool]] = []
+    router.watch(lambda source, alive: seen.append((source, alive)))
+    child = spawn(SERVICE.format(place="connect", endpoint=endpoint, name="a"))
+    eventually(lambda: ("safety-a", True) in seen)
+    assert router.living() == {"launcher", "safety-a"}
+    child.kill()
+    eventually(lambda: ("safety-a", False) in seen, seconds=3.0)
+    assert router.living() == {"launcher"}
+
+
+def test_a_stopped_process_is_missed_within_two_seconds(join: Join, spawn: Spawn, endpoint: str) -> None:
+    router = join("launcher", listen=True)
+    child = spawn(SERVICE.format(place="connect", endpoint=endpoint, name="a"))
+    eventually(lambda: "safety-a" in router.living())
+    child.send_signal(signal.SIGSTOP)
+    start = time.monotonic()
+    eventually(lambda: "safety-a" not in router.living(), seconds=5.0)
+    assert time.monotonic() - start < 3.0
+    child.send_signal(signal.SIGCONT)
+    eventually(lambda: "safety-a" in router.living())
+
+
+ROUTER = """
+import sys, time
+from messaging.bus import Bus, BusSettings
+bus = Bus(BusSettings(listen=("{endpoint}",)), "router")
+print("ready", flush=True)
+time.sleep(60)
+"""
+
+
+def test_everything_comes_back_after_the_router_was_killed(join: Join, spawn: Spawn, endpoint: str) -> None:
+    router = spawn(ROUTER.format(endpoint=endpoint))
+    actor, safety = join("actor-0"), join("safety")
+    got: list[int] = []
+    safety.serve(DECIDE, lambda payload: payload)
+    safety.subscribe(LOG, lambda sample: got.append(sample.message().header.sequence))
+    eventually(lambda: answers(actor) == b"?")
+    router.kill()
+    router.wait()
+    with pytest.raises((NoReply, Late)):
+        actor.ask(DECIDE, b"?", timeout=0.2, robot="ground")
+    eventually(lambda: not actor.connected)
+    publisher = actor.publisher(LOG)
+    publisher.put(pb.LogLine(text="lost"))
+    spawn(ROUTER.format(endpoint=endpoint))
+    eventually(lambda: answers(actor) == b"?")
+    eventually(lambda: actor.living() == {"router", "actor-0", "safety"})
+
+    def arrives() -> bool:
+        publisher.put(pb.LogLine(text="?"))
+        return bool(got)
+
+    eventually(arrives)
+    assert got[0] > 1, "what was put while the router was away is a gap"
+
+
+def test_without_a_router_a_client_says_so_after_its_patience(join: Join, endpoint: str) -> None:
+    start = time.monotonic()
+    with pytest.raises(Unreachable, match="start one there"):
+        join("actor-0", patience=0.5)
+    assert 0.4 < time.monotonic() - start < 3.0
+
+
+def test_a_client_waits_for_its_router(join: Join) -> None:
+    opened: list[Bus] = []
+    waiting = threading.Thread(target=lambda: opened.append(join("actor-0", patience=10.0)))
+    waiting.start()
+    time.sleep(0.4)
+    assert not opened
+    join("launcher", listen=True)
+    waiting.join(5.0)
+    assert opened[0].connected
+
+
+def test_an_endpoint_in_use_cannot_be_listened_on(join: Join) -> None:
+    join("launcher", listen=True)
+    with pytest.raises(Unreachable, match="cannot listen"):
+        join("second", listen=True)
+
+
+def test_closing_ends_the_handlers_and_what_comes_after_is_an_error(join: Join) -> None:
+    bus = join("launcher", listen=True)
+    bus.subscribe(HEALTH, lambda _: None)
+    publisher = bus.publisher(HEALTH)
+    bus.close()
+    bus.close()
+    assert not [thread for thread in threading.enumerate() if thread.name == "bus health/*"]
+    with pytest.raises(BusError, match="cannot publish"):
+        publisher.put(pb.Health())
+    with pytest.raises(BusError, match="cannot ask"):
+        bus.ask(DECIDE, b"", timeout=0.1, robot="ground")

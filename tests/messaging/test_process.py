@@ -1,0 +1,101 @@
+"""What a process says while it lives and when it ends."""
+
+import logging
+import signal
+import subprocess
+import time
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+
+from messaging.bus import Bus, BusSettings, Sample
+from messaging.process import Process
+from messaging.topics import HEALTH, LOG
+
+Join = Callable[..., Bus]
+Spawn = Callable[[str], "subprocess.Popen[str]"]
+
+PROCESS = """
+from messaging.bus import BusSettings
+from messaging.process import Process
+with Process(BusSettings(connect=("{endpoint}",)), "worker") as process:
+    process.figures["rate"] = 2.5
+    print("ready", flush=True)
+    process.stop.wait(30.0)
+    {end}
+"""
+
+
+def listen(bus: Bus) -> tuple[list[Any], list[Any]]:
+    health: list[Any] = []
+    lines: list[Any] = []
+
+    def into(messages: list[Any]) -> Callable[[Sample], None]:
+        return lambda sample: messages.append(sample.message())
+
+    bus.subscribe(HEALTH, into(health))
+    bus.subscribe(LOG, into(lines))
+    return health, lines
+
+
+def wait_for_goodbye(health: list[Any]) -> Any:
+    deadline = time.monotonic() + 8.0
+    while not (health and health[-1].last):
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+    return health[-1]
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_it_with_a_goodbye(join: Join, spawn: Spawn, endpoint: str, number: signal.Signals) -> None:
+    health, lines = listen(join("launcher", listen=True))
+    child = spawn(PROCESS.format(endpoint=endpoint, end=""))
+    time.sleep(1.2)
+    child.send_signal(number)
+    last = wait_for_goodbye(health)
+    assert child.wait(5.0) == 0
+    assert len(health) >= 3, "one at the start, one a second, one at the end"
+    assert last.figures["rate"] == 2.5
+    assert last.published["health/worker"] == len(health) == last.header.sequence
+    assert lines == []
+
+
+def test_a_process_that_fails_is_not_silent(join: Join, spawn: Spawn, endpoint: str) -> None:
+    health, lines = listen(join("launcher", listen=True))
+    child = spawn(PROCESS.format(endpoint=endpoint, end="raise ZeroDivisionError('oh')"))
+    child.terminate()
+    assert "ZeroDivisionError: oh" in wait_for_goodbye(health).notes["died of"]
+    assert child.wait(5.0) == 1
+    assert [line.level for line in lines] == ["ERROR"]
+    assert "Traceback" in lines[0].text
+
+
+def test_what_is_logged_goes_out_on_the_bus(join: Join, endpoint: str) -> None:
+    health, lines = listen(join("launcher", listen=True))
+    log = logging.getLogger("somewhere")
+    with Process(BusSettings(connect=(endpoint,)), "worker", stderr=False) as process:
+        process.refresh = lambda: process.notes.update(model="v3")
+        log.info("%d robots", 2)
+        log.critical("bad")
+        log.debug("not this")
+    log.error("not this either: it has ended")
+    assert wait_for_goodbye(health).notes["model"] == "v3"
+    assert [(line.process, line.level, line.text) for line in lines] == [
+        ("worker", "INFO", "2 robots"),
+        ("worker", "ERROR", "bad"),
+    ]
+
+
+def test_a_refresh_that_fails_does_not_stop_the_signs_of_life(join: Join, endpoint: str) -> None:
+    health, lines = listen(join("launcher", listen=True))
+
+    def refresh() -> None:
+        raise KeyError("lost")
+
+    with Process(BusSettings(connect=(endpoint,)), "worker", stderr=False) as process:
+        process.refresh = refresh
+        time.sleep(1.2)
+        process.refresh = None
+    wait_for_goodbye(health)
+    assert "no sign of life" in lines[0].text
