@@ -1,0 +1,176 @@
+"""The ground robot: a TurtleBot3 Burger in MuJoCo, moved by one input a period."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from messaging.robots import GROUND
+from sim.estimator import Estimator, NoiseLevels
+from sim.scene import add_obstacles
+from sim.world import Arena
+
+Array = NDArray[np.float64]
+
+MODEL = Path(__file__).with_name("ground.xml").read_text()
+WHEEL_RADIUS = 0.033  # m
+TRACK = 0.160  # m between the wheels
+SAMPLES = 10  # of encoders and gyro in a period
+PAYLOAD_GYRATION = 0.05  # m, radius of gyration of what is loaded
+
+
+class BadInput(ValueError):
+    """An input that is not a finite vector of the robot's length."""
+
+
+@dataclass(frozen=True)
+class Period:
+    """What happened in one period."""
+
+    measured: Array  # (5,) state at its end, as estimated
+    true: Array  # (5,) state at its end, as it is
+    collision: bool  # some geom of the robot touched an obstacle at some physics step
+    closest: float  # m, least distance from the footprint's disc to an obstacle, at the samples
+    clearance: float  # m, the same at the period's end
+    subsamples: Array  # (SAMPLES, 2) m, dead-reckoned positions in the robot's frame at the period's start
+    turned: float  # rad, dead-reckoned change of heading
+
+
+class GroundRobot:
+    """One TurtleBot3 in one arena.
+
+    true, measured: states (x [m], y [m], heading [rad], speed [m/s], turn rate [rad/s]) of the axle's midpoint;
+    input: what was executed last (speed [m/s], turn rate [rad/s]), after clipping.
+    """
+
+    def __init__(
+        self,
+        arena: Arena,
+        rng: np.random.Generator,
+        noise: NoiseLevels | None = None,
+        payload_kg: float = 0.0,
+        floor_friction: float = 1.0,
+    ) -> None:
+        self.arena = arena
+        self._model = _build(arena)
+        self._data = mujoco.MjData(self._model)
+        base = self._model.body("base").id
+        self._base = base
+        self._bare_mass = float(self._model.body_mass[base])
+        self._bare_inertia = self._model.body_inertia[base].copy()
+        self._wheel_geoms = [self._model.geom(name).id for name in ("left wheel", "right wheel")]
+        self._physics_steps = round(GROUND.period / SAMPLES / self._model.opt.timestep)
+        self.set_payload(payload_kg)
+        self.set_friction(floor_friction)
+        mujoco.mj_forward(self._model, self._data)
+        self._run(np.zeros(2))  # sink onto the wheels
+        self.estimator = Estimator(
+            noise or NoiseLevels(), rng, self._true_pose(), self._wheels(), WHEEL_RADIUS, GROUND.period / SAMPLES
+        )
+        self.true = self._true_state()
+        self.measured = np.array([*self.estimator.pose, 0.0, 0.0])
+        self.input = np.zeros(GROUND.action_dim)
+
+    def set_payload(self, kg: float) -> None:
+        """Load that many kg on top of the bare robot's mass, at its centre of mass; at any time."""
+        if not (math.isfinite(kg) and kg >= 0.0):
+            raise ValueError(f"a payload is 0 kg or more, not {kg}")
+        self._model.body_mass[self._base] = self._bare_mass + kg
+        self._model.body_inertia[self._base] = self._bare_inertia + kg * PAYLOAD_GYRATION**2
+        mujoco.mj_setConst(self._model, mujoco.MjData(self._model))
+
+    def set_friction(self, coefficient: float) -> None:
+        """Friction between wheels and floor (1: rubber on a dry floor; 0.1: ice); at any time."""
+        if not (math.isfinite(coefficient) and coefficient > 0.0):
+            raise ValueError(f"a friction coefficient is positive, not {coefficient}")
+        self._model.geom_friction[self._wheel_geoms, 0] = coefficient
+
+    def step(self, input: Array) -> Period:
+        """Drive one period at (speed [m/s], turn rate [rad/s]), clipped to the robot's bounds.
+
+        Raises:
+            BadInput: when the input is not two finite numbers.
+        """
+        input = np.asarray(input, dtype=np.float64)
+        if input.shape != (GROUND.action_dim,) or not np.isfinite(input).all():
+            raise BadInput(f"an input is {GROUND.action_dim} finite numbers, not {input!r}")
+        self.input = np.clip(input, GROUND.low(), GROUND.high())
+        positions, wheels, rates, collision = self._run(self.input)
+        reading = self.estimator.update(wheels, rates, self._true_pose())
+        self.true, self.measured = self._true_state(), reading.measured
+        distances = self._clearance(positions)
+        return Period(
+            self.measured,
+            self.true,
+            collision,
+            float(distances.min()),
+            float(distances[-1]),
+            reading.path,
+            reading.turned,
+        )
+
+    def standing(self) -> Period:
+        """The present state as a period in which nothing happened: what there is to say before the first step."""
+        clearance = float(self._clearance(self.true[:2]))
+        return Period(self.measured, self.true, False, clearance, clearance, np.zeros((SAMPLES, 2)), 0.0)
+
+    def _clearance(self, positions: Array) -> Array:
+        """From the footprint's disc at positions (..., 2) to the nearest obstacle, m."""
+        return np.asarray(self.arena.shapes.distance(positions).min(axis=0) - GROUND.footprint)
+
+    def _run(self, input: Array) -> tuple[Array, Array, Array, bool]:
+        """One period of physics: position (S, 2), wheel angles (S, 2), turn rate (S,) at each sample; any collision."""
+        model, data = self._model, self._data
+        speed, turn = input
+        data.ctrl[:] = (speed - 0.5 * TRACK * turn) / WHEEL_RADIUS, (speed + 0.5 * TRACK * turn) / WHEEL_RADIUS
+        positions, wheels, headings = np.empty((SAMPLES, 2)), np.empty((SAMPLES, 2)), np.empty(SAMPLES + 1)
+        headings[0] = self._true_heading()
+        collision = False
+        for i in range(SAMPLES):
+            for _ in range(self._physics_steps):
+                # step2 before step1: contacts are then those of the position just reached
+                mujoco.mj_step2(model, data)
+                mujoco.mj_step1(model, data)
+                collision = collision or self._touching()
+            positions[i], wheels[i], headings[i + 1] = data.qpos[:2], self._wheels(), self._true_heading()
+        rates = np.diff(np.unwrap(headings)) * (SAMPLES / GROUND.period)
+        return positions, wheels, rates, collision
+
+    def _touching(self) -> bool:
+        """Whether any contact now is with an obstacle: the robot touches nothing else but the floor, which is geom 0.
+
+        A plane is the lowest type of geom, and a contact names the geom of lower type first.
+        """
+        return bool(np.count_nonzero(self._data.contact.geom[:, 0]))
+
+    def _wheels(self) -> Array:
+        return np.asarray(self._data.qpos[7:9])
+
+    def _true_heading(self) -> float:
+        w, x, y, z = self._data.qpos[3:7]
+        return math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+
+    def _true_pose(self) -> Array:
+        return np.array([*self._data.qpos[:2], self._true_heading()])
+
+    def _true_state(self) -> Array:
+        x, y, heading = self._true_pose()
+        vx, vy = self._data.qvel[:2]
+        speed = vx * math.cos(heading) + vy * math.sin(heading)
+        return np.array([x, y, heading, speed, self._data.qvel[5]])
+
+
+def _build(arena: Arena) -> mujoco.MjModel:
+    """Compile robot and arena, the robot standing at the start."""
+    spec = mujoco.MjSpec.from_string(MODEL)
+    add_obstacles(spec, arena)
+    base = spec.body("base")
+    x, y, heading = arena.start
+    base.pos = (x, y, WHEEL_RADIUS)
+    base.quat = (math.cos(0.5 * heading), 0.0, 0.0, math.sin(0.5 * heading))
+    return spec.compile()
