@@ -162,6 +162,7 @@ def record(process: Process, run: Path, metadata: Metadata) -> Recording:
     subscriptions = [process.bus.subscribe(topic, inbox.put) for topic in RECORDED]
     recording.save()
     process.refresh = refresh
+    process.announce()
     while not process.stop.wait(PERIOD):
         recording.save()
     _until_quiet(inbox, recording)

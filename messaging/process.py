@@ -31,7 +31,7 @@ class Process:
     `stop` is set by SIGINT and SIGTERM (and by whoever wants the process to end); a second signal kills. `figures` and
     `notes` go out with the next Health; `refresh`, if set, is called before each to bring them up to date. All that is
     logged goes to stderr (unless `stderr` is False) and to the LOG topic. An exception that leaves the block is logged,
-    noted in the last Health, and goes on its way.
+    noted in the last Health, and goes on its way. The first Health follows `announce`, or a second.
 
     Raises:
         Unreachable: on entering, when there is no bus at `settings`.
@@ -47,7 +47,8 @@ class Process:
         self._stderr = stderr
         self._handlers: list[logging.Handler] = []
         self._signals: dict[int, Any] = {}
-        self._ended = threading.Event()
+        self._ended = False
+        self._due = threading.Event()
 
     def __enter__(self) -> Self:
         self.bus = Bus(self.settings, self.source)
@@ -64,7 +65,8 @@ class Process:
             log.error("%s ends: %s", self.source, error, exc_info=error)
             self.notes["died of"] = f"{type(error).__name__}: {error}"
         self.stop.set()
-        self._ended.set()
+        self._ended = True
+        self._due.set()
         self._pulse.join(2.0)
         self._stop_logging()
         try:
@@ -75,6 +77,10 @@ class Process:
         for number, handler in self._signals.items():
             signal.signal(number, handler)
 
+    def announce(self) -> None:
+        """Send a Health now: the process is ready, or something changed that cannot wait."""
+        self._due.set()
+
     def _asked(self, number: int, _: FrameType | None) -> None:
         if self.stop.is_set():  # asked twice: at once
             signal.signal(number, signal.SIG_DFL)
@@ -83,12 +89,14 @@ class Process:
 
     def _beat(self) -> None:
         while True:
+            self._due.wait(1.0 / (HEALTH.rate or 1.0))
+            self._due.clear()
+            if self._ended:
+                return
             try:
                 self._report()
             except Exception:
                 log.exception("no sign of life")
-            if self._ended.wait(1.0 / (HEALTH.rate or 1.0)):
-                return
 
     def _report(self, last: bool = False) -> None:
         if self.refresh is not None:

@@ -21,6 +21,7 @@ from messaging.bus import BusSettings
 from messaging.process import Process
 with Process(BusSettings(connect=("{endpoint}",)), "worker") as process:
     process.figures["rate"] = 2.5
+    process.announce()
     print("ready", flush=True)
     process.stop.wait(30.0)
     {end}
@@ -55,7 +56,7 @@ def test_a_signal_ends_it_with_a_goodbye(join: Join, spawn: Spawn, endpoint: str
     child.send_signal(number)
     last = wait_for_goodbye(health)
     assert child.wait(5.0) == 0
-    assert len(health) >= 3, "one at the start, one a second, one at the end"
+    assert len(health) >= 3, "one when announced, one a second, one at the end"
     assert last.figures["rate"] == 2.5
     assert last.published["health/worker"] == len(health) == last.header.sequence
     assert lines == []
@@ -95,7 +96,8 @@ def test_a_refresh_that_fails_does_not_stop_the_signs_of_life(join: Join, endpoi
 
     with Process(BusSettings(connect=(endpoint,)), "worker", stderr=False) as process:
         process.refresh = refresh
-        time.sleep(1.2)
+        process.announce()
+        time.sleep(0.3)
         process.refresh = None
     wait_for_goodbye(health)
     assert "no sign of life" in lines[0].text

@@ -1,0 +1,202 @@
+"""Figures against counts made by hand."""
+
+import json
+import math
+import random
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from logs.figures import curve, draw, smooth
+from logs.metrics import Metrics, Tally, closed_loop, spread
+from logs.reader import Record
+from logs.recorder import entry
+from logs.report import analyse, show
+from logs.segment import open_segment
+from messaging import brakeline_pb2 as pb
+from messaging.bus import Sample
+from messaging.topics import LOG, STEP
+
+Say = Callable[..., Sample]
+
+
+def episode(number: int, decisions: list[int], actor: str = "a", **last: object) -> list[pb.Step]:
+    """Steps of 0.1 m/s more each and a reward of 1; the fields of the last one as given."""
+    steps = [
+        pb.Step(actor=actor, robot="ground", episode=number, step=k, reward=1.0, penalty=5.0, speed=0.1 * (k + 1))
+        for k in range(len(decisions))
+    ]
+    for k, (step, kind) in enumerate(zip(steps, decisions, strict=True)):
+        step.decision = kind  # type: ignore[assignment]
+        step.decide_ms = 1.0 + k
+    steps[-1].MergeFrom(pb.Step(**last))  # type: ignore[arg-type]
+    return steps
+
+
+def some_steps() -> list[pb.Step]:
+    none, fine, changed, safe = pb.UNKNOWN, pb.ALLOWED, pb.ADJUSTED, pb.FAILSAFE
+    return [
+        *episode(0, [fine, changed, fine], terminated=True, goal=True, reward=10.0),
+        *episode(1, [safe, safe], truncated=True, outside=True),
+        *episode(2, [fine, none], terminated=True, collision=True, fallback=True, compared=True),
+        *episode(3, [fine], compared=True, contained=True),  # not finished
+        *episode(4, [fine, fine], collision=True),  # hit, and never finished
+    ]
+
+
+def test_steps_are_counted() -> None:
+    tally = Tally()
+    for step in some_steps():
+        tally.step(step)
+    figures = closed_loop([tally])
+    expected = {
+        "episodes": 3, "goals": 1, "collisions": 2, "timeouts": 1, "steps": 10, "interventions": 4, "failsafes": 3,
+        "fallbacks": 1, "max_speed": pytest.approx(0.3), "mean_speed": pytest.approx(1.6 / 10),
+        "mean_reward": pytest.approx((12.0 + 2.0 + 2.0) / 3), "outside": 1,
+        "containment": {"steps": 2, "violations": 1},
+    }  # fmt: skip
+    assert {name: figures[name] for name in expected} == expected
+    times = figures["decision_ms"]
+    allowed = [1.0, 3.0, 1.0, 1.0, 1.0, 2.0]
+    assert times["allowed"]["mean"] == pytest.approx(np.mean(allowed))
+    assert times["adjusted"] == {"mean": 2.0, "std": 0.0, "p50": 2.0, "p99": 2.0}
+    assert times["failsafe"]["p50"] == 1.5
+    assert times["std"] == pytest.approx(np.std([*allowed, 2.0, 1.0, 2.0]))
+
+
+def test_a_collision_counts_once_an_episode() -> None:
+    tally = Tally()
+    for number in range(2):
+        for step in episode(number, [0, 0, 0]):
+            step.collision = True
+            tally.step(step)
+    assert tally.collisions == 2
+
+
+def test_without_steps_and_without_a_filter_there_are_no_numbers() -> None:
+    figures = closed_loop([])
+    assert figures["steps"] == figures["episodes"] == 0
+    assert [figures[name] for name in ("mean_speed", "max_speed", "mean_reward", "decision_ms")] == [None] * 4
+    tally = Tally()
+    tally.step(pb.Step(speed=0.1))
+    assert closed_loop([tally])["decision_ms"] is None
+    assert spread() is None
+
+
+def put(metrics: Metrics, sample: Sample) -> None:
+    metrics.add(sample.key, sample.message())
+
+
+def test_losses_are_gaps_in_the_numbers_and_what_health_tells_of(say: Say) -> None:
+    lines = [say("log/a", pb.LogLine(level="INFO")) for _ in range(10)]
+    metrics = Metrics()
+    for line in (*lines[2:5], lines[4], lines[7]):
+        put(metrics, line)
+    assert metrics.topics() == {"log/a": {"messages": 4, "missing": 4, "duplicates": 1}}
+    put(metrics, say("health/a", pb.Health(process="a", published={"log/a": 10, "step/ground/a": 3, "flow/ground": 9})))
+    topics = metrics.topics()
+    assert topics["log/a"]["missing"] == 6
+    assert topics["step/ground/a"] == {"messages": 0, "missing": 3, "duplicates": 0}
+    assert "flow/ground" not in topics, "it is not recorded"
+    put(metrics, say("log/a", pb.LogLine(level="ERROR"), run=2))  # the process was started again: number 11 of run 2
+    assert metrics.topics()["log/a"] == {"messages": 5, "missing": 16, "duplicates": 1}
+    assert metrics.figures()["log_lines"] == {"ERROR": 1, "INFO": 4}
+
+
+def test_a_listener_of_few_topics_misses_only_these(say: Say) -> None:
+    metrics = Metrics([LOG])
+    put(metrics, say("health/a", pb.Health(process="a", published={"log/a": 1, "step/ground/a": 3})))
+    assert metrics.topics()["log/a"]["missing"] == 1
+    assert "step/ground/a" not in metrics.topics()
+
+
+def test_processes_learners_and_round_trips(say: Say) -> None:
+    metrics = Metrics()
+    for sample in (
+        say("health/a", pb.Health(process="a", figures={"rate": 1.0}), run=1),
+        say("health/a", pb.Health(process="a", notes={"model": "v2"}, last=True), run=2),
+        say("metrics/ground", pb.LearnerMetrics(robot="ground", updates=5)),
+        say("metrics/ground", pb.LearnerMetrics(robot="ground", updates=9, critic_loss=0.5, updates_per_s=100.0)),
+        say("exchange/ground/a", pb.Exchange(round_trip_ms=1.0)),
+        say("exchange/ground/a", pb.Exchange(round_trip_ms=3.0)),
+        say("exchange/ground/a", pb.Exchange(failure="Late: no answer within 60 ms")),
+    ):
+        put(metrics, sample)
+    figures = metrics.figures()
+    process = figures["processes"]["a"]
+    assert (process["starts"], process["alive"], process["notes"]) == (2, False, {"model": "v2"})
+    assert figures["learners"]["ground"]["updates"] == 9
+    assert figures["learners"]["ground"]["critic_loss"] == 0.5
+    assert figures["round_trip_ms"]["p50"] == 2.0
+    assert figures["no_decision"] == {"Late": 1}
+    assert figures["seconds"] == 6.0
+
+
+def run_of_two_actors(say: Say) -> dict[str, list[Sample]]:
+    chance = random.Random(1)
+    samples: dict[str, list[Sample]] = {}
+    for actor in "ab":
+        samples[actor] = []
+        for number in range(20):
+            for step in episode(number, [chance.choice([1, 1, 2, 3]) for _ in range(7)], actor, terminated=True):
+                step.reward, step.speed, step.decide_ms = (chance.random() for _ in range(3))
+                samples[actor].append(say(f"step/ground/{actor}", step))
+    return samples
+
+
+def test_the_figures_do_not_depend_on_how_actors_are_interleaved(say: Say) -> None:
+    samples = run_of_two_actors(say)
+    one, two = Metrics(), Metrics()
+    for sample in samples["a"] + samples["b"]:
+        put(one, sample)
+    for pair in zip(samples["b"], samples["a"], strict=True):
+        for sample in pair:
+            put(two, sample)
+    assert one.figures() == two.figures()
+
+
+def test_analyse_gives_what_a_live_listener_had(tmp_path: Path, say: Say) -> None:
+    samples = run_of_two_actors(say)
+    live = Metrics()
+    about = {"method": "ddpc", "certificate": "residual", "arena": "default", "seed": "7"}
+    segment = open_segment(tmp_path / "run.mcap", {"run": about})
+    for sample in samples["a"] + samples["b"]:
+        put(live, sample)
+        segment.save([entry(sample)])
+    segment.finish()
+    figures = analyse(tmp_path)
+    assert {name: figures[name] for name in live.figures()} == live.figures()
+    assert [figures[name] for name in ("method", "policy", "seed")] == ["ddpc", None, 7]
+    assert figures["cuts"] == [] and figures["malformed"] == 0
+    assert json.loads(json.dumps(figures, allow_nan=False)) == figures
+    assert math.isfinite(figures["steps_per_s"])
+
+    console = Console(record=True, width=140)
+    console.print(show(figures))
+    text = console.export_text()
+    for expected in ("280", "method ddpc, certificate residual", "step/ground/a", "adjusted"):
+        assert expected in text
+
+
+def test_an_empty_run_can_be_shown() -> None:
+    console = Console(record=True, width=140)
+    console.print(show(Metrics().figures()))
+    assert "steps" in console.export_text()
+
+
+def test_learning_curve(tmp_path: Path, say: Say) -> None:
+    samples = [say(f"step/ground/{step.actor}", step) for step in some_steps()]
+    found = curve(Record(STEP.name, sample.key, sample.message(), 0, 0) for sample in samples)
+    assert found.steps.tolist() == [3.0, 5.0, 7.0]
+    assert found.goal.tolist() == [1.0, 0.0, 0.0]
+    assert found.reward.tolist() == [12.0, 2.0, 2.0]
+    assert found.interventions.tolist() == pytest.approx([1 / 3, 1.0, 0.5])
+    assert smooth(np.array([1.0, 2.0, 3.0, 4.0]), 2).tolist() == [1.0, 1.5, 2.5, 3.5]
+    segment = open_segment(tmp_path / "run.mcap", {})
+    segment.save([entry(sample) for sample in samples])
+    segment.finish()
+    draw(tmp_path, tmp_path / "pictures" / "curve.png")
+    assert (tmp_path / "pictures" / "curve.png").stat().st_size > 10_000

@@ -1,0 +1,228 @@
+"""The recorder over a real bus, killed, and on a disk that fills up."""
+
+import errno
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import IO, Any, cast
+
+import pytest
+
+from logs.metrics import Metrics
+from logs.reader import open_log, read
+from logs.recorder import Inbox, Recording, entry
+from logs.segment import Metadata, Segment, open_segment
+from messaging import brakeline_pb2 as pb
+from messaging.bus import Bus, BusSettings, Sample
+from messaging.topics import EPISODE, EXCHANGE, HEALTH, LEARNER, LOG, STEP
+
+Say = Callable[..., Sample]
+Start = Callable[[Path], "subprocess.Popen[bytes]"]
+
+RECORDER = """
+import sys
+from pathlib import Path
+from logs.recorder import main
+from messaging.bus import BusSettings
+main(BusSettings(connect=(sys.argv[1],)), Path(sys.argv[2]), {"run": {"method": "none"}})
+"""
+
+
+@pytest.fixture
+def router() -> Iterator[Bus]:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+    with Bus(BusSettings(listen=(endpoint,)), "launcher") as bus:
+        yield bus
+
+
+@pytest.fixture
+def start(router: Bus) -> Iterator[Start]:
+    """Start a recorder and wait until it records."""
+    children: list[subprocess.Popen[bytes]] = []
+
+    def launch(run: Path) -> "subprocess.Popen[bytes]":
+        ready: list[str] = []
+        subscription = router.subscribe(
+            HEALTH, lambda sample: ready.extend(filter(None, [sample.message().notes["file"]])), source="recorder"
+        )
+        child = subprocess.Popen([sys.executable, "-c", RECORDER, router.settings.listen[0], str(run)])
+        children.append(child)
+        deadline = time.monotonic() + 15.0
+        while not ready:
+            assert time.monotonic() < deadline
+            time.sleep(0.02)
+        subscription.close()
+        return child
+
+    yield launch
+    for child in children:
+        child.kill()
+        child.wait()
+
+
+def test_the_log_holds_as_many_messages_per_topic_as_were_published(router: Bus, start: Start, tmp_path: Path) -> None:
+    recorder = start(tmp_path / "run.mcap")
+    settings = BusSettings(connect=router.settings.listen)
+    messages: list[tuple[Any, Any]] = [(STEP, pb.Step()), (EPISODE, pb.Episode()), (EXCHANGE, pb.Exchange())]
+    with Bus(settings, "actor-0") as one, Bus(settings, "actor-1") as two, Bus(settings, "learner") as learner:
+        for number in range(300):
+            for actor in (one, two):
+                for topic, message in messages[: 3 if number % 10 == 0 else 1]:
+                    actor.publisher(topic, robot="ground").put(message)
+            learner.publisher(LEARNER, robot="ground").put(pb.LearnerMetrics(updates=number))
+            learner.publisher(LOG).put(pb.LogLine(text="a line"))
+        published = one.published() | two.published() | learner.published()
+    recorder.send_signal(signal.SIGTERM)
+    assert recorder.wait(10.0) == 0
+    log = open_log(tmp_path)
+    records = list(log)
+    recorded = Counter(record.key for record in records if not record.key.endswith("/recorder"))
+    assert recorded == published
+    assert published["step/ground/actor-0"] == 300 and published["exchange/ground/actor-1"] == 30
+    assert log.cuts == []
+    assert log.metadata["run"] == {"method": "none"}
+    metrics = Metrics()
+    for record in records:
+        metrics.add(record.key, record.message)
+    topics = metrics.topics()
+    assert not any(counts["missing"] or counts["duplicates"] for counts in topics.values())
+
+
+def test_a_killed_recorder_loses_less_than_a_second_and_the_next_goes_on(
+    router: Bus, start: Start, tmp_path: Path
+) -> None:
+    run = tmp_path / "run.mcap"
+    recorder = start(run)
+    publisher = router.publisher(STEP, robot="ground")
+
+    def publish(seconds: float) -> None:
+        end = time.monotonic() + seconds
+        while time.monotonic() < end:
+            publisher.put(pb.Step(observation=[1.0] * 26, next_observation=[1.0] * 26))
+            time.sleep(0.005)
+
+    publish(2.6)
+    recorder.kill()
+    recorder.wait()
+    killed_at = time.time_ns()
+    steps = [record for record in read(run) if record.topic == "step"]
+    assert [step.message.header.sequence for step in steps] == list(range(1, len(steps) + 1))
+    assert killed_at - steps[-1].message.header.wall_time < 1e9
+    assert len(open_log(run).paths) == 1
+
+    publish(0.3)  # to nobody
+    recorder = start(run)
+    publish(0.5)
+    recorder.terminate()
+    assert recorder.wait(10.0) == 0
+    log = open_log(run)
+    metrics = Metrics()
+    for record in log:
+        metrics.add(record.key, record.message)
+    counts = metrics.topics()["step/ground/launcher"]
+    assert len(log.paths) == 2
+    assert counts["messages"] + counts["missing"] == publisher.count
+    assert 0 < counts["missing"] < 1.5 / 0.005
+    assert len(log.cuts) == 1
+
+
+class SmallDisk:
+    """Files that share `free` bytes, as a full disk does: it takes what fits and then fails."""
+
+    def __init__(self, free: int) -> None:
+        self.free = free
+
+    def open_segment(self, run: Path, metadata: Metadata) -> Segment:
+        segment = open_segment(run.with_suffix(".probe"), {})  # a free name is found on the real disk
+        segment.abandon()
+        number = len(list(run.parent.glob("*.mcap")))
+        path = run.with_suffix(f".{number}.mcap") if number else run
+        file = path.open("xb", buffering=0)
+        try:
+            return Segment(path, cast(Any, Quota(self, file)), metadata)
+        except OSError:
+            file.close()
+            path.unlink()
+            raise
+
+
+class Quota:
+    def __init__(self, disk: SmallDisk, file: IO[bytes]) -> None:
+        self.disk, self.file, self.size = disk, file, 0
+
+    def write(self, data: memoryview) -> int:
+        if self.disk.free == 0:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        taken = min(len(data), self.disk.free)
+        self.file.write(data[:taken])
+        self.disk.free -= taken
+        self.size += taken
+        return taken
+
+    def truncate(self, size: int) -> None:
+        self.file.truncate(size)
+        self.disk.free += self.size - size
+        self.size = size
+
+    def close(self) -> None:
+        self.file.close()
+
+
+def test_a_full_disk_keeps_what_is_recorded_and_goes_on_when_there_is_space(
+    tmp_path: Path, say: Say, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    caplog.set_level("INFO")
+    monkeypatch.setattr("logs.recorder.RETRY", 0.0)
+    disk = SmallDisk(30_000)
+    inbox = Inbox(limit=100_000)
+    recording = Recording(tmp_path / "run.mcap", {}, inbox, disk.open_segment)
+    lines = [say("log/a", pb.LogLine(text=os.urandom(500).hex())) for _ in range(300)]
+    for number, line in enumerate(lines):
+        if number == 290:
+            disk.free = 10_000_000
+        inbox.put(line)
+        recording.save()
+        saved = recording.recorded["log/a"]
+        assert saved * 1000 + inbox.bytes + inbox.dropped["log/a"] * 1000 >= number * 1000, "none is lost silently"
+    assert recording.failure == ""
+    recording.finish()
+    kept = [record.message for record in read(tmp_path)]
+    assert len(kept) == recording.recorded.total() == 300 - inbox.dropped.total()
+    assert 0 < inbox.dropped.total() < 250
+    sequences = [message.header.sequence for message in kept]
+    assert sequences == sorted(set(sequences))
+    assert sequences[-9:] == list(range(292, 301))
+    assert sorted(path.name for path in tmp_path.glob("*.mcap")) == ["run.1.mcap", "run.mcap"]
+    assert "NOT RECORDING" in caplog.text and "No space left" in caplog.text
+    assert "messages were dropped" in caplog.text
+    assert "recording again" in caplog.text
+
+
+def test_a_disk_that_stays_full_is_said_at_the_end(tmp_path: Path, say: Say, caplog: pytest.LogCaptureFixture) -> None:
+    inbox = Inbox()
+    recording = Recording(tmp_path / "run.mcap", {}, inbox, SmallDisk(0).open_segment)
+    inbox.put(say("log/a", pb.LogLine(text="x")))
+    recording.finish()
+    assert "could not be recorded" in caplog.text
+    assert list(tmp_path.glob("*.mcap")) == []
+    assert "No space left" in recording.failure
+
+
+def test_a_folder_that_cannot_be_written_is_a_failure_too(tmp_path: Path, say: Say) -> None:
+    (tmp_path / "file").touch()
+    recording = Recording(tmp_path / "file" / "run.mcap", {}, Inbox())
+    recording.save()
+    assert "Not a directory" in recording.failure or "File exists" in recording.failure
+
+
+def test_a_message_that_cannot_be_decoded_is_stored_all_the_same() -> None:
+    stored = entry(Sample(STEP, "step/ground/a", b"\xff", 7))
+    assert (stored.payload, stored.log_time, stored.publish_time, stored.sequence) == (b"\xff", 7, 7, 0)

@@ -1,0 +1,133 @@
+"""What is written is what was received, readable by anyone's MCAP tools."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from mcap.reader import make_reader
+from mcap_protobuf.decoder import DecoderFactory
+
+from logs.reader import NoLog, NotALog, find, open_log, read
+from logs.recorder import entry
+from logs.segment import Segment, number_of, open_segment
+from messaging import brakeline_pb2 as pb
+from messaging.bus import Sample
+from messaging.topics import STEP
+
+Say = Callable[..., Sample]
+
+
+def write(run: Path, *portions: list[Sample], finish: bool = True) -> Segment:
+    segment = open_segment(run, {"run": {"method": "ddpc", "seed": "3"}, "configuration": {"json": "{}"}})
+    for portion in portions:
+        segment.save([entry(sample) for sample in portion])
+    if finish:
+        segment.finish()
+    else:
+        segment.abandon()
+    return segment
+
+
+def test_the_plain_reader_gives_the_same_bytes_and_its_decoder_the_same_values(tmp_path: Path, say: Say) -> None:
+    step = say("step/ground/a", pb.Step(robot="ground", index=1, observation=[0.5, 0.25], decision=pb.ADJUSTED), 0.2)
+    health = say("health/a", pb.Health(process="a", figures={"rate": 2.5}))
+    write(tmp_path / "run.mcap", [step], [health])
+    with (tmp_path / "run.mcap").open("rb") as file:
+        reader = make_reader(file, validate_crcs=True, decoder_factories=[DecoderFactory()])
+        stored = list(reader.iter_decoded_messages())
+        metadata = {item.name: item.metadata for item in reader.iter_metadata()}
+        summary = reader.get_summary()
+    assert summary is not None and summary.statistics is not None
+    assert summary.statistics.message_count == 2
+    assert [item.channel.topic for item in stored] == ["step/ground/a", "health/a"]
+    assert [item.message.data for item in stored] == [step.payload, health.payload]
+    assert [item.message.log_time for item in stored] == [step.received, health.received]
+    assert stored[0].message.publish_time == 200_000_000, "simulated time where there is one"
+    assert stored[1].message.publish_time == health.message().header.wall_time
+    assert stored[0].schema is not None and stored[0].schema.name == "brakeline.Step"
+    assert list(stored[0].decoded_message.observation) == [0.5, 0.25]
+    assert stored[1].decoded_message.figures["rate"] == 2.5
+    assert metadata["run"] == {"method": "ddpc", "seed": "3"}
+    assert "simulated" in metadata["brakeline"]["publish_time"]
+
+
+def test_our_reader_gives_the_messages_of_every_segment_in_order(tmp_path: Path, say: Say) -> None:
+    run = tmp_path / "demo" / "run.mcap"
+    lines = [say("log/a", pb.LogLine(text=str(number))) for number in range(30)]
+    written = [write(run, [line]).path.name for line in lines[:12]]
+    assert written[:3] == ["run.mcap", "run.1.mcap", "run.2.mcap"]
+    for place in (run, run.parent, [run], str(run)):
+        assert [record.message.text for record in read(place)] == [str(number) for number in range(12)]
+    later = run.with_name("run.11.mcap")
+    record = next(read(later))
+    assert (record.topic, record.key, record.message) == ("log", "log/a", lines[11].message())
+    assert (record.log_time, record.publish_time) == (lines[11].received, lines[11].message().header.wall_time)
+
+
+def test_names_of_segments() -> None:
+    assert [number_of(Path(name)) for name in ("run.mcap", "run.2.mcap", "a.b.mcap")] == [
+        ("run", 0),
+        ("run", 2),
+        ("a.b", 0),
+    ]
+
+
+def test_a_file_cut_anywhere_gives_what_is_whole_and_says_what_is_not(tmp_path: Path, say: Say) -> None:
+    run = tmp_path / "run.mcap"
+    portions = [[say("log/a", pb.LogLine(text="x" * 50)) for _ in range(20)] for _ in range(5)]
+    segment = open_segment(run, {})
+    ends = []
+    for portion in portions:
+        segment.save([entry(sample) for sample in portion])
+        ends.append(segment.size)
+    segment.finish()
+    whole = run.read_bytes()
+    cut = tmp_path / "cut.mcap"
+    for size in (*range(ends[1], ends[3] + 1, 37), *ends, len(whole) - 1):
+        cut.write_bytes(whole[:size])
+        log = open_log(cut)
+        assert len(list(log)) >= 20 * sum(end <= size for end in ends), size
+        assert len(log.cuts) == 1, size
+        assert log.cuts[0].lost < size
+    assert open_log(run).cuts == []
+
+
+def test_a_segment_that_was_never_finished_is_read_in_full(tmp_path: Path, say: Say) -> None:
+    write(tmp_path / "run.mcap", [say("log/a", pb.LogLine(text="1"))], finish=False)
+    write(tmp_path / "run.mcap", [say("log/a", pb.LogLine(text="2"))])
+    (tmp_path / "run.2.mcap").touch()
+    log = open_log(tmp_path)
+    assert [record.message.text for record in log] == ["1", "2"]
+    assert [cut.path.name for cut in log.cuts] == ["run.mcap", "run.2.mcap"]
+    assert "ends without a summary" in str(log.cuts[0])
+
+
+def test_a_damaged_chunk_is_noticed(tmp_path: Path, say: Say) -> None:
+    run = tmp_path / "run.mcap"
+    write(run, *[[say("log/a", pb.LogLine(text=f"{number} {'x' * 500}"))] for number in range(3)])
+    data = bytearray(run.read_bytes())
+    data[data.rindex(b"zstd", 0, len(data) - 800) + 40] ^= 0xFF
+    run.write_bytes(data)
+    log = open_log(run)
+    assert len(list(log)) < 3
+    assert log.cuts[0].lost > 0
+
+
+def test_what_is_not_of_its_type_is_stored_as_it_came_and_counted(tmp_path: Path, say: Say) -> None:
+    noise = Sample(STEP, "step/ground/a", b"\xff\xff", 5)
+    write(tmp_path / "run.mcap", [noise, say("log/a", pb.LogLine())])
+    log = open_log(tmp_path)
+    assert [record.topic for record in log] == ["log"]
+    assert log.malformed == 1
+    with (tmp_path / "run.mcap").open("rb") as file:
+        assert next(message.data for _, _, message in make_reader(file).iter_messages()) == b"\xff\xff"
+
+
+def test_what_is_no_log_is_said(tmp_path: Path) -> None:
+    with pytest.raises(NoLog, match="no log at"):
+        find(tmp_path)
+    with pytest.raises(NoLog):
+        list(read(tmp_path / "run.mcap"))
+    (tmp_path / "text.mcap").write_text("a long story, but not a log")
+    with pytest.raises(NotALog, match="not an MCAP file"):
+        list(read(tmp_path / "text.mcap"))
