@@ -1,0 +1,159 @@
+"""One process of a launched run: `python -m deploy.child RUN_FOLDER PROCESS`.
+
+Everything it needs is in the run's resolved configuration, so that all processes of a run agree. Each process can also
+be started alone, with `brakeline safety | learner | actor | recorder`.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import json
+import os
+import signal
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from importlib.metadata import version
+from pathlib import Path
+
+from deploy import experiments
+from deploy.experiments import RunConfig
+from messaging.bus import BusError, BusSettings
+from messaging.robots import robot_named
+
+CONFIG, ENDPOINT, LOG = "config.json", "endpoint", "run.mcap"
+MODELS = "models"  # versions that came over the bus
+PARENT_DIED = 1  # prctl: PR_SET_PDEATHSIG
+
+
+@dataclass(frozen=True)
+class Place:
+    """A process's name, and how it is called on in a run."""
+
+    name: str
+    kind: str  # a key of KINDS
+    robot: str = ""
+    number: int = 0
+    nice: int = 0  # the robot's safety comes before learning
+
+
+def places(config: RunConfig) -> list[Place]:
+    """THE table of a run's processes, in the order in which they start."""
+    table = [Place("recorder", "recorder")]
+    if config.method != "none":
+        table += [Place(f"safety-{i}", "safety") for i in range(config.replicas)]
+    one = len(config.robots) == 1
+    for robot in config.robots:
+        table.append(Place("learner" if one else f"learner-{robot}", "learner", robot, nice=10))
+        for i in range(config.actors):
+            name = f"actor-{i}" if one else f"actor-{robot}-{i}"
+            table.append(Place(name, "actor", robot, i * config.robots_per_actor, nice=2))
+    return table
+
+
+def metadata(config: RunConfig) -> dict[str, dict[str, str]]:
+    """What the log says of its run, besides the messages."""
+    from deploy.store import model_path
+    from safety.model_set import ModelSet
+
+    filtered = config.method != "none"
+    run = {
+        "method": config.method,
+        "policy": "learning",
+        "arena": config.arena,
+        "seed": str(config.seed),
+        "robots": ",".join(config.robots),
+    }
+    if filtered:
+        run |= {"certificate": config.recipe.certificate, "mode": config.recipe.mode}
+    packages = ("brakeline", "mujoco", "proxsuite", "numpy", "torch", "eclipse-zenoh", "mcap")
+    about = {
+        "run": run,
+        "configuration": {"json": experiments.encode(config)},
+        "versions": {name: version(name) for name in packages},
+        "conditions": config.conditions.describe(),
+    }
+    for robot in config.robots if filtered else ():
+        model = ModelSet.load(model_path(robot_named(robot), config.recipe))
+        about[f"model {robot}"] = {"version": model.version, **model.about}
+    return about
+
+
+def _recorder(place: Place, folder: Path, config: RunConfig, bus: BusSettings) -> None:
+    from logs import recorder
+
+    recorder.main(bus, folder / LOG, metadata(config), place.name)
+
+
+def _safety(place: Place, folder: Path, config: RunConfig, bus: BusSettings) -> None:
+    from deploy.store import model_path
+    from safety.service import SafetySettings, main
+
+    models = tuple(model_path(robot_named(robot), config.recipe) for robot in config.robots)
+    newest = (newest_model(folder, robot) or path for robot, path in zip(config.robots, models, strict=True))
+    main(SafetySettings(bus, tuple(newest), folder / MODELS, place.name))
+
+
+def newest_model(folder: Path, robot: str) -> Path | None:
+    """The version that a service of this run used last: a restarted one goes on with it."""
+    versions = list((folder / MODELS / robot / "models").glob("*.safetensors"))
+    return max(versions, key=lambda path: path.stat().st_mtime_ns, default=None)
+
+
+def _learner(place: Place, folder: Path, config: RunConfig, bus: BusSettings) -> None:
+    from learner.checkpoint import exists
+    from learner.service import CHECKPOINT, LearnerSettings, main
+
+    out = folder / place.name
+    main(LearnerSettings(bus, place.robot, out, exists(out / CHECKPOINT), place.name, config.learning()))
+
+
+def _actor(place: Place, folder: Path, config: RunConfig, bus: BusSettings) -> None:
+    from actors.loop import ActorSettings, run
+    from deploy.vehicles import environment
+
+    settings = ActorSettings(
+        bus=bus,
+        robot=place.robot,
+        name=place.name,
+        number=place.number,
+        robots=config.robots_per_actor,
+        seed=config.seed,
+        arena=config.arena,
+        method=config.method,
+        penalty=config.penalty,
+        deadline=60.0 if config.deterministic else config.deadline,
+        lockstep=config.deterministic,
+    )
+    run(settings, partial(environment, conditions=config.conditions))
+
+
+KINDS: dict[str, Callable[[Place, Path, RunConfig, BusSettings], None]] = {
+    "recorder": _recorder,
+    "safety": _safety,
+    "learner": _learner,
+    "actor": _actor,
+}
+
+
+def main() -> int:
+    """Run the process named on the command line; it ends with its launcher."""
+    folder, name = Path(sys.argv[1]), sys.argv[2]
+    ctypes.CDLL(None).prctl(PARENT_DIED, signal.SIGTERM)
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+    config = experiments.load(folder / CONFIG)
+    place = next(place for place in places(config) if place.name == name)
+    if place.nice:
+        os.nice(place.nice)
+    bus = BusSettings(connect=(json.loads((folder / ENDPOINT).read_text())["endpoint"],))
+    try:
+        KINDS[place.kind](place, folder, config, bus)
+    except (BusError, ValueError, OSError, RuntimeError) as error:
+        print(f"{name}: {type(error).__name__}: {error}", file=sys.stderr)
+        return 1
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,99 @@
+"""`brakeline evaluate`: a policy through the filter, in process, on fresh episodes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from actors.driver import Driver, Identity
+from actors.guard import Ask, consult
+from deploy.store import model_for
+from deploy.vehicles import Conditions, environment
+from logs.metrics import Tally, closed_loop
+from messaging import brakeline_pb2 as pb
+from messaging.robots import Robot
+from messaging.weights import MLP
+from safety.model_set import ModelSet, Recipe
+from safety.service import Counts, Models, answerer
+from sim.policies import POLICIES, Policy, scripted
+
+FRESH = 1_000_000  # added to the seed: no training run draws its episodes from there
+UNTRAINED = "untrained"
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """What to evaluate."""
+
+    policy: str = "astar"  # a file, or untrained | random | greedy | adversary | astar
+    method: str = "ddpc"
+    recipe: Recipe = field(default_factory=Recipe)
+    arena: str = "default"
+    episodes: int = 100
+    seed: int = 0
+    conditions: Conditions = field(default_factory=Conditions)
+
+
+def policy_named(name: str, robot: Robot, seed: int) -> Policy:
+    """A scripted policy, an untrained one, or the one in a file.
+
+    Raises:
+        ValueError: neither a name nor a file; BadWeights: a file that is no policy of this robot.
+    """
+    if name in POLICIES:
+        return scripted(name, robot, np.random.default_rng(seed))
+    if name != UNTRAINED and not Path(name).is_file():
+        names = ", ".join([UNTRAINED, *POLICIES])
+        raise ValueError(f"no policy is called {name!r} and no such file exists; there are: {names}, or a file's path")
+    mlp = MLP.untrained(robot, seed) if name == UNTRAINED else MLP.load(Path(name), robot)
+    return lambda observation, info: mlp(observation)
+
+
+def in_process(model: ModelSet) -> Ask:
+    """The safety service's own core, called directly: the same bytes, no bus."""
+    models = Models()
+    models.install(model)
+    answer = answerer(models, Counts())
+
+    def ask(requests: Sequence[pb.Request]) -> list[pb.Reply]:
+        payload = pb.RequestBatch(requests=requests).SerializeToString()
+        return list(pb.ReplyBatch.FromString(answer(payload)).replies)
+
+    return ask
+
+
+def episode(driver: Driver, policy: Policy, question: Ask | None, number: int) -> Iterator[pb.Step]:
+    """The steps of one episode."""
+    driver.begin(number)
+    while driver.running:
+        proposal = np.asarray(policy(driver.observation, driver.info), dtype=float)
+        outcome = None
+        if question is not None:
+            outcome = consult(question, [driver.request(proposal)], driver.robot)[0]
+        yield driver.execute(proposal, outcome)
+
+
+def evaluate(robot: Robot, what: Evaluation, each: Callable[[Tally], Any] = lambda tally: None) -> dict[str, Any]:
+    """The shared figures of `what.episodes` episodes; `each` is called after every one."""
+    policy = policy_named(what.policy, robot, what.seed)
+    question = None if what.method == "none" else in_process(model_for(robot, what.recipe))
+    env = environment(robot, what.arena, FRESH + what.seed, what.conditions)
+    driver = Driver(robot, env, Identity("evaluate", 0, what.seed), filtered=question is not None)
+    tally = Tally()
+    for number in range(what.episodes):
+        for step in episode(driver, policy, question, number):
+            tally.step(step)
+        each(tally)
+    return closed_loop([tally]) | {
+        "method": what.method,
+        "certificate": what.recipe.certificate if question is not None else None,
+        "mode": what.recipe.mode if question is not None else None,
+        "policy": what.policy,
+        "arena": what.arena,
+        "seed": what.seed,
+        "conditions": what.conditions.describe(),
+    }

@@ -1,0 +1,98 @@
+"""Named whole-system configurations, and a run's one resolved configuration as it is saved and read back."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import types
+import typing
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from deploy.vehicles import Conditions
+from learner.config import LearnerConfig
+from learner.td3 import TD3Config
+from safety.model_set import Recipe
+
+METHODS = ("ddpc", "none")
+
+
+@dataclass(frozen=True)
+class RunConfig:
+    """Everything that a run depends on, besides the machine."""
+
+    robots: tuple[str, ...] = ("ground",)
+    method: str = "ddpc"
+    recipe: Recipe = field(default_factory=Recipe)
+    arena: str = "default"
+    actors: int = 2  # processes a robot kind
+    robots_per_actor: int = 1  # robots in a process; they share a question to the safety service
+    steps: int = 100_000  # a robot kind
+    seed: int = 0
+    penalty: float = 1.0  # for a correction by the whole range of an input
+    deadline: float = 0.1  # s for an answer of the safety service
+    deterministic: bool = False  # one actor, lockstep, no deadlines
+    replicas: int = 1  # of the safety service
+    conditions: Conditions = field(default_factory=Conditions)
+    learner: LearnerConfig = field(default_factory=lambda: LearnerConfig(checkpoint_every=2500))
+
+    def __post_init__(self) -> None:
+        if self.method not in METHODS:
+            raise ValueError(f"no method is called {self.method!r}; there are: {', '.join(METHODS)}")
+        if self.deterministic and (self.actors != 1 or self.robots_per_actor != 1 or len(self.robots) != 1):
+            raise ValueError("a deterministic run has one actor with one robot: --actors 1")
+
+    def learning(self) -> LearnerConfig:
+        """The learner's part, with what it shares with the others."""
+        return replace(self.learner, seed=self.seed, steps=self.steps, lockstep=self.deterministic)
+
+
+EXPERIMENTS: dict[str, RunConfig] = {
+    "default": RunConfig(),
+    "demo": RunConfig(steps=24_000),
+    # Minutes of nothing: whole runs in the tests, with networks too small to learn much.
+    "debug": RunConfig(
+        steps=1_200,
+        learner=LearnerConfig(
+            td3=TD3Config(hidden=(32, 32), batch=32, warmup=200), checkpoint_every=400, capacity=5_000
+        ),
+    ),
+}
+
+
+def encode(config: Any) -> str:
+    """JSON of a configuration."""
+    return json.dumps(dataclasses.asdict(config), indent=2)
+
+
+def decode(kind: type[Any], values: Any) -> Any:
+    """The configuration (a dataclass, nested ones included) that `encode` wrote.
+
+    Raises:
+        ValueError: a field is unknown: the file is another version's.
+    """
+    hints = typing.get_type_hints(kind)
+    unknown = values.keys() - {f.name for f in dataclasses.fields(kind)}
+    if unknown:
+        raise ValueError(f"{kind.__name__} has no {', '.join(sorted(unknown))}: written by another version?")
+    return kind(**{name: _value(hints[name], value) for name, value in values.items()})
+
+
+def _value(hint: Any, value: Any) -> Any:
+    if dataclasses.is_dataclass(hint):
+        return decode(typing.cast(type[Any], hint), value)
+    if typing.get_origin(hint) is tuple:
+        return tuple(value)
+    if typing.get_origin(hint) in (typing.Union, types.UnionType) or value is None:
+        return value
+    return Path(value) if hint is Path else value
+
+
+def load(path: Path) -> RunConfig:
+    """Raises ValueError, naming the file, when it is no run's configuration."""
+    try:
+        config: RunConfig = decode(RunConfig, json.loads(path.read_text()))
+    except (OSError, ValueError, TypeError, KeyError) as error:
+        raise ValueError(f"{path} is no run's configuration: {error}") from error
+    return config
