@@ -82,24 +82,25 @@ class Recording:
         self._complained_of = 0
 
     def save(self) -> None:
-        """Bring everything from the inbox to the operating system; what can't be written waits in the inbox."""
+        """Bring what is in the inbox now to the operating system; what can't be written stays there."""
         self._complain_of_drops()
         if time.monotonic() < self._retry_at:
             return
         try:
             if self._segment is None:
                 self._segment = self._open(self._run, self._metadata)
-                self.path = self._segment.path
-                log.info("recording to %s", self.path)
-            while portion := self._inbox.portion():
+            waiting = self._inbox.bytes
+            while waiting > 0 and (portion := self._inbox.portion()):
                 self._segment.save([entry(sample) for sample in portion])
+                waiting -= sum(len(sample.payload) for sample in portion)
                 self._inbox.forget(portion)
                 self.recorded.update(sample.key for sample in portion)
         except OSError as error:
             self._fail(error)
         else:
-            if self.failure:
-                log.warning("recording again, to %s", self.path)
+            if self.path != self._segment.path:
+                self.path = self._segment.path
+                log.log(logging.WARNING if self.failure else logging.INFO, "recording to %s", self.path)
             self.failure = ""
 
     def finish(self) -> None:
