@@ -131,6 +131,8 @@ class Driver:
             state=info["state"].tolist(),
             true_state=info["true_state"].tolist(),
             outside=info["outside"],
+            path=info["subsamples"].ravel().tolist(),
+            turned=info["turned"],
         )
         step.header.time = info["time"]
         self.step += 1

@@ -505,6 +505,8 @@ class Step(_message.Message):
     CONTAINED_FIELD_NUMBER: _builtins.int
     DECIDE_MS_FIELD_NUMBER: _builtins.int
     FALLBACK_FIELD_NUMBER: _builtins.int
+    PATH_FIELD_NUMBER: _builtins.int
+    TURNED_FIELD_NUMBER: _builtins.int
     robot: _builtins.str
     actor: _builtins.str
     episode: _builtins.int
@@ -540,6 +542,8 @@ class Step(_message.Message):
     """inside decide; 0 without a filter"""
     fallback: _builtins.bool
     """no decision came: the committed plan's next input"""
+    turned: _builtins.float
+    """rad, dead-reckoned heading change over the period"""
     @_builtins.property
     def header(self) -> Global___Header: ...
     @_builtins.property
@@ -560,6 +564,10 @@ class Step(_message.Message):
 
     @_builtins.property
     def true_state(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]: ...
+    @_builtins.property
+    def path(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]:
+        """(instants, position): within the period, dead-reckoned, in the frame of its start"""
+
     def __init__(
         self,
         *,
@@ -590,10 +598,12 @@ class Step(_message.Message):
         contained: _builtins.bool = ...,
         decide_ms: _builtins.float = ...,
         fallback: _builtins.bool = ...,
+        path: _abc.Iterable[_builtins.float] | None = ...,
+        turned: _builtins.float = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _typing.Literal["header", b"header"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["action", b"action", "actor", b"actor", "clearance", b"clearance", "collision", b"collision", "compared", b"compared", "contained", b"contained", "decide_ms", b"decide_ms", "decision", b"decision", "episode", b"episode", "fallback", b"fallback", "goal", b"goal", "header", b"header", "index", b"index", "next_observation", b"next_observation", "observation", b"observation", "outside", b"outside", "penalty", b"penalty", "proposed", b"proposed", "reward", b"reward", "robot", b"robot", "speed", b"speed", "state", b"state", "step", b"step", "terminated", b"terminated", "true_state", b"true_state", "truncated", b"truncated", "weights_version", b"weights_version"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["action", b"action", "actor", b"actor", "clearance", b"clearance", "collision", b"collision", "compared", b"compared", "contained", b"contained", "decide_ms", b"decide_ms", "decision", b"decision", "episode", b"episode", "fallback", b"fallback", "goal", b"goal", "header", b"header", "index", b"index", "next_observation", b"next_observation", "observation", b"observation", "outside", b"outside", "path", b"path", "penalty", b"penalty", "proposed", b"proposed", "reward", b"reward", "robot", b"robot", "speed", b"speed", "state", b"state", "step", b"step", "terminated", b"terminated", "true_state", b"true_state", "truncated", b"truncated", "turned", b"turned", "weights_version", b"weights_version"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import json
 import logging
+import math
 import re
 import secrets
 import threading
@@ -170,7 +171,6 @@ class Subscription:
 
     def __init__(self, name: str, receiver: Any, work: Callable[[Any], None]) -> None:
         self._name, self._receiver, self._work = name, receiver, work
-        self._seen: dict[str, float] = {}
         self._complained = -1e9
         self._failures = 0
         self._thread = threading.Thread(target=self._run, name=f"bus {name}", daemon=True)
@@ -201,6 +201,26 @@ class Subscription:
                 if time.monotonic() - self._complained > 1.0:
                     self._complained = time.monotonic()
                     log.exception("handler of %s failed (%d times so far)", self._name, self._failures)
+
+
+class Listener(Subscription):
+    """A subscription that knows who fell silent."""
+
+    def __init__(self, topic: Topic, key: str, receiver: Any, prefix: str, handler: Callable[[Sample], None]) -> None:
+        self._topic, self._cut, self._handler = topic, len(prefix) + 1, handler
+        self._heard: dict[str, float] = {}  # per key: when (time.monotonic) the latest sample came
+        super().__init__(key, receiver, self._take)
+
+    def stale(self) -> frozenset[str]:
+        """Keys that were heard of, but for three periods of the topic's rate no more."""
+        limit = math.inf if self._topic.stale_after is None else self._topic.stale_after
+        now = time.monotonic()
+        return frozenset(key for key, moment in self._heard.copy().items() if now - moment > limit)
+
+    def _take(self, sample: zenoh.Sample) -> None:
+        key = str(sample.key_expr)[self._cut :]
+        self._heard[key] = time.monotonic()
+        self._handler(Sample(self._topic, key, sample.payload.to_bytes(), time.time_ns()))
 
 
 class Bus:
@@ -274,7 +294,7 @@ class Bus:
         with self._lock:
             return {key: publisher.count for key, publisher in self._publishers.items()}
 
-    def subscribe(self, topic: Topic, handler: Callable[[Sample], None], **names: str) -> Subscription:
+    def subscribe(self, topic: Topic, handler: Callable[[Sample], None], **names: str) -> Listener:
         """Call `handler` with every sample of `topic`, in a thread of its own; names left out match any.
 
         A handler that raises is logged and goes on with the next sample. One that is slow delays the publisher of a
@@ -283,12 +303,9 @@ class Bus:
         channel: Any = FifoChannel(FIFO) if topic.delivery is Delivery.BLOCK else RingChannel(RING)
         key = _key(topic, names)
         receiver: Any = self._telemetry.declare_subscriber(self._full(key), channel)
-        cut = len(self.settings.prefix) + 1
-
-        def take(sample: zenoh.Sample) -> None:
-            handler(Sample(topic, str(sample.key_expr)[cut:], sample.payload.to_bytes(), time.time_ns()))
-
-        return self._start(key, receiver, take)
+        listener = Listener(topic, key, receiver, self.settings.prefix, handler)
+        self._keep(listener)
+        return listener
 
     def serve(self, topic: Topic, handler: Callable[[bytes], bytes], **names: str) -> Subscription:
         """Answer the questions of `topic`, one at a time, in a thread of its own.
@@ -299,7 +316,7 @@ class Bus:
         """
         key = _key(topic, names)
         receiver = self._queries.declare_queryable(self._full(key), FifoChannel(FIFO), complete=True)
-        return self._start(key, receiver, partial(_answer, handler))
+        return self._keep(Subscription(key, receiver, partial(_answer, handler)))
 
     def ask(self, topic: Topic, payload: bytes, timeout: float, **names: str) -> bytes:
         """The answer to a question, within `timeout` s.
@@ -342,13 +359,12 @@ class Bus:
         def take(sample: zenoh.Sample) -> None:
             handler(str(sample.key_expr).rsplit("/", 1)[1], sample.kind == zenoh.SampleKind.PUT)
 
-        return self._start("alive/*", receiver, take)
+        return self._keep(Subscription("alive/*", receiver, take))
 
     def _full(self, key: str) -> str:
         return f"{self.settings.prefix}/{key}"
 
-    def _start(self, name: str, receiver: Any, work: Callable[[Any], None]) -> Subscription:
-        subscription = Subscription(name, receiver, work)
+    def _keep(self, subscription: Subscription) -> Subscription:
         with self._lock:
             self._subscriptions.append(subscription)
         return subscription

@@ -43,6 +43,7 @@ class Trajectory:
     inputs: Array
     paths: Array
     turned: Array
+    before: Array | None = None  # (m,) the input in force at the start; None: standing still
 
 
 @dataclass(frozen=True)
@@ -91,6 +92,8 @@ class Dataset:
         """Writes a safetensors file: trajectories one after the other, with their lengths."""
         names = ("states", "inputs", "paths", "turned")
         tensors = {n: np.concatenate([getattr(t, n) for t in self.trajectories]) for n in names}
+        still = np.zeros(self.robot.action_dim)
+        tensors["before"] = np.array([still if t.before is None else t.before for t in self.trajectories])
         tensors["lengths"] = np.array([len(t.inputs) for t in self.trajectories])
         about = {"robot": self.robot.name, "layout": self.robot.layout(), "about": json.dumps(self.about)}
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -111,7 +114,7 @@ class Dataset:
                 tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - no mapping
         except (OSError, SafetensorError) as error:
             raise BadData(f"{path} is no data set: {error}") from error
-        missing = {"states", "inputs", "paths", "turned", "lengths"} - tensors.keys()
+        missing = {"states", "inputs", "paths", "turned", "before", "lengths"} - tensors.keys()
         if missing or "robot" not in about:
             raise BadData(f"{path} is no data set: {', '.join(sorted(missing)) or 'its robot'} is missing")
         robot = robot_named(about["robot"])
@@ -127,6 +130,7 @@ class Dataset:
                 tensors["inputs"][start:end],
                 tensors["paths"][start:end],
                 tensors["turned"][start:end],
+                tensors["before"][i],
             )
             for i, (start, end) in enumerate(zip(ends - lengths, ends, strict=True))
         )
@@ -188,7 +192,8 @@ def _windows_of(robot: Robot, t: Trajectory, k: int, number: int) -> Windows:
     planned = chosen @ robot.schedule()[: k * m].T
     actual = np.hstack([t.inputs[j : j + count] for j in range(k)]).reshape(count, k * m)
     start = np.flatnonzero((np.abs(planned - actual) < 1e-9).all(1))
-    before = np.vstack([np.zeros((1, m)), t.inputs])[start]
+    earlier = np.zeros(m) if t.before is None else t.before
+    before = np.vstack([earlier, t.inputs])[start]
     z = np.hstack([t.states[start][:, list(robot.regressor)], before, chosen[start]])
     y = displacement(robot, t.states[start], t.states[start + k])
     bulge = _off_chord(t.paths)[start + k - 1]
