@@ -1,5 +1,6 @@
 """The bus between real sessions, and real processes, on loopback."""
 
+import dataclasses
 import signal
 import subprocess
 import threading
@@ -98,6 +99,19 @@ def test_a_handler_that_raises_is_logged_and_goes_on(join: Join, caplog: pytest.
         actor.publisher(STEP, robot="ground").put(pb.Step(index=index))
     eventually(lambda: len(got) == 5 and subscription.failures == 5)
     assert "handler of step/*/* failed" in caplog.text
+
+
+def test_a_publisher_that_falls_silent_is_stale_after_three_periods(join: Join) -> None:
+    bus = join("launcher", listen=True)
+    often = bus.subscribe(dataclasses.replace(HEALTH, rate=10.0), lambda _: None)
+    occasional = bus.subscribe(LOG, lambda _: None)
+    start = time.monotonic()
+    bus.publisher(HEALTH).put(pb.Health())
+    bus.publisher(LOG).put(pb.LogLine())
+    assert often.stale() == frozenset()
+    eventually(lambda: often.stale() == {"health/launcher"})
+    assert 0.3 <= time.monotonic() - start < 1.0
+    assert occasional.stale() == frozenset()
 
 
 def test_what_is_not_a_message_is_malformed() -> None:
