@@ -11,8 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from deploy.vehicles import Conditions
-from learner.config import LearnerConfig
-from learner.td3 import TD3Config
+from learner.config import LearnerConfig, TD3Config
 from safety.model_set import Recipe
 
 METHODS = ("ddpc", "none")

@@ -1,0 +1,125 @@
+"""`brakeline COMMAND ...`: THE table of commands, each with an example.
+
+A command's module is imported when it is called, so that `--help` answers at once.
+"""
+
+from __future__ import annotations
+
+import difflib
+import importlib
+import os
+import sys
+from dataclasses import dataclass
+from typing import Any
+
+import tyro
+from rich.console import Console
+from rich.table import Table
+
+from messaging.bus import BusError
+from messaging.robots import UnknownRobot
+
+
+@dataclass(frozen=True)
+class Command:
+    """Where a command's dataclass stands (module:class; its `run` returns the exit status), and what it is for."""
+
+    place: str
+    what: str
+    example: str
+
+
+COMMANDS: dict[str, Command] = {
+    "demo": Command("train:Demo", "train the ground robot for some minutes, and look on", "brakeline demo"),
+    "train": Command(
+        "train:Train",
+        "all processes on this machine: actors, safety, learner, recorder",
+        "brakeline train ground --steps 90000 --actors 2 --seed 0",
+    ),
+    "safety": Command(
+        "processes:Safety", "the safety service alone", "brakeline safety ground --listen tcp/0.0.0.0:7447"
+    ),
+    "learner": Command(
+        "processes:LearnerProcess", "a learner alone", "brakeline learner ground --connect tcp/10.0.0.1:7447"
+    ),
+    "actor": Command(
+        "processes:Actor",
+        "one actor process alone, with one or several robots",
+        "brakeline actor ground --connect tcp/10.0.0.1:7447 --name actor-7 --number 7",
+    ),
+    "recorder": Command(
+        "processes:Recorder", "the recorder alone", "brakeline recorder runs/a/run.mcap --connect tcp/10.0.0.1:7447"
+    ),
+    "collect": Command(
+        "data:Collect", "record the data that the filter learns a robot from", "brakeline collect ground --seed 1"
+    ),
+    "certify": Command(
+        "data:Certify",
+        "what held-out data say about each certificate; make and publish model sets",
+        "brakeline certify data/ground/record.safetensors",
+    ),
+    "evaluate": Command(
+        "evaluation:Evaluate",
+        "a policy through the filter, in process, on fresh episodes",
+        "brakeline evaluate ground --policy astar --episodes 100 --json",
+    ),
+    "query": Command(
+        "service:Query",
+        "ask a running safety service about a state and an action",
+        "brakeline query ground --action 0.25 0 --obstacle 'cylinder 0.3 0 0.1'",
+    ),
+    "status": Command("service:Status", "which processes live, and how they fare", "brakeline status"),
+    "analyse": Command("evaluation:Analyse", "figures of a log", "brakeline analyse runs/latest --json"),
+}
+
+
+def overview(console: Console) -> None:
+    table = Table(box=None, padding=(0, 2, 0, 0), show_header=False)
+    for name, command in COMMANDS.items():
+        table.add_row(f"[bold]{name}[/]", command.what)
+        table.add_row("", f"[dim]{command.example}[/]")
+    console.print("[bold]brakeline[/]: robots learn by trial and error without ever hitting anything\n")
+    console.print(table)
+    console.print("\nOptions of a command: brakeline COMMAND --help. With --json, one JSON object on stdout.")
+
+
+def find(name: str) -> Any:
+    """The dataclass of a command."""
+    module, _, kind = COMMANDS[name].place.partition(":")
+    return getattr(importlib.import_module(f"deploy.commands.{module}"), kind)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Exit status: 0; 1: it failed, with the reason on stderr; 2: not understood; 130: ^C."""
+    os.environ.setdefault("OMP_NUM_THREADS", "1")  # two processes with two threads each on two cores are slower
+    given = sys.argv[1:] if arguments is None else arguments
+    errors = Console(stderr=True, highlight=False)
+    if not given or given[0] in ("-h", "--help"):
+        overview(Console())
+        return 0 if given else 2
+    name = given[0]
+    if name not in COMMANDS:
+        near = difflib.get_close_matches(name, COMMANDS, 1)
+        hint = f"; did you mean `{near[0]}`?" if near else ""
+        errors.print(f"brakeline: no command is called {name!r}{hint} `brakeline --help` lists them")
+        return 2
+    try:
+        command = tyro.cli(
+            find(name),
+            prog=f"brakeline {name}",
+            description=f"{COMMANDS[name].what}\n\nExample: {COMMANDS[name].example}",
+            args=given[1:],
+        )
+        return int(command.run())
+    except KeyboardInterrupt:
+        return 130
+    except BrokenPipeError:  # who read the output has seen enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
+    except (BusError, UnknownRobot, ValueError, OSError, RuntimeError) as error:
+        errors.print(f"[red]brakeline {name}:[/] {error}", markup=True, soft_wrap=True)
+        return 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

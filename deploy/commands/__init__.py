@@ -1,0 +1,1 @@
+"""The commands of `deploy.cli`, a dataclass each: its fields are the options, `run` does the work."""

@@ -1,0 +1,100 @@
+"""Options and small things that several commands share."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal, TypeVar
+
+import tyro
+from rich.console import Console
+
+from deploy.vehicles import Conditions
+from messaging.bus import BusSettings
+from safety.model_set import Recipe
+from sim.estimator import NoiseLevels
+
+Certificate = Literal["residual", "set-membership", "matrix-zonotope"]
+Mode = Literal["direct", "recursion"]
+Method = Literal["ddpc", "none"]
+T = TypeVar("T")
+Flags = Annotated[T, tyro.conf.OmitArgPrefixes]
+
+LATEST = Path("runs/latest")
+
+
+@dataclass(frozen=True)
+class Filtering:
+    """Which filter stands before the policy."""
+
+    method: Method = "ddpc"
+    """ddpc: ours; none: no filter."""
+    certificate: Certificate = "residual"
+    """What the model set trusts in the data (README)."""
+    mode: Mode = "direct"
+    """A predictor for each step of the plan, or the paper's recursion."""
+
+    def recipe(self) -> Recipe:
+        return Recipe(self.certificate, self.mode)
+
+
+@dataclass(frozen=True)
+class Physics:
+    """What may differ between the robot that was recorded and the one that drives."""
+
+    payload: float = 0.0
+    """kg on top of the robot."""
+    friction: float = 1.0
+    """Friction coefficient of the wheels on the floor."""
+    noise: float = 1.0
+    """Factor on all sensor errors."""
+
+    def conditions(self) -> Conditions:
+        return Conditions(NoiseLevels(scale=self.noise), self.payload, self.friction)
+
+
+@dataclass(frozen=True)
+class Endpoints:
+    """Where the bus is, as Zenoh writes it: tcp/HOST:PORT."""
+
+    connect: tuple[str, ...] = ()
+    """Routers to connect to; without any: that of the newest run here."""
+    listen: tuple[str, ...] = ()
+    """Be the router at these endpoints."""
+
+    def bus(self) -> BusSettings:
+        """Raises ValueError when there is neither an endpoint nor a run."""
+        if self.connect or self.listen:
+            return BusSettings(connect=self.connect, listen=self.listen)
+        return BusSettings(connect=(endpoint_of(LATEST),))
+
+
+def endpoint_of(run: Path) -> str:
+    """The endpoint of a run's router. Raises ValueError with what to do."""
+    try:
+        found: str = json.loads((run / "endpoint").read_text())["endpoint"]
+    except (OSError, ValueError, KeyError) as error:
+        raise ValueError(f"no run at {run}: give --connect tcp/HOST:PORT, or start `brakeline train`") from error
+    return found
+
+
+def say_json(figures: dict[str, Any]) -> None:
+    """One JSON object on stdout; what is not finite becomes null."""
+    print(json.dumps(_finite(figures)))
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _finite(inner) for key, inner in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(inner) for inner in value]
+    if isinstance(value, float) and not abs(value) < float("inf"):
+        return None
+    return value
+
+
+console = Console(highlight=False)
+errors = Console(stderr=True, highlight=False)
+
+Robot = Annotated[str, tyro.conf.Positional]

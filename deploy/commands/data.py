@@ -1,0 +1,128 @@
+"""`brakeline collect` and `brakeline certify`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+from rich.table import Table
+
+from deploy.commands.common import Endpoints, Flags, Mode, Physics, Robot, console, errors, say_json
+from deploy.logged import Recorded, from_log
+from deploy.store import SEED, TRAJECTORIES, certified, model_path, record_path, recorded
+from messaging import brakeline_pb2 as pb
+from messaging.bus import Bus
+from messaging.robots import robot_named
+from messaging.topics import MODEL
+from safety.certificates import KINDS, RESIDUAL, CertificateError
+from safety.dataset import BadData, Dataset
+from safety.model_set import MODES, ModelSet, Recipe
+from safety.statement import Statement
+
+
+@dataclass(frozen=True)
+class Collect:
+    robot: Robot = "ground"
+    trajectories: int = TRAJECTORIES
+    """Of 300 periods each."""
+    seed: int = SEED
+    physics: Flags[Physics] = field(default_factory=Physics)
+    out: Path | None = None
+    """File; default: the data set in use (data/ROBOT/record.safetensors), replaced."""
+    json: bool = False
+
+    def run(self) -> int:
+        robot = robot_named(self.robot)
+        path = self.out or record_path(robot)
+        data = recorded(robot, path, self.trajectories, self.seed, self.physics.conditions(), again=True)
+        figures = {"path": str(path), "trajectories": len(data.trajectories), "periods": data.periods}
+        if self.json:
+            say_json(figures | {"digest": data.digest(), "about": data.about})
+        else:
+            console.print(f"{path}: {data.periods} periods in {len(data.trajectories)} trajectories, {data.digest()}")
+            console.print("next: " + f"brakeline certify {path}")
+        return 0
+
+
+@dataclass(frozen=True)
+class Certify:
+    data: Annotated[Path, tyro.conf.Positional] = Path("data/ground/record.safetensors")
+    """A data set, or a log (file or run folder): then of its last steps."""
+    certificates: tuple[str, ...] = KINDS
+    mode: Mode | None = None
+    """Only this one; default: both."""
+    robot: str = "ground"
+    """Of a log: the robot whose steps are taken."""
+    last: int = 20_000
+    """Of a log: so many of the last steps."""
+    use: bool = False
+    """Write the model sets to where the other commands look for them."""
+    publish: bool = False
+    """Replace the model set of running safety services by the first of `certificates` (mode direct unless given)."""
+    endpoints: Flags[Endpoints] = field(default_factory=Endpoints)
+    json: bool = False
+
+    def run(self) -> int:
+        source = self._load()
+        results: dict[str, Any] = {}
+        statements: list[Statement] = []
+        chosen: ModelSet | None = None
+        for kind in self.certificates:
+            for mode in (self.mode,) if self.mode else MODES:
+                with errors.status(f"{kind}, {mode}"):
+                    try:
+                        model, statement = certified(source.data, Recipe(kind, mode))
+                    except (BadData, CertificateError) as error:
+                        results.setdefault(kind, {})[mode] = {"refused": str(error)}
+                        errors.print(f"[red]{kind}, {mode}: refused:[/] {error}")
+                        continue
+                chosen = chosen or model
+                statements.append(statement)
+                results.setdefault(kind, {})[mode] = statement.figures()
+                if self.use:
+                    model.save(model_path(source.data.robot, model.recipe))
+        if self.json:
+            # The figures of a certificate are those of the direct mode; the recursion's stand beside them.
+            flat = {k: modes.get("direct", next(iter(modes.values()))) | modes for k, modes in results.items()}
+            say_json(flat | {"source": str(self.data), "periods": source.data.periods, "note": source.note})
+        else:
+            console.print(table(statements))
+            console.print(source.note)
+        if chosen is None:
+            return 1
+        if self.publish:
+            self._publish(chosen)
+        return 0
+
+    def _load(self) -> Recorded:
+        if self.data.suffix == ".safetensors":
+            data = Dataset.load(self.data) if self.data.exists() else recorded(robot_named(self.robot), self.data)
+            return Recorded(data, f"{data.periods} recorded periods: {data.about}")
+        return from_log(self.data, robot_named(self.robot), self.last)
+
+    def _publish(self, model: ModelSet) -> None:
+        with Bus(self.endpoints.bus(), "certify") as bus:
+            message = pb.Model(robot=model.robot.name, version=model.version, file=model.encode())
+            bus.publisher(MODEL, robot=model.robot.name).put(message)
+        errors.print(f"published {model.recipe.certificate} {model.version} for {model.robot.name}")
+
+
+def table(statements: list[Statement]) -> Table:
+    shown = Table(title="what held-out plans say (bounds at 99 % confidence)")
+    for column in (
+        *("certificate", "mode", "samples", "rank", "condition", "plans", "violations"),
+        *("≤ per step", "≤ per plan", "stop from rest", "from full speed", "comfort"),
+    ):
+        shown.add_column(column, justify="left" if column in ("certificate", "mode") else "right")
+    for s in statements:
+        shown.add_row(
+            s.certificate,
+            s.mode + ("" if s.certificate != RESIDUAL or s.mode != "direct" else " *"),
+            *(str(s.samples), str(s.rank), f"{s.condition:.0f}", str(s.windows), str(s.violations)),
+            *(f"{s.bound_step:.3%}", f"{s.bound_plan:.3%}"),
+            *(f"{1e3 * s.half_width_rest:.1f} mm", f"{1e3 * s.half_width_full:.1f} mm", f"{1e3 * s.comfort:.1f} mm"),
+        )
+    shown.caption = "* the default. Half-widths of a full stop's set, largest axis"
+    return shown

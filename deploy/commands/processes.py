@@ -1,0 +1,109 @@
+"""`brakeline safety | learner | actor | recorder`: each process alone, on any machine."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass, field, replace
+from functools import partial
+from importlib.metadata import version
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from deploy.commands.common import Endpoints, Filtering, Flags, Physics, Robot
+from deploy.experiments import RunConfig
+from deploy.store import data_root, model_for, model_path
+from deploy.vehicles import environment
+from learner.config import LearnerConfig
+from messaging.robots import robot_named
+
+
+@dataclass(frozen=True)
+class Safety:
+    robots: Annotated[tuple[str, ...], tyro.conf.Positional] = ("ground",)
+    endpoints: Flags[Endpoints] = field(default_factory=Endpoints)
+    filtering: Flags[Filtering] = field(default_factory=Filtering)
+    name: str = "safety"
+    """On the bus; replicas need different ones."""
+
+    def run(self) -> int:
+        from safety.service import SafetySettings, main
+
+        recipe = self.filtering.recipe()
+        for robot in self.robots:
+            model_for(robot_named(robot), recipe)
+        paths = tuple(model_path(robot_named(robot), recipe) for robot in self.robots)
+        main(SafetySettings(self.endpoints.bus(), paths, data_root(), self.name))
+        return 0
+
+
+@dataclass(frozen=True)
+class LearnerProcess:
+    robot: Robot = "ground"
+    endpoints: Flags[Endpoints] = field(default_factory=Endpoints)
+    out: Path = Path("runs/learner")
+    """Folder of its checkpoint and policy."""
+    resume: bool = False
+    """From the checkpoint there."""
+    name: str = "learner"
+    seed: int = 0
+    steps: int = 100_000
+    learner: LearnerConfig = field(default_factory=lambda: RunConfig().learner)
+
+    def run(self) -> int:
+        from learner.service import LearnerSettings, main
+
+        config = replace(self.learner, seed=self.seed, steps=self.steps)
+        main(LearnerSettings(self.endpoints.bus(), self.robot, self.out, self.resume, self.name, config))
+        return 0
+
+
+@dataclass(frozen=True)
+class Actor:
+    robot: Robot = "ground"
+    endpoints: Flags[Endpoints] = field(default_factory=Endpoints)
+    filtering: Flags[Filtering] = field(default_factory=Filtering)
+    physics: Flags[Physics] = field(default_factory=Physics)
+    name: str = f"actor-{os.uname().nodename.split('.')[0]}"
+    """On the bus; every actor of a run needs its own."""
+    number: int = 0
+    """Of its first robot in the run: two robots of one number and seed see the same episodes."""
+    robots: int = 1
+    """In this process; their requests share a question."""
+    seed: int = 0
+    arena: str = "default"
+    penalty: float = RunConfig.penalty
+    deadline: float = RunConfig.deadline
+
+    def run(self) -> int:
+        from actors.loop import ActorSettings, run
+
+        settings = ActorSettings(
+            bus=self.endpoints.bus(),
+            robot=robot_named(self.robot).name,
+            name=self.name,
+            number=self.number,
+            robots=self.robots,
+            seed=self.seed,
+            arena=self.arena,
+            method=self.filtering.method,
+            penalty=self.penalty,
+            deadline=self.deadline,
+        )
+        run(settings, partial(environment, conditions=self.physics.conditions()))
+        return 0
+
+
+@dataclass(frozen=True)
+class Recorder:
+    log: Annotated[Path, tyro.conf.Positional] = Path("runs/run.mcap")
+    """File to write; if it exists, the next segment."""
+    endpoints: Flags[Endpoints] = field(default_factory=Endpoints)
+    name: str = "recorder"
+
+    def run(self) -> int:
+        from logs import recorder
+
+        recorder.main(self.endpoints.bus(), self.log, {"versions": {"brakeline": version("brakeline")}}, self.name)
+        return 0

@@ -1,0 +1,137 @@
+"""`brakeline query` and `brakeline status`: look at a running system."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, field
+from typing import Any
+
+from rich.table import Table
+
+from deploy.commands.common import Endpoints, Flags, Robot, console, say_json
+from messaging.bus import Bus, Sample
+from messaging.robots import robot_named
+from messaging.shapes import KINDS, Obstacle
+from messaging.topics import HEALTH, LEARNER
+from safety.client import SafetyClient
+
+
+def obstacle_of(words: tuple[str, ...], dim: int) -> Obstacle:
+    """KIND, position, sizes, and a box's or wall's yaw if one number is left. Raises ValueError with the form."""
+    form = "an obstacle is: cylinder X Y RADIUS | box X Y LENGTH WIDTH [YAW] | wall X Y YAW"
+    kind, numbers = words[0] if words else "", words[1:]
+    if kind not in KINDS:
+        raise ValueError(f"{kind!r}: {form}")
+    try:
+        values = [float(number) for number in numbers]
+    except ValueError:
+        raise ValueError(f"{' '.join(words)}: {form}") from None
+    sizes = {"box": dim, "cylinder": dim - 1, "sphere": 1, "wall": 0}[kind]
+    if len(values) not in (dim + sizes, dim + sizes + 1):
+        raise ValueError(f"{' '.join(words)}: {form}")
+    yaw = values[dim + sizes] if len(values) > dim + sizes else 0.0
+    return Obstacle(kind, tuple(values[:dim]), tuple(values[dim : dim + sizes]), yaw)
+
+
+@dataclass(frozen=True)
+class Query:
+    robot: Robot = "ground"
+    endpoints: Flags[Endpoints] = field(default_factory=Endpoints)
+    state: tuple[float, ...] = ()
+    """Measured state in the robot's order; default: at rest at the origin."""
+    action: tuple[float, ...] = ()
+    """Proposed; default: the highest inputs."""
+    obstacle: str = ""
+    """What is near, separated by commas, e.g. "cylinder 0.4 0 0.1, wall 1 0 3.14"."""
+    timeout: float = 1.0
+    json: bool = False
+
+    def run(self) -> int:
+        robot = robot_named(self.robot)
+        near = [
+            obstacle_of(tuple(part.split()), robot.position_dim) for part in self.obstacle.split(",") if part.strip()
+        ]
+        state = self.state or (0.0,) * robot.state_dim
+        action = self.action or robot.action_high
+        with Bus(self.endpoints.bus(), f"query-{time.time_ns() % 10**6}") as bus:
+            message = SafetyClient(bus, robot.name, self.timeout).decide(state, action, near).message
+        d = robot.position_dim
+        figures: dict[str, Any] = {
+            "decision": {1: "allowed", 2: "adjusted", 3: "failsafe"}[message.kind],
+            "plan": _rows(message.plan, robot.action_dim),
+            "tube": {"center": _rows(message.tube_center, d), "half_width": _rows(message.tube_half_width, d)},
+            "margin": message.margin,
+            "time_ms": message.time_ms,
+            "model": message.model,
+            "reason": message.reason,
+        }
+        if self.json:
+            say_json(figures)
+            return 0
+        console.print(f"[bold]{figures['decision']}[/] {message.reason}")
+        shown = Table(box=None, padding=(0, 2, 0, 0))
+        for column in ("period", *robot.action, "center [m]", "± [m]"):
+            shown.add_column(column)
+        for k, (u, c, h) in enumerate(
+            zip(figures["plan"], figures["tube"]["center"], figures["tube"]["half_width"], strict=True)
+        ):
+            shown.add_row(str(k), *(f"{value:.4f}" for value in u), _numbers(c), _numbers(h))
+        console.print(shown)
+        console.print(f"margin {message.margin:.4f} m, {message.time_ms:.2f} ms in decide, model {message.model}")
+        return 0
+
+
+def _rows(values: Any, width: int) -> list[list[float]]:
+    return [list(values[i : i + width]) for i in range(0, len(values), width)]
+
+
+def _numbers(values: list[float]) -> str:
+    return ", ".join(f"{value:.4f}" for value in values)
+
+
+@dataclass(frozen=True)
+class Status:
+    endpoints: Flags[Endpoints] = field(default_factory=Endpoints)
+    wait: float = 1.5
+    """s to listen: every living process speaks once a second."""
+    json: bool = False
+
+    def run(self) -> int:
+        processes: dict[str, Any] = {}
+        learners: dict[str, Any] = {}
+
+        def health(sample: Sample) -> None:
+            said = sample.message()
+            processes[said.process] = {"pid": said.pid, **dict(said.figures), **dict(said.notes)}
+
+        def learner(sample: Sample) -> None:
+            said = sample.message()
+            names = [f.name for f in said.DESCRIPTOR.fields if f.name not in ("header", "robot")]
+            learners[said.robot] = {name: getattr(said, name) for name in names}
+
+        with Bus(self.endpoints.bus(), f"status-{time.time_ns() % 10**6}") as bus:
+            bus.subscribe(HEALTH, health)
+            bus.subscribe(LEARNER, learner)
+            time.sleep(self.wait)
+            alive = sorted(name for name in bus.living() if name != bus.source)
+        if self.json:
+            say_json({"alive": alive, "processes": processes, "learners": learners})
+            return 0
+        for name in sorted({*alive, *processes}):
+            state = "[green]alive[/]" if name in alive else "[red]gone[/]"
+            told = processes.get(name, {})
+            shown = ", ".join(f"{k} {v:.4g}" if isinstance(v, float) else f"{k} {v}" for k, v in _main(told).items())
+            console.print(f"{name:<12} {state}  {shown}")
+        for robot, figures in learners.items():
+            console.print(
+                f"learning {robot}: {figures['steps']} steps, {figures['updates']} updates, "
+                f"{figures['steps_per_s']:.0f} steps/s, {figures['updates_per_s']:.0f} updates/s, "
+                f"critic loss {figures['critic_loss']:.3f}, actor loss {figures['actor_loss']:.3f}, "
+                f"weights {figures['weights_version']}"
+            )
+        return 0
+
+
+def _main(figures: dict[str, Any]) -> dict[str, Any]:
+    """Without the counts per channel, which --json has."""
+    return {name: value for name, value in figures.items() if "/" not in name}

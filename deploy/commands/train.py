@@ -1,0 +1,111 @@
+"""`brakeline train` and `brakeline demo`."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+
+from deploy.child import CONFIG
+from deploy.commands.common import Filtering, Flags, Physics, console, errors, say_json
+from deploy.display import Display, summary
+from deploy.experiments import EXPERIMENTS, RunConfig, load
+from deploy.launch import Launcher, prepare
+from learner.config import LearnerConfig
+from messaging.robots import robot_named
+
+
+def launch(config: RunConfig, folder: Path, resume: bool, listen: str | None, as_json: bool) -> dict[str, Any]:
+    """Prepare and run, with a display on stderr (when JSON is asked for) or stdout."""
+    prepare(config, folder, resume)
+    shown = errors if as_json else console
+    if resume:
+        shown.print(f"resuming {folder} from the learner's last checkpoint; the log goes on in a new segment")
+    with Display(shown, config.steps * len(config.robots)) as display:
+        figures = Launcher(config, folder, listen).run(display)
+    if as_json:
+        say_json(figures)
+    else:
+        summary(console, figures)
+    return figures
+
+
+def stamped() -> Path:
+    return Path("runs") / time.strftime("%Y%m%d-%H%M%S")
+
+
+@dataclass(frozen=True)
+class Train:
+    robots: Annotated[tuple[str, ...], tyro.conf.Positional] = ("ground",)
+    """Robot kinds; each has a learner and actors of its own, all share the safety service."""
+    filtering: Flags[Filtering] = field(default_factory=Filtering)
+    physics: Flags[Physics] = field(default_factory=Physics)
+    actors: int = 2
+    """Actor processes a robot kind."""
+    robots_per_actor: int = 1
+    """Robots in each of them; their requests share a question."""
+    steps: int = 100_000
+    """Steps a robot kind."""
+    seed: int = 0
+    arena: str = "default"
+    penalty: float = RunConfig.penalty
+    """Subtracted from the learned reward for a correction by the whole range of an input."""
+    deadline: float = RunConfig.deadline
+    """s, for an answer of the safety service; then the robot brakes along its plan."""
+    replicas: int = 1
+    """Of the safety service."""
+    out: Path | None = None
+    """The run's folder; default: runs/ and the time."""
+    resume: Path | None = None
+    """Go on with the run in this folder: its configuration, except for --steps."""
+    deterministic: bool = False
+    """One actor, lockstep, no deadlines: the same seed gives the same weights, bit for bit."""
+    listen: str | None = None
+    """The router's endpoint; default: a free port of this machine."""
+    learner: LearnerConfig = field(default_factory=lambda: RunConfig().learner)
+    json: bool = False
+    """Print the final figures as one JSON object on stdout; the display goes to stderr."""
+
+    def config(self) -> RunConfig:
+        """The run's configuration; a resumed run's is its own, but for the steps."""
+        if self.resume is not None:
+            return replace(load(self.resume / CONFIG), steps=self.steps)
+        return RunConfig(
+            robots=tuple(robot_named(name).name for name in self.robots),
+            method=self.filtering.method,
+            recipe=self.filtering.recipe(),
+            arena=self.arena,
+            actors=1 if self.deterministic else self.actors,
+            robots_per_actor=self.robots_per_actor,
+            steps=self.steps,
+            seed=self.seed,
+            penalty=self.penalty,
+            deadline=self.deadline,
+            deterministic=self.deterministic,
+            replicas=self.replicas,
+            conditions=self.physics.conditions(),
+            learner=self.learner,
+        )
+
+    def run(self) -> int:
+        folder = self.resume or self.out or stamped()
+        launch(self.config(), folder, self.resume is not None, self.listen, self.json)
+        return 0
+
+
+@dataclass(frozen=True)
+class Demo:
+    steps: int = EXPERIMENTS["demo"].steps
+    seed: int = 0
+    out: Path | None = None
+    """The run's folder; default: runs/ and the time."""
+    json: bool = False
+    """Print the final figures as one JSON object on stdout; the display goes to stderr."""
+
+    def run(self) -> int:
+        config = replace(EXPERIMENTS["demo"], steps=self.steps, seed=self.seed)
+        launch(config, self.out or stamped(), False, None, self.json)
+        return 0
