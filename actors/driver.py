@@ -26,6 +26,9 @@ class Environment(Protocol):
 
     def step(self, action: Array) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]: ...
 
+    def alter(self, payload_kg: float, floor_friction: float) -> None:
+        """Change the robot, from now on."""
+
 
 @dataclass(frozen=True)
 class Identity:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -27,6 +27,15 @@ PATIENCE = 0.05  # s between questions of a standing robot that got no answer
 
 
 @dataclass(frozen=True)
+class Change:
+    """What becomes of each robot after so many steps: the robot that was recorded is not the one that drives on."""
+
+    after: int = -1  # -1: never
+    payload_kg: float = 0.0
+    floor_friction: float = 1.0
+
+
+@dataclass(frozen=True)
 class ActorSettings:
     bus: BusSettings
     robot: str = "ground"
@@ -39,9 +48,29 @@ class ActorSettings:
     penalty: float = 1.0
     deadline: float = 0.1  # s for an answer of the safety service
     lockstep: bool = False
+    practice: float = 0.0  # share of steps at which a robot starts to follow its committed plan to the stop
+    change: Change = field(default_factory=Change)
 
 
 Make = Callable[[Robot, str, int], Environment]  # robot, arena, seed
+STANDING = 2  # periods that a practised stop lasts beyond its plan
+
+
+class Practice:
+    """Now and then the committed plan to its end: safe, for it was verified, and the only way to go on recording what
+    a stop is like (`brakeline certify LOG`)."""
+
+    def __init__(self, share: float) -> None:
+        self.share, self._left = share, 0
+
+    def instead(self, driver: Driver, proposal: Array) -> Array:
+        """The committed plan's next input while a stop is practised, else the proposal."""
+        if self._left == 0 and self.share > 0.0 and driver.rng.random() < self.share:
+            self._left = driver.robot.horizon - 1 + STANDING
+        elif self._left == 0:
+            return proposal
+        self._left -= 1
+        return np.asarray(driver.commitment.plan[0])
 
 
 class Rider:
@@ -55,6 +84,7 @@ class Rider:
         self.driver = Driver(robot, env, identity, settings.penalty, settings.method != "none")
         self.student = Student(process.bus, robot, actor, settings.lockstep)
         self.next_episode = 0
+        self.practice, self.change = Practice(settings.practice), settings.change
         publisher: Callable[..., Publisher] = process.bus.publisher
         self.steps = publisher(STEP, robot=robot.name, source=actor)
         self.episodes = publisher(EPISODE, robot=robot.name, source=actor)
@@ -68,6 +98,8 @@ class Rider:
 
     def ready(self, stop: Callable[[], bool]) -> bool:
         """Wait for permission to step, and begin an episode if none is running; False: the end."""
+        if self.driver.index == self.change.after:
+            self.driver.env.alter(self.change.payload_kg, self.change.floor_friction)
         if not self.student.wait(self.driver.index + 1, self.next_episode, stop):
             return False
         if not self.driver.running:
@@ -80,12 +112,12 @@ class Rider:
         """The exploring policy's action, at random during warm-up; standing still if it is no number."""
         driver, policy = self.driver, self.student.policy
         if policy is None or self.student.warmup:
-            return self.random(driver.observation, driver.info)
+            return self.practice.instead(driver, self.random(driver.observation, driver.info))
         action = policy.explore(driver.observation, driver.rng)
         if not np.isfinite(action).all():
             log.error("weights %d propose %s: standing still", policy.version, action)
             return np.zeros(driver.robot.action_dim)
-        return action
+        return self.practice.instead(driver, action)
 
     def act(self, proposal: Array, outcome: Outcome | None) -> pb.Step:
         if outcome is not None:

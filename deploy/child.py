@@ -23,7 +23,6 @@ from messaging.bus import BusError, BusSettings
 from messaging.robots import robot_named
 
 CONFIG, ENDPOINT, LOG = "config.json", "endpoint", "run.mcap"
-MODELS = "models"  # versions that came over the bus
 PARENT_DIED = 1  # prctl: PR_SET_PDEATHSIG
 
 
@@ -92,12 +91,12 @@ def _safety(place: Place, folder: Path, config: RunConfig, bus: BusSettings) -> 
 
     models = tuple(model_path(robot_named(robot), config.recipe) for robot in config.robots)
     newest = (newest_model(folder, robot) or path for robot, path in zip(config.robots, models, strict=True))
-    main(SafetySettings(bus, tuple(newest), folder / MODELS, place.name))
+    main(SafetySettings(bus, tuple(newest), folder, place.name))
 
 
 def newest_model(folder: Path, robot: str) -> Path | None:
     """The version that a service of this run used last: a restarted one goes on with it."""
-    versions = list((folder / MODELS / robot / "models").glob("*.safetensors"))
+    versions = list((folder / robot / "models").glob("*.safetensors"))
     return max(versions, key=lambda path: path.stat().st_mtime_ns, default=None)
 
 
@@ -125,6 +124,8 @@ def _actor(place: Place, folder: Path, config: RunConfig, bus: BusSettings) -> N
         penalty=config.penalty,
         deadline=60.0 if config.deterministic else config.deadline,
         lockstep=config.deterministic,
+        practice=config.practice,
+        change=config.change,
     )
     run(settings, partial(environment, conditions=config.conditions))
 

@@ -10,6 +10,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+from actors.loop import Change
 from deploy.vehicles import Conditions
 from learner.config import LearnerConfig, TD3Config
 from safety.model_set import Recipe
@@ -33,6 +34,8 @@ class RunConfig:
     deadline: float = 0.1  # s for an answer of the safety service
     deterministic: bool = False  # one actor, lockstep, no deadlines
     replicas: int = 1  # of the safety service
+    practice: float = 0.0  # share of steps at which a robot starts to follow its committed plan to the stop
+    change: Change = field(default_factory=Change)  # of the robots, in mid-run
     conditions: Conditions = field(default_factory=Conditions)
     learner: LearnerConfig = field(default_factory=lambda: LearnerConfig(checkpoint_every=2500))
 
@@ -79,12 +82,14 @@ def decode(kind: type[Any], values: Any) -> Any:
 
 
 def _value(hint: Any, value: Any) -> Any:
+    if value is None:
+        return None
+    if typing.get_origin(hint) in (typing.Union, types.UnionType):
+        hint = next(part for part in typing.get_args(hint) if part is not type(None))
     if dataclasses.is_dataclass(hint):
         return decode(typing.cast(type[Any], hint), value)
     if typing.get_origin(hint) is tuple:
         return tuple(value)
-    if typing.get_origin(hint) in (typing.Union, types.UnionType) or value is None:
-        return value
     return Path(value) if hint is Path else value
 
 

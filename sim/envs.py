@@ -109,17 +109,12 @@ class NavigationEnv(gymnasium.Env[Observation, Any]):
             raise gymnasium.error.ResetNeeded("reset the environment before anything else")
         return self._vehicle
 
-    def set_payload(self, kg: float) -> None:
-        """Load the robot with that much beside its own mass, from now on and in later episodes."""
-        self._payload_kg = kg
+    def alter(self, payload_kg: float, floor_friction: float) -> None:
+        """Load the robot [kg] and change the friction of its wheels on the floor (1 at first), from now on."""
+        self._payload_kg, self._floor_friction = payload_kg, floor_friction
         if self._vehicle is not None:
-            self._vehicle.set_payload(kg)
-
-    def set_friction(self, coefficient: float) -> None:
-        """Change the friction between wheels and floor (1 at first), from now on and in later episodes."""
-        self._floor_friction = coefficient
-        if self._vehicle is not None:
-            self._vehicle.set_friction(coefficient)
+            self._vehicle.set_payload(payload_kg)
+            self._vehicle.set_friction(floor_friction)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Observation, Info]:
         super().reset(seed=seed)

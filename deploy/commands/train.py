@@ -9,6 +9,7 @@ from typing import Annotated, Any
 
 import tyro
 
+from actors.loop import Change
 from deploy.child import CONFIG
 from deploy.commands.common import Filtering, Flags, Physics, console, errors, say_json
 from deploy.display import Display, summary
@@ -61,6 +62,10 @@ class Train:
     """The run's folder; default: runs/ and the time."""
     resume: Path | None = None
     """Go on with the run in this folder: its configuration, except for --steps."""
+    practice: float = 0.0
+    """Share of steps at which a robot follows its committed plan to the stop: the stops that `certify LOG` needs."""
+    change: Change = field(default_factory=Change)
+    """Load the robots or change the floor in mid-run, e.g. --change.after 5000 --change.payload-kg 1."""
     deterministic: bool = False
     """One actor, lockstep, no deadlines: the same seed gives the same weights, bit for bit."""
     listen: str | None = None
@@ -84,6 +89,8 @@ class Train:
             seed=self.seed,
             penalty=self.penalty,
             deadline=self.deadline,
+            practice=self.practice,
+            change=self.change,
             deterministic=self.deterministic,
             replicas=self.replicas,
             conditions=self.physics.conditions(),

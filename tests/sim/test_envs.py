@@ -160,13 +160,13 @@ def test_time_runs_out_after_300_steps() -> None:
 
 def test_payload_and_friction_last_over_resets() -> None:
     env = NavigationEnv()
-    env.set_payload(2.0)
+    env.alter(2.0, 1.0)
     env.reset(options={"episode_seed": 1})
     laden = env.step(np.array([0.25, 0.0]))[4]["speed"]
-    env.set_payload(0.0)
+    env.alter(0.0, 1.0)
     env.reset(options={"episode_seed": 1})
     bare = env.step(np.array([0.25, 0.0]))[4]["speed"]
-    env.set_friction(0.1)
+    env.alter(0.0, 0.1)
     slippery = env.step(np.zeros(2))[4]["speed"]
     assert laden < bare - 0.005
     assert slippery > 0.02
