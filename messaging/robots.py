@@ -18,6 +18,8 @@ Array = NDArray[np.float64]
 class UnknownRobot(ValueError):
     """The name is not in `ROBOTS`."""
 
+    field = "robot"  # of a request, where it stands
+
 
 @dataclass(frozen=True)
 class Robot:

@@ -5,7 +5,7 @@ Every shape is `{c + R(yaw)(s + r)}`, s in the box |s_i| <= half_i, r in the dis
     box       half, rho = 0
     cylinder  vertical; half = (0, 0, h), rho = radius, disc      (in the plane: a disc)
     sphere    half = 0, rho = radius, ball
-    wall      the half-space behind a plane: a box that reaches WALL_DEPTH beyond its face
+    wall      the half-space behind a plane: a box of edge 2 WALL_DEPTH with one face in it
 
 so one vectorised formula serves all. Shapes are convex: the closest point gives a supporting half-space.
 """
@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float64]
 
-WALL_DEPTH = 100.0  # m; how far behind its face a wall is solid
+WALL_DEPTH = 1e4  # m; half the edge of the box that a wall is: as good as a half-space
 BOX, CYLINDER, SPHERE, WALL = "box", "cylinder", "sphere", "wall"
 KINDS = (BOX, CYLINDER, SPHERE, WALL)
 
@@ -54,8 +54,10 @@ class Obstacle:
         dim = len(self.position)
         if dim not in (2, 3):
             raise BadShape("position", f"an obstacle's position has 2 or 3 coordinates, not {dim}")
-        if not all(math.isfinite(value) for value in (*self.position, self.yaw)):
-            raise BadShape("position", "an obstacle's position and yaw must be finite")
+        if not all(math.isfinite(value) for value in self.position):
+            raise BadShape("position", f"an obstacle's position must be finite, not {list(self.position)}")
+        if not math.isfinite(self.yaw):
+            raise BadShape("yaw", f"an obstacle's yaw must be finite, not {self.yaw}")
         sizes = {BOX: dim, CYLINDER: dim - 1, SPHERE: 1, WALL: 0}[self.kind]
         if len(self.size) != sizes:
             raise BadShape("size", f"a {dim}-D {self.kind} has {sizes} sizes, not {len(self.size)}")
@@ -109,15 +111,13 @@ class Shapes:
 
     def towards(self, points: Array) -> Array:
         """Vectors from points (..., d) to the closest points of the n obstacles: (n, ..., d); zero inside."""
-        extra = (slice(None), *([None] * (points.ndim - 1)))
-        local = np.einsum("n...i,nij->n...j", points[None] - self.center[extra], self.axes)
-        half = self.half[extra]
-        rest = local - np.clip(local, -half, half)
-        rounded = rest * self.round[extra]
-        norm = np.sqrt(np.einsum("n...i,n...i->n...", rounded, rounded))
-        cut = np.minimum(self.rho[extra] / np.maximum(norm, 1e-300), 1.0)
-        rest = rest - rounded * cut[..., None]
-        return np.asarray(-np.einsum("n...j,nij->n...i", rest, self.axes))
+        local = (points.reshape(-1, points.shape[-1]) - self.center[:, None]) @ self.axes  # (n, points, d)
+        half = self.half[:, None]
+        rest = local - np.minimum(np.maximum(local, -half), half)
+        rounded = rest * self.round[:, None]
+        norm = np.sqrt(np.einsum("npi,npi->np", rounded, rounded))
+        rest -= rounded * (self.rho[:, None] / np.maximum(norm, np.maximum(self.rho, 1e-300)[:, None]))[..., None]
+        return np.asarray(-(rest @ self.axes.transpose(0, 2, 1))).reshape(len(self), *points.shape)
 
     def distance(self, points: Array) -> Array:
         """Distances from points (..., d) to the n obstacles: (n, ...); 0 inside."""

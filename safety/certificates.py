@@ -82,8 +82,11 @@ def whitening(z: Array) -> Array:
 def envelope(features: Array, values: Array, inflation: float) -> tuple[Array, float]:
     """The smallest `κ·f + w >= v` over all samples, f (T, q) >= 0, v (T,) >= 0, scaled by `inflation`.
 
-    Minimises the mean of the bound over the samples, by an LP to which violated samples are added until none is.
+    Minimises the mean of the bound over the samples, by an LP to which violated samples are added until none is; what
+    the solver's tolerance leaves violated is added to w.
     """
+    if not len(values):
+        raise CertificateError("no sample to bound")
     cost = np.append(features.mean(0), 1.0)
     rows = np.column_stack([features, np.ones(len(features))])
     active = np.unique(np.concatenate([np.argsort(values)[-ROWS_A_ROUND:], rows.argmax(0)]))
@@ -92,13 +95,15 @@ def envelope(features: Array, values: Array, inflation: float) -> tuple[Array, f
         found = linprog(cost, A_ub=-rows[active], b_ub=-values[active] / scale, bounds=(0, None), method="highs")
         if found.status != 0:
             raise CertificateError(f"no envelope of the residuals: {found.message}")
-        short = values / scale - rows @ found.x
+        bound = np.maximum(found.x, 0.0)
+        short = values / scale - rows @ bound
         worst = np.argsort(short)[-ROWS_A_ROUND:]
-        worst = worst[short[worst] > 1e-7]
-        if not len(worst):
-            bound = found.x * scale * inflation
-            return bound[:-1], float(bound[-1]) + 1e-7 * scale
-        active = np.union1d(active, worst)
+        more = np.union1d(active, worst[short[worst] > 1e-7])
+        if len(more) == len(active):
+            bound[-1] += max(float(short.max()), 0.0) + 1e-9
+            bound *= scale * inflation
+            return bound[:-1], float(bound[-1])
+        active = more
 
 
 def residual(z: Array, y: Array, C: Array, inflation: float = 1.0) -> Certificate:
@@ -143,8 +148,11 @@ def set_membership(z: Array, y: Array, sizes: Array, kappa: Array, w: Array) -> 
 
 
 def _row_box(white: Array, y: Array, size: Array) -> tuple[Array, Array]:
-    """Interval hull of the polytope `|y_t - a·white_t| <= size_t`, by 2 nz LPs that share their active samples."""
-    nz, unit = white.shape[1], float(size.mean())
+    """Interval hull of the polytope `|y_t - a·white_t| <= size_t`, by 2 nz LPs that share their active samples.
+
+    Leaving samples out only widens it, so it holds whatever the loop stops at.
+    """
+    nz, unit = white.shape[1], float(size.mean()) or 1.0
     y, size = y / unit, size / unit  # the solver's tolerances are absolute
     active = np.unique(np.concatenate([np.argsort(size)[:ROWS_A_ROUND], np.abs(white).argmax(0)]))
     corners = np.zeros((2, nz))
@@ -158,21 +166,23 @@ def _row_box(white: Array, y: Array, size: Array) -> tuple[Array, Array]:
                     b_ub=np.concatenate([values + bound, bound - values]),
                     bounds=(None, None),
                 )
-                if found.status == 3:  # unbounded on so few samples
-                    active = np.union1d(active, np.arange(0, len(y), max(1, len(y) // (4 * ROWS_A_ROUND))))
-                    if len(active) >= len(y):
-                        raise CertificateError("the samples do not bound the matrix")
+                if found.status in (3, 4) and len(active) < len(y):  # unbounded, so it seems, on so few samples
+                    spread = np.arange(0, len(y), max(1, len(y) // (4 * ROWS_A_ROUND)))
+                    more = np.union1d(active, spread)
+                    active = more if len(more) > len(active) else np.arange(len(y))
                     continue
+                if found.status == 3:
+                    raise CertificateError("the samples do not bound the matrix")
                 if found.status == 2:
                     raise CertificateError("no matrix is consistent with all samples: the noise bound is too small")
                 if found.status != 0:
                     raise CertificateError(f"no bound of the consistent matrices: {found.message}")
                 over = np.abs(y - white @ found.x) - size
                 worst = np.argsort(over)[-ROWS_A_ROUND:]
-                worst = worst[over[worst] > 1e-6]
-                if not len(worst):
+                more = np.union1d(active, worst[over[worst] > 1e-6])
+                if len(more) == len(active):
                     break
-                active = np.union1d(active, worst)
+                active = more
             corners[side, axis] = found.x[axis] - sign * 1e-6
     return unit * corners[0], unit * corners[1]
 

@@ -13,6 +13,7 @@ from types import TracebackType
 from typing import Any, Self
 
 import numpy as np
+from google.protobuf.message import DecodeError
 from numpy.typing import ArrayLike, NDArray
 
 from messaging import brakeline_pb2 as pb
@@ -75,18 +76,28 @@ def read(reply: pb.Reply, robot: Robot) -> Answer:
     """The decision in a reply.
 
     Raises:
-        SafetyError: it is an error, or its plan is not one of this robot's.
+        SafetyError: it is an error, or its plan or prediction is not one of this robot's.
     """
     if reply.WhichOneof("result") != "decision":
         raise SafetyError(reply.error)
     decision = reply.decision
+    if decision.kind not in KINDS:
+        raise _bad_reply("kind", f"kind {decision.kind}")
     plan = np.array(decision.plan)
-    if plan.size != robot.horizon * robot.action_dim or decision.kind not in KINDS:
-        raise SafetyError(pb.Error(type="BadReply", field="plan", message=f"a plan of {plan.size} numbers"))
+    if plan.size != robot.horizon * robot.action_dim:
+        raise _bad_reply("plan", f"a plan of {plan.size} numbers")
     plan = plan.reshape(robot.horizon, robot.action_dim)
     if not ((plan >= robot.low() - 1e-9) & (plan <= robot.high() + 1e-9)).all():  # NaN fails too
-        raise SafetyError(pb.Error(type="BadReply", field="plan", message="an input out of bounds"))
+        raise _bad_reply("plan", "an input out of bounds")
+    if plan[-1].any():
+        raise _bad_reply("plan", "a plan that does not end in a stop")
+    if not len(decision.predicted_center) == len(decision.predicted_half_width) == robot.state_dim:
+        raise _bad_reply("predicted_center", "a predicted state of the wrong size")
     return Answer(KINDS[decision.kind], plan[0], plan, decision)
+
+
+def _bad_reply(field: str, message: str) -> SafetyError:
+    return SafetyError(pb.Error(type="BadReply", field=field, message=message))
 
 
 def accept(commitment: Commitment, answer: Answer) -> Array:
@@ -95,7 +106,7 @@ def accept(commitment: Commitment, answer: Answer) -> Array:
     predicted = Prediction(
         np.array(message.predicted_center), np.array(message.predicted_half_width), message.predicted_heading
     )
-    return commitment.accept(answer.plan, message.model, predicted)
+    return commitment.accept(answer.plan, message.model, predicted, message.verified)
 
 
 class SafetyClient:
@@ -155,11 +166,14 @@ def ask(bus: Bus, requests: Sequence[pb.Request], deadline: float) -> list[pb.Re
 
     Raises:
         NoReply, Late, Refused: nobody serves, too late, or not understood at all.
-        SafetyError: not as many replies as requests.
+        SafetyError: no batch of replies, or not as many as requests.
     """
     payload = pb.RequestBatch(requests=requests).SerializeToString()
-    batch = pb.ReplyBatch.FromString(bus.ask(DECIDE, payload, deadline, robot=requests[0].robot))
+    answer = bus.ask(DECIDE, payload, deadline, robot=requests[0].robot)
+    try:
+        batch = pb.ReplyBatch.FromString(answer)
+    except DecodeError as error:
+        raise _bad_reply("", f"not a reply batch: {error}") from error
     if len(batch.replies) != len(requests):
-        message = f"{len(batch.replies)} replies to {len(requests)} requests"
-        raise SafetyError(pb.Error(type="BadReply", message=message))
+        raise _bad_reply("", f"{len(batch.replies)} replies to {len(requests)} requests")
     return list(batch.replies)

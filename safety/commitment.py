@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from messaging.robots import Robot
-from messaging.shapes import rotate
 
 Array = NDArray[np.float64]
 
 SAME_SET = 1e-9  # m, rad, ...: rounding allowed when a measurement is compared with its prediction
+UNVERIFIED = "unverified"  # in place of a model's version: no model vouches for the committed plan
 
 
 @dataclass(frozen=True)
@@ -30,8 +31,8 @@ class Prediction:
         """Does the measured state (n,) lie in the set?"""
         away = state - self.center
         if robot.heading is not None:
-            d = robot.position_dim
-            away[:d] = rotate(away[:d], -self.heading)
+            cos, sin = math.cos(self.heading), math.sin(self.heading)
+            away[0], away[1] = cos * away[0] + sin * away[1], cos * away[1] - sin * away[0]
             away[robot.heading] = (away[robot.heading] + np.pi) % (2.0 * np.pi) - np.pi
         return bool((np.abs(away) <= self.half_width + SAME_SET).all())
 
@@ -39,7 +40,8 @@ class Prediction:
 class Commitment:
     """The committed plan of one robot: verified when it was made, from then to standstill.
 
-    plan (N, m) is its tail: the first row is what to execute if no better answer comes.
+    plan (N, m) is its tail: the first row is what to execute if no better answer comes. model is the version of the
+    model set that verified it, empty when the robot stands still, `UNVERIFIED` if none did.
     """
 
     def __init__(self, robot: Robot) -> None:
@@ -52,10 +54,11 @@ class Commitment:
         self.input_in_force: Array = np.zeros(self.robot.action_dim)
         self.model = ""
         self.predicted: Prediction | None = None
+        self._still = self.robot.horizon  # periods of zero input
 
-    def accept(self, plan: Array, model: str, predicted: Prediction | None) -> Array:
+    def accept(self, plan: Array, model: str, predicted: Prediction | None, verified: bool) -> Array:
         """A decision's plan becomes the committed one; returns the input to execute now."""
-        self.plan, self.model, self.predicted = plan, model, predicted
+        self.plan, self.model, self.predicted = plan, model if verified else UNVERIFIED, predicted
         return self._advance()
 
     def fallback(self) -> Array:
@@ -67,12 +70,18 @@ class Commitment:
         now: Array = self.plan[0].copy()
         self.plan = np.vstack([self.plan[1:], np.zeros((1, self.robot.action_dim))])
         self.input_in_force = now
-        if not self.plan.any() and not now.any():
+        self._still = 0 if now.any() else self._still + 1
+        stopped = self.model != UNVERIFIED or self._still >= self.robot.horizon
+        if stopped and not self.plan.any() and not now.any():
             self.model = ""  # standing still needs nobody's word
         return now
 
 
 def correction_penalty(robot: Robot, proposed: ArrayLike, executed: ArrayLike, weight: float) -> float:
-    """weight · ‖executed - proposed‖, each input in units of its range: what leaning on the filter costs."""
-    difference = (np.asarray(executed, float) - np.asarray(proposed, float)) / (robot.high() - robot.low())
+    """weight · ‖executed - proposed‖, each input in units of its range: what leaning on the filter costs.
+
+    From the proposal clipped to bounds; one that is no number counts as zero input.
+    """
+    clipped = np.clip(np.nan_to_num(np.asarray(proposed, float), posinf=0.0, neginf=0.0), robot.low(), robot.high())
+    difference = (np.asarray(executed, float) - clipped) / (robot.high() - robot.low())
     return weight * float(np.linalg.norm(difference))

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save_file
 
-from messaging.robots import Robot, robot_named
+from messaging.robots import Robot, UnknownRobot, robot_named
 from messaging.shapes import rotate
 
 Array = NDArray[np.float64]
@@ -34,7 +34,7 @@ class BadData(ValueError):
 class Trajectory:
     """One uninterrupted recording; nothing pairs its last sample with another's first.
 
-    states: (T+1, n) measured; inputs: (T, m) executed, the one in force before the first is standing still.
+    states: (T+1, n) measured; inputs: (T, m) executed.
     paths: (T, S, d) positions within each period relative to its start, in the frame of its start, from
     dead reckoning; turned: (T,) heading change over each period, likewise [rad].
     """
@@ -63,20 +63,27 @@ class Dataset:
             raise BadData("the data set holds no trajectory")
         for i, t in enumerate(self.trajectories):
             periods = len(t.inputs)
-            shapes = t.states.shape, t.inputs.shape, t.paths.shape[::2], t.turned.shape
+            shapes = t.states.shape, t.inputs.shape, t.paths.shape, t.turned.shape
+            samples = max(t.paths.shape[1], 1) if t.paths.ndim == 3 else 1
             wanted = (
                 (periods + 1, robot.state_dim),
                 (periods, robot.action_dim),
-                (periods, robot.position_dim),
+                (periods, samples, robot.position_dim),
                 (periods,),
             )
-            if shapes != wanted:
+            if shapes != wanted or not periods:
                 raise BadData(f"trajectory {i}: shapes {shapes} where {wanted} belong")
-            for name in ("states", "inputs", "paths", "turned"):
-                if not np.isfinite(getattr(t, name)).all():
+            if t.before is not None and t.before.shape != (robot.action_dim,):
+                raise BadData(f"trajectory {i}: the input before it has shape {t.before.shape}")
+            for name in ("states", "inputs", "paths", "turned", "before"):
+                if getattr(t, name) is not None and not np.isfinite(getattr(t, name)).all():
                     raise BadData(f"trajectory {i}: {name} holds NaN or infinity")
-            if (t.inputs < robot.low() - 1e-9).any() or (t.inputs > robot.high() + 1e-9).any():
+            inputs = t.inputs if t.before is None else np.vstack([t.before, t.inputs])
+            if (inputs < robot.low() - 1e-9).any() or (inputs > robot.high() + 1e-9).any():
                 raise BadData(f"trajectory {i}: an input is out of the robot's bounds")
+            jumps = np.flatnonzero(_jump(robot, t) > 0.0)
+            if len(jumps):
+                raise BadData(f"trajectory {i}: the position jumps in period {jumps[0]}: two recordings in one?")
 
     def split(self, shares: Sequence[float]) -> list[Dataset]:
         """Whole trajectories dealt out in turn, by shares that add up to 1."""
@@ -112,16 +119,31 @@ class Dataset:
             with safe_open(path, framework="np") as file:
                 about = file.metadata() or {}
                 tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - no mapping
-        except (OSError, SafetensorError) as error:
+                about_data = json.loads(about.get("about", "{}"))
+        except (OSError, SafetensorError, ValueError, KeyError, TypeError) as error:
             raise BadData(f"{path} is no data set: {error}") from error
         missing = {"states", "inputs", "paths", "turned", "before", "lengths"} - tensors.keys()
         if missing or "robot" not in about:
             raise BadData(f"{path} is no data set: {', '.join(sorted(missing)) or 'its robot'} is missing")
-        robot = robot_named(about["robot"])
+        try:
+            robot = robot_named(about["robot"])
+        except UnknownRobot as error:
+            raise BadData(f"{path}: {error}") from error
         if about.get("layout") != robot.layout():
             raise BadData(f"{path} was recorded for another layout of {robot.name}: record it again")
-        lengths = tensors["lengths"]
-        if lengths.sum() != len(tensors["inputs"]) or lengths.sum() + len(lengths) != len(tensors["states"]):
+        lengths = tensors.pop("lengths")
+        tensors = {name: np.atleast_1d(tensor).astype(float) for name, tensor in tensors.items()}
+        if lengths.ndim != 1 or lengths.dtype.kind != "i" or (lengths <= 0).any():
+            raise BadData(f"{path}: the trajectories' lengths are no lengths")
+        total = lengths.sum()
+        wanted = {
+            "states": total + len(lengths),
+            "inputs": total,
+            "paths": total,
+            "turned": total,
+            "before": len(lengths),
+        }
+        if any(len(tensors[name]) != count for name, count in wanted.items()):
             raise BadData(f"{path}: the trajectories' lengths do not add up")
         ends = np.cumsum(lengths)
         trajectories = tuple(
@@ -134,7 +156,7 @@ class Dataset:
             )
             for i, (start, end) in enumerate(zip(ends - lengths, ends, strict=True))
         )
-        data = Dataset(robot, trajectories, json.loads(about.get("about", "{}")))
+        data = Dataset(robot, trajectories, about_data)
         data.check()
         return data
 
@@ -144,6 +166,9 @@ class Dataset:
         for t in self.trajectories:
             sha.update(t.states.tobytes())
             sha.update(t.inputs.tobytes())
+            sha.update(t.paths.tobytes())
+            sha.update(t.turned.tobytes())
+            sha.update(b"" if t.before is None else t.before.tobytes())
         return sha.hexdigest()[:12]
 
 
@@ -179,7 +204,9 @@ def displacement(robot: Robot, start: Array, end: Array) -> Array:
 
 
 def windows(data: Dataset, k: int) -> Windows:
-    """All windows of k periods in the data, within trajectories only."""
+    """All windows of k periods in the data, within trajectories only. Raises BadData when there is no trajectory."""
+    if not data.trajectories:
+        raise BadData("no trajectory: record more of them")
     parts = [_windows_of(data.robot, t, k, i) for i, t in enumerate(data.trajectories)]
     return Windows(*(np.concatenate([getattr(p, n) for p in parts]) for n in ("z", "y", "bulge", "latch", "start")))
 
@@ -199,6 +226,15 @@ def _windows_of(robot: Robot, t: Trajectory, k: int, number: int) -> Windows:
     bulge = _off_chord(t.paths)[start + k - 1]
     latch = _rest_travel(t)[np.minimum(start + k, len(t.inputs))]
     return Windows(z, y, bulge, latch, np.column_stack([np.full(len(start), number), start]))
+
+
+def _jump(robot: Robot, t: Trajectory) -> Array:
+    """How much farther [m] the measured position moved in each period than dead reckoning and noise explain: (T,)."""
+    moved = np.linalg.norm(np.diff(t.states[:, : robot.position_dim], axis=0), axis=1)
+    steps = np.diff(t.paths, axis=1, prepend=0.0)
+    way = np.linalg.norm(steps, axis=2).sum(1)
+    noise = 2.0 * np.linalg.norm(robot.measurement_bound[: robot.position_dim])
+    return np.asarray(moved - 2.0 * (way + noise))  # twice: it is for gross errors, not for a slipping wheel
 
 
 def _off_chord(paths: Array) -> Array:

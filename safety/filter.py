@@ -6,13 +6,15 @@ log can be replayed.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+import math
+from dataclasses import dataclass, field
 from time import perf_counter_ns
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from messaging.shapes import Shapes, rotate
+from messaging.shapes import Shapes
 from safety.commitment import Prediction
 from safety.freespace import half_spaces
 from safety.model_set import ModelSet
@@ -24,6 +26,7 @@ Array = NDArray[np.float64]
 ALLOWED, ADJUSTED, FAILSAFE = "allowed", "adjusted", "failsafe"
 OUTSIDE_DOMAIN = 0.02  # of the recorded range: how far beyond it a regressor may lie (rounding, not extrapolation)
 SAME_INPUT = 1e-6  # of the input's range: an answer this close to the proposal is the proposal
+FARTHEST = 1e5  # m (and any other unit): beyond it a position's rounding would begin to show
 
 
 class BadRequest(ValueError):
@@ -41,8 +44,8 @@ class StaleModel(BadRequest):
 @dataclass(frozen=True)
 class Request:
     """state (n,) measured; action (m,) proposed; input_in_force (m,) of the period before; plan (N, m): the committed
-    plan's tail, verified by model set `model` (empty: standing still); obstacles: at least those within
-    `Filter.reach`; predicted: what the last decision said of this state, if there was one."""
+    plan's tail, verified by model set `model` (empty: standing still; `UNVERIFIED`: by none); obstacles: at least those
+    within `Filter.reach`; predicted: what the last decision said of this state, if there was one."""
 
     state: Array
     action: Array
@@ -53,11 +56,18 @@ class Request:
     predicted: Prediction | None = None
     observation: NDArray[np.float32] = field(default_factory=lambda: np.zeros(0, np.float32))
 
+    @property
+    def still(self) -> bool:
+        """Is the robot said to stand, and to be committed to that? Needs no model's word."""
+        return not self.model and not self.plan.any() and not self.input_in_force.any()
+
 
 @dataclass(frozen=True)
 class Decision:
     """kind: allowed | adjusted | failsafe; plan (N, m), its first row is for now; tube: true positions at the N
-    periods' ends, centers and half-widths (N, d), world; margin [m] to the nearest half-space, capped at the reach."""
+    periods' ends, centers and half-widths (N, d), world, of the plan's free inputs and the ramp after them; predicted:
+    the next measured state; margin [m] of that tube to the nearest half-space, within ± the reach. A failsafe's may be
+    negative though it is verified: it was so when it was made, this is how it looks from the new measurement."""
 
     kind: str
     plan: Array
@@ -90,6 +100,28 @@ class _Attempt:
     iterations: int = 0
     solve_ns: int = 0
     reason: str = ""
+    contained: bool = True
+
+
+@dataclass(frozen=True)
+class _Scene:
+    """start (d,): the measured position; turn (d, d): world from the frame of now; near: the obstacles that count."""
+
+    start: Array
+    heading: float
+    turn: Array
+    near: Shapes
+
+
+@dataclass(frozen=True)
+class _Found:
+    """A plan (N, m) with its free inputs (F·m,)."""
+
+    kind: str
+    plan: Array
+    free: Array
+    margin: float
+    verified: bool
 
 
 class Filter:
@@ -101,7 +133,6 @@ class Filter:
         self.robot = robot = model.robot
         self.tube, outer = model.tube(), model.outer_tube()
         self.layout = Layout(self.tube)
-        self.outer_layout = self.layout if outer.generators == self.tube.generators else Layout(outer)
         self.builder = Builder(robot, outer)
         self.schedule = robot.schedule()
         self.measured = np.asarray(robot.measurement_bound[: robot.position_dim])
@@ -111,6 +142,8 @@ class Filter:
         driven = np.tile(robot.translates, robot.free_steps)
         self.translating = np.concatenate([np.zeros(robot.regressor_dim), driven])
         self.low, self.high, self.slew = robot.low(), robot.high(), np.asarray(robot.action_slew)
+        self.nothing = np.minimum(np.maximum(0.0, self.low), self.high)
+        self.braking = np.maximum(1.0 - np.arange(robot.free_steps) / robot.brake_steps, 0.0)[:, None]
         self.regressor = list(robot.regressor)
         self.comfort = self._comfort()
         wanted = self._reach()
@@ -177,79 +210,69 @@ class Filter:
         """
         attempt = _Attempt(perf_counter_ns())
         self._check(request)
-        compared = request.predicted is not None
-        contained = request.predicted is None or request.predicted.contains(self.robot, request.state.copy())
+        attempt.contained = request.predicted is None or request.predicted.contains(self.robot, request.state)
         proposal = self._clipped(request)
         z_0 = np.concatenate([request.state[self.regressor], request.input_in_force])
-        near = self._near(request)
-        z = self._regressors(z_0, proposal)
-        in_domain = bool((z_0 >= self.domain[0]).all() and (z_0 <= self.domain[1]).all())
-        kind, free, margin, verified = FAILSAFE, None, self.reach, False
-        if not in_domain:
+        scene = self._scene(request)
+        in_domain = bool(((z_0 >= self.domain[0]) & (z_0 <= self.domain[1])).all())
+        found = None
+        if in_domain:
+            found = self._search(scene, z_0, proposal, attempt)
+        else:
             attempt.reason = "the state is outside the domain that was recorded"
-        elif not len(near) and not (self.far and self._extent(z) > self.reach):
-            kind, free, verified = ALLOWED, z[len(z_0) :], True
-        else:
-            kind, free, margin, verified = self._search(request, near, z_0, z, proposal, attempt)
-        if free is not None:
-            plan = (self.schedule @ free).reshape(self.robot.horizon, -1)
-            if kind == ALLOWED:
-                plan[0] = proposal
-        else:
-            trusted = contained and request.model in ("", self.version)
-            plan, free, margin, verified = self._committed(request, near, z_0, trusted and in_domain)
-            if not contained:
-                attempt.reason += "; the measured state was outside the predicted set"
-        decision = self._decision(request, kind, plan, np.concatenate([z_0, free]), margin, attempt)
-        return replace(decision, verified=verified, contained=contained, compared=compared)
+        if found is None:
+            found = self._committed(request, scene, z_0, attempt, in_domain)
+        return self._decision(request, scene, z_0, found, attempt)
 
-    def _search(
-        self, request: Request, near: Shapes, z_0: Array, z: Array, proposal: Array, attempt: _Attempt
-    ) -> tuple[str, Array | None, float, bool]:
+    def _search(self, scene: _Scene, z_0: Array, proposal: Array, attempt: _Attempt) -> _Found | None:
         """The proposal if its tube is verified, else the QP's answer if that is, else nothing."""
-        known = len(z_0)
-        rows, outer = self._rows(request, near, z)
-        stay = self._regressors(z_0, np.where(self.standing, proposal, np.clip(0.0, self.low, self.high)))
-        kept = self._comfortable(rows, stay)
-        margin = self._margin(kept, z)
-        if margin >= 0.0:
-            return ALLOWED, z[known:], margin, True
-        attempt.reason = f"the proposal's tube leaves the free space by {-margin:.3g} m"
-        for choice, outer_choice in (
-            (kept, self._comfortable(outer, stay)),  # comfort margin kept, or at least not driven into
-            (rows, outer),  # free space alone: from here even standing still would not keep the comfort margin
-        ):
+        known, m = len(z_0), len(proposal)
+        z = self._regressors(z_0, proposal)
+        if not len(scene.near) and not self.far:
+            return _Found(ALLOWED, self._plan(z[known:]), z[known:], self.reach, True)
+        rows = self._rows(scene, z)
+        margin = self._margin(rows, z)
+        if margin >= self.comfort:
+            return _Found(ALLOWED, self._plan(z[known:]), z[known:], margin, True)
+        kept = self._comfortable(rows, z_0, proposal)
+        if margin >= 0.0 and self._margin(kept, z) >= 0.0:
+            return _Found(ALLOWED, self._plan(z[known:]), z[known:], margin, True)
+        attempt.reason = f"the proposal's tube comes within {margin:.3g} m of the free space's edge"
+        # Keeping the comfort margin, or at least not driving into it; else free space alone: from here even standing
+        # still would not do.
+        for choice in (kept, rows):
             if not np.isfinite(choice.bound).all():
                 break
-            candidate = self._closest(outer_choice, z_0, proposal, attempt)
-            if candidate is None:
+            candidate = self._closest(choice, z_0, proposal, attempt)
+            if candidate is None or self._margin(choice, candidate) < 0.0:
                 continue
-            margin = self._margin(choice, candidate)
-            if margin >= 0.0:
-                near_enough = np.abs(candidate[known : known + len(proposal)] - proposal) <= SAME_INPUT * self.high
-                if near_enough.all() and self._margin(choice, z) >= 0.0:
-                    return ALLOWED, z[known:], margin, True
-                return ADJUSTED, candidate[known:], margin, True
+            near_enough = np.abs(candidate[known : known + m] - proposal) <= SAME_INPUT * (self.high - self.low)
+            if near_enough.all() and self._margin(choice, z) >= 0.0:
+                return _Found(ALLOWED, self._plan(z[known:]), z[known:], margin, True)
+            free = candidate[known:]
+            return _Found(ADJUSTED, self._plan(free), free, self._margin(rows, candidate), True)
         attempt.reason += "; no verified input was found"
-        return FAILSAFE, None, margin, False
+        return None
 
     def _closest(self, rows: Rows, z_0: Array, proposal: Array, attempt: _Attempt) -> Array | None:
-        """The QP's answer, clipped, as regressors; None if there is no number in it."""
+        """The QP's answer, clipped to bounds and slew, as regressors; None if there is no number in it."""
         before = perf_counter_ns()
         solution = solve(self.builder.program(rows, z_0, proposal))
         attempt.solve_ns += perf_counter_ns() - before
         attempt.solver, attempt.iterations = solution.status, attempt.iterations + solution.iterations
         if not solution.found:
             return None
-        F = self.robot.free_steps
-        free = np.clip(self.builder.inputs(solution.x), np.tile(self.low, F), np.tile(self.high, F))
-        return np.concatenate([z_0, free])
+        free = self.builder.inputs(solution.x).reshape(self.robot.free_steps, -1)
+        last = z_0[-self.robot.action_dim :]
+        for k in range(len(free)):
+            last = free[k] = self._limited(free[k], last)
+        return np.concatenate([z_0, free.ravel()])
 
-    def _comfortable(self, rows: Rows, stay: Array) -> Rows:
+    def _comfortable(self, rows: Rows, z_0: Array, proposal: Array) -> Rows:
         """Rows with the comfort margin. Where moving in place would not keep it, the tube may stay as near as the
         free space allows, but no input may translate the robot nearer: two rows instead of one."""
-        tube = self.tube if rows.spread.shape[1] == len(self.tube.m_0) else self.builder.tube
-        inside = rows.support(tube, stay) > rows.bound - self.comfort
+        stay = self._regressors(z_0, np.where(self.standing, proposal, self.nothing))
+        inside = rows.support(self.tube, stay) > rows.bound - self.comfort
         bound = np.where(inside, rows.bound, rows.bound - self.comfort)
         if not inside.any():
             return Rows(rows.gradient, rows.spread, bound)
@@ -265,53 +288,56 @@ class Filter:
         margin = float((rows.bound - rows.support(self.tube, z)).min(initial=self.reach))
         if self.far:
             margin = min(margin, self.reach - self._extent(z))
-        return margin if np.isfinite(margin) else -np.inf
+        return max(margin, -self.reach) if margin == margin else -self.reach
 
-    def _rows(self, request: Request, near: Shapes, z: Array) -> tuple[Rows, Rows]:
-        """Rows of the exact tube and of the QP's, about the rollout of regressors z."""
-        d, robot = self.robot.position_dim, self.robot
-        start = request.state[:d]
-        heading = request.state[robot.heading] if robot.heading is not None else 0.0
-        nominal = start + rotate(self.tube.centers(z), heading)
-        normals, offsets = half_spaces(near, start, nominal, robot.footprint, self.measured)
-        local = rotate(normals, -heading)
-        rows = self.layout.rows(local, offsets)
-        return rows, rows if self.outer_layout is self.layout else self.outer_layout.rows(local, offsets)
+    def _rows(self, scene: _Scene, z: Array) -> Rows:
+        """Half-spaces about the rollout of regressors z, as rows of the tube (and of the QP's: its generators are the
+        same, only their magnitudes are not)."""
+        nominal = scene.start + self.tube.centers(z) @ scene.turn.T
+        normals, offsets = half_spaces(scene.near, scene.start, nominal, self.robot.footprint, self.measured)
+        return self.layout.rows(normals @ scene.turn, offsets)
 
-    def _committed(self, request: Request, near: Shapes, z_0: Array, trusted: bool) -> tuple[Array, Array, float, bool]:
-        """The committed plan, verified anew if it is not trusted; braking if it can't be. (plan, free, margin, ok)"""
-        robot = self.robot
-        free = request.plan[: robot.free_steps].ravel()
-        represented = np.abs(self.schedule @ free - request.plan.ravel()).max() < 1e-9
-        margin = self.reach
-        if len(near):
+    def _committed(self, request: Request, scene: _Scene, z_0: Array, attempt: _Attempt, in_domain: bool) -> _Found:
+        """The committed plan; unless it still counts as verified, verified anew, or braking.
+
+        It counts if the measured state is where it was predicted, and this model set verified it or it is standing
+        still. A tube from outside the recorded domain verifies nothing.
+        """
+        F, N = self.robot.free_steps, self.robot.horizon
+        vouched = request.model == self.version or request.still
+        if not attempt.contained:
+            attempt.reason += "; the measured state was outside the predicted set"
+        left = np.maximum(1.0 - (np.arange(N) + 1.0) / self.robot.brake_steps, 0.0)
+        for plan in (request.plan, left[:, None] * request.input_in_force):
+            free = plan[:F].ravel()
             z = np.concatenate([z_0, free])
-            margin = self._margin(self._rows(request, near, z)[0], z)
-        if trusted or (represented and margin >= 0.0):
-            return request.plan, free, margin, True
-        left = np.maximum(1.0 - (np.arange(robot.horizon) + 1.0) / robot.brake_steps, 0.0)
-        plan = left[:, None] * request.input_in_force
-        return plan, plan[: robot.free_steps].ravel(), margin, False
+            margin = self._margin(self._rows(scene, z), z)
+            verified = attempt.contained and vouched and plan is request.plan
+            if not verified and in_domain and margin >= 0.0:
+                verified = bool(np.abs(self._plan(free) - plan).max() < 1e-9)
+            if verified:
+                break
+        return _Found(FAILSAFE, plan, free, margin, verified)
 
-    def _decision(
-        self, request: Request, kind: str, plan: Array, z: Array, margin: float, attempt: _Attempt
-    ) -> Decision:
-        robot, d = self.robot, self.robot.position_dim
-        heading = float(request.state[robot.heading]) if robot.heading is not None else 0.0
-        centers = request.state[:d] + rotate(self.tube.centers(z), heading)
-        turned = self.tube.directions if robot.heading is None else self._turned(heading)
-        half = np.abs(turned) @ self.tube.magnitudes(z)[: self.tube.generators] + self.measured
-        finished = perf_counter_ns()
-        total, solved = (finished - attempt.started) * 1e-6, attempt.solve_ns * 1e-6
+    def _decision(self, request: Request, scene: _Scene, z_0: Array, found: _Found, attempt: _Attempt) -> Decision:
+        z = np.concatenate([z_0, found.free])
+        centers = scene.start + self.tube.centers(z) @ scene.turn.T
+        sizes = self.tube.magnitudes(z)[: self.tube.generators]
+        half = np.abs(scene.turn @ self.tube.directions) @ sizes + self.measured
+        predicted = self._predict(scene, z)
+        total, solved = (perf_counter_ns() - attempt.started) * 1e-6, attempt.solve_ns * 1e-6
         return Decision(
-            kind=kind,
-            plan=plan,
+            kind=found.kind,
+            plan=found.plan,
             tube_center=centers,
             tube_half_width=half,
-            predicted=self._predict(request, z, heading),
-            margin=min(margin, self.reach),
+            predicted=predicted,
+            margin=min(found.margin, self.reach),
             model=self.version,
-            reason="" if kind == ALLOWED else attempt.reason,
+            reason="" if found.kind == ALLOWED else attempt.reason,
+            verified=found.verified,
+            contained=attempt.contained,
+            compared=request.predicted is not None,
             time_ms=total,
             solve_ms=solved,
             verify_ms=total - solved,
@@ -319,62 +345,76 @@ class Filter:
             iterations=attempt.iterations,
         )
 
-    def _turned(self, heading: float) -> Array:
-        cos, sin = np.cos(heading), np.sin(heading)
-        turn = np.eye(self.robot.position_dim)
-        turn[:2, :2] = (cos, -sin), (sin, cos)
-        return np.asarray(turn @ self.tube.directions)
-
-    def _predict(self, request: Request, z: Array, heading: float) -> Prediction:
+    def _predict(self, scene: _Scene, z: Array) -> Prediction:
         """The set of the next measured state, all coordinates."""
-        robot, first = self.robot, self.model.first
+        robot, first, d = self.robot, self.model.first, self.robot.position_dim
         regressor = self.model.first_regressor(z)
         center = first.C @ regressor
-        position = center[: robot.position_dim]
-        center[: robot.position_dim] = request.state[: robot.position_dim] + rotate(position, heading)
+        center[:d] = scene.start + scene.turn @ center[:d]
         if robot.heading is not None:
-            center[robot.heading] += heading
-        return Prediction(center, first.half_widths(regressor), heading)
+            center[robot.heading] += scene.heading
+        return Prediction(center, first.half_widths(regressor), scene.heading)
 
     # --- small steps -------------------------------------------------------------------------------------------
 
     def _clipped(self, request: Request) -> Array:
-        low = np.maximum(self.low, request.input_in_force - self.slew)
-        high = np.minimum(self.high, request.input_in_force + self.slew)
-        return np.asarray(np.clip(request.action, low, high))
+        return self._limited(request.action, request.input_in_force)
+
+    def _limited(self, wanted: Array, before: Array) -> Array:
+        """The input closest to the wanted one within bounds and slew."""
+        low, high = np.maximum(self.low, before - self.slew), np.minimum(self.high, before + self.slew)
+        return np.asarray(np.minimum(np.maximum(wanted, low), high))
 
     def _regressors(self, z_0: Array, action: Array) -> Array:
         """z of an action followed by braking."""
-        robot = self.robot
-        left = np.maximum(1.0 - np.arange(robot.free_steps) / robot.brake_steps, 0.0)
-        return np.concatenate([z_0, (left[:, None] * action).ravel()])
+        return np.concatenate([z_0, (self.braking * action).ravel()])
 
-    def _near(self, request: Request) -> Shapes:
-        if not len(request.obstacles):
-            return request.obstacles
-        distance = request.obstacles.distance(request.state[: self.robot.position_dim])
-        return request.obstacles.take(distance <= self.reach)
+    def _plan(self, free: Array) -> Array:
+        return (self.schedule @ free).reshape(self.robot.horizon, -1)
+
+    def _scene(self, request: Request) -> _Scene:
+        d, robot = self.robot.position_dim, self.robot
+        start, near = request.state[:d], request.obstacles
+        heading = float(request.state[robot.heading]) if robot.heading is not None else 0.0
+        turn = np.eye(d)
+        cos, sin = math.cos(heading), math.sin(heading)
+        turn[0, 0], turn[0, 1], turn[1, 0], turn[1, 1] = cos, -sin, sin, cos
+        if len(near):
+            near = near.take(~(near.distance(start) > self.reach))  # one whose distance is no number stays
+        return _Scene(start, heading, turn, near)
 
     def _check(self, request: Request) -> None:
         robot = self.robot
-        sizes = {
-            "state": (robot.state_dim,),
-            "action": (robot.action_dim,),
-            "input_in_force": (robot.action_dim,),
-            "plan": (robot.horizon, robot.action_dim),
-        }
-        for name, size in sizes.items():
+        n, m = robot.state_dim, robot.action_dim
+        self._finite("state", request.state, (n,))
+        self._finite("action", request.action, (m,))
+        self._finite("input_in_force", request.input_in_force, (m,))
+        self._finite("plan", request.plan, (robot.horizon, m))
+        if np.abs(request.state).max() > FARTHEST:
+            raise BadRequest("state", f"a state beyond ±{FARTHEST:g} is not plausible")
+        for name in ("plan", "input_in_force"):
             value = getattr(request, name)
-            if value.shape != size:
-                raise BadRequest(name, f"{name} has shape {value.shape}, a {robot.name} robot's has {size}")
-            if not np.isfinite(value).all():
-                raise BadRequest(name, f"{name} holds NaN or infinity")
-        if (request.plan < self.low - 1e-9).any() or (request.plan > self.high + 1e-9).any():
-            raise BadRequest("plan", "the committed plan has an input out of the robot's bounds")
-        if request.predicted is not None and not (
-            request.predicted.center.shape == request.predicted.half_width.shape == (robot.state_dim,)
-        ):
-            raise BadRequest("predicted_center", f"a prediction has {robot.state_dim} coordinates")
+            if (value < self.low - 1e-9).any() or (value > self.high + 1e-9).any():
+                raise BadRequest(name, f"{name}: an input is out of the robot's bounds")
+        if request.plan[-1].any():
+            raise BadRequest("plan", "the committed plan does not end in a stop")
+        if request.obstacles.center.shape[1] != robot.position_dim:
+            raise BadRequest("obstacles", f"a {robot.name} robot's obstacles have {robot.position_dim} coordinates")
+        if request.observation.size:
+            self._finite("observation", request.observation, (robot.observation_dim,))
+        if request.predicted is not None:
+            self._finite("predicted_center", request.predicted.center, (n,))
+            self._finite("predicted_half_width", request.predicted.half_width, (n,))
+            if (request.predicted.half_width < 0.0).any():
+                raise BadRequest("predicted_half_width", "a predicted set has a negative half-width")
+            if not math.isfinite(request.predicted.heading):
+                raise BadRequest("predicted_heading", "predicted_heading is NaN or infinite")
+
+    def _finite(self, name: str, value: NDArray[np.floating[Any]], shape: tuple[int, ...]) -> None:
+        if value.shape != shape:
+            raise BadRequest(name, f"{name} has shape {value.shape}, a {self.robot.name} robot's has {shape}")
+        if not np.isfinite(value).all():
+            raise BadRequest(name, f"{name} holds NaN or infinity")
 
 
 __all__ = ["ADJUSTED", "ALLOWED", "FAILSAFE", "BadRequest", "Decision", "Filter", "Prediction", "Request", "StaleModel"]

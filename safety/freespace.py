@@ -14,7 +14,7 @@ from messaging.shapes import Shapes
 
 Array = NDArray[np.float64]
 
-TOUCHING = 1e-9  # m; nearer than this a direction can't be told
+TOUCHING = 1e-6  # m; nearer than this a direction can't be told
 
 
 def half_spaces(near: Shapes, start: Array, nominal: Array, keep_off: float, measured: Array) -> tuple[Array, Array]:
@@ -31,15 +31,16 @@ def half_spaces(near: Shapes, start: Array, nominal: Array, keep_off: float, mea
         normals a (n, N, d) and offsets b (n, N), relative to `start`: `a·(p - start) <= b`. An obstacle that the
         start touches gets `b = -inf`: nothing there can be verified.
     """
-    here = near.towards(start[None])  # (n, 1, d)
-    there = near.towards(nominal)  # (n, N, d)
-    closest = there + nominal
+    towards = near.towards(np.concatenate([start[None], nominal]))
+    here, there = towards[:, :1], towards[:, 1:]  # (n, 1, d), (n, N, d)
+    closest = there + (nominal - start)  # relative to the start, as `here` is
     # A nominal position inside an obstacle has no direction, and one beyond it a plane that the start is beyond of.
-    from_start = np.einsum("nkd,nkd->nk", there, closest - start) <= 0.0
-    vector = np.where(from_start[..., None], here, there)
-    point = np.where(from_start[..., None], here + start, closest)
-    length = np.sqrt(np.einsum("nkd,nkd->nk", vector, vector))
+    gap = np.sqrt(np.einsum("nkd,nkd->nk", there, there))
+    ahead = (gap > TOUCHING) & (np.einsum("nkd,nkd->nk", there, closest) > 0.0)
+    vector = np.where(ahead[..., None], there, here)
+    point = np.where(ahead[..., None], closest, here)
+    length = np.where(ahead, gap, np.sqrt(np.einsum("nkd,nkd->nk", here, here)))
     normal = vector / np.maximum(length, TOUCHING)[..., None]
-    offset = np.einsum("nkd,nkd->nk", normal, point - start) - keep_off - np.abs(normal) @ measured
-    offset[length <= TOUCHING] = -np.inf
+    offset = np.einsum("nkd,nkd->nk", normal, point) - keep_off - np.abs(normal) @ measured
+    offset[~(length > TOUCHING)] = -np.inf
     return normal, offset

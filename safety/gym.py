@@ -40,7 +40,7 @@ class SafetyWrapper(gymnasium.Wrapper[Any, Any, Any, Any]):
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         decision = self.decide(np.asarray(action, dtype=float))
-        executed = self.commitment.accept(decision.plan, decision.model, decision.predicted)
+        executed = self.commitment.accept(decision.plan, decision.model, decision.predicted, decision.verified)
         observation, reward, terminated, truncated, self._info = self.env.step(executed.astype(np.float32))
         cost = correction_penalty(self.filter.robot, action, executed, self.penalty)
         self._info |= {"safety": decision, "proposed": action, "penalty": cost}

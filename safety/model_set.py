@@ -55,6 +55,8 @@ class Recipe:
             raise ValueError(f"no certificate is called {self.certificate!r}; there are: {', '.join(KINDS)}")
         if self.mode not in MODES:
             raise ValueError(f"no mode is called {self.mode!r}; there are: {', '.join(MODES)}")
+        if not 1.0 <= self.inflation < np.inf:
+            raise ValueError(f"an envelope scaled by {self.inflation} bounds nothing")
 
 
 @dataclass(frozen=True)
@@ -93,6 +95,25 @@ class ModelSet:
         """One that contains it and has few atoms: for the QP."""
         return self._stack([step.outer(whitening_of(step, self.basis)) for step in self.steps])
 
+    def _check_sizes(self) -> None:
+        """Raises BadModel unless every array has the size that robot and mode give it."""
+        robot = self.robot
+        nz = robot.regressor_dim + robot.free_steps * robot.action_dim
+        one = nz if self.recipe.mode == DIRECT else robot.state_dim - robot.position_dim + 2 * robot.action_dim
+        expected = [(step, robot.state_dim, one) for step in self.steps]
+        expected += [(self.bulges, robot.horizon, nz), (self.latch, 1, nz)]
+        for c, n, width in expected:
+            g, q = c.w.size, len(c.W)
+            sizes = [(n, width), (q, width), (g, q), (g, width), (g,), (n, g)]
+            if [getattr(c, name).shape for name in TENSORS] != sizes:
+                raise BadModel(
+                    f"the model set's arrays are not those of a {robot.name} robot in mode {self.recipe.mode}"
+                )
+        if self.domain.shape != (2, robot.regressor_dim) or (self.domain[0] > self.domain[1]).any():
+            raise BadModel("the model set's domain is none")
+        if self.basis.shape != (nz, nz) or np.linalg.matrix_rank(self.basis) < nz:
+            raise BadModel("the model set's basis is none")
+
     def _stack(self, steps: list[Certificate] | tuple[Certificate, ...]) -> Tube:
         if self.recipe.mode == DIRECT:
             return stack_direct(steps, self.robot.position_dim, self.bulges, self.latch)
@@ -100,8 +121,9 @@ class ModelSet:
 
     @property
     def version(self) -> str:
-        """Hash of the content, so that one name can't mean two models."""
-        return hashlib.sha256(self._payload()).hexdigest()[:12]
+        """Hash of the content and of what it means, so that one name can't mean two models."""
+        meaning = f"{self.robot.layout()} {self.recipe.certificate} {self.recipe.mode} "
+        return hashlib.sha256(meaning.encode() + self._payload()).hexdigest()[:12]
 
     def _payload(self) -> bytes:
         named = {"bulges": self.bulges, "latch": self.latch} | {f"step{k}": c for k, c in enumerate(self.steps)}
@@ -137,15 +159,16 @@ class ModelSet:
             more = tensors["domain"], tensors["basis"], json.loads(about["about"])
         except (SafetensorError, KeyError, TypeError, ValueError, UnknownRobot) as error:
             raise BadModel(f"no model set: {error!r}") from error
-        if about["layout"] != robot.layout():
+        if about.get("layout") != robot.layout():
             raise BadModel(f"the model set is for another layout of {robot.name}: make it again from data")
-        if not all(np.isfinite(t).all() for t in tensors.values()):
-            raise BadModel("the model set holds NaN or infinity")
+        if not all(t.dtype == np.float64 and np.isfinite(t).all() for t in tensors.values()):
+            raise BadModel("the model set holds NaN, infinity or numbers of another type")
         if any((c.M < 0).any() or (c.kappa < 0).any() or (c.w < 0).any() for c in certificates.values()):
             raise BadModel("the model set has a negative width")
         steps = tuple(certificates[f"step{k}"] for k in range(robot.horizon))
         model = ModelSet(robot, recipe, steps, certificates["bulges"], certificates["latch"], *more)
-        if model.version != about["version"]:
+        model._check_sizes()
+        if model.version != about.get("version"):
             raise BadModel("the model set's content is not what its version says")
         return model
 
@@ -188,7 +211,8 @@ def make(data: Dataset, recipe: Recipe) -> ModelSet:
     horizon = robot.horizon
     for k in range(1, horizon + 1):
         seen, rest = windows(fit, k), windows(bound, k)
-        quality(_used(robot, seen.z, k), f"windows of {k} periods")
+        for part in (seen, rest):
+            quality(_used(robot, part.z, k), f"windows of {k} periods")
         bulges.append(envelope(np.abs(rest.z), rest.bulge, recipe.inflation))
         if recipe.mode == DIRECT:
             steps.append(_certificate(seen.z, seen.y, rest.z, rest.y, recipe, _columns(robot, k)))
@@ -196,6 +220,8 @@ def make(data: Dataset, recipe: Recipe) -> ModelSet:
             steps.append(_recursive_step(robot, windows(fit, 1), windows(bound, 1), k - 1, recipe))
     whole = windows(data, horizon)
     still = ~np.isnan(whole.latch)
+    if not still.any():
+        raise BadData("no plan's stop was recorded: let the robot stand after braking")
     latch = envelope(np.abs(whole.z[still]), whole.latch[still], recipe.inflation)
     nz = whole.z.shape[1]
     known = windows(data, 1).z[:, : robot.regressor_dim]
@@ -247,8 +273,8 @@ def _certificate(
 def _recursive_step(robot: Robot, fit: Windows, bound: Windows, k: int, recipe: Recipe) -> Certificate:
     """Period k of the recursion: z_k = [heading, ...; u_prev; u] from one-period windows turned by a random offset.
 
-    After k periods the robot may have turned by k ω_max dt against the frame of now; without offsets the heading
-    would be zero in every window and the data would say nothing about it.
+    After k periods the robot may have turned by k ω_max dt against the frame of now, as measured a bit more; without
+    offsets the heading would be zero in every window and the data would say nothing about it.
     """
     rng = np.random.default_rng((recipe.seed, k))
     turned = [_turned(robot, w, k, rng) for w in (fit, bound)]
@@ -263,7 +289,7 @@ def _turned(robot: Robot, w: Windows, k: int, rng: np.random.Generator) -> tuple
     between = robot.state_dim - robot.position_dim - reg
     lead = np.zeros((len(y), between))
     if robot.heading is not None:
-        fastest = robot.high()[-1] * robot.period * k
+        fastest = robot.high()[-1] * robot.period * k + 2.0 * robot.measurement_bound[robot.heading]
         offset = rng.uniform(-fastest, fastest, len(y)) if k else np.zeros(len(y))
         y[:, : robot.position_dim] = rotate(y[:, : robot.position_dim], offset)
         y[:, robot.heading] += offset

@@ -10,10 +10,11 @@ from threading import Lock
 from time import perf_counter_ns
 
 from messaging import brakeline_pb2 as pb
-from messaging.bus import BusSettings, Sample
+from messaging.bus import BusError, BusSettings, Sample
 from messaging.process import Process
 from messaging.robots import UnknownRobot, robot_named
 from messaging.topics import DECIDE, MODEL
+from safety.commitment import UNVERIFIED
 from safety.filter import BadRequest, Filter, StaleModel
 from safety.model_set import BadModel, ModelSet
 from safety.wire import batch_of, error_of, message_of, request_of
@@ -51,7 +52,8 @@ class Models:
         if ready is None:
             have = ", ".join(self.filters) or "none"
             raise NoModel("robot", f"no model set of {robot.name} is loaded (loaded: {have})")
-        if request.model and request.model not in self.known and not self._archived(robot.name, request.model):
+        vouched = request.model in ("", UNVERIFIED) or request.model in self.known
+        if not vouched and not self._archived(robot.name, request.model):
             raise StaleModel("model", f"the plan was verified by model {request.model}, which was never in use here")
         return ready
 
@@ -140,8 +142,10 @@ def main(settings: SafetySettings) -> None:
         def replace(sample: Sample) -> None:
             try:
                 models.install(ModelSet.decode(sample.message().file))
-            except BadModel as error:
+            except (BadModel, BusError) as error:
                 log.error("a model set was refused: %s", error)
+            except OSError as error:
+                log.error("a model set is in use but could not be archived: %s", error)
 
         def refresh() -> None:
             process.figures.update(counts.figures())

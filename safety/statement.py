@@ -25,7 +25,8 @@ CHUNK = 256  # windows at once: an exact matrix zonotope has thousands of atoms
 
 @dataclass(frozen=True)
 class Statement:
-    """Of one model set. The unit is a plan window that overlaps no other; a violation is any part of it outside."""
+    """Of one model set. The unit is a plan window that overlaps no other and whose stop was recorded for a period at
+    least; a violation is any part of it outside."""
 
     certificate: str
     mode: str
@@ -60,7 +61,8 @@ def state(model: ModelSet, fitted: Dataset, held_out: Dataset) -> Statement:
     robot, ready = model.robot, Filter(model)
     used = windows(fitted, robot.horizon)
     figures: Quality = quality(used.z, "plan windows")
-    plans = apart(windows(held_out, robot.horizon), robot.horizon)
+    whole = windows(held_out, robot.horizon)
+    plans = apart(whole.take(~np.isnan(whole.latch)), robot.horizon)
     ends = {tuple(start): row for row, start in enumerate(plans.start)}
     outside = np.zeros(len(plans), dtype=bool)
     first = np.zeros(len(plans), dtype=bool)
@@ -114,7 +116,6 @@ def _outside(ready: Filter, w: Windows, k: int) -> NDArray[np.bool_]:
         outside = (away > sizes[:, : tube.generators] @ spread.T).any(1)
         outside |= w.bulge[i : i + CHUNK] > sizes[:, tube.generators + k - 1]
         if k == tube.horizon:
-            latch = np.nan_to_num(w.latch[i : i + CHUNK], nan=0.0)
-            outside |= latch > sizes[:, -1]
+            outside |= w.latch[i : i + CHUNK] > sizes[:, -1]
         bad[i : i + CHUNK] = outside
     return bad

@@ -184,13 +184,14 @@ def _merged(W: Array, M: Array) -> tuple[Array, Array]:
     """The same sums with parallel rows of W as one and rows that bound nothing left out."""
     length = np.linalg.norm(W, axis=1)
     length[M.max(0, initial=0.0) <= 0.0] = 0.0
-    unit = W / np.maximum(length, 1e-300)[:, None]
-    sign = np.sign(unit[np.arange(len(W)), np.abs(unit).argmax(1)]) if W.size else np.ones(len(W))
-    keep = length > 1e-14
-    rows, inverse = np.unique(np.round((unit * sign[:, None])[keep], 12), axis=0, return_inverse=True)
-    merged = np.zeros((len(M), len(rows)))
-    np.add.at(merged.T, inverse.ravel(), (M * length)[:, keep].T)
-    return rows, merged
+    keep = length > 0.0
+    W, M, length = W[keep], M[:, keep], length[keep]
+    unit = W / length[:, None]
+    unit *= np.sign(unit[np.arange(len(W)), np.abs(unit).argmax(1)])[:, None]
+    _, first, inverse = np.unique(np.round(unit, 12), axis=0, return_index=True, return_inverse=True)
+    merged = np.zeros((len(M), len(first)))
+    np.add.at(merged.T, inverse.ravel(), (M * length).T)
+    return unit[first], merged
 
 
 def _block_diagonal(blocks: Sequence[Array]) -> Array:

@@ -65,13 +65,12 @@ def shapes_of(messages: Sequence[pb.Obstacle], dim: int) -> Shapes:
     obstacles = []
     for i, o in enumerate(messages):
         try:
+            if len(o.position) != dim:
+                raise BadShape("position", f"{len(o.position)} coordinates; this robot's obstacles have {dim}")
             obstacles.append(Obstacle(o.kind, tuple(o.position), tuple(o.size), o.yaw))
         except BadShape as error:
             raise BadRequest(f"obstacles[{i}].{error.field}", str(error)) from error
-    try:
-        return Shapes.of(obstacles, dim)
-    except BadShape as error:
-        raise BadRequest("obstacles.position", str(error)) from error
+    return Shapes.of(obstacles, dim)
 
 
 def message_of(decision: Decision, queue_ms: float) -> pb.Reply:
