@@ -1,0 +1,135 @@
+"""Closest points and distances, against points of the shapes that are drawn independently."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from messaging.shapes import BOX, CYLINDER, SPHERE, WALL, BadShape, Obstacle, Shapes, rotate
+
+COORDINATE = st.floats(-4, 4)
+SIZE = st.floats(0.05, 2)
+ANGLE = st.floats(-7, 7)
+
+
+@st.composite
+def obstacles(draw, dim=None):
+    dim = dim or draw(st.sampled_from([2, 3]))
+    kind = draw(st.sampled_from([BOX, CYLINDER, SPHERE, WALL]))
+    count = {BOX: dim, CYLINDER: dim - 1, SPHERE: 1, WALL: 0}[kind]
+    position = tuple(draw(COORDINATE) for _ in range(dim))
+    return Obstacle(kind, position, tuple(draw(SIZE) for _ in range(count)), draw(ANGLE))
+
+
+def sample(obstacle, rng, count=4000):
+    """Points of the solid, from what the words mean."""
+    dim, kind = len(obstacle.position), obstacle.kind
+    draw = rng.uniform(-1, 1, (count, dim))
+    if kind == BOX:
+        local = 0.5 * np.array(obstacle.size) * draw
+    elif kind == WALL:
+        local = 6.0 * draw
+        local[:, 0] = -np.abs(local[:, 0])
+    else:
+        round_dim = 2 if kind == CYLINDER else dim
+        ball = draw[:, :round_dim]
+        ball /= np.maximum(np.linalg.norm(ball, axis=1, keepdims=True), 1.0)  # many on the surface
+        local = np.zeros((count, dim))
+        local[:, :round_dim] = obstacle.size[0] * ball
+        if kind == CYLINDER and dim == 3:
+            local[:, 2] = 0.5 * obstacle.size[1] * draw[:, 2]
+    return np.array(obstacle.position) + rotate(local, obstacle.yaw)
+
+
+def holds(obstacle, point, slack=1e-9):
+    """Is the point in the solid? By the words again."""
+    local = rotate(point - np.array(obstacle.position), -obstacle.yaw)
+    if obstacle.kind == BOX:
+        return (np.abs(local) <= 0.5 * np.array(obstacle.size) + slack).all()
+    if obstacle.kind == WALL:
+        return local[0] <= slack
+    if obstacle.kind == SPHERE:
+        return np.linalg.norm(local) <= obstacle.size[0] + slack
+    flat = len(local) == 2 or abs(local[2]) <= 0.5 * obstacle.size[1] + slack
+    return flat and np.hypot(local[0], local[1]) <= obstacle.size[0] + slack
+
+
+@settings(max_examples=150)
+@given(obstacles(), st.integers(0, 10_000))
+def test_the_closest_point_is_in_the_shape_and_no_point_of_it_is_closer(obstacle, seed):
+    rng = np.random.default_rng(seed)
+    dim = len(obstacle.position)
+    shapes = Shapes.of([obstacle], dim)
+    points = rng.uniform(-5, 5, (5, dim))
+    towards = shapes.towards(points)
+    assert towards.shape == (1, 5, dim)
+    drawn = sample(obstacle, rng)
+    for point, vector, distance in zip(points, towards[0], shapes.distance(points)[0], strict=True):
+        assert holds(obstacle, point + vector, 1e-8)
+        assert distance == pytest.approx(np.linalg.norm(vector), abs=1e-9)
+        assert np.linalg.norm(drawn - point, axis=1).min() >= distance - 1e-8
+        if holds(obstacle, point, 0.0):
+            assert distance < 1e-8
+        # the closest point of a convex set: all of it is behind the plane there
+        assert ((drawn - point - vector) @ vector >= -1e-7).all()
+
+
+def test_distances_by_hand():
+    shapes = Shapes.of(
+        [
+            Obstacle(BOX, (0, 0), (2, 2), np.pi / 4),
+            Obstacle(CYLINDER, (3, 0), (1,)),
+            Obstacle(SPHERE, (0, 5), (1,)),
+            Obstacle(WALL, (0, -2), (), np.pi / 2),
+        ],
+        2,
+    )
+    assert shapes.distance(np.array([0.0, 2.0])) == pytest.approx([2 - np.sqrt(2), np.sqrt(13) - 1, 2, 4])
+    assert shapes.distance(np.array([0.0, -3.0]))[3] == 0.0
+    assert shapes.distance(np.zeros((2, 3, 2))).shape == (4, 2, 3)
+    assert len(shapes.take(np.array([True, False, True, False]))) == 2
+    space = Shapes.of([Obstacle(CYLINDER, (0, 0, 0), (1, 2)), Obstacle(SPHERE, (0, 0, 0), (1,))], 3)
+    assert space.distance(np.array([2.0, 0.0, 2.0])) == pytest.approx([np.sqrt(2), np.sqrt(8) - 1])
+
+
+def test_a_wall_is_wide_and_deep():
+    wall = Shapes.of([Obstacle(WALL, (0.0, 0.0))], 2)
+    for point, distance in (((0.5, 5000.0), 0.5), ((-5000.0, 0.0), 0.0), ((0.1, -9000.0), 0.1)):
+        assert wall.distance(np.array(point))[0] == pytest.approx(distance, abs=1e-9)
+
+
+def test_no_obstacles():
+    none = Shapes.of([], 2)
+    assert len(none) == 0
+    assert none.distance(np.zeros((4, 2))).shape == (0, 4)
+
+
+NAN, INF = float("nan"), float("inf")
+
+
+@pytest.mark.parametrize(
+    ("field", "arguments"),
+    [
+        ("kind", ("cone", (0, 0), (1,))),
+        ("position", (SPHERE, (0,), (1,))),
+        ("position", (SPHERE, (0, 0, 0, 0), (1,))),
+        ("position", (SPHERE, (0, NAN), (1,))),
+        ("yaw", (WALL, (0, 0), (), INF)),
+        ("size", (SPHERE, (0, 0), (-1,))),
+        ("size", (SPHERE, (0, 0), (0,))),
+        ("size", (SPHERE, (0, 0), (NAN,))),
+        ("size", (BOX, (0, 0), (1,))),
+        ("size", (CYLINDER, (0, 0, 0), (1,))),
+        ("size", (WALL, (0, 0), (1,))),
+    ],
+)
+def test_what_is_no_obstacle_is_refused_by_its_field(field, arguments):
+    with pytest.raises(BadShape) as caught:
+        Obstacle(*arguments)
+    assert caught.value.field == field
+
+
+def test_dimensions_do_not_mix():
+    with pytest.raises(BadShape) as caught:
+        Shapes.of([Obstacle(SPHERE, (0, 0, 0), (1,))], 2)
+    assert caught.value.field == "position"

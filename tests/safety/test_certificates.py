@@ -1,0 +1,323 @@
+"""The three certificates: published sets, known noise, and what ties them to each other."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.linalg import expm
+from scipy.optimize import linprog
+
+from safety.certificates import (
+    Certificate,
+    CertificateError,
+    envelope,
+    least_squares,
+    matrix_zonotope,
+    measured_noise,
+    residual,
+    set_membership,
+    whitening,
+)
+from safety.tube import Recursion, stack_recursive
+from tests.safety.linear import PUBLISHED, count_outside, double_integrator, lti5
+
+HORIZON = 5
+SEQUENCES = 10_000
+PLANS = 20
+
+
+def certificates(system, seed=0, **size):
+    """The matrix zonotope's and the set membership's certificate of a linear system, the noise known as a box."""
+    z, y = system.data(seed, **size)
+    half = np.abs(system.G).sum(1)
+    if system.v_half.any():
+        half = measured_noise(z, y, half, system.v_half)
+    n, nz = y.shape[1], z.shape[1]
+    sizes, kappa = np.tile(half[:, None], len(z)), np.zeros((n, nz))
+    return {
+        "matrix-zonotope": matrix_zonotope(z, y, np.eye(n), sizes, kappa, half),
+        "set-membership": set_membership(z, y, sizes, kappa, half),
+    }
+
+
+# --- published sets ----------------------------------------------------------------------------------------------
+
+
+def test_published_model_set_of_the_double_integrator():
+    truth = PUBLISHED["tzpc_double_integrator"]
+    z = np.vstack([truth["X0"], truth["U"]]).T
+    y, generators = np.array(truth["X1"]).T, np.array(truth["W_gen"])
+    made = matrix_zonotope(z, y, generators, np.ones((2, len(z))), np.zeros((2, 3)), np.ones(2))
+    low, high = made.matrix_hull()
+    assert np.allclose(low, truth["M_sigma_lo"], atol=1e-8)
+    assert np.allclose(high, truth["M_sigma_hi"], atol=1e-8)
+
+
+def test_published_reachable_set_of_the_five_dimensional_system():
+    truth = PUBLISHED["cora_linear_dt_5d"]
+    n, k = 5, truth["k"]
+    A, half = np.array(truth["A"]), np.array(truth["e_half"])
+    step = Certificate(A, np.zeros((0, n)), np.zeros((n, 0)), np.zeros((n, n)), half, np.eye(n))
+    how = Recursion(tuple(range(n)), 0, 0, np.zeros((0, 0)), np.eye(n))
+    tube = stack_recursive([step] * k, how, n, initial=truth["x0_half"] * np.eye(n))
+    start = np.array(truth["x0_center"], float)
+    center, width = tube.centers(start)[-1], tube.half_widths(start)[-1]
+    assert np.allclose(center - width, truth["lo"], atol=1e-8)
+    assert np.allclose(center + width, truth["hi"], atol=1e-8)
+
+
+def test_published_discretisation():
+    truth = PUBLISHED["lti5_zoh"]
+    Ac, Bc = np.array(truth["Ac"], float), np.array(truth["Bc"], float)
+    block = np.zeros((6, 6))
+    block[:5, :5], block[:5, 5] = Ac, Bc
+    exact = expm(block * truth["dt"])
+    assert np.allclose(exact[:5, :5], truth["Ad"], atol=1e-8)
+    assert np.allclose(exact[:5, 5], truth["Bd"], atol=1e-8)
+    still = np.linalg.solve(np.eye(5) - np.array(truth["Ad"]), 8.0 * np.array(truth["Bd"]))
+    assert np.allclose(still, truth["x_eq"], atol=1e-8)
+
+
+# --- known noise: nothing outside ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["matrix-zonotope", "set-membership"])
+@pytest.mark.parametrize(
+    "system", [lti5(), lti5(v_half=0.0005), double_integrator()], ids=["lti5", "lti5-measured", "double-integrator"]
+)
+def test_no_noise_sequence_leaves_the_tube(system, name):
+    tube = system.tube(certificates(system)[name], HORIZON)
+    rng = np.random.default_rng(7)
+    n, m = system.B.shape
+    directions = np.vstack([np.eye(n), rng.normal(size=(30, n))])
+    outside = 0
+    for i in range(2 * PLANS):
+        y_0 = rng.normal(size=n)
+        plan = system.center + rng.uniform(-system.swing, system.swing, (HORIZON, m))
+        states = system.rollouts(rng, y_0, plan, SEQUENCES // PLANS, worst=bool(i % 2))
+        z = np.concatenate([y_0, np.zeros(m), plan.ravel()])
+        outside += count_outside(tube, z, states, directions)
+    assert outside == 0
+
+
+def test_a_tube_of_half_the_noise_is_left():
+    """The check above can fail."""
+    system = lti5()
+    made = certificates(system)["set-membership"]
+    narrow = Certificate(made.C, made.W, 0.0 * made.M, made.kappa, 0.5 * made.w, made.generators)
+    rng = np.random.default_rng(7)
+    plan = np.full((HORIZON, 1), 8.0)
+    states = system.rollouts(rng, np.zeros(5), plan, 1000, worst=True)
+    tube = system.tube(narrow, HORIZON)
+    assert count_outside(tube, np.concatenate([np.zeros(6), plan.ravel()]), states, np.eye(5)) > 100
+
+
+def test_the_true_matrices_are_in_both_sets():
+    for system in (lti5(), lti5(v_half=0.0005), double_integrator()):
+        truth = np.hstack([system.A, system.B])
+        for made in certificates(system).values():
+            rng = np.random.default_rng(3)
+            z = rng.normal(size=(200, truth.shape[1]))
+            off = np.abs(z @ (truth - made.C).T)
+            assert (off <= np.abs(z @ made.W.T) @ made.M.T + 1e-9).all()
+
+
+def test_too_much_measurement_noise_is_refused():
+    system = lti5(v_half=0.5)
+    z, y = system.data(0, trajectories=5)
+    with pytest.raises(CertificateError, match="β"):
+        measured_noise(z, y, np.full(5, 0.005), np.full(5, 0.5))
+
+
+def test_the_bound_on_a_v_holds_for_the_true_matrix_though_made_without_it():
+    system = lti5(v_half=0.0005)
+    z, y = system.data(0)
+    half = measured_noise(z, y, np.full(5, 0.005), system.v_half)
+    with_truth = 0.005 + system.v_half + np.abs(system.A) @ system.v_half
+    assert (half >= with_truth - 1e-12).all()
+    with_estimate = 0.005 + system.v_half + np.abs(least_squares(z, y)[:, :5]) @ system.v_half
+    assert (half > with_estimate).all()  # the estimate alone is no bound
+
+
+# --- how they hang together ---------------------------------------------------------------------------------------
+
+
+def test_the_factored_form_is_the_matrix_zonotope_multiplied_out():
+    """M_Σ z from the T·γ generator matrices of lemma 1 has the same support in every direction."""
+    truth = PUBLISHED["tzpc_double_integrator"]
+    z = np.vstack([truth["X0"], truth["U"]]).T
+    y, G = np.array(truth["X1"]).T, np.array(truth["W_gen"])
+    rng = np.random.default_rng(0)
+    sizes = rng.uniform(0.5, 2.0, (2, len(z)))
+    made = matrix_zonotope(z, y, G, sizes, np.zeros((2, 3)), np.zeros(2))
+    pseudo = np.linalg.pinv(z.T)
+    matrices = []
+    for j in range(2):
+        for t in range(len(z)):
+            noise = np.zeros((2, len(z)))
+            noise[:, t] = sizes[j, t] * G[:, j]
+            matrices.append(noise @ pseudo)
+    assert len(matrices) == 2 * len(z)
+    for _ in range(20):
+        at, direction = rng.normal(size=3), rng.normal(size=2)
+        explicit = sum(abs(direction @ matrix @ at) for matrix in matrices)
+        factored = np.abs(direction @ made.generators) @ made.magnitudes(at)
+        assert factored == pytest.approx(explicit, rel=1e-10)
+
+
+@pytest.mark.parametrize("system", [lti5(), double_integrator()], ids=["lti5", "double-integrator"])
+def test_set_membership_is_never_wider_along_whitened_axes(system):
+    z, _ = system.data(0)
+    made = certificates(system)
+    for i in range(z.shape[1]):
+        at = np.linalg.solve(whitening(z), np.eye(z.shape[1])[i])
+        inner, outer = made["set-membership"].magnitudes(at), made["matrix-zonotope"].magnitudes(at)
+        assert (inner <= outer + 1e-6).all()
+
+
+def test_set_membership_shrinks_with_data_and_the_matrix_zonotope_does_not():
+    system = lti5()
+    few, many = certificates(system, trajectories=10), certificates(system, trajectories=160)
+    at = np.array([1.0, 1.0, 1.0, 1.0, 1.0, 8.0])
+    noise = system.G.diagonal()
+
+    def widths(made):
+        return (made.magnitudes(at) - noise).sum()
+
+    assert widths(many["set-membership"]) < 0.5 * widths(few["set-membership"])
+    assert widths(many["matrix-zonotope"]) > 0.5 * widths(few["matrix-zonotope"])
+
+
+def test_too_small_a_noise_bound_is_refused():
+    z, y = lti5().data(0)
+    sizes = np.full((5, len(z)), 0.001)
+    with pytest.raises(CertificateError, match="too small"):
+        set_membership(z, y, sizes, np.zeros((5, 6)), np.full(5, 0.001))
+
+
+def test_samples_that_leave_a_direction_open_are_refused():
+    z = np.zeros((300, 2))
+    z[:, 0] = np.linspace(-1, 1, 300)
+    with pytest.raises(CertificateError, match="span"):
+        set_membership(z, z[:, :1], np.ones((1, 300)), np.zeros((1, 2)), np.ones(1))
+
+
+@settings(max_examples=60)
+@given(st.integers(0, 10_000), st.integers(4, 40))
+def test_the_outer_form_is_never_narrower(seed, rows):
+    rng = np.random.default_rng(seed)
+    nz, g = 4, 3
+    made = Certificate(
+        rng.normal(size=(2, nz)),
+        rng.normal(size=(rows, nz)),
+        rng.uniform(size=(g, rows)),
+        rng.uniform(size=(g, nz)),
+        rng.uniform(size=g),
+        rng.normal(size=(2, g)),
+    )
+    basis = rng.normal(size=(nz, nz)) + 3.0 * np.eye(nz)
+    outer = made.outer(basis)
+    assert len(outer.W) <= max(nz, 4)
+    z = rng.normal(size=(50, nz))
+    assert (outer.magnitudes(z) >= made.magnitudes(z) - 1e-9).all()
+
+
+def test_the_envelope_bounds_every_sample_and_is_the_smallest():
+    rng = np.random.default_rng(1)
+    features = np.abs(rng.normal(size=(3000, 3)))
+    values = features @ [0.1, 0.0, 0.3] + 0.02 * rng.random(3000)
+    kappa, w = envelope(features, values, 1.0)
+    assert (features @ kappa + w >= values).all()
+    rows = np.column_stack([features, np.ones(3000)])
+    whole = linprog(np.append(features.mean(0), 1.0), A_ub=-rows, b_ub=-values, bounds=(0, None))
+    assert features.mean(0) @ kappa + w == pytest.approx(whole.fun, rel=1e-5)
+    wider, more = envelope(features, values, 1.2)
+    assert np.allclose(wider, 1.2 * kappa)
+    assert more == pytest.approx(1.2 * w)
+
+
+@given(st.integers(0, 1000), st.floats(1e-6, 1e3))
+@settings(max_examples=30)
+def test_the_envelope_bounds_whatever_the_scale(seed, scale):
+    rng = np.random.default_rng(seed)
+    features = np.abs(rng.normal(size=(200, 2)))
+    values = scale * rng.random(200) ** 4
+    kappa, w = envelope(features, values, 1.0)
+    assert (features @ kappa + w >= values).all()
+
+
+def test_envelopes_of_nothing():
+    kappa, w = envelope(np.ones((50, 2)), np.zeros(50), 1.0)
+    assert kappa @ np.ones(2) + w < 1e-6
+    with pytest.raises(CertificateError, match="no sample"):
+        envelope(np.ones((0, 2)), np.zeros(0), 1.0)
+
+
+def test_the_residual_certificate_bounds_its_samples():
+    rng = np.random.default_rng(2)
+    z = rng.normal(size=(500, 3))
+    y = z @ rng.normal(size=(3, 2)) + 0.01 * np.sin(5.0 * z[:, :2]) * np.abs(z[:, :1])
+    made = residual(z, y, least_squares(z, y))
+    assert (np.abs(y - z @ made.C.T) <= made.half_widths(z)).all()
+
+
+# --- traps in public code -----------------------------------------------------------------------------------------
+
+
+def explicit_noise(y_dim, T, half, index):
+    """Generator matrices of M_w as public code builds them, `index(j, i)` the place of axis j's at sample i."""
+    matrices = np.zeros((y_dim * T, y_dim, T))
+    for j in range(y_dim):
+        for i in range(T):
+            matrices[index(j, i)] = 0.0
+            matrices[index(j, i)][j, i] = half[j]
+    return matrices
+
+
+def test_trap_generators_indexed_j_plus_i_vanish():
+    system = lti5()
+    z, y = system.data(0, trajectories=10)
+    T, half = len(z), np.full(5, 0.005)
+    pseudo, at = np.linalg.pinv(z.T), np.array([1.0, -1.0, 2.0, 0.5, 1.0, 8.0])
+    right = explicit_noise(5, T, half, lambda j, i: j * T + i)
+    wrong = explicit_noise(5, T, half, lambda j, i: j + i)
+    made = matrix_zonotope(z, y, np.eye(5), np.tile(half[:, None], T), np.zeros((5, 6)), np.zeros(5))
+    assert np.allclose(np.abs(right @ pseudo @ at).sum(0), made.half_widths(at))
+    assert (np.abs(wrong @ pseudo @ at).sum(0) < 0.5 * made.half_widths(at)).any()
+
+
+def test_trap_a_box_is_not_one_generator_of_ones():
+    system = lti5()
+    z, y = system.data(0)
+    boxed, line = np.eye(5), np.ones((5, 1))
+    T = len(z)
+    right = matrix_zonotope(z, y, boxed, np.full((5, T), 0.005), np.zeros((5, 6)), np.full(5, 0.005))
+    wrong = matrix_zonotope(z, y, line, np.full((1, T), 0.005), np.zeros((1, 6)), np.full(1, 0.005))
+    rng, plan = np.random.default_rng(0), np.full((1, 1), 8.0)
+    states = system.rollouts(rng, np.zeros(5), plan, 2000, worst=True)
+    at = np.concatenate([np.zeros(6), plan.ravel()])
+    directions = np.array([[1.0, -1, 0, 0, 0], [0, 1, -1, 0, 0]])
+    assert count_outside(system.tube(right, 1), at, states, directions) == 0
+    assert count_outside(system.tube(wrong, 1), at, states, directions) > 0
+
+
+def test_trap_pairs_across_trajectories_are_no_data():
+    """The last sample of one trajectory and the first of the next: no matrix is consistent with such data."""
+    system = lti5()
+    z, y = system.data(0)
+    shifted = np.vstack([z[1:, :5], z[:1, :5]])  # what a program takes for y that forgets the boundaries
+    assert np.allclose(shifted[:10], y[:10])
+    sizes = np.full((5, len(z)), 0.005)
+    with pytest.raises(CertificateError, match="no matrix"):
+        set_membership(z, shifted, sizes, np.zeros((5, 6)), np.full(5, 0.005))
+
+
+def test_trap_measurement_noise_differs_from_sample_to_sample():
+    """With the same v at t and t+1 a much smaller noise bound would look consistent; with real data it is not."""
+    system = lti5(v_half=0.0005)
+    z, y = system.data(0)
+    same_v = 0.005 + np.abs(system.A - np.eye(5)) @ system.v_half  # |w + v - A v|
+    anew = measured_noise(z, y, np.full(5, 0.005), system.v_half)
+    rest = np.abs(y - z @ np.hstack([system.A, system.B]).T)
+    assert (rest <= anew).all()
+    assert (rest > same_v).any()

@@ -1,0 +1,205 @@
+"""Recordings: what is refused, and what the windows hold."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from safetensors.numpy import load_file, save_file
+
+from messaging.robots import GROUND
+from messaging.shapes import rotate
+from safety.dataset import BadData, Dataset, Trajectory, apart, displacement, quality, windows
+from tests.safety.unicycle import record
+
+
+@pytest.fixture(scope="module")
+def small() -> Dataset:
+    return record(trajectories=4, periods=60)
+
+
+def changed(data, **parts):
+    """The data set with parts of its first trajectory replaced."""
+    return replace(data, trajectories=(replace(data.trajectories[0], **parts), *data.trajectories[1:]))
+
+
+def with_value(array, value, at=(3, 0)):
+    array = array.copy()
+    array[at[: array.ndim]] = value
+    return array
+
+
+def test_what_is_saved_is_what_is_loaded(small, tmp_path):
+    moving = changed(small, before=np.array([0.1, -0.2]))
+    moving.save(tmp_path / "deep" / "set.safetensors")
+    again = Dataset.load(tmp_path / "deep" / "set.safetensors")
+    assert again.digest() == Dataset.load(tmp_path / "deep" / "set.safetensors").digest()
+    assert again.about == small.about
+    assert again.periods == 240
+    for one, other in zip(moving.trajectories, again.trajectories, strict=True):
+        for name in ("states", "inputs", "paths", "turned"):
+            assert np.array_equal(getattr(one, name), getattr(other, name))
+    assert np.array_equal(again.trajectories[0].before, [0.1, -0.2])
+    assert [p.name for p in (tmp_path / "deep").iterdir()] == ["set.safetensors"]
+
+
+@pytest.mark.parametrize("name", ["states", "inputs", "paths", "turned"])
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_numbers_that_are_none_are_refused(small, name, value):
+    bad = changed(small, **{name: with_value(getattr(small.trajectories[0], name), value)})
+    with pytest.raises(BadData, match=f"{name} holds NaN"):
+        bad.check()
+
+
+def test_wrong_sizes_bounds_and_boundaries_are_refused(small):
+    t = small.trajectories[0]
+    for parts in (
+        {"states": t.states[:-1]},
+        {"states": t.states[:, :4]},
+        {"inputs": t.inputs[:, :1]},
+        {"turned": t.turned[1:]},
+        {"paths": t.paths[:, :, :1]},
+        {"paths": t.paths[:, 0]},
+        {"before": np.zeros(3)},
+    ):
+        with pytest.raises(BadData, match="shape"):
+            changed(small, **parts).check()
+    with pytest.raises(BadData, match="out of the robot's bounds"):
+        changed(small, inputs=with_value(t.inputs, -0.1)).check()
+    with pytest.raises(BadData, match="out of the robot's bounds"):
+        changed(small, before=np.array([0.0, 0.7])).check()
+    with pytest.raises(BadData, match="no trajectory"):
+        replace(small, trajectories=()).check()
+    with pytest.raises(BadData, match="no trajectory"):
+        windows(replace(small, trajectories=()), 1)
+
+
+def test_two_recordings_glued_into_one_are_refused(small):
+    a, b = small.trajectories[:2]
+    moved = b.states + np.array([1.0, 0.5, 0.0, 0.0, 0.0])
+    glued = Trajectory(
+        np.vstack([a.states[:-1], moved]),
+        np.vstack([a.inputs, b.inputs]),
+        np.concatenate([a.paths, b.paths]),
+        np.concatenate([a.turned, b.turned]),
+    )
+    with pytest.raises(BadData, match=r"jumps in period 59"):
+        replace(small, trajectories=(glued,)).check()
+
+
+def test_files_that_are_no_data_set_are_refused(small, tmp_path):
+    path = tmp_path / "set.safetensors"
+    small.save(path)
+    whole = path.read_bytes()
+    for garbage in (b"", b"garbage", whole[:-100], whole[:50]):
+        path.write_bytes(garbage)
+        with pytest.raises(BadData, match="no data set"):
+            Dataset.load(path)
+    with pytest.raises(BadData):
+        Dataset.load(tmp_path / "nowhere")
+    path.write_bytes(whole)
+    tensors = load_file(path)
+    about = {"robot": "ground", "layout": GROUND.layout(), "about": "{}"}
+    ends = tensors["lengths"]
+    for changes, metadata, message in (
+        ({"lengths": ends + 1}, about, "do not add up"),
+        ({"lengths": np.array([70, -10, *ends[2:], 60])}, about, "no lengths"),
+        ({"lengths": ends.astype(float)}, about, "no lengths"),
+        ({"paths": tensors["paths"][:-1]}, about, "do not add up"),
+        ({"states": tensors["states"][:, :3]}, about, "shapes"),
+        ({}, about | {"layout": "another"}, "layout"),
+        ({}, about | {"robot": "submarine"}, "submarine"),
+        ({}, {}, "missing"),
+        ({}, about | {"about": "{"}, "no data set"),
+    ):
+        save_file(tensors | changes, path, metadata)
+        with pytest.raises(BadData, match=message):
+            Dataset.load(path)
+    del tensors["turned"]
+    save_file(tensors, path, about)
+    with pytest.raises(BadData, match="turned is missing"):
+        Dataset.load(path)
+
+
+def test_poor_regressors_are_refused():
+    rng = np.random.default_rng(0)
+    good = rng.normal(size=(400, 3))
+    assert quality(good, "these").rank == 3
+    with pytest.raises(BadData, match="at least"):
+        quality(good[:50], "these")
+    with pytest.raises(BadData, match="rank 2 of 3"):
+        quality(np.column_stack([good[:, :2], good[:, 0] + good[:, 1]]), "these")
+    with pytest.raises(BadData, match="condition number"):
+        quality(np.column_stack([good[:, :2], good[:, 0] + 1e-5 * good[:, 2]]), "these")
+
+
+def test_splitting_keeps_trajectories_whole(data):
+    parts = data.split((0.7, 0.3))
+    assert sum(len(p.trajectories) for p in parts) == len(data.trajectories)
+    assert len(parts[0].trajectories) == pytest.approx(0.7 * len(data.trajectories), abs=2)
+    ids = [id(t) for p in parts for t in p.trajectories]
+    assert len(set(ids)) == len(data.trajectories)
+
+
+@pytest.mark.parametrize("k", [1, 2, 3])
+def test_windows_are_plans_within_one_trajectory(small, k):
+    found = windows(changed(small, before=np.array([0.2, 0.1])), k)
+    expected = []
+    for number, t in enumerate(small.trajectories):
+        for start in range(len(t.inputs) - k + 1):
+            if not t.inputs[start + 1 : start + k].any():  # one free input, then zero
+                expected.append((number, start))
+    assert [tuple(s) for s in found.start] == expected
+    for row, (number, start) in enumerate(expected):
+        t = small.trajectories[number]
+        first = [0.2, 0.1] if number == 0 else [0.0, 0.0]
+        before = t.inputs[start - 1] if start else first
+        assert np.array_equal(found.z[row], [*t.states[start, 3:], *before, *t.inputs[start]])
+        assert np.array_equal(found.y[row, 3:], t.states[start + k, 3:])
+
+
+def test_bulge_and_latch_against_brute_force(small):
+    found = windows(small, 3)
+    for row in range(0, len(found), 7):
+        number, start = found.start[row]
+        t = small.trajectories[number]
+        path = np.vstack([np.zeros(2), t.paths[start + 2]])
+        along = path[0] + np.linspace(0, 1, 4001)[:, None] * (path[-1] - path[0])
+        brute = np.linalg.norm(path[:, None] - along[None], axis=2).min(1).max()
+        assert found.bulge[row] == pytest.approx(brute, abs=1e-5)
+        at, position, heading, farthest = start + 3, np.zeros(2), 0.0, np.nan
+        while at < len(t.inputs) and not t.inputs[at].any():
+            points = position + rotate(t.paths[at], heading)
+            farthest = np.nanmax([farthest, np.linalg.norm(points, axis=1).max()])
+            position, heading, at = points[-1], heading + t.turned[at], at + 1
+        assert found.latch[row] == pytest.approx(farthest, abs=1e-12, nan_ok=True)
+    assert np.isnan(found.latch).any()
+    assert not np.isnan(found.latch).all()
+
+
+STATE = arrays(float, 5, elements=st.floats(-3, 3))
+
+
+@settings(max_examples=100)
+@given(STATE, STATE, st.floats(-10, 10), st.floats(-10, 10), st.floats(-4, 4))
+def test_displacement_does_not_depend_on_where_and_whither(start, end, dx, dy, turn):
+    seen = displacement(GROUND, start, end)
+
+    def moved(state):
+        out = state.copy()
+        out[:2] = rotate(state[:2], turn) + [dx, dy]
+        out[2] += turn
+        return out
+
+    again = displacement(GROUND, moved(start), moved(end))
+    again[2] = (again[2] - seen[2] + np.pi) % (2 * np.pi) - np.pi + seen[2]
+    assert np.allclose(seen, again, atol=1e-9)
+    assert -np.pi <= seen[2] < np.pi
+
+
+def test_windows_apart_do_not_overlap(small):
+    chosen = apart(windows(small, 3), 3)
+    for one, other in zip(chosen.start, chosen.start[1:], strict=False):
+        assert one[0] != other[0] or other[1] - one[1] >= 3
