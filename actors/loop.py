@@ -165,8 +165,8 @@ def cycle(riders: list[Rider], question: Ask | None, tally: Tally, stop: Callabl
     return True
 
 
-def run(settings: ActorSettings, make: Make) -> None:
-    """Drive until the learner says the run is done, or SIGINT or SIGTERM.
+def run(settings: ActorSettings, make: Make) -> bool:
+    """Drive until the learner says the run is done (True), or SIGINT or SIGTERM.
 
     Raises:
         RefusedByLearner, Unreachable: with what to do.
@@ -196,3 +196,4 @@ def run(settings: ActorSettings, make: Make) -> None:
             while not stop() and cycle(riders, question, tally, stop):
                 pass
         log.info("%s: %d steps, %d fallbacks, %d waits", settings.name, tally.steps, tally.fallbacks, tally.waits)
+        return not stop()

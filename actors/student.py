@@ -17,6 +17,7 @@ log = logging.getLogger("brakeline.actor")
 
 JOIN_TIMEOUT = 2.0  # s
 REJOIN_AFTER = 2.0  # s without permission: the learner may have missed our last step
+SAY_EVERY = 10.0  # s between log lines while there is no learner
 
 
 class RefusedByLearner(RuntimeError):
@@ -55,11 +56,14 @@ class Student:
         message = pb.Join(
             robot=self.robot.name, actor=self.actor, layout=self.robot.layout(), index=index, episode=episode
         )
+        say_at = 0.0
         while not stop():
             try:
                 payload = self.bus.ask(JOIN, message.SerializeToString(), JOIN_TIMEOUT, robot=self.robot.name)
             except BusError as error:
-                log.info("no learner yet: %s", error)
+                if time.monotonic() >= say_at:
+                    log.info("%s waits for a learner: %s", self.actor, error)
+                    say_at = time.monotonic() + SAY_EVERY
                 time.sleep(0.2)
                 continue
             reply = pb.JoinReply.FromString(payload)
@@ -76,18 +80,16 @@ class Student:
     def wait(self, index: int, episode: int, stop: Callable[[], bool]) -> bool:
         """Wait for permission to take the step of that index; False: the run is done, or told to stop."""
         asked = time.monotonic()
-        with self._news:
-            while not self._may(index):
-                if stop() or self.flow.done:
-                    return False
+        while not stop() and not self.flow.done:
+            with self._news:
+                if self._may(index):
+                    return True
                 self._news.wait(0.1)
-                if self.flow.incarnation != self._joined or time.monotonic() - asked > REJOIN_AFTER:
-                    break
-            else:
-                return True
-        if self.join(index - 1, episode, stop) is None:
-            return False
-        return self.wait(index, episode, stop)
+                rejoin = self.flow.incarnation != self._joined or time.monotonic() - asked > REJOIN_AFTER
+            if rejoin:
+                self.join(index - 1, episode, stop)
+                asked = time.monotonic()
+        return False
 
     def _may(self, index: int) -> bool:
         if self.policy is None or self.flow.limit.get(self.actor, 0) < index or self.flow.incarnation != self._joined:

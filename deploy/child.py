@@ -24,6 +24,7 @@ from messaging.robots import robot_named
 
 CONFIG, ENDPOINT, LOG = "config.json", "endpoint", "run.mcap"
 PARENT_DIED = 1  # prctl: PR_SET_PDEATHSIG
+UNFINISHED = 75  # exit status: asked to end before its work was done
 
 
 @dataclass(frozen=True)
@@ -79,19 +80,21 @@ def metadata(config: RunConfig) -> dict[str, dict[str, str]]:
     return about
 
 
-def _recorder(place: Place, folder: Path, config: RunConfig, bus: BusSettings) -> None:
+def _recorder(place: Place, folder: Path, config: RunConfig, bus: BusSettings) -> bool:
     from logs import recorder
 
     recorder.main(bus, folder / LOG, metadata(config), place.name)
+    return False
 
 
-def _safety(place: Place, folder: Path, config: RunConfig, bus: BusSettings) -> None:
+def _safety(place: Place, folder: Path, config: RunConfig, bus: BusSettings) -> bool:
     from deploy.store import model_path
     from safety.service import SafetySettings, main
 
     models = tuple(model_path(robot_named(robot), config.recipe) for robot in config.robots)
     newest = (newest_model(folder, robot) or path for robot, path in zip(config.robots, models, strict=True))
     main(SafetySettings(bus, tuple(newest), folder, place.name))
+    return False
 
 
 def newest_model(folder: Path, robot: str) -> Path | None:
@@ -100,15 +103,15 @@ def newest_model(folder: Path, robot: str) -> Path | None:
     return max(versions, key=lambda path: path.stat().st_mtime_ns, default=None)
 
 
-def _learner(place: Place, folder: Path, config: RunConfig, bus: BusSettings) -> None:
+def _learner(place: Place, folder: Path, config: RunConfig, bus: BusSettings) -> bool:
     from learner.checkpoint import exists
     from learner.service import CHECKPOINT, LearnerSettings, main
 
     out = folder / place.name
-    main(LearnerSettings(bus, place.robot, out, exists(out / CHECKPOINT), place.name, config.learning()))
+    return main(LearnerSettings(bus, place.robot, out, exists(out / CHECKPOINT), place.name, config.learning()))
 
 
-def _actor(place: Place, folder: Path, config: RunConfig, bus: BusSettings) -> None:
+def _actor(place: Place, folder: Path, config: RunConfig, bus: BusSettings) -> bool:
     from actors.loop import ActorSettings, run
     from deploy.vehicles import environment
 
@@ -127,10 +130,11 @@ def _actor(place: Place, folder: Path, config: RunConfig, bus: BusSettings) -> N
         practice=config.practice,
         change=config.change,
     )
-    run(settings, partial(environment, conditions=config.conditions))
+    return run(settings, partial(environment, conditions=config.conditions))
 
 
-KINDS: dict[str, Callable[[Place, Path, RunConfig, BusSettings], None]] = {
+# Each runs until its work is done (True) or it is asked to end; a recorder's and a safety service's never is.
+KINDS: dict[str, Callable[[Place, Path, RunConfig, BusSettings], bool]] = {
     "recorder": _recorder,
     "safety": _safety,
     "learner": _learner,
@@ -139,21 +143,23 @@ KINDS: dict[str, Callable[[Place, Path, RunConfig, BusSettings], None]] = {
 
 
 def main() -> int:
-    """Run the process named on the command line; it ends with its launcher."""
+    """Run the process named on the command line; it ends with its launcher. 0: its work is done."""
     folder, name = Path(sys.argv[1]), sys.argv[2]
     ctypes.CDLL(None).prctl(PARENT_DIED, signal.SIGTERM)
     signal.signal(signal.SIGINT, signal.SIG_DFL)
+    launcher = json.loads((folder / ENDPOINT).read_text())
+    if os.getppid() != launcher["pid"]:  # it died before we could ask to be told
+        return UNFINISHED
     config = experiments.load(folder / CONFIG)
     place = next(place for place in places(config) if place.name == name)
     if place.nice:
         os.nice(place.nice)
-    bus = BusSettings(connect=(json.loads((folder / ENDPOINT).read_text())["endpoint"],))
     try:
-        KINDS[place.kind](place, folder, config, bus)
-    except (BusError, ValueError, OSError, RuntimeError) as error:
+        done = KINDS[place.kind](place, folder, config, BusSettings(connect=(launcher["endpoint"],)))
+    except BusError as error:
         print(f"{name}: {type(error).__name__}: {error}", file=sys.stderr)
         return 1
-    return 0
+    return 0 if done else UNFINISHED
 
 
 if __name__ == "__main__":

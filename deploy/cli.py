@@ -14,10 +14,11 @@ from typing import Any
 
 import tyro
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
+from logs.reader import LogError
 from messaging.bus import BusError
-from messaging.robots import UnknownRobot
 
 
 @dataclass(frozen=True)
@@ -90,7 +91,7 @@ def find(name: str) -> Any:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Exit status: 0; 1: it failed, with the reason on stderr; 2: not understood; 130: ^C."""
+    """Exit status: 0; 1: it failed, with the reason on stderr; 2: not understood; 130: ^C before it was done."""
     os.environ.setdefault("OMP_NUM_THREADS", "1")  # two processes with two threads each on two cores are slower
     given = sys.argv[1:] if arguments is None else arguments
     errors = Console(stderr=True, highlight=False)
@@ -101,11 +102,14 @@ def main(arguments: list[str] | None = None) -> int:
     if name not in COMMANDS:
         near = difflib.get_close_matches(name, COMMANDS, 1)
         hint = f"; did you mean `{near[0]}`?" if near else ""
-        errors.print(f"brakeline: no command is called {name!r}{hint} `brakeline --help` lists them")
+        errors.print(f"brakeline: no command is called {name!r}{hint} (`brakeline --help` lists them)", markup=False)
         return 2
     try:
+        kind = find(name)
+        defaults = {"default": kind.defaults(given[1:])} if hasattr(kind, "defaults") else {}
         command = tyro.cli(
-            find(name),
+            kind,
+            **defaults,
             prog=f"brakeline {name}",
             description=f"{COMMANDS[name].what}\n\nExample: {COMMANDS[name].example}",
             args=given[1:],
@@ -116,8 +120,8 @@ def main(arguments: list[str] | None = None) -> int:
     except BrokenPipeError:  # who read the output has seen enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
-    except (BusError, UnknownRobot, ValueError, OSError, RuntimeError) as error:
-        errors.print(f"[red]brakeline {name}:[/] {error}", markup=True, soft_wrap=True)
+    except (BusError, LogError, ValueError, OSError, RuntimeError) as error:
+        errors.print(f"[red]brakeline {name}:[/] {escape(str(error))}", soft_wrap=True)
         return 1
 
 

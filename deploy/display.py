@@ -11,6 +11,7 @@ from rich.live import Live
 from rich.panel import Panel
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
+from rich.text import Text
 
 from deploy.launch import View
 from logs.report import show
@@ -30,8 +31,7 @@ class Display:
         )
         self._task = self._bar.add_task("steps", total=steps)
         self._live = Live(console=console, auto_refresh=False, transient=True) if console.is_terminal else None
-        self._last = -1e9
-        self._said = 0
+        self._last = -1e9 if self._live is not None else time.monotonic()
 
     def __enter__(self) -> Self:
         if self._live is not None:
@@ -44,7 +44,7 @@ class Display:
 
     def __call__(self, view: View) -> None:
         spacing = REFRESH if self._live is not None else PLAIN
-        if time.monotonic() - self._last < spacing and not view.ending:
+        if time.monotonic() - self._last < spacing and not (view.ending and self._live is not None):
             return
         self._last = time.monotonic()
         figures = view.metrics.figures()
@@ -52,7 +52,7 @@ class Display:
         if self._live is not None:
             self._live.update(live(view, figures, self._bar), refresh=True)
         else:
-            self.console.print(line(figures), highlight=False)
+            self.console.print(line(figures))
 
 
 def line(figures: dict[str, Any]) -> str:
@@ -70,36 +70,31 @@ def live(view: View, figures: dict[str, Any], bar: Progress) -> RenderableType:
     """The whole picture: progress, the learning, the safety, the processes, the latest warnings."""
     parts: list[RenderableType] = [bar, _run(figures), _processes(view)]
     if view.lines:
-        parts.append("\n".join(f"[yellow]{text}[/]" for text in list(view.lines)[-LINES:]))
-    return Panel(Group(*parts), title=f"brakeline: {view.folder}", subtitle="^C ends every process in order")
+        parts += [Text(text, "yellow", no_wrap=True, overflow="ellipsis") for text in list(view.lines)[-LINES:]]
+    subtitle = "ending" if view.ending else "^C ends every process in order"
+    return Panel(Group(*parts), title=Text(f"brakeline: {view.folder}"), subtitle=subtitle)
 
 
 def _run(figures: dict[str, Any]) -> Table:
-    table = Table(box=None, show_header=False, padding=(0, 3, 0, 0))
+    """Pairs of a name and a value, two in a row: it fits 80 columns."""
+    table = Table(box=None, show_header=False, padding=(0, 2, 0, 0))
     episodes, steps = figures["episodes"], figures["steps"]
-    times, trip = figures["decision_ms"], figures["round_trip_ms"]
-    table.add_row("episodes", str(episodes), "goals", share(figures["goals"], episodes))
+    times, trip, contained = figures["decision_ms"], figures["round_trip_ms"], figures["containment"]
     color = "green" if figures["collisions"] == 0 else "bold red"
+    table.add_row("episodes", str(episodes), "goals", share(figures["goals"], episodes))
+    table.add_row("collisions", f"[{color}]{figures['collisions']}[/]", "mean reward", _mean(figures))
+    table.add_row("interventions", share(figures["interventions"], steps), "failsafe", str(figures["failsafes"]))
     table.add_row(
-        "collisions",
-        f"[{color}]{figures['collisions']}[/]",
-        "interventions",
-        f"{share(figures['interventions'], steps)} ({figures['failsafes']} failsafe, {figures['fallbacks']} no answer)",
+        "left the set", share(contained["violations"], contained["steps"]), "no answer", str(figures["fallbacks"])
     )
-    if times:
-        table.add_row("decide p50 / p99", _pair(times), "round trip p50 / p99", _pair(trip) if trip else "-")
-    contained = figures["containment"]
-    table.add_row(
-        "outside predicted set", share(contained["violations"], contained["steps"]), "mean reward", _mean(figures)
-    )
+    table.add_row("decide p50 / p99", _pair(times), "asked p50 / p99", _pair(trip))
+    several = len(figures["learners"]) > 1
     for robot, learner in figures["learners"].items():
-        table.add_row(
-            f"learner {robot}",
-            f"{learner['steps_per_s']:.0f} steps/s, {learner['updates_per_s']:.0f} updates/s",
-            "losses",
-            f"critic {learner['critic_loss']:.3f}, actor {learner['actor_loss']:.3f}; "
-            f"lost {learner['missing']}, twice {learner['duplicates']}",
-        )
+        steps_per_s, updates_per_s = (f"{learner[name]:.0f}/s" for name in ("steps_per_s", "updates_per_s"))
+        table.add_row(f"steps {robot}" if several else "steps", steps_per_s, "updates", updates_per_s)
+        critic, actor = (f"{learner[name]:.3f}" for name in ("critic_loss", "actor_loss"))
+        table.add_row("critic loss", critic, "actor loss", actor)
+        table.add_row("steps lost", str(learner["missing"]), "steps twice", str(learner["duplicates"]))
     return table
 
 
@@ -107,8 +102,8 @@ def _mean(figures: dict[str, Any]) -> str:
     return "-" if figures["mean_reward"] is None else f"{figures['mean_reward']:.1f}"
 
 
-def _pair(times: dict[str, Any]) -> str:
-    return f"{times['p50']:.2f} / {times['p99']:.2f} ms"
+def _pair(times: dict[str, Any] | None) -> str:
+    return "-" if times is None else f"{times['p50']:.2f} / {times['p99']:.2f} ms"
 
 
 def _processes(view: View) -> Table:
@@ -130,7 +125,10 @@ def summary(console: Console, figures: dict[str, Any]) -> None:
     """The end of a run: what happened, and where it is."""
     console.print(show({name: value for name, value in figures.items() if name != "topics"}))
     lost = sum(topic["missing"] for topic in figures["topics"].values())
-    console.print(f"messages lost: {lost}; restarts: {figures['restarts'] or 'none'}")
-    console.print(f"log:    {figures['log']}")
+    restarts = ", ".join(f"{name} {count}" for name, count in figures["restarts"].items())
+    console.print(f"messages lost: {lost}; restarts: {restarts or 'none'}")
+    if not figures["finished"]:
+        console.print(f"[yellow]stopped before the last step[/]; go on: brakeline train --resume {figures['folder']}")
+    console.print(f"log:    {figures['log']}", markup=False)
     for path in figures["policies"]:
-        console.print(f"policy: {path}")
+        console.print(f"policy: {path}", markup=False)

@@ -80,8 +80,8 @@ def episode(driver: Driver, policy: Policy, question: Ask | None, number: int) -
 def evaluate(robot: Robot, what: Evaluation, each: Callable[[Tally], Any] = lambda tally: None) -> dict[str, Any]:
     """The shared figures of `what.episodes` episodes; `each` is called after every one."""
     policy = policy_named(what.policy, robot, what.seed)
-    question = None if what.method == "none" else in_process(model_for(robot, what.recipe))
     env = environment(robot, what.arena, FRESH + what.seed, what.conditions)
+    question = None if what.method == "none" else in_process(model_for(robot, what.recipe))
     driver = Driver(robot, env, Identity("evaluate", 0, what.seed), filtered=question is not None)
     tally = Tally()
     for number in range(what.episodes):

@@ -14,6 +14,7 @@ from actors.loop import Change
 from deploy.vehicles import Conditions
 from learner.config import LearnerConfig, TD3Config
 from safety.model_set import Recipe
+from sim.world import arena_kind
 
 METHODS = ("ddpc", "none")
 
@@ -42,6 +43,9 @@ class RunConfig:
     def __post_init__(self) -> None:
         if self.method not in METHODS:
             raise ValueError(f"no method is called {self.method!r}; there are: {', '.join(METHODS)}")
+        arena_kind(self.arena)
+        if min(self.actors, self.robots_per_actor, self.replicas, self.steps) < 1:
+            raise ValueError("actors, robots per actor, replicas and steps are 1 or more")
         if self.deterministic and (self.actors != 1 or self.robots_per_actor != 1 or len(self.robots) != 1):
             raise ValueError("a deterministic run has one actor with one robot: --actors 1")
 

@@ -12,12 +12,12 @@ import sys
 import time
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from deploy import experiments
-from deploy.child import CONFIG, ENDPOINT, KINDS, LOG, Place, places
+from deploy.child import CONFIG, ENDPOINT, KINDS, LOG, UNFINISHED, Place, places
 from deploy.experiments import RunConfig
 from deploy.store import model_for
 from logs.metrics import Metrics
@@ -30,8 +30,10 @@ log = logging.getLogger("brakeline.launcher")
 
 FIRST_BACKOFF, LONGEST_BACKOFF = 0.5, 10.0  # s before a restart, doubled each time ...
 HEALTHY_AFTER = 20.0  # s of life after which the next backoff is the first one again
+MOST_FAILURES = 5  # in a row, each before HEALTHY_AFTER: then it is no accident
 TURN = 0.1  # s
 END_PATIENCE = 10.0  # s from SIGTERM to SIGKILL: a checkpoint may be in progress
+RECORDER_PATIENCE = 30.0  # s until the run starts without a recorder: its disk may be full
 QUIET = 0.5  # s without a message after which the last one has come
 FIGURES = "figures.json"
 
@@ -47,12 +49,11 @@ class Child:
     place: Place
     folder: Path
     restarts: int = 0
-    backoff: float = FIRST_BACKOFF
+    failures: int = 0  # in a row
     popen: subprocess.Popen[bytes] | None = None
     started: float = 0.0
     due: float = 0.0  # when to start it (again)
     finished: bool = False  # it ended with 0: its work is done
-    history: list[str] = field(default_factory=list)
 
     def start(self) -> None:
         logs = self.folder / "logs"
@@ -74,7 +75,11 @@ class Child:
         return self.popen is not None and self.popen.poll() is None
 
     def watch(self) -> None:
-        """Start it if that is due; see how it ended if it did."""
+        """Start it if that is due; see how it ended if it did.
+
+        Raises:
+            LaunchError: it fails again and again.
+        """
         now = time.monotonic()
         if self.finished or self.alive:
             return
@@ -87,14 +92,18 @@ class Child:
         if code == 0:
             self.finished = True
             return
-        self.backoff = FIRST_BACKOFF if lived > HEALTHY_AFTER else self.backoff
-        self.due = now + self.backoff
-        how = f"was killed by {signal.Signals(-code).name}" if code < 0 else f"ended with {code}"
-        line = f"{self.place.name} {how} after {lived:.1f} s; starting it again in {self.backoff:.1f} s"
-        self.backoff = min(2.0 * self.backoff, LONGEST_BACKOFF)
+        self.failures = 1 if lived > HEALTHY_AFTER else self.failures + 1
+        how = ended(code, lived)
+        log_file = self.folder / "logs" / f"{self.place.name}.log"
+        words = f"its last words: {last_line(log_file) or 'none'}"
+        if self.failures == MOST_FAILURES:
+            raise LaunchError(
+                f"{self.place.name} {how}, the {MOST_FAILURES}th time in a row; {words}; more in {log_file}"
+            )
+        backoff = min(FIRST_BACKOFF * 2.0 ** (self.failures - 1), LONGEST_BACKOFF)
+        self.due = now + backoff
         self.restarts += 1
-        self.history.append(line)
-        log.error("%s (its last words: %s)", line, last_line(self.folder / "logs" / f"{self.place.name}.log"))
+        log.error("%s %s; starting it again in %.1f s (%s)", self.place.name, how, backoff, words)
 
     def terminate(self) -> None:
         if self.popen is not None and self.alive:
@@ -110,6 +119,15 @@ class Child:
             log.error("%s did not end; killing it", self.place.name)
             self.popen.kill()
             self.popen.wait()
+
+
+def ended(code: int, lived: float) -> str:
+    """How a process ended that should not have."""
+    if code < 0:
+        return f"was killed by {signal.Signals(-code).name} after {lived:.1f} s"
+    if code == UNFINISHED:
+        return f"was asked to end after {lived:.1f} s, not by the launcher"
+    return f"ended with {code} after {lived:.1f} s"
 
 
 def last_line(path: Path) -> str:
@@ -129,7 +147,6 @@ class View:
     metrics: Metrics
     children: list[Child]
     lines: deque[str]
-    started: float
     ending: bool = False
 
 
@@ -141,7 +158,7 @@ def free_endpoint() -> str:
 
 
 def prepare(config: RunConfig, folder: Path, resume: bool) -> None:
-    """Model sets, the run's folder and its configuration.
+    """See that the folder can take the run, and that there are model sets.
 
     Raises:
         LaunchError: the folder holds another run.
@@ -152,11 +169,6 @@ def prepare(config: RunConfig, folder: Path, resume: bool) -> None:
         for robot in config.robots:
             model_for(robot_named(robot), config.recipe)
     folder.mkdir(parents=True, exist_ok=True)
-    (folder / CONFIG).write_text(experiments.encode(config))
-    latest = folder.parent / "latest"
-    if latest.is_symlink() or not latest.exists():
-        latest.unlink(missing_ok=True)
-        latest.symlink_to(folder.name)
 
 
 class Launcher:
@@ -172,11 +184,16 @@ class Launcher:
         self._inbox: deque[Sample] = deque()
 
     def run(self, show: Callable[[View], Any] = lambda view: None) -> dict[str, Any]:
-        """Until the learners are done or SIGINT or SIGTERM; returns the figures, also saved in the run's folder."""
-        view = View(self.config, self.folder, self.metrics, self.children, self.lines, time.monotonic())
-        settings = BusSettings(listen=(self.endpoint,))
-        with Process(settings, "launcher", stderr=False) as process:
-            (self.folder / ENDPOINT).write_text(json.dumps({"endpoint": self.endpoint, "pid": os.getpid()}))
+        """Until the learners are done or SIGINT or SIGTERM; returns the figures, also saved in the run's folder.
+
+        Raises:
+            LaunchError: a process fails again and again; the others were ended in order.
+            Unreachable: the endpoint cannot be listened on.
+        """
+        view = View(self.config, self.folder, self.metrics, self.children, self.lines)
+        failure: LaunchError | None = None
+        with Process(BusSettings(listen=(self.endpoint,)), "launcher", stderr=False, reserved=True) as process:
+            self._claim_folder()
             for topic in RECORDED:
                 process.bus.subscribe(topic, self._inbox.append)
             process.refresh = lambda: process.figures.update(
@@ -184,21 +201,24 @@ class Launcher:
             )
             try:
                 self._start_recorder(process)
-                while not process.stop.is_set() and not self._done():
+                while not process.stop.is_set() and not self.finished:
                     for child in self.children:
                         child.watch()
                     self._drain()
                     show(view)
                     process.stop.wait(TURN)
+            except LaunchError as error:
+                failure = error
+                log.error("%s", error)
+            finally:
                 view.ending = True
                 show(view)
-            finally:
                 self._end()
-            self._drain()
         self._drain()
         figures = self.figures()
         (self.folder / FIGURES).write_text(json.dumps(figures, indent=2))
-        show(view)
+        if failure is not None:
+            raise failure
         return figures
 
     def figures(self) -> dict[str, Any]:
@@ -212,29 +232,42 @@ class Launcher:
         }
         restarts = {child.place.name: child.restarts for child in self.children if child.restarts}
         paths = {"folder": str(self.folder), "log": str(self.folder / LOG), "policies": self.policies()}
-        return setup | self.metrics.figures() | {"restarts": restarts} | paths
+        return setup | self.metrics.figures() | {"finished": self.finished, "restarts": restarts} | paths
+
+    @property
+    def finished(self) -> bool:
+        """Have all learners done their work? Then nobody needs the others."""
+        return all(child.finished for child in self.children if child.place.kind == "learner")
 
     def policies(self) -> list[str]:
         """The policy files that were saved."""
         return [str(path) for path in sorted(self.folder.glob("learner*/policy.safetensors"))]
 
+    def _claim_folder(self) -> None:
+        """Write what the processes read, and that this is the latest run."""
+        (self.folder / CONFIG).write_text(experiments.encode(self.config))
+        (self.folder / ENDPOINT).write_text(json.dumps({"endpoint": self.endpoint, "pid": os.getpid()}))
+        latest = self.folder.parent / "latest"
+        if latest.is_symlink() or not latest.exists():
+            latest.unlink(missing_ok=True)
+            latest.symlink_to(self.folder.name)
+
     def _start_recorder(self, process: Process) -> None:
-        """The recorder first, and nothing else before it listens: no message shall be missing in the log."""
+        """The recorder first, and not a word, of the launcher's either, before it listens: no message shall be missing
+        in the log."""
         recorder = self.children[0]
-        deadline = time.monotonic() + 15.0
+        deadline = time.monotonic() + RECORDER_PATIENCE
         while not process.stop.is_set() and time.monotonic() < deadline:
             recorder.watch()
             self._drain()
             known = self.metrics.processes.get("recorder")
             if known is not None and known.notes.get("file"):
-                return
+                break
             process.stop.wait(0.05)
-        if not process.stop.is_set():
-            log.error("the recorder does not record: %s", last_line(self.folder / "logs" / "recorder.log"))
-
-    def _done(self) -> bool:
-        """Have all learners finished? Then nobody needs the others."""
-        return all(child.finished for child in self.children if child.place.kind == "learner")
+        else:
+            if not process.stop.is_set():
+                log.error("the recorder does not record: %s", last_line(self.folder / "logs" / "recorder.log"))
+        process.announce()
 
     def _drain(self) -> None:
         while self._inbox:

@@ -25,7 +25,7 @@ TRAJECTORIES = 200  # of 300 periods
 HELD_OUT = 0.3  # of the trajectories, for the statement about a model set
 SEED = 20260
 
-console = Console(stderr=True)
+console = Console(stderr=True, highlight=False, soft_wrap=True)
 
 
 def data_root() -> Path:

@@ -12,7 +12,7 @@ from messaging.shapes import WALL, Obstacle
 from sim.envs import NavigationEnv
 from sim.estimator import NoiseLevels
 from sim.ground import GroundRobot
-from sim.world import Arena
+from sim.world import Arena, arena_kind
 
 YARD = 50.0  # m to the walls of the place where data are recorded: farther than a trajectory can go
 
@@ -35,6 +35,7 @@ def environment(robot: Robot, arena: str, seed: int, conditions: Conditions | No
     """A Gymnasium environment; `seed` sets its episodes apart from those of another seed."""
     if robot is not GROUND:
         raise ValueError(f"no simulator for {robot.name}")
+    arena_kind(arena)
     c = conditions or Conditions()
     return NavigationEnv(
         robot, arena, noise=c.noise, seed_key=seed, payload_kg=c.payload_kg, floor_friction=c.floor_friction

@@ -27,7 +27,7 @@ MANIFEST = "manifest.json"
 PARTIAL = ".partial"
 
 
-class CheckpointError(Exception):
+class CheckpointError(RuntimeError):
     """A checkpoint could not be written or read."""
 
 

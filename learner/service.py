@@ -49,8 +49,8 @@ class LearnerSettings:
     learner: LearnerConfig = field(default_factory=LearnerConfig)
 
 
-def main(settings: LearnerSettings) -> None:
-    """Learn until the run's last step, SIGINT or SIGTERM; end with a checkpoint and a policy file.
+def main(settings: LearnerSettings) -> bool:
+    """Learn until the run's last step (True), SIGINT or SIGTERM; end with a checkpoint and a policy file.
 
     Raises:
         CheckpointError: `resume` was asked for and is impossible, or was not and there is a checkpoint in the folder.
@@ -67,6 +67,7 @@ def main(settings: LearnerSettings) -> None:
             learner.restore(root)
             log.info("resumed at step %d, update %d", learner.steps, learner.updates)
         LearnerLoop(process, learner, settings).run()
+        return learner.done
 
 
 class LearnerLoop:

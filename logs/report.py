@@ -6,6 +6,7 @@ from typing import Any
 
 from rich.console import Group, RenderableType
 from rich.table import Table
+from rich.text import Text
 
 from logs.metrics import Figures, Metrics
 from logs.reader import Paths, open_log
@@ -41,7 +42,7 @@ def show(figures: Figures) -> RenderableType:
         parts.append(_decisions(figures["decision_ms"]))
     if figures.get("topics"):
         parts.append(_topics(figures["topics"]))
-    parts += [f"[yellow]{cut}[/yellow]" for cut in figures.get("cuts", ())]
+    parts += [Text(cut, "yellow") for cut in figures.get("cuts", ())]
     return Group(*parts)
 
 
@@ -74,7 +75,7 @@ def _summary(figures: Figures) -> Table:
 
 
 LEARNER = (
-    "{updates} updates, {updates_per_s:.1f}/s, critic loss {critic_loss:.4g}, actor loss {actor_loss:.4g}, "
+    "{updates} updates, critic loss {critic_loss:.4g}, actor loss {actor_loss:.4g}, "
     "weights v{weights_version}, staleness {staleness:.1f}"
 )
 

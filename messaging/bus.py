@@ -35,6 +35,7 @@ log = logging.getLogger("brakeline.bus")
 FIFO = 16384
 RING = 64
 NAME = re.compile(r"[A-Za-z0-9_.-]+")
+SOURCE = re.compile(r" at /\S+\.rs:\d+\.?")  # where in Zenoh's source an error arose
 
 
 class BusError(Exception):
@@ -393,11 +394,12 @@ def _open(settings: BusSettings) -> zenoh.Session:
     try:
         return zenoh.open(configuration(settings))
     except zenoh.ZError as error:
+        why = SOURCE.sub("", str(error))
         if settings.listen:
-            raise Unreachable(f"cannot listen on {', '.join(settings.listen)}: {error}") from error
+            raise Unreachable(f"cannot listen on {', '.join(settings.listen)}: {why}") from error
         raise Unreachable(
             f"no router at {', '.join(settings.connect)} within {settings.patience:.0f} s; start one there "
-            "(any process with --listen), or check --connect"
+            f"(any process with --listen), or check --connect: {why}"
         ) from error
 
 

@@ -30,21 +30,22 @@ class Process:
 
     `stop` is set by SIGINT and SIGTERM (and by whoever wants the process to end); a second signal kills. `figures` and
     `notes` go out with the next Health; `refresh`, if set, is called before each to bring them up to date. All that is
-    logged goes to stderr (unless `stderr` is False) and to the LOG topic. An exception that leaves the block is logged,
-    noted in the last Health, and goes on its way. The first Health follows `announce`, or a second.
+    logged goes to stderr (unless `stderr` is False) and to the LOG topic. An exception that leaves the block goes to the
+    LOG topic with its traceback, is noted in the last Health, and goes on its way: stderr is for who catches it. The
+    first Health follows `announce`, or a second (not if `reserved`).
 
     Raises:
         Unreachable: on entering, when there is no bus at `settings`.
     """
 
-    def __init__(self, settings: BusSettings, source: str, stderr: bool = True) -> None:
+    def __init__(self, settings: BusSettings, source: str, stderr: bool = True, reserved: bool = False) -> None:
         self.settings = settings
         self.source = source
         self.stop = threading.Event()
         self.figures: dict[str, float] = {}
         self.notes: dict[str, str] = {}
         self.refresh: Callable[[], None] | None = None
-        self._stderr = stderr
+        self._stderr, self._reserved = stderr, reserved
         self._handlers: list[logging.Handler] = []
         self._signals: dict[int, Any] = {}
         self._ended = False
@@ -62,6 +63,8 @@ class Process:
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None) -> None:
         if isinstance(error, Exception):
+            for handler in self._handlers[1:]:
+                logging.getLogger().removeHandler(handler)
             log.error("%s ends: %s", self.source, error, exc_info=error)
             self.notes["died of"] = f"{type(error).__name__}: {error}"
         self.stop.set()
@@ -88,8 +91,11 @@ class Process:
         self.stop.set()
 
     def _beat(self) -> None:
+        period = 1.0 / (HEALTH.rate or 1.0)
+        waiting = None if self._reserved else period
         while True:
-            self._due.wait(1.0 / (HEALTH.rate or 1.0))
+            self._due.wait(waiting)
+            waiting = period
             self._due.clear()
             if self._ended:
                 return
@@ -115,7 +121,7 @@ class Process:
         )
 
     def _start_logging(self) -> None:
-        self._handlers = [BusHandler(self.bus.publisher(LOG), self.source)]
+        self._handlers = [BusHandler(self.bus.publisher(LOG), self.source)]  # the bus's comes first
         if self._stderr:
             stream = logging.StreamHandler(sys.stderr)
             stream.setFormatter(logging.Formatter(f"%(asctime)s {self.source} %(levelname)s %(message)s"))

@@ -109,6 +109,13 @@ ATTEMPTS = 1000  # whole arenas drawn before giving up
 CANDIDATES = 12  # drawn at once for each obstacle, of which the first that fits stays
 
 
+def arena_kind(name: str) -> ArenaKind:
+    """Raises UnknownArena with the names there are."""
+    if name not in ARENAS:
+        raise UnknownArena(f"no arena is called {name!r}; there are: {', '.join(sorted(ARENAS))}")
+    return ARENAS[name]
+
+
 def draw_arena(name: str, rng: np.random.Generator, robot: Robot) -> Arena:
     """An arena of that name in which `robot` can get from start to goal.
 
@@ -116,9 +123,7 @@ def draw_arena(name: str, rng: np.random.Generator, robot: Robot) -> Arena:
         UnknownArena: with the names there are.
         NoArena: when a kind's numbers leave no solvable arena.
     """
-    if name not in ARENAS:
-        raise UnknownArena(f"no arena is called {name!r}; there are: {', '.join(sorted(ARENAS))}")
-    kind = ARENAS[name]
+    kind = arena_kind(name)
     for _ in range(ATTEMPTS):
         obstacles = _place(kind, rng, robot)
         if obstacles is None:

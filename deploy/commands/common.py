@@ -94,7 +94,8 @@ def _finite(value: Any) -> Any:
     return value
 
 
-console = Console(highlight=False)
-errors = Console(stderr=True, highlight=False)
+# Soft wrap: lines are the terminal's to break, and a pipe's not to be broken.
+console = Console(highlight=False, soft_wrap=True)
+errors = Console(stderr=True, highlight=False, soft_wrap=True)
 
 Robot = Annotated[str, tyro.conf.Positional]

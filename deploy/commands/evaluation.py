@@ -42,7 +42,7 @@ class Evaluate:
             conditions=self.physics.conditions(),
         )
         columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
-        with Progress(*columns, console=errors, transient=True) as progress:
+        with Progress(*columns, console=errors, transient=True, disable=not errors.is_terminal) as progress:
             task = progress.add_task("episodes", total=self.episodes)
 
             def each(tally: Tally) -> None:

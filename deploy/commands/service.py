@@ -6,6 +6,7 @@ import time
 from dataclasses import dataclass, field
 from typing import Any
 
+from rich.markup import escape
 from rich.table import Table
 
 from deploy.commands.common import Endpoints, Flags, Robot, console, say_json
@@ -117,11 +118,12 @@ class Status:
         if self.json:
             say_json({"alive": alive, "processes": processes, "learners": learners})
             return 0
+        table = Table(box=None, padding=(0, 2, 0, 0))
+        for column in ("process", "state", "what it says"):
+            table.add_column(column)
         for name in sorted({*alive, *processes}):
-            state = "[green]alive[/]" if name in alive else "[red]gone[/]"
-            told = processes.get(name, {})
-            shown = ", ".join(f"{k} {v:.4g}" if isinstance(v, float) else f"{k} {v}" for k, v in _main(told).items())
-            console.print(f"{name:<12} {state}  {shown}")
+            table.add_row(name, "[green]alive[/]" if name in alive else "[red]gone[/]", said(processes.get(name, {})))
+        console.print(table)
         for robot, figures in learners.items():
             console.print(
                 f"learning {robot}: {figures['steps']} steps, {figures['updates']} updates, "
@@ -132,6 +134,7 @@ class Status:
         return 0
 
 
-def _main(figures: dict[str, Any]) -> dict[str, Any]:
-    """Without the counts per channel, which --json has."""
-    return {name: value for name, value in figures.items() if "/" not in name}
+def said(told: dict[str, Any]) -> str:
+    """A process's figures and notes that are not zero or empty; --json has all, and the counts per channel."""
+    shown = {name: value for name, value in told.items() if value and "/" not in name}
+    return escape(", ".join(f"{k} {v:.4g}" if isinstance(v, float) else f"{k} {v}" for k, v in shown.items()))

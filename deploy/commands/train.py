@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import tyro
 
@@ -19,8 +19,8 @@ from learner.config import LearnerConfig
 from messaging.robots import robot_named
 
 
-def launch(config: RunConfig, folder: Path, resume: bool, listen: str | None, as_json: bool) -> dict[str, Any]:
-    """Prepare and run, with a display on stderr (when JSON is asked for) or stdout."""
+def launch(config: RunConfig, folder: Path, resume: bool, listen: str | None, as_json: bool) -> int:
+    """Prepare and run, with a display on stderr (when JSON is asked for) or stdout; returns the exit status."""
     prepare(config, folder, resume)
     shown = errors if as_json else console
     if resume:
@@ -31,7 +31,10 @@ def launch(config: RunConfig, folder: Path, resume: bool, listen: str | None, as
         say_json(figures)
     else:
         summary(console, figures)
-    return figures
+    return 0 if figures["finished"] else STOPPED
+
+
+STOPPED = 130  # exit status: ^C before the last step
 
 
 def stamped() -> Path:
@@ -48,8 +51,10 @@ class Train:
     """Actor processes a robot kind."""
     robots_per_actor: int = 1
     """Robots in each of them; their requests share a question."""
-    steps: int = 100_000
-    """Steps a robot kind."""
+    experiment: str = "default"
+    """The configuration that the other options start from: default | demo | debug."""
+    steps: int | None = None
+    """Steps a robot kind; default: those of the experiment, or of the run that is resumed."""
     seed: int = 0
     arena: str = "default"
     penalty: float = RunConfig.penalty
@@ -74,10 +79,29 @@ class Train:
     json: bool = False
     """Print the final figures as one JSON object on stdout; the display goes to stderr."""
 
+    @classmethod
+    def defaults(cls, arguments: list[str]) -> Train:
+        """The options before any is given: those of the experiment that is.
+
+        Raises:
+            ValueError: no experiment has that name.
+        """
+        name = cls.experiment
+        for flag, value in zip(arguments, [*arguments[1:], ""], strict=True):
+            option, equals, attached = flag.partition("=")
+            if option == "--experiment":
+                name = attached if equals else value
+        if name not in EXPERIMENTS:
+            raise ValueError(f"no experiment is called {name!r}; there are: {', '.join(EXPERIMENTS)}")
+        chosen = EXPERIMENTS[name]
+        shared = {f.name for f in fields(cls)} & {f.name for f in fields(chosen)} - {"steps"}
+        return cls(experiment=name, **{name: getattr(chosen, name) for name in shared})
+
     def config(self) -> RunConfig:
         """The run's configuration; a resumed run's is its own, but for the steps."""
         if self.resume is not None:
-            return replace(load(self.resume / CONFIG), steps=self.steps)
+            resumed = load(self.resume / CONFIG)
+            return replace(resumed, steps=self.steps or resumed.steps)
         return RunConfig(
             robots=tuple(robot_named(name).name for name in self.robots),
             method=self.filtering.method,
@@ -85,7 +109,7 @@ class Train:
             arena=self.arena,
             actors=1 if self.deterministic else self.actors,
             robots_per_actor=self.robots_per_actor,
-            steps=self.steps,
+            steps=EXPERIMENTS[self.experiment].steps if self.steps is None else self.steps,
             seed=self.seed,
             penalty=self.penalty,
             deadline=self.deadline,
@@ -99,8 +123,7 @@ class Train:
 
     def run(self) -> int:
         folder = self.resume or self.out or stamped()
-        launch(self.config(), folder, self.resume is not None, self.listen, self.json)
-        return 0
+        return launch(self.config(), folder, self.resume is not None, self.listen, self.json)
 
 
 @dataclass(frozen=True)
@@ -114,5 +137,4 @@ class Demo:
 
     def run(self) -> int:
         config = replace(EXPERIMENTS["demo"], steps=self.steps, seed=self.seed)
-        launch(config, self.out or stamped(), False, None, self.json)
-        return 0
+        return launch(config, self.out or stamped(), False, None, self.json)
