@@ -48,7 +48,8 @@ class Display:
             return
         self._last = time.monotonic()
         figures = view.metrics.figures()
-        self._bar.update(self._task, completed=figures["steps"])
+        learned = sum(learner["steps"] for learner in figures["learners"].values())
+        self._bar.update(self._task, completed=max(figures["steps"], learned))  # resumed: learned of earlier ones too
         if self._live is not None:
             self._live.update(live(view, figures, self._bar), refresh=True)
         else:

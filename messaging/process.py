@@ -30,9 +30,9 @@ class Process:
 
     `stop` is set by SIGINT and SIGTERM (and by whoever wants the process to end); a second signal kills. `figures` and
     `notes` go out with the next Health; `refresh`, if set, is called before each to bring them up to date. All that is
-    logged goes to stderr (unless `stderr` is False) and to the LOG topic. An exception that leaves the block goes to the
-    LOG topic with its traceback, is noted in the last Health, and goes on its way: stderr is for who catches it. The
-    first Health follows `announce`, or a second (not if `reserved`).
+    logged goes to stderr (unless `stderr` is False) and to the LOG topic. An exception that leaves the block goes to
+    the LOG topic with its traceback, is noted in the last Health, and goes on its way: stderr is for who catches it.
+    The first Health follows `announce`, or a second (not if `reserved`).
 
     Raises:
         Unreachable: on entering, when there is no bus at `settings`.
