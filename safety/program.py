@@ -15,6 +15,7 @@ Array = NDArray[np.float64]
 
 SHARPEN = 1e-6  # m; the QP's rows are this much tighter, so that its answer's rounding passes the exact check
 REGULAR = 1e-4  # weight of what the objective leaves free; much less and the solver needs thousands of iterations
+ROUNDING = 1e-12  # of a unit row of W: an atom that depends on the inputs no more than this does not
 
 
 @dataclass(frozen=True)
@@ -78,7 +79,7 @@ class Builder:
         m, free = robot.action_dim, robot.free_steps * robot.action_dim
         self.known = tube.position.shape[2] - free  # length of z_0
         self.free = free
-        moving = np.abs(tube.W[:, self.known :]).max(1, initial=0.0) > 0.0
+        moving = np.abs(tube.W[:, self.known :]).max(1, initial=0.0) > ROUNDING
         self.W_t, self.M_t = tube.W[moving], tube.M[:, moving]
         self.W_c, self.M_c = tube.W[~moving][:, : self.known], tube.M[:, ~moving]
         atoms = len(self.W_t)

@@ -26,7 +26,7 @@ class Linear:
     def data(self, seed, trajectories=40, periods=12):
         """(z, y): regressors [y_t; u_t] (T, n+m) and next measurements (T, n), paired within trajectories only."""
         rng = np.random.default_rng(seed)
-        n, m = self.B.shape
+        n = len(self.A)
         z, y = [], []
         for _ in range(trajectories):
             x = rng.normal(size=n)

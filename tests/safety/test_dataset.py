@@ -148,9 +148,8 @@ def test_windows_are_plans_within_one_trajectory(small, k):
     found = windows(changed(small, before=np.array([0.2, 0.1])), k)
     expected = []
     for number, t in enumerate(small.trajectories):
-        for start in range(len(t.inputs) - k + 1):
-            if not t.inputs[start + 1 : start + k].any():  # one free input, then zero
-                expected.append((number, start))
+        starts = range(len(t.inputs) - k + 1)  # of one free input, then zero
+        expected += [(number, start) for start in starts if not t.inputs[start + 1 : start + k].any()]
     assert [tuple(s) for s in found.start] == expected
     for row, (number, start) in enumerate(expected):
         t = small.trajectories[number]
@@ -189,7 +188,7 @@ def test_displacement_does_not_depend_on_where_and_whither(start, end, dx, dy, t
 
     def moved(state):
         out = state.copy()
-        out[:2] = rotate(state[:2], turn) + [dx, dy]
+        out[:2] = rotate(state[:2], turn) + np.array([dx, dy])
         out[2] += turn
         return out
 

@@ -1,0 +1,66 @@
+"""Half-spaces: the obstacle, grown by the body and the measurement's error, is on their far side."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from messaging.shapes import Obstacle, Shapes
+from safety.freespace import half_spaces
+from tests.messaging.test_shapes import obstacles, sample
+
+BODY = 0.1
+
+
+@settings(max_examples=200)
+@given(obstacles(), st.integers(0, 10_000))
+def test_whoever_is_inside_keeps_off_the_obstacle(obstacle, seed):
+    rng = np.random.default_rng(seed)
+    d = len(obstacle.position)
+    start, nominal = rng.uniform(-5, 5, d), rng.uniform(-5, 5, (3, d))
+    measured = rng.uniform(0, 0.05, d)
+    near = Shapes.of([obstacle], d)
+    normals, offsets = half_spaces(near, start, nominal, BODY, measured)
+    assert normals.shape == (1, 3, d)
+    drawn = sample(obstacle, rng, 2000)
+    for a, b in zip(normals[0], offsets[0], strict=True):
+        if near.distance(start)[0] < 1e-6:
+            assert b == -np.inf
+            continue
+        assert np.linalg.norm(a) == pytest.approx(1.0)
+        for _ in range(5):  # a measured position on the plane: the true one, and the body about it, are clear
+            p = start + rng.normal(size=d)
+            p += a * (b - a @ (p - start))
+            true = p - measured * rng.choice([-1.0, 1.0], d)
+            assert np.linalg.norm(drawn - true, axis=1).min() >= BODY - 1e-7
+            assert (a @ (drawn - true).T).min() >= BODY - 1e-7
+
+
+def test_the_start_is_on_the_near_side_wherever_the_plan_leads():
+    """Nominal positions inside the obstacle and behind it: the plane is taken from the start."""
+    near = Shapes.of([Obstacle("cylinder", (1.0, 0.0), (0.3,))], 2)
+    nominal = np.array([[0.5, 0.0], [1.0, 0.1], [2.0, 0.0]])
+    normals, offsets = half_spaces(near, np.zeros(2), nominal, BODY, np.array([0.01, 0.02]))
+    assert np.allclose(normals, [1.0, 0.0])
+    assert np.allclose(offsets, 0.7 - BODY - 0.01)
+
+
+def test_the_plane_turns_with_the_nominal_position():
+    near = Shapes.of([Obstacle("cylinder", (1.0, 0.0), (0.3,))], 2)
+    normals, _ = half_spaces(near, np.zeros(2), np.array([[0.8, 0.4]]), 0.0, np.zeros(2))
+    assert np.allclose(normals[0, 0], np.array([0.2, -0.4]) / np.hypot(0.2, 0.4))
+
+
+@pytest.mark.parametrize("start", [(1.0, 0.0), (1.2, 0.1), (0.7, 0.0)])
+def test_nothing_is_free_for_a_start_that_touches(start):
+    near = Shapes.of([Obstacle("cylinder", (1.0, 0.0), (0.3,)), Obstacle("wall", (-1.0, 0.0))], 2)
+    _, offsets = half_spaces(near, np.array(start), np.zeros((2, 2)), BODY, np.zeros(2))
+    assert (offsets[0] == -np.inf).all()
+    assert np.isfinite(offsets[1]).all()
+
+
+def test_no_number_is_never_free():
+    near = Shapes.of([Obstacle("sphere", (1.0, 0.0), (0.3,))], 2)
+    broken = Shapes(near.center * np.nan, near.axes, near.half, near.rho, near.round)
+    _, offsets = half_spaces(broken, np.zeros(2), np.zeros((1, 2)), BODY, np.zeros(2))
+    assert not (offsets > -np.inf).any()

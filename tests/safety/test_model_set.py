@@ -1,0 +1,137 @@
+"""Model sets: what goes in comes out, one version means one content, and what is no model set is refused."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from safetensors.numpy import load, save
+
+from safety.certificates import KINDS, CertificateError, least_squares
+from safety.dataset import BadData, windows
+from safety.filter import Filter
+from safety.model_set import MODES, BadModel, ModelSet, Recipe, make
+from tests.safety.unicycle import record
+
+ALL = [(kind, mode) for kind in KINDS for mode in MODES]
+
+
+@pytest.mark.parametrize("which", ALL, ids="-".join)
+def test_what_is_encoded_is_decoded(models, which, tmp_path):
+    model = models[which]
+    again = ModelSet.decode(model.encode())
+    assert again.version == model.version
+    assert again.recipe == model.recipe
+    assert again.about == model.about
+    model.save(tmp_path / "deep" / "model.safetensors")
+    assert ModelSet.load(tmp_path / "deep" / "model.safetensors").version == model.version
+    z = np.array([0.1, 0.2, 0.1, 0.2, 0.25, -0.5])
+    for one, other in ((model.tube(), again.tube()), (model.outer_tube(), again.outer_tube())):
+        assert np.array_equal(one.magnitudes(z), other.magnitudes(z))
+        assert np.array_equal(one.centers(z), other.centers(z))
+
+
+def test_the_version_is_the_content(models, model, data):
+    assert len({m.version for m in models.values()}) == len(models)
+    assert make(data, Recipe()).version == model.version
+    wider = replace(model, latch=replace(model.latch, w=model.latch.w + 1e-6))
+    assert wider.version != model.version
+    assert replace(model, about={"note": "another"}).version == model.version
+    assert replace(model, recipe=replace(model.recipe, mode="recursion")).version != model.version
+
+
+def test_garbage_is_refused(model, tmp_path):
+    whole = model.encode()
+    for bad in (b"", b"garbage", whole[:-8], whole[: len(whole) // 2], b"\xff" * 100):
+        with pytest.raises(BadModel, match="no model set"):
+            ModelSet.decode(bad)
+    path = tmp_path / "model.safetensors"
+    with pytest.raises(BadModel, match=str(path)):
+        ModelSet.load(path)
+    path.write_bytes(whole[:-8])
+    with pytest.raises(BadModel, match=str(path)):
+        ModelSet.load(path)
+
+
+def edited(model, metadata=None, **tensors):
+    """The model's bytes with tensors or metadata replaced; its version as it was."""
+    payload = model.encode()
+    size = int.from_bytes(payload[:8], "little")
+    about = json.loads(payload[8 : 8 + size])["__metadata__"]
+    changed = {name.replace("__", "."): value for name, value in tensors.items()}
+    return save(load(payload) | changed, about | (metadata or {}))
+
+
+def test_tampered_model_sets_are_refused(model):
+    assert ModelSet.decode(edited(model)).version == model.version
+    first = model.steps[0]
+    for changes, message in (
+        ({"step0__w": first.w * 0.5}, "version"),
+        ({"step0__C": first.C + 1e-12}, "version"),
+        ({"step0__w": np.full_like(first.w, np.nan)}, "NaN"),
+        ({"latch__w": -model.latch.w}, "negative width"),
+        ({"step1__kappa": -model.steps[1].kappa}, "negative width"),
+        ({"step0__w": first.w[:-1]}, "arrays"),
+        ({"step2__C": first.C[:, :-1]}, "arrays"),
+        ({"bulges__C": model.latch.C}, "arrays"),
+        ({"domain": model.domain[:1]}, "domain"),
+        ({"domain": model.domain[::-1].copy()}, "domain"),
+        ({"basis": np.zeros_like(model.basis)}, "basis"),
+        ({"basis": model.basis.astype(np.float32)}, "another type"),
+    ):
+        with pytest.raises(BadModel, match=message):
+            ModelSet.decode(edited(model, **changes))
+    for metadata, message in (
+        ({"robot": "submarine"}, "submarine"),
+        ({"layout": "another"}, "layout"),
+        ({"version": "0" * 12}, "version"),
+        ({"recipe": "{}x"}, "no model set"),
+        ({"recipe": json.dumps({"certificate": "hope"})}, "hope"),
+        ({"recipe": json.dumps({"inflation": 0.5})}, "bounds nothing"),
+        ({"recipe": json.dumps({"mode": "recursion"})}, "arrays"),
+    ):
+        with pytest.raises(BadModel, match=message):
+            ModelSet.decode(edited(model, metadata))
+
+
+def test_recipes_that_mean_nothing_are_refused():
+    for bad in ({"certificate": "hope"}, {"mode": "magic"}, {"inflation": 0.9}, {"inflation": float("nan")}):
+        with pytest.raises(ValueError, match=r"certificate|mode|envelope"):
+            Recipe(**bad)
+
+
+def test_data_that_support_no_model_are_refused(data):
+    with pytest.raises(BadData, match="trajectory"):
+        make(replace(data, trajectories=data.trajectories[:1]), Recipe())
+    with pytest.raises(BadData, match="at least"):
+        make(record(trajectories=4, periods=60), Recipe())
+    slow = tuple(replace(t, inputs=t.inputs * [1.0, 0.0]) for t in data.trajectories)
+    with pytest.raises((BadData, CertificateError)):
+        make(replace(data, trajectories=slow), Recipe())
+
+
+@pytest.mark.parametrize("which", ALL, ids="-".join)
+def test_every_model_bounds_the_data_it_was_bounded_on(models, data, which):
+    model = models[which]
+    _, bound = data.split((0.5, 0.5))
+    w = windows(bound, 1)
+    z = model.first_regressor(w.z)
+    assert (np.abs(w.y - z @ model.first.C.T) <= model.first.half_widths(z) + 1e-12).all()
+    assert (w.bulge <= model.bulges.half_widths(w.z)[:, 0]).all()
+    whole = windows(data, 3)
+    seen = ~np.isnan(whole.latch)
+    assert (whole.latch[seen] <= model.latch.half_widths(whole.z[seen])[:, 0]).all()
+
+
+def test_the_residual_certificate_is_the_narrowest_and_the_envelope_serves_all(models, data):
+    """The noise of all three is the residual of one fit: the matrices of (a) and (b) include it."""
+    w = windows(data, 3)
+    widths = {kind: Filter(models[kind, "direct"]).tube.half_widths(w.z[0])[-1].max() for kind in KINDS}
+    assert widths["residual"] <= widths["set-membership"] <= widths["matrix-zonotope"]
+    fit, _ = data.split((0.5, 0.5))
+    seen = windows(fit, 3)
+    trusted = least_squares(seen.z, seen.y)
+    for kind in ("set-membership", "matrix-zonotope"):
+        step = models[kind, "direct"].steps[2]
+        off = np.abs(w.z[:500] @ (trusted - step.C).T)
+        assert (off <= np.abs(w.z[:500] @ step.W.T) @ step.M.T + 1e-9).all()

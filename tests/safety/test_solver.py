@@ -1,0 +1,84 @@
+"""The QP: another solver finds the same answers, and the solver's own word counts for nothing."""
+
+import daqp
+import numpy as np
+import pytest
+
+from messaging.shapes import Obstacle, Shapes
+from safety.freespace import half_spaces
+from safety.model_set import ModelSet
+from safety.program import Builder, Layout
+from safety.solver import ACCURACY, Program, Solution, solve
+
+
+def programs(model: ModelSet, count, seed=0):
+    """QPs as the filter builds them, of proposals near obstacles."""
+    rng = np.random.default_rng(seed)
+    tube, outer = model.tube(), model.outer_tube()
+    layout, builder = Layout(tube), Builder(model.robot, outer)
+    for _ in range(count):
+        angles, distance = rng.uniform(-np.pi, np.pi, 4), rng.uniform(0.26, 0.36, 4)
+        near = Shapes.of(
+            [
+                Obstacle("cylinder", (r * np.cos(a), r * np.sin(a)), (0.1,))
+                for a, r in zip(angles, distance, strict=True)
+            ],
+            2,
+        )
+        v, w = rng.uniform(0, 0.25), rng.uniform(-0.5, 0.5)
+        z_0, r = np.array([v, w, v, w]), rng.uniform([0.0, -0.5], [0.25, 0.5])
+        normals, offsets = half_spaces(
+            near, np.zeros(2), tube.centers(np.concatenate([z_0, r])), 0.105, np.full(2, 0.004)
+        )
+        yield builder, builder.program(layout.rows(normals, offsets), z_0, r)
+
+
+def by_daqp(program):
+    n = len(program.h)
+    x, _, flag, _ = daqp.solve(
+        np.diag(program.h),
+        program.g,
+        np.ascontiguousarray(program.A),
+        program.b,
+        np.full(len(program.b), -1e30),
+        np.zeros(len(program.b), dtype=np.int32),
+    )
+    return x[:n], flag
+
+
+@pytest.mark.parametrize("kind", ["residual", "set-membership", "matrix-zonotope"])
+def test_another_solver_agrees(models, kind):
+    feasible = 0
+    for builder, program in programs(models[kind, "direct"], 150):
+        ours = solve(program)
+        theirs, flag = by_daqp(program)
+        if flag < 1:
+            assert ours.residual > 10 * ACCURACY or ours.status != "solved"
+            continue
+        feasible += 1
+        assert ours.status == "solved"
+        assert ours.residual <= 2 * ACCURACY
+        assert np.abs(builder.inputs(ours.x) - builder.inputs(theirs)).max() < 2e-4
+    assert feasible > 30
+
+
+def test_an_infeasible_problem_comes_back_with_its_residual():
+    program = Program(np.ones(1), np.zeros(1), np.array([[1.0], [-1.0]]), np.array([-1.0, -1.0]))
+    solution = solve(program)
+    assert solution.residual > 0.5
+    assert solution.found  # a candidate: whoever uses it must check
+
+
+def test_the_residual_is_recomputed_from_the_rows():
+    program = Program(np.ones(2), np.array([-1.0, -1.0]), np.eye(2), np.array([0.5, 2.0]))
+    solution = solve(program)
+    assert solution.x == pytest.approx([0.5, 1.0], abs=1e-5)
+    assert solution.residual == (program.A @ solution.x - program.b).max()
+    assert not Solution(np.array([np.nan]), "solved", 1, 0.0).found
+
+
+def test_the_answer_depends_on_the_program_alone(model):
+    found = list(programs(model, 20))
+    once = [solve(program).x.tobytes() for _, program in found]
+    again = [solve(program).x.tobytes() for _, program in reversed(found)]
+    assert once == again[::-1]
