@@ -84,6 +84,7 @@ class Rider:
         self.driver = Driver(robot, env, identity, settings.penalty, settings.method != "none")
         self.student = Student(process.bus, robot, actor, settings.lockstep)
         self.next_episode = 0
+        self.waiting = False  # for the safety service, standing
         self.practice, self.change = Practice(settings.practice), settings.change
         publisher: Callable[..., Publisher] = process.bus.publisher
         self.steps = publisher(STEP, robot=robot.name, source=actor)
@@ -151,13 +152,15 @@ def cycle(riders: list[Rider], question: Ask | None, tally: Tally, stop: Callabl
         if outcome is not None:
             tally.round_trip_ms += outcome.round_trip_ms
             if rider.driver.may_wait(outcome):
-                if tally.waits == 0 or outcome.round_trip_ms > 50.0:
+                if not rider.waiting:
                     log.warning("standing and waiting for the safety service: %s", outcome.failure)
+                rider.waiting = True
                 tally.waits += 1
                 time.sleep(PATIENCE)
                 continue
             if outcome.answer is None:
                 log.warning("no decision, braking along the committed plan: %s", outcome.failure)
+            rider.waiting = False
         step = rider.act(proposal, outcome)
         tally.steps += 1
         tally.fallbacks += step.fallback

@@ -1,0 +1,39 @@
+"""A learner that the tests play."""
+
+from messaging import brakeline_pb2 as pb
+from messaging.bus import Bus
+from messaging.robots import GROUND
+from messaging.topics import FLOW, JOIN, WEIGHTS
+from messaging.weights import MLP
+
+
+class Teacher:
+    """A learner's bus side: takes every actor of the right layout in, and says what it is told to."""
+
+    def __init__(self, bus: Bus) -> None:
+        self.flow = pb.Flow(robot="ground", incarnation=1)
+        self.version, self.layout = 1, GROUND.layout()
+        self.joins: list[pb.Join] = []
+        self._flow, self._weights = bus.publisher(FLOW, robot="ground"), bus.publisher(WEIGHTS, robot="ground")
+        bus.serve(JOIN, self._join, robot="ground")
+
+    def _join(self, payload: bytes) -> bytes:
+        join = pb.Join.FromString(payload)
+        self.joins.append(join)
+        if join.layout != self.layout:
+            return pb.JoinReply(error=pb.Error(type="Refused", field="layout", message="another")).SerializeToString()
+        return pb.JoinReply(weights=self.weights(), flow=self.flow, episode=join.episode + 3).SerializeToString()
+
+    def weights(self) -> pb.Weights:
+        file = MLP(GROUND, MLP.untrained(GROUND, 0, (8,)).layers, self.version).encode()
+        return pb.Weights(robot="ground", version=self.version, file=file)
+
+    def say(self, limit: int, **fields: object) -> None:
+        self.flow.limit["actor-0"] = limit
+        for name, value in fields.items():
+            setattr(self.flow, name, value)
+        self._flow.put(self.flow)
+
+    def publish(self, version: int) -> None:
+        self.version = version
+        self._weights.put(self.weights())

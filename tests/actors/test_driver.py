@@ -1,0 +1,93 @@
+"""One robot through an episode, without a bus."""
+
+import numpy as np
+import pytest
+
+from actors.driver import Driver, Identity
+from actors.guard import consult
+from deploy.evaluate import in_process
+from deploy.vehicles import environment
+from messaging import brakeline_pb2 as pb
+from messaging.bus import NoReply
+from messaging.robots import GROUND
+from safety.model_set import Recipe
+
+FAST = np.array([0.25, 0.1])
+
+
+def driver(number: int = 0, seed: int = 0, **more) -> Driver:
+    return Driver(GROUND, environment(GROUND, "default", seed), Identity("actor-0", number, seed), **more)
+
+
+@pytest.fixture(scope="module")
+def ask(data_folder):
+    from deploy.store import model_for
+
+    return in_process(model_for(GROUND, Recipe()))
+
+
+def test_the_steps_of_an_episode(ask):
+    robot = driver(penalty=2.0)
+    episode = robot.begin(5)
+    assert (episode.episode, episode.actor, episode.arena) == (5, "actor-0", "default")
+    assert episode.obstacles and len(episode.start) == 5 and episode.goal_radius > 0
+    observation = robot.observation
+    for number in range(40):
+        outcome = consult(ask, [robot.request(FAST)], GROUND)[0]
+        step = robot.execute(FAST, outcome, weights_version=3)
+        assert (step.episode, step.step, step.index, step.weights_version) == (5, number, number + 1, 3)
+        assert np.array_equal(np.float32(step.observation), observation)
+        assert np.array_equal(np.float32(step.next_observation), robot.observation)
+        assert step.decision == outcome.answer.message.kind and step.decide_ms > 0 and not step.fallback
+        assert np.allclose(step.action, outcome.answer.action) and np.allclose(step.proposed, FAST)
+        intervened = step.decision != pb.ALLOWED
+        assert (step.penalty > 0) == intervened and step.penalty <= 2.0 * np.sqrt(2)
+        assert step.compared and step.contained
+        assert len(step.state) == len(step.true_state) == 5 and len(step.path) % 2 == 0 and step.path
+        assert not step.collision and step.clearance > 0 and step.header.time == pytest.approx(0.2 * (number + 1))
+        observation = robot.observation
+        if not robot.running:
+            break
+
+
+def test_containment_is_of_the_state_after_the_step_and_unknown_after_a_fallback(ask):
+    robot = driver()
+    robot.begin(0)
+    for wrong in (False, True):
+        outcome = consult(ask, [robot.request(FAST)], GROUND)[0]
+        if wrong:  # a prediction that cannot come true
+            outcome.answer.message.predicted_center[0] += 1.0
+        step = robot.execute(FAST, outcome)
+        assert step.compared and step.contained is not wrong
+    missing = consult(lambda requests: (_ for _ in ()).throw(NoReply("gone")), [robot.request(FAST)], GROUND)[0]
+    plan = robot.commitment.plan.copy()
+    step = robot.execute(FAST, missing)
+    assert step.fallback and step.decision == pb.FAILSAFE and not step.compared
+    assert np.allclose(step.action, plan[0])
+
+
+def test_without_a_filter_the_proposal_is_executed_within_bounds():
+    robot = driver(filtered=False)
+    robot.begin(0)
+    step = robot.execute(np.array([9.0, -9.0]), None)
+    assert np.allclose(step.action, [0.25, -0.5])
+    assert (step.decision, step.penalty, step.compared) == (pb.UNKNOWN, 0.0, False)
+
+
+def test_no_two_robots_of_a_run_ever_see_the_same_episode():
+    seeds = {
+        Identity(f"actor-{number}", number, 0).episode_seed(episode) for number in range(64) for episode in range(200)
+    }
+    assert len(seeds) == 64 * 200
+    arenas = {
+        driver(number, seed).begin(episode).SerializeToString()
+        for number in (0, 1)
+        for seed in (0, 1)
+        for episode in (0, 1)
+    }
+    assert len(arenas) == 8
+    one, same = driver(1, 7), driver(1, 7)
+    assert one.begin(3) == same.begin(3)
+    assert one.rng.random() == same.rng.random()
+    same.begin(4)
+    assert one.rng.random() != same.rng.random()

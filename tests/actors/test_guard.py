@@ -1,0 +1,110 @@
+"""Whatever happens to a question, the robot brakes along the plan that it committed to, stands, and goes on later."""
+
+import numpy as np
+import pytest
+
+from actors.guard import at_rest, consult, next_input
+from messaging import brakeline_pb2 as pb
+from messaging.bus import BusError, Late, NoReply, Refused
+from messaging.robots import GROUND
+from safety.client import request_message
+from safety.commitment import Commitment
+
+PLAN = np.array([[0.2, 0.3], [0.1, 0.15], [0.0, 0.0]])
+REQUEST = pb.Request(robot="ground")
+
+
+def decision(plan=PLAN, **fields):
+    values = {"kind": pb.ALLOWED, "plan": np.ravel(plan), "model": "abc", "verified": True}
+    predicted = {"predicted_center": [0.0] * 5, "predicted_half_width": [1.0] * 5}
+    return pb.Reply(decision=pb.Decision(**(values | predicted | fields)))
+
+
+def outcome_of(reply):
+    """Of a question that is answered by `reply`, or fails with it."""
+
+    def ask(requests):
+        if isinstance(reply, BusError):
+            raise reply
+        return [reply] * len(requests)
+
+    return consult(ask, [REQUEST], GROUND)[0]
+
+
+def committed():
+    """A robot that just executes the first input of PLAN."""
+    commitment = Commitment(GROUND)
+    assert (next_input(commitment, outcome_of(decision())) == PLAN[0]).all()
+    return commitment
+
+
+FAILURES = {
+    "late": Late("no answer within 100 ms"),
+    "nobody": NoReply("nobody answers"),
+    "refused": Refused(pb.Error(type="BadRequest", field="payload", message="not a request batch")),
+    "error": pb.Reply(error=pb.Error(type="StaleModel", field="model", message="never in use here")),
+    "empty": pb.Reply(),
+    "no kind": decision(kind=pb.UNKNOWN),
+    "short plan": decision(PLAN[:2]),
+    "not a number": decision(np.where(PLAN == 0.1, np.nan, PLAN)),
+    "infinite": decision(np.where(PLAN == 0.1, np.inf, PLAN)),
+    "out of bounds": decision(PLAN * 10),
+    "backwards": decision(-PLAN),
+    "no stop at its end": decision(np.ones((3, 2)) * 0.1),
+    "no prediction": decision(predicted_center=[]),
+}
+
+
+@pytest.mark.parametrize("failure", FAILURES.values(), ids=FAILURES.keys())
+def test_without_a_decision_the_plan_is_followed_to_standstill_and_beyond(failure):
+    commitment, executed = committed(), []
+    for _ in range(5):
+        outcome = outcome_of(failure)
+        assert outcome.answer is None and outcome.failure
+        executed.append(next_input(commitment, outcome))
+    assert np.array(executed).tolist() == [[0.1, 0.15], [0, 0], [0, 0], [0, 0], [0, 0]]
+    assert commitment.predicted is None, "nobody predicted where it is now"
+
+
+def test_what_failed_is_recorded_with_its_reason_and_the_reply_if_one_came():
+    assert outcome_of(FAILURES["late"]).exchange(1.0).failure.startswith("Late: no answer within 100 ms")
+    refused = outcome_of(FAILURES["error"]).exchange(1.0)
+    assert refused.failure == "StaleModel: never in use here"
+    assert refused.reply.error.field == "model"
+    allowed = outcome_of(decision()).exchange(2.5)
+    assert (allowed.failure, allowed.header.time, allowed.reply.decision.model) == ("", 2.5, "abc")
+    assert allowed.round_trip_ms > 0.0
+
+
+def test_it_waits_only_when_it_stands_and_is_committed_to_that():
+    commitment = Commitment(GROUND)
+    assert at_rest(commitment)
+    next_input(commitment, outcome_of(decision()))
+    moving = []
+    for _ in range(3):
+        moving.append(at_rest(commitment))
+        next_input(commitment, outcome_of(FAILURES["nobody"]))
+    assert moving == [False, False, True], "it still moves while the last but one input, the first zero, is executed"
+    commitment = Commitment(GROUND)
+    next_input(commitment, outcome_of(decision(np.array([[0.0, 0.0], [0.1, 0.0], [0.0, 0.0]]))))
+    assert not at_rest(commitment), "it stands, but has committed to move"
+
+
+def test_it_goes_on_when_the_service_is_back():
+    commitment = committed()
+    next_input(commitment, outcome_of(FAILURES["late"]))
+    again = np.array([[0.25, -0.5], [0.0, 0.0], [0.0, 0.0]])
+    assert (next_input(commitment, outcome_of(decision(again))) == again[0]).all()
+    assert commitment.model == "abc" and commitment.predicted is not None
+    for _ in range(3):
+        next_input(commitment, outcome_of(FAILURES["late"]))
+    request = request_message(commitment, np.zeros(5), np.zeros(2), [])
+    assert request.model == "" and not any(request.plan), "standing still needs nobody's word"
+
+
+def test_a_wrong_reply_about_one_robot_leaves_the_others_theirs():
+    replies = [decision(), FAILURES["error"], decision()]
+    outcomes = consult(lambda requests: replies, [REQUEST] * 3, GROUND)
+    assert [outcome.answer is not None for outcome in outcomes] == [True, False, True]
+    lost = consult(lambda requests: (_ for _ in ()).throw(NoReply("gone")), [REQUEST] * 3, GROUND)
+    assert [outcome.failure for outcome in lost] == ["NoReply: gone"] * 3

@@ -1,0 +1,117 @@
+"""The actor's process on a real bus, with a learner that the tests play and the safety service's own core."""
+
+import threading
+import time
+from functools import partial
+
+import numpy as np
+import pytest
+
+from actors.loop import ActorSettings, run
+from deploy.vehicles import environment
+from messaging import brakeline_pb2 as pb
+from messaging.bus import Bus, BusSettings
+from messaging.robots import GROUND
+from messaging.topics import DECIDE, EXCHANGE, STEP
+from safety.model_set import Recipe
+from safety.service import Counts, Models, answerer
+from tests.actors.teacher import Teacher
+
+STEPS = 60  # that each robot may take
+
+
+class Service:
+    """Safety in the test's process: it can be away, and says what it was asked."""
+
+    def __init__(self, bus: Bus, data_folder) -> None:
+        from deploy.store import model_for
+
+        models = Models()
+        models.install(model_for(GROUND, Recipe()))
+        self._answer = answerer(models, Counts())
+        self.batches: list[list[str]] = []
+        self.failing = self.fails_when_moving = False
+        bus.serve(DECIDE, self._decide, robot="ground")
+
+    def _decide(self, payload: bytes) -> bytes:
+        requests = pb.RequestBatch.FromString(payload).requests
+        self.batches.append([request.actor for request in requests])
+        self.failing |= self.fails_when_moving and any(requests[0].input_in_force)
+        if self.failing:
+            raise RuntimeError("out of order")
+        return self._answer(payload)
+
+
+@pytest.fixture
+def scene(buses, data_folder):
+    """`(service, steps, exchanges, start)`: what the actors publish, and how to start their process."""
+    learner, _ = buses
+    steps: list[pb.Step] = []
+    exchanges: list[pb.Exchange] = []
+    learner.subscribe(STEP, lambda sample: steps.append(sample.message()))
+    learner.subscribe(EXCHANGE, lambda sample: exchanges.append(sample.message()))
+    threads: list[threading.Thread] = []
+    teacher = Teacher(learner)
+
+    def start(robots: int, limit: int = STEPS, **settings) -> None:
+        names = ["actor-0"] if robots == 1 else [f"actor-0.{i}" for i in range(robots)]
+        teacher.flow.limit.update(dict.fromkeys(names, limit))
+        bus = BusSettings(connect=learner.settings.listen)
+        values = ActorSettings(bus, robots=robots, deadline=2.0, **settings)
+        threads.append(threading.Thread(target=run, args=(values, partial(environment)), daemon=True))
+        threads[0].start()
+
+    def end() -> None:
+        teacher.say(0, done=True)
+        for thread in threads:
+            thread.join(20.0)
+            assert not thread.is_alive()
+
+    service = Service(learner, data_folder)
+    yield service, steps, exchanges, start
+    end()
+
+
+def until(condition, seconds=60.0):
+    deadline = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < deadline, "it did not come about"
+        time.sleep(0.01)
+
+
+def test_the_robots_of_a_process_share_a_question(scene):
+    service, steps, exchanges, start = scene
+    start(robots=3, limit=20)
+    until(lambda: len(steps) == 3 * 20 and len(exchanges) == 3 * 20)
+    names = ["actor-0.0", "actor-0.1", "actor-0.2"]
+    assert service.batches == [names] * 20
+    for name in names:
+        own = [step for step in steps if step.actor == name]
+        assert [step.index for step in own] == list(range(1, 21))
+        assert [step.header.sequence for step in own] == list(range(1, 21))
+    starts = {tuple(step.true_state) for step in steps if step.index == 1}
+    assert len(starts) == 3, "each in an arena of its own"
+
+
+def test_without_the_service_it_brakes_along_its_plan_waits_and_goes_on(scene):
+    service, steps, exchanges, start = scene
+    start(robots=1, limit=10**6)
+
+    until(lambda: len(steps) > 20)
+    service.fails_when_moving = True
+    until(lambda: service.failing)
+    quiet = -1
+    while quiet != len(steps):  # it stands, and does not let the episode pass
+        quiet = len(steps)
+        time.sleep(1.0)
+    lost = [step for step in steps if step.fallback]
+    assert lost and lost[-1] is steps[-1] and not any(steps[-1].action)
+    first = steps.index(lost[0])
+    answers = {(e.request.episode, e.request.step): e.reply.decision for e in exchanges if not e.failure}
+    before = steps[first - 1]
+    plan = np.reshape(answers[before.episode, before.step].plan, (-1, 2))
+    assert np.allclose([step.action for step in steps[first:]], plan[1 : 1 + len(lost)])
+    service.fails_when_moving = service.failing = False
+    until(lambda: len(steps) > quiet + 20)
+    assert not any(step.fallback for step in steps[quiet:])
+    assert not any(step.collision for step in steps)
