@@ -1,0 +1,134 @@
+"""Whole runs through the real command line, and what the tests do to them."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Self
+
+import psutil
+
+from logs.metrics import Metrics
+from messaging.bus import Bus, BusSettings, Sample
+from messaging.topics import RECORDED
+
+BRAKELINE = (sys.executable, "-m", "deploy.cli")
+PATIENCE = 120.0  # s: two cores that others use too
+
+
+def until(condition: Callable[[], Any], what: str, seconds: float = PATIENCE) -> Any:
+    """Wait for the condition; returns what it gave."""
+    deadline = time.monotonic() + seconds
+    while not (result := condition()):
+        assert time.monotonic() < deadline, f"not within {seconds:.0f} s: {what}"
+        time.sleep(0.05)
+    return result
+
+
+def brakeline(*arguments: object, timeout: float = PATIENCE) -> subprocess.CompletedProcess[str]:
+    """A command from its start to its end."""
+    return subprocess.run([*BRAKELINE, *map(str, arguments)], capture_output=True, text=True, timeout=timeout)
+
+
+class Run:
+    """`brakeline train` in progress, in a folder, with the `debug` experiment; killed, with all it started, at the
+    end of the block."""
+
+    def __init__(self, folder: Path, *arguments: object, fresh: bool = True) -> None:
+        self.folder = folder
+        place = ("--out", folder) if fresh else ("--resume", folder)
+        words = (*BRAKELINE, "train", *("ground --experiment debug".split() if fresh else ()), *place, *arguments)
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        self._output = folder.parent / f"{folder.name}{'' if fresh else '-resumed'}.out"
+        self.errors = self._output.with_suffix(".err")
+        with self._output.open("w") as out, self.errors.open("w") as err:
+            self.popen = subprocess.Popen([*map(str, words), "--json"], stdout=out, stderr=err)
+        self._bus: Bus | None = None
+        self.metrics = Metrics()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._bus is not None:
+            self._bus.close()
+        for process in [self.popen, *self.children().values()]:
+            process.kill()
+        self.popen.wait()
+
+    def children(self) -> dict[str, psutil.Process]:
+        """The living processes of the run, the launcher aside, by name; a zombie is alive."""
+        found = {}
+        for process in psutil.process_iter(["cmdline"]):
+            words = process.info["cmdline"] or []
+            if "deploy.child" in words and str(self.folder) in words:
+                found[words[-1]] = process
+        return found
+
+    def watch(self) -> Metrics:
+        """Figures of what is on the bus from now on."""
+
+        def endpoint() -> str | None:
+            try:
+                said = json.loads((self.folder / "endpoint").read_text())
+            except (OSError, ValueError):
+                assert self.popen.poll() is None, self.errors.read_text()
+                return None
+            return said["endpoint"] if said["pid"] == self.popen.pid else None
+
+        def take(sample: Sample) -> None:
+            self.metrics.add(sample.key, sample.message())
+
+        if self._bus is None:
+            settings = BusSettings(connect=(until(endpoint, "an endpoint"),))
+            self._bus = Bus(settings, "watcher")
+            for topic in RECORDED:
+                self._bus.subscribe(topic, take)
+        return self.metrics
+
+    def steps(self) -> int:
+        """Taken since `watch`."""
+        return sum(tally.steps for tally in self.metrics.actors.copy().values())
+
+    def learned(self) -> int:
+        """Steps, as the learner last said."""
+        known = self.metrics.learners.get("ground")
+        return 0 if known is None else int(known.steps)
+
+    def until_steps(self, count: int) -> None:
+        """Wait for so many more steps."""
+        self.watch()
+        target = self.steps() + count
+        until(lambda: self.steps() >= target or self.popen.poll() is not None, f"{count} steps")
+        assert self.popen.poll() is None, self.errors.read_text()
+
+    def kill(self, name: str) -> None:
+        """kill -9 of a process, and wait until another one has taken its place."""
+        victim = until(lambda: self.children().get(name), f"{name} lives")
+        victim.kill()
+        until(lambda: self.children().get(name, victim).pid != victim.pid, f"{name} is started again")
+
+    def end(self, number: signal.Signals | None = None) -> dict[str, Any]:
+        """Wait for the end, after a signal if one is given; the figures that were printed. Nothing may be left."""
+        if number is not None:
+            self.popen.send_signal(number)
+        self.popen.wait(PATIENCE)
+        assert self.children() == {}, "processes are left"
+        printed = self._output.read_text()
+        assert printed.count("\n") == 1, f"one JSON object and nothing else: {printed}\n{self.errors.read_text()}"
+        figures: dict[str, Any] = json.loads(printed)
+        return figures
+
+
+def alive(pid: int) -> bool:
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    return True
