@@ -53,7 +53,7 @@ class Learner:
         self._td3 = TD3(*dims, td3, seed=int(networks.generate_state(1)[0]))
         self._draws = np.random.default_rng(draws)
         self._replay, self._batch = Replay(config.capacity, *dims), Batch(td3.batch, *dims)
-        self._windows, self._ledger = Windows(td3.n_step, td3.gamma), Ledger()
+        self._windows, self._ledger = Windows(td3.n_step, td3.gamma, td3.stored), Ledger()
         ahead = 0.0 if config.lockstep else config.ahead
         self._limiter = Limiter(td3.updates_per_step * td3.batch, td3.batch, td3.warmup, ahead)
         self._limits: dict[str, int] = {}

@@ -21,7 +21,7 @@ class BadStep(ValueError):
 
 
 class Intake:
-    """Reads the steps of one kind of robot. The reward learned is `reward − penalty`, the action the executed one."""
+    """Reads the steps of one kind of robot. The reward learned is `reward − penalty`."""
 
     def __init__(self, robot: Robot) -> None:
         self.robot = robot
@@ -38,14 +38,19 @@ class Intake:
             raise BadStep("actor", "empty")
         if step.index == 0:
             raise BadStep("index", "counts from 1")
-        reward = step.reward - step.penalty
-        if not np.isfinite(reward):
+        if not np.isfinite(step.reward - step.penalty):
             raise BadStep("reward", f"{step.reward} - {step.penalty}")
-        executed = _vector("action", step.action, self.robot.action_dim)
-        action = np.clip((executed - self._centre) / self._half, -1.0, 1.0).astype(np.float32)
+        action, proposed = self._normalised("action", step.action), self._normalised("proposed", step.proposed)
         observation = _vector("observation", step.observation, self.robot.observation_dim)
         after = _vector("next_observation", step.next_observation, self.robot.observation_dim)
-        return Move(step.episode, step.step, observation, action, reward, after, step.terminated, step.truncated)
+        values = action, proposed, step.reward, step.penalty
+        return Move(step.episode, step.step, observation, *values, after, step.terminated, step.truncated)
+
+    def _normalised(self, name: str, values: Any) -> Vector:
+        """An action in [-1, 1]: what is out of bounds would have been clipped."""
+        action = _vector(name, values, self.robot.action_dim)
+        normalised: Vector = np.clip((action - self._centre) / self._half, -1.0, 1.0).astype(np.float32)
+        return normalised
 
 
 def _vector(name: str, values: Any, size: int) -> Vector:

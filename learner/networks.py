@@ -9,12 +9,12 @@ from __future__ import annotations
 
 import math
 from itertools import pairwise
-from typing import Literal
 
 import torch
 from torch import Tensor
 
-Precision = Literal["float32", "bfloat16"]
+from learner.config import Precision
+
 WIDE = 64  # a product is worth rounding to bfloat16 from this width on
 
 

@@ -20,36 +20,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from learner.adam import Adam
-from learner.networks import Network, Precision
+from learner.config import TD3Config
+from learner.networks import Network
 from learner.replay import Batch
 from learner.state import State
-
-
-@dataclass(frozen=True)
-class TD3Config:
-    hidden: tuple[int, ...] = (256, 256)
-    actor_rate: float = 3e-4
-    critic_rate: float = 3e-4
-    batch: int = 256
-    gamma: float = 0.99
-    n_step: int = 3
-    tau: float = 0.005
-    policy_delay: int = 2
-    target_noise: float = 0.2  # σ, of the half range of an action
-    target_noise_clip: float = 0.5  # η
-    exploration_noise: float = 0.1  # of the half range; travels to the actors with the weights
-    reward_scale: float = 0.1  # keeps |Q| near 10 for rewards of ±100, where Adam at 3e-4 is quick
-    updates_per_step: float = 1.0
-    warmup: int = 2000  # steps at random before the first update
-    precision: Precision = "float32"  # of the wide products
-
-    def __post_init__(self) -> None:
-        if min(self.batch, self.n_step, self.policy_delay, self.updates_per_step) <= 0 or not self.hidden:
-            raise ValueError(f"batch, n_step, policy_delay, updates_per_step and hidden must be positive: {self}")
-        if self.warmup < self.n_step:
-            raise ValueError(f"warmup {self.warmup} is shorter than n_step {self.n_step}: nothing to sample from")
-        if not 0.0 <= self.gamma <= 1.0 or not 0.0 < self.tau <= 1.0:
-            raise ValueError(f"gamma must be in [0, 1] and tau in (0, 1]: {self}")
 
 
 @dataclass

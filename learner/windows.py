@@ -3,6 +3,11 @@
 A window opens at every step and closes after n steps or, shorter, where the episode ends or a step is missing. Only a
 *terminated* episode has no value beyond its end; truncation and gaps leave one, γ^k Q(s'), with s' as last seen. So
 nothing spans a gap and nothing that arrived is lost.
+
+A step that the safety filter corrected is two lessons in one: proposing what was executed would have had the same
+outcome without a penalty, and proposing what was proposed had it with one. With `Stored` "both" each becomes a
+transition. "executed" alone teaches nothing about actions that the filter never lets pass, and the critic's guesses
+about them draw the policy to the obstacles; there the penalty stands with the executed action.
 """
 
 from __future__ import annotations
@@ -12,8 +17,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from learner.config import Stored
 from learner.replay import Transition, Vector
 from learner.state import State
+
+VECTORS = ("observation", "action", "proposed", "next_observation")
 
 
 class Move(NamedTuple):
@@ -22,8 +30,10 @@ class Move(NamedTuple):
     episode: int
     step: int
     observation: Vector
-    action: Vector
-    reward: float
+    action: Vector  # executed
+    proposed: Vector
+    reward: float  # without the penalty
+    penalty: float
     next_observation: Vector
     terminated: bool
     truncated: bool
@@ -32,8 +42,8 @@ class Move(NamedTuple):
 class Windows:
     """Open windows of every actor: at most n − 1 consecutive moves each."""
 
-    def __init__(self, n: int, gamma: float) -> None:
-        self.n, self.gamma = n, gamma
+    def __init__(self, n: int, gamma: float, stored: Stored = "executed") -> None:
+        self.n, self.gamma, self.stored = n, gamma, stored
         self._open: dict[str, deque[Move]] = {}
         self._last: dict[str, tuple[int, int]] = {}  # newest (episode, step) of an actor
 
@@ -41,7 +51,7 @@ class Windows:
         """The transitions that this move completes, oldest first. Moves are not repeated (`learner/ledger.py`)."""
         here, last = (move.episode, move.step), self._last.get(actor, (-1, -1))
         if here < last:  # a straggler: its neighbours are closed, it stands for itself
-            return [self._close([move])]
+            return self._close([move])
         self._last[actor] = here
         moves = self._open.setdefault(actor, deque())
         done: list[Transition] = []
@@ -51,24 +61,29 @@ class Windows:
         if move.terminated or move.truncated:
             done += self._drain(moves)
         elif len(moves) == self.n:
-            done.append(self._close(moves))
+            done += self._close(moves)
             moves.popleft()
         return done
 
     def _drain(self, moves: deque[Move]) -> list[Transition]:
-        done = []
+        done: list[Transition] = []
         while moves:
-            done.append(self._close(moves))
+            done += self._close(moves)
             moves.popleft()
         return done
 
-    def _close(self, moves: deque[Move] | list[Move]) -> Transition:
+    def _close(self, moves: deque[Move] | list[Move]) -> list[Transition]:
         first, last = moves[0], moves[-1]
         reward = 0.0
         for move in reversed(moves):
-            reward = move.reward + self.gamma * reward
+            reward = move.reward - move.penalty + self.gamma * reward
         discount = 0.0 if last.terminated else self.gamma ** len(moves)
-        return Transition(first.observation, first.action, reward, discount, last.next_observation)
+        if self.stored == "executed" or np.array_equal(first.action, first.proposed):
+            return [Transition(first.observation, first.action, reward, discount, last.next_observation)]
+        return [
+            Transition(first.observation, first.action, reward + first.penalty, discount, last.next_observation),
+            Transition(first.observation, first.proposed, reward, discount, last.next_observation),
+        ]
 
     def state(self) -> State:
         """The open windows too: with several actors a checkpoint cuts through the episodes of all but one."""
@@ -76,9 +91,9 @@ class Windows:
         moves = [(number, move) for number, actor in enumerate(actors) for move in self._open[actor]]
         tensors = {
             "place": np.array([(n, m.episode, m.step) for n, m in moves], np.int64).reshape(len(moves), 3),
-            "reward": np.array([m.reward for _, m in moves], np.float64),
+            "reward": np.array([(m.reward, m.penalty) for _, m in moves], np.float64).reshape(len(moves), 2),
         }
-        for name in ("observation", "action", "next_observation"):
+        for name in VECTORS:
             rows = [getattr(move, name) for _, move in moves]
             tensors[name] = np.array(rows, np.float32) if rows else np.zeros((0, 0), np.float32)
         return State(tensors, {"actors": actors, "last": [list(self._last[actor]) for actor in actors]})
@@ -88,10 +103,10 @@ class Windows:
         self._last = {actor: (last[0], last[1]) for actor, last in zip(actors, state.value("last"), strict=True)}
         self._open = {actor: deque() for actor in actors}
         place = state.tensor("place", (None, 3), "int64")
-        rewards = state.tensor("reward", (len(place),), "float64")
-        vectors = [
-            state.tensor(name, (len(place), None), "float32") for name in ("observation", "action", "next_observation")
-        ]
-        for (number, episode, step), reward, observation, action, after in zip(place, rewards, *vectors, strict=True):
-            move = Move(int(episode), int(step), observation, action, float(reward), after, False, False)
+        rewards = state.tensor("reward", (len(place), 2), "float64")
+        vectors = [state.tensor(name, (len(place), None), "float32") for name in VECTORS]
+        for (number, episode, step), (reward, penalty), *parts in zip(place, rewards, *vectors, strict=True):
+            observation, action, proposed, after = parts
+            places, values = (int(episode), int(step)), (float(reward), float(penalty))
+            move = Move(*places, observation, action, proposed, *values, after, False, False)
             self._open[actors[number]].append(move)

@@ -34,7 +34,8 @@ def step(number: int, **fields) -> pb.Step:
         "action": [1.0],
         "next_observation": [0.0, 0.0],
     }
-    return pb.Step(**(values | fields))
+    values |= fields
+    return pb.Step(**({"proposed": values["action"]} | values))
 
 
 def test_lockstep_runs_are_alike_bit_for_bit():

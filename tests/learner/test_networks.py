@@ -8,9 +8,10 @@ import torch
 from torch.nn.functional import linear, relu
 
 from learner.adam import Adam
+from learner.config import TD3Config
 from learner.networks import Network
 from learner.replay import Batch
-from learner.td3 import TD3, TD3Config
+from learner.td3 import TD3
 
 SMALL = TD3Config(hidden=(24, 16), batch=32)
 

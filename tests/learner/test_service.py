@@ -11,10 +11,9 @@ import numpy as np
 import pytest
 
 from learner import checkpoint
-from learner.config import LearnerConfig
+from learner.config import LearnerConfig, TD3Config
 from learner.core import Learner
 from learner.service import CHECKPOINT, POLICY, LearnerLoop, LearnerSettings, main
-from learner.td3 import TD3Config
 from messaging import brakeline_pb2 as pb
 from messaging.bus import Bus, BusSettings, Refused
 from messaging.robots import GROUND, UnknownRobot
@@ -94,6 +93,7 @@ class Actor:
             message.observation.extend(generator.uniform(-1, 1, 26))
             message.next_observation.extend(generator.uniform(-1, 1, 26))
             message.action.extend(generator.uniform(GROUND.low(), GROUND.high()))
+            message.proposed.extend(message.action)
             message.truncated = step == 19
             step += 1
             if message.truncated:

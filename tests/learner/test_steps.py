@@ -17,7 +17,9 @@ GAMMA = 0.9
 
 def move(episode: int, step: int, reward: float, terminated: bool = False, truncated: bool = False) -> Move:
     name = np.array([episode, step], np.float32)  # a vector that says which step it is of
-    return Move(episode, step, name, name, reward, name + np.array([0, 1], np.float32), terminated, truncated)
+    return Move(
+        episode, step, name, name, name, reward, 0.0, name + np.array([0, 1], np.float32), terminated, truncated
+    )
 
 
 @given(st.lists(st.integers(0, 30)))
@@ -207,3 +209,19 @@ def test_replay_refuses_what_does_not_fit():
         Replay(4, 3, 1).restore(State(state.tensors, state.values | {"next": 3}))
     with pytest.raises(ValueError, match="nothing"):
         Replay(4, 3, 1).sample(np.random.default_rng(0), Batch(2, 3, 1))
+
+
+def test_a_corrected_step_is_two_lessons():
+    """What was executed would have cost nothing; what was proposed cost the penalty; later penalties are on both."""
+    ends = [np.array([v], np.float32) for v in (0.0, 1.0)]
+    moves = [Move(0, i, ends[0], ends[0], ends[1], 1.0, 0.25, ends[1], False, i == 1) for i in range(2)]
+    windows = Windows(2, 0.5, "both")
+    first = windows.push("a", moves[0]) + windows.push("a", moves[1])
+    assert [(t.action[0], t.reward) for t in first] == [
+        (0.0, 1.0 + 0.5 * 0.75),
+        (1.0, 0.75 + 0.5 * 0.75),
+        (0.0, 1.0),
+        (1.0, 0.75),
+    ]
+    single = Windows(1, 0.5, "executed").push("a", moves[0])
+    assert [(t.action[0], t.reward) for t in single] == [(0.0, 0.75)]

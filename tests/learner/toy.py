@@ -7,9 +7,8 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from learner.config import LearnerConfig
+from learner.config import LearnerConfig, TD3Config
 from learner.core import Learner
-from learner.td3 import TD3Config
 from messaging import brakeline_pb2 as pb
 from messaging import weights
 from messaging.robots import GROUND
