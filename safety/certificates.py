@@ -37,6 +37,11 @@ class Certificate:
     w: Array
     generators: Array
 
+    def __post_init__(self) -> None:
+        """One memory layout, whether made or read: the order of summation, and so the last bit, depends on it."""
+        for name in ("C", "W", "M", "kappa", "w", "generators"):
+            object.__setattr__(self, name, np.ascontiguousarray(getattr(self, name), dtype=float))
+
     def magnitudes(self, z: Array) -> Array:
         """Lengths of the generators for regressors z (..., nz): (..., g)."""
         return np.asarray(np.abs(z @ self.W.T) @ self.M.T + np.abs(z) @ self.kappa.T + self.w)

@@ -56,8 +56,8 @@ class Layout:
         """Rows for half-spaces `a·p <= b` in the frame of now, a (n, N, d), b (n, N)."""
         n = len(normals)
         spread = normals[:, self.period, None, :] @ self.maps  # (n, 2N+1, 1, nz + L)
-        spread = spread.reshape(n * len(self.period), -1)
-        extra = np.broadcast_to(self.extra, (n, *self.extra.shape)).reshape(len(spread), -1)
+        spread = spread.reshape(n * len(self.period), self.maps.shape[2])
+        extra = np.broadcast_to(self.extra, (n, *self.extra.shape)).reshape(len(spread), self.extra.shape[1])
         both = np.hstack([np.abs(spread[:, self.nz :]), extra])
         return Rows(spread[:, : self.nz], both, offsets[:, self.period].ravel())
 

@@ -1,0 +1,372 @@
+"""The service's core, the client and the wrapper: what comes in is checked, what goes out can be relied on."""
+
+import logging
+from dataclasses import replace
+
+import gymnasium
+import numpy as np
+import pytest
+
+from messaging import brakeline_pb2 as pb
+from messaging.bus import NoReply, Refused
+from messaging.robots import GROUND
+from messaging.shapes import Obstacle
+from messaging.topics import DECIDE
+from safety.client import SafetyClient, SafetyError, ask, read, request_message
+from safety.commitment import UNVERIFIED, Commitment
+from safety.filter import BadRequest, Filter
+from safety.gym import SafetyWrapper
+from safety.model_set import ModelSet
+from safety.service import Counts, Models, answerer
+from safety.wire import LARGEST, MOST_OBSTACLES, request_of
+from tests.messaging.conftest import endpoint, join  # noqa: F401 - fixtures
+from tests.safety.unicycle import Unicycle
+
+NAN, INF = float("nan"), float("inf")
+AHEAD = Obstacle("cylinder", (0.34, 0.0), (0.1,))
+
+
+def good(**more):
+    return request_message(Commitment(GROUND), np.zeros(5), [0.2, 0.1], [AHEAD], actor="actor-0", **more)
+
+
+class Service:
+    """The core, called with bytes."""
+
+    def __init__(self, *models: ModelSet, archive=None):
+        self.models, self.counts = Models(archive), Counts()
+        for model in models:
+            self.models.install(model)
+        self.answer = answerer(self.models, self.counts)
+
+    def replies(self, *requests):
+        payload = pb.RequestBatch(requests=requests).SerializeToString()
+        return list(pb.ReplyBatch.FromString(self.answer(payload)).replies)
+
+    def error(self, request):
+        reply = self.replies(request)[0]
+        assert reply.WhichOneof("result") == "error"
+        return reply.error
+
+
+@pytest.fixture
+def service(model):
+    return Service(model)
+
+
+def test_a_batch_is_answered_in_its_order(service, model):
+    replies = service.replies(*(good(step=i) for i in range(5)), good(time=2.0))
+    assert len(replies) == 6
+    for reply in replies:
+        answer = read(reply, GROUND)
+        assert answer.kind in ("allowed", "adjusted")
+        assert answer.message.model == model.version
+        assert answer.message.verified
+        assert answer.message.time_ms > 0
+    assert service.counts.figures()["decisions"] == 6
+    assert service.counts.errors == 0
+
+
+def test_the_wire_changes_no_decision(service, ready):
+    message = good()
+    direct = ready.decide(request_of(message, GROUND))
+    answer = read(service.replies(message)[0], GROUND)
+    assert np.array_equal(answer.plan, direct.plan)
+    assert answer.kind == direct.kind
+    assert answer.message.margin == direct.margin
+    assert list(answer.message.predicted_half_width) == list(direct.predicted.half_width)
+
+
+def bad(**changes):
+    message = good()
+    for name, value in changes.items():
+        if isinstance(value, str | float):
+            setattr(message, name, value)
+        else:
+            message.ClearField(name)
+            getattr(message, name).extend(value)
+    return message
+
+
+def with_obstacle(**changes):
+    message = good()
+    obstacle = {"kind": "cylinder", "position": [0.3, 0.0], "size": [0.1]} | changes
+    message.obstacles.append(pb.Obstacle(**obstacle))
+    return message
+
+
+@pytest.mark.parametrize(
+    ("field", "message"),
+    [
+        ("state", bad(state=[NAN, 0, 0, 0, 0])),
+        ("state", bad(state=[INF, 0, 0, 0, 0])),
+        ("state", bad(state=[0.0] * 4)),
+        ("state", bad(state=[])),
+        ("action", bad(action=[NAN, 0])),
+        ("action", bad(action=[0.0] * 3)),
+        ("input_in_force", bad(input_in_force=[INF, 0])),
+        ("input_in_force", bad(input_in_force=[5.0, 0])),
+        ("plan", bad(plan=[0.0] * 5)),
+        ("plan", bad(plan=[0.0] * 600)),
+        ("plan", bad(plan=[NAN] * 6)),
+        ("plan", bad(plan=[9.0, 0, 0, 0, 0, 0])),
+        ("plan", bad(plan=[0.1, 0, 0.1, 0, 0.1, 0])),
+        ("observation", bad(observation=[0.0] * 3)),
+        ("predicted_center", bad(predicted_center=[0.0] * 2, predicted_half_width=[0.0] * 2)),
+        ("predicted_half_width", bad(predicted_center=[0.0] * 5)),
+        ("predicted_half_width", bad(predicted_center=[0.0] * 5, predicted_half_width=[NAN] * 5)),
+        ("robot", bad(robot="submarine")),
+        ("robot", bad(robot="")),
+        ("model", bad(model="ffffffffffff")),
+        ("model", bad(model="../../etc/passwd")),
+        ("obstacles[1].size", with_obstacle(size=[-0.1])),
+        ("obstacles[1].size", with_obstacle(size=[NAN])),
+        ("obstacles[1].size", with_obstacle(size=[])),
+        ("obstacles[1].position", with_obstacle(position=[NAN, 0.0])),
+        ("obstacles[1].position", with_obstacle(position=[0.0, 0.0, 0.0], size=[0.1, 0.1])),
+        ("obstacles[1].position", with_obstacle(position=[])),
+        ("obstacles[1].kind", with_obstacle(kind="cloud")),
+        ("obstacles[1].yaw", with_obstacle(kind="wall", size=[], yaw=INF)),
+        ("obstacles", bad(obstacles=[pb.Obstacle(kind="sphere", position=[1, 1], size=[0.1])] * (MOST_OBSTACLES + 1))),
+    ],
+)
+def test_bad_requests_get_an_error_that_names_the_field(service, field, message):
+    error = service.error(message)
+    assert error.field == field
+    assert error.type in ("BadRequest", "StaleModel", "UnknownRobot")
+    assert error.message
+    assert service.counts.errors == 1
+    assert read(service.replies(good())[0], GROUND).message.verified
+
+
+def test_a_bad_request_spoils_no_other_of_its_batch(service):
+    replies = service.replies(good(), bad(action=[NAN, 0]), good())
+    assert [reply.WhichOneof("result") for reply in replies] == ["decision", "error", "decision"]
+
+
+def test_what_is_no_batch_is_refused_and_the_service_goes_on(service):
+    rng = np.random.default_rng(0)
+    whole = pb.RequestBatch(requests=[good()]).SerializeToString()
+    for payload in (rng.bytes(10 << 20), bytes(LARGEST + 1), b"", b"\xff" * 50, rng.bytes(500), whole[:-3], whole[:40]):
+        with pytest.raises(BadRequest) as caught:
+            service.answer(payload)
+        assert caught.value.field in ("payload", "requests")
+        assert read(service.replies(good())[0], GROUND).message.verified
+
+
+def test_random_damage_never_gets_an_unchecked_decision(service):
+    """A flipped byte may make another valid request; whatever comes back is an error or a plan within bounds."""
+    rng = np.random.default_rng(1)
+    whole = bytearray(pb.RequestBatch(requests=[good()]).SerializeToString())
+    for _ in range(300):
+        damaged = bytearray(whole)
+        damaged[rng.integers(len(damaged))] = rng.integers(256)
+        try:
+            replies = pb.ReplyBatch.FromString(service.answer(bytes(damaged))).replies
+        except BadRequest:
+            continue
+        for reply in replies:
+            if reply.WhichOneof("result") == "decision":
+                read(reply, GROUND)
+            else:
+                assert reply.error.type in ("BadRequest", "StaleModel", "UnknownRobot")
+
+
+def test_without_a_model_there_is_no_decision():
+    error = Service().error(good())
+    assert (error.type, error.field) == ("NoModel", "robot")
+
+
+def test_an_unexpected_failure_is_an_error_reply(service, monkeypatch, caplog):
+    def broken(request):
+        raise ArithmeticError("boom")
+
+    monkeypatch.setattr(service.models.filters["ground"], "decide", broken)
+    with caplog.at_level(logging.ERROR):
+        error = service.error(good())
+    assert error.type == "ArithmeticError"
+    assert "decide failed for actor-0" in caplog.text
+    monkeypatch.undo()
+    assert read(service.replies(good())[0], GROUND)
+
+
+def test_a_model_is_replaced_while_the_service_runs(model, models, tmp_path):
+    newer = models["set-membership", "direct"]
+    service = Service(model, archive=tmp_path)
+    moving = good()
+    moving.ClearField("obstacles")
+    moving.model, moving.input_in_force[0], moving.plan[0] = model.version, 0.2, 0.1
+    assert read(service.replies(moving)[0], GROUND).message.model == model.version
+    service.models.install(newer)
+    answer = read(service.replies(moving)[0], GROUND)
+    assert answer.message.model == newer.version
+    assert answer.message.verified
+    moving.model = UNVERIFIED
+    assert read(service.replies(moving)[0], GROUND).message.model == newer.version
+    stale = good()
+    stale.model = models["matrix-zonotope", "direct"].version
+    assert service.error(stale).type == "StaleModel"
+    # another replica that shares the archive knows what this one has used
+    other = Service(newer, archive=tmp_path)
+    assert read(other.replies(moving)[0], GROUND)
+    moving.model = model.version
+    assert read(other.replies(moving)[0], GROUND)
+
+
+def test_violations_and_what_could_not_be_verified_are_counted(service, caplog):
+    message = good()
+    message.predicted_center.extend([9.0] * 5)
+    message.predicted_half_width.extend([0.1] * 5)
+    answer = read(service.replies(message)[0], GROUND)
+    assert answer.message.compared
+    assert not answer.message.contained
+    assert "outside the predicted set" in caplog.text
+    message.obstacles.append(pb.Obstacle(kind="cylinder", position=[0.2, 0.0], size=[0.1]))
+    assert not read(service.replies(message)[0], GROUND).message.verified
+    figures = service.counts.figures()
+    assert (figures["violations"], figures["compared"], figures["unverified"]) == (2, 2, 1)
+
+
+# --- what the client believes -------------------------------------------------------------------------------------
+
+
+def test_the_client_believes_no_bad_reply(service):
+    reply = service.replies(good())[0]
+    for change, field in (
+        (lambda d: d.plan.append(0.0), "plan"),
+        (lambda d: d.plan.__setitem__(0, 3.0), "plan"),
+        (lambda d: d.plan.__setitem__(1, NAN), "plan"),
+        (lambda d: d.plan.__setitem__(4, 0.1), "plan"),
+        (lambda d: setattr(d, "kind", pb.UNKNOWN), "kind"),
+        (lambda d: d.predicted_center.pop(), "predicted_center"),
+    ):
+        damaged = pb.Reply()
+        damaged.CopyFrom(reply)
+        change(damaged.decision)
+        with pytest.raises(SafetyError) as caught:
+            read(damaged, GROUND)
+        assert caught.value.field == field
+    with pytest.raises(SafetyError):
+        read(pb.Reply(), GROUND)
+
+
+class FakeBus:
+    def __init__(self, answer):
+        self.answer = answer
+
+    def ask(self, topic, payload, timeout, **names):
+        return self.answer
+
+
+def test_replies_that_are_none_are_typed_errors():
+    for answer in (b"\xff\xff", pb.ReplyBatch().SerializeToString()):
+        with pytest.raises(SafetyError, match="BadReply"):
+            ask(FakeBus(answer), [good()], 0.1)
+
+
+def test_a_client_over_the_bus(join, endpoint, service):  # noqa: F811
+    router = join("safety", listen=True)
+    with SafetyClient.open(endpoint, "ground", deadline=5.0) as client:
+        with pytest.raises(NoReply):
+            client.decide(np.zeros(5), [0.25, 0.0], [AHEAD])
+        assert not client.fallback().any()
+        router.serve(DECIDE, service.answer)
+        robot, done = Unicycle((0, 0, 0), np.random.default_rng(0)), 0
+        while done < 20:
+            try:
+                answer = client.decide(robot.measure(), [0.25, 0.05], [AHEAD])
+            except NoReply:
+                continue  # the service is not yet known on this side
+            robot.step(answer.action)
+            done += 1
+        assert np.hypot(*(robot.state[:2] - [0.34, 0.0])) > 0.1 + GROUND.footprint
+        assert robot.state[0] > 0.02
+        assert client.commitment.model in ("", answer.message.model)
+        with pytest.raises(SafetyError) as caught:
+            client.decide(robot.measure(), [NAN, 0.0], [AHEAD])
+        assert caught.value.field == "action"
+        assert not client.fallback().any(), "the committed plan brakes"
+        with pytest.raises(Refused):
+            client.bus.ask(DECIDE, b"\xff" * 20, 5.0, robot="ground")
+        assert client.decide(robot.measure(), [0.0, 0.1], [AHEAD]).message.verified
+
+
+# --- the wrapper --------------------------------------------------------------------------------------------------
+
+
+class Yard(gymnasium.Env):
+    """The kinematic robot before one obstacle; reward 1 a step."""
+
+    observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (5,), np.float32)
+    action_space = gymnasium.spaces.Box(np.array([0, -0.5], np.float32), np.array([0.25, 0.5], np.float32))
+
+    def __init__(self, obstacle=AHEAD):
+        self.obstacle = obstacle
+        self.executed = []
+
+    def _now(self):
+        state = self.robot.measure()
+        return state.astype(np.float32), {"state": state, "obstacles": [self.obstacle]}
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.robot, self.executed = Unicycle((0, 0, 0), np.random.default_rng(seed)), []
+        return self._now()
+
+    def step(self, action):
+        assert action.dtype == np.float32
+        self.executed.append(action)
+        self.robot.step(action)
+        observation, info = self._now()
+        return observation, 1.0, False, False, info
+
+
+def test_the_wrapper_lets_through_what_is_safe(ready):
+    env = SafetyWrapper(Yard(Obstacle("cylinder", (3.0, 0.0), (0.1,))), ready, penalty=2.0)
+    env.reset(seed=0)
+    _, reward, _, _, info = env.step(np.array([0.2, 0.25], np.float32))
+    assert np.array_equal(env.unwrapped.executed[0], np.array([0.2, 0.25], np.float32))
+    assert info["safety"].kind == "allowed"
+    assert (reward, info["penalty"]) == (1.0, 0.0)
+    assert np.array_equal(info["proposed"], np.array([0.2, 0.25], np.float32))
+    _, reward, *_ = env.step(np.array([9.0, 0.0]))
+    assert reward == 1.0, "clipping to bounds costs nothing"
+
+
+def test_the_wrapper_replaces_and_penalises_what_is_not(ready):
+    env = SafetyWrapper(Yard(), ready, penalty=2.0)
+    env.reset(seed=1)
+    kinds, costs = set(), []
+    for _ in range(60):
+        _, reward, _, _, info = env.step(np.array([0.25, 0.0]))
+        kinds.add(info["safety"].kind)
+        off = np.linalg.norm((info["safety"].action - [0.25, 0.0]) / [0.25, 1.0])
+        assert info["penalty"] == pytest.approx(2.0 * off)
+        assert reward == pytest.approx(1.0 - info["penalty"])
+        costs.append(info["penalty"])
+        assert np.hypot(*(env.unwrapped.robot.state[:2] - [0.34, 0.0])) > 0.1 + GROUND.footprint
+    assert "adjusted" in kinds
+    assert max(costs) > 1.0
+
+
+def test_a_proposal_that_is_no_number_is_standing_still(ready):
+    env = SafetyWrapper(Yard(), ready, penalty=1.0)
+    env.reset(seed=2)
+    _, reward, _, _, info = env.step(np.array([NAN, 0.1]))
+    assert not env.unwrapped.executed[0].any()
+    assert np.isfinite(reward)
+    assert info["safety"].verified
+
+
+def test_every_episode_starts_standing(ready):
+    env = SafetyWrapper(Yard(), ready)
+    env.reset(seed=3)
+    env.step(np.array([0.25, 0.1]))
+    assert env.commitment.input_in_force.any()
+    env.reset(seed=4)
+    assert not env.commitment.input_in_force.any()
+    assert env.commitment.predicted is None
+
+
+def test_a_filter_needs_no_more_than_the_model_set(model):
+    assert Filter(replace(model, about={})).version == model.version
