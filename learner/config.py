@@ -15,7 +15,7 @@ class TD3Config:
     hidden: tuple[int, ...] = (256, 256)
     actor_rate: float = 3e-4
     critic_rate: float = 3e-4
-    batch: int = 256
+    batch: int = 128
     gamma: float = 0.99
     n_step: int = 3
     tau: float = 0.005

@@ -66,7 +66,9 @@ def main(settings: LearnerSettings) -> bool:
         if settings.resume:
             learner.restore(root)
             log.info("resumed at step %d, update %d", learner.steps, learner.updates)
-        LearnerLoop(process, learner, settings).run()
+        loop = LearnerLoop(process, learner, settings)
+        process.announce()
+        loop.run()
         return learner.done
 
 

@@ -1,0 +1,35 @@
+"""`decide`, by kind of decision, for every certificate and mode. The paper's figure is 80.4 ms a step."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from time import perf_counter
+
+from deploy.bench import situations
+from deploy.bench.timing import WARM_UP, Figures, milliseconds
+from messaging import brakeline_pb2 as pb
+from safety.certificates import KINDS
+from safety.filter import Filter
+from safety.model_set import MODES
+
+
+def run() -> Figures:
+    asked = situations.messages()
+    figures: Figures = {}
+    for certificate in KINDS:
+        for mode in MODES:
+            ready = Filter(situations.model(certificate, mode))
+            for kind, seconds in _by_kind(ready, asked).items():
+                figures[f"{certificate} {mode}: {kind}"] = milliseconds(seconds) | {"count": len(seconds)}
+    figures["the paper, a step (its own machine)"] = {"mean ms": 80.41}
+    return figures
+
+
+def _by_kind(ready: Filter, asked: list[pb.Request]) -> dict[str, list[float]]:
+    times = defaultdict(list)
+    for i, request in enumerate(situations.requests(ready, asked)):
+        before = perf_counter()
+        kind = ready.decide(request).kind
+        if i >= WARM_UP:
+            times[kind].append(perf_counter() - before)
+    return dict(sorted(times.items()))

@@ -1,0 +1,46 @@
+"""Requests as they come up while driving: what the benchmarks of the filter decide on."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from actors.driver import Driver, Identity
+from actors.guard import consult
+from deploy.evaluate import in_process, policy_named
+from deploy.store import model_for
+from deploy.vehicles import environment
+from messaging import brakeline_pb2 as pb
+from messaging.robots import GROUND
+from safety.filter import Filter, Request
+from safety.model_set import ModelSet, Recipe
+from safety.wire import request_of
+
+STEPS = 1500
+
+
+def model(certificate: str = "residual", mode: str = "direct") -> ModelSet:
+    return model_for(GROUND, Recipe(certificate, mode))
+
+
+def messages(policy: str = "random", seed: int = 5) -> list[pb.Request]:
+    """The questions of some episodes of a policy behind the default filter."""
+    question = in_process(model())
+    driver = Driver(GROUND, environment(GROUND, "default", seed), Identity("bench", 0, seed))
+    choose = policy_named(policy, GROUND, seed)
+    asked: list[pb.Request] = []
+    episode = 0
+    while len(asked) < STEPS:
+        driver.begin(episode)
+        episode += 1
+        while driver.running and len(asked) < STEPS:
+            proposal = np.asarray(choose(driver.observation, driver.info), dtype=float)
+            asked.append(driver.request(proposal))
+            driver.execute(proposal, consult(question, [asked[-1]], GROUND)[0])
+    return asked
+
+
+def requests(ready: Filter, asked: list[pb.Request]) -> list[Request]:
+    """The same as the filter takes them; plans of another model count as standing still's."""
+    for message in asked:
+        message.model = message.model and ready.version
+    return [request_of(message, GROUND) for message in asked]

@@ -1,0 +1,40 @@
+"""Timing in one process: medians and percentiles of many calls, after a warm-up."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from time import perf_counter
+
+import numpy as np
+
+Figures = dict[str, dict[str, float]]
+
+WARM_UP = 20  # calls
+
+
+def milliseconds(seconds: list[float]) -> dict[str, float]:
+    """p50, p99 and mean, in ms."""
+    p50, p99 = np.percentile(seconds, (50, 99)) * 1e3
+    return {"p50 ms": float(p50), "p99 ms": float(p99), "mean ms": float(np.mean(seconds) * 1e3)}
+
+
+def timed(call: Callable[[], object], count: int) -> dict[str, float]:
+    """Times of `count` calls."""
+    for _ in range(min(WARM_UP, count)):
+        call()
+    seconds = []
+    for _ in range(count):
+        before = perf_counter()
+        call()
+        seconds.append(perf_counter() - before)
+    return milliseconds(seconds)
+
+
+def each(calls: list[Callable[[], object]]) -> dict[str, float]:
+    """Times of one call each, the first ones not counted."""
+    seconds = []
+    for call in calls:
+        before = perf_counter()
+        call()
+        seconds.append(perf_counter() - before)
+    return milliseconds(seconds[min(WARM_UP, len(seconds) // 2) :])
