@@ -192,6 +192,7 @@ def run(settings: ActorSettings, make: Make) -> bool:
             )
 
         process.refresh = refresh
+        process.announce()
         question: Ask | None = None
         if settings.method != "none":
             question = lambda requests: ask(process.bus, requests, settings.deadline)  # noqa: E731

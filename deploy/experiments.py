@@ -78,6 +78,8 @@ def decode(kind: type[Any], values: Any) -> Any:
     Raises:
         ValueError: a field is unknown: the file is another version's.
     """
+    if not isinstance(values, dict):
+        raise ValueError(f"{kind.__name__} is an object of named values, not {values!r}")
     hints = typing.get_type_hints(kind)
     unknown = values.keys() - {f.name for f in dataclasses.fields(kind)}
     if unknown:

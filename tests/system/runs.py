@@ -33,7 +33,8 @@ def until(condition: Callable[[], Any], what: str, seconds: float = PATIENCE) ->
 
 def brakeline(*arguments: object, timeout: float = PATIENCE) -> subprocess.CompletedProcess[str]:
     """A command from its start to its end."""
-    return subprocess.run([*BRAKELINE, *map(str, arguments)], capture_output=True, text=True, timeout=timeout)
+    words = [*BRAKELINE, *map(str, arguments)]
+    return subprocess.run(words, check=False, capture_output=True, text=True, timeout=timeout)
 
 
 class Run:
@@ -43,7 +44,7 @@ class Run:
     def __init__(self, folder: Path, *arguments: object, fresh: bool = True) -> None:
         self.folder = folder
         place = ("--out", folder) if fresh else ("--resume", folder)
-        words = (*BRAKELINE, "train", *("ground --experiment debug".split() if fresh else ()), *place, *arguments)
+        words = (*BRAKELINE, "train", *(["ground", "--experiment", "debug"] if fresh else ()), *place, *arguments)
         folder.parent.mkdir(parents=True, exist_ok=True)
         self._output = folder.parent / f"{folder.name}{'' if fresh else '-resumed'}.out"
         self.errors = self._output.with_suffix(".err")

@@ -33,7 +33,7 @@ def run(data_folder, tmp_path_factory) -> tuple[Path, dict]:
 
 
 def test_it_ends_at_its_last_step_without_a_fault(run):
-    folder, figures = run
+    _, figures = run
     steps = EXPERIMENTS["debug"].steps
     assert figures["finished"] and figures["restarts"] == {}
     assert figures["collisions"] == 0 and figures["episodes"] > 0
@@ -48,7 +48,7 @@ def test_it_ends_at_its_last_step_without_a_fault(run):
 
 
 def test_every_message_that_was_published_is_in_the_log(run):
-    folder, figures = run
+    folder, _ = run
     numbers: dict[str, list[int]] = {}
     published: Counter[str] = Counter()
     with (folder / "run.mcap").open("rb") as file:
@@ -101,7 +101,7 @@ def test_the_configuration_is_in_the_folder_and_in_the_log(run):
 
 
 def test_the_policy_loads_and_drives(run):
-    folder, figures = run
+    _, figures = run
     (path,) = figures["policies"]
     assert MLP.load(Path(path), GROUND).sizes == (26, 32, 32, 2)
     done = brakeline("evaluate", "ground", "--policy", path, "--episodes", 2, "--json")

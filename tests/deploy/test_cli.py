@@ -1,0 +1,185 @@
+"""The commands as they are typed: help, errors, and JSON."""
+
+import json
+import shlex
+
+import pytest
+
+from deploy.cli import COMMANDS, find, main
+from deploy.commands.service import obstacle_of
+from logs.report import analyse
+from logs.segment import open_segment
+from messaging.shapes import Obstacle
+
+SHARED = {
+    *("episodes", "goals", "collisions", "timeouts", "steps", "interventions", "failsafes", "mean_speed", "max_speed"),
+    *("mean_reward", "decision_ms", "containment", "method", "certificate", "policy", "arena", "seed"),
+}
+STATED = {
+    *("samples", "rank", "condition", "windows", "violations", "bound_step", "bound_plan"),
+    *("half_width_rest", "half_width_full"),
+}
+
+
+@pytest.fixture
+def command(capsys):
+    """`command("evaluate", "ground")`: exit status, stdout, stderr."""
+
+    def run(*words):
+        try:
+            status = main([str(word) for word in words])
+        except SystemExit as end:
+            status = end.code
+        printed = capsys.readouterr()
+        return status, printed.out, printed.err
+
+    return run
+
+
+@pytest.fixture
+def figures(command):
+    """The one JSON object that a command prints, and nothing else."""
+
+    def run(*words):
+        status, out, err = command(*words, "--json")
+        assert status == 0, err
+        assert out.endswith("\n") and out.count("\n") == 1
+        return json.loads(out)
+
+    return run
+
+
+def test_the_overview_has_every_command_with_an_example(command):
+    status, out, _ = command("--help")
+    assert status == 0
+    for name, entry in COMMANDS.items():
+        assert name in out and entry.example.split(" --")[0] in out
+    assert command()[0] == 2
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_help_shows_the_example_and_ends_with_0(command, name):
+    status, out, err = command(name, "--help")
+    assert status == 0 and err == ""
+    assert f"Example: {COMMANDS[name].example}" in " ".join(out.split())
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_every_example_is_understood(name, monkeypatch):
+    understood = []
+    monkeypatch.setattr(find(name), "run", lambda self: understood.append(self) or 0)
+    assert main(shlex.split(COMMANDS[name].example)[1:]) == 0 and understood
+
+
+def test_a_typing_error_is_answered_with_a_suggestion(command):
+    status, out, err = command("evalute", "ground")
+    assert (status, out) == (2, "") and "did you mean `evaluate`?" in err
+    status, out, err = command("evaluate", "ground", "--episods", 3)
+    assert (status, out) == (2, "") and "--episodes" in err
+
+
+@pytest.mark.parametrize(
+    "words, said",
+    [
+        ("safety ground --listen nonsense", "cannot listen on nonsense"),
+        ("recorder {folder}/x.mcap --listen smoke/signals", "cannot listen on smoke/signals"),
+        ("train ground --listen tcp/127.0.0.1 --out {folder}/run", "cannot listen on tcp/127.0.0.1: invalid"),
+        ("actor ground --listen tcp/127.0.0.1:0 --arena ballroom", "no arena is called 'ballroom'; there are: default"),
+        (
+            "train ground --arena ballroom --out {folder}/run",
+            "no arena is called 'ballroom'; there are: default, dense",
+        ),
+        ("train submarine --out {folder}/run", "no robot is called 'submarine'; there are: ground"),
+        ("train ground --resume {folder}/none", "is no run's configuration"),
+        ("train ground --deterministic --robots-per-actor 2", "one actor with one robot"),
+        ("train ground --actors 0", "1 or more"),
+        ("train ground --experiment sleep", "there are: default, demo, debug"),
+        ("evaluate submarine", "there are: ground"),
+        ("evaluate ground --arena ballroom", "there are: default, dense, open"),
+        ("evaluate ground --policy [bold]", "no policy is called '[bold]' and no such file exists"),
+        ("analyse {folder}/none", "no log at"),
+        ("certify {folder}/none.mcap", "no log at"),
+        ("query ground --connect tcp/127.0.0.1:1 --obstacle ball", "an obstacle is: cylinder X Y RADIUS"),
+        ("status", "no run at runs/latest: give --connect tcp/HOST:PORT"),
+        ("query ground", "no run at runs/latest"),
+    ],
+)
+def test_what_cannot_be_is_said_in_a_line(command, data_folder, tmp_path, monkeypatch, words, said):
+    monkeypatch.chdir(tmp_path)
+    status, out, err = command(*words.format(folder=tmp_path).split())
+    assert (status, out) == (1, "") and said in err and err.startswith("brakeline ")
+    assert err.count("\n") == 1 and not (tmp_path / "run" / "logs").exists()
+
+
+@pytest.mark.parametrize("words", ["train --method prayer", "evaluate --certificate hope", "certify --mode loud"])
+def test_a_wrong_choice_is_answered_with_the_choices(command, words):
+    status, out, err = command(*words.split())
+    assert (status, out) == (2, "") and "invalid choice" in err
+
+
+def test_a_run_that_could_not_listen_can_be_started_again(command, data_folder, tmp_path):
+    for _ in range(2):
+        status, _, err = command("train", "--experiment", "debug", "--out", tmp_path / "run", "--listen", "nonsense")
+        assert status == 1 and "cannot listen" in err
+
+
+def test_obstacles_are_read_as_words():
+    assert obstacle_of(("cylinder", "0.4", "0", "0.1"), 2) == Obstacle("cylinder", (0.4, 0.0), (0.1,))
+    assert obstacle_of(("box", "1", "2", "0.3", "0.4", "0.5"), 2) == Obstacle("box", (1.0, 2.0), (0.3, 0.4), 0.5)
+    assert obstacle_of(("wall", "1", "0", "3.14"), 2) == Obstacle("wall", (1.0, 0.0), (), 3.14)
+    for wrong in ((), ("pond", "1", "2"), ("cylinder", "1", "2"), ("box", "1", "2", "x", "4")):
+        with pytest.raises(ValueError, match="an obstacle is"):
+            obstacle_of(wrong, 2)
+
+
+def test_collect_is_reproducible_by_its_seed(figures, tmp_path):
+    words = ("collect", "--trajectories", 2, "--out")
+    said = [figures(*words, tmp_path / f"{i}", "--seed", seed) for i, seed in enumerate("556")]
+    assert said[0]["digest"] == said[1]["digest"] != said[2]["digest"]
+    assert (said[0]["trajectories"], said[0]["periods"]) == (2, 600) and said[0]["about"]["seed"] == "5"
+
+
+def test_certify_states_every_certificate(figures, data_folder):
+    said = figures("certify", data_folder / "ground" / "record.safetensors", "--mode", "direct")
+    assert said.keys() >= {"residual", "set-membership", "matrix-zonotope"}
+    for name in ("residual", "set-membership", "matrix-zonotope"):
+        assert said[name].keys() >= STATED
+        assert said[name]["violations"] <= said[name]["windows"] and 0 < said[name]["bound_step"] < 0.1
+        assert 0 < said[name]["half_width_rest"] <= said[name]["half_width_full"] < 0.1
+
+
+def test_certify_refuses_too_little_data_with_status_1(command, figures, tmp_path):
+    figures("collect", "--trajectories", 2, "--out", tmp_path / "few.safetensors")
+    status, out, err = command("certify", tmp_path / "few.safetensors", "--mode", "direct", "--json")
+    assert status == 1 and "at least" in err
+    assert "refused" in json.loads(out)["residual"]
+
+
+def test_evaluate_and_analyse_share_their_keys(figures, data_folder, tmp_path):
+    evaluated = figures("evaluate", "ground", "--policy", "random", "--episodes", 1, "--arena", "dense", "--seed", 4)
+    assert evaluated.keys() >= SHARED
+    assert (evaluated["arena"], evaluated["seed"], evaluated["policy"]) == ("dense", 4, "random")
+    times = evaluated["decision_ms"]
+    assert times.keys() == {"mean", "std", "p50", "p99", "allowed", "adjusted", "failsafe"}
+    assert evaluated["containment"].keys() == {"steps", "violations"}
+    open_segment(tmp_path / "empty.mcap", {}).finish()
+    assert figures("analyse", tmp_path / "empty.mcap").keys() >= SHARED
+    assert analyse(tmp_path / "empty.mcap")["steps"] == 0
+
+
+def test_evaluate_without_a_filter_has_no_times(figures):
+    said = figures("evaluate", "--policy", "greedy", "--method", "none", "--episodes", 2)
+    assert (said["decision_ms"], said["certificate"], said["interventions"]) == (None, None, 0)
+    assert said["containment"] == {"steps": 0, "violations": 0}
+
+
+def test_the_same_seed_gives_the_same_figures(figures, data_folder):
+    words = ("evaluate", "ground", "--policy", "greedy", "--episodes", 2)
+    one, same, other = (figures(*words, "--seed", seed) for seed in (1, 1, 2))
+    for said in (one, same, other):
+        for kind in ("allowed", "adjusted", "failsafe"):
+            said["decision_ms"][kind] = said["decision_ms"][kind] is not None
+        for name in ("mean", "std", "p50", "p99"):
+            del said["decision_ms"][name]
+    assert one == same
+    assert one["mean_reward"] != other["mean_reward"]

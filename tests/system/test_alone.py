@@ -1,0 +1,68 @@
+"""Each process started alone, by its command, as on machines of their own."""
+
+import signal
+import socket
+import subprocess
+
+import pytest
+
+from logs.report import analyse
+from messaging.bus import Bus, BusSettings
+from messaging.shapes import Obstacle
+from safety.client import SafetyClient
+from tests.system.runs import BRAKELINE, brakeline, until
+
+LEARNING = ("--learner.td3.hidden", 16, "--learner.td3.batch", 16, "--learner.td3.warmup", 100)
+
+
+@pytest.fixture
+def start(tmp_path):
+    """`start("safety", "ground", ...)` runs a command until the end of the test."""
+    started = []
+
+    def run(*words):
+        name = f"{words[0]}-{len(started)}"
+        with (tmp_path / f"{name}.out").open("w") as out:
+            started.append(subprocess.Popen([*BRAKELINE, *map(str, words)], stdout=out, stderr=out))
+        return started[-1]
+
+    yield run
+    for process in started:
+        process.kill()
+        process.wait()
+
+
+def test_safety_learner_actor_and_recorder_alone(start, data_folder, tmp_path):
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+    there = ("--connect", endpoint)
+    safety = start("safety", "ground", "--listen", endpoint)
+    # Before anybody else is there: the processes may be started in any order.
+    actor = start("actor", "ground", *there, "--name", "actor-7", "--number", 7, "--robots", 2)
+    recorder = start("recorder", tmp_path / "run.mcap", *there)
+    until((tmp_path / "run.mcap").exists, "the recorder records")
+    learner = start("learner", "ground", *there, "--out", tmp_path / "learner", "--steps", 400, *LEARNING)
+
+    with Bus(BusSettings(connect=(endpoint,), patience=60.0), "test") as bus:
+        until(lambda: {"safety", "actor-7", "recorder", "learner"} <= bus.living(), "all live")
+        near = [Obstacle("cylinder", (0.3, 0.0), (0.1,))]
+        answer = SafetyClient(bus, "ground", 5.0).decide([0.0] * 5, [0.25, 0.0], near)
+        assert answer.kind in ("allowed", "adjusted")
+    status = brakeline("status", *there)
+    assert all(name in status.stdout for name in ("safety", "actor-7", "recorder"))
+
+    assert learner.wait(120.0) == 0, "the last step is learned from"
+    assert (tmp_path / "learner" / "policy.safetensors").exists()
+    assert actor.wait(30.0) == 0, "and the actor knows"
+    recorder.send_signal(signal.SIGINT)
+    assert recorder.wait(30.0) == 0
+    safety.send_signal(signal.SIGTERM)
+    assert safety.wait(30.0) == 0
+    figures = analyse(tmp_path / "run.mcap")
+    assert sorted(figures["actors"]) == ["actor-7.0", "actor-7.1"]
+    assert figures["steps"] >= 400 and figures["collisions"] == 0 and figures["cuts"] == []
+    assert figures["topics"]["step/ground/actor-7.0"]["missing"] == 0
+
+    again = brakeline("learner", "ground", "--listen", endpoint, "--out", tmp_path / "learner", *LEARNING)
+    assert again.returncode == 1 and "holds a checkpoint already" in again.stderr and "Traceback" not in again.stderr

@@ -1,0 +1,161 @@
+"""What is killed in mid-run is started again, nothing is hit meanwhile, and what was lost is counted and said."""
+
+import json
+import re
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+
+from deploy.child import CONFIG
+from deploy.experiments import EXPERIMENTS, encode
+from learner.checkpoint import exists
+from logs.reader import open_log, read
+from logs.report import analyse
+from messaging.robots import GROUND
+from tests.system.runs import Run, alive, brakeline, until
+
+
+def test_each_process_is_killed_in_turn_and_the_run_goes_on_to_its_end(data_folder, tmp_path):
+    with Run(tmp_path / "run", "--steps", 2500, "--learner.checkpoint-every", 600) as run:
+        run.until_steps(150)
+        assert not exists(run.folder / "learner" / "checkpoint"), "the learner dies before its first checkpoint"
+        run.kill("learner")
+        run.until_steps(150)
+        run.kill("safety-0")
+        run.until_steps(150)
+        run.kill("actor-1")
+        run.until_steps(150)
+        run.kill("recorder")
+        until(lambda: exists(run.folder / "learner" / "checkpoint"), "a checkpoint")
+        run.until_steps(50)
+        run.kill("learner")
+        figures = run.end()
+        assert run.popen.returncode == 0, run.errors.read_text()
+    assert figures["finished"] and figures["collisions"] == 0
+    assert figures["learners"]["ground"]["steps"] == 2500
+    assert figures["restarts"] == {"learner": 2, "safety-0": 1, "actor-1": 1, "recorder": 1}
+    starts = {name: process["starts"] for name, process in figures["processes"].items()}
+    assert starts == {"launcher": 1, "recorder": 2, "safety-0": 2, "learner": 3, "actor-0": 1, "actor-1": 2}
+    log = open_log(run.folder)
+    records = list(log)
+    assert len(log.paths) == 2 and len(log.cuts) == 1 and "run.mcap" in str(log.cuts[0])
+    analysed = analyse(run.folder)
+    assert analysed["collisions"] == 0 and analysed["cuts"] == [str(log.cuts[0])]
+    lost = {key: topic["missing"] for key, topic in analysed["topics"].items() if topic["missing"]}
+    assert lost, "what nobody recorded shows as gaps"
+    assert analysed["steps"] + sum(n for key, n in lost.items() if key.startswith("step/")) >= figures["steps"]
+    told = [record.message.text for record in records if record.key == "log/launcher"]
+    for name in ("learner", "safety-0", "actor-1"):
+        assert any(f"{name} was killed by SIGKILL" in text for text in told), told
+    _braked_as_committed(records)
+
+
+def _braked_as_committed(records):
+    """Each step without a decision executed the next input of the plan of the step before."""
+    plans, fallbacks = {}, 0
+    for record in records:
+        if record.topic == "exchange" and not record.message.failure:
+            request = record.message.request
+            plan = np.reshape(record.message.reply.decision.plan, (-1, GROUND.action_dim))
+            plans[request.actor, request.episode, request.step] = plan[1:]
+        elif record.topic == "step" and record.message.fallback:
+            step = record.message
+            fallbacks += 1
+            before = plans.get((step.actor, step.episode, step.step - 1))
+            if before is not None:
+                assert np.allclose(step.action, before[0], atol=1e-6)
+                plans[step.actor, step.episode, step.step] = before[1:]
+    waited = [r.message for r in records if r.topic == "exchange" and r.message.failure]
+    assert waited and len(waited) >= fallbacks
+    standing = [e for e in waited if not any(e.request.input_in_force) and not any(e.request.plan)]
+    assert all(not any(e.request.plan) for e in standing)
+
+
+def test_interrupted_it_ends_in_order_and_is_resumed(data_folder, tmp_path):
+    with Run(tmp_path / "run", "--steps", 1500) as run:
+        run.until_steps(500)
+        figures = run.end(signal.SIGINT)
+        assert run.popen.returncode == 130, run.errors.read_text()
+    learned = figures["learners"]["ground"]["steps"]
+    assert not figures["finished"] and 300 < learned < 1500
+    assert exists(run.folder / "learner" / "checkpoint") and figures["policies"]
+    before = analyse(run.folder)
+    assert (before["cuts"], before["steps"], before["seconds"] > 0) == ([], figures["steps"], True)
+    assert not any(topic["missing"] for topic in before["topics"].values())
+    assert not [name for name, process in before["processes"].items() if process["alive"] and "actor" in name]
+    last = max(record.message.episode for record in read(run.folder) if record.topic == "episode")
+
+    with Run(run.folder, fresh=False) as resumed:
+        figures = resumed.end()
+        assert resumed.popen.returncode == 0, resumed.errors.read_text()
+    assert figures["finished"] and figures["learners"]["ground"]["steps"] == 1500, "--steps is that of the run"
+    assert figures["steps"] < 1500 + 64 - learned + 64
+    after = analyse(run.folder)
+    assert [path.rsplit("/", 1)[1] for path in after["log"]] == ["run.mcap", "run.1.mcap"]
+    assert after["steps"] == before["steps"] + figures["steps"]
+    assert not any(topic["missing"] for topic in after["topics"].values())
+    assert after["processes"]["learner"]["starts"] == 2
+    episodes = [record.message.episode for record in read(run.folder / "run.1.mcap") if record.topic == "episode"]
+    assert episodes and min(episodes) <= last + 1 and max(episodes) >= last, "episodes go on, they are not repeated"
+
+
+def test_two_replicas_and_then_no_launcher(data_folder, tmp_path):
+    with Run(tmp_path / "run", "--steps", 100_000, "--replicas", 2) as run:
+        run.until_steps(200)
+        status = brakeline("status", "--connect", json.loads((run.folder / "endpoint").read_text())["endpoint"])
+        assert status.returncode == 0 and "safety-1" in status.stdout and "learning ground" in status.stdout
+        victims = run.children()
+        assert {"safety-0", "safety-1", "recorder", "learner", "actor-0", "actor-1"} == victims.keys()
+        victims["safety-0"].kill()
+        run.until_steps(300)  # some are taken before it is back
+        assert not [e for e in run.metrics.failures if e not in ("NoReply", "Late")]
+        until(lambda: run.children().get("safety-0", victims["safety-0"]).pid != victims["safety-0"].pid, "a new one")
+        children = run.children()
+        run.popen.kill()
+        run.popen.wait()
+        until(lambda: run.children() == {}, "no process is left without its launcher", 30.0)
+        assert len(children) == 6
+    log = open_log(run.folder)
+    steps = [record.message for record in log if record.topic == "step"]
+    assert log.cuts == [], "the recorder ended in order"
+    assert len(steps) > 500 and not any(step.collision for step in steps)
+    assert exists(run.folder / "learner" / "checkpoint"), "and so did the learner"
+
+
+def test_what_fails_again_and_again_ends_the_run_and_says_why(data_folder, tmp_path):
+    folder = tmp_path / "run"
+    archive = folder / "ground" / "models"
+    archive.mkdir(parents=True)
+    (archive / "0123456789ab.safetensors").write_bytes(b"no model set")
+    with Run(folder) as run:
+        run.popen.wait(120.0)
+        errors = run.errors.read_text()
+        assert run.popen.returncode == 1
+        assert "safety-0 ended with 1" in errors and "5th time in a row" in errors and "BadModel" in errors
+        assert "Traceback" not in errors and run.children() == {}
+    words = (folder / "logs" / "safety-0.log").read_text()
+    assert len(re.findall(r"deploy/child.py\", line \d+, in <module>", words)) == 5, "one traceback for each start"
+    assert json.loads((folder / "figures.json").read_text())["restarts"]["safety-0"] == 4
+
+
+def test_a_second_interrupt_leaves_nothing_either(data_folder, tmp_path):
+    with Run(tmp_path / "run") as run:
+        until(lambda: len(run.children()) >= 3, "some processes")
+        run.popen.send_signal(signal.SIGINT)
+        time.sleep(0.3)
+        run.popen.send_signal(signal.SIGINT)
+        run.popen.wait(30.0)
+        until(lambda: run.children() == {}, "no process is left", 30.0)
+
+
+def test_a_child_whose_launcher_is_gone_ends_at_once(tmp_path):
+    (tmp_path / CONFIG).write_text(encode(EXPERIMENTS["debug"]))
+    nobody = next(pid for pid in range(2**15, 2**22) if not alive(pid))
+    (tmp_path / "endpoint").write_text(json.dumps({"endpoint": "tcp/127.0.0.1:1", "pid": nobody}))
+    start = time.monotonic()
+    child = [sys.executable, "-m", "deploy.child", str(tmp_path), "actor-0"]
+    assert subprocess.run(child, check=False).returncode != 0
+    assert time.monotonic() - start < 9.0, "it does not wait for a bus"
