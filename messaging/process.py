@@ -12,6 +12,7 @@ import os
 import signal
 import sys
 import threading
+import time
 from collections.abc import Callable
 from types import FrameType, TracebackType
 from typing import Any, Self
@@ -22,15 +23,17 @@ from messaging.topics import HEALTH, LOG
 
 log = logging.getLogger("brakeline.process")
 
+# s; signals this close are one: the kernel tells of a parent's death once for each thread that it had.
+ECHO = 1.0
 LEVELS = {"CRITICAL": "ERROR"}  # names that LogLine does not know
 
 
 class Process:
     """A process under the name `source`, from `with` to the end of the block.
 
-    `stop` is set by SIGINT and SIGTERM (and by whoever wants the process to end); a second signal kills. `figures` and
-    `notes` go out with the next Health; `refresh`, if set, is called before each to bring them up to date. All that is
-    logged goes to stderr (unless `stderr` is False) and to the LOG topic. An exception that leaves the block goes to
+    `stop` is set by SIGINT and SIGTERM (and by whoever wants the process to end); a second one, later, kills. `figures`
+    and `notes` go out with the next Health; `refresh`, if set, is called before each to bring them up to date. All that
+    is logged goes to stderr (unless `stderr` is False) and to the LOG topic. An exception that leaves the block goes to
     the LOG topic with its traceback, is noted in the last Health, and goes on its way: stderr is for who catches it.
     The first Health follows `announce`, or a second (not if `reserved`).
 
@@ -49,6 +52,7 @@ class Process:
         self._handlers: list[logging.Handler] = []
         self._signals: dict[int, Any] = {}
         self._ended = False
+        self._asked_at: float | None = None
         self._due = threading.Event()
 
     def __enter__(self) -> Self:
@@ -85,9 +89,11 @@ class Process:
         self._due.set()
 
     def _asked(self, number: int, _: FrameType | None) -> None:
-        if self.stop.is_set():  # asked twice: at once
+        now = time.monotonic()
+        if self._asked_at is not None and now - self._asked_at > ECHO:  # asked twice: at once
             signal.signal(number, signal.SIG_DFL)
             os.kill(os.getpid(), number)
+        self._asked_at = self._asked_at or now
         self.stop.set()
 
     def _beat(self) -> None:

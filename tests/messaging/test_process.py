@@ -62,6 +62,19 @@ def test_a_signal_ends_it_with_a_goodbye(join: Join, spawn: Spawn, endpoint: str
     assert lines == []
 
 
+def test_an_echo_of_the_signal_changes_nothing_and_a_second_one_kills(join: Join, spawn: Spawn, endpoint: str) -> None:
+    health, _ = listen(join("launcher", listen=True))
+    child = spawn(PROCESS.format(endpoint=endpoint, end="import time; time.sleep(30)"))
+    for _ in range(5):
+        child.terminate()
+        time.sleep(0.02)
+    time.sleep(1.2)
+    assert child.poll() is None, "it ends in order"
+    child.terminate()
+    assert child.wait(5.0) == -signal.SIGTERM
+    assert not any(said.last for said in health)
+
+
 def test_a_process_that_fails_is_not_silent(join: Join, spawn: Spawn, endpoint: str) -> None:
     health, lines = listen(join("launcher", listen=True))
     child = spawn(PROCESS.format(endpoint=endpoint, end="raise ZeroDivisionError('oh')"))

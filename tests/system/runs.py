@@ -64,7 +64,7 @@ class Run:
         self.popen.wait()
 
     def children(self) -> dict[str, psutil.Process]:
-        """The living processes of the run, the launcher aside, by name; a zombie is alive."""
+        """The living processes of the run, the launcher aside, by name."""
         found = {}
         for process in psutil.process_iter(["cmdline"]):
             words = process.info["cmdline"] or []
@@ -114,6 +114,8 @@ class Run:
         victim = until(lambda: self.children().get(name), f"{name} lives")
         victim.kill()
         until(lambda: self.children().get(name, victim).pid != victim.pid, f"{name} is started again")
+        states = [child.status() for child in psutil.Process(self.popen.pid).children()]
+        assert psutil.STATUS_ZOMBIE not in states
 
     def end(self, number: signal.Signals | None = None) -> dict[str, Any]:
         """Wait for the end, after a signal if one is given; the figures that were printed. Nothing may be left."""

@@ -50,7 +50,8 @@ def test_safety_learner_actor_and_recorder_alone(start, data_folder, tmp_path):
         answer = SafetyClient(bus, "ground", 5.0).decide([0.0] * 5, [0.25, 0.0], near)
         assert answer.kind in ("allowed", "adjusted")
     status = brakeline("status", *there)
-    assert all(name in status.stdout for name in ("safety", "actor-7", "recorder"))
+    assert status.returncode == 0, status.stderr
+    assert "safety" in status.stdout and "recorder" in status.stdout
 
     assert learner.wait(120.0) == 0, "the last step is learned from"
     assert (tmp_path / "learner" / "policy.safetensors").exists()
