@@ -120,7 +120,39 @@ GROUND = Robot(
     brake_steps=1,
 )
 
-ROBOTS: dict[str, Robot] = {robot.name: robot for robot in (GROUND,)}
+SPHERE_RAYS = 180  # of the quadrotor's lidar: 36 azimuths over 360° x 5 elevations over 60°
+
+QUADROTOR = Robot(
+    name="quadrotor",
+    period=0.2,
+    state=(
+        *(f"{axis} [m]" for axis in "xyz"),
+        *(f"v{axis} [m/s]" for axis in "xyz"),
+        *(f"a{axis} [m/s2]" for axis in "xyz"),
+    ),
+    position_dim=3,
+    heading=None,  # the yaw is held at zero: its frame is the world's
+    action=tuple(f"v{axis} setpoint [m/s]" for axis in "xyz"),
+    action_low=(-5.0, -5.0, -5.0),
+    action_high=(5.0, 5.0, 5.0),
+    translates=(True, True, True),
+    action_slew=(0.8, 0.8, 0.8),  # 4 m/s² by a period of 0.2 s
+    observation=(
+        *(f"ray {i} [range/max]" for i in range(SPHERE_RAYS)),
+        *(f"goal - p, {axis} [20 m]" for axis in "xyz"),
+        *(f"v{axis} [5 m/s]" for axis in "xyz"),
+        *(f"last v{axis} setpoint [5 m/s]" for axis in "xyz"),
+    ),
+    regressor=(3, 4, 5, 6, 7, 8),
+    measurement_bound=(0.03, 0.03, 0.03, 0.03, 0.03, 0.03, 0.3, 0.3, 0.3),
+    footprint=0.3,
+    sight=12.0,
+    horizon=12,
+    free_steps=1,
+    brake_steps=7,  # from 5 m/s the ramp falls by 0.71 m/s a period, within the slew
+)
+
+ROBOTS: dict[str, Robot] = {robot.name: robot for robot in (GROUND, QUADROTOR)}
 
 
 def robot_named(name: str) -> Robot:

@@ -16,7 +16,7 @@ def march(shapes: Shapes, origin: np.ndarray, heading: float) -> np.ndarray:
     travelled = np.zeros(RAYS)
     for _ in range(3000):
         nearest = shapes.distance(origin + travelled[:, None] * directions).min(axis=0)
-        travelled += nearest
+        travelled = np.minimum(travelled + nearest, 2.0 * MAX_RANGE)  # gone: far off, distances only double
         if ((nearest < 1e-7) | (travelled > MAX_RANGE)).all():
             break
     return np.minimum(travelled, MAX_RANGE)
