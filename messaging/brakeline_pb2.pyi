@@ -507,6 +507,8 @@ class Step(_message.Message):
     FALLBACK_FIELD_NUMBER: _builtins.int
     PATH_FIELD_NUMBER: _builtins.int
     TURNED_FIELD_NUMBER: _builtins.int
+    CUT_FIELD_NUMBER: _builtins.int
+    PROPOSE_MS_FIELD_NUMBER: _builtins.int
     robot: _builtins.str
     actor: _builtins.str
     episode: _builtins.int
@@ -544,6 +546,10 @@ class Step(_message.Message):
     """no decision came: the committed plan's next input"""
     turned: _builtins.float
     """rad, dead-reckoned heading change over the period"""
+    cut: _builtins.bool
+    """for the learner the episode ends here: `proposed` was intervened against (SAILR)"""
+    propose_ms: _builtins.float
+    """the policy's forward pass; 0: not measured"""
     @_builtins.property
     def header(self) -> Global___Header: ...
     @_builtins.property
@@ -600,10 +606,12 @@ class Step(_message.Message):
         fallback: _builtins.bool = ...,
         path: _abc.Iterable[_builtins.float] | None = ...,
         turned: _builtins.float = ...,
+        cut: _builtins.bool = ...,
+        propose_ms: _builtins.float = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _typing.Literal["header", b"header"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["action", b"action", "actor", b"actor", "clearance", b"clearance", "collision", b"collision", "compared", b"compared", "contained", b"contained", "decide_ms", b"decide_ms", "decision", b"decision", "episode", b"episode", "fallback", b"fallback", "goal", b"goal", "header", b"header", "index", b"index", "next_observation", b"next_observation", "observation", b"observation", "outside", b"outside", "path", b"path", "penalty", b"penalty", "proposed", b"proposed", "reward", b"reward", "robot", b"robot", "speed", b"speed", "state", b"state", "step", b"step", "terminated", b"terminated", "true_state", b"true_state", "truncated", b"truncated", "turned", b"turned", "weights_version", b"weights_version"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["action", b"action", "actor", b"actor", "clearance", b"clearance", "collision", b"collision", "compared", b"compared", "contained", b"contained", "cut", b"cut", "decide_ms", b"decide_ms", "decision", b"decision", "episode", b"episode", "fallback", b"fallback", "goal", b"goal", "header", b"header", "index", b"index", "next_observation", b"next_observation", "observation", b"observation", "outside", b"outside", "path", b"path", "penalty", b"penalty", "propose_ms", b"propose_ms", "proposed", b"proposed", "reward", b"reward", "robot", b"robot", "speed", b"speed", "state", b"state", "step", b"step", "terminated", b"terminated", "true_state", b"true_state", "truncated", b"truncated", "turned", b"turned", "weights_version", b"weights_version"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 
