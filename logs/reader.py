@@ -16,7 +16,7 @@ from typing import IO, Any
 import zstandard
 from google.protobuf.message import DecodeError, Message
 from mcap.exceptions import McapError
-from mcap.records import Channel, Chunk, McapRecord, Metadata, Schema
+from mcap.records import Attachment, Channel, Chunk, McapRecord, Metadata, Schema
 from mcap.records import Message as Stored
 from mcap.stream_reader import StreamReader, breakup_chunk
 
@@ -72,6 +72,7 @@ class Log:
 
     paths: tuple[Path, ...]
     metadata: dict[str, dict[str, str]] = field(default_factory=dict)
+    attachments: dict[str, bytes] = field(default_factory=dict)
     cuts: list[Cut] = field(default_factory=list)
     malformed: int = 0  # messages that are not of their type
 
@@ -87,6 +88,8 @@ class Log:
         for item in self._intact(path, file):
             if isinstance(item, Metadata):
                 self.metadata[item.name] = dict(item.metadata)
+            elif isinstance(item, Attachment):
+                self.attachments[item.name] = item.data
             elif isinstance(item, Schema):
                 schemas[item.id] = item
             elif isinstance(item, Channel):

@@ -10,10 +10,11 @@ import logging
 import threading
 import time
 from collections import Counter, deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from functools import partial
 from pathlib import Path
 
-from logs.segment import Entry, Metadata, Segment, open_segment
+from logs.segment import Attachments, Entry, Metadata, Segment, open_segment
 from messaging.bus import BusSettings, Malformed, Sample
 from messaging.process import Process
 from messaging.topics import RECORDED
@@ -28,6 +29,7 @@ INBOX = 64 * 2**20  # bytes
 PORTION = 2**20  # bytes saved at once: what fits on a nearly full disk is saved
 
 Open = Callable[[Path, Metadata], Segment]
+Derive = Callable[[Sample], Iterable[Entry]]  # what is stored of a sample besides itself: Foxglove's pictures
 
 
 class Inbox:
@@ -72,11 +74,14 @@ class Inbox:
 class Recording:
     """Empties an inbox into the segments of a run, on a disk that may fill up. For one thread."""
 
-    def __init__(self, run: Path, metadata: Metadata, inbox: Inbox, open_one: Open = open_segment) -> None:
+    def __init__(
+        self, run: Path, metadata: Metadata, inbox: Inbox, open_one: Open = open_segment, derive: Derive | None = None
+    ) -> None:
         self.recorded: Counter[str] = Counter()  # messages in the files, per key
         self.failure = ""  # why nothing can be written at present
         self.path: Path | None = None  # of the latest segment
         self._run, self._metadata, self._inbox, self._open = run, metadata, inbox, open_one
+        self._derive = derive or (lambda sample: ())
         self._segment: Segment | None = None
         self._retry_at = 0.0
         self._complained_of = 0
@@ -91,7 +96,7 @@ class Recording:
                 self._segment = self._open(self._run, self._metadata)
             waiting = self._inbox.bytes
             while waiting > 0 and (portion := self._inbox.portion()):
-                self._segment.save([entry(sample) for sample in portion])
+                self._segment.save([item for sample in portion for item in (entry(sample), *self._derive(sample))])
                 waiting -= sum(len(sample.payload) for sample in portion)
                 self._inbox.forget(portion)
                 self.recorded.update(sample.key for sample in portion)
@@ -142,14 +147,20 @@ def entry(sample: Sample) -> Entry:
     return Entry(sample.key, sample.topic.message, sample.payload, sample.received, publish_time, header.sequence)
 
 
-def record(process: Process, run: Path, metadata: Metadata) -> Recording:
+def record(
+    process: Process,
+    run: Path,
+    metadata: Metadata,
+    attachments: Attachments | None = None,
+    derive: Derive | None = None,
+) -> Recording:
     """Record until `process.stop` is set and nothing more comes. Its Health has the note `file` once it listens.
 
     Health figures: `recorded` and `dropped` messages, `waiting` bytes, and `recorded <key>` per channel; the note
     `failure` says why nothing can be written.
     """
     inbox = Inbox()
-    recording = Recording(run, metadata, inbox)
+    recording = Recording(run, metadata, inbox, partial(open_segment, attachments=attachments), derive)
 
     def refresh() -> None:
         process.figures.update(
@@ -184,7 +195,15 @@ def _until_quiet(inbox: Inbox, recording: Recording) -> None:
             return
 
 
-def main(settings: BusSettings, run: Path, metadata: Metadata, source: str = "recorder") -> None:
-    """The recorder's process: `run` is the log's path, `metadata` what goes into it besides the messages."""
+def main(
+    settings: BusSettings,
+    run: Path,
+    metadata: Metadata,
+    source: str = "recorder",
+    attachments: Attachments | None = None,
+    derive: Derive | None = None,
+) -> None:
+    """The recorder's process: `run` is the log's path; metadata, attachments and what `derive` makes of the samples go
+    into it besides the messages."""
     with Process(settings, source) as process:
-        record(process, run, metadata)
+        record(process, run, metadata, attachments, derive)

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import os
 import re
+import time
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,6 +20,7 @@ from mcap_protobuf.schema import build_file_descriptor_set
 CHUNK = 256 * 1024  # bytes before compression; a flush ends one early
 
 Metadata = Mapping[str, Mapping[str, str]]
+Attachments = Mapping[str, bytes]  # by name: files that come along with the messages, e.g. model sets
 
 TIMES = {
     "log_time": "ns since the Unix epoch, when the recorder received the message",
@@ -100,8 +102,8 @@ class Spool:
 class Segment:
     """Writes one MCAP file: a channel per key, protobuf schemas with all they depend on, zstd chunks."""
 
-    def __init__(self, path: Path, file: BinaryIO, metadata: Metadata) -> None:
-        """`file` is `path` opened for writing, unbuffered. The metadata is written at once.
+    def __init__(self, path: Path, file: BinaryIO, metadata: Metadata, attachments: Attachments | None = None) -> None:
+        """`file` is `path` opened for writing, unbuffered. Metadata and attachments are written at once.
 
         Raises:
             OSError: there is no space for it.
@@ -116,6 +118,9 @@ class Segment:
         self._writer.start(profile="", library="brakeline")
         for name, values in (("brakeline", TIMES), *metadata.items()):
             self._writer.add_metadata(name, dict(values))
+        for name, data in (attachments or {}).items():
+            now = time.time_ns()
+            self._writer.add_attachment(now, now, name, "application/octet-stream", data)
         self._writer.flush()  # type: ignore[no-untyped-call]
 
     @property
@@ -168,7 +173,7 @@ class Segment:
         return self._channels[key]
 
 
-def open_segment(run: Path, metadata: Metadata) -> Segment:
+def open_segment(run: Path, metadata: Metadata, attachments: Attachments | None = None) -> Segment:
     """The first segment of the run that does not exist yet.
 
     Raises:
@@ -181,7 +186,7 @@ def open_segment(run: Path, metadata: Metadata) -> Segment:
         except FileExistsError:
             continue
         try:
-            return Segment(path, file, metadata)
+            return Segment(path, file, metadata, attachments)
         except OSError:
             file.close()
             path.unlink(missing_ok=True)
