@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 
 import numpy as np
@@ -12,34 +13,45 @@ from messaging.robots import Robot
 Array = NDArray[np.float64]
 
 MOST_LEAD = 4  # random inputs before a plan, each held for up to
-MOST_HELD = 3  # periods
+MOST_HELD = 3  # periods, and as many more as it takes to get there
 SHORT_STOP, LONG_STOP = 2, 15  # periods of standing still after a plan, mostly short
 LONG_STOPS = 0.1  # share of long stops
 EXTREMES = 0.45  # share of inputs that are at a bound or zero: driving has more of them than a uniform draw
 
 
-def random_input(robot: Robot, rng: np.random.Generator, before: Array) -> Array:
-    """An input within bounds and slew; each coordinate often at a bound or zero."""
+def random_target(robot: Robot, rng: np.random.Generator) -> Array:
+    """An input within bounds; each coordinate often at a bound or zero."""
     low, high = robot.low(), robot.high()
     drawn = rng.uniform(low, high)
     edge = np.stack([low, high, np.zeros(len(low))])[rng.integers(3, size=len(low)), np.arange(len(low))]
-    chosen = np.where(rng.random(len(low)) < EXTREMES, edge, drawn)
+    return np.where(rng.random(len(low)) < EXTREMES, edge, drawn)
+
+
+def towards(robot: Robot, before: Array, target: Array) -> Array:
+    """The input nearest to a target that the slew allows after `before`."""
     slew = np.asarray(robot.action_slew)
-    return np.asarray(np.clip(chosen, np.maximum(low, before - slew), np.minimum(high, before + slew)))
+    return np.asarray(np.clip(target, before - slew, before + slew))
 
 
 def excitation(robot: Robot, rng: np.random.Generator) -> Iterator[Array]:
-    """Inputs without end: lead-in, plan (chosen inputs, then braking), stop, and again."""
+    """Inputs without end: lead-in, plan (chosen inputs, then braking), stop, and again.
+
+    A lead-in goes for one target after the other, and may leave each before it gets there: every speed comes with
+    every acceleration.
+    """
     before = np.zeros(robot.action_dim)
     schedule = robot.schedule()
+    across = (robot.high() - robot.low()) / np.asarray(robot.action_slew)  # periods from bound to bound
+    longest_lead = MOST_HELD + math.ceil(across.max())
     while True:
         for _ in range(rng.integers(MOST_LEAD + 1)):
-            before = random_input(robot, rng, before)
-            for _ in range(rng.integers(1, MOST_HELD + 1)):
+            target = random_target(robot, rng)
+            for _ in range(rng.integers(1, longest_lead + 1)):
+                before = towards(robot, before, target)
                 yield before
         free = []
         for _ in range(robot.free_steps):
-            before = random_input(robot, rng, before)
+            before = towards(robot, before, random_target(robot, rng))
             free.append(before)
         yield from (schedule @ np.concatenate(free)).reshape(robot.horizon, -1)
         before = np.zeros(robot.action_dim)

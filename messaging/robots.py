@@ -65,6 +65,12 @@ class Robot:
         """Length of z_0 = [x_0 (regressor coordinates); input in force], to which a plan's inputs are appended."""
         return len(self.regressor) + self.action_dim
 
+    @property
+    def speeds(self) -> slice:
+        """The state coordinates that follow the inputs: they come after the pose."""
+        first = self.position_dim + (self.heading is not None)
+        return slice(first, first + self.action_dim)
+
     def low(self) -> Array:
         return np.asarray(self.action_low)
 

@@ -157,10 +157,10 @@ class Filter:
 
         Without it a robot may stop so close to an obstacle that no motion can be verified from there, for good.
         """
-        robot, m = self.robot, self.robot.action_dim
+        robot = self.robot
         in_place = np.where(self.standing, self.high, 0.0)
         state = np.zeros(robot.state_dim)
-        state[-m:] = in_place  # its speeds follow its inputs
+        state[robot.speeds] = in_place
         z = np.concatenate([state[self.regressor], in_place, np.tile(in_place, robot.free_steps)])
         sizes = self.tube.magnitudes(z)
         L, d = self.tube.generators, robot.position_dim
@@ -196,7 +196,7 @@ class Filter:
     def half_width(self, speed: Array) -> float:
         """[m] of the full stop's set, largest axis, from driving at inputs `speed` (m,) with that input once more."""
         state = np.zeros(self.robot.state_dim)
-        state[-len(speed) :] = speed
+        state[self.robot.speeds] = speed
         z = np.concatenate([state[self.regressor], speed, np.tile(speed, self.robot.free_steps)])
         return float(self.tube.half_widths(z)[-1].max())
 
@@ -262,16 +262,15 @@ class Filter:
         attempt.solver, attempt.iterations = solution.status, attempt.iterations + solution.iterations
         if not solution.found:
             return None
-        free = self.builder.inputs(solution.x).reshape(self.robot.free_steps, -1)
-        last = z_0[-self.robot.action_dim :]
-        for k in range(len(free)):
-            last = free[k] = self._limited(free[k], last)
-        return np.concatenate([z_0, free.ravel()])
+        free = self._within(self.builder.inputs(solution.x), z_0[-self.robot.action_dim :])
+        return np.concatenate([z_0, free])
 
     def _comfortable(self, rows: Rows, z_0: Array, proposal: Array) -> Rows:
         """Rows with the comfort margin. Where moving in place would not keep it, the tube may stay as near as the
-        free space allows, but no input may translate the robot nearer: two rows instead of one."""
-        stay = self._regressors(z_0, np.where(self.standing, proposal, self.nothing))
+        free space allows, but no input may translate the robot nearer (one that can't stop at once: not more than
+        the strongest braking does): two rows instead of one."""
+        in_place = self._limited(np.where(self.standing, proposal, self.nothing), z_0[-len(proposal) :])
+        stay = self._regressors(z_0, in_place)
         inside = rows.support(self.tube, stay) > rows.bound - self.comfort
         bound = np.where(inside, rows.bound, rows.bound - self.comfort)
         if not inside.any():
@@ -298,26 +297,27 @@ class Filter:
         return self.layout.rows(normals @ scene.turn, offsets)
 
     def _committed(self, request: Request, scene: _Scene, z_0: Array, attempt: _Attempt, in_domain: bool) -> _Found:
-        """The committed plan; unless it still counts as verified, verified anew, or braking.
+        """The committed plan; if it no longer counts as verified, braking that is verified anew; else just braking.
 
         It counts if the measured state is where it was predicted, and this model set verified it or it is standing
-        still. A tube from outside the recorded domain verifies nothing.
+        still. A tube from outside the recorded domain verifies nothing. Anew are looked at: the committed plan's next
+        inputs and the strongest braking, both followed by the schedule's ramp, for tubes speak of nothing else.
         """
-        F, N = self.robot.free_steps, self.robot.horizon
-        vouched = request.model == self.version or request.still
+        known, F = len(z_0), self.robot.free_steps
         if not attempt.contained:
             attempt.reason += "; the measured state was outside the predicted set"
-        left = np.maximum(1.0 - (np.arange(N) + 1.0) / self.robot.brake_steps, 0.0)
-        for plan in (request.plan, left[:, None] * request.input_in_force):
-            free = plan[:F].ravel()
-            z = np.concatenate([z_0, free])
+        vouched = request.model == self.version or request.still
+        as_committed = np.concatenate([z_0, request.plan[:F].ravel()])
+        if attempt.contained and vouched:
+            margin = self._margin(self._rows(scene, as_committed), as_committed)
+            return _Found(FAILSAFE, request.plan, as_committed[known:], margin, True)
+        brake = self._regressors(z_0, self._limited(self.nothing, request.input_in_force))
+        as_committed[known:] = self._within(as_committed[known:], request.input_in_force)
+        for z in (as_committed, brake):
             margin = self._margin(self._rows(scene, z), z)
-            verified = attempt.contained and vouched and plan is request.plan
-            if not verified and in_domain and margin >= 0.0:
-                verified = bool(np.abs(self._plan(free) - plan).max() < 1e-9)
-            if verified:
-                break
-        return _Found(FAILSAFE, plan, free, margin, verified)
+            if in_domain and margin >= 0.0:
+                return _Found(FAILSAFE, self._plan(z[known:]), z[known:], margin, True)
+        return _Found(FAILSAFE, self._plan(brake[known:]), brake[known:], margin, False)
 
     def _decision(self, request: Request, scene: _Scene, z_0: Array, found: _Found, attempt: _Attempt) -> Decision:
         z = np.concatenate([z_0, found.free])
@@ -364,6 +364,13 @@ class Filter:
         """The input closest to the wanted one within bounds and slew."""
         low, high = np.maximum(self.low, before - self.slew), np.minimum(self.high, before + self.slew)
         return np.asarray(np.minimum(np.maximum(wanted, low), high))
+
+    def _within(self, free: Array, before: Array) -> Array:
+        """Free inputs (F·m,) brought within bounds and slew, one after the other."""
+        inputs = free.reshape(self.robot.free_steps, -1).copy()
+        for k in range(len(inputs)):
+            before = inputs[k] = self._limited(inputs[k], before)
+        return inputs.ravel()
 
     def _regressors(self, z_0: Array, action: Array) -> Array:
         """z of an action followed by braking."""

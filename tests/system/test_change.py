@@ -1,0 +1,48 @@
+"""A robot that changes in mid-run: violations are seen and counted; a new model set from its own steps ends them."""
+
+import json
+
+from logs.reader import open_log
+from messaging import brakeline_pb2 as pb
+from tests.system.runs import Run, brakeline, until
+
+BEFORE, DURING, AFTER = 800, 7000, 2200  # steps of both actors
+
+
+def share(steps):
+    compared = [step for step in steps if step.compared]
+    return sum(not step.contained for step in compared) / len(compared)
+
+
+def test_a_payload_is_noticed_and_a_new_model_set_takes_over_in_mid_run(data_folder, tmp_path):
+    steps = BEFORE + DURING + AFTER
+    change = ("--change.after", BEFORE // 2, "--change.payload-kg", 2, "--practice", 0.15)
+    with Run(tmp_path / "run", "--steps", steps, "--learner.td3.warmup", steps, *change) as run:
+        metrics = run.watch()
+        run.until_steps(BEFORE + DURING)
+        endpoint = json.loads((run.folder / "endpoint").read_text())["endpoint"]
+        words = ("--last", DURING - 500, "--certificates", "residual", "--mode", "direct", "--publish", "--json")
+        certify = brakeline("certify", run.folder, *words, "--connect", endpoint)
+        assert certify.returncode == 0, certify.stderr
+        published = json.loads(certify.stdout)["residual"]
+        until(
+            lambda: metrics.processes["safety-0"].notes["model ground"] == published["version"], "the new model in use"
+        )
+        figures = run.end()
+        assert run.popen.returncode == 0, run.errors.read_text()
+    assert figures["finished"] and figures["collisions"] == 0
+    records = list(open_log(run.folder))
+    models = [record.message.version for record in records if record.topic == "model"]
+    assert models[-1] == published["version"]
+    last = next(
+        i for i, record in enumerate(records) if record.topic == "model" and record.message.version == models[-1]
+    )
+    taken = [(i, record.message) for i, record in enumerate(records) if isinstance(record.message, pb.Step)]
+    recorded = [step for _, step in taken if step.index < BEFORE // 2]
+    loaded = [step for i, step in taken if step.index > BEFORE // 2 and i < last]
+    anew = [step for i, step in taken if i > last + 20]  # those on their way were decided on by the old one
+    assert len(anew) > 500
+    assert share(recorded) <= 0.01
+    assert share(loaded) > 0.05, "the old model set does not know the payload"
+    assert share(anew) <= max(2.0 * published["bound_step"], 0.02)
+    assert published["bound_step"] < 0.05
