@@ -13,7 +13,9 @@ from messaging import brakeline_pb2 as pb
 from messaging.robots import Robot
 from safety.client import obstacle_messages, request_message
 from safety.commitment import Array, Commitment, Prediction, correction_penalty
+from sim.envs import Reward
 
+LOWEST = Reward().collision  # what the learner is paid where an intervention ends its episode
 EPISODE_STRIDE = 4096  # episodes of different robots of a run never share a seed: seed = episode · stride + number
 
 
@@ -50,9 +52,18 @@ class Driver:
     """Everything about one robot but the bus and the policy."""
 
     def __init__(
-        self, robot: Robot, env: Environment, identity: Identity, penalty: float = 0.0, filtered: bool = True
+        self,
+        robot: Robot,
+        env: Environment,
+        identity: Identity,
+        penalty: float = 0.0,
+        filtered: bool = True,
+        cuts: bool = False,
     ) -> None:
+        """penalty: for a correction by the whole range of an input; cuts: instead of a penalty, an intervention ends
+        the episode for the learner with the lowest reward, while the environment's goes on (SAILR)."""
         self.robot, self.env, self.identity, self.penalty, self.filtered = robot, env, identity, penalty, filtered
+        self.cuts = cuts
         self.commitment = Commitment(robot)
         self.index = 0  # steps so far
         self.running = False
@@ -149,6 +160,9 @@ class Driver:
             return
         step.decision = outcome.answer.message.kind
         step.decide_ms = outcome.answer.message.time_ms
+        if self.cuts:
+            step.cut = step.decision == pb.FAILSAFE
+            step.penalty = step.reward - LOWEST if step.cut else 0.0
         predicted: Prediction | None = self.commitment.predicted
         if predicted is not None:
             step.compared = True

@@ -81,7 +81,8 @@ class Rider:
         actor = settings.name if settings.robots == 1 else f"{settings.name}.{offset}"
         identity = Identity(actor, settings.number + offset, settings.seed)
         env = make(robot, settings.arena, settings.seed)
-        self.driver = Driver(robot, env, identity, settings.penalty, settings.method != "none")
+        filtered, cuts = settings.method != "none", settings.method == "sailr"
+        self.driver = Driver(robot, env, identity, settings.penalty, filtered, cuts)
         self.student = Student(process.bus, robot, actor, settings.lockstep)
         self.next_episode = 0
         self.waiting = False  # for the safety service, standing

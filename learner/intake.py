@@ -44,7 +44,7 @@ class Intake:
         observation = _vector("observation", step.observation, self.robot.observation_dim)
         after = _vector("next_observation", step.next_observation, self.robot.observation_dim)
         values = action, proposed, step.reward, step.penalty
-        return Move(step.episode, step.step, observation, *values, after, step.terminated, step.truncated)
+        return Move(step.episode, step.step, observation, *values, after, step.terminated, step.truncated, step.cut)
 
     def _normalised(self, name: str, values: Any) -> Vector:
         """An action in [-1, 1]: what is out of bounds would have been clipped."""

@@ -8,6 +8,10 @@ A step that the safety filter corrected is two lessons in one: proposing what wa
 outcome without a penalty, and proposing what was proposed had it with one. With `Stored` "both" each becomes a
 transition. "executed" alone teaches nothing about actions that the filter never lets pass, and the critic's guesses
 about them draw the policy to the obstacles; there the penalty stands with the executed action.
+
+A step that is *cut* (SAILR's intervention) ends the episode for the learner alone: proposing what was proposed leads to
+nothing, with the lowest reward (Wagener et al. 2021, section 4: the absorbing MDP). With "both" what the backup policy
+did instead is a transition of its own, of one step.
 """
 
 from __future__ import annotations
@@ -37,6 +41,7 @@ class Move(NamedTuple):
     next_observation: Vector
     terminated: bool
     truncated: bool
+    cut: bool = False  # for the learner the episode ends here; the reward less the penalty is the lowest there is
 
 
 class Windows:
@@ -58,7 +63,7 @@ class Windows:
         if here != (last[0], last[1] + 1):
             done += self._drain(moves)
         moves.append(move)
-        if move.terminated or move.truncated:
+        if move.terminated or move.truncated or move.cut:
             done += self._drain(moves)
         elif len(moves) == self.n:
             done += self._close(moves)
@@ -77,13 +82,23 @@ class Windows:
         reward = 0.0
         for move in reversed(moves):
             reward = move.reward - move.penalty + self.gamma * reward
-        discount = 0.0 if last.terminated else self.gamma ** len(moves)
+        discount = 0.0 if last.terminated or last.cut else self.gamma ** len(moves)
+        if first.cut:
+            return self._cut(first)
         if self.stored == "executed" or np.array_equal(first.action, first.proposed):
             return [Transition(first.observation, first.action, reward, discount, last.next_observation)]
         return [
             Transition(first.observation, first.action, reward + first.penalty, discount, last.next_observation),
             Transition(first.observation, first.proposed, reward, discount, last.next_observation),
         ]
+
+    def _cut(self, move: Move) -> list[Transition]:
+        seen, after = move.observation, move.next_observation
+        done = [Transition(seen, move.proposed, move.reward - move.penalty, 0.0, after)]
+        if self.stored == "both" and not np.array_equal(move.action, move.proposed):
+            discount = 0.0 if move.terminated else self.gamma
+            done.insert(0, Transition(seen, move.action, move.reward, discount, after))
+        return done
 
     def state(self) -> State:
         """The open windows too: with several actors a checkpoint cuts through the episodes of all but one."""

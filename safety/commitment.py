@@ -37,6 +37,9 @@ class Prediction:
         return bool((np.abs(away) <= self.half_width + SAME_SET).all())
 
 
+NO_PREDICTION = Prediction(np.zeros(0), np.zeros(0), 0.0)  # of a method that predicts nothing
+
+
 class Commitment:
     """The committed plan of one robot: verified when it was made, from then to standstill.
 
@@ -58,7 +61,8 @@ class Commitment:
 
     def accept(self, plan: Array, model: str, predicted: Prediction | None, verified: bool) -> Array:
         """A decision's plan becomes the committed one; returns the input to execute now."""
-        self.plan, self.model, self.predicted = plan, model if verified else UNVERIFIED, predicted
+        self.plan, self.model = plan, model if verified else UNVERIFIED
+        self.predicted = predicted if predicted is not None and len(predicted.center) else None
         return self._advance()
 
     def fallback(self) -> Array:

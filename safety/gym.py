@@ -1,4 +1,4 @@
-"""The filter in front of any policy, in process, as a Gymnasium wrapper.
+"""The filter (or a rival: `safety/methods.py`) in front of any policy, in process, as a Gymnasium wrapper.
 
 env = SafetyWrapper(NavigationEnv(), Filter(ModelSet.load(path)))
 model = AnyLibrary("MlpPolicy", env).learn(...)
@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 
 from messaging.shapes import Shapes
 from safety.commitment import Commitment, correction_penalty
-from safety.filter import Decision, Filter, Request
+from safety.filter import Decision, Request
+from safety.methods import Method
 
 Observation = NDArray[np.float32]
 
@@ -27,24 +28,25 @@ class SafetyWrapper(gymnasium.Wrapper[Any, Any, Any, Any]):
     `Decision`), `proposed` and `penalty`; the penalty is subtracted from the reward.
     """
 
-    def __init__(self, env: gymnasium.Env[Any, Any], filter: Filter, penalty: float = 0.0) -> None:
+    def __init__(self, env: gymnasium.Env[Any, Any], filter: Method, penalty: float = 0.0) -> None:
         super().__init__(env)
         self.filter, self.penalty = filter, penalty
         self.commitment = Commitment(filter.robot)
         self._info: dict[str, Any] = {}
+        self._seen: Any = None  # the last observation, which some methods need
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        observation, self._info = self.env.reset(seed=seed, options=options)
+        self._seen, self._info = self.env.reset(seed=seed, options=options)
         self.commitment.reset()
-        return observation, self._info
+        return self._seen, self._info
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         decision = self.decide(np.asarray(action, dtype=float))
         executed = self.commitment.accept(decision.plan, decision.model, decision.predicted, decision.verified)
-        observation, reward, terminated, truncated, self._info = self.env.step(executed.astype(np.float32))
+        self._seen, reward, terminated, truncated, self._info = self.env.step(executed.astype(np.float32))
         cost = correction_penalty(self.filter.robot, action, executed, self.penalty)
         self._info |= {"safety": decision, "proposed": action, "penalty": cost}
-        return observation, float(reward) - cost, terminated, truncated, self._info
+        return self._seen, float(reward) - cost, terminated, truncated, self._info
 
     def decide(self, action: NDArray[np.float64]) -> Decision:
         """The decision on an action in the current state; a proposal that is no number becomes standing still."""
@@ -59,5 +61,11 @@ class SafetyWrapper(gymnasium.Wrapper[Any, Any, Any, Any]):
                 obstacles=Shapes.of(self._info["obstacles"], robot.position_dim),
                 model=kept.model,
                 predicted=kept.predicted,
+                observation=self._observed(),
             )
         )
+
+    def _observed(self) -> Observation:
+        """The observation, if it is the robot's own: another environment has none that a method could read."""
+        seen = np.asarray(self._seen, np.float32) if isinstance(self._seen, np.ndarray) else np.zeros(0, np.float32)
+        return seen if seen.shape == (self.filter.robot.observation_dim,) else np.zeros(0, np.float32)

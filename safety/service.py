@@ -15,47 +15,52 @@ from messaging.process import Process
 from messaging.robots import UnknownRobot, robot_named
 from messaging.topics import DECIDE, MODEL
 from safety.commitment import UNVERIFIED
-from safety.filter import BadRequest, Filter, StaleModel
-from safety.model_set import BadModel, ModelSet
+from safety.filter import BadRequest, StaleModel
+from safety.methods import Method, Model, decode, load, ready
+from safety.model_set import BadModel
 from safety.wire import batch_of, error_of, message_of, request_of
 
 log = logging.getLogger("brakeline.safety")
 
 
 class NoModel(BadRequest):
-    """No model set of this robot is loaded."""
+    """No model of this robot is loaded."""
 
 
 @dataclass
 class Models:
-    """The filter in use for each robot, and every version there has been, with an archive folder if given."""
+    """The method in use for each robot, and every version there has been, with an archive folder if given."""
 
     archive: Path | None = None
-    filters: dict[str, Filter] = field(default_factory=dict)
+    filters: dict[str, Method] = field(default_factory=dict)
     known: set[str] = field(default_factory=set)
     _lock: Lock = field(default_factory=Lock)
 
-    def install(self, model: ModelSet) -> None:
-        """Put a model set to use; requests in hand finish with the one before."""
-        ready = Filter(model)
-        with self._lock:
-            self.filters[model.robot.name] = ready
-            self.known.add(ready.version)
-        log.info("%s: model %s in use (%s)", model.robot.name, ready.version, model.recipe.certificate)
-        if self.archive is not None:
-            model.save(self.archive / model.robot.name / "models" / f"{ready.version}.safetensors")
+    def install(self, model: Model) -> None:
+        """Put a model to use; requests in hand finish with the one before.
 
-    def filter_for(self, request: pb.Request) -> Filter:
+        Raises:
+            BadModel: it does not fit its robot.
+        """
+        method = ready(model)
+        with self._lock:
+            self.filters[model.robot.name] = method
+            self.known.add(method.version)
+        log.info("%s: model %s in use (%s)", model.robot.name, method.version, type(method).__name__)
+        if self.archive is not None:
+            model.save(self.archive / model.robot.name / "models" / f"{method.version}.safetensors")
+
+    def filter_for(self, request: pb.Request) -> Method:
         """Raises UnknownRobot, NoModel or StaleModel."""
         robot = robot_named(request.robot)
-        ready = self.filters.get(robot.name)
-        if ready is None:
+        method = self.filters.get(robot.name)
+        if method is None:
             have = ", ".join(self.filters) or "none"
-            raise NoModel("robot", f"no model set of {robot.name} is loaded (loaded: {have})")
+            raise NoModel("robot", f"no model of {robot.name} is loaded (loaded: {have})")
         vouched = request.model in ("", UNVERIFIED) or request.model in self.known
         if not vouched and not self._archived(robot.name, request.model):
             raise StaleModel("model", f"the plan was verified by model {request.model}, which was never in use here")
-        return ready
+        return method
 
     def _archived(self, robot: str, version: str) -> bool:
         if self.archive is None or not version.isalnum():
@@ -123,7 +128,7 @@ def answerer(models: Models, counts: Counts) -> Callable[[bytes], bytes]:
 @dataclass(frozen=True)
 class SafetySettings:
     bus: BusSettings
-    models: tuple[Path, ...]  # model set files, one a robot
+    models: tuple[Path, ...]  # model files, one a robot; each says which method it is of
     archive: Path | None = None  # where versions that come over the bus are kept
     name: str = "safety"
 
@@ -132,24 +137,24 @@ def main(settings: SafetySettings) -> None:
     """Serve until SIGINT or SIGTERM.
 
     Raises:
-        BadModel: a file is no model set: a service without one would only refuse.
+        BadModel: a file is no model: a service without one would only refuse.
     """
     models, counts = Models(settings.archive), Counts()
     with Process(settings.bus, settings.name) as process:
         for path in settings.models:
-            models.install(ModelSet.load(path))
+            models.install(load(path))
 
         def replace(sample: Sample) -> None:
             try:
-                models.install(ModelSet.decode(sample.message().file))
+                models.install(decode(sample.message().file))
             except (BadModel, BusError) as error:
-                log.error("a model set was refused: %s", error)
+                log.error("a model was refused: %s", error)
             except OSError as error:
-                log.error("a model set is in use but could not be archived: %s", error)
+                log.error("a model is in use but could not be archived: %s", error)
 
         def refresh() -> None:
             process.figures.update(counts.figures())
-            process.notes.update({f"model {name}": ready.version for name, ready in models.filters.items()})
+            process.notes.update({f"model {name}": method.version for name, method in models.filters.items()})
 
         process.refresh = refresh
         process.bus.subscribe(MODEL, replace)

@@ -1,0 +1,76 @@
+"""Perceptrons side by side and their forward pass without torch: the networks of the rivals' models.
+
+x → relu(W₀ x + b₀) → … → W_L x + b_L        for each of `count` perceptrons of one shape, all on the same input
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Tensor = NDArray[np.float32]
+Layer = tuple[Tensor, Tensor]  # weight (count, out, in), bias (count, out)
+
+
+class BadPerceptrons(ValueError):
+    """The layers do not fit each other, or are not finite; the message says which."""
+
+
+class Perceptrons:
+    """`count` perceptrons of one shape; the same input gives the same output, bit for bit."""
+
+    def __init__(self, layers: Sequence[Layer]) -> None:
+        """
+        Raises:
+            BadPerceptrons: as it says.
+        """
+        self.layers = [(np.ascontiguousarray(w, np.float32), np.ascontiguousarray(b, np.float32)) for w, b in layers]
+        if not self.layers:
+            raise BadPerceptrons("layers: there are none")
+        self.count, _, self.inputs = self.layers[0][0].shape if self.layers[0][0].ndim == 3 else (0, 0, 0)
+        width = self.inputs
+        for number, (weight, bias) in enumerate(self.layers):
+            if weight.ndim != 3 or weight.shape[::2] != (self.count, width) or bias.shape != weight.shape[:2]:
+                raise BadPerceptrons(f"layers.{number}: {weight.shape} and {bias.shape} behind {width} inputs")
+            if not (np.isfinite(weight).all() and np.isfinite(bias).all()):
+                raise BadPerceptrons(f"layers.{number}: not finite")
+            width = weight.shape[1]
+        self.outputs = width
+
+    def __call__(self, x: NDArray[Any]) -> Tensor:
+        """Outputs (count, outputs) for one input (inputs,)."""
+        value: Tensor = np.broadcast_to(np.asarray(x, np.float32), (self.count, self.inputs))
+        last = len(self.layers) - 1
+        for number, (weight, bias) in enumerate(self.layers):
+            value = np.matmul(weight, value[:, :, None])[:, :, 0] + bias
+            if number != last:
+                np.maximum(value, 0.0, out=value)
+        return value
+
+    def tensors(self, name: str) -> dict[str, Tensor]:
+        """As they rest: `<name>.<layer>.weight` and `.bias`."""
+        parts = {}
+        for number, (weight, bias) in enumerate(self.layers):
+            parts[f"{name}.{number}.weight"], parts[f"{name}.{number}.bias"] = weight, bias
+        return parts
+
+    @classmethod
+    def of(cls, tensors: Mapping[str, NDArray[Any]], name: str) -> Perceptrons:
+        """The perceptrons of that name among the tensors.
+
+        Raises:
+            BadPerceptrons: missing, of another type, or not fitting.
+        """
+        layers: list[Layer] = []
+        while f"{name}.{len(layers)}.weight" in tensors:
+            parts = [tensors.get(f"{name}.{len(layers)}.{kind}") for kind in ("weight", "bias")]
+            if any(part is None or part.dtype != np.float32 for part in parts):
+                raise BadPerceptrons(f"{name}.{len(layers)}: a part is missing or not float32")
+            layers.append((np.asarray(parts[0]), np.asarray(parts[1])))
+        try:
+            return cls(layers)
+        except BadPerceptrons as error:
+            raise BadPerceptrons(f"{name}: {error}") from error

@@ -1,0 +1,34 @@
+"""The backup policy μ that every robot has, and the plans that rest on it: brake as fast as the slew allows.
+
+    μ(u_before) = u_before − clip(u_before, −slew, slew)      (the ground robot has no slew: zero at once)
+
+A plan here is only what to do when no answer comes; the rivals verify nothing.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from messaging.robots import Array, Robot
+
+
+def brake(robot: Robot, before: Array) -> Array:
+    """μ: the input (m,) that follows the input `before` (m,) while braking."""
+    slew = np.asarray(robot.action_slew)
+    return np.asarray(before - np.clip(before, -slew, slew))
+
+
+def within(robot: Robot, wanted: Array, before: Array) -> Array:
+    """The input (m,) closest to the wanted one within bounds and slew of the one in force."""
+    slew = np.asarray(robot.action_slew)
+    low, high = np.maximum(robot.low(), before - slew), np.minimum(robot.high(), before + slew)
+    return np.asarray(np.minimum(np.maximum(wanted, low), high))
+
+
+def braking_plan(robot: Robot, first: Array) -> Array:
+    """(N, m): `first`, then μ; the last input is zero (`horizon` periods suffice to brake from any input)."""
+    plan = np.zeros((robot.horizon, robot.action_dim))
+    plan[0] = first
+    for k in range(1, robot.horizon):
+        plan[k] = brake(robot, plan[k - 1])
+    return plan

@@ -1,0 +1,73 @@
+"""THE table of the methods that a safety service can serve: what turns a request into a decision, behind one interface.
+
+`none` is not among them: a robot without a filter asks nobody.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Protocol
+
+from messaging.robots import Robot
+from safety.filter import Decision, Filter, Request
+from safety.model_set import BadModel, ModelSet
+from safety.pretrained import ENTRY, Pretrained, entry_of
+from safety.sailr import SAILR, Sailr
+from safety.secas import SECAS, Secas
+
+DDPC = "ddpc"
+
+Model = ModelSet | Pretrained
+
+
+class Method(Protocol):
+    """A pure function of the request and the model: it keeps nothing about a robot."""
+
+    @property
+    def robot(self) -> Robot: ...
+
+    @property
+    def version(self) -> str:
+        """Of the model: its hash."""
+
+    def decide(self, request: Request) -> Decision:
+        """Raises BadRequest."""
+
+
+RIVALS: dict[str, Callable[[Pretrained], Method]] = {SECAS: Secas, SAILR: Sailr}
+METHODS = (DDPC, *RIVALS)
+
+
+def ready(model: Model) -> Method:
+    """A model made ready for decisions.
+
+    Raises:
+        BadModel: it is of no method here, or does not fit its robot.
+    """
+    if isinstance(model, ModelSet):
+        return Filter(model)
+    if model.method not in RIVALS:
+        raise BadModel(f"no method is called {model.method!r}; there are: {', '.join(METHODS)}")
+    return RIVALS[model.method](model)
+
+
+def decode(payload: bytes) -> Model:
+    """The model in a file, of whichever kind.
+
+    Raises:
+        BadModel: of none; the message says why.
+    """
+    try:
+        entry_of(payload, ENTRY)
+    except (KeyError, ValueError, AttributeError):
+        return ModelSet.decode(payload)
+    return Pretrained.decode(payload)
+
+
+def load(path: Path) -> Model:
+    """Raises BadModel, naming the file."""
+    try:
+        return decode(path.read_bytes())
+    except (OSError, BadModel) as error:
+        raise BadModel(f"{path}: {error}") from error

@@ -1,0 +1,93 @@
+"""What a rival knows of a robot: trained networks and a few settings, as one file with a version that is its hash.
+
+The file is safetensors; the metadata entry `pretrained` holds, as JSON, the robot, the hash of its layout, the method,
+the settings, what is known of the training, and the version. Nothing of it is believed before it was checked.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from safetensors import SafetensorError
+from safetensors.numpy import load, save
+
+from messaging.perceptrons import BadPerceptrons, Perceptrons
+from messaging.robots import Robot, UnknownRobot, robot_named
+from safety.model_set import BadModel
+
+ENTRY = "pretrained"
+
+
+@dataclass(frozen=True)
+class Pretrained:
+    """networks by name; settings: numbers that a decision depends on; about: where it comes from, in words."""
+
+    robot: Robot
+    method: str
+    networks: Mapping[str, Perceptrons]
+    settings: Mapping[str, float]
+    about: dict[str, str] = field(default_factory=dict)
+
+    @property
+    def version(self) -> str:
+        """Hash of everything that decisions depend on."""
+        digest = hashlib.sha256(json.dumps([self.robot.layout(), self.method, dict(self.settings)]).encode())
+        for name, tensor in sorted(self._tensors().items()):
+            digest.update(f"{name}{tensor.shape}".encode() + tensor.tobytes())
+        return digest.hexdigest()[:12]
+
+    def _tensors(self) -> dict[str, Any]:
+        return {key: t for name, network in self.networks.items() for key, t in network.tensors(name).items()}
+
+    def encode(self) -> bytes:
+        about = {
+            "robot": self.robot.name,
+            "layout": self.robot.layout(),
+            "method": self.method,
+            "settings": dict(self.settings),
+            "networks": sorted(self.networks),
+            "about": self.about,
+            "version": self.version,
+        }
+        return save(self._tensors(), {ENTRY: json.dumps(about, sort_keys=True)})
+
+    def save(self, path: Path) -> None:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        beside = path.with_name(path.name + ".new")
+        beside.write_bytes(self.encode())
+        beside.replace(path)
+
+    @staticmethod
+    def decode(payload: bytes) -> Pretrained:
+        """
+        Raises:
+            BadModel: it is no pretrained model, or not of this layout; the message says why.
+        """
+        try:
+            tensors = load(payload)
+            about = json.loads(entry_of(payload, ENTRY))
+            robot = robot_named(about["robot"])
+            networks = {str(name): Perceptrons.of(tensors, name) for name in about["networks"]}
+            settings = {str(name): float(value) for name, value in about["settings"].items()}
+            model = Pretrained(robot, str(about["method"]), networks, settings, dict(about["about"]))
+        except (SafetensorError, KeyError, TypeError, ValueError, UnknownRobot, BadPerceptrons) as error:
+            raise BadModel(f"no pretrained model: {error!r}") from error
+        if about.get("layout") != robot.layout():
+            raise BadModel(f"the model is for another layout of {robot.name}: pretrain it again")
+        if not np.isfinite(list(settings.values())).all():
+            raise BadModel("the model's settings hold NaN or infinity")
+        if model.version != about.get("version"):
+            raise BadModel("the model's content is not what its version says")
+        return model
+
+
+def entry_of(payload: bytes, name: str) -> str:
+    """A metadata entry of a safetensors file. Raises KeyError if there is none, ValueError for no such file."""
+    size = int.from_bytes(payload[:8], "little")
+    return str(json.loads(payload[8 : 8 + size]).get("__metadata__", {})[name])
