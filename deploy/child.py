@@ -80,10 +80,28 @@ def metadata(config: RunConfig) -> dict[str, dict[str, str]]:
     return about
 
 
+def attachments(config: RunConfig) -> dict[str, bytes]:
+    """The model sets in use when the run started, so that the log alone can be replayed."""
+    from deploy.store import model_path
+    from safety.model_set import ModelSet
+
+    if config.method == "none":
+        return {}
+    models = (ModelSet.load(model_path(robot_named(robot), config.recipe)) for robot in config.robots)
+    return {attachment(model.robot.name, model.version): model.encode() for model in models}
+
+
+def attachment(robot: str, version: str) -> str:
+    """The name in a log of a model set."""
+    return f"model/{robot}/{version}.safetensors"
+
+
 def _recorder(place: Place, folder: Path, config: RunConfig, bus: BusSettings) -> bool:
     from logs import recorder
+    from logs.foxglove import Pictures
 
-    recorder.main(bus, folder / LOG, metadata(config), place.name)
+    derive = Pictures(config.pictures).of_sample if config.pictures > 0.0 else None
+    recorder.main(bus, folder / LOG, metadata(config), place.name, attachments(config), derive)
     return False
 
 

@@ -36,6 +36,7 @@ class RunConfig:
     deterministic: bool = False  # one actor, lockstep, no deadlines
     replicas: int = 1  # of the safety service
     practice: float = 0.0  # share of steps at which a robot starts to follow its committed plan to the stop
+    pictures: float = 10.0  # a second and robot, drawn for Foxglove in the log; 0: none
     change: Change = field(default_factory=Change)  # of the robots, in mid-run
     conditions: Conditions = field(default_factory=Conditions)
     learner: LearnerConfig = field(default_factory=lambda: LearnerConfig(checkpoint_every=2500))

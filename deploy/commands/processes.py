@@ -101,9 +101,14 @@ class Recorder:
     """File to write; if it exists, the next segment."""
     endpoints: Flags[Endpoints] = field(default_factory=Endpoints)
     name: str = "recorder"
+    pictures: float = RunConfig.pictures
+    """A second and robot, drawn for Foxglove in the log besides all interventions; 0: none at all."""
 
     def run(self) -> int:
         from logs import recorder
+        from logs.foxglove import Pictures
 
-        recorder.main(self.endpoints.bus(), self.log, {"versions": {"brakeline": version("brakeline")}}, self.name)
+        about = {"versions": {"brakeline": version("brakeline")}}
+        derive = Pictures(self.pictures).of_sample if self.pictures > 0.0 else None
+        recorder.main(self.endpoints.bus(), self.log, about, self.name, derive=derive)
         return 0

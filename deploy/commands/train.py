@@ -73,6 +73,8 @@ class Train:
     """Load the robots or change the floor in mid-run, e.g. --change.after 5000 --change.payload-kg 1."""
     deterministic: bool = False
     """One actor, lockstep, no deadlines: the same seed gives the same weights, bit for bit."""
+    pictures: float = RunConfig.pictures
+    """A second and robot, drawn for Foxglove in the log besides all interventions; 0: none at all."""
     listen: str | None = None
     """The router's endpoint; default: a free port of this machine."""
     learner: LearnerConfig = field(default_factory=lambda: RunConfig().learner)
@@ -117,6 +119,7 @@ class Train:
             change=self.change,
             deterministic=self.deterministic,
             replicas=self.replicas,
+            pictures=self.pictures,
             conditions=self.physics.conditions(),
             learner=self.learner,
         )
