@@ -7,27 +7,23 @@ for record in read("runs/demo"):
 from __future__ import annotations
 
 import os
-import struct
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
+from itertools import groupby
 from pathlib import Path
-from typing import IO, Any
+from typing import Any, NamedTuple
 
-import zstandard
 from google.protobuf.message import DecodeError, Message
-from mcap.exceptions import McapError
-from mcap.records import Attachment, Channel, Chunk, McapRecord, Metadata, Schema
-from mcap.records import Message as Stored
-from mcap.stream_reader import StreamReader, breakup_chunk
+from mcap.records import Attachment, Metadata
 
-from logs.segment import number_of
+from logs.container import Damage, NotMcap, Row, Series, records
+from logs.segment import being_written, name_of, number_of
 from messaging.topics import TOPICS
 
 Paths = str | os.PathLike[str] | Iterable[str | os.PathLike[str]]
 
 TYPES: dict[str, type[Message]] = {topic.message.DESCRIPTOR.full_name: topic.message for topic in TOPICS}
 NAMES: dict[str, str] = {topic.key.split("/", 1)[0]: topic.name for topic in TOPICS}
-DAMAGE = (McapError, struct.error, ValueError, zstandard.ZstdError)
 
 
 class LogError(Exception):
@@ -42,8 +38,7 @@ class NotALog(LogError):
     """The file is not an MCAP file."""
 
 
-@dataclass(frozen=True)
-class Record:
+class Record(NamedTuple):
     """One message of a log."""
 
     topic: str  # its name in messaging/topics.py, e.g. "step"
@@ -55,15 +50,45 @@ class Record:
 
 @dataclass(frozen=True)
 class Cut:
-    """A file that does not end as it should: the recorder was killed, or its disk was full."""
+    """A file that is not as it should be: the recorder was killed, its disk was full, or bytes were changed."""
 
     path: Path
-    lost: int  # bytes at the end that cannot be read; 0: only the summary is missing
+    lost: int  # bytes that cannot be read; 0: only the summary is missing
     reason: str
+    at: int | None = None  # where in the file these bytes are; None: at its end
 
     def __str__(self) -> str:
-        what = f"{self.lost} bytes at its end cannot be read" if self.lost else "it ends without a summary"
-        return f"{self.path}: {what} ({self.reason})"
+        if not self.lost:
+            return f"{self.path}: it ends without a summary ({self.reason})"
+        where = "its end" if self.at is None else f"byte {self.at}"
+        return f"{self.path}: {self.lost} bytes at {where} cannot be read ({self.reason})"
+
+
+@dataclass(frozen=True)
+class Absent:
+    """A segment that must have been there: later ones are."""
+
+    path: Path
+
+    def __str__(self) -> str:
+        return f"{self.path}: this segment is missing, with all that was recorded in it"
+
+
+@dataclass
+class Segment:
+    """What was found in a file, once it was read."""
+
+    path: Path
+    size: int  # bytes
+    messages: int = 0
+    start: int = 0  # ns since the Unix epoch: first and last time of receipt; 0 without messages
+    end: int = 0
+    recording: bool = False  # somebody writes to it now
+
+    def took(self, log_time: int) -> None:
+        self.messages += 1
+        self.end = max(self.end, log_time)
+        self.start = min(self.start or log_time, log_time)
 
 
 @dataclass
@@ -71,58 +96,63 @@ class Log:
     """The segments of one or more runs, in order. The other attributes fill up while it is iterated over."""
 
     paths: tuple[Path, ...]
-    metadata: dict[str, dict[str, str]] = field(default_factory=dict)
-    attachments: dict[str, bytes] = field(default_factory=dict)
-    cuts: list[Cut] = field(default_factory=list)
+    metadata: dict[str, dict[str, str]] = field(default_factory=dict)  # the latest of each name
+    cuts: list[Cut | Absent] = field(default_factory=list)
     malformed: int = 0  # messages that are not of their type
+    segments: list[Segment] = field(default_factory=list)
 
     def __iter__(self) -> Iterator[Record]:
+        for series, message, log_time, publish_time in self.decoded():
+            yield Record(series.topic, series.key, message, log_time, publish_time)
+
+    def decoded(self) -> Iterator[tuple[Series, Any, int, int]]:
+        """As iterating, with plain tuples (channel, message, log_time, publish_time): faster."""
+        for series, log_time, publish_time, payload in self.rows():
+            try:
+                message = series.decode(payload)
+            except DecodeError:
+                self.malformed += 1
+                continue
+            yield series, message, log_time, publish_time
+
+    def rows(self) -> Iterator[Row]:
+        """The messages of types that we know as they are stored: (channel, log_time, publish_time, payload)."""
+        self.cuts += absent(self.paths)
         for path in self.paths:
-            with path.open("rb") as file:
-                yield from self._records(path, file)
+            yield from self._rows_of(path)
 
-    def _records(self, path: Path, file: IO[bytes]) -> Iterator[Record]:
+    def _rows_of(self, path: Path) -> Iterator[Row]:
         """The messages of one file, front to back; that needs no summary, so it works for every file."""
-        schemas: dict[int, Schema] = {}
-        channels: dict[int, Channel] = {}
-        for item in self._intact(path, file):
-            if isinstance(item, Metadata):
-                self.metadata[item.name] = dict(item.metadata)
-            elif isinstance(item, Attachment):
-                self.attachments[item.name] = item.data
-            elif isinstance(item, Schema):
-                schemas[item.id] = item
-            elif isinstance(item, Channel):
-                channels[item.id] = item
-            elif isinstance(item, Stored):
-                channel = channels[item.channel_id]
-                schema = schemas.get(channel.schema_id)
-                kind = TYPES.get(schema.name) if schema is not None else None
-                if kind is not None:  # others may have added channels of their own
-                    try:
-                        message = kind.FromString(item.data)
-                    except DecodeError:
-                        self.malformed += 1
-                        continue
-                    root = channel.topic.split("/", 1)[0]
-                    yield Record(NAMES.get(root, root), channel.topic, message, item.log_time, item.publish_time)
-
-    def _intact(self, path: Path, file: IO[bytes]) -> Iterator[McapRecord]:
-        """The records of the file, those within chunks too, up to the first that is not whole."""
-        size = path.stat().st_size
-        good = 0  # bytes up to the end of the last whole record
+        about = Segment(path, path.stat().st_size, recording=being_written(path))
+        self.segments.append(about)
         try:
-            for item in StreamReader(file, emit_chunks=True).records:
-                yield from breakup_chunk(item, validate_crc=True) if isinstance(item, Chunk) else [item]
-                good = file.tell()
-        except DAMAGE as error:
-            if size > 0 and good == 0:
-                raise NotALog(f"{path} is not an MCAP file: {error}") from error
-            self.cuts.append(Cut(path, size - good, str(error) or type(error).__name__))
+            with path.open("rb") as file:
+                for item in records(file, about.size, self._series):
+                    if type(item) is tuple:
+                        about.took(item[1])
+                        if item[0].known:  # others may have added channels of their own
+                            yield item
+                    elif isinstance(item, Damage):
+                        self._note(about, item)
+                    elif isinstance(item, Metadata):
+                        self.metadata[item.name] = dict(item.metadata)
+                    elif isinstance(item, Attachment):
+                        pass
+        except NotMcap as error:
+            raise NotALog(f"{path} is not an MCAP file: {error}") from error
+
+    def _note(self, about: Segment, damage: Damage) -> None:
+        reason = "it is being recorded" if about.recording and damage.at_end else damage.reason
+        self.cuts.append(Cut(about.path, damage.lost, reason, None if damage.at_end else damage.at))
+
+    @staticmethod
+    def _series(key: str, schema: str) -> Series:
+        kind, root = TYPES.get(schema), key.split("/", 1)[0]
+        return Series(NAMES.get(root, root), key, None if kind is None else kind.FromString)
 
 
 def find(paths: Paths) -> tuple[Path, ...]:
-    """The log files meant: all of a folder; for run.mcap its later segments run.1.mcap … too; else the file itself.
+    """The log files meant: all of a folder; for run.mcap its later segments run_0001.mcap … too; else the file itself.
 
     Raises:
         NoLog: there is none.
@@ -142,6 +172,31 @@ def find(paths: Paths) -> tuple[Path, ...]:
             raise NoLog(f"no log at {path}: give an .mcap file or the folder of a run")
         found.update(dict.fromkeys(sorted(files, key=number_of)))
     return tuple(found)
+
+
+def by_run(paths: Sequence[Path]) -> dict[str, tuple[Path, ...]]:
+    """The files that belong to one run, under a name for it: its folder, and the file's name unless that is `run`.
+
+    A resumed or restarted run has several files; they come in the order in which they were recorded.
+    """
+    runs: dict[str, tuple[Path, ...]] = {}
+    for (folder, name), files in groupby(paths, key=lambda path: (path.parent, number_of(path)[0])):
+        place = folder.resolve().name
+        label = place if name == "run" else f"{place}/{name}"
+        taken = sum(other == label or other.startswith(f"{label} (") for other in runs)
+        runs[f"{label} ({taken + 1})" if taken else label] = tuple(files)
+    return runs
+
+
+def absent(paths: Sequence[Path]) -> list[Cut | Absent]:
+    """The segments that are missing between those at `paths`: numbers that were left out."""
+    found: list[Cut | Absent] = []
+    for (folder, name), files in groupby(paths, key=lambda path: (path.parent, number_of(path)[0])):
+        numbers = [number_of(path)[1] for path in files]
+        if len(numbers) > 1:
+            gone = sorted(set(range(numbers[-1])) - set(numbers))
+            found += [Absent(folder / name_of(f"{name}.mcap", number)) for number in gone]
+    return found
 
 
 def open_log(paths: Paths) -> Log:

@@ -2,6 +2,7 @@
 
 Subscribers only put samples into an inbox; one thread empties it into the file twice a second. So a `kill -9` loses
 less than a second. While the disk is full the inbox fills up; what no longer fits is counted as dropped, and said.
+A file that has grown large or old is finished, and the log goes on in the next.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ import threading
 import time
 from collections import Counter, deque
 from collections.abc import Callable, Iterable
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
@@ -30,6 +32,24 @@ PORTION = 2**20  # bytes saved at once: what fits on a nearly full disk is saved
 
 Open = Callable[[Path, Metadata], Segment]
 Derive = Callable[[Sample], Iterable[Entry]]  # what is stored of a sample besides itself: Foxglove's pictures
+
+
+@dataclass(frozen=True)
+class Rotation:
+    """When a file is finished and the log goes on in the next one. What is finished can be moved away."""
+
+    size: int = 512 * 2**20  # bytes
+    seconds: float = 3600.0  # since the file was begun
+
+    def __post_init__(self) -> None:
+        if self.size <= 0 or not self.seconds > 0.0:
+            raise ValueError(
+                f"a log's files have a size and a duration above 0, not {self.size} B and {self.seconds} s"
+            )
+
+    def due(self, segment: Segment, age: float) -> bool:
+        """Has the file had enough? One without a message never has."""
+        return not segment.empty and (segment.size >= self.size or age >= self.seconds)
 
 
 class Inbox:
@@ -75,14 +95,22 @@ class Recording:
     """Empties an inbox into the segments of a run, on a disk that may fill up. For one thread."""
 
     def __init__(
-        self, run: Path, metadata: Metadata, inbox: Inbox, open_one: Open = open_segment, derive: Derive | None = None
+        self,
+        run: Path,
+        metadata: Metadata,
+        inbox: Inbox,
+        open_one: Open = open_segment,
+        derive: Derive | None = None,
+        rotation: Rotation | None = None,
     ) -> None:
         self.recorded: Counter[str] = Counter()  # messages in the files, per key
         self.failure = ""  # why nothing can be written at present
         self.path: Path | None = None  # of the latest segment
         self._run, self._metadata, self._inbox, self._open = run, metadata, inbox, open_one
         self._derive = derive or (lambda sample: ())
+        self._rotation = rotation or Rotation()
         self._segment: Segment | None = None
+        self._begun_at = 0.0
         self._retry_at = 0.0
         self._complained_of = 0
 
@@ -92,33 +120,51 @@ class Recording:
         if time.monotonic() < self._retry_at:
             return
         try:
-            if self._segment is None:
-                self._segment = self._open(self._run, self._metadata)
+            segment = self._begun()
             waiting = self._inbox.bytes
             while waiting > 0 and (portion := self._inbox.portion()):
-                self._segment.save([item for sample in portion for item in (entry(sample), *self._derive(sample))])
+                segment.save([item for sample in portion for item in (entry(sample), *self._derive(sample))])
                 waiting -= sum(len(sample.payload) for sample in portion)
                 self._inbox.forget(portion)
                 self.recorded.update(sample.key for sample in portion)
+                segment = self._rotated(segment)
+            self._rotated(segment)
         except OSError as error:
             self._fail(error)
         else:
-            if self.path != self._segment.path:
-                self.path = self._segment.path
-                log.log(logging.WARNING if self.failure else logging.INFO, "recording to %s", self.path)
             self.failure = ""
 
     def finish(self) -> None:
         """Save what is left, try hard, and close the file with its summary."""
         self._retry_at = 0.0
         self.save()
-        if self._segment is not None:
-            try:
-                self._segment.finish()
-            except OSError as error:
-                log.error("no summary for %s: %s; `analyse` reads it all the same", self.path, error)
+        self._close(sync=True)
         if self._inbox.bytes:
             log.error("%d bytes of messages could not be recorded: %s", self._inbox.bytes, self.failure)
+
+    def _begun(self) -> Segment:
+        """The file to write to, a new one if there is none. Raises OSError."""
+        if self._segment is None:
+            self._segment, self._begun_at = self._open(self._run, self._metadata), time.monotonic()
+            self.path = self._segment.path
+            log.log(logging.WARNING if self.failure else logging.INFO, "recording to %s", self.path)
+        return self._segment
+
+    def _rotated(self, segment: Segment) -> Segment:
+        """The file to go on with: the next one, if this one has had enough. Raises OSError."""
+        if not self._rotation.due(segment, time.monotonic() - self._begun_at):
+            return segment
+        self._close()
+        return self._begun()
+
+    def _close(self, sync: bool = False) -> None:
+        """Finish the file, if there is one."""
+        segment, self._segment = self._segment, None
+        if segment is not None:
+            try:
+                segment.finish(sync)
+            except OSError as error:
+                log.error("no summary for %s: %s; `analyse` reads it all the same", segment.path, error)
 
     def _fail(self, error: OSError) -> None:
         self._retry_at = time.monotonic() + RETRY
@@ -153,6 +199,7 @@ def record(
     metadata: Metadata,
     attachments: Attachments | None = None,
     derive: Derive | None = None,
+    rotation: Rotation | None = None,
 ) -> Recording:
     """Record until `process.stop` is set and nothing more comes. Its Health has the note `file` once it listens.
 
@@ -160,7 +207,7 @@ def record(
     `failure` says why nothing can be written.
     """
     inbox = Inbox()
-    recording = Recording(run, metadata, inbox, partial(open_segment, attachments=attachments), derive)
+    recording = Recording(run, metadata, inbox, partial(open_segment, attachments=attachments), derive, rotation)
 
     def refresh() -> None:
         process.figures.update(
@@ -202,8 +249,9 @@ def main(
     source: str = "recorder",
     attachments: Attachments | None = None,
     derive: Derive | None = None,
+    rotation: Rotation | None = None,
 ) -> None:
     """The recorder's process: `run` is the log's path; metadata, attachments and what `derive` makes of the samples go
-    into it besides the messages."""
+    into each of its files besides the messages."""
     with Process(settings, source) as process:
-        record(process, run, metadata, attachments, derive)
+        record(process, run, metadata, attachments, derive, rotation)

@@ -1,9 +1,12 @@
-"""One MCAP file of a run. A run has several if its recorder was restarted or its disk filled up: files can't be
-appended to, so run.mcap is followed by run.1.mcap, run.2.mcap …
+"""One MCAP file of a run. A run has several if it was resumed, its recorder was restarted, its disk was full, or it grew
+long: run.mcap, run_0001.mcap, run_0002.mcap …, names that sort. Each can be read without the others.
 """
 
 from __future__ import annotations
 
+import contextlib
+import fcntl
+import itertools
 import os
 import re
 import time
@@ -43,19 +46,34 @@ class Entry:
     sequence: int
 
 
+def name_of(path: Path | str, number: int) -> str:
+    """The file name of a run's segment: run.mcap for 0, then run_0001.mcap, run_0002.mcap …"""
+    path = Path(path)
+    return f"{path.stem}_{number:04}{path.suffix}" if number else path.name
+
+
 def segments(path: Path) -> Iterator[Path]:
-    """The names of a run's segments, without end: run.mcap, run.1.mcap, run.2.mcap …"""
-    yield path
-    number = 1
-    while True:
-        yield path.with_suffix(f".{number}{path.suffix}")
-        number += 1
+    """The names of a run's segments, without end."""
+    for number in itertools.count():
+        yield path.with_name(name_of(path, number))
 
 
 def number_of(path: Path) -> tuple[str, int]:
-    """The name of a segment's run, and which of its segments it is: ("run", 2) for run.2.mcap, 0 for run.mcap."""
-    numbered = re.fullmatch(r"(.+)\.(\d+)", path.stem)
-    return (numbered[1], int(numbered[2])) if numbered else (path.stem, 0)
+    """The name of a segment's run, and which of its segments it is: ("run", 2) for run_0002.mcap, 0 for run.mcap."""
+    numbered = re.fullmatch(r"(.+?)(?:_(\d{4,})|\.(\d+))", path.stem)  # run.2.mcap: as they were called before
+    return (numbered[1], int(numbered[2] or numbered[3])) if numbered else (path.stem, 0)
+
+
+def being_written(path: Path) -> bool:
+    """Does a recorder hold the file now?"""
+    with path.open("rb") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return True
+        except OSError:  # a file system without locks
+            return False
+    return False
 
 
 class Spool:
@@ -94,6 +112,10 @@ class Spool:
         self._written += len(waiting)
         self._waiting = bytearray()
 
+    def sync(self) -> None:
+        """Wait until the disk has what was flushed. Raises OSError."""
+        os.fsync(self._file.fileno())
+
     def close(self) -> None:
         """Close the file as it was after the last flush."""
         self._file.close()
@@ -114,9 +136,10 @@ class Segment:
         self._writer: Any = mcap.writer.Writer(output, chunk_size=CHUNK)
         self._schemas: dict[str, int] = {}
         self._channels: dict[str, int] = {}
-        self._empty = True
+        self.empty = True  # it holds no message
         self._writer.start(profile="", library="brakeline")
-        for name, values in (("brakeline", TIMES), *metadata.items()):
+        about = TIMES | {"segment": str(number_of(path)[1])}
+        for name, values in (("brakeline", about), *metadata.items()):
             self._writer.add_metadata(name, dict(values))
         for name, data in (attachments or {}).items():
             now = time.time_ns()
@@ -143,10 +166,10 @@ class Segment:
                 sequence=entry.sequence & 0xFFFFFFFF,
             )
         self._writer.flush()
-        self._empty = False
+        self.empty = False
 
-    def finish(self) -> None:
-        """Write the summary, and close.
+    def finish(self, sync: bool = False) -> None:
+        """Write the summary, and close; with `sync`, wait until the disk has it: then not even a power cut can lose it.
 
         Raises:
             OSError: there is no space for the summary; all messages are there.
@@ -154,13 +177,15 @@ class Segment:
         try:
             self._writer.finish()
             self._spool.flush()
+            if sync:
+                self._spool.sync()
         finally:
             self._spool.close()
 
     def abandon(self) -> None:
         """Close without a summary. A file that holds no message is removed."""
         self._spool.close()
-        if self._empty:
+        if self.empty:
             self.path.unlink(missing_ok=True)
 
     def _channel(self, key: str, kind: type[Message]) -> int:
@@ -185,6 +210,8 @@ def open_segment(run: Path, metadata: Metadata, attachments: Attachments | None 
             file = os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o644), "wb", buffering=0)
         except FileExistsError:
             continue
+        with contextlib.suppress(OSError):  # a file system without locks
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)  # until it is closed, or we are killed
         try:
             return Segment(path, file, metadata, attachments)
         except OSError:

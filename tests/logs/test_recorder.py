@@ -17,7 +17,7 @@ import pytest
 from logs.metrics import Metrics
 from logs.reader import open_log, read
 from logs.recorder import Inbox, Recording, entry
-from logs.segment import Metadata, Segment, open_segment
+from logs.segment import Metadata, Segment, name_of, open_segment
 from messaging import brakeline_pb2 as pb
 from messaging.bus import Bus, BusSettings, Sample
 from messaging.topics import EPISODE, EXCHANGE, HEALTH, LEARNER, LOG, STEP
@@ -144,7 +144,7 @@ class SmallDisk:
         segment = open_segment(run.with_suffix(".probe"), {})  # a free name is found on the real disk
         segment.abandon()
         number = len(list(run.parent.glob("*.mcap")))
-        path = run.with_suffix(f".{number}.mcap") if number else run
+        path = run.with_name(name_of(run, number))
         file = path.open("xb", buffering=0)
         try:
             return Segment(path, cast(Any, Quota(self, file)), metadata)
@@ -171,6 +171,9 @@ class Quota:
         self.file.truncate(size)
         self.disk.free += self.size - size
         self.size = size
+
+    def fileno(self) -> int:
+        return self.file.fileno()
 
     def close(self) -> None:
         self.file.close()
@@ -200,7 +203,7 @@ def test_a_full_disk_keeps_what_is_recorded_and_goes_on_when_there_is_space(
     sequences = [message.header.sequence for message in kept]
     assert sequences == sorted(set(sequences))
     assert sequences[-9:] == list(range(292, 301))
-    assert sorted(path.name for path in tmp_path.glob("*.mcap")) == ["run.1.mcap", "run.mcap"]
+    assert sorted(path.name for path in tmp_path.glob("*.mcap")) == ["run.mcap", "run_0001.mcap"]
     assert "NOT RECORDING" in caplog.text and "No space left" in caplog.text
     assert "messages were dropped" in caplog.text
     assert [line.levelname for line in caplog.records if "recording to" in line.message] == ["INFO", "WARNING"]

@@ -1,5 +1,6 @@
 """What is written is what was received, readable by anyone's MCAP tools."""
 
+import itertools
 from collections.abc import Callable
 from pathlib import Path
 
@@ -9,7 +10,7 @@ from mcap_protobuf.decoder import DecoderFactory
 
 from logs.reader import NoLog, NotALog, find, open_log, read
 from logs.recorder import entry
-from logs.segment import Segment, number_of, open_segment
+from logs.segment import Segment, number_of, open_segment, segments
 from messaging import brakeline_pb2 as pb
 from messaging.bus import Sample
 from messaging.topics import STEP
@@ -55,21 +56,21 @@ def test_our_reader_gives_the_messages_of_every_segment_in_order(tmp_path: Path,
     run = tmp_path / "demo" / "run.mcap"
     lines = [say("log/a", pb.LogLine(text=str(number))) for number in range(30)]
     written = [write(run, [line]).path.name for line in lines[:12]]
-    assert written[:3] == ["run.mcap", "run.1.mcap", "run.2.mcap"]
+    assert written[:3] == ["run.mcap", "run_0001.mcap", "run_0002.mcap"]
     for place in (run, run.parent, [run], str(run)):
         assert [record.message.text for record in read(place)] == [str(number) for number in range(12)]
-    later = run.with_name("run.11.mcap")
+    later = run.with_name("run_0011.mcap")
     record = next(read(later))
     assert (record.topic, record.key, record.message) == ("log", "log/a", lines[11].message())
     assert (record.log_time, record.publish_time) == (lines[11].received, lines[11].message().header.wall_time)
 
 
 def test_names_of_segments() -> None:
-    assert [number_of(Path(name)) for name in ("run.mcap", "run.2.mcap", "a.b.mcap")] == [
-        ("run", 0),
-        ("run", 2),
-        ("a.b", 0),
-    ]
+    names = ("run.mcap", "run_0002.mcap", "run.2.mcap", "a.b.mcap", "a_12.mcap")
+    numbers = [("run", 0), ("run", 2), ("run", 2), ("a.b", 0), ("a_12", 0)]
+    assert [number_of(Path(name)) for name in names] == numbers
+    first = [path.name for path in itertools.islice(segments(Path("run.mcap")), 200)]
+    assert first == sorted(first)
 
 
 def test_a_file_cut_anywhere_gives_what_is_whole_and_says_what_is_not(tmp_path: Path, say: Say) -> None:
@@ -95,10 +96,10 @@ def test_a_file_cut_anywhere_gives_what_is_whole_and_says_what_is_not(tmp_path: 
 def test_a_segment_that_was_never_finished_is_read_in_full(tmp_path: Path, say: Say) -> None:
     write(tmp_path / "run.mcap", [say("log/a", pb.LogLine(text="1"))], finish=False)
     write(tmp_path / "run.mcap", [say("log/a", pb.LogLine(text="2"))])
-    (tmp_path / "run.2.mcap").touch()
+    (tmp_path / "run_0002.mcap").touch()
     log = open_log(tmp_path)
     assert [record.message.text for record in log] == ["1", "2"]
-    assert [cut.path.name for cut in log.cuts] == ["run.mcap", "run.2.mcap"]
+    assert [cut.path.name for cut in log.cuts] == ["run.mcap", "run_0002.mcap"]
     assert "ends without a summary" in str(log.cuts[0])
 
 

@@ -92,11 +92,11 @@ def test_interrupted_it_ends_in_order_and_is_resumed(data_folder, tmp_path):
     assert figures["finished"] and figures["learners"]["ground"]["steps"] == 1500, "--steps is that of the run"
     assert figures["steps"] < 1500 + 64 - learned + 64
     after = analyse(run.folder)
-    assert [path.rsplit("/", 1)[1] for path in after["log"]] == ["run.mcap", "run.1.mcap"]
+    assert [path.rsplit("/", 1)[1] for path in after["log"]] == ["run.mcap", "run_0001.mcap"]
     assert after["steps"] == before["steps"] + figures["steps"]
     assert not any(topic["missing"] for topic in after["topics"].values())
     assert after["processes"]["learner"]["starts"] == 2
-    episodes = [record.message.episode for record in read(run.folder / "run.1.mcap") if record.topic == "episode"]
+    episodes = [record.message.episode for record in read(run.folder / "run_0001.mcap") if record.topic == "episode"]
     assert episodes and min(episodes) <= last + 1 and max(episodes) >= last, "episodes go on, they are not repeated"
 
 
