@@ -97,6 +97,7 @@ class Log:
 
     paths: tuple[Path, ...]
     metadata: dict[str, dict[str, str]] = field(default_factory=dict)  # the latest of each name
+    attachments: dict[str, bytes] = field(default_factory=dict)  # likewise: the model sets of the run's start
     cuts: list[Cut | Absent] = field(default_factory=list)
     malformed: int = 0  # messages that are not of their type
     segments: list[Segment] = field(default_factory=list)
@@ -137,7 +138,7 @@ class Log:
                     elif isinstance(item, Metadata):
                         self.metadata[item.name] = dict(item.metadata)
                     elif isinstance(item, Attachment):
-                        pass
+                        self.attachments[item.name] = item.data
         except NotMcap as error:
             raise NotALog(f"{path} is not an MCAP file: {error}") from error
 
