@@ -127,7 +127,8 @@ class _Found:
 class Filter:
     """A model set made ready for decisions."""
 
-    def __init__(self, model: ModelSet) -> None:
+    def __init__(self, model: ModelSet, comfort: float | None = None) -> None:
+        """`comfort` [m]: what is kept to obstacles beyond the tube; as wide as it needs be, unless given."""
         self.model = model
         self.version = model.version
         self.robot = robot = model.robot
@@ -145,7 +146,7 @@ class Filter:
         self.nothing = np.minimum(np.maximum(0.0, self.low), self.high)
         self.braking = np.maximum(1.0 - np.arange(robot.free_steps) / robot.brake_steps, 0.0)[:, None]
         self.regressor = list(robot.regressor)
-        self.comfort = self._comfort()
+        self.comfort = self._comfort() if comfort is None else comfort
         wanted = self._reach()
         self.reach = min(wanted, robot.sight)
         self.far = wanted > robot.sight  # a tube may leave what can be seen: every candidate must be looked at
