@@ -81,29 +81,35 @@ class Shapes:
     @staticmethod
     def of(obstacles: Sequence[Obstacle], dim: int) -> Shapes:
         """Stack obstacles of one dimension. Raises BadShape when one has another dimension."""
-        n = len(obstacles)
-        center, half, rho = np.zeros((n, dim)), np.zeros((n, dim)), np.zeros(n)
-        axes, rounded = np.zeros((n, dim, dim)), np.ones((n, dim))
+        n, flat = len(obstacles), dim == 2
+        center, axes, half, rho, rounded = [], [], [], [], []  # lists: filling arrays number by number costs more
         for i, obstacle in enumerate(obstacles):
-            if len(obstacle.position) != dim:
-                raise BadShape("position", f"obstacle {i} has {len(obstacle.position)} coordinates, not {dim}")
-            center[i] = obstacle.position
+            position, size = obstacle.position, obstacle.size
+            if len(position) != dim:
+                raise BadShape("position", f"obstacle {i} has {len(position)} coordinates, not {dim}")
             cos, sin = math.cos(obstacle.yaw), math.sin(obstacle.yaw)
-            axes[i] = np.eye(dim)
-            axes[i, :2, :2] = (cos, -sin), (sin, cos)
+            axes.append((cos, -sin, sin, cos) if flat else (cos, -sin, 0.0, sin, cos, 0.0, 0.0, 0.0, 1.0))
+            extent, radius = (0.0,) * dim, 0.0
+            upright = obstacle.kind == CYLINDER and not flat
             if obstacle.kind == BOX:
-                half[i] = 0.5 * np.asarray(obstacle.size)
-            elif obstacle.kind == CYLINDER:
-                rho[i] = obstacle.size[0]
-                if dim == 3:
-                    half[i, 2] = 0.5 * obstacle.size[1]
-                    rounded[i, 2] = 0.0
-            elif obstacle.kind == SPHERE:
-                rho[i] = obstacle.size[0]
+                extent = tuple(0.5 * edge for edge in size)
+            elif obstacle.kind == WALL:
+                extent = (WALL_DEPTH,) * dim
+                position = (position[0] - WALL_DEPTH * cos, position[1] - WALL_DEPTH * sin, *position[2:])
             else:
-                half[i] = WALL_DEPTH
-                center[i] -= WALL_DEPTH * axes[i, :, 0]
-        return Shapes(center, axes, half, rho, rounded)
+                radius = size[0]
+                extent = (0.0, 0.0, 0.5 * size[1]) if upright else extent
+            center.append(position)
+            half.append(extent)
+            rho.append(radius)
+            rounded.append((1.0, 1.0, 0.0) if upright else (1.0,) * dim)
+        return Shapes(
+            np.array(center, dtype=float).reshape(n, dim),
+            np.array(axes, dtype=float).reshape(n, dim, dim),
+            np.array(half, dtype=float).reshape(n, dim),
+            np.array(rho, dtype=float),
+            np.array(rounded, dtype=float).reshape(n, dim),
+        )
 
     def take(self, index: NDArray[np.intp] | NDArray[np.bool_]) -> Shapes:
         """The chosen obstacles."""

@@ -3,10 +3,11 @@ in `Filter.decide` before it is used."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
 import numpy as np
 from google.protobuf.message import DecodeError
+from numpy.typing import NDArray
 
 from messaging import brakeline_pb2 as pb
 from messaging.robots import Robot
@@ -40,22 +41,27 @@ def request_of(message: pb.Request, robot: Robot) -> Request:
     """
     predicted = None
     if message.predicted_center or message.predicted_half_width:
-        center, half = np.array(message.predicted_center), np.array(message.predicted_half_width)
+        center, half = numbers(message.predicted_center), numbers(message.predicted_half_width)
         predicted = Prediction(center, half, message.predicted_heading)
-    plan = np.array(message.plan)
+    plan = numbers(message.plan)
     if plan.size != robot.horizon * robot.action_dim:
         wanted = f"{robot.horizon} x {robot.action_dim}"
         raise BadRequest("plan", f"plan has {plan.size} numbers, a {robot.name} robot's has {wanted}")
     return Request(
-        state=np.array(message.state),
-        action=np.array(message.action),
-        input_in_force=np.array(message.input_in_force),
+        state=numbers(message.state),
+        action=numbers(message.action),
+        input_in_force=numbers(message.input_in_force),
         plan=plan.reshape(robot.horizon, robot.action_dim),
         obstacles=shapes_of(message.obstacles, robot.position_dim),
         model=message.model,
         predicted=predicted,
-        observation=np.array(message.observation, np.float32),
+        observation=np.fromiter(message.observation, np.float32, len(message.observation)),
     )
+
+
+def numbers(field: Collection[float]) -> NDArray[np.float64]:
+    """A repeated field as an array: `np.array` takes five times as long for it."""
+    return np.fromiter(field, np.float64, len(field))
 
 
 def shapes_of(messages: Sequence[pb.Obstacle], dim: int) -> Shapes:

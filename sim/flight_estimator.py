@@ -1,0 +1,112 @@
+"""What the quadrotor knows of itself: the estimate of position, velocity and attitude, and its IMU, each with errors."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from sim.estimator import cut_normal
+from sim.flight import GRAVITY, Vector
+
+Quaternion = tuple[float, float, float, float]  # w, x, y, z; world from body
+
+
+@dataclass(frozen=True)
+class QuadrotorNoise:
+    """Errors of the quadrotor's estimate and sensors. All are normal, cut off at `CUT` sigma; `scale` = 0: none.
+
+    With scale 1 they stay within QUADROTOR.measurement_bound: position and velocity by their cut; acceleration, in
+    which the accelerometer's error adds to a wrong attitude's share of up to 30 m/s², by √3·CUT·(0.04 + 0.001·30) < 0.25.
+    """
+
+    scale: float = 1.0  # multiplies every sigma below
+    position: float = 0.0145  # m, each axis
+    velocity: float = 0.0145  # m/s, each axis
+    attitude: float = 0.001  # rad, about each axis
+    accelerometer: float = 0.04  # m/s², each axis, anew at each reading
+    gyro: float = 0.005  # rad/s, each axis, anew at each reading
+    lidar: float = 0.02  # m, each ray
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """One reading of all of it: ENU, SI units, body axes x forward, y left, z up."""
+
+    position: Vector  # m
+    velocity: Vector  # m/s
+    attitude: Quaternion
+    rates: Vector  # rad/s, about the body's axes
+    specific_force: Vector  # m/s² along the body's axes: what an accelerometer feels, gravity's reaction included
+
+    @property
+    def acceleration(self) -> Vector:
+        """In the world, gravity taken out, m/s²."""
+        x, y, z = rotate(self.attitude, self.specific_force)
+        return (x, y, z - GRAVITY)
+
+
+class FlightEstimator:
+    """Errors that wander: drawn anew once a period, and on a straight line from draw to draw in between.
+
+    So they never leave the cut, change slowly as a filter's do, and those of different periods are independent.
+    """
+
+    def __init__(self, noise: QuadrotorNoise, rng: np.random.Generator, steps: int) -> None:
+        """steps: calls of `advance` in a period."""
+        self.noise, self._rng, self._steps = noise, rng, steps
+        self._sigma = noise.scale * np.repeat((noise.position, noise.velocity, noise.attitude), 3)
+        self.errors = self._next = self._draw()
+        self._slopes = [0.0] * 9
+        self._left = 0
+
+    def advance(self) -> None:
+        """One step on: `errors` of position, velocity and attitude (9)."""
+        if self._left == 0:
+            self.errors, self._next = self._next, self._draw()
+            self._slopes = [(b - a) / self._steps for a, b in zip(self.errors, self._next, strict=True)]
+            self._left = self._steps
+        self._left -= 1
+        if self._left == 0:
+            self.errors = self._next
+        else:
+            self.errors = [e + s for e, s in zip(self.errors, self._slopes, strict=True)]
+
+    def read(
+        self, position: Vector, velocity: Vector, attitude: Quaternion, rates: Vector, acceleration: Vector
+    ) -> Estimate:
+        """The estimate of a true state; acceleration in the world."""
+        e = self.errors
+        white = cut_normal(self._rng, self.noise.scale, (6,)).tolist()
+        ax, ay, az = acceleration
+        w, x, y, z = attitude
+        felt = rotate((w, -x, -y, -z), (ax, ay, az + GRAVITY))
+        force, gyro = self.noise.accelerometer, self.noise.gyro
+        return Estimate(
+            (position[0] + e[0], position[1] + e[1], position[2] + e[2]),
+            (velocity[0] + e[3], velocity[1] + e[4], velocity[2] + e[5]),
+            tilted(attitude, (e[6], e[7], e[8])),
+            (rates[0] + gyro * white[0], rates[1] + gyro * white[1], rates[2] + gyro * white[2]),
+            (felt[0] + force * white[3], felt[1] + force * white[4], felt[2] + force * white[5]),
+        )
+
+    def _draw(self) -> list[float]:
+        errors: list[float] = (cut_normal(self._rng, 1.0, (9,)) * self._sigma).tolist()
+        return errors
+
+
+def rotate(attitude: Quaternion, vector: Vector) -> Vector:
+    """A vector in the body's axes, in the world's."""
+    w, x, y, z = attitude
+    a, b, c = vector
+    tx, ty, tz = 2.0 * (y * c - z * b), 2.0 * (z * a - x * c), 2.0 * (x * b - y * a)
+    return (a + w * tx + y * tz - z * ty, b + w * ty + z * tx - x * tz, c + w * tz + x * ty - y * tx)
+
+
+def tilted(attitude: Quaternion, angles: Vector) -> Quaternion:
+    """The attitude turned by small angles about the body's axes, rad."""
+    w, x, y, z = attitude
+    a, b, c = 0.5 * angles[0], 0.5 * angles[1], 0.5 * angles[2]
+    q = (w - x * a - y * b - z * c, x + w * a + y * c - z * b, y + w * b + z * a - x * c, z + w * c + x * b - y * a)
+    size = (1.0 + a * a + b * b + c * c) ** 0.5
+    return (q[0] / size, q[1] / size, q[2] / size, q[3] / size)

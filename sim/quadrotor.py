@@ -1,0 +1,199 @@
+"""The quadrotor: a rigid body with four rotors in MuJoCo, its flight controller, and the vehicle that they make."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from messaging.robots import QUADROTOR
+from sim.flight import Body, FlightController, Gains
+from sim.flight_estimator import Estimate, FlightEstimator, QuadrotorNoise
+from sim.scene import add_obstacles
+from sim.vehicle import BadInput, Period
+from sim.wind import Air, Wind
+from sim.world import Arena
+
+Array = NDArray[np.float64]
+
+MODEL = Path(__file__).with_name("quadrotor.xml").read_text()
+SAMPLES = 10  # of the position in a period
+OUTER_EVERY = 2  # physics steps for one of the velocity loop
+FLOOR_BIT = 1
+SETTLE = 5  # periods of hovering before the start
+
+
+class Quadrotor:
+    """One quadrotor in one arena, hovering at its start, or standing on the floor with its motors off.
+
+    true, measured: states (p [m], v [m/s], a [m/s²]; ENU) of the centre of mass; input: the velocity setpoint executed
+    last, after clipping and slew. The heading is kept at zero, east, unless `controller` is told otherwise.
+    """
+
+    def __init__(
+        self,
+        arena: Arena,
+        rng: np.random.Generator,
+        noise: QuadrotorNoise | None = None,
+        wind: Wind | None = None,
+        gains: Gains | None = None,
+        floor: float | None = None,
+    ) -> None:
+        """floor: height of a plane to start from and to land on, m; None: there is none, and it starts hovering."""
+        self.arena = arena
+        self._model = _build(arena, floor)
+        self._data = mujoco.MjData(self._model)
+        self.timestep: float = self._model.opt.timestep
+        self._ticks = round(QUADROTOR.period / SAMPLES / self.timestep)  # in a sample
+        self._body = Body()
+        self.controller = FlightController(self.timestep, OUTER_EVERY, gains, self._body)
+        steps = round(QUADROTOR.period / self.timestep / OUTER_EVERY)
+        self._estimator = FlightEstimator(noise or QuadrotorNoise(), rng, steps)
+        self._air = None if wind is None or wind.calm else Air(wind, rng, self.timestep)
+        self.armed = floor is None  # the motors turn
+        self.collided = False  # an obstacle was touched since `clear_contacts`
+        self.on_floor = False  # the floor was touched in the last tick
+        self._count = 0
+        self._acceleration = (0.0, 0.0, 0.0)
+        self.input = np.zeros(QUADROTOR.action_dim)
+        mujoco.mj_forward(self._model, self._data)
+        if self.armed:
+            self._hover()
+        self.true, self.measured = self.state(), self.estimated_state(self.estimate())
+
+    def step(self, input: Array) -> Period:
+        """Fly one period at a velocity setpoint (3,) [m/s], clipped to bounds and to the slew from the one before.
+
+        Raises:
+            BadInput: when the input is not three finite numbers.
+        """
+        self.input = slewed(input, self.input)
+        x, y, z = self.input.tolist()
+        self.controller.setpoint = (x, y, z)
+        self.collided = False
+        start = self.measured[:3]
+        true, seen = np.empty((SAMPLES, 3)), np.empty((SAMPLES, 3))
+        for i in range(SAMPLES):
+            self.fly(self._ticks)
+            true[i] = self._data.qpos[:3]
+            seen[i] = true[i] + self._estimator.errors[:3]
+        self.true, self.measured = self.state(), self.estimated_state(self.estimate())
+        distances = self.clearance(true)
+        closest, clearance = float(distances.min()), float(distances[-1])
+        return Period(self.measured, self.true, self.collided, closest, clearance, seen - start, 0.0)
+
+    def standing(self) -> Period:
+        """The present state as a period in which nothing happened: what there is to say before the first step."""
+        clearance = float(self.clearance(self.true[:3]))
+        return Period(self.measured, self.true, False, clearance, clearance, np.zeros((SAMPLES, 3)), 0.0)
+
+    def fly(self, ticks: int) -> None:
+        """Let that many physics steps pass, each with the rotors' thrusts from the controller."""
+        model, data, estimator, controller = self._model, self._data, self._estimator, self.controller
+        qpos, qvel, control = data.qpos, data.qvel, data.ctrl
+        position, velocity = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
+        vx, vy, vz = before = (0.0, 0.0, 0.0)
+        for _ in range(ticks):
+            px, py, pz, qw, qx, qy, qz = qpos.tolist()
+            vx, vy, vz, p, q, r = qvel.tolist()
+            before = (vx, vy, vz)
+            if self._count % OUTER_EVERY == 0:
+                estimator.advance()
+                e = estimator.errors
+                position = (px + e[0], py + e[1], pz + e[2])
+                velocity = (vx + e[3], vy + e[4], vz + e[5])
+            self._count += 1
+            if self.armed:
+                control[:] = controller.update(position, velocity, (qw, qx, qy, qz), (p, q, r))
+            else:
+                data.act[:] = control[:] = 0.0
+            self._blow(vx, vy, vz)
+            # step2 before step1: contacts are then those of the position just reached
+            mujoco.mj_step2(model, data)
+            mujoco.mj_step1(model, data)
+            if data.ncon:
+                self._touch()
+            else:
+                self.on_floor = False
+        vx, vy, vz = qvel[:3].tolist()
+        self._acceleration = tuple((b - a) / self.timestep for a, b in zip(before, (vx, vy, vz), strict=True))
+
+    def estimate(self) -> Estimate:
+        """What the vehicle knows of itself now."""
+        px, py, pz, qw, qx, qy, qz = self._data.qpos.tolist()
+        vx, vy, vz, p, q, r = self._data.qvel.tolist()
+        return self._estimator.read((px, py, pz), (vx, vy, vz), (qw, qx, qy, qz), (p, q, r), self._acceleration)
+
+    def state(self) -> Array:
+        """The true state (9,); its acceleration is the mean over the last physics step."""
+        return np.array([*self._data.qpos[:3], *self._data.qvel[:3], *self._acceleration])
+
+    @staticmethod
+    def estimated_state(estimate: Estimate) -> Array:
+        """The state (9,) of an estimate."""
+        return np.array([*estimate.position, *estimate.velocity, *estimate.acceleration])
+
+    def clearance(self, positions: Array) -> Array:
+        """From the footprint's sphere at positions (..., 3) to the nearest obstacle, m; inf without any."""
+        if not len(self.arena.shapes):
+            return np.full(positions.shape[:-1], math.inf)
+        return np.asarray(self.arena.shapes.distance(positions).min(axis=0) - QUADROTOR.footprint)
+
+    def _hover(self) -> None:
+        """Be in the air for long: rotors at hovering thrust, the mean wind leant against, the start held."""
+        self._data.act[:] = 0.25 * self._body.mass * 9.81
+        controller = self.controller
+        controller.x.hold, controller.y.hold, controller.z.hold = self._data.qpos[:3].tolist()
+        if self._air is not None:
+            for axis, wind in zip((controller.x, controller.y, controller.z), self._air.mean, strict=True):
+                axis.integral = -wind * (self._body.drag_linear + self._body.drag_quadratic * math.hypot(*self._air.mean))
+        self.fly(SETTLE * SAMPLES * self._ticks)
+        self.collided = False
+
+    def _blow(self, vx: float, vy: float, vz: float) -> None:
+        """The air's drag on the body moving at a velocity, m/s."""
+        if self._air is not None:
+            self._air.advance()
+            wx, wy, wz = self._air.velocity
+            vx, vy, vz = vx - wx, vy - wy, vz - wz
+        body = self._body
+        drag = body.mass * (body.drag_linear + body.drag_quadratic * math.sqrt(vx * vx + vy * vy + vz * vz))
+        self._data.qfrc_applied[:3] = (-drag * vx, -drag * vy, -drag * vz)
+
+    def _touch(self) -> None:
+        """Note what the vehicle touches: a plane is the lowest type of geom, and comes first in a contact."""
+        first = self._data.contact.geom[:, 0]
+        floor = self._floor_geom
+        self.on_floor = bool((first == floor).any())
+        self.collided = self.collided or bool((first != floor).any())
+
+
+def slewed(input: Array, before: Array) -> Array:
+    """The setpoint (3,) [m/s] that is executed after `before`: within the quadrotor's bounds and slew.
+
+    Raises:
+        BadInput: when the input is not three finite numbers.
+    """
+    input = np.asarray(input, dtype=np.float64)
+    if input.shape != (QUADROTOR.action_dim,) or not np.isfinite(input).all():
+        raise BadInput(f"an input is {QUADROTOR.action_dim} finite numbers, not {input!r}")
+    slew = np.asarray(QUADROTOR.action_slew)
+    return np.clip(np.clip(input, QUADROTOR.low(), QUADROTOR.high()), before - slew, before + slew)
+
+
+def _build(arena: Arena, floor: float | None) -> mujoco.MjModel:
+    """Compile vehicle and arena, the vehicle at the start, or on the floor below it."""
+    spec = mujoco.MjSpec.from_string(MODEL)
+    add_obstacles(spec, arena)
+    x, y, z = arena.start[:3]
+    if floor is not None:
+        spec.worldbody.add_geom(
+            name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=(0.0, 0.0, 1.0), pos=(0.0, 0.0, floor),
+            contype=FLOOR_BIT, conaffinity=0,
+        )
+        z = floor + spec.geom("guard").size[1]
+    spec.body("base").pos = (x, y, z)
+    return spec.compile()
