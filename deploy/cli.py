@@ -70,6 +70,11 @@ COMMANDS: dict[str, Command] = {
         "brakeline query ground --action 0.25 0 --obstacle 'cylinder 0.3 0 0.1'",
     ),
     "status": Command("service:Status", "which processes live, and how they fare", "brakeline status"),
+    "replay": Command(
+        "replay:Replay",
+        "ask every logged question again: is the same decided, and what would be with another model set?",
+        "brakeline replay runs/latest --certificate set-membership",
+    ),
     "analyse": Command("evaluation:Analyse", "figures of a log", "brakeline analyse runs/latest --json"),
 }
 

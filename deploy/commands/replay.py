@@ -1,0 +1,115 @@
+"""`brakeline replay`."""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.table import Table
+
+from deploy.commands.common import LATEST, Certificate, Mode, console, errors, say_json
+from deploy.replay import Instead, replay
+from deploy.store import certified, model_for
+from logs.extent import count
+from messaging.robots import robot_named
+from messaging.topics import EXCHANGE
+from safety.dataset import Dataset
+from safety.filter import Filter
+from safety.model_set import ModelSet, Recipe
+
+DIFFERENT = 1  # exit status: decisions differ though nothing was asked to be different
+
+
+@dataclass(frozen=True)
+class Replay:
+    logs: Annotated[tuple[Path, ...], tyro.conf.Positional] = (LATEST,)
+    """Log files, or run folders."""
+    certificate: Certificate | None = None
+    """What would have been decided with this certificate (of the data set in use, or of --data)?"""
+    mode: Mode = "direct"
+    """Of --certificate or --data."""
+    data: Path | None = None
+    """What would have been decided with a model set from this data set (a file that `collect` wrote)?"""
+    margin: float | None = None
+    """What would have been decided with this comfort margin, m, instead of the model set's own?"""
+    json: bool = False
+
+    def run(self) -> int:
+        instead = self._instead()
+        logging.getLogger("brakeline.safety").setLevel(logging.ERROR)  # its warnings were about the robots of then
+        total = count(list(self.logs), EXCHANGE)
+        columns = TextColumn("requests"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
+        with Progress(*columns, console=errors, transient=True, disable=not errors.is_terminal) as progress:
+            task = progress.add_task("requests", total=total)
+            result = replay(list(self.logs), instead, lambda: progress.advance(task))
+        figures = result.figures() | {"log": [str(path) for path in self.logs], "instead": self._words()}
+        if self.json:
+            say_json(figures)
+        else:
+            show(figures)
+        return DIFFERENT if instead is None and result.different else 0
+
+    def _words(self) -> dict[str, Any]:
+        """What was asked to be different."""
+        given = {"certificate": self.certificate, "data": self.data and str(self.data), "margin": self.margin}
+        chosen = {name: value for name, value in given.items() if value is not None}
+        return chosen | ({"mode": self.mode} if self.certificate or self.data else {})
+
+    def _instead(self) -> Instead | None:
+        """The filter to be asked in place of the one that was in use, made once for each robot; None: the same."""
+        if self.certificate is None and self.data is None and self.margin is None:
+            return None
+        recipe = Recipe(self.certificate or "residual", self.mode)
+        filters: dict[str, Filter] = {}
+        make: Callable[[str], ModelSet]
+        if self.data is not None:
+            model, _ = certified(Dataset.load(self.data), recipe)
+            make = lambda name: model  # noqa: E731
+        else:
+            make = lambda name: model_for(robot_named(name), recipe)  # noqa: E731
+
+        def chosen(name: str) -> Filter:
+            if name not in filters:
+                filters[name] = Filter(make(name), self.margin)
+                if filters[name].robot.name != name:
+                    raise ValueError(f"{self.data} is of {filters[name].robot.name}, and the log of {name}")
+            return filters[name]
+
+        return chosen
+
+
+def show(figures: dict[str, Any]) -> None:
+    """The figures of a replay, on stdout."""
+    compared = figures["requests"] - figures["unanswered"]
+    asked = ", ".join(f"{name} {value}" for name, value in figures["instead"].items())
+    question = f"asked again with {asked}" if asked else "asked again"
+    console.print(f"{question}: {compared} requests; {figures['unanswered']} had no answer")
+    share = f" ({figures['identical'] / compared:.2%})" if compared else ""
+    console.print(f"identical: {figures['identical']}{share}, different: {figures['different']}")
+    if not figures["different"]:
+        return
+    console.print(f"the robot is told the same in {figures['same_input']} ({figures['same_input'] / compared:.2%})")
+    kinds = Table("decided", "now", "requests", box=None, padding=(0, 2, 0, 0))
+    for logged, row in figures["kinds"].items():
+        for now, number in row.items():
+            kinds.add_row(logged, now, str(number))
+    fields = Table("field", "differs in", "by at most", box=None, padding=(0, 2, 0, 0))
+    for name, about in figures["fields"].items():
+        fields.add_row(name, str(about["count"]), size(about["largest"]))
+    examples = Table("largest differences", "decided", "now", "differences", box=None, padding=(0, 2, 0, 0))
+    for one in figures["examples"]:
+        place = f"{one['actor']} episode {one['episode']} step {one['step']}"
+        found = ", ".join(f"{name} {size(value)}".strip() for name, value in one["differences"].items())
+        examples.add_row(place, one["logged"], one["now"], found)
+    for table in (kinds, fields, examples):
+        console.print(table)
+
+
+def size(value: float) -> str:
+    return f"{value:.3g}" if math.isfinite(value) else ""
