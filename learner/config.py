@@ -30,7 +30,8 @@ class TD3Config:
     precision: Precision = "float32"  # of the wide products
 
     def __post_init__(self) -> None:
-        if min(self.batch, self.n_step, self.policy_delay, self.updates_per_step) <= 0 or not self.hidden:
+        widths = min(self.hidden, default=0)
+        if min(self.batch, self.n_step, self.policy_delay, self.updates_per_step, widths) <= 0:
             raise ValueError(f"batch, n_step, policy_delay, updates_per_step and hidden must be positive: {self}")
         if self.warmup < self.n_step:
             raise ValueError(f"warmup {self.warmup} is shorter than n_step {self.n_step}: nothing to sample from")

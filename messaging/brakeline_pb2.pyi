@@ -151,7 +151,7 @@ class Request(_message.Message):
     time: _builtins.float
     """s"""
     model: _builtins.str
-    """version that verified it; empty: standing still"""
+    """version that verified it; empty: standing still; "unverified": none did"""
     predicted_heading: _builtins.float
     """rad, of the frame in which that set's position part is a box"""
     @_builtins.property
