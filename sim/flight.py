@@ -6,6 +6,7 @@ Scalar code: at these sizes NumPy costs ten times as much. ENU, SI units; body a
 from __future__ import annotations
 
 import math
+from collections import deque
 from dataclasses import dataclass
 
 Vector = tuple[float, float, float]
@@ -33,8 +34,11 @@ class Body:
 class Gains:
     """How it flies. Times in s, limits in SI units."""
 
-    reference_lag: float = 0.06  # each of three lags between the setpoint and the reference that is tracked
-    lead: float = 0.06  # what the acceleration's command runs ahead by: the attitude follows that late
+    ramp: float = 0.2  # the setpoint is averaged over this time: the period of those who send one
+    round: float = 0.4  # and once more over this
+    ease: float = 0.06  # and a third time
+    attitude_lag: float = 0.03  # how late a wanted horizontal acceleration comes
+    thrust_lag: float = 0.02  # and a vertical one
     velocity: float = 3.0  # 1/s
     integral: float = 1.0  # 1/s²
     integral_limit: float = 4.0  # m/s²
@@ -52,42 +56,80 @@ class Gains:
     jump: float = 0.82  # m/s
 
 
+class Mean:
+    """The mean of the last samples: `value`; what it gains from a sample to the next follows from `push`'s answer."""
+
+    __slots__ = ("_samples", "_sum", "value")
+
+    def __init__(self, samples: int) -> None:
+        self._samples = deque([0.0] * samples)
+        self.fill(0.0)
+
+    def fill(self, value: float) -> None:
+        """As if that had been the value for long."""
+        samples = len(self._samples)
+        self._samples = deque([value] * samples)
+        self._sum, self.value = value * samples, value
+
+    def push(self, value: float) -> float:
+        """Take in a sample; returns how much the new mean differs from the old one."""
+        change = value - self._samples.popleft()
+        self._samples.append(value)
+        samples = len(self._samples)
+        self._sum += change
+        self.value = self._sum / samples
+        return change / samples
+
+
 class VelocityAxis:
-    """One axis of the outer loop: reference, velocity control, hold."""
+    """One axis of the outer loop: reference, velocity control, hold.
 
-    __slots__ = ("_a", "_allowance", "_b", "_gains", "_keep", "_period", "hold", "integral", "target", "velocity")
+    The reference is the setpoint averaged over `ramp`, that over `round`, and that over `ease`. Stairs of a step every
+    `ramp` seconds become a straight line, so acceleration has no ripple; `round` bounds jerk and `ease` snap; and the
+    past is forgotten after the sum of the three, which makes the closed loop nearly linear and of short memory.
+    """
 
-    def __init__(self, gains: Gains, period: float) -> None:
-        """period: s between two updates."""
+    __slots__ = (
+        "_allowance", "_eased", "_gains", "_jerk", "_late", "_period", "_ramped", "_rounded", "_velocity", "hold",
+        "integral", "target", "velocity",
+    )  # fmt: skip
+
+    def __init__(self, gains: Gains, period: float, lag: float) -> None:
+        """period: s between two updates; lag: s until a commanded acceleration is there."""
         self._gains, self._period = gains, period
-        self._keep = 1.0 - math.exp(-period / gains.reference_lag)
+        self._ramped, self._rounded = Mean(round(gains.ramp / period)), Mean(round(gains.round / period))
+        self._eased, self._jerk = Mean(round(gains.ease / period)), Mean(round(gains.ease / period))
+        self._late = deque([0.0] * max(round(lag / period), 1))
         self.integral = 0.0
         self.reset(0.0)
 
     def reset(self, velocity: float) -> None:
         """Follow this velocity [m/s] as if it had been the setpoint for long; the integral stays."""
-        self.target = self._a = self._b = self.velocity = velocity
+        self.target = self.velocity = self._velocity = velocity
+        self._ramped.fill(velocity)
+        for mean in (self._rounded, self._eased, self._jerk):
+            mean.fill(0.0)
+        self._late = deque([velocity] * len(self._late))
         self._allowance = self._gains.jump
         self.hold: float | None = None  # m, the position to be held
 
-    def follow(self, setpoint: float) -> float:
-        """Move the reference for one period; returns its jerk, m/s³."""
+    def follow(self, setpoint: float) -> tuple[float, float]:
+        """Move the reference for one period; returns its jerk, m/s³, and snap, m/s⁴."""
         g, period = self._gains, self._period
         allowance = min(self._allowance + g.acceleration * period, g.jump)
-        change = setpoint - self.target
-        if change > allowance:
-            change = allowance
-        elif change < -allowance:
-            change = -allowance
+        change = min(max(setpoint - self.target, -allowance), allowance)
         self.target += change
         self._allowance = allowance - abs(change)
-        keep = self._keep
-        self._a += keep * (self.target - self._a)
-        self._b += keep * (self._a - self._b)
-        self.velocity += keep * (self._b - self.velocity)
-        return (self._a - 2.0 * self._b + self.velocity) / g.reference_lag**2
+        slope = self._ramped.push(self.target) / period
+        jerk = self._rounded.push(slope) / period
+        self._eased.push(self._rounded.value)
+        snap = self._jerk.push(jerk) / period
+        self._velocity += self._eased.value * period
+        self._late.append(self._velocity)
+        self.velocity = self._late.popleft()
+        return self._jerk.value, snap
 
-    def acceleration(self, position: float, velocity: float, jerk: float) -> float:
+    def acceleration(self, position: float, velocity: float) -> float:
         """What to command, m/s², without gravity and drag, seeing an estimated position and velocity."""
         g = self._gains
         wanted = self.velocity
@@ -96,7 +138,7 @@ class VelocityAxis:
         error = wanted - velocity
         integral = self.integral + g.integral * self._period * error
         self.integral = min(max(integral, -g.integral_limit), g.integral_limit)
-        return (self._b - self.velocity) / g.reference_lag + g.lead * jerk + g.velocity * error + self.integral
+        return self._eased.value + g.velocity * error + self.integral
 
 
 class FlightController:
@@ -110,7 +152,8 @@ class FlightController:
         self.gains, self.body = gains or Gains(), body or Body()
         self._period, self._outer_every = period, outer_every
         outer = period * outer_every
-        self.x, self.y, self.z = (VelocityAxis(self.gains, outer) for _ in range(3))
+        g = self.gains
+        self.x, self.y, self.z = (VelocityAxis(g, outer, lag) for lag in (g.attitude_lag, g.attitude_lag, g.thrust_lag))
         self.reset()
 
     def reset(self, yaw: float = 0.0) -> None:
@@ -122,7 +165,7 @@ class FlightController:
             axis.reset(0.0)
             axis.integral = 0.0
         self._force: Vector = (0.0, 0.0, GRAVITY)
-        self._force_rate: Vector = STILL
+        self._force_rate = self._force_curve = STILL
         self._count = 0
 
     @property
@@ -149,7 +192,7 @@ class FlightController:
         g, x, y, z = self.gains, self.x, self.y, self.z
         px, py, pz = position
         ux, uy, uz = self.setpoint
-        jx, jy, jz = x.follow(ux), y.follow(uy), z.follow(uz)
+        (jx, sx), (jy, sy), (jz, sz) = x.follow(ux), y.follow(uy), z.follow(uz)
         vx, vy, vz = x.velocity, y.velocity, z.velocity
         if ux or uy or uz:
             x.hold = y.hold = z.hold = None
@@ -158,15 +201,15 @@ class FlightController:
         drag = g.known_drag * (
             self.body.drag_linear + self.body.drag_quadratic * math.sqrt(vx * vx + vy * vy + vz * vz)
         )
-        fx = x.acceleration(px, velocity[0], jx) + drag * vx
-        fy = y.acceleration(py, velocity[1], jy) + drag * vy
-        fz = z.acceleration(pz, velocity[2], jz) + drag * vz + GRAVITY
+        fx = x.acceleration(px, velocity[0]) + drag * vx
+        fy = y.acceleration(py, velocity[1]) + drag * vy
+        fz = z.acceleration(pz, velocity[2]) + drag * vz + GRAVITY
         fz = max(fz, 0.2 * GRAVITY)
         steepest = math.tan(g.tilt_limit) * fz
         level = math.hypot(fx, fy)
         if level > steepest:
             fx, fy = fx * steepest / level, fy * steepest / level
-        self._force, self._force_rate = (fx, fy, fz), (jx, jy, jz)
+        self._force, self._force_rate, self._force_curve = (fx, fy, fz), (jx, jy, jz), (sx, sy, sz)
         self._steer_yaw(self._period * self._outer_every)
 
     def _steer_yaw(self, period: float) -> None:
@@ -185,11 +228,12 @@ class FlightController:
         w, x, y, z = attitude
         fx, fy, fz = self._force
         jx, jy, jz = self._force_rate
+        sx, sy, sz = self._force_curve
         xx, xy, xz = 1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y + w * z), 2.0 * (x * z - w * y)  # body's x axis
         yx, yy, yz = 2.0 * (x * y - w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z + w * x)  # its y axis
-        # the wanted force and its rate in the body's axes
+        upright = max(1.0 - 2.0 * (x * x + y * y), 0.3)  # cosine of the tilt
+        # the wanted force in the body's axes
         bx, by = xx * fx + xy * fy + xz * fz, yx * fx + yy * fy + yz * fz
-        bz = 2.0 * (x * z + w * y) * fx + 2.0 * (y * z - w * x) * fy + (1.0 - 2.0 * (x * x + y * y)) * fz
         size = math.sqrt(fx * fx + fy * fy + fz * fz)
         limit = g.rate_limit
         p = -g.attitude * by / size - (yx * jx + yy * jy + yz * jz) / size
@@ -197,15 +241,20 @@ class FlightController:
         r = g.yaw * math.remainder(self.yaw - math.atan2(xy, xx), math.tau) + self._turn
         p, q = min(max(p, -limit), limit), min(max(q, -limit), limit)
         ix, iy, iz = body.inertia
-        roll = g.rate * ix * (p - rates[0]) / (4.0 * body.arm)
-        pitch = g.rate * iy * (q - rates[1]) / (4.0 * body.arm)
+        p_dot, q_dot = -(yx * sx + yy * sy + yz * sz) / size, (xx * sx + xy * sy + xz * sz) / size
+        roll = ix * (g.rate * (p - rates[0]) + p_dot) / (4.0 * body.arm)
+        pitch = iy * (g.rate * (q - rates[1]) + q_dot) / (4.0 * body.arm)
         turn = 0.3 * g.rate * iz * (r - rates[2]) / (4.0 * body.rotor_torque)
         turn = min(max(turn, -1.0), 1.0)
         low, high = body.least_thrust, body.most_thrust
-        lift = min(max(0.25 * body.mass * bz, low), high)
+        lift = min(max(0.25 * body.mass * fz / upright, low + 0.5), high - 1.0)  # the height comes first
+        # what a rotor cannot give is taken from the torques, not from the lift
+        asked, room = abs(roll) + abs(pitch) + abs(turn), min(lift - low, high - lift)
+        if asked > room:
+            roll, pitch, turn = roll * room / asked, pitch * room / asked, turn * room / asked
         return (
-            min(max(lift - roll - pitch - turn, low), high),
-            min(max(lift + roll + pitch - turn, low), high),
-            min(max(lift + roll - pitch + turn, low), high),
-            min(max(lift - roll + pitch + turn, low), high),
+            lift - roll - pitch - turn,
+            lift + roll + pitch - turn,
+            lift + roll - pitch + turn,
+            lift - roll + pitch + turn,
         )

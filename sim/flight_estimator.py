@@ -1,4 +1,4 @@
-"""What the quadrotor knows of itself: the estimate of position, velocity and attitude, and its IMU, each with errors."""
+"""What the quadrotor knows of itself: estimates of position, velocity and attitude, and its IMU, each with errors."""
 
 from __future__ import annotations
 
@@ -17,7 +17,8 @@ class QuadrotorNoise:
     """Errors of the quadrotor's estimate and sensors. All are normal, cut off at `CUT` sigma; `scale` = 0: none.
 
     With scale 1 they stay within QUADROTOR.measurement_bound: position and velocity by their cut; acceleration, in
-    which the accelerometer's error adds to a wrong attitude's share of up to 30 m/s², by √3·CUT·(0.04 + 0.001·30) < 0.25.
+    which the accelerometer's error adds to a wrong attitude's share of up to 30 m/s², by √3·CUT·(0.04 + 0.001·30),
+    less than 0.25 m/s².
     """
 
     scale: float = 1.0  # multiplies every sigma below

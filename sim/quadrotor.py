@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import mujoco
@@ -10,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from messaging.robots import QUADROTOR
-from sim.flight import Body, FlightController, Gains
+from sim.flight import GRAVITY, Body, FlightController, Gains
 from sim.flight_estimator import Estimate, FlightEstimator, QuadrotorNoise
 from sim.scene import add_obstacles
 from sim.vehicle import BadInput, Period
@@ -52,9 +53,11 @@ class Quadrotor:
         self.controller = FlightController(self.timestep, OUTER_EVERY, gains, self._body)
         steps = round(QUADROTOR.period / self.timestep / OUTER_EVERY)
         self._estimator = FlightEstimator(noise or QuadrotorNoise(), rng, steps)
-        self._air = None if wind is None or wind.calm else Air(wind, rng, self.timestep)
+        self._rng, self._wind = rng, wind or Wind()
+        self._air = None if self._wind.calm else Air(self._wind, rng, self.timestep)
+        self._floor_geom = -1 if floor is None else self._model.geom("floor").id
         self.armed = floor is None  # the motors turn
-        self.collided = False  # an obstacle was touched since `clear_contacts`
+        self.collided = False  # an obstacle was touched since it was last set to False
         self.on_floor = False  # the floor was touched in the last tick
         self._count = 0
         self._acceleration = (0.0, 0.0, 0.0)
@@ -90,12 +93,30 @@ class Quadrotor:
         clearance = float(self.clearance(self.true[:3]))
         return Period(self.measured, self.true, False, clearance, clearance, np.zeros((SAMPLES, 3)), 0.0)
 
+    def alter(self, **changes: float) -> None:
+        """Change `payload_kg` (at the centre of mass), `wind_speed` or `gust` [m/s], from now on.
+
+        Raises:
+            ValueError: it has no such thing, or it cannot have this value.
+        """
+        for name, value in changes.items():
+            if not (math.isfinite(value) and value >= 0.0):
+                raise ValueError(f"{name} is 0 or more, not {value}")
+            if name == "payload_kg":
+                self._model.body_mass[self._model.body("base").id] = self._body.mass + value
+                mujoco.mj_setConst(self._model, mujoco.MjData(self._model))
+            elif name in ("wind_speed", "gust"):
+                self._wind = replace(self._wind, **{"speed" if name == "wind_speed" else name: value})
+                self._air = None if self._wind.calm else Air(self._wind, self._rng, self.timestep)
+            else:
+                raise ValueError(f"a quadrotor has no {name}; it has: payload_kg, wind_speed, gust")
+
     def fly(self, ticks: int) -> None:
         """Let that many physics steps pass, each with the rotors' thrusts from the controller."""
         model, data, estimator, controller = self._model, self._data, self._estimator, self.controller
         qpos, qvel, control = data.qpos, data.qvel, data.ctrl
         position, velocity = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
-        vx, vy, vz = before = (0.0, 0.0, 0.0)
+        before = (0.0, 0.0, 0.0)
         for _ in range(ticks):
             px, py, pz, qw, qx, qy, qz = qpos.tolist()
             vx, vy, vz, p, q, r = qvel.tolist()
@@ -119,7 +140,8 @@ class Quadrotor:
             else:
                 self.on_floor = False
         vx, vy, vz = qvel[:3].tolist()
-        self._acceleration = tuple((b - a) / self.timestep for a, b in zip(before, (vx, vy, vz), strict=True))
+        dt = self.timestep
+        self._acceleration = ((vx - before[0]) / dt, (vy - before[1]) / dt, (vz - before[2]) / dt)
 
     def estimate(self) -> Estimate:
         """What the vehicle knows of itself now."""
@@ -144,12 +166,14 @@ class Quadrotor:
 
     def _hover(self) -> None:
         """Be in the air for long: rotors at hovering thrust, the mean wind leant against, the start held."""
-        self._data.act[:] = 0.25 * self._body.mass * 9.81
+        self._data.act[:] = 0.25 * self._body.mass * GRAVITY
         controller = self.controller
         controller.x.hold, controller.y.hold, controller.z.hold = self._data.qpos[:3].tolist()
         if self._air is not None:
             for axis, wind in zip((controller.x, controller.y, controller.z), self._air.mean, strict=True):
-                axis.integral = -wind * (self._body.drag_linear + self._body.drag_quadratic * math.hypot(*self._air.mean))
+                axis.integral = -wind * (
+                    self._body.drag_linear + self._body.drag_quadratic * math.hypot(*self._air.mean)
+                )
         self.fly(SETTLE * SAMPLES * self._ticks)
         self.collided = False
 
@@ -191,8 +215,12 @@ def _build(arena: Arena, floor: float | None) -> mujoco.MjModel:
     x, y, z = arena.start[:3]
     if floor is not None:
         spec.worldbody.add_geom(
-            name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=(0.0, 0.0, 1.0), pos=(0.0, 0.0, floor),
-            contype=FLOOR_BIT, conaffinity=0,
+            name="floor",
+            type=mujoco.mjtGeom.mjGEOM_PLANE,
+            size=(0.0, 0.0, 1.0),
+            pos=(0.0, 0.0, floor),
+            contype=FLOOR_BIT,
+            conaffinity=0,
         )
         z = floor + spec.geom("guard").size[1]
     spec.body("base").pos = (x, y, z)

@@ -12,7 +12,7 @@ GUST_CUT = 3.0  # sigma at which a gust is cut off
 
 @dataclass(frozen=True)
 class Wind:
-    """The air about a vehicle. Gusts are a first-order Gauss-Markov process on each axis, as Dryden's is along the wind."""
+    """The air about a vehicle. Gusts are a first-order Gauss-Markov process on each axis (Dryden's along the wind)."""
 
     speed: float = 0.0  # m/s, mean, horizontal
     direction: float | None = None  # rad from east, where it blows to; None: drawn anew for each vehicle
