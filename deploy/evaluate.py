@@ -17,7 +17,8 @@ from logs.metrics import Tally, closed_loop
 from messaging import brakeline_pb2 as pb
 from messaging.robots import Robot
 from messaging.weights import MLP
-from safety.model_set import ModelSet, Recipe
+from safety.methods import Model
+from safety.model_set import Recipe
 from safety.service import Counts, Models, answerer
 from sim.policies import POLICIES, Policy, scripted
 
@@ -53,7 +54,7 @@ def policy_named(name: str, robot: Robot, seed: int) -> Policy:
     return lambda observation, info: mlp(observation)
 
 
-def in_process(model: ModelSet) -> Ask:
+def in_process(model: Model) -> Ask:
     """The safety service's own core, called directly: the same bytes, no bus."""
     models = Models()
     models.install(model)

@@ -37,7 +37,8 @@ class Pretrained:
     @property
     def version(self) -> str:
         """Hash of everything that decisions depend on."""
-        digest = hashlib.sha256(json.dumps([self.robot.layout(), self.method, dict(self.settings)]).encode())
+        words = json.dumps([self.robot.layout(), self.method, sorted(self.settings.items())])
+        digest = hashlib.sha256(words.encode())
         for name, tensor in sorted(self._tensors().items()):
             digest.update(f"{name}{tensor.shape}".encode() + tensor.tobytes())
         return digest.hexdigest()[:12]

@@ -33,6 +33,7 @@ Array = NDArray[np.float64]
 SECAS = "secas"
 SECTOR = 0.55  # rad, about the width of a sector of rays
 LAG = 0.5  # periods that an input needs to take hold
+BESIDE = 0.3  # m beside the footprint, and twice the way to a stop: what is farther is far
 GUARD = 1e-6  # m² per squared unit of scaled input: a constraint below is one that the input does not move
 INSIDE = 1e-6  # m: a constraint violated by less is met
 UNMET = 100.0  # price of violating a unit row of the QP by one unit of scaled input; inputs are worth at most about 4
@@ -42,16 +43,19 @@ CURVED = 1e-3
 class Constraints:
     """c (K,) of a state, in m: for each sector of the lidar the way to a stop, less the range, at its worst ray.
 
-        c_j = max over rays e of sector j:  T (v·e)₊ − range_e,      T the time in which braking covers v·T
+        c_j = max over rays e of sector j:  T (v·e)₊ − min(range_e, near),      T the time in which braking covers v·T
 
     For a robot that stops within a period that is nearly −range; for one that does not, the next sample's range alone
-    would be looked at too late.
+    would be looked at too late. Ranges beyond `near` are all the same: what enters or leaves a sector far away says
+    nothing about the input, and would drown what is near in the fit.
     """
 
     def __init__(self, robot: Robot) -> None:
         rays = rays_of(robot)
         self.robot, self.directions, self.range = robot, rays.directions, rays.range
         self.stopping = robot.period * (0.5 * robot.brake_steps + LAG)  # s
+        fastest = float(np.linalg.norm(np.where(robot.translates, robot.high(), 0.0)))
+        self.near = min(rays.range, robot.footprint + BESIDE + 2.0 * self.stopping * fastest)  # m
         self.sectors = _sectors(rays.directions)
 
     @property
@@ -62,7 +66,7 @@ class Constraints:
         """Of an observation and the measured state with it."""
         speeds = state[self.robot.speeds]
         velocity = speeds if self.robot.heading is None else np.eye(self.directions.shape[1])[0] * speeds[0]
-        ranges = np.asarray(observation[: len(self.directions)], float) * self.range
+        ranges = np.minimum(np.asarray(observation[: len(self.directions)], float) * self.range, self.near)
         way = self.stopping * np.maximum(self.directions @ velocity, 0.0) - ranges
         return np.array([way[rays].max() for rays in self.sectors])
 
