@@ -41,11 +41,13 @@ class Place:
 def places(config: RunConfig) -> list[Place]:
     """THE table of a run's processes, in the order in which they start."""
     table = [Place("recorder", "recorder")]
-    if config.method != "none":
+    if config.filtered:
         table += [Place(f"safety-{i}", "safety") for i in range(config.replicas)]
     one = len(config.robots) == 1
     for robot in config.robots:
         table.append(Place("learner" if one else f"learner-{robot}", "learner", robot, nice=10))
+        if config.from_logs:
+            table.append(Place("feeder" if one else f"feeder-{robot}", "feeder", robot, nice=2))
         for i in range(config.actors):
             name = f"actor-{i}" if one else f"actor-{robot}-{i}"
             table.append(Place(name, "actor", robot, i * config.robots_per_actor, nice=2))
@@ -57,7 +59,7 @@ def metadata(config: RunConfig) -> dict[str, dict[str, str]]:
     from deploy.store import model_path
     from safety.model_set import ModelSet
 
-    filtered = config.method != "none"
+    filtered = config.filtered
     run = {
         "method": config.method,
         "policy": "learning",
@@ -85,7 +87,7 @@ def attachments(config: RunConfig) -> dict[str, bytes]:
     from deploy.store import model_path
     from safety.model_set import ModelSet
 
-    if config.method == "none":
+    if not config.filtered:
         return {}
     models = (ModelSet.load(model_path(robot_named(robot), config.recipe)) for robot in config.robots)
     return {attachment(model.robot.name, model.version): model.encode() for model in models}
@@ -151,12 +153,19 @@ def _actor(place: Place, folder: Path, config: RunConfig, bus: BusSettings) -> b
     return run(settings, partial(environment, conditions=config.conditions))
 
 
+def _feeder(place: Place, folder: Path, config: RunConfig, bus: BusSettings) -> bool:
+    from deploy.feed import FeederSettings, main
+
+    return main(FeederSettings(bus, config.from_logs, place.robot, place.name, config.actors == 0))
+
+
 # Each runs until its work is done (True) or it is asked to end; a recorder's and a safety service's never is.
 KINDS: dict[str, Callable[[Place, Path, RunConfig, BusSettings], bool]] = {
     "recorder": _recorder,
     "safety": _safety,
     "learner": _learner,
     "actor": _actor,
+    "feeder": _feeder,
 }
 
 

@@ -128,6 +128,9 @@ def summary(console: Console, figures: dict[str, Any]) -> None:
     lost = sum(topic["missing"] for topic in figures["topics"].values())
     restarts = ", ".join(f"{name} {count}" for name, count in figures["restarts"].items())
     console.print(f"messages lost: {lost}; restarts: {restarts or 'none'}")
+    if "from_logs" in figures:
+        fed = figures["from_logs"]
+        console.print(f"steps from logs: {fed.get('published', 0)}, and {fed.get('known', 0)} that the learner knew")
     if not figures["finished"]:
         console.print(f"[yellow]stopped before the last step[/]; go on: brakeline train --resume {figures['folder']}")
     console.print(f"log:    {figures['log']}", markup=False)

@@ -10,7 +10,7 @@ import socket
 import subprocess
 import sys
 import time
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -165,7 +165,7 @@ def prepare(config: RunConfig, folder: Path, resume: bool) -> None:
     """
     if not resume and (folder / CONFIG).exists():
         raise LaunchError(f"{folder} holds a run already: give --resume {folder}, or another --out")
-    if config.method != "none":
+    if config.filtered:
         for robot in config.robots:
             model_for(robot_named(robot), config.recipe)
     folder.mkdir(parents=True, exist_ok=True)
@@ -203,7 +203,8 @@ class Launcher:
                 self._start_recorder(process)
                 while not process.stop.is_set() and not self.finished:
                     for child in self.children:
-                        child.watch()
+                        if not self._must_wait(child):
+                            child.watch()
                     self._drain()
                     show(view)
                     process.stop.wait(TURN)
@@ -225,19 +226,43 @@ class Launcher:
         """As `analyse` would give them for the log, with what only the launcher knows."""
         setup = {
             "method": self.config.method,
-            "certificate": self.config.recipe.certificate if self.config.method != "none" else None,
+            "certificate": self.config.recipe.certificate if self.config.filtered else None,
             "policy": "learning",
             "arena": self.config.arena,
             "seed": self.config.seed,
         }
         restarts = {child.place.name: child.restarts for child in self.children if child.restarts}
         paths = {"folder": str(self.folder), "log": str(self.folder / LOG), "policies": self.policies()}
-        return setup | self.metrics.figures() | {"finished": self.finished, "restarts": restarts} | paths
+        return (
+            setup
+            | self.metrics.figures()
+            | {"finished": self.finished, "restarts": restarts}
+            | self._from_logs()
+            | paths
+        )
 
     @property
     def finished(self) -> bool:
-        """Have all learners done their work? Then nobody needs the others."""
-        return all(child.finished for child in self.children if child.place.kind == "learner")
+        """Have all learners done their work? Then nobody needs the others. Offline they may be a few steps short of it
+        when the logs end: what a learner that was interrupted had not saved."""
+        done = {kind: [c.finished for c in self.children if c.place.kind == kind] for kind in ("learner", "feeder")}
+        return all(done["learner"]) or (self.config.actors == 0 and all(done["feeder"]))
+
+    def _must_wait(self, child: Child) -> bool:
+        """Robots start when what the logs hold of their kind was learned from."""
+        feeders = (c for c in self.children if c.place.kind == "feeder" and c.place.robot == child.place.robot)
+        return child.place.kind == "actor" and not all(feeder.finished for feeder in feeders)
+
+    def _from_logs(self) -> dict[str, Any]:
+        """What was learned from logs, if anything was to be."""
+        if not self.config.from_logs:
+            return {}
+        fed: Counter[str] = Counter()
+        for child in self.children:
+            process = self.metrics.processes.get(child.place.name)
+            if child.place.kind == "feeder" and process is not None:
+                fed.update({name: int(count) for name, count in process.figures.items()})
+        return {"from_logs": {"logs": list(self.config.from_logs)} | dict(fed)}
 
     def policies(self) -> list[str]:
         """The policy files that were saved."""

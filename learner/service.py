@@ -23,7 +23,7 @@ from messaging import brakeline_pb2 as pb
 from messaging.bus import BusSettings, Malformed, Sample
 from messaging.process import Process
 from messaging.robots import ROBOTS, UnknownRobot
-from messaging.topics import FLOW, JOIN, LEARNER, STEP, WEIGHTS
+from messaging.topics import FLOW, JOIN, LEARNER, LOGGED, STEP, WEIGHTS
 
 log = logging.getLogger("brakeline.learner")
 
@@ -93,7 +93,8 @@ class LearnerLoop:
         self._weights, self._flow = bus.publisher(WEIGHTS, robot=robot), bus.publisher(FLOW, robot=robot)
         self._metrics = bus.publisher(LEARNER, robot=robot)
         self._weights.put(learner.weights())
-        bus.subscribe(STEP, self._receive, robot=robot)
+        for topic in (STEP, LOGGED):
+            bus.subscribe(topic, self._receive, robot=robot)
         bus.serve(JOIN, self._answer, robot=robot)
 
     # --- in the bus's threads ---

@@ -51,6 +51,7 @@ DECIDE = Topic(
 JOIN = Topic("join", "learner/{robot}/join", pb.Join, Delivery.QUERY, None, "actor", ("learner",), False, pb.JoinReply)
 MODEL = Topic("model", "model/{robot}/{source}", pb.Model, Delivery.BLOCK, None, "certify", ("safety",), True)
 STEP = Topic("step", "step/{robot}/{source}", pb.Step, Delivery.BLOCK, None, "actor", ("learner", "launcher"), True)
+LOGGED = Topic("logged", "logged/{robot}/{source}", pb.Step, Delivery.BLOCK, None, "feeder", ("learner",), False)
 EPISODE = Topic("episode", "episode/{robot}/{source}", pb.Episode, Delivery.BLOCK, None, "actor", ("launcher",), True)
 EXCHANGE = Topic("exchange", "exchange/{robot}/{source}", pb.Exchange, Delivery.BLOCK, None, "actor", (), True)
 WEIGHTS = Topic("weights", "weights/{robot}", pb.Weights, Delivery.DROP, None, "learner", ("actor",), False)
@@ -61,5 +62,5 @@ LEARNER = Topic(
 HEALTH = Topic("health", "health/{source}", pb.Health, Delivery.BLOCK, 1.0, "all", ("launcher", "status"), True)
 LOG = Topic("log", "log/{source}", pb.LogLine, Delivery.BLOCK, None, "all", ("launcher",), True)
 
-TOPICS: tuple[Topic, ...] = (DECIDE, JOIN, MODEL, STEP, EPISODE, EXCHANGE, WEIGHTS, FLOW, LEARNER, HEALTH, LOG)
+TOPICS: tuple[Topic, ...] = (DECIDE, JOIN, MODEL, STEP, LOGGED, EPISODE, EXCHANGE, WEIGHTS, FLOW, LEARNER, HEALTH, LOG)
 RECORDED: tuple[Topic, ...] = tuple(topic for topic in TOPICS if topic.recorded)

@@ -102,11 +102,12 @@ def show(figures: dict[str, Any]) -> None:
     fields = Table("field", "differs in", "by at most", box=None, padding=(0, 2, 0, 0))
     for name, about in figures["fields"].items():
         fields.add_row(name, str(about["count"]), size(about["largest"]))
-    examples = Table("largest differences", "decided", "now", "differences", box=None, padding=(0, 2, 0, 0))
+    columns = ("largest differences", "decided", "now", "input", "margin")
+    examples = Table(*columns, box=None, padding=(0, 2, 0, 0))
     for one in figures["examples"]:
         place = f"{one['actor']} episode {one['episode']} step {one['step']}"
-        found = ", ".join(f"{name} {size(value)}".strip() for name, value in one["differences"].items())
-        examples.add_row(place, one["logged"], one["now"], found)
+        found = (size(one["differences"].get(name, 0.0)) for name in ("input", "margin"))
+        examples.add_row(place, one["logged"], one["now"], *found)
     for table in (kinds, fields, examples):
         console.print(table)
 

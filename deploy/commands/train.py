@@ -14,6 +14,7 @@ from deploy.child import CONFIG
 from deploy.commands.common import Filtering, Flags, Physics, console, errors, say_json
 from deploy.display import Display, summary
 from deploy.experiments import EXPERIMENTS, RunConfig, load
+from deploy.feed import count
 from deploy.launch import Launcher, prepare
 from learner.config import LearnerConfig
 from messaging.robots import robot_named
@@ -67,6 +68,9 @@ class Train:
     """The run's folder; default: runs/ and the time."""
     resume: Path | None = None
     """Go on with the run in this folder: its configuration, except for --steps."""
+    from_logs: tuple[Path, ...] = ()
+    """Learn from the steps in these logs (files or run folders) before any robot starts; with --actors 0 from them
+    alone, with a --resume whose checkpoint is lost from the run's own."""
     practice: float = 0.0
     """Share of steps at which a robot follows its committed plan to the stop: the stops that `certify LOG` needs."""
     change: Change = field(default_factory=Change)
@@ -103,7 +107,8 @@ class Train:
         """The run's configuration; a resumed run's is its own, but for the steps."""
         if self.resume is not None:
             resumed = load(self.resume / CONFIG)
-            return replace(resumed, steps=self.steps or resumed.steps)
+            from_logs = tuple(map(str, self.from_logs)) or resumed.from_logs
+            return replace(resumed, steps=self.steps or resumed.steps, from_logs=from_logs)
         return RunConfig(
             robots=tuple(robot_named(name).name for name in self.robots),
             method=self.filtering.method,
@@ -111,7 +116,8 @@ class Train:
             arena=self.arena,
             actors=1 if self.deterministic else self.actors,
             robots_per_actor=self.robots_per_actor,
-            steps=EXPERIMENTS[self.experiment].steps if self.steps is None else self.steps,
+            steps=self._steps(),
+            from_logs=tuple(map(str, self.from_logs)),
             seed=self.seed,
             penalty=self.penalty,
             deadline=self.deadline,
@@ -123,6 +129,14 @@ class Train:
             conditions=self.physics.conditions(),
             learner=self.learner,
         )
+
+    def _steps(self) -> int:
+        """As given; offline the logs have an end; else the experiment's."""
+        if self.steps is None and self.from_logs and self.actors == 0:
+            logs = [str(path) for path in self.from_logs]
+            with errors.status("counting the logs' steps"):
+                return max(count(logs, robot_named(name)) for name in self.robots)
+        return EXPERIMENTS[self.experiment].steps if self.steps is None else self.steps
 
     def run(self) -> int:
         folder = self.resume or self.out or stamped()
