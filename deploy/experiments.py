@@ -34,6 +34,7 @@ class RunConfig:
     penalty: float = 1.0  # for a correction by the whole range of an input
     deadline: float = 0.1  # s for an answer of the safety service
     deterministic: bool = False  # one actor, lockstep, no deadlines
+    from_logs: tuple[str, ...] = ()  # files or folders whose steps are learned from first; with no actor: only these
     replicas: int = 1  # of the safety service
     practice: float = 0.0  # share of steps at which a robot starts to follow its committed plan to the stop
     pictures: float = 10.0  # a second and robot, drawn for Foxglove in the log; 0: none
@@ -45,10 +46,19 @@ class RunConfig:
         if self.method not in METHODS:
             raise ValueError(f"no method is called {self.method!r}; there are: {', '.join(METHODS)}")
         arena_kind(self.arena)
-        if min(self.actors, self.robots_per_actor, self.replicas, self.steps) < 1:
-            raise ValueError("actors, robots per actor, replicas and steps are 1 or more")
+        if min(self.robots_per_actor, self.replicas, self.steps) < 1 or self.actors < (0 if self.from_logs else 1):
+            raise ValueError(
+                "actors (unless there are logs to learn from), robots per actor, replicas, steps: 1 or more"
+            )
+        if self.deterministic and self.from_logs:
+            raise ValueError("a deterministic run learns from its own actor, not from logs")
         if self.deterministic and (self.actors != 1 or self.robots_per_actor != 1 or len(self.robots) != 1):
             raise ValueError("a deterministic run has one actor with one robot: --actors 1")
+
+    @property
+    def filtered(self) -> bool:
+        """Is anybody asked before a robot acts? Offline there is no robot."""
+        return self.method != "none" and self.actors > 0
 
     def learning(self) -> LearnerConfig:
         """The learner's part, with what it shares with the others."""
