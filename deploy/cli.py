@@ -75,6 +75,11 @@ COMMANDS: dict[str, Command] = {
         "ask every logged question again: is the same decided, and what would be with another model set?",
         "brakeline replay runs/latest --certificate set-membership",
     ),
+    "export": Command(
+        "export:Export",
+        "a log as CSV, as a Minari data set, or with a picture of every step for Foxglove",
+        "brakeline export runs/latest --csv steps.csv",
+    ),
     "analyse": Command("evaluation:Analyse", "figures of a log", "brakeline analyse runs/latest --json"),
 }
 

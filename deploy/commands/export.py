@@ -1,0 +1,65 @@
+"""`brakeline export`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+
+from deploy.commands.common import LATEST, console, errors, say_json
+from messaging.robots import robot_named
+
+
+@dataclass(frozen=True)
+class Export:
+    logs: Annotated[tuple[Path, ...], tyro.conf.Positional] = (LATEST,)
+    """Log files, or run folders."""
+    csv: Path | None = None
+    """Every step as a line of this file."""
+    minari: str | None = None
+    """The episodes as a local Minari data set of this name, e.g. brakeline/ground-v0."""
+    foxglove: Path | None = None
+    """An MCAP file with a picture of every step; the log itself has pictures of some."""
+    robot: str = "ground"
+    """Whose steps --csv and --minari take."""
+    json: bool = False
+
+    def run(self) -> int:
+        wanted = {"csv": self._csv, "minari": self._minari, "foxglove": self._foxglove}  # .tlog: a row here
+        asked = [name for name in wanted if getattr(self, name) is not None]
+        if not asked:
+            raise ValueError(f"export to what? Give {', '.join(f'--{name}' for name in wanted)}, or several of them")
+        figures: dict[str, Any] = {}
+        for name in asked:
+            with errors.status(f"writing {getattr(self, name)}"):
+                figures[name] = wanted[name]()
+        if self.json:
+            say_json(figures)
+        else:
+            for about in figures.values():
+                counts = ", ".join(f"{count} {what}" for what, count in about.items() if what != "path")
+                console.print(f"{about['path']}: {counts}", markup=False)
+        return 0
+
+    def _csv(self) -> dict[str, Any]:
+        from logs.export import to_csv
+
+        assert self.csv is not None
+        self.csv.parent.mkdir(parents=True, exist_ok=True)
+        with self.csv.open("w", newline="") as file:
+            return {"path": str(self.csv), "steps": to_csv(list(self.logs), robot_named(self.robot), file)}
+
+    def _minari(self) -> dict[str, Any]:
+        from logs.trajectories import to_minari
+
+        assert self.minari is not None
+        written = to_minari(list(self.logs), robot_named(self.robot), self.minari)
+        return {"path": str(written.path), "episodes": written.episodes, "steps": written.steps}
+
+    def _foxglove(self) -> dict[str, Any]:
+        from logs.export import to_foxglove
+
+        assert self.foxglove is not None
+        return {"path": str(self.foxglove), "messages": to_foxglove(list(self.logs), self.foxglove)}
