@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import hashlib
 import math
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,6 +47,7 @@ class Robot:
     horizon: int
     free_steps: int
     brake_steps: int
+    late: bool = False  # an answer counts from the next period on: a plan's first input is the one in force meanwhile
 
     @property
     def state_dim(self) -> int:
@@ -64,6 +65,16 @@ class Robot:
     def regressor_dim(self) -> int:
         """Length of z_0 = [x_0 (regressor coordinates); input in force], to which a plan's inputs are appended."""
         return len(self.regressor) + self.action_dim
+
+    @property
+    def given(self) -> int:
+        """So many of a plan's free inputs are no longer free when the question is asked."""
+        return int(self.late)
+
+    def in_real_time(self) -> Robot:
+        """The same robot where the world does not wait for an answer: it decides on the period after this one."""
+        more = {"horizon": self.horizon + 1, "free_steps": self.free_steps + 1}
+        return replace(self, name=self.name + LATE, late=True, **more)
 
     @property
     def speeds(self) -> slice:
@@ -90,9 +101,11 @@ class Robot:
 
     def layout(self) -> str:
         """Hash of everything that two processes must share to understand each other's vectors."""
-        return hashlib.sha256(repr(sorted(asdict(self).items())).encode()).hexdigest()[:16]
+        shared = {name: value for name, value in asdict(self).items() if name != "late" or value}
+        return hashlib.sha256(repr(sorted(shared.items())).encode()).hexdigest()[:16]
 
 
+LATE = "-late"  # ends the name of a robot in real time
 RAYS = 18
 
 GROUND = Robot(
@@ -144,8 +157,8 @@ QUADROTOR = Robot(
     translates=(True, True, True),
     action_slew=(0.8, 0.8, 0.8),  # 4 m/s² by a period of 0.2 s
     observation=(
-        *(f"ray {i} [range/max]" for i in range(SPHERE_RAYS)),
-        *(f"goal - p, {axis} [20 m]" for axis in "xyz"),
+        *(f"ray {i} [range/12 m]" for i in range(SPHERE_RAYS)),
+        *(f"goal - p, {axis} [its length + 5 m]" for axis in "xyz"),
         *(f"v{axis} [5 m/s]" for axis in "xyz"),
         *(f"last v{axis} setpoint [5 m/s]" for axis in "xyz"),
     ),
@@ -162,12 +175,12 @@ ROBOTS: dict[str, Robot] = {robot.name: robot for robot in (GROUND, QUADROTOR)}
 
 
 def robot_named(name: str) -> Robot:
-    """The robot of that name.
+    """The robot of that name; with `LATE` at its end, the same in real time.
 
     Raises:
         UnknownRobot: with the names there are.
     """
     try:
-        return ROBOTS[name]
+        return ROBOTS[name.removesuffix(LATE)].in_real_time() if name.endswith(LATE) else ROBOTS[name]
     except KeyError:
         raise UnknownRobot(f"no robot is called {name!r}; there are: {', '.join(sorted(ROBOTS))}") from None

@@ -43,7 +43,8 @@ NO_PREDICTION = Prediction(np.zeros(0), np.zeros(0), 0.0)  # of a method that pr
 class Commitment:
     """The committed plan of one robot: verified when it was made, from then to standstill.
 
-    plan (N, m) is its tail: the first row is what to execute if no better answer comes. model is the version of the
+    plan (N, m) is its tail: the first row is what to execute if no better answer comes; of a late robot what is being
+    executed, and `accept` and `fallback` return the input of the next period. model is the version of the
     model set that verified it, empty when the robot stands still, `UNVERIFIED` if none did.
     """
 
@@ -60,7 +61,7 @@ class Commitment:
         self._still = self.robot.horizon  # periods of zero input
 
     def accept(self, plan: Array, model: str, predicted: Prediction | None, verified: bool) -> Array:
-        """A decision's plan becomes the committed one; returns the input to execute now."""
+        """A decision's plan becomes the committed one; returns the input to execute next."""
         self.plan, self.model = plan, model if verified else UNVERIFIED
         self.predicted = predicted if predicted is not None and len(predicted.center) else None
         return self._advance()
@@ -78,7 +79,7 @@ class Commitment:
         stopped = self.model != UNVERIFIED or self._still >= self.robot.horizon
         if stopped and not self.plan.any() and not now.any():
             self.model = ""  # standing still needs nobody's word
-        return now
+        return self.plan[0].copy() if self.robot.late else now
 
 
 def correction_penalty(robot: Robot, proposed: ArrayLike, executed: ArrayLike, weight: float) -> float:

@@ -44,8 +44,9 @@ class StaleModel(BadRequest):
 @dataclass(frozen=True)
 class Request:
     """state (n,) measured; action (m,) proposed; input_in_force (m,) of the period before; plan (N, m): the committed
-    plan's tail, verified by model set `model` (empty: standing still; `UNVERIFIED`: by none); obstacles: at least those
-    within `Filter.reach`; predicted: what the last decision said of this state, if there was one."""
+    plan's tail (of a late robot: from the input on that is in force now), verified by model set `model` (empty:
+    standing still; `UNVERIFIED`: by none); obstacles: at least those within `Filter.reach`; predicted: what the last
+    decision said of this state, if there was one."""
 
     state: Array
     action: Array
@@ -64,7 +65,8 @@ class Request:
 
 @dataclass(frozen=True)
 class Decision:
-    """kind: allowed | adjusted | failsafe; plan (N, m), its first row is for now; tube: true positions at the N
+    """kind: allowed | adjusted | failsafe; plan (N, m), its first row is for now (of a late robot: is in force, and the
+    second is for the next period); tube: true positions at the N
     periods' ends, centers and half-widths (N, d), world, of the plan's free inputs and the ramp after them; predicted:
     the next measured state; margin [m] of that tube to the nearest half-space, within ± the reach. A failsafe's may be
     negative though it is verified: it was so when it was made, this is how it looks from the new measurement."""
@@ -115,11 +117,11 @@ class _Scene:
 
 @dataclass(frozen=True)
 class _Found:
-    """A plan (N, m) with its free inputs (F·m,)."""
+    """A plan (N, m) and the regressors z of its tube."""
 
     kind: str
     plan: Array
-    free: Array
+    z: Array
     margin: float
     verified: bool
 
@@ -144,7 +146,7 @@ class Filter:
         self.translating = np.concatenate([np.zeros(robot.regressor_dim), driven])
         self.low, self.high, self.slew = robot.low(), robot.high(), np.asarray(robot.action_slew)
         self.nothing = np.minimum(np.maximum(0.0, self.low), self.high)
-        self.braking = np.maximum(1.0 - np.arange(robot.free_steps) / robot.brake_steps, 0.0)[:, None]
+        self.braking = np.maximum(1.0 - np.arange(robot.free_steps - robot.given) / robot.brake_steps, 0.0)[:, None]
         self.regressor = list(robot.regressor)
         self.comfort = self._comfort() if comfort is None else comfort
         wanted = self._reach()
@@ -212,10 +214,12 @@ class Filter:
         attempt = _Attempt(perf_counter_ns())
         self._check(request)
         attempt.contained = request.predicted is None or request.predicted.contains(self.robot, request.state)
-        proposal = self._clipped(request)
-        z_0 = np.concatenate([request.state[self.regressor], request.input_in_force])
+        given = request.plan[: self.robot.given].ravel()
+        z_0 = np.concatenate([request.state[self.regressor], request.input_in_force, given])
+        proposal = self._limited(request.action, z_0[-self.robot.action_dim :])
         scene = self._scene(request)
-        in_domain = bool(((z_0 >= self.domain[0]) & (z_0 <= self.domain[1])).all())
+        recorded = z_0[: self.robot.regressor_dim]
+        in_domain = bool(((recorded >= self.domain[0]) & (recorded <= self.domain[1])).all())
         found = None
         if in_domain:
             found = self._search(scene, z_0, proposal, attempt)
@@ -223,21 +227,21 @@ class Filter:
             attempt.reason = "the state is outside the domain that was recorded"
         if found is None:
             found = self._committed(request, scene, z_0, attempt, in_domain)
-        return self._decision(request, scene, z_0, found, attempt)
+        return self._decision(request, scene, found, attempt)
 
     def _search(self, scene: _Scene, z_0: Array, proposal: Array, attempt: _Attempt) -> _Found | None:
         """The proposal if its tube is verified, else the QP's answer if that is, else nothing."""
         known, m = len(z_0), len(proposal)
         z = self._regressors(z_0, proposal)
         if not len(scene.near) and not self.far:
-            return _Found(ALLOWED, self._plan(z[known:]), z[known:], self.reach, True)
+            return _Found(ALLOWED, self._plan(z), z, self.reach, True)
         rows = self._rows(scene, z)
         margin = self._margin(rows, z)
         if margin >= self.comfort:
-            return _Found(ALLOWED, self._plan(z[known:]), z[known:], margin, True)
+            return _Found(ALLOWED, self._plan(z), z, margin, True)
         kept = self._comfortable(rows, z_0, proposal)
         if margin >= 0.0 and self._margin(kept, z) >= 0.0:
-            return _Found(ALLOWED, self._plan(z[known:]), z[known:], margin, True)
+            return _Found(ALLOWED, self._plan(z), z, margin, True)
         attempt.reason = f"the proposal's tube comes within {margin:.3g} m of the free space's edge"
         # Keeping the comfort margin, or at least not driving into it; else free space alone: from here even standing
         # still would not do.
@@ -249,9 +253,8 @@ class Filter:
                 continue
             near_enough = np.abs(candidate[known : known + m] - proposal) <= SAME_INPUT * (self.high - self.low)
             if near_enough.all() and self._margin(choice, z) >= 0.0:
-                return _Found(ALLOWED, self._plan(z[known:]), z[known:], margin, True)
-            free = candidate[known:]
-            return _Found(ADJUSTED, self._plan(free), free, self._margin(rows, candidate), True)
+                return _Found(ALLOWED, self._plan(z), z, margin, True)
+            return _Found(ADJUSTED, self._plan(candidate), candidate, self._margin(rows, candidate), True)
         attempt.reason += "; no verified input was found"
         return None
 
@@ -304,24 +307,25 @@ class Filter:
         still. A tube from outside the recorded domain verifies nothing. Anew are looked at: the committed plan's next
         inputs and the strongest braking, both followed by the schedule's ramp, for tubes speak of nothing else.
         """
-        known, F = len(z_0), self.robot.free_steps
         if not attempt.contained:
             attempt.reason += "; the measured state was outside the predicted set"
         vouched = request.model == self.version or request.still
-        as_committed = np.concatenate([z_0, request.plan[:F].ravel()])
+        before = z_0[-self.robot.action_dim :]
+        chosen = request.plan[self.robot.given : self.robot.free_steps].ravel()
+        as_committed = np.concatenate([z_0, chosen])
         if attempt.contained and vouched:
             margin = self._margin(self._rows(scene, as_committed), as_committed)
-            return _Found(FAILSAFE, request.plan, as_committed[known:], margin, True)
-        brake = self._regressors(z_0, self._limited(self.nothing, request.input_in_force))
-        as_committed[known:] = self._within(as_committed[known:], request.input_in_force)
+            return _Found(FAILSAFE, request.plan, as_committed, margin, True)
+        brake = self._regressors(z_0, self._limited(self.nothing, before))
+        as_committed[len(z_0) :] = self._within(chosen, before)
         for z in (as_committed, brake):
             margin = self._margin(self._rows(scene, z), z)
             if in_domain and margin >= 0.0:
-                return _Found(FAILSAFE, self._plan(z[known:]), z[known:], margin, True)
-        return _Found(FAILSAFE, self._plan(brake[known:]), brake[known:], margin, False)
+                return _Found(FAILSAFE, self._plan(z), z, margin, True)
+        return _Found(FAILSAFE, self._plan(brake), brake, margin, False)
 
-    def _decision(self, request: Request, scene: _Scene, z_0: Array, found: _Found, attempt: _Attempt) -> Decision:
-        z = np.concatenate([z_0, found.free])
+    def _decision(self, request: Request, scene: _Scene, found: _Found, attempt: _Attempt) -> Decision:
+        z = found.z
         centers = scene.start + self.tube.centers(z) @ scene.turn.T
         sizes = self.tube.magnitudes(z)[: self.tube.generators]
         half = np.abs(scene.turn @ self.tube.directions) @ sizes + self.measured
@@ -358,9 +362,6 @@ class Filter:
 
     # --- small steps -------------------------------------------------------------------------------------------
 
-    def _clipped(self, request: Request) -> Array:
-        return self._limited(request.action, request.input_in_force)
-
     def _limited(self, wanted: Array, before: Array) -> Array:
         """The input closest to the wanted one within bounds and slew."""
         low, high = np.maximum(self.low, before - self.slew), np.minimum(self.high, before + self.slew)
@@ -368,7 +369,7 @@ class Filter:
 
     def _within(self, free: Array, before: Array) -> Array:
         """Free inputs (F·m,) brought within bounds and slew, one after the other."""
-        inputs = free.reshape(self.robot.free_steps, -1).copy()
+        inputs = free.reshape(-1, self.robot.action_dim).copy()
         for k in range(len(inputs)):
             before = inputs[k] = self._limited(inputs[k], before)
         return inputs.ravel()
@@ -377,8 +378,9 @@ class Filter:
         """z of an action followed by braking."""
         return np.concatenate([z_0, (self.braking * action).ravel()])
 
-    def _plan(self, free: Array) -> Array:
-        return (self.schedule @ free).reshape(self.robot.horizon, -1)
+    def _plan(self, z: Array) -> Array:
+        """The inputs (N, m) that regressors z speak of."""
+        return (self.schedule @ z[self.robot.regressor_dim :]).reshape(self.robot.horizon, -1)
 
     def _scene(self, request: Request) -> _Scene:
         d, robot = self.robot.position_dim, self.robot

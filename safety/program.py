@@ -76,14 +76,15 @@ class Builder:
     def __init__(self, robot: Robot, tube: Tube) -> None:
         self.robot = robot
         self.tube = tube
-        m, free = robot.action_dim, robot.free_steps * robot.action_dim
+        m, steps = robot.action_dim, robot.free_steps - robot.given
+        free = steps * m
         self.known = tube.position.shape[2] - free  # length of z_0
         self.free = free
         moving = np.abs(tube.W[:, self.known :]).max(1, initial=0.0) > ROUNDING
         self.W_t, self.M_t = tube.W[moving], tube.M[:, moving]
         self.W_c, self.M_c = tube.W[~moving][:, : self.known], tube.M[:, ~moving]
         atoms = len(self.W_t)
-        width = np.tile(robot.high() - robot.low(), robot.free_steps)
+        width = np.tile(robot.high() - robot.low(), steps)
         self.scale = np.concatenate([width, np.abs(self.W_t[:, self.known :]) @ width])
         self.h = np.full(free + atoms, REGULAR)
         self.h[:m] = 1.0
@@ -92,14 +93,14 @@ class Builder:
         below = np.hstack([-W_f, -np.eye(atoms)])
         inputs = np.hstack([np.eye(free), np.zeros((free, atoms))])
         difference = np.hstack([np.eye(free) - np.eye(free, k=-m), np.zeros((free, atoms))])
-        limited = np.tile(np.isfinite(robot.action_slew), robot.free_steps)
+        limited = np.tile(np.isfinite(robot.action_slew), steps)
         difference = difference[limited]
         fixed = np.vstack([above, below, inputs, -inputs, difference, -difference]) * self.scale
         self.length = np.linalg.norm(fixed, axis=1)
         self.fixed = fixed / self.length[:, None]
         self.limited = limited
-        self.slew = np.tile(robot.action_slew, robot.free_steps)[limited]
-        self.box = np.concatenate([np.tile(robot.high(), robot.free_steps), -np.tile(robot.low(), robot.free_steps)])
+        self.slew = np.tile(robot.action_slew, steps)[limited]
+        self.box = np.concatenate([np.tile(robot.high(), steps), -np.tile(robot.low(), steps)])
 
     def program(self, rows: Rows, z_0: Array, proposal: Array) -> Program:
         """The QP for known regressors z_0 (known,) and a proposal r (m,)."""

@@ -145,8 +145,8 @@ def test_adjusted_is_the_closest_input_that_can_be_verified(ready):
         adjusted += 1
         z_0 = np.concatenate([ask.state[3:], ask.input_in_force])
         scene = ready._scene(ask)
-        rows = ready._rows(scene, np.concatenate([z_0, ready._clipped(ask)]))
-        kept = ready._comfortable(rows, z_0, ready._clipped(ask))
+        rows = ready._rows(scene, np.concatenate([z_0, ready._limited(ask.action, ask.input_in_force)]))
+        kept = ready._comfortable(rows, z_0, ready._limited(ask.action, ask.input_in_force))
         taken = np.linalg.norm((decision.action - ask.action) / width)
         best = np.inf
         for u in grid:
