@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import json
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 
 import numpy as np
 
 from deploy.rollouts import costs, transitions
 from learner.pretrain import Fit, fit_cost, fit_linear
+from messaging.perceptrons import Perceptrons
 from messaging.robots import Robot
 from safety.pretrained import Pretrained
 from safety.sailr import SAILR
@@ -26,7 +28,7 @@ class SecasRecipe:
     arena: str = "default"
     seed: int = 20_261
     fit: Fit = field(default_factory=lambda: Fit(hidden=(64, 64)))
-    margin: float = 0.05  # m beside the footprint: the bound C, tuned (deploy/experiments.md)
+    margin: float = 0.1  # m beside the footprint: the bound C, tuned (deploy/experiments.md)
 
 
 @dataclass(frozen=True)
@@ -43,7 +45,13 @@ class SailrRecipe:
 
 
 Recipe = SecasRecipe | SailrRecipe
+Made = tuple[dict[str, Perceptrons], dict[str, float], dict[str, str]]  # networks, settings, about
 RECIPES: dict[str, type[SecasRecipe] | type[SailrRecipe]] = {SECAS: SecasRecipe, SAILR: SailrRecipe}
+
+
+def made_by(model: Pretrained, recipe: Recipe) -> bool:
+    """Was the model made by this recipe?"""
+    return model.about.get("recipe") == json.dumps(asdict(recipe))
 
 
 def pretrain(robot: Robot, recipe: Recipe, each: Each = lambda: None) -> Pretrained:
@@ -60,6 +68,7 @@ def pretrain(robot: Robot, recipe: Recipe, each: Each = lambda: None) -> Pretrai
         networks, settings, about = _sailr(robot, recipe, each)
         method = SAILR
     about |= {
+        "recipe": json.dumps(asdict(recipe)),
         "samples": str(recipe.samples),
         "arena": recipe.arena,
         "seed": str(recipe.seed),
@@ -68,7 +77,7 @@ def pretrain(robot: Robot, recipe: Recipe, each: Each = lambda: None) -> Pretrai
     return Pretrained(robot, method, networks, settings, about)
 
 
-def _secas(robot: Robot, recipe: SecasRecipe, each: Each):  # type: ignore[no-untyped-def]
+def _secas(robot: Robot, recipe: SecasRecipe, each: Each) -> Made:
     data = transitions(robot, recipe.arena, recipe.samples, recipe.seed, each)
     g, errors = fit_linear(data.observation, data.action, data.change, recipe.fit, recipe.seed)
     about = {
@@ -78,7 +87,7 @@ def _secas(robot: Robot, recipe: SecasRecipe, each: Each):  # type: ignore[no-un
     return {"g": g}, {"clearance": robot.footprint + recipe.margin}, about
 
 
-def _sailr(robot: Robot, recipe: SailrRecipe, each: Each):  # type: ignore[no-untyped-def]
+def _sailr(robot: Robot, recipe: SailrRecipe, each: Each) -> Made:
     """V from what braking came to; Q of every driven step from V after it, the more cautious of the two."""
     gamma = recipe.gamma
     data = costs(robot, recipe.arena, recipe.samples, recipe.seed, gamma, recipe.smoothing, each)

@@ -2,6 +2,7 @@
 
 data/<robot>/record.safetensors                     the recorded trajectories
 data/<robot>/<certificate>-<mode>.safetensors       the model set in use, made from them
+data/<robot>/<rival>.safetensors                    the rival's networks, pre-trained
 data/<robot>/models/<version>.safetensors           every version a service has used
 """
 
@@ -12,18 +13,23 @@ from dataclasses import replace
 from pathlib import Path
 
 from rich.console import Console
-from rich.progress import track
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn, track
 
 from deploy import collect
+from deploy import pretrain as rivals
 from deploy.vehicles import Conditions
 from messaging.robots import Robot
 from safety.dataset import BadData, Dataset
+from safety.methods import DDPC, Model
 from safety.model_set import BadModel, ModelSet, Recipe, make
+from safety.pretrained import Pretrained
 from safety.statement import Statement, state
 
 TRAJECTORIES = 200  # of 300 periods
 HELD_OUT = 0.3  # of the trajectories, for the statement about a model set
 SEED = 20260
+
+COLUMNS = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
 
 console = Console(stderr=True, highlight=False, soft_wrap=True)
 
@@ -39,6 +45,11 @@ def record_path(robot: Robot) -> Path:
 
 def model_path(robot: Robot, recipe: Recipe) -> Path:
     return data_root() / robot.name / f"{recipe.certificate}-{recipe.mode}.safetensors"
+
+
+def method_path(robot: Robot, method: str, recipe: Recipe) -> Path:
+    """Of the model that the safety service needs for a method."""
+    return model_path(robot, recipe) if method == DDPC else data_root() / robot.name / f"{method}.safetensors"
 
 
 def recorded(
@@ -99,4 +110,39 @@ def model_for(robot: Robot, recipe: Recipe) -> ModelSet:
         f"{statement.windows} held-out plans, at most {statement.bound_plan:.2%} of plans (99 % confidence)"
     )
     model.save(path)
+    return model
+
+def method_for(robot: Robot, method: str, recipe: Recipe) -> Model:
+    """What a method must know of a robot: ours a model set, a rival its networks, made if they are not there.
+
+    Raises:
+        ValueError: no method of that name needs anything.
+    """
+    if method == DDPC:
+        return model_for(robot, recipe)
+    if method not in rivals.RECIPES:
+        raise ValueError(f"no method is called {method!r}; there are: {', '.join((DDPC, *rivals.RECIPES))}")
+    return pretrained(robot, method, rivals.RECIPES[method]())
+
+
+def pretrained(robot: Robot, method: str, recipe: rivals.Recipe, again: bool = False) -> Pretrained:
+    """A rival's model of this recipe, pre-trained if it is not there (or `again`)."""
+    path = method_path(robot, method, Recipe())
+    if path.exists() and not again:
+        try:
+            kept = Pretrained.decode(path.read_bytes())
+            if rivals.made_by(kept, recipe):
+                return kept
+            console.print(f"[yellow]pre-training {method} again:[/] {path} is of another recipe")
+        except BadModel as error:
+            console.print(f"[yellow]pre-training {method} again:[/] {error}")
+    with Progress(*COLUMNS, console=console, transient=True) as progress:
+        task = progress.add_task(f"pre-training {method} for {robot.name}", total=recipe.samples)
+        model = rivals.pretrain(robot, recipe, lambda: progress.advance(task))
+    model.save(path)
+    about = model.about
+    console.print(
+        f"{robot.name}: {method} {model.version}: {about['samples']} steps with {about['collisions']} collisions and "
+        f"{about['seconds']} s of pre-training; on held-out steps {about['error']}"
+    )
     return model

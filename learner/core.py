@@ -142,6 +142,11 @@ class Learner:
     def updates(self) -> int:
         return self._td3.updates
 
+    @property
+    def warming_up(self) -> bool:
+        """Are there too few steps yet to learn from? Until then actors act at random."""
+        return self._limiter.warming_up
+
     # --- out ---
 
     def weights_due(self) -> bool:

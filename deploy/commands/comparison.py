@@ -1,0 +1,149 @@
+"""`brakeline pretrain` and `brakeline compare`."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import tyro
+from rich.markdown import Markdown
+from rich.table import Table
+
+from deploy import compare
+from deploy.commands.common import Robot, console, errors, say_json
+from deploy.compare import RESULTS, RUNS, SEEDS, Cell, Job
+from deploy.conservatism import Conservatism
+from deploy.curves import learning_curves, seeds_as_points
+from deploy.pretrain import RECIPES
+from deploy.store import method_for, method_path, pretrained
+from deploy.study import METHODS, NONE, quick
+from deploy.table import markdown, plain, table
+from messaging.robots import robot_named
+from safety.model_set import Recipe
+
+QUICK = Path("runs/quick")
+
+
+@dataclass(frozen=True)
+class Pretrain:
+    method: Annotated[Literal["secas", "sailr"], tyro.conf.Positional]
+    """The rival."""
+    robot: Robot = "ground"
+    samples: int | None = None
+    """Steps to drive; default: the recipe's."""
+    seed: int | None = None
+    json: bool = False
+
+    def run(self) -> int:
+        robot = robot_named(self.robot)
+        recipe = RECIPES[self.method]()
+        changed = {name: value for name in ("samples", "seed") if (value := getattr(self, name)) is not None}
+        model = pretrained(robot, self.method, replace(recipe, **changed), again=True)
+        path = method_path(robot, self.method, Recipe())
+        if self.json:
+            say_json({"path": str(path), "version": model.version, "settings": dict(model.settings)} | model.about)
+        else:
+            console.print(f"{path}: {model.version}")
+        return 0
+
+
+@dataclass(frozen=True)
+class Compare:
+    robots: Annotated[tuple[str, ...], tyro.conf.Positional] = ("ground",)
+    seeds: tuple[int, ...] = SEEDS
+    steps: int | None = None
+    """Of training; default: the comparison's own for each robot."""
+    episodes: int | None = None
+    """Of evaluation, a seed and arena."""
+    methods: tuple[str, ...] = METHODS
+    quick: bool = False
+    """A minute or two with the same code: few steps, small networks, one seed; into runs/quick, always anew."""
+    workers: int = 2
+    """Cells at once, each on one core."""
+    again: bool = False
+    """Run what is there already anew."""
+    conservatism: bool = True
+    """Also the table of certificates and modes, with the stored policy."""
+    results: Path = RESULTS
+    runs: Path = RUNS
+    """Where the logs and policies of the cells go."""
+    json: bool = False
+
+    def run(self) -> int:
+        results, runs, again = self.results, self.runs, self.again
+        if self.quick:
+            results, runs, again = (
+                QUICK / "results" if results == RESULTS else results,
+                QUICK / "runs" if runs == RUNS else runs,
+                True,
+            )
+        told: dict[str, Any] = {}
+        for name in self.robots:
+            robot = robot_named(name).name
+            self._prepare(robot)
+            jobs = self._jobs(robot)
+            found = compare.complete(jobs, results, runs, self.workers, again, self._say)
+            cells = [result for result, job in zip(found, jobs, strict=True) if isinstance(job, Cell)]
+            rest = [result for result, job in zip(found, jobs, strict=True) if not isinstance(job, Cell)]
+            told[robot] = self._show(robot, cells, rest, results / robot)
+        if self.json:
+            say_json(told)
+        return 0
+
+    def _prepare(self, robot: str) -> None:
+        """What several cells need is made once, before them."""
+        for method in self.methods:
+            if method != NONE:
+                method_for(robot_named(robot), method, Recipe())
+
+    def _jobs(self, robot: str) -> list[Job]:
+        seeds = self.seeds[:1] if self.quick else self.seeds
+        wanted = [study for study in compare.studies(robot, seeds) if study.method in self.methods]
+        given = {name: value for name in ("steps", "episodes") if (value := getattr(self, name)) is not None}
+        jobs: list[Job] = [Cell(replace(quick(study) if self.quick else study, **given)) for study in wanted]
+        if self.conservatism and not self.quick:
+            jobs.append(Conservatism(robot))
+        return jobs
+
+    def _say(self, name: str, text: str) -> None:
+        errors.print(f"[dim]{name}:[/] {text}")
+
+    def _show(self, robot: str, cells: list[dict[str, Any]], rest: list[dict[str, Any]], folder: Path) -> Any:
+        figures = table(cells)
+        text = markdown(figures)
+        (folder / "table.md").write_text(text + "\n")
+        (folder / "table.json").write_text(json.dumps(plain(figures), indent=1) + "\n")
+        learning_curves(cells, folder / "curves.png")
+        seeds_as_points(figures, folder / "seeds.png")
+        if not self.json:
+            console.print(Markdown(text))
+            for result in rest:
+                console.print(conservatism(result))
+            console.print(f"[dim]{folder}: table.md, table.json, curves.png, seeds.png[/]")
+        return plain(figures) | {"conservatism": rest[0]["rows"] if rest else None}
+
+
+def conservatism(result: dict[str, Any]) -> Table:
+    """The certificates' rows as a table."""
+    shown = Table(title=f"conservatism of {result['study']['robot']} ({result['study']['episodes']} episodes)")
+    policies = result["study"]["policies"]
+    for column in ("certificate", "mode", "stop from rest", "from full speed", "plans violated", "≤ per plan"):
+        shown.add_column(column)
+    for policy in policies:
+        shown.add_column(f"goals, {policy}")
+    for row in result["rows"]:
+        if "refused" in row:
+            shown.add_row(row["certificate"], row["mode"], f"refused: {row['refused']}")
+            continue
+        said = row["statement"]
+        shown.add_row(
+            row["certificate"],
+            row["mode"],
+            *(f"{1e3 * said[name]:.1f} mm" for name in ("half_width_rest", "half_width_full")),
+            f"{said['violations']} of {said['windows']}",
+            f"{said['bound_plan']:.2%}",
+            *(str(row["driving"][policy]["goals"]) for policy in policies),
+        )
+    return shown

@@ -1,0 +1,76 @@
+"""How conservative each certificate is, in both modes (method §6): what its tubes are like, and what that costs.
+
+Half-widths of a full stop, what held-out plans say of the bound, and closed-loop goal rates of the map's oracle (A*)
+and of the stored policy, which was trained behind the default.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from actors.driver import Driver, Identity
+from deploy.evaluate import FRESH, in_process, policy_named
+from deploy.store import certified, recorded
+from deploy.trials import Episodes, evaluate
+from deploy.vehicles import environment
+from messaging.robots import Robot, robot_named
+from safety.certificates import KINDS, CertificateError
+from safety.dataset import BadData
+from safety.model_set import MODES, Recipe
+
+ORACLE = "astar"
+
+
+@dataclass(frozen=True)
+class Conservatism:
+    """A job of `deploy/compare.py`."""
+
+    robot: str
+    episodes: int = 60
+    arena: str = "default"
+    policies: tuple[str, ...] = (ORACLE, "trained")
+
+    @property
+    def name(self) -> str:
+        return "conservatism"
+
+    def config(self) -> dict[str, Any]:
+        config: dict[str, Any] = json.loads(json.dumps(asdict(self)))
+        return config
+
+    def run(self, folder: Path, say: Callable[[str], object] = lambda text: None) -> dict[str, Any]:
+        """A row for each certificate and mode, the refused ones with the reason."""
+        robot = robot_named(self.robot)
+        data = recorded(robot)
+        rows = []
+        for certificate in KINDS:
+            for mode in MODES:
+                say(f"{certificate}, {mode}")
+                recipe = Recipe(certificate, mode)
+                row: dict[str, Any] = asdict(recipe)
+                try:
+                    model, statement = certified(data, recipe)
+                except (BadData, CertificateError) as error:
+                    rows.append(row | {"refused": str(error)})
+                    continue
+                row |= {"model": model.version, "statement": statement.figures()}
+                driving = {policy: self._drive(robot, policy, in_process(model)) for policy in self.policies}
+                rows.append(row | {"driving": driving})
+        return {"study": self.config(), "data": data.digest(), "rows": rows}
+
+    def _drive(self, robot: Robot, policy: str, question: Any) -> dict[str, Any]:
+        """Closed loop on the first fresh episodes."""
+        driver = Driver(robot, environment(robot, self.arena, FRESH), Identity("conservatism", 0, 0))
+        found: Episodes = evaluate(driver, policy_named(policy, robot, 0), question, self.episodes)
+        columns, steps = found.columns(), found.decisions
+        return {
+            "goals": sum(columns["goal"]),
+            "collisions": sum(columns["collision"]),
+            "interventions": sum(columns["interventions"]) / max(steps, 1),
+            "steps": steps,
+            "decision_ms": found.decision_ms(),
+        }
