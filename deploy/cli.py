@@ -70,6 +70,9 @@ COMMANDS: dict[str, Command] = {
         "brakeline query ground --action 0.25 0 --obstacle 'cylinder 0.3 0 0.1'",
     ),
     "status": Command("service:Status", "which processes live, and how they fare", "brakeline status"),
+    "watch": Command(
+        "watch:Watch", "a running system, live: on a web page, and in Foxglove", "brakeline watch --port 8787"
+    ),
     "replay": Command(
         "replay:Replay",
         "ask every logged question again: is the same decided, and what would be with another model set?",

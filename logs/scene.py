@@ -149,11 +149,11 @@ def decision(robot: Robot, step: pb.Step, exchange: pb.Exchange | None, time: in
         made = exchange.reply.decision
         centers = [made.tube_center[i : i + d] for i in range(0, len(made.tube_center), d)]
         halves = [made.tube_half_width[i : i + d] for i in range(0, len(made.tube_half_width), d)]
-        boxes = [(center, half, 0.0, 0.6) for center, half in zip(centers, halves, strict=True)]
-        boxes += [(centers[-1], halves[-1], robot.footprint, 0.15)]
-        for center, half, grown, alpha in boxes:
-            edges = [2.0 * (h + grown) for h in half] + [FLAT] * (3 - d)
-            entity.cubes.append(CubePrimitive(pose=_pose(center), size=_vector(*edges), color=_color(*color, alpha)))
+        for center, half in zip(centers, halves, strict=True):
+            edges = [2.0 * h for h in half] + [FLAT] * (3 - d)
+            entity.cubes.append(CubePrimitive(pose=_pose(center), size=_vector(*edges), color=_color(*color, 0.6)))
+        if centers:
+            _stop(entity, centers[-1], 2.0 * (math.hypot(*halves[-1]) + robot.footprint), _color(*color, 0.2))
         points = [_point(at) for at in (exchange.request.state[:d], *centers)]
         way = LinePrimitive(type=LinePrimitive.LINE_STRIP, pose=_pose(()), thickness=3.0, scale_invariant=True)
         way.points.extend(points)
@@ -164,6 +164,16 @@ def decision(robot: Robot, step: pb.Step, exchange: pb.Exchange | None, time: in
         above = HEIGHT + 3.0 * robot.footprint
         entity.texts.append(_text(word, step.state[:d], _color(*color), above))
     return SceneUpdate(entities=[entity])
+
+
+def _stop(entity: SceneEntity, center: Sequence[float], across: float, color: Color) -> None:
+    """Add the disc (ball) that holds the body wherever in its last box the robot comes to a stop."""
+    if len(center) == 3:
+        entity.spheres.append(SpherePrimitive(pose=_pose(center), size=_vector(across, across, across), color=color))
+        return
+    disc = CylinderPrimitive(pose=_pose(center), size=_vector(across, across, FLAT), color=color)
+    disc.bottom_scale = disc.top_scale = 1.0
+    entity.cylinders.append(disc)
 
 
 def frames(robot: Robot, actor: str, site: tuple[float, float], state: Sequence[float], time: int) -> FrameTransforms:

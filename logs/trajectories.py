@@ -79,7 +79,7 @@ def to_minari(paths: Paths, robot: Robot, name: str) -> Written:
         raise ExportError(f"{path} is there already: give another name, e.g. with the next -v<number>")
     about: dict[str, Any] = {
         "observation_space": gymnasium.spaces.Box(-np.inf, np.inf, (robot.observation_dim,), np.float32),
-        "action_space": gymnasium.spaces.Box(*(np.float32(bound) for bound in (robot.low(), robot.high()))),
+        "action_space": gymnasium.spaces.Box(robot.low().astype(np.float32), robot.high().astype(np.float32)),
         "algorithm_name": "logged by brakeline",
         "author": "brakeline",
         "author_email": "none",

@@ -1,0 +1,162 @@
+"""What the live page shows: the latest of every robot, and the figures of the run."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import deque
+from dataclasses import dataclass, field
+from typing import Any
+
+from logs.metrics import Metrics
+from logs.scene import half_width
+from messaging import brakeline_pb2 as pb
+from messaging.bus import Malformed, Sample
+from messaging.robots import Robot, UnknownRobot, robot_named
+from messaging.shapes import WALL
+
+LINES = 8  # of warnings
+EPISODES = 300  # whose rewards are drawn
+TRAIL = 600  # positions of the running episode
+FIGURES_EVERY = 1.0  # s
+KINDS = {pb.ALLOWED: "allowed", pb.ADJUSTED: "adjusted", pb.FAILSAFE: "failsafe"}
+SHOWN = ("steps", "episodes", "goals", "collisions", "interventions", "failsafes", "fallbacks", "mean_reward")
+
+
+@dataclass
+class Card:
+    """One robot, in its running episode. Positions are x and y in m, in the arena's frame."""
+
+    robot: Robot
+    actor: str
+    number: int = 0  # of the episode
+    arena: dict[str, Any] = field(default_factory=dict)
+    pose: list[float] = field(default_factory=list)  # x, y, heading (0 where there is none)
+    height: float | None = None  # m, in space
+    kind: str = ""
+    tube: list[list[float]] = field(default_factory=list)  # per period: center x, y, half-width x, y
+    margin: float | None = None
+    trail: deque[tuple[float, float]] = field(default_factory=lambda: deque(maxlen=TRAIL))
+    marks: deque[tuple[float, float, str]] = field(default_factory=lambda: deque(maxlen=TRAIL))  # interventions
+    reward: float = 0.0
+    ended: str = ""  # how the episode before this one ended
+
+    def begin(self, episode: pb.Episode) -> None:
+        self.number, self.reward = episode.episode, 0.0
+        self.trail.clear()
+        self.marks.clear()
+        half = half_width(episode)
+        # Floors and ceilings would cover all; walls are the square's edges.
+        inside = [o for o in episode.obstacles if o.kind != WALL and max(o.size) < 2.0 * half]
+        self.arena = {
+            "half": half,
+            "obstacles": [
+                {"kind": o.kind, "at": list(o.position[:2]), "size": list(o.size), "yaw": o.yaw} for o in inside
+            ],
+            "goal": list(episode.goal[:2]),
+            "goal_radius": episode.goal_radius,
+        }
+        self._stand(list(episode.start))
+
+    def decide(self, exchange: pb.Exchange) -> None:
+        if not exchange.reply.HasField("decision"):
+            self.tube, self.margin = [], None
+            return
+        decision, d = exchange.reply.decision, self.robot.position_dim
+        centers, halves = decision.tube_center, decision.tube_half_width
+        self.tube = [[*centers[i : i + 2], *halves[i : i + 2]] for i in range(0, len(centers), d)]
+        self.margin = decision.margin
+
+    def step(self, step: pb.Step) -> None:
+        self._stand(list(step.state))
+        self.kind = "failsafe" if step.fallback else KINDS.get(step.decision, "")
+        self.reward += step.reward
+        x, y, _ = self.pose
+        self.trail.append((x, y))
+        if self.kind in ("adjusted", "failsafe"):
+            self.marks.append((x, y, self.kind))
+        if step.terminated or step.truncated:
+            self.ended = "collision" if step.collision else "goal" if step.goal else "time limit"
+
+    def _stand(self, state: list[float]) -> None:
+        heading = 0.0 if self.robot.heading is None else state[self.robot.heading]
+        self.pose = [state[0], state[1], heading]
+        self.height = state[2] if self.robot.position_dim == 3 else None
+
+    def view(self) -> dict[str, Any]:
+        names = ("actor", "number", "arena", "pose", "height", "kind", "tube", "margin", "reward", "ended")
+        about = {name: getattr(self, name) for name in names}
+        lists = {"trail": list(self.trail), "marks": list(self.marks)}
+        return about | lists | {"robot": self.robot.name, "footprint": self.robot.footprint}
+
+
+class Board:
+    """Takes samples in one thread; others ask for its `view`."""
+
+    def __init__(self) -> None:
+        self.metrics = Metrics()
+        self._cards: dict[str, Card] = {}
+        self._lines: deque[str] = deque(maxlen=LINES)
+        self._returns: deque[float] = deque(maxlen=EPISODES)
+        self._heard = time.monotonic()
+        self._figures: dict[str, Any] = {}
+        self._figures_at = -1e9
+        self._lock = threading.Lock()
+
+    def take(self, sample: Sample) -> None:
+        """One message; what is malformed, or of a robot that is not known here, is left out."""
+        try:
+            message = sample.message()
+        except Malformed:
+            return
+        with self._lock:
+            self._heard = time.monotonic()
+            self.metrics.add(sample.key, message)
+            if isinstance(message, pb.LogLine):
+                if message.level in ("WARNING", "ERROR"):
+                    self._lines.append(f"{message.process}: {message.text.splitlines()[0] if message.text else ''}")
+            elif isinstance(message, pb.Episode | pb.Step):
+                self._robot(message)
+            elif isinstance(message, pb.Exchange):
+                card = self._cards.get(message.request.actor)
+                if card is not None:
+                    card.decide(message)
+
+    def _robot(self, message: pb.Episode | pb.Step) -> None:
+        card = self._cards.get(message.actor)
+        if card is None:
+            try:
+                card = self._cards[message.actor] = Card(robot_named(message.robot), message.actor)
+            except UnknownRobot:
+                return
+        if isinstance(message, pb.Episode):
+            card.begin(message)
+            return
+        card.step(message)
+        if message.terminated or message.truncated:
+            self._returns.append(card.reward)
+
+    def view(self) -> dict[str, Any]:
+        """All that the page shows, as JSON can hold it."""
+        with self._lock:
+            now = time.monotonic()
+            if now - self._figures_at > FIGURES_EVERY:
+                self._figures, self._figures_at = self._count(), now
+            cards = [self._cards[name].view() for name in sorted(self._cards)]
+            return {"robots": cards, "silent": now - self._heard} | self._figures
+
+    def _count(self) -> dict[str, Any]:
+        figures = self.metrics.figures()
+        learners = {
+            name: {key: about[key] for key in ("steps", "updates", "steps_per_s", "updates_per_s")}
+            for name, about in figures["learners"].items()
+        }
+        times = figures.get("decision_ms") or {}
+        return {
+            "figures": {name: figures[name] for name in SHOWN}
+            | {"decide_p50": times.get("p50"), "decide_p99": times.get("p99")},
+            "learners": learners,
+            "processes": {name: bool(about["alive"]) for name, about in figures["processes"].items()},
+            "returns": list(self._returns),
+            "lines": list(self._lines),
+        }

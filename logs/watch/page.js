@@ -1,0 +1,230 @@
+// Draws what /events says: a map for each robot, figures, rewards, processes, warnings.
+"use strict";
+
+const COLORS = { allowed: "#34a864", adjusted: "#f0961e", failsafe: "#d6303c", "": "#8a93a3" };
+const SILENT = 3; // s without a message on the bus after which the run counts as quiet
+const CLOSE = 6; // footprints from the robot to the edge of the close view
+const WINDOW = 20; // episodes that the reward's mean is over
+const cards = new Map();
+const at = (id) => document.getElementById(id);
+
+const number = (value, digits = 0) => (value === null || value === undefined ? "–" : value.toFixed(digits));
+const share = (count, of) => (of ? `${count} (${((100 * count) / of).toFixed(1)} %)` : String(count));
+
+function element(kind, text = "", name = "") {
+  const made = document.createElement(kind);
+  made.textContent = text;
+  if (name) made.className = name;
+  return made;
+}
+
+/** A canvas's context, scaled so that one unit is a CSS pixel; and its size. */
+function fresh(canvas) {
+  const { width, height } = canvas.getBoundingClientRect();
+  const ratio = window.devicePixelRatio || 1;
+  if (canvas.width !== Math.round(width * ratio) || canvas.height !== Math.round(height * ratio)) {
+    canvas.width = Math.round(width * ratio);
+    canvas.height = Math.round(height * ratio);
+  }
+  const pen = canvas.getContext("2d");
+  pen.setTransform(ratio, 0, 0, ratio, 0, 0);
+  pen.clearRect(0, 0, width, height);
+  return { pen, width, height };
+}
+
+function card(robot) {
+  if (!cards.has(robot.actor)) {
+    if (cards.size === 0) at("robots").replaceChildren();
+    const box = element("article", "", "card");
+    box.dataset.actor = robot.actor;
+    const title = element("h2", robot.actor);
+    const made = { episode: element("span"), note: element("p"), map: element("canvas"), near: element("canvas") };
+    made.map.setAttribute("aria-label", `the arena of ${robot.actor}`);
+    made.near.setAttribute("aria-label", `what is about ${robot.actor}`);
+    const maps = element("div", "", "maps");
+    maps.append(made.map, made.near);
+    title.append(made.episode);
+    box.append(title, maps, made.note);
+    at("robots").append(box);
+    cards.set(robot.actor, made);
+  }
+  return cards.get(robot.actor);
+}
+
+function drawRobot(robot) {
+  const { episode, map, near, note } = card(robot);
+  episode.textContent = `episode ${robot.number}`;
+  const words = [robot.kind || "no filter", `reward ${number(robot.reward, 1)}`, `stepped in ${robot.marks.length} ×`];
+  if (robot.margin !== null) words.push(`margin ${number(100 * robot.margin, 1)} cm`);
+  if (robot.height !== null) words.push(`height ${number(robot.height, 1)} m`);
+  if (robot.ended) words.push(`before: ${robot.ended}`);
+  note.textContent = words.join(" · ");
+  if (!robot.arena.half) return;
+  drawMap(map, robot, [0, 0], 1.04 * robot.arena.half);
+  drawMap(near, robot, robot.pose, CLOSE * robot.footprint);
+}
+
+/** What is within `half` m of a point, to the sides and up and down. */
+function drawMap(canvas, robot, [x, y], half) {
+  const { pen, width, height } = fresh(canvas);
+  const scale = Math.min(width, height) / (2 * half); // px a metre
+  pen.translate(width / 2, height / 2);
+  pen.scale(scale, -scale); // metres, y up
+  pen.translate(-x, -y);
+  pen.lineWidth = 1.5 / scale;
+  drawArena(pen, robot.arena, scale);
+  drawWay(pen, robot, scale);
+  drawBody(pen, robot, scale);
+  drawTube(pen, robot, scale);
+}
+
+function drawArena(pen, arena, scale) {
+  const half = arena.half;
+  pen.strokeStyle = "#667085";
+  pen.strokeRect(-half, -half, 2 * half, 2 * half);
+  pen.fillStyle = "#c3c9d4";
+  for (const { kind, at: [x, y], size, yaw } of arena.obstacles) {
+    pen.save();
+    pen.translate(x, y);
+    pen.rotate(yaw);
+    pen.beginPath();
+    if (kind === "box") pen.rect(-size[0] / 2, -size[1] / 2, size[0], size[1]);
+    else pen.arc(0, 0, size[0], 0, 2 * Math.PI);
+    pen.fill();
+    pen.restore();
+  }
+  pen.beginPath();
+  pen.arc(arena.goal[0], arena.goal[1], arena.goal_radius, 0, 2 * Math.PI);
+  pen.fillStyle = "rgba(52, 168, 100, 0.18)";
+  pen.fill();
+  pen.strokeStyle = COLORS.allowed;
+  pen.lineWidth = 2 / scale;
+  pen.stroke();
+}
+
+function drawWay(pen, robot, scale) {
+  pen.lineWidth = 1.5 / scale;
+  pen.strokeStyle = "rgba(40, 96, 190, 0.45)";
+  pen.beginPath();
+  robot.trail.forEach(([x, y], i) => (i ? pen.lineTo(x, y) : pen.moveTo(x, y)));
+  pen.stroke();
+  for (const [x, y, kind] of robot.marks) {
+    pen.fillStyle = COLORS[kind];
+    pen.beginPath();
+    pen.arc(x, y, 2.5 / scale, 0, 2 * Math.PI);
+    pen.fill();
+  }
+}
+
+function drawTube(pen, robot, scale) {
+  const color = COLORS[robot.kind];
+  robot.tube.forEach(([x, y, dx, dy], i) => {
+    const around = robot.footprint; // of the last one, where it comes to a stop, with the body about it
+    pen.fillStyle = pen.strokeStyle = color;
+    if (i === robot.tube.length - 1) {
+      pen.globalAlpha = 0.3;
+      pen.beginPath();
+      pen.roundRect(x - dx - around, y - dy - around, 2 * (dx + around), 2 * (dy + around), around);
+      pen.fill();
+    }
+    pen.globalAlpha = 0.5;
+    pen.fillRect(x - dx, y - dy, 2 * dx, 2 * dy);
+    pen.globalAlpha = 1;
+    pen.lineWidth = 1 / scale;
+    pen.strokeRect(x - dx, y - dy, 2 * dx, 2 * dy);
+  });
+}
+
+function drawBody(pen, robot, scale) {
+  const [x, y, heading] = robot.pose;
+  const radius = Math.max(robot.footprint, 3 / scale);
+  pen.fillStyle = "#2860be";
+  pen.beginPath();
+  pen.arc(x, y, radius, 0, 2 * Math.PI);
+  pen.fill();
+  pen.strokeStyle = "#fff";
+  pen.lineWidth = 2 / scale;
+  pen.beginPath();
+  pen.moveTo(x, y);
+  pen.lineTo(x + radius * Math.cos(heading), y + radius * Math.sin(heading));
+  pen.stroke();
+}
+
+function drawFigures(view) {
+  const figures = view.figures;
+  const learners = Object.values(view.learners);
+  const sum = (name) => learners.reduce((total, learner) => total + learner[name], 0);
+  const pairs = [
+    ["steps", figures.steps],
+    ["episodes", figures.episodes],
+    ["goals", share(figures.goals, figures.episodes)],
+    ["collisions", figures.collisions],
+    ["interventions", share(figures.interventions, figures.steps)],
+    ["of these failsafe", figures.failsafes],
+    ["mean reward", number(figures.mean_reward, 1)],
+    ["decide p50 / p99", `${number(figures.decide_p50, 2)} / ${number(figures.decide_p99, 2)} ms`],
+    ["steps learned", learners.length ? `${sum("steps")} (${number(sum("steps_per_s"))}/s)` : "–"],
+    ["updates", learners.length ? `${sum("updates")} (${number(sum("updates_per_s"))}/s)` : "–"],
+  ];
+  at("figures").replaceChildren(
+    ...pairs.map(([name, value]) => {
+      const box = element("div", "", name === "collisions" && value > 0 ? "bad" : "");
+      box.append(element("dt", name), element("dd", String(value)));
+      return box;
+    }),
+  );
+}
+
+function drawCurve(returns) {
+  const { pen, width, height } = fresh(at("curve"));
+  if (returns.length < 2) return;
+  const low = Math.min(...returns, 0), high = Math.max(...returns, 1), foot = 14;
+  const x = (i) => (i / (returns.length - 1)) * (width - 44) + 40;
+  const y = (value) => height - foot - ((value - low) / (high - low)) * (height - foot - 8);
+  pen.font = "11px system-ui, sans-serif";
+  pen.fillStyle = "#667085";
+  pen.textAlign = "right";
+  for (const value of [low, 0, high]) pen.fillText(value.toFixed(0), 34, y(value) + 4);
+  pen.strokeStyle = "#dfe3ea";
+  pen.beginPath();
+  pen.moveTo(40, y(0));
+  pen.lineTo(width, y(0));
+  pen.stroke();
+  pen.fillStyle = "rgba(40, 96, 190, 0.35)";
+  returns.forEach((value, i) => pen.fillRect(x(i) - 1, y(value) - 1, 2.5, 2.5));
+  pen.strokeStyle = "#2860be";
+  pen.lineWidth = 2;
+  pen.beginPath();
+  returns.forEach((_, i) => {
+    const last = returns.slice(Math.max(0, i + 1 - WINDOW), i + 1);
+    const mean = last.reduce((a, b) => a + b, 0) / last.length;
+    if (i) pen.lineTo(x(i), y(mean));
+    else pen.moveTo(x(i), y(mean));
+  });
+  pen.stroke();
+}
+
+function drawLists(view) {
+  const processes = Object.entries(view.processes);
+  at("processes").replaceChildren(...processes.map(([name, alive]) => element("li", name, alive ? "alive" : "gone")));
+  at("lines").replaceChildren(...view.lines.map((line) => element("li", line)));
+}
+
+function say(up, words) {
+  at("link").className = up ? "up" : "down";
+  at("link").textContent = words;
+}
+
+let drawn = 0;
+const events = new EventSource("/events");
+events.onmessage = ({ data }) => {
+  const view = JSON.parse(data);
+  const quiet = view.silent > SILENT;
+  say(!quiet, quiet ? `nothing on the bus for ${view.silent.toFixed(0)} s` : "live");
+  view.robots.forEach(drawRobot);
+  drawFigures(view);
+  drawCurve(view.returns);
+  drawLists(view);
+  document.body.dataset.drawn = String((drawn += 1));
+};
+events.onerror = () => say(false, "`brakeline watch` does not answer; trying again");

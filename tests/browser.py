@@ -1,0 +1,118 @@
+"""A headless Chromium, driven over its DevTools protocol: what a page shows, complains of and asks for."""
+
+from __future__ import annotations
+
+import base64
+import json
+import shutil
+import subprocess
+import time
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+from websockets.sync.client import connect
+
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+START = 30.0  # s
+FLAGS = (
+    "--headless=new",
+    "--no-sandbox",
+    "--disable-gpu",
+    "--disable-dev-shm-usage",
+    "--disable-background-networking",
+    "--no-first-run",
+    "--hide-scrollbars",
+    "--remote-debugging-port=0",
+)
+
+
+class Page:
+    """One page of a browser of its own, from `with` to the end of the block.
+
+    `requests` are the addresses it asked for, `complaints` its exceptions and the errors on its console.
+    """
+
+    def __init__(self, folder: Path, width: int = 1280, height: int = 900) -> None:
+        self._folder, self._size = folder, (width, height)
+        self.requests: list[str] = []
+        self.complaints: list[str] = []
+        self._number = 0
+
+    def __enter__(self) -> Self:
+        assert CHROMIUM is not None
+        size = f"--window-size={self._size[0]},{self._size[1]}"
+        profile = f"--user-data-dir={self._folder}"
+        words = [CHROMIUM, *FLAGS, size, profile, "about:blank"]
+        self._process = subprocess.Popen(words, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        address = self._folder / "DevToolsActivePort"
+        deadline = time.monotonic() + START
+        while not address.exists() or len(address.read_text().splitlines()) < 2:
+            assert self._process.poll() is None and time.monotonic() < deadline, "the browser does not start"
+            time.sleep(0.05)
+        port, path = address.read_text().splitlines()[:2]
+        self._socket = connect(f"ws://127.0.0.1:{port}{path}", max_size=None)
+        self._session = ""
+        targets = self.call("Target.getTargets")["targetInfos"]
+        target = next(target["targetId"] for target in targets if target["type"] == "page")
+        self._session = self.call("Target.attachToTarget", targetId=target, flatten=True)["sessionId"]
+        for domain in ("Page", "Runtime", "Network", "Log"):
+            self.call(f"{domain}.enable")
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None) -> None:
+        self._socket.close()
+        self._process.terminate()
+        try:
+            self._process.wait(10.0)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+
+    def call(self, method: str, **parameters: Any) -> dict[str, Any]:
+        """The result of one command of the protocol; what else comes meanwhile is taken note of."""
+        self._number += 1
+        message: dict[str, Any] = {"id": self._number, "method": method, "params": parameters}
+        if self._session:
+            message["sessionId"] = self._session
+        self._socket.send(json.dumps(message))
+        while True:
+            answer = json.loads(self._socket.recv(timeout=START))
+            if answer.get("id") == self._number:
+                assert "error" not in answer, answer["error"]
+                result: dict[str, Any] = answer["result"]
+                return result
+            self._note(answer)
+
+    def open(self, url: str) -> None:
+        self.call("Page.navigate", url=url)
+        self.until("document.readyState === 'complete' && location.href !== 'about:blank'")
+
+    def value(self, expression: str) -> Any:
+        """What a JavaScript expression comes to."""
+        answer = self.call("Runtime.evaluate", expression=expression, returnByValue=True, awaitPromise=True)
+        assert "exceptionDetails" not in answer, answer["exceptionDetails"]
+        return answer["result"].get("value")
+
+    def until(self, expression: str, seconds: float = START) -> Any:
+        """Wait until an expression is true; returns what it came to."""
+        deadline = time.monotonic() + seconds
+        while not (value := self.value(expression)):
+            assert time.monotonic() < deadline, f"not within {seconds:.0f} s: {expression}; {self.complaints}"
+            time.sleep(0.05)
+        return value
+
+    def picture(self, path: Path) -> None:
+        """A screenshot, as PNG."""
+        path.write_bytes(base64.b64decode(self.call("Page.captureScreenshot", format="png")["data"]))
+
+    def _note(self, event: dict[str, Any]) -> None:
+        method, about = event.get("method"), event.get("params", {})
+        if method == "Network.requestWillBeSent":
+            self.requests.append(about["request"]["url"])
+        elif method == "Runtime.exceptionThrown":
+            self.complaints.append(json.dumps(about["exceptionDetails"]))
+        elif method == "Runtime.consoleAPICalled" and about["type"] in ("error", "assert"):
+            self.complaints.append(json.dumps(about["args"]))
+        elif method == "Log.entryAdded" and about["entry"]["level"] == "error":
+            self.complaints.append(about["entry"]["text"])
