@@ -83,7 +83,12 @@ COMMANDS: dict[str, Command] = {
         "a log as CSV, as a Minari data set, or with a picture of every step for Foxglove",
         "brakeline export runs/latest --csv steps.csv",
     ),
-    "analyse": Command("evaluation:Analyse", "figures of a log", "brakeline analyse runs/latest --json"),
+    "analyse": Command(
+        "analysis:Analyse",
+        "figures of logs, whole or cut off, one run or many; a report as a page",
+        "brakeline analyse runs/latest --html report.html",
+    ),
+    "recover": Command("analysis:Recover", "make damaged logs whole", "brakeline recover runs/latest"),
 }
 
 

@@ -45,6 +45,12 @@ class Damage:
     reason: str
     at_end: bool  # nothing can be read after them
 
+    def __str__(self) -> str:
+        if not self.lost:
+            return f"it ended without a summary ({self.reason})"
+        where = "its end" if self.at_end else f"byte {self.at}"
+        return f"{self.lost} bytes at {where} could not be read ({self.reason})"
+
 
 @dataclass(slots=True, eq=False)
 class Series:
@@ -56,9 +62,12 @@ class Series:
     schema: Schema | None = None
     channel: Channel | None = None
     known: bool = False
+    place: str = ""  # the key without the topic: "ground/actor-0"
+    sequence: int = 0  # of the message that was read last
 
     def __post_init__(self) -> None:
         self.known = self.decode is not None
+        self.place = self.key.partition("/")[2]
 
 
 Row = tuple[Any, int, int, bytes]  # Series, log_time, publish_time [ns], payload
@@ -161,10 +170,12 @@ def _unpacked(data: bytes, tables: _Tables) -> Iterator[Row]:
         if after > end:
             raise ValueError("a record is longer than its chunk")
         if opcode == MESSAGE:
-            number, _, log_time, publish_time = message(data, at + 9)
-            if number not in series:
+            number, sequence, log_time, publish_time = message(data, at + 9)
+            channel = series.get(number)
+            if channel is None:
                 raise ValueError(f"a message is of channel {number}, which is not declared")
-            yield series[number], log_time, publish_time, data[at + _TO_PAYLOAD : after]
+            channel.sequence = sequence
+            yield channel, log_time, publish_time, data[at + _TO_PAYLOAD : after]
         elif opcode in (SCHEMA, CHANNEL):
             tables.learn(opcode, data[at + 9 : after])
         at = after

@@ -1,85 +1,31 @@
-"""The figures of a run, kept up to date message by message: the live display, `evaluate` and `analyse` share them.
+"""The figures of a run, kept up to date message by message: the live display and `analyse` share them.
 
 Sums are kept per actor and joined in the order of the actors' names, so that the same messages give the same figures to
-the last bit, however those of different actors were interleaved. `evaluate`, without a bus, fills a `Tally` itself.
+the last bit, however those of different actors were interleaved.
 """
 
 from __future__ import annotations
 
 import math
-from array import array
 from collections import Counter
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from typing import Any
 
-import numpy as np
 from google.protobuf.message import Message
 
+from logs.decisions import Decisions, joined
+from logs.sketch import Histogram, spread
+from logs.tally import KINDS, Figures, Tally, closed_loop
 from messaging import brakeline_pb2 as pb
-from messaging.topics import RECORDED, Topic
+from messaging.topics import HEALTH, RECORDED, Topic
 
-Figures = dict[str, Any]  # what JSON can hold
+__all__ = ["KINDS", "Figures", "Metrics", "Tally", "closed_loop", "spread"]
 
-KINDS = {pb.ALLOWED: "allowed", pb.ADJUSTED: "adjusted", pb.FAILSAFE: "failsafe"}
-
-
-def numbers() -> array[float]:
-    return array("d")
+SILENT = HEALTH.stale_after or 3.0  # s without a sign of life after which a process counts as gone
 
 
-@dataclass
-class Tally:
-    """The figures of one actor's steps."""
-
-    steps: int = 0
-    goals: int = 0
-    collisions: int = 0  # episodes with one
-    timeouts: int = 0
-    interventions: int = 0  # steps whose action was not the proposed one
-    failsafes: int = 0  # of these, steps along the committed plan
-    fallbacks: int = 0  # of these, because no decision came
-    outside: int = 0  # steps whose true state was outside the stated bound of the measurement
-    compared: int = 0  # steps whose measured state was compared with the predicted set
-    violations: int = 0  # of these, not contained
-    speed: float = 0.0  # m/s, summed
-    max_speed: float = 0.0  # m/s
-    returns: array[float] = field(default_factory=numbers)  # per finished episode: its reward, without the penalty
-    decision_ms: dict[str, array[float]] = field(default_factory=lambda: {kind: numbers() for kind in KINDS.values()})
-    _episode: int | None = None
-    _return: float = 0.0
-    _collided: bool = False
-
-    def step(self, step: pb.Step) -> None:
-        """Take the actor's next step. An episode that is left unfinished counts only for its steps and collisions."""
-        if step.episode != self._episode or step.step == 0:
-            self._episode, self._return, self._collided = step.episode, 0.0, False
-        self.steps += 1
-        self.speed += step.speed
-        self.max_speed = max(self.max_speed, step.speed)
-        self.outside += step.outside
-        self.compared += step.compared
-        self.violations += step.compared and not step.contained
-        self.collisions += step.collision and not self._collided
-        self._collided |= step.collision
-        self._return += step.reward
-        self._decision(step)
-        if step.terminated or step.truncated:
-            self.returns.append(self._return)
-            self.goals += step.goal
-            self.timeouts += step.truncated and not step.terminated
-            self._episode = None
-
-    def _decision(self, step: pb.Step) -> None:
-        failsafe = step.fallback or step.decision == pb.FAILSAFE
-        self.fallbacks += step.fallback
-        self.failsafes += failsafe
-        self.interventions += failsafe or step.decision == pb.ADJUSTED
-        if step.decision in KINDS and not step.fallback:
-            self.decision_ms[KINDS[step.decision]].append(step.decide_ms)
-
-
-@dataclass
+@dataclass(slots=True)
 class Stream:
     """One publisher's messages at one key: the gaps in their numbers are losses."""
 
@@ -87,6 +33,8 @@ class Stream:
     duplicates: int = 0
     published: int = 0  # the most that is known of, by the last number or by its process's Health
     last: int = 0
+    first_at: int = 0  # ns since the Unix epoch, published
+    last_at: int = 0
 
     @property
     def missing(self) -> int:
@@ -95,13 +43,17 @@ class Stream:
 
 @dataclass
 class ProcessFigures:
-    """What a process last said of itself."""
+    """What a process last said of itself, and how regularly it spoke."""
 
     starts: int = 0
     run: int = 0
     alive: bool = True  # it has not said goodbye
     figures: dict[str, float] = field(default_factory=dict)
     notes: dict[str, str] = field(default_factory=dict)
+    silences: int = 0  # times that it was not heard of for `SILENT` seconds while it lived
+    longest_silence: float = 0.0  # s
+    runs: set[int] = field(default_factory=set)
+    heard_at: int = 0  # ns since the Unix epoch
 
 
 class Metrics:
@@ -112,14 +64,13 @@ class Metrics:
     """
 
     def __init__(self, topics: Iterable[Topic] = RECORDED) -> None:
+        self.prefix = ""  # before the names of actors, learners and processes: tells runs apart
         self.actors: dict[str, Tally] = {}
+        self.decisions: dict[str, Decisions] = {}  # by actor
         self.streams: dict[tuple[str, int], Stream] = {}  # by key and start of the process
         self.learners: dict[str, pb.LearnerMetrics] = {}  # the latest, by robot
         self.processes: dict[str, ProcessFigures] = {}
-        self.round_trip_ms = numbers()
-        self.failures: Counter[str] = Counter()  # exchanges without a decision, by reason
         self.log_lines: Counter[str] = Counter()  # by level
-        self.start, self.end = math.inf, -math.inf  # s since the Unix epoch
         self._roots = {topic.key.split("/", 1)[0] for topic in topics}
         self._takers: dict[type[Message], Callable[[Any], None]] = {
             pb.Step: self._step,
@@ -129,37 +80,62 @@ class Metrics:
             pb.LogLine: self._log_line,
         }
 
-    def add(self, key: str, message: Any) -> None:
-        """Take a message that was published at `key`. One that came before is only counted as a duplicate."""
+    def add(self, key: str, message: Any) -> bool:
+        """Take a message that was published at `key`; False: it came before, and is only counted as a duplicate."""
         header: pb.Header = message.header
-        stream = self._stream(key, header.run)
-        if header.sequence and header.sequence <= stream.last:
+        sequence, place = header.sequence, (key, header.run)
+        stream = self.streams.get(place)
+        if stream is None:
+            stream = self.streams[place] = Stream()
+        if sequence and sequence <= stream.last:
             stream.duplicates += 1
-            return
+            return False
         stream.received += 1
-        stream.last = header.sequence
-        stream.published = max(stream.published, stream.last)
-        self.start = min(self.start, header.wall_time * 1e-9)
-        self.end = max(self.end, header.wall_time * 1e-9)
+        stream.last = sequence
+        if sequence > stream.published:
+            stream.published = sequence
+        stream.last_at = header.wall_time
+        if not stream.first_at:
+            stream.first_at = stream.last_at
         taker = self._takers.get(type(message))
         if taker is not None:
             taker(message)
+        return True
+
+    @property
+    def failures(self) -> Counter[str]:
+        """Exchanges without a decision, by reason."""
+        return sum((decisions.failures for decisions in self.decisions.copy().values()), Counter())
 
     def figures(self) -> Figures:
         """All figures; None where nothing was measured."""
-        seconds = max(0.0, self.end - self.start)
-        figures = closed_loop([self.actors[name] for name in sorted(self.actors)])
+        seconds = self.seconds()
+        names = sorted(self.actors)
+        figures = closed_loop([self.actors[name] for name in names])
+        robots = sorted({tally.robot for tally in self.actors.values()})
+        by_robot = {
+            robot: [self.actors[name] for name in names if self.actors[name].robot == robot] for robot in robots
+        }
         return figures | {
             "seconds": seconds,
             "steps_per_s": figures["steps"] / seconds if seconds > 0.0 else None,
-            "actors": {name: closed_loop([self.actors[name]]) for name in sorted(self.actors)},
+            "robots": {robot: closed_loop(tallies) for robot, tallies in by_robot.items()},
+            "actors": {name: closed_loop([self.actors[name]]) for name in names},
             "learners": {robot: learner(self.learners[robot]) for robot in sorted(self.learners)},
-            "round_trip_ms": spread(self.round_trip_ms),
-            "no_decision": dict(sorted(self.failures.items())),
+            **joined([self.decisions[name] for name in sorted(self.decisions)]).figures(),
             "topics": self.topics(),
-            "processes": {name: vars(self.processes[name]) for name in sorted(self.processes)},
+            "processes": {name: self._process(self.processes[name]) for name in sorted(self.processes)},
             "log_lines": dict(sorted(self.log_lines.items())),
         }
+
+    def seconds(self) -> float:
+        """How long at least one process was heard of; a pause before a run was resumed does not count."""
+        return covered(self.spans(self.streams).values())
+
+    def latency(self) -> dict[str, dict[str, Histogram]]:
+        """By kind of decision and part of the time, in ms."""
+        every = joined([self.decisions[name] for name in sorted(self.decisions)])
+        return {KINDS[kind]: parts for kind, parts in every.latency.items()}
 
     def topics(self) -> dict[str, dict[str, int]]:
         """Per key: `messages` received, `missing` ones (gaps in the numbers, or never come) and `duplicates`."""
@@ -172,25 +148,67 @@ class Metrics:
             totals[key]["duplicates"] += stream.duplicates
         return totals
 
+    @staticmethod
+    def spans(streams: dict[tuple[str, int], Stream]) -> dict[int, tuple[int, int]]:
+        """When each start of a process was first and last heard of, in ns."""
+        spans: dict[int, tuple[int, int]] = {}
+        for (_, run), stream in streams.items():
+            if stream.received:
+                first, last = spans.get(run, (stream.first_at, stream.last_at))
+                spans[run] = min(first, stream.first_at), max(last, stream.last_at)
+        return spans
+
+    def _process(self, process: ProcessFigures) -> Figures:
+        spans = self.spans(self.streams)
+        seconds = math.fsum((spans[run][1] - spans[run][0]) * 1e-9 for run in process.runs if run in spans)
+        messages = sum(stream.received for (_, run), stream in self.streams.items() if run in process.runs)
+        latest = max((last for _, last in spans.values()), default=0)
+        silent = (latest - process.heard_at) * 1e-9 > SILENT
+        return {
+            "starts": process.starts,
+            "run": process.run,
+            "alive": process.alive,
+            "ended": "in order" if not process.alive else "without a word" if silent else "lived at the log's end",
+            "seconds": seconds,
+            "messages": messages,
+            "messages_per_s": messages / seconds if seconds > 0.0 else None,
+            "silences": process.silences,
+            "longest_silence": process.longest_silence,
+            "figures": process.figures,
+            "notes": process.notes,
+        }
+
     def _stream(self, key: str, run: int) -> Stream:
         return self.streams.setdefault((key, run), Stream())
 
     def _step(self, step: pb.Step) -> None:
-        self.actors.setdefault(step.actor, Tally()).step(step)
+        name = self.prefix + step.actor
+        tally = self.actors.get(name)
+        if tally is None:
+            tally = self.actors[name] = Tally()
+        tally.step(step)
 
     def _exchange(self, exchange: pb.Exchange) -> None:
-        if exchange.failure:
-            self.failures[exchange.failure.split(":", 1)[0]] += 1
-        else:
-            self.round_trip_ms.append(exchange.round_trip_ms)
+        name = self.prefix + exchange.request.actor
+        decisions = self.decisions.get(name)
+        if decisions is None:
+            decisions = self.decisions[name] = Decisions()
+        decisions.exchange(exchange)
 
     def _learner(self, metrics: pb.LearnerMetrics) -> None:
-        self.learners[metrics.robot] = metrics
+        self.learners[self.prefix + metrics.robot] = metrics
 
     def _health(self, health: pb.Health) -> None:
-        process = self.processes.setdefault(health.process, ProcessFigures())
-        process.starts += health.header.run != process.run
-        process.run = health.header.run
+        process = self.processes.setdefault(self.prefix + health.process, ProcessFigures())
+        now = health.header.wall_time
+        if health.header.run == process.run:
+            silence = (now - process.heard_at) * 1e-9
+            process.silences += silence > SILENT
+            process.longest_silence = max(process.longest_silence, silence)
+        else:
+            process.starts += 1
+        process.run, process.heard_at = health.header.run, now
+        process.runs.add(process.run)
         process.alive = not health.last
         process.figures, process.notes = dict(health.figures), dict(health.notes)
         for key, count in health.published.items():
@@ -202,42 +220,13 @@ class Metrics:
         self.log_lines[line.level] += 1
 
 
-def closed_loop(tallies: Iterable[Tally]) -> Figures:
-    """The figures that `evaluate` and `analyse` share, over the steps of these actors."""
-    tallies = list(tallies)
-
-    def total(name: str) -> int:
-        return sum(int(getattr(tally, name)) for tally in tallies)
-
-    steps = total("steps")
-    returns = np.concatenate([np.asarray(tally.returns) for tally in tallies]) if tallies else np.zeros(0)
-    times = {kind: [tally.decision_ms[kind] for tally in tallies] for kind in KINDS.values()}
-    every = spread(*(part for parts in times.values() for part in parts))
-    return {
-        "episodes": len(returns),
-        "goals": total("goals"),
-        "collisions": total("collisions"),
-        "timeouts": total("timeouts"),
-        "steps": steps,
-        "interventions": total("interventions"),
-        "failsafes": total("failsafes"),
-        "fallbacks": total("fallbacks"),
-        "mean_speed": math.fsum(tally.speed for tally in tallies) / steps if steps else None,
-        "max_speed": max(tally.max_speed for tally in tallies) if steps else None,
-        "mean_reward": float(returns.mean()) if len(returns) else None,
-        "decision_ms": every and every | {kind: spread(*parts) for kind, parts in times.items()},
-        "containment": {"steps": total("compared"), "violations": total("violations")},
-        "outside": total("outside"),
-    }
-
-
-def spread(*parts: array[float]) -> dict[str, float] | None:
-    """Mean, standard deviation, median and 99th percentile of the values; None if there is none."""
-    values = np.concatenate([np.asarray(part) for part in parts]) if parts else np.zeros(0)
-    if not len(values):
-        return None
-    p50, p99 = np.percentile(values, (50, 99))
-    return {"mean": float(values.mean()), "std": float(values.std()), "p50": float(p50), "p99": float(p99)}
+def covered(spans: Iterable[tuple[int, int]]) -> float:
+    """Seconds in the union of spans of ns."""
+    total, end = 0, 0
+    for first, last in sorted(spans):
+        total += max(0, last - max(first, end))
+        end = max(end, last)
+    return total * 1e-9
 
 
 def learner(metrics: pb.LearnerMetrics) -> Figures:

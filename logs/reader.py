@@ -87,8 +87,11 @@ class Segment:
 
     def took(self, log_time: int) -> None:
         self.messages += 1
-        self.end = max(self.end, log_time)
-        self.start = min(self.start or log_time, log_time)
+        if log_time > self.end:
+            self.end = log_time
+            self.start = self.start or log_time
+        elif log_time < self.start:
+            self.start = log_time
 
 
 @dataclass

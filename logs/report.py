@@ -8,80 +8,142 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from logs.metrics import Figures, Metrics
-from logs.reader import Paths, open_log
+from logs.analysis import SETUP, analysed
+from logs.metrics import Figures
+from logs.reader import Paths
 
-SETUP = ("method", "certificate", "policy", "arena", "seed")
+BLOCKS = "▁▂▃▄▅▆▇█"
+PLAIN: dict[str, Any] = {"box": None, "padding": (0, 2, 0, 0)}
 
 
 def analyse(paths: Paths) -> Figures:
-    """The figures of the log at `paths`: those of `Metrics`, how the run was set up, and what of the log is damaged.
-
-    `method certificate policy arena seed` come from the metadata record `run`, None where it does not tell.
+    """The figures of the logs at `paths`: those of `Metrics` and of `Training`, how each run was set up (from the
+    metadata in its log; None where it does not tell, or where runs differ), and what of the logs is damaged.
 
     Raises:
         NoLog: there is none.
         NotALog: a file is something else.
     """
-    log = open_log(paths)
-    metrics = Metrics()
-    for record in log:
-        metrics.add(record.key, record.message)
-    about = log.metadata.get("run", {})
-    setup: Figures = {name: about.get(name) for name in SETUP}
-    if setup["seed"] is not None and setup["seed"].lstrip("-").isdigit():
-        setup["seed"] = int(setup["seed"])
-    damage = {"cuts": [str(cut) for cut in log.cuts], "malformed": log.malformed}
-    return setup | metrics.figures() | {"log": [str(path) for path in log.paths]} | damage
+    return analysed(paths).figures()
 
 
 def show(figures: Figures) -> RenderableType:
     """The figures that `analyse`, `Metrics` or `closed_loop` gave, as tables for a rich console."""
     parts: list[RenderableType] = [_summary(figures)]
-    if figures.get("decision_ms"):
+    if len(figures.get("runs", {})) > 1:
+        parts.append(_runs(figures["runs"]))
+    if any(part for parts in figures.get("latency_ms", {}).values() for part in parts.values()):
+        parts.append(_latency(figures["latency_ms"]))
+    elif figures.get("decision_ms"):
         parts.append(_decisions(figures["decision_ms"]))
+    parts += [_training(robot, training) for robot, training in figures.get("training", {}).items()]
+    if figures.get("processes") and figures.get("topics"):
+        parts.append(_processes(figures["processes"]))
     if figures.get("topics"):
         parts.append(_topics(figures["topics"]))
+    if figures.get("metadata"):
+        parts.append(_metadata(figures["metadata"]))
     parts += [Text(cut, "yellow") for cut in figures.get("cuts", ())]
     return Group(*parts)
 
 
+def show_episode(episode: Figures) -> RenderableType:
+    """One of the `episode_detail` of figures, step by step."""
+    closest = _optional(", closest approach {:.3f} m", episode["closest"])
+    title = (
+        f"{episode['actor']}, episode {episode['episode']} ({episode['arena'] or 'its beginning is in no file'}): "
+        f"{episode['outcome']} after {episode['steps']} steps, reward {episode['reward']:.2f}{closest}"
+    )
+    table = Table(
+        "step", "x, y [m]", "proposed", "executed", "decision", "ms", "margin [m]", "clear [m]", "why", **PLAIN
+    )
+    for row in episode["rows"]:
+        table.add_row(
+            str(row["step"]),
+            _vector(row["state"][:2]),
+            _vector(row["proposed"]),
+            _vector(row["action"]),
+            row["decision"] or "-",
+            _optional("{:.2f}", row["decide_ms"]),
+            _optional("{:.4f}", row["margin"]),
+            f"{row['clearance']:.3f}",
+            row["reason"] or "",
+        )
+    return Group(Text(title, "bold"), table)
+
+
+def _vector(values: list[float]) -> str:
+    return " ".join(f"{value:.2f}" for value in values)
+
+
 def _summary(figures: Figures) -> Table:
-    table = Table(show_header=False, box=None, padding=(0, 2, 0, 0))
+    table = Table(show_header=False, **PLAIN)
     episodes, steps = figures["episodes"], figures["steps"]
+    within = figures.get("intervals") or {}
     setup = [f"{name} {figures[name]}" for name in SETUP if figures.get(name) is not None]
     if setup:
         table.add_row("set-up", ", ".join(setup))
     table.add_row("steps", f"{steps}" + _optional(", {:.1f}/s", figures.get("steps_per_s")))
     table.add_row("episodes", f"{episodes}" + _optional(", mean reward {:.2f}", figures["mean_reward"]))
     for name in ("goals", "collisions", "timeouts"):
-        table.add_row(name, _share(figures[name], episodes))
-    table.add_row(
-        "interventions", _share(figures["interventions"], steps) + f", of these failsafe {figures['failsafes']}"
-    )
+        table.add_row(name, _share(figures[name], episodes, within.get(name)))
+    interventions = _share(figures["interventions"], steps, within.get("interventions"))
+    table.add_row("interventions", f"{interventions}, of these failsafe {figures['failsafes']}")
     table.add_row(
         "speed", _optional("{:.3f} m/s", figures["mean_speed"]) + _optional(", at most {:.3f}", figures["max_speed"])
     )
+    table.add_row("closest approach", _optional("{:.3f} m", figures.get("closest_approach")))
     containment = figures["containment"]
-    table.add_row("outside the predicted set", _share(containment["violations"], containment["steps"]))
+    outside = _share(containment["violations"], containment["steps"], within.get("violations"), digits=3)
+    table.add_row("outside the predicted set", outside)
     table.add_row("outside the measurement's bound", _share(figures["outside"], steps))
-    if figures.get("round_trip_ms"):
-        table.add_row("question to answer", "p50 {p50:.2f} ms, p99 {p99:.2f} ms".format(**figures["round_trip_ms"]))
-    for reason, count in figures.get("no_decision", {}).items():
-        table.add_row("no decision", f"{count}: {reason}")
+    _add_safety(table, figures)
     for robot, learner in figures.get("learners", {}).items():
         table.add_row(f"learner {robot}", LEARNER.format(**learner))
     return table
 
 
+def _add_safety(table: Table, figures: Figures) -> None:
+    """What only the exchanges with the safety service tell."""
+    if figures.get("round_trip_ms"):
+        table.add_row("question to answer", "p50 {p50:.2f} ms, p99 {p99:.2f} ms".format(**figures["round_trip_ms"]))
+    for reason, count in figures.get("no_decision", {}).items():
+        table.add_row("no decision", f"{count}: {reason}")
+    if figures.get("tube_half_width"):
+        table.add_row("tube half-width", "p50 {p50:.4f} m, at most {max:.4f} m".format(**figures["tube_half_width"]))
+    solver = figures.get("solver") or {}
+    if solver.get("programs"):
+        statuses = ", ".join(f"{status} {count}" for status, count in solver["statuses"].items())
+        iterations = "iterations p50 {p50:.0f}, at most {max:.0f}".format(**solver["iterations"])
+        table.add_row(
+            "solver", f"{solver['programs']} programs, {solver['failures']} failed ({statuses}); {iterations}"
+        )
+    if figures.get("unverified"):
+        table.add_row("[red]unverified failsafes[/]", str(figures["unverified"]))
+
+
 LEARNER = (
-    "{updates} updates, critic loss {critic_loss:.4g}, actor loss {actor_loss:.4g}, "
-    "weights v{weights_version}, staleness {staleness:.1f}"
+    "{updates} updates, critic loss {critic_loss:.4g}, actor loss {actor_loss:.4g}, weights v{weights_version}, "
+    "staleness {staleness:.1f}, steps missing {missing}, twice {duplicates}"
 )
 
 
+def _runs(runs: dict[str, Figures]) -> Table:
+    """One row for each run, where there are several."""
+    columns = ("method", "certificate", "seed", "steps", "episodes", "goals", "collisions", "interventions", "reward")
+    table = Table("run", *columns, **PLAIN)
+    for label, run in runs.items():
+        setup = ["-" if run[name] is None else str(run[name]) for name in ("method", "certificate", "seed")]
+        episodes = run["episodes"]
+        ends = [_share(run[name], episodes) for name in ("goals", "collisions")]
+        stopped = _share(run["interventions"], run["steps"])
+        reward = _optional("{:.1f}", run["mean_reward"])
+        table.add_row(label, *setup, str(run["steps"]), str(episodes), *ends, stopped, reward)
+    return table
+
+
 def _decisions(times: Figures) -> Table:
-    table = Table("decision [ms]", "mean", "std", "p50", "p99", box=None, padding=(0, 2, 0, 0))
+    table = Table("decision [ms]", "mean", "std", "p50", "p99", **PLAIN)
     for kind in ("all", "allowed", "adjusted", "failsafe"):
         row = times if kind == "all" else times[kind]
         if row is not None:
@@ -89,15 +151,88 @@ def _decisions(times: Figures) -> Table:
     return table
 
 
+def _latency(latency: Figures) -> Table:
+    """Where the time of a decision goes, by its kind."""
+    columns = ("mean", "std", "p50", "p90", "p99", "max")
+    table = Table("decision [ms]", "part", *columns, **PLAIN)
+    for kind, parts in latency.items():
+        for part, row in parts.items():
+            if row is not None:
+                first = f"{kind} ({row['count']})" if part == "round_trip" else ""
+                table.add_row(first, part.replace("_", " "), *(f"{row[name]:.3f}" for name in columns))
+    return table
+
+
+def _training(robot: str, training: Figures) -> Table:
+    """Rates over the training, as rows of characters."""
+    bins = _coarse(training["bins"], 60)
+    table = Table(f"{robot} over training", "first", "last", "", **PLAIN)
+    for label, name in (("interventions", "interventions"), ("goals", "goals"), ("reward", "reward")):
+        values = [row[name] for row in bins if row[name] is not None]
+        if values:
+            table.add_row(label, f"{values[0]:.3g}", f"{values[-1]:.3g}", _sparkline(values))
+    stale = training["staleness"]
+    if stale is not None and stale["max"] > 0:
+        table.add_row(
+            "weights behind", "", "", "mean {mean:.2f}, p99 {p99:.0f}, at most {max:.0f} versions".format(**stale)
+        )
+    return table
+
+
+def _coarse(bins: list[Figures], most: int) -> list[Figures]:
+    """Neighbours put together until there are no more than `most`."""
+    per = -(-len(bins) // most) or 1
+    rows = []
+    for start in range(0, len(bins), per):
+        part = bins[start : start + per]
+        steps, episodes = sum(row["steps"] for row in part), sum(row["episodes"] for row in part)
+        ended = [row for row in part if row["episodes"]]
+        rows.append(
+            {"interventions": sum((row["adjusted"] + row["failsafes"]) * row["steps"] for row in part) / steps}
+            | {
+                name: sum(row[name] * row["episodes"] for row in ended) / episodes if episodes else None
+                for name in ("goals", "reward")
+            }
+        )
+    return rows
+
+
+def _sparkline(values: list[float]) -> str:
+    low, high = min(values), max(values)
+    scale = (len(BLOCKS) - 1) / (high - low) if high > low else 0.0
+    return "".join(BLOCKS[round((value - low) * scale)] for value in values)
+
+
+def _processes(processes: Figures) -> Table:
+    table = Table("process", "starts", "seconds", "messages/s", "silences", "ended", **PLAIN)
+    for name, process in processes.items():
+        rate = _optional("{:.1f}", process["messages_per_s"])
+        longest = process["longest_silence"]
+        silences = f"{process['silences']}" + (f" (longest {longest:.1f} s)" if process["silences"] else "")
+        ended = process["notes"].get("died of", process["ended"])
+        table.add_row(name, str(process["starts"]), f"{process['seconds']:.1f}", rate, silences, ended)
+    return table
+
+
 def _topics(topics: dict[str, dict[str, int]]) -> Table:
-    table = Table("topic", "messages", "missing", "duplicates", box=None, padding=(0, 2, 0, 0))
+    table = Table("topic", "messages", "missing", "duplicates", **PLAIN)
     for key, counts in topics.items():
         table.add_row(key, *(str(counts[name]) for name in ("messages", "missing", "duplicates")))
     return table
 
 
-def _share(count: int, of: int) -> str:
-    return f"{count}" + (f" ({count / of:.1%})" if of else "")
+def _metadata(metadata: Figures) -> Table:
+    """What the log says of its run; the configuration is long, and left to --json and --html."""
+    table = Table("metadata", "", **PLAIN)
+    for name, values in metadata.items():
+        if name != "configuration" and isinstance(values, dict):
+            table.add_row(name, Text(", ".join(f"{key} {value}" for key, value in values.items())))
+    return table
+
+
+def _share(count: int, of: int, within: list[float] | None = None, digits: int = 1) -> str:
+    said = f"{count}" + (f" ({count / of:.{digits}%})" if of else "")
+    return said + (f", 95 %: {within[0]:.{digits}%} to {within[1]:.{digits}%}" if within is not None else "")
 
 
 def _optional(form: str, value: Any) -> str:

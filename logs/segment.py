@@ -1,5 +1,5 @@
-"""One MCAP file of a run. A run has several if it was resumed, its recorder was restarted, its disk was full, or it grew
-long: run.mcap, run_0001.mcap, run_0002.mcap …, names that sort. Each can be read without the others.
+"""One MCAP file of a run: run.mcap, then run_0001.mcap, run_0002.mcap …, names that sort. There are several if the run
+was resumed, the recorder restarted, the disk full or a file too long. Each can be read without the others.
 """
 
 from __future__ import annotations

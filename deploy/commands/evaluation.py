@@ -1,19 +1,15 @@
-"""`brakeline evaluate` and `brakeline analyse`."""
+"""`brakeline evaluate`."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from pathlib import Path
-from typing import Annotated, Any
 
-import tyro
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from deploy.commands.common import Filtering, Flags, Physics, Robot, console, errors, say_json
 from deploy.evaluate import Evaluation, evaluate
-from logs.figures import draw
 from logs.metrics import Tally
-from logs.report import analyse, show
+from logs.report import show
 from messaging.robots import robot_named
 
 
@@ -55,24 +51,4 @@ class Evaluate:
         else:
             console.print(show(figures))
             console.print("[dim]conditions: " + ", ".join(f"{k} {v}" for k, v in figures["conditions"].items()) + "[/]")
-        return 0
-
-
-@dataclass(frozen=True)
-class Analyse:
-    logs: Annotated[tuple[Path, ...], tyro.conf.Positional] = (Path("runs/latest"),)
-    """Log files, or run folders."""
-    png: Path | None = None
-    """Draw the learning curves into this file."""
-    json: bool = False
-
-    def run(self) -> int:
-        figures: dict[str, Any] = analyse(list(self.logs))
-        if self.png is not None:
-            draw(list(self.logs), self.png)
-            errors.print(f"learning curves: {self.png}")
-        if self.json:
-            say_json(figures)
-        else:
-            console.print(show(figures))
         return 0

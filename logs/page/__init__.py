@@ -1,0 +1,140 @@
+"""The report: one HTML page about logs that needs nothing but itself, in the browser or on paper.
+
+Styles, scripts and data are in the page; its own policy forbids every request to another host. Tables are written here,
+so that they can be read without scripts; drawings are made by the scripts, from the data in the page.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import time
+from collections.abc import Iterable
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+from jinja2 import Environment, StrictUndefined
+
+from logs.decisions import PARTS
+from logs.tally import Figures
+
+STYLES = ("report.css",)
+SCRIPTS = ("svg.js", "charts.js", "arena.js", "episodes.js", "main.js")
+
+# What the drawings need of the figures; the whole of them is what `analyse --json` is for.
+DRAWN = ("episodes", "steps", "intervals", "training", "runs", "containment")
+
+RATES = (  # name, of what, in words
+    ("goals", "episodes", "goals reached"),
+    ("collisions", "episodes", "collisions"),
+    ("timeouts", "episodes", "timeouts"),
+    ("interventions", "steps", "steps in which the filter stepped in"),
+)
+
+
+def render(figures: Figures, pictures: Figures) -> str:
+    """The page about what an `Analysis` gave."""
+    environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+    environment.filters.update(number=number, percent=percent, moment=moment, pretty=pretty, raw=raw)
+    template = environment.from_string(_text("report.html.j2"))
+    drawn = {name: figures[name] for name in DRAWN} | pictures
+    drawn["runs"] = {label: {"seconds": run["seconds"]} for label, run in figures["runs"].items()}
+    return template.render(
+        f=figures,
+        title=", ".join(figures["runs"]) or "no run",
+        rates=rates(figures),
+        parts=PARTS,
+        missing=missing(figures),
+        style="\n".join(map(_text, STYLES)),
+        script="\n".join(map(_text, SCRIPTS)),
+        data=embedded(drawn),
+        kept=sum(len(gallery["episodes"]) for gallery in pictures["galleries"].values()),
+    )
+
+
+def write(path: Path, figures: Figures, pictures: Figures) -> None:
+    """Write the page to a file; its folder is made if it is missing."""
+    page = render(figures, pictures)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(page, encoding="utf-8")
+
+
+def rates(figures: Figures) -> list[Figures]:
+    """Rows of the table of rates: what, how often, of how many, and the interval."""
+    rows = [
+        {"name": name, "what": what, "count": figures[name], "of": figures[of], "unit": of}
+        | {"interval": figures["intervals"][name]}
+        for name, of, what in RATES
+    ]
+    contained = figures["containment"]
+    outside = {"name": "violations", "what": "measured states outside the predicted set", "unit": "steps compared"}
+    rows.append(
+        outside
+        | {"count": contained["violations"], "of": contained["steps"], "interval": figures["intervals"]["violations"]}
+    )
+    return rows
+
+
+def missing(figures: Figures) -> list[str]:
+    """What the logs lack, in words."""
+    said = list(figures["cuts"])
+    lost = {key: topic["missing"] for key, topic in figures["topics"].items() if topic["missing"]}
+    said += [f"{key}: {count} messages were published and are in no file" for key, count in lost.items()]
+    if figures["malformed"]:
+        said.append(f"{figures['malformed']} messages are not of their type")
+    return said
+
+
+def embedded(data: Any) -> str:
+    """JSON that may stand in a script element: nothing in it can end the element."""
+    text = json.dumps(finite(data), separators=(",", ":"), allow_nan=False)
+    return text.replace("<", "\\u003c").replace("\u2028", "\\u2028").replace("\u2029", "\\u2029")
+
+
+def finite(value: Any) -> Any:
+    """The value, with None for each number that is not finite."""
+    if isinstance(value, dict):
+        return {key: finite(inner) for key, inner in value.items()}
+    if isinstance(value, list | tuple):
+        return [finite(inner) for inner in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def number(value: float | None, digits: int = 3) -> str:
+    """For people: thousands apart, no more digits than matter; a dash for None."""
+    if value is None:
+        return "–"
+    if isinstance(value, int) or (value == int(value) and abs(value) >= 1000):
+        return f"{int(value):,}".replace(",", "\u202f")
+    return f"{value:.{digits}g}" if abs(value) < 1000 else f"{value:,.0f}".replace(",", "\u202f")
+
+
+def percent(share: float | None) -> str:
+    if share is None:
+        return "–"
+    value = 100.0 * share
+    return f"{value:.1f} %" if value >= 1.0 or value == 0.0 else f"{value:.2g} %"
+
+
+def moment(seconds: float | None) -> str:
+    """A time since the Unix epoch, in UTC."""
+    return "–" if seconds is None else time.strftime("%Y-%m-%d %H:%M:%S UTC", time.gmtime(seconds))
+
+
+def pretty(value: Any) -> str:
+    return json.dumps(value, indent=2)
+
+
+def raw(value: Any) -> str:
+    """The value as `--json` prints it, for programs that read the page."""
+    return json.dumps(finite(value))
+
+
+def _text(name: str) -> str:
+    return files(__name__).joinpath(name).read_text(encoding="utf-8")
+
+
+def names() -> Iterable[str]:
+    """The files that a page is made of."""
+    return ("report.html.j2", *STYLES, *SCRIPTS)

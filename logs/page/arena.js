@@ -1,0 +1,87 @@
+// One episode from above: obstacles, goal, path by decision, a tube and the plan in it.
+
+/** The part of the plane that an episode needs. */
+function bounds(episode) {
+  const xs = [...episode.x], ys = [...episode.y];
+  const add = (x, y, reach = 0) => { xs.push(x - reach, x + reach); ys.push(y - reach, y + reach); };
+  if (episode.goal) add(...episode.goal, episode.goal_radius);
+  if (episode.start) add(...episode.start);
+  for (const o of episode.obstacles) add(o.at[0], o.at[1], o.kind === "wall" ? 0 : 0.5 * Math.hypot(...o.size.slice(0, 2)));
+  const pad = 0.04 * Math.max(Math.max(...xs) - Math.min(...xs), Math.max(...ys) - Math.min(...ys), 0.5);
+  return [Math.min(...xs) - pad, Math.min(...ys) - pad, Math.max(...xs) + pad, Math.max(...ys) + pad];
+}
+
+/** A square or less of `size` pixels that shows [x0, y0, x1, y1] with y upwards. */
+function view([x0, y0, x1, y1], size) {
+  const per = size / Math.max(x1 - x0, y1 - y0);
+  return { per, width: per * (x1 - x0), height: per * (y1 - y0), x: (v) => per * (v - x0), y: (v) => per * (y1 - v) };
+}
+
+function polygon(v, points, attributes) {
+  return tag("polygon", { points: points.map(([x, y]) => `${v.x(x).toFixed(2)},${v.y(y).toFixed(2)}`).join(" "), ...attributes });
+}
+
+function obstacle(v, o) {
+  const fill = { fill: "#c9d1da", stroke: "#8e9aa8" };
+  const [x, y] = o.at, cos = Math.cos(o.yaw), sin = Math.sin(o.yaw);
+  const corner = (a, b) => [x + a * cos - b * sin, y + a * sin + b * cos];
+  if (o.kind === "wall") return polygon(v, [corner(0, -1e3), corner(0, 1e3), corner(-1e3, 1e3), corner(-1e3, -1e3)], fill);
+  if (o.kind === "box") {
+    const [a, b] = [o.size[0] / 2, o.size[1] / 2];
+    return polygon(v, [corner(-a, -b), corner(a, -b), corner(a, b), corner(-a, b)], fill);
+  }
+  return tag("circle", { cx: v.x(x), cy: v.y(y), r: v.per * o.size[0], ...fill });
+}
+
+/** The path up to `last`, in stretches of one kind of decision; interventions as dots too. */
+function path(v, episode, last, faint) {
+  const parts = [], { x, y, kinds } = episode;
+  const from = episode.first === 0 && episode.start ? episode.start : [x[0], y[0]];
+  let previous = from;
+  let run = null;
+  const flush = () => { if (run) parts.push(tag("polyline", { points: run.points.join(" "), fill: "none", stroke: KINDS[run.kind].color, "stroke-width": faint ? 1.2 : 2.4, "stroke-linecap": "round", "stroke-linejoin": "round", opacity: faint ? 0.25 : 1 })); };
+  const point = ([px, py]) => `${v.x(px).toFixed(1)},${v.y(py).toFixed(1)}`;
+  for (let k = 0; k <= last; k++) {
+    const here = [x[k], y[k]];
+    if (run?.kind !== kinds[k]) { flush(); run = { kind: kinds[k], points: [point(previous)] }; }
+    run.points.push(point(here));
+    if (!faint && (kinds[k] === "d" || kinds[k] === "a")) parts.push(tag("circle", { cx: v.x(here[0]), cy: v.y(here[1]), r: kinds[k] === "a" ? 3.4 : 2.2, fill: KINDS[kinds[k]].color }));
+    previous = here;
+  }
+  flush();
+  return parts.join("");
+}
+
+/** The tube of a step: a box for each step of its plan, which runs through their centres. */
+function tube(v, t, footprint) {
+  const parts = [];
+  for (const [cx, cy, wx, wy] of t.boxes) {
+    parts.push(tag("rect", { x: v.x(cx - wx - footprint), y: v.y(cy + wy + footprint), width: 2 * v.per * (wx + footprint), height: 2 * v.per * (wy + footprint), rx: v.per * footprint, fill: "#7a4fc0", opacity: 0.1 }));
+    parts.push(tag("rect", { x: v.x(cx - wx), y: v.y(cy + wy), width: 2 * v.per * wx, height: 2 * v.per * wy, fill: "#7a4fc0", "fill-opacity": 0.25, stroke: "#7a4fc0", "stroke-width": 1 }));
+  }
+  const points = [t.from, ...t.boxes].map(([x, y]) => `${v.x(x).toFixed(1)},${v.y(y).toFixed(1)}`).join(" ");
+  parts.push(tag("polyline", { points, fill: "none", stroke: "#4b2a8c", "stroke-width": 1.6, "stroke-dasharray": "3 2" }));
+  return parts.join("");
+}
+
+function robot(v, episode, k) {
+  const x = v.x(episode.x[k]), y = v.y(episode.y[k]), r = Math.max(4, v.per * episode.footprint);
+  const parts = [tag("circle", { cx: x, cy: y, r, fill: "#1b2430", "fill-opacity": 0.12, stroke: "#1b2430", "stroke-width": 1.3 })];
+  if (episode.heading) parts.push(tag("line", { x1: x, y1: y, x2: x + r * Math.cos(episode.heading[k]), y2: y - r * Math.sin(episode.heading[k]), stroke: "#1b2430", "stroke-width": 1.6 }));
+  return parts.join("");
+}
+
+/** The episode at step `k`, within `box` or all of it. */
+function arena(episode, k, size, box = null) {
+  const v = view(box || bounds(episode), size);
+  const parts = [tag("rect", { x: 0, y: 0, width: v.width, height: v.height, fill: "#fcfdfe" })];
+  parts.push(...episode.obstacles.map((o) => obstacle(v, o)));
+  if (episode.goal) parts.push(tag("circle", { cx: v.x(episode.goal[0]), cy: v.y(episode.goal[1]), r: v.per * episode.goal_radius, fill: "#1d7f4e", "fill-opacity": 0.18, stroke: "#1d7f4e", "stroke-dasharray": "4 3" }));
+  if (episode.start) parts.push(tag("circle", { cx: v.x(episode.start[0]), cy: v.y(episode.start[1]), r: 3.5, fill: "#fff", stroke: "#1b2430", "stroke-width": 1.4 }));
+  parts.push(path(v, episode, episode.steps - 1, true), path(v, episode, Math.min(k, episode.x.length - 1), false));
+  if (episode.tubes[k]) parts.push(tube(v, episode.tubes[k], episode.footprint));
+  parts.push(robot(v, episode, k));
+  const length = ticks(0, (box ? box[2] - box[0] : v.width / v.per) / 4, 1).at(-1) || 0.1;
+  parts.push(tag("path", { d: `M8 ${v.height - 12} v4 h${v.per * length} v-4`, fill: "none", stroke: "#1b2430" }), label(10, v.height - 14, `${figure(length)} m`));
+  return drawing(v.width, v.height, `${episode.actor}, episode ${episode.episode}, step ${episode.first + k}`, parts.join(""));
+}

@@ -1,0 +1,173 @@
+// Rates, learning curves, latencies, the map of interventions, the timeline of processes.
+
+function whiskers() {
+  for (const cell of document.querySelectorAll("td.whisker")) {
+    const { rate, low, high } = cell.dataset;
+    if (rate === "") continue;
+    const most = Math.max(+high || 0, +rate) > 0.2 ? 1 : Math.max(+high || 0, +rate, 1e-9) * 1.15;
+    const x = scale(0, most, 4, 256);
+    const parts = [tag("line", { x1: 4, x2: 256, y1: 10, y2: 10, stroke: "#dfe4ea", "stroke-width": 2 })];
+    if (low !== "") parts.push(tag("line", { x1: x(+low), x2: x(+high), y1: 10, y2: 10, stroke: "#2b6cb8", "stroke-width": 5, "stroke-linecap": "round", opacity: 0.35 }));
+    parts.push(tag("circle", { cx: x(+rate), cy: 10, r: 4, fill: "#2b6cb8" }));
+    parts.push(label(310, 14, `of ${percent(most)}`, { "text-anchor": "end" }));
+    cell.innerHTML = drawing(312, 20, `${percent(+rate)}, interval ${percent(+low)} to ${percent(+high)}`, parts.join(""));
+  }
+}
+
+const CURVES = [
+  { title: "goals reached", lines: [[(b) => b.goals, "#1d7f4e"]], form: percent, low: 0, high: 1, weight: "episodes" },
+  { title: "reward of an episode", lines: [[(b) => b.reward, "#2b6cb8"]], form: figure, weight: "episodes" },
+  { title: "interventions, share of steps", areas: true, form: percent, low: 0, weight: "steps",
+    lines: [[(b) => b.adjusted + b.failsafes, KINDS.d.color], [(b) => b.failsafes, KINDS.a.color]] },
+  { title: "closest approach in the bin [cm]", lines: [[(b) => b.closest === null ? null : 100 * b.closest, "#5d6b7c"]], form: figure, low: 0 },
+];
+
+/** Means over a few neighbours, weighted by how much is in each: bins with few episodes are noisy. */
+function smoothed(bins, value, weight, reach) {
+  return bins.map((_, k) => {
+    let sum = 0, total = 0;
+    for (let i = Math.max(0, k - reach); i <= Math.min(bins.length - 1, k + reach); i++) {
+      const v = value(bins[i]), w = weight ? bins[i][weight] : 1;
+      if (v !== null && w > 0) { sum += v * w; total += w; }
+    }
+    return total > 0 ? sum / total : null;
+  });
+}
+
+function curve(bins, what) {
+  const frame = { left: 52, right: 486, top: 30, bottom: 178 };
+  const reach = what.weight ? Math.ceil(bins.length / 50) : 0;
+  const rows = what.lines.map(([value]) => smoothed(bins, value, what.weight, reach));
+  const seen = rows.flat().filter((v) => v !== null);
+  if (!seen.length) return null;
+  const low = what.low ?? Math.min(...seen), high = what.high ?? (Math.max(...seen) * (what.low === 0 ? 1.1 : 1) || 1);
+  const x = scale(0, bins.at(-1).until, frame.left, frame.right), y = scale(low, high > low ? high : low + 1, frame.bottom, frame.top);
+  const parts = [label(4, 14, what.title, { class: "title" }), axes(frame, x, y, ticks(0, bins.at(-1).until, 4), ticks(low, high, 4), { y: what.form, x: (v) => v >= 1000 ? `${figure(v / 1000)}k` : figure(v) })];
+  rows.forEach((values, k) => {
+    const points = values.map((v, i) => [v, i]).filter(([v]) => v !== null).map(([v, i]) => [x(bins[i].until - bins[i].steps / 2), y(v)]);
+    const line = points.map(([px, py]) => `${px.toFixed(1)},${py.toFixed(1)}`).join(" ");
+    const color = what.lines[k][1];
+    if (what.areas) parts.push(tag("polygon", { points: `${points[0][0]},${y(0)} ${line} ${points.at(-1)[0]},${y(0)}`, fill: color, opacity: 0.25 }));
+    parts.push(tag("polyline", { points: line, fill: "none", stroke: color, "stroke-width": 1.8, "stroke-linejoin": "round" }));
+  });
+  parts.push(label(frame.right, 206, "steps of all actors", { "text-anchor": "end" }));
+  const box = element("div");
+  box.innerHTML = drawing(496, 212, what.title, parts.join(""));
+  hovers(box, (px) => {
+    const k = bins.findIndex((b) => x(b.until) >= px);
+    if (k < 0 || px < frame.left) return null;
+    return `to step ${figure(bins[k].until, 6)}\n` + rows.map((values) => what.form(values[k])).join(", of these failsafe ");
+  });
+  return box;
+}
+
+function learning(target, training) {
+  for (const [robot, { bins }] of Object.entries(training)) {
+    if (Object.keys(training).length > 1) target.append(element("h3", { style: "grid-column:1/-1;margin:0" }, robot));
+    if (bins.length) target.append(...CURVES.map((what) => curve(bins, what)).filter(Boolean));
+  }
+  if (!target.children.length) target.append(nothing("No steps were recorded."));
+}
+
+function latency(target, kinds) {
+  const parts = ["round_trip", "network", "queue", "decide", "solve", "verify"];
+  const buttons = element("div", { class: "bar", role: "group", "aria-label": "part of the time" });
+  const place = element("div");
+  const show = (part) => {
+    for (const button of buttons.children) button.setAttribute("aria-pressed", String(button.dataset.part === part));
+    place.innerHTML = "";
+    place.append(bars(kinds, part));
+  };
+  for (const part of parts) buttons.append(element("button", { "data-part": part, onclick: () => show(part) }, part.replace("_", " ")));
+  target.append(buttons, place);
+  show("round_trip");
+}
+
+function bars(kinds, part) {
+  const rows = Object.entries(KINDS).filter(([, k]) => kinds[k.name]?.[part]?.length).map(([, k]) => [k, kinds[k.name][part]]);
+  if (!rows.length) return nothing("Nothing of this kind was measured.");
+  const frame = { left: 56, right: 1030, top: 12, bottom: 60 };
+  const low = Math.min(...rows.map(([, b]) => b[0][0])), high = Math.max(...rows.map(([, b]) => b.at(-1)[1]));
+  const x = scale(Math.log(low), Math.log(high), frame.left, frame.right), at = (v) => x(Math.log(v));
+  const marks = [];
+  for (let p = Math.floor(Math.log10(low)); p <= Math.log10(high); p++) for (const m of [1, 2, 5]) marks.push(m * 10 ** p);
+  const height = 62, out = [];
+  rows.forEach(([kind, given], k) => {
+    const base = frame.top + (k + 1) * height, most = Math.max(...given.map((b) => b[2]));
+    out.push(label(frame.left - 6, base - 4, kind.name, { "text-anchor": "end" }));
+    for (const [from, to, count] of given) {
+      const tall = count ? Math.max(1.2, (height - 12) * count / most) : 0;
+      out.push(tag("rect", { x: at(from), y: base - tall, width: Math.max(0.5, at(to) - at(from) - 1), height: tall, fill: kind.color }, tag("title", {}, `${figure(from)} to ${figure(to)} ms: ${count}`)));
+    }
+    out.push(tag("line", { x1: frame.left, x2: frame.right, y1: base, y2: base, stroke: "#aab4c0" }));
+  });
+  const bottom = frame.top + rows.length * height;
+  for (const v of marks.filter((v) => v >= low && v <= high)) out.push(label(at(v), bottom + 16, figure(v), { "text-anchor": "middle" }), tag("line", { x1: at(v), x2: at(v), y1: bottom, y2: bottom + 4, stroke: "#aab4c0" }));
+  out.push(label(frame.right, bottom + 32, "ms, logarithmic; each kind to its own height", { "text-anchor": "end" }));
+  const box = element("div");
+  box.innerHTML = drawing(1040, bottom + 38, `latency of decisions, ${part}`, out.join(""), { "data-part": part });
+  return box;
+}
+
+/** White to amber to red: readable in grey too. */
+function heat(share) {
+  const stops = [[240, 244, 248], [250, 206, 120], [224, 120, 20], [160, 30, 24]];
+  const at = Math.min(0.999, Math.max(0, share)) * 3, k = Math.floor(at), f = at - k;
+  return `rgb(${stops[k].map((v, i) => Math.round(v + f * (stops[k + 1][i] - v))).join(",")})`;
+}
+
+function places(target, robots) {
+  for (const [robot, { cell, cells }] of Object.entries(robots)) {
+    if (!cells.length) continue;
+    const xs = cells.map((c) => c[0]), ys = cells.map((c) => c[1]);
+    const box = { x0: Math.min(...xs) * cell, x1: (Math.max(...xs) + 1) * cell, y0: Math.min(...ys) * cell, y1: (Math.max(...ys) + 1) * cell };
+    const per = Math.min(560 / (box.x1 - box.x0), 560 / (box.y1 - box.y0));
+    const frame = { left: 50, top: 10, right: 50 + per * (box.x1 - box.x0), bottom: 10 + per * (box.y1 - box.y0) };
+    const x = (v) => frame.left + per * (v - box.x0), y = (v) => frame.bottom - per * (v - box.y0);
+    const shares = cells.filter((c) => c[2] >= 5).map((c) => (c[3] + c[4]) / c[2]).sort((a, b) => a - b);
+    const most = Math.max(0.02, shares.length ? shares[Math.floor(0.98 * (shares.length - 1))] : 1);
+    const out = cells.map(([cx, cy, steps, adjusted, failsafe, hit]) =>
+      tag("rect", { x: x(cx * cell), y: y((cy + 1) * cell), width: per * cell, height: per * cell, fill: heat((adjusted + failsafe) / steps / most) },
+        tag("title", {}, `${steps} steps, ${adjusted} adjusted, ${failsafe} failsafe${hit ? `, ${hit} in collision` : ""}`)) +
+      (hit ? tag("circle", { cx: x((cx + 0.5) * cell), cy: y((cy + 0.5) * cell), r: 4, fill: "none", stroke: "#000", "stroke-width": 1.5 }) : ""));
+    out.push(axes(frame, x, y, ticks(box.x0, box.x1, 6), ticks(box.y0, box.y1, 6)).replaceAll('stroke="#e6eaef"', 'stroke="none"'));
+    const wide = frame.right + 130;
+    for (let k = 0; k <= 20; k++) out.push(tag("rect", { x: frame.right + 30, y: frame.bottom - 20 - k * 8, width: 14, height: 8, fill: heat(k / 20) }));
+    for (const k of [0, 10, 20]) out.push(label(frame.right + 50, frame.bottom - 12 - k * 8, percent(most * k / 20)));
+    out.push(label(frame.right + 30, frame.bottom - 192, "interventions", {}), label(frame.right + 30, frame.bottom + 16, `cell ${figure(cell)} m`));
+    const made = element("div", { "data-robot": robot });
+    made.innerHTML = drawing(wide, frame.bottom + 26, `where the filter stepped in, ${robot}`, out.join(""));
+    if (Object.keys(robots).length > 1) target.append(element("h3", {}, robot));
+    target.append(made);
+  }
+  if (!target.children.length) target.append(nothing("No positions were recorded."));
+}
+
+function timeline(target, { lives, lines, bin_s, steps }) {
+  if (!lives.length) return target.append(nothing("No process gave a sign of life."));
+  const names = [...new Set(lives.map((life) => life.process))];
+  const begin = Math.min(...lives.map((l) => l.start)), end = Math.max(...lives.map((l) => l.end), begin + 1);
+  const frame = { left: 120, right: 1030, top: 90, bottom: 90 + 24 * names.length };
+  const x = scale(0, end - begin, frame.left, frame.right), at = (t) => Math.min(frame.right, Math.max(frame.left, x(t - begin)));
+  const out = [label(4, 16, "steps/s", { class: "title" })];
+  if (steps.length) {
+    const most = Math.max(...steps.map((s) => s[1])), y = scale(0, most, 70, 8);
+    for (const [from, rate] of steps) out.push(tag("rect", { x: at(from), width: Math.max(0.5, at(from + bin_s) - at(from)), y: y(rate), height: 70 - y(rate), fill: "#9db8d8" }, tag("title", {}, `${figure(rate)} steps/s after ${figure(from - begin)} s`)));
+    out.push(label(frame.left - 6, 18, figure(most), { "text-anchor": "end" }), tag("line", { x1: frame.left, x2: frame.right, y1: 70, y2: 70, stroke: "#aab4c0" }));
+  }
+  names.forEach((name, k) => {
+    const y = frame.top + 24 * k;
+    out.push(label(4, y + 12, name.length > 20 ? `…${name.slice(-19)}` : name), tag("rect", { x: frame.left, y, width: frame.right - frame.left, height: 16, fill: "#f1f3f6" }));
+    for (const life of lives.filter((l) => l.process === name)) {
+      const said = `${name}: ${figure(life.start - begin)} to ${figure(life.end - begin)} s, ${life.goodbye ? "ended in order" : "then not heard of"}`;
+      out.push(tag("rect", { x: at(life.start), y, width: Math.max(2, at(life.end) - at(life.start)), height: 16, fill: "#4f9d78", rx: 2 }, tag("title", {}, said)));
+      if (!life.goodbye) out.push(tag("rect", { x: at(life.end) - 1.5, y: y - 2, width: 3, height: 20, fill: KINDS.a.color }, tag("title", {}, said)));
+      if (life.restart) out.push(tag("path", { d: `M${at(life.start)} ${y - 2} l6 10 l-6 10 z`, fill: "#1b2430" }, tag("title", {}, `${name} was started again`)));
+    }
+    for (const line of lines.filter((l) => l.process === name)) out.push(tag("circle", { cx: at(line.t), cy: y + 8, r: 3.2, fill: line.level === "ERROR" ? KINDS.a.color : "#f2c14e", stroke: "#fff" }, tag("title", {}, `${line.level}: ${line.text}`)));
+  });
+  for (const t of ticks(0, end - begin, 8)) out.push(label(x(t), frame.bottom + 14, `${figure(t, 6)} s`, { "text-anchor": "middle" }));
+  const box = element("div");
+  box.innerHTML = drawing(1040, frame.bottom + 22, "health of the processes", out.join(""));
+  target.append(box, legend([["#4f9d78", "alive"], [KINDS.a.color, "not heard of from here on; an error"], ["#f2c14e", "a warning"], ["#1b2430", "started again"]]));
+}

@@ -1,0 +1,103 @@
+// The nearest misses, and the picker of episodes.
+
+function why(episode, k) {
+  const t = episode.tubes[k];
+  if (!t) return KINDS[episode.kinds[k]].name;
+  return `${KINDS[episode.kinds[k]].name}; proposed ${t.proposed.join(", ")}, executed ${t.plan.join(", ")}; margin ${figure(100 * t.margin)} cm${t.reason ? `; ${t.reason}` : ""}`;
+}
+
+function near(target, galleries, choose) {
+  for (const [robot, { near: orders, episodes }] of Object.entries(galleries)) {
+    for (const order of orders) {
+      const episode = episodes.find((e) => e.order === order), k = episode.closest_at;
+      const reach = Math.max(0.6, 6 * episode.footprint, 1.3 * Math.max(0, ...(episode.tubes[k]?.boxes ?? []).map(([x, y]) => Math.hypot(x - episode.x[k], y - episode.y[k]))));
+      const box = [episode.x[k] - reach, episode.y[k] - reach, episode.x[k] + reach, episode.y[k] + reach];
+      const picture = element("div");
+      picture.innerHTML = arena(episode, k, 260, box);
+      picture.querySelector("svg").setAttribute("width", "100%");
+      const facts = element("p", {}, element("b", {}, `${figure(100 * episode.closest)} cm`), ` ${episode.actor}, episode ${episode.episode}, step ${episode.first + k} (${episode.outcome}) `);
+      facts.append(element("button", { onclick: () => choose(robot, order, k) }, "show"));
+      target.append(element("div", { class: "card" }, picture, facts, element("p", { class: "why" }, why(episode, k))));
+    }
+  }
+  if (!target.children.length) target.append(nothing("No episode was recorded with its clearance."));
+}
+
+/** Clearance over the steps of an episode, coloured by decision. */
+function strip(episode, k) {
+  const frame = { left: 40, right: 390, top: 22, bottom: 112 };
+  const most = Math.max(0.05, ...episode.clearance);
+  const x = scale(0, Math.max(1, episode.steps - 1), frame.left, frame.right), y = scale(0, most, frame.bottom, frame.top);
+  const parts = [label(4, 12, "clearance [m] over steps", { class: "title" }), axes(frame, x, y, ticks(0, episode.steps - 1, 5).filter(Number.isInteger), ticks(0, most, 3))];
+  parts.push(tag("polyline", { points: episode.clearance.map((c, i) => `${x(i).toFixed(1)},${y(c).toFixed(1)}`).join(" "), fill: "none", stroke: "#5d6b7c", "stroke-width": 1.3 }));
+  episode.clearance.forEach((c, i) => { if ("da".includes(episode.kinds[i])) parts.push(tag("circle", { cx: x(i), cy: y(c), r: 2.3, fill: KINDS[episode.kinds[i]].color })); });
+  parts.push(tag("line", { x1: x(k), x2: x(k), y1: frame.top, y2: frame.bottom, stroke: "#1b2430", "stroke-dasharray": "3 3" }));
+  return drawing(400, 132, "clearance over the episode", parts.join(""));
+}
+
+class Picker {
+  constructor(target, galleries) {
+    this.all = Object.entries(galleries).flatMap(([robot, { near: nearest, episodes }]) => episodes.map((episode) => ({ robot, episode, near: nearest.indexOf(episode.order) })));
+    if (!this.all.length) return void target.append(nothing("No episode was recorded."));
+    this.select = element("select", { "aria-label": "episode", onchange: () => this.show(+this.select.value) });
+    this.all.forEach(({ episode: e, near: rank }, i) => {
+      const marks = [e.outcome, `${e.steps} steps`, e.failsafes ? `${e.failsafes} failsafe` : "", rank >= 0 ? `near miss ${rank + 1}` : ""].filter(Boolean);
+      this.select.append(element("option", { value: i }, `${e.actor}, episode ${e.episode}: ${marks.join(", ")}`));
+    });
+    const move = (by) => this.show((this.at + by + this.all.length) % this.all.length);
+    this.slider = element("input", { type: "range", min: 0, "aria-label": "step", oninput: () => this.step(+this.slider.value) });
+    this.play = element("button", { onclick: () => this.toggle() }, "play");
+    target.append(element("div", { class: "bar" }, element("button", { onclick: () => move(-1), "aria-label": "previous episode" }, "‹"), this.select, element("button", { onclick: () => move(1), "aria-label": "next episode" }, "›"), this.play, this.slider));
+    this.map = element("div", { id: "episode-map" });
+    this.facts = element("dl", { class: "facts", id: "episode-facts" });
+    this.strip = element("div");
+    target.append(element("div", { class: "split" }, this.map, element("div", {}, this.facts, this.strip)));
+    target.append(legend([...["l", "d", "a"].map((k) => [KINDS[k].color, KINDS[k].name]), ["#7a4fc0", "tube, and the plan in it"], ["#1d7f4e", "goal"], ["#c9d1da", "obstacles"]]));
+    const wanted = this.all.findIndex(({ episode }) => episode.rows);
+    this.show(wanted >= 0 ? wanted : Math.max(0, this.all.findIndex(({ near: rank }) => rank === 0)));
+  }
+
+  choose(robot, order, k) {
+    this.show(this.all.findIndex((item) => item.robot === robot && item.episode.order === order), k);
+    document.getElementById("picker-section").scrollIntoView({ behavior: "smooth" });
+  }
+
+  show(index, k = null) {
+    this.stop();
+    this.at = index;
+    this.select.value = String(index);
+    const { episode } = this.all[index];
+    this.slider.max = episode.steps - 1;
+    this.step(k ?? episode.closest_at);
+  }
+
+  step(k) {
+    const { episode: e } = this.all[this.at];
+    this.k = k;
+    this.slider.value = k;
+    this.map.innerHTML = arena(e, k, 600);
+    this.strip.innerHTML = strip(e, k);
+    const facts = {
+      actor: e.actor, episode: e.episode, arena: e.arena ?? "its beginning is in no file", outcome: e.outcome, steps: e.steps, reward: figure(e.reward, 4),
+      interventions: `${e.interventions}, of these failsafe ${e.failsafes}`, "closest approach": e.closest === null ? "–" : `${figure(100 * e.closest)} cm at step ${e.first + e.closest_at}`,
+      step: e.first + k, position: `${figure(e.x[k])}, ${figure(e.y[k])} m`, speed: `${figure(e.speed[k])} m/s`, clearance: `${figure(100 * e.clearance[k])} cm`, decision: why(e, k),
+    };
+    this.facts.replaceChildren(...Object.entries(facts).flatMap(([name, value]) => [element("dt", {}, name), element("dd", { "data-fact": name }, String(value))]));
+  }
+
+  toggle() {
+    if (this.timer) return this.stop();
+    if (this.k >= this.all[this.at].episode.steps - 1) this.step(0);
+    this.play.textContent = "pause";
+    this.timer = setInterval(() => {
+      if (this.k >= this.all[this.at].episode.steps - 1) return this.stop();
+      this.step(this.k + 1);
+    }, 60);
+  }
+
+  stop() {
+    clearInterval(this.timer);
+    this.timer = null;
+    if (this.play) this.play.textContent = "play";
+  }
+}

@@ -1,0 +1,117 @@
+// Small tools for drawing: elements, numbers, scales and axes.
+
+const KINDS = {
+  l: { name: "allowed", color: "#2b6cb8" },
+  d: { name: "adjusted", color: "#e08600" },
+  a: { name: "failsafe", color: "#c2312a" },
+  n: { name: "no filter", color: "#7b8794" },
+};
+
+function escaped(text) {
+  return String(text).replace(/[&<>"]/g, (c) => ({ "&": "&amp;", "<": "&lt;", ">": "&gt;", '"': "&quot;" })[c]);
+}
+
+/** An SVG element as text; attributes without a value are left out. */
+function tag(name, attributes, content = "") {
+  const said = Object.entries(attributes)
+    .filter(([, value]) => value !== null && value !== undefined)
+    .map(([key, value]) => ` ${key}="${typeof value === "number" ? +value.toFixed(3) : escaped(value)}"`);
+  return `<${name}${said.join("")}>${content}</${name}>`;
+}
+
+function label(x, y, text, attributes = {}) {
+  return tag("text", { x, y, ...attributes }, escaped(text));
+}
+
+function drawing(width, height, what, content, attributes = {}) {
+  const box = { viewBox: `0 0 ${width} ${height}`, width, height, role: "img", "aria-label": what };
+  return tag("svg", { xmlns: "http://www.w3.org/2000/svg", ...box, ...attributes }, content);
+}
+
+function element(name, attributes = {}, ...children) {
+  const made = document.createElement(name);
+  for (const [key, value] of Object.entries(attributes)) {
+    if (key.startsWith("on")) made.addEventListener(key.slice(2), value);
+    else if (value !== null) made.setAttribute(key, value);
+  }
+  made.append(...children);
+  return made;
+}
+
+function figure(value, digits = 3) {
+  if (value === null || value === undefined) return "–";
+  if (Math.abs(value) < 1e-12) return "0";
+  if (Math.abs(value) >= 1000) return Math.round(value).toLocaleString("en").replaceAll(",", "\u202f");
+  return String(+value.toPrecision(digits));
+}
+
+function percent(share) {
+  if (share === null || share === undefined) return "–";
+  const value = 100 * share;
+  return `${value >= 1 || value === 0 ? value.toFixed(1) : value.toPrecision(2)} %`;
+}
+
+/** Round values between low and high, about `count` of them. */
+function ticks(low, high, count = 5) {
+  if (!(high > low)) return [low];
+  const rough = (high - low) / count;
+  const power = 10 ** Math.floor(Math.log10(rough));
+  const step = [1, 2, 2.5, 5, 10].map((m) => m * power).find((s) => s >= rough * 0.999);
+  const found = [];
+  for (let k = Math.ceil(low / step - 1e-9); k * step <= high + step * 1e-9; k++) found.push(+(k * step).toPrecision(12));
+  return found;
+}
+
+function scale(from, to, begin, end) {
+  const factor = to > from ? (end - begin) / (to - from) : 0;
+  return (value) => begin + (value - from) * factor;
+}
+
+/** Grid lines and numbers of both axes. `frame`: left, right, top, bottom in the drawing. */
+function axes(frame, x, y, xs, ys, form = {}) {
+  const { left, right, top, bottom } = frame;
+  const parts = [];
+  for (const value of ys) {
+    parts.push(tag("line", { x1: left, x2: right, y1: y(value), y2: y(value), stroke: "#e6eaef" }));
+    parts.push(label(left - 6, y(value) + 4, (form.y || figure)(value), { "text-anchor": "end" }));
+  }
+  for (const value of xs) {
+    parts.push(tag("line", { x1: x(value), x2: x(value), y1: bottom, y2: bottom + 4, stroke: "#aab4c0" }));
+    parts.push(label(x(value), bottom + 16, (form.x || figure)(value), { "text-anchor": "middle" }));
+  }
+  parts.push(tag("line", { x1: left, x2: right, y1: bottom, y2: bottom, stroke: "#aab4c0" }));
+  return parts.join("");
+}
+
+function legend(entries) {
+  const box = element("div", { class: "legend" });
+  for (const [color, text] of entries) {
+    const item = element("span", {}, element("i", { style: `background:${color}` }), text);
+    box.append(item);
+  }
+  return box;
+}
+
+function nothing(text) {
+  return element("p", { class: "none" }, text);
+}
+
+const tip = element("div", { id: "tip" });
+
+/** Show a text beside the pointer while it is over `target`; `text(x, y)` in the drawing's units, or null. */
+function hovers(target, text) {
+  const svg = target.querySelector("svg");
+  const hide = () => { tip.style.display = "none"; };
+  target.addEventListener("pointermove", (event) => {
+    const box = svg.getBoundingClientRect();
+    const per = svg.viewBox.baseVal.width / box.width;
+    const said = text((event.clientX - box.left) * per, (event.clientY - box.top) * per);
+    if (said === null) return hide();
+    tip.textContent = said;
+    tip.style.display = "block";
+    const left = Math.min(event.clientX + 14, innerWidth - tip.offsetWidth - 8);
+    tip.style.left = `${left}px`;
+    tip.style.top = `${Math.max(8, event.clientY - tip.offsetHeight - 10)}px`;
+  });
+  target.addEventListener("pointerleave", hide);
+}

@@ -1,0 +1,117 @@
+"""How a robot changes while it learns: rates over the steps of all actors, in a bounded number of bins.
+
+When the bins are used up, each two become one that is twice as wide. What is "over training" depends on the order in
+which the steps of different actors came in, so this is no part of `Metrics`.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields
+
+from logs.sketch import Histogram, summary
+from logs.tally import Figures
+from messaging import brakeline_pb2 as pb
+
+MOST_BINS = 200
+FIRST_WIDTH = 50  # steps
+
+_ADJUSTED, _FAILSAFE = int(pb.ADJUSTED), int(pb.FAILSAFE)
+
+
+@dataclass
+class Bin:
+    """Sums over some steps, and over the episodes that ended in them."""
+
+    steps: int = 0
+    adjusted: int = 0
+    failsafes: int = 0
+    episodes: int = 0
+    goals: int = 0
+    collisions: int = 0
+    reward: float = 0.0  # of these episodes, without the penalty
+    closest: float = math.inf  # m
+
+    def join(self, other: Bin) -> None:
+        for item in fields(self):
+            mine, its = getattr(self, item.name), getattr(other, item.name)
+            setattr(self, item.name, min(mine, its) if item.name == "closest" else mine + its)
+
+
+class Training:
+    """Takes the steps of one robot kind in the order in which they came in."""
+
+    def __init__(self) -> None:
+        self.width = FIRST_WIDTH
+        self.bins: list[Bin] = [Bin()]
+        self.staleness = Histogram()  # versions that a step's weights were behind the newest that was known
+        self._returns: dict[str, float] = {}
+        self._newest = 0
+        self._now = self.bins[0]
+
+    def step(self, step: pb.Step) -> None:
+        now = self._now
+        if now.steps >= self.width:
+            now = self._next()
+        now.steps += 1
+        kind = step.decision
+        if step.fallback or kind == _FAILSAFE:
+            now.failsafes += 1
+        elif kind == _ADJUSTED:
+            now.adjusted += 1
+        clearance = step.clearance
+        if clearance < now.closest:
+            now.closest = clearance
+        version = step.weights_version
+        if version > self._newest:
+            self._newest = version
+        self.staleness.add(self._newest - version)
+        actor, reward = step.actor, step.reward
+        total = reward if step.step == 0 else self._returns.get(actor, 0.0) + reward
+        self._returns[actor] = total
+        if step.terminated or step.truncated:
+            now.episodes += 1
+            now.goals += step.goal
+            now.collisions += step.collision
+            now.reward += total
+
+    def known(self, version: int) -> None:
+        """The learner has weights of that version."""
+        self._newest = max(self._newest, version)
+
+    def begins(self) -> None:
+        """Another run: its versions count anew."""
+        self._newest = 0
+        self._returns.clear()
+
+    def figures(self) -> Figures:
+        """`bins`: one row each, up to the step `until`; None where no episode ended."""
+        rows, until = [], 0
+        for row in self.bins:
+            until += row.steps
+            if row.steps:
+                rows.append(
+                    {
+                        "until": until,
+                        "steps": row.steps,
+                        "adjusted": row.adjusted / row.steps,
+                        "failsafes": row.failsafes / row.steps,
+                        "episodes": row.episodes,
+                        "goals": row.goals / row.episodes if row.episodes else None,
+                        "collisions": row.collisions,
+                        "reward": row.reward / row.episodes if row.episodes else None,
+                        "closest": row.closest if math.isfinite(row.closest) else None,
+                    }
+                )
+        return {"bin_steps": self.width, "bins": rows, "staleness": summary(self.staleness)}
+
+    def _next(self) -> Bin:
+        """Begin a bin, after making room for it."""
+        if len(self.bins) == MOST_BINS:
+            for even, odd in zip(self.bins[::2], self.bins[1::2], strict=True):
+                even.join(odd)
+            self.bins = self.bins[::2]
+            self.width *= 2
+        self.bins.append(Bin())
+        self._now = self.bins[-1]
+        return self._now
