@@ -19,7 +19,7 @@ from safety.commitment import Prediction
 from safety.freespace import half_spaces
 from safety.model_set import ModelSet
 from safety.program import SHARPEN, Builder, Layout, Rows
-from safety.solver import solve
+from safety.solver import INFEASIBLE, solve
 
 Array = NDArray[np.float64]
 
@@ -261,7 +261,8 @@ class Filter:
     def _closest(self, rows: Rows, z_0: Array, proposal: Array, attempt: _Attempt) -> Array | None:
         """The QP's answer, clipped to bounds and slew, as regressors; None if there is no number in it."""
         before = perf_counter_ns()
-        solution = solve(self.builder.program(rows, z_0, proposal))
+        program = self.builder.program(rows, z_0, proposal)
+        solution = solve(program) if program is not None else INFEASIBLE
         attempt.solve_ns += perf_counter_ns() - before
         attempt.solver, attempt.iterations = solution.status, attempt.iterations + solution.iterations
         if not solution.found:

@@ -102,21 +102,43 @@ class Builder:
         self.slew = np.tile(robot.action_slew, steps)[limited]
         self.box = np.concatenate([np.tile(robot.high(), steps), -np.tile(robot.low(), steps)])
 
-    def program(self, rows: Rows, z_0: Array, proposal: Array) -> Program:
-        """The QP for known regressors z_0 (known,) and a proposal r (m,)."""
+    def program(self, rows: Rows, z_0: Array, proposal: Array) -> Program | None:
+        """The QP for known regressors z_0 (known,) and a proposal r (m,); None if some row rules out every input.
+
+        Over the box of inputs that bounds and slew leave, each row's support has a least and a largest value: one
+        whose least is beyond its bound can't be met, one whose largest is within it need not be looked at. With many
+        obstacles that is nearly all of them.
+        """
         m = self.robot.action_dim
         constant = self.M_c @ np.abs(self.W_c @ z_0) + self.tube.m_0
         bound = rows.bound - rows.gradient[:, : self.known] @ z_0 - rows.spread @ constant - SHARPEN
-        A = np.hstack([rows.gradient[:, self.known :], rows.spread @ self.M_t]) * self.scale
-        length = np.maximum(np.sqrt(np.einsum("ri,ri->r", A, A)), SHARPEN)
+        steer, stretch = rows.gradient[:, self.known :], rows.spread @ self.M_t
         offset = self.W_t[:, : self.known] @ z_0
+        center, radius = self._box(z_0[-m:])
+        atom = offset + self.W_t[:, self.known :] @ center
+        give = np.abs(self.W_t[:, self.known :]) @ radius
+        middle, swing = steer @ center, np.abs(steer) @ radius
+        if (middle - swing + stretch @ np.maximum(np.abs(atom) - give, 0.0) > bound).any():
+            return None
+        matter = middle + swing + stretch @ (np.abs(atom) + give) > bound
+        A = np.hstack([steer[matter], stretch[matter]]) * self.scale
+        length = np.maximum(np.sqrt(np.einsum("ri,ri->r", A, A)), SHARPEN)
         first = np.zeros(self.free)
         first[:m] = z_0[-m:]
         first = first[self.limited]
         g = np.zeros(len(self.h))
         g[:m] = -proposal / self.scale[:m]
         fixed = np.concatenate([-offset, offset, self.box, self.slew + first, self.slew - first]) / self.length
-        return Program(self.h, g, np.vstack([A / length[:, None], self.fixed]), np.concatenate([bound / length, fixed]))
+        A, b = np.vstack([A / length[:, None], self.fixed]), np.concatenate([bound[matter] / length, fixed])
+        return Program(self.h, g, A, b)
+
+    def _box(self, before: Array) -> tuple[Array, Array]:
+        """Center and half-widths (F·m,) of what bounds and slew leave to the free inputs after `before` (m,)."""
+        steps = self.free // len(before)
+        way = np.arange(1, steps + 1)[:, None] * np.asarray(self.robot.action_slew)
+        low = np.maximum(self.robot.low(), before - way).ravel()
+        high = np.minimum(self.robot.high(), before + way).ravel()
+        return 0.5 * (low + high), 0.5 * (high - low)
 
     def inputs(self, x: Array) -> Array:
         """The free inputs (F·m,) in a solution."""

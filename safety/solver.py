@@ -41,6 +41,9 @@ class Solution:
         return bool(np.isfinite(self.x).all())
 
 
+INFEASIBLE = Solution(np.array([np.nan]), "ruled out", 0, np.inf)  # of a program that need not be solved
+
+
 def solve(program: Program) -> Solution:
     """Cold start: the answer depends on the program alone, so that a log can be replayed."""
     rows, n = program.A.shape
