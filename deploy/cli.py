@@ -48,6 +48,11 @@ COMMANDS: dict[str, Command] = {
         "one actor process alone, with one or several robots",
         "brakeline actor ground --connect tcp/10.0.0.1:7447 --name actor-7 --number 7",
     ),
+    "autopilot": Command(
+        "autopilot:Autopilot",
+        "quadrotors behind MAVLink in real time, with PX4's or ArduPilot's rules",
+        "brakeline autopilot --rules px4 --url udpout:127.0.0.1:14540 --arena default",
+    ),
     "recorder": Command(
         "processes:Recorder", "the recorder alone", "brakeline recorder runs/a/run.mcap --connect tcp/10.0.0.1:7447"
     ),

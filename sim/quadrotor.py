@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from messaging.robots import QUADROTOR
-from sim.flight import GRAVITY, Body, FlightController, Gains
+from sim.flight import GRAVITY, Body, FlightController, Gains, Vector
 from sim.flight_estimator import Estimate, FlightEstimator, QuadrotorNoise
 from sim.scene import add_obstacles
 from sim.vehicle import BadInput, Period
@@ -21,7 +21,7 @@ from sim.world import Arena
 Array = NDArray[np.float64]
 
 MODEL = Path(__file__).with_name("quadrotor.xml").read_text()
-SAMPLES = 10  # of the position in a period
+SAMPLES = 5  # of the position in a period
 OUTER_EVERY = 2  # physics steps for one of the velocity loop
 FLOOR_BIT = 1
 SETTLE = 5  # periods of hovering before the start
@@ -56,14 +56,14 @@ class Quadrotor:
         self._rng, self._wind = rng, wind or Wind()
         self._air = None if self._wind.calm else Air(self._wind, rng, self.timestep)
         self._floor_geom = -1 if floor is None else self._model.geom("floor").id
-        self.armed = floor is None  # the motors turn
+        self.flying = floor is None  # the controller has the rotors; else they stand or idle
         self.collided = False  # an obstacle was touched since it was last set to False
         self.on_floor = False  # the floor was touched in the last tick
         self._count = 0
         self._acceleration = (0.0, 0.0, 0.0)
         self.input = np.zeros(QUADROTOR.action_dim)
         mujoco.mj_forward(self._model, self._data)
-        if self.armed:
+        if self.flying:
             self._hover()
         self.true, self.measured = self.state(), self.estimated_state(self.estimate())
 
@@ -127,10 +127,8 @@ class Quadrotor:
                 position = (px + e[0], py + e[1], pz + e[2])
                 velocity = (vx + e[3], vy + e[4], vz + e[5])
             self._count += 1
-            if self.armed:
+            if self.flying:
                 control[:] = controller.update(position, velocity, (qw, qx, qy, qz), (p, q, r))
-            else:
-                data.act[:] = control[:] = 0.0
             self._blow(vx, vy, vz)
             # step2 before step1: contacts are then those of the position just reached
             mujoco.mj_step2(model, data)
@@ -142,6 +140,24 @@ class Quadrotor:
         vx, vy, vz = qvel[:3].tolist()
         dt = self.timestep
         self._acceleration = ((vx - before[0]) / dt, (vy - before[1]) / dt, (vz - before[2]) / dt)
+
+    def cut_rotors(self) -> None:
+        """Rotors at rest, or idling: no thrust to speak of, until `launch`."""
+        self.flying = False
+        self._data.ctrl[:] = 0.0
+
+    def launch(self) -> None:
+        """The controller takes the rotors, holding the heading as it is."""
+        w, x, y, z = self._data.qpos[3:7].tolist()
+        self.controller.reset(math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z)))
+        self.flying = True
+
+    def seen(self) -> tuple[Vector, Vector]:
+        """Position [m] and velocity [m/s] as estimated now: the cheap part of `estimate`, with the same errors."""
+        x, y, z = self._data.qpos[:3].tolist()
+        vx, vy, vz = self._data.qvel[:3].tolist()
+        e = self._estimator.errors
+        return (x + e[0], y + e[1], z + e[2]), (vx + e[3], vy + e[4], vz + e[5])
 
     def estimate(self) -> Estimate:
         """What the vehicle knows of itself now."""

@@ -1,0 +1,99 @@
+"""The parameters of both rule sets, and how a value travels: PX4 sends its bits, ArduPilot casts it to a float."""
+
+from __future__ import annotations
+
+import math
+import struct
+from dataclasses import dataclass
+
+from sim.autopilot.dialect import mavlink
+
+INTEGER, REAL = mavlink.MAV_PARAM_TYPE_INT32, mavlink.MAV_PARAM_TYPE_REAL32
+
+
+class BadParameter(ValueError):
+    """There is no such parameter, or it cannot have this value."""
+
+
+@dataclass(frozen=True)
+class Parameter:
+    name: str
+    value: float
+    low: float
+    high: float
+    what: str
+    integer: bool = False
+
+    @property
+    def type(self) -> int:
+        """As MAVLink numbers it."""
+        return int(INTEGER if self.integer else REAL)
+
+
+PX4: tuple[Parameter, ...] = (
+    Parameter("COM_DISARM_LAND", 2.0, -1.0, 20.0, "s after a landing until it disarms"),
+    Parameter("COM_DISARM_PRFLT", 10.0, -1.0, 60.0, "s after arming until it disarms if it stays on the ground"),
+    Parameter("COM_OBL_RC_ACT", 5, 4, 5, "setpoints lost: 4 land, 5 hold", integer=True),
+    Parameter("COM_OF_LOSS_T", 1.0, 0.1, 60.0, "s without a setpoint until it leaves offboard"),
+    Parameter("MIS_TAKEOFF_ALT", 2.5, 0.5, 80.0, "m above home to take off to"),
+    Parameter("MPC_LAND_SPEED", 0.7, 0.3, 2.0, "m/s"),
+    Parameter("MPC_XY_VEL_MAX", 8.0, 0.5, 8.0, "m/s, horizontal"),
+    Parameter("MPC_Z_VEL_MAX_DN", 5.0, 0.5, 5.0, "m/s"),
+    Parameter("MPC_Z_VEL_MAX_UP", 5.0, 0.5, 5.0, "m/s"),
+    Parameter("SYS_AUTOSTART", 4001, 0, 9999999, "airframe", integer=True),
+)
+
+ARDUPILOT: tuple[Parameter, ...] = (
+    Parameter("DISARM_DELAY", 10, 0, 127, "s after arming until it disarms if it stays on the ground", integer=True),
+    Parameter("FRAME_CLASS", 1, 0, 15, "1: quadrotor", integer=True),
+    Parameter("GUID_TIMEOUT", 3.0, 0.1, 5.0, "s without a setpoint until it stops"),
+    Parameter("LAND_SPEED", 70, 30, 200, "cm/s", integer=True),
+    Parameter("WPNAV_SPEED", 800.0, 10.0, 800.0, "cm/s, horizontal"),
+    Parameter("WPNAV_SPEED_DN", 500.0, 10.0, 500.0, "cm/s"),
+    Parameter("WPNAV_SPEED_UP", 500.0, 10.0, 500.0, "cm/s"),
+)
+
+
+class Parameters:
+    """One vehicle's parameters, by name, in the table's order."""
+
+    def __init__(self, table: tuple[Parameter, ...], bitwise: bool) -> None:
+        """bitwise: an integer's 32 bits travel in the place of the float's (PX4); else its value does (ArduPilot)."""
+        self.table, self.bitwise = table, bitwise
+        self._values = {parameter.name: parameter.value for parameter in table}
+
+    def __getitem__(self, name: str) -> float:
+        return self._values[name]
+
+    def find(self, name: str) -> int:
+        """Its index. Raises BadParameter."""
+        for index, parameter in enumerate(self.table):
+            if parameter.name == name:
+                return index
+        raise BadParameter(f"no parameter {name}")
+
+    def set(self, name: str, value: float) -> None:
+        """Raises BadParameter: unknown, not finite, out of range."""
+        parameter = self.table[self.find(name)]
+        if not (math.isfinite(value) and parameter.low <= value <= parameter.high):
+            raise BadParameter(f"{name} is {parameter.low:g} to {parameter.high:g}")
+        self._values[name] = float(round(value)) if parameter.integer else value
+
+    def message(self, index: int) -> mavlink.MAVLink_param_value_message:
+        """PARAM_VALUE of the parameter with that index."""
+        parameter = self.table[index]
+        value = self._values[parameter.name]
+        if parameter.integer and self.bitwise:
+            (value,) = struct.unpack("<f", struct.pack("<i", round(value)))
+        return mavlink.MAVLink_param_value_message(
+            parameter.name.encode(), value, parameter.type, len(self.table), index
+        )
+
+    def sent(self, name: str, value: float, kind: int) -> float:
+        """The value that somebody sent. Raises BadParameter when it is not of the parameter's type."""
+        parameter = self.table[self.find(name)]
+        if not self.bitwise:
+            return value
+        if kind != parameter.type:
+            raise BadParameter(f"{name} has another type")
+        return float(struct.unpack("<i", struct.pack("<f", value))[0]) if parameter.integer else value
