@@ -104,7 +104,7 @@ class Gallery:
         return source
 
     def step(self, source: Source, step: pb.Step) -> None:
-        """Take a step of the actor; its question came before."""
+        """Take a step of the actor. An episode is looked at when the next one begins: questions may come after steps."""
         held = source.running
         number = step.episode
         if held is None or held.number != number or step.step == 0:
@@ -112,12 +112,9 @@ class Gallery:
                 self._ended(source, held)
             held = source.running = Held(self.label, number, source.episode(number))
         held.take(step)
-        if step.terminated or step.truncated:
-            source.running = None
-            self._ended(source, held)
 
     def close(self) -> None:
-        """No more comes of this run: episodes in progress stay unfinished."""
+        """No more comes of this run."""
         for source in self._sources.values():
             if source.running is not None:
                 held, source.running = source.running, None

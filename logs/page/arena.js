@@ -81,7 +81,8 @@ function arena(episode, k, size, box = null) {
   parts.push(path(v, episode, episode.steps - 1, true), path(v, episode, Math.min(k, episode.x.length - 1), false));
   if (episode.tubes[k]) parts.push(tube(v, episode.tubes[k], episode.footprint));
   parts.push(robot(v, episode, k));
-  const length = ticks(0, (box ? box[2] - box[0] : v.width / v.per) / 4, 1).at(-1) || 0.1;
+  const quarter = v.width / v.per / 4, power = 10 ** Math.floor(Math.log10(quarter));
+  const length = power * [5, 2, 1].find((m) => m * power <= quarter);
   parts.push(tag("path", { d: `M8 ${v.height - 12} v4 h${v.per * length} v-4`, fill: "none", stroke: "#1b2430" }), label(10, v.height - 14, `${figure(length)} m`));
   return drawing(v.width, v.height, `${episode.actor}, episode ${episode.episode}, step ${episode.first + k}`, parts.join(""));
 }

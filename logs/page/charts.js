@@ -15,9 +15,9 @@ function whiskers() {
 }
 
 const CURVES = [
-  { title: "goals reached", lines: [[(b) => b.goals, "#1d7f4e"]], form: percent, low: 0, high: 1, weight: "episodes" },
+  { title: "goals reached", lines: [[(b) => b.goals, "#1d7f4e"]], form: percents, low: 0, high: 1, weight: "episodes" },
   { title: "reward of an episode", lines: [[(b) => b.reward, "#2b6cb8"]], form: figure, weight: "episodes" },
-  { title: "interventions, share of steps", areas: true, form: percent, low: 0, weight: "steps",
+  { title: "interventions, share of steps", areas: true, form: percents, low: 0, weight: "steps",
     lines: [[(b) => b.adjusted + b.failsafes, KINDS.d.color], [(b) => b.failsafes, KINDS.a.color]] },
   { title: "closest approach in the bin [cm]", lines: [[(b) => b.closest === null ? null : 100 * b.closest, "#5d6b7c"]], form: figure, low: 0 },
 ];
@@ -116,27 +116,36 @@ function heat(share) {
   return `rgb(${stops[k].map((v, i) => Math.round(v + f * (stops[k + 1][i] - v))).join(",")})`;
 }
 
+/** One map: `value` of a cell between 0 and `most`, said as `form` says it. */
+function map(cells, cell, what, value, most, form) {
+  const xs = cells.map((c) => c[0]), ys = cells.map((c) => c[1]);
+  const box = { x0: Math.min(...xs) * cell, x1: (Math.max(...xs) + 1) * cell, y0: Math.min(...ys) * cell, y1: (Math.max(...ys) + 1) * cell };
+  const per = 400 / Math.max(box.x1 - box.x0, box.y1 - box.y0);
+  const frame = { left: 36, top: 26, right: 36 + per * (box.x1 - box.x0), bottom: 26 + per * (box.y1 - box.y0) };
+  const x = (v) => frame.left + per * (v - box.x0), y = (v) => frame.bottom - per * (v - box.y0);
+  const out = [label(4, 14, what, { class: "title" })];
+  for (const c of cells) {
+    const [cx, cy, steps, adjusted, failsafe, hit] = c;
+    const said = `${steps} steps, ${adjusted} adjusted, ${failsafe} failsafe${hit ? `, ${hit} in collision` : ""}`;
+    out.push(tag("rect", { x: x(cx * cell), y: y((cy + 1) * cell), width: per * cell, height: per * cell, fill: heat(value(c) / most) }, tag("title", {}, said)));
+    if (hit) out.push(tag("circle", { cx: x((cx + 0.5) * cell), cy: y((cy + 0.5) * cell), r: 4, fill: "none", stroke: "#000", "stroke-width": 1.5 }));
+  }
+  for (const v of ticks(box.x0, box.x1, 5)) out.push(label(x(v), frame.bottom + 15, figure(v), { "text-anchor": "middle" }));
+  for (const v of ticks(box.y0, box.y1, 5)) out.push(label(frame.left - 6, y(v) + 4, figure(v), { "text-anchor": "end" }));
+  for (let k = 0; k <= 20; k++) out.push(tag("rect", { x: frame.right + 12, y: frame.bottom - 8 - k * 8, width: 12, height: 8.3, fill: heat(k / 20) }));
+  for (const k of [0, 10, 20]) out.push(label(frame.right + 29, frame.bottom - k * 8, form(most * k / 20)));
+  return drawing(frame.right + 76, frame.bottom + 24, `${what}, from above`, out.join(""));
+}
+
 function places(target, robots) {
   for (const [robot, { cell, cells }] of Object.entries(robots)) {
     if (!cells.length) continue;
-    const xs = cells.map((c) => c[0]), ys = cells.map((c) => c[1]);
-    const box = { x0: Math.min(...xs) * cell, x1: (Math.max(...xs) + 1) * cell, y0: Math.min(...ys) * cell, y1: (Math.max(...ys) + 1) * cell };
-    const per = Math.min(560 / (box.x1 - box.x0), 560 / (box.y1 - box.y0));
-    const frame = { left: 50, top: 10, right: 50 + per * (box.x1 - box.x0), bottom: 10 + per * (box.y1 - box.y0) };
-    const x = (v) => frame.left + per * (v - box.x0), y = (v) => frame.bottom - per * (v - box.y0);
-    const shares = cells.filter((c) => c[2] >= 5).map((c) => (c[3] + c[4]) / c[2]).sort((a, b) => a - b);
-    const most = Math.max(0.02, shares.length ? shares[Math.floor(0.98 * (shares.length - 1))] : 1);
-    const out = cells.map(([cx, cy, steps, adjusted, failsafe, hit]) =>
-      tag("rect", { x: x(cx * cell), y: y((cy + 1) * cell), width: per * cell, height: per * cell, fill: heat((adjusted + failsafe) / steps / most) },
-        tag("title", {}, `${steps} steps, ${adjusted} adjusted, ${failsafe} failsafe${hit ? `, ${hit} in collision` : ""}`)) +
-      (hit ? tag("circle", { cx: x((cx + 0.5) * cell), cy: y((cy + 0.5) * cell), r: 4, fill: "none", stroke: "#000", "stroke-width": 1.5 }) : ""));
-    out.push(axes(frame, x, y, ticks(box.x0, box.x1, 6), ticks(box.y0, box.y1, 6)).replaceAll('stroke="#e6eaef"', 'stroke="none"'));
-    const wide = frame.right + 130;
-    for (let k = 0; k <= 20; k++) out.push(tag("rect", { x: frame.right + 30, y: frame.bottom - 20 - k * 8, width: 14, height: 8, fill: heat(k / 20) }));
-    for (const k of [0, 10, 20]) out.push(label(frame.right + 50, frame.bottom - 12 - k * 8, percent(most * k / 20)));
-    out.push(label(frame.right + 30, frame.bottom - 192, "interventions", {}), label(frame.right + 30, frame.bottom + 16, `cell ${figure(cell)} m`));
-    const made = element("div", { "data-robot": robot });
-    made.innerHTML = drawing(wide, frame.bottom + 26, `where the filter stepped in, ${robot}`, out.join(""));
+    const share = (c) => (c[3] + c[4]) / c[2], steps = (c) => c[2];
+    const high = (value, some) => { const found = some.map(value).sort((a, b) => a - b); return found[Math.floor(0.98 * (found.length - 1))] ?? 0; };
+    const often = cells.filter((c) => c[2] >= 5);
+    const made = element("div", { class: "charts", "data-robot": robot }, element("div"), element("div"));
+    made.children[0].innerHTML = map(cells, cell, `interventions, share of the steps in a cell of ${figure(cell)} m`, share, Math.max(0.02, high(share, often)), percents);
+    made.children[1].innerHTML = map(cells, cell, "steps in a cell", steps, Math.max(2, high(steps, cells)), (v) => figure(Math.round(v)));
     if (Object.keys(robots).length > 1) target.append(element("h3", {}, robot));
     target.append(made);
   }
@@ -159,9 +168,9 @@ function timeline(target, { lives, lines, bin_s, steps }) {
     const y = frame.top + 24 * k;
     out.push(label(4, y + 12, name.length > 20 ? `…${name.slice(-19)}` : name), tag("rect", { x: frame.left, y, width: frame.right - frame.left, height: 16, fill: "#f1f3f6" }));
     for (const life of lives.filter((l) => l.process === name)) {
-      const said = `${name}: ${figure(life.start - begin)} to ${figure(life.end - begin)} s, ${life.goodbye ? "ended in order" : "then not heard of"}`;
+      const said = `${name}: ${figure(life.start - begin)} to ${figure(life.end - begin)} s, ${life.goodbye ? "ended in order" : end - life.end > 3 ? "then not heard of" : "lived at the log's end"}`;
       out.push(tag("rect", { x: at(life.start), y, width: Math.max(2, at(life.end) - at(life.start)), height: 16, fill: "#4f9d78", rx: 2 }, tag("title", {}, said)));
-      if (!life.goodbye) out.push(tag("rect", { x: at(life.end) - 1.5, y: y - 2, width: 3, height: 20, fill: KINDS.a.color }, tag("title", {}, said)));
+      if (!life.goodbye && end - life.end > 3) out.push(tag("rect", { x: at(life.end) - 1.5, y: y - 2, width: 3, height: 20, fill: KINDS.a.color }, tag("title", {}, said)));
       if (life.restart) out.push(tag("path", { d: `M${at(life.start)} ${y - 2} l6 10 l-6 10 z`, fill: "#1b2430" }, tag("title", {}, `${name} was started again`)));
     }
     for (const line of lines.filter((l) => l.process === name)) out.push(tag("circle", { cx: at(line.t), cy: y + 8, r: 3.2, fill: line.level === "ERROR" ? KINDS.a.color : "#f2c14e", stroke: "#fff" }, tag("title", {}, `${line.level}: ${line.text}`)));

@@ -10,7 +10,7 @@ function near(target, galleries, choose) {
   for (const [robot, { near: orders, episodes }] of Object.entries(galleries)) {
     for (const order of orders) {
       const episode = episodes.find((e) => e.order === order), k = episode.closest_at;
-      const reach = Math.max(0.6, 6 * episode.footprint, 1.3 * Math.max(0, ...(episode.tubes[k]?.boxes ?? []).map(([x, y]) => Math.hypot(x - episode.x[k], y - episode.y[k]))));
+      const reach = Math.max(0.1, 3.4 * episode.footprint, 1.3 * Math.max(0, ...(episode.tubes[k]?.boxes ?? []).map(([x, y]) => Math.hypot(x - episode.x[k], y - episode.y[k]))));
       const box = [episode.x[k] - reach, episode.y[k] - reach, episode.x[k] + reach, episode.y[k] + reach];
       const picture = element("div");
       picture.innerHTML = arena(episode, k, 260, box);

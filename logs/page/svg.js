@@ -51,6 +51,11 @@ function percent(share) {
   return `${value >= 1 || value === 0 ? value.toFixed(1) : value.toPrecision(2)} %`;
 }
 
+/** Percent for an axis. */
+function percents(share) {
+  return `${+(100 * share).toPrecision(3)} %`;
+}
+
 /** Round values between low and high, about `count` of them. */
 function ticks(low, high, count = 5) {
   if (!(high > low)) return [low];
