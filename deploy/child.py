@@ -56,8 +56,8 @@ def places(config: RunConfig) -> list[Place]:
 
 def metadata(config: RunConfig) -> dict[str, dict[str, str]]:
     """What the log says of its run, besides the messages."""
-    from deploy.store import model_path
-    from safety.model_set import ModelSet
+    from deploy.store import method_path
+    from safety.methods import DDPC, load
 
     filtered = config.filtered
     run = {
@@ -67,7 +67,7 @@ def metadata(config: RunConfig) -> dict[str, dict[str, str]]:
         "seed": str(config.seed),
         "robots": ",".join(config.robots),
     }
-    if filtered:
+    if config.method == DDPC:
         run |= {"certificate": config.recipe.certificate, "mode": config.recipe.mode}
     packages = ("brakeline", "mujoco", "proxsuite", "numpy", "torch", "eclipse-zenoh", "mcap")
     about = {
@@ -77,19 +77,19 @@ def metadata(config: RunConfig) -> dict[str, dict[str, str]]:
         "conditions": config.conditions.describe(),
     }
     for robot in config.robots if filtered else ():
-        model = ModelSet.load(model_path(robot_named(robot), config.recipe))
+        model = load(method_path(robot_named(robot), config.method, config.recipe))
         about[f"model {robot}"] = {"version": model.version, **model.about}
     return about
 
 
 def attachments(config: RunConfig) -> dict[str, bytes]:
-    """The model sets in use when the run started, so that the log alone can be replayed."""
-    from deploy.store import model_path
-    from safety.model_set import ModelSet
+    """The models in use when the run started, so that the log alone can be replayed."""
+    from deploy.store import method_path
+    from safety.methods import load
 
     if not config.filtered:
         return {}
-    models = (ModelSet.load(model_path(robot_named(robot), config.recipe)) for robot in config.robots)
+    models = (load(method_path(robot_named(robot), config.method, config.recipe)) for robot in config.robots)
     return {attachment(model.robot.name, model.version): model.encode() for model in models}
 
 
@@ -108,10 +108,10 @@ def _recorder(place: Place, folder: Path, config: RunConfig, bus: BusSettings) -
 
 
 def _safety(place: Place, folder: Path, config: RunConfig, bus: BusSettings) -> bool:
-    from deploy.store import model_path
+    from deploy.store import method_path
     from safety.service import SafetySettings, main
 
-    models = tuple(model_path(robot_named(robot), config.recipe) for robot in config.robots)
+    models = tuple(method_path(robot_named(robot), config.method, config.recipe) for robot in config.robots)
     newest = (newest_model(folder, robot) or path for robot, path in zip(config.robots, models, strict=True))
     main(SafetySettings(bus, tuple(newest), folder, place.name))
     return False

@@ -69,6 +69,16 @@ COMMANDS: dict[str, Command] = {
         "a policy through the filter, in process, on fresh episodes",
         "brakeline evaluate ground --policy astar --episodes 100 --json",
     ),
+    "pretrain": Command(
+        "comparison:Pretrain",
+        "what a rival must know of a robot, driven and fitted, with its cost",
+        "brakeline pretrain secas ground",
+    ),
+    "compare": Command(
+        "comparison:Compare",
+        "every method from the same seeds, as tables and figures; resumes from results/",
+        "brakeline compare ground --quick",
+    ),
     "query": Command(
         "service:Query",
         "ask a running safety service about a state and an action",

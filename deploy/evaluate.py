@@ -11,26 +11,27 @@ import numpy as np
 
 from actors.driver import Driver, Identity
 from actors.guard import Ask, consult
-from deploy.store import model_for
+from deploy.store import method_for
 from deploy.vehicles import Conditions, environment
 from logs.metrics import Tally, closed_loop
 from messaging import brakeline_pb2 as pb
 from messaging.robots import Robot
 from messaging.weights import MLP
-from safety.methods import Model
+from safety.methods import DDPC, Model
 from safety.model_set import Recipe
 from safety.service import Counts, Models, answerer
 from sim.policies import POLICIES, Policy, scripted
 
 FRESH = 1_000_000  # added to the seed: no training run draws its episodes from there
-UNTRAINED = "untrained"
+UNTRAINED, TRAINED = "untrained", "trained"
+POLICY_FOLDER = Path(__file__).parents[1] / "policies"
 
 
 @dataclass(frozen=True)
 class Evaluation:
     """What to evaluate."""
 
-    policy: str = "astar"  # a file, or untrained | random | greedy | adversary | astar
+    policy: str = "astar"  # a file, or trained | untrained | random | greedy | adversary | astar
     method: str = "ddpc"
     recipe: Recipe = field(default_factory=Recipe)
     arena: str = "default"
@@ -40,17 +41,24 @@ class Evaluation:
 
 
 def policy_named(name: str, robot: Robot, seed: int) -> Policy:
-    """A scripted policy, an untrained one, or the one in a file.
+    """A scripted policy, the trained one of this repository (policies/), an untrained one, or the one in a file.
 
     Raises:
         ValueError: neither a name nor a file; BadWeights: a file that is no policy of this robot.
     """
     if name in POLICIES:
         return scripted(name, robot, np.random.default_rng(seed))
-    if name != UNTRAINED and not Path(name).is_file():
-        names = ", ".join([UNTRAINED, *POLICIES])
+    if name == UNTRAINED:
+        return driving(MLP.untrained(robot, seed))
+    path = POLICY_FOLDER / robot.name / "trained.safetensors" if name == TRAINED else Path(name)
+    if not path.is_file():
+        names = ", ".join([TRAINED, UNTRAINED, *POLICIES])
         raise ValueError(f"no policy is called {name!r} and no such file exists; there are: {names}, or a file's path")
-    mlp = MLP.untrained(robot, seed) if name == UNTRAINED else MLP.load(Path(name), robot)
+    return driving(MLP.load(path, robot))
+
+
+def driving(mlp: MLP) -> Policy:
+    """The network as a policy, without exploration."""
     return lambda observation, info: mlp(observation)
 
 
@@ -78,12 +86,18 @@ def episode(driver: Driver, policy: Policy, question: Ask | None, number: int) -
         yield driver.execute(proposal, outcome)
 
 
-def evaluate(robot: Robot, what: Evaluation, each: Callable[[Tally], Any] = lambda tally: None) -> dict[str, Any]:
-    """The shared figures of `what.episodes` episodes; `each` is called after every one."""
+def prepared(robot: Robot, what: Evaluation) -> tuple[Driver, Policy, Ask | None]:
+    """What an evaluation is made of: the driver in a fresh environment, the policy, and whom it asks."""
     policy = policy_named(what.policy, robot, what.seed)
     env = environment(robot, what.arena, FRESH + what.seed, what.conditions)
-    question = None if what.method == "none" else in_process(model_for(robot, what.recipe))
+    question = None if what.method == "none" else in_process(method_for(robot, what.method, what.recipe))
     driver = Driver(robot, env, Identity("evaluate", 0, what.seed), filtered=question is not None)
+    return driver, policy, question
+
+
+def evaluate(robot: Robot, what: Evaluation, each: Callable[[Tally], Any] = lambda tally: None) -> dict[str, Any]:
+    """The shared figures of `what.episodes` episodes; `each` is called after every one."""
+    driver, policy, question = prepared(robot, what)
     tally = Tally()
     for number in range(what.episodes):
         for step in episode(driver, policy, question, number):
@@ -91,8 +105,8 @@ def evaluate(robot: Robot, what: Evaluation, each: Callable[[Tally], Any] = lamb
         each(tally)
     return closed_loop([tally]) | {
         "method": what.method,
-        "certificate": what.recipe.certificate if question is not None else None,
-        "mode": what.recipe.mode if question is not None else None,
+        "certificate": what.recipe.certificate if what.method == DDPC else None,
+        "mode": what.recipe.mode if what.method == DDPC else None,
         "policy": what.policy,
         "arena": what.arena,
         "seed": what.seed,

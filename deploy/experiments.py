@@ -13,10 +13,11 @@ from typing import Any
 from actors.loop import Change
 from deploy.vehicles import Conditions
 from learner.config import LearnerConfig, TD3Config
+from safety.methods import METHODS as FILTERS
 from safety.model_set import Recipe
 from sim.world import arena_kind
 
-METHODS = ("ddpc", "none")
+METHODS = (*FILTERS, "none")
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ from typing import Any
 from deploy import experiments
 from deploy.child import CONFIG, ENDPOINT, KINDS, LOG, UNFINISHED, Place, places
 from deploy.experiments import RunConfig
-from deploy.store import model_for
+from deploy.store import method_for
 from logs.metrics import Metrics
 from messaging.bus import BusError, BusSettings, Malformed, Sample
 from messaging.process import Process
@@ -167,7 +167,7 @@ def prepare(config: RunConfig, folder: Path, resume: bool) -> None:
         raise LaunchError(f"{folder} holds a run already: give --resume {folder}, or another --out")
     if config.filtered:
         for robot in config.robots:
-            model_for(robot_named(robot), config.recipe)
+            method_for(robot_named(robot), config.method, config.recipe)
     folder.mkdir(parents=True, exist_ok=True)
 
 
@@ -226,7 +226,7 @@ class Launcher:
         """As `analyse` would give them for the log, with what only the launcher knows."""
         setup = {
             "method": self.config.method,
-            "certificate": self.config.recipe.certificate if self.config.filtered else None,
+            "certificate": self.config.recipe.certificate if self.config.method == "ddpc" else None,
             "policy": "learning",
             "arena": self.config.arena,
             "seed": self.config.seed,

@@ -17,7 +17,7 @@ from sim.estimator import NoiseLevels
 
 Certificate = Literal["residual", "set-membership", "matrix-zonotope"]
 Mode = Literal["direct", "recursion"]
-Method = Literal["ddpc", "none"]
+Method = Literal["ddpc", "secas", "sailr", "none"]
 T = TypeVar("T")
 Flags = Annotated[T, tyro.conf.OmitArgPrefixes]
 
@@ -29,7 +29,7 @@ class Filtering:
     """Which filter stands before the policy."""
 
     method: Method = "ddpc"
-    """ddpc: ours; none: no filter."""
+    """ddpc: ours; secas, sailr: the rivals; none: no filter."""
     certificate: Certificate = "residual"
     """What the model set trusts in the data (README)."""
     mode: Mode = "direct"

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from pathlib import Path
 
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from deploy.commands.common import Filtering, Flags, Physics, Robot, console, errors, say_json
-from deploy.evaluate import Evaluation, evaluate
+from deploy.evaluate import Evaluation, evaluate, prepared
 from logs.metrics import Tally
 from logs.report import show
+from messaging.robots import Robot as RobotKind
 from messaging.robots import robot_named
 
 
@@ -17,13 +19,17 @@ from messaging.robots import robot_named
 class Evaluate:
     robot: Robot = "ground"
     policy: str = "astar"
-    """A policy file, or untrained | random | greedy | adversary | astar."""
+    """A policy file, or trained (the one in policies/) | untrained | random | greedy | adversary | astar."""
     filtering: Flags[Filtering] = field(default_factory=Filtering)
     physics: Flags[Physics] = field(default_factory=Physics)
     arena: str = "default"
     """default | open | dense."""
     episodes: int = 100
     seed: int = 0
+    render: Path | None = None
+    """Also draw an episode from above, with tube and plan, into this file (.png, .gif, .mp4)."""
+    episode: int = 0
+    """Which one to draw."""
     json: bool = False
 
     def run(self) -> int:
@@ -37,6 +43,8 @@ class Evaluate:
             seed=self.seed,
             conditions=self.physics.conditions(),
         )
+        if self.render is not None:
+            self._draw(robot, what, self.render)
         columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
         with Progress(*columns, console=errors, transient=True, disable=not errors.is_terminal) as progress:
             task = progress.add_task("episodes", total=self.episodes)
@@ -52,3 +60,11 @@ class Evaluate:
             console.print(show(figures))
             console.print("[dim]conditions: " + ", ".join(f"{k} {v}" for k, v in figures["conditions"].items()) + "[/]")
         return 0
+
+    def _draw(self, robot: RobotKind, what: Evaluation, path: Path) -> None:
+        from deploy.render import record, save
+
+        driver, policy, question = prepared(robot, what)
+        film = record(driver, policy, question, self.episode)
+        save(film, path)
+        errors.print(f"{path}: episode {self.episode}, {film.end} after {len(film.frames) * robot.period:.1f} s")

@@ -13,7 +13,7 @@ import tyro
 
 from deploy.commands.common import Endpoints, Filtering, Flags, Physics, Robot
 from deploy.experiments import RunConfig
-from deploy.store import data_root, model_for, model_path
+from deploy.store import data_root, method_for, method_path
 from deploy.vehicles import environment
 from learner.config import LearnerConfig
 from messaging.robots import robot_named
@@ -32,8 +32,8 @@ class Safety:
 
         recipe = self.filtering.recipe()
         for robot in self.robots:
-            model_for(robot_named(robot), recipe)
-        paths = tuple(model_path(robot_named(robot), recipe) for robot in self.robots)
+            method_for(robot_named(robot), self.filtering.method, recipe)
+        paths = tuple(method_path(robot_named(robot), self.filtering.method, recipe) for robot in self.robots)
         main(SafetySettings(self.endpoints.bus(), paths, data_root(), self.name))
         return 0
 

@@ -1,0 +1,236 @@
+"""An episode seen from above: obstacles, the way driven, the plan and its tube; as a picture, or moving.
+
+What flies is drawn from above too: colours say how high things are.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.animation import AbstractMovieWriter, FFMpegWriter, PillowWriter
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection, PatchCollection
+from matplotlib.figure import Figure
+from matplotlib.patches import Circle, Patch, Polygon, Rectangle
+from matplotlib.transforms import Affine2D
+from numpy.typing import NDArray
+
+from actors.driver import Driver
+from actors.guard import Ask, consult
+from messaging import brakeline_pb2 as pb
+from messaging.robots import Robot
+from messaging.shapes import BOX, WALL, Obstacle
+from sim.policies import Policy
+
+Array = NDArray[np.float64]
+
+KINDS = {pb.UNKNOWN: "no filter", pb.ALLOWED: "allowed", pb.ADJUSTED: "adjusted", pb.FAILSAFE: "failsafe"}
+COLOURS = {"no filter": "#444444", "allowed": "#0072b2", "adjusted": "#e69f00", "failsafe": "#d55e00"}
+FORMATS = (".png", ".gif", ".mp4")
+SPEED = 3.0  # times as fast as the robot
+REST = 8  # frames that the last picture stands
+HEIGHTS = "viridis"
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One period: where the robot truly was before it, what was decided, and the set that its plan may reach.
+
+    position (d,), heading [rad]; tube: lowest and highest corners (N, d), none without one; center (N, d).
+    """
+
+    position: Array
+    heading: float
+    kind: str
+    low: Array
+    high: Array
+    center: Array
+    margin: float
+
+
+@dataclass(frozen=True)
+class Film:
+    """An episode, frame by frame; `end` is where it ended and how."""
+
+    robot: Robot
+    arena: Any
+    frames: list[Frame]
+    last: Array
+    end: str
+
+
+def record(driver: Driver, policy: Policy, question: Ask | None, number: int) -> Film:
+    """Drive episode `number` and keep what can be seen."""
+    driver.begin(number)
+    d = driver.robot.position_dim
+    frames, step = [], pb.Step()
+    while driver.running:
+        proposal = np.asarray(policy(driver.observation, driver.info), dtype=float)
+        outcome = consult(question, [driver.request(proposal)], driver.robot)[0] if question is not None else None
+        decision = outcome.answer.message if outcome is not None and outcome.answer is not None else pb.Decision()
+        before = np.asarray(driver.info["true_state"])
+        step = driver.execute(proposal, outcome)
+        center = np.reshape(decision.tube_center, (-1, d))
+        half = np.reshape(decision.tube_half_width, (-1, d))
+        heading = 0.0 if driver.robot.heading is None else float(before[driver.robot.heading])
+        kind = KINDS.get(step.decision, "no filter")
+        frames.append(Frame(before[:d], heading, kind, center - half, center + half, center, decision.margin))
+    end = "goal" if step.goal else "collision" if step.collision else "out of time"
+    return Film(driver.robot, driver.info["arena"], frames, np.asarray(step.true_state[:d]), end)
+
+
+def save(film: Film, path: Path) -> None:
+    """Draw the film: one picture of all of it (.png), or a moving one (.gif, .mp4).
+
+    Raises:
+        ValueError: another ending.
+    """
+    if path.suffix not in FORMATS:
+        raise ValueError(f"{path}: a picture ends in {', '.join(FORMATS)}")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    stage = _Stage(film)
+    if path.suffix == ".png":
+        stage.all_at_once()
+        stage.figure.savefig(path, dpi=130)
+        return
+    with (writer := _writer(path, SPEED / film.robot.period)).saving(stage.figure, str(path), dpi=90):
+        for k in range(len(film.frames)):
+            stage.show(k)
+            writer.grab_frame()
+        for _ in range(REST):
+            writer.grab_frame()
+
+
+def _writer(path: Path, rate: float) -> AbstractMovieWriter:
+    if path.suffix == ".gif":
+        return PillowWriter(fps=rate)
+    import imageio_ffmpeg
+    import matplotlib
+
+    matplotlib.rcParams["animation.ffmpeg_path"] = imageio_ffmpeg.get_ffmpeg_exe()
+    return FFMpegWriter(fps=rate, codec="h264", extra_args=["-pix_fmt", "yuv420p", "-crf", "20"])
+
+
+class _Stage:
+    """The room, and what moves in it."""
+
+    def __init__(self, film: Film) -> None:
+        self.film, self.robot = film, film.robot
+        self.flies = film.robot.position_dim == 3
+        self.figure = Figure(figsize=(7.0, 7.4), layout="constrained")
+        self.axes: Axes = self.figure.subplots()
+        self.way = np.array([frame.position for frame in film.frames] + [film.last])
+        self._room()
+        self.lines = LineCollection([], linewidths=2.2, zorder=4)
+        self.axes.add_collection(self.lines)
+        self._moving: list[Any] = []
+
+    def _room(self) -> None:
+        axes, arena = self.axes, self.film.arena
+        (left, right), (bottom, top) = arena.bounds[:2]
+        edge = 0.03 * (right - left)
+        axes.add_patch(Rectangle((left, bottom), right - left, top - bottom, fill=False, linewidth=2.0, zorder=1))
+        axes.set(xlim=(left - edge, right + edge), ylim=(bottom - edge, top + edge), aspect="equal")
+        axes.set_xlabel("x [m]")
+        axes.set_ylabel("y [m]")
+        inside = [o for o in arena.obstacles if o.kind != WALL and not self._closes(o)]
+        drawn = PatchCollection([_patch(o) for o in inside], edgecolor="#333333", linewidth=0.8, zorder=2)
+        if self.flies:
+            drawn.set_array(np.array([_top(o) for o in inside]))
+            drawn.set(cmap=HEIGHTS, clim=arena.bounds[2], alpha=0.45)
+            self.figure.colorbar(drawn, ax=axes, label="height: tops of obstacles, and of the way [m]", shrink=0.7)
+        else:
+            drawn.set_facecolor("#9a9a9a")
+        axes.add_collection(drawn)
+        goal = arena.goal
+        axes.add_patch(Circle(goal[:2], arena.goal_radius, color="#009e73", alpha=0.35, zorder=1))
+        axes.plot(*goal[:2], marker="*", color="#009e73", markersize=12, zorder=3)
+        axes.plot(*self.way[0, :2], marker="o", color="white", markeredgecolor="black", markersize=6, zorder=6)
+
+    def _closes(self, obstacle: Obstacle) -> bool:
+        """Is it a floor or a ceiling?"""
+        (left, right), _ = self.film.arena.bounds[:2]
+        return obstacle.kind == BOX and obstacle.size[0] >= right - left
+
+    def show(self, k: int) -> None:
+        """The state before period k, with its plan."""
+        frame = self.film.frames[k]
+        for artist in self._moving:
+            artist.remove()
+        self._moving = [*self._tube(frame, 0.35), *self._body(frame.position, frame.heading, frame.kind)]
+        if len(frame.center):
+            points = np.vstack([frame.position, frame.center])
+            self._moving += self.axes.plot(
+                points[:, 0], points[:, 1], color=COLOURS[frame.kind], linewidth=1.2, zorder=5
+            )
+        self._draw_way(k)
+        seconds = k * self.robot.period
+        self.axes.set_title(f"{self._heading()}{seconds:5.1f} s, {frame.kind}", fontsize=11, loc="left")
+
+    def all_at_once(self) -> None:
+        """The whole way; the tubes of a few plans; where it was corrected."""
+        frames = self.film.frames
+        for k in np.unique(np.linspace(0, len(frames) - 1, 16).astype(int)):
+            self._tube(frames[k], 0.18)
+            self._body(frames[k].position, frames[k].heading, frames[k].kind, alpha=0.25)
+        self._body(self.film.last, frames[-1].heading, frames[-1].kind)
+        self._draw_way(len(frames))
+        shares = [f"{100 * np.mean([f.kind == kind for f in frames]):.0f} % {kind}" for kind in COLOURS]
+        shown = ", ".join(text for text in shares if not text.startswith("0 %"))
+        time = f"{len(frames) * self.robot.period:.1f} s"
+        self.axes.set_title(f"{self._heading()}{self.film.end} after {time}; {shown}", fontsize=11, loc="left")
+        seen = [kind for kind in COLOURS if any(frame.kind == kind for frame in frames)]
+        if not self.flies:
+            handles = [Patch(color=COLOURS[kind], label=kind) for kind in seen]
+            self.axes.legend(handles=handles, loc="upper right", fontsize=8, framealpha=0.9)
+
+    def _heading(self) -> str:
+        return f"{self.robot.name}, {self.film.arena.name}: "
+
+    def _draw_way(self, k: int) -> None:
+        """The way up to period k; on the ground in the colour of each decision, in the air in that of its height."""
+        pieces = np.stack([self.way[:k], self.way[1 : k + 1]], axis=1)
+        self.lines.set_segments(list(pieces[:, :, :2]))
+        if self.flies:
+            self.lines.set(array=pieces[:, :, 2].mean(axis=1), cmap=HEIGHTS, clim=self.film.arena.bounds[2])
+        else:
+            self.lines.set_color([COLOURS[frame.kind] for frame in self.film.frames[:k]])
+
+    def _tube(self, frame: Frame, alpha: float) -> list[Any]:
+        """The sets of the body's position at the periods' ends, grown by the footprint."""
+        drawn = []
+        for low, high in zip(frame.low, frame.high, strict=True):
+            size = high - low + 2.0 * self.robot.footprint
+            corner = low - self.robot.footprint
+            box = Rectangle(corner[:2], size[0], size[1], color=COLOURS[frame.kind], alpha=alpha, linewidth=0, zorder=3)
+            drawn.append(self.axes.add_patch(box))
+        return drawn
+
+    def _body(self, position: Array, heading: float, kind: str, alpha: float = 1.0) -> list[Any]:
+        radius = self.robot.footprint
+        disc = Circle(position[:2], radius, facecolor=COLOURS[kind], edgecolor="black", alpha=alpha, zorder=7)
+        drawn: list[Any] = [self.axes.add_patch(disc)]
+        if self.robot.heading is not None:
+            nose = position[:2] + radius * np.array([np.cos(heading), np.sin(heading)])
+            line = np.stack([position[:2], nose])
+            drawn += self.axes.plot(line[:, 0], line[:, 1], color="white", linewidth=1.5, alpha=alpha, zorder=8)
+        return drawn
+
+
+def _patch(obstacle: Obstacle) -> Patch:
+    x, y = obstacle.position[:2]
+    if obstacle.kind != BOX:
+        return Circle((x, y), obstacle.size[0])
+    corners = 0.5 * np.array([(1, 1), (-1, 1), (-1, -1), (1, -1)]) * obstacle.size[:2]
+    return Polygon(Affine2D().rotate(obstacle.yaw).translate(x, y).transform(corners))
+
+
+def _top(obstacle: Obstacle) -> float:
+    """The height of an obstacle's highest point, m."""
+    if len(obstacle.position) == 2:
+        return 0.0
+    vertical = obstacle.size[0] if obstacle.kind == "sphere" else 0.5 * obstacle.size[-1]
+    return float(obstacle.position[2] + vertical)
