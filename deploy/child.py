@@ -40,7 +40,7 @@ class Place:
 
 def places(config: RunConfig) -> list[Place]:
     """THE table of a run's processes, in the order in which they start."""
-    table = [Place("recorder", "recorder")]
+    table = [Place("recorder", "recorder")] if config.record else []
     if config.filtered:
         table += [Place(f"safety-{i}", "safety") for i in range(config.replicas)]
     one = len(config.robots) == 1
@@ -103,7 +103,8 @@ def _recorder(place: Place, folder: Path, config: RunConfig, bus: BusSettings) -
     from logs.foxglove import Pictures
 
     derive = Pictures(config.pictures).of_sample if config.pictures > 0.0 else None
-    recorder.main(bus, folder / LOG, metadata(config), place.name, attachments(config), derive)
+    about, files = metadata(config), attachments(config)
+    recorder.main(bus, folder / LOG, about, place.name, files, derive, config.rotation)
     return False
 
 

@@ -133,6 +133,6 @@ def summary(console: Console, figures: dict[str, Any]) -> None:
         console.print(f"steps from logs: {fed.get('published', 0)}, and {fed.get('known', 0)} that the learner knew")
     if not figures["finished"]:
         console.print(f"[yellow]stopped before the last step[/]; go on: brakeline train --resume {figures['folder']}")
-    console.print(f"log:    {figures['log']}", markup=False)
+    console.print(f"log:    {figures['log'] or 'none was recorded'}", markup=False)
     for path in figures["policies"]:
         console.print(f"policy: {path}", markup=False)

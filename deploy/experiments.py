@@ -13,9 +13,11 @@ from typing import Any
 from actors.loop import Change
 from deploy.vehicles import Conditions
 from learner.config import LearnerConfig, TD3Config
+from logs.recorder import Rotation
+from messaging.robots import robot_named
 from safety.methods import METHODS as FILTERS
 from safety.model_set import Recipe
-from sim.world import arena_kind
+from sim.arenas import arena_kind
 
 METHODS = (*FILTERS, "none")
 
@@ -37,8 +39,10 @@ class RunConfig:
     deterministic: bool = False  # one actor, lockstep, no deadlines
     from_logs: tuple[str, ...] = ()  # files or folders whose steps are learned from first; with no actor: only these
     replicas: int = 1  # of the safety service
-    practice: float = 0.0  # share of steps at which a robot starts to follow its committed plan to the stop
+    record: bool = True  # a log; without one nothing can be analysed or replayed
+    rotation: Rotation = field(default_factory=Rotation)  # of the log's files
     pictures: float = 10.0  # a second and robot, drawn for Foxglove in the log; 0: none
+    practice: float = 0.0  # share of steps at which a robot starts to follow its committed plan to the stop
     change: Change = field(default_factory=Change)  # of the robots, in mid-run
     conditions: Conditions = field(default_factory=Conditions)
     learner: LearnerConfig = field(default_factory=lambda: LearnerConfig(checkpoint_every=2500))
@@ -46,7 +50,8 @@ class RunConfig:
     def __post_init__(self) -> None:
         if self.method not in METHODS:
             raise ValueError(f"no method is called {self.method!r}; there are: {', '.join(METHODS)}")
-        arena_kind(self.arena)
+        for robot in self.robots:
+            arena_kind(robot_named(robot), self.arena)
         if min(self.robots_per_actor, self.replicas, self.steps) < 1 or self.actors < (0 if self.from_logs else 1):
             raise ValueError(
                 "actors (unless there are logs to learn from), robots per actor, replicas, steps: 1 or more"

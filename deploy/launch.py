@@ -200,7 +200,9 @@ class Launcher:
                 {f"restarts {child.place.name}": child.restarts for child in self.children}
             )
             try:
-                self._start_recorder(process)
+                if self.config.record:
+                    self._start_recorder(process)
+                process.announce()
                 while not process.stop.is_set() and not self.finished:
                     for child in self.children:
                         if not self._must_wait(child):
@@ -232,7 +234,8 @@ class Launcher:
             "seed": self.config.seed,
         }
         restarts = {child.place.name: child.restarts for child in self.children if child.restarts}
-        paths = {"folder": str(self.folder), "log": str(self.folder / LOG), "policies": self.policies()}
+        log_path = str(self.folder / LOG) if self.config.record else None
+        paths = {"folder": str(self.folder), "log": log_path, "policies": self.policies()}
         return (
             setup
             | self.metrics.figures()
@@ -292,7 +295,6 @@ class Launcher:
         else:
             if not process.stop.is_set():
                 log.error("the recorder does not record: %s", last_line(self.folder / "logs" / "recorder.log"))
-        process.announce()
 
     def _drain(self) -> None:
         while self._inbox:
@@ -308,8 +310,9 @@ class Launcher:
 
     def _end(self) -> None:
         """Everything but the recorder first, so that their last words are in the log."""
-        recorder, others = self.children[0], self.children[1:]
-        for group in (others, [recorder]):
+        recorders = [child for child in self.children if child.place.kind == "recorder"]
+        others = [child for child in self.children if child not in recorders]
+        for group in filter(None, (others, recorders)):
             for child in group:
                 child.terminate()
             deadline = time.monotonic() + END_PATIENCE

@@ -104,7 +104,7 @@ class Gallery:
         return source
 
     def step(self, source: Source, step: pb.Step) -> None:
-        """Take a step of the actor. An episode is looked at when the next one begins: questions may come after steps."""
+        """Take a step of the actor. An episode is looked at when the next begins: questions may come after steps."""
         held = source.running
         number = step.episode
         if held is None or held.number != number or step.step == 0:

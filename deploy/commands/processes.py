@@ -16,6 +16,7 @@ from deploy.experiments import RunConfig
 from deploy.store import data_root, method_for, method_path
 from deploy.vehicles import environment
 from learner.config import LearnerConfig
+from logs.recorder import Rotation
 from messaging.robots import robot_named
 
 
@@ -103,6 +104,7 @@ class Recorder:
     name: str = "recorder"
     pictures: float = RunConfig.pictures
     """A second and robot, drawn for Foxglove in the log besides all interventions; 0: none at all."""
+    rotation: Rotation = field(default_factory=Rotation)
 
     def run(self) -> int:
         from logs import recorder
@@ -110,5 +112,5 @@ class Recorder:
 
         about = {"versions": {"brakeline": version("brakeline")}}
         derive = Pictures(self.pictures).of_sample if self.pictures > 0.0 else None
-        recorder.main(self.endpoints.bus(), self.log, about, self.name, derive=derive)
+        recorder.main(self.endpoints.bus(), self.log, about, self.name, derive=derive, rotation=self.rotation)
         return 0

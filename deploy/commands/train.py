@@ -17,6 +17,7 @@ from deploy.experiments import EXPERIMENTS, RunConfig, load
 from deploy.feed import count
 from deploy.launch import Launcher, prepare
 from learner.config import LearnerConfig
+from logs.recorder import Rotation
 from messaging.robots import robot_named
 
 
@@ -77,6 +78,9 @@ class Train:
     """Load the robots or change the floor in mid-run, e.g. --change.after 5000 --change.payload-kg 1."""
     deterministic: bool = False
     """One actor, lockstep, no deadlines: the same seed gives the same weights, bit for bit."""
+    record: bool = True
+    """A log of the run. Without one nothing can be analysed, replayed or watched later."""
+    rotation: Rotation = field(default_factory=Rotation)
     pictures: float = RunConfig.pictures
     """A second and robot, drawn for Foxglove in the log besides all interventions; 0: none at all."""
     listen: str | None = None
@@ -126,6 +130,8 @@ class Train:
             deterministic=self.deterministic,
             replicas=self.replicas,
             pictures=self.pictures,
+            record=self.record,
+            rotation=self.rotation,
             conditions=self.physics.conditions(),
             learner=self.learner,
         )
