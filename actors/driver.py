@@ -28,8 +28,8 @@ class Environment(Protocol):
 
     def step(self, action: Array) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]: ...
 
-    def alter(self, payload_kg: float, floor_friction: float) -> None:
-        """Change the robot, from now on."""
+    def alter(self, **changes: float) -> None:
+        """Change the robot's physics, from now on."""
 
 
 @dataclass(frozen=True)

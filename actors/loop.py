@@ -101,7 +101,7 @@ class Rider:
     def ready(self, stop: Callable[[], bool]) -> bool:
         """Wait for permission to step, and begin an episode if none is running; False: the end."""
         if self.driver.index == self.change.after:
-            self.driver.env.alter(self.change.payload_kg, self.change.floor_friction)
+            self.driver.env.alter(payload_kg=self.change.payload_kg, floor_friction=self.change.floor_friction)
         if not self.student.wait(self.driver.index + 1, self.next_episode, stop):
             return False
         if not self.driver.running:

@@ -3,53 +3,73 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass, field
-from typing import Any
+from functools import partial
 
 import numpy as np
 
-from messaging.robots import GROUND, Robot
-from messaging.shapes import WALL, Obstacle
+from messaging.robots import GROUND, QUADROTOR, Robot
+from sim.arenas import arena_kind
 from sim.envs import NavigationEnv
 from sim.estimator import NoiseLevels
+from sim.flight_estimator import QuadrotorNoise
 from sim.ground import GroundRobot
-from sim.world import Arena, arena_kind
+from sim.quadrotor import Quadrotor
+from sim.vehicle import MakeVehicle, Vehicle
+from sim.wind import Wind
+from sim.world import Arena, closing, room_bounds
 
 YARD = 50.0  # m to the walls of the place where data are recorded: farther than a trajectory can go
 
 
 @dataclass(frozen=True)
 class Conditions:
-    """What may differ between the robot that was recorded and the one that drives."""
+    """What may differ between the robot that was recorded and the one that drives, of every robot kind."""
 
     noise: NoiseLevels = field(default_factory=NoiseLevels)
     payload_kg: float = 0.0
     floor_friction: float = 1.0
+    flight_noise: QuadrotorNoise = field(default_factory=QuadrotorNoise)
+    wind: Wind = field(default_factory=Wind)
 
     def describe(self) -> dict[str, str]:
         """For metadata and printed results: every level with its value."""
         values = asdict(self.noise) | {"payload_kg": self.payload_kg, "floor_friction": self.floor_friction}
-        return {name: f"{value:g}" for name, value in values.items()}
+        values |= {f"flight_{name}": value for name, value in asdict(self.flight_noise).items()}
+        values |= {f"wind_{name}": value for name, value in asdict(self.wind).items()}
+        return {name: "drawn" if value is None else f"{value:g}" for name, value in values.items()}
+
+    def factory(self, robot: Robot) -> MakeVehicle:
+        """What makes a vehicle of that kind under these conditions. Raises ValueError when there is none."""
+        if robot is GROUND:
+            return partial(
+                GroundRobot, noise=self.noise, payload_kg=self.payload_kg, floor_friction=self.floor_friction
+            )
+        if robot is QUADROTOR:
+            return partial(Quadrotor, noise=self.flight_noise, wind=self.wind)
+        raise ValueError(f"no simulator for {robot.name}")
+
+    def lidar_noise(self, robot: Robot) -> float:
+        """Sigma of a range, m."""
+        noise = self.noise if robot is GROUND else self.flight_noise
+        return noise.scale * noise.lidar
 
 
 def environment(robot: Robot, arena: str, seed: int, conditions: Conditions | None = None) -> NavigationEnv:
-    """A Gymnasium environment; `seed` sets its episodes apart from those of another seed."""
-    if robot is not GROUND:
-        raise ValueError(f"no simulator for {robot.name}")
-    arena_kind(arena)
+    """A Gymnasium environment; `seed` sets its episodes apart from those of another seed.
+
+    Raises:
+        ValueError: no simulator for this robot; UnknownArena: no such arena for it.
+    """
     c = conditions or Conditions()
-    return NavigationEnv(
-        robot, arena, noise=c.noise, seed_key=seed, payload_kg=c.payload_kg, floor_friction=c.floor_friction
-    )
+    make = c.factory(robot)
+    arena_kind(robot, arena)
+    return NavigationEnv(robot, arena, make, c.lidar_noise(robot), seed_key=seed)
 
 
-def vehicle_in_yard(robot: Robot, rng: np.random.Generator, conditions: Conditions) -> Any:
+def vehicle_in_yard(robot: Robot, rng: np.random.Generator, conditions: Conditions) -> Vehicle:
     """The bare vehicle with nothing near it, heading at random."""
-    if robot is not GROUND:
-        raise ValueError(f"no simulator for {robot.name}")
-    walls = tuple(
-        Obstacle(WALL, (-YARD * np.cos(yaw), -YARD * np.sin(yaw)), (), yaw) for yaw in np.arange(4) * (np.pi / 2)
-    )
-    start = (0.0, 0.0, float(rng.uniform(-np.pi, np.pi)))
-    bounds = (-YARD, YARD)
-    arena = Arena("yard", walls, start, (YARD / 2, 0.0), 0.25, 10**9, bounds)
-    return GroundRobot(arena, rng, conditions.noise, conditions.payload_kg, conditions.floor_friction)
+    height = None if robot.position_dim == 2 else 2.0 * YARD
+    start = (0.0, 0.0, float(rng.uniform(-np.pi, np.pi)) if height is None else YARD)
+    goal = (0.5 * YARD, 0.0) if height is None else (0.5 * YARD, 0.0, YARD)
+    arena = Arena("yard", closing(YARD, height), start, goal, 0.25, 10**9, room_bounds(YARD, height))
+    return conditions.factory(robot)(arena, rng)

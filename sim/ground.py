@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from pathlib import Path
 
 import mujoco
@@ -13,6 +12,7 @@ from numpy.typing import NDArray
 from messaging.robots import GROUND
 from sim.estimator import Estimator, NoiseLevels
 from sim.scene import add_obstacles
+from sim.vehicle import BadInput, Period
 from sim.world import Arena
 
 Array = NDArray[np.float64]
@@ -22,23 +22,6 @@ WHEEL_RADIUS = 0.033  # m
 TRACK = 0.160  # m between the wheels
 SAMPLES = 10  # of encoders and gyro in a period
 PAYLOAD_GYRATION = 0.05  # m, radius of gyration of what is loaded
-
-
-class BadInput(ValueError):
-    """An input that is not a finite vector of the robot's length."""
-
-
-@dataclass(frozen=True)
-class Period:
-    """What happened in one period."""
-
-    measured: Array  # (5,) state at its end, as estimated
-    true: Array  # (5,) state at its end, as it is
-    collision: bool  # some geom of the robot touched an obstacle at some physics step
-    closest: float  # m, least distance from the footprint's disc to an obstacle, at the samples
-    clearance: float  # m, the same at the period's end
-    subsamples: Array  # (SAMPLES, 2) m, dead-reckoned positions in the robot's frame at the period's start
-    turned: float  # rad, dead-reckoned change of heading
 
 
 class GroundRobot:
@@ -75,6 +58,14 @@ class GroundRobot:
         self.true = self._true_state()
         self.measured = np.array([*self.estimator.pose, 0.0, 0.0])
         self.input = np.zeros(GROUND.action_dim)
+
+    def alter(self, **changes: float) -> None:
+        """Change `payload_kg`, `floor_friction` or both, from now on. Raises ValueError for any other name."""
+        setters = {"payload_kg": self.set_payload, "floor_friction": self.set_friction}
+        if unknown := changes.keys() - setters.keys():
+            raise ValueError(f"a ground robot has no {', '.join(sorted(unknown))}; it has: {', '.join(setters)}")
+        for name, value in changes.items():
+            setters[name](value)
 
     def set_payload(self, kg: float) -> None:
         """Load that many kg on top of the bare robot's mass, at its centre of mass; at any time."""

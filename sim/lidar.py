@@ -1,59 +1,63 @@
-"""A planar lidar: exact ranges along a fan of rays, to discs and to rotated boxes (walls are large boxes)."""
+"""Lidars: exact ranges along a fan of beams, cast at the obstacles of an arena by MuJoCo, with the sensor's noise."""
 
 from __future__ import annotations
 
-import math
-
+import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from messaging.robots import RAYS
-from messaging.shapes import Shapes
+from messaging.rays import Rays
+from messaging.shapes import rotate
+from sim.estimator import cut_normal
+from sim.scene import HEIGHT, map_model
+from sim.world import Arena
 
 Array = NDArray[np.float64]
 
-FAN = np.linspace(-0.5 * math.pi, 0.5 * math.pi, RAYS)  # rad from straight ahead; right to left
-MAX_RANGE = 3.5  # m
-TINY = 1e-12  # stands for a component of a direction that is zero: 1/TINY is finite, and 0/TINY is not a NaN
 
+class Lidar:
+    """One lidar in one arena. What it sees are the obstacles of the arena's map; robots are not among them."""
 
-def cast(shapes: Shapes, origin: Array, heading: float, max_range: float = MAX_RANGE) -> Array:
-    """Ranges (RAYS,) in m from `origin` (2,) along the fan about `heading` (rad); `max_range` where nothing is hit.
+    def __init__(self, arena: Arena, rays: Rays, noise: float = 0.0, rng: np.random.Generator | None = None) -> None:
+        """rays: of the arena's dimension, in the frame of the robot's heading; noise: m, sigma of a range.
 
-    `shapes` are 2-D; each is a box (rho = 0) or a disc (half = 0). Inside one of them every range is 0.
-    """
-    if not len(shapes):
-        return np.full(RAYS, max_range)
-    angles = heading + FAN
-    rays = np.stack((np.cos(angles), np.sin(angles)))  # (2, RAYS)
-    disc = shapes.rho > 0.0
-    return np.minimum(
-        np.minimum(_to_discs(shapes.center[disc] - origin, shapes.rho[disc], rays, max_range), max_range),
-        _to_boxes(shapes.take(~disc), origin, rays, max_range),
-    )
+        The noise is normal, cut off at 2 sigma, anew each range; it needs `rng`.
+        """
+        self.max_range, self._noise, self._rng = rays.range, noise, rng
+        beams = np.zeros((len(rays.directions), 3))
+        beams[:, : arena.dim] = rays.directions
+        self._beams = beams
+        self._height = 0.5 * HEIGHT if arena.dim == 2 else None
+        self._model, self._data = map_model(arena)
+        self._hit, self._ranges = np.empty(len(beams), np.int32), np.empty(len(beams))
 
+    def cast(self, origin: Array, heading: float = 0.0) -> Array:
+        """True ranges (R,) in m from a point (d,) of free space; `max_range` where nothing is hit within it.
 
-def _to_discs(offset: Array, radius: Array, rays: Array, max_range: float) -> Array:
-    """Ranges (RAYS,) to discs of `radius` (n,) at `offset` (n, 2): the smaller root t of |t·ray − offset| = radius."""
-    along = offset @ rays  # (n, RAYS)
-    beyond = (offset * offset).sum(axis=1) - radius * radius  # negative inside
-    square = along * along - beyond[:, None]
-    near = along - np.sqrt(np.maximum(square, 0.0))
-    hit = (square >= 0.0) & (along > 0.0) & (beyond[:, None] > 0.0)
-    ranges = np.where(hit, near, max_range)
-    ranges[beyond <= 0.0] = 0.0
-    return np.asarray(ranges.min(axis=0, initial=max_range))
+        A point inside an obstacle has no true range: a beam then ends where it leaves the obstacle.
+        """
+        beams = rotate(self._beams, heading) if heading else self._beams
+        point = origin if self._height is None else np.array([*origin, self._height])
+        mujoco.mj_multiRay(
+            self._model,
+            self._data,
+            point,
+            beams.ravel(),
+            None,  # no groups of geoms
+            True,  # geoms that can't move are seen
+            -1,  # no body is left out
+            self._hit,
+            self._ranges,
+            None,  # no normals
+            len(beams),
+            self.max_range,
+        )
+        return np.where((self._hit >= 0) & (self._ranges < self.max_range), self._ranges, self.max_range)
 
-
-def _to_boxes(boxes: Shapes, origin: Array, rays: Array, max_range: float) -> Array:
-    """Ranges (RAYS,) to rotated boxes: a ray is inside from the last pair of sides it enters to the first it leaves."""
-    turned = boxes.axes.transpose(0, 2, 1)
-    local = turned @ (origin - boxes.center)[:, :, None]  # (n, 2, 1)
-    direction = turned @ rays  # (n, 2, RAYS)
-    inverse = 1.0 / np.where(np.abs(direction) < TINY, TINY, direction)
-    middle = -local * inverse
-    reach = boxes.half[:, :, None] * np.abs(inverse)
-    enter = (middle - reach).max(axis=1)  # (n, RAYS)
-    leave = (middle + reach).min(axis=1)
-    ranges = np.where((enter <= leave) & (leave >= 0.0), np.maximum(enter, 0.0), max_range)
-    return np.asarray(ranges.min(axis=0, initial=max_range))
+    def ranges(self, origin: Array, heading: float = 0.0) -> Array:
+        """What the lidar reports there, (R,) m in [0, max_range]; a beam that hits nothing reports `max_range`."""
+        true = self.cast(origin, heading)
+        if self._rng is None:
+            return true
+        noisy = true + cut_normal(self._rng, self._noise, true.shape)
+        return np.where(true < self.max_range, np.clip(noisy, 0.0, self.max_range), self.max_range)

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import label
+from scipy.ndimage import label, map_coordinates, minimum_filter
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 
@@ -14,54 +15,83 @@ from messaging.shapes import Obstacle, Shapes
 
 Array = NDArray[np.float64]
 
-CELL = 0.05  # m, edge of a cell
-CELLS_PER_SIDE = 110  # at most; wider rooms get wider cells
-STEPS = ((1, 0), (0, 1), (1, 1), (1, -1))  # half of the eight neighbours; the others are these reversed
+CELL = {2: 0.05, 3: 0.625}  # m, edge of a cell in the plane and in space
+CELLS_PER_SIDE = 110  # along x, at most; wider rooms get wider cells
 
 
 class ClearanceMap:
-    """Distance from every cell's centre to the nearest obstacle: `clearance` (n, n), m, first index along x."""
+    """Distance from every cell's centre to the nearest obstacle: `clearance`, m, one index per axis, x first."""
 
-    def __init__(self, obstacles: Sequence[Obstacle], bounds: tuple[float, float]) -> None:
-        self.low = bounds[0]
-        width = bounds[1] - bounds[0]
-        self.side = min(round(width / CELL), CELLS_PER_SIDE)
-        self.cell = width / self.side
-        centres = self.low + self.cell * (np.arange(self.side) + 0.5)
-        points = np.stack(np.meshgrid(centres, centres, indexing="ij"), axis=-1)
-        self.centres: Array = points.reshape(-1, 2)
-        self.clearance: Array = _nearest(Shapes.of(obstacles, dim=2), self.centres).reshape(self.side, self.side)
+    def __init__(self, obstacles: Sequence[Obstacle], bounds: Sequence[tuple[float, float]]) -> None:
+        """bounds: lowest and highest coordinate of each of the d = 2 or 3 axes, m."""
+        widths = [high - low for low, high in bounds]
+        self.dim = len(bounds)
+        self.low: Array = np.array([low for low, _ in bounds])
+        self.cell = widths[0] / min(round(widths[0] / CELL[self.dim]), CELLS_PER_SIDE)
+        self.shape = tuple(round(width / self.cell) for width in widths)
+        axes = [low + self.cell * (np.arange(n) + 0.5) for low, n in zip(self.low, self.shape, strict=True)]
+        self.centres: Array = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, self.dim)
+        plan = np.stack(np.meshgrid(*axes[:2], indexing="ij"), axis=-1).reshape(-1, 2)
+        shapes = Shapes.of(obstacles, dim=self.dim)
+        self.clearance: Array = _nearest(shapes, plan, *axes[2:]).reshape(self.shape)
 
     def index(self, points: Array) -> NDArray[np.intp]:
-        """Cells of points (..., 2), the outermost ones for points beyond the walls: (..., 2)."""
+        """Cells of points (..., d), the outermost ones for points beyond the walls: (..., d)."""
         cells = np.floor((points - self.low) / self.cell).astype(np.intp)
-        return np.clip(cells, 0, self.side - 1)
+        return np.clip(cells, 0, np.array(self.shape) - 1)
+
+    def number(self, points: Array) -> NDArray[np.intp]:
+        """Cells of points (..., d) as places in `centres`: (...)."""
+        return np.asarray(np.ravel_multi_index(tuple(np.moveaxis(self.index(points), -1, 0)), self.shape))
 
     def at(self, points: Array) -> Array:
-        """Clearance of the cells that hold points (..., 2), in m."""
-        cells = self.index(points)
-        return np.asarray(self.clearance[cells[..., 0], cells[..., 1]])
+        """Clearance of the cells that hold points (..., d), in m."""
+        return np.asarray(self.clearance[tuple(np.moveaxis(self.index(points), -1, 0))])
+
+    def between(self, values: Array, points: Array) -> Array:
+        """Values of the cells (as `clearance` is shaped), interpolated linearly at points (..., d): (...)."""
+        places = np.moveaxis((points - self.low) / self.cell - 0.5, -1, 0)
+        return np.asarray(map_coordinates(values, places, order=1, mode="nearest"))
 
     def connected(self, start: Sequence[float], goal: Sequence[float], clearance: float) -> bool:
-        """Whether a disc of radius `clearance` (m) can go from start to goal.
+        """Whether a disc (ball) of radius `clearance` (m) can go from start to goal.
 
-        Between two cells h = cell·√2 apart, both at least c from a point, the way is at least √(c² − h²/4) from it.
+        Between two cells h = cell·√d apart, both at least c from a point, the way is at least √(c² − h²/4) from it.
         """
-        least = float(np.hypot(clearance, self.cell / np.sqrt(2.0)))
-        regions, _ = label(self.clearance >= least, structure=np.ones((3, 3)))
-        ends = self.index(np.array([start, goal]))
-        first, last = regions[ends[:, 0], ends[:, 1]]
+        least = float(np.hypot(clearance, 0.5 * self.cell * np.sqrt(self.dim)))
+        regions, _ = label(self.clearance >= least, structure=np.ones((3,) * self.dim))
+        first, last = regions.ravel()[self.number(np.array([start, goal]))]
         return bool(first == last and first > 0)
 
 
-def _nearest(shapes: Shapes, points: Array) -> Array:
-    """Distances (p,) from points (p, 2) to the nearest shape: `Shapes.distance`, ten times faster for many points."""
-    least = np.full(len(points), np.inf)
-    x, y = np.ascontiguousarray(points.T)
-    for (cx, cy), axes, (half_x, half_y), rho in zip(shapes.center, shapes.axes, shapes.half, shapes.rho, strict=True):
-        along = np.abs((x - cx) * axes[0, 0] + (y - cy) * axes[1, 0]) - half_x
-        across = np.abs((x - cx) * axes[0, 1] + (y - cy) * axes[1, 1]) - half_y
-        np.minimum(least, np.hypot(np.maximum(along, 0.0), np.maximum(across, 0.0)) - rho, out=least)
+def _nearest(shapes: Shapes, plan: Array, heights: Array | None = None) -> Array:
+    """Distances to the nearest shape from points (p, 2); with heights (q,): from all points above these, (p, q).
+
+    `Shapes.distance`, ten times faster for many points: shapes turn about the vertical only, so what lies in the plan
+    is the same for all heights.
+    """
+    x, y = np.ascontiguousarray(plan.T)
+    least = np.full(len(plan) if heights is None else (len(plan), len(heights)), np.inf)
+    square = least.copy()  # of the distance to all but balls, in space: it takes one root for all
+    scratch = np.empty_like(least)
+    for center, axes, half, rho, rounded in zip(
+        shapes.center, shapes.axes, shapes.half, shapes.rho, shapes.round, strict=True
+    ):
+        along = np.abs((x - center[0]) * axes[0, 0] + (y - center[1]) * axes[1, 0]) - half[0]
+        across = np.abs((x - center[0]) * axes[0, 1] + (y - center[1]) * axes[1, 1]) - half[1]
+        beside = np.hypot(np.maximum(along, 0.0), np.maximum(across, 0.0))
+        if heights is None:
+            np.minimum(least, beside - rho, out=least)
+            continue
+        above = np.maximum(np.abs(heights - center[2]) - half[2], 0.0)
+        ball = rho > 0.0 and rounded[2] > 0.0
+        np.add.outer((beside if ball else np.maximum(beside - rho, 0.0)) ** 2, above**2, out=scratch)
+        if ball:
+            np.minimum(least, np.sqrt(scratch, out=scratch) - rho, out=least)
+        else:
+            np.minimum(square, scratch, out=square)
+    if heights is not None:
+        np.minimum(least, np.sqrt(square), out=least)
     return np.asarray(np.maximum(least, 0.0))
 
 
@@ -77,33 +107,44 @@ class Routes:
     BLOCKED = 1e4
 
     def __init__(self, grid: ClearanceMap, goal: Sequence[float], footprint: float, comfort: float) -> None:
-        """footprint, comfort: m; distances from the axle to an obstacle that are possible, and that are liked."""
+        """footprint, comfort: m; distances from the position to an obstacle that are possible, and that are liked."""
         self.grid = grid
-        side = grid.side
         lack = np.clip((comfort - grid.clearance) / (comfort - footprint), 0.0, 1.0)
-        weight = np.where(grid.clearance > footprint, 1.0 + self.AVOIDANCE * lack**2, self.BLOCKED)
-        ids = np.arange(side * side).reshape(side, side)
-        rows, columns, costs = [], [], []
-        for dx, dy in STEPS:
-            here = (slice(0, side - dx), slice(max(0, -dy), side - max(0, dy)))
-            there = (slice(dx, side), slice(max(0, dy), side + min(0, dy)))
-            rows.append(ids[here].ravel())
-            columns.append(ids[there].ravel())
-            costs.append((0.5 * np.hypot(dx, dy) * grid.cell * (weight[here] + weight[there])).ravel())
-        graph = csr_array(
-            (np.concatenate(costs), (np.concatenate(rows), np.concatenate(columns))), shape=(side**2, side**2)
-        )
-        cell = grid.index(np.asarray(goal, dtype=np.float64))
-        self._goal = int(ids[cell[0], cell[1]])
-        _, before = dijkstra(graph, directed=False, indices=self._goal, return_predecessors=True)
+        free = grid.clearance > footprint
+        weight = np.where(free, 1.0 + self.AVOIDANCE * lack**2, self.BLOCKED)
+        self._goal = int(grid.number(np.asarray(goal, dtype=np.float64)))
+        cost, before = dijkstra(_graph(weight, grid.cell), directed=False, indices=self._goal, return_predecessors=True)
         self._next = before
+        self._cost = cost.reshape(grid.shape)
+        # For interpolation: no free cell's neighbour may look as far from the goal as crossing a solid is
+        around = minimum_filter(self._cost, size=3) + grid.cell
+        self._cost[~free] = np.minimum(self._cost, around)[~free]
+
+    def to_go(self, points: Array) -> Array:
+        """Cost of the best way from points (..., d) to the goal, interpolated between cells, m: (...)."""
+        return self.grid.between(self._cost, points)
 
     def way(self, position: Array, length: float) -> Array:
-        """Centres of the next cells from a position (2,) on towards the goal, up to `length` m: (k, 2), k ≥ 1."""
-        x, y = self.grid.index(position)
-        cell = int(x) * self.grid.side + int(y)
+        """Centres of the next cells from a position (d,) on towards the goal, up to `length` m: (k, d), k ≥ 1."""
+        cell = int(self.grid.number(position))
         cells = [cell]
         while cell != self._goal and len(cells) * self.grid.cell < length:
             cell = int(self._next[cell])
             cells.append(cell)
         return np.asarray(self.grid.centres[cells])
+
+
+def _graph(weight: Array, cell: float) -> csr_array:
+    """Edges from every cell to half of its neighbours (the others are these reversed), each length times weight."""
+    ids = np.arange(weight.size).reshape(weight.shape)
+    rows, columns, costs = [], [], []
+    for step in product((-1, 0, 1), repeat=weight.ndim):
+        if step <= (0,) * weight.ndim:
+            continue
+        here = tuple(slice(max(0, -d), n - max(0, d)) for d, n in zip(step, weight.shape, strict=True))
+        there = tuple(slice(max(0, d), n - max(0, -d)) for d, n in zip(step, weight.shape, strict=True))
+        rows.append(ids[here].ravel())
+        columns.append(ids[there].ravel())
+        costs.append((0.5 * np.linalg.norm(step) * cell * (weight[here] + weight[there])).ravel())
+    pairs = (np.concatenate(rows), np.concatenate(columns))
+    return csr_array((np.concatenate(costs), pairs), shape=(weight.size, weight.size))

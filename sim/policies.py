@@ -1,4 +1,7 @@
-"""Scripted policies: to collect data, to test a safety filter, to show what an arena allows."""
+"""Scripted policies of both robots, by name; those of the ground robot (`sim.pilots` has the quadrotor's).
+
+They are there to collect data, to test a safety filter, and to show what an arena allows.
+"""
 
 from __future__ import annotations
 
@@ -9,8 +12,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from messaging.robots import Robot
+from messaging.robots import GROUND, QUADROTOR, Robot
 from sim.estimator import wrap
+from sim.pilots import GreedyPilot, HostilePilot, MapPilot
 from sim.planner import Routes
 from sim.world import Arena
 
@@ -26,11 +30,13 @@ def scripted(name: str, robot: Robot, rng: np.random.Generator) -> Policy:
     """The scripted policy of that name: `random`, `greedy`, `adversary` or `astar`. It notices new episodes itself.
 
     Raises:
-        UnknownPolicy: with the names there are.
+        UnknownPolicy: with the names there are, or because the robot has none.
     """
     if name not in POLICIES:
         raise UnknownPolicy(f"no policy is called {name!r}; there are: {', '.join(POLICIES)}")
-    return POLICIES[name](robot, rng)
+    if robot.name not in POLICIES[name]:
+        raise UnknownPolicy(f"no policy of the {robot.name} is called {name!r}")
+    return POLICIES[name][robot.name](robot, rng)
 
 
 def bearing(state: Array, target: Array | tuple[float, float]) -> float:
@@ -134,9 +140,9 @@ class MapDriver:
         return bounded(self._robot, speed, self.GAIN * angle)
 
 
-POLICIES: dict[str, Callable[[Robot, np.random.Generator], Policy]] = {
-    "random": RandomInputs,
-    "greedy": Greedy,
-    "adversary": Adversary,
-    "astar": MapDriver,
+POLICIES: dict[str, dict[str, Callable[[Robot, np.random.Generator], Policy]]] = {
+    "random": {GROUND.name: RandomInputs, QUADROTOR.name: RandomInputs},
+    "greedy": {GROUND.name: Greedy, QUADROTOR.name: GreedyPilot},
+    "adversary": {GROUND.name: Adversary, QUADROTOR.name: HostilePilot},
+    "astar": {GROUND.name: MapDriver, QUADROTOR.name: MapPilot},
 }

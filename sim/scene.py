@@ -1,4 +1,4 @@
-"""Obstacles of an arena as MuJoCo geoms."""
+"""Obstacles of an arena as MuJoCo geoms: to collide with, and to cast rays at."""
 
 from __future__ import annotations
 
@@ -6,39 +6,66 @@ import math
 
 import mujoco
 
-from messaging.shapes import BOX, CYLINDER, WALL, Obstacle
+from messaging.shapes import BOX, CYLINDER, SPHERE, Obstacle
 from sim.world import Arena
 
-HEIGHT = 0.4  # m, of every obstacle: taller than the robot
+HEIGHT = 0.4  # m, of every obstacle of an arena in the plane: taller than the robot
 THICKNESS = 0.2  # m, of walls
 OBSTACLE_BIT = 2  # the contact bit that the robots' geoms answer to
 
+Geom = tuple[mujoco.mjtGeom, tuple[float, float, float], tuple[float, float, float]]
+
 
 def add_obstacles(spec: mujoco.MjSpec, arena: Arena) -> None:
-    """Add an arena's obstacles to the world body, in their order, named `obstacle 0`, `obstacle 1`, …"""
+    """Add an arena's obstacles to the world body, in their order, named `obstacle 0`, `obstacle 1`, …
+
+    Those of an arena in the plane stand on the floor z = 0 (which is not theirs to add); in space all have their true
+    heights, and floor and ceiling are among them.
+    """
     for i, obstacle in enumerate(arena.obstacles):
-        kind, size, position = _geom(obstacle, arena.bounds[1] - arena.bounds[0])
+        kind, half, position = _geom(obstacle, arena)
         spec.worldbody.add_geom(
             name=f"obstacle {i}",
             type=kind,
-            size=size,
-            pos=(*position, 0.5 * HEIGHT),
+            size=half,
+            pos=position,
             quat=(math.cos(0.5 * obstacle.yaw), 0.0, 0.0, math.sin(0.5 * obstacle.yaw)),
             contype=OBSTACLE_BIT,
             conaffinity=0,
         )
 
 
-def _geom(obstacle: Obstacle, room: float) -> tuple[mujoco.mjtGeom, tuple[float, ...], tuple[float, float]]:
-    """Type, MuJoCo's half sizes and centre of one obstacle; `room` is the width that a wall has to close off, m."""
-    x, y = obstacle.position
+def _geom(obstacle: Obstacle, arena: Arena) -> Geom:
+    """Type, MuJoCo's half sizes and centre of one obstacle."""
+    x, y = obstacle.position[:2]
+    z, tall = 0.5 * HEIGHT, HEIGHT
+    if arena.dim == 3:
+        z, tall = obstacle.position[2], obstacle.size[-1] if obstacle.size else 0.0
     if obstacle.kind == CYLINDER:
-        return mujoco.mjtGeom.mjGEOM_CYLINDER, (obstacle.size[0], 0.5 * HEIGHT, 0.0), (x, y)
+        return mujoco.mjtGeom.mjGEOM_CYLINDER, (obstacle.size[0], 0.5 * tall, 0.0), (x, y, z)
     if obstacle.kind == BOX:
-        length, width = obstacle.size
-        return mujoco.mjtGeom.mjGEOM_BOX, (0.5 * length, 0.5 * width, 0.5 * HEIGHT), (x, y)
-    if obstacle.kind == WALL:
-        half = 0.5 * THICKNESS
-        behind = (x - half * math.cos(obstacle.yaw), y - half * math.sin(obstacle.yaw))
-        return mujoco.mjtGeom.mjGEOM_BOX, (half, 0.5 * room + THICKNESS, 0.5 * HEIGHT), behind
-    raise ValueError(f"an arena on the ground has no {obstacle.kind}")
+        return mujoco.mjtGeom.mjGEOM_BOX, (0.5 * obstacle.size[0], 0.5 * obstacle.size[1], 0.5 * tall), (x, y, z)
+    if obstacle.kind == SPHERE:
+        if arena.dim == 2:
+            raise ValueError("an arena on the ground has no sphere")
+        return mujoco.mjtGeom.mjGEOM_SPHERE, (obstacle.size[0], 0.0, 0.0), (x, y, z)
+    return _wall(obstacle, arena)
+
+
+def _wall(wall: Obstacle, arena: Arena) -> Geom:
+    """A wall as a box with its face in the plane, as tall as the room; however it is turned, it ends outside."""
+    half = 0.5 * THICKNESS
+    room = max(high - low for low, high in arena.bounds[:2])
+    low, high = arena.bounds[2] if arena.dim == 3 else (0.0, HEIGHT)
+    x, y = (wall.position[i] - half * turn(wall.yaw) for i, turn in enumerate((math.cos, math.sin)))
+    return mujoco.mjtGeom.mjGEOM_BOX, (half, 1.5 * room, 0.5 * (high - low)), (x, y, 0.5 * (low + high))
+
+
+def map_model(arena: Arena) -> tuple[mujoco.MjModel, mujoco.MjData]:
+    """The obstacles alone, compiled, with their places computed: what a sensor can be simulated on without a robot."""
+    spec = mujoco.MjSpec()
+    add_obstacles(spec, arena)
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    return model, data

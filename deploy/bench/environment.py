@@ -1,4 +1,4 @@
-"""Steps a second of the environment; its lidar beside MuJoCo's own ray casting."""
+"""Steps a second of the environment with each robot; its lidar beside casting the rays one by one."""
 
 from __future__ import annotations
 
@@ -9,15 +9,26 @@ import numpy as np
 
 from deploy.bench.timing import Figures, timed
 from deploy.vehicles import environment
-from messaging.robots import GROUND, RAYS
-from sim.lidar import cast
-from sim.scene import add_obstacles
+from messaging.rays import rays_of
+from messaging.robots import ROBOTS, Robot
+from sim.lidar import Lidar
+from sim.scene import HEIGHT, map_model
+from sim.world import Arena
 
 STEPS = 3000
 
 
 def run() -> Figures:
-    env = environment(GROUND, "default", 0)
+    figures: Figures = {}
+    for robot in ROBOTS.values():
+        figures[f"{robot.name}: environment, lidar included"], arena = _steps(robot)
+        figures |= _lidars(robot, arena)
+    return figures
+
+
+def _steps(robot: Robot) -> tuple[dict[str, float], Arena]:
+    """Speed of random driving; the last arena."""
+    env = environment(robot, "default", 0)
     rng = np.random.default_rng(0)
     seconds, resets, episode = 0.0, 0.0, 0
     running = False
@@ -27,29 +38,27 @@ def run() -> Figures:
             env.reset(options={"episode_seed": episode})
             resets += perf_counter() - before
             episode += 1
-        action = rng.uniform(GROUND.low(), GROUND.high())
+        action = rng.uniform(robot.low(), robot.high())
         before = perf_counter()
         _, _, terminated, truncated, info = env.step(action)
         seconds += perf_counter() - before
         running = not (terminated or truncated)
-    arena = info["arena"]
-    spec = mujoco.MjSpec()
-    add_obstacles(spec, arena)
-    model = spec.compile()
-    data = mujoco.MjData(model)
-    mujoco.mj_forward(model, data)
-    angles = np.linspace(-np.pi / 2, np.pi / 2, RAYS)
-    point = np.array([*arena.start[:2], 0.1])
-    ways = [np.array([np.cos(a), np.sin(a), 0.0]) for a in angles]
+    return {"steps/s": STEPS / seconds, "reset ms": 1e3 * resets / episode}, info["arena"]
+
+
+def _lidars(robot: Robot, arena: Arena) -> Figures:
+    lidar, origin = Lidar(arena, rays_of(robot)), np.asarray(arena.start[: arena.dim])
+    model, data = map_model(arena)
+    ways = np.zeros((len(rays_of(robot).directions), 3))
+    ways[:, : arena.dim] = rays_of(robot).directions
+    point = np.array([*origin, 0.5 * HEIGHT][:3])
     hit, normal = np.zeros(1, np.int32), np.zeros(3)
 
-    def by_mujoco() -> None:
+    def one_by_one() -> None:
         for way in ways:
             mujoco.mj_ray(model, data, point, way, None, 1, -1, hit, normal)
 
-    position = np.asarray(arena.start[:2])
     return {
-        "environment, lidar included": {"steps/s": STEPS / seconds, "reset ms": 1e3 * resets / episode},
-        "lidar, ours": timed(lambda: cast(arena.shapes, position, 0.0), 2000),
-        "lidar, mj_ray": timed(by_mujoco, 2000),
+        f"{robot.name}: lidar, ours": timed(lambda: lidar.cast(origin), 2000),
+        f"{robot.name}: lidar, mj_ray": timed(one_by_one, 2000),
     }

@@ -1,102 +1,145 @@
 """Arenas: what is drawn keeps its promises, a way through above all."""
 
-from collections import deque
-from itertools import pairwise
+import math
+from heapq import heappop, heappush
+from itertools import pairwise, product
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from messaging.robots import GROUND
-from messaging.shapes import BOX, CYLINDER, WALL, Obstacle
-from sim.planner import ClearanceMap, Routes
-from sim.world import ARENAS, Arena, UnknownArena, draw_arena, gaps
-from sim.world import staged_arena as room
+from messaging.robots import GROUND, QUADROTOR, ROBOTS, Robot
+from messaging.shapes import BOX, CYLINDER, SPHERE, WALL, Obstacle
+from sim.arenas import ARENAS, UnknownArena, arena_kind, draw_arena, gaps
+from sim.world import Arena
+
+ALL = [(ROBOTS[robot], name) for robot, kinds in ARENAS.items() for name in kinds]
+each_arena = pytest.mark.parametrize(("robot", "name"), ALL, ids=[f"{robot.name}-{name}" for robot, name in ALL])
 
 
 def pillar(x: float, y: float, radius: float) -> Obstacle:
     return Obstacle(CYLINDER, (x, y), (radius,))
 
 
-def arena(name: str, seed: int) -> Arena:
-    return draw_arena(name, np.random.default_rng(seed), GROUND)
+def arena(name: str, seed: int, robot: Robot = GROUND) -> Arena:
+    return draw_arena(name, np.random.default_rng(seed), robot)
 
 
-def way_through(arena: Arena, clearance: float) -> np.ndarray | None:
-    """Cell centres of some way from start to goal over cells with that clearance, by breadth-first search."""
-    grid = ClearanceMap(arena.obstacles, arena.bounds)
-    start, goal = (tuple(grid.index(np.array(point))) for point in (arena.start[:2], arena.goal))
+def ends(drawn: Arena) -> np.ndarray:
+    """Start and goal, (2, d)."""
+    return np.array([drawn.start[: drawn.dim], drawn.goal])
+
+
+def way_through(drawn: Arena, clearance: float) -> np.ndarray | None:
+    """Cell centres of some way from start to goal over cells with that clearance: always on from the nearest to it."""
+    grid = drawn.clearance_map
+    start, goal = (tuple(cell) for cell in grid.index(ends(drawn)).tolist())
     before = {start: start}
-    queue = deque([start])
+    queue = [(math.dist(start, goal), start)]
     while queue and goal not in before:
-        x, y = queue.popleft()
-        for cell in ((x + i, y + j) for i in (-1, 0, 1) for j in (-1, 0, 1)):
-            inside = all(0 <= c < grid.side for c in cell)
+        _, here = heappop(queue)
+        for step in product((-1, 0, 1), repeat=drawn.dim):
+            cell = tuple(a + b for a, b in zip(here, step, strict=True))
+            inside = all(0 <= c < n for c, n in zip(cell, grid.shape, strict=True))
             if inside and cell not in before and grid.clearance[cell] >= clearance:
-                before[cell] = (x, y)
-                queue.append(cell)
+                before[cell] = here
+                heappush(queue, (math.dist(cell, goal), cell))
     if goal not in before:
         return None
     cells = [goal]
     while cells[-1] != start:
         cells.append(before[cells[-1]])
-    return np.array([grid.centres[x * grid.side + y] for x, y in cells])
+    return grid.centres[np.ravel_multi_index(np.array(cells).T, grid.shape)]
 
 
-@pytest.mark.parametrize("name", ARENAS)
-@settings(max_examples=12)
+@each_arena
+@settings(max_examples=6, deadline=None)
 @given(seed=st.integers(0, 2**32))
-def test_a_way_exists_at_every_point_of_it(name: str, seed: int) -> None:
-    drawn = arena(name, seed)
-    needed = GROUND.footprint + ARENAS[name].path_clearance
-    cell = drawn.clearance_map.cell
-    way = way_through(drawn, float(np.hypot(needed, cell / np.sqrt(2.0))))
+def test_a_way_exists_at_every_point_of_it(robot: Robot, name: str, seed: int) -> None:
+    drawn = arena(name, seed, robot)
+    needed = robot.footprint + arena_kind(robot, name).path_clearance
+    half_step = 0.5 * drawn.clearance_map.cell * np.sqrt(drawn.dim)
+    way = way_through(drawn, float(np.hypot(needed, half_step)))
     assert way is not None
-    way = np.concatenate(([drawn.goal], way, [drawn.start[:2]]))
+    way = np.concatenate(([drawn.goal], way, [drawn.start[: drawn.dim]]))
     fine = np.concatenate([np.linspace(a, b, 12) for a, b in pairwise(way)])
-    assert drawn.shapes.distance(fine).min() >= needed - 1e-9
+    # from start and goal to the centres of their cells the clearance falls by no more than that way
+    assert drawn.shapes.distance(fine[12:-12]).min() >= needed - 1e-9
+    assert drawn.shapes.distance(fine).min() >= needed - half_step
 
 
-@pytest.mark.parametrize("name", ARENAS)
-def test_what_is_drawn_is_within_the_kind(name: str) -> None:
-    kind = ARENAS[name]
+@each_arena
+def test_what_is_drawn_is_within_the_kind(robot: Robot, name: str) -> None:
+    kind = arena_kind(robot, name)
     smallest_gaps = []
     for seed in range(25):
-        drawn = arena(name, seed)
-        count = {shape: sum(o.kind == shape for o in drawn.obstacles) for shape in (BOX, CYLINDER, WALL)}
-        assert kind.boxes[0] <= count[BOX] <= kind.boxes[1]
-        assert kind.cylinders[0] <= count[CYLINDER] <= kind.cylinders[1]
-        assert count[WALL] == 4
-        start, goal = np.array(drawn.start[:2]), np.array(drawn.goal)
+        drawn = arena(name, seed, robot)
+        placed = drawn.obstacles[: -4 if kind.height is None else -6]
+        for shape, (few, many) in ((BOX, kind.boxes), (CYLINDER, kind.cylinders), (SPHERE, kind.spheres)):
+            assert few <= sum(obstacle.kind == shape for obstacle in placed) <= many
+        assert [o.kind for o in drawn.obstacles[len(placed) :]] == [WALL] * 4 + [BOX] * (len(drawn.bounds) - 2) * 2
+        start, goal = ends(drawn)
         assert np.linalg.norm(goal - start) >= kind.goal_distance
-        ends = np.stack((start, goal))
-        assert drawn.shapes.distance(ends).min() >= GROUND.footprint + 0.1
-        assert np.abs(ends).max() < kind.half_width
-        for i, obstacle in enumerate(drawn.obstacles[:-4]):
-            others = drawn.obstacles[:i] + drawn.obstacles[i + 1 :]
-            smallest_gaps.append(float(gaps([obstacle], others)[0]))
-    assert min(smallest_gaps) >= 2.0 * GROUND.footprint + kind.gap
+        assert drawn.shapes.distance(ends(drawn)).min() >= robot.footprint + kind.start_clearance
+        low, high = np.array(drawn.bounds).T
+        assert (ends(drawn) > low).all() and (ends(drawn) < high).all()
+        plans = [plan(obstacle) for obstacle in placed]
+        walls = [plan(obstacle) for obstacle in drawn.obstacles if obstacle.kind == WALL]
+        for i, obstacle in enumerate(plans):
+            smallest_gaps.append(float(gaps([obstacle], [*plans[:i], *plans[i + 1 :], *walls])[0]))
+    assert min(smallest_gaps) >= 2.0 * robot.footprint + kind.gap
     if name == "dense":
-        assert min(smallest_gaps) < 2.0 * GROUND.footprint + 0.11  # it gets as narrow as it may
+        assert min(smallest_gaps) < 2.0 * robot.footprint + 1.1 * kind.gap  # it gets as narrow as it may
+
+
+def plan(obstacle: Obstacle) -> Obstacle:
+    """What an obstacle looks like from above."""
+    size = obstacle.size[:2] if obstacle.kind == BOX else obstacle.size[:1]
+    return Obstacle(obstacle.kind, obstacle.position[:2], size, obstacle.yaw)
+
+
+def test_obstacles_in_space_stand_hang_and_float_between_floor_and_ceiling() -> None:
+    hanging = 0
+    for seed in range(10):
+        drawn = arena("default", seed, QUADROTOR)
+        for obstacle in drawn.obstacles[:-6]:
+            z, half = obstacle.position[2], obstacle.size[0] if obstacle.kind == SPHERE else 0.5 * obstacle.size[-1]
+            if obstacle.kind == CYLINDER:
+                assert (z, half) == (5.0, 5.0)
+            elif obstacle.kind == BOX:
+                hanging += z + half == pytest.approx(10.0)
+                assert z + half == pytest.approx(10.0) or z == half
+            else:
+                assert half <= z <= 10.0 - half
+        for z in (0.0, 10.0):  # floor and ceiling are surfaces, as the walls are
+            assert drawn.shapes.distance(np.array([19.9, -19.9, abs(z - 0.03)]))[-2:].min() == pytest.approx(0.03)
+    assert 10 < hanging < 40
 
 
 def test_default_is_what_it_is_called_for() -> None:
     counts = [len(arena("default", seed).obstacles) - 4 for seed in range(40)]
     assert (min(counts), max(counts)) == (6, 10)
-    kind = ARENAS["default"]
+    kind = arena_kind(GROUND, "default")
     assert (kind.half_width, kind.goal_distance, kind.goal_radius, kind.step_limit) == (2.5, 1.5, 0.25, 300)
     assert kind.path_clearance == 0.05
+    kind = arena_kind(QUADROTOR, "default")
+    assert kind.bounds == ((-20.0, 20.0), (-20.0, 20.0), (0.0, 10.0))
+    assert (kind.goal_distance, kind.goal_radius, kind.step_limit) == (12.0, 1.0, 200)
+    assert arena_kind(QUADROTOR, "tall").bounds[2] == (0.0, 30.0)
 
 
 def test_the_generator_decides() -> None:
-    assert arena("dense", 7) == arena("dense", 7)
-    assert arena("dense", 7) != arena("dense", 8)
+    for robot in (GROUND, QUADROTOR):
+        assert arena("dense", 7, robot) == arena("dense", 7, robot)
+        assert arena("dense", 7, robot) != arena("dense", 8, robot)
 
 
 def test_an_unknown_name_is_refused_with_the_names_there_are() -> None:
-    with pytest.raises(UnknownArena, match="default, dense, open"):
+    with pytest.raises(UnknownArena, match="no arena is called 'moon'; there are: default, dense, open"):
         arena("moon", 0)
+    with pytest.raises(UnknownArena, match="default, dense, tall"):
+        arena("open", 0, QUADROTOR)
 
 
 def test_gaps_of_staged_shapes() -> None:
@@ -108,19 +151,3 @@ def test_gaps_of_staged_shapes() -> None:
     assert gaps([turned], [crate])[0] == pytest.approx(1.5 - np.sqrt(0.5))
     assert gaps([crate], [crate])[0] <= 0.0
     assert gaps([crate], [Obstacle(WALL, (3.0, 0.0), yaw=np.pi)])[0] == pytest.approx(2.0)
-
-
-def test_the_map_holds_the_distances_to_the_shapes() -> None:
-    drawn = arena("default", 3)
-    exact = drawn.shapes.distance(drawn.clearance_map.centres).min(axis=0)
-    assert drawn.clearance_map.clearance.ravel() == pytest.approx(exact, abs=1e-12)
-
-
-def test_routes_go_round_and_keep_away() -> None:
-    walled = room(Obstacle(BOX, (0.0, 0.0), (0.2, 4.0)), start=(-1.0, 0.0, 0.0), goal=(1.0, 0.0), half_width=3.0)
-    routes = Routes(walled.clearance_map, walled.goal, GROUND.footprint, GROUND.footprint + 0.25)
-    way = routes.way(np.array([-1.0, 0.0]), 100.0)
-    assert np.linalg.norm(way[-1] - walled.goal) < 0.05
-    assert walled.shapes.distance(way).min() > GROUND.footprint + 0.15
-    assert not walled.clearance_map.connected((-1.0, 0.0), (1.0, 0.0), 0.51)
-    assert walled.clearance_map.connected((-1.0, 0.0), (1.0, 0.0), 0.4)

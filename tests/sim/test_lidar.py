@@ -1,28 +1,37 @@
-"""The lidar against marching along its rays by distances to the shapes."""
+"""Lidars against the distances to the shapes along their beams, and against MuJoCo's rays one by one."""
 
+import mujoco
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from messaging.robots import RAYS
-from messaging.shapes import BOX, CYLINDER, WALL, Obstacle, Shapes
-from sim.lidar import FAN, MAX_RANGE, cast
+from messaging.rays import Rays, rays_of
+from messaging.robots import GROUND, QUADROTOR
+from messaging.shapes import BOX, CYLINDER, SPHERE, WALL, Obstacle, rotate
+from sim.arenas import draw_arena
+from sim.lidar import Lidar
+from sim.scene import map_model
+from sim.world import Arena, staged_arena
+
+PLANE, SPACE = rays_of(GROUND), rays_of(QUADROTOR)
+SAMPLES = 60  # along a beam
 
 
-def march(shapes: Shapes, origin: np.ndarray, heading: float) -> np.ndarray:
-    """Ranges by sphere tracing: go on by the distance to the nearest shape until it vanishes."""
-    directions = np.stack((np.cos(heading + FAN), np.sin(heading + FAN)), axis=1)
-    travelled = np.zeros(RAYS)
-    for _ in range(3000):
-        nearest = shapes.distance(origin + travelled[:, None] * directions).min(axis=0)
-        travelled = np.minimum(travelled + nearest, 2.0 * MAX_RANGE)  # gone: far off, distances only double
-        if ((nearest < 1e-7) | (travelled > MAX_RANGE)).all():
-            break
-    return np.minimum(travelled, MAX_RANGE)
+def agree(arena: Arena, rays: Rays, origin: np.ndarray, heading: float) -> None:
+    """Each beam ends on a surface or at the full range, and is free up to there."""
+    ranges = Lidar(arena, rays).cast(origin, heading)
+    directions = rotate(rays.directions, heading)
+    hit = ranges < rays.range
+    assert (ranges <= rays.range).all()
+    ends = origin + ranges[:, None] * directions
+    assert arena.shapes.distance(ends[hit]).min(axis=0, initial=1.0) == pytest.approx(np.zeros(hit.sum()), abs=1e-6)
+    shares = np.linspace(0.0, 1.0, SAMPLES)[:, None]
+    before = origin + (shares * (ranges - 1e-6))[..., None] * directions
+    assert arena.shapes.distance(before).min() > 0.0
 
 
-def random_shapes(rng: np.random.Generator) -> Shapes:
+def random_flat(rng: np.random.Generator) -> Arena:
     obstacles = [Obstacle(WALL, (-2.0, 0.3), yaw=float(rng.uniform(-0.5, 0.5)))]
     for _ in range(int(rng.integers(0, 8))):
         position = tuple(rng.uniform(-3.0, 3.0, 2))
@@ -30,34 +39,76 @@ def random_shapes(rng: np.random.Generator) -> Shapes:
             obstacles.append(Obstacle(CYLINDER, position, (float(rng.uniform(0.05, 0.6)),)))
         else:
             obstacles.append(Obstacle(BOX, position, tuple(rng.uniform(0.1, 1.0, 2)), float(rng.uniform(-4.0, 4.0))))
-    return Shapes.of(obstacles, dim=2)
+    return staged_arena(*obstacles)
+
+
+def random_solid(rng: np.random.Generator) -> Obstacle:
+    position = tuple(rng.uniform((-8.0, -8.0, 0.0), (8.0, 8.0, 8.0)))
+    kind = (BOX, CYLINDER, SPHERE)[int(rng.integers(3))]
+    size = tuple(rng.uniform(0.3, 2.0, {BOX: 3, CYLINDER: 2, SPHERE: 1}[kind]))
+    return Obstacle(kind, position, size, float(rng.uniform(-4.0, 4.0)) if kind == BOX else 0.0)
 
 
 @given(st.integers(0, 2**32), st.floats(-3.1, 3.1))
-def test_ranges_are_those_of_marching(seed: int, heading: float) -> None:
+def test_in_the_plane_beams_end_at_the_first_surface(seed: int, heading: float) -> None:
     rng = np.random.default_rng(seed)
-    shapes = random_shapes(rng)
+    arena = random_flat(rng)
     origin = rng.uniform(-1.5, 1.5, 2)
-    exact, marched = cast(shapes, origin, heading), march(shapes, origin, heading)
-    # marching creeps past a shape that a ray grazes, and may count it as hit; the exact ray then goes on
-    grazing = exact - marched > 1e-3
-    assert (np.abs(exact - marched) < 1e-3)[~grazing].all()
-    ends = origin + marched[:, None] * np.stack((np.cos(heading + FAN), np.sin(heading + FAN)), axis=1)
-    assert (shapes.distance(ends).min(axis=0)[grazing] < 1e-6).all()
-    assert grazing.sum() <= 1
+    if arena.shapes.distance(origin).min() > 0.0:
+        agree(arena, PLANE, origin, heading)
 
 
-def test_staged_ranges() -> None:
-    shapes = Shapes.of([Obstacle(WALL, (2.0, 0.0), yaw=np.pi), Obstacle(CYLINDER, (0.0, -1.0), (0.25,))], dim=2)
-    ranges = cast(shapes, np.zeros(2), 0.0)
+@settings(deadline=None)
+@given(st.integers(0, 2**32), st.sampled_from([0.0, 0.7]))
+def test_in_space_beams_end_at_the_first_surface(seed: int, heading: float) -> None:
+    rng = np.random.default_rng(seed)
+    arena = staged_arena(*(random_solid(rng) for _ in range(8)), half_width=10.0, height=8.0, goal=(4.0, 4.0, 4.0))
+    origin = rng.uniform((-9.0, -9.0, 0.5), (9.0, 9.0, 7.5))
+    if arena.shapes.distance(origin).min() > 0.0:
+        agree(arena, SPACE, origin, heading)
+
+
+def test_all_rays_at_once_are_mujocos_rays_one_by_one() -> None:
+    for seed in range(5):
+        arena = draw_arena("dense", np.random.default_rng(seed), QUADROTOR)
+        model, data = map_model(arena)
+        hit = np.zeros(1, np.int32)
+        alone = [
+            mujoco.mj_ray(model, data, np.array(arena.start), ray, None, 1, -1, hit, None) for ray in SPACE.directions
+        ]
+        assert Lidar(arena, SPACE).cast(np.array(arena.start)) == pytest.approx(np.minimum(alone, SPACE.range))
+
+
+def test_staged_ranges_in_the_plane() -> None:
+    arena = staged_arena(Obstacle(WALL, (2.0, 0.0), yaw=np.pi), Obstacle(CYLINDER, (0.0, -1.0), (0.25,)))
+    ranges = Lidar(arena, PLANE).cast(np.zeros(2))
     assert ranges[0] == pytest.approx(0.75)  # the first ray looks to the right
-    assert ranges[-1] == MAX_RANGE
-    assert ranges[RAYS // 2] == pytest.approx(2.0 / np.cos(FAN[RAYS // 2]))
+    assert ranges[-1] == PLANE.range
+    assert ranges[9] == pytest.approx(2.0 / PLANE.directions[9, 0])
 
 
-def test_inside_a_shape_and_among_none() -> None:
-    pillar = Shapes.of([Obstacle(CYLINDER, (0.0, 0.0), (0.5,))], dim=2)
-    assert (cast(pillar, np.array([0.1, 0.0]), 0.3) == 0.0).all()
-    crate = Shapes.of([Obstacle(BOX, (0.0, 0.0), (1.0, 1.0))], dim=2)
-    assert (cast(crate, np.array([0.1, 0.0]), 0.3) == 0.0).all()
-    assert (cast(Shapes.of([], dim=2), np.zeros(2), 0.0) == MAX_RANGE).all()
+def test_staged_ranges_in_space() -> None:
+    ball = Obstacle(SPHERE, (0.0, 6.0, 3.0), (1.5,))
+    lidar = Lidar(staged_arena(ball, goal=(9.0, 9.0, 3.0), half_width=10.0, height=8.0), SPACE)
+    ranges = lidar.cast(np.array([0.0, 0.0, 3.0])).reshape(36, 5)  # azimuths from ahead to the left, elevations upwards
+    assert ranges[0, 2] == pytest.approx(10.0)  # the wall ahead
+    assert ranges[9, 2] == pytest.approx(4.5)  # the ball to the left
+    assert ranges[27, 0] == pytest.approx(6.0)  # 30° down to the floor
+    assert ranges[27, 4] == pytest.approx(10.0)  # 30° up to the ceiling, 5 m above
+    assert lidar.cast(np.array([0.0, -9.0, 3.0])).reshape(36, 5)[9, 2] == SPACE.range
+
+
+def test_noise_is_cut_and_leaves_rays_that_hit_nothing() -> None:
+    arena = staged_arena(goal=(9.0, 9.0, 3.0), half_width=20.0, height=30.0)
+    origin = np.array([12.0, 0.0, 3.0])
+    true = Lidar(arena, SPACE).cast(origin)
+    noisy = Lidar(arena, SPACE, 0.02, np.random.default_rng(0)).ranges(origin)
+    hit = true < SPACE.range
+    assert 20 < hit.sum() < 160
+    assert (noisy[~hit] == SPACE.range).all()
+    error = noisy[hit] - true[hit]
+    assert 0.012 < error.std() < 0.02 and np.abs(error).max() <= 0.04 + 1e-12
+    assert noisy.max() <= SPACE.range
+    close = Lidar(arena, SPACE, 0.02, np.random.default_rng(0)).ranges(np.array([19.99, 0.0, 3.0]))
+    assert close.min() == 0.0
+    assert (Lidar(arena, SPACE).ranges(origin) == true).all()

@@ -1,11 +1,12 @@
-"""Scripted policies, and what they say of the arenas."""
+"""Scripted policies of the ground robot, and what they say of its arenas; the random one and the names of both."""
 
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
 import pytest
 
-from messaging.robots import GROUND
+from messaging.robots import GROUND, ROBOTS, Robot
 from sim.envs import NavigationEnv
 from sim.policies import UnknownPolicy, scripted
 
@@ -62,10 +63,12 @@ def test_the_adversary_hits_always_and_soon() -> None:
     assert share(results, "steps") < 60
 
 
-def test_random_inputs_are_held_and_within_bounds() -> None:
-    policy = scripted("random", GROUND, np.random.default_rng(0))
+@pytest.mark.parametrize("robot", ROBOTS.values(), ids=ROBOTS)
+def test_random_inputs_are_held_and_within_bounds(robot: Robot) -> None:
+    policy = scripted("random", robot, np.random.default_rng(0))
     inputs = [policy(np.zeros(26, np.float32), {"time": 0.2 * i}) for i in range(300)]
-    assert all((GROUND.low() <= u).all() and (u <= GROUND.high()).all() for u in inputs)
+    assert all((robot.low() <= u).all() and (u <= robot.high()).all() for u in inputs)
+    assert np.ptp(inputs, axis=0) == pytest.approx(robot.high() - robot.low(), rel=0.1)
     changes = sum(bool((a != b).any()) for a, b in pairwise(inputs))
     assert 30 < changes < 120
 
@@ -80,3 +83,5 @@ def test_the_generator_decides() -> None:
 def test_an_unknown_name_is_refused_with_the_names_there_are() -> None:
     with pytest.raises(UnknownPolicy, match="random, greedy, adversary, astar"):
         scripted("psychic", GROUND, np.random.default_rng(0))
+    with pytest.raises(UnknownPolicy, match="no policy of the submarine is called 'astar'"):
+        scripted("astar", replace(GROUND, name="submarine"), np.random.default_rng(0))

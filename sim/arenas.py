@@ -1,0 +1,247 @@
+"""The arenas there are, by robot and name, and how one is drawn: at random, so that a way through exists.
+
+An arena in space is drawn as a plan whose obstacles then get heights: pillars from floor to ceiling, boxes that stand
+on the floor or hang from the ceiling, spheres that float.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from messaging.robots import Robot
+from messaging.shapes import BOX, CYLINDER, SPHERE, WALL, Obstacle, Shapes
+from sim.world import Arena, closing, room_bounds
+
+Array = NDArray[np.float64]
+
+
+class UnknownArena(ValueError):
+    """The robot has no arena of that name."""
+
+
+class NoArena(RuntimeError):
+    """No draw of an arena kind had a way from start to goal: its numbers ask for too much."""
+
+
+@dataclass(frozen=True)
+class ArenaKind:
+    """What is drawn for an arena of one name. Pairs are (least, most)."""
+
+    half_width: float  # m
+    cylinders: tuple[int, int]
+    radius: tuple[float, float]  # m
+    boxes: tuple[int, int]
+    edge: tuple[float, float]  # m, both edges of a box
+    square: bool  # boxes have two equal edges
+    gap: float  # m between any two obstacles in plan, walls included, beyond the robot's diameter
+    path_clearance: float  # m beside the footprint, all along some way from start to goal
+    goal_distance: float  # m from the start, at least
+    step_limit: int
+    start_clearance: float = 0.1  # m beside the footprint, at the start and at the goal
+    goal_radius: float = 0.25  # m
+    height: float | None = None  # m from floor to ceiling; None: an arena in the plane, without
+    tall: tuple[float, float] = (0.0, 0.0)  # m, a box's height in space
+    spheres: tuple[int, int] = (0, 0)
+    ball: tuple[float, float] = (0.0, 0.0)  # m, radius of a sphere
+
+    @property
+    def bounds(self) -> tuple[tuple[float, float], ...]:
+        return room_bounds(self.half_width, self.height)
+
+
+_FLIGHT = ArenaKind(
+    half_width=20.0,
+    height=10.0,
+    cylinders=(6, 8),
+    radius=(0.6, 1.2),
+    boxes=(4, 6),
+    edge=(2.0, 4.0),
+    square=False,
+    tall=(4.0, 8.0),
+    spheres=(3, 5),
+    ball=(1.0, 2.0),
+    gap=1.4,
+    path_clearance=0.4,
+    goal_distance=12.0,
+    step_limit=200,
+    start_clearance=0.7,
+    goal_radius=1.0,
+)
+
+ARENAS: dict[str, dict[str, ArenaKind]] = {
+    "ground": {
+        "default": ArenaKind(
+            half_width=2.5,
+            cylinders=(3, 5),
+            radius=(0.1, 0.2),
+            boxes=(3, 5),
+            edge=(0.2, 0.4),
+            square=False,
+            gap=0.2,
+            path_clearance=0.05,
+            goal_distance=1.5,
+            step_limit=300,
+        ),
+        "open": ArenaKind(
+            half_width=8.2,
+            cylinders=(0, 6),
+            radius=(0.5, 0.5),
+            boxes=(0, 6),
+            edge=(1.0, 1.0),
+            square=True,
+            gap=0.3,
+            path_clearance=0.05,
+            goal_distance=3.0,
+            # the diagonal is 23 m, 5 cm a step: twice the steps of a straight drive, nearly
+            step_limit=800,
+        ),
+        "dense": ArenaKind(
+            half_width=2.5,
+            cylinders=(6, 8),
+            radius=(0.1, 0.2),
+            boxes=(6, 8),
+            edge=(0.2, 0.4),
+            square=False,
+            gap=0.1,
+            # a hair below half the gap: a grid cannot thread a passage that has no width to spare
+            path_clearance=0.04,
+            goal_distance=1.5,
+            step_limit=300,
+        ),
+    },
+    "quadrotor": {
+        "default": _FLIGHT,
+        "dense": replace(_FLIGHT, cylinders=(10, 17), boxes=(8, 12), tall=(5.0, 8.0), spheres=(5, 8), gap=0.8),
+        # room for full speed on all three axes at once
+        "tall": replace(_FLIGHT, height=30.0, cylinders=(3, 4), boxes=(2, 3), spheres=(4, 6), goal_distance=30.0),
+    },
+}
+
+ATTEMPTS = 1000  # whole arenas drawn before giving up
+CANDIDATES = 12  # drawn at once for each obstacle, of which the first that fits stays
+ENDS = 64  # points drawn at once, of which the first two that are free and far apart are start and goal
+
+
+def arena_kind(robot: Robot, name: str) -> ArenaKind:
+    """Raises UnknownArena with the names there are for this robot."""
+    kinds = ARENAS.get(robot.name, {})
+    if name not in kinds:
+        there = ", ".join(sorted(kinds)) or "none"
+        raise UnknownArena(f"no arena is called {name!r}; there are: {there} ({robot.name})")
+    return kinds[name]
+
+
+def draw_arena(name: str, rng: np.random.Generator, robot: Robot) -> Arena:
+    """An arena of that name in which `robot` can get from start to goal.
+
+    Raises:
+        UnknownArena: with the names there are.
+        NoArena: when a kind's numbers leave no solvable arena.
+    """
+    kind = arena_kind(robot, name)
+    for _ in range(ATTEMPTS):
+        obstacles = _place(kind, rng, robot)
+        if obstacles is None:
+            continue
+        ends = _start_and_goal(kind, obstacles, rng, robot)
+        if ends is None:
+            continue
+        start, goal = ends
+        if robot.heading is not None:
+            start = (*start, float(rng.uniform(-math.pi, math.pi)))
+        arena = Arena(name, obstacles, start, goal, kind.goal_radius, kind.step_limit, kind.bounds)
+        if arena.clearance_map.connected(start[: arena.dim], goal, robot.footprint + kind.path_clearance):
+            return arena
+    raise NoArena(f"no arena {name!r} with a way from start to goal in {ATTEMPTS} draws")
+
+
+def _place(kind: ArenaKind, rng: np.random.Generator, robot: Robot) -> tuple[Obstacle, ...] | None:
+    """Obstacles at least a gap apart in plan, what closes the room last; None: fewer than the least found room."""
+    walls = closing(kind.half_width, None)
+    placed: list[Obstacle] = []
+    least = 2.0 * robot.footprint + kind.gap
+    for shape, (few, many) in ((BOX, kind.boxes), (CYLINDER, kind.cylinders), (SPHERE, kind.spheres)):
+        for i in range(int(rng.integers(few, many, endpoint=True))):
+            candidates = [_draw_obstacle(shape, kind, least, rng) for _ in range(CANDIDATES)]
+            fitting = np.flatnonzero(gaps(candidates, (*placed, *walls)) >= least)
+            if len(fitting):
+                placed.append(candidates[fitting[0]])
+            elif i < few:
+                return None
+    if kind.height is not None:
+        placed = [_lift(obstacle, kind, kind.height, rng) for obstacle in placed]
+    return (*placed, *closing(kind.half_width, kind.height))
+
+
+def _draw_obstacle(shape: str, kind: ArenaKind, least: float, rng: np.random.Generator) -> Obstacle:
+    """The plan of one that is at least `least` m from the walls, but for the corners of boxes."""
+    if shape == BOX:
+        length, width = rng.uniform(*kind.edge, 2)
+        size: tuple[float, ...] = (float(length), float(length if kind.square else width))
+        yaw, extent = float(rng.uniform(-math.pi, math.pi)), 0.5 * min(size)
+    else:
+        size = (float(rng.uniform(*(kind.radius if shape == CYLINDER else kind.ball))),)
+        yaw, extent = 0.0, size[0]
+    within = kind.half_width - least - extent
+    x, y = rng.uniform(-within, within, 2)
+    return Obstacle(shape, (float(x), float(y)), size, yaw)
+
+
+def _lift(plan: Obstacle, kind: ArenaKind, height: float, rng: np.random.Generator) -> Obstacle:
+    """The obstacle in space whose plan this is."""
+    if plan.kind == SPHERE:
+        z = float(rng.uniform(plan.size[0], height - plan.size[0]))
+        return Obstacle(SPHERE, (*plan.position, z), plan.size)
+    if plan.kind == CYLINDER:
+        return Obstacle(CYLINDER, (*plan.position, 0.5 * height), (*plan.size, height))
+    tall = float(rng.uniform(*kind.tall))
+    z = height - 0.5 * tall if rng.random() < 0.5 else 0.5 * tall
+    return Obstacle(BOX, (*plan.position, z), (*plan.size, tall), plan.yaw)
+
+
+@lru_cache(maxsize=1024)
+def _outline(obstacle: Obstacle) -> tuple[Array, float]:
+    """Points (5, 2) and a radius: the points' convex hull, grown by the radius, is the obstacle's plan."""
+    if obstacle.kind != BOX:
+        return np.tile(obstacle.position, (5, 1)), obstacle.size[0]
+    cos, sin = math.cos(obstacle.yaw), math.sin(obstacle.yaw)
+    corners = 0.5 * np.array([(1, 1), (1, -1), (-1, 1), (-1, -1), (0, 0)]) * obstacle.size
+    return corners @ np.array([(cos, sin), (-sin, cos)]) + obstacle.position, 0.0
+
+
+def gaps(candidates: Sequence[Obstacle], others: Sequence[Obstacle]) -> Array:
+    """From each candidate (in the plane, no wall) the way to the nearest other, in m; 0 or less on overlap. Shape (k,).
+
+    Two disjoint convex polygons are closest at a corner of one of them: the corners of each are measured to the other.
+    """
+    mine = [_outline(candidate) for candidate in candidates]
+    points, radii = np.stack([outline[0] for outline in mine]), np.array([outline[1] for outline in mine])
+    least = Shapes.of(others, dim=2).distance(points).min(axis=(0, 2)) - radii
+    theirs = [_outline(other) for other in others if other.kind != WALL]
+    if theirs:
+        corners, grown = np.stack([outline[0] for outline in theirs]), np.array([outline[1] for outline in theirs])
+        back = Shapes.of(candidates, dim=2).distance(corners).min(axis=2) - grown
+        least = np.minimum(least, back.min(axis=1))
+    return np.asarray(least)
+
+
+def _start_and_goal(
+    kind: ArenaKind, obstacles: tuple[Obstacle, ...], rng: np.random.Generator, robot: Robot
+) -> tuple[tuple[float, ...], tuple[float, ...]] | None:
+    """Two free points far enough apart, or None."""
+    low, high = np.array(kind.bounds).T
+    points = rng.uniform(low, high, (ENDS, len(low)))
+    free = Shapes.of(obstacles, dim=len(low)).distance(points).min(axis=0) >= robot.footprint + kind.start_clearance
+    points = points[free]
+    if not len(points):
+        return None
+    far = np.linalg.norm(points - points[0], axis=1) >= kind.goal_distance
+    if not far.any():
+        return None
+    return tuple(points[0].tolist()), tuple(points[far][0].tolist())

@@ -1,0 +1,117 @@
+"""Scripted policies of the quadrotor: straight at the goal, straight at an obstacle, and along routes over the map."""
+
+from __future__ import annotations
+
+from itertools import product
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from messaging.robots import Robot
+from sim.planner import Routes
+from sim.world import Arena
+
+Array = NDArray[np.float64]
+
+
+def full_speed(robot: Robot, direction: Array) -> Array:
+    """The fastest setpoint within the robot's bounds in a direction (3,); zero when there is none."""
+    largest = float(np.abs(direction).max())
+    return robot.high() * direction / largest if largest > 0.0 else np.zeros_like(direction)
+
+
+class GreedyPilot:
+    """Full speed straight at the goal, whatever stands there."""
+
+    def __init__(self, robot: Robot, rng: np.random.Generator) -> None:
+        self._robot = robot
+
+    def __call__(self, observation: NDArray[np.float32], info: dict[str, Any]) -> Array:
+        return full_speed(self._robot, np.asarray(info["goal"]) - info["state"][:3])
+
+
+class HostilePilot:
+    """Full speed straight at the nearest obstacle, floor and ceiling included."""
+
+    def __init__(self, robot: Robot, rng: np.random.Generator) -> None:
+        self._robot = robot
+
+    def __call__(self, observation: NDArray[np.float32], info: dict[str, Any]) -> Array:
+        ways = info["arena"].shapes.towards(info["state"][:3])
+        return full_speed(self._robot, ways[np.argmin(np.einsum("ni,ni->n", ways, ways))])
+
+
+class StopModel:
+    """Where a setpoint and the stop after it lead: the vehicle's velocity follows setpoints with a first-order lag.
+
+    The setpoint u holds for a period, then falls to zero as the robot's plans do. Positions are linear in the velocity
+    at the start and u: p + `from_velocity`·v + `from_setpoint`·u, at `times` (K,) s.
+    """
+
+    LAG = 0.35  # s, fitted to the quadrotor: a cascade of shorter ones
+    POINTS = 2  # a period
+
+    def __init__(self, robot: Robot) -> None:
+        fine = 20  # steps of the integration a point
+        step = robot.period / (self.POINTS * fine)
+        fractions = robot.schedule()[:: robot.action_dim, 0]  # of u, one a period
+        velocity, way = np.array([1.0, 0.0]), np.zeros(2)  # the shares of v and of u in them
+        ways: list[Array] = []
+        for fraction in np.repeat(fractions, self.POINTS * fine):
+            velocity = velocity + (step / self.LAG) * (np.array([0.0, fraction]) - velocity)
+            way = way + step * velocity
+            ways.append(way)
+        self.from_velocity, self.from_setpoint = np.array(ways[fine - 1 :: fine]).T
+        self.times: Array = np.cumsum(np.full(len(ways) // fine, robot.period / self.POINTS))
+
+    def __call__(self, position: Array, velocity: Array, setpoints: Array) -> Array:
+        """Positions (C, K, 3) from a state's position (3,) and velocity (3,) after each of the setpoints (C, 3)."""
+        coasting = position + self.from_velocity[:, None] * velocity
+        return np.asarray(coasting + self.from_setpoint[:, None] * setpoints[:, None])
+
+
+class MapPilot:
+    """Knows the map: of the setpoints within reach takes the one whose stop leads farthest along the routes to the
+    goal.
+
+    At every step the stops after a grid of setpoints are predicted. Those count that keep `MARGIN` from every obstacle,
+    and `CARE` seconds' way more while they are fast: whoever sees only half-spaces between the robot and the obstacles
+    can verify them too. So it is as fast as the room ahead allows, and slows down where a way bends.
+    """
+
+    COMFORT = 2.0  # m; more clearance than this is worth no detour
+    MARGIN = 0.3  # m beside the footprint
+    CARE = 0.1  # s
+    PACE = 1.0  # m/s; a second earlier at a place is worth this many metres of the way
+    SHARES = (-1.0, -0.5, 0.0, 0.5, 1.0)  # of the slew, on each axis
+
+    def __init__(self, robot: Robot, rng: np.random.Generator) -> None:
+        self._robot = robot
+        self._stops = StopModel(robot)
+        self._changes = np.array(list(product(self.SHARES, repeat=robot.action_dim))) * robot.action_slew
+        self._arena: Arena | None = None
+
+    def __call__(self, observation: NDArray[np.float32], info: dict[str, Any]) -> Array:
+        if info["arena"] is not self._arena:
+            self._arena = info["arena"]
+            self._grid = info["arena"].clearance_map
+            self._routes = Routes(self._grid, info["goal"], self._robot.footprint, self.COMFORT)
+        state = info["state"]
+        low, high = self._robot.low(), self._robot.high()
+        setpoints = np.clip(info["input_in_force"] + self._changes, low, high)
+        places = self._stops(state[:3], state[3:6], setpoints)
+        to_go = self._routes.to_go(places)
+        at_goal = np.linalg.norm(places - info["goal"], axis=-1) < info["arena"].goal_radius
+        value = (np.where(at_goal, 0.0, to_go) + self.PACE * self._stops.times).min(axis=1)
+        lack = self._lack(places, state[:3])
+        free = lack == 0.0
+        best = np.argmin(np.where(free, value, np.inf) if free.any() else lack)
+        return np.asarray(setpoints[best])
+
+    def _lack(self, places: Array, position: Array) -> Array:
+        """What each stop (C, K, 3) from a position (3,) misses to the clearance asked for, summed over it, m: (C,)."""
+        before = np.concatenate((np.broadcast_to(position, (len(places), 1, 3)), places[:, :-1]), axis=1)
+        speed = np.linalg.norm(places - before, axis=-1) / self._stops.times[0]
+        clearance = self._grid.between(self._grid.clearance, places) - self._robot.footprint
+        return np.asarray(np.maximum(self.MARGIN + self.CARE * speed - clearance, 0.0).sum(axis=1))

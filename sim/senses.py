@@ -1,0 +1,111 @@
+"""What each robot kind observes: its lidar, its goal, itself; in the order of `robot.observation`."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from messaging.rays import rays_of
+from messaging.robots import GROUND, QUADROTOR
+from sim.lidar import Lidar
+from sim.world import Arena
+
+Array = NDArray[np.float64]
+
+LIDAR_NOISE = 0.01  # m, sigma of a range
+
+
+class Senses(Protocol):
+    """One robot's observations in one episode."""
+
+    def observe(self, true: Array, measured: Array, input: Array) -> Array:
+        """The observation after a period, unclipped. To be called once a period: it may remember.
+
+        true: (n,) state, for the lidar's place alone; measured: (n,) state; input: (m,) executed last.
+        """
+
+    def speed(self, state: Array) -> float:
+        """Speed in a state (n,), m/s."""
+
+
+@dataclass
+class TurnMemory:
+    """Measured turn rate through a first-order low pass, rad/s: the observation's one coordinate of memory.
+
+    A policy without memory dithers in front of an obstacle that can be passed on both sides: as soon as it has turned
+    a little to one side, noise makes the other look better. Seeing which way it has been turning for about
+    `TIME` seconds it can go on turning that way.
+    """
+
+    TIME = 2.0  # s
+    value: float = 0.0
+
+    def update(self, turn_rate: float, period: float) -> None:
+        self.value += (1.0 - math.exp(-period / self.TIME)) * (turn_rate - self.value)
+
+
+class GroundSenses:
+    """18 beams ahead; the goal by distance and bearing."""
+
+    MOUNT = -0.032  # m, the lidar's place along the robot's x axis from the axle's midpoint
+    DISTANCE_SCALE = 5.0  # m, the goal distance that is observed as 1
+
+    def __init__(self, arena: Arena, rng: np.random.Generator, lidar_noise: float) -> None:
+        self._goal = arena.goal
+        self._lidar = Lidar(arena, rays_of(GROUND), lidar_noise, rng)
+        self._memory = TurnMemory()
+
+    def speed(self, state: Array) -> float:
+        return float(state[3])
+
+    def observe(self, true: Array, measured: Array, input: Array) -> Array:
+        top = GROUND.high()
+        x, y, heading, speed, turn_rate = measured
+        self._memory.update(float(turn_rate), GROUND.period)
+        bearing = math.atan2(self._goal[1] - y, self._goal[0] - x) - heading
+        own = (
+            math.hypot(self._goal[0] - x, self._goal[1] - y) / self.DISTANCE_SCALE,
+            math.sin(bearing),
+            math.cos(bearing),
+            speed / top[0],
+            turn_rate / top[1],
+            *(input / top),
+            self._memory.value / top[1],
+        )
+        mount = true[:2] + self.MOUNT * np.array([math.cos(true[2]), math.sin(true[2])])
+        return np.concatenate((self._lidar.ranges(mount, true[2]) / self._lidar.max_range, own))
+
+
+class AirSenses:
+    """180 beams all round from a lidar that is kept level; the goal by its offset.
+
+    The offset o is observed as o / (|o| + `NEAR`): its direction stays exact however far the goal is, and near the
+    goal a metre still counts.
+    """
+
+    NEAR = 5.0  # m
+
+    def __init__(self, arena: Arena, rng: np.random.Generator, lidar_noise: float) -> None:
+        self._goal = np.asarray(arena.goal)
+        self._lidar = Lidar(arena, rays_of(QUADROTOR), lidar_noise, rng)
+
+    def speed(self, state: Array) -> float:
+        return math.hypot(*state[3:6])
+
+    def observe(self, true: Array, measured: Array, input: Array) -> Array:
+        top = QUADROTOR.high()
+        offset = self._goal - measured[:3]
+        near = offset / (math.hypot(*offset) + self.NEAR)
+        ranges = self._lidar.ranges(true[:3])
+        return np.concatenate((ranges / self._lidar.max_range, near, measured[3:6] / top, input / top))
+
+
+SENSES: dict[str, Callable[[Arena, np.random.Generator, float], Senses]] = {
+    GROUND.name: GroundSenses,
+    QUADROTOR.name: AirSenses,
+}

@@ -1,0 +1,56 @@
+"""Obstacles as geoms: they are where `messaging.shapes` says."""
+
+import mujoco
+import numpy as np
+import pytest
+
+from messaging.robots import GROUND, QUADROTOR
+from messaging.shapes import SPHERE, Obstacle
+from sim.arenas import draw_arena
+from sim.scene import HEIGHT, add_obstacles
+from sim.world import Arena, staged_arena
+
+REACH = 3.0  # m
+
+
+def distances(arena: Arena, points: np.ndarray) -> np.ndarray:
+    """From points (p, 3) to the geoms of the obstacles, by MuJoCo: (n, p), at most `REACH`."""
+    spec = mujoco.MjSpec()
+    add_obstacles(spec, arena)
+    probe = spec.worldbody.add_body(name="probe", mocap=True)
+    probe.add_geom(name="probe", type=mujoco.mjtGeom.mjGEOM_SPHERE, size=(1e-3, 0.0, 0.0))
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    geoms = [model.geom(f"obstacle {i}").id for i in range(len(arena.obstacles))]
+    measured = np.empty((len(geoms), len(points)))
+    for j, point in enumerate(points):
+        data.mocap_pos[0] = point
+        mujoco.mj_kinematics(model, data)
+        for i, geom in enumerate(geoms):
+            measured[i, j] = mujoco.mj_geomDistance(model, data, geom, model.geom("probe").id, REACH, None) + 1e-3
+    return measured
+
+
+@pytest.mark.parametrize("name", ["default", "dense", "tall"])
+def test_in_space_the_geoms_are_the_shapes(name: str) -> None:
+    arena = draw_arena(name, np.random.default_rng(4), QUADROTOR)
+    low, high = np.array(arena.bounds).T
+    points = np.random.default_rng(0).uniform(low, high, (60, 3))
+    exact = arena.shapes.distance(points)
+    points, exact = points[exact.min(axis=0) > 0.0], exact[:, exact.min(axis=0) > 0.0]
+    assert distances(arena, points) == pytest.approx(np.minimum(exact, REACH + 1e-3), abs=2e-3)
+
+
+def test_in_the_plane_they_stand_on_the_floor() -> None:
+    arena = draw_arena("dense", np.random.default_rng(4), GROUND)
+    points = np.random.default_rng(0).uniform(-2.5, 2.5, (60, 2))
+    exact = arena.shapes.distance(points)
+    points, exact = points[exact.min(axis=0) > 0.0], exact[:, exact.min(axis=0) > 0.0]
+    for height in (0.01, HEIGHT - 0.01):
+        at = np.column_stack((points, np.full(len(points), height)))
+        assert distances(arena, at) == pytest.approx(np.minimum(exact, REACH + 1e-3), abs=2e-3)
+
+
+def test_on_the_ground_there_are_no_spheres() -> None:
+    with pytest.raises(ValueError, match="no sphere"):
+        add_obstacles(mujoco.MjSpec(), staged_arena(Obstacle(SPHERE, (0.0, 1.0), (0.5,))))
