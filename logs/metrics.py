@@ -18,7 +18,7 @@ from logs.decisions import Decisions, joined
 from logs.sketch import Histogram, spread
 from logs.tally import KINDS, Figures, Tally, closed_loop
 from messaging import brakeline_pb2 as pb
-from messaging.topics import HEALTH, RECORDED, Topic
+from messaging.topics import HEALTH, RECORDED, STEP, Topic
 
 __all__ = ["KINDS", "Figures", "Metrics", "Tally", "closed_loop", "spread"]
 
@@ -119,6 +119,7 @@ class Metrics:
         return figures | {
             "seconds": seconds,
             "steps_per_s": figures["steps"] / seconds if seconds > 0.0 else None,
+            "driven_s": self.seconds(STEP),
             "robots": {robot: closed_loop(tallies) for robot, tallies in by_robot.items()},
             "actors": {name: closed_loop([self.actors[name]]) for name in names},
             "learners": {robot: learner(self.learners[robot]) for robot in sorted(self.learners)},
@@ -128,9 +129,12 @@ class Metrics:
             "log_lines": dict(sorted(self.log_lines.items())),
         }
 
-    def seconds(self) -> float:
-        """How long at least one process was heard of; a pause before a run was resumed does not count."""
-        return covered(self.spans(self.streams).values())
+    def seconds(self, topic: Topic | None = None) -> float:
+        """How long at least one process was heard of (of the topic: from its first to its last message); a pause before
+        a run was resumed does not count."""
+        root = "" if topic is None else topic.key.partition("/")[0] + "/"
+        streams = {place: stream for place, stream in self.streams.items() if place[0].startswith(root)}
+        return covered(self.spans(streams).values())
 
     def latency(self) -> dict[str, dict[str, Histogram]]:
         """By kind of decision and part of the time, in ms."""
