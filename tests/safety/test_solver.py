@@ -30,7 +30,9 @@ def programs(model: ModelSet, count, seed=0):
         normals, offsets = half_spaces(
             near, np.zeros(2), tube.centers(np.concatenate([z_0, r])), 0.105, np.full(2, 0.004)
         )
-        yield builder, builder.program(layout.rows(normals, offsets), z_0, r)
+        program = builder.program(layout.rows(normals, offsets), z_0, r)
+        if program is not None:
+            yield builder, program
 
 
 def by_daqp(program):
@@ -63,7 +65,7 @@ def test_another_solver_agrees(models, kind):
         assert ours.status == "solved"
         assert ours.residual <= 2 * ACCURACY
         assert np.abs(builder.inputs(ours.x) - builder.inputs(theirs)).max() < 5e-3  # where it hardly matters
-        assert value(program, ours.x) == pytest.approx(value(program, theirs), abs=5e-4)
+        assert value(program, ours.x) == pytest.approx(value(program, theirs), abs=1e-3)
     assert feasible > 30
 
 
@@ -87,3 +89,24 @@ def test_the_answer_depends_on_the_program_alone(model):
     once = [solve(program).x.tobytes() for _, program in found]
     again = [solve(program).x.tobytes() for _, program in reversed(found)]
     assert once == again[::-1]
+
+
+@pytest.mark.parametrize("kind", ["residual", "matrix-zonotope"])
+def test_rows_that_are_left_out_change_no_answer(models, kind, monkeypatch):
+    """Against the same programs with every row in them."""
+    pruned = [program for _, program in programs(models[kind, "direct"], 150)]
+    monkeypatch.setattr(Builder, "_box", lambda self, before: (np.zeros(self.free), np.full(self.free, 1e3)))
+    full = [program for _, program in programs(models[kind, "direct"], 150)]
+    assert sum(len(program.b) for program in pruned) < 0.7 * sum(len(program.b) for program in full)
+    left_out = 0
+    for program in full:
+        answers = [solve(other) for other in pruned if np.array_equal(other.g, program.g)]
+        whole = by_daqp(program)
+        if not answers:
+            left_out += 1
+            assert whole[1] < 1, "ruled out, though there is a solution"
+        elif whole[1] >= 1:
+            assert np.allclose(
+                answers[0].x[:2], whole[0][:2], atol=5e-3
+            )  # of the range; atoms that bind nothing are loose
+    assert left_out == len(full) - len(pruned)
