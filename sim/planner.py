@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from itertools import product
 
@@ -16,18 +17,22 @@ from messaging.shapes import Obstacle, Shapes
 Array = NDArray[np.float64]
 
 CELL = {2: 0.05, 3: 0.625}  # m, edge of a cell in the plane and in space
-CELLS_PER_SIDE = 110  # along x, at most; wider rooms get wider cells
+MOST_CELLS = {2: 110**2, 3: 65_536}  # larger rooms get larger cells
 
 
 class ClearanceMap:
     """Distance from every cell's centre to the nearest obstacle: `clearance`, m, one index per axis, x first."""
 
     def __init__(self, obstacles: Sequence[Obstacle], bounds: Sequence[tuple[float, float]]) -> None:
-        """bounds: lowest and highest coordinate of each of the d = 2 or 3 axes, m."""
+        """bounds: lowest and highest coordinate of each of the d = 2 or 3 axes, m.
+
+        Cells are cubes that fill the first axis; along the others the last may end half a cell beside the bound.
+        """
         widths = [high - low for low, high in bounds]
         self.dim = len(bounds)
         self.low: Array = np.array([low for low, _ in bounds])
-        self.cell = widths[0] / min(round(widths[0] / CELL[self.dim]), CELLS_PER_SIDE)
+        cell = max(CELL[self.dim], (math.prod(widths) / MOST_CELLS[self.dim]) ** (1.0 / self.dim))
+        self.cell = widths[0] / round(widths[0] / cell)
         self.shape = tuple(round(width / self.cell) for width in widths)
         axes = [low + self.cell * (np.arange(n) + 0.5) for low, n in zip(self.low, self.shape, strict=True)]
         self.centres: Array = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, self.dim)
