@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import deque
 from dataclasses import replace
 from pathlib import Path
 
@@ -60,6 +61,7 @@ class Quadrotor:
         self.collided = False  # an obstacle was touched since it was last set to False
         self.on_floor = False  # the floor was touched in the last tick
         self._count = 0
+        self._track: deque[list[float]] = deque(maxlen=64)  # positions at the end of each `fly` since `watch`
         self._acceleration = (0.0, 0.0, 0.0)
         self.input = np.zeros(QUADROTOR.action_dim)
         mujoco.mj_forward(self._model, self._data)
@@ -76,17 +78,25 @@ class Quadrotor:
         self.input = slewed(input, self.input)
         x, y, z = self.input.tolist()
         self.controller.setpoint = (x, y, z)
-        self.collided = False
-        start = self.measured[:3]
-        true, seen = np.empty((SAMPLES, 3)), np.empty((SAMPLES, 3))
+        self.watch()
+        start, seen = self.measured[:3], np.empty((SAMPLES, 3))
         for i in range(SAMPLES):
             self.fly(self._ticks)
-            true[i] = self._data.qpos[:3]
-            seen[i] = true[i] + self._estimator.errors[:3]
-        self.true, self.measured = self.state(), self.estimated_state(self.estimate())
-        distances = self.clearance(true)
+            seen[i] = self.seen()[0]
+        self.measured = self.estimated_state(self.estimate())
+        return self.watched(self.measured, seen - start)
+
+    def watch(self) -> None:
+        """A period begins: note from now on what is touched, and where it has been."""
+        self.collided = False
+        self._track.clear()
+
+    def watched(self, measured: Array, path: Array) -> Period:
+        """The period since `watch`, as it was; measured (9,) and path (S, 3) are what others made of it."""
+        self.true = self.state()
+        distances = self.clearance(np.array(self._track))
         closest, clearance = float(distances.min()), float(distances[-1])
-        return Period(self.measured, self.true, self.collided, closest, clearance, seen - start, 0.0)
+        return Period(measured, self.true, self.collided, closest, clearance, path, 0.0)
 
     def standing(self) -> Period:
         """The present state as a period in which nothing happened: what there is to say before the first step."""
@@ -139,6 +149,7 @@ class Quadrotor:
                 self.on_floor = False
         vx, vy, vz = qvel[:3].tolist()
         dt = self.timestep
+        self._track.append(qpos[:3].tolist())
         self._acceleration = ((vx - before[0]) / dt, (vy - before[1]) / dt, (vz - before[2]) / dt)
 
     def cut_rotors(self) -> None:

@@ -56,8 +56,10 @@ class Autopilot:
         system: int = 1,
         parameters: dict[str, float] | None = None,
         lidar: Lidar | None = None,
+        quiet: bool = False,
     ) -> None:
-        """parameters: other values than the table's; lidar: for OBSTACLE_DISTANCE.
+        """parameters: other values than the table's; lidar: for OBSTACLE_DISTANCE; quiet: nothing but the heartbeat is
+        sent without being asked for.
 
         Raises:
             UnknownRules, BadParameter.
@@ -75,7 +77,7 @@ class Autopilot:
         self.mav.robust_parsing = True
         self.schedule = Schedule(TICK)
         self.schedule.set(HEARTBEAT, 1.0, 0.0)
-        for kind, rate in self.rules.rates.items():
+        for kind, rate in () if quiet else self.rules.rates.items():
             self.schedule.set(kind, 1.0 / rate, 0.0)
         self._heartbeat()
 
