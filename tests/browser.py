@@ -7,6 +7,7 @@ import json
 import shutil
 import subprocess
 import time
+from contextlib import ExitStack
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -37,37 +38,35 @@ class Page:
         self._folder, self._size = folder, (width, height)
         self.requests: list[str] = []
         self.complaints: list[str] = []
-        self._number = 0
+        self._number, self._session = 0, ""
 
     def __enter__(self) -> Self:
+        with ExitStack() as stack:
+            self._start(stack)
+            self._end = stack.pop_all()
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None) -> None:
+        self._end.close()
+
+    def _start(self, stack: ExitStack) -> None:
         assert CHROMIUM is not None
         size = f"--window-size={self._size[0]},{self._size[1]}"
-        profile = f"--user-data-dir={self._folder}"
-        words = [CHROMIUM, *FLAGS, size, profile, "about:blank"]
-        self._process = subprocess.Popen(words, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        words = [CHROMIUM, *FLAGS, size, f"--user-data-dir={self._folder}", "about:blank"]
+        process = subprocess.Popen(words, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        stack.callback(_end, process)
         address = self._folder / "DevToolsActivePort"
         deadline = time.monotonic() + START
         while not address.exists() or len(address.read_text().splitlines()) < 2:
-            assert self._process.poll() is None and time.monotonic() < deadline, "the browser does not start"
+            assert process.poll() is None and time.monotonic() < deadline, "the browser does not start"
             time.sleep(0.05)
         port, path = address.read_text().splitlines()[:2]
-        self._socket = connect(f"ws://127.0.0.1:{port}{path}", max_size=None)
-        self._session = ""
+        self._socket = stack.enter_context(connect(f"ws://127.0.0.1:{port}{path}", max_size=None))
         targets = self.call("Target.getTargets")["targetInfos"]
         target = next(target["targetId"] for target in targets if target["type"] == "page")
         self._session = self.call("Target.attachToTarget", targetId=target, flatten=True)["sessionId"]
         for domain in ("Page", "Runtime", "Network", "Log"):
             self.call(f"{domain}.enable")
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None) -> None:
-        self._socket.close()
-        self._process.terminate()
-        try:
-            self._process.wait(10.0)
-        except subprocess.TimeoutExpired:
-            self._process.kill()
-            self._process.wait()
 
     def call(self, method: str, **parameters: Any) -> dict[str, Any]:
         """The result of one command of the protocol; what else comes meanwhile is taken note of."""
@@ -116,3 +115,12 @@ class Page:
             self.complaints.append(json.dumps(about["args"]))
         elif method == "Log.entryAdded" and about["entry"]["level"] == "error":
             self.complaints.append(about["entry"]["text"])
+
+
+def _end(process: subprocess.Popen[bytes]) -> None:
+    process.terminate()
+    try:
+        process.wait(10.0)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.wait()

@@ -1,0 +1,61 @@
+"""A short log of a robot that a greedy policy drives through the filter, made without processes or a bus."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from itertools import count
+from pathlib import Path
+
+import numpy as np
+
+from actors.driver import Driver, Identity
+from actors.guard import consult
+from deploy.child import attachment
+from deploy.evaluate import in_process
+from deploy.store import model_for
+from deploy.vehicles import environment
+from logs.recorder import entry
+from logs.segment import open_segment
+from messaging import brakeline_pb2 as pb
+from messaging.bus import Sample
+from messaging.robots import GROUND
+from messaging.topics import EPISODE, EXCHANGE, STEP, Topic
+from safety.model_set import Recipe
+from sim.policies import scripted
+
+Change = Callable[[pb.Exchange], None]
+
+
+def drive(
+    log: Path, steps: int = 150, change: Change | None = None, attach: bool = True, actor: str = "actor-0"
+) -> str:
+    """Drive and record; `change` may falsify what is recorded of an exchange. Returns the model set's version."""
+    model = model_for(GROUND, Recipe())
+    ask = in_process(model)
+    driver = Driver(GROUND, environment(GROUND, "dense", 7), Identity(actor, 0, 0), penalty=1.0)
+    attachments = {attachment("ground", model.version): model.encode()} if attach else None
+    segment = open_segment(log, {"run": {"method": "ddpc"}}, attachments)
+    numbers: dict[str, Iterator[int]] = {}
+
+    def put(topic: Topic, message: pb.Episode | pb.Exchange | pb.Step) -> None:
+        key = topic.at(robot="ground", source=actor)
+        number = next(numbers.setdefault(key, count(1)))
+        now = time.time_ns()
+        message.header.MergeFrom(pb.Header(sequence=number, source=actor, run=1, wall_time=now))
+        segment.save([entry(Sample(topic, key, message.SerializeToString(), now))])
+
+    policy, episode = scripted("greedy", GROUND, np.random.default_rng(0)), 0
+    for _ in range(steps):
+        if not driver.running:
+            put(EPISODE, driver.begin(episode))
+            episode += 1
+        proposal = np.asarray(policy(driver.observation, driver.info), dtype=float)
+        outcome = consult(ask, [driver.request(proposal)], GROUND)[0]
+        exchange = outcome.exchange(driver.info["time"])
+        if change is not None:
+            change(exchange)
+        put(EXCHANGE, exchange)
+        put(STEP, driver.execute(proposal, outcome, 5))
+    segment.finish()
+    return model.version

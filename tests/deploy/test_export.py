@@ -1,0 +1,97 @@
+"""What a log is exported to, read back by others than wrote it."""
+
+import csv
+import json
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from mcap_protobuf.decoder import DecoderFactory
+
+from deploy import cli
+from messaging import brakeline_pb2 as pb
+from messaging.robots import GROUND
+
+STEPS = 150
+
+
+def messages(path: Path) -> list[tuple[str, Any, bytes]]:
+    """(topic, decoded, payload) of a log, by the plain reader."""
+    with path.open("rb") as file:
+        reader = make_reader(file, decoder_factories=[DecoderFactory()])
+        return [(channel.topic, message, raw.data) for _, channel, raw, message in reader.iter_decoded_messages()]
+
+
+def run(capsys: pytest.CaptureFixture[str], *words: object) -> dict[str, Any]:
+    assert cli.main(["export", *map(str, words), "--json"]) == 0
+    return json.loads(capsys.readouterr().out)
+
+
+def test_csv_has_every_step_with_every_field(log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    steps = [message for topic, message, _ in messages(log) if topic.startswith("step/")]
+    assert run(capsys, log, "--csv", tmp_path / "a" / "steps.csv")["csv"]["steps"] == len(steps) == STEPS
+    with (tmp_path / "a" / "steps.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == STEPS
+    for row, step in zip(rows, steps, strict=True):
+        assert (row["actor"], int(row["episode"]), int(row["step"])) == (step.actor, step.episode, step.step)
+        assert float(row["reward"]) == step.reward and int(row["terminated"]) == step.terminated
+        assert row["decision"] == pb.Kind.Name(step.decision) and float(row["header.time"]) == step.header.time
+        for name, parts in (("observation", GROUND.observation), ("action", GROUND.action), ("state", GROUND.state)):
+            assert [float(row[f"{name}.{part}"]) for part in parts] == list(getattr(step, name)), name
+    missing = {f.name for f in pb.Step.DESCRIPTOR.fields} - {name.split(".")[0] for name in rows[0]}
+    assert missing == {"path"}
+
+
+def test_minari_gives_the_episodes_back(
+    log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    minari = pytest.importorskip("minari")
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
+    figures = run(capsys, log, "--minari", "brakeline/ground-v0")["minari"]
+    steps = [message for topic, message, _ in messages(log) if topic.startswith("step/")]
+    numbers = Counter(step.episode for step in steps)
+    assert (figures["steps"], figures["episodes"]) == (STEPS, len(numbers))
+    data = minari.load_dataset("brakeline/ground-v0")
+    assert data.action_space.shape == (2,) and data.action_space.low.tolist() == pytest.approx([0.0, -0.5])
+    for episode, number in zip(data.iterate_episodes(), sorted(numbers), strict=True):
+        mine = [step for step in steps if step.episode == number]
+        assert len(episode.observations) == len(mine) + 1 and len(episode.actions) == len(mine)
+        assert np.array_equal(episode.observations[:-1], np.array([s.observation for s in mine], np.float32))
+        assert np.array_equal(episode.observations[-1], np.array(mine[-1].next_observation, np.float32))
+        assert np.array_equal(episode.actions, np.array([s.action for s in mine], np.float32))
+        assert episode.rewards.tolist() == [s.reward for s in mine]
+        assert episode.terminations[-1] == mine[-1].terminated
+        assert episode.truncations[-1] == (not mine[-1].terminated), "also where the log ends within an episode"
+        assert np.array_equal(episode.infos["proposed"], np.array([s.proposed for s in mine], np.float32))
+        assert episode.infos["decision"].tolist() == [s.decision for s in mine]
+    assert cli.main(["export", str(log), "--minari", "brakeline/ground-v0"]) == 1
+    assert "is there already" in capsys.readouterr().err
+
+
+def test_foxglove_draws_every_step_and_keeps_every_byte(
+    log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "full.mcap"
+    count = run(capsys, log, "--foxglove", out)["foxglove"]["messages"]
+    before, after = messages(log), messages(out)
+    assert count == len(after)
+    ours = [(topic, payload) for topic, _, payload in after if not topic.startswith("foxglove/")]
+    assert ours == [(topic, payload) for topic, _, payload in before]
+    drawn = Counter(topic.split("/")[1] for topic, _, _ in after if topic.startswith("foxglove/"))
+    assert drawn["decision"] == drawn["lidar"] == STEPS
+    again = tmp_path / "again.mcap"
+    assert run(capsys, out, "--foxglove", again)["foxglove"]["messages"] == count, "old pictures are not kept"
+    assert cli.main(["replay", str(out)]) == 0, "the model sets are in it too"
+    assert cli.main(["export", str(log), "--foxglove", str(out)]) == 1
+
+
+def test_what_cannot_be_exported_is_said(log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["export", str(log)]) == 1
+    assert "--csv, --minari, --foxglove" in capsys.readouterr().err
+    assert cli.main(["export", str(tmp_path), "--csv", str(tmp_path / "a.csv")]) == 1
+    assert "no log" in capsys.readouterr().err
+    assert run(capsys, log, "--csv", tmp_path / "q.csv", "--robot", "quadrotor")["csv"]["steps"] == 0
