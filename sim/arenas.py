@@ -58,7 +58,7 @@ class ArenaKind:
 _FLIGHT = ArenaKind(
     half_width=20.0,
     height=10.0,
-    cylinders=(6, 8),
+    cylinders=(6, 9),
     radius=(0.6, 1.2),
     boxes=(4, 6),
     edge=(2.0, 4.0),
