@@ -18,14 +18,14 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from deploy import collect
 from deploy import pretrain as rivals
 from deploy.vehicles import Conditions
-from messaging.robots import Robot
+from messaging.robots import LATE, Robot, robot_named
 from safety.dataset import BadData, Dataset
 from safety.methods import DDPC, Model
 from safety.model_set import BadModel, ModelSet, Recipe, make
 from safety.pretrained import Pretrained
 from safety.statement import Statement, state
 
-TRAJECTORIES = 200  # of 300 periods
+TRAJECTORIES = {"ground": 200, "quadrotor": 500}  # of 300 periods: a plan of 12 periods needs more than one of 3
 HELD_OUT = 0.3  # of the trajectories, for the statement about a model set
 SEED = 20260
 
@@ -55,7 +55,7 @@ def method_path(robot: Robot, method: str, recipe: Recipe) -> Path:
 def recorded(
     robot: Robot,
     path: Path | None = None,
-    trajectories: int = TRAJECTORIES,
+    trajectories: int | None = None,
     seed: int = SEED,
     conditions: Conditions | None = None,
     again: bool = False,
@@ -64,7 +64,7 @@ def recorded(
     path = path or record_path(robot)
     if path.exists() and not again:
         return Dataset.load(path)
-    conditions = conditions or Conditions()
+    conditions, trajectories = conditions or Conditions(), trajectories or TRAJECTORIES[robot.name]
     driven = track(
         collect.record(robot, trajectories, seed, conditions),
         f"recording {trajectories} trajectories of {robot.name}",
@@ -98,11 +98,13 @@ def model_for(robot: Robot, recipe: Recipe) -> ModelSet:
             return ModelSet.load(path)
         except BadModel as error:
             console.print(f"[yellow]making the model set again:[/] {error}")
+    base = robot_named(robot.name.removesuffix(LATE))  # one record serves, whether questions are late or not
     try:
-        data = recorded(robot)
+        data = recorded(base)
     except BadData as error:
         console.print(f"[yellow]recording again:[/] {error}")
-        data = recorded(robot, again=True)
+        data = recorded(base, again=True)
+    data = replace(data, robot=robot)
     with console.status(f"certifying {robot.name}: {recipe.certificate}, {recipe.mode}"):
         model, statement = certified(data, recipe)
     console.print(
@@ -111,6 +113,7 @@ def model_for(robot: Robot, recipe: Recipe) -> ModelSet:
     )
     model.save(path)
     return model
+
 
 def method_for(robot: Robot, method: str, recipe: Recipe) -> Model:
     """What a method must know of a robot: ours a model set, a rival its networks, made if they are not there.

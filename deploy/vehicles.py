@@ -18,7 +18,7 @@ from sim.vehicle import MakeVehicle, Vehicle
 from sim.wind import Wind
 from sim.world import Arena, closing, room_bounds
 
-YARD = 50.0  # m to the walls of the place where data are recorded: farther than a trajectory can go
+YARD = {2: 50.0, 3: 500.0}  # m to the walls of the place where data are recorded: farther than a trajectory can go
 
 
 @dataclass(frozen=True)
@@ -68,8 +68,9 @@ def environment(robot: Robot, arena: str, seed: int, conditions: Conditions | No
 
 def vehicle_in_yard(robot: Robot, rng: np.random.Generator, conditions: Conditions) -> Vehicle:
     """The bare vehicle with nothing near it, heading at random."""
-    height = None if robot.position_dim == 2 else 2.0 * YARD
-    start = (0.0, 0.0, float(rng.uniform(-np.pi, np.pi)) if height is None else YARD)
-    goal = (0.5 * YARD, 0.0) if height is None else (0.5 * YARD, 0.0, YARD)
-    arena = Arena("yard", closing(YARD, height), start, goal, 0.25, 10**9, room_bounds(YARD, height))
+    yard = YARD[robot.position_dim]
+    height = None if robot.position_dim == 2 else 2.0 * yard
+    start = (0.0, 0.0, float(rng.uniform(-np.pi, np.pi)) if height is None else yard)
+    goal = (0.5 * yard, 0.0) if height is None else (0.5 * yard, 0.0, yard)
+    arena = Arena("yard", closing(yard, height), start, goal, 0.25, 10**9, room_bounds(yard, height))
     return conditions.factory(robot)(arena, rng)

@@ -11,7 +11,7 @@ from rich.table import Table
 
 from deploy.commands.common import Endpoints, Flags, Mode, Physics, Robot, console, errors, say_json
 from deploy.logged import Recorded, from_log
-from deploy.store import SEED, TRAJECTORIES, certified, model_path, record_path, recorded
+from deploy.store import SEED, certified, model_path, record_path, recorded
 from messaging import brakeline_pb2 as pb
 from messaging.bus import Bus
 from messaging.robots import robot_named
@@ -25,8 +25,8 @@ from safety.statement import Statement
 @dataclass(frozen=True)
 class Collect:
     robot: Robot = "ground"
-    trajectories: int = TRAJECTORIES
-    """Of 300 periods each."""
+    trajectories: int | None = None
+    """Of 300 periods each; default: as many as this robot's plans need."""
     seed: int = SEED
     physics: Flags[Physics] = field(default_factory=Physics)
     out: Path | None = None
