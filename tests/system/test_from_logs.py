@@ -1,0 +1,69 @@
+"""A run's log asked again, learned from without a robot, and in place of a checkpoint that was lost."""
+
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+
+from deploy.experiments import EXPERIMENTS
+from logs.reader import read
+from messaging.robots import GROUND
+from messaging.weights import MLP
+from tests.system.runs import brakeline
+
+STEPS = EXPERIMENTS["debug"].steps
+
+
+@pytest.fixture(scope="module")
+def logged(logged_run: Path) -> dict[str, int]:
+    """How many steps and exchanges its log has."""
+    topics = [record.topic for record in read(logged_run)]
+    return {name: topics.count(name) for name in ("step", "exchange")}
+
+
+def test_replay_of_a_whole_run_decides_the_same(logged_run: Path, logged: dict[str, int]) -> None:
+    done = brakeline("replay", logged_run, "--json")
+    assert done.returncode == 0, done.stderr + done.stdout
+    figures = json.loads(done.stdout)
+    assert figures["requests"] == figures["identical"] == logged["exchange"] > 0
+    other = json.loads(brakeline("replay", logged_run, "--margin", "0.05", "--json").stdout)
+    assert other["different"] > 0 and other["examples"][0]["differences"]
+
+
+def test_offline_a_policy_comes_from_the_log_alone(logged_run: Path, logged: dict[str, int], tmp_path: Path) -> None:
+    words = ("train", "ground", "--experiment", "debug", "--from-logs", logged_run, "--actors", "0")
+    done = brakeline(*words, "--out", tmp_path / "offline", "--json")
+    assert done.returncode == 0, done.stderr
+    figures = json.loads(done.stdout)
+    learner = figures["learners"]["ground"]
+    assert figures["finished"] and figures["steps"] == 0, "nobody drove"
+    assert figures["from_logs"]["published"] == learner["steps"] == logged["step"]
+    assert (learner["missing"], learner["duplicates"], learner["done"]) == (0, 0, True)
+    assert learner["updates"] == logged["step"] - EXPERIMENTS["debug"].learner.td3.warmup
+    assert set(figures["processes"]) == {"launcher", "recorder", "learner", "feeder"}
+    assert not any(record.topic in ("step", "logged") for record in read(tmp_path / "offline"))
+    (path,) = figures["policies"]
+    assert MLP.load(Path(path), GROUND).sizes[0] == GROUND.observation_dim
+
+
+def test_a_lost_checkpoint_comes_back_from_the_log(logged_run: Path, logged: dict[str, int], tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    shutil.copytree(logged_run, folder)
+    shutil.rmtree(folder / "learner")
+    more = 60
+    words = ("train", "--resume", folder, "--from-logs", folder, "--steps", logged["step"] + more)
+    done = brakeline(*words, "--json")
+    assert done.returncode == 0, done.stderr
+    figures = json.loads(done.stdout)
+    learner = figures["learners"]["ground"]
+    assert figures["from_logs"]["published"] == logged["step"], "the figures say how many steps came back"
+    assert (learner["steps"], learner["duplicates"]) == (logged["step"] + more, 0)
+    assert more <= figures["steps"] <= more + 2 * EXPERIMENTS["debug"].learner.window, "then robots went on"
+    first = min(record.message.episode for record in read(folder / "run_0001.mcap") if record.topic == "step")
+    assert first > 0, "with episodes that were not there before"
+    # Once more: now the learner knows all that is in the log.
+    done = brakeline("train", "--resume", folder, "--from-logs", folder, "--steps", logged["step"] + 2 * more, "--json")
+    figures = json.loads(done.stdout)
+    assert figures["from_logs"]["published"] == 0 and figures["from_logs"]["known"] >= logged["step"]
+    assert figures["finished"] and figures["learners"]["ground"]["duplicates"] == 0
