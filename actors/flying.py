@@ -267,7 +267,7 @@ class LiveVehicle:
             self._velocity = CLIMB
         if not wait(lambda: client.position is not None and client.position[2] > top - 0.3, 10.0 + 3.0 * height):
             raise MavlinkError("it does not climb")
-        self._velocity = np.zeros(3)
+        self._velocity, self._sent_at = np.zeros(3), -math.inf
         wait(lambda: float(np.linalg.norm(client.velocity)) < 0.1, 5.0)
 
     def _state(self, now: float) -> Array:

@@ -21,7 +21,7 @@ from messaging.clock import Clock
 from messaging.links import Link
 from sim.autopilot.endpoint import TICK, Autopilot
 
-TRUTH_RATE = 5.0  # Hz
+TRUTH_RATE = 25.0  # Hz
 PATIENCE = 0.25  # s that it may be late before it gives up catching up
 
 

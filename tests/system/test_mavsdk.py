@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import os
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import Any
 
 import pytest
 from mavsdk.component_type import ComponentType
 from mavsdk.mavsdk import Configuration, Mavsdk
-from mavsdk.plugins.action import Action, ActionError, ActionResult
-from mavsdk.plugins.offboard import Offboard, OffboardError, OffboardResult, VelocityBodyYawspeed, VelocityNedYaw
+from mavsdk.plugins.action import Action, ActionError
+from mavsdk.plugins.offboard import Offboard, OffboardError, VelocityBodyYawspeed, VelocityNedYaw
 from mavsdk.plugins.param import Param
 from mavsdk.plugins.telemetry import FlightMode, Telemetry
 
@@ -19,8 +18,6 @@ from tests.system.flights import autopilot
 from tests.system.runs import until
 
 os.environ.setdefault("MAVLINK20", "1")
-
-from pymavlink import mavutil  # noqa: E402
 
 
 @pytest.fixture

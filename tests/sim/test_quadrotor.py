@@ -1,0 +1,186 @@
+"""The quadrotor flies setpoints: fast, settled, level with what was promised about its noise, its wind and its size."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+import pytest
+
+from messaging.robots import QUADROTOR
+from messaging.shapes import CYLINDER, Obstacle
+from sim.flight import FlightController, VelocityAxis
+from sim.flight_estimator import QuadrotorNoise
+from sim.quadrotor import MODEL, SAMPLES, Quadrotor
+from sim.vehicle import BadInput
+from sim.wind import Air, Wind
+from sim.world import Arena, staged_arena
+
+QUIET = QuadrotorNoise(scale=0.0)
+STAND = np.zeros(3)
+
+
+def room(*obstacles: Obstacle, start: tuple[float, ...] = (0.0, 0.0, 500.0)) -> Arena:
+    return staged_arena(*obstacles, start=start, goal=(50.0, 50.0, 50.0), half_width=1000.0, height=1000.0)
+
+
+def fly(vehicle: Quadrotor, setpoint: tuple[float, float, float], periods: int) -> list[np.ndarray]:
+    """The true states after each period."""
+    return [vehicle.step(np.array(setpoint)).true for _ in range(periods)]
+
+
+def quadrotor(seed: int = 0, noise: QuadrotorNoise = QUIET, wind: Wind | None = None) -> Quadrotor:
+    return Quadrotor(room(), np.random.default_rng(seed), noise, wind)
+
+
+def test_it_starts_hovering_at_the_start() -> None:
+    vehicle = quadrotor()
+    assert np.abs(vehicle.true - [0, 0, 500, *[0] * 6]).max() < 1e-3
+    assert not vehicle.standing().collision
+    assert vehicle.standing().clearance == pytest.approx(500.0 - QUADROTOR.footprint, abs=1e-3)
+
+
+@pytest.mark.parametrize("setpoint", [(5, 5, 5), (-5, 5, -5), (5, -5, 0), (0, 0, 5)])
+def test_full_speed_on_every_axis_at_once_then_a_stop(setpoint: tuple[float, float, float]) -> None:
+    vehicle = quadrotor()
+    at_speed = fly(vehicle, setpoint, 20)[-1][3:6]
+    assert np.abs(at_speed - setpoint).max() < 0.1
+    stop = fly(vehicle, (0, 0, 0), 7 + 4)  # the slew takes seven periods, settling three, and one to spare
+    assert np.abs(stop[-1][3:6]).max() < 0.03
+    assert (np.sign(setpoint) * (stop[-1][:3] - stop[9][:3]) < 0.02).all()  # no way back worth mentioning
+    for axis in range(3):
+        backward = -np.sign(setpoint[axis]) * np.array([state[3 + axis] for state in stop])
+        assert backward.max() < 0.05 or setpoint[axis] == 0
+
+
+def test_velocity_settles_within_six_tenths_of_a_second() -> None:
+    vehicle = quadrotor()
+    fly(vehicle, (0.8, 0.8, 0.8), 1)
+    after = fly(vehicle, (0.8, 0.8, 0.8), 3)
+    assert np.abs(after[1][3:6] - 0.8).max() < 0.05
+    assert np.abs(after[-1][3:6] - 0.8).max() < 0.03
+
+
+def test_a_setpoint_is_clipped_to_bounds_and_slew() -> None:
+    vehicle = quadrotor()
+    vehicle.step(np.array([9.0, -9.0, 0.5]))
+    assert vehicle.input.tolist() == pytest.approx([0.8, -0.8, 0.5])
+    for _ in range(20):
+        vehicle.step(np.array([9.0, -9.0, 0.5]))
+    assert vehicle.input.tolist() == pytest.approx([5.0, -5.0, 0.5])
+
+
+@pytest.mark.parametrize("bad", [[1.0, 2.0], [np.nan, 0.0, 0.0], [np.inf, 0.0, 0.0]])
+def test_no_vector_of_three_numbers_is_refused(bad: list[float]) -> None:
+    with pytest.raises(BadInput):
+        quadrotor().step(np.array(bad))
+
+
+def test_the_closed_loop_is_nearly_linear() -> None:
+    """A linear map of (v, a, setpoint in force, new setpoint) foretells the next displacement to a centimetre or so."""
+    vehicle, rng = quadrotor(), np.random.default_rng(5)
+    rows, moved = [], []
+    for _ in range(500):
+        before, held = vehicle.true.copy(), vehicle.input.copy()
+        target = vehicle.input + rng.uniform(-0.8, 0.8, 3)
+        vehicle.step(target)
+        rows.append([*before[3:], *held, *vehicle.input, 1.0])
+        moved.append(vehicle.true[:3] - before[:3])
+    solution = np.linalg.lstsq(np.array(rows), np.array(moved), rcond=None)[0]
+    residual = np.array(rows) @ solution - np.array(moved)
+    assert np.sqrt((residual**2).mean()) < 0.005
+    assert np.abs(residual).max() < 0.03
+
+
+def test_hold_stays_where_it_stopped() -> None:
+    vehicle = quadrotor(noise=QuadrotorNoise())
+    fly(vehicle, (3, -2, 1), 15)
+    fly(vehicle, (0, 0, 0), 12)
+    held = np.array(fly(vehicle, (0, 0, 0), 150))[:, :3]
+    assert np.linalg.norm(held - held[0], axis=1).max() < 0.08
+
+
+def test_the_estimate_stays_within_its_bound() -> None:
+    vehicle, rng = quadrotor(noise=QuadrotorNoise()), np.random.default_rng(1)
+    errors = []
+    for _ in range(600):
+        period = vehicle.step(vehicle.input + rng.choice([-0.8, 0.8], 3))
+        errors.append(np.abs(period.measured - period.true))
+    worst = np.max(errors, axis=0)
+    assert (worst < QUADROTOR.measurement_bound).all()
+    assert (worst[:6] > 0.9 * np.array(QUADROTOR.measurement_bound[:6])).all()  # and the bound is not idle
+
+
+def test_subsamples_lead_from_the_measured_start_to_the_measured_end() -> None:
+    vehicle = quadrotor(noise=QuadrotorNoise())
+    fly(vehicle, (2, 0, 0), 5)
+    before = vehicle.measured[:3]
+    period = vehicle.step(np.array([2.0, 1.0, 0.0]))
+    assert period.subsamples.shape == (SAMPLES, 3)
+    assert period.subsamples[-1] == pytest.approx(period.measured[:3] - before)
+
+
+def test_every_geom_lies_within_the_footprint() -> None:
+    model = mujoco.MjModel.from_xml_string(MODEL)
+    body = model.body("base").id
+    for geom in np.flatnonzero(model.geom_bodyid == body):
+        assert np.linalg.norm(model.geom_pos[geom]) + model.geom_rbound[geom] < QUADROTOR.footprint
+
+
+def test_running_into_a_pillar_is_a_collision_at_the_clearance_zero() -> None:
+    pillar = Obstacle(CYLINDER, (3.0, 0.0, 5.0), (0.5, 10.0))
+    vehicle = Quadrotor(room(pillar, start=(0.0, 0.0, 5.0)), np.random.default_rng(0), QUIET)
+    for _ in range(20):
+        period = vehicle.step(np.array([3.0, 0.0, 0.0]))
+        if period.collision:
+            break
+    assert period.collision
+    assert period.closest < 0.05
+    assert abs(period.true[0] - 2.5) < 0.4
+
+
+def test_wind_is_leant_against() -> None:
+    vehicle = quadrotor(wind=Wind(speed=6.0, direction=0.7, gust=1.0))
+    held = np.array(fly(vehicle, (0, 0, 0), 100))
+    assert np.abs(held[:, :3] - [0, 0, 500]).max() < 0.6
+    moving = np.array(fly(vehicle, (3, 0, 0), 40))[15:, 3]
+    assert abs(moving.mean() - 3.0) < 0.1
+
+
+def test_gusts_have_their_spread_and_their_cut() -> None:
+    air = Air(Wind(speed=2.0, direction=0.0, gust=1.5, correlation=0.5), np.random.default_rng(0), 0.05)
+    course = []
+    for _ in range(20000):
+        air.advance()
+        course.append(air.velocity)
+    gusts = np.array(course) - [2.0, 0.0, 0.0]
+    assert gusts.std(axis=0) == pytest.approx([1.5] * 3, rel=0.1)
+    assert np.abs(gusts).max() <= 4.5
+
+
+def test_physics_can_be_altered_and_nonsense_cannot() -> None:
+    vehicle = quadrotor()
+    vehicle.alter(payload_kg=0.2, wind_speed=3.0)
+    assert np.abs(fly(vehicle, (0, 0, 0), 40)[-1][:3] - [0, 0, 500]).max() < 1.0
+    with pytest.raises(ValueError, match="floor_friction"):
+        vehicle.alter(floor_friction=0.5)
+    with pytest.raises(ValueError, match="0 or more"):
+        vehicle.alter(payload_kg=-1.0)
+
+
+def test_the_same_seed_is_the_same_flight() -> None:
+    flights = []
+    for _ in range(2):
+        vehicle = Quadrotor(room(), np.random.default_rng(3), QuadrotorNoise(), Wind(speed=2.0, gust=1.0))
+        flights.append([vehicle.step(np.array([1.0, 2.0, -1.0])).measured for _ in range(20)])
+    assert np.array_equal(*flights)
+
+
+def test_a_large_jump_of_the_setpoint_is_ramped() -> None:
+    """Whoever does not slew is slewed: the reference never asks for more than the body can give."""
+    axis = VelocityAxis(FlightController(0.005, 2).gains, 0.01, 0.03)
+    speeds = []
+    for _ in range(300):
+        axis.follow(5.0)
+        speeds.append(axis.velocity)
+    assert np.diff(speeds).max() / 0.01 < 5.5
+    assert speeds[-1] == pytest.approx(5.0)
