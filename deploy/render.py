@@ -14,7 +14,7 @@ from matplotlib.animation import AbstractMovieWriter, FFMpegWriter, PillowWriter
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection, PatchCollection
 from matplotlib.figure import Figure
-from matplotlib.patches import Circle, Patch, Polygon, Rectangle
+from matplotlib.patches import BoxStyle, Circle, FancyBboxPatch, Patch, Polygon, Rectangle
 from matplotlib.transforms import Affine2D
 from numpy.typing import NDArray
 
@@ -185,7 +185,14 @@ class _Stage:
         seen = [kind for kind in COLOURS if any(frame.kind == kind for frame in frames)]
         if not self.flies:
             handles = [Patch(color=COLOURS[kind], label=kind) for kind in seen]
-            self.axes.legend(handles=handles, loc="upper right", fontsize=8, framealpha=0.9)
+            self.axes.legend(
+                handles=handles,
+                loc="upper right",
+                fontsize=8,
+                ncols=len(seen),
+                frameon=False,
+                bbox_to_anchor=(1.0, 1.0),
+            )
 
     def _heading(self) -> str:
         return f"{self.robot.name}, {self.film.arena.name}: "
@@ -203,9 +210,9 @@ class _Stage:
         """The sets of the body's position at the periods' ends, grown by the footprint."""
         drawn = []
         for low, high in zip(frame.low, frame.high, strict=True):
-            size = high - low + 2.0 * self.robot.footprint
-            corner = low - self.robot.footprint
-            box = Rectangle(corner[:2], size[0], size[1], color=COLOURS[frame.kind], alpha=alpha, linewidth=0, zorder=3)
+            size, style = high - low, BoxStyle("Round", pad=self.robot.footprint, rounding_size=self.robot.footprint)
+            box = FancyBboxPatch(low[:2], size[0], size[1], boxstyle=style, color=COLOURS[frame.kind], alpha=alpha)
+            box.set(linewidth=0, zorder=3)
             drawn.append(self.axes.add_patch(box))
         return drawn
 
