@@ -82,15 +82,19 @@ def metadata(config: RunConfig) -> dict[str, dict[str, str]]:
     return about
 
 
-def attachments(config: RunConfig) -> dict[str, bytes]:
-    """The models in use when the run started, so that the log alone can be replayed."""
+def attachments(config: RunConfig, folder: Path) -> dict[str, bytes]:
+    """The models in use when the log begins, or before (of a run that goes on), so that it alone can be replayed."""
     from deploy.store import method_path
     from safety.methods import load
 
     if not config.filtered:
         return {}
     models = (load(method_path(robot_named(robot), config.method, config.recipe)) for robot in config.robots)
-    return {attachment(model.robot.name, model.version): model.encode() for model in models}
+    files = {attachment(model.robot.name, model.version): model.encode() for model in models}
+    for robot in config.robots:
+        archived = (folder / robot / "models").glob("*.safetensors")
+        files |= {attachment(robot, path.stem): path.read_bytes() for path in archived}
+    return files
 
 
 def attachment(robot: str, version: str) -> str:
@@ -103,7 +107,7 @@ def _recorder(place: Place, folder: Path, config: RunConfig, bus: BusSettings) -
     from logs.foxglove import Pictures
 
     derive = Pictures(config.pictures).of_sample if config.pictures > 0.0 else None
-    about, files = metadata(config), attachments(config)
+    about, files = metadata(config), attachments(config, folder)
     recorder.main(bus, folder / LOG, about, place.name, files, derive, config.rotation)
     return False
 
