@@ -81,7 +81,7 @@ class MapPilot:
     """
 
     COMFORT = 2.0  # m; more clearance than this is worth no detour
-    MARGIN = 0.3  # m beside the footprint
+    MARGIN = 0.6  # m beside the footprint: what a tube about the stop takes, and comfort
     CARE = 0.1  # s
     PACE = 1.0  # m/s; a second earlier at a place is worth this many metres of the way
     SHARES = (-1.0, -0.5, 0.0, 0.5, 1.0)  # of the slew, on each axis
