@@ -1,0 +1,238 @@
+"""All figures against a count by another reader; many logs at once; memory that does not grow."""
+
+import itertools
+import json
+import tracemalloc
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+
+from logs.analysis import Look, analysed
+from logs.gallery import SPREAD
+from logs.places import MOST_CELLS, Places
+from logs.reader import by_run, find, open_log
+from logs.report import analyse, show, show_episode
+from logs.timeline import MOST_BINS as MOST_TIMES
+from logs.timeline import Timeline
+from logs.training import MOST_BINS, Training
+from messaging import brakeline_pb2 as pb
+from tests.logs.mixed import ABOUT, BEGIN, SECOND, Writer, agree, counted, decoded, mixed, once
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return mixed(tmp_path_factory.mktemp("logs") / "mixed")
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_every_figure_agrees_with_a_count_by_another_reader(tmp_path: Path, seed: int) -> None:
+    folder = mixed(tmp_path, seed)
+    expected = counted(decoded(find(folder)))
+    figures = analyse(folder)
+    agree({name: figures[name] for name in expected}, expected)
+    lost = sum(topic["missing"] for topic in figures["topics"].values())
+    twice = sum(topic["duplicates"] for topic in figures["topics"].values())
+    assert lost > 20 and twice > 20 and figures["collisions"] > 5 and figures["no_decision"]["Late"] > 5
+
+
+def test_robots_and_actors_add_up(log: Path) -> None:
+    figures = analyse(log)
+    assert set(figures["robots"]) == {"ground", "quadrotor"}
+    for part in (figures["robots"], figures["actors"]):
+        for name in ("steps", "episodes", "goals", "collisions", "interventions"):
+            assert sum(row[name] for row in part.values()) == figures[name], name
+
+
+def test_training_rates_are_those_of_the_steps_in_each_bin(log: Path) -> None:
+    steps = [m for key, m in once(decoded(find(log))) if key.startswith("step/ground")]
+    training = analyse(log)["training"]["ground"]
+    for row in training["bins"]:
+        own = steps[row["until"] - row["steps"] : row["until"]]
+        assert row["adjusted"] == pytest.approx(sum(s.decision == 2 and not s.fallback for s in own) / len(own))
+        assert row["failsafes"] == pytest.approx(sum(s.fallback or s.decision == 3 for s in own) / len(own))
+        assert row["episodes"] == sum(s.terminated or s.truncated for s in own)
+        assert row["closest"] == min(s.clearance for s in own)
+    assert training["bins"][-1]["until"] == len(steps)
+    newest, behind = 0, []
+    for key, message in once(decoded(find(log))):
+        if key == "metrics/ground" or key.startswith("step/ground"):
+            newest = max(newest, message.weights_version)
+        if key.startswith("step/ground"):
+            behind.append(newest - message.weights_version)
+    assert training["staleness"]["mean"] == pytest.approx(sum(behind) / len(behind))
+    assert training["staleness"]["max"] == max(behind) > 0
+
+
+def test_a_resumed_run_is_one_run_and_its_pause_is_not_counted(log: Path) -> None:
+    figures = analyse(log)
+    assert [Path(path).name for path in figures["log"]] == ["run.mcap", "run_0001.mcap"]
+    assert list(figures["runs"]) == ["mixed"]
+    first, last = (figures["segments"][place][edge] for place, edge in ((0, "start"), (1, "end")))
+    assert last - first > 100.0 > figures["seconds"] > 1.0
+    actor = figures["processes"]["actor-1"]
+    assert (actor["starts"], actor["ended"]) == (2, "lived at the log's end")
+    assert figures["processes"]["actor-0"]["ended"] == "in order"
+    assert figures["metadata"]["configuration"] == {"steps": 12}
+    assert figures["metadata"]["model ground"] == ABOUT["model ground"] and figures["seed"] == 7
+
+
+def test_many_runs_are_told_apart_and_joined(tmp_path: Path) -> None:
+    folders = [mixed(tmp_path / name, seed, 8) for seed, name in enumerate(("one", "two"), 5)]
+    both, single = analyse(folders), [analyse(folder) for folder in folders]
+    assert list(both["runs"]) == ["one", "two"]
+    for name in ("steps", "episodes", "goals", "collisions", "timeouts", "interventions"):
+        assert both[name] == sum(figures[name] for figures in single), name
+        assert [run[name] for run in both["runs"].values()] == [figures[name] for figures in single]
+    assert both["mean_speed"] == pytest.approx(
+        sum(f["mean_speed"] * f["steps"] for f in single) / sum(f["steps"] for f in single)
+    )
+    assert "one/actor-0" in both["actors"] and "two/actor-0" in both["processes"]
+    assert (both["seed"], both["metadata"]["run"]) == (7, ABOUT["run"])
+    assert [run["messages"] for run in both["runs"].values()] == [
+        f["runs"][k]["messages"] for f in single for k in f["runs"]
+    ]
+
+
+def test_names_of_runs() -> None:
+    paths = ["a/run.mcap", "a/run_0001.mcap", "a/other.mcap", "b/run.mcap", "c/a/run.mcap"]
+    runs = by_run([Path(path) for path in paths])
+    assert list(runs) == ["a", "a/other", "b", "a (2)"]
+    assert [path.name for path in runs["a"]] == ["run.mcap", "run_0001.mcap"]
+
+
+def test_what_is_missing_is_said(tmp_path: Path) -> None:
+    writer = Writer()
+    for number in range(4):
+        writer.episode("actor-0", number)
+        writer.write(tmp_path / "run.mcap")
+    (tmp_path / "run_0002.mcap").unlink()
+    whole = (tmp_path / "run_0003.mcap").read_bytes()
+    (tmp_path / "run_0003.mcap").write_bytes(whole[: len(whole) // 2])
+    figures = analyse(tmp_path)
+    assert ["run_0002.mcap: this segment is missing" in figures["cuts"][0], "cannot be read" in figures["cuts"][1]] == [
+        True,
+        True,
+    ]
+    assert figures["topics"]["step/ground/actor-0"]["missing"] > 0
+
+
+def test_an_episode_in_detail_is_what_was_recorded(log: Path) -> None:
+    figures = analysed(log, Look(episode=3, actor="actor-1")).figures()
+    (detail,) = figures["episode_detail"]
+    messages = once(decoded(find(log)))
+    steps = [m for key, m in messages if key == "step/ground/actor-1" and m.episode == 3]
+    asked = {m.request.step: m for key, m in messages if key == "exchange/ground/actor-1" and m.request.episode == 3}
+    assert [row["step"] for row in detail["rows"]] == [step.step for step in steps]
+    for row, step in zip(detail["rows"], steps, strict=True):
+        assert (row["reward"], row["clearance"], row["action"]) == (step.reward, step.clearance, list(step.action))
+        if step.step in asked and not step.fallback:
+            assert row["decide_ms"] == asked[step.step].reply.decision.time_ms
+    assert detail["closest"] == min(step.clearance for step in steps) and detail["start"] == [0.0, 0.0]
+    console = Console(record=True, width=200)
+    console.print(show_episode(detail))
+    assert "actor-1, episode 3" in console.export_text()
+    assert len(analysed(log, Look(episode=3)).figures()["episode_detail"]) == 3, "of every actor"
+
+
+def test_the_nearest_misses_are_the_nearest(log: Path) -> None:
+    pictures = analysed(log, Look(pictures=True)).pictures()
+    closest: dict[tuple[str, int, int], float] = {}
+    for key, step in once(decoded(find(log))):
+        if key.startswith("step/ground"):
+            place = key.rsplit("/", 1)[1], step.header.run, step.episode
+            closest[place] = min(closest.get(place, 1e9), step.clearance)
+    gallery = pictures["galleries"]["ground"]
+    by_order = {episode["order"]: episode for episode in gallery["episodes"]}
+    assert [by_order[order]["closest"] for order in gallery["near"]] == sorted(closest.values())[:8]
+    near = by_order[gallery["near"][0]]
+    assert near["tubes"] and len(near["tubes"][min(near["tubes"])]["boxes"]) == 3
+    drone = pictures["galleries"]["quadrotor"]["episodes"][0]
+    assert len(drone["goal"]) == 2 and drone["heading"] is None and drone["x"], "in space, x and y are drawn"
+    assert pictures["timeline"]["lines"][0]["text"] == "killed soon"
+    assert {life["process"] for life in pictures["timeline"]["lives"]} == {"actor-0", "actor-1"}
+    json.dumps(pictures, allow_nan=False)
+
+
+def test_it_is_shown_whole(log: Path) -> None:
+    console = Console(record=True, width=160)
+    console.print(show(analyse(log)))
+    text = console.export_text()
+    words = (
+        "closest approach",
+        "network",
+        "95 %:",
+        "over training",
+        "tube half-width",
+        "bound_step 0.003",
+        "primal_inf",
+    )
+    assert not [word for word in words if word not in text]
+
+
+def test_memory_does_not_grow_with_the_log(tmp_path: Path) -> None:
+    """Six times the messages need hardly more: bins of histograms that were empty before. (How much for gigabytes, with
+    all that is not Python's: `python -m deploy.bench logs-2gb`.)"""
+    held = []
+    for name, rounds in (("short", 100), ("long", 600)):
+        writer = Writer(3, losses=0.0)
+        for number in range(rounds):
+            writer.episode("actor-0", number)
+            if number % 50 == 49:
+                writer.write(tmp_path / name / "run.mcap")
+        writer.write(tmp_path / name / "run.mcap")
+        tracemalloc.start()
+        analysis = analysed(tmp_path / name, Look(pictures=True))
+        held.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
+        pictures = analysis.pictures()
+        assert len(pictures["galleries"]["ground"]["episodes"]) <= SPREAD + 8 + 8 + 4 + 1
+    assert held[1] - held[0] < 2**20
+
+
+def test_bins_become_wider_instead_of_more() -> None:
+    training, places, timeline = Training(), Places(), Timeline()
+    for k in range(40_000):
+        step = pb.Step(
+            actor="a", episode=k // 100, step=k % 100, decision=pb.ADJUSTED, terminated=k % 100 == 99, goal=True
+        )
+        step.goal = step.terminated
+        training.step(step)
+        places.step((k % 300 * 0.1, k // 300 * 0.1), step)
+        timeline.step(BEGIN + k * SECOND)
+    figures = training.figures()
+    assert len(figures["bins"]) <= MOST_BINS and figures["bins"][-1]["until"] == 40_000
+    assert {row["adjusted"] for row in figures["bins"]} == {1.0}
+    assert sum(row["episodes"] for row in figures["bins"]) == 400
+    assert len(places.cells) <= MOST_CELLS and sum(cell[2] for cell in places.figures()["cells"]) == 40_000
+    times = timeline.figures()
+    assert len(times["steps"]) <= MOST_TIMES and {rate for _, rate in times["steps"][:-1]} == {1.0}
+
+
+def test_lives_of_a_process_that_fell_silent_and_was_started_again() -> None:
+    timeline = Timeline()
+    for run, seconds in ((1, (0, 1, 2, 9, 10)), (2, (12, 13))):
+        for second in seconds:
+            health = pb.Health(process="a", last=second == 13)
+            health.header.run, health.header.wall_time = run, BEGIN + second * SECOND
+            timeline.health("a", health)
+    lives = [(life.start - BEGIN / 1e9, life.end - BEGIN / 1e9, life.goodbye, life.restart) for life in timeline.lives]
+    assert lives == [(0.0, 2.0, False, False), (9.0, 10.0, False, False), (12.0, 13.0, True, True)]
+
+
+def test_a_damaged_chunk_in_the_middle_is_skipped_and_the_rest_is_read(tmp_path: Path) -> None:
+    writer = Writer(losses=0.0)
+    for number in range(20):
+        writer.episode("actor-0", number)
+    total = len(writer.entries)
+    path = writer.write(tmp_path / "run.mcap", portion=50)
+    data = bytearray(path.read_bytes())
+    places = [at for at in range(len(data)) if data.startswith(b"zstd", at)]
+    data[places[3] + 40] ^= 0xFF
+    path.write_bytes(data)
+    log = open_log(path)
+    numbers = [record.message.header.sequence for record in log if record.topic == "step"]
+    assert total - 50 <= sum(1 for _ in open_log(path)) < total and numbers == sorted(numbers)
+    (cut,) = log.cuts
+    assert cut.lost > 0 and "byte" in str(cut) and len(list(itertools.pairwise(numbers))) == len(numbers) - 1
+    assert log.segments[0].messages == sum(1 for _ in open_log(path))

@@ -1,0 +1,216 @@
+"""Damaged files become whole ones, and a recorder that is killed at any moment leaves all but the last second."""
+
+import json
+import os
+import random
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+from mcap.reader import make_reader
+from mcap.writer import CompressionType, IndexType
+from mcap.writer import Writer as McapWriter
+from mcap_protobuf.decoder import DecoderFactory
+
+from deploy.cli import main
+from logs.reader import Log, NotALog, open_log
+from logs.recorder import Inbox, Recording, Rotation, entry
+from logs.recover import BeingRecorded, recover
+from logs.segment import being_written, open_segment
+from messaging import brakeline_pb2 as pb
+from messaging.bus import Bus, BusSettings, Sample
+from messaging.topics import HEALTH, STEP
+from tests.logs.mixed import ABOUT, Writer
+
+Say = Callable[..., Sample]
+KILLS = 10
+
+RECORDER = """
+import sys
+from pathlib import Path
+from logs.recorder import Rotation, main
+from messaging.bus import BusSettings
+main(BusSettings(connect=(sys.argv[1],)), Path(sys.argv[2]), {"run": {"seed": "3"}}, rotation=Rotation(0.02, 1.5))
+"""
+
+
+def whole(path: Path) -> list[int]:
+    """The sequence numbers in a file that the `mcap` package's seeking reader finds whole."""
+    with path.open("rb") as file:
+        reader = make_reader(file, validate_crcs=True, decoder_factories=[DecoderFactory()])
+        decoded = reader.iter_decoded_messages(topics=["step/ground/actor-0"])
+        numbers = [item.decoded_message.header.sequence for item in decoded]
+        summary = reader.get_summary()
+        assert summary is not None and summary.statistics is not None
+        assert summary.statistics.message_count == sum(1 for _ in reader.iter_messages())
+        assert len(list(reader.iter_metadata())) >= 2
+    return numbers
+
+
+def test_a_file_cut_anywhere_is_made_whole_and_what_was_cut_is_said(tmp_path: Path) -> None:
+    writer = Writer(losses=0.0)
+    for number in range(6):
+        writer.episode("actor-0", number)
+    source = writer.write(tmp_path / "source.mcap", portion=30)
+    data, every = source.read_bytes(), whole(source)
+    for place in (0.3, 0.5, 0.77, 0.9, 0.999):
+        folder = tmp_path / str(place)
+        folder.mkdir()
+        path = folder / "run.mcap"
+        path.write_bytes(data[: int(place * len(data))])
+        expected = sum(1 for _ in open_log(path))
+        found = recover(path)
+        assert found.messages == expected == sum(1 for _ in open_log(path)) and open_log(path).cuts == []
+        assert whole(path) == every[: len(whole(path))]
+        assert found.kept is not None and found.kept.read_bytes() == data[: int(place * len(data))]
+        assert "damaged file is" in str(found) and (found.lost > 0 or "summary" in found.cuts[0])
+        again = recover(path)
+        assert again.kept is None and "nothing to do" in str(again)
+        assert sorted(item.name for item in folder.iterdir()) == ["run.mcap", "run.mcap.damaged"]
+
+
+def test_everything_in_the_file_is_taken_over_that_of_others_too(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    with path.open("wb") as file:
+        writer = McapWriter(file, chunk_size=200, compression=CompressionType.LZ4, index_types=IndexType.NONE)
+        writer.start()
+        schema = writer.register_schema("a.Type", "jsonschema", b"{}")
+        channel = writer.register_channel("/theirs", "json", schema, {"unit": "m"})
+        bare = writer.register_channel("/bare", "json", 0)
+        writer.add_attachment(1, 2, "note.txt", "text/plain", b"hello")
+        writer.add_metadata("about", {"x": "y"})
+        for number in range(40):
+            writer.add_message(channel, 10 + number, b'{"n": %d}' % number, 20 + number, number)
+            writer.add_message(bare, 10 + number, b"{}", 0, number)
+        writer.finish()
+    path.write_bytes(path.read_bytes()[:-30])
+    recover(path)
+    with path.open("rb") as file:
+        reader = make_reader(file)
+        stored = list(reader.iter_messages(topics=["/theirs"]))
+        times = [(10 + number, 20 + number, number) for number in range(40)]
+        assert [(m.log_time, m.publish_time, m.sequence) for _, _, m in stored] == times
+        assert stored[0][0].name == "a.Type" and stored[0][1].metadata == {"unit": "m"}
+        assert [a.data for a in reader.iter_attachments()] == [b"hello"]
+        assert [(m.name, m.metadata) for m in reader.iter_metadata()] == [("about", {"x": "y"})]
+        assert len(list(reader.iter_messages(topics=["/bare"]))) == 40
+
+
+def test_what_is_being_recorded_or_is_no_log_is_left_alone(tmp_path: Path) -> None:
+    segment = open_segment(tmp_path / "run.mcap", {})
+    assert being_written(segment.path)
+    with pytest.raises(BeingRecorded, match="is being recorded"):
+        recover(segment.path)
+    log = open_log(segment.path)
+    assert list(log) == [] and "it is being recorded" in str(log.cuts[0]) and log.segments[0].recording
+    segment.finish()
+    assert not being_written(segment.path)
+    (tmp_path / "text.mcap").write_text("a long story, but not a log")
+    with pytest.raises(NotALog):
+        recover(tmp_path / "text.mcap")
+    with pytest.raises(FileExistsError, match="exists already"):
+        recover(segment.path, tmp_path / "text.mcap")
+    assert sorted(item.name for item in tmp_path.iterdir()) == ["run.mcap", "text.mcap"]
+
+
+def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    writer = Writer(losses=0.0)
+    for _ in range(2):
+        writer.episode("actor-0", 0)
+        writer.write(tmp_path / "run.mcap")
+    path = tmp_path / "run_0001.mcap"
+    path.write_bytes(path.read_bytes()[:-100])
+    assert main(["recover", str(path), "--out", str(tmp_path / "out.mcap")]) == 0
+    assert open_log(path).cuts == [] and list(open_log(path)) and open_log(tmp_path / "out.mcap")
+    assert main(["recover", str(tmp_path / "run.mcap"), "--json"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    files = json.loads(lines[-1])["files"]
+    assert [(item["kept"] is None, item["lost"] >= 0) for item in files] == [(True, True), (False, True)]
+    assert main(["recover", str(tmp_path), "--out", "x"]) == 1
+
+
+def test_files_rotate_by_size_and_by_time_and_each_is_whole(
+    tmp_path: Path, say: Say, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now = [100.0]
+    monkeypatch.setattr("logs.recorder.time.monotonic", lambda: now[0])
+    inbox = Inbox()
+    recording = Recording(tmp_path / "run.mcap", ABOUT, inbox, rotation=Rotation(mib=0.02, seconds=60.0))
+    for _ in range(12):
+        inbox.put(say("log/a", pb.LogLine(text=os.urandom(2000).hex())))
+        recording.save()
+    by_size = len(list(tmp_path.glob("*.mcap")))
+    assert 2 <= by_size <= 4
+    now[0] += 61.0
+    recording.save()
+    assert len(list(tmp_path.glob("*.mcap"))) == by_size + 1, "by time"
+    now[0] += 61.0
+    recording.save()
+    assert len(list(tmp_path.glob("*.mcap"))) == by_size + 1, "but none without a message"
+    inbox.put(say("log/a", pb.LogLine(text="x")))
+    recording.finish()
+    paths = sorted(tmp_path.glob("*.mcap"))
+    log = open_log(tmp_path)
+    assert [record.message.header.sequence for record in log] == list(range(1, 14)) and log.cuts == []
+    assert log.paths == tuple(paths), "the names sort"
+    for number, path in enumerate(paths):
+        alone = Log((path,))
+        list(alone)
+        assert alone.metadata["run"] == ABOUT["run"] and alone.metadata["brakeline"]["segment"] == str(number)
+    with pytest.raises(ValueError, match="above 0"):
+        Rotation(mib=0.0)
+
+
+@pytest.fixture
+def router() -> Iterator[Bus]:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+    with Bus(BusSettings(listen=(endpoint,)), "actor-0") as bus:
+        yield bus
+
+
+def test_killed_at_ten_random_moments_nothing_older_than_a_second_is_missing(router: Bus, tmp_path: Path) -> None:
+    """Files rotate all the time, so that some moments fall into the end of one and the beginning of the next."""
+    chance, publisher = random.Random(os.urandom(8)), router.publisher(STEP, robot="ground")
+    ready: list[str] = []
+    router.subscribe(HEALTH, lambda sample: ready.append(sample.message().notes["file"]), source="recorder")
+    for number in range(KILLS):
+        folder = tmp_path / str(number)
+        ready.clear()
+        child = subprocess.Popen([sys.executable, "-c", RECORDER, router.settings.listen[0], str(folder / "run.mcap")])
+        try:
+            _until(lambda place=f"/{number}/": any(place in file for file in ready))
+            first, dated = publisher.count + 1, []
+            end = time.monotonic() + chance.uniform(0.2, 2.2)
+            while time.monotonic() < end:
+                publisher.put(pb.Step(observation=[chance.random() for _ in range(26)]))
+                dated.append(time.time())
+                time.sleep(0.002)
+        finally:
+            child.send_signal(signal.SIGKILL)
+            killed = time.time()
+            child.wait()
+        found: list[int] = []
+        for path in sorted(folder.glob("*.mcap")):
+            recover(path)
+            found += whole(path)
+        assert found == list(range(first, first + len(found))), "none is missing in between, or twice"
+        old = sum(at < killed - 1.0 for at in dated)
+        assert len(found) >= old, f"kill {number}: {old - len(found)} older than a second are missing"
+
+
+def _until(condition: Callable[..., bool], seconds: float = 30.0) -> None:
+    deadline = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+
+
+def test_entries_keep_what_cannot_be_decoded() -> None:
+    assert entry(Sample(STEP, "step/ground/a", b"\xff", 7)).payload == b"\xff"

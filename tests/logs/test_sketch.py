@@ -1,0 +1,110 @@
+"""Laws of the histograms and the intervals, against NumPy and SciPy on all the values."""
+
+import math
+import random
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.stats import binomtest
+
+from logs.intervals import Clustered, clopper_pearson
+from logs.sketch import BATCH, RESOLUTION, Histogram, merged, spread, summary
+
+VALUES = st.lists(st.floats(-1e6, 1e6).filter(lambda x: x == 0.0 or abs(x) > 1e-6), min_size=1, max_size=300)
+
+
+def filled(values: list[float]) -> Histogram:
+    histogram = Histogram()
+    for value in values:
+        histogram.add(value)
+    return histogram
+
+
+@given(VALUES, st.floats(0.0, 100.0))
+def test_percentiles_are_right_to_the_resolution(values: list[float], percent: float) -> None:
+    exact = float(np.percentile(values, percent, method="inverted_cdf"))
+    said = merged([filled(values)]).percentile(percent)
+    assert math.isclose(said, exact, rel_tol=RESOLUTION, abs_tol=1e-12)
+
+
+@given(VALUES, VALUES)
+def test_merging_is_taking_all_values(one: list[float], two: list[float]) -> None:
+    parts, whole = merged([filled(one), filled(two)]), merged([filled(one + two)])
+    assert (parts.bins, parts.count, parts.low, parts.high) == (whole.bins, whole.count, whole.low, whole.high)
+    assert parts.total == pytest.approx(whole.total, rel=1e-9, abs=1e-6)
+
+
+@given(VALUES)
+def test_moments(values: list[float]) -> None:
+    found = summary(filled(values))
+    assert found is not None
+    largest = max(map(abs, values))
+    assert found["mean"] == pytest.approx(np.mean(values), rel=1e-9, abs=1e-9 * largest)
+    assert found["std"] == pytest.approx(np.std(values), rel=1e-6, abs=1e-6 * largest)
+    assert (found["min"], found["max"], found["count"]) == (min(values), max(values), len(values))
+
+
+def test_looking_changes_nothing() -> None:
+    chance = random.Random(1)
+    values = [chance.lognormvariate(0.0, 2.0) for _ in range(3 * BATCH)]
+    one, two = Histogram(), Histogram()
+    for place, value in enumerate(values):
+        one.add(value)
+        two.add(value)
+        if place % 100 == 0:
+            spread(two)
+    assert spread(one) == spread(two), "to the last bit"
+
+
+def test_what_is_no_number_is_counted_apart() -> None:
+    found = merged([filled([1.0, math.inf, -math.inf, math.nan, 0.0])])
+    assert (found.count, found.strange, found.low, found.high) == (2, 3, 0.0, 1.0)
+    assert summary(Histogram()) is None and spread() is None
+    with pytest.raises(ValueError, match="nothing was measured"):
+        Histogram().percentile(50)
+
+
+def test_bars_hold_all_positive_values_where_they_are() -> None:
+    chance = random.Random(2)
+    values = [chance.lognormvariate(0.0, 1.0) for _ in range(2000)]
+    bars = merged([filled([*values, 0.0])]).bars()
+    assert sum(count for *_, count in bars) == 2000
+    for low, high, count in bars:
+        inside = sum(low * 0.99 <= value < high * 1.01 for value in values)
+        assert count <= inside
+    assert all(first[1] == second[0] for first, second in pairwise(bars))
+    assert merged([filled([0.0])]).bars() == []
+
+
+@given(st.integers(0, 400), st.integers(1, 400))
+def test_clopper_pearson_is_scipys_exact_interval(count: int, of: int) -> None:
+    count = min(count, of)
+    exact = binomtest(count, of).proportion_ci(0.95, "exact")
+    assert clopper_pearson(count, of) == pytest.approx((exact.low, exact.high), abs=1e-9)
+
+
+def test_no_trial_no_interval() -> None:
+    assert clopper_pearson(0, 0) is None and Clustered().interval() is None
+    alone = Clustered()
+    alone.add(3, 10)
+    assert alone.interval() is None
+
+
+def test_intervals_by_episodes_cover_where_intervals_by_steps_do_not() -> None:
+    """Episodes of 50 steps, each with a rate of its own: 95 % intervals hold the true mean rate about as often."""
+    chance = np.random.default_rng(0)
+    covered = naive = 0
+    for _ in range(300):
+        whole, hits = Clustered(), 0
+        for rate in chance.beta(0.5, 2.0, size=80):
+            count = int(chance.binomial(50, rate))
+            hits += count
+            whole.add(count, 50)
+        low, high = whole.interval() or (1.0, 0.0)
+        covered += low <= 0.2 <= high
+        by_steps = clopper_pearson(hits, 80 * 50) or (1.0, 0.0)
+        naive += by_steps[0] <= 0.2 <= by_steps[1]
+    assert covered > 0.9 * 300 > naive
