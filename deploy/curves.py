@@ -45,8 +45,8 @@ def _lines(results: Sequence[dict[str, Any]], name: str, grid: Array) -> Array:
 def learning_curves(results: Sequence[dict[str, Any]], png: Path) -> None:
     """Goals, collisions so far, reward and interventions over training steps; thin: a seed, thick: their mean."""
     picture = Figure(figsize=(10.0, 7.0), layout="constrained")
-    rows = (("goal", "goals reached"), ("collision", "collisions so far"), ("reward", "reward of an episode"))
-    rows += (("interventions", "share of steps with an intervention"),)
+    rows = [("goal", "goals reached"), ("collision", "collisions so far"), ("reward", "reward of an episode")]
+    rows.append(("interventions", "share of steps with an intervention"))
     panels: list[Axes] = list(picture.subplots(2, 2, sharex=True).ravel())
     steps = results[0]["study"]["steps"]
     grid = np.linspace(0.0, steps, POINTS)

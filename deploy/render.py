@@ -14,7 +14,7 @@ from matplotlib.animation import AbstractMovieWriter, FFMpegWriter, PillowWriter
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection, PatchCollection
 from matplotlib.figure import Figure
-from matplotlib.patches import BoxStyle, Circle, FancyBboxPatch, Patch, Polygon, Rectangle
+from matplotlib.patches import Circle, FancyBboxPatch, Patch, Polygon, Rectangle
 from matplotlib.transforms import Affine2D
 from numpy.typing import NDArray
 
@@ -96,7 +96,7 @@ def save(film: Film, path: Path) -> None:
         stage.all_at_once()
         stage.figure.savefig(path, dpi=130)
         return
-    with (writer := _writer(path, SPEED / film.robot.period)).saving(stage.figure, str(path), dpi=90):
+    with (writer := _writer(path, round(SPEED / film.robot.period))).saving(stage.figure, str(path), dpi=90):
         for k in range(len(film.frames)):
             stage.show(k)
             writer.grab_frame()
@@ -104,7 +104,7 @@ def save(film: Film, path: Path) -> None:
             writer.grab_frame()
 
 
-def _writer(path: Path, rate: float) -> AbstractMovieWriter:
+def _writer(path: Path, rate: int) -> AbstractMovieWriter:
     if path.suffix == ".gif":
         return PillowWriter(fps=rate)
     import imageio_ffmpeg
@@ -210,15 +210,17 @@ class _Stage:
         """The sets of the body's position at the periods' ends, grown by the footprint."""
         drawn = []
         for low, high in zip(frame.low, frame.high, strict=True):
-            size, style = high - low, BoxStyle("Round", pad=self.robot.footprint, rounding_size=self.robot.footprint)
-            box = FancyBboxPatch(low[:2], size[0], size[1], boxstyle=style, color=COLOURS[frame.kind], alpha=alpha)
+            size, round_off = high - low, f"Round, pad={self.robot.footprint}, rounding_size={self.robot.footprint}"
+            box = FancyBboxPatch(low[:2], size[0], size[1], boxstyle=round_off, color=COLOURS[frame.kind], alpha=alpha)
             box.set(linewidth=0, zorder=3)
             drawn.append(self.axes.add_patch(box))
         return drawn
 
     def _body(self, position: Array, heading: float, kind: str, alpha: float = 1.0) -> list[Any]:
         radius = self.robot.footprint
-        disc = Circle(position[:2], radius, facecolor=COLOURS[kind], edgecolor="black", alpha=alpha, zorder=7)
+        disc = Circle(
+            (position[0], position[1]), radius, facecolor=COLOURS[kind], edgecolor="black", alpha=alpha, zorder=7
+        )
         drawn: list[Any] = [self.axes.add_patch(disc)]
         if self.robot.heading is not None:
             nose = position[:2] + radius * np.array([np.cos(heading), np.sin(heading)])

@@ -93,8 +93,8 @@ def transitions(
         executed = np.asarray(drive.info["input_in_force"]) / robot.high()
         rows.append((seen, executed, constraints(drive.observation, drive.info["state"]) - before))
         each()
-    columns = (np.array([row[i] for row in rows], float) for i in range(3))
-    return Transitions(*columns, drive.collisions)
+    seen, inputs, changes = (np.array([row[i] for row in rows], float) for i in range(3))
+    return Transitions(seen, inputs, changes, drive.collisions)
 
 
 def costs(
