@@ -188,6 +188,13 @@ def test_the_quadrotors_rays_are_a_cloud_of_the_points_that_were_hit() -> None:
     assert (body.translation.z, body.rotation.w) == (3.0, 1.0)
 
 
+def test_a_robot_in_real_time_is_drawn_as_any_other(studio: Studio) -> None:
+    key = "ground-late/actor-0"
+    studio(f"episode/{key}", episode(robot="ground-late"))
+    assert f"foxglove/lidar/{key}" in studio(f"step/{key}", step(0, pb.UNKNOWN))
+    assert studio.pictures.failures == 0
+
+
 def test_a_room_in_space_is_drawn_without_its_lid() -> None:
     lid = pb.Obstacle(kind="box", position=(0.0, 0.0, 5.0), size=(14.0, 14.0, 2.0))
     walls = [pb.Obstacle(kind="wall", position=(*wall.position, 2.0), yaw=wall.yaw) for wall in WALLS]
