@@ -60,8 +60,9 @@ def line(figures: dict[str, Any]) -> str:
     """The figures that matter most, for a log."""
     learners = figures["learners"].values()
     updates = sum(learner["updates_per_s"] for learner in learners)
+    steps = max(figures["steps"], sum(learner["steps"] for learner in learners))  # offline nobody drives
     return (
-        f"steps {figures['steps']}  episodes {figures['episodes']}  goals {figures['goals']}  "
+        f"steps {steps}  episodes {figures['episodes']}  goals {figures['goals']}  "
         f"collisions {figures['collisions']}  interventions {share(figures['interventions'], figures['steps'])}  "
         f"{sum(learner['steps_per_s'] for learner in learners):.0f} steps/s  {updates:.0f} updates/s"
     )
