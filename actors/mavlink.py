@@ -27,6 +27,7 @@ VELOCITY_ONLY = 0x0DC7  # type mask: position, acceleration, yaw and yaw rate ar
 GRAVITY = 9.81  # m/s²
 ANSWER = 0.5  # s for a COMMAND_ACK, then it is sent again
 TRIES = 5
+ARMINGS = 20  # times that arming may be refused at first
 KINDS = {int(mavlink.MAV_AUTOPILOT_PX4): "px4", int(mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA): "ardupilot"}
 OFFBOARD = {"px4": (6, 6 << 16), "ardupilot": (4, 4)}  # DO_SET_MODE's param2, and HEARTBEAT's custom mode
 RESULTS = {
@@ -191,8 +192,14 @@ class Client:
         )
 
     def arm(self, wait: Wait) -> None:
-        """Raises CommandRefused."""
-        self.command(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 1.0, wait=wait)
+        """Both kinds refuse until their estimate is good: ask for a while. Raises CommandRefused."""
+        for last in (*[False] * ARMINGS, True):
+            try:
+                return self.command(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 1.0, wait=wait)
+            except CommandRefused:
+                if last:
+                    raise
+                wait(lambda: False, ANSWER)
 
     def take_off(self, height: float, wait: Wait) -> None:
         """ArduPilot's way off the ground, once guided and armed. Raises CommandRefused."""

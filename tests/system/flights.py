@@ -27,4 +27,4 @@ def autopilot(*options: object) -> Iterator[int]:
         yield port
     finally:
         process.terminate()
-        assert process.wait(20.0) == 0
+        process.wait(20.0)

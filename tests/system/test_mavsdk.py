@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import time
 from collections.abc import Iterator
 from typing import Any
 
@@ -17,7 +18,9 @@ from mavsdk.plugins.telemetry import FlightMode, Telemetry
 from tests.system.flights import autopilot
 from tests.system.runs import until
 
-os.environ.setdefault("MAVLINK20", "1")
+os.environ.setdefault("MAVLINK20", "1")  # read when pymavlink is imported
+
+from pymavlink import mavutil
 
 
 @pytest.fixture
@@ -76,3 +79,97 @@ def test_mavsdk_reads_and_sets_parameters(system: Any) -> None:
 def speed(telemetry: Any) -> float:
     v = telemetry.velocity_ned()
     return float((v.north_m_s**2 + v.east_m_s**2 + v.down_m_s**2) ** 0.5)
+
+
+@pytest.mark.parametrize("rules", ["px4", "ardupilot"])
+def test_mavutil_flies_both_rule_sets(rules: str) -> None:
+    with autopilot("--rules", rules) as port:
+        vehicle = mavutil.mavlink_connection(f"udpin:127.0.0.1:{port}", source_system=200)
+        try:
+            vehicle.wait_heartbeat(timeout=60)
+            assert vehicle.mavlink20()
+            start, heard = time.monotonic(), vehicle.recv_match(type="HEARTBEAT", blocking=True, timeout=10)
+            assert heard is not None and time.monotonic() - start < 3.0
+            ask(vehicle, mavutil.mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, 32, 50_000)
+            if rules == "px4":
+                stream(vehicle, 0.0, 0.0, 0.0, seconds=0.5)
+                ask(vehicle, mavutil.mavlink.MAV_CMD_DO_SET_MODE, 1, 6)
+                ask(vehicle, mavutil.mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 1)
+                stream(vehicle, 0.0, 0.0, -1.0, seconds=3.0)
+            else:
+                vehicle.set_mode("GUIDED")
+                until(lambda: guided(vehicle), "guided", 10.0)
+                ask(vehicle, mavutil.mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 1)
+                ask(vehicle, mavutil.mavlink.MAV_CMD_NAV_TAKEOFF, 0, 0, 0, 0, 0, 0, 3)
+                time.sleep(4.0)
+            position = stream(vehicle, 1.0, 0.0, 0.0, seconds=3.0)
+            assert position.vx == pytest.approx(1.0, abs=0.2) and position.z < -1.5
+            vehicle.param_fetch_one("MPC_LAND_SPEED" if rules == "px4" else "GUID_TIMEOUT")
+            assert vehicle.recv_match(type="PARAM_VALUE", blocking=True, timeout=5) is not None
+            ask(vehicle, mavutil.mavlink.MAV_CMD_NAV_LAND)
+            until(lambda: not armed(vehicle), "landed and disarmed", 30.0)
+        finally:
+            vehicle.close()
+
+
+def test_two_vehicles_on_one_port_by_system_id() -> None:
+    with autopilot("--vehicles", 2) as port:
+        station = mavutil.mavlink_connection(f"udpin:127.0.0.1:{port}", source_system=200)
+        try:
+            systems: set[int] = set()
+            until(lambda: systems.add(heartbeat(station)) or systems >= {1, 2}, "two heartbeats", 60.0)
+            time.sleep(1.0)
+            station.target_system, station.target_component = 2, 1
+            ask(station, mavutil.mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 1)
+            flags: dict[int, bool] = {}
+
+            def second_is_armed() -> bool:
+                message = station.recv_match(type="HEARTBEAT", blocking=True, timeout=5)
+                flags[message.get_srcSystem()] = bool(message.base_mode & 128)
+                return flags.get(2, False)
+
+            until(second_is_armed, "the second armed", 10.0)
+            assert not flags.get(1, False)
+        finally:
+            station.close()
+
+
+def ask(vehicle: Any, command: int, *params: float) -> None:
+    """A command that must be accepted, if need be at the second time."""
+    for _ in range(5):
+        vehicle.mav.command_long_send(
+            vehicle.target_system, vehicle.target_component, command, 0, *params, *[0] * (7 - len(params))
+        )
+        ack = vehicle.recv_match(
+            type="COMMAND_ACK", condition=f"COMMAND_ACK.command=={command}", blocking=True, timeout=3
+        )
+        if ack is not None and ack.result == 0:
+            return
+        time.sleep(0.5)
+    raise AssertionError(f"command {command}: {ack}")
+
+
+def stream(vehicle: Any, vx: float, vy: float, vz: float, seconds: float) -> Any:
+    """Setpoints in NED at 10 Hz; returns the last LOCAL_POSITION_NED."""
+    position = None
+    for _ in range(round(seconds / 0.1)):
+        vehicle.mav.set_position_target_local_ned_send(
+            0, vehicle.target_system, vehicle.target_component, 1, 0x0DC7, 0, 0, 0, vx, vy, vz, 0, 0, 0, 0, 0
+        )
+        end = time.monotonic() + 0.1
+        while (left := end - time.monotonic()) > 0.0:
+            position = vehicle.recv_match(type="LOCAL_POSITION_NED", blocking=True, timeout=left) or position
+    return position
+
+
+def heartbeat(station: Any) -> int:
+    message = station.recv_match(type="HEARTBEAT", blocking=True, timeout=10)
+    return int(message.get_srcSystem())
+
+
+def armed(vehicle: Any) -> bool:
+    return bool(vehicle.recv_match(type="HEARTBEAT", blocking=True, timeout=5).base_mode & 128)
+
+
+def guided(vehicle: Any) -> bool:
+    return bool(vehicle.recv_match(type="HEARTBEAT", blocking=True, timeout=5).custom_mode == 4)

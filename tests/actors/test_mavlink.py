@@ -1,0 +1,197 @@
+"""The client at its own edge, and the vehicles over it: in lockstep and in real time, with both rule sets."""
+
+from __future__ import annotations
+
+import json
+import socket
+import threading
+import time
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+
+from actors.flying import LAPSE, LiveVehicle, MavlinkVehicle, Truth
+from actors.mavlink import Client, CommandRefused, Frame, NoAutopilot, mavlink
+from messaging.clock import WallClock
+from messaging.links import open_link
+from messaging.robots import QUADROTOR
+from messaging.shapes import CYLINDER, Obstacle
+from sim.autopilot import server
+from sim.autopilot.endpoint import Autopilot
+from sim.autopilot.pilot import Mode
+from sim.flight_estimator import QuadrotorNoise
+from sim.quadrotor import SAMPLES, Quadrotor
+from sim.vehicle import BadInput
+from sim.world import Arena, staged_arena
+
+TIMEOUT = {"px4": "COM_OF_LOSS_T", "ardupilot": "GUID_TIMEOUT"}
+RULES = ("px4", "ardupilot")
+
+
+def arena(*obstacles: Obstacle) -> Arena:
+    return staged_arena(*obstacles, start=(0.0, 0.0, 10.0), goal=(9.0, 9.0, 9.0), half_width=500.0, height=500.0)
+
+
+def quadrotor(*obstacles: Obstacle, floor: float | None = None, scale: float = 1.0) -> Quadrotor:
+    return Quadrotor(arena(*obstacles), np.random.default_rng(0), QuadrotorNoise(scale=scale), floor=floor)
+
+
+def embedded(rules: str, *obstacles: Obstacle) -> Autopilot:
+    return Autopilot(quadrotor(*obstacles), rules, parameters={TIMEOUT[rules]: 0.2}, quiet=True)
+
+
+@pytest.mark.parametrize("rules", RULES)
+def test_in_lockstep_it_takes_control_before_time_begins(rules: str) -> None:
+    autopilot = embedded(rules)
+    vehicle = MavlinkVehicle(autopilot)
+    assert autopilot.pilot.time == 0.0
+    assert autopilot.pilot.mode is Mode.OFFBOARD
+    assert vehicle.standing().clearance > 9.0
+
+
+@pytest.mark.parametrize("rules", RULES)
+def test_over_bytes_it_is_the_vehicle_that_it_is_without_them(rules: str) -> None:
+    """Same seed, same inputs: the same flight, but for the rounding of float32."""
+    bare, flown = quadrotor(scale=0.0), Autopilot(quadrotor(scale=0.0), rules, quiet=True)
+    vehicle = MavlinkVehicle(flown)
+    rng = np.random.default_rng(1)
+    for _ in range(40):
+        input = rng.uniform(-5.0, 5.0, 3)
+        period, direct = vehicle.step(input), bare.step(input)
+        assert vehicle.input == pytest.approx(bare.input)
+        assert period.true == pytest.approx(direct.true, abs=1e-3)
+        assert period.measured == pytest.approx(direct.measured, abs=2e-3)
+        assert period.subsamples == pytest.approx(direct.subsamples, abs=1e-3)
+        assert period.clearance == pytest.approx(direct.clearance, abs=1e-3)
+        assert period.closest <= direct.closest + 1e-3  # looked at more often
+
+
+def test_what_is_measured_by_telemetry_stays_within_its_bound() -> None:
+    vehicle, rng = MavlinkVehicle(embedded("px4")), np.random.default_rng(2)
+    worst = np.zeros(9)
+    for _ in range(400):
+        before = vehicle.measured[:3]
+        period = vehicle.step(vehicle.input + rng.choice([-0.8, 0.8], 3))
+        worst = np.maximum(worst, np.abs(period.measured - period.true))
+        assert period.subsamples.shape == (SAMPLES, 3)
+        assert period.subsamples[-1] == pytest.approx(period.measured[:3] - before)
+    assert (worst < QUADROTOR.measurement_bound).all()
+
+
+def test_it_never_meets_its_own_timeout() -> None:
+    autopilot = embedded("px4")
+    vehicle = MavlinkVehicle(autopilot)
+    for _ in range(50):
+        vehicle.step(np.array([2.0, 0.0, 0.0]))
+    assert autopilot.pilot.mode is Mode.OFFBOARD
+    autopilot.advance(0.22)  # nobody steps any more
+    assert autopilot.pilot.mode is Mode.HOLD
+
+
+def test_collisions_come_from_the_simulator() -> None:
+    vehicle = MavlinkVehicle(embedded("px4", Obstacle(CYLINDER, (3.0, 0.0, 10.0), (0.5, 10.0))))
+    assert any(vehicle.step(np.array([3.0, 0.0, 0.0])).collision for _ in range(12))
+
+
+def test_bad_inputs_are_refused() -> None:
+    with pytest.raises(BadInput):
+        MavlinkVehicle(embedded("px4")).step(np.array([np.nan, 0.0, 0.0]))
+
+
+def test_every_frame_goes_through_the_tap_and_can_be_read_again() -> None:
+    frames: list[Frame] = []
+    vehicle = MavlinkVehicle(embedded("px4"), frames.append)
+    frames.clear()
+    vehicle.step(np.array([0.5, 0.0, 0.0]))
+    names = [(frame.outgoing, frame.name) for frame in frames]
+    assert names.count((True, "mavlink/245/191/SET_POSITION_TARGET_LOCAL_NED")) == 1
+    assert names.count((False, "mavlink/1/1/LOCAL_POSITION_NED")) == SAMPLES
+    again = mavlink.MAVLink(None).parse_buffer(b"".join(frame.raw for frame in frames))
+    assert [message.get_type() for message in again] == [frame.message.get_type() for frame in frames]
+    sent = next(frame for frame in frames if frame.outgoing)
+    assert json.loads(json.dumps(sent.fields))["vy"] == pytest.approx(0.5)  # east
+
+
+def test_the_clients_edge_agrees_with_the_autopilots() -> None:
+    sent: list[bytes] = []
+    client = Client(sent.append)
+    client.setpoint(np.array([1.0, 2.0, 3.0]))
+    message = mavlink.MAVLink(None).parse_buffer(sent[0])[0]
+    assert (message.vx, message.vy, message.vz) == (2.0, 1.0, -3.0)
+    assert message.type_mask == 0x0DC7 and message.coordinate_frame == mavlink.MAV_FRAME_LOCAL_NED
+
+    autopilot = embedded("ardupilot")
+    vehicle = MavlinkVehicle(autopilot)
+    for _ in range(10):
+        vehicle.step(np.array([3.0, -2.0, 1.0]))  # tilted, and accelerating
+    assert vehicle.measured[6:] == pytest.approx(vehicle.true[6:], abs=0.3)
+
+
+def test_nobody_there_and_refusals_are_errors() -> None:
+    client = Client(lambda _: None)
+    with pytest.raises(NoAutopilot):
+        client.identify(lambda condition, _: condition())
+    with pytest.raises(CommandRefused, match="no answer"):
+        client.arm(lambda condition, _: condition())
+    autopilot = Autopilot(quadrotor(floor=0.02), "ardupilot")
+    client = Client(autopilot.receive)
+
+    def wait(condition, seconds):  # type: ignore[no-untyped-def]
+        autopilot.advance(0.1)
+        client.feed(autopilot.take())
+        return condition()
+
+    with pytest.raises(CommandRefused, match=r"NAV_TAKEOFF: failed.*not in guided"):
+        client.take_off(3.0, wait)
+
+
+@pytest.fixture(params=RULES)
+def live(request: pytest.FixtureRequest) -> Iterator[tuple[LiveVehicle, Autopilot]]:
+    """A vehicle in real time over UDP, the autopilot in a thread, on the floor at first."""
+    link, stop = open_link("udpin:127.0.0.1:0"), threading.Event()
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(("127.0.0.1", 0))
+        truth_port = probe.getsockname()[1]
+    autopilot = Autopilot(quadrotor(floor=0.02), request.param, parameters={TIMEOUT[request.param]: 0.3})
+    arguments = ([autopilot], link, WallClock(), stop.is_set, server.Truth("127.0.0.1", truth_port))
+    thread = threading.Thread(target=server.serve, args=arguments)
+    thread.start()
+    vehicle = LiveVehicle(open_link(f"udpout:127.0.0.1:{link.port}"), height=2.0, truth=Truth(truth_port, 1))  # type: ignore[union-attr]
+    yield vehicle, autopilot
+    vehicle.close()
+    stop.set()
+    thread.join()
+    link.close()
+    arguments[-1].close()  # type: ignore[attr-defined]
+
+
+def test_in_real_time_it_takes_off_flies_brakes_and_lands(live: tuple[LiveVehicle, Autopilot]) -> None:
+    vehicle, autopilot = live
+    assert autopilot.pilot.armed and autopilot.pilot.mode is Mode.OFFBOARD
+    for _ in range(10):
+        period = vehicle.step(np.array([2.0, 1.0, 0.0]))
+    assert period.measured[3:6] == pytest.approx([2.0, 1.0, 0.0], abs=0.3)
+    assert period.measured[:3] == pytest.approx(period.true[:3], abs=0.3)  # the truth's word is of a moment before
+    assert period.subsamples[-1] == pytest.approx([0.4, 0.2, 0.0], abs=0.15)
+    assert vehicle.timing.worst_gap < 0.25 and not vehicle.lost and not period.collision
+
+    vehicle.begin(np.array([2.0, 1.0, 0.0]))
+    time.sleep(LAPSE + 1.2)  # whoever decides hangs
+    assert vehicle.timing.lapses == 1 and not vehicle.input.any()
+    assert np.linalg.norm(vehicle.finish().measured[3:6]) < 0.3
+
+    vehicle.land()
+    deadline = time.monotonic() + 15.0
+    while autopilot.pilot.armed and time.monotonic() < deadline:
+        time.sleep(0.1)
+    assert not autopilot.pilot.armed
+
+
+def test_the_autopilot_brakes_when_the_link_dies(live: tuple[LiveVehicle, Autopilot]) -> None:
+    vehicle, autopilot = live
+    for _ in range(8):
+        vehicle.step(np.array([2.0, 0.0, 0.0]))
+    vehicle.close()
+    time.sleep(2.5)
+    assert np.linalg.norm(autopilot.vehicle.state()[3:6]) < 0.1
