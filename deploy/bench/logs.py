@@ -16,22 +16,13 @@ from itertools import islice
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from mcap.reader import NonSeekingReader
 from mcap_protobuf.decoder import DecoderFactory
 
-from actors.driver import Driver, Identity
-from actors.guard import consult
 from deploy.bench.timing import Figures
-from deploy.evaluate import in_process
-from deploy.store import model_for
-from deploy.vehicles import environment
 from logs.analysis import Look, analysed
 from logs.segment import Entry, open_segment
 from messaging import brakeline_pb2 as pb
-from messaging.robots import GROUND
-from safety.model_set import Recipe
-from sim.policies import scripted
 
 MB = 10**6
 SMALL, LARGE = 200 * MB, 2000 * MB
@@ -42,7 +33,18 @@ PERIOD = 2_000_000  # ns between messages: some 250 steps a second
 
 
 def real() -> list[tuple[str, Any]]:
-    """Keys and messages of some episodes, driven in process."""
+    """Keys and messages of some episodes, driven in process (what it takes is not loaded where memory is measured)."""
+    import numpy as np
+
+    from actors.driver import Driver, Identity
+    from actors.guard import consult
+    from deploy.evaluate import in_process
+    from deploy.store import model_for
+    from deploy.vehicles import environment
+    from messaging.robots import GROUND
+    from safety.model_set import Recipe
+    from sim.policies import scripted
+
     ask = in_process(model_for(GROUND, Recipe()))
     driver = Driver(GROUND, environment(GROUND, "default", 7), Identity("actor-0", 0, 7))
     policy = scripted("greedy", GROUND, np.random.default_rng(7))
