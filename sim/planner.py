@@ -31,8 +31,8 @@ class ClearanceMap:
         widths = [high - low for low, high in bounds]
         self.dim = len(bounds)
         self.low: Array = np.array([low for low, _ in bounds])
-        cell = max(CELL[self.dim], (math.prod(widths) / MOST_CELLS[self.dim]) ** (1.0 / self.dim))
-        self.cell = widths[0] / round(widths[0] / cell)
+        cell: float = max(CELL[self.dim], (math.prod(widths) / MOST_CELLS[self.dim]) ** (1.0 / self.dim))
+        self.cell: float = widths[0] / round(widths[0] / cell)
         self.shape = tuple(round(width / self.cell) for width in widths)
         axes = [low + self.cell * (np.arange(n) + 0.5) for low, n in zip(self.low, self.shape, strict=True)]
         self.centres: Array = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, self.dim)

@@ -217,9 +217,9 @@ def test_it_is_fast(env: NavigationEnv, least: float) -> None:
     rates = []
     for seed in range(3):
         env.reset(options={"episode_seed": seed})
-        begin = time.perf_counter()
+        begin = time.process_time()  # of this process alone: others may be busy
         for i in range(150):
             env.step(0.1 * high if i % 2 else np.maximum(low, -0.1 * high))
-        rates.append(150 / (time.perf_counter() - begin))
+        rates.append(150 / (time.process_time() - begin))
     print(f"environment: {max(rates):.0f} steps/s")
-    assert max(rates) > least  # twice that and more on an idle core; a busy machine is no defect
+    assert max(rates) > least  # twice that and more on an idle core
