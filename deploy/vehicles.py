@@ -7,8 +7,12 @@ from functools import partial
 
 import numpy as np
 
+from actors.flying import MavlinkVehicle
+from actors.mavlink import Tap
 from messaging.robots import GROUND, QUADROTOR, Robot
 from sim.arenas import arena_kind
+from sim.autopilot.endpoint import Autopilot
+from sim.autopilot.rules import SETPOINT_TIMEOUT
 from sim.envs import NavigationEnv
 from sim.estimator import NoiseLevels
 from sim.flight_estimator import QuadrotorNoise
@@ -45,13 +49,29 @@ class Conditions:
                 GroundRobot, noise=self.noise, payload_kg=self.payload_kg, floor_friction=self.floor_friction
             )
         if robot is QUADROTOR:
-            return partial(Quadrotor, noise=self.flight_noise, wind=self.wind)
+            return partial(embedded_quadrotor, noise=self.flight_noise, wind=self.wind)
         raise ValueError(f"no simulator for {robot.name}")
 
     def lidar_noise(self, robot: Robot) -> float:
         """Sigma of a range, m."""
         noise = self.noise if robot is GROUND else self.flight_noise
         return noise.scale * noise.lidar
+
+
+def embedded_quadrotor(
+    arena: Arena,
+    rng: np.random.Generator,
+    noise: QuadrotorNoise | None = None,
+    wind: Wind | None = None,
+    rules: str = "px4",
+    tap: Tap | None = None,
+) -> MavlinkVehicle:
+    """A quadrotor behind its own autopilot, over MAVLink in memory.
+
+    It brakes by itself when a setpoint is overdue by a period. tap: is called with every MAVLink frame.
+    """
+    parameters = {SETPOINT_TIMEOUT[rules]: QUADROTOR.period}
+    return MavlinkVehicle(Autopilot(Quadrotor(arena, rng, noise, wind), rules, parameters=parameters, quiet=True), tap)
 
 
 def environment(robot: Robot, arena: str, seed: int, conditions: Conditions | None = None) -> NavigationEnv:

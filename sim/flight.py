@@ -59,10 +59,11 @@ class Gains:
 class Mean:
     """The mean of the last samples: `value`; what it gains from a sample to the next follows from `push`'s answer."""
 
-    __slots__ = ("_samples", "_sum", "value")
+    __slots__ = ("_samples", "_share", "_sum", "value")
 
     def __init__(self, samples: int) -> None:
         self._samples = deque([0.0] * samples)
+        self._share = 1.0 / samples
         self.fill(0.0)
 
     def fill(self, value: float) -> None:
@@ -75,10 +76,9 @@ class Mean:
         """Take in a sample; returns how much the new mean differs from the old one."""
         change = value - self._samples.popleft()
         self._samples.append(value)
-        samples = len(self._samples)
         self._sum += change
-        self.value = self._sum / samples
-        return change / samples
+        self.value = self._sum * self._share
+        return change * self._share
 
 
 class VelocityAxis:

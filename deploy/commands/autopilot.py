@@ -16,6 +16,7 @@ from messaging.rays import rays_of
 from messaging.robots import QUADROTOR
 from sim.arenas import draw_arena
 from sim.autopilot.endpoint import Autopilot as Endpoint
+from sim.autopilot.rules import SETPOINT_TIMEOUT
 from sim.autopilot.server import Truth, serve
 from sim.flight_estimator import QuadrotorNoise
 from sim.lidar import Lidar
@@ -25,7 +26,6 @@ from sim.world import Arena, closing, room_bounds
 
 FIELD = 1000.0  # m to the walls of the open field
 PAD = 0.02  # m, height of the plane to stand on above an arena's own floor, which is an obstacle
-TIMEOUT = {"px4": "COM_OF_LOSS_T", "ardupilot": "GUID_TIMEOUT"}
 
 
 @dataclass(frozen=True)
@@ -86,7 +86,7 @@ class Autopilot:
         wind = Wind(speed=self.wind, gust=self.gust)
         vehicle = Quadrotor(arena, rng, noise, wind, floor=None if self.airborne else PAD)
         lidar = Lidar(arena, rays_of(QUADROTOR), noise.scale * noise.lidar, rng)
-        timeout = {} if self.setpoint_timeout is None else {TIMEOUT[self.rules]: self.setpoint_timeout}
+        timeout = {} if self.setpoint_timeout is None else {SETPOINT_TIMEOUT[self.rules]: self.setpoint_timeout}
         return Endpoint(vehicle, self.rules, system, timeout, lidar)
 
 

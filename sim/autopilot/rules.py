@@ -227,6 +227,8 @@ class ArduCopter:
 
 RULES: dict[str, type[Px4] | type[ArduCopter]] = {kind.name: kind for kind in (Px4, ArduCopter)}
 
+SETPOINT_TIMEOUT = {"px4": "COM_OF_LOSS_T", "ardupilot": "GUID_TIMEOUT"}  # the parameter that sets it, s
+
 
 def _seconds(parameter: float) -> float:
     """A delay that a negative parameter switches off."""

@@ -20,12 +20,12 @@ from messaging.shapes import CYLINDER, Obstacle
 from sim.autopilot import server
 from sim.autopilot.endpoint import Autopilot
 from sim.autopilot.pilot import Mode
+from sim.autopilot.rules import SETPOINT_TIMEOUT as TIMEOUT
 from sim.flight_estimator import QuadrotorNoise
 from sim.quadrotor import SAMPLES, Quadrotor
 from sim.vehicle import BadInput
 from sim.world import Arena, staged_arena
 
-TIMEOUT = {"px4": "COM_OF_LOSS_T", "ardupilot": "GUID_TIMEOUT"}
 RULES = ("px4", "ardupilot")
 
 
