@@ -102,6 +102,17 @@ def test_falsified_decisions_are_found(data_folder: Path, tmp_path: Path, capsys
     assert "11 requests; 1 had no answer" in shown and "different: 3" in shown
 
 
+def test_a_log_that_begins_after_a_change_of_models_has_no_stale_ones(data_folder: Path, tmp_path: Path) -> None:
+    def verified_before(exchange: pb.Exchange) -> None:
+        if exchange.request.model:
+            exchange.request.model = "0123456789ab"
+
+    drive(tmp_path / "run.mcap", 30, verified_before)
+    figures = replay(tmp_path).figures()
+    assert figures["requests"] == 30 and "result" not in figures["fields"]
+    assert not any("error" in now for now in figures["kinds"].values())
+
+
 def test_differences_of_replies() -> None:
     one = pb.Reply(decision=pb.Decision(plan=(1.0, 2.0, 0.0, 0.0), reason="a", time_ms=1.0))
     other = pb.Reply(decision=pb.Decision(plan=(1.0, 2.5, 0.0, 0.0), reason="b", time_ms=9.0))

@@ -1,0 +1,42 @@
+"""Does a policy that was learned from a log alone do better than chance? Half an hour on two cores."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from deploy.evaluate import Evaluation, evaluate
+from logs.tally import Tally
+from messaging.robots import GROUND
+from tests.system.runs import brakeline
+
+STEPS = 25_000
+EPISODES = 200
+HOUR = 3600.0
+
+
+def returns(policy: str, episodes: int = EPISODES) -> np.ndarray[Any, np.dtype[np.float64]]:
+    """The rewards of fresh episodes through the filter."""
+    found: list[float] = []
+
+    def each(tally: Tally) -> None:
+        found.append(tally.returns[-1])
+
+    evaluate(GROUND, Evaluation(policy=policy, episodes=episodes), each)
+    return np.array(found)
+
+
+@pytest.mark.long
+@pytest.mark.timeout(HOUR)
+def test_offline_training_beats_chance(data_folder: Path, tmp_path: Path) -> None:
+    done = brakeline("train", "ground", "--steps", STEPS, "--out", tmp_path / "run", "--json", timeout=HOUR)
+    assert done.returncode == 0, done.stderr
+    words = ("train", "ground", "--from-logs", tmp_path / "run", "--actors", 0)
+    done = brakeline(*words, "--out", tmp_path / "offline", "--json", timeout=HOUR)
+    assert done.returncode == 0, done.stderr
+    learned = returns(str(tmp_path / "offline" / "learner" / "policy.safetensors"))
+    chance = returns("random")
+    difference = learned.mean() - chance.mean()
+    deviation = np.sqrt(learned.var(ddof=1) / len(learned) + chance.var(ddof=1) / len(chance))
+    assert difference - 1.96 * deviation > 0.0, f"{difference:.1f} ± {1.96 * deviation:.1f}"
