@@ -1,8 +1,10 @@
 """Free space about a nominal plan, as half-spaces `a·p <= b` (method §3).
 
 A supporting half-space per near obstacle and period: the obstacle is convex, so the plane through its point closest
-to the nominal position, normal to the line between them, has all of it on the far side. The same half-space holds for
-both ends of the period, so that the chord between them is inside too.
+to some nominal position, normal to the line between them, has all of it on the far side. The same half-space holds for
+both ends of the period, so that the chord between them is inside too: of the planes seen from the period's start,
+middle and end the one is taken that leaves both ends the most room. A fast robot passes by an obstacle within a
+period, and the plane seen from one end alone would cut off the other.
 """
 
 from __future__ import annotations
@@ -31,16 +33,36 @@ def half_spaces(near: Shapes, start: Array, nominal: Array, keep_off: float, mea
         normals a (n, N, d) and offsets b (n, N), relative to `start`: `a·(p - start) <= b`. An obstacle that the
         start touches gets `b = -inf`: nothing there can be verified.
     """
-    towards = near.towards(np.concatenate([start[None], nominal]))
-    here, there = towards[:, :1], towards[:, 1:]  # (n, 1, d), (n, N, d)
-    closest = there + (nominal - start)  # relative to the start, as `here` is
-    # A nominal position inside an obstacle has no direction, and one beyond it a plane that the start is beyond of.
-    gap = np.sqrt(np.einsum("nkd,nkd->nk", there, there))
-    ahead = (gap > TOUCHING) & (np.einsum("nkd,nkd->nk", there, closest) > 0.0)
-    vector = np.where(ahead[..., None], there, here)
-    point = np.where(ahead[..., None], closest, here)
-    length = np.where(ahead, gap, np.sqrt(np.einsum("nkd,nkd->nk", here, here)))
-    normal = vector / np.maximum(length, TOUCHING)[..., None]
-    offset = np.einsum("nkd,nkd->nk", normal, point) - keep_off - np.abs(normal) @ measured
-    offset[~(length > TOUCHING)] = -np.inf
-    return normal, offset
+    between = np.concatenate([np.zeros((1, nominal.shape[1])), nominal - start])
+    seen_from = np.empty((2 * len(nominal) + 1, nominal.shape[1]))  # relative to the start
+    seen_from[::2] = between
+    seen_from[1::2] = 0.5 * (between[1:] + between[:-1])
+    towards = near.towards(start + seen_from)  # (n, 2N+1, d)
+    gap = np.sqrt(np.einsum("nqd,nqd->nq", towards, towards))
+    unit = towards / np.maximum(gap, TOUCHING)[..., None]
+    level = np.einsum("nqd,nqd->nq", unit, towards + seen_from)
+    inside = ~(gap > TOUCHING)  # true for NaN, too
+    level[inside | inside[:, :1]] = -np.inf
+    choice = _roomiest(unit, level, between)
+    each = np.arange(len(choice))[:, None]
+    normal = unit[each, choice]
+    return normal, level[each, choice] - keep_off - np.abs(normal) @ measured
+
+
+def _roomiest(unit: Array, level: Array, ends: Array) -> NDArray[np.intp]:
+    """Which of the planes (n, 2N+1) serves which period, the ends (N+1, d) of which are nominal: (n, N).
+
+    From the first period on whose ends no plane keeps apart from the obstacle, the nominal plan goes through it: the
+    last plane before stays in force, for one beyond the obstacle would hold on the wrong side.
+    """
+    places = 2 * np.arange(len(ends) - 1)[:, None] + np.arange(3)  # (N, 3)
+    along = np.einsum("nqd,ed->nqe", unit, ends)[:, places]  # (n, N, 3, N+1)
+    periods = np.arange(len(ends) - 1)[:, None]
+    farther = np.maximum(along[:, periods, np.arange(3), periods], along[:, periods, np.arange(3), periods + 1])
+    room = level[:, places] - farther  # (n, N, 3)
+    best = room.argmax(axis=2)
+    choice = places[periods[:, 0], best]
+    through = np.logical_or.accumulate(~(room.max(axis=2) > 0.0), axis=1)
+    before = (~through).sum(axis=1)  # periods until then
+    last = np.where(before > 0, choice[np.arange(len(choice)), before - 1], 0)
+    return np.asarray(np.where(through, last[:, None], choice))

@@ -64,3 +64,29 @@ def test_no_number_is_never_free():
     broken = Shapes(near.center * np.nan, near.axes, near.half, near.rho, near.round)
     _, offsets = half_spaces(broken, np.zeros(2), np.zeros((1, 2)), BODY, np.zeros(2))
     assert not (offsets > -np.inf).any()
+
+
+def test_who_passes_by_in_a_period_keeps_the_room_beside_the_obstacle():
+    """From one end of the period alone the plane would cut off the other."""
+    near = Shapes.of([Obstacle("cylinder", (1.5, 1.0), (0.5,))], 2)
+    nominal = np.array([[1.0, 0.0], [2.0, 0.0], [3.0, 0.0]])
+    normals, offsets = half_spaces(near, np.zeros(2), nominal, 0.0, np.zeros(2))
+    assert np.allclose(normals[0, 1], [0.0, 1.0]) and offsets[0, 1] == pytest.approx(0.5)
+    ends = np.vstack([np.zeros(2), nominal])
+    for k in range(3):
+        assert (ends[k : k + 2] @ normals[0, k] < offsets[0, k] - 0.2).all()
+
+
+@given(obstacles(), st.integers(0, 10_000))
+def test_a_plan_that_keeps_apart_is_inside_its_half_spaces_and_one_that_does_not_is_not(obstacle, seed):
+    rng = np.random.default_rng(seed)
+    d = len(obstacle.position)
+    near = Shapes.of([obstacle], d)
+    nominal = np.cumsum(rng.uniform(-1.5, 1.5, (5, d)), axis=0)
+    start, nominal = nominal[0], nominal[1:]
+    normals, offsets = half_spaces(near, start, nominal, 0.0, np.zeros(d))
+    ends = np.vstack([start, nominal])
+    chords = ends[:-1, None] + np.linspace(0.0, 1.0, 200)[:, None] * np.diff(ends, axis=0)[:, None]
+    touched = (near.distance(chords)[0] < 1e-9).any(axis=1)
+    inside = [((ends[k : k + 2] - start) @ normals[0, k] <= offsets[0, k]).all() for k in range(len(nominal))]
+    assert not (touched & np.array(inside)).any()

@@ -42,6 +42,7 @@ def test_the_closed_form_is_the_qp_where_one_of_several_is_active(r, seed):
     d = G @ r + rng.uniform(0.5, 1.0, 4)
     d[2] -= 1.2  # the one that is violated
     mine = closed_form(r, G, d)
+    assert G[2] @ mine == pytest.approx(d[2]), "whichever else there are, it is the violated one that is met"
     if (G @ mine <= d).all():
         assert np.allclose(mine, quadratic(r, G, d, -WIDE, WIDE)[0], atol=SAME)
 
