@@ -14,6 +14,8 @@ from deploy.vehicles import Conditions
 from messaging.bus import BusSettings
 from safety.model_set import Recipe
 from sim.estimator import NoiseLevels
+from sim.flight_estimator import QuadrotorNoise
+from sim.wind import Wind
 
 Certificate = Literal["residual", "set-membership", "matrix-zonotope"]
 Mode = Literal["direct", "recursion"]
@@ -49,9 +51,19 @@ class Physics:
     """Friction coefficient of the wheels on the floor."""
     noise: float = 1.0
     """Factor on all sensor errors."""
+    wind: float = 0.0
+    """m/s on average, on the quadrotor, from a side that is drawn anew each episode."""
+    gust: float = 0.0
+    """m/s, standard deviation of the wind on each axis."""
 
     def conditions(self) -> Conditions:
-        return Conditions(NoiseLevels(scale=self.noise), self.payload, self.friction)
+        return Conditions(
+            NoiseLevels(scale=self.noise),
+            self.payload,
+            self.friction,
+            QuadrotorNoise(scale=self.noise),
+            Wind(self.wind, gust=self.gust),
+        )
 
 
 @dataclass(frozen=True)
