@@ -83,7 +83,8 @@ class Station:
         for _ in range(round(seconds / 0.1)):
             self.setpoint(*setpoint, **options)
             self.wait(0.1)
-        return np.array(frames.world(tuple(self.autopilot.vehicle.state()[3:6])))
+        east, north, up = self.autopilot.vehicle.state()[3:6]
+        return np.array([north, east, -up])
 
     def into_the_air(self) -> None:
         """Take off to three metres, and be ready for setpoints."""
