@@ -38,7 +38,8 @@ def _lines(results: Sequence[dict[str, Any]], name: str, grid: Array) -> Array:
         if name == "interventions":
             values = values / np.array(episodes["steps"], float)
         curve = np.cumsum(values) if name == "collision" else _smooth(values)
-        lines.append(np.interp(grid, ends, curve))
+        before = 0.0 if name == "collision" else np.nan  # until an episode has ended nothing is known
+        lines.append(np.interp(grid, ends, curve, left=before))
     return np.array(lines)
 
 
@@ -61,7 +62,9 @@ def learning_curves(results: Sequence[dict[str, Any]], png: Path) -> None:
         axes.set_title(label, fontsize=10)
         axes.grid(alpha=0.3)
         axes.margins(x=0.01)
-    panels[0].legend(loc="lower right", frameon=False)
+        if name in ("goal", "interventions"):
+            axes.set_ylim(-0.02, 1.02)
+    panels[0].legend(loc="best", frameon=False)
     for axes in panels[2:]:
         axes.set_xlabel(f"steps (means over {WINDOW} episodes)")
     png.parent.mkdir(parents=True, exist_ok=True)
@@ -86,7 +89,10 @@ def seeds_as_points(found: dict[str, Any], png: Path) -> None:
             axes.set_title(f"{part}: {name} [%]", fontsize=10)
             axes.grid(axis="y", alpha=0.3)
             axes.set_xlim(-0.6, len(methods) - 0.4)
-            axes.set_ylim(bottom=-0.5 if name == "collision rate" else None)
+            if name == "goal rate":
+                axes.set_ylim(-2.0, 102.0)
+            else:
+                axes.set_ylim(bottom=-0.5)
     png.parent.mkdir(parents=True, exist_ok=True)
     picture.savefig(png, dpi=120, metadata={"Software": None})
 

@@ -14,8 +14,8 @@ from typing import Any
 
 from actors.driver import Driver, Identity
 from actors.guard import Ask
-from deploy.evaluate import FRESH, UNTRAINED, in_process, policy_named
-from deploy.store import method_for
+from deploy.evaluate import FRESH, TRAINED, UNTRAINED, in_process, policy_named
+from deploy.store import method_for, recorded
 from deploy.trials import Episodes, Trainer, TrialLog, evaluate
 from deploy.vehicles import environment
 from learner.config import LearnerConfig, TD3Config
@@ -26,10 +26,10 @@ from safety.methods import DDPC, Model
 from safety.model_set import Recipe
 from safety.pretrained import Pretrained
 from safety.sailr import SAILR
+from safety.secas import SECAS
 
 NONE = "none"
-METHODS = (DDPC, SAILR, "secas", NONE)  # in the order of the paper's table
-TRAINED = "trained"
+METHODS = (DDPC, SAILR, SECAS, NONE)  # in the order of the paper's table
 PACKAGES = ("brakeline", "mujoco", "proxsuite", "numpy", "torch")
 
 
@@ -115,10 +115,10 @@ def run(study: Study, folder: Path, say: Report = lambda text: None) -> dict[str
 
 
 def _cost(model: Model) -> dict[str, str]:
-    """What was driven beforehand, and how it went."""
+    """What was driven beforehand, and how it went. Ours is recorded in an empty yard: there is nothing to touch."""
     if isinstance(model, Pretrained):
         return {name: model.about[name] for name in ("samples", "collisions", "seconds", "error")}
-    return {"samples": model.about["periods"], "collisions": "0"}
+    return {"samples": str(recorded(model.robot).periods), "collisions": "0"}
 
 
 def _driver(study: Study, trial: Trial, robot: Robot, seed: int, actor: str) -> Driver:

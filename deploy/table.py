@@ -13,9 +13,9 @@ from typing import Any
 
 import numpy as np
 
-from deploy.evaluate import UNTRAINED
+from deploy.evaluate import TRAINED, UNTRAINED
 from deploy.intervals import Estimate, mean, ratio
-from deploy.study import METHODS, NONE, TRAINED
+from deploy.study import METHODS, NONE
 from safety.methods import DDPC
 
 Result = dict[str, Any]
