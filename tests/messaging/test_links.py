@@ -1,0 +1,57 @@
+"""Bytes there and back over each kind of link, and peers that are gone."""
+
+import time
+
+import pytest
+
+from messaging.links import BadLink, Link, Tcp, TcpServer, Udp, open_link
+
+
+def arrives(link: Link, expected: bytes) -> bool:
+    """Within a second, in however many pieces."""
+    data, deadline = b"", time.monotonic() + 1.0
+    while data != expected and time.monotonic() < deadline:
+        data += link.receive()
+    return data == expected
+
+
+@pytest.mark.parametrize(("listening", "calling"), [("udpin", "udpout"), ("tcpin", "tcp")])
+def test_bytes_go_both_ways(listening: str, calling: str) -> None:
+    server = open_link(f"{listening}:127.0.0.1:0")
+    assert isinstance(server, Udp | TcpServer)
+    client = open_link(f"{calling}:127.0.0.1:{server.port}")
+    client.send(b"hello")
+    assert arrives(server, b"hello")
+    server.send(b"good day")
+    assert arrives(client, b"good day")
+    assert client.receive() == b""
+    client.close()
+    server.close()
+
+
+def test_a_peer_that_is_gone_is_no_error() -> None:
+    server = open_link("tcpin:127.0.0.1:0")
+    assert isinstance(server, TcpServer)
+    client = open_link(f"tcp:127.0.0.1:{server.port}")
+    assert isinstance(client, Tcp)
+    client.send(b"x")
+    assert arrives(server, b"x")
+    server.close()
+    deadline = time.monotonic() + 1.0
+    while client.open and time.monotonic() < deadline:
+        client.receive()
+    assert not client.open
+    client.send(b"y")
+    client.close()
+
+    nobody = open_link("udpout:127.0.0.1:9")
+    nobody.send(b"x")
+    nobody.send(b"y")
+    assert nobody.receive() == b""
+    nobody.close()
+
+
+@pytest.mark.parametrize("url", ["", "udpin", "udpin:127.0.0.1", "carrier:pigeon:1", "tcp:127.0.0.1:99999"])
+def test_what_is_no_link_is_refused(url: str) -> None:
+    with pytest.raises(BadLink):
+        open_link(url)
