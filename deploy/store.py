@@ -119,12 +119,14 @@ def method_for(robot: Robot, method: str, recipe: Recipe) -> Model:
     """What a method must know of a robot: ours a model set, a rival its networks, made if they are not there.
 
     Raises:
-        ValueError: no method of that name needs anything.
+        ValueError: no method of that name needs anything, or it knows nothing of robots in real time.
     """
     if method == DDPC:
         return model_for(robot, recipe)
     if method not in rivals.RECIPES:
         raise ValueError(f"no method is called {method!r}; there are: {', '.join((DDPC, *rivals.RECIPES))}")
+    if robot.late:
+        raise ValueError(f"{method} has no real-time mode: its answer counts for the period in which it was asked for")
     return pretrained(robot, method, rivals.RECIPES[method]())
 
 
