@@ -37,10 +37,10 @@ class Gains:
     ramp: float = 0.2  # the setpoint is averaged over this time: the period of those who send one
     round: float = 0.4  # and once more over this
     ease: float = 0.06  # and a third time
-    attitude_lag: float = 0.05  # how late a wanted horizontal acceleration comes
+    attitude_lag: float = 0.03  # how late a wanted horizontal acceleration comes
     thrust_lag: float = 0.02  # and a vertical one
     velocity: float = 4.0  # 1/s
-    integral: float = 4.0  # 1/s²
+    integral: float = 2.0  # 1/s²
     integral_limit: float = 4.0  # m/s²
     position: float = 1.5  # 1/s, in hold
     attitude: float = 16.0  # 1/s
