@@ -213,7 +213,8 @@ def make(data: Dataset, recipe: Recipe) -> ModelSet:
         seen, rest = windows(fit, k), windows(bound, k)
         for part in (seen, rest):
             quality(_used(robot, part.z, k), f"windows of {k} periods")
-        bulges.append(envelope(np.abs(rest.z), rest.bulge, recipe.inflation))
+        every = windows(data, k)  # no predictor is fitted to bulges: both parts may bound them
+        bulges.append(envelope(np.abs(every.z), every.bulge, recipe.inflation))
         if recipe.mode == DIRECT:
             steps.append(_certificate(seen.z, seen.y, rest.z, rest.y, recipe, _columns(robot, k)))
         else:
