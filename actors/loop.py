@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 
 import numpy as np
 
@@ -28,11 +28,21 @@ PATIENCE = 0.05  # s between questions of a standing robot that got no answer
 
 @dataclass(frozen=True)
 class Change:
-    """What becomes of each robot after so many steps: the robot that was recorded is not the one that drives on."""
+    """What becomes of each robot after so many steps: the robot that was recorded is not the one that drives on.
+
+    What is None stays as it is; a robot kind refuses what it does not have.
+    """
 
     after: int = -1  # -1: never
-    payload_kg: float = 0.0
-    floor_friction: float = 1.0
+    payload_kg: float | None = None
+    floor_friction: float | None = None
+    wind_speed: float | None = None  # m/s
+    gust: float | None = None  # m/s
+
+    def changes(self) -> dict[str, float]:
+        """What a vehicle's `alter` takes."""
+        values = {name: value for name, value in asdict(self).items() if name != "after"}
+        return {name: value for name, value in values.items() if value is not None}
 
 
 @dataclass(frozen=True)
@@ -101,7 +111,7 @@ class Rider:
     def ready(self, stop: Callable[[], bool]) -> bool:
         """Wait for permission to step, and begin an episode if none is running; False: the end."""
         if self.driver.index == self.change.after:
-            self.driver.env.alter(payload_kg=self.change.payload_kg, floor_friction=self.change.floor_friction)
+            self.driver.env.alter(**self.change.changes())
         if not self.student.wait(self.driver.index + 1, self.next_episode, stop):
             return False
         if not self.driver.running:
