@@ -73,9 +73,7 @@ class Robot:
 
     def in_real_time(self) -> Robot:
         """The same robot where the world does not wait for an answer: it decides on the period after this one."""
-        return replace(
-            self, name=self.name + LATE, late=True, horizon=self.horizon + 1, free_steps=self.free_steps + 1
-        )
+        return replace(self, name=self.name + LATE, late=True, horizon=self.horizon + 1, free_steps=self.free_steps + 1)
 
     @property
     def speeds(self) -> slice:
