@@ -18,7 +18,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from deploy import collect
 from deploy import pretrain as rivals
 from deploy.vehicles import Conditions
-from messaging.robots import LATE, Robot, robot_named
+from messaging.robots import Robot, robot_named
 from safety.dataset import BadData, Dataset
 from safety.methods import DDPC, Model
 from safety.model_set import BadModel, ModelSet, Recipe, make
@@ -64,7 +64,7 @@ def recorded(
     path = path or record_path(robot)
     if path.exists() and not again:
         return Dataset.load(path)
-    conditions, trajectories = conditions or Conditions(), trajectories or TRAJECTORIES[robot.name]
+    conditions, trajectories = conditions or Conditions(), trajectories or TRAJECTORIES[robot.kind]
     driven = track(
         collect.record(robot, trajectories, seed, conditions),
         f"recording {trajectories} trajectories of {robot.name}",
@@ -98,7 +98,7 @@ def model_for(robot: Robot, recipe: Recipe) -> ModelSet:
             return ModelSet.load(path)
         except BadModel as error:
             console.print(f"[yellow]making the model set again:[/] {error}")
-    base = robot_named(robot.name.removesuffix(LATE))  # one record serves, whether questions are late or not
+    base = robot_named(robot.kind)  # one record serves, whether questions are late or not
     try:
         data = recorded(base)
     except BadData as error:

@@ -9,7 +9,7 @@ import numpy as np
 
 from actors.flying import MavlinkVehicle
 from actors.mavlink import Tap
-from messaging.robots import GROUND, QUADROTOR, Robot
+from messaging.robots import GROUND, QUADROTOR, Robot, robot_named
 from sim.arenas import arena_kind
 from sim.autopilot.endpoint import Autopilot
 from sim.autopilot.rules import SETPOINT_TIMEOUT
@@ -17,6 +17,7 @@ from sim.envs import NavigationEnv
 from sim.estimator import NoiseLevels
 from sim.flight_estimator import QuadrotorNoise
 from sim.ground import GroundRobot
+from sim.late import late
 from sim.quadrotor import Quadrotor
 from sim.vehicle import MakeVehicle, Vehicle
 from sim.wind import Wind
@@ -44,6 +45,8 @@ class Conditions:
 
     def factory(self, robot: Robot) -> MakeVehicle:
         """What makes a vehicle of that kind under these conditions. Raises ValueError when there is none."""
+        if robot.late:
+            return late(self.factory(robot_named(robot.kind)), robot)
         if robot is GROUND:
             return partial(
                 GroundRobot, noise=self.noise, payload_kg=self.payload_kg, floor_friction=self.floor_friction
@@ -54,7 +57,7 @@ class Conditions:
 
     def lidar_noise(self, robot: Robot) -> float:
         """Sigma of a range, m."""
-        noise = self.noise if robot is GROUND else self.flight_noise
+        noise = self.noise if robot.kind == GROUND.name else self.flight_noise
         return noise.scale * noise.lidar
 
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from messaging.robots import GROUND, LATE, QUADROTOR, RAYS, Robot
+from messaging.robots import GROUND, QUADROTOR, RAYS, Robot
 
 Array = NDArray[np.float64]
 
@@ -49,4 +49,4 @@ def rays_of(robot: Robot) -> Rays:
     Raises:
         KeyError: nobody has said where this robot's rays point.
     """
-    return RAYS_OF[robot.name.removesuffix(LATE)]  # in real time it sees the same
+    return RAYS_OF[robot.kind]

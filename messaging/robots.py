@@ -50,6 +50,11 @@ class Robot:
     late: bool = False  # an answer counts from the next period on: a plan's first input is the one in force meanwhile
 
     @property
+    def kind(self) -> str:
+        """Its name but for the time it lives in: robots of one kind have the same body, senses, arenas and policies."""
+        return self.name.removesuffix(LATE)
+
+    @property
     def state_dim(self) -> int:
         return len(self.state)
 

@@ -130,10 +130,10 @@ ENDS = 64  # points drawn at once, of which the first two that are free and far 
 
 def arena_kind(robot: Robot, name: str) -> ArenaKind:
     """Raises UnknownArena with the names there are for this robot."""
-    kinds = ARENAS.get(robot.name, {})
+    kinds = ARENAS.get(robot.kind, {})
     if name not in kinds:
         there = ", ".join(sorted(kinds)) or "none"
-        raise UnknownArena(f"no arena is called {name!r}; there are: {there} ({robot.name})")
+        raise UnknownArena(f"no arena is called {name!r}; there are: {there} ({robot.kind})")
     return kinds[name]
 
 

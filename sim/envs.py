@@ -83,7 +83,7 @@ class NavigationEnv(gymnasium.Env[Observation, Any]):
         of a range; seed_key: sets apart the episodes of two environments whose episode seeds are the same, 0 or more.
         """
         self.robot, self.arena_name, self.seed_key = robot, arena, seed_key
-        self.reward = reward or REWARDS[robot.name]
+        self.reward = reward or REWARDS[robot.kind]
         self.action_space = Box(robot.low().astype(np.float32), robot.high().astype(np.float32), dtype=np.float32)
         limit = np.full(robot.observation_dim, OBSERVED_LIMIT, dtype=np.float32)
         self.observation_space = Box(-limit, limit, dtype=np.float32)
@@ -116,7 +116,7 @@ class NavigationEnv(gymnasium.Env[Observation, Any]):
         self._vehicle = self._make_vehicle(self._arena, rng)
         if self._changes:
             self._vehicle.alter(**self._changes)
-        self._senses = SENSES[self.robot.name](self._arena, rng, self._lidar_noise)
+        self._senses = SENSES[self.robot.kind](self._arena, rng, self._lidar_noise)
         self._steps = 0
         self._distance = self._goal_distance(self._vehicle.true)
         return self._observe(), self._info(self._vehicle.standing())

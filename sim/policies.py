@@ -34,9 +34,9 @@ def scripted(name: str, robot: Robot, rng: np.random.Generator) -> Policy:
     """
     if name not in POLICIES:
         raise UnknownPolicy(f"no policy is called {name!r}; there are: {', '.join(POLICIES)}")
-    if robot.name not in POLICIES[name]:
-        raise UnknownPolicy(f"no policy of the {robot.name} is called {name!r}")
-    return POLICIES[name][robot.name](robot, rng)
+    if robot.kind not in POLICIES[name]:
+        raise UnknownPolicy(f"no policy of the {robot.kind} is called {name!r}")
+    return POLICIES[name][robot.kind](robot, rng)
 
 
 def bearing(state: Array, target: Array | tuple[float, float]) -> float:
