@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from itertools import product
 from typing import Any
 
@@ -53,9 +54,10 @@ class StopModel:
     POINTS = 2  # a period
 
     def __init__(self, robot: Robot) -> None:
+        self._period = robot.period
         fine = 20  # steps of the integration a point
         step = robot.period / (self.POINTS * fine)
-        fractions = robot.schedule()[:: robot.action_dim, 0]  # of u, one a period
+        fractions = robot.schedule()[robot.given * robot.action_dim :: robot.action_dim, -robot.action_dim]  # of u
         velocity, way = np.array([1.0, 0.0]), np.zeros(2)  # the shares of v and of u in them
         ways: list[Array] = []
         for fraction in np.repeat(fractions, self.POINTS * fine):
@@ -64,6 +66,12 @@ class StopModel:
             ways.append(way)
         self.from_velocity, self.from_setpoint = np.array(ways[fine - 1 :: fine]).T
         self.times: Array = np.cumsum(np.full(len(ways) // fine, robot.period / self.POINTS))
+
+    def after(self, position: Array, velocity: Array, setpoint: Array) -> tuple[Array, Array]:
+        """Position and velocity (3,) after a period at a setpoint (3,)."""
+        lost = 1.0 - math.exp(-self._period / self.LAG)
+        slip = velocity - setpoint
+        return position + self._period * setpoint + self.LAG * lost * slip, velocity - lost * slip
 
     def __call__(self, position: Array, velocity: Array, setpoints: Array) -> Array:
         """Positions (C, K, 3) from a state's position (3,) and velocity (3,) after each of the setpoints (C, 3)."""
@@ -100,11 +108,14 @@ class MapPilot:
         state = info["state"]
         low, high = self._robot.low(), self._robot.high()
         setpoints = np.clip(info["input_in_force"] + self._changes, low, high)
-        places = self._stops(state[:3], state[3:6], setpoints)
+        position, velocity = state[:3], state[3:6]
+        if self._robot.late:  # the setpoint is for the period after this one
+            position, velocity = self._stops.after(position, velocity, info["input_in_force"])
+        places = self._stops(position, velocity, setpoints)
         to_go = self._routes.to_go(places)
         at_goal = np.linalg.norm(places - info["goal"], axis=-1) < info["arena"].goal_radius
         value = (np.where(at_goal, 0.0, to_go) + self.PACE * self._stops.times).min(axis=1)
-        lack = self._lack(places, state[:3])
+        lack = self._lack(places, position)
         free = lack == 0.0
         best = np.argmin(np.where(free, value, np.inf) if free.any() else lack)
         return np.asarray(setpoints[best])
