@@ -34,6 +34,7 @@ Array = NDArray[np.float64]
 
 DIRECT, RECURSION = "direct", "recursion"
 MODES = (DIRECT, RECURSION)
+MOST_ATOMS = 120_000  # of a matrix zonotope, over the horizon: the exact check looks at every one
 TENSORS = ("C", "W", "M", "kappa", "w", "generators")
 
 
@@ -216,7 +217,9 @@ def make(data: Dataset, recipe: Recipe) -> ModelSet:
         every = windows(data, k)  # no predictor is fitted to bulges: both parts may bound them
         bulges.append(envelope(np.abs(every.z), every.bulge, recipe.inflation))
         if recipe.mode == DIRECT:
-            steps.append(_certificate(seen.z, seen.y, rest.z, rest.y, recipe, _columns(robot, k)))
+            steps.append(
+                _certificate(seen.z, seen.y, rest.z, rest.y, recipe, _columns(robot, k), MOST_ATOMS // horizon)
+            )
         else:
             steps.append(_recursive_step(robot, windows(fit, 1), windows(bound, 1), k - 1, recipe))
     whole = windows(data, horizon)
@@ -252,12 +255,19 @@ def _scalar(bounds: list[tuple[Array, float]], nz: int) -> Certificate:
 
 
 def _certificate(
-    z: Array, y: Array, z_bound: Array, y_bound: Array, recipe: Recipe, columns: NDArray[np.bool_]
+    z: Array, y: Array, z_bound: Array, y_bound: Array, recipe: Recipe, columns: NDArray[np.bool_], most_atoms: int
 ) -> Certificate:
-    """The recipe's certificate: the noise of all three is the residual's envelope, they differ in trusting C."""
+    """The recipe's certificate: the noise of all three is the residual's envelope, they differ in trusting C.
+
+    A matrix zonotope has an atom a sample and more samples do not shrink it: it takes no more than `most_atoms`,
+    evenly over the data.
+    """
     trusted = residual(z_bound, y_bound, least_squares(z, y, columns), recipe.inflation)
     if recipe.certificate == RESIDUAL:
         return trusted
+    if recipe.certificate == MATRIX_ZONOTOPE and len(z_bound) > most_atoms:
+        chosen = np.linspace(0, len(z_bound) - 1, most_atoms).astype(int)
+        z_bound, y_bound = z_bound[chosen], y_bound[chosen]
     z_in = z_bound[:, columns]
     sizes = (np.abs(z_bound) @ trusted.kappa.T + trusted.w).T
     kappa, w = trusted.kappa, trusted.w
@@ -280,7 +290,7 @@ def _recursive_step(robot: Robot, fit: Windows, bound: Windows, k: int, recipe: 
     rng = np.random.default_rng((recipe.seed, k))
     turned = [_turned(robot, w, k, rng) for w in (fit, bound)]
     columns = np.abs(turned[0][0]).max(0) > 0.0
-    return _certificate(*turned[0], *turned[1], recipe, columns)
+    return _certificate(*turned[0], *turned[1], recipe, columns, MOST_ATOMS // robot.horizon)
 
 
 def _turned(robot: Robot, w: Windows, k: int, rng: np.random.Generator) -> tuple[Array, Array]:
