@@ -13,9 +13,8 @@ from messaging import brakeline_pb2 as pb
 from messaging.robots import Robot
 from safety.client import obstacle_messages, request_message
 from safety.commitment import Array, Commitment, Prediction, correction_penalty
-from sim.envs import Reward
 
-LOWEST = Reward().collision  # what the learner is paid where an intervention ends its episode
+LOWEST = -20.0  # what the learner is paid where an intervention ends the episode (deploy/experiments.md)
 EPISODE_STRIDE = 4096  # episodes of different robots of a run never share a seed: seed = episode · stride + number
 
 
@@ -61,7 +60,8 @@ class Driver:
         cuts: bool = False,
     ) -> None:
         """penalty: for a correction by the whole range of an input; cuts: instead of a penalty, an intervention ends
-        the episode for the learner with the lowest reward, while the environment's goes on (SAILR)."""
+        the episode, for the learner as a terminal step with the lowest reward, for the robot as one that was called
+        off (SAILR's training; without `cuts` its episodes go on, braked step by step)."""
         self.robot, self.env, self.identity, self.penalty, self.filtered = robot, env, identity, penalty, filtered
         self.cuts = cuts
         self.commitment = Commitment(robot)
@@ -161,9 +161,15 @@ class Driver:
         step.decision = outcome.answer.message.kind
         step.decide_ms = outcome.answer.message.time_ms
         if self.cuts:
-            step.cut = step.decision == pb.FAILSAFE
-            step.penalty = step.reward - LOWEST if step.cut else 0.0
+            self._cut(step)
         predicted: Prediction | None = self.commitment.predicted
         if predicted is not None:
             step.compared = True
             step.contained = predicted.contains(self.robot, self.info["state"])
+
+    def _cut(self, step: pb.Step) -> None:
+        """No penalty, but the end of the episode if there was an intervention. A collision while braking stays one."""
+        step.cut = step.decision == pb.FAILSAFE
+        step.penalty = max(step.reward - LOWEST, 0.0) if step.cut else 0.0
+        if step.cut and self.running:
+            self.running, step.truncated = False, True

@@ -28,7 +28,7 @@ from safety.pretrained import Pretrained
 from safety.sailr import SAILR
 from safety.secas import SECAS
 
-NONE = "none"
+NONE, LEARNING = "none", "learning"
 METHODS = (DDPC, SAILR, SECAS, NONE)  # in the order of the paper's table
 PACKAGES = ("brakeline", "mujoco", "proxsuite", "numpy", "torch")
 
@@ -41,7 +41,7 @@ class Unconfirmed(RuntimeError):
 class Trial:
     """An evaluation: whose policy, behind which filter, where, how often."""
 
-    policy: str  # trained | untrained
+    policy: str  # trained | untrained | learning
     method: str
     arena: str
     episodes: int
@@ -124,7 +124,9 @@ def _cost(model: Model) -> dict[str, str]:
 def _driver(study: Study, trial: Trial, robot: Robot, seed: int, actor: str) -> Driver:
     env = environment(robot, trial.arena, seed)
     identity, filtered = Identity(actor, 0, study.seed), trial.method != NONE
-    return Driver(robot, env, identity, study.penalty, filtered, trial.method == SAILR)
+    # at an intervention training calls the episode off; an evaluation goes on, or its goal rate would mean nothing
+    cuts = trial.method == SAILR and trial.policy == LEARNING
+    return Driver(robot, env, identity, study.penalty, filtered, cuts)
 
 
 def _question(models: dict[str, Model], method: str) -> Ask | None:
@@ -132,7 +134,7 @@ def _question(models: dict[str, Model], method: str) -> Ask | None:
 
 
 def _train(study: Study, robot: Robot, models: dict[str, Model], folder: Path, say: Report) -> dict[str, Any]:
-    trial = Trial("learning", study.method, study.arenas[0], 0)
+    trial = Trial(LEARNING, study.method, study.arenas[0], 0)
     config = LearnerConfig(td3=study.td3, seed=study.seed, steps=study.steps)
     driver = _driver(study, trial, robot, study.seed, study.name)
     trainer = Trainer(driver, _question(models, study.method), Learner(robot, config))

@@ -85,7 +85,7 @@ class Episodes:
         row[0] += 1
         row[1] += step.goal
         row[2] = max(row[2], float(step.collision))
-        row[3] += step.truncated and not step.terminated
+        row[3] += step.truncated and not step.terminated and not step.cut
         row[4] += step.reward
         row[5] += step.speed
         row[6] = max(row[6], step.speed)

@@ -11,7 +11,7 @@ about them draw the policy to the obstacles; there the penalty stands with the e
 
 A step that is *cut* (SAILR's intervention) ends the episode for the learner alone: proposing what was proposed leads to
 nothing, with the lowest reward (Wagener et al. 2021, section 4: the absorbing MDP). With "both" what the backup policy
-did instead is a transition of its own, of one step.
+did instead is a transition of its own, of one step, with a value beyond it.
 """
 
 from __future__ import annotations

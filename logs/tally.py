@@ -99,7 +99,7 @@ class Tally:
         self.returns.append(self._return)
         if step.goal:
             self.goals += 1
-        if step.truncated and not step.terminated:
+        if step.truncated and not step.terminated and not step.cut:
             self.timeouts += 1
         steps, interventions = self._begun_at
         self.shares.add(self.interventions - interventions, self.steps - steps)

@@ -1,4 +1,4 @@
-"""SAILR's driver: an intervention is the learner's end of the episode, not the robot's."""
+"""SAILR's driver: in training an intervention is a terminal step for the learner, and for nobody else."""
 
 import numpy as np
 import pytest
@@ -7,6 +7,7 @@ from actors.driver import LOWEST, Driver, Identity
 from actors.guard import consult
 from deploy.evaluate import in_process
 from deploy.vehicles import environment
+from logs.metrics import Tally
 from messaging import brakeline_pb2 as pb
 from messaging.bus import NoReply
 from messaging.robots import GROUND
@@ -26,14 +27,35 @@ def step(driver: Driver, proposal, ask) -> pb.Step:
     return driver.execute(proposal, consult(ask, [driver.request(proposal)], GROUND)[0])
 
 
-def test_the_learner_is_told_of_an_end_with_the_lowest_reward_and_the_robot_drives_on(driver):
+def test_an_intervention_is_a_terminal_step_for_the_learner_alone(driver):
     ask = in_process(known(threshold=0.3))
-    allowed, cut, after = (step(driver, proposal, ask) for proposal in (SLOW, FAST, SLOW))
+    allowed, cut = (step(driver, proposal, ask) for proposal in (SLOW, FAST))
     assert not allowed.cut and allowed.penalty == 0.0 and allowed.decision == pb.ALLOWED
     assert cut.cut and cut.decision == pb.FAILSAFE and not any(cut.action) and list(cut.proposed) == pytest.approx(FAST)
-    assert cut.reward - cut.penalty == pytest.approx(LOWEST) and cut.reward > -50
-    assert not cut.terminated and not cut.truncated and driver.running
-    assert (after.episode, after.step, after.cut) == (cut.episode, cut.step + 1, False)
+    assert cut.reward - cut.penalty == pytest.approx(LOWEST) and cut.reward > -5
+    assert not cut.terminated and not cut.goal and not cut.collision, "nothing ended in the environment"
+    assert cut.truncated and not driver.running, "the robot's episode was called off"
+    seen = Tally()
+    for taken in (allowed, cut):
+        seen.step(taken)
+    assert (seen.timeouts, seen.collisions, seen.goals, len(seen.returns)) == (0, 0, 0, 1)
+
+
+def test_in_use_the_episode_goes_on_behind_the_rule():
+    driver = Driver(GROUND, environment(GROUND, "default", 0), Identity("a", 0, 0))
+    driver.begin(0)
+    ask = in_process(known(threshold=0.3))
+    for number, proposal in enumerate((FAST, FAST, SLOW)):
+        taken = step(driver, proposal, ask)
+        assert driver.running and not taken.cut and taken.step == number
+        assert (taken.decision == pb.FAILSAFE) == (proposal is FAST)
+
+
+def test_a_collision_while_braking_is_still_paid_for_as_one(driver):
+    taken = pb.Step(reward=-100.0, terminated=True, collision=True, decision=pb.FAILSAFE)
+    driver.running = False
+    driver._cut(taken)
+    assert taken.cut and taken.penalty == 0.0 and taken.terminated and not taken.truncated
 
 
 def test_a_missing_answer_is_no_intervention(driver):

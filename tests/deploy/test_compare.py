@@ -154,10 +154,13 @@ def test_only_where_a_policy_and_a_filter_are_crossed_there_are_more_trials():
     assert Trial("trained", "ddpc", "default", 1) in TINY.trials()
 
 
-def test_sailr_learns_from_its_interventions_and_goes_on(cells):
-    """Episodes of training are the environment's: as long as those of the others, interventions or not."""
+def test_sailrs_interventions_end_episodes_in_training_and_not_in_evaluation(cells):
     training = cells["sailr"]["training"]["episodes"]
-    assert sum(training["interventions"]) > 0 or max(training["steps"]) > 1
+    assert max(training["interventions"]) <= 1
+    for ended, goal, collision, timeout in zip(
+        *(training[n] for n in ("interventions", "goal", "collision", "timeout"))
+    ):
+        assert ended or goal or collision or timeout
 
 
 def test_the_table_curves_and_points_of_real_cells(cells, tmp_path):
