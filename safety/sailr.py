@@ -6,8 +6,8 @@ and V(s) are the costs to be expected from a followed by the backup policy μ, a
     intervene  ⟺  Q(s, a) − V(s) > η                 (their eq. 6: the advantage of a over μ); then execute μ(s)
 
 Q and V are learned beforehand, two networks each: the larger Q and the smaller V count. μ brakes (`safety/backup.py`).
-In training an intervention ends the episode: for the learner it is a terminal step with the lowest reward, for the robot
-an episode that was called off (`actors/driver.py`, `learner/windows.py`). In use the rule applies at every step anew.
+In training an intervention ends the episode: for the learner with a terminal step and the lowest reward, for the robot
+as one that was called off (`actors/driver.py`, `learner/windows.py`). In use the rule applies at every step anew.
 """
 
 from __future__ import annotations

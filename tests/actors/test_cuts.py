@@ -7,7 +7,7 @@ from actors.driver import LOWEST, Driver, Identity
 from actors.guard import consult
 from deploy.evaluate import in_process
 from deploy.vehicles import environment
-from logs.metrics import Tally
+from logs.tally import Tally
 from messaging import brakeline_pb2 as pb
 from messaging.bus import NoReply
 from messaging.robots import GROUND
