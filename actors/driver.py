@@ -58,12 +58,14 @@ class Driver:
         penalty: float = 0.0,
         filtered: bool = True,
         cuts: bool = False,
+        goes_on: bool = False,
     ) -> None:
         """penalty: for a correction by the whole range of an input; cuts: instead of a penalty, an intervention ends
         the episode, for the learner as a terminal step with the lowest reward, for the robot as one that was called
-        off (SAILR's training; without `cuts` its episodes go on, braked step by step)."""
+        off (SAILR's training; without `cuts` its episodes go on, braked step by step);
+        goes_on: a reset gives another goal to a robot that goes on as it was, and so does its committed plan."""
         self.robot, self.env, self.identity, self.penalty, self.filtered = robot, env, identity, penalty, filtered
-        self.cuts = cuts
+        self.cuts, self._goes_on = cuts, goes_on
         self.commitment = Commitment(robot)
         self.index = 0  # steps so far
         self.running = False
@@ -72,7 +74,8 @@ class Driver:
         """Reset to an episode of that number."""
         seed = self.identity.episode_seed(episode)
         self.observation, self.info = self.env.reset(options={"episode_seed": seed})
-        self.commitment.reset()
+        if not self._goes_on:
+            self.commitment.reset()
         self.episode, self.step, self.running = episode, 0, True
         self.rng = self.identity.noise(episode)
         arena = self.info["arena"]

@@ -6,20 +6,25 @@ import logging
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
 from actors.driver import Driver, Environment, Identity
 from actors.guard import Ask, Outcome, consult
+from actors.proposers import Fixed, FlyingPupil, MakePolicy, Proposer, Pupil, finite
 from actors.student import Student
+from actors.tape import Puts, Tape
 from messaging import brakeline_pb2 as pb
 from messaging.bus import BusSettings, Publisher
 from messaging.process import Process
 from messaging.robots import Robot, robot_named
-from messaging.topics import EPISODE, EXCHANGE, STEP
+from messaging.topics import EPISODE, EXCHANGE, FRAMES, STEP
 from safety.client import ask
 from safety.commitment import Array
-from sim.policies import scripted
+
+if TYPE_CHECKING:
+    from actors.mavlink import Tap
 
 log = logging.getLogger("brakeline.actor")
 
@@ -60,9 +65,16 @@ class ActorSettings:
     lockstep: bool = False
     practice: float = 0.0  # share of steps at which a robot starts to follow its committed plan to the stop
     change: Change = field(default_factory=Change)
+    mavlink: bool = False  # log every frame of quadrotors in memory; in real time it is always done
+    steps: int = 0  # of each robot with a policy that does not learn; 0: no end
 
 
-Make = Callable[[Robot, str, int], Environment]  # robot, arena, seed
+class Make(Protocol):
+    """Makes a robot's environment; tap: is to be called with every MAVLink frame, if there are any."""
+
+    def __call__(self, robot: Robot, arena: str, seed: int, *, tap: Tap | None = None) -> Environment: ...
+
+
 STANDING = 2  # periods that a practised stop lasts beyond its plan
 
 
@@ -86,25 +98,43 @@ class Practice:
 class Rider:
     """A driver with its link to the learner and its publishers."""
 
-    def __init__(self, process: Process, settings: ActorSettings, offset: int, make: Make) -> None:
+    waits = True  # standing, for the safety service, instead of letting time pass
+
+    def __init__(
+        self,
+        process: Process,
+        settings: ActorSettings,
+        offset: int,
+        make: Make,
+        propose: MakePolicy | None = None,
+        goes_on: bool = False,
+    ) -> None:
+        """propose: instead of learning; goes_on: see Driver."""
         robot = robot_named(settings.robot)
         actor = settings.name if settings.robots == 1 else f"{settings.name}.{offset}"
         identity = Identity(actor, settings.number + offset, settings.seed)
-        env = make(robot, settings.arena, settings.seed)
+        publisher: Callable[..., Publisher] = process.bus.publisher
+        frames = publisher(FRAMES, robot=robot.name, source=actor)
+        self.tape = Tape(frames, robot.name, actor)
+        env = make(robot, settings.arena, settings.seed, tap=self.tape.take if settings.mavlink else None)
         filtered, cuts = settings.method != "none", settings.method == "sailr"
-        self.driver = Driver(robot, env, identity, settings.penalty, filtered, cuts)
-        self.student = Student(process.bus, robot, actor, settings.lockstep)
+        self.driver = Driver(robot, env, identity, settings.penalty, filtered, cuts, goes_on)
+        if propose is None:
+            student = Student(process.bus, robot, actor, settings.lockstep)
+            self.proposer: Proposer = FlyingPupil(student) if goes_on else Pupil(student)
+        else:
+            self.proposer = Fixed(propose, settings.seed + identity.number, settings.steps)
         self.next_episode = 0
         self.waiting = False  # for the safety service, standing
+        self.braking = False  # for want of a decision
         self.practice, self.change = Practice(settings.practice), settings.change
-        publisher: Callable[..., Publisher] = process.bus.publisher
-        self.steps = publisher(STEP, robot=robot.name, source=actor)
-        self.episodes = publisher(EPISODE, robot=robot.name, source=actor)
-        self.exchanges = publisher(EXCHANGE, robot=robot.name, source=actor)
+        self.steps: Puts = publisher(STEP, robot=robot.name, source=actor)
+        self.episodes: Puts = publisher(EPISODE, robot=robot.name, source=actor)
+        self.exchanges: Puts = publisher(EXCHANGE, robot=robot.name, source=actor)
 
     def join(self, stop: Callable[[], bool]) -> bool:
-        """Join the learner; False: told to stop."""
-        episode = self.student.join(self.driver.index, self.next_episode, stop)
+        """Wait until there are proposals; False: told to stop."""
+        episode = self.proposer.join(self.driver.index, self.next_episode, stop)
         self.next_episode = max(self.next_episode, episode or 0)
         return episode is not None
 
@@ -112,31 +142,35 @@ class Rider:
         """Wait for permission to step, and begin an episode if none is running; False: the end."""
         if self.driver.index == self.change.after:
             self.driver.env.alter(**self.change.changes())
-        if not self.student.wait(self.driver.index + 1, self.next_episode, stop):
+        if not self.proposer.ready(self.driver.index + 1, self.next_episode, stop):
             return False
         if not self.driver.running:
             self.episodes.put(self.driver.begin(self.next_episode))
             self.next_episode += 1
-            self.random = scripted("random", self.driver.robot, self.driver.rng)
+            self.proposer.begin(self.driver.rng)
         return True
 
     def propose(self) -> Array:
-        """The exploring policy's action, at random during warm-up; standing still if it is no number."""
-        driver, policy = self.driver, self.student.policy
-        if policy is None or self.student.warmup:
-            return self.practice.instead(driver, self.random(driver.observation, driver.info))
-        action = policy.explore(driver.observation, driver.rng)
-        if not np.isfinite(action).all():
-            log.error("weights %d propose %s: standing still", policy.version, action)
-            return np.zeros(driver.robot.action_dim)
-        return self.practice.instead(driver, action)
+        """The proposer's action, standing still if it is no number; now and then a practised stop's."""
+        driver = self.driver
+        proposal = self.proposer.propose(driver.observation, driver.info)
+        return self.practice.instead(driver, finite(proposal, driver.robot, self.proposer.version))
+
+    def settle(self, outcome: Outcome) -> Outcome:
+        """The last word on an outcome, when it is to be put into action."""
+        if (outcome.answer is None) != self.braking:
+            self.braking = outcome.answer is None
+            if self.braking:
+                log.warning("no decision, braking along the committed plan: %s", outcome.failure)
+        return outcome
 
     def act(self, proposal: Array, outcome: Outcome | None) -> pb.Step:
         if outcome is not None:
+            outcome = self.settle(outcome)
             self.exchanges.put(outcome.exchange(self.driver.info["time"]))
-        version = 0 if self.student.policy is None else self.student.policy.version
-        step = self.driver.execute(proposal, outcome, version)
+        step = self.driver.execute(proposal, outcome, self.proposer.version)
         self.steps.put(step)
+        self.tape.publish()
         return step
 
 
@@ -147,6 +181,17 @@ class Tally:
     waits: int = 0
     round_trip_ms: float = 0.0  # sum
     collisions: int = 0
+
+    def figures(self, seconds: float) -> dict[str, float]:
+        """For Health."""
+        return {
+            "steps": self.steps,
+            "steps_per_s": self.steps / max(seconds, 1e-9),
+            "fallbacks": self.fallbacks,
+            "waits": self.waits,
+            "collisions": self.collisions,
+            "round_trip_ms": self.round_trip_ms / max(self.steps, 1),
+        }
 
 
 def cycle(riders: list[Rider], question: Ask | None, tally: Tally, stop: Callable[[], bool]) -> bool:
@@ -162,15 +207,13 @@ def cycle(riders: list[Rider], question: Ask | None, tally: Tally, stop: Callabl
     for rider, proposal, outcome in zip(riders, proposals, outcomes, strict=True):
         if outcome is not None:
             tally.round_trip_ms += outcome.round_trip_ms
-            if rider.driver.may_wait(outcome):
+            if rider.waits and rider.driver.may_wait(outcome):
                 if not rider.waiting:
                     log.warning("standing and waiting for the safety service: %s", outcome.failure)
                 rider.waiting = True
                 tally.waits += 1
                 time.sleep(PATIENCE)
                 continue
-            if outcome.answer is None:
-                log.warning("no decision, braking along the committed plan: %s", outcome.failure)
             rider.waiting = False
         step = rider.act(proposal, outcome)
         tally.steps += 1
@@ -179,8 +222,9 @@ def cycle(riders: list[Rider], question: Ask | None, tally: Tally, stop: Callabl
     return True
 
 
-def run(settings: ActorSettings, make: Make) -> bool:
-    """Drive until the learner says the run is done (True), or SIGINT or SIGTERM.
+def run(settings: ActorSettings, make: Make, propose: MakePolicy | None = None) -> bool:
+    """Drive until the learner says the run is done (True), or SIGINT or SIGTERM. propose: a policy instead of learning,
+    for as many steps as the settings say.
 
     Raises:
         RefusedByLearner, Unreachable: with what to do.
@@ -188,21 +232,10 @@ def run(settings: ActorSettings, make: Make) -> bool:
     tally = Tally()
     with Process(settings.bus, settings.name) as process:
         stop = process.stop.is_set
-        riders = [Rider(process, settings, offset, make) for offset in range(settings.robots)]
+        riders = [Rider(process, settings, offset, make, propose) for offset in range(settings.robots)]
         started = time.monotonic()
 
-        def refresh() -> None:
-            elapsed = max(time.monotonic() - started, 1e-9)
-            process.figures.update(
-                steps=tally.steps,
-                steps_per_s=tally.steps / elapsed,
-                fallbacks=tally.fallbacks,
-                waits=tally.waits,
-                collisions=tally.collisions,
-                round_trip_ms=tally.round_trip_ms / max(tally.steps, 1),
-            )
-
-        process.refresh = refresh
+        process.refresh = lambda: process.figures.update(tally.figures(time.monotonic() - started))
         process.announce()
         question: Ask | None = None
         if settings.method != "none":

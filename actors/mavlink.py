@@ -68,8 +68,24 @@ class Frame:
         """For JSON: numbers that are not finite become None."""
         return {key: _plain(value) for key, value in self.message.to_dict().items()}
 
+    @property
+    def described(self) -> dict[str, Any]:
+        """Header and fields, for JSON."""
+        m, fields = self.message, self.fields
+        header = {"system_id": m.get_srcSystem(), "component_id": m.get_srcComponent(), "sequence": m.get_seq()}
+        return {"header": header, "message": {"type": fields.pop("mavpackettype"), **fields}}
+
 
 Tap = Callable[[Frame], None]
+
+
+def decoded(raw: bytes, outgoing: bool) -> Frame | None:
+    """A frame from its bytes; None if they are none."""
+    try:
+        message = mavlink.MAVLink(None).decode(bytearray(raw))
+    except mavlink.MAVError:
+        return None
+    return Frame(outgoing, raw, message)
 
 
 class Client:

@@ -47,6 +47,11 @@ class Student:
     def warmup(self) -> bool:
         return self.flow.warmup
 
+    @property
+    def welcome(self) -> bool:
+        """The learner that took us in is still the one that there is."""
+        return self.flow.incarnation == self._joined
+
     def join(self, index: int, episode: int, stop: Callable[[], bool]) -> int | None:
         """Wait until a learner takes us in; returns the episode to go on with, None if told to stop.
 

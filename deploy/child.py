@@ -40,17 +40,21 @@ class Place:
 
 def places(config: RunConfig) -> list[Place]:
     """THE table of a run's processes, in the order in which they start."""
-    table = [Place("recorder", "recorder")] if config.record else []
+    table = [Place("recorder", "recorder", nice=5 if config.flight is not None else 0)] if config.record else []
     if config.filtered:
         table += [Place(f"safety-{i}", "safety") for i in range(config.replicas)]
+    if config.autopilot is not None:
+        table.append(Place("autopilot", "autopilot"))
     one = len(config.robots) == 1
     for robot in config.robots:
-        table.append(Place("learner" if one else f"learner-{robot}", "learner", robot, nice=10))
+        if not config.policy:
+            table.append(Place("learner" if one else f"learner-{robot}", "learner", robot, nice=10))
         if config.from_logs:
             table.append(Place("feeder" if one else f"feeder-{robot}", "feeder", robot, nice=2))
         for i in range(config.actors):
             name = f"actor-{i}" if one else f"actor-{robot}-{i}"
-            table.append(Place(name, "actor", robot, i * config.robots_per_actor, nice=2))
+            nice = 0 if config.flight is not None else 2
+            table.append(Place(name, "actor", robot, i * config.robots_per_actor, nice))
     return table
 
 
@@ -62,7 +66,7 @@ def metadata(config: RunConfig) -> dict[str, dict[str, str]]:
     filtered = config.filtered
     run = {
         "method": config.method,
-        "policy": "learning",
+        "policy": config.policy or "learning",
         "arena": config.arena,
         "seed": str(config.seed),
         "robots": ",".join(config.robots),
@@ -103,10 +107,11 @@ def attachment(robot: str, version: str) -> str:
 
 
 def _recorder(place: Place, folder: Path, config: RunConfig, bus: BusSettings) -> bool:
+    from deploy.frames import as_json, both
     from logs import recorder
     from logs.foxglove import Pictures
 
-    derive = Pictures(config.pictures).of_sample if config.pictures > 0.0 else None
+    derive = both(Pictures(config.pictures).of_sample, as_json) if config.pictures > 0.0 else as_json
     about, files = metadata(config), attachments(config, folder)
     recorder.main(bus, folder / LOG, about, place.name, files, derive, config.rotation)
     return False
@@ -137,8 +142,10 @@ def _learner(place: Place, folder: Path, config: RunConfig, bus: BusSettings) ->
 
 
 def _actor(place: Place, folder: Path, config: RunConfig, bus: BusSettings) -> bool:
+    from actors import flight
     from actors.loop import ActorSettings, run
-    from deploy.vehicles import environment
+    from deploy.evaluate import policy_named
+    from deploy.vehicles import environment, flight_arena
 
     settings = ActorSettings(
         bus=bus,
@@ -154,8 +161,32 @@ def _actor(place: Place, folder: Path, config: RunConfig, bus: BusSettings) -> b
         lockstep=config.deterministic,
         practice=config.practice,
         change=config.change,
+        mavlink=config.mavlink,
+        steps=config.steps,
     )
-    return run(settings, partial(environment, conditions=config.conditions))
+    propose = partial(policy_named, config.policy, robot_named(place.robot)) if config.policy else None
+    if config.flight is not None:
+        return flight.run(settings, config.flight, flight_arena(config.arena, config.seed), propose)
+    return run(settings, partial(environment, conditions=config.conditions), propose)
+
+
+def _autopilot(place: Place, folder: Path, config: RunConfig, bus: BusSettings) -> bool:
+    from deploy.commands.autopilot import Autopilot
+
+    assert config.autopilot is not None and config.flight is not None
+    other_end = config.flight.url.replace("udpin:0.0.0.0", "udpout:127.0.0.1").replace("udpin", "udpout")
+    Autopilot(
+        url=other_end,
+        rules="ardupilot" if config.autopilot.rules == "ardupilot" else "px4",
+        arena=config.arena,
+        seed=config.seed,
+        airborne=True,
+        setpoint_timeout=config.autopilot.setpoint_timeout,
+        wind=config.conditions.wind.speed,
+        gust=config.conditions.wind.gust,
+        truth=f"127.0.0.1:{config.flight.truth}",
+    ).run()
+    return False
 
 
 def _feeder(place: Place, folder: Path, config: RunConfig, bus: BusSettings) -> bool:
@@ -170,6 +201,7 @@ KINDS: dict[str, Callable[[Place, Path, RunConfig, BusSettings], bool]] = {
     "safety": _safety,
     "learner": _learner,
     "actor": _actor,
+    "autopilot": _autopilot,
     "feeder": _feeder,
 }
 

@@ -48,6 +48,11 @@ COMMANDS: dict[str, Command] = {
         "one actor process alone, with one or several robots",
         "brakeline actor ground --connect tcp/10.0.0.1:7447 --name actor-7 --number 7",
     ),
+    "fly": Command(
+        "fly:Fly",
+        "a quadrotor in real time, over MAVLink: autopilot, safety service, actor, recorder",
+        "brakeline fly --minutes 10 --policy astar",
+    ),
     "autopilot": Command(
         "autopilot:Autopilot",
         "quadrotors behind MAVLink in real time, with PX4's or ArduPilot's rules",

@@ -10,6 +10,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+from actors.flight import FlightSettings
 from actors.loop import Change
 from deploy.vehicles import Conditions
 from learner.config import LearnerConfig, TD3Config
@@ -20,6 +21,14 @@ from safety.model_set import Recipe
 from sim.arenas import arena_kind
 
 METHODS = (*FILTERS, "none")
+
+
+@dataclass(frozen=True)
+class Embedded:
+    """The simulated autopilot of a flight in real time."""
+
+    rules: str = "px4"
+    setpoint_timeout: float = 0.3  # s without a setpoint until it brakes
 
 
 @dataclass(frozen=True)
@@ -45,6 +54,10 @@ class RunConfig:
     practice: float = 0.0  # share of steps at which a robot starts to follow its committed plan to the stop
     change: Change = field(default_factory=Change)  # of the robots, in mid-run
     conditions: Conditions = field(default_factory=Conditions)
+    policy: str = ""  # a file or a name, as `evaluate` takes it; empty: one is learned
+    flight: FlightSettings | None = None  # in real time, behind a link; None: simulated as fast as it goes
+    autopilot: Embedded | None = None  # that the run starts itself, at the other end of the link
+    mavlink: bool = False  # every frame of quadrotors in memory into the log; those of a flight always are
     learner: LearnerConfig = field(default_factory=lambda: LearnerConfig(checkpoint_every=2500))
 
     def __post_init__(self) -> None:
@@ -60,6 +73,8 @@ class RunConfig:
             raise ValueError("a deterministic run learns from its own actor, not from logs")
         if self.deterministic and (self.actors != 1 or self.robots_per_actor != 1 or len(self.robots) != 1):
             raise ValueError("a deterministic run has one actor with one robot: --actors 1")
+        if self.flight is not None and (self.actors != 1 or self.robots_per_actor != 1 or len(self.robots) != 1):
+            raise ValueError("a flight in real time has one robot")
 
     @property
     def filtered(self) -> bool:

@@ -229,7 +229,7 @@ class Launcher:
         setup = {
             "method": self.config.method,
             "certificate": self.config.recipe.certificate if self.config.method == "ddpc" else None,
-            "policy": "learning",
+            "policy": self.config.policy or "learning",
             "arena": self.config.arena,
             "seed": self.config.seed,
         }
@@ -246,9 +246,12 @@ class Launcher:
 
     @property
     def finished(self) -> bool:
-        """Have all learners done their work? Then nobody needs the others. Offline they may be a few steps short of it
-        when the logs end: what a learner that was interrupted had not saved."""
-        done = {kind: [c.finished for c in self.children if c.place.kind == kind] for kind in ("learner", "feeder")}
+        """Have all learners done their work (where nobody learns, the robots)? Then nobody needs the others. Offline
+        they may be a few steps short of it when the logs end: what a learner that was interrupted had not saved."""
+        kinds = ("learner", "feeder", "actor")
+        done = {kind: [c.finished for c in self.children if c.place.kind == kind] for kind in kinds}
+        if self.config.policy:
+            return all(done["actor"])
         return all(done["learner"]) or (self.config.actors == 0 and all(done["feeder"]))
 
     def _must_wait(self, child: Child) -> bool:
@@ -311,8 +314,9 @@ class Launcher:
     def _end(self) -> None:
         """Everything but the recorder first, so that their last words are in the log."""
         recorders = [child for child in self.children if child.place.kind == "recorder"]
-        others = [child for child in self.children if child not in recorders]
-        for group in filter(None, (others, recorders)):
+        flying = [child for child in self.children if child.place.kind == "actor" and self.config.flight is not None]
+        others = [child for child in self.children if child not in (*recorders, *flying)]
+        for group in filter(None, (flying, others, recorders)):
             for child in group:
                 child.terminate()
             deadline = time.monotonic() + END_PATIENCE

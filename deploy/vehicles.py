@@ -10,7 +10,7 @@ import numpy as np
 from actors.flying import MavlinkVehicle
 from actors.mavlink import Tap
 from messaging.robots import GROUND, QUADROTOR, Robot, robot_named
-from sim.arenas import arena_kind
+from sim.arenas import arena_kind, draw_arena
 from sim.autopilot.endpoint import Autopilot
 from sim.autopilot.rules import SETPOINT_TIMEOUT
 from sim.envs import NavigationEnv
@@ -43,16 +43,20 @@ class Conditions:
         values |= {f"wind_{name}": value for name, value in asdict(self.wind).items()}
         return {name: "drawn" if value is None else f"{value:g}" for name, value in values.items()}
 
-    def factory(self, robot: Robot) -> MakeVehicle:
-        """What makes a vehicle of that kind under these conditions. Raises ValueError when there is none."""
+    def factory(self, robot: Robot, tap: Tap | None = None) -> MakeVehicle:
+        """What makes a vehicle of that kind under these conditions; tap: see `environment`.
+
+        Raises:
+            ValueError: there is none.
+        """
         if robot.late:
-            return late(self.factory(robot_named(robot.kind)), robot)
+            return late(self.factory(robot_named(robot.kind), tap), robot)
         if robot is GROUND:
             return partial(
                 GroundRobot, noise=self.noise, payload_kg=self.payload_kg, floor_friction=self.floor_friction
             )
         if robot is QUADROTOR:
-            return partial(embedded_quadrotor, noise=self.flight_noise, wind=self.wind)
+            return partial(embedded_quadrotor, noise=self.flight_noise, wind=self.wind, tap=tap)
         raise ValueError(f"no simulator for {robot.name}")
 
     def lidar_noise(self, robot: Robot) -> float:
@@ -67,6 +71,7 @@ def embedded_quadrotor(
     noise: QuadrotorNoise | None = None,
     wind: Wind | None = None,
     rules: str = "px4",
+    *,
     tap: Tap | None = None,
 ) -> MavlinkVehicle:
     """A quadrotor behind its own autopilot, over MAVLink in memory.
@@ -77,14 +82,22 @@ def embedded_quadrotor(
     return MavlinkVehicle(Autopilot(Quadrotor(arena, rng, noise, wind), rules, parameters=parameters, quiet=True), tap)
 
 
-def environment(robot: Robot, arena: str, seed: int, conditions: Conditions | None = None) -> NavigationEnv:
-    """A Gymnasium environment; `seed` sets its episodes apart from those of another seed.
+def flight_arena(name: str, seed: int) -> Arena:
+    """The one arena of a flight in real time: the autopilot's world, and the actor's map."""
+    return draw_arena(name, np.random.default_rng(seed), QUADROTOR)
+
+
+def environment(
+    robot: Robot, arena: str, seed: int, conditions: Conditions | None = None, *, tap: Tap | None = None
+) -> NavigationEnv:
+    """A Gymnasium environment; `seed` sets its episodes apart from those of another seed; tap: is called with every
+    MAVLink frame of a robot that has any.
 
     Raises:
         ValueError: no simulator for this robot; UnknownArena: no such arena for it.
     """
     c = conditions or Conditions()
-    make = c.factory(robot)
+    make = c.factory(robot, tap)
     arena_kind(robot, arena)
     return NavigationEnv(robot, arena, make, c.lidar_noise(robot), seed_key=seed)
 

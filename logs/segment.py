@@ -20,6 +20,7 @@ from google.protobuf.message import Message
 from mcap.well_known import MessageEncoding, SchemaEncoding
 from mcap_protobuf.schema import build_file_descriptor_set
 
+NO_SCHEMA = 0
 CHUNK = 256 * 1024  # bytes before compression; a flush ends one early
 
 Metadata = Mapping[str, Mapping[str, str]]
@@ -39,7 +40,7 @@ class Entry:
     """What is stored of one message: its bytes as they came from the wire, and when."""
 
     key: str
-    type: type[Message]
+    type: type[Message] | str  # a name: of the encoding of a message that describes itself
     payload: bytes
     log_time: int  # ns
     publish_time: int  # ns
@@ -188,8 +189,11 @@ class Segment:
         if self.empty:
             self.path.unlink(missing_ok=True)
 
-    def _channel(self, key: str, kind: type[Message]) -> int:
-        if key not in self._channels:
+    def _channel(self, key: str, kind: type[Message] | str) -> int:
+        if key not in self._channels and isinstance(kind, str):
+            self._channels[key] = self._writer.register_channel(key, kind, NO_SCHEMA)
+        elif key not in self._channels:
+            assert not isinstance(kind, str)
             name = kind.DESCRIPTOR.full_name
             if name not in self._schemas:
                 data = build_file_descriptor_set(kind).SerializeToString()

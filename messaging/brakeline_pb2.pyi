@@ -909,6 +909,69 @@ class LearnerMetrics(_message.Message):
 Global___LearnerMetrics: _TypeAlias = LearnerMetrics  # noqa: Y015
 
 @_typing.final
+class MavlinkFrame(_message.Message):
+    """--- flight -------------------------------------------------------------------------------------------------------
+
+    One MAVLink frame, as it was sent or received.
+    """
+
+    DESCRIPTOR: _descriptor.Descriptor
+
+    WALL_TIME_FIELD_NUMBER: _builtins.int
+    OUTGOING_FIELD_NUMBER: _builtins.int
+    RAW_FIELD_NUMBER: _builtins.int
+    wall_time: _builtins.int
+    """ns since the Unix epoch"""
+    outgoing: _builtins.bool
+    raw: _builtins.bytes
+    def __init__(
+        self,
+        *,
+        wall_time: _builtins.int = ...,
+        outgoing: _builtins.bool = ...,
+        raw: _builtins.bytes = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["outgoing", b"outgoing", "raw", b"raw", "wall_time", b"wall_time"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    def WhichOneof(self, oneof_group: _Never) -> None: ...
+
+Global___MavlinkFrame: _TypeAlias = MavlinkFrame  # noqa: Y015
+
+@_typing.final
+class MavlinkFrames(_message.Message):
+    """Those of a period."""
+
+    DESCRIPTOR: _descriptor.Descriptor
+
+    HEADER_FIELD_NUMBER: _builtins.int
+    ROBOT_FIELD_NUMBER: _builtins.int
+    ACTOR_FIELD_NUMBER: _builtins.int
+    FRAMES_FIELD_NUMBER: _builtins.int
+    robot: _builtins.str
+    actor: _builtins.str
+    @_builtins.property
+    def header(self) -> Global___Header: ...
+    @_builtins.property
+    def frames(self) -> _containers.RepeatedCompositeFieldContainer[Global___MavlinkFrame]: ...
+    def __init__(
+        self,
+        *,
+        header: Global___Header | None = ...,
+        robot: _builtins.str = ...,
+        actor: _builtins.str = ...,
+        frames: _abc.Iterable[Global___MavlinkFrame] | None = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _typing.Literal["header", b"header"]  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["actor", b"actor", "frames", b"frames", "header", b"header", "robot", b"robot"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    def WhichOneof(self, oneof_group: _Never) -> None: ...
+
+Global___MavlinkFrames: _TypeAlias = MavlinkFrames  # noqa: Y015
+
+@_typing.final
 class Health(_message.Message):
     """--- health -------------------------------------------------------------------------------------------------------"""
 

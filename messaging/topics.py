@@ -54,6 +54,7 @@ STEP = Topic("step", "step/{robot}/{source}", pb.Step, Delivery.BLOCK, None, "ac
 LOGGED = Topic("logged", "logged/{robot}/{source}", pb.Step, Delivery.BLOCK, None, "feeder", ("learner",), False)
 EPISODE = Topic("episode", "episode/{robot}/{source}", pb.Episode, Delivery.BLOCK, None, "actor", ("launcher",), True)
 EXCHANGE = Topic("exchange", "exchange/{robot}/{source}", pb.Exchange, Delivery.BLOCK, None, "actor", (), True)
+FRAMES = Topic("frames", "frames/{robot}/{source}", pb.MavlinkFrames, Delivery.BLOCK, None, "actor", (), True)
 WEIGHTS = Topic("weights", "weights/{robot}", pb.Weights, Delivery.DROP, None, "learner", ("actor",), False)
 FLOW = Topic("flow", "flow/{robot}", pb.Flow, Delivery.BLOCK, 1.0, "learner", ("actor",), False)
 LEARNER = Topic(
@@ -62,5 +63,8 @@ LEARNER = Topic(
 HEALTH = Topic("health", "health/{source}", pb.Health, Delivery.BLOCK, 1.0, "all", ("launcher", "status"), True)
 LOG = Topic("log", "log/{source}", pb.LogLine, Delivery.BLOCK, None, "all", ("launcher",), True)
 
-TOPICS: tuple[Topic, ...] = (DECIDE, JOIN, MODEL, STEP, LOGGED, EPISODE, EXCHANGE, WEIGHTS, FLOW, LEARNER, HEALTH, LOG)
+TOPICS: tuple[Topic, ...] = (
+    *(DECIDE, JOIN, MODEL, STEP, LOGGED, EPISODE, EXCHANGE, FRAMES),
+    *(WEIGHTS, FLOW, LEARNER, HEALTH, LOG),
+)
 RECORDED: tuple[Topic, ...] = tuple(topic for topic in TOPICS if topic.recorded)

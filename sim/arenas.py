@@ -161,6 +161,31 @@ def draw_arena(name: str, rng: np.random.Generator, robot: Robot) -> Arena:
     raise NoArena(f"no arena {name!r} with a way from start to goal in {ATTEMPTS} draws")
 
 
+def tour(arena: Arena, goals: int, rng: np.random.Generator, robot: Robot) -> tuple[Arena, ...]:
+    """The same arena with one goal after another, for a robot that is not put back: each start is the goal before.
+
+    Raises:
+        UnknownArena: the robot has no arena of that name.
+        NoArena: no goals were found that a way leads to.
+    """
+    kind, stages, start = arena_kind(robot, arena.name), list[Arena](), arena.start[: arena.dim]
+    low, high = np.array(kind.bounds).T
+    for _ in range(ATTEMPTS):
+        if len(stages) == goals:
+            return tuple(stages)
+        points = rng.uniform(low, high, (ENDS, arena.dim))
+        free = arena.shapes.distance(points).min(axis=0) >= robot.footprint + kind.start_clearance
+        far = np.linalg.norm(points - start, axis=1) >= kind.goal_distance
+        for goal in (tuple(point) for point in points[free & far].tolist()):
+            if arena.clearance_map.connected(start, goal, robot.footprint + kind.path_clearance):
+                stage = replace(arena, start=start, goal=goal)
+                vars(stage).update(shapes=arena.shapes, clearance_map=arena.clearance_map)  # they cost a period
+                stages.append(stage)
+                start = goal
+                break
+    raise NoArena(f"no {goals} goals that a way leads to in {arena.name!r}")
+
+
 def _place(kind: ArenaKind, rng: np.random.Generator, robot: Robot) -> tuple[Obstacle, ...] | None:
     """Obstacles at least a gap apart in plan, what closes the room last; None: fewer than the least found room."""
     walls = closing(kind.half_width, None)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,10 +18,12 @@ from sim.estimator import wrap
 from sim.ground import GroundRobot
 from sim.senses import LIDAR_NOISE, SENSES
 from sim.vehicle import MakeVehicle, Period, Vehicle
+from sim.world import Arena
 
 Array = NDArray[np.float64]
 Observation = NDArray[np.float32]
 Info = dict[str, Any]
+DrawArena = Callable[[str, np.random.Generator, Robot], Arena]
 
 OBSERVED_LIMIT = 1.5  # every coordinate of the observation is clipped to ± this
 
@@ -78,16 +81,18 @@ class NavigationEnv(gymnasium.Env[Observation, Any]):
         lidar_noise: float = LIDAR_NOISE,
         seed_key: int = 0,
         reward: Reward | None = None,
+        draw: DrawArena = draw_arena,
     ) -> None:
         """make_vehicle: puts a vehicle of that robot kind at an arena's start, for one episode; lidar_noise: m, sigma
-        of a range; seed_key: sets apart the episodes of two environments whose episode seeds are the same, 0 or more.
+        of a range; seed_key: sets apart the episodes of two environments whose episode seeds are the same, 0 or more;
+        draw: makes an episode's arena.
         """
         self.robot, self.arena_name, self.seed_key = robot, arena, seed_key
         self.reward = reward or REWARDS[robot.kind]
         self.action_space = Box(robot.low().astype(np.float32), robot.high().astype(np.float32), dtype=np.float32)
         limit = np.full(robot.observation_dim, OBSERVED_LIMIT, dtype=np.float32)
         self.observation_space = Box(-limit, limit, dtype=np.float32)
-        self._make_vehicle, self._lidar_noise = make_vehicle, lidar_noise
+        self._make_vehicle, self._lidar_noise, self._draw = make_vehicle, lidar_noise, draw
         self._bound = np.asarray(robot.measurement_bound)
         self._changes: dict[str, float] = {}
         self._vehicle: Vehicle | None = None
@@ -112,7 +117,7 @@ class NavigationEnv(gymnasium.Env[Observation, Any]):
         drawn = int(self.np_random.integers(2**31)) if "episode_seed" not in options else options["episode_seed"]
         self._episode_seed = int(drawn)
         rng = np.random.default_rng((self.seed_key, self._episode_seed))
-        self._arena = draw_arena(self.arena_name, rng, self.robot)
+        self._arena = self._draw(self.arena_name, rng, self.robot)
         self._vehicle = self._make_vehicle(self._arena, rng)
         if self._changes:
             self._vehicle.alter(**self._changes)

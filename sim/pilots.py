@@ -97,6 +97,7 @@ class MapPilot:
     def __init__(self, robot: Robot, rng: np.random.Generator) -> None:
         self._robot = robot
         self._stops = StopModel(robot)
+        self._prepared: dict[int, tuple[Arena, Routes]] = {}
         self._changes = np.array(list(product(self.SHARES, repeat=robot.action_dim))) * robot.action_slew
         self._arena: Arena | None = None
 
@@ -104,7 +105,7 @@ class MapPilot:
         if info["arena"] is not self._arena:
             self._arena = info["arena"]
             self._grid = info["arena"].clearance_map
-            self._routes = Routes(self._grid, info["goal"], self._robot.footprint, self.COMFORT)
+            _, self._routes = self._prepared.get(id(self._arena)) or (self._arena, self._plan(info["arena"]))
         state = info["state"]
         low, high = self._robot.low(), self._robot.high()
         setpoints = np.clip(info["input_in_force"] + self._changes, low, high)
@@ -119,6 +120,13 @@ class MapPilot:
         free = lack == 0.0
         best = np.argmin(np.where(free, value, np.inf) if free.any() else lack)
         return np.asarray(setpoints[best])
+
+    def prepare(self, arena: Arena) -> None:
+        """Find the ways in an arena now: it takes longer than a period, and in flight there is no time for it."""
+        self._prepared[id(arena)] = (arena, self._plan(arena))
+
+    def _plan(self, arena: Arena) -> Routes:
+        return Routes(arena.clearance_map, arena.goal, self._robot.footprint, self.COMFORT)
 
     def _lack(self, places: Array, position: Array) -> Array:
         """What each stop (C, K, 3) from a position (3,) misses to the clearance asked for, summed over it, m: (C,)."""

@@ -10,11 +10,11 @@ from typing import Literal
 import numpy as np
 
 from deploy.commands.common import errors, say_json
+from deploy.vehicles import flight_arena
 from messaging.clock import WallClock
 from messaging.links import open_link
 from messaging.rays import rays_of
 from messaging.robots import QUADROTOR
-from sim.arenas import draw_arena
 from sim.autopilot.endpoint import Autopilot as Endpoint
 from sim.autopilot.rules import SETPOINT_TIMEOUT
 from sim.autopilot.server import Truth, serve
@@ -55,8 +55,7 @@ class Autopilot:
     json: bool = False
 
     def run(self) -> int:
-        rng = np.random.default_rng(self.seed)
-        arena = draw_arena(self.arena, rng, QUADROTOR) if self.arena else open_field()
+        arena = flight_arena(self.arena, self.seed) if self.arena else open_field()
         link = open_link(self.url)
         truth = None
         if self.truth:

@@ -10,12 +10,14 @@ from typing import Annotated, Any, Literal, TypeVar
 import tyro
 from rich.console import Console
 
+from actors.flight import FlightSettings
 from deploy.vehicles import Conditions
 from messaging.bus import BusSettings
 from safety.model_set import Recipe
 from sim.estimator import NoiseLevels
 from sim.flight_estimator import QuadrotorNoise
 from sim.wind import Wind
+from sim.world import Arena
 
 Certificate = Literal["residual", "set-membership", "matrix-zonotope"]
 Mode = Literal["direct", "recursion"]
@@ -64,6 +66,27 @@ class Physics:
             QuadrotorNoise(scale=self.noise),
             Wind(self.wind, gust=self.gust),
         )
+
+
+@dataclass(frozen=True)
+class Flight:
+    """The autopilot behind a link, and where it is."""
+
+    system: int = 1
+    """MAVLink system id of the vehicle."""
+    truth: int = 0
+    """UDP port at which a simulator tells of collisions (`brakeline autopilot --truth`); 0: none does."""
+    height: float = 3.0
+    """m above the ground that it climbs to first, unless it flies already. Nothing is filtered on this way."""
+    origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """m: where in the arena the autopilot's local frame begins."""
+    at_start: bool = False
+    """Its local frame begins on the floor below the arena's start: a simulator on its home position."""
+
+    def settings(self, url: str, arena: Arena) -> FlightSettings:
+        """For the flight in an arena."""
+        x, y, *_ = arena.start
+        return FlightSettings(url, self.system, self.truth, self.height, (x, y, 0.0) if self.at_start else self.origin)
 
 
 @dataclass(frozen=True)

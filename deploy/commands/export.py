@@ -22,12 +22,14 @@ class Export:
     """The episodes as a local Minari data set of this name, e.g. brakeline/ground-v0."""
     foxglove: Path | None = None
     """An MCAP file with a picture of every step; the log itself has pictures of some."""
+    tlog: Path | None = None
+    """Every MAVLink frame, as ground stations and pymavlink read it."""
     robot: str = "ground"
     """Whose steps --csv and --minari take."""
     json: bool = False
 
     def run(self) -> int:
-        wanted = {"csv": self._csv, "minari": self._minari, "foxglove": self._foxglove}  # .tlog: a row here
+        wanted = {"csv": self._csv, "minari": self._minari, "foxglove": self._foxglove, "tlog": self._tlog}
         asked = [name for name in wanted if getattr(self, name) is not None]
         if not asked:
             raise ValueError(f"export to what? Give {', '.join(f'--{name}' for name in wanted)}, or several of them")
@@ -57,6 +59,13 @@ class Export:
         assert self.minari is not None
         written = to_minari(list(self.logs), robot_named(self.robot), self.minari)
         return {"path": str(written.path), "episodes": written.episodes, "steps": written.steps}
+
+    def _tlog(self) -> dict[str, Any]:
+        from logs.tlog import to_tlog
+
+        assert self.tlog is not None
+        with self.tlog.open("wb") as file:
+            return {"path": str(self.tlog), "frames": to_tlog(list(self.logs), file)}
 
     def _foxglove(self) -> dict[str, Any]:
         from logs.export import to_foxglove

@@ -11,10 +11,11 @@ from typing import Annotated
 
 import tyro
 
-from deploy.commands.common import Endpoints, Filtering, Flags, Physics, Robot
+from deploy.commands.common import Endpoints, Filtering, Flags, Flight, Physics, Robot
+from deploy.evaluate import policy_named
 from deploy.experiments import RunConfig
 from deploy.store import data_root, method_for, method_path
-from deploy.vehicles import environment
+from deploy.vehicles import environment, flight_arena
 from learner.config import LearnerConfig
 from logs.recorder import Rotation
 from messaging.robots import robot_named
@@ -76,13 +77,27 @@ class Actor:
     arena: str = "default"
     penalty: float = RunConfig.penalty
     deadline: float = RunConfig.deadline
+    """s, for an answer of the safety service; then the robot brakes along its plan."""
+    policy: str = ""
+    """A file, or trained | untrained | random | greedy | adversary | astar; without one: a learner's weights."""
+    steps: int = 0
+    """With a policy: until it ends; 0: on ^C."""
+    mavlink: bool = False
+    """Have every MAVLink frame of quadrotors in memory logged too; with --url they always are."""
+    url: str = ""
+    """Fly a quadrotor in real time behind udpin:HOST:PORT, udpout:HOST:PORT or tcp:HOST:PORT, on the arena's map as it
+    is drawn with the seed. The safety service must know quadrotor-late."""
+    flight: Flags[Flight] = field(default_factory=Flight)
 
     def run(self) -> int:
+        from actors import flight
         from actors.loop import ActorSettings, run
 
+        robot = robot_named(self.robot)
+        robot = robot.in_real_time() if self.url and not robot.late else robot
         settings = ActorSettings(
             bus=self.endpoints.bus(),
-            robot=robot_named(self.robot).name,
+            robot=robot.name,
             name=self.name,
             number=self.number,
             robots=self.robots,
@@ -91,8 +106,15 @@ class Actor:
             method=self.filtering.method,
             penalty=self.penalty,
             deadline=self.deadline,
+            mavlink=self.mavlink,
+            steps=self.steps,
         )
-        run(settings, partial(environment, conditions=self.physics.conditions()))
+        propose = partial(policy_named, self.policy, robot) if self.policy else None
+        if self.url:
+            arena = flight_arena(self.arena, self.seed)
+            flight.run(settings, self.flight.settings(self.url, arena), arena, propose)
+        else:
+            run(settings, partial(environment, conditions=self.physics.conditions()), propose)
         return 0
 
 
@@ -107,10 +129,11 @@ class Recorder:
     rotation: Rotation = field(default_factory=Rotation)
 
     def run(self) -> int:
+        from deploy.frames import as_json, both
         from logs import recorder
         from logs.foxglove import Pictures
 
         about = {"versions": {"brakeline": version("brakeline")}}
-        derive = Pictures(self.pictures).of_sample if self.pictures > 0.0 else None
+        derive = both(Pictures(self.pictures).of_sample, as_json) if self.pictures > 0.0 else as_json
         recorder.main(self.endpoints.bus(), self.log, about, self.name, derive=derive, rotation=self.rotation)
         return 0

@@ -83,6 +83,8 @@ class Train:
     rotation: Rotation = field(default_factory=Rotation)
     pictures: float = RunConfig.pictures
     """A second and robot, drawn for Foxglove in the log besides all interventions; 0: none at all."""
+    mavlink: bool = False
+    """Log every MAVLink frame of quadrotors too, as bytes and as JSON: about as much again as all the rest."""
     listen: str | None = None
     """The router's endpoint; default: a free port of this machine."""
     learner: LearnerConfig = field(default_factory=lambda: RunConfig().learner)
@@ -132,6 +134,7 @@ class Train:
             pictures=self.pictures,
             record=self.record,
             rotation=self.rotation,
+            mavlink=self.mavlink,
             conditions=self.physics.conditions(),
             learner=self.learner,
         )

@@ -66,6 +66,7 @@ class Live:
 
     def _publish(self, one: Entry) -> None:
         if one.key not in self._channels:
+            assert not isinstance(one.type, str), "what we publish has a schema"
             schema = self._schema(one.type)
             self._channels[one.key] = foxglove.Channel(
                 one.key, message_encoding="protobuf", schema=schema, context=self._context

@@ -1,0 +1,287 @@
+"""PROCESS: flies one quadrotor in real time behind a MAVLink link; the loop is that of every actor.
+
+Period k: its input goes out; then it is observed, proposed and asked, and what the answer says is for period k + 1. An
+answer that comes too late is discarded for the committed plan's next input, which the vehicle's thread sends by itself.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from queue import SimpleQueue
+from threading import Thread
+from typing import Any
+
+import numpy as np
+from google.protobuf.message import Message
+
+from actors.guard import Ask, Outcome, consult
+from actors.live import LiveVehicle, Truth, Turn
+from actors.loop import ActorSettings, Make, Rider, Tally, cycle
+from actors.mavlink import Tap
+from actors.proposers import MakePolicy
+from actors.tape import Puts
+from messaging.bus import BusError
+from messaging.links import open_link
+from messaging.process import Process
+from messaging.robots import Robot, robot_named
+from safety.client import ask, request_message
+from safety.commitment import Array, Commitment
+from sim.arenas import tour
+from sim.envs import NavigationEnv
+from sim.vehicle import Period
+from sim.world import Arena
+
+log = logging.getLogger("brakeline.flight")
+
+GOALS = 12  # after which they come again: what a policy works out about a goal it works out before the flight
+PATIENCE = 0.2  # s between questions to a service that does not answer yet
+
+
+class Unfiltered(ValueError):
+    """In real time nobody flies without the filter: its plan is what is flown when nothing else comes."""
+
+
+@dataclass(frozen=True)
+class FlightSettings:
+    """Which autopilot, and where it is."""
+
+    url: str
+    system: int = 1  # MAVLink system id
+    truth: int = 0  # UDP port at which a simulator tells collisions; 0: none does
+    height: float = 3.0  # m above the ground that it climbs to, unless it flies already
+    origin: tuple[float, float, float] = (0.0, 0.0, 0.0)  # m: where the autopilot's local frame begins
+
+
+class Outbox:
+    """Publishes in a thread of its own: a receiver that does not drain may block it, and not the flight."""
+
+    def __init__(self) -> None:
+        self._queue: SimpleQueue[tuple[Puts, Message] | None] = SimpleQueue()
+        self._thread = Thread(target=self._run, name="outbox", daemon=True)
+        self._thread.start()
+
+    def at(self, publisher: Puts) -> Posting:
+        """What publishes there."""
+        return Posting(publisher, self._queue)
+
+    def close(self, patience: float = 2.0) -> None:
+        """Wait until all is published, but not for ever."""
+        self._queue.put(None)
+        self._thread.join(patience)
+
+    def _run(self) -> None:
+        while (item := self._queue.get()) is not None:
+            publisher, message = item
+            try:
+                publisher.put(message)
+            except BusError as error:
+                log.error("not published: %s", error)
+
+
+@dataclass(frozen=True)
+class Posting:
+    """A publisher behind an outbox."""
+
+    publisher: Puts
+    queue: SimpleQueue[tuple[Puts, Message] | None]
+
+    def put(self, message: Message) -> None:
+        """Never waits."""
+        self.queue.put((self.publisher, message))
+
+
+class Flight:
+    """A live vehicle as the environment sees it: `step` ends with the period; what was committed is carried out.
+
+    What is true is not known here: the estimate stands for it, also where rays are cast.
+    """
+
+    def __init__(self, vehicle: LiveVehicle, skip: Callable[[], object]) -> None:
+        """skip: is called for each period that went by unseen."""
+        self.vehicle, self._skip = vehicle, skip
+        self.turn: Turn = vehicle.turn
+        self.skipped = 0
+
+    @property
+    def true(self) -> Array:
+        """(9,) as estimated."""
+        return self.turn.report.measured
+
+    measured = true
+
+    @property
+    def input(self) -> Array:
+        """(3,) m/s, in force."""
+        return self.turn.input
+
+    def catch_up(self) -> None:
+        """Go on from the next period on, whatever the number of the last one."""
+        self.turn = self.vehicle.wait(self.vehicle.turn.number + 1)
+
+    def step(self, input: Array) -> Period:
+        """The running period to its end. Raises MavlinkError."""
+        expected = self.turn.number + 1
+        self.turn = self.vehicle.wait(expected)
+        for _ in range(self.turn.number - expected):
+            self.skipped += 1
+            self._skip()
+        return self.standing()
+
+    def standing(self) -> Period:
+        """The report about the period that ended last."""
+        return replace(self.turn.report, true=self.turn.report.measured)
+
+    def alter(self, **changes: float) -> None:
+        """Raises ValueError: nobody can, from here."""
+        raise ValueError(f"a vehicle behind a link cannot be altered: {', '.join(changes)}")
+
+
+class FlightRider(Rider):
+    """A rider whose world does not wait."""
+
+    waits = False
+
+    def __init__(
+        self,
+        process: Process,
+        settings: ActorSettings,
+        stages: Sequence[Arena],
+        propose: MakePolicy | None,
+        outbox: Outbox,
+    ) -> None:
+        super().__init__(process, settings, 0, self._environment(stages), propose, goes_on=True)
+        self._flight: Flight | None = None
+        self.answers: Counter[str] = Counter()  # in time | late | none | lost
+        self.steps, self.episodes, self.exchanges = map(outbox.at, (self.steps, self.episodes, self.exchanges))
+        self.tape.publisher = outbox.at(self.tape.publisher)
+
+    @property
+    def flight(self) -> Flight:
+        """Once it has begun."""
+        assert self._flight is not None, "begin the flight first"
+        return self._flight
+
+    def take(self, vehicle: LiveVehicle) -> None:
+        """From here on it flies this one, which hovers. What is slow the first time is done once before."""
+        self._flight = Flight(vehicle, self.driver.commitment.fallback)
+        observation, info = self.driver.env.reset(options={"episode_seed": 0})
+        self.proposer.begin(np.random.default_rng(0))
+        self.proposer.propose(observation, info)
+        self._stage = -1
+        self._flight.catch_up()
+
+    def settle(self, outcome: Outcome) -> Outcome:
+        """Hand the plan over, if it comes in time and what it was made from counts; else there is no answer."""
+        turn, answer = self.flight.turn, outcome.answer
+        if turn.lost:
+            what, outcome = "lost", replace(outcome, answer=None, failure=f"Lost: {turn.lost}")
+        elif answer is None:
+            what = "none"
+        elif self.flight.vehicle.commit(answer.plan[self.driver.robot.given :], turn.number + 1):
+            what = "in time"
+        else:
+            what, outcome = "late", replace(outcome, answer=None, failure="Late: its period had begun")
+        self.answers[what] += 1
+        return super().settle(outcome)
+
+    def stop(self) -> None:
+        """Along the committed plan to hovering."""
+        turn = self.flight.turn
+        self.flight.vehicle.wait(turn.number + self.driver.robot.horizon)
+
+    def figures(self) -> dict[str, float]:
+        """For Health."""
+        if self._flight is None:
+            return {}
+        asked = max(self.answers.total(), 1)
+        return {
+            **{f"answers {what}": self.answers[what] for what in ("in time", "late", "none", "lost")},
+            "answers in time share": self.answers["in time"] / asked,
+            "periods skipped": self._flight.skipped,
+            **self._flight.vehicle.timing.figures(),
+        }
+
+    def _environment(self, stages: Sequence[Arena]) -> Make:
+        def draw(name: str, rng: np.random.Generator, robot: Robot) -> Arena:
+            self._stage += 1
+            return stages[self._stage % len(stages)]
+
+        self._stage = -1
+
+        def make(robot: Robot, arena: str, seed: int, *, tap: Tap | None = None) -> NavigationEnv:
+            vehicle = lambda arena, rng: self.flight  # noqa: E731
+            return NavigationEnv(robot, arena, vehicle, lidar_noise=0.0, seed_key=seed, draw=draw)
+
+        return make
+
+
+def prepared(propose: MakePolicy, stages: Sequence[Arena], seed: int) -> Any:
+    """The policy, with what it must know of the map worked out."""
+    policy = propose(seed)
+    if hasattr(policy, "prepare"):
+        for stage in stages:
+            policy.prepare(stage)
+    return policy
+
+
+def answered(question: Ask, robot: Robot, start: Sequence[float], stop: Callable[[], bool]) -> bool:
+    """Wait until the safety service answers about a robot that hovers at the start; False: told to stop."""
+    state = np.zeros(robot.state_dim)
+    state[: robot.position_dim] = start
+    said = ""
+    while not stop():
+        request = request_message(Commitment(robot), state, np.zeros(robot.action_dim), [])
+        outcome = consult(question, [request], robot)[0]
+        if outcome.answer is not None:
+            return True
+        if outcome.failure != said:
+            log.info("on the ground, waiting for the safety service: %s", outcome.failure)
+            said = outcome.failure
+        time.sleep(PATIENCE)
+    return False
+
+
+def run(settings: ActorSettings, flight: FlightSettings, arena: Arena, propose: MakePolicy | None = None) -> bool:
+    """Fly from goal to goal on the arena's map until the learner's run is done or the policy's steps are taken (True),
+    or SIGINT or SIGTERM; then brake, and leave the vehicle to its autopilot.
+
+    Raises:
+        Unfiltered, RefusedByLearner, Unreachable, BadLink: with what to do.
+        MavlinkError: no autopilot, it refuses something, or nobody flies it any more.
+    """
+    robot = robot_named(settings.robot)
+    if settings.method == "none" or not robot.late:
+        raise Unfiltered("in real time a robot flies behind the filter, with plans that reckon with the delay")
+    stages = tour(arena, GOALS, np.random.default_rng(settings.seed), robot)
+    if propose is not None:
+        policy = prepared(propose, stages, settings.seed)
+        propose = lambda _: policy  # noqa: E731
+    tally, outbox, truth = Tally(), Outbox(), Truth(flight.truth, flight.system) if flight.truth else None
+    with Process(settings.bus, settings.name) as process:
+        stop, started = process.stop.is_set, time.monotonic()
+        rider = FlightRider(process, settings, stages, propose, outbox)
+        process.refresh = lambda: process.figures.update(tally.figures(time.monotonic() - started) | rider.figures())
+        process.announce()
+        question = partial(ask, process.bus, deadline=settings.deadline)
+        if not (rider.join(stop) and answered(question, robot, stages[0].start, stop)):
+            return False
+        vehicle = LiveVehicle(
+            open_link(flight.url), flight.system, flight.height, flight.origin, truth, rider.tape.take
+        )
+        try:
+            rider.take(vehicle)
+            while not stop() and cycle([rider], question, tally, stop):
+                pass
+            done = not stop()
+            rider.stop()
+        finally:
+            vehicle.close()
+            rider.tape.publish()
+            outbox.close()
+        log.info("%s: %d periods, %d without an answer in time", settings.name, tally.steps, tally.fallbacks)
+        return done

@@ -1,0 +1,350 @@
+"""A quadrotor in real time behind a link: a thread of its own keeps time, and carries out the plan it was given."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import logging
+import math
+import socket
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from actors.mavlink import ATTITUDE, IMU, POSITION, STATE, Array, Client, MavlinkError, Tap
+from messaging.links import Link
+from messaging.robots import QUADROTOR
+from sim.quadrotor import SAMPLES, slewed
+from sim.vehicle import Period
+
+log = logging.getLogger("brakeline.flight")
+
+SAMPLE_TIME = QUADROTOR.period / SAMPLES  # s
+POLL = 0.005  # s between two looks at a link
+RESEND = 0.05  # s after which a setpoint is sent again
+STALE = 0.15  # s without a position after which telemetry counts as lost
+LATE = 0.02  # s after its time at which a period's beginning counts as late
+REST = 0.1  # m/s: slower is hovering
+CLIMB = np.array([0.0, 0.0, 1.0])  # m/s
+KEPT = 10_000  # latest beginnings whose lateness is remembered
+
+
+@dataclass
+class Timing:
+    """How real time was kept."""
+
+    periods: int = 0
+    late: int = 0  # begun more than `LATE` after their time
+    slips: int = 0  # begun so late that the clock was set anew: the one before lasted two periods or more
+    worst_gap: float = 0.0  # s between two setpoints
+    lateness: deque[float] = field(default_factory=lambda: deque(maxlen=KEPT))  # s, of the beginnings of periods
+
+    def figures(self) -> dict[str, float]:
+        """For Health, in ms where it says so."""
+        lateness = 1e3 * np.array([*self.lateness] or [0.0])
+        return {
+            "periods": self.periods,
+            "periods late": self.late,
+            "periods slipped": self.slips,
+            "lateness p50 ms": float(np.percentile(lateness, 50)),
+            "lateness p99 ms": float(np.percentile(lateness, 99)),
+            "lateness worst ms": float(lateness.max()),
+            "worst setpoint gap ms": 1e3 * self.worst_gap,
+        }
+
+
+@dataclass(frozen=True)
+class Turn:
+    """The moment at which a period begins: its number, and how the one before ended.
+
+    lost: no telemetry came lately, or the autopilot does not follow our setpoints: why; empty: neither.
+    """
+
+    number: int
+    input: Array  # (3,) m/s, in force from now on
+    report: Period
+    lost: str = ""
+
+
+class Offset:
+    """Our clock less the autopilot's [s], by the message that came soonest lately: clocks drift, simulators slip."""
+
+    WINDOW = 2.0  # s
+
+    def __init__(self) -> None:
+        self._before = self._now = math.inf  # of the window before, and of this one
+        self._begun = -math.inf
+
+    @property
+    def value(self) -> float:
+        """inf before the first message."""
+        return min(self._before, self._now)
+
+    def note(self, now: float, theirs: float) -> None:
+        """A message of their time `theirs` has come."""
+        if now - self._begun > self.WINDOW:
+            self._before, self._now, self._begun = self._now, math.inf, now
+        self._now = min(self._now, now - theirs)
+
+
+class Truth:
+    """What a simulator tells about a vehicle beside MAVLink (sim.autopilot.server): its last word."""
+
+    def __init__(self, port: int, system: int) -> None:
+        """Listen on a UDP port of this machine. Raises OSError when it is taken."""
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._socket.bind(("0.0.0.0", port))
+        self._socket.setblocking(False)
+        self._system = system
+        self.state: Array | None = None
+        self.collisions = 0
+        self.clearance = math.inf
+
+    def poll(self) -> None:
+        """Take what has come."""
+        with contextlib.suppress(BlockingIOError):
+            while True:
+                told = json.loads(self._socket.recv(4096))
+                if told["system"] == self._system:
+                    self.state, self.collisions = np.array(told["state"]), told["collisions"]
+                    self.clearance = math.inf if told["clearance"] is None else told["clearance"]
+
+    def close(self) -> None:
+        self._socket.close()
+
+
+class LiveVehicle:
+    """A quadrotor in real time on a link: any autopilot that speaks MAVLink, simulated or not.
+
+    Periods follow each other by the clock, whoever decides. `commit` hands over a plan: one input for each period from
+    one on that has not begun. Its thread sends each at its time, again every `RESEND` seconds, and reads telemetry. So
+    a plan that nobody replaces is carried out to its end, and then zero: hover. If the process dies, the autopilot's
+    own timeout brakes.
+
+    Collisions and clearance are what the simulator's truth channel says, where there is one.
+    """
+
+    def __init__(
+        self,
+        link: Link,
+        system: int = 1,
+        height: float = 3.0,
+        origin: tuple[float, float, float] = (0.0, 0.0, 0.0),
+        truth: Truth | None = None,
+        tap: Tap | None = None,
+    ) -> None:
+        """Take control, climb to that height [m] above the ground unless it flies already, and begin the first period.
+
+        origin: where the autopilot's local frame begins, in ours, m.
+
+        Raises:
+            MavlinkError: nobody there, or it refuses.
+        """
+        self._link, self._client, self._truth = link, Client(link.send, system, tap), truth
+        self._origin = np.asarray(origin)
+        self.timing = Timing()
+        self._plan: list[Array] = []  # the inputs after the one in force
+        self._sent_at = self._beaten_at = self._heard_at = -math.inf
+        self._velocity: Array | None = None  # the setpoint to be repeated
+        self._offsets = Offset()
+        self._turned, self._ended, self._failure = threading.Condition(), threading.Event(), ""
+        self._take_off(height)
+        self._collisions = 0 if truth is None else truth.collisions
+        self._due = time.monotonic()  # s: when the next period begins
+        state = self._state(self._due)
+        standing = Period(state, state, False, math.inf, math.inf, np.zeros((SAMPLES, 3)), 0.0)
+        self.turn = Turn(0, np.zeros(QUADROTOR.action_dim), standing)
+        self._pump = threading.Thread(target=self._run, name="mavlink", daemon=True)
+        self._pump.start()
+
+    def commit(self, plan: Array, number: int) -> bool:
+        """Carry out inputs (K, 3) [m/s], clipped to bounds and slew, from the period of that number on, then zero.
+
+        False: that period has begun already, with what was committed before.
+
+        Raises:
+            BadInput: when one is not three finite numbers.
+        """
+        rows = [slewed(row, row) for row in np.asarray(plan, float)]
+        with self._turned:
+            in_time = self.turn.number < number
+            if in_time:
+                ahead = number - self.turn.number - 1
+                self._plan = self._plan[:ahead] + rows
+        return in_time
+
+    def wait(self, number: int) -> Turn:
+        """The latest turn, once the period of that number has begun.
+
+        Raises:
+            MavlinkError: its thread has died.
+        """
+        with self._turned:
+            patience = 2.0 + QUADROTOR.period * max(0, number - self.turn.number)
+            if not self._turned.wait_for(lambda: self.turn.number >= number or bool(self._failure), patience):
+                raise MavlinkError(f"period {number} does not begin")
+            if self._failure:
+                raise MavlinkError(f"nobody flies any more: {self._failure}")
+            return self.turn
+
+    def step(self, input: Array) -> Period:
+        """The running period to its end; then an input is in force that nothing follows: a brake. Raises BadInput."""
+        number = self.turn.number + 1
+        self.commit(np.asarray(input)[None], number)
+        return self.wait(number).report
+
+    def land(self) -> None:
+        """Give up control: land and disarm. Raises MavlinkError."""
+        self._stop()
+        self._velocity = None
+        self._client.land(self._wait)
+
+    def close(self) -> None:
+        """Send nothing any more: unless it has landed, the autopilot's timeout brakes it."""
+        self._stop()
+        self._link.close()
+        if self._truth is not None:
+            self._truth.close()
+
+    def _take_off(self, height: float) -> None:
+        client, wait = self._client, self._wait
+        kind = client.identify(wait)
+        for message, interval in ((POSITION, POLL * 4), (ATTITUDE, POLL * 4), (IMU, POLL * 4), (STATE, 0.2)):
+            client.stream(message, interval, wait)
+        if not wait(lambda: client.position is not None and client.airborne is not None, 10.0):
+            raise MavlinkError("it does not tell its position, or whether it flies")
+        self._velocity = np.zeros(3)
+        client.follow_setpoints(wait)
+        if not client.armed:
+            client.arm(wait)
+        if not client.airborne:
+            self._climb(kind, height)
+        self._velocity = np.zeros(3)
+        if not wait(lambda: float(np.linalg.norm(client.velocity)) < REST, 8.0):  # it may have flown when we came
+            raise MavlinkError("it does not come to rest")
+        if not wait(lambda: client.offboard and client.armed, 3.0):
+            raise MavlinkError("it says that it follows setpoints, and its heartbeat that it does not")
+
+    def _climb(self, kind: str, height: float) -> None:
+        client, wait = self._client, self._wait
+        assert client.position is not None
+        top = client.position[2] + height
+        if kind == "ardupilot":
+            self._velocity = None  # a setpoint would end the takeoff
+            client.take_off(height, wait)
+        else:
+            self._velocity = CLIMB
+        if not wait(lambda: client.position is not None and client.position[2] > top - 0.3, 10.0 + 3.0 * height):
+            raise MavlinkError("it does not climb")
+        self._sent_at = -math.inf
+
+    # --- in the thread, once it runs --------------------------------------------------------------------------
+
+    def _run(self) -> None:
+        try:
+            while not self._ended.wait(min(POLL, max(0.0, self._due - time.monotonic()))):
+                with self._turned:
+                    now = time.monotonic()
+                    if now >= self._due:
+                        self._begin(now)
+                    self._exchange(now)
+        except Exception as error:  # whatever it is: without setpoints the autopilot brakes
+            log.exception("no setpoint is sent any more")
+            with self._turned:
+                self._failure = f"{type(error).__name__}: {error}"
+                self._turned.notify_all()
+
+    def _begin(self, now: float) -> None:
+        """A period begins: send its input first, then see what the one before has come to."""
+        following = self._plan.pop(0) if self._plan else np.zeros(QUADROTOR.action_dim)
+        self._velocity = slewed(following, self.turn.input)
+        self._send_setpoint(now)
+        self._keep_time(now - self._due)
+        start, state = self.turn.report.measured[:3], self._state(now)
+        report = self._report(state, self._path(now, state) - start)
+        self.turn = Turn(self.turn.number + 1, self._velocity, report, self._lost(now))
+        self._client.path = self._client.path[-1:]
+        self._turned.notify_all()
+
+    def _keep_time(self, lateness: float) -> None:
+        timing = self.timing
+        timing.periods += 1
+        timing.late += lateness > LATE
+        timing.lateness.append(lateness)
+        slipped = lateness > QUADROTOR.period
+        timing.slips += slipped
+        self._due += QUADROTOR.period + (lateness if slipped else 0.0)
+
+    def _lost(self, now: float) -> str:
+        """Why what is measured, or asked of the autopilot, does not count."""
+        if now - self._heard_at > STALE:
+            return f"no telemetry for {now - self._heard_at:.2f} s"
+        if not (self._client.offboard and self._client.armed):
+            return "the autopilot does not follow our setpoints"
+        return ""
+
+    def _state(self, now: float) -> Array:
+        """The state (9,) at a moment of ours: the latest telemetry, carried on by its own velocity and acceleration."""
+        client = self._client
+        assert client.position is not None
+        ahead = min(max(now - self._offsets.value - client.time, 0.0), STALE)
+        v, a = client.velocity, client.acceleration
+        position = client.position + self._origin + ahead * v + 0.5 * ahead**2 * a
+        return np.concatenate((position, v + ahead * a, a))
+
+    def _path(self, now: float, state: Array) -> Array:
+        """Positions (S, 3) at even times of the period that ends now, in that state."""
+        heard = self._client.path
+        times = [t + self._offsets.value for t, _ in heard] + [now]
+        places = np.array([p + self._origin for _, p in heard] + [state[:3]])
+        at = now - QUADROTOR.period + SAMPLE_TIME * np.arange(1, SAMPLES + 1)
+        return np.stack([np.interp(at, times, places[:, axis]) for axis in range(3)], axis=1)
+
+    def _report(self, state: Array, path: Array) -> Period:
+        truth = self._truth
+        if truth is None or truth.state is None:
+            return Period(state, state, False, math.inf, math.inf, path, 0.0)
+        collision, self._collisions = truth.collisions > self._collisions, truth.collisions
+        return Period(state, truth.state, collision, truth.clearance, truth.clearance, path, 0.0)
+
+    def _exchange(self, now: float) -> None:
+        """Read what has come, and send what is due."""
+        client = self._client
+        before = len(client.path), client.time
+        client.feed(self._link.receive())
+        if (len(client.path), client.time) != before:
+            self._heard_at = now
+            self._offsets.note(now, client.time)
+        if self._truth is not None:
+            self._truth.poll()
+        if now - self._beaten_at >= 1.0:
+            self._beaten_at = now
+            client.heartbeat()
+        if self._velocity is not None and now - self._sent_at >= RESEND:
+            self._send_setpoint(now)
+
+    def _send_setpoint(self, now: float) -> None:
+        assert self._velocity is not None
+        if math.isfinite(self._sent_at):
+            self.timing.worst_gap = max(self.timing.worst_gap, now - self._sent_at)
+        self._sent_at = now
+        self._client.setpoint(self._velocity)
+
+    def _wait(self, condition: Callable[[], bool], seconds: float) -> bool:
+        """While no thread does: exchange until it holds."""
+        deadline = time.monotonic() + seconds
+        while not condition():
+            if time.monotonic() > deadline:
+                return False
+            self._exchange(time.monotonic())
+            time.sleep(POLL)
+        return True
+
+    def _stop(self) -> None:
+        self._ended.set()
+        if self._pump.is_alive():
+            self._pump.join(2.0)

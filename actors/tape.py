@@ -1,0 +1,39 @@
+"""MAVLink frames on their way into the log: collected as they come, published once a period."""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from typing import TYPE_CHECKING, Protocol
+
+from google.protobuf.message import Message
+
+from messaging import brakeline_pb2 as pb
+
+if TYPE_CHECKING:
+    from actors.mavlink import Frame
+
+
+class Puts(Protocol):
+    """A publisher, or what stands before one."""
+
+    def put(self, message: Message) -> None:
+        """Publish it."""
+
+
+class Tape:
+    """Takes frames, in whatever thread, and publishes those of a period as one message."""
+
+    def __init__(self, publisher: Puts, robot: str, actor: str) -> None:
+        self.publisher, self._robot, self._actor = publisher, robot, actor
+        self._frames: deque[pb.MavlinkFrame] = deque()
+
+    def take(self, frame: Frame) -> None:
+        """A frame that was sent or received now."""
+        self._frames.append(pb.MavlinkFrame(wall_time=time.time_ns(), outgoing=frame.outgoing, raw=frame.raw))
+
+    def publish(self) -> None:
+        """Those since the last call, if there are any."""
+        frames = [self._frames.popleft() for _ in range(len(self._frames))]
+        if frames:
+            self.publisher.put(pb.MavlinkFrames(robot=self._robot, actor=self._actor, frames=frames))

@@ -1,0 +1,119 @@
+"""`brakeline fly`: one quadrotor in real time, with all that it needs on this machine."""
+
+from __future__ import annotations
+
+import socket
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import tyro
+
+from actors.flight import FlightSettings
+from deploy.commands.common import Filtering, Flags, Flight, Physics, console, errors, say_json
+from deploy.commands.train import STOPPED, stamped
+from deploy.display import Display, summary
+from deploy.experiments import Embedded, RunConfig
+from deploy.launch import Launcher, prepare
+from deploy.vehicles import flight_arena
+from messaging.robots import QUADROTOR, robot_named
+
+LEARN = "learn"
+ACTOR = "actor-0"
+
+
+def free_port() -> int:
+    """A UDP port of this machine that is free now."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+@dataclass(frozen=True)
+class Fly:
+    robot: Annotated[str, tyro.conf.Positional] = QUADROTOR.name
+    minutes: float = 10.0
+    policy: str = "astar"
+    """A file, or trained | untrained | random | greedy | adversary | astar; learn: from what it flies."""
+    url: str = ""
+    """An autopilot that runs elsewhere: udpin:HOST:PORT, udpout:HOST:PORT or tcp:HOST:PORT. Without one: our own."""
+    flight: Flags[Flight] = field(default_factory=Flight)
+    rules: Literal["px4", "ardupilot"] = "px4"
+    """Of our own autopilot."""
+    setpoint_timeout: float = Embedded.setpoint_timeout
+    """s without a setpoint until our own autopilot brakes by itself."""
+    arena: str = "default"
+    seed: int = 0
+    filtering: Flags[Filtering] = field(default_factory=Filtering)
+    physics: Flags[Physics] = field(default_factory=Physics)
+    deadline: float = 0.12
+    """s, for an answer of the safety service; the answer counts from the next period on, of 0.2 s."""
+    pictures: float = RunConfig.pictures
+    """A second, drawn for Foxglove in the log besides all interventions; 0: none at all."""
+    out: Path | None = None
+    """The run's folder; default: runs/ and the time."""
+    listen: str | None = None
+    """The router's endpoint; default: a free port of this machine."""
+    json: bool = False
+    """Print the final figures as one JSON object on stdout; the display goes to stderr."""
+
+    def run(self) -> int:
+        config, folder, shown = self.config(), self.out or stamped(), errors if self.json else console
+        prepare(config, folder, resume=False)
+        with Display(shown, config.steps) as display:
+            figures = Launcher(config, folder, self.listen).run(display)
+        figures["flight"] = flown(figures)
+        if self.json:
+            say_json(figures)
+        else:
+            summary(console, figures)
+            for name, value in figures["flight"].items():
+                console.print(f"{name}: {value}", markup=False)
+        return 0 if figures["finished"] else STOPPED
+
+    def config(self) -> RunConfig:
+        """The run's configuration. Raises ValueError for a robot that does not fly."""
+        robot = robot_named(self.robot)
+        if robot.kind != QUADROTOR.name:
+            raise ValueError(f"a {robot.kind} robot does not fly")
+        robot = robot if robot.late else robot.in_real_time()
+        return RunConfig(
+            robots=(robot.name,),
+            method=self.filtering.method,
+            recipe=self.filtering.recipe(),
+            arena=self.arena,
+            actors=1,
+            steps=max(1, round(60.0 * self.minutes / robot.period)),
+            seed=self.seed,
+            deadline=self.deadline,
+            pictures=self.pictures,
+            conditions=self.physics.conditions(),
+            policy="" if self.policy == LEARN else self.policy,
+            flight=self._flight(),
+            autopilot=None if self.url else Embedded(self.rules, self.setpoint_timeout),
+        )
+
+    def _flight(self) -> FlightSettings:
+        if self.url:
+            return self.flight.settings(self.url, flight_arena(self.arena, self.seed))
+        return FlightSettings(f"udpin:127.0.0.1:{free_port()}", truth=free_port())
+
+
+def flown(figures: dict[str, Any]) -> dict[str, Any]:
+    """How real time was kept, and what it came to, of a finished run's figures."""
+    actor = figures["processes"].get(ACTOR, {}).get("figures", {})
+    names = ("periods", "answers in time", "answers in time share", "answers late", "answers none", "answers lost")
+    timing = {name: value for name, value in actor.items() if name.startswith(("periods ", "lateness", "worst"))}
+    return {
+        **{name: actor.get(name) for name in names},
+        **timing,
+        "collisions": figures["collisions"],
+        "goals": figures["goals"],
+        "decision_ms": _pair(figures["decision_ms"]),
+        "round_trip_ms": _pair(figures["round_trip_ms"]),
+        "left the predicted set": figures["containment"]["violations"],
+    }
+
+
+def _pair(times: dict[str, Any] | None) -> dict[str, float] | None:
+    return None if times is None else {name: times[name] for name in ("p50", "p99")}
