@@ -26,7 +26,7 @@ log = logging.getLogger("brakeline.flight")
 SAMPLE_TIME = QUADROTOR.period / SAMPLES  # s
 POLL = 0.005  # s between two looks at a link
 RESEND = 0.05  # s after which a setpoint is sent again
-STALE = 0.15  # s without a position after which telemetry counts as lost
+STALE = 0.2  # s without a position after which telemetry counts as lost
 LATE = 0.02  # s after its time at which a period's beginning counts as late
 REST = 0.1  # m/s: slower is hovering
 CLIMB = np.array([0.0, 0.0, 1.0])  # m/s
@@ -154,10 +154,10 @@ class LiveVehicle:
         self._turned, self._ended, self._failure = threading.Condition(), threading.Event(), ""
         self._take_off(height)
         self._collisions = 0 if truth is None else truth.collisions
-        self._due = time.monotonic()  # s: when the next period begins
-        state = self._state(self._due)
+        state = self._state(time.monotonic())
         standing = Period(state, state, False, math.inf, math.inf, np.zeros((SAMPLES, 3)), 0.0)
         self.turn = Turn(0, np.zeros(QUADROTOR.action_dim), standing)
+        self._due = time.monotonic() + QUADROTOR.period  # s: when the next period begins
         self._pump = threading.Thread(target=self._run, name="mavlink", daemon=True)
         self._pump.start()
 
@@ -173,8 +173,9 @@ class LiveVehicle:
         with self._turned:
             in_time = self.turn.number < number
             if in_time:
-                ahead = number - self.turn.number - 1
-                self._plan = self._plan[:ahead] + rows
+                before = number - self.turn.number - 1
+                kept = [*self._plan, *[np.zeros(QUADROTOR.action_dim)] * before][:before]
+                self._plan = kept + rows
         return in_time
 
     def wait(self, number: int) -> Turn:

@@ -7,9 +7,10 @@ from pathlib import Path
 import pytest
 
 from deploy import store
-from messaging.robots import GROUND
+from messaging.robots import GROUND, QUADROTOR
 from safety.model_set import Recipe
 
+FLIGHTS = 80  # trajectories of the quadrotor, recorded in half a minute
 TRAJECTORIES = 50  # enough for every check of the certificates, recorded in ten seconds
 
 
@@ -26,3 +27,12 @@ def data_folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
         del os.environ["BRAKELINE_DATA"]
     else:
         os.environ["BRAKELINE_DATA"] = before
+
+
+@pytest.fixture(scope="session")
+def flight_folder(data_folder: Path) -> Path:
+    """The same, with a data set of the quadrotor, and its models in lockstep and in real time."""
+    store.recorded(QUADROTOR, trajectories=FLIGHTS)
+    for robot in (QUADROTOR, QUADROTOR.in_real_time()):
+        store.model_for(robot, Recipe())
+    return data_folder

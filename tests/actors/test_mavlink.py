@@ -1,23 +1,16 @@
-"""The client at its own edge, and the vehicles over it: in lockstep and in real time, with both rule sets."""
+"""The client at its own edge, and the vehicle over it in lockstep, with both rule sets."""
 
 from __future__ import annotations
 
 import json
-import socket
-import threading
-import time
-from collections.abc import Iterator
 
 import numpy as np
 import pytest
 
-from actors.flying import LAPSE, LiveVehicle, MavlinkVehicle, Truth
+from actors.flying import MavlinkVehicle
 from actors.mavlink import Client, CommandRefused, Frame, NoAutopilot, mavlink
-from messaging.clock import WallClock
-from messaging.links import open_link
 from messaging.robots import QUADROTOR
 from messaging.shapes import CYLINDER, Obstacle
-from sim.autopilot import server
 from sim.autopilot.endpoint import Autopilot
 from sim.autopilot.pilot import Mode
 from sim.autopilot.rules import SETPOINT_TIMEOUT as TIMEOUT
@@ -144,54 +137,3 @@ def test_nobody_there_and_refusals_are_errors() -> None:
 
     with pytest.raises(CommandRefused, match=r"NAV_TAKEOFF: failed.*not in guided"):
         client.take_off(3.0, wait)
-
-
-@pytest.fixture(params=RULES)
-def live(request: pytest.FixtureRequest) -> Iterator[tuple[LiveVehicle, Autopilot]]:
-    """A vehicle in real time over UDP, the autopilot in a thread, on the floor at first."""
-    link, stop = open_link("udpin:127.0.0.1:0"), threading.Event()
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.bind(("127.0.0.1", 0))
-        truth_port = probe.getsockname()[1]
-    autopilot = Autopilot(quadrotor(floor=0.02), request.param, parameters={TIMEOUT[request.param]: 0.3})
-    arguments = ([autopilot], link, WallClock(), stop.is_set, server.Truth("127.0.0.1", truth_port))
-    thread = threading.Thread(target=server.serve, args=arguments)
-    thread.start()
-    vehicle = LiveVehicle(open_link(f"udpout:127.0.0.1:{link.port}"), height=2.0, truth=Truth(truth_port, 1))  # type: ignore[union-attr]
-    yield vehicle, autopilot
-    vehicle.close()
-    stop.set()
-    thread.join()
-    link.close()
-    arguments[-1].close()  # type: ignore[attr-defined]
-
-
-def test_in_real_time_it_takes_off_flies_brakes_and_lands(live: tuple[LiveVehicle, Autopilot]) -> None:
-    vehicle, autopilot = live
-    assert autopilot.pilot.armed and autopilot.pilot.mode is Mode.OFFBOARD
-    for _ in range(10):
-        period = vehicle.step(np.array([2.0, 1.0, 0.0]))
-    assert period.measured[3:6] == pytest.approx([2.0, 1.0, 0.0], abs=0.3)
-    assert period.measured[:3] == pytest.approx(period.true[:3], abs=0.3)  # the truth's word is of a moment before
-    assert period.subsamples[-1] == pytest.approx([0.4, 0.2, 0.0], abs=0.15)
-    assert vehicle.timing.worst_gap < 0.25 and not vehicle.lost and not period.collision
-
-    vehicle.begin(np.array([2.0, 1.0, 0.0]))
-    time.sleep(LAPSE + 1.2)  # whoever decides hangs
-    assert vehicle.timing.lapses == 1 and not vehicle.input.any()
-    assert np.linalg.norm(vehicle.finish().measured[3:6]) < 0.3
-
-    vehicle.land()
-    deadline = time.monotonic() + 15.0
-    while autopilot.pilot.armed and time.monotonic() < deadline:
-        time.sleep(0.1)
-    assert not autopilot.pilot.armed
-
-
-def test_the_autopilot_brakes_when_the_link_dies(live: tuple[LiveVehicle, Autopilot]) -> None:
-    vehicle, autopilot = live
-    for _ in range(8):
-        vehicle.step(np.array([2.0, 0.0, 0.0]))
-    vehicle.close()
-    time.sleep(2.5)
-    assert np.linalg.norm(autopilot.vehicle.state()[3:6]) < 0.1

@@ -38,13 +38,19 @@ def brakeline(*arguments: object, timeout: float = PATIENCE) -> subprocess.Compl
 
 
 class Run:
-    """`brakeline train` in progress, in a folder, with the `debug` experiment; killed, with all it started, at the
-    end of the block."""
+    """`brakeline train` in progress, in a folder, with the `debug` experiment (or another command that starts a run);
+    killed, with all it started, at the end of the block."""
 
-    def __init__(self, folder: Path, *arguments: object, fresh: bool = True) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        *arguments: object,
+        fresh: bool = True,
+        command: tuple[str, ...] = ("train", "ground", "--experiment", "debug"),
+    ) -> None:
         self.folder = folder
         place = ("--out", folder) if fresh else ("--resume", folder)
-        words = (*BRAKELINE, "train", *(["ground", "--experiment", "debug"] if fresh else ()), *place, *arguments)
+        words = (*BRAKELINE, *(command if fresh else ("train",)), *place, *arguments)
         folder.parent.mkdir(parents=True, exist_ok=True)
         self._output = folder.parent / f"{folder.name}{'' if fresh else '-resumed'}.out"
         self.errors = self._output.with_suffix(".err")

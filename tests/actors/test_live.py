@@ -1,0 +1,145 @@
+"""A vehicle in real time over UDP: the clock goes on, plans are carried out, and what is late does not count."""
+
+from __future__ import annotations
+
+import socket
+import threading
+import time
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+
+from actors.live import LiveVehicle, Offset, Truth
+from actors.mavlink import Frame
+from messaging.clock import WallClock
+from messaging.links import open_link
+from sim.autopilot import server
+from sim.autopilot.endpoint import Autopilot
+from sim.autopilot.pilot import Mode
+from sim.autopilot.rules import SETPOINT_TIMEOUT as TIMEOUT
+from sim.vehicle import BadInput
+from tests.actors.test_mavlink import RULES, quadrotor
+
+GAP = 0.25  # s between two setpoints, at most
+
+Live = tuple[LiveVehicle, Autopilot, list[Frame]]
+
+
+@pytest.fixture(params=RULES)
+def live(request: pytest.FixtureRequest) -> Iterator[Live]:
+    """A vehicle, its autopilot in a thread, on the floor at first, and the frames between them."""
+    link, stop, frames = open_link("udpin:127.0.0.1:0"), threading.Event(), list[Frame]()
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(("127.0.0.1", 0))
+        truth_port = probe.getsockname()[1]
+    autopilot = Autopilot(quadrotor(floor=0.02), request.param, parameters={TIMEOUT[request.param]: 0.3})
+    channel = server.Truth("127.0.0.1", truth_port)
+    thread = threading.Thread(target=server.serve, args=([autopilot], link, WallClock(), stop.is_set, channel))
+    thread.start()
+    try:
+        there = open_link(f"udpout:127.0.0.1:{link.port}")  # type: ignore[union-attr]
+        vehicle = LiveVehicle(there, height=2.0, truth=Truth(truth_port, 1), tap=frames.append)
+        try:
+            yield vehicle, autopilot, frames
+        finally:
+            vehicle.close()
+    finally:
+        stop.set()
+        thread.join()
+        link.close()
+        channel.close()
+
+
+def setpoints(frames: list[Frame]) -> list[tuple[float, float, float]]:
+    """What was sent [m/s], ENU, repetitions left out."""
+    sent = [f.message for f in frames if f.name.endswith("SET_POSITION_TARGET_LOCAL_NED")]
+    inputs = [(round(m.vy, 3), round(m.vx, 3), round(-m.vz, 3)) for m in sent]
+    return [u for u, before in zip(inputs, [None, *inputs[:-1]], strict=True) if u != before]
+
+
+def test_it_takes_off_flies_brakes_and_lands(live: Live) -> None:
+    vehicle, autopilot, _ = live
+    assert autopilot.pilot.armed and autopilot.pilot.mode is Mode.OFFBOARD
+    for _ in range(12):
+        period = vehicle.step(np.array([2.0, 1.0, 0.0]))
+    assert period.measured[3:6] == pytest.approx([2.0, 1.0, 0.0], abs=0.3)
+    assert period.measured[:3] == pytest.approx(period.true[:3], abs=0.3)  # the truth's word is of a moment before
+    assert period.subsamples[-1] == pytest.approx([0.4, 0.2, 0.0], abs=0.15)
+    assert vehicle.timing.worst_gap < GAP and not vehicle.turn.lost and not period.collision
+    assert vehicle.turn.number >= 12
+
+    hovering = vehicle.wait(vehicle.turn.number + 10)  # nothing follows: it brakes within its slew
+    assert not hovering.input.any()
+    assert np.linalg.norm(hovering.report.measured[3:6]) < 0.3
+
+    vehicle.land()
+    deadline = time.monotonic() + 15.0
+    while autopilot.pilot.armed and time.monotonic() < deadline:
+        time.sleep(0.1)
+    assert not autopilot.pilot.armed
+
+
+def test_a_plan_is_carried_out_input_by_input_and_then_it_hovers(live: Live) -> None:
+    vehicle, _, frames = live
+    frames.clear()
+    plan = np.array([[0.5, 0.0, 0.0], [1.0, 0.2, 0.0], [0.6, 0.1, 0.0], [0.0, 0.0, 0.0]])
+    number = vehicle.turn.number + 2
+    assert vehicle.commit(plan, number)
+    turns = [vehicle.wait(number + k) for k in range(6)]
+    assert [turn.number - number for turn in turns] == [0, 1, 2, 3, 4, 5], "nobody was late to look"
+    assert np.array([turn.input for turn in turns]) == pytest.approx(np.vstack([plan, np.zeros((2, 3))]))
+    assert setpoints(frames) == [(0.0, 0.0, 0.0), *(tuple(row) for row in plan)]
+
+
+def test_a_plan_that_comes_late_does_not_count_and_a_newer_one_does(live: Live) -> None:
+    vehicle, _, _ = live
+    first, second = np.full((3, 3), 0.3), np.full((3, 3), 0.6)
+    number = vehicle.turn.number + 2
+    assert vehicle.commit(first, number)
+    vehicle.wait(number)
+    assert not vehicle.commit(second, number), "the period has begun"
+    assert vehicle.turn.input == pytest.approx(first[0])
+    assert vehicle.commit(second, number + 1)
+    assert vehicle.wait(number + 1).input == pytest.approx(second[0])
+    with pytest.raises(BadInput):
+        vehicle.commit(np.full((2, 3), np.nan), number + 4)
+
+
+def test_without_telemetry_it_says_so_and_goes_on(live: Live) -> None:
+    vehicle, autopilot, _ = live
+    assert vehicle.commit(np.full((9, 3), 0.4), vehicle.turn.number + 2)
+    real, autopilot.take = autopilot.take, lambda: real() and b""  # type: ignore[method-assign, func-returns-value]
+    turn = vehicle.wait(vehicle.turn.number + 4)
+    assert "no telemetry" in turn.lost
+    assert turn.input == pytest.approx([0.4, 0.4, 0.4])
+    autopilot.take = real  # type: ignore[method-assign]
+    time.sleep(0.3)
+    assert not vehicle.wait(vehicle.turn.number + 2).lost
+
+
+def test_a_pilot_may_take_over(live: Live) -> None:
+    vehicle, autopilot, _ = live
+    autopilot.pilot.change(Mode.HOLD)
+    time.sleep(1.3)  # a heartbeat
+    assert "does not follow" in vehicle.wait(vehicle.turn.number + 1).lost
+    assert autopilot.pilot.mode is Mode.HOLD, "who took it keeps it"
+
+
+def test_the_autopilot_brakes_when_the_link_dies(live: Live) -> None:
+    vehicle, autopilot, _ = live
+    for _ in range(8):
+        vehicle.step(np.array([2.0, 0.0, 0.0]))
+    vehicle.close()
+    time.sleep(2.5)
+    assert np.linalg.norm(autopilot.vehicle.state()[3:6]) < 0.1
+
+
+def test_the_offset_of_two_clocks_follows_them() -> None:
+    offset = Offset()
+    for k in range(1000):
+        offset.note(0.02 * k + 0.001 * (k % 7), 0.02 * k)
+    assert offset.value == 0.0
+    for k in range(1000, 1300):
+        offset.note(0.02 * k, 0.02 * k - 0.5)  # their clock has slipped
+    assert offset.value == pytest.approx(0.5)
