@@ -126,6 +126,7 @@ class Rider:
             self.proposer = Fixed(propose, settings.seed + identity.number, settings.steps)
         self.next_episode = 0
         self.waiting = False  # for the safety service, standing
+        self.proposal = np.zeros(robot.action_dim)  # the last one
         self.braking = False  # for want of a decision
         self.practice, self.change = Practice(settings.practice), settings.change
         self.steps: Puts = publisher(STEP, robot=robot.name, source=actor)
@@ -151,10 +152,15 @@ class Rider:
         return True
 
     def propose(self) -> Array:
-        """The proposer's action, standing still if it is no number; now and then a practised stop's."""
+        """The proposer's action, standing still if it is no number; now and then a practised stop's.
+
+        Who stands and waits goes on proposing the same: how often it has to ask must not move the random generator.
+        """
         driver = self.driver
-        proposal = self.proposer.propose(driver.observation, driver.info)
-        return self.practice.instead(driver, finite(proposal, driver.robot, self.proposer.version))
+        if not self.waiting:
+            proposal = self.proposer.propose(driver.observation, driver.info)
+            self.proposal = self.practice.instead(driver, finite(proposal, driver.robot, self.proposer.version))
+        return self.proposal
 
     def settle(self, outcome: Outcome) -> Outcome:
         """The last word on an outcome, when it is to be put into action."""

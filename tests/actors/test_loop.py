@@ -30,12 +30,14 @@ class Service:
         models.install(model_for(GROUND, Recipe()))
         self._answer = answerer(models, Counts())
         self.batches: list[list[str]] = []
+        self.proposals: list[list[float]] = []  # of the first robot
         self.failing = self.fails_when_moving = False
         bus.serve(DECIDE, self._decide, robot="ground")
 
     def _decide(self, payload: bytes) -> bytes:
         requests = pb.RequestBatch.FromString(payload).requests
         self.batches.append([request.actor for request in requests])
+        self.proposals.append(list(requests[0].action))
         self.failing |= self.fails_when_moving and any(requests[0].input_in_force)
         if self.failing:
             raise RuntimeError("out of order")
@@ -102,8 +104,10 @@ def test_without_the_service_it_brakes_along_its_plan_waits_and_goes_on(scene):
     until(lambda: service.failing)
     quiet = -1
     while quiet != len(steps):  # it stands, and does not let the episode pass
-        quiet = len(steps)
+        quiet, asked = len(steps), len(service.proposals)
         time.sleep(1.0)
+    again = service.proposals[asked:]
+    assert len(again) > 3 and again == [again[0]] * len(again), "who waits draws no new proposals"
     lost = [step for step in steps if step.fallback]
     assert lost and lost[-1] is steps[-1] and not any(steps[-1].action)
     first = steps.index(lost[0])
