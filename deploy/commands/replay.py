@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -26,6 +27,18 @@ from safety.model_set import ModelSet, Recipe
 DIFFERENT = 1  # exit status: decisions differ though nothing was asked to be different
 
 
+@contextmanager
+def quiet(name: str) -> Iterator[None]:
+    """Nothing but errors from that logger."""
+    logger = logging.getLogger(name)
+    before = logger.level
+    logger.setLevel(logging.ERROR)
+    try:
+        yield
+    finally:
+        logger.setLevel(before)
+
+
 @dataclass(frozen=True)
 class Replay:
     logs: Annotated[tuple[Path, ...], tyro.conf.Positional] = (LATEST,)
@@ -42,12 +55,12 @@ class Replay:
 
     def run(self) -> int:
         instead = self._instead()
-        logging.getLogger("brakeline.safety").setLevel(logging.ERROR)  # its warnings were about the robots of then
         total = count(list(self.logs), EXCHANGE)
         columns = TextColumn("requests"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
         with Progress(*columns, console=errors, transient=True, disable=not errors.is_terminal) as progress:
             task = progress.add_task("requests", total=total)
-            result = replay(list(self.logs), instead, lambda: progress.advance(task))
+            with quiet("brakeline.safety"):  # its warnings were about the robots of then
+                result = replay(list(self.logs), instead, lambda: progress.advance(task))
         figures = result.figures() | {"log": [str(path) for path in self.logs], "instead": self._words()}
         if self.json:
             say_json(figures)

@@ -64,8 +64,8 @@ def test_another_solver_agrees(models, kind):
         feasible += 1
         assert ours.status == "solved"
         assert ours.residual <= 2 * ACCURACY
-        assert np.abs(builder.inputs(ours.x) - builder.inputs(theirs)).max() < 5e-3  # where it hardly matters
-        assert value(program, ours.x) == pytest.approx(value(program, theirs), abs=1e-3)
+        assert np.abs(builder.inputs(ours.x) - builder.inputs(theirs)).max() < 1e-2  # where it hardly matters
+        assert value(program, ours.x) == pytest.approx(value(program, theirs), abs=2e-3)
     assert feasible > 30
 
 
@@ -106,7 +106,6 @@ def test_rows_that_are_left_out_change_no_answer(models, kind, monkeypatch):
             left_out += 1
             assert whole[1] < 1, "ruled out, though there is a solution"
         elif whole[1] >= 1:
-            assert np.allclose(
-                answers[0].x[:2], whole[0][:2], atol=5e-3
-            )  # of the range; atoms that bind nothing are loose
+            assert value(program, answers[0].x) == pytest.approx(value(program, whole[0]), abs=2e-3)
+            assert np.allclose(answers[0].x[:2], whole[0][:2], atol=4e-2)  # of the range
     assert left_out == len(full) - len(pruned)
