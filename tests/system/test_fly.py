@@ -1,0 +1,125 @@
+"""`brakeline fly`: a quadrotor in real time over UDP, while its processes are killed, too.
+
+How many answers come in time depends on the machine, which others use too: README has the figure of a calmer one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from pymavlink import mavutil
+
+from actors.mavlink import decoded
+from deploy import cli
+from logs.reader import Record, read
+from messaging import brakeline_pb2 as pb
+from messaging.robots import QUADROTOR
+from tests.system.runs import Run
+
+pytestmark = pytest.mark.usefixtures("flight_folder")
+
+IN_TIME = 0.99  # of the answers
+GAP = 250.0  # ms between two setpoints, at most
+PX4_HOLD = 4 << 16 | 3 << 24  # custom mode
+
+
+class Flight(Run):
+    """`brakeline fly` in progress."""
+
+    def __init__(self, folder: Path, *arguments: object) -> None:
+        super().__init__(folder, *arguments, command=("fly", "quadrotor"))
+
+
+def follows_the_plan(records: list[Record]) -> int:
+    """Checks that every step executed what was decided, and without a decision the next input of the plan of the step
+    before; returns how many of these there are. A plan's first row is what is in force while it is asked for."""
+    m = QUADROTOR.action_dim
+    exchanges = [record.message for record in records if record.topic == "exchange" and not record.message.failure]
+    decided = {(e.header.run, e.request.episode, e.request.step): e.reply.decision.plan for e in exchanges}
+    rest, run, fallbacks = np.zeros((0, m)), 0, 0  # the inputs from the next period on
+    for step in (record.message for record in records if record.topic == "step"):
+        if step.header.run != run:
+            rest, run = np.zeros((0, m)), step.header.run  # another actor: it begins at rest
+        plan = decided.get((run, step.episode, step.step))
+        assert step.fallback == (plan is None)
+        rest = rest if plan is None else np.reshape(plan, (-1, m))[1:]
+        assert np.allclose(step.action, rest[0] if len(rest) else np.zeros(m), atol=1e-6)
+        rest, fallbacks = rest[1:], fallbacks + step.fallback
+    return fallbacks
+
+
+def sent(records: list[Record]) -> Iterator[tuple[float, Any]]:
+    """(s, message) of all that was sent to the autopilot."""
+    for record in records:
+        if record.topic == "frames":
+            for frame in record.message.frames:
+                found = decoded(frame.raw, frame.outgoing)
+                if frame.outgoing and found is not None:
+                    yield frame.wall_time * 1e-9, found.message
+
+
+@pytest.mark.parametrize("policy", ["adversary", "astar"])
+def test_it_flies_in_time_and_hits_nothing(policy: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with Flight(tmp_path / "run", "--minutes", 0.6, "--policy", policy) as run:
+        figures = run.end()
+        assert figures["finished"], run.errors.read_text()
+    flight, records = figures["flight"], list(read(run.folder))
+    assert figures["collisions"] == 0 and figures["steps"] == 180
+    assert flight["answers in time share"] >= IN_TIME, flight
+    assert flight["worst setpoint gap ms"] <= GAP and flight["periods slipped"] == 0, flight
+    assert follows_the_plan(records) == figures["fallbacks"]
+    if policy == "astar":
+        assert figures["goals"] >= 3
+
+    times = [at for at, message in sent(records) if message.get_type() == "SET_POSITION_TARGET_LOCAL_NED"]
+    assert max(np.diff(times)) <= 1e-3 * GAP and len(times) > 4 * 180
+
+    tlog = tmp_path / "flight.tlog"
+    assert cli.main(["export", str(run.folder), "--tlog", str(tlog)]) == 0
+    capsys.readouterr()
+    frames = [frame for record in records if record.topic == "frames" for frame in record.message.frames]
+    _read_by_mavutil(tlog, frames)
+
+
+def _read_by_mavutil(tlog: Path, frames: list[pb.MavlinkFrame]) -> None:
+    """pymavlink reads the frames that were logged, each at its time."""
+    connection = mavutil.mavlink_connection(str(tlog))
+    for frame in frames:
+        message = connection.recv_match()
+        assert bytes(message.get_msgbuf()) == frame.raw
+        assert message._timestamp == pytest.approx(frame.wall_time * 1e-9, abs=1e-5)
+    assert connection.recv_match() is None
+    connection.close()
+
+
+def test_what_is_killed_in_flight_hurts_nobody(tmp_path: Path) -> None:
+    with Flight(tmp_path / "run", "--minutes", 1.0, "--policy", "adversary") as run:
+        run.until_steps(30)
+        run.kill("safety-0")
+        run.until_steps(40)
+        run.kill("actor-0")
+        run.until_steps(40)
+        figures = run.end()
+        assert figures["finished"], run.errors.read_text()
+    assert figures["collisions"] == 0
+    assert figures["restarts"] == {"safety-0": 1, "actor-0": 1}
+    records = list(read(run.folder))
+    steps = [record.message for record in records if record.topic == "step"]
+    first_lives = [step for step in steps if step.header.run == steps[0].header.run]
+    assert follows_the_plan(records) >= 1, "it braked along the plan"
+    speeds = [float(np.linalg.norm(step.state[3:6])) for step in first_lives if step.fallback]
+    assert min(speeds) < 0.3, "it came to a stop without the service"
+    assert _mode_at_takeover(records) == PX4_HOLD, "the autopilot braked by itself, and held"
+    assert "0 collisions" in (run.folder / "logs" / "autopilot.log").read_text()
+
+
+def _mode_at_takeover(records: list[Record]) -> int:
+    """What the autopilot's first heartbeat said to the second actor."""
+    batches = [record.message for record in records if record.topic == "frames"]
+    second = next(batch for batch in batches if batch.header.run != batches[0].header.run)
+    messages = [found.message for f in second.frames if (found := decoded(f.raw, f.outgoing)) and not f.outgoing]
+    return int(next(message.custom_mode for message in messages if message.get_type() == "HEARTBEAT"))
