@@ -117,10 +117,14 @@ class Driver:
             action = np.clip(proposal, self.robot.low(), self.robot.high())
         else:
             action = next_input(self.commitment, outcome)
-        before = self.observation
+        before, held = self.observation, self.info["input_in_force"]
         self.observation, reward, terminated, truncated, self.info = self.env.step(action)
         self.running = not (terminated or truncated)
+        if outcome is None:
+            action = self.info["input_in_force"]  # the vehicle kept to its slew
         step = self._step(before, proposal, action, reward)
+        if self.filtered:
+            step.penalty = correction_penalty(self.robot, proposal, held, action, self.penalty)
         step.terminated, step.truncated = terminated, truncated
         step.goal, step.collision = self.info["at_goal"], self.info["collision"]
         step.weights_version = weights_version
@@ -142,7 +146,6 @@ class Driver:
             action=action.tolist(),
             next_observation=self.observation.tolist(),
             reward=reward,
-            penalty=correction_penalty(self.robot, proposal, action, self.penalty) if self.filtered else 0.0,
             speed=info["speed"],
             clearance=info["clearance"],
             state=info["state"].tolist(),

@@ -82,11 +82,16 @@ class Commitment:
         return self.plan[0].copy() if self.robot.late else now
 
 
-def correction_penalty(robot: Robot, proposed: ArrayLike, executed: ArrayLike, weight: float) -> float:
+def correction_penalty(
+    robot: Robot, proposed: ArrayLike, before: ArrayLike, executed: ArrayLike, weight: float
+) -> float:
     """weight · ‖executed - proposed‖, each input in units of its range: what leaning on the filter costs.
 
-    From the proposal clipped to bounds; one that is no number counts as zero input.
+    From the proposal clipped to bounds and to the slew from the input `before`, which is what `allowed` lets pass; one
+    that is no number counts as zero input.
     """
-    clipped = np.clip(np.nan_to_num(np.asarray(proposed, float), posinf=0.0, neginf=0.0), robot.low(), robot.high())
-    difference = (np.asarray(executed, float) - clipped) / (robot.high() - robot.low())
-    return weight * float(np.linalg.norm(difference))
+    low, high, slew = robot.low(), robot.high(), np.asarray(robot.action_slew)
+    before = np.asarray(before, float)
+    wanted = np.nan_to_num(np.asarray(proposed, float), posinf=0.0, neginf=0.0)
+    clipped = np.clip(wanted, np.maximum(low, before - slew), np.minimum(high, before + slew))
+    return weight * float(np.linalg.norm((np.asarray(executed, float) - clipped) / (high - low)))

@@ -41,10 +41,10 @@ class SafetyWrapper(gymnasium.Wrapper[Any, Any, Any, Any]):
         return self._seen, self._info
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        decision = self.decide(np.asarray(action, dtype=float))
+        decision, before = self.decide(np.asarray(action, dtype=float)), self.commitment.input_in_force
         executed = self.commitment.accept(decision.plan, decision.model, decision.predicted, decision.verified)
         self._seen, reward, terminated, truncated, self._info = self.env.step(executed.astype(np.float32))
-        cost = correction_penalty(self.filter.robot, action, executed, self.penalty)
+        cost = correction_penalty(self.filter.robot, action, before, executed, self.penalty)
         self._info |= {"safety": decision, "proposed": action, "penalty": cost}
         return self._seen, float(reward) - cost, terminated, truncated, self._info
 

@@ -157,9 +157,8 @@ def test_only_where_a_policy_and_a_filter_are_crossed_there_are_more_trials():
 def test_sailrs_interventions_end_episodes_in_training_and_not_in_evaluation(cells):
     training = cells["sailr"]["training"]["episodes"]
     assert max(training["interventions"]) <= 1
-    for ended, goal, collision, timeout in zip(
-        *(training[n] for n in ("interventions", "goal", "collision", "timeout"))
-    ):
+    columns = (training[name] for name in ("interventions", "goal", "collision", "timeout"))
+    for ended, goal, collision, timeout in zip(*columns, strict=True):
         assert ended or goal or collision or timeout
 
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from messaging.robots import GROUND
+from messaging.robots import GROUND, QUADROTOR
 from messaging.shapes import Obstacle, Shapes, rotate
 from safety.certificates import KINDS, Certificate
 from safety.commitment import UNVERIFIED, Commitment, Prediction, correction_penalty
@@ -102,7 +102,14 @@ def test_allowed_is_the_proposal_clipped_to_the_bounds(ready):
     decision = ready.decide(request(action=(7.0, -3.0)))
     assert decision.kind == ALLOWED
     assert np.array_equal(decision.action, [0.25, -0.5])
-    assert correction_penalty(GROUND, (7.0, -3.0), decision.action, 1.0) == 0.0
+    assert correction_penalty(GROUND, (7.0, -3.0), np.zeros(2), decision.action, 1.0) == 0.0
+
+
+def test_the_penalty_counts_from_what_bounds_and_slew_let_pass():
+    before, wanted = np.array([1.0, 0.0, -4.9]), (5.0, 0.1, -9.0)
+    assert correction_penalty(QUADROTOR, wanted, before, (1.8, 0.1, -5.0), 2.0) == pytest.approx(0.0)
+    assert correction_penalty(QUADROTOR, wanted, before, (0.8, 0.1, -5.0), 2.0) == pytest.approx(0.2)
+    assert correction_penalty(QUADROTOR, (np.nan, 0.1, np.inf), before, (0.2, 0.1, -4.1), 1.0) == pytest.approx(0.0)
 
 
 def test_a_slew_limit_is_kept():
