@@ -10,7 +10,7 @@ from deploy.evaluate import in_process, policy_named
 from deploy.store import model_for
 from deploy.vehicles import environment
 from messaging import brakeline_pb2 as pb
-from messaging.robots import GROUND
+from messaging.robots import GROUND, Robot
 from safety.filter import Filter, Request
 from safety.model_set import ModelSet, Recipe
 from safety.wire import request_of
@@ -18,15 +18,15 @@ from safety.wire import request_of
 STEPS = 1500
 
 
-def model(certificate: str = "residual", mode: str = "direct") -> ModelSet:
-    return model_for(GROUND, Recipe(certificate, mode))
+def model(certificate: str = "residual", mode: str = "direct", robot: Robot = GROUND) -> ModelSet:
+    return model_for(robot, Recipe(certificate, mode))
 
 
-def messages(policy: str = "random", seed: int = 5) -> list[pb.Request]:
+def messages(policy: str = "random", seed: int = 5, robot: Robot = GROUND) -> list[pb.Request]:
     """The questions of some episodes of a policy behind the default filter."""
-    question = in_process(model())
-    driver = Driver(GROUND, environment(GROUND, "default", seed), Identity("bench", 0, seed))
-    choose = policy_named(policy, GROUND, seed)
+    question = in_process(model(robot=robot))
+    driver = Driver(robot, environment(robot, "default", seed), Identity("bench", 0, seed))
+    choose = policy_named(policy, robot, seed)
     asked: list[pb.Request] = []
     episode = 0
     while len(asked) < STEPS:
@@ -35,7 +35,7 @@ def messages(policy: str = "random", seed: int = 5) -> list[pb.Request]:
         while driver.running and len(asked) < STEPS:
             proposal = np.asarray(choose(driver.observation, driver.info), dtype=float)
             asked.append(driver.request(proposal))
-            driver.execute(proposal, consult(question, [asked[-1]], GROUND)[0])
+            driver.execute(proposal, consult(question, [asked[-1]], robot)[0])
     return asked
 
 
@@ -43,4 +43,4 @@ def requests(ready: Filter, asked: list[pb.Request]) -> list[Request]:
     """The same as the filter takes them; plans of another model count as standing still's."""
     for message in asked:
         message.model = message.model and ready.version
-    return [request_of(message, GROUND) for message in asked]
+    return [request_of(message, ready.robot) for message in asked]
