@@ -28,7 +28,7 @@ class Embedded:
     """The simulated autopilot of a flight in real time."""
 
     rules: str = "px4"
-    setpoint_timeout: float = 0.3  # s without a setpoint until it brakes
+    setpoint_timeout: float = 0.2  # s without a setpoint until it brakes
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ import sys
 from rich.console import Console
 from rich.table import Table
 
-from deploy.bench import decide, environment, learning, logs, reachability, recording, roundtrip, solvers
+from deploy.bench import decide, environment, learning, linkloss, logs, reachability, recording, roundtrip, solvers
 from deploy.bench.timing import Figures
 
 BENCHMARKS = {
@@ -26,6 +26,7 @@ BENCHMARKS = {
     "environment": environment.run,
     "learning": learning.run,
     "roundtrip": roundtrip.run,
+    "linkloss": linkloss.run,
     "logs": logs.run,
     "recording": recording.run,
     "logs-2gb": logs.run_large,
