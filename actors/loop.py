@@ -92,7 +92,7 @@ class Practice:
         elif self._left == 0:
             return proposal
         self._left -= 1
-        return np.asarray(driver.commitment.plan[0])
+        return np.asarray(driver.commitment.plan[driver.robot.given])
 
 
 class Rider:

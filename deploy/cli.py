@@ -100,7 +100,7 @@ COMMANDS: dict[str, Command] = {
     ),
     "export": Command(
         "export:Export",
-        "a log as CSV, as a Minari data set, or with a picture of every step for Foxglove",
+        "a log as CSV, as a Minari data set, as a .tlog, or with a picture of every step for Foxglove",
         "brakeline export runs/latest --csv steps.csv",
     ),
     "analyse": Command(

@@ -132,7 +132,7 @@ def summary(console: Console, figures: dict[str, Any]) -> None:
     if "from_logs" in figures:
         fed = figures["from_logs"]
         console.print(f"steps from logs: {fed.get('published', 0)}, and {fed.get('known', 0)} that the learner knew")
-    if not figures["finished"]:
+    if not figures["finished"] and figures.get("policy") in (None, "learning"):
         console.print(f"[yellow]stopped before the last step[/]; go on: brakeline train --resume {figures['folder']}")
     console.print(f"log:    {figures['log'] or 'none was recorded'}", markup=False)
     for path in figures["policies"]:

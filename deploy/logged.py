@@ -58,13 +58,18 @@ def trajectories_of(steps: Iterable[pb.Step], robot: Robot) -> Iterable[Trajecto
 
 
 def _trajectory(run: list[pb.Step], robot: Robot) -> Trajectory:
-    """The first step only gives the state that the others start from, and the input in force then."""
-    first, rest = run[0], run[1:]
+    """The first step only gives the state that the others start from, and the input in force then.
+
+    In real time a step's action is what it decided for the period after it: it takes one step more to know that input.
+    """
+    given = robot.given
+    first, rest = run[given], run[1 + given :]
+    actions = np.array([s.action for s in run], dtype=float)
     paths = np.array([s.path for s in rest], dtype=float).reshape(len(rest), -1, robot.position_dim)
     return Trajectory(
         states=np.array([first.state, *(s.state for s in rest)]),
-        inputs=np.array([s.action for s in rest], dtype=float),
+        inputs=actions[1 : len(run) - given],
         paths=paths,
         turned=np.array([s.turned for s in rest]),
-        before=np.array(first.action, dtype=float),
+        before=actions[0],
     )

@@ -46,6 +46,8 @@ class Fly:
     seed: int = 0
     filtering: Flags[Filtering] = field(default_factory=Filtering)
     physics: Flags[Physics] = field(default_factory=Physics)
+    practice: float = 0.0
+    """Share of steps at which it starts to follow its committed plan to the stop: what `certify LOG` needs."""
     deadline: float = 0.12
     """s, for an answer of the safety service; the answer counts from the next period on, of 0.2 s."""
     pictures: float = RunConfig.pictures
@@ -86,6 +88,7 @@ class Fly:
             steps=max(1, round(60.0 * self.minutes / robot.period)),
             seed=self.seed,
             deadline=self.deadline,
+            practice=self.practice,
             pictures=self.pictures,
             conditions=self.physics.conditions(),
             policy="" if self.policy == LEARN else self.policy,

@@ -1,0 +1,74 @@
+"""The filter for a robot in real time, in a closed loop: it asks about the period after this one."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from actors.driver import Driver, Identity
+from actors.guard import consult
+from deploy.evaluate import Evaluation, episode, evaluate, prepared
+from deploy.logged import trajectories_of
+from messaging.robots import QUADROTOR
+
+ROBOT = QUADROTOR.in_real_time()
+pytestmark = pytest.mark.usefixtures("flight_folder")
+
+
+@pytest.mark.parametrize("policy", ["adversary", "greedy", "random"])
+def test_nothing_is_hit_and_states_are_where_they_were_predicted(policy: str) -> None:
+    figures = evaluate(ROBOT, Evaluation(policy, episodes=3))
+    assert figures["collisions"] == 0
+    assert figures["containment"]["violations"] <= 0.01 * figures["containment"]["steps"]
+
+
+def test_a_pilot_that_knows_of_its_delay_gets_there() -> None:
+    figures = evaluate(ROBOT, Evaluation("astar", episodes=5))
+    assert figures["goals"] == 5 and figures["collisions"] == 0
+    assert figures["mean_speed"] > 3.5
+
+
+def test_without_answers_it_brakes_along_the_plan_that_it_was_committed_to(flight_folder: Path) -> None:
+    driver, policy, question = prepared(ROBOT, Evaluation("greedy"))
+    assert question is not None
+    driver.begin(0)
+
+    def nobody(requests):  # type: ignore[no-untyped-def]
+        return [None] * len(requests)
+
+    for step in range(14 + ROBOT.horizon):
+        proposal = np.asarray(policy(driver.observation, driver.info))
+        outcome = consult(question if step < 14 else nobody, [driver.request(proposal)], ROBOT)[0]
+        expected = driver.commitment.plan[1].copy()
+        taken = driver.execute(proposal, outcome)
+        if step >= 14:
+            assert taken.fallback and taken.action == pytest.approx(expected, abs=1e-6)
+            assert driver.info["input_in_force"] == pytest.approx(expected, abs=1e-6)
+        assert not taken.collision
+    assert np.linalg.norm(driver.info["state"][3:6]) < 0.2
+
+
+def test_a_flight_that_goes_on_keeps_its_plan_from_goal_to_goal() -> None:
+    driver, _, question = prepared(ROBOT, Evaluation("greedy"))
+    assert question is not None
+    flying = Driver(ROBOT, driver.env, Identity("a", 0, 0), goes_on=True)
+    flying.begin(0)
+    outcome = consult(question, [flying.request(np.array([1.0, 0.0, 0.0]))], ROBOT)[0]
+    flying.execute(np.array([1.0, 0.0, 0.0]), outcome)
+    plan = flying.commitment.plan.copy()
+    assert plan.any()
+    flying.begin(1)
+    assert (flying.commitment.plan == plan).all()
+
+
+def test_a_log_tells_which_input_was_in_force() -> None:
+    driver, policy, question = prepared(ROBOT, Evaluation("greedy"))
+    steps, in_force = [], []
+    for step in episode(driver, policy, question, 0):
+        steps.append(step)
+        in_force.append(np.array(driver.info["input_in_force"]))  # from the state after this step on
+    (trajectory,) = trajectories_of(steps, ROBOT)
+    assert trajectory.states == pytest.approx(np.array([step.state for step in steps[1:]]))
+    assert trajectory.inputs == pytest.approx(np.array(in_force[1:-1]), abs=1e-6)
+    assert trajectory.before == pytest.approx(in_force[0], abs=1e-6)
+    assert len(trajectory.paths) == len(trajectory.inputs) == len(trajectory.states) - 1

@@ -1,0 +1,57 @@
+"""Real time in simulation: inputs come a period late; and goals that follow each other without a reset."""
+
+import numpy as np
+import pytest
+
+from messaging.robots import GROUND, QUADROTOR
+from sim.arenas import arena_kind, draw_arena, tour
+from sim.late import late
+from sim.pilots import MapPilot
+from sim.quadrotor import Quadrotor
+from sim.vehicle import BadInput
+from sim.world import staged_arena
+
+ROBOT = QUADROTOR.in_real_time()
+
+
+def test_each_input_is_carried_out_a_period_after_it_was_given() -> None:
+    arena = staged_arena(start=(0.0, 0.0, 50.0), goal=(9.0, 9.0, 50.0), half_width=100.0, height=100.0)
+    at_once = Quadrotor(arena, np.random.default_rng(3))
+    delayed = late(Quadrotor, ROBOT)(arena, np.random.default_rng(3))
+    inputs = [*np.random.default_rng(4).uniform(-5.0, 5.0, (10, 3))]
+    for executed, given in zip([np.zeros(3), *inputs[:-1]], inputs, strict=True):
+        period, expected = delayed.step(given), at_once.step(executed)
+        assert period.true == pytest.approx(expected.true, abs=1e-12)
+        assert period.measured == pytest.approx(expected.measured, abs=1e-12)
+        assert (np.abs(delayed.input - at_once.input) <= 0.8 + 1e-12).all(), "within the slew"
+        assert (np.abs(delayed.input - given) <= np.abs(at_once.input - given) + 1e-12).all(), "on the way to it"
+    with pytest.raises(BadInput):
+        delayed.step(np.array([np.nan, 0.0, 0.0]))
+
+
+def test_a_late_robot_has_the_same_body_senses_and_arenas() -> None:
+    assert ROBOT.kind == QUADROTOR.kind == QUADROTOR.name != ROBOT.name
+    assert arena_kind(ROBOT, "default") is arena_kind(QUADROTOR, "default")
+
+
+@pytest.mark.parametrize("robot", [GROUND, ROBOT], ids=lambda robot: robot.name)
+def test_a_tour_leads_from_goal_to_goal(robot) -> None:  # type: ignore[no-untyped-def]
+    arena, kind = draw_arena("default", np.random.default_rng(5), robot), arena_kind(robot, "default")
+    stages = tour(arena, 6, np.random.default_rng(6), robot)
+    start = arena.start[: arena.dim]
+    for stage in stages:
+        assert stage.start == start and stage.obstacles == arena.obstacles
+        assert np.linalg.norm(np.subtract(stage.goal, start)) >= kind.goal_distance
+        assert stage.shapes.distance(np.array(stage.goal)).min() >= robot.footprint + kind.start_clearance
+        assert stage.clearance_map is arena.clearance_map
+        assert stage.clearance_map.connected(start, stage.goal, robot.footprint + kind.path_clearance)
+        start = stage.goal
+
+
+def test_a_pilot_that_is_prepared_proposes_the_same() -> None:
+    arena = draw_arena("default", np.random.default_rng(7), QUADROTOR)
+    state = np.array([*arena.start, *np.zeros(6)])
+    info = {"arena": arena, "goal": arena.goal, "state": state, "input_in_force": np.zeros(3)}
+    pilot, ready = (MapPilot(ROBOT, np.random.default_rng(0)) for _ in range(2))
+    ready.prepare(arena)
+    assert (pilot(np.zeros(0, np.float32), info) == ready(np.zeros(0, np.float32), info)).all()
