@@ -34,6 +34,7 @@ MOST_FAILURES = 5  # in a row, each before HEALTHY_AFTER: then it is no accident
 TURN = 0.1  # s
 END_PATIENCE = 10.0  # s from SIGTERM to SIGKILL: a checkpoint may be in progress
 RECORDER_PATIENCE = 30.0  # s until the run starts without a recorder: its disk may be full
+HEARD_OUT = 2.0  # s that is waited for the last message at most
 QUIET = 0.5  # s without a message after which the last one has come
 FIGURES = "figures.json"
 
@@ -325,12 +326,17 @@ class Launcher:
                 time.sleep(0.02)
             for child in group:
                 child.end(deadline)
-            quiet = time.monotonic() + QUIET
-            while time.monotonic() < quiet:
-                if self._inbox:
-                    quiet = time.monotonic() + QUIET
-                self._drain()
-                time.sleep(0.02)
+            self._hear_out()
+
+    def _hear_out(self) -> None:
+        """Wait for the last words of those who have ended; who still lives may go on talking."""
+        now = time.monotonic()
+        quiet, patience = now + QUIET, now + HEARD_OUT
+        while time.monotonic() < min(quiet, patience):
+            if self._inbox:
+                quiet = time.monotonic() + QUIET
+            self._drain()
+            time.sleep(0.02)
 
 
 __all__ = ["BusError", "LaunchError", "Launcher", "View", "prepare"]

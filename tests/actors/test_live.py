@@ -139,7 +139,12 @@ def test_the_offset_of_two_clocks_follows_them() -> None:
     offset = Offset()
     for k in range(1000):
         offset.note(0.02 * k + 0.001 * (k % 7), 0.02 * k)
-    assert offset.value == 0.0
-    for k in range(1000, 1300):
+    assert offset.value == pytest.approx(0.0, abs=1e-4)
+    for k in range(1000, 1040):
+        offset.note(0.02 * k + 0.03, 0.02 * k)  # all of them late, for a while
+    assert offset.value == pytest.approx(0.0, abs=1e-3)
+    for k in range(1040, 1240):
         offset.note(0.02 * k, 0.02 * k - 0.5)  # their clock has slipped
-    assert offset.value == pytest.approx(0.5)
+    assert offset.value == pytest.approx(0.5, abs=1e-3)
+    offset.note(25.0, 24.9)
+    assert offset.value == pytest.approx(0.1)
