@@ -15,7 +15,7 @@ from deploy.store import method_for
 from deploy.vehicles import Conditions, environment
 from logs.metrics import Tally, closed_loop
 from messaging import brakeline_pb2 as pb
-from messaging.robots import Robot, robot_named
+from messaging.robots import Robot
 from messaging.weights import MLP
 from safety.methods import DDPC, Model
 from safety.model_set import Recipe
@@ -50,11 +50,12 @@ def policy_named(name: str, robot: Robot, seed: int) -> Policy:
         return scripted(name, robot, np.random.default_rng(seed))
     if name == UNTRAINED:
         return driving(MLP.untrained(robot, seed))
-    robot = robot_named(robot.kind)  # a network that was trained in lockstep proposes in real time too
     path = POLICY_FOLDER / robot.kind / "trained.safetensors" if name == TRAINED else Path(name)
     if not path.is_file():
         names = ", ".join([TRAINED, UNTRAINED, *POLICIES])
         raise ValueError(f"no policy is called {name!r} and no such file exists; there are: {names}, or a file's path")
+    if robot.late and MLP.load(path).robot.kind == robot.kind:
+        return driving(MLP.load(path))  # it may have been trained in lockstep: it proposes in real time too
     return driving(MLP.load(path, robot))
 
 

@@ -22,7 +22,7 @@ from learner.intake import BadStep
 from messaging import brakeline_pb2 as pb
 from messaging.bus import BusSettings, Malformed, Sample
 from messaging.process import Process
-from messaging.robots import ROBOTS, UnknownRobot
+from messaging.robots import robot_named
 from messaging.topics import FLOW, JOIN, LEARNER, LOGGED, STEP, WEIGHTS
 
 log = logging.getLogger("brakeline.learner")
@@ -56,13 +56,12 @@ def main(settings: LearnerSettings) -> bool:
         CheckpointError: `resume` was asked for and is impossible, or was not and there is a checkpoint in the folder.
         UnknownRobot, Unreachable: as they say.
     """
-    if settings.robot not in ROBOTS:
-        raise UnknownRobot(f"{settings.robot!r} is none of {', '.join(ROBOTS)}")
+    robot = robot_named(settings.robot)
     with Process(settings.bus, settings.source) as process:
         root = settings.out / CHECKPOINT
         if exists(root) and not settings.resume:
             raise CheckpointError(f"{root}: holds a checkpoint already; resume it, or choose another folder")
-        learner = Learner(ROBOTS[settings.robot], settings.learner, incarnation=process.bus.run)
+        learner = Learner(robot, settings.learner, incarnation=process.bus.run)
         if settings.resume:
             learner.restore(root)
             log.info("resumed at step %d, update %d", learner.steps, learner.updates)

@@ -18,7 +18,7 @@ import safetensors
 import safetensors.numpy
 from numpy.typing import NDArray
 
-from messaging.robots import ROBOTS, Array, Robot
+from messaging.robots import Array, Robot, UnknownRobot, robot_named
 
 Matrix = NDArray[np.float32]
 Layers = Sequence[tuple[Matrix, Matrix]]  # weight (out, in), bias (out,)
@@ -147,9 +147,10 @@ def _robot(about: Any, robot: Robot | None) -> Robot:
     if not isinstance(about, dict) or not isinstance(about.get("robot"), str):
         raise BadWeights("robot: missing")
     if robot is None:
-        if about["robot"] not in ROBOTS:
-            raise BadWeights(f"robot: unknown, {about['robot']!r}")
-        robot = ROBOTS[about["robot"]]
+        try:
+            robot = robot_named(about["robot"])
+        except UnknownRobot as error:
+            raise BadWeights(f"robot: unknown, {about['robot']!r}") from error
     if about["robot"] != robot.name:
         raise BadWeights(f"robot: of {about['robot']!r} where {robot.name!r} is meant")
     if about.get("layout") != robot.layout():
