@@ -9,6 +9,8 @@ period, and the plane seen from one end alone would cut off the other.
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -55,14 +57,21 @@ def _roomiest(unit: Array, level: Array, ends: Array) -> NDArray[np.intp]:
     From the first period on whose ends no plane keeps apart from the obstacle, the nominal plan goes through it: the
     last plane before stays in force, for one beyond the obstacle would hold on the wrong side.
     """
-    places = 2 * np.arange(len(ends) - 1)[:, None] + np.arange(3)  # (N, 3)
-    along = np.einsum("nqd,ed->nqe", unit, ends)[:, places]  # (n, N, 3, N+1)
-    periods = np.arange(len(ends) - 1)[:, None]
-    farther = np.maximum(along[:, periods, np.arange(3), periods], along[:, periods, np.arange(3), periods + 1])
-    room = level[:, places] - farther  # (n, N, 3)
+    places, periods = _places(len(ends) - 1)
+    along = unit @ ends.T  # (n, 2N+1, N+1)
+    room = level[:, places] - np.maximum(along[:, places, periods], along[:, places, periods + 1])  # (n, N, 3)
     best = room.argmax(axis=2)
-    choice = places[periods[:, 0], best]
+    choice: NDArray[np.intp] = 2 * periods[:, 0] + best
     through = np.logical_or.accumulate(~(room.max(axis=2) > 0.0), axis=1)
+    if not through.any():
+        return choice
     before = (~through).sum(axis=1)  # periods until then
     last = np.where(before > 0, choice[np.arange(len(choice)), before - 1], 0)
     return np.asarray(np.where(through, last[:, None], choice))
+
+
+@cache
+def _places(periods: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Of each period: where its start, middle and end are among the places, (N, 3), and its number, (N, 1)."""
+    number = np.arange(periods)[:, None]
+    return 2 * number + np.arange(3), number
