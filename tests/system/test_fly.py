@@ -22,7 +22,8 @@ from tests.system.runs import Run
 
 pytestmark = pytest.mark.usefixtures("flight_folder")
 
-IN_TIME = 0.99  # of the answers
+PERIODS = 105  # of a flight
+IN_TIME = 0.98  # of the answers
 GAP = 250.0  # ms between two setpoints, at most
 PX4_HOLD = 4 << 16 | 3 << 24  # custom mode
 
@@ -64,19 +65,19 @@ def sent(records: list[Record]) -> Iterator[tuple[float, Any]]:
 
 @pytest.mark.parametrize("policy", ["adversary", "astar"])
 def test_it_flies_in_time_and_hits_nothing(policy: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    with Flight(tmp_path / "run", "--minutes", 0.6, "--policy", policy) as run:
+    with Flight(tmp_path / "run", "--minutes", PERIODS * QUADROTOR.period / 60.0, "--policy", policy) as run:
         figures = run.end()
         assert figures["finished"], run.errors.read_text()
     flight, records = figures["flight"], list(read(run.folder))
-    assert figures["collisions"] == 0 and figures["steps"] == 180
+    assert figures["collisions"] == 0 and figures["steps"] == PERIODS
     assert flight["answers in time share"] >= IN_TIME, flight
     assert flight["worst setpoint gap ms"] <= GAP and flight["periods slipped"] == 0, flight
     assert follows_the_plan(records) == figures["fallbacks"]
     if policy == "astar":
-        assert figures["goals"] >= 3
+        assert figures["goals"] >= 2
 
     times = [at for at, message in sent(records) if message.get_type() == "SET_POSITION_TARGET_LOCAL_NED"]
-    assert max(np.diff(times)) <= 1e-3 * GAP and len(times) > 4 * 180
+    assert max(np.diff(times)) <= 1e-3 * GAP and len(times) > 4 * PERIODS
 
     tlog = tmp_path / "flight.tlog"
     assert cli.main(["export", str(run.folder), "--tlog", str(tlog)]) == 0
@@ -97,7 +98,7 @@ def _read_by_mavutil(tlog: Path, frames: list[pb.MavlinkFrame]) -> None:
 
 
 def test_what_is_killed_in_flight_hurts_nobody(tmp_path: Path) -> None:
-    with Flight(tmp_path / "run", "--minutes", 1.0, "--policy", "adversary") as run:
+    with Flight(tmp_path / "run", "--minutes", 0.7, "--policy", "adversary") as run:
         run.until_steps(30)
         run.kill("safety-0")
         run.until_steps(40)
