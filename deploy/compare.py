@@ -19,6 +19,7 @@ from typing import Any, Protocol
 
 from deploy import study as cells
 from deploy.study import METHODS, NONE, Study
+from messaging.files import write_whole
 from messaging.robots import GROUND, QUADROTOR
 
 RESULTS, RUNS = Path("results"), Path("runs/compare")
@@ -93,10 +94,7 @@ def read(results: Path, job: Job) -> dict[str, Any] | None:
 def write(results: Path, job: Job, result: dict[str, Any]) -> Path:
     """At once, and whole."""
     path = result_path(results, job)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    beside = path.with_suffix(".new")
-    beside.write_text(json.dumps(result, separators=(",", ":")) + "\n")
-    beside.replace(path)
+    write_whole(path, (json.dumps(result, separators=(",", ":")) + "\n").encode())
     return path
 
 

@@ -28,7 +28,7 @@ class SecasRecipe:
     arena: str = "default"
     seed: int = 20_261
     fit: Fit = field(default_factory=lambda: Fit(hidden=(64, 64)))
-    margin: float = 0.1  # m beside the footprint: the bound C, tuned (deploy/experiments.md)
+    margin: float = 0.1  # m beside the footprint: the bound C, tuned
 
 
 @dataclass(frozen=True)
@@ -41,12 +41,19 @@ class SailrRecipe:
     fit: Fit = field(default_factory=lambda: Fit(hidden=(256, 256, 256), epochs=10))
     gamma: float = 0.99
     smoothing: float = 0.5  # m of clearance
-    threshold: float = 0.08  # η, tuned (deploy/experiments.md)
+    threshold: float = 0.08  # η, tuned
 
 
 Recipe = SecasRecipe | SailrRecipe
 Made = tuple[dict[str, Perceptrons], dict[str, float], dict[str, str]]  # networks, settings, about
 RECIPES: dict[str, type[SecasRecipe] | type[SailrRecipe]] = {SECAS: SecasRecipe, SAILR: SailrRecipe}
+TUNED: dict[tuple[str, str], dict[str, float]] = {  # where a robot's differ; found by `pretrain METHOD ROBOT --tune`
+}
+
+
+def recipe_for(method: str, robot: Robot) -> Recipe:
+    """With the threshold that was found for this robot (deploy/experiments.md)."""
+    return RECIPES[method](**TUNED.get((method, robot.name), {}))  # type: ignore[arg-type]
 
 
 def made_by(model: Pretrained, recipe: Recipe) -> bool:

@@ -127,7 +127,7 @@ def method_for(robot: Robot, method: str, recipe: Recipe) -> Model:
         raise ValueError(f"no method is called {method!r}; there are: {', '.join((DDPC, *rivals.RECIPES))}")
     if robot.late:
         raise ValueError(f"{method} has no real-time mode: its answer counts for the period in which it was asked for")
-    return pretrained(robot, method, rivals.RECIPES[method]())
+    return pretrained(robot, method, rivals.recipe_for(method, robot))
 
 
 def pretrained(robot: Robot, method: str, recipe: rivals.Recipe, again: bool = False) -> Pretrained:

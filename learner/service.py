@@ -21,6 +21,7 @@ from learner.core import Learner
 from learner.intake import BadStep
 from messaging import brakeline_pb2 as pb
 from messaging.bus import BusSettings, Malformed, Sample
+from messaging.files import write_whole
 from messaging.process import Process
 from messaging.robots import robot_named
 from messaging.topics import FLOW, JOIN, LEARNER, LOGGED, STEP, WEIGHTS
@@ -206,11 +207,8 @@ class LearnerLoop:
 
     def _write_policy(self) -> None:
         path = self._settings.out / POLICY
-        beside = path.with_name(path.name + ".new")
         try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            beside.write_bytes(self._learner.weights().file)
-            beside.replace(path)
+            write_whole(path, self._learner.weights().file)
         except OSError as error:
             log.error("the policy was not written: %s", error)
 

@@ -7,21 +7,21 @@ for k periods. Displacement is taken in the robot's frame at the window's start,
 from __future__ import annotations
 
 import hashlib
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from safetensors import SafetensorError, safe_open
-from safetensors.numpy import save_file
 
+from messaging.files import write_whole
 from messaging.robots import Robot, UnknownRobot, robot_named
 from messaging.shapes import rotate
+from safety.tensors import pack, unpack
 
 Array = NDArray[np.float64]
 
+ENTRY = "dataset"
 FEWEST_WINDOWS = 200  # of a length; below it nothing useful is bounded
 WORST_CONDITION = 1e4  # of the whitened regressors' second moment
 
@@ -102,11 +102,8 @@ class Dataset:
         still = np.zeros(self.robot.action_dim)
         tensors["before"] = np.array([still if t.before is None else t.before for t in self.trajectories])
         tensors["lengths"] = np.array([len(t.inputs) for t in self.trajectories])
-        about = {"robot": self.robot.name, "layout": self.robot.layout(), "about": json.dumps(self.about)}
-        path.parent.mkdir(parents=True, exist_ok=True)
-        beside = path.with_name(path.name + ".part")
-        save_file({k: np.ascontiguousarray(v) for k, v in tensors.items()}, beside, about)
-        beside.replace(path)
+        about = {"robot": self.robot.name, "layout": self.robot.layout(), "about": self.about}
+        write_whole(path, pack(tensors, ENTRY, about))
 
     @staticmethod
     def load(path: Path) -> Dataset:
@@ -116,17 +113,15 @@ class Dataset:
             BadData: not such a file, of another robot layout, or a check fails.
         """
         try:
-            with safe_open(path, framework="np") as file:
-                about = file.metadata() or {}
-                tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - no mapping
-                about_data = json.loads(about.get("about", "{}"))
-        except (OSError, SafetensorError, ValueError, KeyError, TypeError) as error:
+            tensors, about = unpack(path.read_bytes(), ENTRY)
+            about_data = dict(about.get("about", {}))
+        except (OSError, ValueError, TypeError) as error:
             raise BadData(f"{path} is no data set: {error}") from error
         missing = {"states", "inputs", "paths", "turned", "before", "lengths"} - tensors.keys()
         if missing or "robot" not in about:
             raise BadData(f"{path} is no data set: {', '.join(sorted(missing)) or 'its robot'} is missing")
         try:
-            robot = robot_named(about["robot"])
+            robot = robot_named(str(about["robot"]))
         except UnknownRobot as error:
             raise BadData(f"{path}: {error}") from error
         if about.get("layout") != robot.layout():

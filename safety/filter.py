@@ -7,9 +7,8 @@ log can be replayed.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from time import perf_counter_ns
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,78 +18,13 @@ from safety.commitment import Prediction
 from safety.freespace import half_spaces
 from safety.model_set import ModelSet
 from safety.program import SHARPEN, Builder, Layout, Rows
+from safety.request import ADJUSTED, ALLOWED, FAILSAFE, Decision, Request, check_for_filter
 from safety.solver import INFEASIBLE, solve
 
 Array = NDArray[np.float64]
 
-ALLOWED, ADJUSTED, FAILSAFE = "allowed", "adjusted", "failsafe"
 OUTSIDE_DOMAIN = 0.02  # of the recorded range: how far beyond it a regressor may lie (rounding, not extrapolation)
 SAME_INPUT = 1e-6  # of the input's range: an answer this close to the proposal is the proposal
-FARTHEST = 1e5  # m (and any other unit): beyond it a position's rounding would begin to show
-
-
-class BadRequest(ValueError):
-    """A request that can't be decided on: `field` names what is wrong."""
-
-    def __init__(self, field: str, message: str) -> None:
-        super().__init__(message)
-        self.field = field
-
-
-class StaleModel(BadRequest):
-    """The committed plan was verified by a model set that this filter never had."""
-
-
-@dataclass(frozen=True)
-class Request:
-    """state (n,) measured; action (m,) proposed; input_in_force (m,) of the period before; plan (N, m): the committed
-    plan's tail (of a late robot: from the input on that is in force now), verified by model set `model` (empty:
-    standing still; `UNVERIFIED`: by none); obstacles: at least those within `Filter.reach`; predicted: what the last
-    decision said of this state, if there was one."""
-
-    state: Array
-    action: Array
-    input_in_force: Array
-    plan: Array
-    obstacles: Shapes
-    model: str = ""
-    predicted: Prediction | None = None
-    observation: NDArray[np.float32] = field(default_factory=lambda: np.zeros(0, np.float32))
-
-    @property
-    def still(self) -> bool:
-        """Is the robot said to stand, and to be committed to that? Needs no model's word."""
-        return not self.model and not self.plan.any() and not self.input_in_force.any()
-
-
-@dataclass(frozen=True)
-class Decision:
-    """kind: allowed | adjusted | failsafe; plan (N, m), its first row is for now (of a late robot: is in force, and the
-    second is for the next period); tube: true positions at the N
-    periods' ends, centers and half-widths (N, d), world, of the plan's free inputs and the ramp after them; predicted:
-    the next measured state; margin [m] of that tube to the nearest half-space, within ± the reach. A failsafe's may be
-    negative though it is verified: it was so when it was made, this is how it looks from the new measurement."""
-
-    kind: str
-    plan: Array
-    tube_center: Array
-    tube_half_width: Array
-    predicted: Prediction
-    margin: float
-    model: str
-    reason: str = ""
-    verified: bool = True
-    contained: bool = True
-    compared: bool = False
-    time_ms: float = 0.0
-    solve_ms: float = 0.0
-    verify_ms: float = 0.0
-    solver: str = ""
-    iterations: int = 0
-
-    @property
-    def action(self) -> Array:
-        return np.asarray(self.plan[0])
 
 
 @dataclass
@@ -212,7 +146,7 @@ class Filter:
             BadRequest: a value is missing, not finite or of the wrong size, with the field's name.
         """
         attempt = _Attempt(perf_counter_ns())
-        self._check(request)
+        check_for_filter(self.robot, request)
         attempt.contained = request.predicted is None or request.predicted.contains(self.robot, request.state)
         given = request.plan[: self.robot.given].ravel()
         z_0 = np.concatenate([request.state[self.regressor], request.input_in_force, given])
@@ -393,39 +327,3 @@ class Filter:
         if len(near):
             near = near.take(~(near.distance(start) > self.reach))  # one whose distance is no number stays
         return _Scene(start, heading, turn, near)
-
-    def _check(self, request: Request) -> None:
-        robot = self.robot
-        n, m = robot.state_dim, robot.action_dim
-        self._finite("state", request.state, (n,))
-        self._finite("action", request.action, (m,))
-        self._finite("input_in_force", request.input_in_force, (m,))
-        self._finite("plan", request.plan, (robot.horizon, m))
-        if np.abs(request.state).max() > FARTHEST:
-            raise BadRequest("state", f"a state beyond ±{FARTHEST:g} is not plausible")
-        for name in ("plan", "input_in_force"):
-            value = getattr(request, name)
-            if (value < self.low - 1e-9).any() or (value > self.high + 1e-9).any():
-                raise BadRequest(name, f"{name}: an input is out of the robot's bounds")
-        if request.plan[-1].any():
-            raise BadRequest("plan", "the committed plan does not end in a stop")
-        if request.obstacles.center.shape[1] != robot.position_dim:
-            raise BadRequest("obstacles", f"a {robot.name} robot's obstacles have {robot.position_dim} coordinates")
-        if request.observation.size:
-            self._finite("observation", request.observation, (robot.observation_dim,))
-        if request.predicted is not None:
-            self._finite("predicted_center", request.predicted.center, (n,))
-            self._finite("predicted_half_width", request.predicted.half_width, (n,))
-            if (request.predicted.half_width < 0.0).any():
-                raise BadRequest("predicted_half_width", "a predicted set has a negative half-width")
-            if not math.isfinite(request.predicted.heading):
-                raise BadRequest("predicted_heading", "predicted_heading is NaN or infinite")
-
-    def _finite(self, name: str, value: NDArray[np.floating[Any]], shape: tuple[int, ...]) -> None:
-        if value.shape != shape:
-            raise BadRequest(name, f"{name} has shape {value.shape}, a {self.robot.name} robot's has {shape}")
-        if not np.isfinite(value).all():
-            raise BadRequest(name, f"{name} holds NaN or infinity")
-
-
-__all__ = ["ADJUSTED", "ALLOWED", "FAILSAFE", "BadRequest", "Decision", "Filter", "Prediction", "Request", "StaleModel"]

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from messaging.shapes import Shapes
 from safety.commitment import Commitment, correction_penalty
-from safety.filter import Decision, Request
 from safety.methods import Method
+from safety.request import Decision, Request
 
 Observation = NDArray[np.float32]
 

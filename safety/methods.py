@@ -10,11 +10,13 @@ from pathlib import Path
 from typing import Protocol
 
 from messaging.robots import Robot
-from safety.filter import Decision, Filter, Request
+from safety.filter import Filter
 from safety.model_set import BadModel, ModelSet
-from safety.pretrained import ENTRY, Pretrained, entry_of
+from safety.pretrained import ENTRY, Pretrained
+from safety.request import Decision, Request
 from safety.sailr import SAILR, Sailr
 from safety.secas import SECAS, Secas
+from safety.tensors import holds
 
 DDPC = "ddpc"
 
@@ -58,11 +60,7 @@ def decode(payload: bytes) -> Model:
     Raises:
         BadModel: of none; the message says why.
     """
-    try:
-        entry_of(payload, ENTRY)
-    except (KeyError, ValueError, AttributeError):
-        return ModelSet.decode(payload)
-    return Pretrained.decode(payload)
+    return Pretrained.decode(payload) if holds(payload, ENTRY) else ModelSet.decode(payload)
 
 
 def load(path: Path) -> Model:

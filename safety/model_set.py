@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import hashlib
-import json
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from safetensors import SafetensorError
-from safetensors.numpy import load, save
 
+from messaging.files import write_whole
 from messaging.robots import Robot, UnknownRobot, robot_named
 from messaging.shapes import rotate
 from safety.certificates import (
@@ -28,6 +26,7 @@ from safety.certificates import (
     whitening,
 )
 from safety.dataset import BadData, Dataset, Windows, quality, windows
+from safety.tensors import content, pack, unpack
 from safety.tube import Tube, recursion_of, stack_direct, stack_recursive
 
 Array = NDArray[np.float64]
@@ -35,6 +34,7 @@ Array = NDArray[np.float64]
 DIRECT, RECURSION = "direct", "recursion"
 MODES = (DIRECT, RECURSION)
 MOST_ATOMS = 120_000  # of a matrix zonotope, over the horizon: the exact check looks at every one
+ENTRY = "model_set"
 TENSORS = ("C", "W", "M", "kappa", "w", "generators")
 
 
@@ -124,41 +124,40 @@ class ModelSet:
     def version(self) -> str:
         """Hash of the content and of what it means, so that one name can't mean two models."""
         meaning = f"{self.robot.layout()} {self.recipe.certificate} {self.recipe.mode} "
-        return hashlib.sha256(meaning.encode() + self._payload()).hexdigest()[:12]
+        return hashlib.sha256(meaning.encode() + content(self._tensors())).hexdigest()[:12]
 
-    def _payload(self) -> bytes:
+    def _tensors(self) -> dict[str, Array]:
         named = {"bulges": self.bulges, "latch": self.latch} | {f"step{k}": c for k, c in enumerate(self.steps)}
-        tensors = {f"{n}.{t}": np.ascontiguousarray(getattr(c, t)) for n, c in named.items() for t in TENSORS}
-        return save(tensors | {"domain": self.domain, "basis": self.basis})
+        tensors = {f"{n}.{t}": getattr(c, t) for n, c in named.items() for t in TENSORS}
+        return tensors | {"domain": self.domain, "basis": self.basis}
 
     def encode(self) -> bytes:
         """Bytes of a safetensors file, with the recipe as its metadata."""
-        about = {"robot": self.robot.name, "layout": self.robot.layout(), "version": self.version}
-        about |= {"recipe": json.dumps(asdict(self.recipe)), "about": json.dumps(self.about, sort_keys=True)}
-        tensors = load(self._payload())
-        return save(tensors, about)
+        about = {
+            "robot": self.robot.name,
+            "layout": self.robot.layout(),
+            "recipe": asdict(self.recipe),
+            "about": self.about,
+            "version": self.version,
+        }
+        return pack(self._tensors(), ENTRY, about)
 
     def save(self, path: Path) -> None:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        beside = path.with_name(path.name + ".part")
-        beside.write_bytes(self.encode())
-        beside.replace(path)
+        write_whole(path, self.encode())
 
     @staticmethod
     def decode(payload: bytes) -> ModelSet:
         """Raises BadModel unless the bytes are a complete, finite model set of a robot that this program knows."""
         try:
-            tensors = load(payload)
-            size = int.from_bytes(payload[:8], "little")
-            about = json.loads(payload[8 : 8 + size]).get("__metadata__", {})
+            tensors, about = unpack(payload, ENTRY)
             robot = robot_named(about["robot"])
-            recipe = Recipe(**json.loads(about["recipe"]))
+            recipe = Recipe(**about["recipe"])
             certificates = {
                 name: Certificate(*(tensors[f"{name}.{t}"] for t in TENSORS))
                 for name in ("bulges", "latch", *(f"step{k}" for k in range(robot.horizon)))
             }
-            more = tensors["domain"], tensors["basis"], json.loads(about["about"])
-        except (SafetensorError, KeyError, TypeError, ValueError, UnknownRobot) as error:
+            more = tensors["domain"], tensors["basis"], dict(about["about"])
+        except (KeyError, TypeError, ValueError, UnknownRobot) as error:
             raise BadModel(f"no model set: {error!r}") from error
         if about.get("layout") != robot.layout():
             raise BadModel(f"the model set is for another layout of {robot.name}: make it again from data")

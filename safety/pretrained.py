@@ -14,12 +14,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from safetensors import SafetensorError
-from safetensors.numpy import load, save
 
+from messaging.files import write_whole
 from messaging.perceptrons import BadPerceptrons, Perceptrons
 from messaging.robots import Robot, UnknownRobot, robot_named
 from safety.model_set import BadModel
+from safety.tensors import pack, unpack
 
 ENTRY = "pretrained"
 
@@ -56,13 +56,10 @@ class Pretrained:
             "about": self.about,
             "version": self.version,
         }
-        return save(self._tensors(), {ENTRY: json.dumps(about, sort_keys=True)})
+        return pack(self._tensors(), ENTRY, about)
 
     def save(self, path: Path) -> None:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        beside = path.with_name(path.name + ".new")
-        beside.write_bytes(self.encode())
-        beside.replace(path)
+        write_whole(path, self.encode())
 
     @staticmethod
     def decode(payload: bytes) -> Pretrained:
@@ -71,13 +68,12 @@ class Pretrained:
             BadModel: it is no pretrained model, or not of this layout; the message says why.
         """
         try:
-            tensors = load(payload)
-            about = json.loads(entry_of(payload, ENTRY))
+            tensors, about = unpack(payload, ENTRY)
             robot = robot_named(about["robot"])
             networks = {str(name): Perceptrons.of(tensors, name) for name in about["networks"]}
             settings = {str(name): float(value) for name, value in about["settings"].items()}
             model = Pretrained(robot, str(about["method"]), networks, settings, dict(about["about"]))
-        except (SafetensorError, KeyError, TypeError, ValueError, UnknownRobot, BadPerceptrons) as error:
+        except (KeyError, TypeError, ValueError, UnknownRobot, BadPerceptrons) as error:
             raise BadModel(f"no pretrained model: {error!r}") from error
         if about.get("layout") != robot.layout():
             raise BadModel(f"the model is for another layout of {robot.name}: pretrain it again")
@@ -86,9 +82,3 @@ class Pretrained:
         if model.version != about.get("version"):
             raise BadModel("the model's content is not what its version says")
         return model
-
-
-def entry_of(payload: bytes, name: str) -> str:
-    """A metadata entry of a safetensors file. Raises KeyError if there is none, ValueError for no such file."""
-    size = int.from_bytes(payload[:8], "little")
-    return str(json.loads(payload[8 : 8 + size]).get("__metadata__", {})[name])

@@ -19,11 +19,10 @@ from numpy.typing import NDArray
 
 from messaging.robots import Robot
 from safety.backup import brake, braking_plan, within
-from safety.checks import check_for_rival
 from safety.commitment import NO_PREDICTION
-from safety.filter import ALLOWED, FAILSAFE, Decision, Request
 from safety.model_set import BadModel
 from safety.pretrained import Pretrained
+from safety.request import ALLOWED, FAILSAFE, Decision, Request, check_for_rival
 
 Array = NDArray[np.float64]
 

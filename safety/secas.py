@@ -21,11 +21,10 @@ from numpy.typing import NDArray
 from messaging.rays import rays_of
 from messaging.robots import Robot
 from safety.backup import braking_plan, within
-from safety.checks import check_for_rival
 from safety.commitment import NO_PREDICTION
-from safety.filter import ADJUSTED, ALLOWED, Decision, Request
 from safety.model_set import BadModel
 from safety.pretrained import Pretrained
+from safety.request import ADJUSTED, ALLOWED, Decision, Request, check_for_rival
 from safety.solver import Program, solve
 
 Array = NDArray[np.float64]

@@ -15,9 +15,9 @@ from messaging.process import Process
 from messaging.robots import UnknownRobot, robot_named
 from messaging.topics import DECIDE, MODEL
 from safety.commitment import UNVERIFIED
-from safety.filter import BadRequest, StaleModel
 from safety.methods import Method, Model, decode, load, ready
 from safety.model_set import BadModel
+from safety.request import BadRequest, StaleModel
 from safety.wire import batch_of, error_of, message_of, request_of
 
 log = logging.getLogger("brakeline.safety")

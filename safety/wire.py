@@ -13,7 +13,7 @@ from messaging import brakeline_pb2 as pb
 from messaging.robots import Robot
 from messaging.shapes import BadShape, Obstacle, Shapes
 from safety.commitment import Prediction
-from safety.filter import ADJUSTED, ALLOWED, FAILSAFE, BadRequest, Decision, Request
+from safety.request import ADJUSTED, ALLOWED, FAILSAFE, BadRequest, Decision, Request
 
 KINDS = {ALLOWED: pb.ALLOWED, ADJUSTED: pb.ADJUSTED, FAILSAFE: pb.FAILSAFE}
 LARGEST = 1 << 20  # bytes of a request batch

@@ -74,20 +74,24 @@ _FLIGHT = ArenaKind(
     goal_radius=1.0,
 )
 
+_ROOM = ArenaKind(
+    half_width=2.5,
+    cylinders=(3, 5),
+    radius=(0.1, 0.2),
+    boxes=(3, 5),
+    edge=(0.2, 0.4),
+    square=False,
+    gap=0.2,
+    path_clearance=0.05,
+    goal_distance=1.5,
+    step_limit=300,
+)
+
 ARENAS: dict[str, dict[str, ArenaKind]] = {
     "ground": {
-        "default": ArenaKind(
-            half_width=2.5,
-            cylinders=(3, 5),
-            radius=(0.1, 0.2),
-            boxes=(3, 5),
-            edge=(0.2, 0.4),
-            square=False,
-            gap=0.2,
-            path_clearance=0.05,
-            goal_distance=1.5,
-            step_limit=300,
-        ),
+        "default": _ROOM,
+        # a hair below half the gap: a grid cannot thread a passage that has no width to spare
+        "dense": replace(_ROOM, cylinders=(6, 8), boxes=(6, 8), gap=0.1, path_clearance=0.04),
         "open": ArenaKind(
             half_width=8.2,
             cylinders=(0, 6),
@@ -100,19 +104,6 @@ ARENAS: dict[str, dict[str, ArenaKind]] = {
             goal_distance=3.0,
             # the diagonal is 23 m, 5 cm a step: twice the steps of a straight drive, nearly
             step_limit=800,
-        ),
-        "dense": ArenaKind(
-            half_width=2.5,
-            cylinders=(6, 8),
-            radius=(0.1, 0.2),
-            boxes=(6, 8),
-            edge=(0.2, 0.4),
-            square=False,
-            gap=0.1,
-            # a hair below half the gap: a grid cannot thread a passage that has no width to spare
-            path_clearance=0.04,
-            goal_distance=1.5,
-            step_limit=300,
         ),
     },
     "quadrotor": {

@@ -11,8 +11,9 @@ from deploy.store import model_for
 from deploy.vehicles import environment
 from messaging import brakeline_pb2 as pb
 from messaging.robots import GROUND, Robot
-from safety.filter import Filter, Request
+from safety.filter import Filter
 from safety.model_set import ModelSet, Recipe
+from safety.request import Request
 from safety.wire import request_of
 
 STEPS = 1500

@@ -16,12 +16,14 @@ from deploy.commands.common import Robot, console, errors, say_json
 from deploy.compare import RESULTS, RUNS, SEEDS, Cell, Job
 from deploy.conservatism import Conservatism
 from deploy.curves import learning_curves, seeds_as_points
-from deploy.pretrain import RECIPES
+from deploy.pretrain import recipe_for
 from deploy.store import method_for, method_path, pretrained
 from deploy.study import METHODS, NONE, quick
 from deploy.table import markdown, plain, table
+from deploy.tune import Tried, best, try_all, values_for
 from messaging.robots import robot_named
 from safety.model_set import Recipe
+from safety.pretrained import Pretrained
 
 QUICK = Path("runs/quick")
 
@@ -34,19 +36,41 @@ class Pretrain:
     samples: int | None = None
     """Steps to drive; default: the recipe's."""
     seed: int | None = None
+    tune: bool = False
+    """Try values of its one threshold in closed loop, and say which to use; nothing is stored."""
+    episodes: int = 60
+    """Of each driver and value, when tuning."""
     json: bool = False
 
     def run(self) -> int:
         robot = robot_named(self.robot)
-        recipe = RECIPES[self.method]()
+        recipe = recipe_for(self.method, robot)
         changed = {name: value for name in ("samples", "seed") if (value := getattr(self, name)) is not None}
-        model = pretrained(robot, self.method, replace(recipe, **changed), again=True)
+        model = pretrained(robot, self.method, replace(recipe, **changed), again=not self.tune)
+        if self.tune:
+            return self._tune(model)
         path = method_path(robot, self.method, Recipe())
         if self.json:
             say_json({"path": str(path), "version": model.version, "settings": dict(model.settings)} | model.about)
         else:
             console.print(f"{path}: {model.version}")
         return 0
+
+    def _tune(self, model: Pretrained) -> int:
+        rows = try_all(model, values_for(model), self.episodes, self._say)
+        chosen = best(rows)
+        if self.json:
+            say_json({"tried": [row.figures() for row in rows], "best": chosen.value})
+        else:
+            console.print(f"best: {chosen.value:g}, of those that cost A* no goal the one with the fewest collisions")
+        return 0
+
+    @staticmethod
+    def _say(row: Tried) -> None:
+        console.print(
+            f"{row.value:g}: A* {row.oracle_goals} goals of {row.episodes}, {row.oracle_interventions:.1%} "
+            f"interventions; greedy {row.greedy_goals} goals, {row.greedy_collisions} collisions"
+        )
 
 
 @dataclass(frozen=True)

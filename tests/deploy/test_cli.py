@@ -136,6 +136,7 @@ def test_collect_is_reproducible_by_its_seed(figures, tmp_path):
     words = ("collect", "--trajectories", 2, "--out")
     said = [figures(*words, tmp_path / f"{i}", "--seed", seed) for i, seed in enumerate("556")]
     assert said[0]["digest"] == said[1]["digest"] != said[2]["digest"]
+    assert (tmp_path / "0").read_bytes() == (tmp_path / "1").read_bytes()
     assert (said[0]["trajectories"], said[0]["periods"]) == (2, 600) and said[0]["about"]["seed"] == "5"
 
 

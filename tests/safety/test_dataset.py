@@ -7,11 +7,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
-from safetensors.numpy import load_file, save_file
 
 from messaging.robots import GROUND
 from messaging.shapes import rotate
-from safety.dataset import BadData, Dataset, Trajectory, apart, displacement, quality, windows
+from safety.dataset import ENTRY, BadData, Dataset, Trajectory, apart, displacement, quality, windows
+from safety.tensors import pack, unpack
 from tests.safety.unicycle import record
 
 
@@ -100,8 +100,8 @@ def test_files_that_are_no_data_set_are_refused(small, tmp_path):
     with pytest.raises(BadData):
         Dataset.load(tmp_path / "nowhere")
     path.write_bytes(whole)
-    tensors = load_file(path)
-    about = {"robot": "ground", "layout": GROUND.layout(), "about": "{}"}
+    tensors, about = unpack(whole, ENTRY)
+    assert about == {"robot": "ground", "layout": GROUND.layout(), "about": small.about}
     ends = tensors["lengths"]
     for changes, metadata, message in (
         ({"lengths": ends + 1}, about, "do not add up"),
@@ -112,13 +112,14 @@ def test_files_that_are_no_data_set_are_refused(small, tmp_path):
         ({}, about | {"layout": "another"}, "layout"),
         ({}, about | {"robot": "submarine"}, "submarine"),
         ({}, {}, "missing"),
+        ({}, about | {"robot": ["ground"]}, "robot"),
         ({}, about | {"about": "{"}, "no data set"),
     ):
-        save_file(tensors | changes, path, metadata)
+        path.write_bytes(pack(tensors | changes, ENTRY, metadata))
         with pytest.raises(BadData, match=message):
             Dataset.load(path)
     del tensors["turned"]
-    save_file(tensors, path, about)
+    path.write_bytes(pack(tensors, ENTRY, about))
     with pytest.raises(BadData, match="turned is missing"):
         Dataset.load(path)
 

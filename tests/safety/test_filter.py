@@ -9,8 +9,9 @@ from messaging.robots import GROUND, QUADROTOR
 from messaging.shapes import Obstacle, Shapes, rotate
 from safety.certificates import KINDS, Certificate
 from safety.commitment import UNVERIFIED, Commitment, Prediction, correction_penalty
-from safety.filter import ADJUSTED, ALLOWED, FAILSAFE, BadRequest, Filter, Request, _Attempt
+from safety.filter import Filter, _Attempt
 from safety.model_set import ModelSet, Recipe
+from safety.request import ADJUSTED, ALLOWED, FAILSAFE, BadRequest, Request
 from tests.safety.unicycle import FIX, Unicycle
 
 NONE = Shapes.of([], 2)

@@ -1,16 +1,15 @@
 """Model sets: what goes in comes out, one version means one content, and what is no model set is refused."""
 
-import json
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from safetensors.numpy import load, save
 
 from safety.certificates import KINDS, CertificateError, least_squares
 from safety.dataset import BadData, windows
 from safety.filter import Filter
-from safety.model_set import MODES, BadModel, ModelSet, Recipe, make
+from safety.model_set import ENTRY, MODES, BadModel, ModelSet, Recipe, make
+from safety.tensors import pack, unpack
 from tests.safety.unicycle import record
 
 ALL = [(kind, mode) for kind in KINDS for mode in MODES]
@@ -55,11 +54,9 @@ def test_garbage_is_refused(model, tmp_path):
 
 def edited(model, metadata=None, **tensors):
     """The model's bytes with tensors or metadata replaced; its version as it was."""
-    payload = model.encode()
-    size = int.from_bytes(payload[:8], "little")
-    about = json.loads(payload[8 : 8 + size])["__metadata__"]
+    before, about = unpack(model.encode(), ENTRY)
     changed = {name.replace("__", "."): value for name, value in tensors.items()}
-    return save(load(payload) | changed, about | (metadata or {}))
+    return pack(before | changed, ENTRY, about | (metadata or {}))
 
 
 def test_tampered_model_sets_are_refused(model):
@@ -86,9 +83,9 @@ def test_tampered_model_sets_are_refused(model):
         ({"layout": "another"}, "layout"),
         ({"version": "0" * 12}, "version"),
         ({"recipe": "{}x"}, "no model set"),
-        ({"recipe": json.dumps({"certificate": "hope"})}, "hope"),
-        ({"recipe": json.dumps({"inflation": 0.5})}, "bounds nothing"),
-        ({"recipe": json.dumps({"mode": "recursion"})}, "arrays"),
+        ({"recipe": {"certificate": "hope"}}, "hope"),
+        ({"recipe": {"inflation": 0.5}}, "bounds nothing"),
+        ({"recipe": {"mode": "recursion"}}, "arrays"),
     ):
         with pytest.raises(BadModel, match=message):
             ModelSet.decode(edited(model, metadata))

@@ -7,9 +7,9 @@ from messaging.perceptrons import Perceptrons
 from messaging.robots import GROUND, QUADROTOR
 from messaging.shapes import Shapes
 from safety.backup import brake, braking_plan
-from safety.filter import BadRequest, Request
 from safety.model_set import BadModel
 from safety.pretrained import Pretrained
+from safety.request import BadRequest, Request
 from safety.sailr import Sailr
 
 STEEP = 3.0

@@ -12,9 +12,9 @@ from messaging.robots import GROUND, QUADROTOR
 from messaging.shapes import Shapes
 from safety.client import accept, read, request_message
 from safety.commitment import UNVERIFIED, Commitment
-from safety.filter import BadRequest, Request
 from safety.model_set import BadModel
 from safety.pretrained import Pretrained
+from safety.request import BadRequest, Request
 from safety.secas import Constraints, Secas, closed_form, quadratic
 from safety.service import Counts, Models, answerer
 

@@ -14,9 +14,10 @@ from messaging.shapes import Obstacle
 from messaging.topics import DECIDE
 from safety.client import SafetyClient, SafetyError, ask, read, request_message
 from safety.commitment import UNVERIFIED, Commitment
-from safety.filter import BadRequest, Filter
+from safety.filter import Filter
 from safety.gym import SafetyWrapper
 from safety.model_set import ModelSet
+from safety.request import BadRequest
 from safety.service import Counts, Models, answerer
 from safety.wire import LARGEST, MOST_OBSTACLES, request_of
 from tests.messaging.conftest import endpoint, join  # noqa: F401 - fixtures

@@ -1,0 +1,143 @@
+"""A question to the filter and its answer, and what makes a question one that can't be decided on."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from messaging.robots import Robot
+from messaging.shapes import Shapes
+from safety.commitment import Prediction
+
+Array = NDArray[np.float64]
+
+ALLOWED, ADJUSTED, FAILSAFE = "allowed", "adjusted", "failsafe"
+FARTHEST = 1e5  # m (and any other unit): beyond it a position's rounding would begin to show
+
+
+class BadRequest(ValueError):
+    """A request that can't be decided on: `field` names what is wrong."""
+
+    def __init__(self, field: str, message: str) -> None:
+        super().__init__(message)
+        self.field = field
+
+
+class StaleModel(BadRequest):
+    """The committed plan was verified by a model set that this filter never had."""
+
+
+@dataclass(frozen=True)
+class Request:
+    """state (n,) measured; action (m,) proposed; input_in_force (m,) of the period before; plan (N, m): the committed
+    plan's tail (of a late robot: from the input on that is in force now), verified by model set `model` (empty:
+    standing still; `UNVERIFIED`: by none); obstacles: at least those within `Filter.reach`; predicted: what the last
+    decision said of this state, if there was one."""
+
+    state: Array
+    action: Array
+    input_in_force: Array
+    plan: Array
+    obstacles: Shapes
+    model: str = ""
+    predicted: Prediction | None = None
+    observation: NDArray[np.float32] = field(default_factory=lambda: np.zeros(0, np.float32))
+
+    @property
+    def still(self) -> bool:
+        """Is the robot said to stand, and to be committed to that? Needs no model's word."""
+        return not self.model and not self.plan.any() and not self.input_in_force.any()
+
+
+@dataclass(frozen=True)
+class Decision:
+    """kind: allowed | adjusted | failsafe; plan (N, m), its first row is for now (of a late robot: is in force, and the
+    second is for the next period); tube: true positions at the N
+    periods' ends, centers and half-widths (N, d), world, of the plan's free inputs and the ramp after them; predicted:
+    the next measured state; margin [m] of that tube to the nearest half-space, within ± the reach. A failsafe's may be
+    negative though it is verified: it was so when it was made, this is how it looks from the new measurement."""
+
+    kind: str
+    plan: Array
+    tube_center: Array
+    tube_half_width: Array
+    predicted: Prediction
+    margin: float
+    model: str
+    reason: str = ""
+    verified: bool = True
+    contained: bool = True
+    compared: bool = False
+    time_ms: float = 0.0
+    solve_ms: float = 0.0
+    verify_ms: float = 0.0
+    solver: str = ""
+    iterations: int = 0
+
+    @property
+    def action(self) -> Array:
+        return np.asarray(self.plan[0])
+
+
+def check_for_filter(robot: Robot, request: Request) -> None:
+    """All fields, for our filter; the observation only if there is one.
+
+    Raises:
+        BadRequest: a value is missing, not finite or of the wrong size, with the field's name.
+    """
+    _check_motion(robot, request)
+    _finite(robot, "plan", request.plan, (robot.horizon, robot.action_dim))
+    _within_bounds(robot, "plan", request.plan)
+    if request.plan[-1].any():
+        raise BadRequest("plan", "the committed plan does not end in a stop")
+    if request.obstacles.center.shape[1] != robot.position_dim:
+        raise BadRequest("obstacles", f"a {robot.name} robot's obstacles have {robot.position_dim} coordinates")
+    if request.observation.size:
+        _finite(robot, "observation", request.observation, (robot.observation_dim,))
+    if request.predicted is not None:
+        _check_prediction(robot, request.predicted)
+
+
+def check_for_rival(robot: Robot, request: Request) -> None:
+    """The fields that the rivals read.
+
+    Raises:
+        BadRequest: a value is missing, not finite or of the wrong size, with the field's name.
+    """
+    _check_motion(robot, request)
+    _finite(robot, "observation", request.observation, (robot.observation_dim,))
+
+
+def _check_motion(robot: Robot, request: Request) -> None:
+    """Where the robot is, and its inputs."""
+    _finite(robot, "state", request.state, (robot.state_dim,))
+    _finite(robot, "action", request.action, (robot.action_dim,))
+    _finite(robot, "input_in_force", request.input_in_force, (robot.action_dim,))
+    if np.abs(request.state).max() > FARTHEST:
+        raise BadRequest("state", f"a state beyond ±{FARTHEST:g} is not plausible")
+    _within_bounds(robot, "input_in_force", request.input_in_force)
+
+
+def _check_prediction(robot: Robot, predicted: Prediction) -> None:
+    _finite(robot, "predicted_center", predicted.center, (robot.state_dim,))
+    _finite(robot, "predicted_half_width", predicted.half_width, (robot.state_dim,))
+    if (predicted.half_width < 0.0).any():
+        raise BadRequest("predicted_half_width", "a predicted set has a negative half-width")
+    if not math.isfinite(predicted.heading):
+        raise BadRequest("predicted_heading", "predicted_heading is NaN or infinite")
+
+
+def _within_bounds(robot: Robot, name: str, inputs: Array) -> None:
+    if (inputs < robot.low() - 1e-9).any() or (inputs > robot.high() + 1e-9).any():
+        raise BadRequest(name, f"{name}: an input is out of the robot's bounds")
+
+
+def _finite(robot: Robot, name: str, value: NDArray[np.floating[Any]], shape: tuple[int, ...]) -> None:
+    if value.shape != shape:
+        raise BadRequest(name, f"{name} has shape {value.shape}, a {robot.name} robot's has {shape}")
+    if not np.isfinite(value).all():
+        raise BadRequest(name, f"{name} holds NaN or infinity")

@@ -1,0 +1,36 @@
+"""Arrays and what is said of them: the same content gives the same bytes, and other bytes are refused with a reason."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from safety.tensors import BadTensors, content, holds, pack, unpack
+
+WORDS = st.dictionaries(st.text(max_size=5), st.one_of(st.text(max_size=5), st.integers(), st.booleans()), max_size=5)
+ARRAYS = st.dictionaries(st.text("abcx.", min_size=1, max_size=4), arrays(np.float64, (2, 3)), max_size=3)
+
+
+@given(ARRAYS, WORDS)
+def test_what_is_packed_is_unpacked_and_the_same_content_gives_the_same_bytes(tensors, about):
+    payload = pack(tensors, "entry", about)
+    found, said = unpack(payload, "entry")
+    assert said == about and found.keys() == tensors.keys()
+    assert all(found[name].tobytes() == tensors[name].tobytes() for name in tensors)
+    turned = dict(reversed(list(about.items())))
+    assert pack(dict(reversed(list(tensors.items()))), "entry", turned) == payload
+    assert content(tensors) == content(found)
+
+
+def test_other_bytes_are_refused_with_a_reason():
+    whole = pack({"a": np.arange(6.0)[::2]}, "entry", {"x": 1})
+    assert holds(whole, "entry") and not holds(whole, "another")
+    with pytest.raises(BadTensors, match="another"):
+        unpack(whole, "another")
+    for garbage in (b"", b"garbage", whole[:-1], whole[:20], b"\x02" + b"\0" * 7 + b"[]", b"\xff" * 40):
+        assert not holds(garbage, "another")
+        with pytest.raises(BadTensors):
+            unpack(garbage, "entry")
+    with pytest.raises(BadTensors, match="no object"):
+        unpack(pack({}, "entry", [1]), "entry")
