@@ -1,13 +1,14 @@
 """How conservative each certificate is, in both modes (method §6): what its tubes are like, and what that costs.
 
 Half-widths of a full stop, what held-out plans say of the bound, and closed-loop goal rates of the map's oracle (A*)
-and of the stored policy, which was trained behind the default.
+and of the stored policy, which was trained behind the default. Where a full stop's set is wider than the robot can see,
+no plan of moving can be verified, and nothing is driven.
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -58,7 +59,9 @@ class Conservatism:
                     rows.append(row | {"refused": str(error)})
                     continue
                 row |= {"model": model.version, "statement": statement.figures()}
-                driving = {policy: self._drive(robot, policy, in_process(model)) for policy in self.policies}
+                driving = None
+                if statement.half_width_full <= robot.sight:
+                    driving = {policy: self._drive(robot, policy, in_process(model)) for policy in self.policies}
                 rows.append(row | {"driving": driving})
         return {"study": self.config(), "data": data.digest(), "rows": rows}
 
@@ -74,3 +77,34 @@ class Conservatism:
             "steps": steps,
             "decision_ms": found.decision_ms(),
         }
+
+
+def markdown(result: dict[str, Any]) -> str:
+    """The rows as a table."""
+    policies, episodes = result["study"]["policies"], result["study"]["episodes"]
+    heads = ["certificate", "mode", "stop from rest", "from full speed", "plans outside", "at most"]
+    heads += [f"{policy}: goals of {episodes}, interventions" for policy in policies] + ["decision"]
+    lines = [f"# Conservatism: {result['study']['robot']}", "", "| " + " | ".join(heads) + " |"]
+    lines.append("|---" * len(heads) + "|")
+    for row in result["rows"]:
+        if "refused" in row:
+            figures = [f"refused: {row['refused']}"] + [""] * (len(heads) - 3)
+        else:
+            figures = _figures(row, policies)
+        lines.append("| " + " | ".join([row["certificate"], row["mode"], *figures]) + " |")
+    lines += [
+        "",
+        "Half-widths of a full stop's set on its widest axis; held-out plans outside their tubes, and the bound on "
+        "that at 99 % confidence.",
+    ]
+    return "\n".join(lines)
+
+
+def _figures(row: dict[str, Any], policies: Sequence[str]) -> list[str]:
+    said, driving = row["statement"], row["driving"]
+    figures = [f"{said[name]:.3g} m" for name in ("half_width_rest", "half_width_full")]
+    figures += [f"{said['violations']} of {said['windows']}", f"{said['bound_plan']:.2%}"]
+    if driving is None:
+        return figures + ["not driven: nothing can be verified"] + [""] * len(policies)
+    figures += [f"{driving[policy]['goals']}, {driving[policy]['interventions']:.1%}" for policy in policies]
+    return [*figures, f"{driving[policies[0]]['decision_ms']['mean']:.2f} ms"]

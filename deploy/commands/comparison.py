@@ -9,12 +9,10 @@ from typing import Annotated, Any, Literal
 
 import tyro
 from rich.markdown import Markdown
-from rich.table import Table
 
-from deploy import compare
+from deploy import compare, conservatism
 from deploy.commands.common import Robot, console, errors, say_json
 from deploy.compare import RESULTS, RUNS, SEEDS, Cell, Job
-from deploy.conservatism import Conservatism
 from deploy.curves import learning_curves, seeds_as_points
 from deploy.pretrain import recipe_for
 from deploy.store import method_for, method_path, pretrained
@@ -128,7 +126,7 @@ class Compare:
         given = {name: value for name in ("steps", "episodes") if (value := getattr(self, name)) is not None}
         jobs: list[Job] = [Cell(replace(quick(study) if self.quick else study, **given)) for study in wanted]
         if self.conservatism and not self.quick:
-            jobs.append(Conservatism(robot))
+            jobs.append(conservatism.Conservatism(robot))
         return jobs
 
     def _say(self, name: str, text: str) -> None:
@@ -141,33 +139,11 @@ class Compare:
         (folder / "table.json").write_text(json.dumps(plain(figures), indent=1) + "\n")
         learning_curves(cells, folder / "curves.png")
         seeds_as_points(figures, folder / "seeds.png")
+        for result in rest:
+            rows = conservatism.markdown(result)
+            (folder / "conservatism.md").write_text(rows + "\n")
+            text += "\n" + rows
         if not self.json:
             console.print(Markdown(text))
-            for result in rest:
-                console.print(conservatism(result))
             console.print(f"[dim]{folder}: table.md, table.json, curves.png, seeds.png[/]")
         return plain(figures) | {"conservatism": rest[0]["rows"] if rest else None}
-
-
-def conservatism(result: dict[str, Any]) -> Table:
-    """The certificates' rows as a table."""
-    shown = Table(title=f"conservatism of {result['study']['robot']} ({result['study']['episodes']} episodes)")
-    policies = result["study"]["policies"]
-    for column in ("certificate", "mode", "stop from rest", "from full speed", "plans violated", "≤ per plan"):
-        shown.add_column(column)
-    for policy in policies:
-        shown.add_column(f"goals, {policy}")
-    for row in result["rows"]:
-        if "refused" in row:
-            shown.add_row(row["certificate"], row["mode"], f"refused: {row['refused']}")
-            continue
-        said = row["statement"]
-        shown.add_row(
-            row["certificate"],
-            row["mode"],
-            *(f"{1e3 * said[name]:.1f} mm" for name in ("half_width_rest", "half_width_full")),
-            f"{said['violations']} of {said['windows']}",
-            f"{said['bound_plan']:.2%}",
-            *(str(row["driving"][policy]["goals"]) for policy in policies),
-        )
-    return shown
