@@ -68,6 +68,7 @@ def training_rows(results: Sequence[Result]) -> Row:
         "collision rate": mean(_training(results, "collision")),
         "collisions": float(np.mean([sum(values) for values in _training(results, "collision")])),
         "steps to 90 % goals": mean([[value] for value in learned]),
+        "seeds that got there": sum(value < r["training"]["steps"] for value, r in zip(learned, results, strict=True)),
         "interventions": ratio(_training(results, "interventions"), _training(results, "steps")),
         "pre-training samples": 0 if results[0]["model"] is None else int(results[0]["model"]["samples"]),
         "pre-training collisions": 0 if results[0]["model"] is None else int(results[0]["model"]["collisions"]),
