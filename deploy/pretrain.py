@@ -12,7 +12,7 @@ import numpy as np
 from deploy.rollouts import costs, transitions
 from learner.pretrain import Fit, fit_cost, fit_linear
 from messaging.perceptrons import Perceptrons
-from messaging.robots import Robot
+from messaging.robots import QUADROTOR, Robot
 from safety.pretrained import Pretrained
 from safety.sailr import SAILR
 from safety.secas import SECAS
@@ -48,6 +48,7 @@ Recipe = SecasRecipe | SailrRecipe
 Made = tuple[dict[str, Perceptrons], dict[str, float], dict[str, str]]  # networks, settings, about
 RECIPES: dict[str, type[SecasRecipe] | type[SailrRecipe]] = {SECAS: SecasRecipe, SAILR: SailrRecipe}
 TUNED: dict[tuple[str, str], dict[str, float]] = {  # where a robot's differ; found by `pretrain METHOD ROBOT --tune`
+    (SECAS, QUADROTOR.name): {"margin": 0.4},
 }
 
 
