@@ -26,6 +26,7 @@ class TD3Config:
     reward_scale: float = 0.1  # keeps |Q| near 10 for rewards of ±100, where Adam at 3e-4 is quick
     updates_per_step: float = 1.0
     stored: Stored = "both"
+    symmetric: bool = True  # learn from a step's mirror images too, where the robot has any (`learner/symmetry.py`)
     warmup: int = 2000  # steps at random before the first update
     precision: Precision = "float32"  # of the wide products
 

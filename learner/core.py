@@ -23,6 +23,7 @@ from learner.ledger import Ledger
 from learner.limiter import Limiter
 from learner.replay import Batch, Replay
 from learner.state import State
+from learner.symmetry import Images
 from learner.td3 import TD3
 from learner.windows import Windows
 from messaging import brakeline_pb2 as pb
@@ -53,6 +54,7 @@ class Learner:
         self._td3 = TD3(*dims, td3, seed=int(networks.generate_state(1)[0]))
         self._draws = np.random.default_rng(draws)
         self._replay, self._batch = Replay(config.capacity, *dims), Batch(td3.batch, *dims)
+        self._images = Images(robot, td3.batch) if td3.symmetric else None
         self._windows, self._ledger = Windows(td3.n_step, td3.gamma, td3.stored), Ledger()
         ahead = 0.0 if config.lockstep else config.ahead
         self._limiter = Limiter(td3.updates_per_step * td3.batch, td3.batch, td3.warmup, ahead)
@@ -121,6 +123,8 @@ class Learner:
         made = 0
         while made < most and self._limiter.may_sample() and len(self._replay) > 0:
             self._replay.sample(self._draws, self._batch)
+            if self._images is not None:
+                self._images.apply(self._batch)
             self._td3.update(self._batch)
             self._limiter.sample()
             made += 1

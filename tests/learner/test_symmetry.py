@@ -1,0 +1,76 @@
+"""Images of transitions: what a turned or mirrored world would have shown, judged by the simulator's own lidar."""
+
+import numpy as np
+import pytest
+
+from learner.replay import Batch
+from learner.symmetry import Images, image_of, turns_of
+from messaging.rays import rays_of
+from messaging.robots import GROUND, QUADROTOR
+
+N = len(rays_of(QUADROTOR).directions)
+
+
+def image(observation, turn):
+    source, sign, _, _ = image_of(QUADROTOR, turn)
+    return observation[source] * sign
+
+
+def test_the_eight_turns_are_a_group_that_keeps_the_vertical():
+    turns = turns_of(QUADROTOR)
+    assert len({turn.tobytes() for turn in [*turns, np.eye(3)]}) == len(turns) == 8
+    assert np.array_equal(turns[0], np.eye(3))
+    for one in turns:
+        assert np.array_equal(one @ one.T, np.eye(3)) and one[2, 2] == 1.0
+        assert all(any(np.array_equal(one @ other, third) for third in turns) for other in turns)
+    assert len(turns_of(GROUND)) == 1
+
+
+@pytest.mark.parametrize("number", range(8))
+def test_the_lidar_of_a_turned_world_sees_the_image(number):
+    """A few balls about the robot, moved with the world; distances along each ray by geometry, not by the table."""
+    turn, rng = turns_of(QUADROTOR)[number], np.random.default_rng(3)
+    balls = rng.uniform(-6.0, 6.0, (12, 3))
+
+    def seen(centres):
+        along = rays_of(QUADROTOR).directions @ centres.T
+        off = (centres**2).sum(axis=1) - along**2
+        hits = np.where((along > 0) & (off < 1.0), along - np.sqrt(np.maximum(1.0 - off, 0.0)), 12.0)
+        return hits.min(axis=1) / 12.0
+
+    vectors = rng.normal(size=(3, 3))
+    before = np.concatenate([seen(balls), vectors.ravel()])
+    after = np.concatenate([seen(balls @ turn.T), (vectors @ turn.T).ravel()])
+    assert (seen(balls) < 1.0).sum() > 10
+    assert np.allclose(image(before, turn), after, atol=1e-9)
+    _, _, source, sign = image_of(QUADROTOR, turn)
+    assert np.array_equal(vectors[0][source] * sign, turn @ vectors[0])
+
+
+def test_a_batch_holds_every_image_alike_and_rewards_as_they_were():
+    batch, rng = Batch(16, QUADROTOR.observation_dim, 3), np.random.default_rng(0)
+    for array in batch.arrays:
+        array[:] = rng.normal(size=array.shape)
+    before = [array.copy() for array in batch.arrays]
+    Images(QUADROTOR, 16).apply(batch)
+    observation, action, reward, discount, after = batch.arrays
+    assert np.array_equal(reward, before[2]) and np.array_equal(discount, before[3])
+    for row in range(16):
+        turn = turns_of(QUADROTOR)[row % 8]
+        assert np.array_equal(observation[row], image(before[0][row], turn).astype(np.float32))
+        assert np.array_equal(after[row], image(before[4][row], turn).astype(np.float32))
+        assert np.allclose(action[row], turn @ before[1][row])
+    assert np.array_equal(batch.observation[0].numpy(), observation), "torch sees the same"
+
+
+def test_a_robot_without_images_keeps_its_batches():
+    batch = Batch(8, GROUND.observation_dim, 2)
+    batch.arrays[0][:] = np.arange(GROUND.observation_dim)
+    Images(GROUND, 8).apply(batch)
+    assert np.array_equal(batch.arrays[0][3], np.arange(GROUND.observation_dim))
+
+
+def test_other_turns_are_no_images():
+    tilted = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, 1.0, 0.0]])
+    with pytest.raises(ValueError, match="rays"):
+        image_of(QUADROTOR, tilted)
