@@ -1,7 +1,7 @@
 """What a robot would have seen and done in a world that is turned or mirrored: as true as what was recorded.
 
-The quadrotor's body, bounds, arenas and rays are the same after a quarter turn about the vertical, and in a mirror. With
-a signed permutation R of the world's axes, a transition of it has the image
+The quadrotor's body, bounds, arenas and rays are the same after a quarter turn about the vertical, and in a mirror.
+With a signed permutation R of the world's axes, a transition of it has the image
 
     ray j of s ↦ the ray i with e_i = Rᵀ e_j,      every vector v in s, and a,  ↦  R v
 
