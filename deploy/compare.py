@@ -23,7 +23,7 @@ from messaging.files import write_whole
 from messaging.robots import GROUND, QUADROTOR
 
 RESULTS, RUNS = Path("results"), Path("runs/compare")
-STEPS = {GROUND.name: 60_000, QUADROTOR.name: 60_000}  # of training: a cell takes ten minutes of one core at the most
+STEPS = {GROUND.name: 60_000, QUADROTOR.name: 40_000}  # of training: a cell takes ten minutes of one core at the most
 EPISODES = 500
 SEEDS = (0, 1, 2)
 
