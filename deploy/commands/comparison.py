@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -19,6 +19,7 @@ from deploy.store import method_for, method_path, pretrained
 from deploy.study import METHODS, NONE, quick
 from deploy.table import markdown, plain, table
 from deploy.tune import Tried, best, try_all, values_for
+from learner.config import TD3Config
 from messaging.robots import robot_named
 from safety.model_set import Recipe
 from safety.pretrained import Pretrained
@@ -88,6 +89,9 @@ class Compare:
     """Run what is there already anew."""
     conservatism: bool = True
     """Also the table of certificates and modes, with the stored policy."""
+    penalty: float = 1.0
+    """For a correction by the whole range of an input; with --td3 and another --results to try what learning needs."""
+    td3: TD3Config = field(default_factory=TD3Config)
     results: Path = RESULTS
     runs: Path = RUNS
     """Where the logs and policies of the cells go."""
@@ -124,6 +128,7 @@ class Compare:
         seeds = self.seeds[:1] if self.quick else self.seeds
         wanted = [study for study in compare.studies(robot, seeds) if study.method in self.methods]
         given = {name: value for name in ("steps", "episodes") if (value := getattr(self, name)) is not None}
+        wanted = [replace(study, penalty=self.penalty, td3=self.td3) for study in wanted]
         jobs: list[Job] = [Cell(replace(quick(study) if self.quick else study, **given)) for study in wanted]
         if self.conservatism and not self.quick:
             jobs.append(conservatism.Conservatism(robot))
