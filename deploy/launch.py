@@ -6,7 +6,6 @@ import json
 import logging
 import os
 import signal
-import socket
 import subprocess
 import sys
 import time
@@ -22,6 +21,7 @@ from deploy.experiments import RunConfig
 from deploy.store import method_for
 from logs.metrics import Metrics
 from messaging.bus import BusError, BusSettings, Malformed, Sample
+from messaging.ports import free_endpoint
 from messaging.process import Process
 from messaging.robots import robot_named
 from messaging.topics import RECORDED
@@ -149,13 +149,6 @@ class View:
     children: list[Child]
     lines: deque[str]
     ending: bool = False
-
-
-def free_endpoint() -> str:
-    """A TCP port of this machine that is free now."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
 
 
 def prepare(config: RunConfig, folder: Path, resume: bool) -> None:

@@ -9,8 +9,8 @@ from multiprocessing.synchronize import Event
 
 from deploy.bench import situations
 from deploy.bench.timing import Figures, each
-from deploy.launch import free_endpoint
 from messaging.bus import Bus, BusSettings
+from messaging.ports import free_endpoint
 from messaging.topics import DECIDE
 from safety.client import ask
 from safety.service import Counts, Models, answerer

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import socket
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -16,17 +15,11 @@ from deploy.display import Display, summary
 from deploy.experiments import Embedded, RunConfig
 from deploy.launch import Launcher, prepare
 from deploy.vehicles import flight_arena
+from messaging.ports import free_udp_port
 from messaging.robots import QUADROTOR, robot_named
 
 LEARN = "learn"
 ACTOR = "actor-0"
-
-
-def free_port() -> int:
-    """A UDP port of this machine that is free now."""
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
 
 
 @dataclass(frozen=True)
@@ -99,7 +92,7 @@ class Fly:
     def _flight(self) -> FlightSettings:
         if self.url:
             return self.flight.settings(self.url, flight_arena(self.arena, self.seed))
-        return FlightSettings(f"udpin:127.0.0.1:{free_port()}", truth=free_port())
+        return FlightSettings(f"udpin:127.0.0.1:{free_udp_port()}", truth=free_udp_port())
 
 
 def flown(figures: dict[str, Any]) -> dict[str, Any]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import socket
 import threading
 import time
 from collections.abc import Iterator
@@ -14,6 +13,7 @@ from actors.live import LiveVehicle, Offset, Truth
 from actors.mavlink import Frame
 from messaging.clock import WallClock
 from messaging.links import open_link
+from messaging.ports import free_udp_port
 from sim.autopilot import server
 from sim.autopilot.endpoint import Autopilot
 from sim.autopilot.pilot import Mode
@@ -30,9 +30,7 @@ Live = tuple[LiveVehicle, Autopilot, list[Frame]]
 def live(request: pytest.FixtureRequest) -> Iterator[Live]:
     """A vehicle, its autopilot in a thread, on the floor at first, and the frames between them."""
     link, stop, frames = open_link("udpin:127.0.0.1:0"), threading.Event(), list[Frame]()
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.bind(("127.0.0.1", 0))
-        truth_port = probe.getsockname()[1]
+    truth_port = free_udp_port()
     autopilot = Autopilot(quadrotor(floor=0.02), request.param, parameters={TIMEOUT[request.param]: 0.3})
     channel = server.Truth("127.0.0.1", truth_port)
     thread = threading.Thread(target=server.serve, args=([autopilot], link, WallClock(), stop.is_set, channel))

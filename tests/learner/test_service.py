@@ -1,6 +1,5 @@
 """The process on a real bus, with an actor that makes its steps up."""
 
-import socket
 import threading
 import time
 from collections.abc import Iterator
@@ -16,6 +15,7 @@ from learner.core import Learner
 from learner.service import CHECKPOINT, POLICY, LearnerLoop, LearnerSettings, main
 from messaging import brakeline_pb2 as pb
 from messaging.bus import Bus, BusSettings, Refused
+from messaging.ports import free_endpoint
 from messaging.robots import GROUND, UnknownRobot
 from messaging.topics import FLOW, JOIN, LEARNER, STEP, WEIGHTS
 from messaging.weights import MLP
@@ -32,9 +32,7 @@ CONFIG = LearnerConfig(
 @pytest.fixture
 def bus() -> Iterator[Bus]:
     """The router, and the actor's place on it."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+    endpoint = free_endpoint()
     with Bus(BusSettings(listen=(endpoint,)), "actor-0") as bus:
         yield bus
 

@@ -3,7 +3,6 @@
 import errno
 import os
 import signal
-import socket
 import subprocess
 import sys
 import time
@@ -20,6 +19,7 @@ from logs.recorder import Inbox, Recording, entry
 from logs.segment import Metadata, Segment, name_of, open_segment
 from messaging import brakeline_pb2 as pb
 from messaging.bus import Bus, BusSettings, Sample
+from messaging.ports import free_endpoint
 from messaging.topics import EPISODE, EXCHANGE, HEALTH, LEARNER, LOG, STEP
 
 Say = Callable[..., Sample]
@@ -36,9 +36,7 @@ main(BusSettings(connect=(sys.argv[1],)), Path(sys.argv[2]), {"run": {"method": 
 
 @pytest.fixture
 def router() -> Iterator[Bus]:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+    endpoint = free_endpoint()
     with Bus(BusSettings(listen=(endpoint,)), "launcher") as bus:
         yield bus
 

@@ -4,7 +4,6 @@ import json
 import os
 import random
 import signal
-import socket
 import subprocess
 import sys
 import time
@@ -24,6 +23,7 @@ from logs.recover import BeingRecorded, recover
 from logs.segment import being_written, open_segment
 from messaging import brakeline_pb2 as pb
 from messaging.bus import Bus, BusSettings, Sample
+from messaging.ports import free_endpoint
 from messaging.topics import HEALTH, STEP
 from tests.logs.mixed import ABOUT, Writer
 
@@ -168,9 +168,7 @@ def test_files_rotate_by_size_and_by_time_and_each_is_whole(
 
 @pytest.fixture
 def router() -> Iterator[Bus]:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+    endpoint = free_endpoint()
     with Bus(BusSettings(listen=(endpoint,)), "actor-0") as bus:
         yield bus
 

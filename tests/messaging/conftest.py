@@ -1,6 +1,5 @@
 """Buses on free loopback ports, closed after the test."""
 
-import socket
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -8,15 +7,14 @@ from collections.abc import Callable, Iterator
 import pytest
 
 from messaging.bus import Bus, BusSettings
+from messaging.ports import free_endpoint
 
 Join = Callable[..., Bus]
 
 
 @pytest.fixture
 def endpoint() -> str:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+    return free_endpoint()
 
 
 @pytest.fixture

@@ -1,13 +1,13 @@
 """Each process started alone, by its command, as on machines of their own."""
 
 import signal
-import socket
 import subprocess
 
 import pytest
 
 from logs.report import analyse
 from messaging.bus import Bus, BusSettings
+from messaging.ports import free_endpoint
 from messaging.shapes import Obstacle
 from safety.client import SafetyClient
 from tests.system.runs import BRAKELINE, brakeline, until
@@ -33,9 +33,7 @@ def start(tmp_path):
 
 
 def test_safety_learner_actor_and_recorder_alone(start, data_folder, tmp_path):
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+    endpoint = free_endpoint()
     there = ("--connect", endpoint)
     safety = start("safety", "ground", "--listen", endpoint)
     # Before anybody else is there: the processes may be started in any order.

@@ -1,0 +1,22 @@
+"""Ports of this machine that nobody has at the moment."""
+
+from __future__ import annotations
+
+import socket
+
+HERE = "127.0.0.1"
+
+
+def free_udp_port() -> int:
+    return _free(socket.SOCK_DGRAM)
+
+
+def free_endpoint() -> str:
+    """To listen on, as `BusSettings` writes it."""
+    return f"tcp/{HERE}:{_free(socket.SOCK_STREAM)}"
+
+
+def _free(kind: socket.SocketKind) -> int:
+    with socket.socket(socket.AF_INET, kind) as probe:
+        probe.bind((HERE, 0))
+        return int(probe.getsockname()[1])
