@@ -42,6 +42,7 @@ class SailrRecipe:
     gamma: float = 0.99
     smoothing: float = 0.5  # m of clearance
     threshold: float = 0.08  # η, tuned
+    lead: int = 5  # periods of driving before braking, at the most
 
 
 Recipe = SecasRecipe | SailrRecipe
@@ -49,6 +50,7 @@ Made = tuple[dict[str, Perceptrons], dict[str, float], dict[str, str]]  # networ
 RECIPES: dict[str, type[SecasRecipe] | type[SailrRecipe]] = {SECAS: SecasRecipe, SAILR: SailrRecipe}
 TUNED: dict[tuple[str, str], dict[str, float]] = {  # where a robot's differ; found by `pretrain METHOD ROBOT --tune`
     (SECAS, QUADROTOR.name): {"margin": 0.4},
+    (SAILR, QUADROTOR.name): {"lead": 20},  # it takes seven periods to full speed
 }
 
 
@@ -98,11 +100,11 @@ def _secas(robot: Robot, recipe: SecasRecipe, each: Each) -> Made:
 def _sailr(robot: Robot, recipe: SailrRecipe, each: Each) -> Made:
     """V from what braking came to; Q of every driven step from V after it, the more cautious of the two."""
     gamma = recipe.gamma
-    data = costs(robot, recipe.arena, recipe.samples, recipe.seed, gamma, recipe.smoothing, each)
-    v, v_error = fit_cost(data.braked, data.braked_cost, 2, recipe.fit, recipe.seed)
+    data = costs(robot, recipe.arena, recipe.samples, recipe.seed, gamma, recipe.smoothing, recipe.lead, each)
+    v, v_error = fit_cost(robot, data.braked, data.braked_cost, 2, recipe.fit, recipe.seed)
     after = np.array([1.0 / (1.0 + np.exp(-v(x).astype(float).max())) for x in data.after])
     cost = np.where(data.collided, 1.0, np.minimum(data.step_cost + gamma * after, 1.0))
-    q, q_error = fit_cost(data.driven, cost, 2, recipe.fit, recipe.seed + 1)
+    q, q_error = fit_cost(robot, data.driven, cost, 2, recipe.fit, recipe.seed + 1)
     about = {
         "collisions": str(data.collisions),
         "error": f"{v_error:.4f} mean of |V - cost|, {q_error:.4f} of |Q - cost|, costs in [0, 1]",

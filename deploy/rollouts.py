@@ -23,7 +23,6 @@ Array = NDArray[np.float64]
 
 APART = 5_000_000  # added to the seed: neither training nor evaluation draws its episodes from there
 DRIVERS = ("random", "greedy", "adversary")  # of the drives that end in braking
-LONGEST_LEAD = 5  # periods of driving before braking
 STAND = 2  # periods that a stop is watched for after the input has come to zero
 
 
@@ -104,9 +103,11 @@ def costs(
     seed: int,
     gamma: float,
     smoothing: float,
+    lead: int,
     each: Callable[[], object] = lambda: None,
 ) -> Costs:
-    """About `samples` steps: some driving, then braking to a stop, and again (Wagener et al. 2021, appendix D).
+    """About `samples` steps: up to `lead` periods of driving, then braking to a stop, and again (Wagener et al. 2021,
+    appendix D).
 
     A step costs max(0, 1 − clearance/smoothing), smoothing in m, and a collision 1 for ever; sums are discounted by γ
     and scaled by 1 − γ.
@@ -146,7 +147,7 @@ def costs(
     while len(driven) < samples:
         drive.ready()
         policy: Policy = drivers[int(rng.integers(len(drivers)))]
-        for _ in range(int(rng.integers(LONGEST_LEAD + 1))):
+        for _ in range(int(rng.integers(lead + 1))):
             if not drive.ended:
                 take(_varied(robot, policy(drive.observation, drive.info), rng))
         if not drive.ended:

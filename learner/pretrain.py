@@ -16,7 +16,9 @@ from torch import Tensor
 
 from learner.adam import Adam
 from learner.networks import Network
+from learner.symmetry import Images
 from messaging.perceptrons import Perceptrons
+from messaging.robots import Robot
 
 Array = NDArray[np.float64]
 
@@ -63,8 +65,9 @@ def fit_linear(observation: Array, action: Array, change: Array, how: Fit, seed:
     return networks, np.sqrt(np.stack([((predicted - rest) ** 2).mean(0), (rest**2).mean(0)]))
 
 
-def fit_cost(x: Array, cost: Array, count: int, how: Fit, seed: int) -> tuple[Perceptrons, float]:
-    """`count` networks whose sigmoid is the cost (N,) in [0, 1] of inputs x (N, i); they differ by their start.
+def fit_cost(robot: Robot, x: Array, cost: Array, count: int, how: Fit, seed: int) -> tuple[Perceptrons, float]:
+    """`count` networks whose sigmoid is the cost (N,) in [0, 1] of inputs x (N, i), observations or pairs of
+    observation and action; they differ by their start. They learn from images too (`learner/symmetry.py`).
 
     Returns them and the mean absolute error of their mean on held-out samples.
 
@@ -76,13 +79,13 @@ def fit_cost(x: Array, cost: Array, count: int, how: Fit, seed: int) -> tuple[Pe
     def gradient(outputs: Tensor, rows: NDArray[np.intp]) -> Tensor:
         return (torch.sigmoid(outputs) - costs[rows][:, None]) / len(rows)
 
-    networks, apart = _fit(inputs, (count, 1), gradient, how, seed)
+    networks, apart = _fit(inputs, (count, 1), gradient, how, seed, Images(robot, how.batch))
     predicted = np.array([1.0 / (1.0 + np.exp(-networks(inputs[t].numpy()).astype(float))) for t in apart])
     return networks, float(np.abs(predicted.mean((1, 2)) - cost[apart]).mean())
 
 
 def _fit(
-    inputs: Tensor, shape: tuple[int, int], gradient: Gradient, how: Fit, seed: int
+    inputs: Tensor, shape: tuple[int, int], gradient: Gradient, how: Fit, seed: int, images: Images | None = None
 ) -> tuple[Perceptrons, NDArray[np.intp]]:
     """`shape[0]` networks with `shape[1]` outputs, and the rows that were held out."""
     torch.set_num_threads(1)
@@ -98,7 +101,8 @@ def _fit(
     adam = Adam(network.parameters, how.rate)
     torch.set_flush_denormal(True)
     for rows in _batches(kept, how, rng):
-        found = network.forward(inputs[rows][None])
+        drawn = inputs[rows] if images is None else torch.from_numpy(images.rows(inputs[rows].numpy()))
+        found = network.forward(drawn[None])
         adam.step(network.parameter_gradient(gradient(found, rows)))
     torch.set_flush_denormal(False)
     layers = [(layer.weight.numpy().copy(), layer.bias[:, 0].numpy().copy()) for layer in network.layers]

@@ -58,28 +58,37 @@ def image_of(robot: Robot, turn: Matrix) -> tuple[Indices, Matrix, Indices, Matr
 
 
 class Images:
-    """Replaces the transitions of a batch by their images: row k by that under `turns_of` number k modulo their count.
+    """Replaces rows by their images: row k by that under number k of `turns_of`, modulo their count.
 
-    Rows are drawn at random, so which image a transition is seen in is as random.
+    Rows are drawn at random, so which image of a transition is seen is as random.
     """
 
     def __init__(self, robot: Robot, batch: int) -> None:
         turns = turns_of(robot)
         if len(turns) == 1:
-            self._sources: tuple[tuple[int, Indices, NDArray[np.float32]], ...] = ()
+            self._sources: dict[int, tuple[Indices, NDArray[np.float32]]] = {}
             return
         images = [image_of(robot, turn) for turn in turns]
         which = np.arange(batch) % len(turns)
         observation, observed, action, acted = (np.array([image[part] for image in images])[which] for part in range(4))
-        seen = _flat(observation), observed.astype(np.float32)
-        done = _flat(action), acted.astype(np.float32)
-        self._sources = (OBSERVATION, *seen), (ACTION, *done), (NEXT_OBSERVATION, *seen)
+        pair = np.hstack([observation, observation.shape[1] + action])
+        self._sources = {
+            columns.shape[1]: (_flat(columns), signs.astype(np.float32))
+            for columns, signs in ((observation, observed), (action, acted), (pair, np.hstack([observed, acted])))
+        }
 
     def apply(self, batch: Batch) -> None:
         """In place."""
-        for number, source, sign in self._sources:
-            array = batch.arrays[number]
-            np.multiply(np.take(array, source), sign, out=array)
+        if self._sources:
+            for number in (OBSERVATION, ACTION, NEXT_OBSERVATION):
+                batch.arrays[number][:] = self.rows(batch.arrays[number])
+
+    def rows(self, array: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Of observations (batch, o), actions (batch, m), or pairs of them (batch, o + m)."""
+        if not self._sources:
+            return array
+        source, sign = self._sources[array.shape[1]]
+        return np.asarray(np.take(array, source) * sign)
 
 
 def _flat(columns: Indices) -> Indices:

@@ -20,7 +20,7 @@ def test_transitions_are_whole_scaled_and_the_same_again():
 
 
 def test_costs_are_of_braking_to_the_end():
-    found = costs(GROUND, "default", 3000, 1, gamma=0.99, smoothing=0.5)
+    found = costs(GROUND, "default", 3000, 1, gamma=0.99, smoothing=0.5, lead=5)
     assert found.collisions > 0 and found.collided.sum() == found.collisions
     for cost in (found.braked_cost, found.step_cost):
         assert (cost >= 0.0).all() and (cost <= 1.0 + 1e-9).all()

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from learner.pretrain import Fit, TooFew, fit_cost, fit_linear
+from messaging.robots import GROUND
 
 HOW = Fit(hidden=(32, 32), rate=3e-3, batch=64, epochs=25)
 
@@ -27,7 +28,7 @@ def test_costs_are_probabilities():
     seen, action, rng = drawn()
     danger = 1.0 / (1.0 + np.exp(-4.0 * (seen[:, 0] + action[:, 0])))
     x = np.hstack([seen, action])
-    networks, error = fit_cost(x, (rng.random(len(x)) < danger).astype(float), 2, HOW, seed=1)
+    networks, error = fit_cost(GROUND, x, (rng.random(len(x)) < danger).astype(float), 2, HOW, seed=1)
     assert networks.count == 2 and error < 0.3
     odds = networks(np.array([0.9, 0, 0, 0.9, 0])), networks(np.array([-0.9, 0, 0, -0.9, 0])), networks(np.zeros(5))
     assert (odds[0] > 2).all() and (odds[1] < -2).all() and (np.abs(odds[2]) < 1.5).all()
@@ -44,7 +45,7 @@ def test_the_seed_decides_alone():
 
 def test_too_few_samples_and_senseless_numbers_are_refused():
     with pytest.raises(TooFew, match="10 samples"):
-        fit_cost(np.zeros((10, 2)), np.zeros(10), 1, HOW, 0)
+        fit_cost(GROUND, np.zeros((10, 2)), np.zeros(10), 1, HOW, 0)
     for wrong in ({"batch": 0}, {"epochs": 0}, {"hidden": ()}, {"held_out": 0.0}):
         with pytest.raises(ValueError, match="1 or more"):
             Fit(**({"hidden": (4,)} | wrong))

@@ -74,3 +74,16 @@ def test_other_turns_are_no_images():
     tilted = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, 1.0, 0.0]])
     with pytest.raises(ValueError, match="rays"):
         image_of(QUADROTOR, tilted)
+
+
+def test_rows_of_observations_actions_and_pairs_of_them():
+    rng = np.random.default_rng(0)
+    seen = rng.normal(size=(8, QUADROTOR.observation_dim)).astype(np.float32)
+    done = rng.normal(size=(8, 3)).astype(np.float32)
+    images = Images(QUADROTOR, 8)
+    both = images.rows(np.hstack([seen, done]))
+    assert np.array_equal(both, np.hstack([images.rows(seen), images.rows(done)]))
+    assert np.array_equal(both[0], np.hstack([seen[0], done[0]])) and not np.array_equal(
+        both[1:], np.hstack([seen, done])[1:]
+    )
+    assert Images(GROUND, 8).rows(seen) is seen
