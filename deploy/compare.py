@@ -11,6 +11,7 @@ from __future__ import annotations
 import json
 import multiprocessing
 import os
+import threading
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
 from dataclasses import dataclass
@@ -131,7 +132,7 @@ def _side_by_side(
 ) -> None:
     """Each in a process of its own, started afresh: a forked one would share locks of libraries that have threads."""
     context = multiprocessing.get_context("spawn")
-    with context.Manager() as manager, ProcessPoolExecutor(workers, context, initializer=_modest) as pool:
+    with context.Manager() as manager, ProcessPoolExecutor(workers, context, initializer=_begin_work) as pool:
         told = manager.Queue()
         under_way = {pool.submit(_found_out, job, results, runs, told): job for job in jobs}
         while under_way:
@@ -147,10 +148,19 @@ def _side_by_side(
                 say(job.name, "done")
 
 
-def _modest() -> None:
-    """Two processes with two threads each on two cores are slower."""
+def _begin_work() -> None:
+    """One thread each, for two processes with two threads each on two cores are slower; and no life after the parent,
+    however that one ends."""
     for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ[name] = "1"
+
+    def follow() -> None:
+        parent = multiprocessing.parent_process()
+        assert parent is not None
+        parent.join()
+        os._exit(1)
+
+    threading.Thread(target=follow, name="follow the parent", daemon=True).start()
 
 
 def _found_out(job: Job, results: Path, runs: Path, told: Any) -> None:

@@ -1,11 +1,16 @@
 """The comparison: jobs that are skipped, refused, resumed; figures by hand; and the same seed twice."""
 
 import json
+import os
+import subprocess
+import sys
+import time
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
 import numpy as np
+import psutil
 import pytest
 
 from deploy import pretrain, store
@@ -19,6 +24,7 @@ from logs.report import analyse
 from messaging.robots import GROUND
 from messaging.weights import MLP
 from safety.model_set import Recipe
+from tests.system.runs import until
 
 DEAR = ("decision_ms", "milliseconds")
 
@@ -63,6 +69,38 @@ def test_side_by_side_they_give_the_same(tmp_path):
     found = complete(jobs, tmp_path / "results", tmp_path / "runs", workers=2)
     assert [result["square"] for result in found] == [0, 1, 4, 9, 16]
     assert len(list((tmp_path / "results" / "ground").iterdir())) == 5
+
+
+@dataclass(frozen=True)
+class Nap(Errand):
+    """A job that says which process does it, and does not end."""
+
+    def run(self, folder: Path, say) -> dict:
+        folder.mkdir(parents=True)
+        write(folder, Errand(self.number), {"pid": os.getpid()})
+        time.sleep(600.0)
+        return {}
+
+
+NAPS = """
+from pathlib import Path
+from deploy.compare import complete
+from tests.deploy.test_compare import Nap
+if __name__ == "__main__":
+    complete([Nap(1), Nap(2)], Path({0!r}) / "results", Path({0!r}) / "runs", workers=2)
+"""
+
+
+def test_killed_it_leaves_no_worker_behind(tmp_path):
+    (tmp_path / "naps.py").write_text(NAPS.format(str(tmp_path)))
+    root = Path(__file__).parents[2]
+    popen = subprocess.Popen([sys.executable, tmp_path / "naps.py"], env=os.environ | {"PYTHONPATH": str(root)})
+    marks = [tmp_path / "runs" / "ground" / f"errand-{n}" / "ground" / f"errand-{n}.json" for n in (1, 2)]
+    until(lambda: all(mark.exists() for mark in marks), "both are at work")
+    workers = [json.loads(mark.read_text())["pid"] for mark in marks]
+    popen.kill()
+    popen.wait()
+    until(lambda: not any(psutil.pid_exists(pid) for pid in workers), "both have ended", 10.0)
 
 
 def test_a_job_that_fails_loses_nothing_that_was_done(tmp_path):
