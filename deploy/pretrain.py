@@ -50,7 +50,7 @@ Made = tuple[dict[str, Perceptrons], dict[str, float], dict[str, str]]  # networ
 RECIPES: dict[str, type[SecasRecipe] | type[SailrRecipe]] = {SECAS: SecasRecipe, SAILR: SailrRecipe}
 TUNED: dict[tuple[str, str], dict[str, float]] = {  # where a robot's differ; found by `pretrain METHOD ROBOT --tune`
     (SECAS, QUADROTOR.name): {"margin": 0.4},
-    (SAILR, QUADROTOR.name): {"lead": 20},  # it takes seven periods to full speed
+    (SAILR, QUADROTOR.name): {"lead": 20, "threshold": 0.15},  # it takes seven periods to full speed
 }
 
 
