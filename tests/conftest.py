@@ -1,7 +1,9 @@
 """A small recording of the ground robot, made once a session, for the tests that need a model set."""
 
 import os
-from collections.abc import Iterator
+import threading
+import time
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -36,3 +38,21 @@ def flight_folder(data_folder: Path) -> Path:
     for robot in (QUADROTOR, QUADROTOR.in_real_time()):
         store.model_for(robot, Recipe())
     return data_folder
+
+
+@pytest.fixture
+def stalled() -> Iterator[Callable[[], float]]:
+    """How long [s] this machine let a thread wait beyond the 10 ms it had asked for, at worst: nobody acts in time then."""
+    worst, done = [0.0], threading.Event()
+
+    def watch() -> None:
+        while not done.is_set():
+            before = time.monotonic()
+            time.sleep(0.01)
+            worst[0] = max(worst[0], time.monotonic() - before - 0.01)
+
+    thread = threading.Thread(target=watch)
+    thread.start()
+    yield lambda: worst[0]
+    done.set()
+    thread.join()
