@@ -42,7 +42,7 @@ def flight_folder(data_folder: Path) -> Path:
 
 @pytest.fixture
 def stalled() -> Iterator[Callable[[], float]]:
-    """How long [s] this machine let a thread wait beyond the 10 ms it had asked for, at worst: nobody acts in time then."""
+    """How long [s] this machine let a thread wait beyond the 10 ms it had asked for: nobody acts in time then."""
     worst, done = [0.0], threading.Event()
 
     def watch() -> None:
