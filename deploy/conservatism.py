@@ -1,8 +1,8 @@
 """How conservative each certificate is, in both modes (method §6): what its tubes are like, and what that costs.
 
 Half-widths of a full stop, what held-out plans say of the bound, and closed-loop goal rates of the map's oracle (A*)
-and of the stored policy, which was trained behind the default. Where a full stop's set is wider than the robot can see,
-no plan of moving can be verified, and nothing is driven.
+and of the stored policy, which was trained behind the default. Where a full stop's set is wider than the arena, no
+plan of moving can be verified, and nothing is driven.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from messaging.robots import Robot, robot_named
 from safety.certificates import KINDS, CertificateError
 from safety.dataset import BadData
 from safety.model_set import MODES, Recipe
+from sim.arenas import arena_kind
 
 ORACLE = "astar"
 
@@ -60,7 +61,7 @@ class Conservatism:
                     continue
                 row |= {"model": model.version, "statement": statement.figures()}
                 driving = None
-                if statement.half_width_full <= robot.sight:
+                if statement.half_width_full <= arena_kind(robot, self.arena).half_width:
                     driving = {policy: self._drive(robot, policy, in_process(model)) for policy in self.policies}
                 rows.append(row | {"driving": driving})
         return {"study": self.config(), "data": data.digest(), "rows": rows}
@@ -100,11 +101,15 @@ def markdown(result: dict[str, Any]) -> str:
     return "\n".join(lines)
 
 
+def _length(metres: float) -> str:
+    return f"{1e3 * metres:.1f} mm" if metres < 1.0 else f"{metres:.3g} m"
+
+
 def _figures(row: dict[str, Any], policies: Sequence[str]) -> list[str]:
     said, driving = row["statement"], row["driving"]
-    figures = [f"{said[name]:.3g} m" for name in ("half_width_rest", "half_width_full")]
+    figures = [_length(said[name]) for name in ("half_width_rest", "half_width_full")]
     figures += [f"{said['violations']} of {said['windows']}", f"{said['bound_plan']:.2%}"]
     if driving is None:
-        return figures + ["not driven: nothing can be verified"] + [""] * len(policies)
+        return figures + ["not driven: wider than the arena"] + [""] * len(policies)
     figures += [f"{driving[policy]['goals']}, {driving[policy]['interventions']:.1%}" for policy in policies]
     return [*figures, f"{driving[policies[0]]['decision_ms']['mean']:.2f} ms"]
