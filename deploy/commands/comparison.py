@@ -64,9 +64,8 @@ class Pretrain:
             console.print(f"best: {chosen.value:g}, of those that cost A* no goal the one with the fewest collisions")
         return 0
 
-    @staticmethod
-    def _say(row: Tried) -> None:
-        console.print(
+    def _say(self, row: Tried) -> None:
+        (errors if self.json else console).print(
             f"{row.value:g}: A* {row.oracle_goals} goals of {row.episodes}, {row.oracle_interventions:.1%} "
             f"interventions; greedy {row.greedy_goals} goals, {row.greedy_collisions} collisions"
         )
