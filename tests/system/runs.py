@@ -20,6 +20,7 @@ from messaging.topics import RECORDED
 
 BRAKELINE = (sys.executable, "-m", "deploy.cli")
 PATIENCE = 120.0  # s: two cores that others use too
+STRIDE = 200  # steps of a run that take no longer
 
 
 def until(condition: Callable[[], Any], what: str, seconds: float = PATIENCE) -> Any:
@@ -109,11 +110,13 @@ class Run:
         return 0 if known is None else int(known.steps)
 
     def until_steps(self, count: int) -> None:
-        """Wait for so many more steps."""
+        """Wait for so many more steps, for as long as it gets on."""
         self.watch()
         target = self.steps() + count
-        until(lambda: self.steps() >= target or self.popen.poll() is not None, f"{count} steps")
-        assert self.popen.poll() is None, self.errors.read_text()
+        while (done := self.steps()) < target:
+            next_stop = min(done + STRIDE, target)
+            until(lambda: self.steps() >= next_stop or self.popen.poll() is not None, f"{count} steps")  # noqa: B023
+            assert self.popen.poll() is None, self.errors.read_text()
 
     def kill(self, name: str) -> None:
         """kill -9 of a process, and wait until another one has taken its place."""
