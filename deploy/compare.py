@@ -15,6 +15,7 @@ import threading
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
 from dataclasses import dataclass
+from multiprocessing.managers import SyncManager
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -132,7 +133,9 @@ def _side_by_side(
 ) -> None:
     """Each in a process of its own, started afresh: a forked one would share locks of libraries that have threads."""
     context = multiprocessing.get_context("spawn")
-    with context.Manager() as manager, ProcessPoolExecutor(workers, context, initializer=_begin_work) as pool:
+    manager = SyncManager(ctx=context)
+    manager.start(_begin_work)
+    with manager, ProcessPoolExecutor(workers, context, initializer=_begin_work) as pool:
         told = manager.Queue()
         under_way = {pool.submit(_found_out, job, results, runs, told): job for job in jobs}
         while under_way:

@@ -97,10 +97,12 @@ def test_killed_it_leaves_no_worker_behind(tmp_path):
     popen = subprocess.Popen([sys.executable, tmp_path / "naps.py"], env=os.environ | {"PYTHONPATH": str(root)})
     marks = [tmp_path / "runs" / "ground" / f"errand-{n}" / "ground" / f"errand-{n}.json" for n in (1, 2)]
     until(lambda: all(mark.exists() for mark in marks), "both are at work")
-    workers = [json.loads(mark.read_text())["pid"] for mark in marks]
+    workers = {json.loads(mark.read_text())["pid"] for mark in marks}
+    children = psutil.Process(popen.pid).children(recursive=True)
+    assert workers <= {child.pid for child in children}
     popen.kill()
     popen.wait()
-    until(lambda: not any(psutil.pid_exists(pid) for pid in workers), "both have ended", 10.0)
+    until(lambda: not any(child.is_running() for child in children), "all have ended", 10.0)
 
 
 def test_a_job_that_fails_loses_nothing_that_was_done(tmp_path):
