@@ -14,7 +14,7 @@ from messaging.robots import GROUND, QUADROTOR, Robot
 from safety.client import obstacle_messages, request_message
 from safety.commitment import Array, Commitment, Prediction, correction_penalty
 
-# What the learner is paid where an intervention ends the episode (deploy/experiments.md).
+# What the learner is paid where an intervention ends the episode (deploy/study/experiments.md).
 LOWEST = {GROUND.name: -20.0, QUADROTOR.name: -2.0}
 EPISODE_STRIDE = 4096  # episodes of different robots of a run never share a seed: seed = episode · stride + number
 

@@ -1,4 +1,4 @@
-"""Fits the networks that the rivals rest on, from data that were driven beforehand (`deploy/rollouts.py`).
+"""Fits the networks that the rivals rest on, from data that were driven beforehand (`deploy/data/rollouts.py`).
 
 SECAS   min Σ_t (c_i(s'_t) − c_i(s_t) − g_i(s_t)ᵀ a_t)²            per constraint i (Dalal et al. 2018, eq. 3)
 SAILR   min Σ_t BCE(σ(f(x_t)), y_t)                                 per critic, y the cost-to-go in [0, 1]

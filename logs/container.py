@@ -179,3 +179,8 @@ def _unpacked(data: bytes, tables: _Tables) -> Iterator[Row]:
         elif opcode in (SCHEMA, CHANNEL):
             tables.learn(opcode, data[at + 9 : after])
         at = after
+
+
+def attachment(robot: str, version: str) -> str:
+    """The name in a log of a model set."""
+    return f"model/{robot}/{version}.safetensors"

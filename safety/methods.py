@@ -12,10 +12,10 @@ from typing import Protocol
 from messaging.robots import Robot
 from safety.filter import Filter
 from safety.model_set import BadModel, ModelSet
-from safety.pretrained import ENTRY, Pretrained
 from safety.request import Decision, Request
-from safety.sailr import SAILR, Sailr
-from safety.secas import SECAS, Secas
+from safety.rivals.pretrained import ENTRY, Pretrained
+from safety.rivals.sailr import SAILR, Sailr
+from safety.rivals.secas import SECAS, Secas
 from safety.tensors import holds
 
 DDPC = "ddpc"

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from deploy import store
+from deploy.data import store
 from messaging.robots import GROUND, QUADROTOR
 from safety.model_set import Recipe
 

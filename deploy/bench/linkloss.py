@@ -14,8 +14,8 @@ from actors.flying import MavlinkVehicle
 from actors.guard import Ask, consult
 from actors.mavlink import Client
 from deploy.bench.timing import Figures
-from deploy.evaluate import in_process
-from deploy.store import model_for
+from deploy.data.store import model_for
+from deploy.study.evaluate import in_process
 from messaging.robots import QUADROTOR
 from safety.model_set import Recipe
 from sim.autopilot.endpoint import TICK, Autopilot

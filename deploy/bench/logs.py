@@ -38,8 +38,8 @@ def real() -> list[tuple[str, Any]]:
 
     from actors.driver import Driver, Identity
     from actors.guard import consult
-    from deploy.evaluate import in_process
-    from deploy.store import model_for
+    from deploy.data.store import model_for
+    from deploy.study.evaluate import in_process
     from deploy.vehicles import environment
     from messaging.robots import GROUND
     from safety.model_set import Recipe

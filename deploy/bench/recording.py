@@ -44,7 +44,7 @@ def processor_time(launcher: int, out: Path) -> dict[str, float]:
     found = {}
     for process in psutil.process_iter(["cmdline"]):
         words = process.info["cmdline"] or []
-        child = "deploy.child" in words and str(out) in words
+        child = "deploy.run.child" in words and str(out) in words
         if child or process.pid == launcher:
             try:
                 times = process.cpu_times()

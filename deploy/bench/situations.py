@@ -6,8 +6,9 @@ import numpy as np
 
 from actors.driver import Driver, Identity
 from actors.guard import consult
-from deploy.evaluate import in_process, policy_named
-from deploy.store import model_for
+from deploy.data.store import model_for
+from deploy.policies import policy_named
+from deploy.study.evaluate import in_process
 from deploy.vehicles import environment
 from messaging import brakeline_pb2 as pb
 from messaging.robots import GROUND, Robot

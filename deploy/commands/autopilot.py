@@ -2,30 +2,13 @@
 
 from __future__ import annotations
 
-import signal
-import threading
 from dataclasses import asdict, dataclass
 from typing import Literal
 
-import numpy as np
-
 from deploy.commands.common import errors, say_json
-from deploy.vehicles import flight_arena
-from messaging.clock import WallClock
-from messaging.links import open_link
-from messaging.rays import rays_of
-from messaging.robots import QUADROTOR
-from sim.autopilot.endpoint import Autopilot as Endpoint
-from sim.autopilot.rules import SETPOINT_TIMEOUT
-from sim.autopilot.server import Truth, serve
-from sim.flight_estimator import QuadrotorNoise
-from sim.lidar import Lidar
-from sim.quadrotor import Quadrotor
+from deploy.run.autopilot import AutopilotSettings, fly
 from sim.wind import Wind
-from sim.world import Arena, closing, room_bounds
-
-FIELD = 1000.0  # m to the walls of the open field
-PAD = 0.02  # m, height of the plane to stand on above an arena's own floor, which is an obstacle
+from sim.world import Arena
 
 
 @dataclass(frozen=True)
@@ -55,42 +38,25 @@ class Autopilot:
     json: bool = False
 
     def run(self) -> int:
-        arena = flight_arena(self.arena, self.seed) if self.arena else open_field()
-        link = open_link(self.url)
-        truth = None
-        if self.truth:
-            host, _, port = self.truth.rpartition(":")
-            truth = Truth(host or "127.0.0.1", int(port))
-        autopilots = [self.autopilot(arena, system) for system in range(1, self.vehicles + 1)]
-        stop = threading.Event()
-        for number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, lambda *_: stop.set())
-        clock = WallClock()
-        if not self.json:
-            errors.print(f"{self.rules} on {self.url}, {self.vehicles} vehicle(s), {arena.name}; ^C ends it")
-        try:
-            tally = serve(autopilots, link, clock, lambda: stop.is_set() or 0.0 < self.seconds <= clock.now(), truth)
-        finally:
-            link.close()
+        settings = AutopilotSettings(
+            self.url,
+            self.rules,
+            self.vehicles,
+            self.arena,
+            self.seed,
+            self.airborne,
+            self.setpoint_timeout,
+            Wind(self.wind, gust=self.gust),
+            self.truth,
+            self.seconds,
+        )
+        tally = fly(settings, self._begun)
         if self.json:
             say_json(asdict(tally))
         else:
             errors.print(f"{tally.ticks} ticks, {tally.late} late, {tally.slips} slips, {tally.collisions} collisions")
         return 0
 
-    def autopilot(self, arena: Arena, system: int) -> Endpoint:
-        """The endpoint of one vehicle."""
-        rng = np.random.default_rng((self.seed, system))
-        noise = QuadrotorNoise()
-        wind = Wind(speed=self.wind, gust=self.gust)
-        vehicle = Quadrotor(arena, rng, noise, wind, floor=None if self.airborne else PAD)
-        lidar = Lidar(arena, rays_of(QUADROTOR), noise.scale * noise.lidar, rng)
-        timeout = {} if self.setpoint_timeout is None else {SETPOINT_TIMEOUT[self.rules]: self.setpoint_timeout}
-        return Endpoint(vehicle, self.rules, system, timeout, lidar)
-
-
-def open_field() -> Arena:
-    """Nothing but walls far away; the origin is where to start."""
-    return Arena(
-        "open field", closing(FIELD, FIELD), (0.0, 0.0, 5.0), (10.0, 0.0, 5.0), 1.0, 10**9, room_bounds(FIELD, FIELD)
-    )
+    def _begun(self, arena: Arena) -> None:
+        if not self.json:
+            errors.print(f"{self.rules} on {self.url}, {self.vehicles} vehicle(s), {arena.name}; ^C ends it")

@@ -10,19 +10,19 @@ from typing import Annotated, Any, Literal
 import tyro
 from rich.markdown import Markdown
 
-from deploy import compare, conservatism
 from deploy.commands.common import Robot, console, errors, say_json
-from deploy.compare import RESULTS, RUNS, SEEDS, Cell, Job
-from deploy.curves import learning_curves, seeds_as_points
-from deploy.pretrain import recipe_for
-from deploy.store import method_for, method_path, pretrained
-from deploy.study import METHODS, NONE, quick
-from deploy.table import markdown, plain, table
-from deploy.tune import Tried, best, try_all, values_for
+from deploy.data.pretrain import recipe_for
+from deploy.data.store import method_for, method_path, pretrained
+from deploy.study import compare, conservatism
+from deploy.study.cells import METHODS, NONE, quick
+from deploy.study.compare import RESULTS, RUNS, SEEDS, Cell, Job
+from deploy.study.curves import learning_curves, seeds_as_points
+from deploy.study.table import markdown, plain, table
+from deploy.study.tune import Tried, best, try_all, values_for
 from learner.config import TD3Config
 from messaging.robots import robot_named
 from safety.model_set import Recipe
-from safety.pretrained import Pretrained
+from safety.rivals.pretrained import Pretrained
 
 QUICK = Path("runs/quick")
 

@@ -10,8 +10,8 @@ import tyro
 from rich.table import Table
 
 from deploy.commands.common import Endpoints, Flags, Mode, Physics, Robot, console, errors, say_json
-from deploy.logged import Recorded, from_log
-from deploy.store import SEED, certified, model_path, record_path, recorded
+from deploy.data.logged import Recorded, from_log
+from deploy.data.store import SEED, certified, model_path, record_path, recorded
 from messaging import brakeline_pb2 as pb
 from messaging.bus import Bus
 from messaging.robots import robot_named

@@ -8,7 +8,7 @@ from pathlib import Path
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from deploy.commands.common import Filtering, Flags, Physics, Robot, console, errors, say_json
-from deploy.evaluate import Evaluation, evaluate, prepared
+from deploy.study.evaluate import Evaluation, evaluate, prepared
 from logs.metrics import Tally
 from logs.report import show
 from messaging.robots import Robot as RobotKind
@@ -62,7 +62,7 @@ class Evaluate:
         return 0
 
     def _draw(self, robot: RobotKind, what: Evaluation, path: Path) -> None:
-        from deploy.render import record, save
+        from deploy.run.render import record, save
 
         driver, policy, question = prepared(robot, what)
         film = record(driver, policy, question, self.episode)

@@ -11,9 +11,9 @@ import tyro
 from actors.flight import FlightSettings
 from deploy.commands.common import Filtering, Flags, Flight, Physics, console, errors, say_json
 from deploy.commands.train import STOPPED, stamped
-from deploy.display import Display, summary
-from deploy.experiments import Embedded, RunConfig
-from deploy.launch import Launcher, prepare
+from deploy.run.configurations import Embedded, RunConfig
+from deploy.run.display import Display, summary
+from deploy.run.launcher import Launcher, prepare
 from deploy.vehicles import flight_arena
 from messaging.ports import free_udp_port
 from messaging.robots import QUADROTOR, robot_named

@@ -12,9 +12,9 @@ from typing import Annotated
 import tyro
 
 from deploy.commands.common import Endpoints, Filtering, Flags, Flight, Physics, Robot
-from deploy.evaluate import policy_named
-from deploy.experiments import RunConfig
-from deploy.store import data_root, method_for, method_path
+from deploy.data.store import data_root, method_for, method_path
+from deploy.policies import policy_named
+from deploy.run.configurations import RunConfig
 from deploy.vehicles import environment, flight_arena
 from learner.config import LearnerConfig
 from logs.recorder import Rotation
@@ -129,7 +129,7 @@ class Recorder:
     rotation: Rotation = field(default_factory=Rotation)
 
     def run(self) -> int:
-        from deploy.frames import as_json, both
+        from deploy.run.frames import as_json, both
         from logs import recorder
         from logs.foxglove import Pictures
 

@@ -15,8 +15,8 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 
 from deploy.commands.common import LATEST, Certificate, Mode, console, errors, say_json
-from deploy.replay import Instead, replay
-from deploy.store import certified, model_for
+from deploy.data.store import certified, model_for
+from deploy.run.replay import Instead, replay
 from logs.extent import count
 from messaging.robots import robot_named
 from messaging.topics import EXCHANGE

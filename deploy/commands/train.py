@@ -10,12 +10,12 @@ from typing import Annotated
 import tyro
 
 from actors.loop import Change
-from deploy.child import CONFIG
 from deploy.commands.common import Filtering, Flags, Physics, console, errors, say_json
-from deploy.display import Display, summary
-from deploy.experiments import EXPERIMENTS, RunConfig, load
-from deploy.feed import count
-from deploy.launch import Launcher, prepare
+from deploy.run.configurations import EXPERIMENTS, RunConfig, load
+from deploy.run.display import Display, summary
+from deploy.run.feed import count
+from deploy.run.launcher import Launcher, prepare
+from deploy.run.places import CONFIG
 from learner.config import LearnerConfig
 from logs.recorder import Rotation
 from messaging.robots import robot_named

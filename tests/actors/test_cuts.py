@@ -5,13 +5,13 @@ import pytest
 
 from actors.driver import LOWEST, Driver, Identity
 from actors.guard import consult
-from deploy.evaluate import in_process
+from deploy.study.evaluate import in_process
 from deploy.vehicles import environment
 from logs.tally import Tally
 from messaging import brakeline_pb2 as pb
 from messaging.bus import NoReply
 from messaging.robots import GROUND
-from tests.safety.test_sailr import known
+from tests.safety.rivals.test_sailr import known
 
 SLOW, FAST = np.array([0.05, 0.1]), np.array([0.25, 0.1])
 

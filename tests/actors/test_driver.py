@@ -5,7 +5,7 @@ import pytest
 
 from actors.driver import Driver, Identity
 from actors.guard import consult
-from deploy.evaluate import in_process
+from deploy.study.evaluate import in_process
 from deploy.vehicles import environment
 from messaging import brakeline_pb2 as pb
 from messaging.bus import NoReply
@@ -21,7 +21,7 @@ def driver(number: int = 0, seed: int = 0, **more) -> Driver:
 
 @pytest.fixture(scope="module")
 def ask(data_folder):
-    from deploy.store import model_for
+    from deploy.data.store import model_for
 
     return in_process(model_for(GROUND, Recipe()))
 

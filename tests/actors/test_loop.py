@@ -24,7 +24,7 @@ class Service:
     """Safety in the test's process: it can be away, and says what it was asked."""
 
     def __init__(self, bus: Bus, data_folder) -> None:
-        from deploy.store import model_for
+        from deploy.data.store import model_for
 
         models = Models()
         models.install(model_for(GROUND, Recipe()))

@@ -11,10 +11,10 @@ import numpy as np
 
 from actors.driver import Driver, Identity
 from actors.guard import consult
-from deploy.child import attachment
-from deploy.evaluate import in_process
-from deploy.store import model_for
+from deploy.data.store import model_for
+from deploy.study.evaluate import in_process
 from deploy.vehicles import environment
+from logs.container import attachment
 from logs.recorder import entry
 from logs.segment import open_segment
 from messaging import brakeline_pb2 as pb

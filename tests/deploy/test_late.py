@@ -7,8 +7,8 @@ import pytest
 
 from actors.driver import Driver, Identity
 from actors.guard import consult
-from deploy.evaluate import Evaluation, episode, evaluate, prepared
-from deploy.logged import trajectories_of
+from deploy.data.logged import trajectories_of
+from deploy.study.evaluate import Evaluation, episode, evaluate, prepared
 from messaging.robots import QUADROTOR
 
 ROBOT = QUADROTOR.in_real_time()

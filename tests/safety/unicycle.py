@@ -6,7 +6,7 @@ import itertools
 
 import numpy as np
 
-from deploy.excite import excitation
+from deploy.data.excite import excitation
 from messaging.robots import GROUND
 from safety.dataset import Dataset, Trajectory
 

@@ -75,7 +75,7 @@ class Run:
         found = {}
         for process in psutil.process_iter(["cmdline"]):
             words = process.info["cmdline"] or []
-            if "deploy.child" in words and str(self.folder) in words:
+            if "deploy.run.child" in words and str(self.folder) in words:
                 found[words[-1]] = process
         return found
 

@@ -9,8 +9,8 @@ import time
 
 import numpy as np
 
-from deploy.child import CONFIG
-from deploy.experiments import EXPERIMENTS, encode
+from deploy.run.configurations import EXPERIMENTS, encode
+from deploy.run.places import CONFIG
 from learner.checkpoint import exists
 from logs.reader import open_log, read
 from logs.report import analyse
@@ -151,7 +151,7 @@ def test_what_fails_again_and_again_ends_the_run_and_says_why(data_folder, tmp_p
         assert "safety-0 ended with 1" in errors and "5th time in a row" in errors and "BadModel" in errors
         assert "Traceback" not in errors and run.children() == {}
     words = (folder / "logs" / "safety-0.log").read_text()
-    assert len(re.findall(r"deploy/child.py\", line \d+, in <module>", words)) == 5, "one traceback for each start"
+    assert len(re.findall(r"deploy/run/child.py\", line \d+, in <module>", words)) == 5, "one traceback for each start"
     assert json.loads((folder / "figures.json").read_text())["restarts"]["safety-0"] == 4
 
 
@@ -170,6 +170,6 @@ def test_a_child_whose_launcher_is_gone_ends_at_once(tmp_path):
     nobody = next(pid for pid in range(2**15, 2**22) if not alive(pid))
     (tmp_path / "endpoint").write_text(json.dumps({"endpoint": "tcp/127.0.0.1:1", "pid": nobody}))
     start = time.monotonic()
-    child = [sys.executable, "-m", "deploy.child", str(tmp_path), "actor-0"]
+    child = [sys.executable, "-m", "deploy.run.child", str(tmp_path), "actor-0"]
     assert subprocess.run(child, check=False).returncode != 0
     assert time.monotonic() - start < 9.0, "it does not wait for a bus"

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from deploy.experiments import EXPERIMENTS
+from deploy.run.configurations import EXPERIMENTS
 from logs.reader import read
 from messaging.robots import GROUND
 from messaging.weights import MLP

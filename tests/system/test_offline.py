@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from deploy.evaluate import Evaluation, evaluate
+from deploy.study.evaluate import Evaluation, evaluate
 from logs.tally import Tally
 from messaging.robots import GROUND
 from tests.system.runs import brakeline

@@ -8,7 +8,7 @@ import pytest
 from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 
-from deploy.experiments import EXPERIMENTS, load
+from deploy.run.configurations import EXPERIMENTS, load
 from logs.report import analyse
 from messaging.robots import GROUND
 from messaging.weights import MLP

@@ -1,0 +1,39 @@
+"""`brakeline collect`: record the data that the filter learns a robot from."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator
+
+import numpy as np
+
+from deploy.data.excite import excitation
+from deploy.vehicles import Conditions, vehicle_in_yard
+from messaging.robots import Robot
+from safety.dataset import Dataset, Trajectory
+
+PERIODS = 300  # a trajectory
+
+
+def record(robot: Robot, trajectories: int, seed: int, conditions: Conditions) -> Iterator[Trajectory]:
+    """Drive trajectories, each from standing still, with a generator of its own: (seed, number)."""
+    for number in range(trajectories):
+        rng = np.random.default_rng((seed, number))
+        vehicle = vehicle_in_yard(robot, rng, conditions)
+        states, inputs, paths, turned = [vehicle.measured], [], [], []
+        for u in itertools.islice(excitation(robot, rng), PERIODS):
+            period = vehicle.step(u)
+            if period.collision:
+                raise RuntimeError(f"trajectory {number} touched something: the yard is too small")
+            states.append(period.measured)
+            inputs.append(vehicle.input)
+            paths.append(period.subsamples)
+            turned.append(period.turned)
+        yield Trajectory(*(np.array(values) for values in (states, inputs, paths, turned)))
+
+
+def dataset(robot: Robot, trajectories: list[Trajectory], seed: int, conditions: Conditions) -> Dataset:
+    """The trajectories as a checked data set that says where it comes from."""
+    data = Dataset(robot, tuple(trajectories), conditions.describe() | {"seed": str(seed), "origin": "collect"})
+    data.check()
+    return data

@@ -1,0 +1,153 @@
+"""Where data sets and model sets lie, and how a missing one comes to be.
+
+data/<robot>/record.safetensors                     the recorded trajectories
+data/<robot>/<certificate>-<mode>.safetensors       the model set in use, made from them
+data/<robot>/<rival>.safetensors                    the rival's networks, pre-trained
+data/<robot>/models/<version>.safetensors           every version a service has used
+"""
+
+from __future__ import annotations
+
+import os
+from dataclasses import replace
+from pathlib import Path
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn, track
+
+from deploy.data import collect
+from deploy.data import pretrain as rivals
+from deploy.vehicles import Conditions
+from messaging.robots import Robot, robot_named
+from safety.dataset import BadData, Dataset
+from safety.methods import DDPC, Model
+from safety.model_set import BadModel, ModelSet, Recipe, make
+from safety.rivals.pretrained import Pretrained
+from safety.statement import Statement, state
+
+TRAJECTORIES = {"ground": 200, "quadrotor": 500}  # of 300 periods: a plan of 12 periods needs more than one of 3
+HELD_OUT = 0.3  # of the trajectories, for the statement about a model set
+SEED = 20260
+
+COLUMNS = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
+
+console = Console(stderr=True, highlight=False, soft_wrap=True)
+
+
+def data_root() -> Path:
+    """`$BRAKELINE_DATA`, else `data` in the working directory."""
+    return Path(os.environ.get("BRAKELINE_DATA", "data"))
+
+
+def record_path(robot: Robot) -> Path:
+    return data_root() / robot.name / "record.safetensors"
+
+
+def model_path(robot: Robot, recipe: Recipe) -> Path:
+    return data_root() / robot.name / f"{recipe.certificate}-{recipe.mode}.safetensors"
+
+
+def method_path(robot: Robot, method: str, recipe: Recipe) -> Path:
+    """Of the model that the safety service needs for a method."""
+    return model_path(robot, recipe) if method == DDPC else data_root() / robot.name / f"{method}.safetensors"
+
+
+def recorded(
+    robot: Robot,
+    path: Path | None = None,
+    trajectories: int | None = None,
+    seed: int = SEED,
+    conditions: Conditions | None = None,
+    again: bool = False,
+) -> Dataset:
+    """The data set at `path`, recorded first if it is not there (or `again`)."""
+    path = path or record_path(robot)
+    if path.exists() and not again:
+        return Dataset.load(path)
+    conditions, trajectories = conditions or Conditions(), trajectories or TRAJECTORIES[robot.kind]
+    driven = track(
+        collect.record(robot, trajectories, seed, conditions),
+        f"recording {trajectories} trajectories of {robot.name}",
+        total=trajectories,
+        console=console,
+    )
+    data = collect.dataset(robot, list(driven), seed, conditions)
+    data.save(path)
+    return data
+
+
+def certified(data: Dataset, recipe: Recipe) -> tuple[ModelSet, Statement]:
+    """A model set from 70 % of the trajectories, with its statement about the others.
+
+    Raises:
+        BadData, CertificateError: the data do not support it; the message says why.
+    """
+    fitted, held_out = data.split((1.0 - HELD_OUT, HELD_OUT))
+    model = make(fitted, recipe)
+    statement = state(model, fitted, held_out)
+    about = model.about | {"bound_step": f"{statement.bound_step:.6g}", "bound_plan": f"{statement.bound_plan:.6g}"}
+    about |= {"windows": str(statement.windows), "violations": str(statement.violations)}
+    return replace(model, about=about), statement
+
+
+def model_for(robot: Robot, recipe: Recipe) -> ModelSet:
+    """The model set in use, made (and its data recorded) if it is not there or not of this layout."""
+    path = model_path(robot, recipe)
+    if path.exists():
+        try:
+            return ModelSet.load(path)
+        except BadModel as error:
+            console.print(f"[yellow]making the model set again:[/] {error}")
+    base = robot_named(robot.kind)  # one record serves, whether questions are late or not
+    try:
+        data = recorded(base)
+    except BadData as error:
+        console.print(f"[yellow]recording again:[/] {error}")
+        data = recorded(base, again=True)
+    data = replace(data, robot=robot)
+    with console.status(f"certifying {robot.name}: {recipe.certificate}, {recipe.mode}"):
+        model, statement = certified(data, recipe)
+    console.print(
+        f"{robot.name}: {recipe.certificate} ({recipe.mode}) {model.version}: {statement.violations} violations in "
+        f"{statement.windows} held-out plans, at most {statement.bound_plan:.2%} of plans (99 % confidence)"
+    )
+    model.save(path)
+    return model
+
+
+def method_for(robot: Robot, method: str, recipe: Recipe) -> Model:
+    """What a method must know of a robot: ours a model set, a rival its networks, made if they are not there.
+
+    Raises:
+        ValueError: no method of that name needs anything, or it knows nothing of robots in real time.
+    """
+    if method == DDPC:
+        return model_for(robot, recipe)
+    if method not in rivals.RECIPES:
+        raise ValueError(f"no method is called {method!r}; there are: {', '.join((DDPC, *rivals.RECIPES))}")
+    if robot.late:
+        raise ValueError(f"{method} has no real-time mode: its answer counts for the period in which it was asked for")
+    return pretrained(robot, method, rivals.recipe_for(method, robot))
+
+
+def pretrained(robot: Robot, method: str, recipe: rivals.Recipe, again: bool = False) -> Pretrained:
+    """A rival's model of this recipe, pre-trained if it is not there (or `again`)."""
+    path = method_path(robot, method, Recipe())
+    if path.exists() and not again:
+        try:
+            kept = Pretrained.decode(path.read_bytes())
+            if rivals.made_by(kept, recipe):
+                return kept
+            console.print(f"[yellow]pre-training {method} again:[/] {path} is of another recipe")
+        except BadModel as error:
+            console.print(f"[yellow]pre-training {method} again:[/] {error}")
+    with Progress(*COLUMNS, console=console, transient=True) as progress:
+        task = progress.add_task(f"pre-training {method} for {robot.name}", total=recipe.samples)
+        model = rivals.pretrain(robot, recipe, lambda: progress.advance(task))
+    model.save(path)
+    about = model.about
+    console.print(
+        f"{robot.name}: {method} {model.version}: {about['samples']} steps with {about['collisions']} collisions and "
+        f"{about['seconds']} s of pre-training; on held-out steps {about['error']}"
+    )
+    return model

@@ -1,0 +1,38 @@
+"""A policy by its name or file: scripted, trained and stored with the program, untrained, or a person's own."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from messaging.robots import Robot
+from messaging.weights import MLP
+from sim.policies import POLICIES, Policy, scripted
+
+UNTRAINED, TRAINED = "untrained", "trained"
+POLICY_FOLDER = Path(__file__).parents[1] / "policies"
+
+
+def policy_named(name: str, robot: Robot, seed: int) -> Policy:
+    """A scripted policy, the trained one of this repository (policies/), an untrained one, or the one in a file.
+
+    Raises:
+        ValueError: neither a name nor a file; BadWeights: a file that is no policy of this robot.
+    """
+    if name in POLICIES:
+        return scripted(name, robot, np.random.default_rng(seed))
+    if name == UNTRAINED:
+        return driving(MLP.untrained(robot, seed))
+    path = POLICY_FOLDER / robot.kind / "trained.safetensors" if name == TRAINED else Path(name)
+    if not path.is_file():
+        names = ", ".join([TRAINED, UNTRAINED, *POLICIES])
+        raise ValueError(f"no policy is called {name!r} and no such file exists; there are: {names}, or a file's path")
+    if robot.late and MLP.load(path).robot.kind == robot.kind:
+        return driving(MLP.load(path))  # it may have been trained in lockstep: it proposes in real time too
+    return driving(MLP.load(path, robot))
+
+
+def driving(mlp: MLP) -> Policy:
+    """The network as a policy, without exploration."""
+    return lambda observation, info: mlp(observation)

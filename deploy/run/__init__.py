@@ -1,0 +1,1 @@
+"""How a run on this machine is started, watched, looked at again."""

@@ -1,0 +1,80 @@
+"""Quadrotors behind MAVLink, in real time, at one end of a link."""
+
+from __future__ import annotations
+
+import signal
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from deploy.vehicles import flight_arena
+from messaging.clock import WallClock
+from messaging.links import open_link
+from messaging.rays import rays_of
+from messaging.robots import QUADROTOR
+from sim.autopilot.endpoint import Autopilot
+from sim.autopilot.rules import SETPOINT_TIMEOUT
+from sim.autopilot.server import Tally, Truth, serve
+from sim.flight_estimator import QuadrotorNoise
+from sim.lidar import Lidar
+from sim.quadrotor import Quadrotor
+from sim.wind import Wind
+from sim.world import Arena, closing, room_bounds
+
+FIELD = 1000.0  # m to the walls of the open field
+PAD = 0.02  # m, height of the plane to stand on above an arena's own floor, which is an obstacle
+
+
+@dataclass(frozen=True)
+class AutopilotSettings:
+    url: str
+    rules: str = "px4"  # whose modes, refusals and parameters: px4 or ardupilot
+    vehicles: int = 1  # by system id 1, 2, ...; they pass through each other
+    arena: str = ""  # of the quadrotor, drawn with the seed; without one: an open field
+    seed: int = 0
+    airborne: bool = False  # start hovering at the arena's start, armed, instead of on the ground below it
+    setpoint_timeout: float | None = None  # s without a setpoint until it brakes; None: as the rules' parameter has it
+    wind: Wind = field(default_factory=Wind)
+    truth: str = "127.0.0.1:14600"  # where states and collisions go, as JSON in UDP datagrams; empty: nowhere
+    seconds: float = 0.0  # until it ends; 0: on SIGINT or SIGTERM
+
+
+def fly(settings: AutopilotSettings, begun: Callable[[Arena], Any] = lambda arena: None) -> Tally:
+    """Serve the vehicles until asked to end; `begun` is called when the link is open."""
+    arena = flight_arena(settings.arena, settings.seed) if settings.arena else open_field()
+    link = open_link(settings.url)
+    truth = None
+    if settings.truth:
+        host, _, port = settings.truth.rpartition(":")
+        truth = Truth(host or "127.0.0.1", int(port))
+    autopilots = [vehicle(settings, arena, system) for system in range(1, settings.vehicles + 1)]
+    stop = threading.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: stop.set())
+    clock = WallClock()
+    begun(arena)
+    try:
+        return serve(autopilots, link, clock, lambda: stop.is_set() or 0.0 < settings.seconds <= clock.now(), truth)
+    finally:
+        link.close()
+
+
+def vehicle(settings: AutopilotSettings, arena: Arena, system: int) -> Autopilot:
+    """The endpoint of one vehicle."""
+    rng = np.random.default_rng((settings.seed, system))
+    noise = QuadrotorNoise()
+    quadrotor = Quadrotor(arena, rng, noise, settings.wind, floor=None if settings.airborne else PAD)
+    lidar = Lidar(arena, rays_of(QUADROTOR), noise.scale * noise.lidar, rng)
+    timeout = settings.setpoint_timeout
+    parameters = {} if timeout is None else {SETPOINT_TIMEOUT[settings.rules]: timeout}
+    return Autopilot(quadrotor, settings.rules, system, parameters, lidar)
+
+
+def open_field() -> Arena:
+    """Nothing but walls far away; the origin is where to start."""
+    return Arena(
+        "open field", closing(FIELD, FIELD), (0.0, 0.0, 5.0), (10.0, 0.0, 5.0), 1.0, 10**9, room_bounds(FIELD, FIELD)
+    )

@@ -1,0 +1,148 @@
+"""One process of a launched run: `python -m deploy.run.child RUN_FOLDER PROCESS`.
+
+Everything it needs is in the run's resolved configuration, so that all processes of a run agree. Each process can also
+be started alone, with `brakeline safety | learner | actor | recorder`.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import json
+import os
+import signal
+import sys
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+from deploy.run.configurations import RunConfig, load
+from deploy.run.places import CONFIG, ENDPOINT, LOG, UNFINISHED, Place, places
+from messaging.bus import BusError, BusSettings
+from messaging.robots import robot_named
+
+PARENT_DIED = 1  # prctl: PR_SET_PDEATHSIG
+
+
+def _recorder(place: Place, folder: Path, config: RunConfig, bus: BusSettings) -> bool:
+    from deploy.run.contents import attachments, metadata
+    from deploy.run.frames import as_json, both
+    from logs import recorder
+    from logs.foxglove import Pictures
+
+    derive = both(Pictures(config.pictures).of_sample, as_json) if config.pictures > 0.0 else as_json
+    about, files = metadata(config), attachments(config, folder)
+    recorder.main(bus, folder / LOG, about, place.name, files, derive, config.rotation)
+    return False
+
+
+def _safety(place: Place, folder: Path, config: RunConfig, bus: BusSettings) -> bool:
+    from deploy.data.store import method_path
+    from safety.service import SafetySettings, main
+
+    models = tuple(method_path(robot_named(robot), config.method, config.recipe) for robot in config.robots)
+    newest = (newest_model(folder, robot) or path for robot, path in zip(config.robots, models, strict=True))
+    main(SafetySettings(bus, tuple(newest), folder, place.name))
+    return False
+
+
+def newest_model(folder: Path, robot: str) -> Path | None:
+    """The version that a service of this run used last: a restarted one goes on with it."""
+    versions = list((folder / robot / "models").glob("*.safetensors"))
+    return max(versions, key=lambda path: path.stat().st_mtime_ns, default=None)
+
+
+def _learner(place: Place, folder: Path, config: RunConfig, bus: BusSettings) -> bool:
+    from learner.checkpoint import exists
+    from learner.service import CHECKPOINT, LearnerSettings, main
+
+    out = folder / place.name
+    return main(LearnerSettings(bus, place.robot, out, exists(out / CHECKPOINT), place.name, config.learning()))
+
+
+def _actor(place: Place, folder: Path, config: RunConfig, bus: BusSettings) -> bool:
+    from actors import flight
+    from actors.loop import ActorSettings, run
+    from deploy.policies import policy_named
+    from deploy.vehicles import environment, flight_arena
+
+    settings = ActorSettings(
+        bus=bus,
+        robot=place.robot,
+        name=place.name,
+        number=place.number,
+        robots=config.robots_per_actor,
+        seed=config.seed,
+        arena=config.arena,
+        method=config.method,
+        penalty=config.penalty,
+        deadline=60.0 if config.deterministic else config.deadline,
+        lockstep=config.deterministic,
+        practice=config.practice,
+        change=config.change,
+        mavlink=config.mavlink,
+        steps=config.steps,
+    )
+    propose = partial(policy_named, config.policy, robot_named(place.robot)) if config.policy else None
+    if config.flight is not None:
+        return flight.run(settings, config.flight, flight_arena(config.arena, config.seed), propose)
+    return run(settings, partial(environment, conditions=config.conditions), propose)
+
+
+def _autopilot(place: Place, folder: Path, config: RunConfig, bus: BusSettings) -> bool:
+    from deploy.run.autopilot import AutopilotSettings, fly
+
+    assert config.autopilot is not None and config.flight is not None
+    fly(
+        AutopilotSettings(
+            url=config.flight.url.replace("udpin:0.0.0.0", "udpout:127.0.0.1").replace("udpin", "udpout"),
+            rules=config.autopilot.rules,
+            arena=config.arena,
+            seed=config.seed,
+            airborne=True,
+            setpoint_timeout=config.autopilot.setpoint_timeout,
+            wind=config.conditions.wind,
+            truth=f"127.0.0.1:{config.flight.truth}",
+        )
+    )
+    return False
+
+
+def _feeder(place: Place, folder: Path, config: RunConfig, bus: BusSettings) -> bool:
+    from deploy.run.feed import FeederSettings, main
+
+    return main(FeederSettings(bus, config.from_logs, place.robot, place.name, config.actors == 0))
+
+
+# Each runs until its work is done (True) or it is asked to end; a recorder's and a safety service's never is.
+KINDS: dict[str, Callable[[Place, Path, RunConfig, BusSettings], bool]] = {
+    "recorder": _recorder,
+    "safety": _safety,
+    "learner": _learner,
+    "actor": _actor,
+    "autopilot": _autopilot,
+    "feeder": _feeder,
+}
+
+
+def main() -> int:
+    """Run the process named on the command line; it ends with its launcher. 0: its work is done."""
+    folder, name = Path(sys.argv[1]), sys.argv[2]
+    ctypes.CDLL(None).prctl(PARENT_DIED, signal.SIGTERM)
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+    launcher = json.loads((folder / ENDPOINT).read_text())
+    if os.getppid() != launcher["pid"]:  # it died before we could ask to be told
+        return UNFINISHED
+    config = load(folder / CONFIG)
+    place = next(place for place in places(config) if place.name == name)
+    if place.nice:
+        os.nice(place.nice)
+    try:
+        done = KINDS[place.kind](place, folder, config, BusSettings(connect=(launcher["endpoint"],)))
+    except BusError as error:
+        print(f"{name}: {type(error).__name__}: {error}", file=sys.stderr)
+        return 1
+    return 0 if done else UNFINISHED
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,139 @@
+"""What a person sees of a run: a live table while it lasts, and a summary at its end."""
+
+from __future__ import annotations
+
+import time
+from types import TracebackType
+from typing import Any, Self
+
+from rich.console import Console, Group, RenderableType
+from rich.live import Live
+from rich.panel import Panel
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.table import Table
+from rich.text import Text
+
+from deploy.run.view import View
+from logs.report import show
+
+REFRESH = 0.5  # s between two looks at the figures
+PLAIN = 10.0  # s between two lines where there is no terminal
+LINES = 5  # of warnings shown
+
+
+class Display:
+    """Call it with the view of a run, as often as you like; it redraws when there is something to see."""
+
+    def __init__(self, console: Console, steps: int) -> None:
+        self.console = console
+        self._bar = Progress(
+            TextColumn("steps"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn()
+        )
+        self._task = self._bar.add_task("steps", total=steps)
+        self._live = Live(console=console, auto_refresh=False, transient=True) if console.is_terminal else None
+        self._last = -1e9 if self._live is not None else time.monotonic()
+
+    def __enter__(self) -> Self:
+        if self._live is not None:
+            self._live.start()
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None) -> None:
+        if self._live is not None:
+            self._live.stop()
+
+    def __call__(self, view: View) -> None:
+        spacing = REFRESH if self._live is not None else PLAIN
+        if time.monotonic() - self._last < spacing and not (view.ending and self._live is not None):
+            return
+        self._last = time.monotonic()
+        figures = view.metrics.figures()
+        learned = sum(learner["steps"] for learner in figures["learners"].values())
+        self._bar.update(self._task, completed=max(figures["steps"], learned))  # resumed: learned of earlier ones too
+        if self._live is not None:
+            self._live.update(live(view, figures, self._bar), refresh=True)
+        else:
+            self.console.print(line(figures))
+
+
+def line(figures: dict[str, Any]) -> str:
+    """The figures that matter most, for a log."""
+    learners = figures["learners"].values()
+    updates = sum(learner["updates_per_s"] for learner in learners)
+    steps = max(figures["steps"], sum(learner["steps"] for learner in learners))  # offline nobody drives
+    return (
+        f"steps {steps}  episodes {figures['episodes']}  goals {figures['goals']}  "
+        f"collisions {figures['collisions']}  interventions {share(figures['interventions'], figures['steps'])}  "
+        f"{sum(learner['steps_per_s'] for learner in learners):.0f} steps/s  {updates:.0f} updates/s"
+    )
+
+
+def live(view: View, figures: dict[str, Any], bar: Progress) -> RenderableType:
+    """The whole picture: progress, the learning, the safety, the processes, the latest warnings."""
+    parts: list[RenderableType] = [bar, _run(figures), _processes(view)]
+    if view.lines:
+        parts += [Text(text, "yellow", no_wrap=True, overflow="ellipsis") for text in list(view.lines)[-LINES:]]
+    subtitle = "ending" if view.ending else "^C ends every process in order"
+    return Panel(Group(*parts), title=Text(f"brakeline: {view.folder}"), subtitle=subtitle)
+
+
+def _run(figures: dict[str, Any]) -> Table:
+    """Pairs of a name and a value, two in a row: it fits 80 columns."""
+    table = Table(box=None, show_header=False, padding=(0, 2, 0, 0))
+    episodes, steps = figures["episodes"], figures["steps"]
+    times, trip, contained = figures["decision_ms"], figures["round_trip_ms"], figures["containment"]
+    color = "green" if figures["collisions"] == 0 else "bold red"
+    table.add_row("episodes", str(episodes), "goals", share(figures["goals"], episodes))
+    table.add_row("collisions", f"[{color}]{figures['collisions']}[/]", "mean reward", _mean(figures))
+    table.add_row("interventions", share(figures["interventions"], steps), "failsafe", str(figures["failsafes"]))
+    table.add_row(
+        "left the set", share(contained["violations"], contained["steps"]), "no answer", str(figures["fallbacks"])
+    )
+    table.add_row("decide p50 / p99", _pair(times), "asked p50 / p99", _pair(trip))
+    several = len(figures["learners"]) > 1
+    for robot, learner in figures["learners"].items():
+        steps_per_s, updates_per_s = (f"{learner[name]:.0f}/s" for name in ("steps_per_s", "updates_per_s"))
+        table.add_row(f"steps {robot}" if several else "steps", steps_per_s, "updates", updates_per_s)
+        critic, actor = (f"{learner[name]:.3f}" for name in ("critic_loss", "actor_loss"))
+        table.add_row("critic loss", critic, "actor loss", actor)
+        table.add_row("steps lost", str(learner["missing"]), "steps twice", str(learner["duplicates"]))
+    return table
+
+
+def _mean(figures: dict[str, Any]) -> str:
+    return "-" if figures["mean_reward"] is None else f"{figures['mean_reward']:.1f}"
+
+
+def _pair(times: dict[str, Any] | None) -> str:
+    return "-" if times is None else f"{times['p50']:.2f} / {times['p99']:.2f} ms"
+
+
+def _processes(view: View) -> Table:
+    table = Table(box=None, padding=(0, 2, 0, 0))
+    for column in ("process", "state", "restarts"):
+        table.add_column(column, style="dim" if column != "process" else "")
+    for child in view.children:
+        state = "[green]runs[/]" if child.alive else "done" if child.finished else "[red]down[/]"
+        table.add_row(child.place.name, state, str(child.restarts))
+    return table
+
+
+def share(count: int, of: int) -> str:
+    """A count with its share."""
+    return f"{count} ({count / of:.1%})" if of else str(count)
+
+
+def summary(console: Console, figures: dict[str, Any]) -> None:
+    """The end of a run: what happened, and where it is."""
+    console.print(show({name: value for name, value in figures.items() if name != "topics"}))
+    lost = sum(topic["missing"] for topic in figures["topics"].values())
+    restarts = ", ".join(f"{name} {count}" for name, count in figures["restarts"].items())
+    console.print(f"messages lost: {lost}; restarts: {restarts or 'none'}")
+    if "from_logs" in figures:
+        fed = figures["from_logs"]
+        console.print(f"steps from logs: {fed.get('published', 0)}, and {fed.get('known', 0)} that the learner knew")
+    if not figures["finished"] and figures.get("policy") in (None, "learning"):
+        console.print(f"[yellow]stopped before the last step[/]; go on: brakeline train --resume {figures['folder']}")
+    console.print(f"log:    {figures['log'] or 'none was recorded'}", markup=False)
+    for path in figures["policies"]:
+        console.print(f"policy: {path}", markup=False)

@@ -1,0 +1,216 @@
+"""Starts the processes of a run on this machine, watches and restarts them, shows what happens, and ends them all."""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import time
+from collections import Counter, deque
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from deploy.data.store import method_for
+from deploy.run.configurations import RunConfig, encode
+from deploy.run.places import CONFIG, ENDPOINT, LOG, places
+from deploy.run.view import View
+from deploy.run.watched import Child, LaunchError, last_line
+from logs.metrics import Metrics
+from messaging.bus import BusError, BusSettings, Malformed, Sample
+from messaging.ports import free_endpoint
+from messaging.process import Process
+from messaging.robots import robot_named
+from messaging.topics import RECORDED
+
+log = logging.getLogger("brakeline.launcher")
+
+TURN = 0.1  # s
+END_PATIENCE = 10.0  # s from SIGTERM to SIGKILL: a checkpoint may be in progress
+RECORDER_PATIENCE = 30.0  # s until the run starts without a recorder: its disk may be full
+HEARD_OUT = 2.0  # s that is waited for the last message at most
+QUIET = 0.5  # s without a message after which the last one has come
+FIGURES = "figures.json"
+
+
+def prepare(config: RunConfig, folder: Path, resume: bool) -> None:
+    """See that the folder can take the run, and that there are model sets.
+
+    Raises:
+        LaunchError: the folder holds another run.
+    """
+    if not resume and (folder / CONFIG).exists():
+        raise LaunchError(f"{folder} holds a run already: give --resume {folder}, or another --out")
+    if config.filtered:
+        for robot in config.robots:
+            method_for(robot_named(robot), config.method, config.recipe)
+    folder.mkdir(parents=True, exist_ok=True)
+
+
+class Launcher:
+    """A run from its first process to its last."""
+
+    def __init__(self, config: RunConfig, folder: Path, endpoint: str | None = None) -> None:
+        self.config, self.folder = config, folder
+        self.endpoint = endpoint or free_endpoint()
+        self.children = [Child(place, folder) for place in places(config)]
+        self.metrics = Metrics()
+        self.lines: deque[str] = deque(maxlen=200)
+        self._inbox: deque[Sample] = deque()
+
+    def run(self, show: Callable[[View], Any] = lambda view: None) -> dict[str, Any]:
+        """Until the learners are done or SIGINT or SIGTERM; returns the figures, also saved in the run's folder.
+
+        Raises:
+            LaunchError: a process fails again and again; the others were ended in order.
+            Unreachable: the endpoint cannot be listened on.
+        """
+        view = View(self.config, self.folder, self.metrics, self.children, self.lines)
+        failure: LaunchError | None = None
+        with Process(BusSettings(listen=(self.endpoint,)), "launcher", stderr=False, reserved=True) as process:
+            self._claim_folder()
+            for topic in RECORDED:
+                process.bus.subscribe(topic, self._inbox.append)
+            process.refresh = lambda: process.figures.update(
+                {f"restarts {child.place.name}": child.restarts for child in self.children}
+            )
+            try:
+                if self.config.record:
+                    self._start_recorder(process)
+                process.announce()
+                while not process.stop.is_set() and not self.finished:
+                    for child in self.children:
+                        if not self._must_wait(child):
+                            child.watch()
+                    self._drain()
+                    show(view)
+                    process.stop.wait(TURN)
+            except LaunchError as error:
+                failure = error
+                log.error("%s", error)
+            finally:
+                view.ending = True
+                show(view)
+                self._end()
+        self._drain()
+        figures = self.figures()
+        (self.folder / FIGURES).write_text(json.dumps(figures, indent=2))
+        if failure is not None:
+            raise failure
+        return figures
+
+    def figures(self) -> dict[str, Any]:
+        """As `analyse` would give them for the log, with what only the launcher knows."""
+        setup = {
+            "method": self.config.method,
+            "certificate": self.config.recipe.certificate if self.config.method == "ddpc" else None,
+            "policy": self.config.policy or "learning",
+            "arena": self.config.arena,
+            "seed": self.config.seed,
+        }
+        restarts = {child.place.name: child.restarts for child in self.children if child.restarts}
+        log_path = str(self.folder / LOG) if self.config.record else None
+        paths = {"folder": str(self.folder), "log": log_path, "policies": self.policies()}
+        return (
+            setup
+            | self.metrics.figures()
+            | {"finished": self.finished, "restarts": restarts}
+            | self._from_logs()
+            | paths
+        )
+
+    @property
+    def finished(self) -> bool:
+        """Have all learners done their work (where nobody learns, the robots)? Then nobody needs the others. Offline
+        they may be a few steps short of it when the logs end: what a learner that was interrupted had not saved."""
+        kinds = ("learner", "feeder", "actor")
+        done = {kind: [c.finished for c in self.children if c.place.kind == kind] for kind in kinds}
+        if self.config.policy:
+            return all(done["actor"])
+        return all(done["learner"]) or (self.config.actors == 0 and all(done["feeder"]))
+
+    def _must_wait(self, child: Child) -> bool:
+        """Robots start when what the logs hold of their kind was learned from."""
+        feeders = (c for c in self.children if c.place.kind == "feeder" and c.place.robot == child.place.robot)
+        return child.place.kind == "actor" and not all(feeder.finished for feeder in feeders)
+
+    def _from_logs(self) -> dict[str, Any]:
+        """What was learned from logs, if anything was to be."""
+        if not self.config.from_logs:
+            return {}
+        fed: Counter[str] = Counter()
+        for child in self.children:
+            process = self.metrics.processes.get(child.place.name)
+            if child.place.kind == "feeder" and process is not None:
+                fed.update({name: int(count) for name, count in process.figures.items()})
+        return {"from_logs": {"logs": list(self.config.from_logs)} | dict(fed)}
+
+    def policies(self) -> list[str]:
+        """The policy files that were saved."""
+        return [str(path) for path in sorted(self.folder.glob("learner*/policy.safetensors"))]
+
+    def _claim_folder(self) -> None:
+        """Write what the processes read, and that this is the latest run."""
+        (self.folder / CONFIG).write_text(encode(self.config))
+        (self.folder / ENDPOINT).write_text(json.dumps({"endpoint": self.endpoint, "pid": os.getpid()}))
+        latest = self.folder.parent / "latest"
+        if latest.is_symlink() or not latest.exists():
+            latest.unlink(missing_ok=True)
+            latest.symlink_to(self.folder.name)
+
+    def _start_recorder(self, process: Process) -> None:
+        """The recorder first, and not a word, of the launcher's either, before it listens: no message shall be missing
+        in the log."""
+        recorder = self.children[0]
+        deadline = time.monotonic() + RECORDER_PATIENCE
+        while not process.stop.is_set() and time.monotonic() < deadline:
+            recorder.watch()
+            self._drain()
+            known = self.metrics.processes.get("recorder")
+            if known is not None and known.notes.get("file"):
+                break
+            process.stop.wait(0.05)
+        else:
+            if not process.stop.is_set():
+                log.error("the recorder does not record: %s", last_line(self.folder / "logs" / "recorder.log"))
+
+    def _drain(self) -> None:
+        while self._inbox:
+            sample = self._inbox.popleft()
+            try:
+                message = sample.message()
+            except Malformed as error:
+                log.error("%s", error)
+                continue
+            self.metrics.add(sample.key, message)
+            if sample.topic.name == "log" and message.level in ("WARNING", "ERROR"):
+                self.lines.append(f"{message.process}: {message.text.splitlines()[0]}")
+
+    def _end(self) -> None:
+        """Everything but the recorder first, so that their last words are in the log."""
+        recorders = [child for child in self.children if child.place.kind == "recorder"]
+        flying = [child for child in self.children if child.place.kind == "actor" and self.config.flight is not None]
+        others = [child for child in self.children if child not in (*recorders, *flying)]
+        for group in filter(None, (flying, others, recorders)):
+            for child in group:
+                child.terminate()
+            deadline = time.monotonic() + END_PATIENCE
+            while any(child.alive for child in group) and time.monotonic() < deadline:
+                self._drain()
+                time.sleep(0.02)
+            for child in group:
+                child.end(deadline)
+            self._hear_out()
+
+    def _hear_out(self) -> None:
+        """Wait for the last words of those who have ended; who still lives may go on talking."""
+        now = time.monotonic()
+        quiet, patience = now + QUIET, now + HEARD_OUT
+        while time.monotonic() < min(quiet, patience):
+            if self._inbox:
+                quiet = time.monotonic() + QUIET
+            self._drain()
+            time.sleep(0.02)
+
+
+__all__ = ["BusError", "LaunchError", "Launcher", "View", "prepare"]

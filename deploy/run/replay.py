@@ -1,0 +1,187 @@
+"""`brakeline replay`: the questions of a log asked again, and what is answered otherwise.
+
+On the same version of this software and the same type of machine nothing is, to the last bit. With another model or
+margin it says what would have been decided: each request stands for itself, with the past as it was.
+"""
+
+from __future__ import annotations
+
+import heapq
+import math
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from deploy.data.store import data_root
+from logs.container import attachment
+from logs.reader import Log, Paths, open_log
+from messaging import brakeline_pb2 as pb
+from messaging.robots import robot_named
+from safety.commitment import UNVERIFIED
+from safety.methods import Method, decode, load, ready
+from safety.service import Counts, Models, answerer
+
+TIMES = ("time_ms", "solve_ms", "verify_ms", "queue_ms")
+EXAMPLES = 20  # decisions that are told in full: those with the largest differences
+NAMES = {pb.ALLOWED: "allowed", pb.ADJUSTED: "adjusted", pb.FAILSAFE: "failsafe", pb.UNKNOWN: "error"}
+
+Instead = Callable[[str], Method]  # by the robot's name: what is asked in place of what was in use
+
+
+class ReplayError(ValueError):
+    """The log cannot be replayed; the message says what is missing."""
+
+
+@dataclass
+class Archive:
+    """The methods that were in use, by their model's version: from the log, else the run's folder, else the data."""
+
+    log: Log
+    methods: dict[str, Method] = field(default_factory=dict)
+
+    def add(self, file: bytes) -> None:
+        """A model that was published while the log was recorded. Raises BadModel."""
+        method = ready(decode(file))
+        self.methods.setdefault(method.version, method)
+
+    def method(self, robot: str, version: str) -> Method:
+        """
+        Raises:
+            ReplayError: it is nowhere; BadModel: its file is damaged or of another layout.
+        """
+        if version not in self.methods:
+            self.methods[version] = ready(self._model(robot, version))
+        return self.methods[version]
+
+    def _model(self, robot: str, version: str) -> Any:
+        attached = self.log.attachments.get(attachment(robot, version))
+        if attached is not None:
+            return decode(attached)
+        for root in (*dict.fromkeys(path.parent for path in self.log.paths), data_root()):
+            path = root / robot / "models" / f"{version}.safetensors"
+            if version.isalnum() and path.exists():
+                return load(path)
+        raise ReplayError(f"model {version} of {robot} is neither in the log nor in its folder: what was in use?")
+
+
+@dataclass
+class Comparison:
+    """What a log's decisions and the replayed ones have in common."""
+
+    requests: int = 0
+    unanswered: int = 0  # no reply came in time: nothing to compare with
+    identical: int = 0
+    kinds: Counter[tuple[str, str]] = field(default_factory=Counter)  # (logged, now)
+    fields: dict[str, list[float]] = field(default_factory=dict)  # sizes of differences; inf: not to be measured
+    _worst: list[tuple[tuple[float, float, int], dict[str, Any]]] = field(default_factory=list)  # a heap
+
+    @property
+    def different(self) -> int:
+        return self.requests - self.unanswered - self.identical
+
+    def add(self, request: pb.Request, logged: pb.Reply, now: pb.Reply, ignored: tuple[str, ...] = ()) -> None:
+        """Compare two replies to a request, but for their times and what else is to be ignored."""
+        self.requests += 1
+        self.kinds[NAMES[logged.decision.kind], NAMES[now.decision.kind]] += 1
+        found = differences(logged, now, robot_named(request.robot).action_dim, (*TIMES, *ignored))
+        self.identical += not found
+        for name, size in found.items():
+            self.fields.setdefault(name, []).append(size)
+        if found:
+            where = {"actor": request.actor, "episode": request.episode, "step": request.step}
+            kinds = {"logged": NAMES[logged.decision.kind], "now": NAMES[now.decision.kind]}
+            # First by what the robot does; of equals the earliest.
+            rank = found.get("input", 0.0), max(found.values()), -self.requests
+            push = heapq.heappushpop if len(self._worst) == EXAMPLES else heapq.heappush
+            push(self._worst, (rank, where | kinds | {"differences": found}))
+
+    def figures(self) -> dict[str, Any]:
+        """`kinds`: what was decided, and of that what is decided now; `fields`: per field of a decision how many
+        differ, and by how much at most (inf: where it is no number, or of another size); `same_input`: requests
+        after which the robot does the same; `examples`: the largest differences."""
+        kinds: dict[str, dict[str, int]] = {}
+        for (logged, now), count in sorted(self.kinds.items()):
+            kinds.setdefault(logged, {})[now] = count
+        fields = {name: {"count": len(sizes), "largest": max(sizes)} for name, sizes in sorted(self.fields.items())}
+        counts = {name: getattr(self, name) for name in ("requests", "unanswered", "identical", "different")}
+        counts["same_input"] = counts["requests"] - counts["unanswered"] - fields.get("input", {"count": 0})["count"]
+        worst = [example for _, example in sorted(self._worst, key=lambda item: item[0], reverse=True)]
+        return counts | {"kinds": kinds, "fields": fields, "examples": worst}
+
+
+def differences(logged: pb.Reply, now: pb.Reply, inputs: int, ignored: tuple[str, ...] = TIMES) -> dict[str, float]:
+    """The fields of two replies that differ, with the largest difference of their numbers; inf if they have none.
+
+    `input` is the plan's first row, `inputs` numbers: what the robot is told to do now.
+    """
+    if logged.WhichOneof("result") != now.WhichOneof("result"):
+        return {"result": math.inf}
+    if not now.HasField("decision"):
+        return {} if logged.error.type == now.error.type else {"error": math.inf}
+    before, after = logged.decision, now.decision
+    found: dict[str, float] = {}
+    for descriptor in pb.Decision.DESCRIPTOR.fields:
+        name = descriptor.name
+        one, other = getattr(before, name), getattr(after, name)
+        if name not in ignored and one != other:
+            found[name] = math.inf if descriptor.enum_type is not None else _size(one, other)
+    if before.plan[:inputs] != after.plan[:inputs]:
+        found["input"] = _size(before.plan[:inputs], after.plan[:inputs])
+    return found
+
+
+def _size(one: Any, other: Any) -> float:
+    if isinstance(one, str | bool):
+        return math.inf
+    first, second = np.atleast_1d(np.array(one, float)), np.atleast_1d(np.array(other, float))
+    if first.shape != second.shape:
+        return math.inf
+    return float(np.abs(first - second).max(initial=0.0))
+
+
+def replay(paths: Paths, instead: Instead | None = None, each: Callable[[], Any] = lambda: None) -> Comparison:
+    """Ask every question of the log at `paths` again; `each` is called after every one.
+
+    With `instead`, the plans that were committed to count as verified by what is asked now.
+
+    Raises:
+        NoLog, NotALog: there is none; ReplayError, BadModel: a model that was in use cannot be had.
+    """
+    log = open_log(paths)
+    archive, models, result = Archive(log), Models(), Comparison()
+    answer = answerer(models, Counts())
+    for record in log:
+        if record.topic == "model":
+            archive.add(record.message.file)
+        if record.topic != "exchange":
+            continue
+        request, logged = record.message.request, record.message.reply
+        if logged.WhichOneof("result") is None:
+            result.requests += 1
+            result.unanswered += 1
+        elif instead is not None:
+            _put_to_use(models, request, instead(request.robot))
+            if request.model not in ("", UNVERIFIED):
+                request.model = models.filters[request.robot].version
+            result.add(request, logged, _asked(answer, request), ("model",))
+        else:
+            if logged.decision.model:  # else it is an error, of whatever was in use
+                _put_to_use(models, request, archive.method(request.robot, logged.decision.model))
+            result.add(request, logged, _asked(answer, request))
+        each()
+    return result
+
+
+def _put_to_use(models: Models, request: pb.Request, method: Method) -> None:
+    """As the service was when it decided: the version before may have been used before this log began."""
+    models.filters[request.robot] = method
+    models.known |= {method.version, request.model}
+
+
+def _asked(answer: Callable[[bytes], bytes], request: pb.Request) -> pb.Reply:
+    """The service's own core is asked: the same bytes, no bus."""
+    replies = pb.ReplyBatch.FromString(answer(pb.RequestBatch(requests=[request]).SerializeToString())).replies
+    return replies[0]

@@ -1,0 +1,1 @@
+"""The comparison: trials, tables, curves, intervals, tuning."""

@@ -1,0 +1,26 @@
+"""The bus: publishers, subscribers, questions and answers, and who is alive, over Zenoh.
+
+A process that is given `listen` is a router; the others are clients of one of the `connect` endpoints.
+"""
+
+from messaging.bus.errors import BusError, Late, Malformed, NoReply, Refused, Unreachable
+from messaging.bus.publisher import Publisher
+from messaging.bus.session import Bus
+from messaging.bus.settings import BusSettings, configuration
+from messaging.bus.subscription import Listener, Sample, Subscription
+
+__all__ = [
+    "Bus",
+    "BusError",
+    "BusSettings",
+    "Late",
+    "Listener",
+    "Malformed",
+    "NoReply",
+    "Publisher",
+    "Refused",
+    "Sample",
+    "Subscription",
+    "Unreachable",
+    "configuration",
+]

@@ -1,0 +1,31 @@
+"""The keys of a topic, with the names filled in."""
+
+from __future__ import annotations
+
+import re
+
+from messaging.topics import Topic
+
+NAME = re.compile(r"[A-Za-z0-9_.-]+")
+
+
+def key_of(topic: Topic, names: dict[str, str]) -> str:
+    """The topic's key without the prefix, wildcards where names are left out.
+
+    Raises:
+        ValueError: the topic's key has no such name, or a name cannot be part of a key.
+    """
+    for field, name in names.items():
+        if f"{{{field}}}" not in topic.key and field != "source":
+            raise ValueError(f"{topic.key} has no {field!r}")
+        if not NAME.fullmatch(name):
+            raise ValueError(f"{field}={name!r}: letters, digits, '_', '.' and '-' only")
+    return topic.at(**names)
+
+
+def exact_key(topic: Topic, names: dict[str, str]) -> str:
+    """As `key_of`, where no name may be left out."""
+    key = key_of(topic, names)
+    if "*" in key:
+        raise ValueError(f"{topic.key}: give every name, not only {', '.join(names) or 'none'}")
+    return key

@@ -1,0 +1,210 @@
+"""A process's place on the bus: its publishers, subscribers, questions and answers, and who is alive, over Zenoh.
+
+Each client holds two sessions, one for telemetry and one for queries: a full telemetry queue blocks its link's
+receiving thread, and a robot's safety query must never wait behind it.
+
+Threads are Zenoh's, so open a bus only after a process was forked (or start processes by spawning).
+"""
+
+from __future__ import annotations
+
+import logging
+import secrets
+import threading
+from collections.abc import Callable, Iterable
+from functools import partial
+from typing import Any, Self
+
+import zenoh
+from zenoh.handlers import FifoChannel, RingChannel
+
+from messaging import brakeline_pb2 as pb
+from messaging.bus.errors import Late, NoReply, Refused, typed
+from messaging.bus.keys import NAME, exact_key, key_of
+from messaging.bus.publisher import Publisher
+from messaging.bus.settings import BusSettings, open_session
+from messaging.bus.subscription import Listener, Sample, Subscription
+from messaging.topics import Delivery, Topic
+
+log = logging.getLogger("brakeline.bus")
+
+# Beyond FIFO the link blocks and with it the publisher; beyond RING the oldest message is dropped.
+FIFO = 16384
+RING = 64
+
+
+class Bus:
+    """A process's place on the bus, under the name `source`; it is alive to others until `close`.
+
+    Raises:
+        Unreachable: no router answered within `patience`, or an endpoint cannot be listened on.
+        ValueError: no endpoint, or a name that cannot be part of a key.
+    """
+
+    def __init__(self, settings: BusSettings, source: str) -> None:
+        if not NAME.fullmatch(source):
+            raise ValueError(f"{source!r} cannot be the name of a process: letters, digits, '_', '.' and '-' only")
+        self.settings = settings
+        self.source = source
+        self.run = secrets.randbits(63)
+        self._lock = threading.Lock()
+        self._publishers: dict[str, Publisher] = {}
+        self._queriers: dict[tuple[str, float], zenoh.Querier] = {}
+        self._subscriptions: list[Subscription] = []
+        self._telemetry = open_session(settings)
+        # A router is one session; the two links of each client end in it separately.
+        self._queries = self._telemetry if settings.listen else open_session(settings)
+        self._token = self._telemetry.liveliness().declare_token(self._full(f"alive/{source}"))
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self, timeout: float = 2.0) -> None:
+        """Send what waits, say goodbye, end the handlers. Returns after `timeout` s even if the network hangs."""
+        worker = threading.Thread(target=self._close_sessions, name="bus close", daemon=True)
+        worker.start()
+        worker.join(timeout)
+        if worker.is_alive():
+            log.warning("the bus did not close within %.1f s; leaving it", timeout)
+            return
+        for subscription in self._subscriptions:
+            subscription.join(timeout)
+
+    @property
+    def connected(self) -> bool:
+        """Is there a link to anybody? A client without one waits for its router to come back."""
+        return bool(self._telemetry.info.transports())
+
+    def publisher(self, topic: Topic, **names: str) -> Publisher:
+        """The publisher of `topic`; the same one for the same key. `source` is this bus's unless given.
+
+        Raises:
+            ValueError: a name is missing or unknown, or the topic is a query.
+        """
+        if topic.delivery is Delivery.QUERY:
+            raise ValueError(f"{topic.name} is a question: use `ask`")
+        names = {"source": self.source} | names
+        key = exact_key(topic, names)
+        block = topic.delivery is Delivery.BLOCK
+        with self._lock:
+            if key not in self._publishers:
+                sender = self._telemetry.declare_publisher(
+                    self._full(key),
+                    encoding=zenoh.Encoding.APPLICATION_PROTOBUF,
+                    congestion_control=zenoh.CongestionControl.BLOCK if block else zenoh.CongestionControl.DROP,
+                )
+                self._publishers[key] = Publisher(topic, key, names["source"], self.run, sender)
+            return self._publishers[key]
+
+    def published(self) -> dict[str, int]:
+        """Messages put so far, per key."""
+        with self._lock:
+            return {key: publisher.count for key, publisher in self._publishers.items()}
+
+    def subscribe(self, topic: Topic, handler: Callable[[Sample], None], **names: str) -> Listener:
+        """Call `handler` with every sample of `topic`, in a thread of its own; names left out match any.
+
+        A handler that raises is logged and goes on with the next sample. One that is slow delays the publisher of a
+        BLOCK topic after `FIFO` samples, and misses the oldest of a DROP topic after `RING`.
+        """
+        channel: Any = FifoChannel(FIFO) if topic.delivery is Delivery.BLOCK else RingChannel(RING)
+        key = key_of(topic, names)
+        receiver: Any = self._telemetry.declare_subscriber(self._full(key), channel)
+        listener = Listener(topic, key, receiver, self.settings.prefix, handler)
+        self._keep(listener)
+        return listener
+
+    def serve(self, topic: Topic, handler: Callable[[bytes], bytes], **names: str) -> Subscription:
+        """Answer the questions of `topic`, one at a time, in a thread of its own.
+
+        What the handler raises goes back to who asked as `Refused` (with the exception's `field`, if it has one) and is
+        logged. Several processes may serve one topic: a question goes to one of them, and to another if that one is
+        gone.
+        """
+        key = key_of(topic, names)
+        receiver = self._queries.declare_queryable(self._full(key), FifoChannel(FIFO), complete=True)
+        return self._keep(Subscription(key, receiver, partial(_answer, handler)))
+
+    def ask(self, topic: Topic, payload: bytes, timeout: float, **names: str) -> bytes:
+        """The answer to a question, within `timeout` s.
+
+        Raises:
+            NoReply: nobody serves it; known at once, without waiting for the deadline.
+            Late: the deadline passed.
+            Refused: the service answered with an error.
+            ValueError: a name is missing or unknown.
+        """
+        key = exact_key(topic, names)
+        refusal: Refused | None = None
+        late = False
+        with typed(f"cannot ask {key}"):
+            for reply in self._querier(key, timeout).get(payload=payload):
+                if reply.ok is not None:
+                    return reply.ok.payload.to_bytes()
+                assert reply.err is not None
+                if reply.err.encoding == zenoh.Encoding.APPLICATION_PROTOBUF:
+                    refusal = Refused(pb.Error.FromString(reply.err.payload.to_bytes()))
+                else:  # Zenoh's own error reply: its timer ran out
+                    late = True
+        if refusal is not None:
+            raise refusal
+        if late:
+            raise Late(f"no answer to {key} within {timeout * 1e3:.0f} ms")
+        raise NoReply(f"nobody answers {key}: is the service running, and on the same bus?")
+
+    def living(self, timeout: float = 1.0) -> frozenset[str]:
+        """The sources that are alive now, this one included."""
+        replies: Iterable[zenoh.Reply] = self._telemetry.liveliness().get(self._full("alive/*"), timeout=timeout)
+        return frozenset(str(reply.ok.key_expr).rsplit("/", 1)[1] for reply in replies if reply.ok is not None)
+
+    def watch(self, handler: Callable[[str, bool], None]) -> Subscription:
+        """Call `handler(source, alive)` for each source that is alive now, then whenever one comes or goes."""
+        receiver = self._telemetry.liveliness().declare_subscriber(
+            self._full("alive/*"), FifoChannel(FIFO), history=True
+        )
+
+        def take(sample: zenoh.Sample) -> None:
+            handler(str(sample.key_expr).rsplit("/", 1)[1], sample.kind == zenoh.SampleKind.PUT)
+
+        return self._keep(Subscription("alive/*", receiver, take))
+
+    def _full(self, key: str) -> str:
+        return f"{self.settings.prefix}/{key}"
+
+    def _keep(self, subscription: Subscription) -> Subscription:
+        with self._lock:
+            self._subscriptions.append(subscription)
+        return subscription
+
+    def _querier(self, key: str, timeout: float) -> zenoh.Querier:
+        with self._lock:
+            if (key, timeout) not in self._queriers:
+                self._queriers[key, timeout] = self._queries.declare_querier(
+                    self._full(key),
+                    target=zenoh.QueryTarget.BEST_MATCHING,
+                    consolidation=zenoh.ConsolidationMode.NONE,  # the first answer is the answer
+                    timeout=timeout,
+                    priority=zenoh.Priority.REAL_TIME,
+                    congestion_control=zenoh.CongestionControl.DROP,  # never stall past the deadline
+                    express=True,
+                )
+            return self._queriers[key, timeout]
+
+    def _close_sessions(self) -> None:
+        closables: list[Any] = [self._queries, self._telemetry]  # Any: their stubs are untyped here
+        for session in closables:
+            session.close()  # which undeclares all that it declared; closing twice does nothing
+
+
+def _answer(handler: Callable[[bytes], bytes], query: zenoh.Query) -> None:
+    """Answer one query; without an answer of some kind the service would look dead."""
+    with query:
+        try:
+            query.reply(query.key_expr, handler(query.payload.to_bytes() if query.payload else b""), express=True)
+        except Exception as error:
+            refusal = pb.Error(type=type(error).__name__, field=str(getattr(error, "field", "")), message=str(error))
+            query.reply_err(refusal.SerializeToString(), encoding=zenoh.Encoding.APPLICATION_PROTOBUF)
+            raise

@@ -1,0 +1,1 @@
+"""The methods that ours is compared with, behind the same interface."""

@@ -1,0 +1,92 @@
+"""SAILR: the proposed action, unless it is riskier by more than η than handing over to the backup policy at once.
+
+Wagener et al. 2021, "Safe Reinforcement Learning Using Advantage-Based Intervention". The rule is (Q, μ, η): Q(s, a)
+and V(s) are the costs to be expected from a followed by the backup policy μ, and from μ alone,
+
+    intervene  ⟺  Q(s, a) − V(s) > η                 (their eq. 6: the advantage of a over μ); then execute μ(s)
+
+Q and V are learned beforehand, two networks each: the larger Q and the smaller V count. μ brakes (`safety/backup.py`).
+In training an intervention ends the episode: for the learner with a terminal step and the lowest reward, for the robot
+as one that was called off (`actors/driver.py`, `learner/windows.py`). In use the rule applies at every step anew.
+"""
+
+from __future__ import annotations
+
+from time import perf_counter_ns
+
+import numpy as np
+from numpy.typing import NDArray
+
+from messaging.robots import Robot
+from safety.backup import brake, braking_plan, within
+from safety.commitment import NO_PREDICTION
+from safety.model_set import BadModel
+from safety.request import ALLOWED, FAILSAFE, Decision, Request, check_for_rival
+from safety.rivals.pretrained import Pretrained
+
+Array = NDArray[np.float64]
+
+SAILR = "sailr"
+
+
+def normalised(robot: Robot, action: Array) -> Array:
+    """Inputs (..., m) in units of half their range about its middle: what Q is a function of."""
+    low, high = robot.low(), robot.high()
+    return np.asarray((2.0 * action - low - high) / (high - low))
+
+
+class Sailr:
+    """Critics made ready for decisions. Their outputs are logits of the cost in [0, 1]."""
+
+    def __init__(self, model: Pretrained) -> None:
+        """
+        Raises:
+            BadModel: not of this method, or its networks do not fit the robot.
+        """
+        self.model, self.robot, self.version = model, model.robot, model.version
+        try:
+            self.q, self.v, self.threshold = model.networks["q"], model.networks["v"], model.settings["threshold"]
+        except KeyError as error:
+            raise BadModel(f"no model of SAILR: {error} is missing") from error
+        seen = self.robot.observation_dim
+        found = (self.q.inputs, self.q.outputs, self.v.inputs, self.v.outputs)
+        if model.method != SAILR or found != (seen + self.robot.action_dim, 1, seen, 1):
+            raise BadModel(f"no model of SAILR for {self.robot.name}: {model.method}, networks {found}")
+
+    def advantage(self, observation: NDArray[np.float32], action: Array) -> float:
+        """max Q(s, a) − min V(s), in [-1, 1]: how much more costly the action is than the backup."""
+        worst = self.q(np.concatenate([observation, normalised(self.robot, action)])).max()
+        best = self.v(observation).min()
+        return _sigmoid(float(worst)) - _sigmoid(float(best))
+
+    def decide(self, request: Request) -> Decision:
+        """The proposal, or the backup policy's input.
+
+        Raises:
+            BadRequest: a value is missing, not finite or of the wrong size, with the field's name.
+        """
+        started = perf_counter_ns()
+        robot = self.robot
+        check_for_rival(robot, request)
+        proposal = within(robot, request.action, request.input_in_force)
+        advantage = self.advantage(request.observation, proposal)
+        intervene = advantage > self.threshold
+        action = within(robot, brake(robot, request.input_in_force), request.input_in_force) if intervene else proposal
+        total = (perf_counter_ns() - started) * 1e-6
+        return Decision(
+            kind=FAILSAFE if intervene else ALLOWED,
+            plan=braking_plan(robot, action),
+            tube_center=np.zeros((0, robot.position_dim)),
+            tube_half_width=np.zeros((0, robot.position_dim)),
+            predicted=NO_PREDICTION,
+            margin=0.0,
+            model=self.version,
+            reason=f"its advantage over braking is {advantage:.3f}, above {self.threshold:g}" if intervene else "",
+            verified=False,
+            time_ms=total,
+            verify_ms=total,
+        )
+
+
+def _sigmoid(x: float) -> float:
+    return float(0.5 * (1.0 + np.tanh(0.5 * x)))

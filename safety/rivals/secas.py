@@ -1,0 +1,180 @@
+"""SECAS: the proposed action, corrected as little as a learned linear model of each constraint asks for.
+
+Dalal et al. 2018, "Safe Exploration in Continuous Action Spaces". For constraints c_i(s) ≤ C and networks g_i trained
+beforehand on random actions,
+
+    c_i(s') ≈ c_i(s) + g_i(s)ᵀ a                                                                    (their eq. 2)
+    min ½‖a − r‖²  s.t.  c_i(s) + g_i(s)ᵀ a ≤ C                                                     (eq. 4)
+    λ_i* = [(g_iᵀ r + c_i − C) / (g_iᵀ g_i)]₊,   a* = r − λ* g_{i*},   i* = argmax λ_i*             (eqs. 5 and 6)
+
+with the closed form if one constraint is active, and the QP with the input's bounds if several are. Nothing is verified
+and no plan is made: only the next sample is looked at, with errors of the fit that nobody bounds.
+"""
+
+from __future__ import annotations
+
+from time import perf_counter_ns
+
+import numpy as np
+from numpy.typing import NDArray
+
+from messaging.rays import rays_of
+from messaging.robots import Robot
+from safety.backup import braking_plan, within
+from safety.commitment import NO_PREDICTION
+from safety.model_set import BadModel
+from safety.request import ADJUSTED, ALLOWED, Decision, Request, check_for_rival
+from safety.rivals.pretrained import Pretrained
+from safety.solver import Program, solve
+
+Array = NDArray[np.float64]
+
+SECAS = "secas"
+SECTOR = 0.55  # rad, about the width of a sector of rays
+LAG = 0.5  # periods that an input needs to take hold
+BESIDE = 0.3  # m beside the footprint, and twice the way to a stop: what is farther is far
+GUARD = 1e-6  # m² per squared unit of scaled input: a constraint below is one that the input does not move
+INSIDE = 1e-6  # m: a constraint violated by less is met
+UNMET = 100.0  # price of violating a unit row of the QP by one unit of scaled input; inputs are worth at most about 4
+CURVED = 1e-3
+
+
+class Constraints:
+    """c (K,) of a state, in m: for each sector of the lidar the way to a stop, less the range, at its worst ray.
+
+        c_j = max over rays e of sector j:  T (v·e)₊ − min(range_e, near),      T the time in which braking covers v·T
+
+    For a robot that stops within a period that is nearly −range; for one that does not, the next sample's range alone
+    would be looked at too late. Ranges beyond `near` are all the same: what enters or leaves a sector far away says
+    nothing about the input, and would drown what is near in the fit.
+    """
+
+    def __init__(self, robot: Robot) -> None:
+        rays = rays_of(robot)
+        self.robot, self.directions, self.range = robot, rays.directions, rays.range
+        self.stopping = robot.period * (0.5 * robot.brake_steps + LAG)  # s
+        fastest = float(np.linalg.norm(np.where(robot.translates, robot.high(), 0.0)))
+        self.near = min(rays.range, robot.footprint + BESIDE + 2.0 * self.stopping * fastest)  # m
+        self.sectors = _sectors(rays.directions)
+
+    @property
+    def count(self) -> int:
+        return len(self.sectors)
+
+    def __call__(self, observation: NDArray[np.floating], state: Array) -> Array:
+        """Of an observation and the measured state with it."""
+        speeds = state[self.robot.speeds]
+        velocity = speeds if self.robot.heading is None else np.eye(self.directions.shape[1])[0] * speeds[0]
+        ranges = np.minimum(np.asarray(observation[: len(self.directions)], float) * self.range, self.near)
+        way = self.stopping * np.maximum(self.directions @ velocity, 0.0) - ranges
+        return np.array([way[rays].max() for rays in self.sectors])
+
+
+def _sectors(directions: Array) -> list[NDArray[np.intp]]:
+    """The rays of each sector: equal shares of the azimuths and, for a robot that flies, of the elevations."""
+    azimuth = np.arctan2(directions[:, 1], directions[:, 0])
+    low, high = azimuth.min(), azimuth.max()
+    count = max(1, round((high - low) / SECTOR))
+    number = np.minimum((count * (azimuth - low) / (high - low) + 1e-9).astype(int), count - 1)
+    if directions.shape[1] == 3:
+        height = np.sign(np.round(directions[:, 2], 6)).astype(int) + 1
+        number = number * 3 + height
+    return [np.flatnonzero(number == n) for n in np.unique(number)]
+
+
+def closed_form(r: Array, G: Array, d: Array) -> Array:
+    """The correction of r (m,) for the most violated of `G a ≤ d`, G (K, m), d (K,); the others are ignored."""
+    square = (G * G).sum(axis=1)
+    moved = square > GUARD
+    if not moved.any():
+        return r
+    multiplier = np.where(moved, np.maximum(G @ r - d, 0.0) / np.where(moved, square, 1.0), 0.0)
+    most = int(multiplier.argmax())
+    return np.asarray(r - multiplier[most] * G[most])
+
+
+def quadratic(r: Array, G: Array, d: Array, low: Array, high: Array) -> tuple[Array, str, int]:
+    """The a closest to r with `G a ≤ d` and `low ≤ a ≤ high`, where that is impossible with the least worst violation.
+
+    Returns a, the solver's word and its iterations; without a word a is r.
+    """
+    size = np.sqrt((G * G).sum(axis=1))
+    moved = size**2 > GUARD
+    rows, m = G[moved] / size[moved, None], len(r)
+    k = len(rows)
+    A = np.vstack([np.hstack([rows, -np.ones((k, 1))]), np.eye(m + 1)[:m], -np.eye(m + 1)])
+    b = np.concatenate([d[moved] / size[moved], high, -low, [0.0]])
+    program = Program(np.append(np.ones(m), CURVED), np.append(-r, UNMET), A, b)
+    solution = solve(program)
+    a = solution.x[:m] if solution.found else r
+    return a, solution.status, solution.iterations
+
+
+class Secas:
+    """Networks made ready for decisions. Inputs are scaled by the robot's highest: zero stays zero."""
+
+    def __init__(self, model: Pretrained) -> None:
+        """
+        Raises:
+            BadModel: not of this method, or its networks do not fit the robot.
+        """
+        self.model, self.robot, self.version = model, model.robot, model.version
+        self.constraints = Constraints(model.robot)
+        try:
+            self.g, clearance = model.networks["g"], model.settings["clearance"]
+        except KeyError as error:
+            raise BadModel(f"no model of SECAS: {error} is missing") from error
+        found = (self.g.count, self.g.inputs, self.g.outputs)
+        wanted = (self.constraints.count, self.robot.observation_dim, self.robot.action_dim)
+        if model.method != SECAS or found != wanted:
+            raise BadModel(f"no model of SECAS for {self.robot.name}: {model.method}, networks {found}")
+        self.bound = -clearance
+        self.scale = self.robot.high()
+
+    def decide(self, request: Request) -> Decision:
+        """The proposal, corrected.
+
+        Raises:
+            BadRequest: a value is missing, not finite or of the wrong size, with the field's name.
+        """
+        started = perf_counter_ns()
+        robot = self.robot
+        check_for_rival(robot, request)
+        proposal = within(robot, request.action, request.input_in_force)
+        c = self.constraints(request.observation, request.state)
+        G, d = np.asarray(self.g(request.observation), float), self.bound - c
+        action, solver, iterations, solve_ns = proposal, "", 0, 0
+        r = proposal / self.scale
+        if (G @ r - d > INSIDE).any():
+            corrected = within(robot, closed_form(r, G, d) * self.scale, request.input_in_force)
+            if (G @ (corrected / self.scale) - d > INSIDE).any():  # several are active, or a bound is
+                before = perf_counter_ns()
+                low, high = self._bounds(request.input_in_force)
+                a, solver, iterations = quadratic(r, G, d, low, high)
+                solve_ns = perf_counter_ns() - before
+                corrected = within(robot, a * self.scale, request.input_in_force)
+            action = corrected
+        worst = float((d - G @ (action / self.scale)).min())
+        changed = bool((np.abs(action - proposal) > INSIDE * self.scale).any())
+        total, solved = (perf_counter_ns() - started) * 1e-6, solve_ns * 1e-6
+        return Decision(
+            kind=ADJUSTED if changed else ALLOWED,
+            plan=braking_plan(robot, action),
+            tube_center=np.zeros((0, robot.position_dim)),
+            tube_half_width=np.zeros((0, robot.position_dim)),
+            predicted=NO_PREDICTION,
+            margin=worst,
+            model=self.version,
+            reason=f"sector {int((c + G @ r).argmax())} would come too near" if changed else "",
+            verified=False,
+            time_ms=total,
+            solve_ms=solved,
+            verify_ms=total - solved,
+            solver=solver,
+            iterations=iterations,
+        )
+
+    def _bounds(self, before: Array) -> tuple[Array, Array]:
+        """The lowest and highest scaled input after the one in force."""
+        robot = self.robot
+        return within(robot, robot.low(), before) / self.scale, within(robot, robot.high(), before) / self.scale

@@ -1,0 +1,108 @@
+"""Recording, storing, and data from a log."""
+
+import itertools
+from functools import partial
+
+import numpy as np
+import pytest
+
+from deploy.data import store
+from deploy.data.excite import excitation
+from deploy.data.logged import from_log, trajectories_of
+from logs.segment import Entry, open_segment
+from messaging import brakeline_pb2 as pb
+from messaging.robots import GROUND
+from safety.dataset import BadData, Dataset, windows
+from safety.model_set import ModelSet, Recipe
+
+
+def test_excitation_stays_in_bounds_and_slew_and_holds_plans_of_the_schedule():
+    inputs = np.array(list(itertools.islice(excitation(GROUND, np.random.default_rng(1)), 20_000)))
+    assert ((inputs >= GROUND.low()) & (inputs <= GROUND.high())).all()
+    steps = np.abs(np.diff(inputs, axis=0, prepend=np.zeros((1, 2))))
+    assert (steps <= np.asarray(GROUND.action_slew) + 1e-12).all()
+    moving = inputs.any(1)
+    stops = np.flatnonzero(moving[:-2] & ~moving[1:-1] & ~moving[2:])
+    assert len(stops) > 1000, "plans to a stop"
+    edges = (inputs[moving] == GROUND.high()).mean(0)
+    assert (edges > 0.1).all(), "inputs at their bounds, as when driving"
+    lengths = [len(list(group)) for still, group in itertools.groupby(~moving) if still]
+    assert max(lengths) >= 10, "some long stops, for the latch"
+
+
+def test_recorded_plans_are_found_as_windows(data_folder):
+    data = Dataset.load(store.record_path(GROUND))
+    assert len(windows(data, GROUND.horizon)) > 0.1 * data.periods
+    assert all(len(t.inputs) == 300 for t in data.trajectories)
+
+
+@pytest.fixture
+def elsewhere(tmp_path, monkeypatch):
+    """An empty store, with small recordings only."""
+    monkeypatch.setenv("BRAKELINE_DATA", str(tmp_path / "data"))
+    recordings = []
+    original = store.collect.record
+    monkeypatch.setattr(store, "recorded", partial(store.recorded, trajectories=20))
+    monkeypatch.setattr(store.collect, "record", lambda *a: (recordings.append(a), original(*a))[1])
+    return recordings
+
+
+def test_the_store_makes_what_is_missing_and_only_that(elsewhere, capsys):
+    model = store.model_for(GROUND, Recipe())
+    assert store.record_path(GROUND).exists() and len(elsewhere) == 1
+    assert ModelSet.load(store.model_path(GROUND, Recipe())).version == model.version
+    assert store.model_for(GROUND, Recipe()).version == model.version
+    other = store.model_for(GROUND, Recipe("set-membership"))
+    assert other.version != model.version and len(elsewhere) == 1, "one recording for all"
+    assert float(model.about["bound_step"]) <= float(model.about["bound_plan"]) < 1.0
+    store.model_path(GROUND, Recipe()).write_bytes(b"damaged")
+    assert store.model_for(GROUND, Recipe()).version == model.version
+    said = capsys.readouterr()
+    assert "making the model set again" in said.err and said.out == ""
+    store.model_path(GROUND, Recipe()).unlink()
+    store.record_path(GROUND).write_bytes(b"damaged")
+    assert store.model_for(GROUND, Recipe()).version == model.version, "the same seed, the same data"
+    assert len(elsewhere) == 2
+
+
+def steps(actor: str, episode: int, numbers, run: int = 1) -> list[pb.Step]:
+    """Steps of an actor's episode; the state tells which."""
+    made = []
+    for number in numbers:
+        path = [0.0] * 8
+        step = pb.Step(robot="ground", actor=actor, episode=episode, step=number, turned=0.0, path=path)
+        step.state.extend([0.0, 0.0, 0.0, episode, number])
+        step.action.extend([0.1, 0.01 * (number % 10)])
+        step.header.run = run
+        made.append(step)
+    return made
+
+
+def test_trajectories_from_a_log_are_cut_at_gaps_episodes_actors_and_restarts():
+    log = [
+        *steps("a", 0, [*range(10), *range(12, 30)]),  # two steps were lost
+        *steps("b", 0, range(10)),
+        *steps("a", 1, range(8)),
+        *steps("a", 1, range(8, 20), run=2),
+        *steps("a", 2, range(4)),  # too short to keep
+    ]
+    np.random.default_rng(0).shuffle(log)
+    found = sorted((int(t.states[0, 3]), int(t.states[0, 4]), len(t.inputs)) for t in trajectories_of(log, GROUND))
+    assert found == [(0, 0, 9), (0, 0, 9), (0, 12, 17), (1, 0, 7), (1, 8, 11)]
+    for t in trajectories_of(log, GROUND):
+        assert (np.diff(t.states[:, 4]) == 1).all() and (t.states[:, 3] == t.states[0, 3]).all()
+        assert np.allclose(t.before, [0.1, 0.01 * (t.states[0, 4] % 10)]), "the input in force at its start"
+        assert np.allclose(t.inputs[:, 1], 0.01 * (t.states[1:, 4] % 10))
+
+
+def test_the_last_steps_of_a_log(tmp_path):
+    segment = open_segment(tmp_path / "run.mcap", {})
+    made = [*steps("a", 0, range(50)), *steps("a", 1, range(50))]
+    segment.save([Entry("step/ground/a", pb.Step, s.SerializeToString(), i, i, i) for i, s in enumerate(made)])
+    segment.finish()
+    recorded = from_log(tmp_path / "run.mcap", GROUND, last=60)
+    assert [len(t.inputs) for t in recorded.data.trajectories] == [9, 49]
+    assert "58 of the last 60 steps" in recorded.note and recorded.data.about == {"origin": "log"}
+    open_segment(tmp_path / "none.mcap", {}).finish()
+    with pytest.raises(BadData, match="no trajectory of ground"):
+        from_log(tmp_path / "none.mcap", GROUND, last=60)

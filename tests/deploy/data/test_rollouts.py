@@ -1,0 +1,41 @@
+"""What the rivals are pre-trained on."""
+
+import numpy as np
+import pytest
+
+from deploy.data.pretrain import RECIPES, SailrRecipe, SecasRecipe, made_by, pretrain
+from deploy.data.rollouts import costs, transitions
+from learner.pretrain import Fit
+from messaging.robots import GROUND
+from safety.methods import ready
+
+
+def test_transitions_are_whole_scaled_and_the_same_again():
+    one, same, other = (transitions(GROUND, "default", 400, seed) for seed in (1, 1, 2))
+    assert one.observation.shape == (400, 26) and one.action.shape == (400, 2) and one.change.shape == (400, 6)
+    assert np.array_equal(one.change, same.change) and not np.array_equal(one.change, other.change)
+    assert (np.abs(one.action) <= 1.0).all() and (one.action[:, 0] >= 0).all()
+    fast = one.action[:, 0] > 0.8
+    assert one.change[fast].sum() > one.change[~fast].sum(), "driving ahead brings things nearer"
+
+
+def test_costs_are_of_braking_to_the_end():
+    found = costs(GROUND, "default", 3000, 1, gamma=0.99, smoothing=0.5, lead=5)
+    assert found.collisions > 0 and found.collided.sum() == found.collisions
+    for cost in (found.braked_cost, found.step_cost):
+        assert (cost >= 0.0).all() and (cost <= 1.0 + 1e-9).all()
+    assert len(found.driven) >= 3000 and found.driven.shape[1] == 28 and (np.abs(found.driven[:, 26:]) <= 1.0).all()
+    quiet = found.braked_cost[found.braked_cost < 0.5]
+    assert quiet.max() < 0.1, "a stop that touched nothing is nearly free, whatever it came near"
+    assert len(found.braked) == len(found.braked_cost) > 500
+
+
+@pytest.mark.parametrize("recipe", [SecasRecipe, SailrRecipe])
+def test_a_pretrained_model_says_what_it_cost(recipe):
+    how = recipe(samples=300, fit=Fit(hidden=(8,), epochs=1, batch=32))
+    driven = []
+    model = pretrain(GROUND, how, lambda: driven.append(1))
+    assert len(driven) >= 300 and ready(model).robot is GROUND
+    assert model.about["samples"] == "300" and int(model.about["collisions"]) >= 0 and model.about["error"]
+    assert made_by(model, how) and not made_by(model, recipe())
+    assert type(how) is RECIPES[model.method]

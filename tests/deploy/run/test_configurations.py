@@ -1,0 +1,94 @@
+"""Configurations: what is saved is what is read, and nothing unknown or impossible passes."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from actors.loop import Change
+from deploy.commands.train import Train
+from deploy.run.configurations import EXPERIMENTS, RunConfig, decode, encode, load
+from deploy.run.places import places
+from deploy.vehicles import Conditions
+from learner.config import LearnerConfig, TD3Config
+from safety.model_set import Recipe
+from sim.estimator import NoiseLevels
+
+CHANGED = RunConfig(
+    robots=("ground",),
+    method="none",
+    recipe=Recipe("set-membership", "recursion"),
+    arena="dense",
+    deadline=0.25,
+    change=Change(after=500, payload_kg=1.0),
+    conditions=Conditions(NoiseLevels(scale=2.0), 0.5, 0.8),
+    learner=LearnerConfig(td3=TD3Config(hidden=(8, 16, 4)), capacity=99),
+)
+
+
+@pytest.mark.parametrize("config", [*EXPERIMENTS.values(), CHANGED])
+def test_a_saved_configuration_is_read_back(config: RunConfig, tmp_path: Path) -> None:
+    (tmp_path / "config.json").write_text(encode(config))
+    assert load(tmp_path / "config.json") == config
+
+
+def test_what_is_unknown_or_damaged_is_refused_with_the_files_name(tmp_path: Path) -> None:
+    path = tmp_path / "config.json"
+    values = json.loads(encode(RunConfig()))
+    for damage, said in (
+        (values | {"colour": "red"}, "RunConfig has no colour"),
+        (values | {"learner": values["learner"] | {"depth": 3}}, "LearnerConfig has no depth"),
+        (values | {"arena": "ballroom"}, "no arena is called 'ballroom'"),
+        (values | {"method": "prayer"}, "no method is called 'prayer'"),
+        ([1, 2], "is no run's configuration"),
+    ):
+        path.write_text(json.dumps(damage))
+        with pytest.raises(ValueError, match=said) as refused:
+            load(path)
+        assert str(path) in str(refused.value)
+    path.write_text("{")
+    with pytest.raises(ValueError, match="is no run's configuration"):
+        load(path)
+    with pytest.raises(ValueError, match="Change has no when"):
+        decode(Change, {"when": 3})
+
+
+@pytest.mark.parametrize("wrong", [{"actors": 0}, {"steps": 0}, {"replicas": 0}, {"robots_per_actor": 0}])
+def test_counts_are_one_or_more(wrong: dict[str, int]) -> None:
+    with pytest.raises(ValueError, match="1 or more"):
+        RunConfig(**wrong)  # type: ignore[arg-type]
+
+
+def test_a_deterministic_run_has_one_robot() -> None:
+    with pytest.raises(ValueError, match="--actors 1"):
+        RunConfig(deterministic=True)
+    assert RunConfig(deterministic=True, actors=1).learning().lockstep
+
+
+def test_the_learner_shares_the_runs_seed_and_steps() -> None:
+    learning = RunConfig(seed=4, steps=77).learning()
+    assert (learning.seed, learning.steps, learning.lockstep) == (4, 77, False)
+
+
+def test_the_processes_of_a_run() -> None:
+    names = [place.name for place in places(RunConfig(actors=2, replicas=2))]
+    assert names == ["recorder", "safety-0", "safety-1", "learner", "actor-0", "actor-1"]
+    assert [place.name for place in places(RunConfig(actors=1, method="none"))] == ["recorder", "learner", "actor-0"]
+    several = places(RunConfig(actors=3, robots_per_actor=4))
+    assert [place.number for place in several if place.kind == "actor"] == [0, 4, 8], "no robot's number comes twice"
+
+
+def test_an_experiment_is_where_the_options_start(tmp_path: Path) -> None:
+    debug = EXPERIMENTS["debug"]
+    assert Train.defaults(["ground", "--experiment", "debug"]).config() == debug
+    assert Train.defaults(["ground", "--experiment=debug"]).config() == debug
+    assert Train.defaults(["ground"]).config() == EXPERIMENTS["default"]
+    with pytest.raises(ValueError, match=r"no experiment is called 'debag'; there are: default, demo, debug"):
+        Train.defaults(["--experiment", "debag"])
+
+
+def test_a_resumed_run_keeps_its_configuration_but_for_the_steps(tmp_path: Path) -> None:
+    (tmp_path / "config.json").write_text(encode(CHANGED))
+    assert Train(resume=tmp_path, arena="open").config() == CHANGED
+    assert Train(resume=tmp_path, steps=5).config() == replace(CHANGED, steps=5)

@@ -1,0 +1,87 @@
+"""What a person sees: on a terminal of 80 columns, and in a file."""
+
+import io
+from collections import deque
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+from rich.progress import Progress
+
+from deploy.commands import common
+from deploy.run.configurations import RunConfig
+from deploy.run.display import Display, line, live, summary
+from deploy.run.places import places
+from deploy.run.view import View
+from deploy.run.watched import Child
+from logs.metrics import Metrics
+from messaging import brakeline_pb2 as pb
+
+
+def step(number: int) -> pb.Step:
+    message = pb.Step(actor="actor-0", episode=0, step=number, decision=pb.ALLOWED, decide_ms=123.45, reward=-1e4)
+    message.truncated = number % 10 == 9
+    message.header.sequence, message.header.run = number + 1, 1
+    return message
+
+
+@pytest.fixture
+def view() -> View:
+    """Of a run with figures as wide as they get."""
+    metrics = Metrics()
+    for number in range(1000):
+        metrics.add("step/ground/actor-0", step(number))
+    learner = pb.LearnerMetrics(robot="ground", critic_loss=-12345.678, actor_loss=-12345.678, missing=123456)
+    metrics.add("metrics/ground", learner)
+    exchange = pb.Exchange(round_trip_ms=543.21)
+    metrics.add("exchange/ground/actor-0", exchange)
+    folder = Path("/a/folder/with [brackets] in its name")
+    lines = deque(["safety-0: [red]no[/] markup " + "and very long " * 20])
+    children = [Child(place, folder) for place in places(RunConfig(replicas=2))]
+    return View(RunConfig(), folder, metrics, children, lines)
+
+
+@pytest.mark.parametrize("width", [80, 100, 120])
+def test_the_live_picture_fits_the_terminal(view: View, width: int) -> None:
+    console = Console(file=io.StringIO(), force_terminal=True, width=width, color_system=None)
+    console.print(live(view, view.metrics.figures(), Progress()))
+    shown = console.file.getvalue()  # type: ignore[attr-defined]
+    rows = shown.splitlines()
+    assert max(map(len, rows)) <= width and len(rows) < 30
+    for word in (
+        "collisions",
+        "interventions",
+        "decide p50 / p99",
+        "critic loss",
+        "safety-1",
+        "[red]no[/]",
+        "[brackets]",
+    ):
+        assert word in shown
+    for name in ("steps lost        123456", "123.45 / 123.45 ms", "543.21 / 543.21 ms"):
+        assert name in shown, "no value is broken"
+
+
+def test_without_a_terminal_it_says_a_line_now_and_then(view: View, monkeypatch: pytest.MonkeyPatch) -> None:
+    console = Console(file=io.StringIO(), soft_wrap=True)
+    with Display(console, 1000) as display:
+        for _ in range(100):
+            display(view)
+        assert console.file.getvalue() == ""  # type: ignore[attr-defined]
+        monkeypatch.setattr("deploy.run.display.PLAIN", 0.0)
+        display(view)
+        monkeypatch.undo()
+        view.ending = True
+        display(view)
+    assert console.file.getvalue().splitlines() == [line(view.metrics.figures())]  # type: ignore[attr-defined]
+
+
+def test_the_summary_has_the_paths_whole(view: View) -> None:
+    console = Console(file=io.StringIO(), soft_wrap=common.console.soft_wrap)
+    folder = "/very/long" * 12
+    paths = {"folder": folder, "log": f"{folder}/run.mcap", "policies": [f"{folder}/policy.safetensors"]}
+    summary(console, view.metrics.figures() | paths | {"finished": False, "restarts": {"learner": 2, "safety-0": 1}})
+    rows = console.file.getvalue().splitlines()  # type: ignore[attr-defined]
+    assert f"log:    {folder}/run.mcap" in rows and f"policy: {folder}/policy.safetensors" in rows
+    assert any(row.endswith("restarts: learner 2, safety-0 1") for row in rows)
+    assert any(f"brakeline train --resume {folder}" in row for row in rows)

@@ -1,0 +1,54 @@
+"""Pictures of an episode: what is in them, and that every kind of file is made."""
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from deploy.run.render import Film, record, save
+from deploy.study.evaluate import Evaluation, prepared
+from messaging.robots import GROUND
+
+
+@pytest.fixture(scope="module")
+def film(data_folder) -> Film:
+    driver, policy, question = prepared(GROUND, Evaluation(policy="greedy", episodes=1))
+    whole = record(driver, policy, question, 0)
+    return Film(whole.robot, whole.arena, whole.frames[:12], whole.frames[12].position, "cut")
+
+
+def test_the_frames_are_what_was_decided(film):
+    assert {frame.kind for frame in film.frames} <= {"allowed", "adjusted", "failsafe"}
+    for frame, after in zip(film.frames, film.frames[1:], strict=False):
+        assert frame.low.shape == frame.high.shape == (GROUND.horizon, 2) and (frame.high > frame.low).all()
+        assert (after.position > frame.low[0]).all() and (after.position < frame.high[0]).all(), "the tube holds"
+
+
+def test_without_a_filter_there_is_no_tube(data_folder):
+    driver, policy, question = prepared(GROUND, Evaluation(policy="greedy", method="none"))
+    found = record(driver, policy, question, 1)
+    assert found.frames[0].kind == "no filter" and len(found.frames[0].low) == 0
+    assert found.end in ("goal", "collision", "out of time")
+
+
+def test_a_picture_shows_the_way_in_the_decisions_colours(film, tmp_path):
+    save(film, tmp_path / "deep" / "way.png")
+    pixels = np.asarray(Image.open(tmp_path / "deep" / "way.png").convert("RGB"), int)
+    blue = (np.abs(pixels - (0x00, 0x72, 0xB2)).sum(-1) < 40).sum()
+    green = (np.abs(pixels - (0x00, 0x9E, 0x73)).sum(-1) < 40).sum()
+    assert pixels.shape[0] > 500 and blue > 20 and green > 20
+
+
+def test_moving_pictures_have_a_frame_a_period(film, tmp_path):
+    save(film, tmp_path / "way.gif")
+    with Image.open(tmp_path / "way.gif") as gif:
+        assert gif.n_frames >= 12
+        first = np.asarray(gif.convert("L"), int)
+        gif.seek(11)
+        assert np.abs(np.asarray(gif.convert("L"), int) - first).max() > 50, "it moves"
+    save(film, tmp_path / "way.mp4")
+    assert (tmp_path / "way.mp4").read_bytes()[4:8] == b"ftyp"
+
+
+def test_another_ending_is_refused_with_those_there_are(film, tmp_path):
+    with pytest.raises(ValueError, match=r"\.png, \.gif, \.mp4"):
+        save(film, tmp_path / "way.bmp")

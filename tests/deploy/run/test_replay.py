@@ -1,0 +1,126 @@
+"""Replay: the same decisions to the last bit, and every difference there is."""
+
+import json
+import math
+import shutil
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from deploy import cli
+from deploy.data.store import model_for, record_path
+from deploy.run.replay import ReplayError, differences, replay
+from messaging import brakeline_pb2 as pb
+from messaging.robots import GROUND
+from safety.filter import Filter
+from safety.model_set import Recipe
+from tests.deploy.drive import drive
+
+STEPS = 150
+
+
+def run(capsys: pytest.CaptureFixture[str], *words: object) -> tuple[int, dict[str, Any]]:
+    status = cli.main([*map(str, words), "--json"])
+    return status, json.loads(capsys.readouterr().out)
+
+
+def test_the_same_version_decides_the_same_to_the_last_bit(log: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    status, figures = run(capsys, "replay", log)
+    assert status == 0
+    assert (figures["requests"], figures["identical"], figures["different"]) == (STEPS, STEPS, 0)
+    assert set(figures["kinds"]) >= {"allowed", "adjusted"}, "the log has something to compare"
+    assert figures["fields"] == {} and figures["examples"] == [] and figures["same_input"] == STEPS
+
+
+def test_the_log_alone_is_enough(
+    log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shutil.copy(log, tmp_path / "elsewhere.mcap")
+    monkeypatch.setenv("BRAKELINE_DATA", str(tmp_path / "nothing"))
+    status, figures = run(capsys, "replay", tmp_path / "elsewhere.mcap")
+    assert (status, figures["identical"]) == (0, STEPS)
+
+
+def test_a_log_without_models_is_replayed_from_its_folder_or_not_at_all(
+    data_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    version = drive(tmp_path / "run.mcap", 20, attach=False)
+    model = model_for(GROUND, Recipe())
+    monkeypatch.setenv("BRAKELINE_DATA", str(tmp_path / "nothing"))
+    with pytest.raises(ReplayError, match=version):
+        replay(tmp_path)
+    model.save(tmp_path / "ground" / "models" / f"{version}.safetensors")
+    assert replay(tmp_path).identical == 20
+
+
+def test_another_margin_decides_otherwise_and_it_is_told_by_how_much(
+    log: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    margin = Filter(model_for(GROUND, Recipe())).comfort
+    status, figures = run(capsys, "replay", log, "--margin", margin + 0.05)
+    assert status == 0, "it was asked for"
+    assert figures["different"] > 0 and figures["instead"] == {"margin": margin + 0.05}
+    assert figures["fields"]["input"]["largest"] > 0.0
+    assert figures["same_input"] == STEPS - figures["fields"]["input"]["count"] < STEPS
+    changes = [example["differences"].get("input", 0.0) for example in figures["examples"]]
+    assert changes == sorted(changes, reverse=True) and changes[0] == figures["fields"]["input"]["largest"]
+    assert run(capsys, "replay", log, "--margin", margin)[1]["identical"] == STEPS
+
+
+def test_another_certificate_and_other_data_can_be_asked(log: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = ("replay", log, "--certificate", "set-membership")
+    _, wider = run(capsys, *words)
+    assert wider["different"] == STEPS and "model" not in wider["fields"]
+    assert sum(count for row in wider["kinds"].values() for count in row.values()) == STEPS
+    _, same = run(capsys, *words, "--data", record_path(GROUND))
+    assert same["kinds"] == wider["kinds"] and same["instead"]["data"] == str(record_path(GROUND))
+
+
+def test_falsified_decisions_are_found(data_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    def falsify(exchange: pb.Exchange) -> None:
+        decision = exchange.reply.decision
+        if exchange.request.step == 3:
+            decision.plan[0] += 1e-12
+        if exchange.request.step == 5:
+            decision.kind = pb.FAILSAFE
+        if exchange.request.step == 7:
+            exchange.ClearField("reply")
+        if exchange.request.step == 9:
+            exchange.reply.error.type = "BadRequest"
+        decision.time_ms += 1.0
+
+    drive(tmp_path / "run.mcap", 12, falsify)
+    status, figures = run(capsys, "replay", tmp_path)
+    assert status == 1
+    assert (figures["requests"], figures["unanswered"], figures["identical"]) == (12, 1, 8)
+    assert figures["fields"]["input"] == {"count": 1, "largest": pytest.approx(1e-12, rel=1e-3)}
+    assert figures["fields"]["kind"]["count"] == 1 and figures["fields"]["result"]["count"] == 1
+    assert {example["step"] for example in figures["examples"]} == {3, 5, 9}
+    assert cli.main(["replay", str(tmp_path)]) == 1
+    shown = capsys.readouterr().out
+    assert "11 requests; 1 had no answer" in shown and "different: 3" in shown
+
+
+def test_a_log_that_begins_after_a_change_of_models_has_no_stale_ones(data_folder: Path, tmp_path: Path) -> None:
+    def verified_before(exchange: pb.Exchange) -> None:
+        if exchange.request.model:
+            exchange.request.model = "0123456789ab"
+
+    drive(tmp_path / "run.mcap", 30, verified_before)
+    figures = replay(tmp_path).figures()
+    assert figures["requests"] == 30 and "result" not in figures["fields"]
+    assert not any("error" in now for now in figures["kinds"].values())
+
+
+def test_differences_of_replies() -> None:
+    one = pb.Reply(decision=pb.Decision(plan=(1.0, 2.0, 0.0, 0.0), reason="a", time_ms=1.0))
+    other = pb.Reply(decision=pb.Decision(plan=(1.0, 2.5, 0.0, 0.0), reason="b", time_ms=9.0))
+    assert differences(one, one, 2) == {}
+    assert differences(one, other, 2) == {"plan": 0.5, "reason": math.inf, "input": 0.5}
+    shorter = pb.Reply(decision=pb.Decision(plan=(1.0, 2.0), reason="a"))
+    assert differences(one, shorter, 2) == {"plan": math.inf}
+    error = pb.Reply(error=pb.Error(type="StaleModel", message="x"))
+    assert differences(one, error, 2) == {"result": math.inf}
+    assert differences(error, pb.Reply(error=pb.Error(type="StaleModel", message="y")), 2) == {}
+    assert differences(error, pb.Reply(error=pb.Error(type="NoModel")), 2) == {"error": math.inf}

@@ -1,0 +1,79 @@
+"""A rival's file: what was written is what is read, and nothing else is."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from messaging.perceptrons import BadPerceptrons, Perceptrons
+from messaging.robots import GROUND, QUADROTOR
+from safety.methods import decode, load, ready
+from safety.model_set import BadModel, ModelSet
+from safety.rivals.pretrained import Pretrained
+from safety.rivals.sailr import Sailr
+from safety.rivals.secas import Secas
+from tests.safety.rivals import test_sailr, test_secas
+
+
+@pytest.fixture(params=[test_secas.known, test_sailr.known])
+def pretrained(request) -> Pretrained:
+    return replace(request.param(), about={"samples": "7"})
+
+
+def test_a_saved_model_is_read_back(pretrained, tmp_path):
+    pretrained.save(tmp_path / "deep" / "model.safetensors")
+    found = load(tmp_path / "deep" / "model.safetensors")
+    assert isinstance(found, Pretrained)
+    assert (found.version, found.about, found.settings) == (pretrained.version, {"samples": "7"}, pretrained.settings)
+    assert type(ready(found)) is {"secas": Secas, "sailr": Sailr}[pretrained.method]
+    assert ready(found).version == pretrained.version
+
+
+def test_the_version_is_of_all_that_decisions_depend_on(pretrained):
+    network = next(iter(pretrained.networks))
+    layers = [(w + np.float32(1e-6), b) for w, b in pretrained.networks[network].layers]
+    other = replace(pretrained, networks=dict(pretrained.networks) | {network: Perceptrons(layers)})
+    setting = next(iter(pretrained.settings))
+    stricter = replace(pretrained, settings={setting: pretrained.settings[setting] + 1e-9})
+    versions = {pretrained.version, other.version, stricter.version, replace(pretrained, robot=QUADROTOR).version}
+    assert len(versions) == 4 and replace(pretrained, about={}).version == pretrained.version
+
+
+def test_what_is_damaged_or_of_another_kind_is_refused(pretrained, tmp_path):
+    whole = pretrained.encode()
+    name = f'"{pretrained.method}\\"'.encode()
+    for wrong in (b"", whole[:40], whole[:-4], whole[:-1] + bytes([whole[-1] ^ 1]), whole.replace(name, name[::-1])):
+        if wrong != whole:
+            with pytest.raises(BadModel):
+                decode(wrong)
+    with pytest.raises(BadModel, match="nothing here"):
+        load(tmp_path / "nothing here")
+    layout = GROUND.layout().encode()
+    with pytest.raises(BadModel, match="another layout"):
+        decode(whole.replace(layout, layout[::-1]))
+    with pytest.raises(BadModel, match="no method is called 'prayer'"):
+        ready(replace(pretrained, method="prayer"))
+
+
+def test_our_own_model_sets_are_still_read(data_folder):
+    found = load(data_folder / "ground" / "residual-direct.safetensors")
+    assert isinstance(found, ModelSet) and ready(found).version == found.version
+
+
+def test_perceptrons_by_their_definition():
+    rng = np.random.default_rng(0)
+    layers = [
+        (rng.normal(size=(3, 5, 4)), rng.normal(size=(3, 5))),
+        (rng.normal(size=(3, 2, 5)), rng.normal(size=(3, 2))),
+    ]
+    networks, x = Perceptrons(layers), rng.normal(size=4)
+    (w0, b0), (w1, b1) = networks.layers
+    for i, found in enumerate(networks(x)):
+        assert np.allclose(found, w1[i] @ np.maximum(w0[i] @ x + b0[i], 0) + b1[i], atol=1e-5)
+    assert np.array_equal(Perceptrons.of(networks.tensors("a"), "a")(x), networks(x))
+    broken = networks.tensors("a") | {"a.1.bias": np.full((3, 2), np.nan, np.float32)}
+    for wrong in (broken, {"b.0.weight": w0}, {}):
+        with pytest.raises(BadPerceptrons):
+            Perceptrons.of(wrong, "a")
+    with pytest.raises(BadPerceptrons, match=r"layers\.1"):
+        Perceptrons([layers[0], (rng.normal(size=(3, 2, 6)), layers[1][1])])

@@ -1,0 +1,201 @@
+"""SECAS alone: the closed form against the QP, and what a decision makes of known constraints."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from messaging import brakeline_pb2 as pb
+from messaging.perceptrons import Perceptrons
+from messaging.rays import rays_of
+from messaging.robots import GROUND, QUADROTOR
+from messaging.shapes import Shapes
+from safety.client import accept, read, request_message
+from safety.commitment import UNVERIFIED, Commitment
+from safety.model_set import BadModel
+from safety.request import BadRequest, Request
+from safety.rivals.pretrained import Pretrained
+from safety.rivals.secas import Constraints, Secas, closed_form, quadratic
+from safety.service import Counts, Models, answerer
+
+WIDE = np.full(3, 10.0)
+SAME = 1e-3  # of scaled input: the solver's accuracy beside the price of a violation
+vectors = st.lists(st.floats(-1.0, 1.0), min_size=3, max_size=3).map(np.array)
+
+
+@settings(max_examples=60)
+@given(vectors, vectors.filter(lambda g: np.linalg.norm(g) > 0.1), st.floats(-1.0, 1.0))
+def test_the_closed_form_is_the_qp_with_one_constraint(r, g, d):
+    G, bound = g[None], np.array([d])
+    mine, (qp, _, _) = closed_form(r, G, bound), quadratic(r, G, bound, -WIDE, WIDE)
+    assert np.allclose(mine, qp, atol=SAME)
+    assert g @ mine <= d + 1e-9
+    assert np.array_equal(mine, r) == (g @ r <= d)
+
+
+@settings(max_examples=60)
+@given(vectors, st.integers(0, 2**31))
+def test_the_closed_form_is_the_qp_where_one_of_several_is_active(r, seed):
+    rng = np.random.default_rng(seed)
+    G = rng.normal(size=(4, 3))
+    G /= np.linalg.norm(G, axis=1, keepdims=True)
+    d = G @ r + rng.uniform(0.5, 1.0, 4)
+    d[2] -= 1.2  # the one that is violated
+    mine = closed_form(r, G, d)
+    assert G[2] @ mine == pytest.approx(d[2]), "whichever else there are, it is the violated one that is met"
+    if (G @ mine <= d).all():
+        assert np.allclose(mine, quadratic(r, G, d, -WIDE, WIDE)[0], atol=SAME)
+
+
+@settings(max_examples=60)
+@given(st.integers(0, 2**31))
+def test_the_qp_is_the_closest_of_all_inputs_that_meet_every_constraint(seed):
+    rng = np.random.default_rng(seed)
+    r, G = rng.uniform(-1, 1, 2), rng.normal(size=(5, 2))
+    inside = rng.uniform(-0.8, 0.8, 2)
+    d = G @ inside + rng.uniform(0.0, 0.3, 5)
+    a, _, _ = quadratic(r, G, d, -np.ones(2), np.ones(2))
+    assert (G @ a <= d + SAME).all() and (np.abs(a) <= 1.0 + SAME).all()
+    grid = np.stack(np.meshgrid(*[np.linspace(-1, 1, 161)] * 2), -1).reshape(-1, 2)
+    best = np.linalg.norm(grid[(grid @ G.T <= d).all(1)] - r, axis=1).min(initial=np.inf)
+    assert np.linalg.norm(a - r) <= best + SAME
+
+
+def test_where_nothing_meets_all_constraints_the_worst_violation_is_the_least():
+    G, d = np.array([[1.0, 0.0], [-1.0, 0.0]]), np.array([-0.4, -0.2])  # a <= -0.4 and a >= 0.2
+    a, _, _ = quadratic(np.array([0.9, 0.3]), G, d, -np.ones(2), np.ones(2))
+    assert a == pytest.approx([-0.1, 0.3], abs=1e-3)
+
+
+def test_a_constraint_that_the_input_does_not_move_is_left_alone():
+    r = np.array([0.3, -0.2])
+    for G in (np.zeros((2, 2)), np.full((1, 2), 1e-5)):
+        assert np.array_equal(closed_form(r, G, np.full(len(G), -1.0)), r)
+        assert quadratic(r, G, np.full(len(G), -1.0), -np.ones(2), np.ones(2))[0] == pytest.approx(r, abs=1e-4)
+
+
+# --- decisions -----------------------------------------------------------------------------------------------------
+
+CLEARANCE = 0.2
+REACT = np.array([0.06, 0.0])  # m that a sector comes nearer at full speed
+
+
+def known(g=REACT, robot=GROUND, **settings) -> Pretrained:
+    """g_i is the same everywhere."""
+    count, m = Constraints(robot).count, robot.action_dim
+    layers = [(np.zeros((count, m, robot.observation_dim), np.float32), np.tile(np.float32(g), (count, 1)))]
+    return Pretrained(robot, "secas", {"g": Perceptrons(layers)}, {"clearance": CLEARANCE} | settings)
+
+
+def seen(ahead: float, beside: float = 3.5) -> np.ndarray:
+    """An observation with something in the sector of the ninth ray."""
+    rays = np.full(18, beside)
+    rays[8] = ahead
+    return np.concatenate([rays / 3.5, np.zeros(8)]).astype(np.float32)
+
+
+def request(observation, action, before=(0.0, 0.0), state=(0, 0, 0, 0, 0), robot=GROUND) -> Request:
+    return Request(
+        state=np.array(state, float),
+        action=np.array(action, float),
+        input_in_force=np.array(before, float),
+        plan=np.zeros((robot.horizon, robot.action_dim)),
+        obstacles=Shapes.of([], robot.position_dim),
+        observation=np.asarray(observation, np.float32),
+    )
+
+
+def test_far_from_everything_the_proposal_passes():
+    decision = Secas(known()).decide(request(seen(1.0), (0.25, 0.4)))
+    assert decision.kind == "allowed" and np.allclose(decision.action, (0.25, 0.4)) and decision.reason == ""
+    assert decision.margin > 0 and not decision.verified and decision.solver == ""
+
+
+def test_the_speed_is_cut_to_what_the_linear_model_allows():
+    ready = Secas(known())
+    for ahead in (0.25, 0.23, 0.21):
+        decision = ready.decide(request(seen(ahead), (0.25, 0.4)))
+        allowed = (ahead - CLEARANCE) / REACT[0]  # of full speed
+        assert decision.kind == "adjusted" and "sector 2" in decision.reason
+        assert decision.action == pytest.approx((0.25 * allowed, 0.4), abs=1e-5)
+        assert decision.margin == pytest.approx(0.0, abs=1e-5)
+        assert not decision.plan[-1].any() and len(decision.plan) == GROUND.horizon
+    too_near = ready.decide(request(seen(0.15), (0.25, 0.4)))  # the correction would be to drive backwards
+    assert too_near.action == pytest.approx((0.0, 0.4), abs=1e-4) and too_near.margin < 0
+
+
+def test_moving_towards_it_counts_as_nearer():
+    constraints = Constraints(GROUND)
+    still, moving = (constraints(seen(0.3), np.array([0, 0, 0, v, 0])) for v in (0.0, 0.25))
+    assert still[2] == pytest.approx(-0.3, abs=1e-6)
+    assert 0.04 < moving[2] - still[2] <= 0.25 * constraints.stopping
+    assert moving[0] == pytest.approx(still[0], abs=0.05), "nothing is nearer at the side"
+
+
+def test_what_is_far_away_is_all_the_same():
+    constraints, at_rest = Constraints(GROUND), np.zeros(5)
+    assert np.array_equal(constraints(seen(3.5), at_rest), constraints(seen(2.0, beside=1.0), at_rest))
+
+
+@pytest.mark.parametrize("robot", [GROUND, QUADROTOR])
+def test_every_ray_is_in_one_sector(robot):
+    constraints = Constraints(robot)
+    assert sorted(np.concatenate(constraints.sectors)) == list(range(len(rays_of(robot).directions)))
+    assert np.allclose(np.linalg.norm(constraints.directions, axis=1), 1.0)
+
+
+def test_a_robot_with_a_slew_is_corrected_within_it():
+    robot = QUADROTOR
+    ready = Secas(known(g=(0.5, 0.0, 0.0), robot=robot))
+    before = np.array([3.0, 0.0, 0.0])
+    state = np.zeros(robot.state_dim)
+    state[3] = 3.0
+    observation = np.full(robot.observation_dim, 0.2)  # walls 2.4 m away all round: too near at that speed
+    decision = ready.decide(request(observation, (5.0, 0.0, 0.0), before, state, robot))
+    assert decision.kind == "adjusted"
+    assert decision.action == pytest.approx((2.2, 0.0, 0.0), abs=1e-3), "as much less as the slew allows"
+    assert (np.abs(np.diff(decision.plan, axis=0)) <= 0.8 + 1e-9).all() and not decision.plan[-1].any()
+
+
+@pytest.mark.parametrize(
+    ("field", "wrong"),
+    [
+        ("observation", {"observation": np.zeros(0)}),
+        ("observation", {"observation": np.full(26, np.nan)}),
+        ("action", {"action": (np.nan, 0.0)}),
+        ("state", {"state": (0.0, 0.0)}),
+        ("input_in_force", {"before": (1.0, 0.0)}),
+    ],
+)
+def test_a_request_that_cannot_be_decided_on_is_refused(field, wrong):
+    values = {"observation": seen(1.0), "action": (0.1, 0.0)} | wrong
+    with pytest.raises(BadRequest) as refused:
+        Secas(known()).decide(request(**values))
+    assert refused.value.field == field
+
+
+def test_a_model_of_another_shape_or_method_is_refused():
+    good = known()
+    short = Perceptrons([(w[:3], b[:3]) for w, b in good.networks["g"].layers])
+    for wrong in (
+        Pretrained(GROUND, "secas", {"g": short}, good.settings),
+        Pretrained(GROUND, "sailr", good.networks, good.settings),
+        Pretrained(GROUND, "secas", good.networks, {}),
+        Pretrained(GROUND, "secas", {}, good.settings),
+    ):
+        with pytest.raises(BadModel):
+            Secas(wrong)
+
+
+def test_the_service_answers_with_it_and_the_asker_brakes_when_it_falls_silent():
+    models = Models()
+    models.install(known())
+    answer, commitment = answerer(models, Counts()), Commitment(GROUND)
+    for _ in range(2):  # the second request carries a plan that nobody vouches for
+        message = request_message(commitment, np.zeros(5), [0.25, 0.3], [], observation=seen(0.25).tolist())
+        payload = pb.RequestBatch(requests=[message]).SerializeToString()
+        reply = read(pb.ReplyBatch.FromString(answer(payload)).replies[0], GROUND)
+        executed = accept(commitment, reply)
+        assert reply.kind == "adjusted" and executed == pytest.approx((0.25 * 0.05 / 0.06, 0.3), abs=1e-5)
+        assert commitment.model == UNVERIFIED and commitment.predicted is None
+    assert not commitment.fallback().any()
