@@ -18,9 +18,8 @@ from threading import Event
 from learner.checkpoint import CheckpointError, exists
 from learner.config import LearnerConfig
 from learner.core import Learner
-from learner.intake import BadStep
 from messaging import brakeline_pb2 as pb
-from messaging.bus import BusSettings, Malformed, Sample
+from messaging.bus import BusSettings, Sample
 from messaging.files import write_whole
 from messaging.process import Process
 from messaging.robots import robot_named
@@ -36,7 +35,6 @@ FLOW_PERIOD = 0.5  # s, the longest without one
 METRICS_PERIOD = 1.0  # s
 JOIN_PATIENCE = 10.0  # s, a checkpoint included
 RETRY = 30.0  # s to the next attempt after a checkpoint could not be written
-COMPLAINT = 1.0  # s between two log lines about bad steps
 LINGER = 1.0  # s that the end of a run is announced before the process goes
 
 
@@ -87,8 +85,7 @@ class LearnerLoop:
         self._joins: deque[tuple[bytes, Future[bytes]]] = deque()
         self._wake = Event()
         self._said: object = None  # the content of the last flow
-        self._flow_at = self._metrics_at = self._retry_at = self._complain_at = -1e9
-        self._malformed = 0
+        self._flow_at = self._metrics_at = self._retry_at = -1e9
         bus, robot = process.bus, settings.robot
         self._weights, self._flow = bus.publisher(WEIGHTS, robot=robot), bus.publisher(FLOW, robot=robot)
         self._metrics = bus.publisher(LEARNER, robot=robot)
@@ -156,19 +153,9 @@ class LearnerLoop:
         while self._steps:
             sample = self._steps.popleft()
             taken += 1
-            try:
+            with self._process.bus.tolerance.over(sample.key):
                 self._learner.insert(sample.message())
-            except Malformed as error:
-                self._malformed += 1
-                self._complain(error)
-            except BadStep as error:
-                self._complain(error)
         return taken
-
-    def _complain(self, error: Exception) -> None:
-        if self._clock() > self._complain_at:
-            self._complain_at = self._clock() + COMPLAINT
-            log.warning("step refused: %s", error)
 
     def _say_flow(self) -> None:
         flow = self._learner.flow()
@@ -187,7 +174,7 @@ class LearnerLoop:
             "updates_per_s": metrics.updates_per_s,
             "missing": metrics.missing,
             "duplicates": metrics.duplicates,
-            "refused": self._learner.rejected + self._malformed,
+            "refused": self._learner.rejected,
             "surplus": self._learner.surplus,
             "waiting": len(self._steps),
         }

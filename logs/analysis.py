@@ -17,6 +17,7 @@ from logs.reader import Log, Paths, by_run, find
 from logs.tally import Figures
 from logs.timeline import Timeline
 from logs.training import Training
+from messaging.tolerant import Tolerance
 from messaging.topics import EPISODE, EXCHANGE, HEALTH, LEARNER, LOG, STEP
 
 SETUP = ("method", "certificate", "policy", "arena", "seed")
@@ -45,6 +46,7 @@ class Analysis:
         self.logs: list[Log] = []
         self._drawn: dict[Series, tuple[Places, Gallery, Source]] = {}
         self._kept: dict[Series, deque[Any]] = {}
+        self._tolerance = Tolerance()
 
     def run(self, label: str, log: Log, alone: bool) -> None:
         """Take the log of a run. If it is not `alone`, `label` goes before the names of its actors and processes."""
@@ -101,21 +103,25 @@ class Analysis:
         }
         trained: dict[str, Training] = {}
         for series, message, _, _ in log.decoded():
-            if not add(series.key, message):
-                continue
-            topic = series.topic
-            if topic == STEP.name:
-                training = trained.get(series.key)
-                if training is None:
-                    training = trained[series.key] = self.training.setdefault(message.robot, Training())
-                training.step(message)
-                if drawn:
-                    self._draw(series, message)
-            elif topic == EXCHANGE.name or topic == EPISODE.name:
-                if drawn:
-                    self._keep(series, message)
-            elif taker := takers.get(topic):
-                taker(series, message)
+            try:
+                if not add(series.key, message):
+                    continue
+                topic = series.topic
+                if topic == STEP.name:
+                    training = trained.get(series.key)
+                    if training is None:
+                        training = trained[series.key] = self.training.setdefault(message.robot, Training())
+                    training.step(message)
+                    if drawn:
+                        self._draw(series, message)
+                elif topic == EXCHANGE.name or topic == EPISODE.name:
+                    if drawn:
+                        self._keep(series, message)
+                elif taker := takers.get(topic):
+                    taker(series, message)
+            except Exception as error:  # one message is one message: the log goes on
+                log.malformed += 1
+                self._tolerance.note(series.key, error)
 
     def _draw(self, series: Series, step: Any) -> None:
         known = self._drawn.get(series)

@@ -25,6 +25,7 @@ PARTS = {
     "solve": "of it, the quadratic programs (where there was one)",
     "verify": "of it, the exact verification of plans",
 }
+MOST_WORDS, OTHER = 50, "other"
 SOLVED = "solved"  # the solver's word for success
 
 
@@ -54,13 +55,13 @@ class Decisions:
     def exchange(self, exchange: pb.Exchange) -> None:
         """Take an exchange."""
         if failure := exchange.failure:
-            self.failures[failure.split(":", 1)[0]] += 1
+            count(self.failures, failure.split(":", 1)[0])
             return
         decision = exchange.reply.decision
         solve = iterations = width = margin = NOTHING
         if solver := decision.solver:
             solve, iterations = decision.solve_ms, decision.iterations
-            self.statuses[solver] += 1
+            count(self.statuses, solver)
         if not decision.verified:
             self.unverified += 1
         if widths := decision.tube_half_width[:]:
@@ -107,6 +108,11 @@ class Decisions:
             "tube_half_width": summary(self.half_width),
             "margin": summary(self.margin),
         }
+
+
+def count(words: Counter[str], word: str) -> None:
+    """Count a word that somebody else chose: the first `MOST_WORDS` each, the rest together."""
+    words[word if word in words or len(words) < MOST_WORDS else OTHER] += 1
 
 
 def joined(parts: Iterable[Decisions]) -> Decisions:

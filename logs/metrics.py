@@ -10,7 +10,7 @@ import math
 from collections import Counter
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, TypeVar
 
 from google.protobuf.message import Message
 
@@ -20,9 +20,18 @@ from logs.tally import KINDS, Figures, Tally, closed_loop
 from messaging import brakeline_pb2 as pb
 from messaging.topics import HEALTH, RECORDED, STEP, Topic
 
+K = TypeVar("K")
+V = TypeVar("V")
+
 __all__ = ["KINDS", "Figures", "Metrics", "Tally", "closed_loop", "spread"]
 
+MOST_STREAMS = 20_000  # and of names as many: what would be one more is nobody's
+LEVELS = ("DEBUG", "INFO", "WARNING", "ERROR")
 SILENT = HEALTH.stale_after or 3.0  # s without a sign of life after which a process counts as gone
+
+
+class Crowded(ValueError):
+    """More publishers, actors or processes than any run has."""
 
 
 @dataclass(slots=True)
@@ -57,7 +66,8 @@ class ProcessFigures:
 
 
 class Metrics:
-    """Takes messages one by one, in the order in which each publisher sent them; `figures` is what they come to.
+    """Takes messages one by one, in the order in which each publisher sent them; `figures` is what they come to, in
+    memory that is bounded whatever they say.
 
     `topics` are those of which it is given every message: of these, what a process says it published and what never
     came is missing.
@@ -81,12 +91,14 @@ class Metrics:
         }
 
     def add(self, key: str, message: Any) -> bool:
-        """Take a message that was published at `key`; False: it came before, and is only counted as a duplicate."""
+        """Take a message that was published at `key`; False: it came before, and is only counted as a duplicate.
+
+        Raises:
+            Crowded: it is of somebody who is one too many.
+        """
         header: pb.Header = message.header
         sequence, place = header.sequence, (key, header.run)
-        stream = self.streams.get(place)
-        if stream is None:
-            stream = self.streams[place] = Stream()
+        stream = self.streams.get(place) or _entered(self.streams, place, Stream)
         if sequence and sequence <= stream.last:
             stream.duplicates += 1
             return False
@@ -183,27 +195,25 @@ class Metrics:
         }
 
     def _stream(self, key: str, run: int) -> Stream:
-        return self.streams.setdefault((key, run), Stream())
+        return _entered(self.streams, (key, run), Stream)
 
     def _step(self, step: pb.Step) -> None:
         name = self.prefix + step.actor
-        tally = self.actors.get(name)
-        if tally is None:
-            tally = self.actors[name] = Tally()
+        tally = self.actors.get(name) or _entered(self.actors, name, Tally)
         tally.step(step)
 
     def _exchange(self, exchange: pb.Exchange) -> None:
         name = self.prefix + exchange.request.actor
-        decisions = self.decisions.get(name)
-        if decisions is None:
-            decisions = self.decisions[name] = Decisions()
+        decisions = self.decisions.get(name) or _entered(self.decisions, name, Decisions)
         decisions.exchange(exchange)
 
     def _learner(self, metrics: pb.LearnerMetrics) -> None:
-        self.learners[self.prefix + metrics.robot] = metrics
+        name = self.prefix + metrics.robot
+        _entered(self.learners, name, pb.LearnerMetrics)
+        self.learners[name] = metrics
 
     def _health(self, health: pb.Health) -> None:
-        process = self.processes.setdefault(self.prefix + health.process, ProcessFigures())
+        process = _entered(self.processes, self.prefix + health.process, ProcessFigures)
         now = health.header.wall_time
         if health.header.run == process.run:
             silence = (now - process.heard_at) * 1e-9
@@ -212,7 +222,8 @@ class Metrics:
         else:
             process.starts += 1
         process.run, process.heard_at = health.header.run, now
-        process.runs.add(process.run)
+        if len(process.runs) < MOST_STREAMS:
+            process.runs.add(process.run)
         process.alive = not health.last
         process.figures, process.notes = dict(health.figures), dict(health.notes)
         for key, count in health.published.items():
@@ -221,7 +232,16 @@ class Metrics:
                 stream.published = max(stream.published, count)
 
     def _log_line(self, line: pb.LogLine) -> None:
-        self.log_lines[line.level] += 1
+        self.log_lines[line.level if line.level in LEVELS else "other"] += 1
+
+
+def _entered(table: dict[K, V], name: K, make: Callable[[], V]) -> V:
+    """What the table has under the name, made anew if it is the first time. Raises Crowded."""
+    if name not in table:
+        if len(table) >= MOST_STREAMS:
+            raise Crowded(f"{name} is one more than {MOST_STREAMS}")
+        table[name] = make()
+    return table[name]
 
 
 def covered(spans: Iterable[tuple[int, int]]) -> float:

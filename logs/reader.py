@@ -18,6 +18,7 @@ from mcap.records import Attachment, Metadata
 
 from logs.container import Damage, NotMcap, Row, Series, records
 from logs.segment import being_written, name_of, number_of
+from messaging.plausible import Implausible, check
 from messaging.topics import TOPICS
 
 Paths = str | os.PathLike[str] | Iterable[str | os.PathLike[str]]
@@ -102,7 +103,7 @@ class Log:
     metadata: dict[str, dict[str, str]] = field(default_factory=dict)  # the latest of each name
     attachments: dict[str, bytes] = field(default_factory=dict)  # likewise: the model sets of the run's start
     cuts: list[Cut | Absent] = field(default_factory=list)
-    malformed: int = 0  # messages that are not of their type
+    malformed: int = 0  # messages that are not of their type, or say what nobody can handle
     segments: list[Segment] = field(default_factory=list)
 
     def __iter__(self) -> Iterator[Record]:
@@ -114,7 +115,8 @@ class Log:
         for series, log_time, publish_time, payload in self.rows():
             try:
                 message = series.decode(payload)
-            except DecodeError:
+                check(message)
+            except (DecodeError, Implausible):
                 self.malformed += 1
                 continue
             yield series, message, log_time, publish_time

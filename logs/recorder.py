@@ -17,8 +17,9 @@ from functools import partial
 from pathlib import Path
 
 from logs.segment import Attachments, Entry, Metadata, Segment, open_segment
-from messaging.bus import BusSettings, Malformed, Sample
+from messaging.bus import BusSettings, Sample
 from messaging.process import Process
+from messaging.tolerant import Tolerance
 from messaging.topics import RECORDED
 
 log = logging.getLogger("brakeline.recorder")
@@ -28,6 +29,7 @@ RETRY = 1.0  # s between attempts to write on a disk that is full
 QUIET = 0.3  # s without a message after which a recorder that was asked to stop has seen the last one
 PATIENCE = 3.0  # s that it waits for this at most
 INBOX = 64 * 2**20  # bytes
+AROUND = 100  # bytes of a sample besides its payload
 PORTION = 2**20  # bytes saved at once: what fits on a nearly full disk is saved
 
 Open = Callable[[Path, Metadata], Segment]
@@ -52,6 +54,11 @@ class Rotation:
         return not segment.empty and (segment.size >= self.mib * 2**20 or age >= self.seconds)
 
 
+def weight(sample: Sample) -> int:
+    """Bytes that a sample takes in memory, at least: an empty one counts too."""
+    return AROUND + len(sample.payload)
+
+
 class Inbox:
     """Samples that are not in the file yet, at most `limit` bytes of them."""
 
@@ -65,10 +72,10 @@ class Inbox:
     def put(self, sample: Sample) -> None:
         """Take the sample, or count it as dropped."""
         with self._lock:
-            if self.bytes + len(sample.payload) > self.limit:
+            if self.bytes + weight(sample) > self.limit:
                 self.dropped[sample.key] += 1
             else:
-                self.bytes += len(sample.payload)
+                self.bytes += weight(sample)
                 self._samples.append(sample)
 
     def portion(self, size: int = PORTION) -> list[Sample]:
@@ -77,10 +84,10 @@ class Inbox:
         total = 0
         with self._lock:
             for sample in self._samples:
-                if taken and total + len(sample.payload) > size:
+                if taken and total + weight(sample) > size:
                     break
                 taken.append(sample)
-                total += len(sample.payload)
+                total += weight(sample)
         return taken
 
     def forget(self, samples: list[Sample]) -> None:
@@ -88,7 +95,7 @@ class Inbox:
         with self._lock:
             for sample in samples:
                 self._samples.popleft()
-                self.bytes -= len(sample.payload)
+                self.bytes -= weight(sample)
 
 
 class Recording:
@@ -102,6 +109,7 @@ class Recording:
         open_one: Open = open_segment,
         derive: Derive | None = None,
         rotation: Rotation | None = None,
+        tolerance: Tolerance | None = None,
     ) -> None:
         self.recorded: Counter[str] = Counter()  # messages in the files, per key
         self.failure = ""  # why nothing can be written at present
@@ -109,6 +117,7 @@ class Recording:
         self._run, self._metadata, self._inbox, self._open = run, metadata, inbox, open_one
         self._derive = derive or (lambda sample: ())
         self._rotation = rotation or Rotation()
+        self._tolerance = tolerance or Tolerance()
         self._segment: Segment | None = None
         self._begun_at = 0.0
         self._retry_at = 0.0
@@ -123,8 +132,10 @@ class Recording:
             segment = self._begun()
             waiting = self._inbox.bytes
             while waiting > 0 and (portion := self._inbox.portion()):
-                segment.save([item for sample in portion for item in (entry(sample), *self._derive(sample))])
-                waiting -= sum(len(sample.payload) for sample in portion)
+                left_out = segment.save([item for sample in portion for item in self._entries(sample)])
+                if left_out:
+                    self._tolerance.note(portion[-1].key, ValueError(f"{left_out} messages of one channel too many"))
+                waiting -= sum(weight(sample) for sample in portion)
                 self._inbox.forget(portion)
                 self.recorded.update(sample.key for sample in portion)
                 segment = self._rotated(segment)
@@ -141,6 +152,14 @@ class Recording:
         self._close(sync=True)
         if self._inbox.bytes:
             log.error("%d bytes of messages could not be recorded: %s", self._inbox.bytes, self.failure)
+
+    def _entries(self, sample: Sample) -> list[Entry]:
+        """The sample, whatever it holds, and what is made of it."""
+        try:
+            return [entry(sample), *self._derive(sample)]
+        except Exception as error:  # its bytes are kept all the same
+            self._tolerance.note(sample.key, error)
+            return [as_it_came(sample)]
 
     def _begun(self) -> Segment:
         """The file to write to, a new one if there is none. Raises OSError."""
@@ -183,14 +202,15 @@ class Recording:
 
 
 def entry(sample: Sample) -> Entry:
-    """A sample as it is stored. One that cannot be decoded is kept as it is, published when it was received."""
-    try:
-        header = sample.message().header
-    except Malformed as error:
-        log.warning("recorded as it came: %s", error)
-        return Entry(sample.key, sample.topic.message, sample.payload, sample.received, sample.received, 0)
+    """A sample as it is stored. Raises Malformed."""
+    header = sample.message().header
     publish_time = round(header.time * 1e9) if header.time > 0.0 else header.wall_time
     return Entry(sample.key, sample.topic.message, sample.payload, sample.received, publish_time, header.sequence)
+
+
+def as_it_came(sample: Sample) -> Entry:
+    """A sample that cannot be understood, published when it was received."""
+    return Entry(sample.key, sample.topic.message, sample.payload, sample.received, sample.received, 0)
 
 
 def record(
@@ -207,7 +227,8 @@ def record(
     `failure` says why nothing can be written.
     """
     inbox = Inbox()
-    recording = Recording(run, metadata, inbox, partial(open_segment, attachments=attachments), derive, rotation)
+    opened = partial(open_segment, attachments=attachments)
+    recording = Recording(run, metadata, inbox, opened, derive, rotation, process.bus.tolerance)
 
     def refresh() -> None:
         process.figures.update(

@@ -22,6 +22,8 @@ from mcap_protobuf.schema import build_file_descriptor_set
 
 NO_SCHEMA = 0
 CHUNK = 256 * 1024  # bytes before compression; a flush ends one early
+MOST_CHANNELS = 2**16 - 1  # of a file: MCAP numbers them with two bytes
+AFTER_ALL = 2**64  # ns: no time in a file is as late
 
 Metadata = Mapping[str, Mapping[str, str]]
 Attachments = Mapping[str, bytes]  # by name: files that come along with the messages, e.g. model sets
@@ -37,7 +39,11 @@ TIMES = {
 
 @dataclass(frozen=True)
 class Entry:
-    """What is stored of one message: its bytes as they came from the wire, and when."""
+    """What is stored of one message: its bytes as they came from the wire, and when.
+
+    Raises:
+        ValueError: a time that no file can hold.
+    """
 
     key: str
     type: type[Message] | str  # a name: of the encoding of a message that describes itself
@@ -45,6 +51,10 @@ class Entry:
     log_time: int  # ns
     publish_time: int  # ns
     sequence: int
+
+    def __post_init__(self) -> None:
+        if not (0 <= self.log_time < AFTER_ALL and 0 <= self.publish_time < AFTER_ALL):
+            raise ValueError(f"{self.key}: received at {self.log_time} ns, published at {self.publish_time} ns")
 
 
 def name_of(path: Path | str, number: int) -> str:
@@ -152,13 +162,19 @@ class Segment:
         """Bytes in the file."""
         return self._spool.tell()
 
-    def save(self, entries: Iterable[Entry]) -> None:
+    def save(self, entries: Iterable[Entry]) -> int:
         """Write the entries and hand them to the operating system: from then on only a power cut can lose them.
+
+        Returns how many were left out, being of channels that are too many for a file.
 
         Raises:
             OSError: as `Spool.flush`; no entry is in the file, which must then be abandoned.
         """
+        left_out = 0
         for entry in entries:
+            if len(self._channels) >= MOST_CHANNELS and entry.key not in self._channels:
+                left_out += 1
+                continue
             self._writer.add_message(
                 channel_id=self._channel(entry.key, entry.type),
                 log_time=entry.log_time,
@@ -168,6 +184,7 @@ class Segment:
             )
         self._writer.flush()
         self.empty = False
+        return left_out
 
     def finish(self, sync: bool = False) -> None:
         """Write the summary, and close; with `sync`, wait until the disk has it: then not even a power cut can lose it.

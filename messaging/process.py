@@ -32,10 +32,10 @@ class Process:
     """A process under the name `source`, from `with` to the end of the block.
 
     `stop` is set by SIGINT and SIGTERM (and by whoever wants the process to end); a second one, later, kills. `figures`
-    and `notes` go out with the next Health; `refresh`, if set, is called before each to bring them up to date. All that
-    is logged goes to stderr (unless `stderr` is False) and to the LOG topic. An exception that leaves the block goes to
-    the LOG topic with its traceback, is noted in the last Health, and goes on its way: stderr is for who catches it.
-    The first Health follows `announce`, or a second (not if `reserved`).
+    and `notes` go out with the next Health, and how many messages were passed over; `refresh`, if set, is called before
+    each to bring them up to date. All that is logged goes to stderr (unless `stderr` is False) and to the LOG topic. An
+    exception that leaves the block goes to the LOG topic with its traceback, is noted in the last Health, and goes on
+    its way: stderr is for who catches it. The first Health follows `announce`, or a second (not if `reserved`).
 
     Raises:
         Unreachable: on entering, when there is no bus at `settings`.
@@ -120,7 +120,7 @@ class Process:
                 process=self.source,
                 pid=os.getpid(),
                 published=published,
-                figures=dict(self.figures),
+                figures=dict(self.figures) | {"passed over": self.bus.tolerance.count},
                 notes=dict(self.notes),
                 last=last,
             )

@@ -33,6 +33,7 @@ class Topic:
     subscribers: tuple[str, ...]
     recorded: bool
     answer: type[Message] | None = None  # of a query
+    largest: int = 2**20  # bytes of a message: what is larger is passed over
 
     @property
     def stale_after(self) -> float | None:
@@ -45,17 +46,23 @@ class Topic:
         return self.key.format(**fields)
 
 
+FILE = 2**26  # bytes: a message that carries one
+
 DECIDE = Topic(
     "decide", "safety/{robot}/decide", pb.RequestBatch, Delivery.QUERY, None, "actor", ("safety",), False, pb.ReplyBatch
 )
 JOIN = Topic("join", "learner/{robot}/join", pb.Join, Delivery.QUERY, None, "actor", ("learner",), False, pb.JoinReply)
-MODEL = Topic("model", "model/{robot}/{source}", pb.Model, Delivery.BLOCK, None, "certify", ("safety",), True)
+MODEL = Topic(
+    "model", "model/{robot}/{source}", pb.Model, Delivery.BLOCK, None, "certify", ("safety",), True, largest=FILE
+)
 STEP = Topic("step", "step/{robot}/{source}", pb.Step, Delivery.BLOCK, None, "actor", ("learner", "launcher"), True)
 LOGGED = Topic("logged", "logged/{robot}/{source}", pb.Step, Delivery.BLOCK, None, "feeder", ("learner",), False)
 EPISODE = Topic("episode", "episode/{robot}/{source}", pb.Episode, Delivery.BLOCK, None, "actor", ("launcher",), True)
 EXCHANGE = Topic("exchange", "exchange/{robot}/{source}", pb.Exchange, Delivery.BLOCK, None, "actor", (), True)
 FRAMES = Topic("frames", "frames/{robot}/{source}", pb.MavlinkFrames, Delivery.BLOCK, None, "actor", (), True)
-WEIGHTS = Topic("weights", "weights/{robot}", pb.Weights, Delivery.DROP, None, "learner", ("actor",), False)
+WEIGHTS = Topic(
+    "weights", "weights/{robot}", pb.Weights, Delivery.DROP, None, "learner", ("actor",), False, largest=FILE
+)
 FLOW = Topic("flow", "flow/{robot}", pb.Flow, Delivery.BLOCK, 1.0, "learner", ("actor",), False)
 LEARNER = Topic(
     "learner", "metrics/{robot}", pb.LearnerMetrics, Delivery.BLOCK, 1.0, "learner", ("launcher", "status"), True

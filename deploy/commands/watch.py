@@ -16,6 +16,7 @@ from logs.watch.board import Board
 from logs.watch.live import Live
 from logs.watch.server import Server
 from messaging.bus import Bus, Sample
+from messaging.tolerant import Tolerance
 from messaging.topics import RECORDED
 
 TURN = 0.05  # s between two looks into the inbox
@@ -47,7 +48,7 @@ class Watch:
                 bus.subscribe(topic, inbox.append)
             self._say(server.url, live.url if live is not None else None)
             while not stop.wait(TURN):
-                _show(inbox, board, live)
+                _show(inbox, board, live, bus.tolerance)
         return 0
 
     def _say(self, page: str, foxglove: str | None) -> None:
@@ -60,13 +61,14 @@ class Watch:
         console.print("[dim]^C ends the watching; the run goes on[/]")
 
 
-def _show(inbox: deque[Sample], board: Board, live: Live | None) -> None:
+def _show(inbox: deque[Sample], board: Board, live: Live | None, tolerance: Tolerance) -> None:
     """What has come since the last look."""
     for _ in range(len(inbox)):
         sample = inbox.popleft()
-        board.take(sample)
-        if live is not None:
-            live.take(sample)
+        with tolerance.over(sample.key):
+            board.take(sample)
+            if live is not None:
+                live.take(sample)
     if live is not None:
         live.refresh()
 

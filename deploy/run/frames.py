@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable
 
 from actors.mavlink import decoded
 from logs.segment import Entry
-from messaging.bus import Malformed, Sample
+from messaging.bus import Sample
 from messaging.topics import FRAMES
 
 log = logging.getLogger("brakeline.frames")
@@ -21,15 +21,15 @@ Derive = Callable[[Sample], Iterable[Entry]]
 
 
 def as_json(sample: Sample) -> list[Entry]:
-    """An entry for each frame of a FRAMES message, dated when it was sent or received; nothing for other messages."""
+    """An entry for each frame of a FRAMES message, dated when it was sent or received; nothing for other messages.
+
+    Raises:
+        Malformed: it can't be understood; ValueError: a frame's time can't be stored.
+    """
     if sample.topic is not FRAMES:
         return []
-    try:
-        frames = sample.message().frames
-    except Malformed:  # the recorder says so
-        return []
     entries = []
-    for frame in frames:
+    for frame in sample.message().frames:
         message = decoded(frame.raw, frame.outgoing)
         if message is not None:
             text = json.dumps(message.described).encode()

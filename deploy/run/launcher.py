@@ -17,10 +17,11 @@ from deploy.run.places import CONFIG, ENDPOINT, LOG, places
 from deploy.run.view import View
 from deploy.run.watched import Child, LaunchError, last_line
 from logs.metrics import Metrics
-from messaging.bus import BusError, BusSettings, Malformed, Sample
+from messaging.bus import BusError, BusSettings, Sample
 from messaging.ports import free_endpoint
 from messaging.process import Process
 from messaging.robots import robot_named
+from messaging.tolerant import Tolerance, headline
 from messaging.topics import RECORDED
 
 log = logging.getLogger("brakeline.launcher")
@@ -57,6 +58,7 @@ class Launcher:
         self.metrics = Metrics()
         self.lines: deque[str] = deque(maxlen=200)
         self._inbox: deque[Sample] = deque()
+        self._tolerance = Tolerance()  # the bus's, once there is one
 
     def run(self, show: Callable[[View], Any] = lambda view: None) -> dict[str, Any]:
         """Until the learners are done or SIGINT or SIGTERM; returns the figures, also saved in the run's folder.
@@ -68,6 +70,7 @@ class Launcher:
         view = View(self.config, self.folder, self.metrics, self.children, self.lines)
         failure: LaunchError | None = None
         with Process(BusSettings(listen=(self.endpoint,)), "launcher", stderr=False, reserved=True) as process:
+            self._tolerance = process.bus.tolerance
             self._claim_folder()
             for topic in RECORDED:
                 process.bus.subscribe(topic, self._inbox.append)
@@ -177,14 +180,11 @@ class Launcher:
     def _drain(self) -> None:
         while self._inbox:
             sample = self._inbox.popleft()
-            try:
+            with self._tolerance.over(sample.key):
                 message = sample.message()
-            except Malformed as error:
-                log.error("%s", error)
-                continue
-            self.metrics.add(sample.key, message)
-            if sample.topic.name == "log" and message.level in ("WARNING", "ERROR"):
-                self.lines.append(f"{message.process}: {message.text.splitlines()[0]}")
+                self.metrics.add(sample.key, message)
+                if sample.topic.name == "log" and message.level in ("WARNING", "ERROR"):
+                    self.lines.append(f"{message.process}: {headline(message.text)}")
 
     def _end(self) -> None:
         """Everything but the recorder first, so that their last words are in the log."""

@@ -82,7 +82,7 @@ def missing(figures: Figures) -> list[str]:
     lost = {key: topic["missing"] for key, topic in figures["topics"].items() if topic["missing"]}
     said += [f"{key}: {count} messages were published and are in no file" for key, count in lost.items()]
     if figures["malformed"]:
-        said.append(f"{figures['malformed']} messages are not of their type")
+        said.append(f"{figures['malformed']} messages are not of their type, or say what can't be handled")
     return said
 
 

@@ -8,17 +8,19 @@ from collections import deque
 from dataclasses import dataclass, field
 from typing import Any
 
-from logs.metrics import Metrics
+from logs.metrics import Crowded, Metrics
 from logs.scene import half_width
 from messaging import brakeline_pb2 as pb
-from messaging.bus import Malformed, Sample
+from messaging.bus import Sample
 from messaging.robots import Robot, UnknownRobot, robot_named
 from messaging.shapes import WALL
+from messaging.tolerant import headline
 
 LINES = 8  # of warnings
 EPISODES = 300  # whose rewards are drawn
 TRAIL = 600  # positions of the running episode
 FIGURES_EVERY = 1.0  # s
+MOST_CARDS = 200
 KINDS = {pb.ALLOWED: "allowed", pb.ADJUSTED: "adjusted", pb.FAILSAFE: "failsafe"}
 SHOWN = ("steps", "episodes", "goals", "collisions", "interventions", "failsafes", "fallbacks", "mean_reward")
 
@@ -64,6 +66,8 @@ class Card:
             return
         decision, d = exchange.reply.decision, self.robot.position_dim
         centers, halves = decision.tube_center, decision.tube_half_width
+        if len(centers) != len(halves) or len(centers) % d or len(centers) > self.robot.horizon * d:
+            raise ValueError(f"a tube of {len(centers)} and {len(halves)} numbers")
         self.tube = [[*centers[i : i + 2], *halves[i : i + 2]] for i in range(0, len(centers), d)]
         self.margin = decision.margin
 
@@ -79,6 +83,8 @@ class Card:
             self.ended = "collision" if step.collision else "goal" if step.goal else "time limit"
 
     def _stand(self, state: list[float]) -> None:
+        if len(state) != self.robot.state_dim:
+            raise ValueError(f"a state of {len(state)} numbers, a {self.robot.name} robot's has {self.robot.state_dim}")
         heading = 0.0 if self.robot.heading is None else state[self.robot.heading]
         self.pose = [state[0], state[1], heading]
         self.height = state[2] if self.robot.position_dim == 3 else None
@@ -104,17 +110,18 @@ class Board:
         self._lock = threading.Lock()
 
     def take(self, sample: Sample) -> None:
-        """One message; what is malformed, or of a robot that is not known here, is left out."""
-        try:
-            message = sample.message()
-        except Malformed:
-            return
+        """One message; one of a robot that is not known here is left out.
+
+        Raises:
+            Malformed, Crowded, ValueError: it can't be shown.
+        """
+        message = sample.message()
         with self._lock:
             self._heard = time.monotonic()
             self.metrics.add(sample.key, message)
             if isinstance(message, pb.LogLine):
                 if message.level in ("WARNING", "ERROR"):
-                    self._lines.append(f"{message.process}: {message.text.splitlines()[0] if message.text else ''}")
+                    self._lines.append(f"{message.process}: {headline(message.text)}")
             elif isinstance(message, pb.Episode | pb.Step):
                 self._robot(message)
             elif isinstance(message, pb.Exchange):
@@ -126,9 +133,12 @@ class Board:
         card = self._cards.get(message.actor)
         if card is None:
             try:
-                card = self._cards[message.actor] = Card(robot_named(message.robot), message.actor)
+                card = Card(robot_named(message.robot), message.actor)
             except UnknownRobot:
                 return
+            if len(self._cards) == MOST_CARDS:
+                raise Crowded(f"{message.actor} is one robot more than the {MOST_CARDS} that are shown")
+            self._cards[message.actor] = card
         if isinstance(message, pb.Episode):
             card.begin(message)
             return

@@ -26,8 +26,8 @@ class Late(BusError):
     """The deadline passed without an answer."""
 
 
-class Malformed(BusError):
-    """The bytes are not a message of the topic's type."""
+class Malformed(BusError, ValueError):
+    """The bytes are not a message of the topic's type, or it says what no honest sender would."""
 
 
 class Refused(BusError):

@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import re
-
+from messaging.plausible import NAME
 from messaging.topics import Topic
-
-NAME = re.compile(r"[A-Za-z0-9_.-]+")
 
 
 def key_of(topic: Topic, names: dict[str, str]) -> str:

@@ -20,10 +20,12 @@ from zenoh.handlers import FifoChannel, RingChannel
 
 from messaging import brakeline_pb2 as pb
 from messaging.bus.errors import Late, NoReply, Refused, typed
-from messaging.bus.keys import NAME, exact_key, key_of
+from messaging.bus.keys import exact_key, key_of
 from messaging.bus.publisher import Publisher
 from messaging.bus.settings import BusSettings, open_session
 from messaging.bus.subscription import Listener, Sample, Subscription
+from messaging.plausible import NAME
+from messaging.tolerant import Tolerance
 from messaging.topics import Delivery, Topic
 
 log = logging.getLogger("brakeline.bus")
@@ -36,6 +38,8 @@ RING = 64
 class Bus:
     """A process's place on the bus, under the name `source`; it is alive to others until `close`.
 
+    What its handlers can't handle is passed over, and counted in `tolerance`.
+
     Raises:
         Unreachable: no router answered within `patience`, or an endpoint cannot be listened on.
         ValueError: no endpoint, or a name that cannot be part of a key.
@@ -47,6 +51,7 @@ class Bus:
         self.settings = settings
         self.source = source
         self.run = secrets.randbits(63)
+        self.tolerance = Tolerance()
         self._lock = threading.Lock()
         self._publishers: dict[str, Publisher] = {}
         self._queriers: dict[tuple[str, float], zenoh.Querier] = {}
@@ -107,13 +112,14 @@ class Bus:
     def subscribe(self, topic: Topic, handler: Callable[[Sample], None], **names: str) -> Listener:
         """Call `handler` with every sample of `topic`, in a thread of its own; names left out match any.
 
-        A handler that raises is logged and goes on with the next sample. One that is slow delays the publisher of a
-        BLOCK topic after `FIFO` samples, and misses the oldest of a DROP topic after `RING`.
+        A sample for which it raises is passed over, as is one with too many bytes or a key of nobody's. One that is
+        slow delays the publisher of a BLOCK topic after `FIFO` samples, and misses the oldest of a DROP topic after
+        `RING`.
         """
         channel: Any = FifoChannel(FIFO) if topic.delivery is Delivery.BLOCK else RingChannel(RING)
         key = key_of(topic, names)
         receiver: Any = self._telemetry.declare_subscriber(self._full(key), channel)
-        listener = Listener(topic, key, receiver, self.settings.prefix, handler)
+        listener = Listener(topic, key, receiver, self.settings.prefix, handler, self.tolerance)
         self._keep(listener)
         return listener
 
@@ -126,7 +132,7 @@ class Bus:
         """
         key = key_of(topic, names)
         receiver = self._queries.declare_queryable(self._full(key), FifoChannel(FIFO), complete=True)
-        return self._keep(Subscription(key, receiver, partial(_answer, handler)))
+        return self._keep(Subscription(key, receiver, partial(_answer, handler), self.tolerance))
 
     def ask(self, topic: Topic, payload: bytes, timeout: float, **names: str) -> bytes:
         """The answer to a question, within `timeout` s.
@@ -169,7 +175,7 @@ class Bus:
         def take(sample: zenoh.Sample) -> None:
             handler(str(sample.key_expr).rsplit("/", 1)[1], sample.kind == zenoh.SampleKind.PUT)
 
-        return self._keep(Subscription("alive/*", receiver, take))
+        return self._keep(Subscription("alive/*", receiver, take, self.tolerance))
 
     def _full(self, key: str) -> str:
         return f"{self.settings.prefix}/{key}"

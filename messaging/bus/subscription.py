@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import math
 import threading
 import time
@@ -14,9 +13,11 @@ import zenoh
 from google.protobuf.message import DecodeError
 
 from messaging.bus.errors import Malformed, typed
+from messaging.plausible import NAME, Implausible, check
+from messaging.tolerant import Tolerance
 from messaging.topics import Topic
 
-log = logging.getLogger("brakeline.bus")
+MOST_KEYS = 2048  # that one subscription listens to; samples of further ones are passed over
 
 
 @dataclass(frozen=True)
@@ -35,25 +36,20 @@ class Sample:
             Malformed: it is not one.
         """
         try:
-            return self.topic.message.FromString(self.payload)
-        except DecodeError as error:
+            message = self.topic.message.FromString(self.payload)
+            check(message)
+        except (DecodeError, Implausible) as error:
             raise Malformed(f"{self.key}: not a {self.topic.message.DESCRIPTOR.name}: {error}") from error
+        return message
 
 
 class Subscription:
     """A thread that hands samples, or questions, to a handler, one by one, until `close`."""
 
-    def __init__(self, name: str, receiver: Any, work: Callable[[Any], None]) -> None:
-        self._name, self._receiver, self._work = name, receiver, work
-        self._complained = -1e9
-        self._failures = 0
+    def __init__(self, name: str, receiver: Any, work: Callable[[Any], None], tolerance: Tolerance) -> None:
+        self._name, self._receiver, self._work, self._tolerance = name, receiver, work, tolerance
         self._thread = threading.Thread(target=self._run, name=f"bus {name}", daemon=True)
         self._thread.start()
-
-    @property
-    def failures(self) -> int:
-        """How often the handler raised."""
-        return self._failures
 
     def close(self) -> None:
         """Stop receiving, and wait for the sample in hand for a moment."""
@@ -67,23 +63,25 @@ class Subscription:
 
     def _run(self) -> None:
         for item in self._receiver.handler:
-            try:
+            with self._tolerance.over(self._name):
                 self._work(item)
-            except Exception:
-                self._failures += 1
-                # Once a second: the line may come back over the bus to the handler that failed.
-                if time.monotonic() - self._complained > 1.0:
-                    self._complained = time.monotonic()
-                    log.exception("handler of %s failed (%d times so far)", self._name, self._failures)
 
 
 class Listener(Subscription):
     """A subscription that knows who fell silent."""
 
-    def __init__(self, topic: Topic, key: str, receiver: Any, prefix: str, handler: Callable[[Sample], None]) -> None:
+    def __init__(
+        self,
+        topic: Topic,
+        key: str,
+        receiver: Any,
+        prefix: str,
+        handler: Callable[[Sample], None],
+        tolerance: Tolerance,
+    ) -> None:
         self._topic, self._cut, self._handler = topic, len(prefix) + 1, handler
         self._heard: dict[str, float] = {}  # per key: when (time.monotonic) the latest sample came
-        super().__init__(key, receiver, self._take)
+        super().__init__(key, receiver, self._take, tolerance)
 
     def stale(self) -> frozenset[str]:
         """Keys that were heard of, but for three periods of the topic's rate no more."""
@@ -93,5 +91,17 @@ class Listener(Subscription):
 
     def _take(self, sample: zenoh.Sample) -> None:
         key = str(sample.key_expr)[self._cut :]
+        if key not in self._heard:
+            self._admit(key)
+        size = len(sample.payload)
+        if size > self._topic.largest:
+            raise Malformed(f"{key}: {size} bytes; a message has at most {self._topic.largest}")
         self._heard[key] = time.monotonic()
         self._handler(Sample(self._topic, key, sample.payload.to_bytes(), time.time_ns()))
+
+    def _admit(self, key: str) -> None:
+        """Raises Malformed for a key that no publisher of ours has, or that is one too many."""
+        if not all(NAME.fullmatch(part) for part in key.split("/")):
+            raise Malformed(f"{key[:200]!r} is no key of {self._topic.name}")
+        if len(self._heard) >= MOST_KEYS:
+            raise Malformed(f"{key}: the {MOST_KEYS} keys before it are all that are listened to")

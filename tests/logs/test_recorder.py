@@ -15,7 +15,7 @@ import pytest
 
 from logs.metrics import Metrics
 from logs.reader import open_log, read
-from logs.recorder import Inbox, Recording, entry
+from logs.recorder import Inbox, Recording, as_it_came
 from logs.segment import Metadata, Segment, name_of, open_segment
 from messaging import brakeline_pb2 as pb
 from messaging.bus import Bus, BusSettings, Sample
@@ -225,5 +225,5 @@ def test_a_folder_that_cannot_be_written_is_a_failure_too(tmp_path: Path, say: S
 
 
 def test_a_message_that_cannot_be_decoded_is_stored_all_the_same() -> None:
-    stored = entry(Sample(STEP, "step/ground/a", b"\xff", 7))
+    stored = as_it_came(Sample(STEP, "step/ground/a", b"\xff", 7))
     assert (stored.payload, stored.log_time, stored.publish_time, stored.sequence) == (b"\xff", 7, 7, 0)

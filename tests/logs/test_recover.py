@@ -18,7 +18,7 @@ from mcap_protobuf.decoder import DecoderFactory
 
 from deploy.cli import main
 from logs.reader import Log, NotALog, open_log
-from logs.recorder import Inbox, Recording, Rotation, entry
+from logs.recorder import Inbox, Recording, Rotation, as_it_came
 from logs.recover import BeingRecorded, recover
 from logs.segment import being_written, open_segment
 from messaging import brakeline_pb2 as pb
@@ -211,4 +211,4 @@ def _until(condition: Callable[..., bool], seconds: float = 30.0) -> None:
 
 
 def test_entries_keep_what_cannot_be_decoded() -> None:
-    assert entry(Sample(STEP, "step/ground/a", b"\xff", 7)).payload == b"\xff"
+    assert as_it_came(Sample(STEP, "step/ground/a", b"\xff", 7)).payload == b"\xff"

@@ -9,7 +9,7 @@ from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 
 from logs.reader import NoLog, NotALog, find, open_log, read
-from logs.recorder import entry
+from logs.recorder import as_it_came, entry
 from logs.segment import Segment, number_of, open_segment, segments
 from messaging import brakeline_pb2 as pb
 from messaging.bus import Sample
@@ -116,7 +116,9 @@ def test_a_damaged_chunk_is_noticed(tmp_path: Path, say: Say) -> None:
 
 def test_what_is_not_of_its_type_is_stored_as_it_came_and_counted(tmp_path: Path, say: Say) -> None:
     noise = Sample(STEP, "step/ground/a", b"\xff\xff", 5)
-    write(tmp_path / "run.mcap", [noise, say("log/a", pb.LogLine())])
+    segment = open_segment(tmp_path / "run.mcap", {})
+    segment.save([as_it_came(noise), entry(say("log/a", pb.LogLine()))])
+    segment.finish()
     log = open_log(tmp_path)
     assert [record.topic for record in log] == ["log"]
     assert log.malformed == 1

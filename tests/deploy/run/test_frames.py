@@ -15,7 +15,7 @@ from logs.recorder import Inbox, Recording
 from logs.tlog import to_tlog
 from logs.trajectories import ExportError
 from messaging import brakeline_pb2 as pb
-from messaging.bus import Sample
+from messaging.bus import Malformed, Sample
 from messaging.topics import FRAMES, LOG
 from sim.autopilot.endpoint import Autopilot
 from sim.quadrotor import Quadrotor
@@ -85,4 +85,5 @@ def test_what_is_no_frame_is_left_out() -> None:
     assert as_json(line) == []
     garbage = pb.MavlinkFrames(frames=[pb.MavlinkFrame(wall_time=1, raw=b"\xfd\x00no frame")])
     assert as_json(Sample(FRAMES, "frames/a/b", garbage.SerializeToString(), 1)) == []
-    assert as_json(Sample(FRAMES, "frames/a/b", b"\xff\xff", 1)) == []
+    with pytest.raises(Malformed):
+        as_json(Sample(FRAMES, "frames/a/b", b"\xff\xff", 1))

@@ -1,0 +1,53 @@
+"""Messages that killed the launcher."""
+
+from pathlib import Path
+
+import pytest
+
+from deploy.run.configurations import RunConfig
+from deploy.run.launcher import Launcher
+from messaging import brakeline_pb2 as pb
+from messaging.bus import Sample
+from messaging.topics import EPISODE, EXCHANGE, HEALTH, LOG, STEP, Topic
+
+
+@pytest.fixture
+def launcher(tmp_path: Path) -> Launcher:
+    return Launcher(RunConfig(), tmp_path, "tcp/127.0.0.1:7447")
+
+
+def say(launcher: Launcher, topic: Topic, message: object) -> None:
+    payload = message if isinstance(message, bytes) else message.SerializeToString()
+    launcher._inbox.append(Sample(topic, topic.at(robot="ground", source="a"), payload, 1))
+    launcher._drain()
+
+
+@pytest.mark.parametrize("text", ["", "\n", " \r\n\n"])
+def test_an_error_without_words_does_not_kill_the_launcher(launcher: Launcher, text: str) -> None:
+    say(launcher, LOG, pb.LogLine(process="a", level="ERROR", text=text))
+    say(launcher, LOG, pb.LogLine(header=pb.Header(sequence=2), process="a", level="ERROR", text="words"))
+    assert list(launcher.lines) == ["a: ", "a: words"]
+
+
+def test_what_it_cannot_handle_is_passed_over(launcher: Launcher) -> None:
+    for topic in (LOG, HEALTH, STEP, EPISODE, EXCHANGE):
+        say(launcher, topic, b"\xff\xff")
+    say(launcher, STEP, pb.Step(header=pb.Header(time=float("inf")), actor="a"))
+    assert launcher._tolerance.count == 6
+    say(launcher, STEP, pb.Step(actor="a"))
+    assert launcher.metrics.figures()["steps"] == 1
+
+
+def test_its_figures_stay_bounded(launcher: Launcher, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("logs.metrics.MOST_STREAMS", 100)
+    for number in range(300):
+        header = pb.Header(run=number)
+        say(launcher, STEP, pb.Step(header=header, actor=f"a{number}"))
+        say(launcher, HEALTH, pb.Health(header=header, process=f"p{number}", published={f"step/{number}": 1}))
+        say(launcher, LOG, pb.LogLine(header=header, level=f"LEVEL{number}"))
+        say(launcher, EXCHANGE, pb.Exchange(header=header, request=pb.Request(actor="a"), failure=f"F{number}"))
+    metrics = launcher.metrics
+    assert (
+        max(map(len, (metrics.streams, metrics.actors, metrics.processes, metrics.log_lines, metrics.failures))) <= 100
+    )
+    assert launcher._tolerance.count > 0

@@ -1,0 +1,105 @@
+"""Messages that killed the recorder and `watch`, or made a log that nothing could read."""
+
+import json
+import math
+from collections import deque
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from deploy.commands.watch import _show
+from logs.analysis import Look, analysed
+from logs.foxglove import Pictures
+from logs.reader import open_log
+from logs.recorder import Inbox, Recording
+from logs.segment import MOST_CHANNELS, Entry
+from logs.watch.board import Board
+from logs.watch.server import encode
+from messaging import brakeline_pb2 as pb
+from messaging.bus import Sample
+from messaging.tolerant import Tolerance
+from messaging.topics import EPISODE, EXCHANGE, FRAMES, LOG, STEP, Topic
+
+Say = Callable[..., Sample]
+
+
+def sample(topic: Topic, message: Any, source: str = "a") -> Sample:
+    return Sample(topic, topic.at(robot="ground", source=source), message.SerializeToString(), 10**9)
+
+
+HOSTILE = [
+    sample(STEP, pb.Step(header=pb.Header(time=math.inf))),
+    sample(STEP, pb.Step(header=pb.Header(time=1e300))),
+    sample(LOG, pb.LogLine(header=pb.Header(wall_time=-1))),
+    sample(FRAMES, pb.MavlinkFrames(frames=[pb.MavlinkFrame(wall_time=-1, raw=bytes(12))])),
+    sample(EPISODE, pb.Episode(robot="ground", actor="a", obstacles=[pb.Obstacle(kind="box")])),
+    Sample(STEP, "step/ground/a", b"\xff\xff", 10**9),
+]
+
+
+def record(path: Path, samples: list[Sample], tolerance: Tolerance | None = None) -> Recording:
+    inbox = Inbox()
+    recording = Recording(path, {}, inbox, derive=Pictures().of_sample, tolerance=tolerance)
+    for one in samples:
+        inbox.put(one)
+    recording.finish()
+    return recording
+
+
+@pytest.mark.parametrize("hostile", HOSTILE, ids=lambda one: one.key)
+def test_the_recorder_keeps_what_it_cannot_date_and_goes_on(hostile: Sample, say: Say, tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    good = say("log/a", pb.LogLine(text="after it"))
+    recording = record(path, [hostile, good])
+    assert recording.recorded.total() == 2
+    log = open_log(path)
+    kept = [payload for _, _, _, payload in log.rows()]
+    assert hostile.payload in kept and good.payload in kept and not log.cuts
+
+
+def test_66000_keys_do_not_end_a_recording(tmp_path: Path) -> None:
+    tolerance = Tolerance()
+    samples = [sample(LOG, pb.LogLine(text="x"), source=f"a{number}") for number in range(66_000)]
+    record(tmp_path / "run.mcap", samples, tolerance)
+    assert sum(1 for _ in open_log(tmp_path).rows()) == MOST_CHANNELS - 1  # and Foxglove's
+    assert tolerance.count > 0
+
+
+@pytest.mark.parametrize(("received", "published"), [(-1, 0), (0, -1), (2**64, 0), (0, 2**64)])
+def test_an_entry_has_times_that_a_file_can_hold(received: int, published: int) -> None:
+    with pytest.raises(ValueError, match="log/a"):
+        Entry("log/a", pb.LogLine, b"", received, published, 0)
+
+
+MALFORMED = [
+    sample(EPISODE, pb.Episode(robot="ground", actor="a", obstacles=[pb.Obstacle(kind="box", position=[0.0, 0.0])])),
+    sample(EPISODE, pb.Episode(robot="ground", actor="a", goal=[0.0, 0.0])),
+    sample(STEP, pb.Step(robot="ground", actor="a")),
+    sample(STEP, pb.Step(robot="ground", actor="a", state=[math.nan] * 5)),
+    sample(STEP, pb.Step(robot="quadrotor", actor="q", state=[0.0])),
+    sample(
+        EXCHANGE, pb.Exchange(request=pb.Request(actor="b"), reply=pb.Reply(decision=pb.Decision(tube_center=[1.0])))
+    ),
+    sample(LOG, pb.LogLine(level="ERROR", text="\n")),
+]
+
+
+@pytest.mark.parametrize("malformed", MALFORMED, ids=lambda one: one.key)
+def test_watch_passes_over_what_it_cannot_show(malformed: Sample, say: Say) -> None:
+    board, tolerance = Board(), Tolerance()
+    step = pb.Step(robot="ground", actor="b", state=[1.0, 0.0, 0.0, 0.0, 0.0])
+    _show(deque([malformed, say("step/ground/b", step)]), board, None, tolerance)
+    shown = {robot["actor"]: robot for robot in json.loads(encode(board.view()))["robots"]}
+    assert shown["b"]["pose"] == [1.0, 0.0, 0.0]
+
+
+def test_an_analysis_counts_what_it_cannot_handle_and_goes_on(say: Say, tmp_path: Path) -> None:
+    step = pb.Step(robot="ground", actor="b", state=[1.0, 0.0, 0.0, 0.0, 0.0], truncated=True)
+    infinite = pb.Step(robot="ground", actor="a", state=[math.inf] * 5)
+    record(tmp_path / "run.mcap", [*HOSTILE, *MALFORMED, sample(STEP, infinite), say("step/ground/b", step)])
+    found = analysed(tmp_path, Look(pictures=True))
+    figures = found.figures()
+    assert figures["actors"]["b"]["episodes"] == 1 and figures["malformed"] >= 5
+    found.pictures()
