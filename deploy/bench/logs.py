@@ -20,6 +20,7 @@ from mcap.reader import NonSeekingReader
 from mcap_protobuf.decoder import DecoderFactory
 
 from deploy.bench.timing import Figures
+from deploy.interpreter import PYTHON
 from logs.analysis import Look, analysed
 from logs.segment import Entry, open_segment
 from messaging import brakeline_pb2 as pb
@@ -91,7 +92,7 @@ def synthesise(path: Path, size: int) -> int:
 
 def measured(what: str, path: Path) -> dict[str, float]:
     """In a process of its own: messages a second, and the peak of its memory."""
-    words = [sys.executable, "-m", "deploy.bench.logs", what, str(path)]
+    words = [*PYTHON, "-m", "deploy.bench.logs", what, str(path)]
     found: dict[str, float] = json.loads(subprocess.run(words, check=True, capture_output=True, text=True).stdout)
     return found
 

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import json
 import subprocess
-import sys
 import tempfile
 import time
 from pathlib import Path
@@ -16,6 +15,7 @@ import numpy as np
 import psutil
 
 from deploy.bench.timing import Figures
+from deploy.interpreter import PYTHON
 
 STEPS = 4000
 PAIRS = 3
@@ -24,7 +24,7 @@ LOOK = 0.5  # s between two looks at the processes
 
 def training(out: Path, record: bool) -> tuple[float, float]:
     """Steps a second of a run, from its first step to its last, and the recorder's share of its processor time then."""
-    words = [sys.executable, "-m", "deploy.cli", "train", "ground", "--steps", str(STEPS), "--json", "--out", str(out)]
+    words = [*PYTHON, "-m", "deploy.cli", "train", "ground", "--steps", str(STEPS), "--json", "--out", str(out)]
     run = subprocess.Popen(
         [*words, "--record" if record else "--no-record"], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL
     )

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import multiprocessing
 import threading
 from functools import partial
 from multiprocessing.synchronize import Event
 
 from deploy.bench import situations
 from deploy.bench.timing import Figures, each
+from deploy.interpreter import spawning
 from messaging.bus import Bus, BusSettings
 from messaging.ports import free_endpoint
 from messaging.topics import DECIDE
@@ -30,7 +30,7 @@ def _serve(endpoint: str, listen: bool, ready: Event, stop: Event) -> None:
 
 def _measure(listen: bool, policy: str) -> dict[str, float]:
     """A policy's questions to a service that is the router itself, or behind one in this process."""
-    spawn = multiprocessing.get_context("spawn")
+    spawn = spawning()
     endpoint, ready, stop = free_endpoint(), spawn.Event(), spawn.Event()
     router = None if listen else Bus(BusSettings(listen=(endpoint,)), "router")
     service = spawn.Process(target=_serve, args=(endpoint, listen, ready, stop), daemon=True)

@@ -6,11 +6,11 @@ import logging
 import os
 import signal
 import subprocess
-import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
 
+from deploy.interpreter import PYTHON
 from deploy.run.places import UNFINISHED, Place
 
 log = logging.getLogger("brakeline.launcher")
@@ -43,7 +43,7 @@ class Child:
         environment = os.environ | {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
         with (logs / f"{self.place.name}.log").open("ab") as errors:
             self.popen = subprocess.Popen(
-                [sys.executable, "-m", "deploy.run.child", str(self.folder), self.place.name],
+                [*PYTHON, "-m", "deploy.run.child", str(self.folder), self.place.name],
                 stdin=subprocess.DEVNULL,
                 stdout=errors,
                 stderr=errors,

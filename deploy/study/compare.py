@@ -20,6 +20,7 @@ from multiprocessing.managers import SyncManager
 from pathlib import Path
 from typing import Any, Protocol
 
+from deploy.interpreter import spawning
 from deploy.study import cells
 from deploy.study.cells import METHODS, NONE, Study
 from messaging.files import write_whole
@@ -132,8 +133,8 @@ def complete(
 def _side_by_side(
     jobs: Sequence[Job], results: Path, runs: Path, workers: int, say: Callable[[str, str], object]
 ) -> None:
-    """Each in a process of its own, started afresh: a forked one would share locks of libraries that have threads."""
-    context = multiprocessing.get_context("spawn")
+    """Each in a process of its own."""
+    context = spawning()
     manager = SyncManager(ctx=context)
     manager.start(_begin_work)
     with manager, ProcessPoolExecutor(workers, context, initializer=_begin_work) as pool:

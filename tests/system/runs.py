@@ -6,7 +6,6 @@ import json
 import os
 import signal
 import subprocess
-import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -14,11 +13,12 @@ from typing import Any, Self
 
 import psutil
 
+from deploy.interpreter import PYTHON
 from logs.metrics import Metrics
 from messaging.bus import Bus, BusSettings, Sample
 from messaging.topics import RECORDED
 
-BRAKELINE = (sys.executable, "-m", "deploy.cli")
+BRAKELINE = (*PYTHON, "-m", "deploy.cli")
 PATIENCE = 120.0  # s: two cores that others use too
 STRIDE = 200  # steps of a run that take no longer
 

@@ -4,11 +4,11 @@ import json
 import re
 import signal
 import subprocess
-import sys
 import time
 
 import numpy as np
 
+from deploy.interpreter import PYTHON
 from deploy.run.configurations import EXPERIMENTS, encode
 from deploy.run.places import CONFIG
 from learner.checkpoint import exists
@@ -170,6 +170,6 @@ def test_a_child_whose_launcher_is_gone_ends_at_once(tmp_path):
     nobody = next(pid for pid in range(2**15, 2**22) if not alive(pid))
     (tmp_path / "endpoint").write_text(json.dumps({"endpoint": "tcp/127.0.0.1:1", "pid": nobody}))
     start = time.monotonic()
-    child = [sys.executable, "-m", "deploy.run.child", str(tmp_path), "actor-0"]
+    child = [*PYTHON, "-m", "deploy.run.child", str(tmp_path), "actor-0"]
     assert subprocess.run(child, check=False).returncode != 0
     assert time.monotonic() - start < 9.0, "it does not wait for a bus"

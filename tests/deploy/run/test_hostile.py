@@ -1,11 +1,15 @@
-"""Messages that killed the launcher."""
+"""Messages that killed the launcher, and modules that its children ran."""
 
+import os
 from pathlib import Path
 
 import pytest
 
-from deploy.run.configurations import RunConfig
+from deploy.interpreter import spawning
+from deploy.run.configurations import EXPERIMENTS, RunConfig, encode
 from deploy.run.launcher import Launcher
+from deploy.run.places import UNFINISHED, Place
+from deploy.run.watched import Child
 from messaging import brakeline_pb2 as pb
 from messaging.bus import Sample
 from messaging.topics import EPISODE, EXCHANGE, HEALTH, LOG, STEP, Topic
@@ -51,3 +55,22 @@ def test_its_figures_stay_bounded(launcher: Launcher, monkeypatch: pytest.Monkey
         max(map(len, (metrics.streams, metrics.actors, metrics.processes, metrics.log_lines, metrics.failures))) <= 100
     )
     assert launcher._tolerance.count > 0
+
+
+def test_modules_in_the_working_directory_are_not_run_by_children(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A launched process and a worker of `compare` begin as usual, with the packages that this process has."""
+    for name in ("safetensors", "zenoh", "numpy", "pickle", "deploy"):
+        (tmp_path / f"{name}.py").write_text(f"open({str(tmp_path / 'run')!r}, 'a').write({name!r})")
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "config.json").write_text(encode(EXPERIMENTS["debug"]))
+    (tmp_path / "endpoint").write_text('{"endpoint": "tcp/127.0.0.1:1", "pid": 1}')
+    child = Child(Place("actor-0", "actor", "ground"), tmp_path)
+    child.start()
+    assert child.popen is not None and child.popen.wait(60.0) == UNFINISHED, "its launcher is another"
+    worker = spawning().Process(target=os.getcwd)
+    worker.start()
+    worker.join(60.0)
+    assert worker.exitcode == 0
+    assert not (tmp_path / "run").exists(), (tmp_path / "run").read_text()
