@@ -266,8 +266,10 @@ def run(settings: ActorSettings, flight: FlightSettings, arena: Arena, propose: 
     if propose is not None:
         policy = prepared(propose, stages, settings.seed)
         propose = lambda _: policy  # noqa: E731
-    tally, outbox, truth = Tally(), Outbox(), Truth(flight.truth, flight.system) if flight.truth else None
+    tally, outbox = Tally(), Outbox()
     with Process(settings.bus, settings.name) as process:
+        tolerance = process.bus.tolerance
+        truth = Truth(flight.truth, flight.system, tolerance) if flight.truth else None
         stop, started = process.stop.is_set, time.monotonic()
         rider = FlightRider(process, settings, stages, propose, outbox)
         process.refresh = lambda: process.figures.update(tally.figures(time.monotonic() - started) | rider.figures())
@@ -276,7 +278,7 @@ def run(settings: ActorSettings, flight: FlightSettings, arena: Arena, propose: 
         if not (rider.join(stop) and answered(question, robot, stages[0].start, stop)):
             return False
         vehicle = LiveVehicle(
-            open_link(flight.url), flight.system, flight.height, flight.origin, truth, rider.tape.take
+            open_link(flight.url), flight.system, flight.height, flight.origin, truth, rider.tape.take, tolerance
         )
         try:
             rider.take(vehicle)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
 import logging
 import math
@@ -12,12 +11,14 @@ import time
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
 from actors.mavlink import ATTITUDE, IMU, POSITION, STATE, Array, Client, MavlinkError, Tap
 from messaging.links import Link
 from messaging.robots import QUADROTOR
+from messaging.tolerant import Tolerance
 from sim.quadrotor import SAMPLES, slewed
 from sim.vehicle import Period
 
@@ -30,6 +31,8 @@ STALE = 0.2  # s without a position after which telemetry counts as lost
 LATE = 0.02  # s after its time at which a period's beginning counts as late
 REST = 0.1  # m/s: slower is hovering
 CLIMB = np.array([0.0, 0.0, 1.0])  # m/s
+FARTHEST = 1e5  # m, m/s, ...: no vehicle is farther off, or as fast
+MOST_TOLD = 100  # datagrams read at one look
 KEPT = 10_000  # latest beginnings whose lateness is remembered
 
 
@@ -97,26 +100,39 @@ class Offset:
 
 
 class Truth:
-    """What a simulator tells about a vehicle beside MAVLink (sim.autopilot.server): its last word."""
+    """What a simulator on this machine tells about a vehicle beside MAVLink (sim.autopilot.server): its last word."""
 
-    def __init__(self, port: int, system: int) -> None:
-        """Listen on a UDP port of this machine. Raises OSError when it is taken."""
+    def __init__(self, port: int, system: int, tolerance: Tolerance | None = None) -> None:
+        """Listen on a UDP port for this machine alone. Raises OSError when it is taken."""
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self._socket.bind(("0.0.0.0", port))
+        self._socket.bind(("127.0.0.1", port))
         self._socket.setblocking(False)
-        self._system = system
+        self._system, self._tolerance = system, tolerance or Tolerance()
         self.state: Array | None = None
         self.collisions = 0
         self.clearance = math.inf
 
     def poll(self) -> None:
-        """Take what has come."""
-        with contextlib.suppress(BlockingIOError):
-            while True:
-                told = json.loads(self._socket.recv(4096))
-                if told["system"] == self._system:
-                    self.state, self.collisions = np.array(told["state"]), told["collisions"]
-                    self.clearance = math.inf if told["clearance"] is None else told["clearance"]
+        """Take what has come, but not for ever: whoever sends without end must not hold up the flight."""
+        for _ in range(MOST_TOLD):
+            try:
+                data = self._socket.recv(4096)
+            except BlockingIOError:
+                return
+            with self._tolerance.over("truth"):
+                self._take(json.loads(data))
+
+    def _take(self, told: Any) -> None:
+        """Raises ValueError, TypeError, KeyError: it is not what a simulator tells."""
+        if told["system"] != self._system:
+            return
+        state, clearance = np.array(told["state"], float), told["clearance"]
+        clearance = math.inf if clearance is None else float(clearance)
+        if state.shape != (QUADROTOR.state_dim,) or not (np.abs(state) < FARTHEST).all() or math.isnan(clearance):
+            raise ValueError(f"state {told['state']}, clearance {clearance}")
+        if type(told["collisions"]) is not int:
+            raise ValueError(f"collisions {told['collisions']!r}")
+        self.state, self.collisions, self.clearance = state, told["collisions"], clearance
 
     def close(self) -> None:
         self._socket.close()
@@ -141,6 +157,7 @@ class LiveVehicle:
         origin: tuple[float, float, float] = (0.0, 0.0, 0.0),
         truth: Truth | None = None,
         tap: Tap | None = None,
+        tolerance: Tolerance | None = None,
     ) -> None:
         """Take control, climb to that height [m] above the ground unless it flies already, and begin the first period.
 
@@ -150,7 +167,7 @@ class LiveVehicle:
             MavlinkError: nobody there, or it refuses.
         """
         self._link, self._client, self._truth = link, Client(link.send, system, tap), truth
-        self._origin = np.asarray(origin)
+        self._origin, self._tolerance = np.asarray(origin), tolerance or Tolerance()
         self.timing = Timing()
         self._plan: list[Array] = []  # the inputs after the one in force
         self._sent_at = self._beaten_at = self._heard_at = -math.inf
@@ -321,7 +338,8 @@ class LiveVehicle:
         """Read what has come, and send what is due."""
         client = self._client
         before = len(client.path), client.time
-        client.feed(self._link.receive())
+        with self._tolerance.over("mavlink"):
+            client.feed(self._link.receive())
         if (len(client.path), client.time) != before:
             self._heard_at = now
             self._offsets.note(now, client.time)

@@ -75,7 +75,7 @@ class Flight:
     system: int = 1
     """MAVLink system id of the vehicle."""
     truth: int = 0
-    """UDP port at which a simulator tells of collisions (`brakeline autopilot --truth`); 0: none does."""
+    """UDP port at which a simulator on this machine tells of collisions (`brakeline autopilot --truth`); 0: none."""
     height: float = 3.0
     """m above the ground that it climbs to first, unless it flies already. Nothing is filtered on this way."""
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
