@@ -128,6 +128,7 @@ class Driver:
             step.penalty = correction_penalty(self.robot, proposal, held, action, self.penalty)
         step.terminated, step.truncated = terminated, truncated
         step.goal, step.collision = self.info["at_goal"], self.info["collision"]
+        step.contact_moving, step.contact_standing = self.info["contact_moving"], self.info["contact_standing"]
         step.weights_version = weights_version
         if outcome is not None:
             self._note(step, outcome)
@@ -167,6 +168,7 @@ class Driver:
             return
         step.decision = outcome.answer.message.kind
         step.decide_ms = outcome.answer.message.time_ms
+        step.broken = outcome.answer.message.broken
         if self.cuts:
             self._cut(step)
         predicted: Prediction | None = self.commitment.predicted

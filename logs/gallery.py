@@ -58,6 +58,8 @@ class Held:
         last = self.steps[-1]
         if any(step.collision for step in self.steps):
             return "collision"
+        if last.contact_moving or last.contact_standing:
+            return "run into" if last.contact_standing else "contact"
         if last.goal:
             return "goal"
         return "timeout" if last.truncated else "unfinished"

@@ -85,8 +85,9 @@ def _summary(figures: Figures) -> Table:
         table.add_row("set-up", ", ".join(setup))
     table.add_row("steps", f"{steps}" + _optional(", {:.1f}/s", figures.get("steps_per_s")))
     table.add_row("episodes", f"{episodes}" + _optional(", mean reward {:.2f}", figures["mean_reward"]))
-    for name in ("goals", "collisions", "timeouts"):
-        table.add_row(name, _share(figures[name], episodes, within.get(name)))
+    touched = [name for name in ("contacts_moving", "contacts_standing") if figures[name]]
+    for name in ("goals", "collisions", *touched, "timeouts"):
+        table.add_row(name.replace("_", " "), _share(figures[name], episodes, within.get(name)))
     interventions = _share(figures["interventions"], steps, within.get("interventions"))
     table.add_row("interventions", f"{interventions}, of these failsafe {figures['failsafes']}")
     table.add_row(
@@ -96,6 +97,8 @@ def _summary(figures: Figures) -> Table:
     containment = figures["containment"]
     outside = _share(containment["violations"], containment["steps"], within.get("violations"), digits=3)
     table.add_row("outside the predicted set", outside)
+    if figures["broken"]:
+        table.add_row("obstacles outside their bounds", str(figures["broken"]))
     table.add_row("outside the measurement's bound", _share(figures["outside"], steps))
     _add_safety(table, figures)
     for robot, learner in figures.get("learners", {}).items():

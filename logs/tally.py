@@ -32,6 +32,9 @@ class Tally:
     steps: int = 0
     goals: int = 0
     collisions: int = 0  # episodes with one
+    contacts_moving: int = 0  # episodes in which it touched something that moves, itself moving when that began
+    contacts_standing: int = 0  # the same, but it had been standing: it was run into
+    broken: int = 0  # times that an obstacle was seen outside of what its bounds allowed
     timeouts: int = 0
     interventions: int = 0  # steps whose action was not the proposed one
     failsafes: int = 0  # of these, steps along the committed plan
@@ -94,6 +97,9 @@ class Tally:
         if step.collision and not self._collided:
             self._collided = True
             self.collisions += 1
+        self.contacts_moving += step.contact_moving  # a contact ends its episode
+        self.contacts_standing += step.contact_standing
+        self.broken += step.broken
 
     def _ended(self, step: pb.Step) -> None:
         self.returns.append(self._return)
@@ -122,6 +128,8 @@ def closed_loop(tallies: Iterable[Tally]) -> Figures:
         "episodes": len(returns),
         "goals": total("goals"),
         "collisions": total("collisions"),
+        "contacts_moving": total("contacts_moving"),
+        "contacts_standing": total("contacts_standing"),
         "timeouts": total("timeouts"),
         "steps": steps,
         "interventions": total("interventions"),
@@ -133,6 +141,7 @@ def closed_loop(tallies: Iterable[Tally]) -> Figures:
         "decision_ms": every and every | {kind: spread(*parts) for kind, parts in times.items()},
         "propose_ms": spread(*(tally.propose_ms for tally in tallies)),
         "containment": {"steps": total("compared"), "violations": total("violations")},
+        "broken": total("broken"),
         "outside": total("outside"),
         "closest_approach": clearance and clearance["min"],
         "clearance": clearance,
@@ -146,7 +155,7 @@ def intervals(figures: Figures, tallies: Iterable[Tally]) -> dict[str, list[floa
     shares = Clustered()
     for tally in tallies:
         shares.join(tally.shares)
-    ends = {name: figures[name] for name in ("goals", "collisions", "timeouts")}
+    ends = {name: figures[name] for name in ("goals", "collisions", "contacts_moving", "contacts_standing", "timeouts")}
     found = {
         **{name: clopper_pearson(count, max(episodes, count)) for name, count in ends.items()},
         "interventions": shares.interval(),

@@ -92,6 +92,7 @@ class Obstacle(_message.Message):
     POSITION_FIELD_NUMBER: _builtins.int
     SIZE_FIELD_NUMBER: _builtins.int
     YAW_FIELD_NUMBER: _builtins.int
+    MOTION_FIELD_NUMBER: _builtins.int
     kind: _builtins.str
     """box | cylinder | sphere | wall (messaging/shapes.py)"""
     yaw: _builtins.float
@@ -104,6 +105,10 @@ class Obstacle(_message.Message):
     def size(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]:
         """m"""
 
+    @_builtins.property
+    def motion(self) -> Global___Motion:
+        """of one that moves"""
+
     def __init__(
         self,
         *,
@@ -111,14 +116,80 @@ class Obstacle(_message.Message):
         position: _abc.Iterable[_builtins.float] | None = ...,
         size: _abc.Iterable[_builtins.float] | None = ...,
         yaw: _builtins.float = ...,
+        motion: Global___Motion | None = ...,
     ) -> None: ...
-    _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
+    _HasFieldArgType: _TypeAlias = _typing.Literal["motion", b"motion"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["kind", b"kind", "position", b"position", "size", b"size", "yaw", b"yaw"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["kind", b"kind", "motion", b"motion", "position", b"position", "size", b"size", "yaw", b"yaw"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 
 Global___Obstacle: _TypeAlias = Obstacle  # noqa: Y015
+
+@_typing.final
+class Motion(_message.Message):
+    """How an obstacle moves (messaging/motion.py): one of `acceleration` and `speed` bounds it."""
+
+    DESCRIPTOR: _descriptor.Descriptor
+
+    VELOCITY_FIELD_NUMBER: _builtins.int
+    POSITION_ERROR_FIELD_NUMBER: _builtins.int
+    VELOCITY_ERROR_FIELD_NUMBER: _builtins.int
+    ACCELERATION_FIELD_NUMBER: _builtins.int
+    SPEED_FIELD_NUMBER: _builtins.int
+    AGE_FIELD_NUMBER: _builtins.int
+    BEFORE_POSITION_FIELD_NUMBER: _builtins.int
+    BEFORE_VELOCITY_FIELD_NUMBER: _builtins.int
+    SINCE_FIELD_NUMBER: _builtins.int
+    position_error: _builtins.float
+    """m"""
+    velocity_error: _builtins.float
+    """m/s"""
+    acceleration: _builtins.float
+    """m/s², the largest"""
+    speed: _builtins.float
+    """m/s, the largest in any direction; nothing else is known"""
+    age: _builtins.float
+    """s since it was measured"""
+    since: _builtins.float
+    """s between the two"""
+    @_builtins.property
+    def velocity(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]:
+        """m/s, measured"""
+
+    @_builtins.property
+    def before_position(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]:
+        """the measurement before; empty: there was none"""
+
+    @_builtins.property
+    def before_velocity(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]: ...
+    def __init__(
+        self,
+        *,
+        velocity: _abc.Iterable[_builtins.float] | None = ...,
+        position_error: _builtins.float = ...,
+        velocity_error: _builtins.float = ...,
+        acceleration: _builtins.float | None = ...,
+        speed: _builtins.float | None = ...,
+        age: _builtins.float = ...,
+        before_position: _abc.Iterable[_builtins.float] | None = ...,
+        before_velocity: _abc.Iterable[_builtins.float] | None = ...,
+        since: _builtins.float = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _typing.Literal["_acceleration", b"_acceleration", "_speed", b"_speed", "acceleration", b"acceleration", "speed", b"speed"]  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["_acceleration", b"_acceleration", "_speed", b"_speed", "acceleration", b"acceleration", "age", b"age", "before_position", b"before_position", "before_velocity", b"before_velocity", "position_error", b"position_error", "since", b"since", "speed", b"speed", "velocity", b"velocity", "velocity_error", b"velocity_error"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    _WhichOneofReturnType__acceleration: _TypeAlias = _typing.Literal["acceleration"]  # noqa: Y015
+    _WhichOneofArgType__acceleration: _TypeAlias = _typing.Literal["_acceleration", b"_acceleration"]  # noqa: Y015
+    _WhichOneofReturnType__speed: _TypeAlias = _typing.Literal["speed"]  # noqa: Y015
+    _WhichOneofArgType__speed: _TypeAlias = _typing.Literal["_speed", b"_speed"]  # noqa: Y015
+    @_typing.overload
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__acceleration) -> _WhichOneofReturnType__acceleration | None: ...
+    @_typing.overload
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__speed) -> _WhichOneofReturnType__speed | None: ...
+
+Global___Motion: _TypeAlias = Motion  # noqa: Y015
 
 @_typing.final
 class Request(_message.Message):
@@ -252,6 +323,7 @@ class Decision(_message.Message):
     QUEUE_MS_FIELD_NUMBER: _builtins.int
     SOLVER_FIELD_NUMBER: _builtins.int
     ITERATIONS_FIELD_NUMBER: _builtins.int
+    BROKEN_FIELD_NUMBER: _builtins.int
     kind: Global___Kind.ValueType
     predicted_heading: _builtins.float
     """rad, of the frame in which its position part is a box"""
@@ -276,6 +348,8 @@ class Decision(_message.Message):
     solver: _builtins.str
     """status of the last QP; empty: none was solved"""
     iterations: _builtins.int
+    broken: _builtins.int
+    """obstacles seen outside of what their bounds allowed since they were seen before"""
     @_builtins.property
     def plan(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]:
         """(horizon, inputs); its first row is to be executed now"""
@@ -316,10 +390,11 @@ class Decision(_message.Message):
         queue_ms: _builtins.float = ...,
         solver: _builtins.str = ...,
         iterations: _builtins.int = ...,
+        broken: _builtins.int = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["compared", b"compared", "contained", b"contained", "iterations", b"iterations", "kind", b"kind", "margin", b"margin", "model", b"model", "plan", b"plan", "predicted_center", b"predicted_center", "predicted_half_width", b"predicted_half_width", "predicted_heading", b"predicted_heading", "queue_ms", b"queue_ms", "reason", b"reason", "solve_ms", b"solve_ms", "solver", b"solver", "time_ms", b"time_ms", "tube_center", b"tube_center", "tube_half_width", b"tube_half_width", "verified", b"verified", "verify_ms", b"verify_ms"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["broken", b"broken", "compared", b"compared", "contained", b"contained", "iterations", b"iterations", "kind", b"kind", "margin", b"margin", "model", b"model", "plan", b"plan", "predicted_center", b"predicted_center", "predicted_half_width", b"predicted_half_width", "predicted_heading", b"predicted_heading", "queue_ms", b"queue_ms", "reason", b"reason", "solve_ms", b"solve_ms", "solver", b"solver", "time_ms", b"time_ms", "tube_center", b"tube_center", "tube_half_width", b"tube_half_width", "verified", b"verified", "verify_ms", b"verify_ms"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 
@@ -509,6 +584,9 @@ class Step(_message.Message):
     TURNED_FIELD_NUMBER: _builtins.int
     CUT_FIELD_NUMBER: _builtins.int
     PROPOSE_MS_FIELD_NUMBER: _builtins.int
+    CONTACT_MOVING_FIELD_NUMBER: _builtins.int
+    CONTACT_STANDING_FIELD_NUMBER: _builtins.int
+    BROKEN_FIELD_NUMBER: _builtins.int
     robot: _builtins.str
     actor: _builtins.str
     episode: _builtins.int
@@ -550,6 +628,12 @@ class Step(_message.Message):
     """for the learner the episode ends here: `proposed` was intervened against (SAILR)"""
     propose_ms: _builtins.float
     """the policy's forward pass; 0: not measured"""
+    contact_moving: _builtins.bool
+    """it touched something that moves, and was moving itself when that began"""
+    contact_standing: _builtins.bool
+    """the same, but it had been standing: it was run into"""
+    broken: _builtins.int
+    """obstacles seen outside of what their bounds allowed"""
     @_builtins.property
     def header(self) -> Global___Header: ...
     @_builtins.property
@@ -608,10 +692,13 @@ class Step(_message.Message):
         turned: _builtins.float = ...,
         cut: _builtins.bool = ...,
         propose_ms: _builtins.float = ...,
+        contact_moving: _builtins.bool = ...,
+        contact_standing: _builtins.bool = ...,
+        broken: _builtins.int = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _typing.Literal["header", b"header"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["action", b"action", "actor", b"actor", "clearance", b"clearance", "collision", b"collision", "compared", b"compared", "contained", b"contained", "cut", b"cut", "decide_ms", b"decide_ms", "decision", b"decision", "episode", b"episode", "fallback", b"fallback", "goal", b"goal", "header", b"header", "index", b"index", "next_observation", b"next_observation", "observation", b"observation", "outside", b"outside", "path", b"path", "penalty", b"penalty", "propose_ms", b"propose_ms", "proposed", b"proposed", "reward", b"reward", "robot", b"robot", "speed", b"speed", "state", b"state", "step", b"step", "terminated", b"terminated", "true_state", b"true_state", "truncated", b"truncated", "turned", b"turned", "weights_version", b"weights_version"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["action", b"action", "actor", b"actor", "broken", b"broken", "clearance", b"clearance", "collision", b"collision", "compared", b"compared", "contact_moving", b"contact_moving", "contact_standing", b"contact_standing", "contained", b"contained", "cut", b"cut", "decide_ms", b"decide_ms", "decision", b"decision", "episode", b"episode", "fallback", b"fallback", "goal", b"goal", "header", b"header", "index", b"index", "next_observation", b"next_observation", "observation", b"observation", "outside", b"outside", "path", b"path", "penalty", b"penalty", "propose_ms", b"propose_ms", "proposed", b"proposed", "reward", b"reward", "robot", b"robot", "speed", b"speed", "state", b"state", "step", b"step", "terminated", b"terminated", "true_state", b"true_state", "truncated", b"truncated", "turned", b"turned", "weights_version", b"weights_version"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 

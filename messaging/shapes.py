@@ -19,6 +19,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from messaging.motion import Motion
+
 Array = NDArray[np.float64]
 
 WALL_DEPTH = 1e4  # m; half the edge of the box that a wall is: as good as a half-space
@@ -41,12 +43,14 @@ class Obstacle:
     size: box: full edge lengths (one per axis); cylinder: (radius,) in the plane, (radius, height) in space;
     sphere: (radius,); wall: () — a plane through `position` whose free side is the direction `yaw` points to.
     yaw: rad about the vertical (box and wall).
+    motion: how it moves; None: it stands still (`Shapes` takes every obstacle for standing: see `movers.parted`).
     """
 
     kind: str
     position: tuple[float, ...]
     size: tuple[float, ...] = ()
     yaw: float = 0.0
+    motion: Motion | None = None
 
     def __post_init__(self) -> None:
         if self.kind not in KINDS:
@@ -63,6 +67,8 @@ class Obstacle:
             raise BadShape("size", f"a {dim}-D {self.kind} has {sizes} sizes, not {len(self.size)}")
         if not all(math.isfinite(value) and value > 0.0 for value in self.size):
             raise BadShape("size", f"the sizes of a {self.kind} must be finite and positive, not {list(self.size)}")
+        if self.motion is not None and (why := self.motion.wrong(dim)):
+            raise BadShape("motion", why)
 
 
 @dataclass(frozen=True)

@@ -48,7 +48,25 @@ class Answer:
 
 
 def obstacle_messages(obstacles: Iterable[Obstacle]) -> list[pb.Obstacle]:
-    return [pb.Obstacle(kind=o.kind, position=o.position, size=o.size, yaw=o.yaw) for o in obstacles]
+    return [pb.Obstacle(kind=o.kind, position=o.position, size=o.size, yaw=o.yaw, motion=_motion(o)) for o in obstacles]
+
+
+def _motion(obstacle: Obstacle) -> pb.Motion | None:
+    if (motion := obstacle.motion) is None:
+        return None
+    message = pb.Motion(
+        velocity=motion.velocity,
+        position_error=motion.position_error,
+        velocity_error=motion.velocity_error,
+        acceleration=motion.acceleration,
+        speed=motion.speed,
+        age=motion.age,
+    )
+    if motion.before is not None:
+        message.before_position.extend(motion.before.position)
+        message.before_velocity.extend(motion.before.velocity)
+        message.since = motion.before.since
+    return message
 
 
 def request_message(

@@ -13,6 +13,7 @@ from time import perf_counter_ns
 import numpy as np
 from numpy.typing import NDArray
 
+from messaging.movers import Movers
 from messaging.shapes import Shapes
 from safety.commitment import Prediction
 from safety.freespace import half_spaces
@@ -20,6 +21,7 @@ from safety.model_set import ModelSet
 from safety.program import SHARPEN, Builder, Layout, Rows
 from safety.request import ADJUSTED, ALLOWED, FAILSAFE, Decision, Request, check_for_filter
 from safety.solver import INFEASIBLE, solve
+from safety.sweep import swept_half_spaces
 
 Array = NDArray[np.float64]
 
@@ -37,6 +39,7 @@ class _Attempt:
     solve_ns: int = 0
     reason: str = ""
     contained: bool = True
+    broken: int = 0
 
 
 @dataclass(frozen=True)
@@ -47,6 +50,7 @@ class _Scene:
     heading: float
     turn: Array
     near: Shapes
+    moving: Movers | None = None  # that may meet the tube
 
 
 @dataclass(frozen=True)
@@ -148,6 +152,7 @@ class Filter:
         attempt = _Attempt(perf_counter_ns())
         check_for_filter(self.robot, request)
         attempt.contained = request.predicted is None or request.predicted.contains(self.robot, request.state)
+        attempt.broken = 0 if request.movers is None else int((~request.movers.kept).sum())
         given = request.plan[: self.robot.given].ravel()
         z_0 = np.concatenate([request.state[self.regressor], request.input_in_force, given])
         proposal = self._limited(request.action, z_0[-self.robot.action_dim :])
@@ -155,7 +160,11 @@ class Filter:
         recorded = z_0[: self.robot.regressor_dim]
         in_domain = bool(((recorded >= self.domain[0]) & (recorded <= self.domain[1])).all())
         found = None
-        if in_domain:
+        if attempt.broken:
+            attempt.reason = (
+                "an obstacle was seen outside of what its bounds allow: nothing is known of where it will be"
+            )
+        elif in_domain:
             found = self._search(scene, z_0, proposal, attempt)
         else:
             attempt.reason = "the state is outside the domain that was recorded"
@@ -167,7 +176,7 @@ class Filter:
         """The proposal if its tube is verified, else the QP's answer if that is, else nothing."""
         known, m = len(z_0), len(proposal)
         z = self._regressors(z_0, proposal)
-        if not len(scene.near) and not self.far:
+        if not len(scene.near) and scene.moving is None and not self.far:
             return _Found(ALLOWED, self._plan(z), z, self.reach, True)
         rows = self._rows(scene, z)
         margin = self._margin(rows, z)
@@ -233,18 +242,24 @@ class Filter:
         same, only their magnitudes are not)."""
         nominal = scene.start + self.tube.centers(z) @ scene.turn.T
         normals, offsets = half_spaces(scene.near, scene.start, nominal, self.robot.footprint, self.measured)
+        if scene.moving is not None:
+            swept = swept_half_spaces(
+                scene.moving, scene.start, nominal, self.robot.footprint, self.measured, self.robot.period
+            )
+            normals, offsets = np.concatenate([normals, swept[0]]), np.concatenate([offsets, swept[1]])
         return self.layout.rows(normals @ scene.turn, offsets)
 
     def _committed(self, request: Request, scene: _Scene, z_0: Array, attempt: _Attempt, in_domain: bool) -> _Found:
         """The committed plan; if it no longer counts as verified, braking that is verified anew; else just braking.
 
-        It counts if the measured state is where it was predicted, and this model set verified it or it is standing
-        still. A tube from outside the recorded domain verifies nothing. Anew are looked at: the committed plan's next
-        inputs and the strongest braking, both followed by the schedule's ramp, for tubes speak of nothing else.
+        It counts if the measured state is where it was predicted, and this model set verified it against obstacles
+        that have kept to their bounds since, or it is standing still. A tube from outside the recorded domain verifies
+        nothing. Anew are looked at: the committed plan's next inputs and the strongest braking, both followed by the
+        schedule's ramp, for tubes speak of nothing else.
         """
         if not attempt.contained:
             attempt.reason += "; the measured state was outside the predicted set"
-        vouched = request.model == self.version or request.still
+        vouched = (request.model == self.version and not attempt.broken) or request.still
         before = z_0[-self.robot.action_dim :]
         chosen = request.plan[self.robot.given : self.robot.free_steps].ravel()
         as_committed = np.concatenate([z_0, chosen])
@@ -283,6 +298,7 @@ class Filter:
             verify_ms=total - solved,
             solver=attempt.solver,
             iterations=attempt.iterations,
+            broken=attempt.broken,
         )
 
     def _predict(self, scene: _Scene, z: Array) -> Prediction:
@@ -326,4 +342,8 @@ class Filter:
         turn[0, 0], turn[0, 1], turn[1, 0], turn[1, 1] = cos, -sin, sin, cos
         if len(near):
             near = near.take(~(near.distance(start) > self.reach))  # one whose distance is no number stays
-        return _Scene(start, heading, turn, near)
+        moving = request.movers
+        if moving is not None:
+            within = robot.horizon * robot.period
+            moving = moving.take(~(moving.least_distance(start, within) > self.reach))
+        return _Scene(start, heading, turn, near, moving if moving is not None and len(moving) else None)

@@ -12,7 +12,7 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from messaging.shapes import Shapes
+from messaging.movers import parted
 from safety.commitment import Commitment, correction_penalty
 from safety.methods import Method
 from safety.request import Decision, Request
@@ -51,6 +51,7 @@ class SafetyWrapper(gymnasium.Wrapper[Any, Any, Any, Any]):
     def decide(self, action: NDArray[np.float64]) -> Decision:
         """The decision on an action in the current state; a proposal that is no number becomes standing still."""
         kept, robot = self.commitment, self.filter.robot
+        obstacles, movers = parted(self._info["obstacles"], robot.position_dim)
         proposal = action if np.isfinite(action).all() else np.zeros(robot.action_dim)
         return self.filter.decide(
             Request(
@@ -58,7 +59,8 @@ class SafetyWrapper(gymnasium.Wrapper[Any, Any, Any, Any]):
                 action=proposal,
                 input_in_force=kept.input_in_force,
                 plan=kept.plan,
-                obstacles=Shapes.of(self._info["obstacles"], robot.position_dim),
+                obstacles=obstacles,
+                movers=movers,
                 model=kept.model,
                 predicted=kept.predicted,
                 observation=self._observed(),

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from messaging.movers import Movers
 from messaging.robots import Robot
 from messaging.shapes import Shapes
 from safety.commitment import Prediction
@@ -36,7 +37,8 @@ class Request:
     """state (n,) measured; action (m,) proposed; input_in_force (m,) of the period before; plan (N, m): the committed
     plan's tail (of a late robot: from the input on that is in force now), verified by model set `model` (empty:
     standing still; `UNVERIFIED`: by none); obstacles: at least those within `Filter.reach`; predicted: what the last
-    decision said of this state, if there was one."""
+    decision said of this state, if there was one; movers: obstacles that move, at least those that may come within
+    reach before the plan ends."""
 
     state: Array
     action: Array
@@ -45,6 +47,7 @@ class Request:
     obstacles: Shapes
     model: str = ""
     predicted: Prediction | None = None
+    movers: Movers | None = None
     observation: NDArray[np.float32] = field(default_factory=lambda: np.zeros(0, np.float32))
 
     @property
@@ -77,6 +80,7 @@ class Decision:
     verify_ms: float = 0.0
     solver: str = ""
     iterations: int = 0
+    broken: int = 0  # movers that were seen outside of what their bounds allowed
 
     @property
     def action(self) -> Array:
@@ -96,6 +100,8 @@ def check_for_filter(robot: Robot, request: Request) -> None:
         raise BadRequest("plan", "the committed plan does not end in a stop")
     if request.obstacles.center.shape[1] != robot.position_dim:
         raise BadRequest("obstacles", f"a {robot.name} robot's obstacles have {robot.position_dim} coordinates")
+    if request.movers is not None and request.movers.drift.shape[1] != robot.position_dim:
+        raise BadRequest("obstacles", f"a {robot.name} robot's movers have {robot.position_dim} coordinates")
     if request.observation.size:
         _finite(robot, "observation", request.observation, (robot.observation_dim,))
     if request.predicted is not None:

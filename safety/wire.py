@@ -10,8 +10,10 @@ from google.protobuf.message import DecodeError
 from numpy.typing import NDArray
 
 from messaging import brakeline_pb2 as pb
+from messaging.motion import Motion, Sighting
+from messaging.movers import parted
 from messaging.robots import Robot
-from messaging.shapes import BadShape, Obstacle, Shapes
+from messaging.shapes import BadShape, Obstacle
 from safety.commitment import Prediction
 from safety.request import ADJUSTED, ALLOWED, FAILSAFE, BadRequest, Decision, Request
 
@@ -47,12 +49,14 @@ def request_of(message: pb.Request, robot: Robot) -> Request:
     if plan.size != robot.horizon * robot.action_dim:
         wanted = f"{robot.horizon} x {robot.action_dim}"
         raise BadRequest("plan", f"plan has {plan.size} numbers, a {robot.name} robot's has {wanted}")
+    obstacles, movers = parted(obstacles_of(message.obstacles, robot.position_dim), robot.position_dim)
     return Request(
         state=numbers(message.state),
         action=numbers(message.action),
         input_in_force=numbers(message.input_in_force),
         plan=plan.reshape(robot.horizon, robot.action_dim),
-        obstacles=shapes_of(message.obstacles, robot.position_dim),
+        obstacles=obstacles,
+        movers=movers,
         model=message.model,
         predicted=predicted,
         observation=np.fromiter(message.observation, np.float32, len(message.observation)),
@@ -64,7 +68,7 @@ def numbers(field: Collection[float]) -> NDArray[np.float64]:
     return np.fromiter(field, np.float64, len(field))
 
 
-def shapes_of(messages: Sequence[pb.Obstacle], dim: int) -> Shapes:
+def obstacles_of(messages: Sequence[pb.Obstacle], dim: int) -> list[Obstacle]:
     """Raises BadRequest naming the obstacle and its field."""
     if len(messages) > MOST_OBSTACLES:
         raise BadRequest("obstacles", f"{len(messages)} obstacles; at most {MOST_OBSTACLES} can be within reach")
@@ -73,10 +77,27 @@ def shapes_of(messages: Sequence[pb.Obstacle], dim: int) -> Shapes:
         try:
             if len(o.position) != dim:
                 raise BadShape("position", f"{len(o.position)} coordinates; this robot's obstacles have {dim}")
-            obstacles.append(Obstacle(o.kind, tuple(o.position), tuple(o.size), o.yaw))
+            motion = motion_of(o.motion) if o.HasField("motion") else None
+            obstacles.append(Obstacle(o.kind, tuple(o.position), tuple(o.size), o.yaw, motion=motion))
         except BadShape as error:
             raise BadRequest(f"obstacles[{i}].{error.field}", str(error)) from error
-    return Shapes.of(obstacles, dim)
+    return obstacles
+
+
+def motion_of(m: pb.Motion) -> Motion:
+    """What an obstacle's message says of how it moves."""
+    before = None
+    if m.before_position or m.before_velocity:
+        before = Sighting(tuple(m.before_position), tuple(m.before_velocity), m.since)
+    return Motion(
+        tuple(m.velocity),
+        m.position_error,
+        m.velocity_error,
+        acceleration=m.acceleration if m.HasField("acceleration") else None,
+        speed=m.speed if m.HasField("speed") else None,
+        age=m.age,
+        before=before,
+    )
 
 
 def message_of(decision: Decision, queue_ms: float) -> pb.Reply:
@@ -100,6 +121,7 @@ def message_of(decision: Decision, queue_ms: float) -> pb.Reply:
         queue_ms=queue_ms,
         solver=decision.solver,
         iterations=decision.iterations,
+        broken=decision.broken,
     )
     return pb.Reply(decision=message)
 

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from messaging.robots import Robot
 from messaging.shapes import BOX, CYLINDER, SPHERE, WALL, Obstacle, Shapes
+from sim.movers import Crowd, MoverKind
 from sim.world import Arena, closing, room_bounds
 
 Array = NDArray[np.float64]
@@ -49,6 +50,7 @@ class ArenaKind:
     tall: tuple[float, float] = (0.0, 0.0)  # m, a box's height in space
     spheres: tuple[int, int] = (0, 0)
     ball: tuple[float, float] = (0.0, 0.0)  # m, radius of a sphere
+    movers: MoverKind | None = None
 
     @property
     def bounds(self) -> tuple[tuple[float, float], ...]:
@@ -87,6 +89,14 @@ _ROOM = ArenaKind(
     step_limit=300,
 )
 
+# People: 1.2 m/s is walking pace.
+_WALKERS = MoverKind(count=(3, 4), radius=0.2, speed=1.2, acceleration=1.0, keep=1.0)
+
+# Other aircraft: heavier and slower than ours.
+_AIRCRAFT = MoverKind((2, 3), 0.5, 3.0, 0.5, keep=6.0, position_error=0.1, velocity_error=0.1)
+
+_HALL = replace(_ROOM, half_width=3.5, cylinders=(2, 4), boxes=(2, 4), gap=0.4, goal_distance=2.5)
+
 ARENAS: dict[str, dict[str, ArenaKind]] = {
     "ground": {
         "default": _ROOM,
@@ -105,12 +115,16 @@ ARENAS: dict[str, dict[str, ArenaKind]] = {
             # the diagonal is 23 m, 5 cm a step: twice the steps of a straight drive, nearly
             step_limit=800,
         ),
+        "walkers": replace(_HALL, movers=_WALKERS),
+        "few-walkers": replace(_HALL, movers=replace(_WALKERS, count=(1, 2))),
+        "many-walkers": replace(_HALL, movers=replace(_WALKERS, count=(6, 8))),
     },
     "quadrotor": {
         "default": _FLIGHT,
         "dense": replace(_FLIGHT, cylinders=(10, 17), boxes=(8, 12), tall=(5.0, 8.0), spheres=(5, 8), gap=0.8),
         # room for full speed on all three axes at once
         "tall": replace(_FLIGHT, height=30.0, cylinders=(3, 4), boxes=(2, 3), spheres=(4, 6), goal_distance=30.0),
+        "traffic": replace(_FLIGHT, cylinders=(3, 5), boxes=(2, 3), movers=_AIRCRAFT),
     },
 }
 
@@ -148,8 +162,18 @@ def draw_arena(name: str, rng: np.random.Generator, robot: Robot) -> Arena:
             start = (*start, float(rng.uniform(-math.pi, math.pi)))
         arena = Arena(name, obstacles, start, goal, kind.goal_radius, kind.step_limit, kind.bounds)
         if arena.clearance_map.connected(start[: arena.dim], goal, robot.footprint + kind.path_clearance):
-            return arena
+            return arena if kind.movers is None else _with_movers(arena, kind.movers, rng)
     raise NoArena(f"no arena {name!r} with a way from start to goal in {ATTEMPTS} draws")
+
+
+def _with_movers(arena: Arena, kind: MoverKind, rng: np.random.Generator) -> Arena:
+    """The arena with movers at free places off the start; they may be fewer than the least where there is no room."""
+    low, high = np.array(arena.bounds).T
+    points = rng.uniform(low, high, (ENDS, arena.dim))
+    free = arena.shapes.distance(points).min(axis=0) >= kind.radius + 0.1
+    free &= np.linalg.norm(points - arena.start[: arena.dim], axis=1) >= kind.radius + kind.keep
+    places = points[free][: int(rng.integers(*kind.count, endpoint=True))]
+    return replace(arena, crowd=Crowd(kind, places, arena.shapes, int(rng.integers(2**31))))
 
 
 def tour(arena: Arena, goals: int, rng: np.random.Generator, robot: Robot) -> tuple[Arena, ...]:

@@ -12,10 +12,13 @@ import numpy as np
 from gymnasium.spaces import Box
 from numpy.typing import NDArray
 
+from messaging.movers import Movers
 from messaging.robots import GROUND, QUADROTOR, Robot
+from messaging.shapes import Obstacle
 from sim.arenas import draw_arena
 from sim.estimator import wrap
 from sim.ground import GroundRobot
+from sim.movers import Watch
 from sim.senses import LIDAR_NOISE, SENSES
 from sim.vehicle import MakeVehicle, Period, Vehicle
 from sim.world import Arena
@@ -35,6 +38,7 @@ class Reward:
     progress: float = 20.0  # a metre nearer to the goal
     goal: float = 100.0
     collision: float = -100.0
+    run_into: float = -50.0  # while it stood
 
 
 # A way from start to goal pays 40 or so, whether it is 2 m or 20 m long.
@@ -45,7 +49,7 @@ class NavigationEnv(gymnasium.Env[Observation, Any]):
     """One robot, a fresh random arena each episode.
 
     Action: the robot's input in physical units, clipped to its bounds and slew. Observation: `robot.observation`,
-    float32. Terminated on reaching the goal or touching an obstacle (both judged on the true position), truncated at
+    float32. Terminated on reaching the goal or touching anything (both judged on the true position), truncated at
     the arena's step limit. An episode is determined by `seed_key` and its episode seed alone; `reset(seed=…)` fixes the
     sequence of episode seeds, `reset(options={"episode_seed": …})` a single one; `options={"arena": …}` changes the
     arena's name, for good.
@@ -59,11 +63,14 @@ class NavigationEnv(gymnasium.Env[Observation, Any]):
     true_state         (n,) the same without measurement error; nothing that drives may look at it
     outside            the true state is farther from the measured one than `robot.measurement_bound`
     input_in_force     (m,) the input executed last, within bounds and slew; zero at the start
-    obstacles          list[Obstacle]: those with their surface within `robot.sight` of the measured position
+    obstacles          list[Obstacle]: those with their surface within `robot.sight` of the measured position; those
+                       that move, as measured, with their motion, if they may come as near within a plan
     arena              Arena: the whole map
     goal               (d,) m
     time               s since the episode's start
-    collision          some part of the robot touched an obstacle during the last period
+    collision          some part of the robot touched an obstacle that stands during the last period
+    contact_moving     it touched something that moves, and was moving itself when that began
+    contact_standing   it was run into while it stood
     at_goal            the goal is reached
     clearance          m from the robot's footprint disc (sphere) to the nearest obstacle, true
     speed              m/s, true
@@ -122,6 +129,7 @@ class NavigationEnv(gymnasium.Env[Observation, Any]):
         if self._changes:
             self._vehicle.alter(**self._changes)
         self._senses = SENSES[self.robot.kind](self._arena, rng, self._lidar_noise)
+        self._watch = None if self._arena.crowd is None else Watch(self._arena.crowd, rng)
         self._steps = 0
         self._distance = self._goal_distance(self._vehicle.true)
         return self._observe(), self._info(self._vehicle.standing())
@@ -132,8 +140,9 @@ class NavigationEnv(gymnasium.Env[Observation, Any]):
         before, self._distance = self._distance, self._goal_distance(period.true)
         at_goal = self._at_goal(period)
         reward = self.reward.progress * (before - self._distance)
-        reward += self.reward.goal * at_goal + self.reward.collision * period.collision
-        terminated = at_goal or period.collision
+        reward += self.reward.goal * at_goal + self.reward.collision * (period.collision or period.contact_moving)
+        reward += self.reward.run_into * period.contact_standing
+        terminated = at_goal or period.collision or period.contact_moving or period.contact_standing
         truncated = not terminated and self._steps >= self._arena.step_limit
         return self._observe(), float(reward), terminated, truncated, self._info(period)
 
@@ -141,11 +150,15 @@ class NavigationEnv(gymnasium.Env[Observation, Any]):
         return math.dist(self._arena.goal, state[: self.robot.position_dim])
 
     def _at_goal(self, period: Period) -> bool:
-        return self._distance <= self._arena.goal_radius and not period.collision
+        return self._distance <= self._arena.goal_radius and not (
+            period.collision or period.contact_moving or period.contact_standing
+        )
 
     def _observe(self) -> Observation:
         vehicle = self.vehicle
-        observation = self._senses.observe(vehicle.true, vehicle.measured, vehicle.input)
+        observation = self._senses.observe(
+            vehicle.true, vehicle.measured, vehicle.input, self._steps * self.robot.period
+        )
         return np.clip(observation, -OBSERVED_LIMIT, OBSERVED_LIMIT).astype(np.float32)
 
     def _outside(self, period: Period) -> bool:
@@ -155,6 +168,15 @@ class NavigationEnv(gymnasium.Env[Observation, Any]):
             error[heading] = abs(wrap(period.measured[heading] - period.true[heading]))
         return bool((error > self._bound).any())
 
+    def _moving(self, position: Array) -> list[Obstacle]:
+        """What moves and may come within sight before a plan ends, as measured now."""
+        if self._watch is None:
+            return []
+        seen = self._watch.look(self._steps * self.robot.period)
+        within = self.robot.horizon * self.robot.period
+        nearest = Movers.of(seen, self.robot.position_dim).least_distance(position, within)
+        return [seen[i] for i in np.flatnonzero(nearest <= self.robot.sight)]
+
     def _info(self, period: Period) -> Info:
         near = self._arena.shapes.distance(period.measured[: self.robot.position_dim]) <= self.robot.sight
         return {
@@ -163,11 +185,14 @@ class NavigationEnv(gymnasium.Env[Observation, Any]):
             "true_state": period.true,
             "outside": self._outside(period),
             "input_in_force": self.vehicle.input,
-            "obstacles": [self._arena.obstacles[i] for i in np.flatnonzero(near)],
+            "obstacles": [self._arena.obstacles[i] for i in np.flatnonzero(near)]
+            + self._moving(period.measured[: self.robot.position_dim]),
             "arena": self._arena,
             "goal": self._arena.goal,
             "time": self._steps * self.robot.period,
             "collision": period.collision,
+            "contact_moving": period.contact_moving,
+            "contact_standing": period.contact_standing,
             "at_goal": self._at_goal(period),
             "clearance": period.clearance,
             "speed": self._senses.speed(period.true),

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from messaging.robots import GROUND
 from sim.estimator import Estimator, NoiseLevels
-from sim.scene import add_obstacles
+from sim.scene import Moving, add_movers, add_obstacles
 from sim.vehicle import BadInput, Period
 from sim.world import Arena
 
@@ -21,6 +21,7 @@ MODEL = Path(__file__).with_name("ground.xml").read_text()
 WHEEL_RADIUS = 0.033  # m
 TRACK = 0.160  # m between the wheels
 SAMPLES = 10  # of encoders and gyro in a period
+STANDING = 0.02  # m/s; no faster, and at no input, it stands
 PAYLOAD_GYRATION = 0.05  # m, radius of gyration of what is loaded
 
 
@@ -46,6 +47,10 @@ class GroundRobot:
         self._base = base
         self._bare_mass = float(self._model.body_mass[base])
         self._bare_inertia = self._model.body_inertia[base].copy()
+        self._moving = Moving(self._model, self._data, arena.crowd)
+        self._time = -GROUND.period  # s; the episode's first is 0
+        self._meeting = False  # something that moves is touched now
+        self._contacts = [False, False]  # in this period one began while moving, while standing
         self._wheel_geoms = [self._model.geom(name).id for name in ("left wheel", "right wheel")]
         self._physics_steps = round(GROUND.period / SAMPLES / self._model.opt.timestep)
         self.set_payload(payload_kg)
@@ -103,6 +108,7 @@ class GroundRobot:
             float(distances[-1]),
             reading.path,
             reading.turned,
+            *self._contacts,
         )
 
     def standing(self) -> Period:
@@ -121,23 +127,41 @@ class GroundRobot:
         data.ctrl[:] = (speed - 0.5 * TRACK * turn) / WHEEL_RADIUS, (speed + 0.5 * TRACK * turn) / WHEEL_RADIUS
         positions, wheels, headings = np.empty((SAMPLES, 2)), np.empty((SAMPLES, 2)), np.empty(SAMPLES + 1)
         headings[0] = self._true_heading()
-        collision = False
+        collision, self._contacts = False, [False, False]
+        driven = bool(input.any())
         for i in range(SAMPLES):
             for _ in range(self._physics_steps):
+                moving = driven or math.hypot(*data.qvel[:2].tolist()) > STANDING
+                if self._moving:
+                    self._time += model.opt.timestep
+                    self._moving.place(self._time)
                 # step2 before step1: contacts are then those of the position just reached
                 mujoco.mj_step2(model, data)
                 mujoco.mj_step1(model, data)
                 collision = collision or self._touching()
+                if self._moving:
+                    self._meet(moving)
             positions[i], wheels[i], headings[i + 1] = data.qpos[:2], self._wheels(), self._true_heading()
         rates = np.diff(np.unwrap(headings)) * (SAMPLES / GROUND.period)
         return positions, wheels, rates, collision
 
+    def _meet(self, moving: bool) -> None:
+        """Note when something that moves begins to be touched, and whether this robot was moving until then."""
+        touched = bool(self._moving.touched().any())
+        if touched and not self._meeting:
+            self._contacts[0 if moving else 1] = True
+        self._meeting = touched
+
     def _touching(self) -> bool:
-        """Whether any contact now is with an obstacle: the robot touches nothing else but the floor, which is geom 0.
+        """Whether any contact now is with an obstacle that stands. Else, but for what moves, it touches only the floor,
+        which is geom 0.
 
         A plane is the lowest type of geom, and a contact names the geom of lower type first.
         """
-        return bool(np.count_nonzero(self._data.contact.geom[:, 0]))
+        first = self._data.contact.geom[:, 0]
+        if self._moving:
+            return bool((first * ~self._moving.touched()).any())
+        return bool(np.count_nonzero(first))
 
     def _wheels(self) -> Array:
         return np.asarray(self._data.qpos[7:9])
@@ -160,6 +184,7 @@ def _build(arena: Arena) -> mujoco.MjModel:
     """Compile robot and arena, the robot standing at the start."""
     spec = mujoco.MjSpec.from_string(MODEL)
     add_obstacles(spec, arena)
+    add_movers(spec, arena.crowd)
     base = spec.body("base")
     x, y, heading = arena.start
     base.pos = (x, y, WHEEL_RADIUS)

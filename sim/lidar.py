@@ -9,14 +9,15 @@ from numpy.typing import NDArray
 from messaging.rays import Rays
 from messaging.shapes import rotate
 from sim.estimator import cut_normal
-from sim.scene import HEIGHT, map_model
+from sim.scene import HEIGHT, Moving, map_model
 from sim.world import Arena
 
 Array = NDArray[np.float64]
 
 
 class Lidar:
-    """One lidar in one arena. What it sees are the obstacles of the arena's map; robots are not among them."""
+    """One lidar in one arena. What it sees are the obstacles of the arena's map, and what moves there; robots are not
+    among them."""
 
     def __init__(self, arena: Arena, rays: Rays, noise: float = 0.0, rng: np.random.Generator | None = None) -> None:
         """rays: of the arena's dimension, in the frame of the robot's heading; noise: m, sigma of a range.
@@ -29,7 +30,14 @@ class Lidar:
         self._beams = beams
         self._height = 0.5 * HEIGHT if arena.dim == 2 else None
         self._model, self._data = map_model(arena)
+        self._moving = Moving(self._model, self._data, arena.crowd)
         self._hit, self._ranges = np.empty(len(beams), np.int32), np.empty(len(beams))
+
+    def at(self, time: float) -> None:
+        """From now on what moves is seen where it is at that time, s."""
+        if self._moving:
+            self._moving.place(time)
+            mujoco.mj_kinematics(self._model, self._data)
 
     def cast(self, origin: Array, heading: float = 0.0) -> Array:
         """True ranges (R,) in m from a point (d,) of free space; `max_range` where nothing is hit within it.

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from messaging.robots import QUADROTOR
 from sim.flight import GRAVITY, Body, FlightController, Gains, Vector
 from sim.flight_estimator import Estimate, FlightEstimator, QuadrotorNoise
-from sim.scene import add_obstacles
+from sim.scene import Moving, add_movers, add_obstacles
 from sim.vehicle import BadInput, Period
 from sim.wind import Air, Wind
 from sim.world import Arena
@@ -25,6 +25,7 @@ MODEL = Path(__file__).with_name("quadrotor.xml").read_text()
 SAMPLES = 5  # of the position in a period
 OUTER_EVERY = 2  # physics steps for one of the velocity loop
 FLOOR_BIT = 1
+STANDING = 0.15  # m/s; no faster, and at no setpoint, it stands in the air
 SETTLE = 5  # periods of hovering before the start
 
 
@@ -56,6 +57,10 @@ class Quadrotor:
         self._estimator = FlightEstimator(noise or QuadrotorNoise(), rng, steps)
         self._rng, self._wind = rng, wind or Wind()
         self._air = None if self._wind.calm else Air(self._wind, rng, self.timestep)
+        self._moving = Moving(self._model, self._data, arena.crowd)
+        self._time = 0.0  # s
+        self._meeting = False  # something that moves is touched now
+        self._contacts = [False, False]  # since `watch` one began while moving, while standing
         self._floor_geom = -1 if floor is None else self._model.geom("floor").id
         self.flying = floor is None  # the controller has the rotors; else they stand or idle
         self.collided = False  # an obstacle was touched since it was last set to False
@@ -67,6 +72,7 @@ class Quadrotor:
         mujoco.mj_forward(self._model, self._data)
         if self.flying:
             self._hover()
+        self._time, self._contacts = 0.0, [False, False]
         self.true, self.measured = self.state(), self.estimated_state(self.estimate())
 
     def step(self, input: Array) -> Period:
@@ -88,7 +94,7 @@ class Quadrotor:
 
     def watch(self) -> None:
         """A period begins: note from now on what is touched, and where it has been."""
-        self.collided = False
+        self.collided, self._contacts = False, [False, False]
         self._track.clear()
 
     def watched(self, measured: Array, path: Array) -> Period:
@@ -96,7 +102,7 @@ class Quadrotor:
         self.true = self.state()
         distances = self.clearance(np.array(self._track))
         closest, clearance = float(distances.min()), float(distances[-1])
-        return Period(measured, self.true, self.collided, closest, clearance, path, 0.0)
+        return Period(measured, self.true, self.collided, closest, clearance, path, 0.0, *self._contacts)
 
     def standing(self) -> Period:
         """The present state as a period in which nothing happened: what there is to say before the first step."""
@@ -140,13 +146,16 @@ class Quadrotor:
             if self.flying:
                 control[:] = controller.update(position, velocity, (qw, qx, qy, qz), (p, q, r))
             self._blow(vx, vy, vz)
+            if self._moving:
+                self._time += self.timestep
+                self._moving.place(self._time)
             # step2 before step1: contacts are then those of the position just reached
             mujoco.mj_step2(model, data)
             mujoco.mj_step1(model, data)
             if data.ncon:
                 self._touch()
             else:
-                self.on_floor = False
+                self.on_floor = self._meeting = False
         vx, vy, vz = qvel[:3].tolist()
         dt = self.timestep
         self._track.append(qpos[:3].tolist())
@@ -218,6 +227,12 @@ class Quadrotor:
         """Note what the vehicle touches: a plane is the lowest type of geom, and comes first in a contact."""
         first = self._data.contact.geom[:, 0]
         floor = self._floor_geom
+        if self._moving:
+            movers = self._moving.touched()
+            if movers.any() and not self._meeting:
+                speed = math.hypot(*self._data.qvel[:3].tolist())
+                self._contacts[0 if speed > STANDING or any(self.controller.setpoint) else 1] = True
+            self._meeting, first = bool(movers.any()), first[~movers]
         self.on_floor = bool((first == floor).any())
         self.collided = self.collided or bool((first != floor).any())
 
@@ -239,6 +254,7 @@ def _build(arena: Arena, floor: float | None) -> mujoco.MjModel:
     """Compile vehicle and arena, the vehicle at the start, or on the floor below it."""
     spec = mujoco.MjSpec.from_string(MODEL)
     add_obstacles(spec, arena)
+    add_movers(spec, arena.crowd)
     x, y, z = arena.start[:3]
     if floor is not None:
         spec.worldbody.add_geom(

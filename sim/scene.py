@@ -5,8 +5,11 @@ from __future__ import annotations
 import math
 
 import mujoco
+import numpy as np
+from numpy.typing import NDArray
 
 from messaging.shapes import BOX, CYLINDER, SPHERE, Obstacle
+from sim.movers import Crowd
 from sim.world import Arena
 
 HEIGHT = 0.4  # m, of every obstacle of an arena in the plane: taller than the robot
@@ -33,6 +36,45 @@ def add_obstacles(spec: mujoco.MjSpec, arena: Arena) -> None:
             contype=OBSTACLE_BIT,
             conaffinity=0,
         )
+
+
+def add_movers(spec: mujoco.MjSpec, crowd: Crowd | None) -> None:
+    """Add what moves as bodies that nothing pushes, `mover 0`, `mover 1`, …; `Movers` puts them in their places."""
+    for i, mover in enumerate(() if crowd is None else crowd.obstacles(0.0)):
+        flat = len(mover.position) == 2
+        z = 0.5 * HEIGHT if flat else mover.position[2]
+        body = spec.worldbody.add_body(name=f"mover {i}", mocap=True, pos=(*mover.position[:2], z))
+        radius = mover.size[0]
+        body.add_geom(
+            name=f"mover {i}",
+            type=mujoco.mjtGeom.mjGEOM_CYLINDER if flat else mujoco.mjtGeom.mjGEOM_SPHERE,
+            size=(radius, 0.5 * HEIGHT, 0.0) if flat else (radius, 0.0, 0.0),
+            contype=OBSTACLE_BIT,
+            conaffinity=0,
+        )
+
+
+class Moving:
+    """The movers of a compiled model."""
+
+    def __init__(self, model: mujoco.MjModel, data: mujoco.MjData, crowd: Crowd | None) -> None:
+        self._data, self._crowd = data, crowd
+        names = [f"mover {i}" for i in range(0 if crowd is None else len(crowd))]
+        self._bodies = [int(model.body_mocapid[model.body(name).id]) for name in names]
+        self._geoms = np.array([model.geom(name).id for name in names], dtype=int)
+
+    def __bool__(self) -> bool:
+        return bool(self._bodies)
+
+    def place(self, time: float) -> None:
+        """Put them where they are at that time, s."""
+        if self._crowd is not None:
+            positions, _ = self._crowd.at(max(time, 0.0))
+            self._data.mocap_pos[self._bodies, : positions.shape[1]] = positions
+
+    def touched(self) -> NDArray[np.bool_]:
+        """Of each contact now: is one of them in it?"""
+        return np.asarray(np.isin(self._data.contact.geom, self._geoms).any(axis=1))
 
 
 def _geom(obstacle: Obstacle, arena: Arena) -> Geom:
@@ -65,6 +107,7 @@ def map_model(arena: Arena) -> tuple[mujoco.MjModel, mujoco.MjData]:
     """The obstacles alone, compiled, with their places computed: what a sensor can be simulated on without a robot."""
     spec = mujoco.MjSpec()
     add_obstacles(spec, arena)
+    add_movers(spec, arena.crowd)
     model = spec.compile()
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)

@@ -23,10 +23,11 @@ LIDAR_NOISE = 0.01  # m, sigma of a range
 class Senses(Protocol):
     """One robot's observations in one episode."""
 
-    def observe(self, true: Array, measured: Array, input: Array) -> Array:
+    def observe(self, true: Array, measured: Array, input: Array, time: float = 0.0) -> Array:
         """The observation after a period, unclipped. To be called once a period: it may remember.
 
-        true: (n,) state, for the lidar's place alone; measured: (n,) state; input: (m,) executed last.
+        true: (n,) state, for the lidar's place alone; measured: (n,) state; input: (m,) executed last;
+        time: s, of what moves.
         """
 
     def speed(self, state: Array) -> float:
@@ -63,7 +64,7 @@ class GroundSenses:
     def speed(self, state: Array) -> float:
         return float(state[3])
 
-    def observe(self, true: Array, measured: Array, input: Array) -> Array:
+    def observe(self, true: Array, measured: Array, input: Array, time: float = 0.0) -> Array:
         top = GROUND.high()
         x, y, heading, speed, turn_rate = measured
         self._memory.update(float(turn_rate), GROUND.period)
@@ -77,6 +78,7 @@ class GroundSenses:
             *(input / top),
             self._memory.value / top[1],
         )
+        self._lidar.at(time)
         mount = true[:2] + self.MOUNT * np.array([math.cos(true[2]), math.sin(true[2])])
         return np.concatenate((self._lidar.ranges(mount, true[2]) / self._lidar.max_range, own))
 
@@ -97,10 +99,11 @@ class AirSenses:
     def speed(self, state: Array) -> float:
         return math.hypot(*state[3:6])
 
-    def observe(self, true: Array, measured: Array, input: Array) -> Array:
+    def observe(self, true: Array, measured: Array, input: Array, time: float = 0.0) -> Array:
         top = QUADROTOR.high()
         offset = self._goal - measured[:3]
         near = offset / (math.hypot(*offset) + self.NEAR)
+        self._lidar.at(time)
         ranges = self._lidar.ranges(true[:3])
         return np.concatenate((ranges / self._lidar.max_range, near, measured[3:6] / top, input / top))
 

@@ -29,6 +29,8 @@ class Period:
     clearance: float  # m, the same at the period's end
     subsamples: Array  # (S, d) m, estimated positions from the period's start, in the robot's frame of that moment
     turned: float  # rad, estimated change of heading; 0 for a robot whose state has none
+    contact_moving: bool = False  # it touched something that moves, and was moving itself when that began
+    contact_standing: bool = False  # it was run into while it stood
 
 
 class Vehicle(Protocol):

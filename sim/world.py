@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 from messaging.shapes import BOX, WALL, Obstacle, Shapes
+from sim.movers import Crowd
 from sim.planner import ClearanceMap
 
 SLAB = 2.0  # m, thickness of floors and ceilings
@@ -26,6 +27,7 @@ class Arena:
     goal_radius: float
     step_limit: int  # periods until the episode is cut off
     bounds: tuple[tuple[float, float], ...]  # lowest and highest coordinate inside the room, for each of the d axes
+    crowd: Crowd | None = field(default=None, compare=False)  # what moves in it
 
     @property
     def dim(self) -> int:

@@ -31,6 +31,8 @@ INFO_KEYS = {
     "goal",
     "time",
     "collision",
+    "contact_moving",
+    "contact_standing",
     "at_goal",
     "clearance",
     "speed",

@@ -1,0 +1,179 @@
+"""Half-spaces beside what moves: whatever keeps its bounds is on their far side, for the whole of every period."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from messaging.motion import Motion, Sighting
+from messaging.movers import Movers, parted
+from messaging.shapes import BadShape, Obstacle, Shapes
+from safety.freespace import half_spaces
+from safety.sweep import swept_half_spaces
+from tests.messaging.test_shapes import obstacles, sample
+
+BODY, PERIOD, PERIODS = 0.1, 0.2, 4
+
+
+def moving(obstacle, motion):
+    return Obstacle(obstacle.kind, obstacle.position, obstacle.size, obstacle.yaw, motion=motion)
+
+
+def ball(rng, d, radius):
+    draw = rng.normal(size=d)
+    return draw * (radius * rng.choice([1.0, rng.uniform()]) / np.linalg.norm(draw))
+
+
+@st.composite
+def motions(draw, d):
+    velocity = tuple(draw(st.floats(-1.5, 1.5)) for _ in range(d))
+    bound = draw(st.floats(0, 2))
+    by_speed = draw(st.booleans())
+    age = draw(st.sampled_from([0.0, 0.1]))
+    limits = {"speed": bound} if by_speed else {"acceleration": bound}
+    return Motion(velocity, draw(st.floats(0, 0.1)), draw(st.floats(0, 0.1)), **limits, age=age)
+
+
+def path(motion, rng, times):
+    """Where something that keeps the motion's bounds may be, relative to its measured place: (T, d), by small steps."""
+    d = len(motion.velocity)
+    at = ball(rng, d, motion.position_error)
+    if motion.speed is not None:
+        velocity = ball(rng, d, motion.speed)
+    else:
+        velocity = np.array(motion.velocity) + ball(rng, d, motion.velocity_error)
+    found, now, dt = [], 0.0, 0.01
+    push = ball(rng, d, motion.acceleration or 0.0)
+    for t in times:
+        while now < t - 1e-12:
+            step = min(dt, t - now)
+            if rng.random() < 0.05:
+                push = ball(rng, d, motion.acceleration or 0.0)
+                velocity = velocity if motion.speed is None else ball(rng, d, motion.speed)
+            if motion.speed is None:
+                at = at + velocity * step + 0.5 * push * step * step
+                velocity = velocity + push * step
+            else:
+                at = at + velocity * step
+            now += step
+        found.append(at)
+    return np.array(found)
+
+
+@settings(max_examples=150, deadline=None)
+@given(st.data(), st.integers(0, 10_000))
+def test_what_keeps_its_bounds_stays_on_the_far_side(data, seed):
+    obstacle = data.draw(obstacles())
+    d = len(obstacle.position)
+    motion = data.draw(motions(d))
+    rng = np.random.default_rng(seed)
+    start, nominal = rng.uniform(-4, 4, d), rng.uniform(-4, 4, (PERIODS, d))
+    measured = rng.uniform(0, 0.05, d)
+    near = Movers.of([moving(obstacle, motion)], d)
+    normals, offsets = swept_half_spaces(near, start, nominal, BODY, measured, PERIOD)
+    solid = sample(obstacle, rng, 300)
+    times = PERIOD * np.linspace(0, PERIODS, 6 * PERIODS + 1)
+    for _ in range(5):
+        places = path(motion, rng, motion.age + times)
+        for k in range(PERIODS):
+            a, b = normals[0, k], offsets[0, k]
+            if b == -np.inf:
+                continue
+            assert np.linalg.norm(a) == pytest.approx(1.0)
+            within = places[6 * k : 6 * k + 7]
+            least = ((solid[:, None] + within - start) @ a).min()
+            assert least >= b + BODY + np.abs(a) @ measured - 1e-7
+
+
+@given(obstacles(), st.integers(0, 10_000))
+def test_one_that_has_no_way_to_go_is_one_that_stands(obstacle, seed):
+    """Up to normals that were seen earlier: these may leave more room, never less."""
+    rng = np.random.default_rng(seed)
+    d = len(obstacle.position)
+    ways = np.cumsum(rng.uniform(-0.5, 0.5, (PERIODS + 1, d)), axis=0)
+    start, nominal = ways[0], ways[1:]
+    near = Movers.of([moving(obstacle, Motion((0.0,) * d, 0.0, speed=0.0))], d)
+    normals, offsets = swept_half_spaces(near, start, nominal, BODY, np.zeros(d), PERIOD)
+    still, stops = half_spaces(Shapes.of([obstacle], d), start, nominal, BODY, np.zeros(d))
+    for k in range(PERIODS):
+        both = (ways[k : k + 2] - start).T
+        room, other = (offsets[0, k] - normals[0, k] @ both).min(), (stops[0, k] - still[0, k] @ both).min()
+        if other > -BODY:  # as long as some plane keeps them apart
+            assert room >= other - 1e-9
+
+
+def test_a_walker_that_comes_is_given_way_to():
+    motion = Motion((-1.0, 0.0), 0.03, 0.05, acceleration=1.0)
+    near = Movers.of([Obstacle("cylinder", (1.0, 0.0), (0.2,), motion=motion)], 2)
+    nominal = np.array([[0.05, 0.0], [0.06, 0.0], [0.06, 0.0]])
+    normals, offsets = swept_half_spaces(near, np.zeros(2), nominal, 0.1, np.zeros(2), 0.2)
+    assert np.allclose(normals[0], [1.0, 0.0])
+    t = 0.2 * np.arange(1, 4)
+    assert np.allclose(offsets[0], 0.8 - t - (0.03 + 0.05 * t + 0.5 * t * t) - 0.1)
+
+
+def test_no_number_is_never_free():
+    near = Movers.of([Obstacle("sphere", (1.0, 0.0), (0.3,), motion=Motion((0.0, 0.0), 0.0, speed=1.0))], 2)
+    near.drift[:] = np.nan
+    _, offsets = swept_half_spaces(near, np.zeros(2), np.zeros((2, 2)), BODY, np.zeros(2), PERIOD)
+    assert not (offsets > -np.inf).any()
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.data(), st.integers(0, 10_000))
+def test_who_keeps_the_bounds_is_seen_where_it_may_be(data, seed):
+    rng = np.random.default_rng(seed)
+    motion = data.draw(motions(2))
+    since = 0.2
+    moved = path(motion, rng, [since])[0]
+    now = tuple(moved + ball(rng, 2, motion.position_error))
+    # The velocity now is not drawn with the path: only the place is looked at here.
+    limits = {"speed": motion.speed if motion.speed is not None else 2.0}
+    later = Motion((0.0, 0.0), motion.position_error, before=Sighting((0.0, 0.0), motion.velocity, since), **limits)
+    if motion.speed is not None:
+        assert later.kept(now)
+    wide = Motion(
+        motion.velocity,
+        motion.position_error,
+        motion.velocity_error,
+        acceleration=motion.acceleration or 0.0,
+        before=Sighting((0.0, 0.0), motion.velocity, since),
+    )
+    if motion.speed is None:
+        assert wide.kept(now)
+
+
+def test_who_breaks_the_bound_is_seen_to():
+    before = Sighting((0.0, 0.0), (1.0, 0.0), 0.2)
+
+    def kept(x, velocity=(1.0, 0.0)):
+        return Motion(velocity, 0.01, 0.01, acceleration=1.0, before=before).kept((x, 0.0))
+
+    assert kept(0.2) and kept(0.24) and not kept(0.25) and not kept(0.15)
+    assert kept(0.2, (1.2, 0.05)) and not kept(0.2, (1.25, 0.0))
+
+
+@pytest.mark.parametrize(
+    "motion",
+    [
+        Motion((0.0,), 0.0, speed=1.0),
+        Motion((0.0, np.nan), 0.0, speed=1.0),
+        Motion((0.0, 0.0), -1.0, speed=1.0),
+        Motion((0.0, 0.0), 0.0),
+        Motion((0.0, 0.0), 0.0, acceleration=1.0, speed=1.0),
+        Motion((0.0, 0.0), 0.0, acceleration=np.inf),
+        Motion((0.0, 0.0), 0.0, speed=1.0, before=Sighting((0.0,), (0.0, 0.0), 0.2)),
+    ],
+)
+def test_a_motion_that_is_none_is_refused(motion):
+    with pytest.raises(BadShape) as error:
+        Obstacle("sphere", (0.0, 0.0), (0.3,), motion=motion)
+    assert error.value.field == "motion"
+
+
+def test_what_moves_is_told_from_what_stands():
+    still = Obstacle("sphere", (1.0, 0.0), (0.3,))
+    mover = moving(still, Motion((1.0, 0.0), 0.0, speed=1.0))
+    shapes, movers = parted([still, mover, still], 2)
+    assert len(shapes) == 2 and movers is not None and len(movers) == 1
+    assert parted([still], 2)[1] is None

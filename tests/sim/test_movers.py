@@ -1,0 +1,142 @@
+"""What moves by itself keeps to its bounds and off what stands, and what is told of it holds."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from messaging.rays import Rays
+from messaging.robots import GROUND
+from messaging.shapes import Obstacle, Shapes
+from sim.arenas import draw_arena
+from sim.envs import NavigationEnv
+from sim.ground import GroundRobot
+from sim.lidar import Lidar
+from sim.movers import Crowd, MoverKind, Watch
+from sim.quadrotor import Quadrotor
+from sim.world import closing, staged_arena
+
+KIND = MoverKind(count=(4, 4), radius=0.2, speed=1.2, acceleration=1.0, keep=1.0)
+ROOM = (*closing(2.0, None), Obstacle("box", (0.5, 0.5), (0.6, 0.4), 0.4), Obstacle("cylinder", (-1.0, -0.5), (0.3,)))
+PLACES = np.array([[-1.0, 1.0], [1.2, -1.0], [0.0, -1.5], [-1.5, 0.3]])
+TIMES = np.arange(0.0, 60.0, 0.01)
+
+
+@pytest.fixture(scope="module")
+def walked():
+    crowd = Crowd(KIND, PLACES, Shapes.of(ROOM, 2), seed=3)
+    return [np.array(part) for part in zip(*(crowd.at(t) for t in TIMES), strict=True)]
+
+
+def test_they_never_walk_into_what_stands(walked):
+    distance = Shapes.of(ROOM, 2).distance(walked[0].reshape(-1, 2)).min(axis=0)
+    assert distance.min() >= KIND.radius
+
+
+def test_they_keep_to_their_speed_and_acceleration(walked):
+    places, velocities = walked
+    assert np.linalg.norm(velocities, axis=-1).max() <= KIND.speed + 1e-9
+    assert np.linalg.norm(np.diff(velocities, axis=0), axis=-1).max() <= KIND.acceleration * 0.01 + 1e-9
+    assert np.allclose(np.diff(places, axis=0), 0.5 * 0.01 * (velocities[1:] + velocities[:-1]), atol=1e-3)
+
+
+def test_they_go_about_turn_and_stop(walked):
+    speeds = np.linalg.norm(walked[1], axis=-1)
+    assert speeds.max() > 0.8 and (speeds < 0.01).mean() > 0.02
+    assert (np.ptp(walked[0], axis=0) > 1.0).any(axis=1).all()
+
+
+def test_where_they_are_does_not_depend_on_who_asks_when():
+    one, other = (Crowd(KIND, PLACES, Shapes.of(ROOM, 2), seed=5) for _ in range(2))
+    one.at(7.0)
+    for t in (0.0, 3.33, 1.0):
+        assert np.array_equal(one.at(t)[0], other.at(t)[0])
+
+
+def test_what_is_told_of_them_holds():
+    crowd = Crowd(KIND, PLACES, Shapes.of(ROOM, 2), seed=9)
+    watch = Watch(crowd, np.random.default_rng(0))
+    for k in range(200):
+        time = 0.2 * k
+        seen = watch.look(time)
+        truth = crowd.at(time)
+        for obstacle, place, pace in zip(seen, *truth, strict=True):
+            motion = obstacle.motion
+            assert np.linalg.norm(np.array(obstacle.position) - place) <= motion.position_error
+            assert np.linalg.norm(np.array(motion.velocity) - pace) <= motion.velocity_error
+            assert (motion.before is None) == (k == 0)
+            assert motion.kept(obstacle.position)
+            for later in (0.1, 0.6):
+                ahead = np.array(obstacle.position) + later * np.array(motion.velocity)
+                i = [o is obstacle for o in seen].index(True)
+                assert np.linalg.norm(crowd.at(time + later)[0][i] - ahead) <= motion.radius(later) + 1e-9
+
+
+class Straight(Crowd):
+    """One that walks along x at a constant velocity."""
+
+    def __init__(self, start, pace, dim=2):
+        self._start, self._pace = np.zeros((1, dim)), np.zeros((1, dim))
+        self._start[0, 0], self._pace[0, 0] = start, pace
+        if dim == 3:
+            self._start[0, 2] = 2.0
+        self.kind = KIND
+        self._next = (self._start, self._pace)
+
+    def at(self, time):
+        return self._start + self._pace * time, self._pace
+
+
+def met(vehicle, input, periods=20):
+    """Which contacts there were, and whether anything else was touched."""
+    found = [vehicle.step(np.array(input)) for _ in range(periods)]
+    return any(p.contact_moving for p in found), any(p.contact_standing for p in found), any(p.collision for p in found)
+
+
+def on_the_ground(crowd):
+    return GroundRobot(replace(staged_arena(), crowd=crowd), np.random.default_rng(0))
+
+
+def in_the_air(crowd):
+    arena = replace(staged_arena(start=(0.0, 0.0, 2.0), goal=(4.0, 4.0, 2.0), height=4.0), crowd=crowd)
+    return Quadrotor(arena, np.random.default_rng(0))
+
+
+def test_who_is_run_into_stood_and_who_runs_into_somebody_moved():
+    assert met(on_the_ground(Straight(1.0, -0.5)), (0.0, 0.0), 8) == (False, True, False)
+    assert met(on_the_ground(Straight(0.5, 0.0)), (0.25, 0.0)) == (True, False, False)
+    assert met(on_the_ground(Straight(1.0, 0.5)), (0.25, 0.0)) == (False, False, False)
+
+
+def test_the_same_in_the_air():
+    assert met(in_the_air(Straight(1.5, -1.0, 3)), (0.0, 0.0, 0.0), 7) == (False, True, False)
+    assert met(in_the_air(Straight(1.5, 0.0, 3)), (2.0, 0.0, 0.0)) == (True, False, False)
+
+
+def test_a_lidar_sees_them_where_they_are():
+    crowd = Straight(1.0, -0.5)
+    lidar = Lidar(replace(staged_arena(), crowd=crowd), Rays(np.array([[1.0, 0.0], [0.0, 1.0]]), 10.0))
+    for time, there in ((0.0, 0.8), (1.0, 0.3)):
+        lidar.at(time)
+        assert lidar.cast(np.zeros(2)) == pytest.approx([there, 5.0])
+
+
+def test_an_episode_ends_with_a_contact_and_tells_of_what_may_come():
+    env = NavigationEnv(draw=lambda *_: replace(staged_arena(), crowd=Straight(1.0, -0.5)))
+    _, info = env.reset(seed=0)
+    told = [o for o in info["obstacles"] if o.motion is not None]
+    assert len(told) == 1 and told[0].motion.acceleration == KIND.acceleration
+    ended = False
+    while not ended:
+        _, reward, ended, _, info = env.step(np.zeros(2, np.float32))
+    assert info["contact_standing"] and not info["contact_moving"] and not info["collision"] and reward < -40.0
+
+
+def test_the_crowd_of_an_arena_is_drawn_with_it_and_the_others_stay_as_they_were():
+    arena = draw_arena("walkers", np.random.default_rng(4), GROUND)
+    again = draw_arena("walkers", np.random.default_rng(4), GROUND)
+    assert arena.crowd is not None and len(arena.crowd) >= 3
+    assert np.array_equal(arena.crowd.at(9.0)[0], again.crowd.at(9.0)[0])
+    places, _ = arena.crowd.at(0.0)
+    assert np.linalg.norm(places - arena.start[:2], axis=1).min() > KIND.keep
+    assert draw_arena("default", np.random.default_rng(4), GROUND).crowd is None
