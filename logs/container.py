@@ -22,7 +22,7 @@ from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, Chunk, Metadata, Schema
 
 MAGIC = b"\x89MCAP0\r\n"
-LARGEST = 2**30  # bytes of a chunk's content: more is damage, not data
+LARGEST = 2**27  # bytes of a chunk's content: more is damage, not data
 BROKEN = (McapError, struct.error, ValueError, EOFError, RuntimeError, zstandard.ZstdError)
 
 SCHEMA, CHANNEL, MESSAGE = int(Opcode.SCHEMA), int(Opcode.CHANNEL), int(Opcode.MESSAGE)
@@ -143,18 +143,27 @@ def _plain(opcode: int, content: bytes, tables: _Tables) -> Iterator[Item]:
 
 
 def _uncompressed(content: bytes) -> bytes:
-    """The records in a chunk. Raises one of `BROKEN`."""
+    """The records in a chunk, in memory for as many bytes as it says that it holds, whatever is packed in it.
+
+    Raises one of `BROKEN`.
+    """
     chunk = Chunk.read(ReadDataStream(BytesIO(content)))
-    if chunk.uncompressed_size > LARGEST:
-        raise ValueError(f"a chunk says that it holds {chunk.uncompressed_size} bytes")
+    size = chunk.uncompressed_size
+    if size > LARGEST:
+        raise ValueError(f"a chunk says that it holds {size} bytes")
     if chunk.compression == "zstd":
-        data = zstandard.decompress(chunk.data, chunk.uncompressed_size)
+        packed = zstandard.frame_content_size(chunk.data)  # -1: it does not say
+        if packed not in (-1, size):  # `decompress` would believe it
+            raise ValueError(f"a chunk says that it holds {size} bytes, and what is in it that it is {packed}")
+        data = zstandard.decompress(chunk.data, size)
     elif chunk.compression == "lz4":
-        data = lz4.frame.decompress(chunk.data)
+        data = lz4.frame.LZ4FrameDecompressor().decompress(chunk.data, size + 1)
     elif chunk.compression == "":
         data = chunk.data
     else:
         raise ValueError(f"a chunk is compressed by {chunk.compression!r}, which we do not know")
+    if len(data) != size:
+        raise ValueError(f"a chunk says that it holds {size} bytes, and holds {len(data)} or more")
     if chunk.uncompressed_crc and zlib.crc32(data) != chunk.uncompressed_crc:
         raise ValueError("the checksum of a chunk is wrong")
     return data

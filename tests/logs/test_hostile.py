@@ -2,18 +2,23 @@
 
 import json
 import math
+import struct
+import tracemalloc
 from collections import deque
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import lz4.frame
 import pytest
+import zstandard
 
 from deploy.commands.watch import _show
 from logs.analysis import Look, analysed
 from logs.foxglove import Pictures
 from logs.reader import open_log
 from logs.recorder import Inbox, Recording
+from logs.recover import recover
 from logs.segment import MOST_CHANNELS, Entry
 from logs.watch.board import Board
 from logs.watch.server import encode
@@ -103,3 +108,39 @@ def test_an_analysis_counts_what_it_cannot_handle_and_goes_on(say: Say, tmp_path
     figures = found.figures()
     assert figures["actors"]["b"]["episodes"] == 1 and figures["malformed"] >= 5
     found.pictures()
+
+
+def chunk_of(size: int, compression: str, frame: bytes) -> bytes:
+    """A chunk's record that says it holds so many bytes."""
+    name = compression.encode()
+    body = struct.pack("<QQQII", 0, 0, size, 0, len(name)) + name + struct.pack("<Q", len(frame)) + frame
+    return struct.pack("<BQ", 6, len(body)) + body
+
+
+def packed(compression: str, said: bool) -> bytes:
+    """64 MiB of zeros in a few kB; `said`: the frame itself tells how large it is."""
+    zeros = bytes(2**26)
+    if compression == "lz4":
+        return bytes(lz4.frame.compress(zeros, store_size=said))
+    return zstandard.ZstdCompressor(write_content_size=said).compress(zeros)
+
+
+@pytest.mark.parametrize("said", [True, False])
+@pytest.mark.parametrize("compression", ["zstd", "lz4"])
+@pytest.mark.parametrize("size", [0, 1000, 2**40])
+def test_a_chunk_that_lies_about_its_size_is_damage_and_not_unpacked(
+    compression: str, said: bool, size: int, tmp_path: Path, say: Say
+) -> None:
+    path = tmp_path / "run.mcap"
+    record(path, [say("log/a", pb.LogLine(text="before"))])
+    whole = path.read_bytes()
+    bomb = chunk_of(size, compression, packed(compression, said))
+    path.write_bytes(whole[:8] + bomb + whole[8:])
+    tracemalloc.start()
+    log = open_log(path)
+    assert [record.message.text for record in log if record.topic == "log"] == ["before"]
+    recovery = recover(path, tmp_path / "whole.mcap")
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert peak < 2**23, f"{peak} bytes"
+    assert [cut.lost for cut in log.cuts] == [len(bomb)] and recovery.lost == len(bomb)
