@@ -1,7 +1,8 @@
 """The report: one HTML page about logs that needs nothing but itself, in the browser or on paper.
 
-Styles, scripts and data are in the page; its own policy forbids every request to another host. Tables are written here,
-so that they can be read without scripts; drawings are made by the scripts, from the data in the page.
+Styles, scripts and data are in the page; its own policy forbids every request to another host, and every script and
+style but these, by their hashes. Tables are written here, so that they can be read without scripts; drawings are made by the
+scripts, from the data in the page.
 """
 
 from __future__ import annotations
@@ -9,7 +10,9 @@ from __future__ import annotations
 import json
 import math
 import time
+from base64 import b64encode
 from collections.abc import Iterable
+from hashlib import sha256
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -36,7 +39,7 @@ RATES = (  # name, of what, in words
 def render(figures: Figures, pictures: Figures) -> str:
     """The page about what an `Analysis` gave."""
     environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
-    environment.filters.update(number=number, percent=percent, moment=moment, pretty=pretty, raw=raw)
+    environment.filters.update(number=number, percent=percent, moment=moment, pretty=pretty, raw=raw, hashed=hashed)
     template = environment.from_string(_text("report.html.j2"))
     drawn = {name: figures[name] for name in DRAWN} | pictures
     drawn["runs"] = {label: {"seconds": run["seconds"]} for label, run in figures["runs"].items()}
@@ -47,7 +50,7 @@ def render(figures: Figures, pictures: Figures) -> str:
         parts=PARTS,
         missing=missing(figures),
         style="\n".join(map(_text, STYLES)),
-        script="\n".join(map(_text, SCRIPTS)),
+        script="\n".join(['"use strict";', *map(_text, SCRIPTS)]),
         data=embedded(drawn),
         kept=sum(len(gallery["episodes"]) for gallery in pictures["galleries"].values()),
     )
@@ -90,6 +93,11 @@ def embedded(data: Any) -> str:
     """JSON that may stand in a script element: nothing in it can end the element."""
     text = json.dumps(finite(data), separators=(",", ":"), allow_nan=False)
     return text.replace("<", "\\u003c").replace("\u2028", "\\u2028").replace("\u2029", "\\u2029")
+
+
+def hashed(text: str) -> str:
+    """As a content security policy names a script or a style."""
+    return f"sha256-{b64encode(sha256(text.encode()).digest()).decode()}"
 
 
 def finite(value: Any) -> Any:

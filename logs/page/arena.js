@@ -49,7 +49,7 @@ function path(v, episode, last, faint) {
     previous = here;
   }
   flush();
-  return parts.join("");
+  return parts;
 }
 
 /** The tube of a step: a box for each step of its plan, which runs through their centres. */
@@ -61,14 +61,14 @@ function tube(v, t, footprint) {
   }
   const points = [t.from, ...t.boxes].map(([x, y]) => `${v.x(x).toFixed(1)},${v.y(y).toFixed(1)}`).join(" ");
   parts.push(tag("polyline", { points, fill: "none", stroke: "#4b2a8c", "stroke-width": 1.6, "stroke-dasharray": "3 2" }));
-  return parts.join("");
+  return parts;
 }
 
 function robot(v, episode, k) {
   const x = v.x(episode.x[k]), y = v.y(episode.y[k]), r = Math.max(4, v.per * episode.footprint);
   const parts = [tag("circle", { cx: x, cy: y, r, fill: "#1b2430", "fill-opacity": 0.12, stroke: "#1b2430", "stroke-width": 1.3 })];
   if (episode.heading) parts.push(tag("line", { x1: x, y1: y, x2: x + r * Math.cos(episode.heading[k]), y2: y - r * Math.sin(episode.heading[k]), stroke: "#1b2430", "stroke-width": 1.6 }));
-  return parts.join("");
+  return parts;
 }
 
 /** The episode at step `k`, within `box` or all of it. */
@@ -84,5 +84,5 @@ function arena(episode, k, size, box = null) {
   const quarter = v.width / v.per / 4, power = 10 ** Math.floor(Math.log10(quarter));
   const length = power * [5, 2, 1].find((m) => m * power <= quarter);
   parts.push(tag("path", { d: `M8 ${v.height - 12} v4 h${v.per * length} v-4`, fill: "none", stroke: "#1b2430" }), label(10, v.height - 14, `${figure(length)} m`));
-  return drawing(v.width, v.height, `${episode.actor}, episode ${episode.episode}, step ${episode.first + k}`, parts.join(""));
+  return drawing(v.width, v.height, `${episode.actor}, episode ${episode.episode}, step ${episode.first + k}`, parts);
 }

@@ -10,7 +10,7 @@ function whiskers() {
     if (low !== "") parts.push(tag("line", { x1: x(+low), x2: x(+high), y1: 10, y2: 10, stroke: "#2b6cb8", "stroke-width": 5, "stroke-linecap": "round", opacity: 0.35 }));
     parts.push(tag("circle", { cx: x(+rate), cy: 10, r: 4, fill: "#2b6cb8" }));
     parts.push(label(310, 14, `of ${percent(most)}`, { "text-anchor": "end" }));
-    cell.innerHTML = drawing(312, 20, `${percent(+rate)}, interval ${percent(+low)} to ${percent(+high)}`, parts.join(""));
+    cell.innerHTML = drawing(312, 20, `${percent(+rate)}, interval ${percent(+low)} to ${percent(+high)}`, parts);
   }
 }
 
@@ -52,7 +52,7 @@ function curve(bins, what) {
   });
   parts.push(label(frame.right, 206, "steps of all actors", { "text-anchor": "end" }));
   const box = element("div");
-  box.innerHTML = drawing(496, 212, what.title, parts.join(""));
+  box.innerHTML = drawing(496, 212, what.title, parts);
   hovers(box, (px) => {
     const k = bins.findIndex((b) => x(b.until) >= px);
     if (k < 0 || px < frame.left) return null;
@@ -105,7 +105,7 @@ function bars(kinds, part) {
   for (const v of marks.filter((v) => v >= low && v <= high)) out.push(label(at(v), bottom + 16, figure(v), { "text-anchor": "middle" }), tag("line", { x1: at(v), x2: at(v), y1: bottom, y2: bottom + 4, stroke: "#aab4c0" }));
   out.push(label(frame.right, bottom + 32, "ms, logarithmic; each kind to its own height", { "text-anchor": "end" }));
   const box = element("div");
-  box.innerHTML = drawing(1040, bottom + 38, `latency of decisions, ${part}`, out.join(""), { "data-part": part });
+  box.innerHTML = drawing(1040, bottom + 38, `latency of decisions, ${part}`, out, { "data-part": part });
   return box;
 }
 
@@ -134,7 +134,7 @@ function map(cells, cell, what, value, most, form) {
   for (const v of ticks(box.y0, box.y1, 5)) out.push(label(frame.left - 6, y(v) + 4, figure(v), { "text-anchor": "end" }));
   for (let k = 0; k <= 20; k++) out.push(tag("rect", { x: frame.right + 12, y: frame.bottom - 8 - k * 8, width: 12, height: 8.3, fill: heat(k / 20) }));
   for (const k of [0, 10, 20]) out.push(label(frame.right + 29, frame.bottom - k * 8, form(most * k / 20)));
-  return drawing(frame.right + 76, frame.bottom + 24, `${what}, from above`, out.join(""));
+  return drawing(frame.right + 76, frame.bottom + 24, `${what}, from above`, out);
 }
 
 function places(target, robots) {
@@ -177,6 +177,6 @@ function timeline(target, { lives, lines, bin_s, steps }) {
   });
   for (const t of ticks(0, end - begin, 8)) out.push(label(x(t), frame.bottom + 14, `${figure(t, 6)} s`, { "text-anchor": "middle" }));
   const box = element("div");
-  box.innerHTML = drawing(1040, frame.bottom + 22, "health of the processes", out.join(""));
+  box.innerHTML = drawing(1040, frame.bottom + 22, "health of the processes", out);
   target.append(box, legend([["#4f9d78", "alive"], [KINDS.a.color, "not heard of from here on; an error"], ["#f2c14e", "a warning"], ["#1b2430", "started again"]]));
 }

@@ -32,7 +32,7 @@ function strip(episode, k) {
   parts.push(tag("polyline", { points: episode.clearance.map((c, i) => `${x(i).toFixed(1)},${y(c).toFixed(1)}`).join(" "), fill: "none", stroke: "#5d6b7c", "stroke-width": 1.3 }));
   episode.clearance.forEach((c, i) => { if ("da".includes(episode.kinds[i])) parts.push(tag("circle", { cx: x(i), cy: y(c), r: 2.3, fill: KINDS[episode.kinds[i]].color })); });
   parts.push(tag("line", { x1: x(k), x2: x(k), y1: frame.top, y2: frame.bottom, stroke: "#1b2430", "stroke-dasharray": "3 3" }));
-  return drawing(400, 132, "clearance over the episode", parts.join(""));
+  return drawing(400, 132, "clearance over the episode", parts);
 }
 
 class Picker {

@@ -7,20 +7,26 @@ const KINDS = {
   n: { name: "no filter", color: "#7b8794" },
 };
 
-function escaped(text) {
-  return String(text).replace(/[&<>"]/g, (c) => ({ "&": "&amp;", "<": "&lt;", ">": "&gt;", '"': "&quot;" })[c]);
+/** What `tag` has made. Everything else that comes into a drawing is a text, and is escaped. */
+class Markup extends String {}
+
+/** THE way of a value into markup, and the only one. */
+function escaped(value) {
+  if (value instanceof Markup) return value;
+  if (Array.isArray(value)) return value.map(escaped).join("");
+  return String(value).replace(/[&<>"']/g, (c) => `&#${c.charCodeAt(0)};`);
 }
 
-/** An SVG element as text; attributes without a value are left out. */
+/** An SVG element; attributes without a value are left out. `content`: texts, elements, or arrays of them. */
 function tag(name, attributes, content = "") {
   const said = Object.entries(attributes)
     .filter(([, value]) => value !== null && value !== undefined)
-    .map(([key, value]) => ` ${key}="${typeof value === "number" ? +value.toFixed(3) : escaped(value)}"`);
-  return `<${name}${said.join("")}>${content}</${name}>`;
+    .map(([key, value]) => ` ${key}="${typeof value === "number" ? +value.toFixed(3) : escaped(String(value))}"`);
+  return new Markup(`<${name}${said.join("")}>${escaped(content)}</${name}>`);
 }
 
 function label(x, y, text, attributes = {}) {
-  return tag("text", { x, y, ...attributes }, escaped(text));
+  return tag("text", { x, y, ...attributes }, String(text));
 }
 
 function drawing(width, height, what, content, attributes = {}) {
@@ -32,6 +38,7 @@ function element(name, attributes = {}, ...children) {
   const made = document.createElement(name);
   for (const [key, value] of Object.entries(attributes)) {
     if (key.startsWith("on")) made.addEventListener(key.slice(2), value);
+    else if (key === "style") made.style.cssText = value; // the page's policy forbids the attribute
     else if (value !== null) made.setAttribute(key, value);
   }
   made.append(...children);
@@ -85,7 +92,7 @@ function axes(frame, x, y, xs, ys, form = {}) {
     parts.push(label(x(value), bottom + 16, (form.x || figure)(value), { "text-anchor": "middle" }));
   }
   parts.push(tag("line", { x1: left, x2: right, y1: bottom, y2: bottom, stroke: "#aab4c0" }));
-  return parts.join("");
+  return parts;
 }
 
 function legend(entries) {

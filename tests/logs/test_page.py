@@ -189,3 +189,60 @@ def test_numbers_are_for_people() -> None:
 def test_what_a_page_is_made_of_is_packaged() -> None:
     folder = Path(__file__).parents[2] / "logs" / "page"
     assert {item.name for item in folder.iterdir() if item.suffix in (".j2", ".css", ".js")} == set(names())
+
+
+HOSTILE = '"><img src=x onerror="document.title=\'owned\'"></title></text><script>document.title="owned"</script>'
+
+
+def hostile(folder: Path) -> Path:
+    """A page of figures in which every text that a log can choose is a script."""
+
+    analysis = analysed(mixed(folder / "log"), Look(pictures=True))
+    figures, pictures = (json.loads(json.dumps(part)) for part in (analysis.figures(), analysis.pictures()))
+    figures["processes"] |= {HOSTILE: next(iter(figures["processes"].values()))}
+    figures["topics"] |= {HOSTILE: {"messages": 1, "missing": 1, "duplicates": 1}}
+    figures["training"] = {HOSTILE: next(iter(figures["training"].values()))} | figures["training"]
+    timeline = pictures["timeline"]
+    timeline["lives"] += [life | {"process": HOSTILE} for life in timeline["lives"]]
+    timeline["lines"].append({"t": 0.0, "process": HOSTILE, "level": HOSTILE, "text": HOSTILE})
+    pictures["places"] = {HOSTILE: next(iter(pictures["places"].values()))} | pictures["places"]
+    for gallery in pictures["galleries"].values():
+        for episode in gallery["episodes"]:
+            episode |= {"actor": HOSTILE, "robot": HOSTILE, "arena": HOSTILE, "outcome": HOSTILE}
+            for tube in episode["tubes"].values():
+                tube["reason"] = HOSTILE
+    path = folder / "hostile.html"
+    path.write_text(render(figures, pictures), encoding="utf-8")
+    return path
+
+
+def test_no_name_in_a_log_is_a_script_of_the_page(tmp_path: Path) -> None:
+    if CHROMIUM is None:
+        pytest.skip("there is no Chromium: the report was not driven in a browser")
+    path = hostile(tmp_path)
+    bare = tmp_path / "bare.html"  # without its policy: the escaping alone must do
+    bare.write_text(re.sub(r'<meta http-equiv="Content-Security-Policy"[^>]*>', "", path.read_text()))
+    with Page(tmp_path / "browser") as page:
+        for place in (bare, path):
+            page.open(place.as_uri())
+            page.until("document.documentElement.dataset.drawn === 'yes'")
+            assert page.value("document.querySelectorAll('img, svg script, main script').length") == 0
+            assert page.value("document.title").startswith("Brakeline: ")
+        assert page.complaints == []
+
+
+def test_its_policy_lets_no_script_or_style_run_but_its_own(
+    report: tuple[Path, dict[str, Any]], tmp_path: Path
+) -> None:
+    policy = re.findall(r'http-equiv="Content-Security-Policy" content="([^"]*)"', report[0].read_text())
+    assert len(policy) == 1 and "unsafe" not in policy[0] and policy[0].count("'sha256-") == 2
+    if CHROMIUM is None:
+        pytest.skip("there is no Chromium: the report was not driven in a browser")
+    injected = tmp_path / "injected.html"
+    tricks = "<script>document.title = 'owned'</script><img src='data:,' onerror=\"document.title = 'owned'\">"
+    injected.write_text(report[0].read_text().replace("<main>", f"<main>{tricks}", 1))
+    with Page(tmp_path / "browser") as page:
+        page.open(injected.as_uri())
+        page.until("document.documentElement.dataset.drawn === 'yes'")
+        assert page.value("document.title").startswith("Brakeline: ")
+        assert any("Content Security Policy" in complaint for complaint in page.complaints)
