@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 
 from deploy.commands.common import Endpoints, Flags, console
 from logs.watch.board import Board
-from logs.watch.live import Live
+from logs.watch.live import ORIGINS, Live
 from logs.watch.server import Server
 from messaging.bus import Bus, Sample
 from messaging.tolerant import Tolerance
@@ -32,6 +32,8 @@ class Watch:
     """Of the web page; 0: any."""
     foxglove_port: int = 8765
     """Of the server that Foxglove connects to; 0: any; -1: none."""
+    origins: tuple[str, ...] = ORIGINS
+    """Of the web pages that may connect there besides programs, e.g. https://app.foxglove.dev."""
     json: bool = False
     """Print where to look as one JSON object on stdout."""
 
@@ -42,7 +44,7 @@ class Watch:
             bus = stack.enter_context(Bus(self.endpoints.bus(), f"watch-{time.time_ns() % 10**6}"))
             server = stack.enter_context(Server(board.view, self.host, self.port))
             if self.foxglove_port >= 0:
-                live = stack.enter_context(Live(self.host, self.foxglove_port))
+                live = stack.enter_context(Live(self.host, self.foxglove_port, origins=self.origins))
             stop = stack.enter_context(asked())
             for topic in RECORDED:
                 bus.subscribe(topic, inbox.append)

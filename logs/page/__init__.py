@@ -1,8 +1,8 @@
 """The report: one HTML page about logs that needs nothing but itself, in the browser or on paper.
 
 Styles, scripts and data are in the page; its own policy forbids every request to another host, and every script and
-style but these, by their hashes. Tables are written here, so that they can be read without scripts; drawings are made by the
-scripts, from the data in the page.
+style but these, by their hashes. Tables are written here, so that they can be read without scripts; drawings are made
+by the scripts, from the data in the page.
 """
 
 from __future__ import annotations

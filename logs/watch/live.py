@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections import deque
+from collections.abc import Collection
 from types import TracebackType
 from typing import Any, Self
 
@@ -15,21 +16,25 @@ from mcap_protobuf.schema import build_file_descriptor_set
 from logs.foxglove import ROOT, Pictures
 from logs.recorder import entry
 from logs.segment import Entry
+from logs.watch.gate import Gate, hidden_host
 from messaging.bus import Sample
 
 RATE = 20.0  # pictures a second and robot
+ORIGINS = ("https://app.foxglove.dev",)  # Foxglove in a browser
 
 
 class Live:
     """A Foxglove server at `url`, from `with` to the end of the block. `take` is for one thread.
 
     Raises:
-        RuntimeError: on entering, when the port is taken.
+        OSError: on entering, when the port is taken.
     """
 
-    def __init__(self, host: str = "127.0.0.1", port: int = 0, rate: float = RATE) -> None:
-        """`port` 0: a free one."""
-        self.host, self.port = host, port
+    def __init__(
+        self, host: str = "127.0.0.1", port: int = 0, rate: float = RATE, origins: Collection[str] = ORIGINS
+    ) -> None:
+        """`port` 0: a free one; origins: of the pages that may connect; programs that are no browser always may."""
+        self.host, self.port, self._origins = host, port, origins
         self._pictures = Pictures(rate)
         self._context = foxglove.Context()
         self._channels: dict[str, foxglove.Channel] = {}
@@ -39,14 +44,21 @@ class Live:
 
     def __enter__(self) -> Self:
         listener: Any = _Listener(self._wanted)
+        hidden = hidden_host()
         self._server = foxglove.start_server(
-            name="brakeline", host=self.host, port=self.port, context=self._context, server_listener=listener
+            name="brakeline", host=hidden, port=0, context=self._context, server_listener=listener
         )
-        self.port = self._server.port
+        try:
+            self._gate = Gate(self.host, self.port, (hidden, self._server.port), self._origins)
+        except OSError:
+            self._server.stop()
+            raise
+        self.port = self._gate.port
         self.url = f"ws://{self.host}:{self.port}"
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None) -> None:
+        self._gate.close()
         self._server.stop()
 
     def take(self, sample: Sample) -> None:

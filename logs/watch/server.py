@@ -1,6 +1,7 @@
 """Serves the live page: a few static files, and the board's view as server-sent events.
 
-It answers nobody but this machine unless told to, and the page asks nobody else: its policy forbids it.
+It answers nobody but this machine unless told to, no page but its own in any case, and the page asks nobody else: its
+policy forbids it.
 """
 
 from __future__ import annotations
@@ -16,7 +17,10 @@ from importlib.resources import files
 from types import TracebackType
 from typing import Any, Self
 
+from logs.watch.visitors import refusal
+
 RATE = 10.0  # Hz of events
+PATIENCE = 10.0  # s for a request, and for a reader that does not read
 FILES = {
     "/": ("page.html", "text/html; charset=utf-8"),
     "/page.js": ("page.js", "text/javascript; charset=utf-8"),
@@ -43,7 +47,7 @@ class Server:
     def __init__(self, view: View, host: str = "127.0.0.1", port: int = 0) -> None:
         """`port` 0: a free one."""
         self._ended = threading.Event()
-        self._http = ThreadingHTTPServer((host, port), partial(_Handler, view, self._ended))
+        self._http = ThreadingHTTPServer((host, port), partial(_Handler, view, self._ended, host))
         self._http.daemon_threads = True
         shown = f"[{host}]" if ":" in host else host
         self.url = f"http://{shown}:{self._http.server_address[1]}/"
@@ -61,14 +65,18 @@ class Server:
 class _Handler(BaseHTTPRequestHandler):
     protocol_version = "HTTP/1.1"
 
-    def __init__(self, view: View, ended: threading.Event, *rest: Any) -> None:
-        self._view, self._ended = view, ended
+    timeout = PATIENCE
+
+    def __init__(self, view: View, ended: threading.Event, host: str, *rest: Any) -> None:
+        self._view, self._ended, self._host = view, ended, host
         super().__init__(*rest)
 
     def do_GET(self) -> None:
         path = self.path.split("?", 1)[0]
         try:
-            if path == "/events":
+            if why := refusal(self.headers, self._host, self.connection.getsockname()[1]):
+                self._send(403, "text/plain; charset=utf-8", f"{why}\n".encode(errors="replace"))
+            elif path == "/events":
                 self._events()
             elif path == "/view.json":
                 self._send(200, "application/json", encode(self._view()).encode())
@@ -77,7 +85,7 @@ class _Handler(BaseHTTPRequestHandler):
                 self._send(200, kind, (files("logs.watch") / name).read_bytes())
             else:
                 self._send(404, "text/plain; charset=utf-8", b"there is only /\n")
-        except ConnectionError:  # whoever looked has gone
+        except (ConnectionError, TimeoutError):  # whoever looked has gone
             self.close_connection = True
 
     def _send(self, status: int, kind: str, body: bytes) -> None:

@@ -1,0 +1,89 @@
+"""Who may look at a running system: no stranger's page, under whatever name it asks."""
+
+import http.client
+import json
+import socket
+from collections.abc import Iterator
+
+import psutil
+import pytest
+from websockets.exceptions import InvalidStatus
+from websockets.sync.client import connect
+
+from logs.watch.board import Board
+from logs.watch.live import Live
+from logs.watch.server import Server
+
+
+@pytest.fixture
+def server() -> Iterator[Server]:
+    with Server(Board().view) as server:
+        yield server
+
+
+def asked(server: Server, path: str, **headers: str) -> tuple[int, bytes]:
+    """Status and body; `Host` is the server's unless given; an empty one is left out."""
+    port = int(server.url.rsplit(":", 1)[1].strip("/"))
+    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=10.0)
+    try:
+        connection.putrequest("GET", path, skip_host=True)
+        for name, value in ({"Host": f"127.0.0.1:{port}"} | headers).items():
+            if value:
+                connection.putheader(name, value.format(port=port))
+        connection.endheaders()
+        answer = connection.getresponse()
+        return answer.status, answer.read()
+    finally:
+        connection.close()
+
+
+@pytest.mark.parametrize("host", ["127.0.0.1:{port}", "localhost:{port}", "[::1]:{port}", "192.168.1.7:{port}"])
+def test_our_own_page_is_answered(server: Server, host: str) -> None:
+    status, body = asked(server, "/view.json", Host=host, Origin=f"http://{host}")
+    assert status == 200 and json.loads(body)["robots"] == []
+
+
+@pytest.mark.parametrize("path", ["/", "/view.json", "/events", "/page.js"])
+@pytest.mark.parametrize(
+    "headers",
+    [
+        *({"Host": host} for host in ("evil", "evil:{port}", "evil.localhost:{port}", "127.0.0.1.evil.com:{port}")),
+        *({"Host": host} for host in ("", "127.0.0.1", "127.0.0.1:1", "a@127.0.0.1:{port}", "[:{port}", "x" * 2000)),
+        *({"Origin": origin} for origin in ("http://evil", "http://evil:{port}", "null", "https://127.0.0.1:{port}")),
+    ],
+    ids=str,
+)
+def test_a_strangers_page_is_not(server: Server, path: str, headers: dict[str, str]) -> None:
+    status, body = asked(server, path, **headers)
+    assert status == 403 and b"robots" not in body
+
+
+@pytest.fixture
+def live() -> Iterator[Live]:
+    with Live() as live:
+        yield live
+
+
+@pytest.mark.parametrize("origin", [None, "https://app.foxglove.dev"])
+def test_foxglove_is_let_in(live: Live, origin: str | None) -> None:
+    with connect(live.url, subprotocols=["foxglove.sdk.v1"], origin=origin) as visit:  # type: ignore[arg-type, list-item]
+        assert json.loads(visit.recv(timeout=10.0))["op"] == "serverInfo"
+
+
+@pytest.mark.parametrize(
+    "headers",
+    [{"Origin": "https://evil"}, {"Origin": "null"}, {"Host": "evil"}, {"Origin": "https://app.foxglove.dev.evil"}],
+)
+def test_a_strangers_page_hears_nothing_of_what_foxglove_is_told(live: Live, headers: dict[str, str]) -> None:
+    url = live.url.replace("127.0.0.1", headers.get("Host", "127.0.0.1"))
+    there = socket.create_connection(("127.0.0.1", live.port))
+    with there, pytest.raises(InvalidStatus) as refused:
+        connect(url, sock=there, subprotocols=["foxglove.sdk.v1"], origin=headers.get("Origin"))  # type: ignore
+    assert refused.value.response.status_code == 403
+
+
+def test_the_server_behind_the_gate_is_where_no_page_looks(live: Live) -> None:
+    listening = [c.laddr for c in psutil.Process().net_connections("tcp") if c.status == psutil.CONN_LISTEN]
+    assert live.port in {place.port for place in listening if place.ip == "127.0.0.1"}
+    hidden = [place.ip for place in listening if place.ip not in ("127.0.0.1", "0.0.0.0", "::", "::1")]
+    assert len(hidden) == 1 and hidden[0].startswith("127.")
