@@ -38,7 +38,7 @@ class Process:
     its way: stderr is for who catches it. The first Health follows `announce`, or a second (not if `reserved`).
 
     Raises:
-        Unreachable: on entering, when there is no bus at `settings`.
+        Unreachable, Insecure, BadKeys: on entering, when there is no bus at `settings`, or not such a one.
     """
 
     def __init__(self, settings: BusSettings, source: str, stderr: bool = True, reserved: bool = False) -> None:
@@ -57,10 +57,14 @@ class Process:
 
     def __enter__(self) -> Self:
         self.bus = Bus(self.settings, self.source)
+        if self.settings.warning:
+            self.notes["security"] = self.settings.warning
         self._health = self.bus.publisher(HEALTH)
         self._start_logging()
         if threading.current_thread() is threading.main_thread():
             self._signals = {number: signal.signal(number, self._asked) for number in (signal.SIGINT, signal.SIGTERM)}
+        if self.settings.warning:
+            log.warning("%s", self.settings.warning)
         self._pulse = threading.Thread(target=self._beat, name="health", daemon=True)
         self._pulse.start()
         return self

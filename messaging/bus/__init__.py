@@ -1,18 +1,21 @@
 """The bus: publishers, subscribers, questions and answers, and who is alive, over Zenoh.
 
-A process that is given `listen` is a router; the others are clients of one of the `connect` endpoints.
+A process that is given `listen` is a router; the others are clients of one of the `connect` endpoints. With keys all show
+who they are, and the router lets each say and hear what the table of topics grants it.
 """
 
-from messaging.bus.errors import BusError, Late, Malformed, NoReply, Refused, Unreachable
+from messaging.bus.errors import BadKeys, BusError, Insecure, Late, Malformed, NoReply, Refused, Unreachable
 from messaging.bus.publisher import Publisher
 from messaging.bus.session import Bus
 from messaging.bus.settings import BusSettings, configuration
 from messaging.bus.subscription import Listener, Sample, Subscription
 
 __all__ = [
+    "BadKeys",
     "Bus",
     "BusError",
     "BusSettings",
+    "Insecure",
     "Late",
     "Listener",
     "Malformed",

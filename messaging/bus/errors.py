@@ -18,6 +18,14 @@ class Unreachable(BusError):
     """No router answered at any endpoint, or an endpoint cannot be listened on."""
 
 
+class Insecure(BusError):
+    """Others could get at this bus, and nothing would tell who they are."""
+
+
+class BadKeys(BusError):
+    """A folder of keys does not hold what is needed; the message says what."""
+
+
 class NoReply(BusError):
     """Nobody serves this question, or who served it went away."""
 

@@ -19,6 +19,7 @@ import zenoh
 from zenoh.handlers import FifoChannel, RingChannel
 
 from messaging import brakeline_pb2 as pb
+from messaging.bus.access import ALIVE
 from messaging.bus.errors import Late, NoReply, Refused, typed
 from messaging.bus.keys import exact_key, key_of
 from messaging.bus.publisher import Publisher
@@ -43,6 +44,7 @@ class Bus:
     Raises:
         Unreachable: no router answered within `patience`, or an endpoint cannot be listened on.
         ValueError: no endpoint, or a name that cannot be part of a key.
+        Insecure, BadKeys: no keys where there must be some, or not those of `source`.
     """
 
     def __init__(self, settings: BusSettings, source: str) -> None:
@@ -56,10 +58,10 @@ class Bus:
         self._publishers: dict[str, Publisher] = {}
         self._queriers: dict[tuple[str, float], zenoh.Querier] = {}
         self._subscriptions: list[Subscription] = []
-        self._telemetry = open_session(settings)
+        self._telemetry = open_session(settings, source)
         # A router is one session; the two links of each client end in it separately.
-        self._queries = self._telemetry if settings.listen else open_session(settings)
-        self._token = self._telemetry.liveliness().declare_token(self._full(f"alive/{source}"))
+        self._queries = self._telemetry if settings.listen else open_session(settings, source)
+        self._token = self._telemetry.liveliness().declare_token(self._full(ALIVE.format(source=source)))
 
     def __enter__(self) -> Self:
         return self
@@ -163,13 +165,13 @@ class Bus:
 
     def living(self, timeout: float = 1.0) -> frozenset[str]:
         """The sources that are alive now, this one included."""
-        replies: Iterable[zenoh.Reply] = self._telemetry.liveliness().get(self._full("alive/*"), timeout=timeout)
+        replies: Iterable[zenoh.Reply] = self._telemetry.liveliness().get(self._full(ALIVE.format(source="*")), timeout=timeout)
         return frozenset(str(reply.ok.key_expr).rsplit("/", 1)[1] for reply in replies if reply.ok is not None)
 
     def watch(self, handler: Callable[[str, bool], None]) -> Subscription:
         """Call `handler(source, alive)` for each source that is alive now, then whenever one comes or goes."""
         receiver = self._telemetry.liveliness().declare_subscriber(
-            self._full("alive/*"), FifoChannel(FIFO), history=True
+            self._full(ALIVE.format(source="*")), FifoChannel(FIFO), history=True
         )
 
         def take(sample: zenoh.Sample) -> None:
