@@ -37,16 +37,23 @@ COMMANDS: dict[str, Command] = {
         "all processes on this machine: actors, safety, learner, recorder",
         "brakeline train ground --steps 90000 --actors 2 --seed 0",
     ),
+    "keys": Command(
+        "keys:KeysCommand",
+        "keys for processes on several machines: who they are, who certifies models, what plans were verified",
+        "brakeline keys keys safety learner recorder actor-0 actor-1 --host 10.0.0.1",
+    ),
     "safety": Command(
-        "processes:Safety", "the safety service alone", "brakeline safety ground --listen tcp/0.0.0.0:7447"
+        "processes:Safety", "the safety service alone", "brakeline safety ground --listen tls/0.0.0.0:7447 --keys keys"
     ),
     "learner": Command(
-        "processes:LearnerProcess", "a learner alone", "brakeline learner ground --connect tcp/10.0.0.1:7447"
+        "processes:LearnerProcess",
+        "a learner alone",
+        "brakeline learner ground --connect tls/10.0.0.1:7447 --keys keys",
     ),
     "actor": Command(
         "processes:Actor",
         "one actor process alone, with one or several robots",
-        "brakeline actor ground --connect tcp/10.0.0.1:7447 --name actor-7 --number 7",
+        "brakeline actor ground --connect tls/10.0.0.1:7447 --keys keys --name actor-7 --number 7",
     ),
     "fly": Command(
         "fly:Fly",
@@ -59,7 +66,9 @@ COMMANDS: dict[str, Command] = {
         "brakeline autopilot --rules px4 --url udpout:127.0.0.1:14540 --arena default",
     ),
     "recorder": Command(
-        "processes:Recorder", "the recorder alone", "brakeline recorder runs/a/run.mcap --connect tcp/10.0.0.1:7447"
+        "processes:Recorder",
+        "the recorder alone",
+        "brakeline recorder runs/a/run.mcap --connect tls/10.0.0.1:7447 --keys keys",
     ),
     "collect": Command(
         "data:Collect", "record the data that the filter learns a robot from", "brakeline collect ground --seed 1"

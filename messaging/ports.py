@@ -11,9 +11,9 @@ def free_udp_port() -> int:
     return _free(socket.SOCK_DGRAM)
 
 
-def free_endpoint() -> str:
-    """To listen on, as `BusSettings` writes it."""
-    return f"tcp/{HERE}:{_free(socket.SOCK_STREAM)}"
+def free_endpoint(protocol: str = "tcp") -> str:
+    """To listen on, as `BusSettings` writes it; with keys the protocol is `tls`."""
+    return f"{protocol}/{HERE}:{_free(socket.SOCK_STREAM)}"
 
 
 def _free(kind: socket.SocketKind) -> int:

@@ -1,8 +1,8 @@
 """THE table of what crosses the bus: key, message, delivery, rate, who may publish, who may listen, is it recorded?
 
-`{robot}` and `{source}` in a key are filled in by the publisher and are wildcards for a subscriber. A query is published
-by who asks, and who listens answers; its answer is a message too. Liveness follows from `rate`: three periods without a
-message is stale. Where processes have keys, their routers let nothing pass that is not in this table
+`{robot}` and `{source}` in a key are filled in by the publisher and are wildcards for a subscriber. Who asks a query
+publishes it, and who listens answers; the answer is a message too. Liveness follows from `rate`: three periods without
+a message is stale. Where processes have keys, their routers let nothing pass that is not in this table
 (messaging/bus/access.py).
 """
 
@@ -14,7 +14,6 @@ from enum import Enum
 from google.protobuf.message import Message
 
 from messaging import brakeline_pb2 as pb
-
 
 # What a process is to the others. A name begins with its role: "actor-7", "learner-ground", "safety".
 ROLES = (
@@ -68,14 +67,16 @@ BLOCK, DROP, QUERY = Delivery.BLOCK, Delivery.DROP, Delivery.QUERY
 # fmt: off
 DECIDE = Topic("decide", "safety/{robot}/decide", pb.RequestBatch, QUERY, None, ("actor", "client"), ("safety",), False,
                pb.ReplyBatch)
-JOIN = Topic("join", "learner/{robot}/join", pb.Join, QUERY, None, ("actor", "feeder"), ("learner",), False, pb.JoinReply)
+JOIN = Topic("join", "learner/{robot}/join", pb.Join, QUERY, None, ("actor", "feeder"), ("learner",), False,
+             pb.JoinReply)
 MODEL = Topic("model", "model/{robot}/{source}", pb.Model, BLOCK, None, ("certify",), ("safety",), True, largest=FILE)
 STEP = Topic("step", "step/{robot}/{source}", pb.Step, BLOCK, None, ("actor",), ("learner",), True)
 LOGGED = Topic("logged", "logged/{robot}/{source}", pb.Step, BLOCK, None, ("feeder",), ("learner",), False, own=False)
 EPISODE = Topic("episode", "episode/{robot}/{source}", pb.Episode, BLOCK, None, ("actor",), (), True)
 EXCHANGE = Topic("exchange", "exchange/{robot}/{source}", pb.Exchange, BLOCK, None, ("actor",), (), True)
 FRAMES = Topic("frames", "frames/{robot}/{source}", pb.MavlinkFrames, BLOCK, None, ("actor",), (), True)
-WEIGHTS = Topic("weights", "weights/{robot}", pb.Weights, DROP, None, ("learner",), ("actor", "feeder"), False, largest=FILE)
+WEIGHTS = Topic("weights", "weights/{robot}", pb.Weights, DROP, None, ("learner",), ("actor", "feeder"), False,
+                largest=FILE)
 FLOW = Topic("flow", "flow/{robot}", pb.Flow, BLOCK, 1.0, ("learner",), ("actor", "feeder"), False)
 LEARNER = Topic("learner", "metrics/{robot}", pb.LearnerMetrics, BLOCK, 1.0, ("learner",), (), True)
 HEALTH = Topic("health", "health/{source}", pb.Health, BLOCK, 1.0, ROLES, (), True)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
@@ -140,14 +141,25 @@ class SafetyClient:
         self._owned = False
 
     @classmethod
-    def open(cls, connect: str | Sequence[str], robot: str, deadline: float = DEADLINE) -> Self:
+    def open(
+        cls,
+        connect: str | Sequence[str],
+        robot: str,
+        deadline: float = DEADLINE,
+        keys: Path | str | None = None,
+        name: str = "client",
+    ) -> Self:
         """A client with a bus of its own.
 
+        Args:
+            keys: the folder with the keys of `name`, if the bus has keys; its endpoints are then tls/HOST:PORT.
+
         Raises:
-            Unreachable: no router at these endpoints.
+            Unreachable: no router at these endpoints; BadKeys: no keys of that name.
         """
         endpoints = (connect,) if isinstance(connect, str) else tuple(connect)
-        client = cls(Bus(BusSettings(connect=endpoints), "client"), robot, deadline)
+        settings = BusSettings(connect=endpoints, keys=None if keys is None else Path(keys))
+        client = cls(Bus(settings, name), robot, deadline)
         client._owned = True
         return client
 

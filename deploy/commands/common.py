@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
@@ -11,8 +12,12 @@ import tyro
 from rich.console import Console
 
 from actors.flight import FlightSettings
+from deploy.run.configurations import RunConfig
+from deploy.run.keys import own_keys
+from deploy.run.places import client_of
 from deploy.vehicles import Conditions
 from messaging.bus import BusSettings
+from messaging.ports import free_endpoint
 from safety.model_set import Recipe
 from sim.estimator import NoiseLevels
 from sim.flight_estimator import QuadrotorNoise
@@ -91,27 +96,58 @@ class Flight:
 
 @dataclass(frozen=True)
 class Endpoints:
-    """Where the bus is, as Zenoh writes it: tcp/HOST:PORT."""
+    """Where the bus is, as Zenoh writes it: tls/HOST:PORT with keys, tcp/HOST:PORT without."""
 
     connect: tuple[str, ...] = ()
     """Routers to connect to; without any: that of the newest run here."""
     listen: tuple[str, ...] = ()
     """Be the router at these endpoints."""
 
+    keys: Path | None = None
+    """Folder with this process's keys (`brakeline keys` makes them); default: $BRAKELINE_KEYS, else none."""
+    insecure: bool = False
+    """Listen beyond this machine without keys. Whoever reaches the bus can command the robots; every Health says so."""
+
     def bus(self) -> BusSettings:
         """Raises ValueError when there is neither an endpoint nor a run."""
         if self.connect or self.listen:
-            return BusSettings(connect=self.connect, listen=self.listen)
-        return BusSettings(connect=(endpoint_of(LATEST),))
+            keys = self.keys or default_keys()
+            return BusSettings(connect=self.connect, listen=self.listen, keys=keys, insecure=self.insecure)
+        return bus_of(LATEST)
 
 
-def endpoint_of(run: Path) -> str:
-    """The endpoint of a run's router. Raises ValueError with what to do."""
+@dataclass(frozen=True)
+class Meeting:
+    """Where the processes of a run meet, and how they know each other."""
+
+    listen: str | None = None
+    """The router's endpoint; default: a free port of this machine."""
+    keys: Path | None = None
+    """Folder with keys of all processes (`brakeline keys`); default: $BRAKELINE_KEYS, else the run's own."""
+    secured: bool = True
+    """Make keys of the run's own where none are given; without, whoever reaches the bus can command the robots."""
+    insecure: bool = False
+    """Let --listen be beyond this machine without keys. Every Health says so."""
+
+    def settings(self, config: RunConfig, folder: Path) -> BusSettings:
+        """The launcher's place on the bus."""
+        keys = self.keys or default_keys() or (own_keys(config, folder) if self.secured else None)
+        endpoint = self.listen or free_endpoint("tcp" if keys is None else "tls")
+        return BusSettings(listen=(endpoint,), keys=keys, insecure=self.insecure)
+
+
+def default_keys() -> Path | None:
+    """`$BRAKELINE_KEYS`, if it is set."""
+    folder = os.environ.get("BRAKELINE_KEYS")
+    return Path(folder) if folder else None
+
+
+def bus_of(run: Path) -> BusSettings:
+    """How a client gets on the bus of a run on this machine. Raises ValueError with what to do."""
     try:
-        found: str = json.loads((run / "endpoint").read_text())["endpoint"]
+        return client_of(run)
     except (OSError, ValueError, KeyError) as error:
-        raise ValueError(f"no run at {run}: give --connect tcp/HOST:PORT, or start `brakeline train`") from error
-    return found
+        raise ValueError(f"no run at {run}: give --connect tls/HOST:PORT, or start `brakeline train`") from error
 
 
 def say_json(figures: dict[str, Any]) -> None:

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from actors.flight import FlightSettings
-from deploy.commands.common import Filtering, Flags, Flight, Physics, console, errors, say_json
+from deploy.commands.common import Filtering, Flags, Flight, Meeting, Physics, console, errors, say_json
 from deploy.commands.train import STOPPED, stamped
 from deploy.run.configurations import Embedded, RunConfig
 from deploy.run.display import Display, summary
@@ -47,8 +47,7 @@ class Fly:
     """A second, drawn for Foxglove in the log besides all interventions; 0: none at all."""
     out: Path | None = None
     """The run's folder; default: runs/ and the time."""
-    listen: str | None = None
-    """The router's endpoint; default: a free port of this machine."""
+    meeting: Flags[Meeting] = field(default_factory=Meeting)
     json: bool = False
     """Print the final figures as one JSON object on stdout; the display goes to stderr."""
 
@@ -56,7 +55,7 @@ class Fly:
         config, folder, shown = self.config(), self.out or stamped(), errors if self.json else console
         prepare(config, folder, resume=False)
         with Display(shown, config.steps) as display:
-            figures = Launcher(config, folder, self.listen).run(display)
+            figures = Launcher(config, folder, self.meeting.settings(config, folder)).run(display)
         figures["flight"] = flown(figures)
         if self.json:
             say_json(figures)

@@ -54,7 +54,7 @@ class Query:
         ]
         state = self.state or (0.0,) * robot.state_dim
         action = self.action or robot.action_high
-        with Bus(self.endpoints.bus(), f"query-{time.time_ns() % 10**6}") as bus:
+        with Bus(self.endpoints.bus(), f"client.query-{time.time_ns() % 10**6}") as bus:
             message = SafetyClient(bus, robot.name, self.timeout).decide(state, action, near).message
         d = robot.position_dim
         figures: dict[str, Any] = {
@@ -110,7 +110,7 @@ class Status:
             names = [f.name for f in said.DESCRIPTOR.fields if f.name not in ("header", "robot")]
             learners[said.robot] = {name: getattr(said, name) for name in names}
 
-        with Bus(self.endpoints.bus(), f"status-{time.time_ns() % 10**6}") as bus:
+        with Bus(self.endpoints.bus(), f"viewer.status-{time.time_ns() % 10**6}") as bus:
             bus.subscribe(HEALTH, health)
             bus.subscribe(LEARNER, learner)
             time.sleep(self.wait)

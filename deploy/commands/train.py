@@ -10,7 +10,7 @@ from typing import Annotated
 import tyro
 
 from actors.loop import Change
-from deploy.commands.common import Filtering, Flags, Physics, console, errors, say_json
+from deploy.commands.common import Filtering, Flags, Meeting, Physics, console, errors, say_json
 from deploy.run.configurations import EXPERIMENTS, RunConfig, load
 from deploy.run.display import Display, summary
 from deploy.run.feed import count
@@ -21,14 +21,14 @@ from logs.recorder import Rotation
 from messaging.robots import robot_named
 
 
-def launch(config: RunConfig, folder: Path, resume: bool, listen: str | None, as_json: bool) -> int:
+def launch(config: RunConfig, folder: Path, resume: bool, meeting: Meeting, as_json: bool) -> int:
     """Prepare and run, with a display on stderr (when JSON is asked for) or stdout; returns the exit status."""
     prepare(config, folder, resume)
     shown = errors if as_json else console
     if resume:
         shown.print(f"resuming {folder} from the learner's last checkpoint; the log goes on in a new segment")
     with Display(shown, config.steps * len(config.robots)) as display:
-        figures = Launcher(config, folder, listen).run(display)
+        figures = Launcher(config, folder, meeting.settings(config, folder)).run(display)
     if as_json:
         say_json(figures)
     else:
@@ -85,8 +85,7 @@ class Train:
     """A second and robot, drawn for Foxglove in the log besides all interventions; 0: none at all."""
     mavlink: bool = False
     """Log every MAVLink frame of quadrotors too, as bytes and as JSON: about as much again as all the rest."""
-    listen: str | None = None
-    """The router's endpoint; default: a free port of this machine."""
+    meeting: Flags[Meeting] = field(default_factory=Meeting)
     learner: LearnerConfig = field(default_factory=lambda: RunConfig().learner)
     json: bool = False
     """Print the final figures as one JSON object on stdout; the display goes to stderr."""
@@ -149,7 +148,7 @@ class Train:
 
     def run(self) -> int:
         folder = self.resume or self.out or stamped()
-        return launch(self.config(), folder, self.resume is not None, self.listen, self.json)
+        return launch(self.config(), folder, self.resume is not None, self.meeting, self.json)
 
 
 @dataclass(frozen=True)
@@ -163,4 +162,4 @@ class Demo:
 
     def run(self) -> int:
         config = replace(EXPERIMENTS["demo"], steps=self.steps, seed=self.seed)
-        return launch(config, self.out or stamped(), False, None, self.json)
+        return launch(config, self.out or stamped(), False, Meeting(), self.json)

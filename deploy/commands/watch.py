@@ -41,7 +41,7 @@ class Watch:
         inbox: deque[Sample] = deque(maxlen=INBOX)
         board, live = Board(), None
         with ExitStack() as stack:
-            bus = stack.enter_context(Bus(self.endpoints.bus(), f"watch-{time.time_ns() % 10**6}"))
+            bus = stack.enter_context(Bus(self.endpoints.bus(), f"viewer.watch-{time.time_ns() % 10**6}"))
             server = stack.enter_context(Server(board.view, self.host, self.port))
             if self.foxglove_port >= 0:
                 live = stack.enter_context(Live(self.host, self.foxglove_port, origins=self.origins))

@@ -7,7 +7,6 @@ be started alone, with `brakeline safety | learner | actor | recorder`.
 from __future__ import annotations
 
 import ctypes
-import json
 import os
 import signal
 import sys
@@ -16,7 +15,7 @@ from functools import partial
 from pathlib import Path
 
 from deploy.run.configurations import RunConfig, load
-from deploy.run.places import CONFIG, ENDPOINT, LOG, UNFINISHED, Place, places
+from deploy.run.places import CONFIG, LOG, UNFINISHED, Place, client_of, launcher_of, places
 from messaging.bus import BusError, BusSettings
 from messaging.robots import robot_named
 
@@ -129,15 +128,14 @@ def main() -> int:
     folder, name = Path(sys.argv[1]), sys.argv[2]
     ctypes.CDLL(None).prctl(PARENT_DIED, signal.SIGTERM)
     signal.signal(signal.SIGINT, signal.SIG_DFL)
-    launcher = json.loads((folder / ENDPOINT).read_text())
-    if os.getppid() != launcher["pid"]:  # it died before we could ask to be told
+    if os.getppid() != launcher_of(folder):  # it died before we could ask to be told
         return UNFINISHED
     config = load(folder / CONFIG)
     place = next(place for place in places(config) if place.name == name)
     if place.nice:
         os.nice(place.nice)
     try:
-        done = KINDS[place.kind](place, folder, config, BusSettings(connect=(launcher["endpoint"],)))
+        done = KINDS[place.kind](place, folder, config, client_of(folder))
     except BusError as error:
         print(f"{name}: {type(error).__name__}: {error}", file=sys.stderr)
         return 1

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import logging
-import os
 import time
 from collections import Counter, deque
 from collections.abc import Callable
@@ -13,12 +12,11 @@ from typing import Any
 
 from deploy.data.store import method_for
 from deploy.run.configurations import RunConfig, encode
-from deploy.run.places import CONFIG, ENDPOINT, LOG, places
+from deploy.run.places import CONFIG, LOG, places, say_where
 from deploy.run.view import View
 from deploy.run.watched import Child, LaunchError, last_line
 from logs.metrics import Metrics
 from messaging.bus import BusError, BusSettings, Sample
-from messaging.ports import free_endpoint
 from messaging.process import Process
 from messaging.robots import robot_named
 from messaging.tolerant import Tolerance, headline
@@ -51,9 +49,9 @@ def prepare(config: RunConfig, folder: Path, resume: bool) -> None:
 class Launcher:
     """A run from its first process to its last."""
 
-    def __init__(self, config: RunConfig, folder: Path, endpoint: str | None = None) -> None:
-        self.config, self.folder = config, folder
-        self.endpoint = endpoint or free_endpoint()
+    def __init__(self, config: RunConfig, folder: Path, bus: BusSettings) -> None:
+        """bus: where it listens, and the keys of all processes, if they have any."""
+        self.config, self.folder, self.bus = config, folder, bus
         self.children = [Child(place, folder) for place in places(config)]
         self.metrics = Metrics()
         self.lines: deque[str] = deque(maxlen=200)
@@ -69,7 +67,7 @@ class Launcher:
         """
         view = View(self.config, self.folder, self.metrics, self.children, self.lines)
         failure: LaunchError | None = None
-        with Process(BusSettings(listen=(self.endpoint,)), "launcher", stderr=False, reserved=True) as process:
+        with Process(self.bus, "launcher", stderr=False, reserved=True) as process:
             self._tolerance = process.bus.tolerance
             self._claim_folder()
             for topic in RECORDED:
@@ -155,7 +153,7 @@ class Launcher:
     def _claim_folder(self) -> None:
         """Write what the processes read, and that this is the latest run."""
         (self.folder / CONFIG).write_text(encode(self.config))
-        (self.folder / ENDPOINT).write_text(json.dumps({"endpoint": self.endpoint, "pid": os.getpid()}))
+        say_where(self.folder, self.bus)
         latest = self.folder.parent / "latest"
         if latest.is_symlink() or not latest.exists():
             latest.unlink(missing_ok=True)

@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+import json
+import os
 from dataclasses import dataclass
+from pathlib import Path
 
 from deploy.run.configurations import RunConfig
+from messaging.bus import BusSettings
+from messaging.files import write_whole
 
 CONFIG, ENDPOINT, LOG = "config.json", "endpoint", "run.mcap"
 UNFINISHED = 75  # exit status: asked to end before its work was done
@@ -39,3 +44,25 @@ def places(config: RunConfig) -> list[Place]:
             nice = 0 if config.flight is not None else 2
             table.append(Place(name, "actor", robot, i * config.robots_per_actor, nice))
     return table
+
+
+def say_where(folder: Path, bus: BusSettings) -> None:
+    """Write down where the run's router is; `client_of` reads it."""
+    said = {"endpoint": bus.listen[0], "pid": os.getpid(), "keys": bus.keys and str(bus.keys.absolute())}
+    write_whole(folder / ENDPOINT, json.dumps(said).encode())
+
+
+def client_of(folder: Path) -> BusSettings:
+    """How a client gets on the bus of the run in a folder.
+
+    Raises:
+        OSError, ValueError, KeyError: there is no run.
+    """
+    said = json.loads((folder / ENDPOINT).read_text())
+    keys = said.get("keys")
+    return BusSettings(connect=(said["endpoint"],), keys=Path(keys) if keys else None)
+
+
+def launcher_of(folder: Path) -> int:
+    """Its process id. Raises as `client_of`."""
+    return int(json.loads((folder / ENDPOINT).read_text())["pid"])

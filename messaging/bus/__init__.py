@@ -1,7 +1,7 @@
 """The bus: publishers, subscribers, questions and answers, and who is alive, over Zenoh.
 
-A process that is given `listen` is a router; the others are clients of one of the `connect` endpoints. With keys all show
-who they are, and the router lets each say and hear what the table of topics grants it.
+A process that is given `listen` is a router; the others are clients of one of the `connect` endpoints. With keys all
+show who they are, and the router lets each say and hear what the table of topics grants it.
 """
 
 from messaging.bus.errors import BadKeys, BusError, Insecure, Late, Malformed, NoReply, Refused, Unreachable

@@ -7,7 +7,6 @@ from pathlib import Path
 from messaging.bus.errors import BadKeys
 from messaging.topics import ROLES
 
-
 SERVERS = ("safety", "launcher", "router")  # roles that may be a router; others' certificates are a client's only
 
 
@@ -68,7 +67,9 @@ def tls(folder: Path, source: str, listens: bool) -> dict[str, object]:
     root, certificate, key = folder / "ca.pem", certificate_file(folder, name), key_file(folder, name)
     for path in (root, certificate, key):
         if not path.is_file():
-            raise BadKeys(f"{path} is missing: no keys of {name} here; issue them with `brakeline keys {folder} {name}`")
+            raise BadKeys(
+                f"{path} is missing: no keys of {name} here; issue them with `brakeline keys {folder} {name}`"
+            )
     return {
         "root_ca_certificate": str(root),
         "listen_certificate": str(certificate),

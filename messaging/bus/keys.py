@@ -26,3 +26,9 @@ def exact_key(topic: Topic, names: dict[str, str]) -> str:
     if "*" in key:
         raise ValueError(f"{topic.key}: give every name, not only {', '.join(names) or 'none'}")
     return key
+
+
+def names_of(topic: Topic, key: str) -> dict[str, str]:
+    """The names in a key of the topic."""
+    parts = zip(topic.key.split("/"), key.split("/"), strict=False)
+    return {part[1:-1]: name for part, name in parts if part.startswith("{")}

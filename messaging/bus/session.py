@@ -165,7 +165,9 @@ class Bus:
 
     def living(self, timeout: float = 1.0) -> frozenset[str]:
         """The sources that are alive now, this one included."""
-        replies: Iterable[zenoh.Reply] = self._telemetry.liveliness().get(self._full(ALIVE.format(source="*")), timeout=timeout)
+        replies: Iterable[zenoh.Reply] = self._telemetry.liveliness().get(
+            self._full(ALIVE.format(source="*")), timeout=timeout
+        )
         return frozenset(str(reply.ok.key_expr).rsplit("/", 1)[1] for reply in replies if reply.ok is not None)
 
     def watch(self, handler: Callable[[str, bool], None]) -> Subscription:

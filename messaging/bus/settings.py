@@ -24,9 +24,9 @@ class BusSettings:
     A client takes the first of `connect` that answers. `patience` is how long it waits for one at the start;
     once connected it reconnects by itself for ever. A peer that is silent for `lease` counts as gone.
 
-    With `keys`, a folder (messaging/bus/authority.py), all endpoints are `tls/HOST:PORT`, both ends show who they are, and
-    a router lets through what the table of topics says. Without, a bus that others than this machine reach does not
-    start, unless it is `insecure` on purpose.
+    With `keys`, a folder (messaging/bus/authority.py), all endpoints are `tls/HOST:PORT`, both ends show who they are,
+    and a router lets through what the table of topics says. Without, a bus that others than this machine reach does
+    not start, unless it is `insecure` on purpose.
     """
 
     connect: tuple[str, ...] = ()
@@ -61,8 +61,8 @@ class BusSettings:
         open_to_others = [endpoint for endpoint in self.listen if not local(endpoint)]
         if self.keys is None and not self.insecure and open_to_others:
             raise Insecure(
-                f"{', '.join(open_to_others)} is open to other machines: give --keys FOLDER (`brakeline keys` makes one) "
-                "and tls/HOST:PORT, or listen on 127.0.0.1; --insecure goes without"
+                f"{', '.join(open_to_others)} is open to other machines: give --keys FOLDER (`brakeline keys` makes "
+                "one) and tls/HOST:PORT, or listen on 127.0.0.1; --insecure goes without"
             )
 
 

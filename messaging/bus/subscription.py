@@ -13,6 +13,7 @@ import zenoh
 from google.protobuf.message import DecodeError
 
 from messaging.bus.errors import Malformed, typed
+from messaging.bus.keys import names_of
 from messaging.plausible import NAME, Implausible, check
 from messaging.tolerant import Tolerance
 from messaging.topics import Topic
@@ -33,14 +34,25 @@ class Sample:
         """The payload, decoded as the topic's type.
 
         Raises:
-            Malformed: it is not one.
+            Malformed: it is not one, or speaks in the name of another robot or source than its key does.
         """
         try:
             message = self.topic.message.FromString(self.payload)
             check(message)
         except (DecodeError, Implausible) as error:
             raise Malformed(f"{self.key}: not a {self.topic.message.DESCRIPTOR.name}: {error}") from error
+        for field, name in names_of(self.topic, self.key).items():
+            for said in _said(message, field):
+                if said not in ("", name):
+                    raise Malformed(f"{self.key}: says that its {field} is {said!r}")
         return message
+
+
+def _said(message: Any, field: str) -> list[str]:
+    """What a message says of its robot or source; the router knows who may publish under which key, and no more."""
+    names = ("robot",) if field == "robot" else ("actor", "process")
+    said = [str(getattr(message, name)) for name in names if name in message.DESCRIPTOR.fields_by_name]
+    return said if field == "robot" else [*said, str(message.header.source)]
 
 
 class Subscription:

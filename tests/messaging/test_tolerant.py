@@ -76,6 +76,7 @@ def test_what_no_honest_sender_says_is_malformed(topic: Topic, message: object) 
 
 
 def test_what_honest_senders_say_is_not() -> None:
-    step = pb.Step(header=stamped(4.2, 1_800_000_000 * 10**9, "actor-host.example_1"), robot="ground", actor="a.1.run2")
+    name = "actor-host.example_1"
+    step = pb.Step(header=stamped(4.2, 1_800_000_000 * 10**9, name), robot="ground", actor=name)
     step.clearance = math.inf
-    assert Sample(STEP, "step/ground/a", step.SerializeToString(), 1).message() == step
+    assert Sample(STEP, f"step/ground/{name}", step.SerializeToString(), 1).message() == step

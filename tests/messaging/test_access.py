@@ -1,0 +1,354 @@
+"""What an attacker on the bus can do, with real routers and sessions: with keys nothing, without them all of it.
+
+Each attack is made twice: on a bus without keys, where it has to succeed (else it would prove nothing), and with them.
+The attacker has an actor's certificate, for the actors are the many, and speaks Zenoh: no code of ours holds it back.
+"""
+
+import json
+import shutil
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+import zenoh
+
+from messaging import brakeline_pb2 as pb
+from messaging.bus import BadKeys, Bus, BusError, BusSettings, Insecure, NoReply, Sample, Unreachable, configuration
+from messaging.bus.access import grants
+from messaging.bus.settings import local
+from messaging.ports import HERE, free_endpoint
+from messaging.process import Process
+from messaging.topics import (
+    DECIDE,
+    FLOW,
+    HEALTH,
+    LOGGED,
+    MODEL,
+    RECORDED,
+    ROLES,
+    STEP,
+    TOPICS,
+    WEIGHTS,
+    Delivery,
+    Topic,
+)
+from tests.messaging.keyring import keyring
+
+JOINED = 0.3  # s that a declaration may take to reach everybody on this machine
+
+
+@pytest.fixture(scope="session")
+def keys(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return keyring(tmp_path_factory.mktemp("keys") / "keys")
+
+
+class System:
+    """A router and honest clients, on loopback, with keys or without."""
+
+    def __init__(self, keys: Path | None) -> None:
+        self.keys = keys
+        self.endpoint = free_endpoint() if keys is None else free_endpoint("tls")
+        self._buses = [Bus(BusSettings(listen=(self.endpoint,), keys=keys), "launcher")]
+        self._sessions: list[zenoh.Session] = []
+
+    @property
+    def router(self) -> Bus:
+        return self._buses[0]
+
+    def settings(self, keys: Path | None = None) -> BusSettings:
+        return BusSettings(connect=(self.endpoint,), keys=keys or self.keys, patience=3.0)
+
+    def join(self, source: str) -> Bus:
+        self._buses.append(Bus(self.settings(), source))
+        return self._buses[-1]
+
+    def attacker(self, name: str = "actor-1") -> zenoh.Session:
+        """A session under a certificate, and nothing of ours between it and the wire."""
+        self._sessions.append(zenoh.open(configuration(self.settings(), name)))
+        return self._sessions[-1]
+
+    def close(self) -> None:
+        for session in self._sessions:
+            session.close()  # type: ignore[no-untyped-call]
+        for bus in reversed(self._buses):
+            bus.close()
+
+
+@pytest.fixture(params=[False, True], ids=["without keys", "with keys"])
+def system(request: pytest.FixtureRequest, keys: Path) -> Iterator[System]:
+    made = System(keys if request.param else None)
+    yield made
+    made.close()
+
+
+@contextmanager
+def heard(listener: Bus, topic: Topic) -> Iterator[list[Sample]]:
+    got: list[Sample] = []
+    listener.subscribe(topic, got.append)
+    time.sleep(JOINED)
+    yield got
+
+
+def eventually(condition: Callable[[], bool], seconds: float = 8.0) -> None:
+    deadline = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < deadline, "it did not come about"
+        time.sleep(0.02)
+
+
+CASES = [
+    # what only one role may say, who says it, who hears it, and the keys at which somebody else tries to
+    (MODEL, "certify", "safety", ("model/ground/certify", "model/ground/actor-1")),
+    (WEIGHTS, "learner", "actor-0", ("weights/ground",)),
+    (FLOW, "learner", "actor-0", ("flow/ground",)),
+    (STEP, "actor-0", "learner", ("step/ground/actor-0", "step/ground/actor-2", "step/ground/actor-10")),
+    (LOGGED, "feeder", "learner", ("logged/ground/actor-1",)),
+    (HEALTH, "actor-0", "recorder", ("health/actor-0", "health/safety")),
+]
+
+
+@pytest.mark.parametrize(
+    ("topic", "owner", "listener", "keys_tried"), CASES, ids=lambda case: getattr(case, "name", "")
+)
+def test_what_one_role_may_say_nobody_else_can(
+    system: System, topic: Topic, owner: str, listener: str, keys_tried: tuple[str, ...]
+) -> None:
+    attacker, honest = system.attacker(), system.join(owner)
+    with heard(system.join(listener), topic) as got:
+        for key in keys_tried:
+            attacker.put(f"brakeline/{key}", b"evil")
+        names = {"source": "actor-0"} if topic is LOGGED else {}
+        names |= {"robot": "ground"} if "{robot}" in topic.key else {}
+        honest.publisher(topic, **names).put(topic.message())
+        eventually(lambda: any(sample.payload != b"evil" for sample in got))
+        if system.keys is None:
+            eventually(lambda: len(got) == 1 + len(keys_tried))
+        time.sleep(JOINED)
+        assert [sample.payload == b"evil" for sample in got].count(True) == (0 if system.keys else len(keys_tried))
+
+
+def test_an_actor_speaks_for_the_robots_in_its_process(keys: Path) -> None:
+    system = System(keys)
+    actor = system.join("actor-0")
+    with heard(system.join("learner"), STEP) as got:
+        actor.publisher(STEP, robot="ground", source="actor-0.3").put(pb.Step(robot="ground", actor="actor-0.3"))
+        eventually(lambda: len(got) == 1)
+    system.close()
+
+
+def test_a_step_that_names_another_actor_than_its_key_is_no_message(system: System) -> None:
+    with heard(system.join("learner"), STEP) as got:
+        step = pb.Step(robot="ground", actor="actor-0")
+        system.attacker().put("brakeline/step/ground/actor-1", step.SerializeToString())
+        eventually(lambda: len(got) == 1)
+        with pytest.raises(BusError, match="actor-0"):
+            got[0].message()
+
+
+def test_a_second_queryable_answers_nobody(system: System) -> None:
+    """It is there first, and from then on, and claims to answer for all robots; also from where there is no service."""
+
+    def evil(query: zenoh.Query) -> None:
+        with query:
+            query.reply(query.key_expr, b"allowed")
+
+    attacker, asker = system.attacker(), system.join("actor-0")
+    attacker.declare_queryable("brakeline/safety/*/decide", evil, complete=True)
+    time.sleep(JOINED)
+    if system.keys is None:
+        assert asker.ask(DECIDE, b"?", 2.0, robot="ground") == b"allowed"
+        return
+    with pytest.raises(NoReply):
+        asker.ask(DECIDE, b"?", 2.0, robot="ground")
+    system.join("safety").serve(DECIDE, lambda payload: b"verified")
+    time.sleep(JOINED)
+    assert {asker.ask(DECIDE, b"?", 2.0, robot="ground") for _ in range(200)} == {b"verified"}
+
+
+def test_an_eavesdropper_on_everything_hears_nothing(system: System) -> None:
+    overheard: list[str] = []
+    attacker = system.attacker()
+    for key in ("**", "brakeline/**", "*/step/**", "brakeline/step/*/*", "brakeline/health/*"):
+        attacker.declare_subscriber(key, lambda sample: overheard.append(str(sample.key_expr)))
+        attacker.declare_queryable(key, lambda query: overheard.append(str(query.key_expr)))
+    attacker.liveliness().declare_subscriber("**", lambda sample: overheard.append(str(sample.key_expr)), history=True)
+    time.sleep(JOINED)
+    actor = system.join("actor-0")
+    with heard(system.join("recorder"), STEP) as got:
+        actor.publisher(STEP, robot="ground").put(pb.Step())
+        actor.publisher(HEALTH).put(pb.Health())
+        with pytest.raises(BusError):
+            actor.ask(DECIDE, b"?", 0.5, robot="ground")
+        eventually(lambda: len(got) >= 1)
+    time.sleep(JOINED)
+    assert bool(overheard) == (system.keys is None), overheard
+
+
+def test_who_has_no_certificate_of_this_authority_cannot_connect(keys: Path, tmp_path: Path) -> None:
+    system = System(keys)
+    rogue = keyring(tmp_path / "rogue", "actor-0")  # the right name, from somebody else
+    mixed = keyring(tmp_path / "mixed", "actor-0")  # it knows our authority, and shows its own
+    (mixed / "ca.pem").write_bytes((keys / "ca.pem").read_bytes())
+    for folder in (rogue, mixed):
+        with pytest.raises(Unreachable, match="one authority"):
+            Bus(BusSettings(connect=(system.endpoint,), keys=folder, patience=1.5), "actor-0")
+    plain = system.endpoint.replace("tls/", "tcp/")
+    with pytest.raises(Unreachable):
+        Bus(BusSettings(connect=(plain,), patience=1.5), "actor-0")
+    assert system.join("actor-0").connected
+    system.close()
+
+
+def test_nobody_with_a_clients_certificate_is_taken_for_a_router(keys: Path) -> None:
+    """In front of the router, or in its place: a client looks at what it is shown."""
+    endpoint = free_endpoint("tls")
+    config = configuration(BusSettings(listen=(endpoint,), keys=keys), "launcher")
+    for name in ("certificate", "private_key"):
+        file = keys / ("actor-1.pem" if name == "certificate" else "actor-1.key")
+        config.insert_json5(f"transport/link/tls/listen_{name}", json.dumps(str(file)))
+    impostor = zenoh.open(config)
+    with pytest.raises(Unreachable):
+        Bus(BusSettings(connect=(endpoint,), keys=keys, patience=1.5), "actor-0")
+    impostor.close()  # type: ignore[no-untyped-call]
+    with pytest.raises(BadKeys, match="cannot be a router"):
+        Bus(BusSettings(listen=(endpoint,), keys=keys), "actor-1")
+
+
+def test_a_name_that_is_struck_out_can_do_nothing(keys: Path, tmp_path: Path) -> None:
+    router_keys = tmp_path / "keys"
+    shutil.copytree(keys, router_keys)
+    names = (keys / "names").read_text().split()
+    (router_keys / "names").write_text("\n".join(name for name in names if name != "actor-1"))
+    system = System(router_keys)
+    revoked, honest = system.join("actor-1"), system.join("actor-0")
+    with heard(system.join("learner"), STEP) as got:
+        revoked.publisher(STEP, robot="ground").put(pb.Step())
+        honest.publisher(STEP, robot="ground").put(pb.Step())
+        eventually(lambda: len(got) == 1)
+        time.sleep(JOINED)
+        assert [sample.key for sample in got] == ["step/ground/actor-0"]
+    system.close()
+
+
+@pytest.mark.parametrize("topic", TOPICS, ids=lambda topic: topic.name)
+def test_the_table_works_with_keys(keys: Path, topic: Topic) -> None:
+    """Whoever the table lets speak is heard by all whom it lets listen: nothing honest is shut out."""
+    system = System(keys)
+    others = [role for role in topic.listeners if role not in ("launcher", "router")]
+    speakers = [role for role in topic.publishers if role not in ("launcher", "router", "viewer")]
+    names = {"actor": "actor-0"}
+    listeners = [system.join(names.get(role, role)) for role in others]
+    robot = {"robot": "ground"} if "{robot}" in topic.key else {}
+    if topic.delivery is Delivery.QUERY:
+        for listener in listeners:
+            listener.serve(topic, lambda payload: b"answer", **({} if topic is DECIDE else robot))
+        time.sleep(JOINED)
+        for role in speakers:
+            assert system.join(names.get(role, role)).ask(topic, b"?", 5.0, **robot) == b"answer"
+        system.close()
+        return
+    got: list[list[Sample]] = [[] for _ in listeners]
+    for listener, samples in zip(listeners, got, strict=True):
+        listener.subscribe(topic, samples.append, **robot)
+    time.sleep(JOINED)
+    for role in speakers:
+        source = names.get(role, role)
+        bus = next((bus for bus in listeners if bus.source == source), None) or system.join(source)
+        bus.publisher(topic, **robot).put(topic.message())
+    eventually(lambda: all(len(samples) == len(speakers) for samples in got))
+    system.close()
+
+
+def test_who_looks_on_knows_who_lives(keys: Path) -> None:
+    system = System(keys)
+    viewer, actor = system.join("viewer.watch-1"), system.join("actor-0")
+    comes: list[tuple[str, bool]] = []
+    viewer.watch(lambda name, alive: comes.append((name, alive)))
+    eventually(lambda: {"launcher", "viewer.watch-1", "actor-0"} <= viewer.living())
+    assert actor.living() == {"actor-0"}, "and an actor need not"
+    actor.close()
+    eventually(lambda: ("actor-0", False) in comes)
+    system.close()
+
+
+@pytest.mark.parametrize("role", ROLES)
+def test_a_role_is_granted_what_the_table_says_and_no_more(role: str) -> None:
+    granted = grants(f"{role}-7", "brakeline")
+    if role == "router":
+        return
+    said = {key for flow, messages, key in granted if flow == "ingress" and "put" in messages}
+    own = {topic for topic in TOPICS if role in topic.publishers and topic.delivery is not Delivery.QUERY}
+    assert {key.split("/")[1] for key in said} == {topic.key.split("/")[0] for topic in own}
+    for key in said:
+        root = key.split("/")[1]
+        if root not in ("weights", "flow", "metrics", "logged"):
+            assert key.split("/")[-1] in (f"{role}-7", f"{role}-7.$*"), "under its own name"
+    answers = {key for _, messages, key in granted if "declare_queryable" in messages and "reply" in messages}
+    asks = {key for flow, messages, key in granted if flow == "ingress" and "query" in messages}
+    assert bool({key for key in asks if "decide" in key}) == (role in ("actor", "client"))
+    assert role in ("safety", "actor", "client") or not any("decide" in key for key in answers)
+    assert not any("**" in key for _, _, key in granted)
+
+
+@pytest.mark.parametrize(
+    ("endpoint", "here"),
+    [
+        ("tcp/127.0.0.1:7447", True), ("tcp/127.8.0.1:7447", True), ("tcp/[::1]:7447", True),
+        ("tcp/localhost:7447", True), ("unixsock-stream//tmp/bus", True), ("tcp/0.0.0.0:7447", False),
+        ("tcp/[::]:7447", False), ("tcp/10.0.0.1:7447", False), ("udp/127.0.0.1.evil.org:7447", False),
+        ("tcp/:7447", False), ("quic/router:7447#iface=lo", False), ("nonsense", False),
+    ],
+)  # fmt: skip
+def test_what_is_within_this_machine(endpoint: str, here: bool) -> None:
+    assert local(endpoint) == here
+
+
+def test_a_bus_that_others_reach_does_not_start_without_keys(keys: Path) -> None:
+    port = free_endpoint().rsplit(":", 1)[1]
+    open_to_all = f"tcp/0.0.0.0:{port}"
+    with pytest.raises(Insecure, match="--keys"):
+        Bus(BusSettings(listen=(open_to_all,)), "launcher")
+    with pytest.raises(ValueError, match="tls/"):
+        Bus(BusSettings(listen=(open_to_all,), keys=keys), "launcher")
+    with pytest.raises(ValueError, match="tls/"):
+        Bus(BusSettings(connect=(f"tls/{HERE}:{port}",)), "actor-0")
+    with Bus(BusSettings(listen=(f"tls/0.0.0.0:{port}",), keys=keys), "launcher"):
+        pass
+
+
+def test_without_keys_on_purpose_every_health_says_so() -> None:
+    port = free_endpoint().rsplit(":", 1)[1]
+    got: list[Sample] = []
+    settings = BusSettings(listen=(f"tcp/0.0.0.0:{port}",), insecure=True)
+    with Process(settings, "safety", stderr=False) as process:
+        process.bus.subscribe(HEALTH, got.append)
+        for _ in range(3):
+            before = len(got)
+            process.announce()
+            eventually(lambda: len(got) > before)  # noqa: B023
+    assert len(got) >= 3
+    for sample in got:
+        assert "INSECURE" in sample.message().notes["security"]
+
+
+def test_missing_keys_are_named(keys: Path, tmp_path: Path) -> None:
+    settings = BusSettings(connect=("tls/127.0.0.1:1",), keys=keys)
+    with pytest.raises(BadKeys, match=r"actor-77\.pem"):
+        Bus(settings, "actor-77")
+    with pytest.raises(BadKeys, match="no role"):
+        Bus(settings, "bob")
+    with pytest.raises(BadKeys, match=r"ca\.pem"):
+        Bus(BusSettings(connect=("tls/127.0.0.1:1",), keys=tmp_path), "actor-0")
+
+
+def test_private_keys_are_their_owners(keys: Path) -> None:
+    for path in keys.glob("*.key"):
+        assert path.stat().st_mode & 0o077 == 0, path
+    assert keys.stat().st_mode & 0o077 == 0
+
+
+def test_all_that_is_recorded_may_be_recorded() -> None:
+    for topic in RECORDED:
+        assert {"recorder", "viewer", "launcher"} <= set(topic.listeners)
