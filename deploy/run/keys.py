@@ -13,7 +13,7 @@ OTHERS = ("launcher", "viewer", "client", "certify")  # who may join in, besides
 
 
 def own_keys(config: RunConfig, folder: Path) -> Path:
-    """The folder of the run's keys, made if there is none; a run that goes on keeps them, for they signed its models."""
+    """The folder of the run's keys, made if there is none; a run that goes on has the same: they signed its models."""
     keys = folder / KEYS
     authority = Authority(keys)
     for name in (*OTHERS, *(place.name for place in places(config) if place.kind != "autopilot")):

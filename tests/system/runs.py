@@ -14,6 +14,7 @@ from typing import Any, Self
 import psutil
 
 from deploy.interpreter import PYTHON
+from deploy.run.places import client_of, launcher_of
 from logs.metrics import Metrics
 from messaging.bus import Bus, BusSettings, Sample
 from messaging.topics import RECORDED
@@ -82,23 +83,27 @@ class Run:
     def watch(self) -> Metrics:
         """Figures of what is on the bus from now on."""
 
-        def endpoint() -> str | None:
+        def settings() -> BusSettings | None:
             try:
-                said = json.loads((self.folder / "endpoint").read_text())
+                return client_of(self.folder) if launcher_of(self.folder) == self.popen.pid else None
             except (OSError, ValueError):
                 assert self.popen.poll() is None, self.errors.read_text()
                 return None
-            return said["endpoint"] if said["pid"] == self.popen.pid else None
 
         def take(sample: Sample) -> None:
             self.metrics.add(sample.key, sample.message())
 
         if self._bus is None:
-            settings = BusSettings(connect=(until(endpoint, "an endpoint"),))
-            self._bus = Bus(settings, "watcher")
+            self._bus = Bus(until(settings, "an endpoint"), "viewer.test")
             for topic in RECORDED:
                 self._bus.subscribe(topic, take)
         return self.metrics
+
+    @property
+    def there(self) -> tuple[object, ...]:
+        """Options of a command that joins in."""
+        (endpoint,) = client_of(self.folder).connect
+        return "--connect", endpoint, "--keys", self.folder / "keys"
 
     def steps(self) -> int:
         """Taken since `watch`."""

@@ -21,9 +21,8 @@ def test_a_payload_is_noticed_and_a_new_model_set_takes_over_in_mid_run(data_fol
     with Run(tmp_path / "run", "--steps", ENDLESS, "--learner.td3.warmup", ENDLESS, *change) as run:
         metrics = run.watch()
         run.until_steps(BEFORE + DURING)
-        endpoint = json.loads((run.folder / "endpoint").read_text())["endpoint"]
         words = ("--last", DURING - 500, "--certificates", "residual", "--mode", "direct", "--publish", "--json")
-        certify = brakeline("certify", run.folder, *words, "--connect", endpoint)
+        certify = brakeline("certify", run.folder, *words, *run.there)
         assert certify.returncode == 0, certify.stderr
         published = json.loads(certify.stdout)["residual"]
         processes = metrics.processes

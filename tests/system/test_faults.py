@@ -103,7 +103,7 @@ def test_interrupted_it_ends_in_order_and_is_resumed(data_folder, tmp_path):
 def test_two_replicas_and_then_no_launcher(data_folder, tmp_path):
     with Run(tmp_path / "run", "--steps", 100_000, "--replicas", 2) as run:
         run.until_steps(200)
-        _is_asked(json.loads((run.folder / "endpoint").read_text())["endpoint"])
+        _is_asked(run.there)
         victims = run.children()
         assert {"safety-0", "safety-1", "recorder", "learner", "actor-0", "actor-1"} == victims.keys()
         victims["safety-0"].kill()
@@ -122,20 +122,20 @@ def test_two_replicas_and_then_no_launcher(data_folder, tmp_path):
     assert exists(run.folder / "learner" / "checkpoint"), "and so did the learner"
 
 
-def _is_asked(endpoint: str) -> None:
+def _is_asked(there: tuple[object, ...]) -> None:
     """`status` and `query` of a run in progress, for people and as JSON."""
-    status = brakeline("status", "--connect", endpoint)
+    status = brakeline("status", *there)
     assert status.returncode == 0 and "safety-1" in status.stdout and "learning ground" in status.stdout
-    told = json.loads(brakeline("status", "--connect", endpoint, "--json").stdout)
+    told = json.loads(brakeline("status", *there, "--json").stdout)
     assert {"launcher", "recorder", "safety-0", "safety-1", "learner", "actor-0", "actor-1"} <= set(told["alive"])
     assert told["processes"]["safety-0"]["model ground"] and told["learners"]["ground"]["steps"] > 0
-    near = ("query", "ground", "--connect", endpoint, "--timeout", 10, "--obstacle", "cylinder 0.25 0 0.1")
+    near = ("query", "ground", *there, "--timeout", 10, "--obstacle", "cylinder 0.25 0 0.1")
     answer = json.loads(brakeline(*near, "--json").stdout)
     assert answer.keys() >= {"decision", "plan", "tube", "margin", "time_ms", "model"}
     assert answer["decision"] in ("allowed", "adjusted", "failsafe") and answer["margin"] >= 0.0
     assert len(answer["plan"]) == len(answer["tube"]["center"]) == len(answer["tube"]["half_width"]) == GROUND.horizon
     assert answer["decision"] in brakeline(*near).stdout
-    wrong = brakeline("query", "ground", "--connect", endpoint, "--state", 1, 2)
+    wrong = brakeline("query", "ground", *there, "--state", 1, 2)
     assert wrong.returncode == 1 and "BadRequest" in wrong.stderr and "Traceback" not in wrong.stderr
 
 

@@ -29,8 +29,7 @@ def run(data_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator
 @pytest.fixture(scope="module")
 def watched(run: Run) -> Iterator[dict[str, str]]:
     """Where `brakeline watch` says one can look at it."""
-    endpoint = json.loads((run.folder / "endpoint").read_text())["endpoint"]
-    words = [*BRAKELINE, "watch", "--connect", endpoint, "--port", "0", "--foxglove-port", "0", "--json"]
+    words = [*BRAKELINE, "watch", *map(str, run.there), "--port", "0", "--foxglove-port", "0", "--json"]
     watcher = subprocess.Popen(words, stdout=subprocess.PIPE, text=True)
     try:
         assert watcher.stdout is not None
