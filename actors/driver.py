@@ -10,12 +10,11 @@ from numpy.typing import NDArray
 
 from actors.guard import Outcome, at_rest, next_input
 from messaging import brakeline_pb2 as pb
-from messaging.robots import GROUND, QUADROTOR, Robot
+from messaging.robots import Robot
+from messaging.tasks import task_of
 from safety.client import obstacle_messages, request_message
 from safety.commitment import Array, Commitment, Prediction, correction_penalty
 
-# What the learner is paid where an intervention ends the episode (deploy/study/experiments.md).
-LOWEST = {GROUND.name: -20.0, QUADROTOR.name: -2.0}
 EPISODE_STRIDE = 4096  # episodes of different robots of a run never share a seed: seed = episode · stride + number
 
 
@@ -179,6 +178,6 @@ class Driver:
     def _cut(self, step: pb.Step) -> None:
         """No penalty, but the end of the episode if there was an intervention. A collision while braking stays one."""
         step.cut = step.decision == pb.FAILSAFE
-        step.penalty = max(step.reward - LOWEST[self.robot.kind], 0.0) if step.cut else 0.0
+        step.penalty = max(step.reward - task_of(self.robot).reward.cut, 0.0) if step.cut else 0.0
         if step.cut and self.running:
             self.running, step.truncated = False, True

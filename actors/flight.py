@@ -278,7 +278,7 @@ def run(settings: ActorSettings, flight: FlightSettings, arena: Arena, propose: 
         if not (rider.join(stop) and answered(question, robot, stages[0].start, stop)):
             return False
         vehicle = LiveVehicle(
-            open_link(flight.url), flight.system, flight.height, flight.origin, truth, rider.tape.take, tolerance
+            open_link(flight.url), robot, flight.system, flight.height, flight.origin, truth, rider.tape.take, tolerance
         )
         try:
             rider.take(vehicle)

@@ -8,11 +8,9 @@ from typing import Protocol
 import numpy as np
 
 from actors.mavlink import ATTITUDE, IMU, POSITION, Array, Client, Tap
-from messaging.robots import QUADROTOR
+from messaging.robots import Robot
 from sim.quadrotor import SAMPLES, Quadrotor, slewed
 from sim.vehicle import Period
-
-SAMPLE_TIME = QUADROTOR.period / SAMPLES  # s
 
 
 class Endpoint(Protocol):
@@ -34,12 +32,13 @@ class MavlinkVehicle:
     the air; setpoints and mode are exchanged before time begins.
     """
 
-    def __init__(self, endpoint: Endpoint, tap: Tap | None = None) -> None:
+    def __init__(self, endpoint: Endpoint, robot: Robot, tap: Tap | None = None) -> None:
         """tap: is called with every MAVLink frame. Raises MavlinkError when the autopilot refuses something."""
         self._endpoint, self._client = endpoint, Client(endpoint.receive, tap=tap)
-        self.input = np.zeros(QUADROTOR.action_dim)
+        self._period = period = robot.period
+        self.input = np.zeros(robot.action_dim)
         wait = self._wait
-        for message, interval in ((POSITION, SAMPLE_TIME), (ATTITUDE, QUADROTOR.period), (IMU, QUADROTOR.period)):
+        for message, interval in ((POSITION, period / SAMPLES), (ATTITUDE, period), (IMU, period)):
             self._client.stream(message, interval, wait)
             self._client.request(message, wait)
         self._client.follow_setpoints(wait)
@@ -56,7 +55,7 @@ class MavlinkVehicle:
         client.path.clear()
         client.setpoint(self.input)
         endpoint.vehicle.watch()
-        endpoint.advance(QUADROTOR.period)
+        endpoint.advance(self._period)
         client.feed(endpoint.take())
         self.measured = self._measured()
         path = np.array([position for _, position in client.path]) - start

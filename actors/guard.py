@@ -64,4 +64,5 @@ def next_input(commitment: Commitment, outcome: Outcome) -> Array:
 
 def at_rest(commitment: Commitment) -> bool:
     """Is the robot standing, and committed to that? Then it can wait for the service for as long as it takes."""
-    return not commitment.input_in_force.any() and not commitment.plan.any()
+    robot = commitment.robot
+    return bool(robot.rests(commitment.input_in_force) and robot.rests(commitment.plan).all())

@@ -17,14 +17,13 @@ import numpy as np
 
 from actors.mavlink import ATTITUDE, IMU, POSITION, STATE, Array, Client, MavlinkError, Tap
 from messaging.links import Link
-from messaging.robots import QUADROTOR
+from messaging.robots import Robot
 from messaging.tolerant import Tolerance
-from sim.quadrotor import SAMPLES, slewed
+from sim.quadrotor import QUADROTOR, SAMPLES, slewed
 from sim.vehicle import Period
 
 log = logging.getLogger("brakeline.flight")
 
-SAMPLE_TIME = QUADROTOR.period / SAMPLES  # s
 POLL = 0.005  # s between two looks at a link
 RESEND = 0.05  # s after which a setpoint is sent again
 STALE = 0.2  # s without a position after which telemetry counts as lost
@@ -152,6 +151,7 @@ class LiveVehicle:
     def __init__(
         self,
         link: Link,
+        robot: Robot,
         system: int = 1,
         height: float = 3.0,
         origin: tuple[float, float, float] = (0.0, 0.0, 0.0),
@@ -166,6 +166,7 @@ class LiveVehicle:
         Raises:
             MavlinkError: nobody there, or it refuses.
         """
+        self._robot = robot
         self._link, self._client, self._truth = link, Client(link.send, system, tap), truth
         self._origin, self._tolerance = np.asarray(origin), tolerance or Tolerance()
         self.timing = Timing()
@@ -178,8 +179,8 @@ class LiveVehicle:
         self._collisions = 0 if truth is None else truth.collisions
         state = self._state(time.monotonic())
         standing = Period(state, state, False, math.inf, math.inf, np.zeros((SAMPLES, 3)), 0.0)
-        self.turn = Turn(0, np.zeros(QUADROTOR.action_dim), standing)
-        self._due = time.monotonic() + QUADROTOR.period  # s: when the next period begins
+        self.turn = Turn(0, np.zeros(self._robot.action_dim), standing)
+        self._due = time.monotonic() + self._robot.period  # s: when the next period begins
         self._pump = threading.Thread(target=self._run, name="mavlink", daemon=True)
         self._pump.start()
 
@@ -196,7 +197,7 @@ class LiveVehicle:
             in_time = self.turn.number < number
             if in_time:
                 before = number - self.turn.number - 1
-                kept = [*self._plan, *[np.zeros(QUADROTOR.action_dim)] * before][:before]
+                kept = [*self._plan, *[np.zeros(self._robot.action_dim)] * before][:before]
                 self._plan = kept + rows
         return in_time
 
@@ -207,7 +208,7 @@ class LiveVehicle:
             MavlinkError: its thread has died.
         """
         with self._turned:
-            patience = 2.0 + QUADROTOR.period * max(0, number - self.turn.number)
+            patience = 2.0 + self._robot.period * max(0, number - self.turn.number)
             if not self._turned.wait_for(lambda: self.turn.number >= number or bool(self._failure), patience):
                 raise MavlinkError(f"period {number} does not begin")
             if self._failure:
@@ -283,7 +284,7 @@ class LiveVehicle:
 
     def _begin(self, now: float) -> None:
         """A period begins: send its input first, then see what the one before has come to."""
-        following = self._plan.pop(0) if self._plan else np.zeros(QUADROTOR.action_dim)
+        following = self._plan.pop(0) if self._plan else np.zeros(self._robot.action_dim)
         self._velocity = slewed(following, self.turn.input)
         self._send_setpoint(now)
         self._keep_time(now - self._due)
@@ -298,9 +299,9 @@ class LiveVehicle:
         timing.periods += 1
         timing.late += lateness > LATE
         timing.lateness.append(lateness)
-        slipped = lateness > QUADROTOR.period
+        slipped = lateness > self._robot.period
         timing.slips += slipped
-        self._due += QUADROTOR.period + (lateness if slipped else 0.0)
+        self._due += self._robot.period + (lateness if slipped else 0.0)
 
     def _lost(self, now: float) -> str:
         """Why what is measured, or asked of the autopilot, does not count."""
@@ -324,7 +325,7 @@ class LiveVehicle:
         heard = self._client.path
         times = [t + self._offsets.value for t, _ in heard] + [now]
         places = np.array([p + self._origin for _, p in heard] + [state[:3]])
-        at = now - QUADROTOR.period + SAMPLE_TIME * np.arange(1, SAMPLES + 1)
+        at = now - self._robot.period + self._robot.period / SAMPLES * np.arange(1, SAMPLES + 1)
         return np.stack([np.interp(at, times, places[:, axis]) for axis in range(3)], axis=1)
 
     def _report(self, state: Array, path: Array) -> Period:

@@ -10,6 +10,7 @@ from collections.abc import Callable
 from messaging import brakeline_pb2 as pb
 from messaging.bus import Bus, BusError, Sample
 from messaging.robots import Robot
+from messaging.tasks import layout
 from messaging.topics import FLOW, JOIN, WEIGHTS
 from messaging.weights import MLP, BadWeights, decode
 
@@ -59,7 +60,7 @@ class Student:
             RefusedByLearner: it says why.
         """
         message = pb.Join(
-            robot=self.robot.name, actor=self.actor, layout=self.robot.layout(), index=index, episode=episode
+            robot=self.robot.name, actor=self.actor, layout=layout(self.robot), index=index, episode=episode
         )
         say_at = 0.0
         while not stop():

@@ -7,8 +7,9 @@ from pathlib import Path
 import numpy as np
 
 from messaging.robots import Robot
+from messaging.tasks import task_of
 from messaging.weights import MLP
-from sim.policies import POLICIES, Policy, scripted
+from sim.policies import Policy, scripted
 
 UNTRAINED, TRAINED = "untrained", "trained"
 POLICY_FOLDER = Path(__file__).parents[1] / "policies"
@@ -20,13 +21,14 @@ def policy_named(name: str, robot: Robot, seed: int) -> Policy:
     Raises:
         ValueError: neither a name nor a file; BadWeights: a file that is no policy of this robot.
     """
-    if name in POLICIES:
+    policies = task_of(robot).policies
+    if name in policies:
         return scripted(name, robot, np.random.default_rng(seed))
     if name == UNTRAINED:
         return driving(MLP.untrained(robot, seed))
     path = POLICY_FOLDER / robot.kind / "trained.safetensors" if name == TRAINED else Path(name)
     if not path.is_file():
-        names = ", ".join([TRAINED, UNTRAINED, *POLICIES])
+        names = ", ".join([TRAINED, UNTRAINED, *policies])
         raise ValueError(f"no policy is called {name!r} and no such file exists; there are: {names}, or a file's path")
     if robot.late and MLP.load(path).robot.kind == robot.kind:
         return driving(MLP.load(path))  # it may have been trained in lockstep: it proposes in real time too

@@ -29,6 +29,7 @@ from learner.windows import Windows
 from messaging import brakeline_pb2 as pb
 from messaging import weights as policy
 from messaging.robots import Robot
+from messaging.tasks import layout, task_of
 
 
 class Part(Protocol):
@@ -48,7 +49,7 @@ class Learner:
     ) -> None:
         """`incarnation` tells actors of a restart: they join again when it changes."""
         self._intake = Intake(robot)
-        td3, dims = config.td3, (robot.observation_dim, robot.action_dim)
+        td3, dims = config.td3, (task_of(robot).observation_dim, robot.action_dim)
         self.robot, self.config, self.incarnation = robot, config, incarnation
         networks, draws = np.random.SeedSequence(config.seed).spawn(2)
         self._td3 = TD3(*dims, td3, seed=int(networks.generate_state(1)[0]))
@@ -106,8 +107,8 @@ class Learner:
     def _refusal(self, join: pb.Join) -> pb.Error | None:
         if join.robot != self.robot.name:
             field, why = "robot", f"{join.robot!r} where {self.robot.name!r} is learned"
-        elif join.layout != self.robot.layout():
-            field, why = "layout", f"{join.layout!r} where {self.robot.name} has {self.robot.layout()!r} here"
+        elif join.layout != layout(self.robot):
+            field, why = "layout", f"{join.layout!r} where {self.robot.name} has {layout(self.robot)!r} here"
         elif not join.actor:
             field, why = "actor", "empty"
         elif self.config.lockstep and self._limits.keys() - {join.actor}:
@@ -169,7 +170,7 @@ class Learner:
     def _encode(self) -> None:
         noise = self.config.td3.exploration_noise
         file = policy.encode(self.robot, self._td3.policy_layers(), self._version, noise)
-        self._weights = pb.Weights(robot=self.robot.name, version=self._version, layout=self.robot.layout(), file=file)
+        self._weights = pb.Weights(robot=self.robot.name, version=self._version, layout=layout(self.robot), file=file)
 
     def weights(self) -> pb.Weights:
         """The version published last."""
@@ -275,7 +276,7 @@ class Learner:
         }
 
     def _about(self) -> dict[str, Any]:
-        about = {"robot": self.robot.name, "layout": self.robot.layout(), "steps": self.steps}
+        about = {"robot": self.robot.name, "layout": layout(self.robot), "steps": self.steps}
         return about | {"config": self.config.lasting()}
 
     def _compare(self, root: Path, about: dict[str, Any]) -> None:

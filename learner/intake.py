@@ -10,6 +10,7 @@ from learner.replay import Vector
 from learner.windows import Move
 from messaging import brakeline_pb2 as pb
 from messaging.robots import Robot
+from messaging.tasks import task_of
 
 
 class BadStep(ValueError):
@@ -41,8 +42,8 @@ class Intake:
         if not np.isfinite(step.reward - step.penalty):
             raise BadStep("reward", f"{step.reward} - {step.penalty}")
         action, proposed = self._normalised("action", step.action), self._normalised("proposed", step.proposed)
-        observation = _vector("observation", step.observation, self.robot.observation_dim)
-        after = _vector("next_observation", step.next_observation, self.robot.observation_dim)
+        observation = _vector("observation", step.observation, task_of(self.robot).observation_dim)
+        after = _vector("next_observation", step.next_observation, task_of(self.robot).observation_dim)
         values = action, proposed, step.reward, step.penalty
         return Move(step.episode, step.step, observation, *values, after, step.terminated, step.truncated, step.cut)
 

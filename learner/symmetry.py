@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from learner.replay import Batch, Replay
-from messaging.rays import rays_of
-from messaging.robots import QUADROTOR, Robot
+from messaging.robots import Robot
+from messaging.tasks import task_of
 
 Indices = NDArray[np.intp]
 Matrix = NDArray[np.float64]
@@ -29,7 +29,7 @@ OBSERVATION, ACTION, NEXT_OBSERVATION = (Replay.NAMES.index(n) for n in ("observ
 def turns_of(robot: Robot) -> list[Matrix]:
     """The R (d, d) under which a robot and its world stay the same, the identity first."""
     d = robot.position_dim
-    if robot.kind != QUADROTOR.name:
+    if task_of(robot).symmetry == "none":
         return [np.eye(d)]
     swap = np.eye(d)[[1, 0, 2]]
     flips = [np.diag([x, y, 1.0]) for x, y in product((1.0, -1.0), repeat=2)]
@@ -42,14 +42,14 @@ def image_of(robot: Robot, turn: Matrix) -> tuple[Indices, Matrix, Indices, Matr
     Raises:
         ValueError: the rays do not come upon each other.
     """
-    directions, d = rays_of(robot).directions, len(turn)
+    directions, d = task_of(robot).rays.directions, len(turn)
     alike = directions @ turn @ directions.T  # [j, i]: e_j · R e_i
     rays = alike.argmax(axis=1)
     if (alike.max(axis=1) < 1.0 - 1e-9).any():
         raise ValueError(f"the rays of {robot.name} are not the same after {turn.tolist()}")
     axes = np.abs(turn).argmax(axis=1)
     signs = turn[np.arange(d), axes]
-    vectors, left = divmod(robot.observation_dim - len(rays), d)
+    vectors, left = divmod(task_of(robot).observation_dim - len(rays), d)
     if left or robot.action_dim != d:
         raise ValueError(f"{robot.name} observes and does more than vectors of {d} coordinates")
     after = len(rays) + (np.arange(vectors)[:, None] * d + axes).ravel()

@@ -16,6 +16,7 @@ from logs.segment import Entry, Segment, open_segment
 from logs.trajectories import ExportError
 from messaging import brakeline_pb2 as pb
 from messaging.robots import Robot
+from messaging.tasks import task_of
 
 BATCH = 1000  # messages that are written at once
 
@@ -23,10 +24,10 @@ BATCH = 1000  # messages that are written at once
 def columns(robot: Robot) -> dict[str, tuple[str, ...]]:
     """The names within each repeated field of a step, in their order. What is not here is not exported: `path`."""
     return {
-        "observation": robot.observation,
+        "observation": task_of(robot).observed,
         "proposed": robot.action,
         "action": robot.action,
-        "next_observation": robot.observation,
+        "next_observation": task_of(robot).observed,
         "state": robot.state,
         "true_state": robot.state,
     }

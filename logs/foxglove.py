@@ -21,8 +21,8 @@ from logs.reader import Record
 from logs.segment import Entry
 from messaging import brakeline_pb2 as pb
 from messaging.bus import Sample
-from messaging.rays import rays_of
 from messaging.robots import Robot, robot_named
+from messaging.tasks import task_of
 from messaging.topics import EPISODE, EXCHANGE, LOG, STEP
 
 log = logging.getLogger("brakeline.foxglove")
@@ -147,7 +147,7 @@ class Pictures:
         return [
             _entry(actor, "frames", scene.frames(robot, name, actor.site, step.state, time), time),
             _entry(actor, "decision", scene.decision(robot, step, exchange, time), time),
-            _entry(actor, "lidar", scene.lidar(rays_of(robot), name, step.next_observation, time), time),
+            _entry(actor, "lidar", scene.lidar(task_of(robot).rays, name, step.next_observation, time), time),
         ]
 
     def _log_line(self, key: str, decode: Decode, time: int) -> list[Entry]:

@@ -15,7 +15,7 @@ from dataclasses import dataclass, field, replace
 from logs.picture import picture, rows
 from logs.tally import Figures
 from messaging import brakeline_pb2 as pb
-from messaging.robots import LATE, ROBOTS
+from messaging.robots import LATE, robot_if_known
 
 NEAREST = 8
 COLLISIONS = 8
@@ -84,7 +84,7 @@ class Gallery:
     """
 
     def __init__(self, robot: str, wanted: int | None = None, actor: str | None = None) -> None:
-        self.robot = ROBOTS.get(robot.removesuffix(LATE))  # what is drawn is the same in real time
+        self.robot = robot_if_known(robot.removesuffix(LATE))  # what is drawn is the same in real time
         self.label = ""
         self.wanted, self.actor = wanted, actor
         self.found: list[Figures] = []  # the wanted ones, with all their steps

@@ -14,6 +14,7 @@ import numpy as np
 from logs.reader import Paths, open_log
 from messaging import brakeline_pb2 as pb
 from messaging.robots import Robot
+from messaging.tasks import task_of
 
 BATCH = 100  # episodes that are written at once
 # Per step, besides what Minari knows; `infos` of a data set.
@@ -78,13 +79,13 @@ def to_minari(paths: Paths, robot: Robot, name: str) -> Written:
     if path.exists():
         raise ExportError(f"{path} is there already: give another name, e.g. with the next -v<number>")
     about: dict[str, Any] = {
-        "observation_space": gymnasium.spaces.Box(-np.inf, np.inf, (robot.observation_dim,), np.float32),
+        "observation_space": gymnasium.spaces.Box(-np.inf, np.inf, (task_of(robot).observation_dim,), np.float32),
         "action_space": gymnasium.spaces.Box(robot.low().astype(np.float32), robot.high().astype(np.float32)),
         "algorithm_name": "logged by brakeline",
         "author": "brakeline",
         "author_email": "none",
         "code_permalink": "none",
-        "description": f"{robot.name}: observation {robot.observation}; action {robot.action}",
+        "description": f"{robot.name}: observation {task_of(robot).observed}; action {robot.action}",
     }
     every = episodes(paths, robot)
     dataset: Any = None

@@ -92,11 +92,14 @@ class Obstacle(_message.Message):
     POSITION_FIELD_NUMBER: _builtins.int
     SIZE_FIELD_NUMBER: _builtins.int
     YAW_FIELD_NUMBER: _builtins.int
+    MARGIN_FIELD_NUMBER: _builtins.int
     MOTION_FIELD_NUMBER: _builtins.int
     kind: _builtins.str
     """box | cylinder | sphere | wall (messaging/shapes.py)"""
     yaw: _builtins.float
     """rad"""
+    margin: _builtins.float
+    """m kept beside the body's own radius; negative: the body may reach over it"""
     @_builtins.property
     def position(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]:
         """m"""
@@ -116,11 +119,12 @@ class Obstacle(_message.Message):
         position: _abc.Iterable[_builtins.float] | None = ...,
         size: _abc.Iterable[_builtins.float] | None = ...,
         yaw: _builtins.float = ...,
+        margin: _builtins.float = ...,
         motion: Global___Motion | None = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _typing.Literal["motion", b"motion"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["kind", b"kind", "motion", b"motion", "position", b"position", "size", b"size", "yaw", b"yaw"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["kind", b"kind", "margin", b"margin", "motion", b"motion", "position", b"position", "size", b"size", "yaw", b"yaw"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 

@@ -1,32 +1,66 @@
-"""What every part must agree on about a robot: names, order, units and bounds of its vectors, and its clock.
+"""What every part must agree on about a robot: names, order, units and bounds of its vectors, how it stops, its clock.
 
-SI units and ENU throughout. The first `position_dim` coordinates of a state are its position.
+A robot is a file (`robots/NAME.toml`, or anybody's own), read by `messaging.descriptions`. SI units and ENU throughout.
+The first `position_dim` coordinates of a state are its position.
 """
 
 from __future__ import annotations
 
 import hashlib
+import json
 import math
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
+LATE = "-late"  # ends the name of a robot in real time
+RAMP, HOLD, FEEDBACK = "ramp", "hold", "feedback"
+FOLLOWED = 1e-6  # of an input's range: two inputs this close are the same (they were rounded to single precision)
+FOLDER = Path(__file__).parents[1] / "robots"
+
 
 class UnknownRobot(ValueError):
-    """The name is not in `ROBOTS`."""
+    """No robot of that name is known here, or its description is none."""
 
     field = "robot"  # of a request, where it stands
+
+
+@dataclass(frozen=True)
+class Disc:
+    """A disc (sphere in space) fixed to the robot's frame. at (d,) [m] from the regressed position; radius [m]."""
+
+    at: tuple[float, ...]
+    radius: float
+
+    @property
+    def arm(self) -> float:
+        """m from the regressed position to its centre."""
+        return math.hypot(*self.at)
+
+
+@dataclass(frozen=True)
+class Limit:
+    """`weights · state <= most`, to be kept along every plan like an obstacle. weights (n,), in units of each."""
+
+    name: str
+    weights: tuple[float, ...]
+    most: float
 
 
 @dataclass(frozen=True)
 class Robot:
     """A robot kind.
 
-    A plan has `horizon` inputs, one a period: `free_steps` chosen ones, then a linear ramp of the last of them
-    down to zero in `brake_steps`. After it the robot stands still (`method` of both robots: zero input is a stop).
+    A plan has `horizon` inputs, one a period: `free_steps` chosen ones, then each input by its own `stop` rule: down to
+    zero linearly in `brake_steps` (`RAMP`), held as it is (`HOLD`: a car keeps its steering), fractions of the last
+    chosen one (a profile that ends in zero), or what `feedback` makes of the measured state (`FEEDBACK`). After it the
+    robot stands.
     """
 
     name: str
@@ -39,14 +73,18 @@ class Robot:
     action_high: tuple[float, ...]
     translates: tuple[bool, ...]  # which inputs move the position; the others can be used while standing
     action_slew: tuple[float, ...]  # largest change of the input from one period to the next; inf: none
-    observation: tuple[str, ...]
     regressor: tuple[int, ...]  # state coordinates that matter for the next step, besides the input in force
     measurement_bound: tuple[float, ...]  # Z_v: half-widths of |measured - true|, one a state coordinate
-    footprint: float  # m, radius of the disc (sphere) about the position that holds the body in every attitude
     sight: float  # m from the measured position: the obstacles that come with every request
     horizon: int
     free_steps: int
     brake_steps: int
+    body: tuple[Disc, ...]  # holds the whole body
+    stop: tuple[str | tuple[float, ...], ...]  # a rule an input
+    follows: tuple[int, ...]  # for each input the state coordinate that comes to it; -1: none does
+    feedback: tuple[tuple[float, ...], ...] = ()  # (m, n): of inputs that stop by it, gains on the measured state
+    stopped: float = math.inf  # residual speed, in units of each followed or regressed coordinate, that counts as none
+    limits: tuple[Limit, ...] = ()
     late: bool = False  # an answer counts from the next period on: a plan's first input is the one in force meanwhile
 
     @property
@@ -63,10 +101,6 @@ class Robot:
         return len(self.action)
 
     @property
-    def observation_dim(self) -> int:
-        return len(self.observation)
-
-    @property
     def regressor_dim(self) -> int:
         """Length of z_0 = [x_0 (regressor coordinates); input in force], to which a plan's inputs are appended."""
         return len(self.regressor) + self.action_dim
@@ -77,14 +111,38 @@ class Robot:
         return int(self.late)
 
     def in_real_time(self) -> Robot:
-        """The same robot where the world does not wait for an answer: it decides on the period after this one."""
+        """The same robot where the world does not wait for an answer: it decides on the period after this one.
+
+        Raises:
+            UnknownRobot: it stops by feedback: what the input in force then is, is not known when it is asked about.
+        """
+        if self.feedback:
+            raise UnknownRobot(f"{self.name} stops by feedback: it has no real-time mode")
         return replace(self, name=self.name + LATE, late=True, horizon=self.horizon + 1, free_steps=self.free_steps + 1)
 
+    def in_lockstep(self) -> Robot:
+        """The same robot where the world waits."""
+        if not self.late:
+            return self
+        return replace(self, name=self.kind, late=False, horizon=self.horizon - 1, free_steps=self.free_steps - 1)
+
+    @cached_property
+    def footprint(self) -> float:
+        """m, radius of the disc (sphere) about the position that holds the body in every attitude."""
+        return max(disc.arm + disc.radius for disc in self.body)
+
     @property
-    def speeds(self) -> slice:
-        """The state coordinates that follow the inputs: they come after the pose."""
-        first = self.position_dim + (self.heading is not None)
-        return slice(first, first + self.action_dim)
+    def speeds(self) -> list[int]:
+        """The state coordinates that come to the inputs, in the order of those that any comes to."""
+        return [index for index in self.follows if index >= 0]
+
+    def driving(self, inputs: Array) -> Array:
+        """The state (n,), at the origin, of a robot that has come to these inputs (m,)."""
+        state = np.zeros(self.state_dim)
+        for index, value in zip(self.follows, inputs, strict=True):
+            if index >= 0:
+                state[index] = value
+        return state
 
     def low(self) -> Array:
         return np.asarray(self.action_low)
@@ -92,99 +150,134 @@ class Robot:
     def high(self) -> Array:
         return np.asarray(self.action_high)
 
+    @cached_property
+    def stopping(self) -> NDArray[np.bool_]:
+        """(m,) which inputs are zero when it stands: all but those that are held."""
+        return np.array([rule != HOLD for rule in self.stop])
+
+    def rests(self, inputs: Array) -> NDArray[np.bool_]:
+        """Are these inputs (..., m) those of a stop?"""
+        return np.asarray((np.abs(inputs) < 1e-9)[..., self.stopping].all(-1))
+
+    def fractions(self) -> Array:
+        """What the rules leave of the last chosen input, j periods after it: (horizon, m), ones for j = 0."""
+        left = np.ones((self.horizon, self.action_dim))
+        for j in range(1, self.horizon):
+            for i, rule in enumerate(self.stop):
+                if rule == RAMP:
+                    left[j, i] = max(0.0, 1.0 - j / self.brake_steps)
+                elif rule == FEEDBACK:
+                    left[j, i] = 0.0
+                elif rule != HOLD:
+                    left[j, i] = float(rule[min(j, len(rule)) - 1])
+        return left
+
     def schedule(self) -> Array:
-        """S with `plan = S @ free`, plan (horizon·m) and free (free_steps·m) stacked step by step. Shape (N·m, F·m)."""
-        m = self.action_dim
-        fractions = np.zeros((self.horizon, self.free_steps))
+        """S with `plan = S @ free`, plan (horizon·m) and free (free_steps·m) stacked step by step. Shape (N·m, F·m).
+
+        What `feedback` adds to it is not known before.
+        """
+        m, F, left = self.action_dim, self.free_steps, self.fractions()
+        S = np.zeros((self.horizon * m, F * m))
         for k in range(self.horizon):
-            if k < self.free_steps:
-                fractions[k, k] = 1.0
-            else:
-                fractions[k, -1] = max(0.0, 1.0 - (k - self.free_steps + 1) / self.brake_steps)
-        return np.asarray(np.kron(fractions, np.eye(m)), dtype=float)
+            for i in range(m):
+                S[k * m + i, min(k, F - 1) * m + i] = 1.0 if k < F else left[k - F + 1, i]
+        return S
+
+    def braked(self, planned: Array, state: Array, before: Array) -> Array:
+        """A plan's rows while it brakes (..., m), with what `feedback` makes of the measured state (..., n), in bounds
+        and slew after the input `before` (..., m)."""
+        if not self.feedback:
+            return planned
+        by_state = np.array([rule == FEEDBACK for rule in self.stop])
+        wanted = np.where(by_state, state @ np.asarray(self.feedback).T, planned)
+        slew = np.asarray(self.action_slew)
+        low, high = np.maximum(self.low(), before - slew), np.minimum(self.high(), before + slew)
+        return np.asarray(np.clip(wanted, low, high))
+
+    def stands(self, state: Array) -> bool:
+        """Is no measured speed more than counts as stopped?"""
+        return bool((np.abs(state[list(self.regressor)]) <= self.stopped).all())
+
+    @cached_property
+    def description(self) -> dict[str, Any]:
+        """What its file says, as JSON would hold it (`messaging.descriptions`); of a late robot: the one that waits."""
+        from messaging.descriptions import describe
+
+        return describe(self.in_lockstep())
 
     def layout(self) -> str:
         """Hash of everything that two processes must share to understand each other's vectors."""
-        shared = {name: value for name, value in asdict(self).items() if name != "late" or value}
-        return hashlib.sha256(repr(sorted(shared.items())).encode()).hexdigest()[:16]
+        words = json.dumps([self.description, self.late])  # the order of names is part of it
+        return hashlib.sha256(words.encode()).hexdigest()[:16]
+
+    def understands(self, layout: object) -> bool:
+        """Is it this robot's layout, or the one it had before robots were files?"""
+        return layout == self.layout() or layout == FORMER_LAYOUTS.get(self.name)
 
 
-LATE = "-late"  # ends the name of a robot in real time
-RAYS = 18
+# Of what was recorded, certified and trained before robots were files.
+FORMER_LAYOUTS = {
+    "ground": "746231dcb2e4fad7",
+    "ground-late": "d013241bb63d32ac",
+    "quadrotor": "82b53a84411b2bee",
+    "quadrotor-late": "296e1f047a7fcc62",
+}
 
-GROUND = Robot(
-    name="ground",
-    period=0.2,
-    state=("x [m]", "y [m]", "heading [rad]", "speed [m/s]", "turn rate [rad/s]"),
-    position_dim=2,
-    heading=2,
-    action=("speed [m/s]", "turn rate [rad/s]"),
-    action_low=(0.0, -0.5),
-    action_high=(0.25, 0.5),
-    translates=(True, False),
-    action_slew=(math.inf, math.inf),
-    observation=(
-        *(f"ray {i} [range/3.5 m]" for i in range(RAYS)),
-        "goal distance [5 m]",
-        "goal bearing sin",
-        "goal bearing cos",
-        "speed [0.25 m/s]",
-        "turn rate [0.5 rad/s]",
-        "last speed input [0.25 m/s]",
-        "last turn input [0.5 rad/s]",
-        "turn memory: low-passed turn rate [0.5 rad/s]",
-    ),
-    regressor=(3, 4),
-    measurement_bound=(0.01, 0.01, 0.02, 0.02, 0.05),
-    footprint=0.105,
-    sight=1.0,
-    horizon=3,
-    free_steps=1,
-    brake_steps=1,
-)
+_known: dict[str, Robot] = {}  # by name, those that were read
 
-SPHERE_RAYS = 180  # of the quadrotor's lidar: 36 azimuths over 360° x 5 elevations over 60°
 
-QUADROTOR = Robot(
-    name="quadrotor",
-    period=0.2,
-    state=(
-        *(f"{axis} [m]" for axis in "xyz"),
-        *(f"v{axis} [m/s]" for axis in "xyz"),
-        *(f"a{axis} [m/s2]" for axis in "xyz"),
-    ),
-    position_dim=3,
-    heading=None,  # the yaw is held at zero: its frame is the world's
-    action=tuple(f"v{axis} setpoint [m/s]" for axis in "xyz"),
-    action_low=(-5.0, -5.0, -5.0),
-    action_high=(5.0, 5.0, 5.0),
-    translates=(True, True, True),
-    action_slew=(0.8, 0.8, 0.8),  # 4 m/s² by a period of 0.2 s
-    observation=(
-        *(f"ray {i} [range/12 m]" for i in range(SPHERE_RAYS)),
-        *(f"goal - p, {axis} [its length + 5 m]" for axis in "xyz"),
-        *(f"v{axis} [5 m/s]" for axis in "xyz"),
-        *(f"last v{axis} setpoint [5 m/s]" for axis in "xyz"),
-    ),
-    regressor=(3, 4, 5, 6, 7, 8),
-    measurement_bound=(0.03, 0.03, 0.03, 0.03, 0.03, 0.03, 0.3, 0.3, 0.3),
-    footprint=0.3,
-    sight=12.0,
-    horizon=12,
-    free_steps=1,
-    brake_steps=7,  # from 5 m/s the ramp falls by 0.71 m/s a period, within the slew
-)
-
-ROBOTS: dict[str, Robot] = {robot.name: robot for robot in (GROUND, QUADROTOR)}
+def shipped() -> tuple[str, ...]:
+    """The names of the robots that come with the program."""
+    return tuple(sorted(path.stem for path in FOLDER.glob("*.toml") if "." not in path.stem))
 
 
 def robot_named(name: str) -> Robot:
-    """The robot of that name; with `LATE` at its end, the same in real time.
+    """The robot of that name, or in the file at that path; with `LATE` at the end, the same in real time.
+
+    A name is one that comes with the program, or one whose file, or model set, was read before.
 
     Raises:
-        UnknownRobot: with the names there are.
+        UnknownRobot: with the names there are, or every mistake in the file.
     """
+    from messaging.descriptions import read
+
+    base = name.removesuffix(LATE)
+    robot = _known.get(base)
+    if robot is None:
+        path = Path(base) if base.endswith(".toml") else FOLDER / f"{base}.toml"
+        if path.parent == FOLDER and path.stem not in shipped():
+            there = ", ".join(sorted({*shipped(), *_known}))
+            raise UnknownRobot(f"no robot is called {name!r}; there are: {there}, or the path of a description (.toml)")
+        robot = _known[base] = known(read(path))
+    return robot.in_real_time() if name.endswith(LATE) else robot
+
+
+def robot_if_known(name: str) -> Robot | None:
+    """`robot_named`, or None."""
     try:
-        return ROBOTS[name.removesuffix(LATE)].in_real_time() if name.endswith(LATE) else ROBOTS[name]
-    except KeyError:
-        raise UnknownRobot(f"no robot is called {name!r}; there are: {', '.join(sorted(ROBOTS))}") from None
+        return robot_named(name)
+    except UnknownRobot:
+        return None
+
+
+def known(robot: Robot) -> Robot:
+    """The same robot, to be found by its name from now on.
+
+    Raises:
+        UnknownRobot: another of that name comes with the program.
+    """
+    base = robot.in_lockstep()
+    if base.name in shipped():
+        own = _known.get(base.name) or _read_shipped(base.name)
+        if own != base:
+            raise UnknownRobot(f"{base.name} is the name of a robot that comes with the program: choose another")
+        base = own
+    _known[base.name] = base
+    return robot
+
+
+def _read_shipped(name: str) -> Robot:
+    from messaging.descriptions import read
+
+    return read(FOLDER / f"{name}.toml")

@@ -42,7 +42,8 @@ class Obstacle:
 
     size: box: full edge lengths (one per axis); cylinder: (radius,) in the plane, (radius, height) in space;
     sphere: (radius,); wall: () — a plane through `position` whose free side is the direction `yaw` points to.
-    yaw: rad about the vertical (box and wall).
+    yaw: rad about the vertical (box and wall). margin: m that are kept beside the body's own radius; negative where the
+    body may reach over it, down to minus its radius where only the regressed position counts.
     motion: how it moves; None: it stands still (`Shapes` takes every obstacle for standing: see `movers.parted`).
     """
 
@@ -50,6 +51,7 @@ class Obstacle:
     position: tuple[float, ...]
     size: tuple[float, ...] = ()
     yaw: float = 0.0
+    margin: float = 0.0
     motion: Motion | None = None
 
     def __post_init__(self) -> None:
@@ -62,6 +64,8 @@ class Obstacle:
             raise BadShape("position", f"an obstacle's position must be finite, not {list(self.position)}")
         if not math.isfinite(self.yaw):
             raise BadShape("yaw", f"an obstacle's yaw must be finite, not {self.yaw}")
+        if not math.isfinite(self.margin):
+            raise BadShape("margin", f"an obstacle's margin must be finite, not {self.margin}")
         sizes = {BOX: dim, CYLINDER: dim - 1, SPHERE: 1, WALL: 0}[self.kind]
         if len(self.size) != sizes:
             raise BadShape("size", f"a {dim}-D {self.kind} has {sizes} sizes, not {len(self.size)}")
@@ -73,13 +77,15 @@ class Obstacle:
 
 @dataclass(frozen=True)
 class Shapes:
-    """Obstacles as arrays: center (n, d), axes (n, d, d) world-from-local, half (n, d), rho (n,), round (n, d)."""
+    """Obstacles as arrays: center (n, d), axes (n, d, d) world-from-local, half (n, d), rho (n,), round (n, d),
+    margin (n,)."""
 
     center: Array
     axes: Array
     half: Array
     rho: Array
     round: Array  # 1 on the axes that the rounding acts on
+    margin: Array  # m
 
     def __len__(self) -> int:
         return len(self.rho)
@@ -115,11 +121,13 @@ class Shapes:
             np.array(half, dtype=float).reshape(n, dim),
             np.array(rho, dtype=float),
             np.array(rounded, dtype=float).reshape(n, dim),
+            np.array([obstacle.margin for obstacle in obstacles], dtype=float),
         )
 
     def take(self, index: NDArray[np.intp] | NDArray[np.bool_]) -> Shapes:
         """The chosen obstacles."""
-        return Shapes(self.center[index], self.axes[index], self.half[index], self.rho[index], self.round[index])
+        parts = self.center, self.axes, self.half, self.rho, self.round, self.margin
+        return Shapes(*(part[index] for part in parts))
 
     def towards(self, points: Array) -> Array:
         """Vectors from points (..., d) to the closest points of the n obstacles: (n, ..., d); zero inside."""

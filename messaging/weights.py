@@ -19,6 +19,7 @@ import safetensors.numpy
 from numpy.typing import NDArray
 
 from messaging.robots import Array, Robot, UnknownRobot, robot_named
+from messaging.tasks import layout, task_of, understands
 
 Matrix = NDArray[np.float32]
 Layers = Sequence[tuple[Matrix, Matrix]]  # weight (out, in), bias (out,)
@@ -43,7 +44,7 @@ class MLP:
         _check(robot, layers)
         self.robot, self.version, self.noise = robot, version, noise
         self.layers = [(np.array(weight, np.float32), np.array(bias, np.float32)) for weight, bias in layers]
-        self._input = np.zeros(robot.observation_dim, np.float32)
+        self._input = np.zeros(task_of(robot).observation_dim, np.float32)
         self._outputs = [np.zeros_like(bias) for _, bias in self.layers]
         self._low, self._high = robot.low(), robot.high()
         self._centre, self._half = (self._high + self._low) / 2.0, (self._high - self._low) / 2.0
@@ -53,7 +54,7 @@ class MLP:
         """Uniform in ±1/√(inputs of the layer), as the learner starts."""
         generator = np.random.default_rng(seed)
         layers = []
-        for inputs, outputs in pairwise((robot.observation_dim, *hidden, robot.action_dim)):
+        for inputs, outputs in pairwise((task_of(robot).observation_dim, *hidden, robot.action_dim)):
             bound = 1.0 / np.sqrt(inputs)
             draw = generator.uniform(-bound, bound, (outputs, inputs + 1)).astype(np.float32)
             layers.append((draw[:, :inputs], draw[:, inputs]))
@@ -61,7 +62,7 @@ class MLP:
 
     @property
     def sizes(self) -> tuple[int, ...]:
-        return (self.robot.observation_dim, *(len(bias) for _, bias in self.layers))
+        return (task_of(self.robot).observation_dim, *(len(bias) for _, bias in self.layers))
 
     def __call__(self, observation: NDArray[Any]) -> Array:
         """The action (action_dim,), in the robot's units."""
@@ -106,7 +107,7 @@ def encode(robot: Robot, layers: Layers, version: int, noise: float = 0.0) -> by
     for number, (weight, bias) in enumerate(layers):
         tensors[f"layers.{number}.weight"] = np.ascontiguousarray(weight, np.float32)
         tensors[f"layers.{number}.bias"] = np.ascontiguousarray(bias, np.float32)
-    about = {"robot": robot.name, "layout": robot.layout(), "version": version, "noise": noise}
+    about = {"robot": robot.name, "layout": layout(robot), "version": version, "noise": noise}
     # One entry: the order of several would change from call to call.
     return safetensors.numpy.save(tensors, {"policy": json.dumps(about, sort_keys=True)})
 
@@ -153,8 +154,8 @@ def _robot(about: Any, robot: Robot | None) -> Robot:
             raise BadWeights(f"robot: unknown, {about['robot']!r}") from error
     if about["robot"] != robot.name:
         raise BadWeights(f"robot: of {about['robot']!r} where {robot.name!r} is meant")
-    if about.get("layout") != robot.layout():
-        raise BadWeights(f"layout: {about.get('layout')!r} where {robot.name} has {robot.layout()!r}")
+    if not understands(robot, about.get("layout")):
+        raise BadWeights(f"layout: {about.get('layout')!r} where {robot.name} has {layout(robot)!r}")
     return robot
 
 
@@ -169,7 +170,7 @@ def _array(entries: dict[str, Any], name: str) -> Matrix:
 def _check(robot: Robot, layers: Layers) -> None:
     if not layers:
         raise BadWeights("layers: there are none")
-    inputs = robot.observation_dim
+    inputs = task_of(robot).observation_dim
     for number, (weight, bias) in enumerate(layers):
         if weight.ndim != 2 or weight.shape[1] != inputs or bias.shape != weight.shape[:1] or not len(bias):
             raise BadWeights(f"layers.{number}: {weight.shape} and {bias.shape} behind {inputs} inputs")

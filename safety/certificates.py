@@ -55,6 +55,18 @@ class Certificate:
         half = np.abs(self.generators) @ self.M @ np.abs(self.W)
         return self.C - half, self.C + half
 
+    def through(self, T: Array) -> Certificate:
+        """The same for regressors z' = T z (nz', nz), as a certificate of z."""
+        unbent = np.zeros((len(self.w), T.shape[1]))
+        return Certificate(
+            self.C @ T,
+            np.vstack([self.W @ T, T]),
+            np.hstack([self.M, self.kappa]),
+            unbent,
+            self.w,
+            self.generators,
+        )
+
     def outer(self, basis: Array) -> Certificate:
         """The same with W replaced by `basis` (nz, nz), never narrower: for the QP, whose size goes with W's rows.
 

@@ -49,7 +49,10 @@ class Answer:
 
 
 def obstacle_messages(obstacles: Iterable[Obstacle]) -> list[pb.Obstacle]:
-    return [pb.Obstacle(kind=o.kind, position=o.position, size=o.size, yaw=o.yaw, motion=_motion(o)) for o in obstacles]
+    return [
+        pb.Obstacle(kind=o.kind, position=o.position, size=o.size, yaw=o.yaw, margin=o.margin, motion=_motion(o))
+        for o in obstacles
+    ]
 
 
 def _motion(obstacle: Obstacle) -> pb.Motion | None:
@@ -74,6 +77,7 @@ def request_message(
     commitment: Commitment, state: ArrayLike, action: ArrayLike, obstacles: Iterable[Obstacle], **more: Any
 ) -> pb.Request:
     """A request; `more`: actor, episode, step, time, observation."""
+    commitment.seen = np.asarray(state, float)
     message = pb.Request(
         robot=commitment.robot.name,
         state=np.asarray(state, float).tolist(),
@@ -108,7 +112,7 @@ def read(reply: pb.Reply, robot: Robot) -> Answer:
     plan = plan.reshape(robot.horizon, robot.action_dim)
     if not ((plan >= robot.low() - 1e-9) & (plan <= robot.high() + 1e-9)).all():  # NaN fails too
         raise _bad_reply("plan", "an input out of bounds")
-    if plan[-1].any():
+    if not robot.rests(plan[-1]):
         raise _bad_reply("plan", "a plan that does not end in a stop")
     sizes = {len(decision.predicted_center), len(decision.predicted_half_width)}
     if sizes not in ({robot.state_dim}, {0}):  # the rivals predict nothing

@@ -58,7 +58,8 @@ class Commitment:
         self.input_in_force: Array = np.zeros(self.robot.action_dim)
         self.model = ""
         self.predicted: Prediction | None = None
-        self._still = self.robot.horizon  # periods of zero input
+        self.seen: Array = np.zeros(self.robot.state_dim)  # the last measured state: of feedback, a stop is made of it
+        self._still = self.robot.horizon  # periods of a stop's inputs
 
     def accept(self, plan: Array, model: str, predicted: Prediction | None, verified: bool) -> Array:
         """A decision's plan becomes the committed one; returns the input to execute next."""
@@ -69,15 +70,20 @@ class Commitment:
     def fallback(self) -> Array:
         """No decision came: the committed plan's next input."""
         self.predicted = None
+        if self.robot.feedback:
+            self.plan[0] = self.robot.braked(self.plan[0], self.seen, self.input_in_force)
         return self._advance()
 
     def _advance(self) -> Array:
+        robot = self.robot
         now: Array = self.plan[0].copy()
-        self.plan = np.vstack([self.plan[1:], np.zeros((1, self.robot.action_dim))])
+        rests = bool(robot.rests(now)) or (bool(robot.feedback) and robot.stands(self.seen))
+        last = np.where(robot.stopping, 0.0, self.plan[-1])
+        self.plan = np.vstack([self.plan[1:], last[None]])
         self.input_in_force = now
-        self._still = 0 if now.any() else self._still + 1
-        stopped = self.model != UNVERIFIED or self._still >= self.robot.horizon
-        if stopped and not self.plan.any() and not now.any():
+        self._still = self._still + 1 if rests else 0
+        stopped = self.model != UNVERIFIED or self._still >= robot.horizon
+        if stopped and rests and robot.rests(self.plan).all():
             self.model = ""  # standing still needs nobody's word
         return self.plan[0].copy() if self.robot.late else now
 

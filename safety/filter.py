@@ -7,26 +7,54 @@ log can be replayed.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from time import perf_counter_ns
 
 import numpy as np
 from numpy.typing import NDArray
 
 from messaging.movers import Movers
+from messaging.robots import Robot
 from messaging.shapes import Shapes
 from safety.commitment import Prediction
 from safety.freespace import half_spaces
-from safety.model_set import ModelSet
+from safety.limits import Limits, stacked
+from safety.model_set import ModelSet, needed
 from safety.program import SHARPEN, Builder, Layout, Rows
 from safety.request import ADJUSTED, ALLOWED, FAILSAFE, Decision, Request, check_for_filter
 from safety.solver import INFEASIBLE, solve
 from safety.sweep import swept_half_spaces
+from safety.tube import Tube
 
 Array = NDArray[np.float64]
 
 OUTSIDE_DOMAIN = 0.02  # of the recorded range: how far beyond it a regressor may lie (rounding, not extrapolation)
 SAME_INPUT = 1e-6  # of the input's range: an answer this close to the proposal is the proposal
+
+
+@dataclass(frozen=True)
+class _Disc:
+    """A disc of the body with the tube of its centre. at (d,): in the robot's frame; swing [m]: what an error of the
+    measured heading adds to where it is."""
+
+    at: Array
+    radius: float
+    swing: float
+    position: Array
+    layout: Layout
+
+
+def _discs(robot: Robot, tube: Tube) -> list[_Disc]:
+    d, found = robot.position_dim, []
+    after = len(needed(robot)) - d * sum(disc.arm > 0.0 for disc in robot.body)
+    for disc in robot.body:
+        position, directions, swing = tube.position, tube.directions, 0.0
+        if disc.arm and robot.heading is not None:
+            position, directions = tube.more[:, after : after + d], tube.more_directions[:, after : after + d]
+            swing = disc.arm * robot.measurement_bound[robot.heading]
+            after += d
+        found.append(_Disc(np.asarray(disc.at), disc.radius, swing, position, Layout(position, directions)))
+    return found
 
 
 @dataclass
@@ -73,7 +101,8 @@ class Filter:
         self.version = model.version
         self.robot = robot = model.robot
         self.tube, outer = model.tube(), model.outer_tube()
-        self.layout = Layout(self.tube)
+        self.discs = _discs(robot, self.tube)
+        self.limits = Limits(robot, self.tube) if robot.limits else None
         self.builder = Builder(robot, outer)
         self.schedule = robot.schedule()
         self.measured = np.asarray(robot.measurement_bound[: robot.position_dim])
@@ -84,7 +113,7 @@ class Filter:
         self.translating = np.concatenate([np.zeros(robot.regressor_dim), driven])
         self.low, self.high, self.slew = robot.low(), robot.high(), np.asarray(robot.action_slew)
         self.nothing = np.minimum(np.maximum(0.0, self.low), self.high)
-        self.braking = np.maximum(1.0 - np.arange(robot.free_steps - robot.given) / robot.brake_steps, 0.0)[:, None]
+        self.braking = robot.fractions()[: robot.free_steps - robot.given]
         self.regressor = list(robot.regressor)
         self.comfort = self._comfort() if comfort is None else comfort
         wanted = self._reach()
@@ -100,8 +129,7 @@ class Filter:
         """
         robot = self.robot
         in_place = np.where(self.standing, self.high, 0.0)
-        state = np.zeros(robot.state_dim)
-        state[robot.speeds] = in_place
+        state = robot.driving(in_place)
         z = np.concatenate([state[self.regressor], in_place, np.tile(in_place, robot.free_steps)])
         sizes = self.tube.magnitudes(z)
         L, d = self.tube.generators, robot.position_dim
@@ -136,8 +164,7 @@ class Filter:
 
     def half_width(self, speed: Array) -> float:
         """[m] of the full stop's set, largest axis, from driving at inputs `speed` (m,) with that input once more."""
-        state = np.zeros(self.robot.state_dim)
-        state[self.robot.speeds] = speed
+        state = self.robot.driving(speed)
         z = np.concatenate([state[self.regressor], speed, np.tile(speed, self.robot.free_steps)])
         return float(self.tube.half_widths(z)[-1].max())
 
@@ -176,11 +203,12 @@ class Filter:
         """The proposal if its tube is verified, else the QP's answer if that is, else nothing."""
         known, m = len(z_0), len(proposal)
         z = self._regressors(z_0, proposal)
-        if not len(scene.near) and scene.moving is None and not self.far:
+        if not len(scene.near) and scene.moving is None and not self.far and self.limits is None:
             return _Found(ALLOWED, self._plan(z), z, self.reach, True)
         rows = self._rows(scene, z)
-        margin = self._margin(rows, z)
-        if margin >= self.comfort:
+        slack = rows.bound - rows.support(self.tube, z)
+        margin = self._least(slack, z)
+        if self._least(slack - self.comfort * rows.keep, z, self.comfort) >= 0.0:
             return _Found(ALLOWED, self._plan(z), z, margin, True)
         kept = self._comfortable(rows, z_0, proposal)
         if margin >= 0.0 and self._margin(kept, z) >= 0.0:
@@ -219,35 +247,46 @@ class Filter:
         the strongest braking does): two rows instead of one."""
         in_place = self._limited(np.where(self.standing, proposal, self.nothing), z_0[-len(proposal) :])
         stay = self._regressors(z_0, in_place)
-        inside = rows.support(self.tube, stay) > rows.bound - self.comfort
-        bound = np.where(inside, rows.bound, rows.bound - self.comfort)
+        comfort = self.comfort * rows.keep
+        inside = rows.support(self.tube, stay) > rows.bound - comfort
+        bound = np.where(inside, rows.bound, rows.bound - comfort)
         if not inside.any():
-            return Rows(rows.gradient, rows.spread, bound)
+            return replace(rows, bound=bound)
         closer = rows.gradient[inside] * self.translating
         return Rows(
             np.vstack([rows.gradient, closer]),
             np.vstack([rows.spread, np.zeros((len(closer), rows.spread.shape[1]))]),
             np.concatenate([bound, closer @ stay + 2.0 * SHARPEN]),
+            np.concatenate([rows.keep, np.zeros(len(closer))]),
         )
 
     def _margin(self, rows: Rows, z: Array) -> float:
-        """Smallest distance [m] of the exact tube to a half-space; NaN never counts as inside."""
-        margin = float((rows.bound - rows.support(self.tube, z)).min(initial=self.reach))
+        """Smallest distance [m] of the exact tube to a half-space (of a limit: in its own units)."""
+        return self._least(rows.bound - rows.support(self.tube, z), z)
+
+    def _least(self, slack: Array, z: Array, comfort: float = 0.0) -> float:
+        """The smallest slack, within ± the reach (less the comfort); NaN never counts as inside."""
+        most = self.reach - comfort
+        margin = float(slack.min(initial=most))
         if self.far:
-            margin = min(margin, self.reach - self._extent(z))
+            margin = min(margin, most - self._extent(z))
         return max(margin, -self.reach) if margin == margin else -self.reach
 
     def _rows(self, scene: _Scene, z: Array) -> Rows:
         """Half-spaces about the rollout of regressors z, as rows of the tube (and of the QP's: its generators are the
         same, only their magnitudes are not)."""
-        nominal = scene.start + self.tube.centers(z) @ scene.turn.T
-        normals, offsets = half_spaces(scene.near, scene.start, nominal, self.robot.footprint, self.measured)
-        if scene.moving is not None:
-            swept = swept_half_spaces(
-                scene.moving, scene.start, nominal, self.robot.footprint, self.measured, self.robot.period
-            )
-            normals, offsets = np.concatenate([normals, swept[0]]), np.concatenate([offsets, swept[1]])
-        return self.layout.rows(normals @ scene.turn, offsets)
+        parts = []
+        for disc in self.discs:
+            start, measured = scene.start + scene.turn @ disc.at, self.measured + disc.swing
+            nominal = start + disc.position @ z @ scene.turn.T
+            normals, offsets = half_spaces(scene.near, start, nominal, disc.radius, measured)
+            if scene.moving is not None:
+                swept = swept_half_spaces(scene.moving, start, nominal, disc.radius, measured, self.robot.period)
+                normals, offsets = np.concatenate([normals, swept[0]]), np.concatenate([offsets, swept[1]])
+            parts.append(disc.layout.rows(normals @ scene.turn, offsets))
+        if self.limits is not None:
+            parts.append(self.limits.rows(scene.start, scene.heading, scene.turn))
+        return stacked(parts)
 
     def _committed(self, request: Request, scene: _Scene, z_0: Array, attempt: _Attempt, in_domain: bool) -> _Found:
         """The committed plan; if it no longer counts as verified, braking that is verified anew; else just braking.
@@ -259,14 +298,17 @@ class Filter:
         """
         if not attempt.contained:
             attempt.reason += "; the measured state was outside the predicted set"
-        vouched = (request.model == self.version and not attempt.broken) or request.still
+        vouched = (request.model == self.version and not attempt.broken) or request.still(self.robot)
         before = z_0[-self.robot.action_dim :]
-        chosen = request.plan[self.robot.given : self.robot.free_steps].ravel()
+        tail = request.plan
+        if self.robot.feedback:  # what the tail's inputs are follows from the measured state, this period's at once
+            tail = np.vstack([self.robot.braked(tail[:1], request.state, before), tail[1:]])
+        chosen = tail[self.robot.given : self.robot.free_steps].ravel()
         as_committed = np.concatenate([z_0, chosen])
         if attempt.contained and vouched:
             margin = self._margin(self._rows(scene, as_committed), as_committed)
-            return _Found(FAILSAFE, request.plan, as_committed, margin, True)
-        brake = self._regressors(z_0, self._limited(self.nothing, before))
+            return _Found(FAILSAFE, tail, as_committed, margin, True)
+        brake = self._regressors(z_0, self._stop(request.state, before))
         as_committed[len(z_0) :] = self._within(chosen, before)
         for z in (as_committed, brake):
             margin = self._margin(self._rows(scene, z), z)
@@ -305,11 +347,16 @@ class Filter:
         """The set of the next measured state, all coordinates."""
         robot, first, d = self.robot, self.model.first, self.robot.position_dim
         regressor = self.model.first_regressor(z)
-        center = first.C @ regressor
+        center = (first.C @ regressor)[: robot.state_dim]
         center[:d] = scene.start + scene.turn @ center[:d]
         if robot.heading is not None:
             center[robot.heading] += scene.heading
-        return Prediction(center, first.half_widths(regressor), scene.heading)
+        return Prediction(center, first.half_widths(regressor)[: robot.state_dim], scene.heading)
+
+    def _stop(self, state: Array, before: Array) -> Array:
+        """The strongest braking's next input: to zero, held, or what the feedback makes of the state."""
+        wanted = np.where(self.robot.stopping, self.nothing, before)
+        return self._limited(self.robot.braked(wanted, state, before), before)
 
     # --- small steps -------------------------------------------------------------------------------------------
 
@@ -341,7 +388,8 @@ class Filter:
         cos, sin = math.cos(heading), math.sin(heading)
         turn[0, 0], turn[0, 1], turn[1, 0], turn[1, 1] = cos, -sin, sin, cos
         if len(near):
-            near = near.take(~(near.distance(start) > self.reach))  # one whose distance is no number stays
+            # One whose distance is no number stays.
+            near = near.take(~(near.distance(start) - near.margin > self.reach))
         moving = request.movers
         if moving is not None:
             within = robot.horizon * robot.period

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from messaging.movers import parted
+from messaging.tasks import UnknownTask, task_of
 from safety.commitment import Commitment, correction_penalty
 from safety.methods import Method
 from safety.request import Decision, Request
@@ -52,6 +53,7 @@ class SafetyWrapper(gymnasium.Wrapper[Any, Any, Any, Any]):
         """The decision on an action in the current state; a proposal that is no number becomes standing still."""
         kept, robot = self.commitment, self.filter.robot
         obstacles, movers = parted(self._info["obstacles"], robot.position_dim)
+        kept.seen = np.asarray(self._info["state"], dtype=float)
         proposal = action if np.isfinite(action).all() else np.zeros(robot.action_dim)
         return self.filter.decide(
             Request(
@@ -70,4 +72,8 @@ class SafetyWrapper(gymnasium.Wrapper[Any, Any, Any, Any]):
     def _observed(self) -> Observation:
         """The observation, if it is the robot's own: another environment has none that a method could read."""
         seen = np.asarray(self._seen, np.float32) if isinstance(self._seen, np.ndarray) else np.zeros(0, np.float32)
-        return seen if seen.shape == (self.filter.robot.observation_dim,) else np.zeros(0, np.float32)
+        try:
+            wanted = task_of(self.filter.robot).observation_dim
+        except UnknownTask:  # then no method reads it
+            wanted = 0
+        return seen if seen.shape == (wanted,) else np.zeros(0, np.float32)

@@ -3,37 +3,36 @@
 from __future__ import annotations
 
 import hashlib
+import json
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from messaging.descriptions import robot_of
 from messaging.files import write_whole
-from messaging.robots import Robot, UnknownRobot, robot_named
-from messaging.shapes import rotate
+from messaging.robots import FORMER_LAYOUTS, LATE, Robot, UnknownRobot, known, robot_named
 from safety.certificates import (
     KINDS,
-    MATRIX_ZONOTOPE,
     RESIDUAL,
-    SET_MEMBERSHIP,
     Certificate,
-    envelope,
-    least_squares,
-    matrix_zonotope,
-    residual,
-    set_membership,
-    whitening,
 )
-from safety.dataset import BadData, Dataset, Windows, quality, windows
 from safety.tensors import content, pack, unpack
 from safety.tube import Tube, recursion_of, stack_direct, stack_recursive
+from safety.windows import (
+    FREE,
+    PLAN,
+    specialised,
+)
+from safety.windows import KINDS as WINDOWS
 
 Array = NDArray[np.float64]
 
 DIRECT, RECURSION = "direct", "recursion"
 MODES = (DIRECT, RECURSION)
-MOST_ATOMS = 120_000  # of a matrix zonotope, over the horizon: the exact check looks at every one
 ENTRY = "model_set"
 TENSORS = ("C", "W", "M", "kappa", "w", "generators")
 
@@ -50,12 +49,15 @@ class Recipe:
     mode: str = DIRECT
     inflation: float = 1.15  # of every envelope: what the next data may exceed the recorded ones by
     seed: int = 0  # of the recursion's heading offsets
+    windows: str = PLAN  # FREE: from driving that follows no plan
 
     def __post_init__(self) -> None:
         if self.certificate not in KINDS:
             raise ValueError(f"no certificate is called {self.certificate!r}; there are: {', '.join(KINDS)}")
         if self.mode not in MODES:
             raise ValueError(f"no mode is called {self.mode!r}; there are: {', '.join(MODES)}")
+        if self.windows not in WINDOWS:
+            raise ValueError(f"no windows are called {self.windows!r}; there are: {', '.join(WINDOWS)}")
         if not 1.0 <= self.inflation < np.inf:
             raise ValueError(f"an envelope scaled by {self.inflation} bounds nothing")
 
@@ -72,6 +74,7 @@ class ModelSet:
     domain: Array  # (2, regressor_dim): smallest and largest recorded [x_0; input in force]
     basis: Array  # (nz, nz): coordinates in which the recorded z are white
     about: dict[str, str]
+    layout: str = ""  # of the robot when it was made, if that was before robots were files
 
     @property
     def first(self) -> Certificate:
@@ -82,7 +85,7 @@ class ModelSet:
         """The regressor of `first` from z (..., nz): [.. ; input in force; first input]."""
         robot = self.robot
         if self.recipe.mode == DIRECT:
-            return z
+            return z if self.recipe.windows == PLAN else z @ specialised(robot).T
         reg, m = len(robot.regressor), robot.action_dim
         missing = robot.state_dim - robot.position_dim - reg  # coordinates that are zero in the frame of now
         zeros = np.zeros((*z.shape[:-1], missing))
@@ -92,6 +95,10 @@ class ModelSet:
         """The stacked tube with every generator as it is: for checks."""
         return self._stack(self.steps)
 
+    def tube_of_windows(self) -> Tube:
+        """The same of the windows that it was made from: their regressors may be all inputs of a plan, one by one."""
+        return self._stack(self.steps, plans=False)
+
     def outer_tube(self) -> Tube:
         """One that contains it and has few atoms: for the QP."""
         return self._stack([step.outer(whitening_of(step, self.basis)) for step in self.steps])
@@ -99,9 +106,12 @@ class ModelSet:
     def _check_sizes(self) -> None:
         """Raises BadModel unless every array has the size that robot and mode give it."""
         robot = self.robot
-        nz = robot.regressor_dim + robot.free_steps * robot.action_dim
+        nz = regressors(robot, self.recipe)
         one = nz if self.recipe.mode == DIRECT else robot.state_dim - robot.position_dim + 2 * robot.action_dim
-        expected = [(step, robot.state_dim, one) for step in self.steps]
+        n = robot.state_dim
+        if self.recipe.mode == DIRECT:
+            n += robot.position_dim * sum(disc.arm > 0.0 for disc in robot.body)
+        expected = [(step, n, one) for step in self.steps]
         expected += [(self.bulges, robot.horizon, nz), (self.latch, 1, nz)]
         for c, n, width in expected:
             g, q = c.w.size, len(c.W)
@@ -115,15 +125,21 @@ class ModelSet:
         if self.basis.shape != (nz, nz) or np.linalg.matrix_rank(self.basis) < nz:
             raise BadModel("the model set's basis is none")
 
-    def _stack(self, steps: list[Certificate] | tuple[Certificate, ...]) -> Tube:
+    def _stack(self, steps: Sequence[Certificate], plans: bool = True) -> Tube:
+        d, bulges, latch, more = self.robot.position_dim, self.bulges, self.latch, needed(self.robot)
+        if plans and self.recipe.windows == FREE:
+            T = specialised(self.robot)
+            bulges, latch = bulges.through(T), latch.through(T)
+            steps = [step.through(T) for step in steps] if self.recipe.mode == DIRECT else steps
         if self.recipe.mode == DIRECT:
-            return stack_direct(steps, self.robot.position_dim, self.bulges, self.latch)
-        return stack_recursive(steps, recursion_of(self.robot), self.robot.position_dim, self.bulges, self.latch)
+            return stack_direct(steps, d, bulges, latch, more)
+        return stack_recursive(steps, recursion_of(self.robot), d, bulges, latch, more=more)
 
     @property
     def version(self) -> str:
         """Hash of the content and of what it means, so that one name can't mean two models."""
-        meaning = f"{self.robot.layout()} {self.recipe.certificate} {self.recipe.mode} "
+        layout = self.layout or self.robot.layout()
+        meaning = f"{layout} {self.recipe.certificate} {self.recipe.mode} "
         return hashlib.sha256(meaning.encode() + content(self._tensors())).hexdigest()[:12]
 
     def _tensors(self) -> dict[str, Array]:
@@ -135,11 +151,13 @@ class ModelSet:
         """Bytes of a safetensors file, with the recipe as its metadata."""
         about = {
             "robot": self.robot.name,
-            "layout": self.robot.layout(),
+            "layout": self.layout or self.robot.layout(),
             "recipe": asdict(self.recipe),
             "about": self.about,
             "version": self.version,
         }
+        if not self.layout:
+            about["description"] = json.dumps(self.robot.description)  # a text: the order of its names counts
         return pack(self._tensors(), ENTRY, about)
 
     def save(self, path: Path) -> None:
@@ -150,7 +168,7 @@ class ModelSet:
         """Raises BadModel unless the bytes are a complete, finite model set of a robot that this program knows."""
         try:
             tensors, about = unpack(payload, ENTRY)
-            robot = robot_named(about["robot"])
+            robot = _robot_in(about)
             recipe = Recipe(**about["recipe"])
             certificates = {
                 name: Certificate(*(tensors[f"{name}.{t}"] for t in TENSORS))
@@ -159,14 +177,15 @@ class ModelSet:
             more = tensors["domain"], tensors["basis"], dict(about["about"])
         except (KeyError, TypeError, ValueError, UnknownRobot) as error:
             raise BadModel(f"no model set: {error!r}") from error
-        if about.get("layout") != robot.layout():
+        if not robot.understands(about.get("layout")):
             raise BadModel(f"the model set is for another layout of {robot.name}: make it again from data")
+        layout = "" if about["layout"] == robot.layout() else str(about["layout"])
         if not all(t.dtype == np.float64 and np.isfinite(t).all() for t in tensors.values()):
             raise BadModel("the model set holds NaN, infinity or numbers of another type")
         if any((c.M < 0).any() or (c.kappa < 0).any() or (c.w < 0).any() for c in certificates.values()):
             raise BadModel("the model set has a negative width")
         steps = tuple(certificates[f"step{k}"] for k in range(robot.horizon))
-        model = ModelSet(robot, recipe, steps, certificates["bulges"], certificates["latch"], *more)
+        model = ModelSet(robot, recipe, steps, certificates["bulges"], certificates["latch"], *more, layout)
         model._check_sizes()
         if model.version != about.get("version"):
             raise BadModel("the model set's content is not what its version says")
@@ -176,11 +195,45 @@ class ModelSet:
     def load(path: Path) -> ModelSet:
         """Raises BadModel, naming the file."""
         try:
-            return ModelSet.decode(path.read_bytes())
+            model = ModelSet.decode(path.read_bytes())
+            known(model.robot)
+            return model
         except OSError as error:
             raise BadModel(f"{path}: {error}") from error
-        except BadModel as error:
+        except (BadModel, UnknownRobot) as error:
             raise BadModel(f"{path}: {error}") from error
+
+
+def _robot_in(about: dict[str, Any]) -> Robot:
+    """The robot that a model set is of: it carries its description, unless it is older than those.
+
+    Raises:
+        UnknownRobot: its description is none, or another's name.
+    """
+    name = str(about["robot"])
+    if "description" not in about:
+        if about.get("layout") != FORMER_LAYOUTS.get(name):
+            raise UnknownRobot(f"{name}: neither a description nor the layout of a robot known before there were any")
+        return robot_named(name)
+    robot = robot_of(json.loads(about["description"]), "the model set's robot")
+    robot = robot.in_real_time() if name.endswith(LATE) else robot
+    if robot.name != name:
+        raise UnknownRobot(f"the model set is of {name!r}, its description of {robot.name!r}")
+    return robot
+
+
+def regressors(robot: Robot, recipe: Recipe) -> int:
+    """Length of the regressors of the windows that a recipe takes."""
+    chosen = robot.free_steps if recipe.windows == PLAN else robot.horizon
+    return robot.regressor_dim + chosen * robot.action_dim
+
+
+def needed(robot: Robot) -> tuple[int, ...]:
+    """The predicted coordinates besides the position that a limit or a further disc of the body needs."""
+    d, n = robot.position_dim, robot.state_dim
+    limited = {i for limit in robot.limits for i, weight in enumerate(limit.weights) if weight and i >= d}
+    discs = d * sum(disc.arm > 0.0 for disc in robot.body)
+    return (*sorted(limited), *range(n, n + discs))
 
 
 def whitening_of(step: Certificate, basis: Array) -> Array:
@@ -197,114 +250,3 @@ def whitening_from(pseudo: Array) -> Array:
     basis = np.eye(len(inverse))
     basis[np.ix_(used, used)] = np.linalg.cholesky(inverse[np.ix_(used, used)]).T
     return basis
-
-
-def make(data: Dataset, recipe: Recipe) -> ModelSet:
-    """A model set from two parts of the data: one fits C, the other bounds what is left (held-out data: certify).
-
-    Raises:
-        BadData: a check failed; CertificateError: the data do not support the certificate.
-    """
-    robot = data.robot
-    fit, bound = data.split((0.5, 0.5))
-    steps, bulges = [], []
-    horizon = robot.horizon
-    for k in range(1, horizon + 1):
-        seen, rest = windows(fit, k), windows(bound, k)
-        for part in (seen, rest):
-            quality(_used(robot, part.z, k), f"windows of {k} periods")
-        every = windows(data, k)  # no predictor is fitted to bulges: both parts may bound them
-        bulges.append(envelope(np.abs(every.z), every.bulge, recipe.inflation))
-        if recipe.mode == DIRECT:
-            steps.append(
-                _certificate(seen.z, seen.y, rest.z, rest.y, recipe, _columns(robot, k), MOST_ATOMS // horizon)
-            )
-        else:
-            steps.append(_recursive_step(robot, windows(fit, 1), windows(bound, 1), k - 1, recipe))
-    whole = windows(data, horizon)
-    still = ~np.isnan(whole.latch)
-    if not still.any():
-        raise BadData("no plan's stop was recorded: let the robot stand after braking")
-    latch = envelope(np.abs(whole.z[still]), whole.latch[still], recipe.inflation)
-    nz = whole.z.shape[1]
-    known = windows(data, 1).z[:, : robot.regressor_dim]
-    domain = np.stack([known.min(0), known.max(0)])
-    about = data.about | {"data": data.digest(), "periods": str(data.periods)}
-    return ModelSet(
-        robot, recipe, tuple(steps), _scalar(bulges, nz), _scalar([latch], nz), domain, whitening(whole.z), about
-    )
-
-
-def _columns(robot: Robot, k: int) -> NDArray[np.bool_]:
-    """Which coordinates of z can matter after k periods: later free inputs can't."""
-    used = np.ones(robot.regressor_dim + robot.free_steps * robot.action_dim, dtype=bool)
-    used[robot.regressor_dim + min(k, robot.free_steps) * robot.action_dim :] = False
-    return used
-
-
-def _used(robot: Robot, z: Array, k: int) -> Array:
-    return z[:, _columns(robot, k)]
-
-
-def _scalar(bounds: list[tuple[Array, float]], nz: int) -> Certificate:
-    """Bounds of lengths as a certificate: nothing but κ and w."""
-    n = len(bounds)
-    kappa, w = np.array([b[0] for b in bounds]), np.array([b[1] for b in bounds])
-    return Certificate(np.zeros((n, nz)), np.zeros((0, nz)), np.zeros((n, 0)), kappa, w, np.eye(n))
-
-
-def _certificate(
-    z: Array, y: Array, z_bound: Array, y_bound: Array, recipe: Recipe, columns: NDArray[np.bool_], most_atoms: int
-) -> Certificate:
-    """The recipe's certificate: the noise of all three is the residual's envelope, they differ in trusting C.
-
-    A matrix zonotope has an atom a sample and more samples do not shrink it: it takes no more than `most_atoms`,
-    evenly over the data.
-    """
-    trusted = residual(z_bound, y_bound, least_squares(z, y, columns), recipe.inflation)
-    if recipe.certificate == RESIDUAL:
-        return trusted
-    if recipe.certificate == MATRIX_ZONOTOPE and len(z_bound) > most_atoms:
-        chosen = np.linspace(0, len(z_bound) - 1, most_atoms).astype(int)
-        z_bound, y_bound = z_bound[chosen], y_bound[chosen]
-    z_in = z_bound[:, columns]
-    sizes = (np.abs(z_bound) @ trusted.kappa.T + trusted.w).T
-    kappa, w = trusted.kappa, trusted.w
-    if recipe.certificate == SET_MEMBERSHIP:
-        small = set_membership(z_in, y_bound, sizes, kappa[:, columns], w)
-    else:
-        assert recipe.certificate == MATRIX_ZONOTOPE
-        small = matrix_zonotope(z_in, y_bound, np.eye(y.shape[1]), sizes, kappa[:, columns], w)
-    C, W = np.zeros_like(trusted.C), np.zeros((len(small.W), len(columns)))
-    C[:, columns], W[:, columns] = small.C, small.W
-    return Certificate(C, W, small.M, kappa, w, small.generators)
-
-
-def _recursive_step(robot: Robot, fit: Windows, bound: Windows, k: int, recipe: Recipe) -> Certificate:
-    """Period k of the recursion: z_k = [heading, ...; u_prev; u] from one-period windows turned by a random offset.
-
-    After k periods the robot may have turned by k ω_max dt against the frame of now, as measured a bit more; without
-    offsets the heading would be zero in every window and the data would say nothing about it.
-    """
-    rng = np.random.default_rng((recipe.seed, k))
-    turned = [_turned(robot, w, k, rng) for w in (fit, bound)]
-    columns = np.abs(turned[0][0]).max(0) > 0.0
-    return _certificate(*turned[0], *turned[1], recipe, columns, MOST_ATOMS // robot.horizon)
-
-
-def _turned(robot: Robot, w: Windows, k: int, rng: np.random.Generator) -> tuple[Array, Array]:
-    reg, m = len(robot.regressor), robot.action_dim
-    values, inputs = w.z[:, :reg], w.z[:, reg : reg + 2 * m]
-    y = w.y.copy()
-    between = robot.state_dim - robot.position_dim - reg
-    lead = np.zeros((len(y), between))
-    if robot.heading is not None:
-        fastest = robot.high()[-1] * robot.period * k + 2.0 * robot.measurement_bound[robot.heading]
-        offset = rng.uniform(-fastest, fastest, len(y)) if k else np.zeros(len(y))
-        y[:, : robot.position_dim] = rotate(y[:, : robot.position_dim], offset)
-        y[:, robot.heading] += offset
-        lead[:, 0] = offset
-    return np.hstack([lead, values, inputs]), y
-
-
-__all__ = ["DIRECT", "MODES", "RECURSION", "BadData", "BadModel", "ModelSet", "Recipe", "make"]

@@ -22,32 +22,35 @@ ROUNDING = 1e-12  # of a unit row of W: an atom that depends on the inputs no mo
 class Rows:
     """A half-space for every end of every period: support of the tube in its normal, `gradient z + spread m(z)`.
 
-    gradient (rows, nz); spread (rows, L+N+1) >= 0; bound (rows,).
+    gradient (rows, nz); spread (rows, L+N+1) >= 0; bound (rows,). keep (rows,): what of the comfort margin a row keeps:
+    1 where it is about an obstacle, 0 where it is about a limit in other units.
     """
 
     gradient: Array
     spread: Array
     bound: Array
+    keep: Array
 
     def support(self, tube: Tube, z: Array) -> Array:
         return np.asarray(self.gradient @ z + self.spread @ tube.magnitudes(z))
 
 
 class Layout:
-    """The parts of a tube that rows are made from, gathered once.
+    """The parts of a tube that rows about obstacles are made from, gathered once, for one disc of the body.
 
     Per obstacle there are 2N+1 rows: period k's half-space at the period's start and at its end, both with the bulge
     of that period, and the last one again with the stop latch.
     """
 
-    def __init__(self, tube: Tube) -> None:
-        N, d, nz = tube.position.shape
-        L = tube.generators
+    def __init__(self, position: Array, directions: Array) -> None:
+        """position (N, d, nz), directions (N, d, L): of a point of the body."""
+        N, d, nz = position.shape
+        L = directions.shape[2]
         at_start, at_end = np.arange(N), np.arange(1, N + 1)
         ends = np.concatenate([at_start, at_end, [N]])
         self.period = np.concatenate([at_start, at_start, [N - 1]])
-        position = np.concatenate([np.zeros((1, d, nz)), tube.position])[ends]
-        directions = np.concatenate([np.zeros((1, d, L)), tube.directions])[ends]
+        position = np.concatenate([np.zeros((1, d, nz)), position])[ends]
+        directions = np.concatenate([np.zeros((1, d, L)), directions])[ends]
         self.maps = np.concatenate([position, directions], axis=2)  # (2N+1, d, nz + L)
         self.extra = np.concatenate([np.eye(N + 1)[at_start], np.eye(N + 1)[at_start], np.eye(N + 1)[[N]]])
         self.nz = nz
@@ -59,7 +62,7 @@ class Layout:
         spread = spread.reshape(n * len(self.period), self.maps.shape[2])
         extra = np.broadcast_to(self.extra, (n, *self.extra.shape)).reshape(len(spread), self.extra.shape[1])
         both = np.hstack([np.abs(spread[:, self.nz :]), extra])
-        return Rows(spread[:, : self.nz], both, offsets[:, self.period].ravel())
+        return Rows(spread[:, : self.nz], both, offsets[:, self.period].ravel(), np.ones(len(spread)))
 
 
 class Builder:

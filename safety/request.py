@@ -12,11 +12,13 @@ from numpy.typing import NDArray
 from messaging.movers import Movers
 from messaging.robots import Robot
 from messaging.shapes import Shapes
+from messaging.tasks import UnknownTask, task_of
 from safety.commitment import Prediction
 
 Array = NDArray[np.float64]
 
 ALLOWED, ADJUSTED, FAILSAFE = "allowed", "adjusted", "failsafe"
+MOST_OBSERVED = 4096  # numbers in an observation
 FARTHEST = 1e5  # m (and any other unit): beyond it a position's rounding would begin to show
 
 
@@ -50,10 +52,10 @@ class Request:
     movers: Movers | None = None
     observation: NDArray[np.float32] = field(default_factory=lambda: np.zeros(0, np.float32))
 
-    @property
-    def still(self) -> bool:
+    def still(self, robot: Robot) -> bool:
         """Is the robot said to stand, and to be committed to that? Needs no model's word."""
-        return not self.model and not self.plan.any() and not self.input_in_force.any()
+        committed = not self.model and bool(robot.rests(self.plan).all() and robot.rests(self.input_in_force))
+        return committed and robot.stands(self.state)
 
 
 @dataclass(frozen=True)
@@ -96,14 +98,14 @@ def check_for_filter(robot: Robot, request: Request) -> None:
     _check_motion(robot, request)
     _finite(robot, "plan", request.plan, (robot.horizon, robot.action_dim))
     _within_bounds(robot, "plan", request.plan)
-    if request.plan[-1].any():
+    if not robot.rests(request.plan[-1]):
         raise BadRequest("plan", "the committed plan does not end in a stop")
     if request.obstacles.center.shape[1] != robot.position_dim:
         raise BadRequest("obstacles", f"a {robot.name} robot's obstacles have {robot.position_dim} coordinates")
     if request.movers is not None and request.movers.drift.shape[1] != robot.position_dim:
         raise BadRequest("obstacles", f"a {robot.name} robot's movers have {robot.position_dim} coordinates")
     if request.observation.size:
-        _finite(robot, "observation", request.observation, (robot.observation_dim,))
+        _finite(robot, "observation", request.observation, (_observed(robot, request),))
     if request.predicted is not None:
         _check_prediction(robot, request.predicted)
 
@@ -115,7 +117,21 @@ def check_for_rival(robot: Robot, request: Request) -> None:
         BadRequest: a value is missing, not finite or of the wrong size, with the field's name.
     """
     _check_motion(robot, request)
-    _finite(robot, "observation", request.observation, (robot.observation_dim,))
+    _finite(robot, "observation", request.observation, (task_of(robot).observation_dim,))
+
+
+def _observed(robot: Robot, request: Request) -> int:
+    """So many numbers an observation has; where no task is known here, as many as there are, within reason.
+
+    Raises:
+        BadRequest: more than that.
+    """
+    try:
+        return task_of(robot).observation_dim
+    except UnknownTask:
+        if request.observation.size > MOST_OBSERVED:
+            raise BadRequest("observation", f"an observation has at most {MOST_OBSERVED} numbers") from None
+        return request.observation.size
 
 
 def _check_motion(robot: Robot, request: Request) -> None:

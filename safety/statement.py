@@ -12,9 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import beta
 
-from safety.dataset import Dataset, Quality, Windows, apart, quality, windows
+from safety.dataset import Dataset
 from safety.filter import Filter
-from safety.model_set import ModelSet
+from safety.model_set import DIRECT, ModelSet, needed
+from safety.tube import Tube
+from safety.windows import PLAN, Quality, Windows, apart, outputs, quality, windows
 from safety.zonotope import facet_normals
 
 Array = NDArray[np.float64]
@@ -58,22 +60,23 @@ def upper_bound(violations: int, count: int) -> float:
 
 def state(model: ModelSet, fitted: Dataset, held_out: Dataset) -> Statement:
     """The statement of a model set made from `fitted` about trajectories that it has not seen."""
-    robot, ready = model.robot, Filter(model)
-    used = windows(fitted, robot.horizon)
+    robot, ready, kind = model.robot, Filter(model), model.recipe.windows
+    tube = model.tube_of_windows()
+    used = windows(fitted, robot.horizon, kind)
     figures: Quality = quality(used.z, "plan windows")
-    whole = windows(held_out, robot.horizon)
-    plans = apart(whole.take(~np.isnan(whole.latch)), robot.horizon)
+    whole = windows(held_out, robot.horizon, kind)
+    plans = apart(whole.take(~np.isnan(whole.latch)) if kind == PLAN else whole, robot.horizon)
     ends = {tuple(start): row for row, start in enumerate(plans.start)}
     outside = np.zeros(len(plans), dtype=bool)
     first = np.zeros(len(plans), dtype=bool)
     for k in range(1, robot.horizon + 1):
-        seen = windows(held_out, k)
+        seen = windows(held_out, k, kind)
         rows = [i for i, start in enumerate(seen.start) if tuple(start) in ends]
         part = seen.take(np.isin(np.arange(len(seen)), rows))
         if k == 1:
             first = _first_outside(model, part)
             outside |= first
-        outside |= _outside(ready, part, k)
+        outside |= _outside(model, tube, part, k)
     full = np.asarray(robot.high())
     bound_step = upper_bound(int(first.sum()), len(plans))
     return Statement(
@@ -98,22 +101,32 @@ def state(model: ModelSet, fitted: Dataset, held_out: Dataset) -> Statement:
 
 def _first_outside(model: ModelSet, w: Windows) -> NDArray[np.bool_]:
     """Is any coordinate of the state after one period outside its predicted set? (T,)"""
-    z = model.first_regressor(w.z)
+    z = w.z if model.recipe.mode == DIRECT else model.first_regressor(w.z)
     half = np.concatenate([model.first.half_widths(z[i : i + CHUNK]) for i in range(0, len(z), CHUNK)])
-    return np.asarray((np.abs(w.y - z @ model.first.C.T) > half).any(1))
+    return np.asarray((np.abs(outputs_of(model, w) - z @ model.first.C.T) > half).any(1))
 
 
-def _outside(ready: Filter, w: Windows, k: int) -> NDArray[np.bool_]:
-    """Is the position after k periods outside the tube, or the path off it between, or the stop not one? (T,)"""
-    tube, d = ready.tube, ready.robot.position_dim
+def outputs_of(model: ModelSet, w: Windows) -> Array:
+    """What the model set's certificates predict of these windows."""
+    return outputs(model.robot, w.y) if model.recipe.mode == DIRECT else w.y
+
+
+def _outside(model: ModelSet, tube: Tube, w: Windows, k: int) -> NDArray[np.bool_]:
+    """Is the position after k periods outside the tube (or what else it speaks of), or the path off it between, or the
+    stop not one? (T,)"""
+    d, more = model.robot.position_dim, list(needed(model.robot))
     normals = facet_normals(tube.directions[k - 1][:, np.abs(tube.directions[k - 1]).any(0)])
     spread = np.abs(normals @ tube.directions[k - 1])  # (facets, L)
+    others = outputs_of(model, w)[:, more]
     bad = np.zeros(len(w), dtype=bool)
     for i in range(0, len(w), CHUNK):
         z = w.z[i : i + CHUNK]
         sizes = tube.magnitudes(z)
+        made = sizes[:, : tube.generators]
         away = np.abs((w.y[i : i + CHUNK, :d] - z @ tube.position[k - 1].T) @ normals.T)
-        outside = (away > sizes[:, : tube.generators] @ spread.T).any(1)
+        outside = (away > made @ spread.T).any(1)
+        off = np.abs(others[i : i + CHUNK] - z @ tube.more[k - 1].T)
+        outside |= (off > made @ np.abs(tube.more_directions[k - 1]).T).any(1)
         outside |= w.bulge[i : i + CHUNK] > sizes[:, tube.generators + k - 1]
         if k == tube.horizon:
             outside |= w.latch[i : i + CHUNK] > sizes[:, -1]

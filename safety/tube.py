@@ -27,7 +27,8 @@ Array = NDArray[np.float64]
 class Tube:
     """position (N, d, nz); directions (N, d, L); W (q, nz); M (L+N+1, q); m_0 (L+N+1).
 
-    Magnitudes: of the L generators, of the N bulges, and of the latch.
+    Magnitudes: of the L generators, of the N bulges, and of the latch. more (N, r, nz), more_directions (N, r, L): the
+    same of other predicted coordinates, where a limit or a further disc of the body needs them.
     """
 
     position: Array
@@ -35,6 +36,8 @@ class Tube:
     W: Array
     M: Array
     m_0: Array
+    more: Array
+    more_directions: Array
 
     @property
     def horizon(self) -> int:
@@ -57,16 +60,20 @@ class Tube:
         return np.asarray(np.abs(self.directions) @ self.magnitudes(z)[: self.generators])
 
 
-def stack_direct(steps: Sequence[Certificate], position_dim: int, bulges: Certificate, latch: Certificate) -> Tube:
+def stack_direct(
+    steps: Sequence[Certificate], position_dim: int, bulges: Certificate, latch: Certificate, more: Sequence[int] = ()
+) -> Tube:
     """One predictor per horizon step: step i has generators of its own and nothing compounds.
 
     steps: certificate i predicts the displacement after i+1 periods from z. bulges (N rows), latch (1 row) likewise.
+    more: further predicted coordinates to keep.
     """
     d, count = position_dim, [c.generators.shape[1] for c in steps]
-    directions = np.zeros((len(steps), d, sum(count)))
+    kept = [*range(d), *more]
+    directions = np.zeros((len(steps), len(kept), sum(count)))
     for i, step in enumerate(steps):
         at = sum(count[:i])
-        directions[i, :, at : at + count[i]] = step.generators[:d]
+        directions[i, :, at : at + count[i]] = step.generators[kept]
     useful = np.abs(directions).sum((0, 1)) > 0.0  # those of the velocity coordinates never touch the position
     atoms = [_atoms(c) for c in (*steps, bulges, latch)]
     W = np.vstack([w for w, _, _ in atoms])
@@ -74,7 +81,8 @@ def stack_direct(steps: Sequence[Certificate], position_dim: int, bulges: Certif
     rows = np.concatenate([useful, np.ones(len(steps) + 1, dtype=bool)])
     m_0 = np.concatenate([m0 for _, _, m0 in atoms])
     W, M = _merged(W, M[rows])
-    return Tube(np.stack([c.C[:d] for c in steps]), directions[:, :, useful], W, M, m_0[rows])
+    centers, directions = np.stack([c.C[kept] for c in steps]), directions[:, :, useful]
+    return Tube(centers[:, :d], directions[:, :d], W, M, m_0[rows], centers[:, d:], directions[:, d:])
 
 
 @dataclass(frozen=True)
@@ -125,6 +133,7 @@ def stack_recursive(
     bulges: Certificate | None = None,
     latch: Certificate | None = None,
     initial: Array | None = None,
+    more: Sequence[int] = (),
 ) -> Tube:
     """The paper's recursion (lemma 2): step k maps z_k to y_{k+1}, `y+ = A y + B [u_prev; u] + noise`.
 
@@ -135,7 +144,7 @@ def stack_recursive(
     y, before = how.first, how.previous()
     made = np.zeros((n, 0)) if initial is None else initial  # all generators so far, propagated to step k
     start = made.shape[1]
-    regress = list(how.E)
+    regress, kept = list(how.E), [*range(position_dim), *more]
     centers, spreads, atoms, K_rows = [], [], [], []
     for k, step in enumerate(steps):
         z_k = np.vstack([y[regress], before, how.input(k)])
@@ -148,8 +157,8 @@ def stack_recursive(
         y = carry @ y + step.C @ z_k
         made = np.hstack([A @ made, step.generators])
         before = how.input(k)
-        centers.append(y[:position_dim])
-        spreads.append(made[:position_dim])
+        centers.append(y[kept])
+        spreads.append(made[kept])
     total = made.shape[1]
     K = np.zeros((total - start, total))
     at = 0
@@ -160,7 +169,7 @@ def stack_recursive(
     W = np.vstack([a for a, _, _ in atoms])
     M = mix @ _block_diagonal([m for _, m, _ in atoms])
     m_0 = mix @ (np.concatenate([w for _, _, w in atoms]) + K[:, :start].sum(1))
-    directions = np.zeros((len(steps), position_dim, total))
+    directions = np.zeros((len(steps), len(kept), total))
     for i, spread in enumerate(spreads):
         directions[i, :, : spread.shape[1]] = spread
     M = np.vstack([np.zeros((start, M.shape[1])), M])
@@ -171,7 +180,8 @@ def stack_recursive(
     W = np.vstack([W, *(w for w, _, _ in extra)])
     M = _block_diagonal([M, *(m for _, m, _ in extra)])
     W, M = _merged(W, M)
-    return Tube(np.stack(centers), directions, W, M, np.concatenate([m_0, *(m0 for _, _, m0 in extra)]))
+    m_0, stacked, d = np.concatenate([m_0, *(m0 for _, _, m0 in extra)]), np.stack(centers), position_dim
+    return Tube(stacked[:, :d], directions[:, :d], W, M, m_0, stacked[:, d:], directions[:, d:])
 
 
 def _atoms(step: Certificate) -> tuple[Array, Array, Array]:

@@ -78,7 +78,7 @@ def obstacles_of(messages: Sequence[pb.Obstacle], dim: int) -> list[Obstacle]:
             if len(o.position) != dim:
                 raise BadShape("position", f"{len(o.position)} coordinates; this robot's obstacles have {dim}")
             motion = motion_of(o.motion) if o.HasField("motion") else None
-            obstacles.append(Obstacle(o.kind, tuple(o.position), tuple(o.size), o.yaw, motion=motion))
+            obstacles.append(Obstacle(o.kind, tuple(o.position), tuple(o.size), o.yaw, o.margin, motion))
         except BadShape as error:
             raise BadRequest(f"obstacles[{i}].{error.field}", str(error)) from error
     return obstacles

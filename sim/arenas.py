@@ -1,4 +1,4 @@
-"""The arenas there are, by robot and name, and how one is drawn: at random, so that a way through exists.
+"""How an arena of a task is drawn: at random, so that a way through exists.
 
 An arena in space is drawn as a plan whose obstacles then get heights: pillars from floor to ceiling, boxes that stand
 on the floor or hang from the ceiling, spheres that float.
@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 
 from messaging.robots import Robot
 from messaging.shapes import BOX, CYLINDER, SPHERE, WALL, Obstacle, Shapes
-from sim.movers import Crowd, MoverKind
+from messaging.tasks import ArenaKind, MoverKind, task_of
+from sim.movers import Crowd
 from sim.world import Arena, closing, room_bounds
 
 Array = NDArray[np.float64]
@@ -30,112 +31,19 @@ class NoArena(RuntimeError):
     """No draw of an arena kind had a way from start to goal: its numbers ask for too much."""
 
 
-@dataclass(frozen=True)
-class ArenaKind:
-    """What is drawn for an arena of one name. Pairs are (least, most)."""
-
-    half_width: float  # m
-    cylinders: tuple[int, int]
-    radius: tuple[float, float]  # m
-    boxes: tuple[int, int]
-    edge: tuple[float, float]  # m, both edges of a box
-    square: bool  # boxes have two equal edges
-    gap: float  # m between any two obstacles in plan, walls included, beyond the robot's diameter
-    path_clearance: float  # m beside the footprint, all along some way from start to goal
-    goal_distance: float  # m from the start, at least
-    step_limit: int
-    start_clearance: float = 0.1  # m beside the footprint, at the start and at the goal
-    goal_radius: float = 0.25  # m
-    height: float | None = None  # m from floor to ceiling; None: an arena in the plane, without
-    tall: tuple[float, float] = (0.0, 0.0)  # m, a box's height in space
-    spheres: tuple[int, int] = (0, 0)
-    ball: tuple[float, float] = (0.0, 0.0)  # m, radius of a sphere
-    movers: MoverKind | None = None
-
-    @property
-    def bounds(self) -> tuple[tuple[float, float], ...]:
-        return room_bounds(self.half_width, self.height)
-
-
-_FLIGHT = ArenaKind(
-    half_width=20.0,
-    height=10.0,
-    cylinders=(6, 9),
-    radius=(0.6, 1.2),
-    boxes=(4, 6),
-    edge=(2.0, 4.0),
-    square=False,
-    tall=(4.0, 8.0),
-    spheres=(3, 5),
-    ball=(1.0, 2.0),
-    gap=1.4,
-    path_clearance=0.4,
-    goal_distance=12.0,
-    step_limit=200,
-    start_clearance=0.7,
-    goal_radius=1.0,
-)
-
-_ROOM = ArenaKind(
-    half_width=2.5,
-    cylinders=(3, 5),
-    radius=(0.1, 0.2),
-    boxes=(3, 5),
-    edge=(0.2, 0.4),
-    square=False,
-    gap=0.2,
-    path_clearance=0.05,
-    goal_distance=1.5,
-    step_limit=300,
-)
-
-# People: 1.2 m/s is walking pace.
-_WALKERS = MoverKind(count=(3, 4), radius=0.2, speed=1.2, acceleration=1.0, keep=1.0)
-
-# Other aircraft: heavier and slower than ours.
-_AIRCRAFT = MoverKind((2, 3), 0.5, 3.0, 0.5, keep=6.0, position_error=0.1, velocity_error=0.1)
-
-_HALL = replace(_ROOM, half_width=3.5, cylinders=(2, 4), boxes=(2, 4), gap=0.4, goal_distance=2.5)
-
-ARENAS: dict[str, dict[str, ArenaKind]] = {
-    "ground": {
-        "default": _ROOM,
-        # a hair below half the gap: a grid cannot thread a passage that has no width to spare
-        "dense": replace(_ROOM, cylinders=(6, 8), boxes=(6, 8), gap=0.1, path_clearance=0.04),
-        "open": ArenaKind(
-            half_width=8.2,
-            cylinders=(0, 6),
-            radius=(0.5, 0.5),
-            boxes=(0, 6),
-            edge=(1.0, 1.0),
-            square=True,
-            gap=0.3,
-            path_clearance=0.05,
-            goal_distance=3.0,
-            # the diagonal is 23 m, 5 cm a step: twice the steps of a straight drive, nearly
-            step_limit=800,
-        ),
-        "walkers": replace(_HALL, movers=_WALKERS),
-        "few-walkers": replace(_HALL, movers=replace(_WALKERS, count=(1, 2))),
-        "many-walkers": replace(_HALL, movers=replace(_WALKERS, count=(6, 8))),
-    },
-    "quadrotor": {
-        "default": _FLIGHT,
-        "dense": replace(_FLIGHT, cylinders=(10, 17), boxes=(8, 12), tall=(5.0, 8.0), spheres=(5, 8), gap=0.8),
-        # room for full speed on all three axes at once
-        "tall": replace(_FLIGHT, height=30.0, cylinders=(3, 4), boxes=(2, 3), spheres=(4, 6), goal_distance=30.0),
-        "traffic": replace(_FLIGHT, cylinders=(3, 5), boxes=(2, 3), movers=_AIRCRAFT),
-    },
-}
-
 ATTEMPTS = 1000  # whole arenas drawn before giving up
 CANDIDATES = 12  # drawn at once for each obstacle, of which the first that fits stays
 ENDS = 64  # points drawn at once, of which the first two that are free and far apart are start and goal
 
 
+def bounds_of(kind: ArenaKind) -> tuple[tuple[float, float], ...]:
+    """Lowest and highest coordinate inside the room, for each axis."""
+    return room_bounds(kind.half_width, kind.height)
+
+
 def arena_kind(robot: Robot, name: str) -> ArenaKind:
     """Raises UnknownArena with the names there are for this robot."""
-    kinds = ARENAS.get(robot.kind, {})
+    kinds = task_of(robot).arenas
     if name not in kinds:
         there = ", ".join(sorted(kinds)) or "none"
         raise UnknownArena(f"no arena is called {name!r}; there are: {there} ({robot.kind})")
@@ -160,7 +68,7 @@ def draw_arena(name: str, rng: np.random.Generator, robot: Robot) -> Arena:
         start, goal = ends
         if robot.heading is not None:
             start = (*start, float(rng.uniform(-math.pi, math.pi)))
-        arena = Arena(name, obstacles, start, goal, kind.goal_radius, kind.step_limit, kind.bounds)
+        arena = Arena(name, obstacles, start, goal, kind.goal_radius, kind.step_limit, bounds_of(kind))
         if arena.clearance_map.connected(start[: arena.dim], goal, robot.footprint + kind.path_clearance):
             return arena if kind.movers is None else _with_movers(arena, kind.movers, rng)
     raise NoArena(f"no arena {name!r} with a way from start to goal in {ATTEMPTS} draws")
@@ -184,7 +92,7 @@ def tour(arena: Arena, goals: int, rng: np.random.Generator, robot: Robot) -> tu
         NoArena: no goals were found that a way leads to.
     """
     kind, stages, start = arena_kind(robot, arena.name), list[Arena](), arena.start[: arena.dim]
-    low, high = np.array(kind.bounds).T
+    low, high = np.array(bounds_of(kind)).T
     for _ in range(ATTEMPTS):
         if len(stages) == goals:
             return tuple(stages)
@@ -275,7 +183,7 @@ def _start_and_goal(
     kind: ArenaKind, obstacles: tuple[Obstacle, ...], rng: np.random.Generator, robot: Robot
 ) -> tuple[tuple[float, ...], tuple[float, ...]] | None:
     """Two free points far enough apart, or None."""
-    low, high = np.array(kind.bounds).T
+    low, high = np.array(bounds_of(kind)).T
     points = rng.uniform(low, high, (ENDS, len(low)))
     free = Shapes.of(obstacles, dim=len(low)).distance(points).min(axis=0) >= robot.footprint + kind.start_clearance
     points = points[free]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 import gymnasium
@@ -13,13 +12,14 @@ from gymnasium.spaces import Box
 from numpy.typing import NDArray
 
 from messaging.movers import Movers
-from messaging.robots import GROUND, QUADROTOR, Robot
+from messaging.robots import Robot
 from messaging.shapes import Obstacle
+from messaging.tasks import Reward, task_of
 from sim.arenas import draw_arena
+from sim.conditions import Conditions
 from sim.estimator import wrap
-from sim.ground import GroundRobot
 from sim.movers import Watch
-from sim.senses import LIDAR_NOISE, SENSES
+from sim.senses import LIDAR_NOISE, Senses
 from sim.vehicle import MakeVehicle, Period, Vehicle
 from sim.world import Arena
 
@@ -31,24 +31,10 @@ DrawArena = Callable[[str, np.random.Generator, Robot], Arena]
 OBSERVED_LIMIT = 1.5  # every coordinate of the observation is clipped to ± this
 
 
-@dataclass(frozen=True)
-class Reward:
-    """What an episode pays. Progress adds up to the way made towards the goal, whichever way was taken."""
-
-    progress: float = 20.0  # a metre nearer to the goal
-    goal: float = 100.0
-    collision: float = -100.0
-    run_into: float = -50.0  # while it stood
-
-
-# A way from start to goal pays 40 or so, whether it is 2 m or 20 m long.
-REWARDS = {GROUND.name: Reward(), QUADROTOR.name: Reward(progress=2.0)}
-
-
 class NavigationEnv(gymnasium.Env[Observation, Any]):
     """One robot, a fresh random arena each episode.
 
-    Action: the robot's input in physical units, clipped to its bounds and slew. Observation: `robot.observation`,
+    Action: the robot's input in physical units, clipped to its bounds and slew. Observation: `task.observed`,
     float32. Terminated on reaching the goal or touching anything (both judged on the true position), truncated at
     the arena's step limit. An episode is determined by `seed_key` and its episode seed alone; `reset(seed=…)` fixes the
     sequence of episode seeds, `reset(options={"episode_seed": …})` a single one; `options={"arena": …}` changes the
@@ -82,24 +68,28 @@ class NavigationEnv(gymnasium.Env[Observation, Any]):
 
     def __init__(
         self,
-        robot: Robot = GROUND,
+        robot: Robot,
         arena: str = "default",
-        make_vehicle: MakeVehicle = GroundRobot,
+        make_vehicle: MakeVehicle | None = None,
         lidar_noise: float = LIDAR_NOISE,
         seed_key: int = 0,
         reward: Reward | None = None,
         draw: DrawArena = draw_arena,
     ) -> None:
-        """make_vehicle: puts a vehicle of that robot kind at an arena's start, for one episode; lidar_noise: m, sigma
+        """make_vehicle: puts a vehicle of that robot kind at an arena's start, for one episode (None: the task's
+        own, under usual conditions); lidar_noise: m, sigma
         of a range; seed_key: sets apart the episodes of two environments whose episode seeds are the same, 0 or more;
         draw: makes an episode's arena.
         """
         self.robot, self.arena_name, self.seed_key = robot, arena, seed_key
-        self.reward = reward or REWARDS[robot.kind]
+        self.task = task_of(robot)
+        self.reward = reward or self.task.reward
         self.action_space = Box(robot.low().astype(np.float32), robot.high().astype(np.float32), dtype=np.float32)
-        limit = np.full(robot.observation_dim, OBSERVED_LIMIT, dtype=np.float32)
+        limit = np.full(self.task.observation_dim, OBSERVED_LIMIT, dtype=np.float32)
         self.observation_space = Box(-limit, limit, dtype=np.float32)
-        self._make_vehicle, self._lidar_noise, self._draw = make_vehicle, lidar_noise, draw
+        self._make_senses = self.task.code(self.task.senses)
+        self._make_vehicle: MakeVehicle = make_vehicle or self.task.code(self.task.simulator)(Conditions(), None)
+        self._lidar_noise, self._draw = lidar_noise, draw
         self._bound = np.asarray(robot.measurement_bound)
         self._changes: dict[str, float] = {}
         self._vehicle: Vehicle | None = None
@@ -128,7 +118,7 @@ class NavigationEnv(gymnasium.Env[Observation, Any]):
         self._vehicle = self._make_vehicle(self._arena, rng)
         if self._changes:
             self._vehicle.alter(**self._changes)
-        self._senses = SENSES[self.robot.kind](self._arena, rng, self._lidar_noise)
+        self._senses: Senses = self._make_senses(self.robot, self._arena, rng, self._lidar_noise)
         self._watch = None if self._arena.crowd is None else Watch(self._arena.crowd, rng)
         self._steps = 0
         self._distance = self._goal_distance(self._vehicle.true)

@@ -3,20 +3,23 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 from pathlib import Path
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from messaging.robots import GROUND
+from messaging.robots import robot_named
+from sim.conditions import Conditions
 from sim.estimator import Estimator, NoiseLevels
 from sim.scene import Moving, add_movers, add_obstacles
-from sim.vehicle import BadInput, Period
+from sim.vehicle import BadInput, MakeVehicle, Period
 from sim.world import Arena
 
 Array = NDArray[np.float64]
 
+GROUND = robot_named("ground")
 MODEL = Path(__file__).with_name("ground.xml").read_text()
 WHEEL_RADIUS = 0.033  # m
 TRACK = 0.160  # m between the wheels
@@ -190,3 +193,9 @@ def _build(arena: Arena) -> mujoco.MjModel:
     base.pos = (x, y, WHEEL_RADIUS)
     base.quat = (math.cos(0.5 * heading), 0.0, 0.0, math.sin(0.5 * heading))
     return spec.compile()
+
+
+def simulated(conditions: Conditions, tap: object = None) -> MakeVehicle:
+    """Makes the task's vehicles: see `messaging.tasks.Task.simulator`."""
+    c = conditions
+    return partial(GroundRobot, noise=c.noise, payload_kg=c.payload_kg, floor_friction=c.floor_friction)

@@ -7,13 +7,12 @@ can. So it keeps to its acceleration and speed at all times, whatever it wants. 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
 from messaging.motion import Motion, Sighting
 from messaging.shapes import CYLINDER, SPHERE, Obstacle, Shapes
+from messaging.tasks import MoverKind
 
 Array = NDArray[np.float64]
 
@@ -22,19 +21,6 @@ CHANGE = 2.0  # s until it wants something else, on average
 STANDS = 0.25  # of these times it wants to stand
 CHECKED = 6  # places at which a way to a stop is looked at
 AIR = 0.02  # m kept to what stands, between these
-
-
-@dataclass(frozen=True)
-class MoverKind:
-    """What goes about in an arena: how many (least, most), how large, how fast; what a sensor tells of them."""
-
-    count: tuple[int, int]
-    radius: float  # m; in the plane a disc, in space a ball
-    speed: float  # m/s, at most
-    acceleration: float  # m/s², at most
-    keep: float  # m from the robot's start to its surface, at the start
-    position_error: float = 0.03  # m, of what is measured of them
-    velocity_error: float = 0.05  # m/s
 
 
 class Crowd:

@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from messaging.robots import GROUND, QUADROTOR, Robot
+from messaging.robots import Robot
+from messaging.tasks import task_of
 from sim.estimator import wrap
-from sim.pilots import GreedyPilot, HostilePilot, MapPilot
 from sim.planner import Routes
 from sim.world import Arena
 
@@ -27,16 +27,17 @@ class UnknownPolicy(ValueError):
 
 
 def scripted(name: str, robot: Robot, rng: np.random.Generator) -> Policy:
-    """The scripted policy of that name: `random`, `greedy`, `adversary` or `astar`. It notices new episodes itself.
+    """The scripted policy of that name (`task.policies`). It notices new episodes itself.
 
     Raises:
         UnknownPolicy: with the names there are, or because the robot has none.
     """
-    if name not in POLICIES:
-        raise UnknownPolicy(f"no policy is called {name!r}; there are: {', '.join(POLICIES)}")
-    if robot.kind not in POLICIES[name]:
-        raise UnknownPolicy(f"no policy of the {robot.kind} is called {name!r}")
-    return POLICIES[name][robot.kind](robot, rng)
+    task = task_of(robot)
+    if name not in task.policies:
+        there = ", ".join(task.policies) or "none"
+        raise UnknownPolicy(f"no policy of the {robot.kind} is called {name!r}; there are: {there}")
+    policy: Policy = task.code(task.policies[name])(robot, rng)
+    return policy
 
 
 def bearing(state: Array, target: Array | tuple[float, float]) -> float:
@@ -138,11 +139,3 @@ class MapDriver:
         """The input that turns to a bearing (rad) as fast as is smooth, and drives when roughly aligned."""
         speed = self._robot.high()[0] * max(0.0, 1.0 - abs(angle) / self.ALIGNED)
         return bounded(self._robot, speed, self.GAIN * angle)
-
-
-POLICIES: dict[str, dict[str, Callable[[Robot, np.random.Generator], Policy]]] = {
-    "random": {GROUND.name: RandomInputs, QUADROTOR.name: RandomInputs},
-    "greedy": {GROUND.name: Greedy, QUADROTOR.name: GreedyPilot},
-    "adversary": {GROUND.name: Adversary, QUADROTOR.name: HostilePilot},
-    "astar": {GROUND.name: MapDriver, QUADROTOR.name: MapPilot},
-}

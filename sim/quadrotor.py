@@ -11,7 +11,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from messaging.robots import QUADROTOR
+from messaging.robots import robot_named
 from sim.flight import GRAVITY, Body, FlightController, Gains, Vector
 from sim.flight_estimator import Estimate, FlightEstimator, QuadrotorNoise
 from sim.scene import Moving, add_movers, add_obstacles
@@ -21,6 +21,7 @@ from sim.world import Arena
 
 Array = NDArray[np.float64]
 
+QUADROTOR = robot_named("quadrotor")
 MODEL = Path(__file__).with_name("quadrotor.xml").read_text()
 SAMPLES = 5  # of the position in a period
 OUTER_EVERY = 2  # physics steps for one of the velocity loop

@@ -1,17 +1,16 @@
-"""What each robot kind observes: its lidar, its goal, itself; in the order of `robot.observation`."""
+"""What each robot kind observes: its lidar, its goal, itself; in the order of `task.observed`."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from messaging.rays import rays_of
-from messaging.robots import GROUND, QUADROTOR
+from messaging.robots import Robot
+from messaging.tasks import task_of
 from sim.lidar import Lidar
 from sim.world import Arena
 
@@ -56,18 +55,18 @@ class GroundSenses:
     MOUNT = -0.032  # m, the lidar's place along the robot's x axis from the axle's midpoint
     DISTANCE_SCALE = 5.0  # m, the goal distance that is observed as 1
 
-    def __init__(self, arena: Arena, rng: np.random.Generator, lidar_noise: float) -> None:
-        self._goal = arena.goal
-        self._lidar = Lidar(arena, rays_of(GROUND), lidar_noise, rng)
+    def __init__(self, robot: Robot, arena: Arena, rng: np.random.Generator, lidar_noise: float) -> None:
+        self._robot, self._goal = robot, arena.goal
+        self._lidar = Lidar(arena, task_of(robot).rays, lidar_noise, rng)
         self._memory = TurnMemory()
 
     def speed(self, state: Array) -> float:
         return float(state[3])
 
     def observe(self, true: Array, measured: Array, input: Array, time: float = 0.0) -> Array:
-        top = GROUND.high()
+        top = self._robot.high()
         x, y, heading, speed, turn_rate = measured
-        self._memory.update(float(turn_rate), GROUND.period)
+        self._memory.update(float(turn_rate), self._robot.period)
         bearing = math.atan2(self._goal[1] - y, self._goal[0] - x) - heading
         own = (
             math.hypot(self._goal[0] - x, self._goal[1] - y) / self.DISTANCE_SCALE,
@@ -92,23 +91,17 @@ class AirSenses:
 
     NEAR = 5.0  # m
 
-    def __init__(self, arena: Arena, rng: np.random.Generator, lidar_noise: float) -> None:
-        self._goal = np.asarray(arena.goal)
-        self._lidar = Lidar(arena, rays_of(QUADROTOR), lidar_noise, rng)
+    def __init__(self, robot: Robot, arena: Arena, rng: np.random.Generator, lidar_noise: float) -> None:
+        self._robot, self._goal = robot, np.asarray(arena.goal)
+        self._lidar = Lidar(arena, task_of(robot).rays, lidar_noise, rng)
 
     def speed(self, state: Array) -> float:
         return math.hypot(*state[3:6])
 
     def observe(self, true: Array, measured: Array, input: Array, time: float = 0.0) -> Array:
-        top = QUADROTOR.high()
+        top = self._robot.high()
         offset = self._goal - measured[:3]
         near = offset / (math.hypot(*offset) + self.NEAR)
         self._lidar.at(time)
         ranges = self._lidar.ranges(true[:3])
         return np.concatenate((ranges / self._lidar.max_range, near, measured[3:6] / top, input / top))
-
-
-SENSES: dict[str, Callable[[Arena, np.random.Generator, float], Senses]] = {
-    GROUND.name: GroundSenses,
-    QUADROTOR.name: AirSenses,
-}

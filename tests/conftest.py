@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 from deploy.data import store
-from messaging.robots import GROUND, QUADROTOR
 from safety.model_set import Recipe
+from tests.robots import GROUND, QUADROTOR
 
 FLIGHTS = 80  # trajectories of the quadrotor, recorded in half a minute
 TRAJECTORIES = 50  # enough for every check of the certificates, recorded in ten seconds

@@ -11,7 +11,7 @@ from time import perf_counter
 from deploy.bench import situations
 from deploy.bench.timing import WARM_UP, Figures, milliseconds
 from messaging import brakeline_pb2 as pb
-from messaging.robots import QUADROTOR
+from messaging.robots import robot_named
 from safety.certificates import KINDS
 from safety.filter import Filter
 from safety.model_set import MODES
@@ -25,8 +25,9 @@ def run() -> Figures:
             ready = Filter(situations.model(certificate, mode))
             for kind, seconds in _by_kind(ready, asked).items():
                 figures[f"{certificate} {mode}: {kind}"] = milliseconds(seconds) | {"count": len(seconds)}
-    flights = situations.messages(robot=QUADROTOR)
-    for kind, seconds in _by_kind(Filter(situations.model(robot=QUADROTOR)), flights).items():
+    quadrotor = robot_named("quadrotor")
+    flights = situations.messages(robot=quadrotor)
+    for kind, seconds in _by_kind(Filter(situations.model(robot=quadrotor)), flights).items():
         figures[f"quadrotor, residual direct: {kind}"] = milliseconds(seconds) | {"count": len(seconds)}
     figures["the paper, a step (its own machine)"] = {"mean ms": 80.41}
     return figures

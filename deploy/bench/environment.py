@@ -9,8 +9,8 @@ import numpy as np
 
 from deploy.bench.timing import Figures, timed
 from deploy.vehicles import environment
-from messaging.rays import rays_of
-from messaging.robots import ROBOTS, Robot
+from messaging.robots import Robot, robot_named, shipped
+from messaging.tasks import task_of
 from sim.lidar import Lidar
 from sim.scene import HEIGHT, map_model
 from sim.world import Arena
@@ -20,7 +20,7 @@ STEPS = 3000
 
 def run() -> Figures:
     figures: Figures = {}
-    for robot in ROBOTS.values():
+    for robot in map(robot_named, shipped()):
         figures[f"{robot.name}: environment, lidar included"], arena = _steps(robot)
         figures |= _lidars(robot, arena)
     return figures
@@ -47,10 +47,10 @@ def _steps(robot: Robot) -> tuple[dict[str, float], Arena]:
 
 
 def _lidars(robot: Robot, arena: Arena) -> Figures:
-    lidar, origin = Lidar(arena, rays_of(robot)), np.asarray(arena.start[: arena.dim])
+    lidar, origin = Lidar(arena, task_of(robot).rays), np.asarray(arena.start[: arena.dim])
     model, data = map_model(arena)
-    ways = np.zeros((len(rays_of(robot).directions), 3))
-    ways[:, : arena.dim] = rays_of(robot).directions
+    ways = np.zeros((len(task_of(robot).rays.directions), 3))
+    ways[:, : arena.dim] = task_of(robot).rays.directions
     point = np.array([*origin, 0.5 * HEIGHT][:3])
     hit, normal = np.zeros(1, np.int32), np.zeros(3)
 

@@ -42,19 +42,20 @@ def real() -> list[tuple[str, Any]]:
     from deploy.data.store import model_for
     from deploy.study.evaluate import in_process
     from deploy.vehicles import environment
-    from messaging.robots import GROUND
+    from messaging.robots import robot_named
     from safety.model_set import Recipe
     from sim.policies import scripted
 
-    ask = in_process(model_for(GROUND, Recipe()))
-    driver = Driver(GROUND, environment(GROUND, "default", 7), Identity("actor-0", 0, 7))
-    policy = scripted("greedy", GROUND, np.random.default_rng(7))
+    ground = robot_named("ground")
+    ask = in_process(model_for(ground, Recipe()))
+    driver = Driver(ground, environment(ground, "default", 7), Identity("actor-0", 0, 7))
+    policy = scripted("greedy", ground, np.random.default_rng(7))
     found: list[tuple[str, Any]] = []
     for number in range(EPISODES):
         found.append(("episode/ground/actor-0", driver.begin(number)))
         while driver.running:
             proposal = np.asarray(policy(driver.observation, driver.info), dtype=float)
-            outcome = consult(ask, [driver.request(proposal)], GROUND)[0]
+            outcome = consult(ask, [driver.request(proposal)], ground)[0]
             found.append(("exchange/ground/actor-0", outcome.exchange(driver.info["time"])))
             found.append(("step/ground/actor-0", driver.execute(proposal, outcome)))
         found.append(("health/actor-0", pb.Health(process="actor-0", figures={"steps_per_s": 100.0, "steps": number})))

@@ -11,7 +11,7 @@ from deploy.policies import policy_named
 from deploy.study.evaluate import in_process
 from deploy.vehicles import environment
 from messaging import brakeline_pb2 as pb
-from messaging.robots import GROUND, Robot
+from messaging.robots import Robot, robot_named
 from safety.filter import Filter
 from safety.model_set import ModelSet, Recipe
 from safety.request import Request
@@ -20,12 +20,13 @@ from safety.wire import request_of
 STEPS = 1500
 
 
-def model(certificate: str = "residual", mode: str = "direct", robot: Robot = GROUND) -> ModelSet:
-    return model_for(robot, Recipe(certificate, mode))
+def model(certificate: str = "residual", mode: str = "direct", robot: Robot | None = None) -> ModelSet:
+    return model_for(robot or robot_named("ground"), Recipe(certificate, mode))
 
 
-def messages(policy: str = "random", seed: int = 5, robot: Robot = GROUND) -> list[pb.Request]:
+def messages(policy: str = "random", seed: int = 5, robot: Robot | None = None) -> list[pb.Request]:
     """The questions of some episodes of a policy behind the default filter."""
+    robot = robot or robot_named("ground")
     question = in_process(model(robot=robot))
     driver = Driver(robot, environment(robot, "default", seed), Identity("bench", 0, seed))
     choose = policy_named(policy, robot, seed)

@@ -15,10 +15,10 @@ from actors.flight import FlightSettings
 from deploy.run.configurations import RunConfig
 from deploy.run.keys import own_keys
 from deploy.run.places import client_of
-from deploy.vehicles import Conditions
 from messaging.bus import BusSettings
 from messaging.ports import free_endpoint
 from safety.model_set import Recipe
+from sim.conditions import Conditions
 from sim.estimator import NoiseLevels
 from sim.flight_estimator import QuadrotorNoise
 from sim.wind import Wind

@@ -20,7 +20,7 @@ from deploy.study.curves import learning_curves, seeds_as_points
 from deploy.study.table import markdown, plain, table
 from deploy.study.tune import Tried, best, try_all, values_for
 from learner.config import TD3Config
-from messaging.robots import robot_named
+from messaging.tasks import learnt
 from safety.model_set import Recipe
 from safety.rivals.pretrained import Pretrained
 
@@ -42,7 +42,7 @@ class Pretrain:
     json: bool = False
 
     def run(self) -> int:
-        robot = robot_named(self.robot)
+        robot = learnt(self.robot)
         recipe = recipe_for(self.method, robot)
         changed = {name: value for name in ("samples", "seed") if (value := getattr(self, name)) is not None}
         model = pretrained(robot, self.method, replace(recipe, **changed), again=not self.tune)
@@ -106,7 +106,7 @@ class Compare:
             )
         told: dict[str, Any] = {}
         for name in self.robots:
-            robot = robot_named(name).name
+            robot = learnt(name).name
             self._prepare(robot)
             jobs = self._jobs(robot)
             found = compare.complete(jobs, results, runs, self.workers, again, self._say)
@@ -121,7 +121,7 @@ class Compare:
         """What several cells need is made once, before them."""
         for method in self.methods:
             if method != NONE:
-                method_for(robot_named(robot), method, Recipe())
+                method_for(learnt(robot), method, Recipe())
 
     def _jobs(self, robot: str) -> list[Job]:
         seeds = self.seeds[:1] if self.quick else self.seeds

@@ -14,7 +14,7 @@ from deploy.data.logged import Recorded, from_log
 from deploy.data.store import SEED, certified, model_path, record_path, recorded
 from messaging import brakeline_pb2 as pb
 from messaging.bus import Bus
-from messaging.robots import robot_named
+from messaging.tasks import learnt
 from messaging.topics import MODEL
 from safety.certificates import KINDS, RESIDUAL, CertificateError
 from safety.dataset import BadData, Dataset
@@ -34,7 +34,7 @@ class Collect:
     json: bool = False
 
     def run(self) -> int:
-        robot = robot_named(self.robot)
+        robot = learnt(self.robot)
         path = self.out or record_path(robot)
         data = recorded(robot, path, self.trajectories, self.seed, self.physics.conditions(), again=True)
         figures = {"path": str(path), "trajectories": len(data.trajectories), "periods": data.periods}
@@ -98,9 +98,9 @@ class Certify:
 
     def _load(self) -> Recorded:
         if self.data.suffix == ".safetensors":
-            data = Dataset.load(self.data) if self.data.exists() else recorded(robot_named(self.robot), self.data)
+            data = Dataset.load(self.data) if self.data.exists() else recorded(learnt(self.robot), self.data)
             return Recorded(data, f"{data.periods} recorded periods: {data.about}")
-        return from_log(self.data, robot_named(self.robot), self.last)
+        return from_log(self.data, learnt(self.robot), self.last)
 
     def _publish(self, model: ModelSet) -> None:
         with Bus(self.endpoints.bus(), "certify") as bus:

@@ -12,7 +12,7 @@ from deploy.study.evaluate import Evaluation, evaluate, prepared
 from logs.metrics import Tally
 from logs.report import show
 from messaging.robots import Robot as RobotKind
-from messaging.robots import robot_named
+from messaging.tasks import learnt
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class Evaluate:
     json: bool = False
 
     def run(self) -> int:
-        robot = robot_named(self.robot)
+        robot = learnt(self.robot)
         what = Evaluation(
             policy=self.policy,
             method=self.filtering.method,

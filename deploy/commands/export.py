@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import tyro
 
 from deploy.commands.common import LATEST, console, errors, say_json
-from messaging.robots import robot_named
+from messaging.tasks import learnt
 
 
 @dataclass(frozen=True)
@@ -51,13 +51,13 @@ class Export:
         assert self.csv is not None
         self.csv.parent.mkdir(parents=True, exist_ok=True)
         with self.csv.open("w", newline="") as file:
-            return {"path": str(self.csv), "steps": to_csv(list(self.logs), robot_named(self.robot), file)}
+            return {"path": str(self.csv), "steps": to_csv(list(self.logs), learnt(self.robot), file)}
 
     def _minari(self) -> dict[str, Any]:
         from logs.trajectories import to_minari
 
         assert self.minari is not None
-        written = to_minari(list(self.logs), robot_named(self.robot), self.minari)
+        written = to_minari(list(self.logs), learnt(self.robot), self.minari)
         return {"path": str(written.path), "episodes": written.episodes, "steps": written.steps}
 
     def _tlog(self) -> dict[str, Any]:

@@ -16,7 +16,7 @@ from deploy.run.display import Display, summary
 from deploy.run.launcher import Launcher, prepare
 from deploy.vehicles import flight_arena
 from messaging.ports import free_udp_port
-from messaging.robots import QUADROTOR, robot_named
+from messaging.tasks import learnt
 
 LEARN = "learn"
 ACTOR = "actor-0"
@@ -24,7 +24,7 @@ ACTOR = "actor-0"
 
 @dataclass(frozen=True)
 class Fly:
-    robot: Annotated[str, tyro.conf.Positional] = QUADROTOR.name
+    robot: Annotated[str, tyro.conf.Positional] = "quadrotor"
     minutes: float = 10.0
     policy: str = "astar"
     """A file, or trained | untrained | random | greedy | adversary | astar; learn: from what it flies."""
@@ -67,8 +67,8 @@ class Fly:
 
     def config(self) -> RunConfig:
         """The run's configuration. Raises ValueError for a robot that does not fly."""
-        robot = robot_named(self.robot)
-        if robot.kind != QUADROTOR.name:
+        robot = learnt(self.robot)
+        if robot.position_dim != 3:
             raise ValueError(f"a {robot.kind} robot does not fly")
         robot = robot if robot.late else robot.in_real_time()
         return RunConfig(

@@ -18,7 +18,7 @@ from deploy.run.configurations import RunConfig
 from deploy.vehicles import environment, flight_arena
 from learner.config import LearnerConfig
 from logs.recorder import Rotation
-from messaging.robots import robot_named
+from messaging.tasks import learnt
 
 
 @dataclass(frozen=True)
@@ -34,8 +34,8 @@ class Safety:
 
         recipe = self.filtering.recipe()
         for robot in self.robots:
-            method_for(robot_named(robot), self.filtering.method, recipe)
-        paths = tuple(method_path(robot_named(robot), self.filtering.method, recipe) for robot in self.robots)
+            method_for(learnt(robot), self.filtering.method, recipe)
+        paths = tuple(method_path(learnt(robot), self.filtering.method, recipe) for robot in self.robots)
         main(SafetySettings(self.endpoints.bus(), paths, data_root(), self.name))
         return 0
 
@@ -93,7 +93,7 @@ class Actor:
         from actors import flight
         from actors.loop import ActorSettings, run
 
-        robot = robot_named(self.robot)
+        robot = learnt(self.robot)
         robot = robot.in_real_time() if self.url and not robot.late else robot
         settings = ActorSettings(
             bus=self.endpoints.bus(),

@@ -18,7 +18,7 @@ from deploy.commands.common import LATEST, Certificate, Mode, console, errors, s
 from deploy.data.store import certified, model_for
 from deploy.run.replay import Instead, replay
 from logs.extent import count
-from messaging.robots import robot_named
+from messaging.tasks import learnt
 from messaging.topics import EXCHANGE
 from safety.dataset import Dataset
 from safety.filter import Filter
@@ -85,7 +85,7 @@ class Replay:
             model, _ = certified(Dataset.load(self.data), recipe)
             make = lambda name: model  # noqa: E731
         else:
-            make = lambda name: model_for(robot_named(name), recipe)  # noqa: E731
+            make = lambda name: model_for(learnt(name), recipe)  # noqa: E731
 
         def chosen(name: str) -> Filter:
             if name not in filters:

@@ -11,8 +11,8 @@ from rich.table import Table
 
 from deploy.commands.common import Endpoints, Flags, Robot, console, say_json
 from messaging.bus import Bus, Sample
-from messaging.robots import robot_named
 from messaging.shapes import KINDS, Obstacle
+from messaging.tasks import learnt
 from messaging.topics import HEALTH, LEARNER
 from safety.client import SafetyClient
 
@@ -48,7 +48,7 @@ class Query:
     json: bool = False
 
     def run(self) -> int:
-        robot = robot_named(self.robot)
+        robot = learnt(self.robot)
         near = [
             obstacle_of(tuple(part.split()), robot.position_dim) for part in self.obstacle.split(",") if part.strip()
         ]

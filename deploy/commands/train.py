@@ -18,7 +18,7 @@ from deploy.run.launcher import Launcher, prepare
 from deploy.run.places import CONFIG
 from learner.config import LearnerConfig
 from logs.recorder import Rotation
-from messaging.robots import robot_named
+from messaging.tasks import address, learnt
 
 
 def launch(config: RunConfig, folder: Path, resume: bool, meeting: Meeting, as_json: bool) -> int:
@@ -115,7 +115,7 @@ class Train:
             from_logs = tuple(map(str, self.from_logs)) or resumed.from_logs
             return replace(resumed, steps=self.steps or resumed.steps, from_logs=from_logs)
         return RunConfig(
-            robots=tuple(robot_named(name).name for name in self.robots),
+            robots=tuple(address(name) for name in self.robots),
             method=self.filtering.method,
             recipe=self.filtering.recipe(),
             arena=self.arena,
@@ -143,7 +143,7 @@ class Train:
         if self.steps is None and self.from_logs and self.actors == 0:
             logs = [str(path) for path in self.from_logs]
             with errors.status("counting the logs' steps"):
-                return max(count(logs, robot_named(name)) for name in self.robots)
+                return max(count(logs, learnt(name)) for name in self.robots)
         return EXPERIMENTS[self.experiment].steps if self.steps is None else self.steps
 
     def run(self) -> int:

@@ -8,9 +8,10 @@ from collections.abc import Iterator
 import numpy as np
 
 from deploy.data.excite import excitation
-from deploy.vehicles import Conditions, vehicle_in_yard
+from deploy.vehicles import vehicle_in_yard
 from messaging.robots import Robot
 from safety.dataset import Dataset, Trajectory
+from sim.conditions import Conditions
 
 PERIODS = 300  # a trajectory
 

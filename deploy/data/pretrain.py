@@ -12,7 +12,8 @@ import numpy as np
 from deploy.data.rollouts import costs, transitions
 from learner.pretrain import Fit, fit_cost, fit_linear
 from messaging.perceptrons import Perceptrons
-from messaging.robots import QUADROTOR, Robot
+from messaging.robots import Robot
+from messaging.tasks import task_of
 from safety.rivals.pretrained import Pretrained
 from safety.rivals.sailr import SAILR
 from safety.rivals.secas import SECAS
@@ -48,15 +49,11 @@ class SailrRecipe:
 Recipe = SecasRecipe | SailrRecipe
 Made = tuple[dict[str, Perceptrons], dict[str, float], dict[str, str]]  # networks, settings, about
 RECIPES: dict[str, type[SecasRecipe] | type[SailrRecipe]] = {SECAS: SecasRecipe, SAILR: SailrRecipe}
-TUNED: dict[tuple[str, str], dict[str, float]] = {  # where a robot's differ; found by `pretrain METHOD ROBOT --tune`
-    (SECAS, QUADROTOR.name): {"margin": 0.4},
-    (SAILR, QUADROTOR.name): {"lead": 20, "threshold": 0.15},  # it takes seven periods to full speed
-}
 
 
 def recipe_for(method: str, robot: Robot) -> Recipe:
     """With the threshold that was found for this robot (deploy/study/experiments.md)."""
-    return RECIPES[method](**TUNED.get((method, robot.name), {}))  # type: ignore[arg-type]
+    return RECIPES[method](**getattr(task_of(robot).rivals, method))
 
 
 def made_by(model: Pretrained, recipe: Recipe) -> bool:

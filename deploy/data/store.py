@@ -17,15 +17,16 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from deploy.data import collect
 from deploy.data import pretrain as rivals
-from deploy.vehicles import Conditions
-from messaging.robots import Robot, robot_named
+from messaging.robots import Robot
+from messaging.tasks import task_of
 from safety.dataset import BadData, Dataset
+from safety.fitting import make
 from safety.methods import DDPC, Model
-from safety.model_set import BadModel, ModelSet, Recipe, make
+from safety.model_set import BadModel, ModelSet, Recipe
 from safety.rivals.pretrained import Pretrained
 from safety.statement import Statement, state
+from sim.conditions import Conditions
 
-TRAJECTORIES = {"ground": 200, "quadrotor": 500}  # of 300 periods: a plan of 12 periods needs more than one of 3
 HELD_OUT = 0.3  # of the trajectories, for the statement about a model set
 SEED = 20260
 
@@ -64,7 +65,7 @@ def recorded(
     path = path or record_path(robot)
     if path.exists() and not again:
         return Dataset.load(path)
-    conditions, trajectories = conditions or Conditions(), trajectories or TRAJECTORIES[robot.kind]
+    conditions, trajectories = conditions or Conditions(), trajectories or task_of(robot).trajectories
     driven = track(
         collect.record(robot, trajectories, seed, conditions),
         f"recording {trajectories} trajectories of {robot.name}",
@@ -98,7 +99,7 @@ def model_for(robot: Robot, recipe: Recipe) -> ModelSet:
             return ModelSet.load(path)
         except BadModel as error:
             console.print(f"[yellow]making the model set again:[/] {error}")
-    base = robot_named(robot.kind)  # one record serves, whether questions are late or not
+    base = robot.in_lockstep()  # one record serves, whether questions are late or not
     try:
         data = recorded(base)
     except BadData as error:

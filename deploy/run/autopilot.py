@@ -13,14 +13,13 @@ import numpy as np
 from deploy.vehicles import flight_arena
 from messaging.clock import WallClock
 from messaging.links import open_link
-from messaging.rays import rays_of
-from messaging.robots import QUADROTOR
+from messaging.tasks import task_of
 from sim.autopilot.endpoint import Autopilot
 from sim.autopilot.rules import SETPOINT_TIMEOUT
 from sim.autopilot.server import Tally, Truth, serve
 from sim.flight_estimator import QuadrotorNoise
 from sim.lidar import Lidar
-from sim.quadrotor import Quadrotor
+from sim.quadrotor import QUADROTOR, Quadrotor
 from sim.wind import Wind
 from sim.world import Arena, closing, room_bounds
 
@@ -67,7 +66,7 @@ def vehicle(settings: AutopilotSettings, arena: Arena, system: int) -> Autopilot
     rng = np.random.default_rng((settings.seed, system))
     noise = QuadrotorNoise()
     quadrotor = Quadrotor(arena, rng, noise, settings.wind, floor=None if settings.airborne else PAD)
-    lidar = Lidar(arena, rays_of(QUADROTOR), noise.scale * noise.lidar, rng)
+    lidar = Lidar(arena, task_of(QUADROTOR).rays, noise.scale * noise.lidar, rng)
     timeout = settings.setpoint_timeout
     parameters = {} if timeout is None else {SETPOINT_TIMEOUT[settings.rules]: timeout}
     return Autopilot(quadrotor, settings.rules, system, parameters, lidar)

@@ -39,7 +39,9 @@ def _safety(place: Place, folder: Path, config: RunConfig, bus: BusSettings) -> 
     from safety.service import SafetySettings, main
 
     models = tuple(method_path(robot_named(robot), config.method, config.recipe) for robot in config.robots)
-    newest = (newest_model(folder, robot) or path for robot, path in zip(config.robots, models, strict=True))
+    newest = (
+        newest_model(folder, robot_named(robot).name) or path for robot, path in zip(config.robots, models, strict=True)
+    )
     main(SafetySettings(bus, tuple(newest), folder, place.name))
     return False
 
@@ -83,7 +85,9 @@ def _actor(place: Place, folder: Path, config: RunConfig, bus: BusSettings) -> b
     )
     propose = partial(policy_named, config.policy, robot_named(place.robot)) if config.policy else None
     if config.flight is not None:
-        return flight.run(settings, config.flight, flight_arena(config.arena, config.seed), propose)
+        return flight.run(
+            settings, config.flight, flight_arena(config.arena, config.seed, robot_named(place.robot)), propose
+        )
     return run(settings, partial(environment, conditions=config.conditions), propose)
 
 

@@ -12,13 +12,13 @@ from typing import Any
 
 from actors.flight import FlightSettings
 from actors.loop import Change
-from deploy.vehicles import Conditions
 from learner.config import LearnerConfig, TD3Config
 from logs.recorder import Rotation
-from messaging.robots import robot_named
+from messaging.tasks import learnt
 from safety.methods import METHODS as FILTERS
 from safety.model_set import Recipe
 from sim.arenas import arena_kind
+from sim.conditions import Conditions
 
 METHODS = (*FILTERS, "none")
 
@@ -64,7 +64,7 @@ class RunConfig:
         if self.method not in METHODS:
             raise ValueError(f"no method is called {self.method!r}; there are: {', '.join(METHODS)}")
         for robot in self.robots:
-            arena_kind(robot_named(robot), self.arena)
+            arena_kind(learnt(robot), self.arena)
         if min(self.robots_per_actor, self.replicas, self.steps) < 1 or self.actors < (0 if self.from_logs else 1):
             raise ValueError(
                 "actors (unless there are logs to learn from), robots per actor, replicas, steps: 1 or more"

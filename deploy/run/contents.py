@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from importlib.metadata import version
 from pathlib import Path
 
@@ -20,7 +21,7 @@ def metadata(config: RunConfig) -> dict[str, dict[str, str]]:
         "policy": config.policy or "learning",
         "arena": config.arena,
         "seed": str(config.seed),
-        "robots": ",".join(config.robots),
+        "robots": ",".join(robot_named(name).name for name in config.robots),
     }
     if config.method == DDPC:
         run |= {"certificate": config.recipe.certificate, "mode": config.recipe.mode}
@@ -31,9 +32,11 @@ def metadata(config: RunConfig) -> dict[str, dict[str, str]]:
         "versions": {name: version(name) for name in packages},
         "conditions": config.conditions.describe(),
     }
-    for robot in config.robots if filtered else ():
-        model = load(method_path(robot_named(robot), config.method, config.recipe))
-        about[f"model {robot}"] = {"version": model.version, **model.about}
+    robots = [robot_named(name) for name in config.robots]
+    about["robots"] = {robot.kind: json.dumps(robot.description) for robot in robots}
+    for robot in robots if filtered else ():
+        model = load(method_path(robot, config.method, config.recipe))
+        about[f"model {robot.name}"] = {"version": model.version, **model.about}
     return about
 
 
@@ -43,7 +46,7 @@ def attachments(config: RunConfig, folder: Path) -> dict[str, bytes]:
         return {}
     models = (load(method_path(robot_named(robot), config.method, config.recipe)) for robot in config.robots)
     files = {attachment(model.robot.name, model.version): model.encode() for model in models}
-    for robot in config.robots:
+    for robot in (robot_named(name).name for name in config.robots):
         archived = (folder / robot / "models").glob("*.safetensors")
         files |= {attachment(robot, path.stem): path.read_bytes() for path in archived}
     return files

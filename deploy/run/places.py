@@ -10,6 +10,7 @@ from pathlib import Path
 from deploy.run.configurations import RunConfig
 from messaging.bus import BusSettings
 from messaging.files import write_whole
+from messaging.robots import robot_named
 
 CONFIG, ENDPOINT, LOG = "config.json", "endpoint", "run.mcap"
 UNFINISHED = 75  # exit status: asked to end before its work was done
@@ -35,12 +36,13 @@ def places(config: RunConfig) -> list[Place]:
         table.append(Place("autopilot", "autopilot"))
     one = len(config.robots) == 1
     for robot in config.robots:
+        kind = robot_named(robot).name
         if not config.policy:
-            table.append(Place("learner" if one else f"learner-{robot}", "learner", robot, nice=10))
+            table.append(Place("learner" if one else f"learner-{kind}", "learner", robot, nice=10))
         if config.from_logs:
-            table.append(Place("feeder" if one else f"feeder-{robot}", "feeder", robot, nice=2))
+            table.append(Place("feeder" if one else f"feeder-{kind}", "feeder", robot, nice=2))
         for i in range(config.actors):
-            name = f"actor-{i}" if one else f"actor-{robot}-{i}"
+            name = f"actor-{i}" if one else f"actor-{kind}-{i}"
             nice = 0 if config.flight is not None else 2
             table.append(Place(name, "actor", robot, i * config.robots_per_actor, nice))
     return table

@@ -24,10 +24,10 @@ from deploy.interpreter import spawning
 from deploy.study import cells
 from deploy.study.cells import METHODS, NONE, Study
 from messaging.files import write_whole
-from messaging.robots import GROUND, QUADROTOR
+from messaging.robots import robot_named
+from messaging.tasks import task_of
 
 RESULTS, RUNS = Path("results"), Path("runs/compare")
-STEPS = {GROUND.name: 60_000, QUADROTOR.name: 40_000}  # of training: a cell takes ten minutes of one core at the most
 EPISODES = 500
 SEEDS = (0, 1, 2)
 
@@ -70,7 +70,8 @@ class Cell:
 
 def studies(robot: str, seeds: Iterable[int] = SEEDS, quick: bool = False) -> list[Study]:
     """All cells of a robot's table, seed by seed, so that an interrupted comparison has whole seeds."""
-    wanted = [Study(robot, method, seed, STEPS[robot], EPISODES) for seed in seeds for method in METHODS]
+    steps = task_of(robot_named(robot)).steps
+    wanted = [Study(robot, method, seed, steps, EPISODES) for seed in seeds for method in METHODS]
     return [cells.quick(study) for study in wanted] if quick else wanted
 
 
@@ -175,4 +176,4 @@ def _found_out(job: Job, results: Path, runs: Path, told: Any) -> None:
     write(results, job, result)
 
 
-__all__ = ["EPISODES", "NONE", "SEEDS", "STEPS", "Cell", "Job", "OtherConfiguration", "complete", "read", "studies"]
+__all__ = ["EPISODES", "NONE", "SEEDS", "Cell", "Job", "OtherConfiguration", "complete", "read", "studies"]

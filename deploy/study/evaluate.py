@@ -12,13 +12,14 @@ from actors.driver import Driver, Identity
 from actors.guard import Ask, consult
 from deploy.data.store import method_for
 from deploy.policies import policy_named
-from deploy.vehicles import Conditions, environment
+from deploy.vehicles import environment
 from logs.metrics import Tally, closed_loop
 from messaging import brakeline_pb2 as pb
 from messaging.robots import Robot
 from safety.methods import DDPC, Model
 from safety.model_set import Recipe
 from safety.service import Counts, Models, answerer
+from sim.conditions import Conditions
 from sim.policies import Policy
 
 FRESH = 1_000_000  # added to the seed: no training run draws its episodes from there

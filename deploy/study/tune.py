@@ -1,4 +1,4 @@
-"""The one threshold that each rival has, tried in closed loop: how `deploy/pretrain.TUNED` was found.
+"""The one threshold that each rival has, tried in closed loop: how `rivals` in the tasks' files was found.
 
 The rule, for both alike: of the values that cost the map's oracle (A*) no goal, the one with the fewest collisions of
 the greedy driver, who goes straight for the goal; of equals the one with the greedy driver's most goals.
@@ -14,13 +14,12 @@ from deploy.policies import policy_named
 from deploy.study.evaluate import FRESH, in_process
 from deploy.study.trials import evaluate
 from deploy.vehicles import environment
-from messaging.robots import GROUND, QUADROTOR
+from messaging.tasks import task_of
 from safety.rivals.pretrained import Pretrained
 from safety.rivals.sailr import SAILR
 from safety.rivals.secas import SECAS
 
 ORACLE, GREEDY = "astar", "greedy"
-MARGINS = {GROUND.name: (0.02, 0.05, 0.075, 0.1), QUADROTOR.name: (0.1, 0.2, 0.4, 0.6)}  # m beside the footprint
 ADVANTAGES = (0.03, 0.05, 0.08, 0.15)  # η; its authors' is 0.08
 SETTING = {SECAS: "clearance", SAILR: "threshold"}
 
@@ -42,7 +41,7 @@ class Tried:
 
 def values_for(model: Pretrained) -> tuple[float, ...]:
     """The four that are tried."""
-    return MARGINS[model.robot.name] if model.method == SECAS else ADVANTAGES
+    return task_of(model.robot).rivals.margins if model.method == SECAS else ADVANTAGES
 
 
 def tried(model: Pretrained, value: float, episodes: int, arena: str = "default") -> Tried:

@@ -75,7 +75,7 @@ class Pretrained:
             model = Pretrained(robot, str(about["method"]), networks, settings, dict(about["about"]))
         except (KeyError, TypeError, ValueError, UnknownRobot, BadPerceptrons) as error:
             raise BadModel(f"no pretrained model: {error!r}") from error
-        if about.get("layout") != robot.layout():
+        if not robot.understands(about.get("layout")):
             raise BadModel(f"the model is for another layout of {robot.name}: pretrain it again")
         if not np.isfinite(list(settings.values())).all():
             raise BadModel("the model's settings hold NaN or infinity")

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from messaging.robots import Robot
+from messaging.tasks import task_of
 from safety.backup import brake, braking_plan, within
 from safety.commitment import NO_PREDICTION
 from safety.model_set import BadModel
@@ -48,7 +49,7 @@ class Sailr:
             self.q, self.v, self.threshold = model.networks["q"], model.networks["v"], model.settings["threshold"]
         except KeyError as error:
             raise BadModel(f"no model of SAILR: {error} is missing") from error
-        seen = self.robot.observation_dim
+        seen = task_of(self.robot).observation_dim
         found = (self.q.inputs, self.q.outputs, self.v.inputs, self.v.outputs)
         if model.method != SAILR or found != (seen + self.robot.action_dim, 1, seen, 1):
             raise BadModel(f"no model of SAILR for {self.robot.name}: {model.method}, networks {found}")

@@ -18,8 +18,8 @@ from time import perf_counter_ns
 import numpy as np
 from numpy.typing import NDArray
 
-from messaging.rays import rays_of
 from messaging.robots import Robot
+from messaging.tasks import task_of
 from safety.backup import braking_plan, within
 from safety.commitment import NO_PREDICTION
 from safety.model_set import BadModel
@@ -50,7 +50,7 @@ class Constraints:
     """
 
     def __init__(self, robot: Robot) -> None:
-        rays = rays_of(robot)
+        rays = task_of(robot).rays
         self.robot, self.directions, self.range = robot, rays.directions, rays.range
         self.stopping = robot.period * (0.5 * robot.brake_steps + LAG)  # s
         fastest = float(np.linalg.norm(np.where(robot.translates, robot.high(), 0.0)))
@@ -125,7 +125,7 @@ class Secas:
         except KeyError as error:
             raise BadModel(f"no model of SECAS: {error} is missing") from error
         found = (self.g.count, self.g.inputs, self.g.outputs)
-        wanted = (self.constraints.count, self.robot.observation_dim, self.robot.action_dim)
+        wanted = (self.constraints.count, task_of(self.robot).observation_dim, self.robot.action_dim)
         if model.method != SECAS or found != wanted:
             raise BadModel(f"no model of SECAS for {self.robot.name}: {model.method}, networks {found}")
         self.bound = -clearance

@@ -3,14 +3,15 @@
 import numpy as np
 import pytest
 
-from actors.driver import LOWEST, Driver, Identity
+from actors.driver import Driver, Identity
 from actors.guard import consult
 from deploy.study.evaluate import in_process
 from deploy.vehicles import environment
 from logs.tally import Tally
 from messaging import brakeline_pb2 as pb
 from messaging.bus import NoReply
-from messaging.robots import GROUND
+from messaging.tasks import task_of
+from tests.robots import GROUND
 from tests.safety.rivals.test_sailr import known
 
 SLOW, FAST = np.array([0.05, 0.1]), np.array([0.25, 0.1])
@@ -32,7 +33,7 @@ def test_an_intervention_is_a_terminal_step_for_the_learner_alone(driver):
     allowed, cut = (step(driver, proposal, ask) for proposal in (SLOW, FAST))
     assert not allowed.cut and allowed.penalty == 0.0 and allowed.decision == pb.ALLOWED
     assert cut.cut and cut.decision == pb.FAILSAFE and not any(cut.action) and list(cut.proposed) == pytest.approx(FAST)
-    assert cut.reward - cut.penalty == pytest.approx(LOWEST["ground"]) and cut.reward > -5
+    assert cut.reward - cut.penalty == pytest.approx(task_of(GROUND).reward.cut) and cut.reward > -5
     assert not cut.terminated and not cut.goal and not cut.collision, "nothing ended in the environment"
     assert cut.truncated and not driver.running, "the robot's episode was called off"
     seen = Tally()

@@ -9,8 +9,8 @@ from deploy.study.evaluate import in_process
 from deploy.vehicles import environment
 from messaging import brakeline_pb2 as pb
 from messaging.bus import NoReply
-from messaging.robots import GROUND
 from safety.model_set import Recipe
+from tests.robots import GROUND
 
 FAST = np.array([0.25, 0.1])
 

@@ -6,9 +6,9 @@ import pytest
 from actors.guard import at_rest, consult, next_input
 from messaging import brakeline_pb2 as pb
 from messaging.bus import BusError, Late, NoReply, Refused
-from messaging.robots import GROUND
 from safety.client import request_message
 from safety.commitment import Commitment
+from tests.robots import GROUND
 
 PLAN = np.array([[0.2, 0.3], [0.1, 0.15], [0.0, 0.0]])
 REQUEST = pb.Request(robot="ground")

@@ -20,6 +20,7 @@ from sim.autopilot.pilot import Mode
 from sim.autopilot.rules import SETPOINT_TIMEOUT as TIMEOUT
 from sim.vehicle import BadInput
 from tests.actors.test_mavlink import RULES, quadrotor
+from tests.robots import QUADROTOR
 
 GAP = 0.25  # s between two setpoints, at most
 
@@ -37,7 +38,7 @@ def live(request: pytest.FixtureRequest) -> Iterator[Live]:
     thread.start()
     try:
         there = open_link(f"udpout:127.0.0.1:{link.port}")  # type: ignore[union-attr]
-        vehicle = LiveVehicle(there, height=2.0, truth=Truth(truth_port, 1), tap=frames.append)
+        vehicle = LiveVehicle(there, QUADROTOR, height=2.0, truth=Truth(truth_port, 1), tap=frames.append)
         try:
             yield vehicle, autopilot, frames
         finally:

@@ -11,11 +11,11 @@ from actors.loop import ActorSettings, run
 from deploy.vehicles import environment
 from messaging import brakeline_pb2 as pb
 from messaging.bus import Bus, BusSettings
-from messaging.robots import GROUND
 from messaging.topics import DECIDE, EXCHANGE, STEP
 from safety.model_set import Recipe
 from safety.service import Counts, Models, answerer
 from tests.actors.teacher import Teacher
+from tests.robots import GROUND
 
 STEPS = 60  # that each robot may take
 

@@ -9,7 +9,6 @@ import pytest
 
 from actors.flying import MavlinkVehicle
 from actors.mavlink import Client, CommandRefused, Frame, NoAutopilot, mavlink
-from messaging.robots import QUADROTOR
 from messaging.shapes import CYLINDER, Obstacle
 from sim.autopilot.endpoint import Autopilot
 from sim.autopilot.pilot import Mode
@@ -18,6 +17,7 @@ from sim.flight_estimator import QuadrotorNoise
 from sim.quadrotor import SAMPLES, Quadrotor
 from sim.vehicle import BadInput
 from sim.world import Arena, staged_arena
+from tests.robots import QUADROTOR
 
 RULES = ("px4", "ardupilot")
 
@@ -37,7 +37,7 @@ def embedded(rules: str, *obstacles: Obstacle) -> Autopilot:
 @pytest.mark.parametrize("rules", RULES)
 def test_in_lockstep_it_takes_control_before_time_begins(rules: str) -> None:
     autopilot = embedded(rules)
-    vehicle = MavlinkVehicle(autopilot)
+    vehicle = MavlinkVehicle(autopilot, QUADROTOR)
     assert autopilot.pilot.time == 0.0
     assert autopilot.pilot.mode is Mode.OFFBOARD
     assert vehicle.standing().clearance > 9.0
@@ -47,7 +47,7 @@ def test_in_lockstep_it_takes_control_before_time_begins(rules: str) -> None:
 def test_over_bytes_it_is_the_vehicle_that_it_is_without_them(rules: str) -> None:
     """Same seed, same inputs: the same flight, but for the rounding of float32."""
     bare, flown = quadrotor(scale=0.0), Autopilot(quadrotor(scale=0.0), rules, quiet=True)
-    vehicle = MavlinkVehicle(flown)
+    vehicle = MavlinkVehicle(flown, QUADROTOR)
     rng = np.random.default_rng(1)
     for _ in range(40):
         input = rng.uniform(-5.0, 5.0, 3)
@@ -61,7 +61,7 @@ def test_over_bytes_it_is_the_vehicle_that_it_is_without_them(rules: str) -> Non
 
 
 def test_what_is_measured_by_telemetry_stays_within_its_bound() -> None:
-    vehicle, rng = MavlinkVehicle(embedded("px4")), np.random.default_rng(2)
+    vehicle, rng = MavlinkVehicle(embedded("px4"), QUADROTOR), np.random.default_rng(2)
     worst = np.zeros(9)
     for _ in range(400):
         before = vehicle.measured[:3]
@@ -74,7 +74,7 @@ def test_what_is_measured_by_telemetry_stays_within_its_bound() -> None:
 
 def test_it_never_meets_its_own_timeout() -> None:
     autopilot = embedded("px4")
-    vehicle = MavlinkVehicle(autopilot)
+    vehicle = MavlinkVehicle(autopilot, QUADROTOR)
     for _ in range(50):
         vehicle.step(np.array([2.0, 0.0, 0.0]))
     assert autopilot.pilot.mode is Mode.OFFBOARD
@@ -83,18 +83,18 @@ def test_it_never_meets_its_own_timeout() -> None:
 
 
 def test_collisions_come_from_the_simulator() -> None:
-    vehicle = MavlinkVehicle(embedded("px4", Obstacle(CYLINDER, (3.0, 0.0, 10.0), (0.5, 10.0))))
+    vehicle = MavlinkVehicle(embedded("px4", Obstacle(CYLINDER, (3.0, 0.0, 10.0), (0.5, 10.0))), QUADROTOR)
     assert any(vehicle.step(np.array([3.0, 0.0, 0.0])).collision for _ in range(12))
 
 
 def test_bad_inputs_are_refused() -> None:
     with pytest.raises(BadInput):
-        MavlinkVehicle(embedded("px4")).step(np.array([np.nan, 0.0, 0.0]))
+        MavlinkVehicle(embedded("px4"), QUADROTOR).step(np.array([np.nan, 0.0, 0.0]))
 
 
 def test_every_frame_goes_through_the_tap_and_can_be_read_again() -> None:
     frames: list[Frame] = []
-    vehicle = MavlinkVehicle(embedded("px4"), frames.append)
+    vehicle = MavlinkVehicle(embedded("px4"), QUADROTOR, frames.append)
     frames.clear()
     vehicle.step(np.array([0.5, 0.0, 0.0]))
     names = [(frame.outgoing, frame.name) for frame in frames]
@@ -115,7 +115,7 @@ def test_the_clients_edge_agrees_with_the_autopilots() -> None:
     assert message.type_mask == 0x0DC7 and message.coordinate_frame == mavlink.MAV_FRAME_LOCAL_NED
 
     autopilot = embedded("ardupilot")
-    vehicle = MavlinkVehicle(autopilot)
+    vehicle = MavlinkVehicle(autopilot, QUADROTOR)
     for _ in range(10):
         vehicle.step(np.array([3.0, -2.0, 1.0]))  # tilted, and accelerating
     assert vehicle.measured[6:] == pytest.approx(vehicle.true[6:], abs=0.3)

@@ -9,8 +9,9 @@ import pytest
 from actors.student import RefusedByLearner, Student
 from messaging import brakeline_pb2 as pb
 from messaging.bus import Bus
-from messaging.robots import GROUND
+from messaging.tasks import layout
 from tests.actors.teacher import Teacher
+from tests.robots import GROUND
 
 
 def never() -> bool:
@@ -48,7 +49,7 @@ def test_it_waits_for_a_learner_joins_it_and_is_told_where_to_go_on(buses: tuple
     thread.join(20.0)
     assert answers == [7] and student.policy is not None and student.policy.version == 1
     join = teacher.joins[0]
-    assert (join.actor, join.index, join.episode, join.layout) == ("actor-0", 12, 4, GROUND.layout())
+    assert (join.actor, join.index, join.episode, join.layout) == ("actor-0", 12, 4, layout(GROUND))
 
 
 def test_a_stop_ends_the_wait_for_a_learner(buses: tuple[Bus, Bus]) -> None:

@@ -19,10 +19,10 @@ from logs.recorder import entry
 from logs.segment import open_segment
 from messaging import brakeline_pb2 as pb
 from messaging.bus import Sample
-from messaging.robots import GROUND
 from messaging.topics import EPISODE, EXCHANGE, STEP, Topic
 from safety.model_set import Recipe
 from sim.policies import scripted
+from tests.robots import GROUND
 
 Change = Callable[[pb.Exchange], None]
 

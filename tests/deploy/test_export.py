@@ -13,7 +13,7 @@ from mcap_protobuf.decoder import DecoderFactory
 
 from deploy import cli
 from messaging import brakeline_pb2 as pb
-from messaging.robots import GROUND
+from tests.robots import GROUND
 
 STEPS = 150
 

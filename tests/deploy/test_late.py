@@ -9,7 +9,7 @@ from actors.driver import Driver, Identity
 from actors.guard import consult
 from deploy.data.logged import trajectories_of
 from deploy.study.evaluate import Evaluation, episode, evaluate, prepared
-from messaging.robots import QUADROTOR
+from tests.robots import QUADROTOR
 
 ROBOT = QUADROTOR.in_real_time()
 pytestmark = pytest.mark.usefixtures("flight_folder")

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from learner.pretrain import Fit, TooFew, fit_cost, fit_linear
-from messaging.robots import GROUND
+from tests.robots import GROUND
 
 HOW = Fit(hidden=(32, 32), rate=3e-3, batch=64, epochs=25)
 

@@ -11,7 +11,8 @@ from learner.config import LearnerConfig, TD3Config
 from learner.core import Learner
 from messaging import brakeline_pb2 as pb
 from messaging import weights
-from messaging.robots import GROUND
+from messaging.tasks import enlist, layout, task_of
+from tests.robots import GROUND
 
 TOY = replace(
     GROUND,
@@ -20,8 +21,11 @@ TOY = replace(
     action_low=(0.0,),
     action_high=(2.0,),
     action_slew=(2.0,),
-    observation=("position [m]", "goal [m]"),
+    translates=(True,),
+    stop=("ramp",),
+    follows=(3,),
 )
+enlist(TOY, replace(task_of(GROUND), lidar=None, observation=("position [m]", "goal [m]")))
 CONFIG = LearnerConfig(
     td3=TD3Config(hidden=(32, 32), batch=32, n_step=2, warmup=60, actor_rate=1e-3, critic_rate=1e-3, reward_scale=1.0),
     capacity=500,
@@ -46,7 +50,7 @@ class ToyActor:
 
     def join(self) -> pb.JoinReply:
         reply = self.learner.join(
-            pb.Join(robot="toy", actor=self.name, layout=TOY.layout(), index=self.index, episode=self.episode)
+            pb.Join(robot="toy", actor=self.name, layout=layout(TOY), index=self.index, episode=self.episode)
         )
         self.episode = reply.episode
         return reply

@@ -5,7 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from messaging.robots import GROUND, ROBOTS, UnknownRobot, robot_named
+from messaging.robots import Disc, UnknownRobot, robot_named
+from tests.robots import GROUND, ROBOTS
 
 
 @pytest.mark.parametrize("robot", ROBOTS.values(), ids=ROBOTS)
@@ -41,7 +42,7 @@ def test_a_ramp_goes_down_step_by_step():
 
 def test_the_layout_changes_with_whatever_two_processes_must_share():
     assert GROUND.layout() == replace(GROUND).layout()
-    assert GROUND.layout() != replace(GROUND, footprint=0.1).layout()
+    assert GROUND.layout() != replace(GROUND, body=(Disc((0.0, 0.0), 0.1),)).layout()
     assert GROUND.layout() != replace(GROUND, action_high=(0.25, 0.6)).layout()
 
 

@@ -7,15 +7,16 @@ import safetensors.numpy
 from hypothesis import given
 from hypothesis import strategies as st
 
-from messaging.robots import GROUND
+from messaging.tasks import layout, task_of
 from messaging.weights import MLP, BadWeights, decode, encode
+from tests.robots import GROUND
 
 POLICY = MLP.untrained(GROUND, seed=1, hidden=(16, 8))
 FILE = encode(GROUND, POLICY.layers, version=7, noise=0.25)
 
 
 def observation(seed: int) -> np.ndarray:
-    return np.random.default_rng(seed).uniform(-1, 1, GROUND.observation_dim)
+    return np.random.default_rng(seed).uniform(-1, 1, task_of(GROUND).observation_dim)
 
 
 def test_round_trip():
@@ -93,7 +94,7 @@ def test_a_flipped_byte_is_refused_or_harmless(place, flip):
 
 
 def rewritten(tensors=None, **about) -> bytes:
-    fields = {"robot": "ground", "layout": GROUND.layout(), "version": 1, "noise": 0.1} | about
+    fields = {"robot": "ground", "layout": layout(GROUND), "version": 1, "noise": 0.1} | about
     if tensors is None:
         tensors = safetensors.numpy.load(FILE)
     return safetensors.numpy.save(tensors, {"policy": json.dumps(fields)})

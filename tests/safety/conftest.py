@@ -5,7 +5,8 @@ import pytest
 from safety.certificates import KINDS
 from safety.dataset import Dataset
 from safety.filter import Filter
-from safety.model_set import MODES, ModelSet, Recipe, make
+from safety.fitting import make
+from safety.model_set import MODES, ModelSet, Recipe
 from tests.safety.unicycle import record
 
 

@@ -1,5 +1,6 @@
 """Recordings: what is refused, and what the windows hold."""
 
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -8,10 +9,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from messaging.robots import GROUND
 from messaging.shapes import rotate
-from safety.dataset import ENTRY, BadData, Dataset, Trajectory, apart, displacement, quality, windows
+from safety.dataset import ENTRY, BadData, Dataset, Trajectory
 from safety.tensors import pack, unpack
+from safety.windows import apart, displacement, quality, windows
+from tests.robots import GROUND
 from tests.safety.unicycle import record
 
 
@@ -101,7 +103,8 @@ def test_files_that_are_no_data_set_are_refused(small, tmp_path):
         Dataset.load(tmp_path / "nowhere")
     path.write_bytes(whole)
     tensors, about = unpack(whole, ENTRY)
-    assert about == {"robot": "ground", "layout": GROUND.layout(), "about": small.about}
+    assert (about["robot"], about["layout"], about["about"]) == ("ground", GROUND.layout(), small.about)
+    assert json.loads(about["description"]) == GROUND.description
     ends = tensors["lengths"]
     for changes, metadata, message in (
         ({"lengths": ends + 1}, about, "do not add up"),

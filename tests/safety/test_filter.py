@@ -5,13 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from messaging.robots import GROUND, QUADROTOR
+from messaging.robots import Disc
 from messaging.shapes import Obstacle, Shapes, rotate
 from safety.certificates import KINDS, Certificate
 from safety.commitment import UNVERIFIED, Commitment, Prediction, correction_penalty
 from safety.filter import Filter, _Attempt
 from safety.model_set import ModelSet, Recipe
 from safety.request import ADJUSTED, ALLOWED, FAILSAFE, BadRequest, Request
+from tests.robots import GROUND, QUADROTOR
 from tests.safety.unicycle import FIX, Unicycle
 
 NONE = Shapes.of([], 2)
@@ -290,7 +291,7 @@ def test_bad_predictions_are_refused_by_the_field(ready, field, center, half, he
 
 def test_an_obstacle_whose_distance_is_no_number_is_never_overlooked(ready):
     near = Shapes.of([cylinder(0.4, 0)], 2)
-    broken = Shapes(near.center * NAN, near.axes, near.half, near.rho, near.round)
+    broken = replace(near, center=near.center * NAN)
     decision = ready.decide(request(obstacles=broken))
     assert decision.kind == FAILSAFE
     assert not decision.action.any()
@@ -539,7 +540,7 @@ def test_a_robot_that_slips_more_than_recorded_is_noticed(ready):
 
 
 def without_footprint(model):
-    return Filter(replace(model, robot=replace(GROUND, footprint=0.05)))
+    return Filter(replace(model, robot=replace(GROUND, body=(Disc((0.0, 0.0), 0.05),))))
 
 
 def with_half_the_width(model):

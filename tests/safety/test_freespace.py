@@ -1,5 +1,7 @@
 """Half-spaces: the obstacle, grown by the body and the measurement's error, is on their far side."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -61,7 +63,7 @@ def test_nothing_is_free_for_a_start_that_touches(start):
 
 def test_no_number_is_never_free():
     near = Shapes.of([Obstacle("sphere", (1.0, 0.0), (0.3,))], 2)
-    broken = Shapes(near.center * np.nan, near.axes, near.half, near.rho, near.round)
+    broken = replace(near, center=near.center * np.nan)
     _, offsets = half_spaces(broken, np.zeros(2), np.zeros((1, 2)), BODY, np.zeros(2))
     assert not (offsets > -np.inf).any()
 

@@ -6,10 +6,12 @@ import numpy as np
 import pytest
 
 from safety.certificates import KINDS, CertificateError, least_squares
-from safety.dataset import BadData, windows
+from safety.dataset import BadData
 from safety.filter import Filter
-from safety.model_set import ENTRY, MODES, BadModel, ModelSet, Recipe, make
+from safety.fitting import make
+from safety.model_set import ENTRY, MODES, BadModel, ModelSet, Recipe
 from safety.tensors import pack, unpack
+from safety.windows import windows
 from tests.safety.unicycle import record
 
 ALL = [(kind, mode) for kind in KINDS for mode in MODES]

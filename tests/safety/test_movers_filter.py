@@ -7,7 +7,6 @@ import pytest
 
 from messaging.motion import Motion, Sighting
 from messaging.movers import Movers, parted
-from messaging.robots import GROUND
 from messaging.shapes import Obstacle, Shapes
 from safety.client import obstacle_messages
 from safety.commitment import Commitment
@@ -16,6 +15,7 @@ from safety.request import ADJUSTED, ALLOWED, FAILSAFE, BadRequest
 from safety.wire import obstacles_of
 from sim.movers import Crowd, MoverKind, Watch
 from sim.world import closing
+from tests.robots import GROUND
 from tests.safety.test_filter import request, same
 from tests.safety.unicycle import Unicycle
 

@@ -9,7 +9,6 @@ import pytest
 
 from messaging import brakeline_pb2 as pb
 from messaging.bus import NoReply, Refused
-from messaging.robots import GROUND
 from messaging.shapes import Obstacle
 from messaging.topics import DECIDE
 from safety.client import SafetyClient, SafetyError, ask, read, request_message
@@ -21,6 +20,7 @@ from safety.request import BadRequest
 from safety.service import Counts, Models, answerer
 from safety.wire import LARGEST, MOST_OBSTACLES, request_of
 from tests.messaging.conftest import endpoint, join  # noqa: F401 - fixtures
+from tests.robots import GROUND
 from tests.safety.unicycle import Unicycle
 
 NAN, INF = float("nan"), float("inf")

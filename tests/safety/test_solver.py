@@ -15,7 +15,7 @@ def programs(model: ModelSet, count, seed=0):
     """QPs as the filter builds them, of proposals near obstacles."""
     rng = np.random.default_rng(seed)
     tube, outer = model.tube(), model.outer_tube()
-    layout, builder = Layout(tube), Builder(model.robot, outer)
+    layout, builder = Layout(tube.position, tube.directions), Builder(model.robot, outer)
     for _ in range(count):
         angles, distance = rng.uniform(-np.pi, np.pi, 4), rng.uniform(0.26, 0.36, 4)
         near = Shapes.of(

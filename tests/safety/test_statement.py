@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from safety.certificates import KINDS
-from safety.dataset import windows
 from safety.model_set import MODES
 from safety.statement import state, upper_bound
+from safety.windows import windows
 from tests.safety.unicycle import record
 
 ALL = [(kind, mode) for kind in KINDS for mode in MODES]

@@ -1,12 +1,14 @@
 """The stacked tube: closed-loop rollouts stay inside, and it is what the definitions say."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from messaging.robots import GROUND
 from safety.certificates import KINDS, Certificate
 from safety.model_set import MODES
 from safety.tube import Recursion, stack_direct, stack_recursive
+from tests.robots import GROUND
 from tests.safety.unicycle import Unicycle
 
 ALL = [(kind, mode) for kind in KINDS for mode in MODES]
@@ -75,7 +77,7 @@ def test_rollouts_stay_inside(models, rollouts, which):
 
 def test_a_tube_of_half_the_width_is_left(model, rollouts):
     tube = model.tube()
-    half = type(tube)(tube.position, tube.directions, tube.W, 0.5 * tube.M, 0.5 * tube.m_0)
+    half = replace(tube, M=0.5 * tube.M, m_0=0.5 * tube.m_0)
     assert violations(half, rollouts) > 0.05 * len(rollouts)
 
 

@@ -7,8 +7,8 @@ import itertools
 import numpy as np
 
 from deploy.data.excite import excitation
-from messaging.robots import GROUND
 from safety.dataset import Dataset, Trajectory
+from tests.robots import GROUND
 
 SUBSTEPS = 10
 LAG = 0.05  # s

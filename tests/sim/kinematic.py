@@ -4,9 +4,9 @@ import math
 
 import numpy as np
 
-from messaging.robots import QUADROTOR
 from sim.vehicle import Period
 from sim.world import Arena
+from tests.robots import QUADROTOR
 
 SAMPLES = 10
 LAG = 0.2  # s

@@ -9,12 +9,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from messaging.robots import GROUND, QUADROTOR, ROBOTS, Robot
+from messaging.robots import Robot
 from messaging.shapes import BOX, CYLINDER, SPHERE, WALL, Obstacle
-from sim.arenas import ARENAS, UnknownArena, arena_kind, draw_arena, gaps
+from messaging.tasks import task_of
+from sim.arenas import UnknownArena, arena_kind, bounds_of, draw_arena, gaps
 from sim.world import Arena
+from tests.robots import GROUND, QUADROTOR, ROBOTS
 
-ALL = [(ROBOTS[robot], name) for robot, kinds in ARENAS.items() for name in kinds]
+ALL = [(ROBOTS[robot], name) for robot in ROBOTS for name in task_of(ROBOTS[robot]).arenas]
 each_arena = pytest.mark.parametrize(("robot", "name"), ALL, ids=[f"{robot.name}-{name}" for robot, name in ALL])
 
 
@@ -124,9 +126,9 @@ def test_default_is_what_it_is_called_for() -> None:
     assert (kind.half_width, kind.goal_distance, kind.goal_radius, kind.step_limit) == (2.5, 1.5, 0.25, 300)
     assert kind.path_clearance == 0.05
     kind = arena_kind(QUADROTOR, "default")
-    assert kind.bounds == ((-20.0, 20.0), (-20.0, 20.0), (0.0, 10.0))
+    assert bounds_of(kind) == ((-20.0, 20.0), (-20.0, 20.0), (0.0, 10.0))
     assert (kind.goal_distance, kind.goal_radius, kind.step_limit) == (12.0, 1.0, 200)
-    assert arena_kind(QUADROTOR, "tall").bounds[2] == (0.0, 30.0)
+    assert bounds_of(arena_kind(QUADROTOR, "tall"))[2] == (0.0, 30.0)
 
 
 def test_the_generator_decides() -> None:

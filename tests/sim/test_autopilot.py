@@ -9,9 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from messaging.rays import rays_of
-from messaging.robots import QUADROTOR
 from messaging.shapes import CYLINDER, Obstacle
+from messaging.tasks import task_of
 from sim.autopilot import frames
 from sim.autopilot.dialect import mavlink
 from sim.autopilot.endpoint import TICK, Autopilot, UnknownRules
@@ -22,6 +21,7 @@ from sim.flight_estimator import QuadrotorNoise
 from sim.lidar import Lidar
 from sim.quadrotor import Quadrotor
 from sim.world import Arena, staged_arena
+from tests.robots import QUADROTOR
 
 LOCAL, BODY, BODY_OFFSET = mavlink.MAV_FRAME_LOCAL_NED, mavlink.MAV_FRAME_BODY_NED, mavlink.MAV_FRAME_BODY_OFFSET_NED
 VELOCITY, VELOCITY_YAW, VELOCITY_RATE = 0x0DC7, 0x09C7, 0x05C7
@@ -305,7 +305,7 @@ def test_messages_come_at_the_rates_asked_for(station: Station) -> None:
 
 
 def test_every_message_can_be_asked_for() -> None:
-    lidar = Lidar(field(), rays_of(QUADROTOR))
+    lidar = Lidar(field(), task_of(QUADROTOR).rays)
     station = Station("px4", airborne=True, lidar=lidar)
     for name in (
         "ATTITUDE", "ATTITUDE_QUATERNION", "LOCAL_POSITION_NED", "HIGHRES_IMU", "OBSTACLE_DISTANCE", "SYS_STATUS",
@@ -348,7 +348,7 @@ def test_frames_turn_back_and_forth() -> None:
 def test_obstacle_distance_is_the_least_of_each_sector() -> None:
     pillar = Obstacle(CYLINDER, (0.0, -4.0, 10.0), (0.5, 20.0))  # to the south: to the right of who looks east
     arena = field(pillar)
-    station = Station("px4", airborne=True, arena=arena, lidar=Lidar(arena, rays_of(QUADROTOR)))
+    station = Station("px4", airborne=True, arena=arena, lidar=Lidar(arena, task_of(QUADROTOR).rays))
     station.command(512, mavlink.MAVLINK_MSG_ID_OBSTACLE_DISTANCE)
     distances = station.last("OBSTACLE_DISTANCE").distances
     assert len(distances) == BINS

@@ -12,12 +12,13 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 import sim
-from messaging.robots import GROUND, QUADROTOR
+from deploy.vehicles import environment
 from messaging.shapes import Shapes
-from sim.arenas import ARENAS
+from messaging.tasks import task_of
 from sim.envs import NavigationEnv, Reward
 from sim.policies import scripted
 from sim.quadrotor import Quadrotor
+from tests.robots import GROUND, QUADROTOR, ROBOTS
 from tests.sim.kinematic import PointMass
 
 INFO_KEYS = {
@@ -48,7 +49,7 @@ ENVS = {
 }
 each_robot = pytest.mark.parametrize("make", ENVS.values(), ids=ENVS)
 each_arena = pytest.mark.parametrize(
-    ("robot", "arena"), [(robot, arena) for robot in ARENAS for arena in ARENAS[robot]]
+    ("robot", "arena"), [(robot, arena) for robot in ROBOTS for arena in task_of(ROBOTS[robot]).arenas]
 )
 
 
@@ -94,7 +95,7 @@ def test_a_seed_makes_the_episode(make: Make) -> None:
 
 
 def test_reset_seeds_the_sequence_of_episodes() -> None:
-    env = NavigationEnv()
+    env = environment(GROUND, "default", 0)
     seeds = [env.reset(seed=3)[1]["episode_seed"], env.reset()[1]["episode_seed"], env.reset()[1]["episode_seed"]]
     assert len(set(seeds)) == 3
     assert [env.reset(seed=3)[1]["episode_seed"], env.reset()[1]["episode_seed"]] == seeds[:2]
@@ -162,7 +163,7 @@ def test_time_runs_out(make: Make) -> None:
 
 
 def test_payload_and_friction_last_over_resets() -> None:
-    env = NavigationEnv()
+    env = environment(GROUND, "default", 0)
     env.alter(payload_kg=2.0)
     env.reset(options={"episode_seed": 1})
     laden = env.step(np.array([0.25, 0.0]))[4]["speed"]
@@ -193,25 +194,25 @@ def test_a_measurement_off_its_bound_is_counted() -> None:
         def _measure(self) -> np.ndarray:
             return self.true + np.array([0.0, 0.0, 0.0301, *np.zeros(6)])
 
-    env = NavigationEnv(QUADROTOR, make_vehicle=Off)
+    env = NavigationEnv(QUADROTOR, "default", Off)
     assert env.reset()[1]["outside"]
     assert env.step(np.ones(3))[4]["outside"]
 
 
 def test_the_arena_can_be_changed_at_reset() -> None:
-    env = NavigationEnv()
+    env = environment(GROUND, "default", 0)
     assert env.reset(options={"arena": "open"})[1]["arena"].name == "open"
     assert env.reset()[1]["arena"].name == "open"
 
 
 def test_a_step_before_reset_is_refused() -> None:
     with pytest.raises(gymnasium.error.ResetNeeded):
-        NavigationEnv().step(np.zeros(2))
+        environment(GROUND, "default", 0).step(np.zeros(2))
 
 
 @pytest.mark.parametrize(
     ("env", "least"),
-    [(NavigationEnv(), 500), (NavigationEnv(QUADROTOR, make_vehicle=Quadrotor), 350)],
+    [(environment(GROUND, "default", 0), 500), (NavigationEnv(QUADROTOR, "default", Quadrotor), 350)],
     ids=["ground", "quadrotor"],
 )
 def test_it_is_fast(env: NavigationEnv, least: float) -> None:

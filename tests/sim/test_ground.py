@@ -5,14 +5,14 @@ import math
 import numpy as np
 import pytest
 
-from messaging.robots import GROUND
+from deploy.vehicles import environment
 from messaging.shapes import BOX, CYLINDER, Obstacle
-from sim.envs import NavigationEnv
 from sim.estimator import NoiseLevels
 from sim.ground import BadInput, GroundRobot, Period
 from sim.policies import scripted
 from sim.world import Arena
 from sim.world import staged_arena as room
+from tests.robots import GROUND
 
 QUIET = NoiseLevels(scale=0.0)
 
@@ -165,7 +165,7 @@ def body_gap(state: np.ndarray, arena: Arena) -> float:
 
 
 def test_contacts_are_where_the_geometry_says() -> None:
-    env = NavigationEnv(arena="dense")
+    env = environment(GROUND, "dense", 0)
     policies = [scripted(name, GROUND, np.random.default_rng(0)) for name in ("adversary", "random", "greedy")]
     collisions = 0
     for episode in range(45):

@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
-from messaging.robots import GROUND, QUADROTOR
 from sim.arenas import arena_kind, draw_arena, tour
 from sim.late import late
 from sim.pilots import MapPilot
 from sim.quadrotor import Quadrotor
 from sim.vehicle import BadInput
 from sim.world import staged_arena
+from tests.robots import GROUND, QUADROTOR
 
 ROBOT = QUADROTOR.in_real_time()
 

@@ -6,15 +6,16 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from messaging.rays import Rays, rays_of
-from messaging.robots import GROUND, QUADROTOR
+from messaging.rays import Rays
 from messaging.shapes import BOX, CYLINDER, SPHERE, WALL, Obstacle, rotate
+from messaging.tasks import task_of
 from sim.arenas import draw_arena
 from sim.lidar import Lidar
 from sim.scene import map_model
 from sim.world import Arena, staged_arena
+from tests.robots import GROUND, QUADROTOR
 
-PLANE, SPACE = rays_of(GROUND), rays_of(QUADROTOR)
+PLANE, SPACE = task_of(GROUND).rays, task_of(QUADROTOR).rays
 SAMPLES = 60  # along a beam
 
 

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from messaging.rays import Rays
-from messaging.robots import GROUND
 from messaging.shapes import Obstacle, Shapes
 from sim.arenas import draw_arena
 from sim.envs import NavigationEnv
@@ -15,6 +14,7 @@ from sim.lidar import Lidar
 from sim.movers import Crowd, MoverKind, Watch
 from sim.quadrotor import Quadrotor
 from sim.world import closing, staged_arena
+from tests.robots import GROUND
 
 KIND = MoverKind(count=(4, 4), radius=0.2, speed=1.2, acceleration=1.0, keep=1.0)
 ROOM = (*closing(2.0, None), Obstacle("box", (0.5, 0.5), (0.6, 0.4), 0.4), Obstacle("cylinder", (-1.0, -0.5), (0.3,)))
@@ -122,7 +122,7 @@ def test_a_lidar_sees_them_where_they_are():
 
 
 def test_an_episode_ends_with_a_contact_and_tells_of_what_may_come():
-    env = NavigationEnv(draw=lambda *_: replace(staged_arena(), crowd=Straight(1.0, -0.5)))
+    env = NavigationEnv(GROUND, draw=lambda *_: replace(staged_arena(), crowd=Straight(1.0, -0.5)))
     _, info = env.reset(seed=0)
     told = [o for o in info["obstacles"] if o.motion is not None]
     assert len(told) == 1 and told[0].motion.acceleration == KIND.acceleration

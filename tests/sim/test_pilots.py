@@ -5,13 +5,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from messaging.robots import QUADROTOR
 from messaging.shapes import BOX, CYLINDER, Obstacle
 from sim.envs import NavigationEnv
 from sim.pilots import MapPilot, StopModel, full_speed
 from sim.policies import scripted
 from sim.quadrotor import Quadrotor
 from sim.world import Arena, staged_arena
+from tests.robots import QUADROTOR
 from tests.sim.kinematic import PointMass
 
 BLIND = np.zeros(189, np.float32)
@@ -19,7 +19,7 @@ BLIND = np.zeros(189, np.float32)
 
 def fly(policy: str, arena: str, episodes: int) -> list[dict[str, Any]]:
     """Per episode: the last info, and of all steps the speeds, the least clearance, measurements off their bound."""
-    env = NavigationEnv(QUADROTOR, arena, make_vehicle=PointMass)
+    env = NavigationEnv(QUADROTOR, arena, PointMass)
     act = scripted(policy, QUADROTOR, np.random.default_rng(1))
     flights = []
     for number in range(episodes):

@@ -5,11 +5,12 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from messaging.robots import GROUND, QUADROTOR, Robot
+from messaging.robots import Robot
 from messaging.shapes import BOX, CYLINDER, SPHERE, Obstacle
 from sim.arenas import draw_arena
 from sim.planner import Routes
 from sim.world import Arena, staged_arena
+from tests.robots import GROUND, QUADROTOR
 
 
 @pytest.mark.parametrize("robot", [GROUND, QUADROTOR], ids=lambda robot: robot.name)

@@ -6,14 +6,16 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from messaging.robots import GROUND, ROBOTS, Robot
-from sim.envs import NavigationEnv
+from deploy.vehicles import environment
+from messaging.robots import Robot
+from messaging.tasks import UnknownTask
 from sim.policies import UnknownPolicy, scripted
+from tests.robots import GROUND, ROBOTS
 
 
 def play(policy_name: str, arena: str, episodes: int) -> list[dict[str, float]]:
     """Per episode: collision, at_goal, steps, least clearance, steps nearer than 4 cm, outside (before any touch)."""
-    env = NavigationEnv(arena=arena)
+    env = environment(GROUND, arena, 0)
     policy = scripted(policy_name, GROUND, np.random.default_rng(1))
     results = []
     for episode in range(episodes):
@@ -83,5 +85,5 @@ def test_the_generator_decides() -> None:
 def test_an_unknown_name_is_refused_with_the_names_there_are() -> None:
     with pytest.raises(UnknownPolicy, match="random, greedy, adversary, astar"):
         scripted("psychic", GROUND, np.random.default_rng(0))
-    with pytest.raises(UnknownPolicy, match="no policy of the submarine is called 'astar'"):
+    with pytest.raises(UnknownTask, match="submarine has no task"):
         scripted("astar", replace(GROUND, name="submarine"), np.random.default_rng(0))

@@ -6,7 +6,6 @@ import mujoco
 import numpy as np
 import pytest
 
-from messaging.robots import QUADROTOR
 from messaging.shapes import CYLINDER, Obstacle
 from sim.flight import FlightController, VelocityAxis
 from sim.flight_estimator import QuadrotorNoise
@@ -14,6 +13,7 @@ from sim.quadrotor import MODEL, SAMPLES, Quadrotor
 from sim.vehicle import BadInput
 from sim.wind import Air, Wind
 from sim.world import Arena, staged_arena
+from tests.robots import QUADROTOR
 
 QUIET = QuadrotorNoise(scale=0.0)
 STAND = np.zeros(3)

@@ -4,11 +4,11 @@ import mujoco
 import numpy as np
 import pytest
 
-from messaging.robots import GROUND, QUADROTOR
 from messaging.shapes import SPHERE, Obstacle
 from sim.arenas import draw_arena
 from sim.scene import HEIGHT, add_obstacles
 from sim.world import Arena, staged_arena
+from tests.robots import GROUND, QUADROTOR
 
 REACH = 3.0  # m
 

@@ -14,7 +14,7 @@ from deploy.run.places import CONFIG
 from learner.checkpoint import exists
 from logs.reader import open_log, read
 from logs.report import analyse
-from messaging.robots import GROUND
+from tests.robots import GROUND
 from tests.system.runs import Run, alive, brakeline, until
 
 

@@ -17,7 +17,7 @@ from actors.mavlink import decoded
 from deploy import cli
 from logs.reader import Record, read
 from messaging import brakeline_pb2 as pb
-from messaging.robots import QUADROTOR
+from tests.robots import QUADROTOR
 from tests.system.runs import Run
 
 pytestmark = pytest.mark.usefixtures("flight_folder")

@@ -8,7 +8,7 @@ import pytest
 
 from deploy.study.evaluate import Evaluation, evaluate
 from logs.tally import Tally
-from messaging.robots import GROUND
+from tests.robots import GROUND
 from tests.system.runs import brakeline
 
 STEPS = 25_000

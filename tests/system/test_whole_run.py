@@ -10,8 +10,8 @@ from mcap_protobuf.decoder import DecoderFactory
 
 from deploy.run.configurations import EXPERIMENTS, load
 from logs.report import analyse
-from messaging.robots import GROUND
 from messaging.weights import MLP
+from tests.robots import GROUND
 from tests.system.runs import Run, brakeline
 
 # What they say after the recorder has stopped is in no log.

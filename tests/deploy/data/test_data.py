@@ -11,9 +11,10 @@ from deploy.data.excite import excitation
 from deploy.data.logged import from_log, trajectories_of
 from logs.segment import Entry, open_segment
 from messaging import brakeline_pb2 as pb
-from messaging.robots import GROUND
-from safety.dataset import BadData, Dataset, windows
+from safety.dataset import BadData, Dataset
 from safety.model_set import ModelSet, Recipe
+from safety.windows import windows
+from tests.robots import GROUND
 
 
 def test_excitation_stays_in_bounds_and_slew_and_holds_plans_of_the_schedule():

@@ -6,8 +6,8 @@ import pytest
 from deploy.data.pretrain import RECIPES, SailrRecipe, SecasRecipe, made_by, pretrain
 from deploy.data.rollouts import costs, transitions
 from learner.pretrain import Fit
-from messaging.robots import GROUND
 from safety.methods import ready
+from tests.robots import GROUND
 
 
 def test_transitions_are_whole_scaled_and_the_same_again():

@@ -10,9 +10,9 @@ from actors.loop import Change
 from deploy.commands.train import Train
 from deploy.run.configurations import EXPERIMENTS, RunConfig, decode, encode, load
 from deploy.run.places import places
-from deploy.vehicles import Conditions
 from learner.config import LearnerConfig, TD3Config
 from safety.model_set import Recipe
+from sim.conditions import Conditions
 from sim.estimator import NoiseLevels
 
 CHANGED = RunConfig(

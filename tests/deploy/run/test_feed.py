@@ -12,8 +12,8 @@ from logs.recorder import entry
 from logs.segment import open_segment
 from messaging import brakeline_pb2 as pb
 from messaging.bus import Sample
-from messaging.robots import GROUND, QUADROTOR
 from messaging.topics import STEP
+from tests.robots import GROUND, QUADROTOR
 
 
 def record(path: Path, *steps: pb.Step) -> None:

@@ -20,6 +20,7 @@ from messaging.topics import FRAMES, LOG
 from sim.autopilot.endpoint import Autopilot
 from sim.quadrotor import Quadrotor
 from sim.world import staged_arena
+from tests.robots import QUADROTOR
 
 
 class Bus:
@@ -39,7 +40,7 @@ def taped(periods: int) -> Bus:
     arena = staged_arena(start=(0.0, 0.0, 50.0), goal=(9.0, 9.0, 50.0), half_width=100.0, height=100.0)
     bus = Bus()
     tape = Tape(bus, "quadrotor", "actor-0")
-    vehicle = MavlinkVehicle(Autopilot(Quadrotor(arena, np.random.default_rng(0)), quiet=True), tape.take)
+    vehicle = MavlinkVehicle(Autopilot(Quadrotor(arena, np.random.default_rng(0)), quiet=True), QUADROTOR, tape.take)
     for _ in range(periods):
         vehicle.step(np.array([0.5, 0.25, 0.0]))
         tape.publish()

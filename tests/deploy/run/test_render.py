@@ -6,7 +6,7 @@ from PIL import Image
 
 from deploy.run.render import Film, record, save
 from deploy.study.evaluate import Evaluation, prepared
-from messaging.robots import GROUND
+from tests.robots import GROUND
 
 
 @pytest.fixture(scope="module")

@@ -12,10 +12,10 @@ from deploy import cli
 from deploy.data.store import model_for, record_path
 from deploy.run.replay import ReplayError, differences, replay
 from messaging import brakeline_pb2 as pb
-from messaging.robots import GROUND
 from safety.filter import Filter
 from safety.model_set import Recipe
 from tests.deploy.drive import drive
+from tests.robots import GROUND
 
 STEPS = 150
 

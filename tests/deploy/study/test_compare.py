@@ -21,9 +21,9 @@ from deploy.study.intervals import mean, ratio
 from deploy.study.table import markdown, plain, steps_to_learn, table, without_times
 from learner.pretrain import Fit
 from logs.report import analyse
-from messaging.robots import GROUND
 from messaging.weights import MLP
 from safety.model_set import Recipe
+from tests.robots import GROUND
 from tests.system.runs import until
 
 DEAR = ("decision_ms", "milliseconds")

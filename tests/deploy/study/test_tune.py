@@ -3,7 +3,7 @@
 from deploy.data.pretrain import SailrRecipe, SecasRecipe, pretrain, recipe_for
 from deploy.study.tune import Tried, best, try_all, values_for
 from learner.pretrain import Fit
-from messaging.robots import GROUND, QUADROTOR
+from tests.robots import GROUND, QUADROTOR
 
 LITTLE = {"samples": 300, "fit": Fit(hidden=(8,), epochs=1, batch=32)}
 

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from messaging.perceptrons import BadPerceptrons, Perceptrons
-from messaging.robots import GROUND, QUADROTOR
 from safety.methods import decode, load, ready
 from safety.model_set import BadModel, ModelSet
 from safety.rivals.pretrained import Pretrained
 from safety.rivals.sailr import Sailr
 from safety.rivals.secas import Secas
+from tests.robots import GROUND, QUADROTOR
 from tests.safety.rivals import test_sailr, test_secas
 
 

@@ -7,9 +7,8 @@ from hypothesis import strategies as st
 
 from messaging import brakeline_pb2 as pb
 from messaging.perceptrons import Perceptrons
-from messaging.rays import rays_of
-from messaging.robots import GROUND, QUADROTOR
 from messaging.shapes import Shapes
+from messaging.tasks import task_of
 from safety.client import accept, read, request_message
 from safety.commitment import UNVERIFIED, Commitment
 from safety.model_set import BadModel
@@ -17,6 +16,7 @@ from safety.request import BadRequest, Request
 from safety.rivals.pretrained import Pretrained
 from safety.rivals.secas import Constraints, Secas, closed_form, quadratic
 from safety.service import Counts, Models, answerer
+from tests.robots import GROUND, QUADROTOR
 
 WIDE = np.full(3, 10.0)
 SAME = 1e-3  # of scaled input: the solver's accuracy beside the price of a violation
@@ -83,7 +83,7 @@ REACT = np.array([0.06, 0.0])  # m that a sector comes nearer at full speed
 def known(g=REACT, robot=GROUND, **settings) -> Pretrained:
     """g_i is the same everywhere."""
     count, m = Constraints(robot).count, robot.action_dim
-    layers = [(np.zeros((count, m, robot.observation_dim), np.float32), np.tile(np.float32(g), (count, 1)))]
+    layers = [(np.zeros((count, m, task_of(robot).observation_dim), np.float32), np.tile(np.float32(g), (count, 1)))]
     return Pretrained(robot, "secas", {"g": Perceptrons(layers)}, {"clearance": CLEARANCE} | settings)
 
 
@@ -140,7 +140,7 @@ def test_what_is_far_away_is_all_the_same():
 @pytest.mark.parametrize("robot", [GROUND, QUADROTOR])
 def test_every_ray_is_in_one_sector(robot):
     constraints = Constraints(robot)
-    assert sorted(np.concatenate(constraints.sectors)) == list(range(len(rays_of(robot).directions)))
+    assert sorted(np.concatenate(constraints.sectors)) == list(range(len(task_of(robot).rays.directions)))
     assert np.allclose(np.linalg.norm(constraints.directions, axis=1), 1.0)
 
 
@@ -150,7 +150,7 @@ def test_a_robot_with_a_slew_is_corrected_within_it():
     before = np.array([3.0, 0.0, 0.0])
     state = np.zeros(robot.state_dim)
     state[3] = 3.0
-    observation = np.full(robot.observation_dim, 0.2)  # walls 2.4 m away all round: too near at that speed
+    observation = np.full(task_of(robot).observation_dim, 0.2)  # walls 2.4 m away all round: too near at that speed
     decision = ready.decide(request(observation, (5.0, 0.0, 0.0), before, state, robot))
     assert decision.kind == "adjusted"
     assert decision.action == pytest.approx((2.2, 0.0, 0.0), abs=1e-3), "as much less as the slew allows"

@@ -1,0 +1,238 @@
+"""What is learned with a robot: what its policy observes and is paid, in which arenas, and what stands for the robot.
+
+A task is a file beside the robot's: `robots/NAME.task.toml`, or `my.task.toml` beside `my.toml`. What a task names as
+code (`simulator`, `senses`, `policies`) is `module:name`, or `file.py:name` beside the task; only `deploy` and `sim`
+load it.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import importlib
+import importlib.util
+import json
+import sys
+import tomllib
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import ConfigDict, TypeAdapter, ValidationError
+
+from messaging.rays import Rays, fan, sphere
+from messaging.robots import FOLDER, FORMER_LAYOUTS, Robot, robot_named
+
+_STRICT = ConfigDict(extra="forbid")
+
+
+class UnknownTask(ValueError):
+    """There is no task for this robot, or its file is none; the message says what is wrong in it."""
+
+
+@dataclass(frozen=True)
+class Reward:
+    """What an episode pays. Progress adds up to the way made towards the goal, whichever way was taken."""
+
+    __pydantic_config__ = _STRICT
+    progress: float = 20.0  # a metre nearer to the goal
+    goal: float = 100.0
+    collision: float = -100.0
+    run_into: float = -50.0  # while it stood
+    cut: float = -20.0  # where an intervention ends the episode: SAILR's lowest
+
+
+@dataclass(frozen=True)
+class MoverKind:
+    """What goes about in an arena: how many (least, most), how large, how fast; what a sensor tells of them."""
+
+    __pydantic_config__ = _STRICT
+    count: tuple[int, int]
+    radius: float  # m; in the plane a disc, in space a ball
+    speed: float  # m/s, at most
+    acceleration: float  # m/s², at most
+    keep: float  # m from the robot's start to its surface, at the start
+    position_error: float = 0.03  # m, of what is measured of them
+    velocity_error: float = 0.05  # m/s
+
+
+@dataclass(frozen=True)
+class ArenaKind:
+    """What is drawn for an arena of one name. Pairs are (least, most)."""
+
+    __pydantic_config__ = _STRICT
+    half_width: float  # m
+    cylinders: tuple[int, int]
+    radius: tuple[float, float]  # m
+    boxes: tuple[int, int]
+    edge: tuple[float, float]  # m, both edges of a box
+    square: bool  # boxes have two equal edges
+    gap: float  # m between any two obstacles in plan, walls included, beyond the robot's diameter
+    path_clearance: float  # m beside the footprint, all along some way from start to goal
+    goal_distance: float  # m from the start, at least
+    step_limit: int
+    start_clearance: float = 0.1  # m beside the footprint, at the start and at the goal
+    goal_radius: float = 0.25  # m
+    height: float | None = None  # m from floor to ceiling; None: an arena in the plane, without
+    tall: tuple[float, float] = (0.0, 0.0)  # m, a box's height in space
+    spheres: tuple[int, int] = (0, 0)
+    ball: tuple[float, float] = (0.0, 0.0)  # m, radius of a sphere
+    movers: MoverKind | None = None
+
+
+@dataclass(frozen=True)
+class Lidar:
+    """The rays of an observation: a fan of so many in the plane, or azimuths x elevations in space."""
+
+    __pydantic_config__ = _STRICT
+    range: float  # m, observed as 1
+    degrees: float  # that the fan, or the elevations, spread over
+    fan: int = 0
+    azimuths: int = 0
+    elevations: int = 0
+
+
+@dataclass(frozen=True)
+class Rivals:
+    """Where SECAS and SAILR are tuned otherwise than by default, and the margins [m] that SECAS's tuning tries."""
+
+    __pydantic_config__ = _STRICT
+    secas: dict[str, float] = field(default_factory=dict)
+    sailr: dict[str, float] = field(default_factory=dict)
+    margins: tuple[float, ...] = ()
+
+
+@dataclass(frozen=True)
+class Task:
+    """A task as its file says it. observation: what follows the rays, each name with its scale."""
+
+    __pydantic_config__ = _STRICT
+    simulator: str  # makes vehicles: (conditions, tap) -> MakeVehicle
+    senses: str  # observes: (robot, arena, rng, noise of a range) -> Senses
+    policies: dict[str, str]  # scripted ones by name: (robot, rng) -> Policy
+    observation: tuple[str, ...]
+    arenas: dict[str, ArenaKind]
+    lidar: Lidar | None = None
+    reward: Reward = field(default_factory=Reward)
+    trajectories: int = 200  # of 300 periods, that are recorded for a model set
+    steps: int = 60_000  # of training, in a comparison
+    symmetry: Literal["none", "turns"] = "none"  # turns: the world turned by quarters and mirrored is as true
+    rivals: Rivals = field(default_factory=Rivals)
+    folder: Path = Path()  # where its file lies
+
+    @cached_property
+    def rays(self) -> Rays:
+        """Where the observation's rays point; none without a lidar."""
+        seen = self.lidar or Lidar(1.0, 0.0)
+        if seen.azimuths:
+            return sphere(seen.azimuths, seen.elevations, seen.degrees, seen.range)
+        return fan(seen.fan, seen.degrees, seen.range)
+
+    @cached_property
+    def observed(self) -> tuple[str, ...]:
+        """The names of all coordinates of an observation, the rays first."""
+        rays = self.rays
+        return (*(f"ray {i} [range/{rays.range:g} m]" for i in range(len(rays.directions))), *self.observation)
+
+    @property
+    def observation_dim(self) -> int:
+        return len(self.observed)
+
+    def code(self, place: str) -> Any:
+        """What stands at `module:name`, or `file.py:name` beside the task's file.
+
+        Raises:
+            UnknownTask: there is no such thing.
+        """
+        module, _, name = place.partition(":")
+        try:
+            if module.endswith(".py"):
+                return getattr(_module_in(self.folder / module), name)
+            return getattr(importlib.import_module(module), name)
+        except (ImportError, AttributeError, OSError) as error:
+            raise UnknownTask(f"{place!r} is no code that can be loaded: {error}") from error
+
+
+def _module_in(path: Path) -> Any:
+    """The module in a file, loaded once."""
+    name = f"task_{hashlib.sha256(str(path.resolve()).encode()).hexdigest()[:12]}"
+    if name not in sys.modules:
+        found = importlib.util.spec_from_file_location(name, path)
+        if found is None or found.loader is None:
+            raise ImportError(f"{path} is no Python file")
+        module = importlib.util.module_from_spec(found)
+        sys.modules[name] = module
+        found.loader.exec_module(module)
+    return sys.modules[name]
+
+
+_tasks: dict[str, Task] = {}  # by the robot's kind
+_files: dict[str, Path] = {}  # by the robot's kind, where a task was said to lie
+
+
+def task_of(robot: Robot) -> Task:
+    """The task of a robot: of those that come with the program, or the one in the file beside the robot's.
+
+    Raises:
+        UnknownTask: there is none.
+    """
+    if robot.kind not in _tasks:
+        path = _files.get(robot.kind, FOLDER / f"{robot.kind}.task.toml")
+        if not path.is_file():
+            raise UnknownTask(f"{robot.kind} has no task: what it observes, is paid, and drives in (expected: {path})")
+        _tasks[robot.kind] = read(path)
+    return _tasks[robot.kind]
+
+
+def learnt(name: str) -> Robot:
+    """`robot_named`, and its task is the file beside the description, if the name is a path."""
+    robot = robot_named(name)
+    if name.endswith(".toml"):
+        _files[robot.kind] = Path(name).with_suffix(".task.toml")
+    return robot
+
+
+def address(name: str) -> str:
+    """What another process finds the robot by: the name, or the path made absolute."""
+    return str(Path(name).resolve()) if name.endswith(".toml") else learnt(name).name
+
+
+def enlist(robot: Robot, task: Task) -> None:
+    """From now on this is the robot's task."""
+    _tasks[robot.kind] = task
+
+
+def read(path: Path) -> Task:
+    """The task in a file.
+
+    Raises:
+        UnknownTask: with every mistake in it.
+    """
+    try:
+        values = tomllib.loads(path.read_text())
+        arenas = values.get("arenas", {})
+        values["arenas"] = {name: _alike(arenas, name) for name in arenas}
+        return TypeAdapter(Task).validate_python(values | {"folder": path.parent})
+    except ValidationError as error:
+        lines = "".join(f"\n  {'.'.join(map(str, e['loc']))}: {e['msg']}" for e in error.errors())
+        raise UnknownTask(f"{path} is no task:{lines}") from error
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise UnknownTask(f"{path} is no task: {error}") from error
+
+
+def _alike(arenas: dict[str, Any], name: str) -> dict[str, Any]:
+    """An arena's values, with those of the one that it is `like` where it has none of its own."""
+    own = dict(arenas[name])
+    base = own.pop("like", None)
+    return (_alike(arenas, base) if base is not None else {}) | own
+
+
+def layout(robot: Robot) -> str:
+    """Hash of what an actor and a learner must share: the robot's vectors and what is observed."""
+    words = json.dumps([robot.layout(), *task_of(robot).observed])
+    return hashlib.sha256(words.encode()).hexdigest()[:16]
+
+
+def understands(robot: Robot, said: object) -> bool:
+    """Is it that layout, or the one it had before robots were files?"""
+    return said == layout(robot) or said == FORMER_LAYOUTS.get(robot.name)
