@@ -9,6 +9,7 @@ from collections.abc import Callable
 
 from messaging import brakeline_pb2 as pb
 from messaging.bus import Bus, BusError, Sample
+from messaging.plausible import Implausible
 from messaging.robots import Robot
 from messaging.tasks import layout
 from messaging.topics import FLOW, JOIN, WEIGHTS
@@ -18,6 +19,8 @@ log = logging.getLogger("brakeline.actor")
 
 JOIN_TIMEOUT = 2.0  # s
 REJOIN_AFTER = 2.0  # s without permission: the learner may have missed our last step
+LEAP = 1000  # versions that weights may be ahead of ours: who is farther behind asks the learner
+MOST_AHEAD = 10_000  # steps that a learner may ever allow at once
 SAY_EVERY = 10.0  # s between log lines while there is no learner
 
 
@@ -34,6 +37,8 @@ class Student:
         self.flow = pb.Flow()
         self.joins = 0
         self._joined = 0  # incarnation
+        self._index = 0  # of the latest step that was asked for
+        self._doubtful = False  # somebody said what our learner would not: ask it
         self._news = threading.Condition()
         self._subscriptions = (
             bus.subscribe(WEIGHTS, self._on_weights, robot=robot.name),
@@ -50,8 +55,8 @@ class Student:
 
     @property
     def welcome(self) -> bool:
-        """The learner that took us in is still the one that there is."""
-        return self.flow.incarnation == self._joined
+        """The learner that took us in is still the one that there is, and nobody says otherwise."""
+        return self.flow.incarnation == self._joined and not self._doubtful
 
     def join(self, index: int, episode: int, stop: Callable[[], bool]) -> int | None:
         """Wait until a learner takes us in; returns the episode to go on with, None if told to stop.
@@ -76,7 +81,7 @@ class Student:
             if reply.error.type:
                 raise RefusedByLearner(f"{reply.error.field}: {reply.error.message}")
             with self._news:
-                self.flow = reply.flow
+                self.flow, self._index, self._doubtful = reply.flow, index, False
                 self._joined = reply.flow.incarnation
                 self._take(reply.weights, joined=True)
             self.joins += 1
@@ -85,13 +90,13 @@ class Student:
 
     def wait(self, index: int, episode: int, stop: Callable[[], bool]) -> bool:
         """Wait for permission to take the step of that index; False: the run is done, or told to stop."""
-        asked = time.monotonic()
+        asked, self._index = time.monotonic(), index
         while not stop() and not self.flow.done:
             with self._news:
                 if self._may(index):
                     return True
                 self._news.wait(0.1)
-                rejoin = self.flow.incarnation != self._joined or time.monotonic() - asked > REJOIN_AFTER
+                rejoin = not self.welcome or time.monotonic() - asked > REJOIN_AFTER
             if rejoin:
                 self.join(index - 1, episode, stop)
                 asked = time.monotonic()
@@ -105,6 +110,8 @@ class Student:
     def _on_flow(self, sample: Sample) -> None:
         flow = sample.message()
         with self._news:
+            if flow.limit.get(self.actor, 0) > self._index + MOST_AHEAD:
+                raise Implausible(f"{flow.limit[self.actor]} steps allowed, at {self._index}")
             if flow.incarnation == self._joined or not self._joined or flow.incarnation != self.flow.incarnation:
                 self.flow = flow
             self._news.notify_all()
@@ -115,11 +122,24 @@ class Student:
             self._news.notify_all()
 
     def _take(self, message: pb.Weights, joined: bool) -> None:
-        """Weights that are newer, or, on joining, whatever the learner has; anything else is refused aloud."""
+        """Weights that are a little newer, or, on joining, whatever the learner has; anything else is refused aloud.
+
+        Raises:
+            Implausible: they do not go on from ours, or there are none yet that they could go on from.
+        """
+        if not joined:
+            if self.policy is None:
+                raise Implausible(f"weights {message.version} before a learner has taken {self.actor} in")
+            if message.version > self.policy.version + LEAP:
+                self._doubtful = True
+                raise Implausible(f"weights {message.version}, after {self.policy.version}")
         try:
             policy = decode(message.file, self.robot)
         except BadWeights as error:
             log.error("weights %d were refused: %s", message.version, error)
+            return
+        if policy.version != message.version:
+            log.error("weights %d were refused: they are of version %d", message.version, policy.version)
             return
         if joined or self.policy is None or policy.version > self.policy.version:
             self.policy = policy

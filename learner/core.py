@@ -18,7 +18,7 @@ import numpy as np
 
 from learner import checkpoint
 from learner.config import LearnerConfig
-from learner.intake import BadStep, Intake
+from learner.intake import LATEST, BadStep, Intake
 from learner.ledger import Ledger
 from learner.limiter import Limiter
 from learner.replay import Batch, Replay
@@ -30,6 +30,9 @@ from messaging import brakeline_pb2 as pb
 from messaging import weights as policy
 from messaging.robots import Robot
 from messaging.tasks import layout, task_of
+
+MOST_ACTORS = 2048
+AHEAD = 1000  # steps beyond its permission that an actor may be: it had it from the learner before
 
 
 class Part(Protocol):
@@ -76,10 +79,12 @@ class Learner:
         """Take in one step; False: a duplicate, or one after the end.
 
         Raises:
-            BadStep: sizes or values are wrong; it is counted and nothing else is changed.
+            BadStep: sizes or values are wrong, or its actor was never taken in, or not so far; it is counted and
+                nothing else is changed.
         """
         try:
             move = self._intake.move(step)
+            self._check_place(step)
         except BadStep:
             self.rejected += 1
             raise
@@ -94,6 +99,14 @@ class Learner:
         self._episode_ended = step.terminated or step.truncated
         self._ages.append(self._version - step.weights_version)
         return True
+
+    def _check_place(self, step: pb.Step) -> None:
+        """Raises BadStep for a step of nobody, or one that nobody allowed."""
+        place = self._ledger.places.get(step.actor)
+        if place is None:
+            raise BadStep("actor", f"{step.actor} never joined")
+        if step.index > max(place.last_index, self._limits.get(step.actor, 0)) + AHEAD:
+            raise BadStep("index", f"{step.index}, where {step.actor} is at {place.last_index}")
 
     def join(self, join: pb.Join) -> pb.JoinReply:
         """Take an actor in, or say in `error` why not."""
@@ -111,6 +124,10 @@ class Learner:
             field, why = "layout", f"{join.layout!r} where {self.robot.name} has {layout(self.robot)!r} here"
         elif not join.actor:
             field, why = "actor", "empty"
+        elif join.index >= LATEST or join.episode >= LATEST:
+            field, why = "index", f"{join.index} steps, episode {join.episode}"
+        elif join.actor not in self._limits and len(self._limits) == MOST_ACTORS:
+            field, why = "actor", f"{join.actor!r} is one more than {MOST_ACTORS}"
         elif self.config.lockstep and self._limits.keys() - {join.actor}:
             field, why = "actor", f"{join.actor!r}, but lockstep has one, {next(iter(self._limits))!r}"
         else:

@@ -12,6 +12,14 @@ from messaging import brakeline_pb2 as pb
 from messaging.robots import Robot
 from messaging.tasks import task_of
 
+# What no task pays and no sensor says: far beyond any (a collision costs 100, observations are clipped at 1.5), and far
+# below what would drown the networks.
+MOST_REWARD = 1e3
+MOST_OBSERVED = 10.0
+MOST_PROPOSED = 1e2  # half ranges from the middle: policies may propose what is out of bounds, and are clipped
+ROUNDING = 1e-3  # of half a range, of an executed action at its bounds
+LATEST = 2**31  # number of an episode or a step
+
 
 class BadStep(ValueError):
     """A step that cannot be learned from; `field` names what is wrong with it."""
@@ -39,19 +47,30 @@ class Intake:
             raise BadStep("actor", "empty")
         if step.index == 0:
             raise BadStep("index", "counts from 1")
-        if not np.isfinite(step.reward - step.penalty):
+        if max(step.episode, step.step) >= LATEST:
+            raise BadStep("episode", f"{step.episode}, step {step.step}")
+        if not (abs(step.reward) <= MOST_REWARD and 0.0 <= step.penalty <= MOST_REWARD):  # NaN fails too
             raise BadStep("reward", f"{step.reward} - {step.penalty}")
-        action, proposed = self._normalised("action", step.action), self._normalised("proposed", step.proposed)
-        observation = _vector("observation", step.observation, task_of(self.robot).observation_dim)
-        after = _vector("next_observation", step.next_observation, task_of(self.robot).observation_dim)
+        action = self._normalised("action", step.action, 1.0 + ROUNDING)
+        proposed = self._normalised("proposed", step.proposed, MOST_PROPOSED)
+        observation = self._observed("observation", step.observation)
+        after = self._observed("next_observation", step.next_observation)
         values = action, proposed, step.reward, step.penalty
         return Move(step.episode, step.step, observation, *values, after, step.terminated, step.truncated, step.cut)
 
-    def _normalised(self, name: str, values: Any) -> Vector:
-        """An action in [-1, 1]: what is out of bounds would have been clipped."""
-        action = _vector(name, values, self.robot.action_dim)
-        normalised: Vector = np.clip((action - self._centre) / self._half, -1.0, 1.0).astype(np.float32)
-        return normalised
+    def _normalised(self, name: str, values: Any, most: float) -> Vector:
+        """An action in [-1, 1]: what is out of bounds, by not too much, would have been clipped."""
+        normalised = (_vector(name, values, self.robot.action_dim) - self._centre) / self._half
+        if np.abs(normalised).max() > most:
+            raise BadStep(name, f"{list(values)}, out of the robot's bounds")
+        clipped: Vector = np.clip(normalised, -1.0, 1.0).astype(np.float32)
+        return clipped
+
+    def _observed(self, name: str, values: Any) -> Vector:
+        vector = _vector(name, values, task_of(self.robot).observation_dim)
+        if np.abs(vector).max() > MOST_OBSERVED:
+            raise BadStep(name, f"{float(np.abs(vector).max())} is not plausible")
+        return vector
 
 
 def _vector(name: str, values: Any, size: int) -> Vector:

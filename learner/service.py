@@ -18,6 +18,7 @@ from threading import Event
 from learner.checkpoint import CheckpointError, exists
 from learner.config import LearnerConfig
 from learner.core import Learner
+from learner.intake import BadStep
 from messaging import brakeline_pb2 as pb
 from messaging.bus import BusSettings, Sample
 from messaging.files import write_whole
@@ -154,7 +155,10 @@ class LearnerLoop:
             sample = self._steps.popleft()
             taken += 1
             with self._process.bus.tolerance.over(sample.key):
-                self._learner.insert(sample.message())
+                step = sample.message()
+                if sample.key.rpartition("/")[2] != step.actor:
+                    raise BadStep("actor", f"{step.actor!r} published at {sample.key}")
+                self._learner.insert(step)
         return taken
 
     def _say_flow(self) -> None:

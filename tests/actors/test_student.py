@@ -133,3 +133,34 @@ def test_damaged_or_older_weights_are_not_taken(buses: tuple[Bus, Bus], caplog: 
     time.sleep(0.2)
     assert student.policy is not None and student.policy.version == 6
     assert "weights 5 were refused" in caplog.text
+
+
+def test_weights_that_do_not_go_on_from_ours_are_not_taken_and_the_learner_is_asked(buses: tuple[Bus, Bus]) -> None:
+    teacher, student = joined(buses)
+    teacher.publish(2**32 - 1)
+    eventually(lambda: buses[1].tolerance.count == 1)
+    assert student.policy is not None and student.policy.version == 1
+    teacher.version = 7
+    teacher.say(5)
+    assert student.wait(5, 7, never)
+    assert len(teacher.joins) == 2 and student.policy.version == 7
+    teacher.publish(8)
+    eventually(lambda: student.policy is not None and student.policy.version == 8)
+
+
+def test_a_permission_that_no_learner_gives_is_passed_over(buses: tuple[Bus, Bus]) -> None:
+    teacher, student = joined(buses)
+    teacher.say(10**9)
+    eventually(lambda: buses[1].tolerance.count == 1)
+    result = waiting(student, 5)
+    time.sleep(0.3)
+    assert not result
+    teacher.say(5)
+    eventually(lambda: result == [True])
+
+
+def test_nothing_is_taken_before_a_learner_has_taken_it_in(buses: tuple[Bus, Bus]) -> None:
+    teacher, student = Teacher(buses[0]), Student(buses[1], GROUND, "actor-0")
+    teacher.publish(1)
+    eventually(lambda: buses[1].tolerance.count >= 1)
+    assert student.policy is None
