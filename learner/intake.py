@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import astuple
 from typing import Any
 
 import numpy as np
@@ -12,10 +13,9 @@ from messaging import brakeline_pb2 as pb
 from messaging.robots import Robot
 from messaging.tasks import task_of
 
-# What no task pays and no sensor says: far beyond any (a collision costs 100, observations are clipped at 1.5), and far
-# below what would drown the networks.
-MOST_REWARD = 1e3
-MOST_OBSERVED = 10.0
+# What no task pays and no sensor says: far beyond any, and far below what would drown the networks.
+AT_ONCE = 10.0  # times all that a task pays, a metre's progress included: no step is paid as much
+MOST_OBSERVED = 10.0  # observations are clipped at 1.5
 MOST_PROPOSED = 1e2  # half ranges from the middle: policies may propose what is out of bounds, and are clipped
 ROUNDING = 1e-3  # of half a range, of an executed action at its bounds
 LATEST = 2**31  # number of an episode or a step
@@ -34,6 +34,7 @@ class Intake:
 
     def __init__(self, robot: Robot) -> None:
         self.robot = robot
+        self.most_reward = AT_ONCE * sum(map(abs, astuple(task_of(robot).reward)))
         self._centre, self._half = (robot.high() + robot.low()) / 2.0, (robot.high() - robot.low()) / 2.0
 
     def move(self, step: pb.Step) -> Move:
@@ -49,7 +50,7 @@ class Intake:
             raise BadStep("index", "counts from 1")
         if max(step.episode, step.step) >= LATEST:
             raise BadStep("episode", f"{step.episode}, step {step.step}")
-        if not (abs(step.reward) <= MOST_REWARD and 0.0 <= step.penalty <= MOST_REWARD):  # NaN fails too
+        if not (abs(step.reward) <= self.most_reward and 0.0 <= step.penalty <= self.most_reward):  # NaN fails too
             raise BadStep("reward", f"{step.reward} - {step.penalty}")
         action = self._normalised("action", step.action, 1.0 + ROUNDING)
         proposed = self._normalised("proposed", step.proposed, MOST_PROPOSED)

@@ -23,7 +23,10 @@ from messaging.motion import Motion
 
 Array = NDArray[np.float64]
 
-WALL_DEPTH = 1e4  # m; half the edge of the box that a wall is: as good as a half-space
+# Whoever is within FARTHEST of the origin, as far as obstacles are, sees a wall of WALL_DEPTH as a half-space, and no
+# obstacle as anything that rounding (1e-11 m there) or an overflow could make smaller than it is.
+FARTHEST = 1e4  # m: of an obstacle's position from the origin along each axis, and its size
+WALL_DEPTH = 1e5  # m; half the edge of the box that a wall is: more than anybody's distance from its middle
 BOX, CYLINDER, SPHERE, WALL = "box", "cylinder", "sphere", "wall"
 KINDS = (BOX, CYLINDER, SPHERE, WALL)
 
@@ -60,8 +63,8 @@ class Obstacle:
         dim = len(self.position)
         if dim not in (2, 3):
             raise BadShape("position", f"an obstacle's position has 2 or 3 coordinates, not {dim}")
-        if not all(math.isfinite(value) for value in self.position):
-            raise BadShape("position", f"an obstacle's position must be finite, not {list(self.position)}")
+        if not all(abs(value) <= FARTHEST for value in self.position):  # NaN fails too
+            raise BadShape("position", f"an obstacle is within {FARTHEST:g} m, not at {list(self.position)}")
         if not math.isfinite(self.yaw):
             raise BadShape("yaw", f"an obstacle's yaw must be finite, not {self.yaw}")
         if not math.isfinite(self.margin):
@@ -69,8 +72,10 @@ class Obstacle:
         sizes = {BOX: dim, CYLINDER: dim - 1, SPHERE: 1, WALL: 0}[self.kind]
         if len(self.size) != sizes:
             raise BadShape("size", f"a {dim}-D {self.kind} has {sizes} sizes, not {len(self.size)}")
-        if not all(math.isfinite(value) and value > 0.0 for value in self.size):
-            raise BadShape("size", f"the sizes of a {self.kind} must be finite and positive, not {list(self.size)}")
+        if not all(0.0 < value <= FARTHEST for value in self.size):
+            raise BadShape(
+                "size", f"the sizes of a {self.kind} are above 0 and up to {FARTHEST:g} m, not {list(self.size)}"
+            )
         if self.motion is not None and (why := self.motion.wrong(dim)):
             raise BadShape("motion", why)
 

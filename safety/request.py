@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from messaging.movers import Movers
 from messaging.robots import Robot
-from messaging.shapes import Shapes
+from messaging.shapes import FARTHEST, Shapes
 from messaging.tasks import UnknownTask, task_of
 from safety.commitment import Prediction
 
@@ -19,7 +19,6 @@ Array = NDArray[np.float64]
 
 ALLOWED, ADJUSTED, FAILSAFE = "allowed", "adjusted", "failsafe"
 MOST_OBSERVED = 4096  # numbers in an observation
-FARTHEST = 1e5  # m (and any other unit): beyond it a position's rounding would begin to show
 
 
 class BadRequest(ValueError):
@@ -139,7 +138,7 @@ def _check_motion(robot: Robot, request: Request) -> None:
     _finite(robot, "state", request.state, (robot.state_dim,))
     _finite(robot, "action", request.action, (robot.action_dim,))
     _finite(robot, "input_in_force", request.input_in_force, (robot.action_dim,))
-    if np.abs(request.state).max() > FARTHEST:
+    if np.abs(request.state).max() > FARTHEST:  # in any unit
         raise BadRequest("state", f"a state beyond ±{FARTHEST:g} is not plausible")
     _within_bounds(robot, "input_in_force", request.input_in_force)
 

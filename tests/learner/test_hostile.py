@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from learner.core import AHEAD, MOST_ACTORS, Learner
-from learner.intake import MOST_OBSERVED, MOST_REWARD, BadStep
+from learner.intake import MOST_OBSERVED, BadStep, Intake
 from messaging import brakeline_pb2 as pb
+from messaging.tasks import layout
 from tests.learner.test_core import step
 from tests.learner.toy import CONFIG, TOY
 
@@ -15,7 +16,7 @@ from tests.learner.toy import CONFIG, TOY
 @pytest.fixture
 def learner() -> Learner:
     learner = Learner(TOY, replace(CONFIG, lockstep=False))
-    learner.join(pb.Join(robot="toy", actor="actor-0", layout=TOY.layout()))
+    learner.join(pb.Join(robot="toy", actor="actor-0", layout=layout(TOY)))
     return learner
 
 
@@ -31,7 +32,7 @@ def test_steps_of_an_actor_that_never_joined_are_refused_and_counted(learner: Le
 @pytest.mark.parametrize(
     ("fields", "field"),
     [
-        *(({"reward": value}, "reward") for value in (1e6, -1e6, MOST_REWARD * 1.01, np.inf, np.nan)),
+        *(({"reward": value}, "reward") for value in (1e6, -1e6, Intake(TOY).most_reward * 1.01, np.inf, np.nan)),
         *(({"penalty": value}, "reward") for value in (1e6, -0.1, np.inf, np.nan)),
         *(({"observation": [value, 0.0]}, "observation") for value in (MOST_OBSERVED * 1.01, -1e30, np.nan)),
         *(({"next_observation": [0.0, value]}, "next_observation") for value in (1e30, -np.inf)),
@@ -56,7 +57,7 @@ def test_proposals_out_of_bounds_are_clipped_as_ever(learner: Learner) -> None:
 
 @pytest.mark.parametrize("place", [{"index": 2**64 - 1}, {"episode": 2**32 - 1}])
 def test_an_actor_that_comes_from_nowhere_is_refused(learner: Learner, place: dict) -> None:
-    join = pb.Join(robot="toy", actor="far", layout=TOY.layout(), **place)
+    join = pb.Join(robot="toy", actor="far", layout=layout(TOY), **place)
     assert learner.join(join).error.field == "index"
     assert "far" not in learner.flow().limit
 
@@ -64,7 +65,7 @@ def test_an_actor_that_comes_from_nowhere_is_refused(learner: Learner, place: di
 def test_there_is_an_end_of_actors(learner: Learner, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("learner.core.MOST_ACTORS", 10)
     assert MOST_ACTORS > 1000
-    errors = [learner.join(pb.Join(robot="toy", actor=f"a{n}", layout=TOY.layout())).error.field for n in range(12)]
+    errors = [learner.join(pb.Join(robot="toy", actor=f"a{n}", layout=layout(TOY))).error.field for n in range(12)]
     assert errors == [""] * 9 + ["actor"] * 3
-    again = pb.Join(robot="toy", actor="a0", layout=TOY.layout())
+    again = pb.Join(robot="toy", actor="a0", layout=layout(TOY))
     assert not learner.join(again).HasField("error"), "who is in may come again"

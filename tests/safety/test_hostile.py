@@ -1,0 +1,68 @@
+"""Questions that were meant to make an obstacle vanish, or a service too busy for others."""
+
+from fractions import Fraction
+from math import isqrt, pi
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from messaging.shapes import BOX, CYLINDER, FARTHEST, SPHERE, WALL, BadShape, Obstacle, Shapes
+
+NEAR = 1e-6  # m: what rounding may hide of a distance
+
+coordinates = st.floats(-FARTHEST, FARTHEST)
+sizes = st.floats(0.0, FARTHEST, exclude_min=True)
+
+
+@st.composite
+def scenes(draw: st.DrawFn) -> tuple[Obstacle, list[float]]:
+    """An obstacle that is accepted, and a place that is."""
+    dim, kind = draw(st.sampled_from([2, 3])), draw(st.sampled_from([BOX, CYLINDER, SPHERE, WALL]))
+    count = {BOX: dim, CYLINDER: dim - 1, SPHERE: 1, WALL: 0}[kind]
+    obstacle = Obstacle(
+        kind,
+        tuple(draw(coordinates) for _ in range(dim)),
+        tuple(draw(sizes) for _ in range(count)),
+        draw(st.floats(-pi, pi)) if kind in (BOX, WALL) else 0.0,
+    )
+    return obstacle, [draw(coordinates) for _ in range(dim)]
+
+
+def exact(obstacle: Obstacle, point: list[float]) -> float:
+    """The distance, in rational numbers but for the sines and the last root."""
+    away = [Fraction(p) - Fraction(c) for p, c in zip(point, obstacle.position, strict=True)]
+    cos, sin = Fraction(float(np.cos(obstacle.yaw))), Fraction(float(np.sin(obstacle.yaw)))
+    along, across = cos * away[0] + sin * away[1], cos * away[1] - sin * away[0]
+    if obstacle.kind == WALL:
+        return float(max(along, Fraction(0)))
+    size = [Fraction(value) for value in obstacle.size]
+    if obstacle.kind == BOX:
+        outside = [abs(a) - e / 2 for a, e in zip([along, across, *away[2:]], size, strict=True)]
+    elif obstacle.kind == CYLINDER:
+        outside = [_root(away[0] ** 2 + away[1] ** 2) - size[0], *(abs(z) - size[1] / 2 for z in away[2:])]
+    else:
+        outside = [_root(sum(a**2 for a in away)) - size[0]]
+    return float(_root(sum(max(value, Fraction(0)) ** 2 for value in outside)))
+
+
+def _root(square: Fraction | int) -> Fraction:
+    return Fraction(isqrt(int(Fraction(square) * 10**24)), 10**12)
+
+
+@settings(max_examples=400, deadline=None)
+@given(scenes())
+def test_no_obstacle_is_farther_off_than_it_is(scene: tuple[Obstacle, list[float]]) -> None:
+    obstacle, point = scene
+    found = float(Shapes.of([obstacle], len(point)).distance(np.array(point))[0])
+    assert abs(found - exact(obstacle, point)) <= NEAR
+
+
+@pytest.mark.parametrize("far", [2e4, 1e5, 1e154, 1e300, float("inf"), float("nan")])
+@pytest.mark.parametrize("field", ["position", "size"])
+def test_what_is_beyond_all_bounds_is_no_obstacle(far: float, field: str) -> None:
+    place = {"position": (1.0, 1.0), "size": (0.1,)} | {field: (far, 0.0) if field == "position" else (far,)}
+    with pytest.raises(BadShape) as refused:
+        Obstacle(SPHERE, **place)
+    assert refused.value.field == field
