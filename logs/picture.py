@@ -80,6 +80,7 @@ def rows(seen: Seen) -> Iterable[Figures]:
             "decision": "no decision" if step.fallback else KINDS.get(step.decision),
             "reason": decision.reason if decision is not None else None,
             "margin": decision.margin if decision is not None and decision.tube_center else None,
+            "at_least": decision.at_least if decision is not None else False,
             "decide_ms": decision.time_ms if decision is not None else None,
             "round_trip_ms": exchange.round_trip_ms if exchange is not None else None,
             "iterations": decision.iterations if decision is not None else None,
@@ -137,6 +138,7 @@ def _tube(request: pb.Request, decision: pb.Decision) -> Figures | None:
         "proposed": _rounded(request.action),
         "plan": _rounded(decision.plan[:inputs]),
         "margin": _rounded([decision.margin])[0],
+        "at_least": decision.at_least,
         "reason": decision.reason,
     }
 

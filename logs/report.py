@@ -65,7 +65,7 @@ def show_episode(episode: Figures) -> RenderableType:
             _vector(row["action"]),
             row["decision"] or "-",
             _optional("{:.2f}", row["decide_ms"]),
-            _optional("{:.4f}", row["margin"]),
+            _optional("> {:.4f}" if row["at_least"] else "{:.4f}", row["margin"]),
             f"{row['clearance']:.3f}",
             row["reason"] or "",
         )

@@ -316,6 +316,7 @@ class Decision(_message.Message):
     PREDICTED_HALF_WIDTH_FIELD_NUMBER: _builtins.int
     PREDICTED_HEADING_FIELD_NUMBER: _builtins.int
     MARGIN_FIELD_NUMBER: _builtins.int
+    AT_LEAST_FIELD_NUMBER: _builtins.int
     MODEL_FIELD_NUMBER: _builtins.int
     REASON_FIELD_NUMBER: _builtins.int
     VERIFIED_FIELD_NUMBER: _builtins.int
@@ -333,6 +334,8 @@ class Decision(_message.Message):
     """rad, of the frame in which its position part is a box"""
     margin: _builtins.float
     """m, smallest distance of the tube to a half-space; negative: violated"""
+    at_least: _builtins.bool
+    """nothing in sight is as near as the margin"""
     model: _builtins.str
     """version of the model set"""
     reason: _builtins.str
@@ -383,6 +386,7 @@ class Decision(_message.Message):
         predicted_half_width: _abc.Iterable[_builtins.float] | None = ...,
         predicted_heading: _builtins.float = ...,
         margin: _builtins.float = ...,
+        at_least: _builtins.bool = ...,
         model: _builtins.str = ...,
         reason: _builtins.str = ...,
         verified: _builtins.bool = ...,
@@ -398,7 +402,7 @@ class Decision(_message.Message):
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["broken", b"broken", "compared", b"compared", "contained", b"contained", "iterations", b"iterations", "kind", b"kind", "margin", b"margin", "model", b"model", "plan", b"plan", "predicted_center", b"predicted_center", "predicted_half_width", b"predicted_half_width", "predicted_heading", b"predicted_heading", "queue_ms", b"queue_ms", "reason", b"reason", "solve_ms", b"solve_ms", "solver", b"solver", "time_ms", b"time_ms", "tube_center", b"tube_center", "tube_half_width", b"tube_half_width", "verified", b"verified", "verify_ms", b"verify_ms"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["at_least", b"at_least", "broken", b"broken", "compared", b"compared", "contained", b"contained", "iterations", b"iterations", "kind", b"kind", "margin", b"margin", "model", b"model", "plan", b"plan", "predicted_center", b"predicted_center", "predicted_half_width", b"predicted_half_width", "predicted_heading", b"predicted_heading", "queue_ms", b"queue_ms", "reason", b"reason", "solve_ms", b"solve_ms", "solver", b"solver", "time_ms", b"time_ms", "tube_center", b"tube_center", "tube_half_width", b"tube_half_width", "verified", b"verified", "verify_ms", b"verify_ms"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 

@@ -72,12 +72,14 @@ class _Attempt:
 
 @dataclass(frozen=True)
 class _Scene:
-    """start (d,): the measured position; turn (d, d): world from the frame of now; near: the obstacles that count."""
+    """start (d,): the measured position; turn (d, d): world from the frame of now; near: the obstacles that
+    count; away (n,): how far [m] all that were told of are."""
 
     start: Array
     heading: float
     turn: Array
     near: Shapes
+    away: Array
     moving: Movers | None = None  # that may meet the tube
 
 
@@ -116,8 +118,9 @@ class Filter:
         self.braking = robot.fractions()[: robot.free_steps - robot.given]
         self.regressor = list(robot.regressor)
         self.comfort = self._comfort() if comfort is None else comfort
-        wanted = self._reach()
-        self.reach = min(wanted, robot.sight)
+        self.widest = self._widest()
+        wanted = self.widest + self.comfort
+        self.reach = min(wanted, robot.sight)  # m from the measured position: an obstacle beyond it decides nothing
         self.far = wanted > robot.sight  # a tube may leave what can be seen: every candidate must be looked at
 
     # --- what is known before any request ---------------------------------------------------------------------
@@ -139,8 +142,8 @@ class Filter:
         drift = np.abs((directions[:, None, None, :] @ self.tube.position)[:, :, 0] @ z)
         return float((width + drift).max() + sizes[L:].max())
 
-    def _reach(self) -> float:
-        """[m] from the robot's measured position: an obstacle beyond it can't meet any plan's tube.
+    def _widest(self) -> float:
+        """[m] from the robot's measured position: no plan's tube, with the body about it, goes beyond.
 
         By interval arithmetic over the box of all regressors, so wide for certificates whose atoms mix them.
         """
@@ -152,7 +155,7 @@ class Filter:
         sizes = tube.M @ (np.abs(tube.W) @ z) + tube.m_0
         way = np.abs(tube.position) @ z + np.abs(tube.directions) @ sizes[: tube.generators]
         body = robot.footprint + np.linalg.norm(self.measured) + sizes[tube.generators :].max()
-        return float(np.linalg.norm(way, axis=1).max() + body + self.comfort)
+        return float(np.linalg.norm(way, axis=1).max() + body)
 
     def _extent(self, z: Array) -> float:
         """[m] from the measured position to the farthest point that the body may reach under regressors z."""
@@ -322,6 +325,7 @@ class Filter:
         sizes = self.tube.magnitudes(z)[: self.tube.generators]
         half = np.abs(scene.turn @ self.tube.directions) @ sizes + self.measured
         predicted = self._predict(scene, z)
+        margin, at_least = self._clear(request, scene, found)
         total, solved = (perf_counter_ns() - attempt.started) * 1e-6, attempt.solve_ns * 1e-6
         return Decision(
             kind=found.kind,
@@ -329,7 +333,8 @@ class Filter:
             tube_center=centers,
             tube_half_width=half,
             predicted=predicted,
-            margin=min(found.margin, self.reach),
+            margin=margin,
+            at_least=at_least,
             model=self.version,
             reason="" if found.kind == ALLOWED else attempt.reason,
             verified=found.verified,
@@ -342,6 +347,23 @@ class Filter:
             iterations=attempt.iterations,
             broken=attempt.broken,
         )
+
+    def _clear(self, request: Request, scene: _Scene, found: _Found) -> tuple[float, bool]:
+        """Smallest distance [m] of the tube to what is in sight; True: nothing is, the end of sight is as near.
+
+        What is beyond the reach decides nothing, but it may be what is nearest to the tube.
+        """
+        if self.far:
+            return found.margin, found.margin >= self.reach - self._extent(found.z)
+        if found.margin + self.widest <= self.reach:
+            return found.margin, False
+        most = self.robot.sight - self.widest
+        seen = request.obstacles.take(~(scene.away > self.robot.sight))
+        if not len(seen) and request.movers is None:
+            return most, True
+        rows = self._rows(replace(scene, near=seen, moving=request.movers), found.z)
+        margin = float((rows.bound - rows.support(self.tube, found.z)).min(initial=most))
+        return margin, margin == most
 
     def _predict(self, scene: _Scene, z: Array) -> Prediction:
         """The set of the next measured state, all coordinates."""
@@ -387,11 +409,12 @@ class Filter:
         turn = np.eye(d)
         cos, sin = math.cos(heading), math.sin(heading)
         turn[0, 0], turn[0, 1], turn[1, 0], turn[1, 1] = cos, -sin, sin, cos
+        away = near.distance(start) - near.margin if len(near) else np.zeros(0)
         if len(near):
             # One whose distance is no number stays.
-            near = near.take(~(near.distance(start) - near.margin > self.reach))
+            near = near.take(~(away > self.reach))
         moving = request.movers
         if moving is not None:
             within = robot.horizon * robot.period
             moving = moving.take(~(moving.least_distance(start, within) > self.reach))
-        return _Scene(start, heading, turn, near, moving if moving is not None and len(moving) else None)
+        return _Scene(start, heading, turn, near, away, moving if moving is not None and len(moving) else None)

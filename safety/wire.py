@@ -110,6 +110,7 @@ def message_of(decision: Decision, queue_ms: float) -> pb.Reply:
         predicted_half_width=decision.predicted.half_width.tolist(),
         predicted_heading=decision.predicted.heading,
         margin=decision.margin,
+        at_least=decision.at_least,
         model=decision.model,
         reason=decision.reason,
         verified=decision.verified,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from itertools import product
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -11,7 +12,9 @@ from rich.table import Table
 
 from deploy.commands.common import Endpoints, Flags, Mode, Physics, Robot, console, errors, say_json
 from deploy.data.logged import Recorded, from_log
-from deploy.data.store import SEED, certified, model_path, record_path, recorded
+from deploy.data.store import SEED, certified, data_for, model_path, record_path, recorded
+from deploy.progress import under_way
+from logs.tables import PLAIN, Stacking
 from messaging import brakeline_pb2 as pb
 from messaging.bus import Bus
 from messaging.tasks import learnt
@@ -20,6 +23,8 @@ from safety.certificates import KINDS, RESIDUAL, CertificateError
 from safety.dataset import BadData, Dataset
 from safety.model_set import MODES, ModelSet, Recipe
 from safety.statement import Statement
+
+DIVERGES = 100.0  # m, of a stop's half-width: wider than any arena
 
 
 @dataclass(frozen=True)
@@ -48,13 +53,13 @@ class Collect:
 
 @dataclass(frozen=True)
 class Certify:
-    data: Annotated[Path, tyro.conf.Positional] = Path("data/ground/record.safetensors")
-    """A data set, or a log (file or run folder): then of its last steps."""
+    data: Annotated[Path | None, tyro.conf.Positional] = None
+    """A data set, or a log (file or run folder): then of its last steps; default: the data set in use of --robot."""
     certificates: tuple[str, ...] = KINDS
     mode: Mode | None = None
     """Only this one; default: both."""
     robot: str = "ground"
-    """Of a log: the robot whose steps are taken."""
+    """Whose data set in use; of a log: whose steps are taken."""
     last: int = 20_000
     """Of a log: so many of the last steps."""
     use: bool = False
@@ -62,22 +67,27 @@ class Certify:
     publish: bool = False
     """Replace the model set of running safety services by the first of `certificates` (mode direct unless given)."""
     endpoints: Flags[Endpoints] = field(default_factory=Endpoints)
+    verbose: bool = False
+    """Say also how the data were recorded: sensors' errors, wind, load."""
     json: bool = False
 
     def run(self) -> int:
-        source = self._load()
+        path, source = self._load()
         results: dict[str, Any] = {}
         statements: list[Statement] = []
         chosen: ModelSet | None = None
-        for kind in self.certificates:
-            for mode in (self.mode,) if self.mode else MODES:
-                with errors.status(f"{kind}, {mode}"):
-                    try:
-                        model, statement = certified(source.data, Recipe(kind, mode))
-                    except (BadData, CertificateError) as error:
-                        results.setdefault(kind, {})[mode] = {"refused": str(error)}
-                        errors.print(f"[red]{kind}, {mode}: refused:[/] {error}")
-                        continue
+        modes = (self.mode,) if self.mode else MODES
+        with under_way("certifying", len(self.certificates) * len(modes)) as advance:
+            for kind, mode in product(self.certificates, modes):
+                advance(0, f"certifying {kind}, {mode}")
+                try:
+                    model, statement = certified(source.data, Recipe(kind, mode))
+                except (BadData, CertificateError) as error:
+                    results.setdefault(kind, {})[mode] = {"refused": str(error)}
+                    errors.print(f"[red]{kind}, {mode}: refused:[/] {error}")
+                    continue
+                finally:
+                    advance()
                 chosen = chosen or model
                 statements.append(statement)
                 results.setdefault(kind, {})[mode] = statement.figures()
@@ -86,21 +96,30 @@ class Certify:
         if self.json:
             # The figures of a certificate are those of the direct mode; the recursion's stand beside them.
             flat = {k: modes.get("direct", next(iter(modes.values()))) | modes for k, modes in results.items()}
-            say_json(flat | {"source": str(self.data), "periods": source.data.periods, "note": source.note})
+            say_json(flat | {"source": str(path), "periods": source.data.periods, "note": source.note})
         else:
             console.print(table(statements))
-            console.print(source.note)
+            console.print(f"{path}: {source.note}", markup=False)
+            if self.verbose:
+                console.print(conditions(source.data.about))
         if chosen is None:
             return 1
         if self.publish:
             self._publish(chosen)
         return 0
 
-    def _load(self) -> Recorded:
-        if self.data.suffix == ".safetensors":
-            data = Dataset.load(self.data) if self.data.exists() else recorded(learnt(self.robot), self.data)
-            return Recorded(data, f"{data.periods} recorded periods: {data.about}")
-        return from_log(self.data, learnt(self.robot), self.last)
+    def _load(self) -> tuple[Path, Recorded]:
+        """Raises ValueError when there is no such file: what was mistyped is not recorded anew."""
+        if self.data is None:
+            robot = learnt(self.robot)
+            path, data = record_path(robot.in_lockstep()), data_for(robot)
+        elif self.data.suffix == ".safetensors":
+            if not self.data.exists():
+                raise ValueError(f"no data set at {self.data}: `brakeline collect {self.robot} --out FILE` records one")
+            path, data = self.data, Dataset.load(self.data)
+        else:
+            return self.data, from_log(self.data, learnt(self.robot), self.last)
+        return path, Recorded(data, f"{data.periods} recorded periods of {data.robot.name}")
 
     def _publish(self, model: ModelSet) -> None:
         with Bus(self.endpoints.bus(), "certify") as bus:
@@ -110,7 +129,7 @@ class Certify:
 
 
 def table(statements: list[Statement]) -> Table:
-    shown = Table(title="what held-out plans say (bounds at 99 % confidence)")
+    shown = Stacking(title="what held-out plans say (bounds at 99 % confidence)")
     for column in (
         *("certificate", "mode", "samples", "rank", "condition", "plans", "violations"),
         *("≤ per step", "≤ per plan", "stop from rest", "from full speed", "comfort"),
@@ -122,7 +141,22 @@ def table(statements: list[Statement]) -> Table:
             s.mode + ("" if s.certificate != RESIDUAL or s.mode != "direct" else " *"),
             *(str(s.samples), str(s.rank), f"{s.condition:.0f}", str(s.windows), str(s.violations)),
             *(f"{s.bound_step:.3%}", f"{s.bound_plan:.3%}"),
-            *(f"{1e3 * s.half_width_rest:.1f} mm", f"{1e3 * s.half_width_full:.1f} mm", f"{1e3 * s.comfort:.1f} mm"),
+            *(width(value) for value in (s.half_width_rest, s.half_width_full, s.comfort)),
         )
-    shown.caption = "* the default. Half-widths of a full stop's set, largest axis"
+    shown.caption = "* the default; half-widths: a full stop's set, largest axis"
+    return shown
+
+
+def width(metres: float) -> str:
+    """Of a tube, for people. A recursion whose bounds grow on themselves ends in numbers that mean nothing."""
+    if not metres < DIVERGES:
+        return "diverges"
+    return f"{1e3 * metres:.1f} mm" if metres < 1.0 else f"{metres:.1f} m"
+
+
+def conditions(about: dict[str, str]) -> Table:
+    """How data were recorded, a line each."""
+    shown = Stacking(show_header=False, **PLAIN)
+    for name, value in about.items():
+        shown.add_row(name.replace("_", " "), value)
     return shown

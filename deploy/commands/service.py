@@ -62,6 +62,7 @@ class Query:
             "plan": _rows(message.plan, robot.action_dim),
             "tube": {"center": _rows(message.tube_center, d), "half_width": _rows(message.tube_half_width, d)},
             "margin": message.margin,
+            "at_least": message.at_least,
             "time_ms": message.time_ms,
             "model": message.model,
             "reason": message.reason,
@@ -78,7 +79,8 @@ class Query:
         ):
             shown.add_row(str(k), *(f"{value:.4f}" for value in u), _numbers(c), _numbers(h))
         console.print(shown)
-        console.print(f"margin {message.margin:.4f} m, {message.time_ms:.2f} ms in decide, model {message.model}")
+        margin = f"{'> ' if message.at_least else ''}{message.margin:.4f} m"
+        console.print(f"margin {margin}, {message.time_ms:.2f} ms in decide, model {message.model}")
         return 0
 
 

@@ -16,9 +16,9 @@ from sim.conditions import Conditions
 PERIODS = 300  # a trajectory
 
 
-def record(robot: Robot, trajectories: int, seed: int, conditions: Conditions) -> Iterator[Trajectory]:
-    """Drive trajectories, each from standing still, with a generator of its own: (seed, number)."""
-    for number in range(trajectories):
+def record(robot: Robot, trajectories: int, seed: int, conditions: Conditions, first: int = 0) -> Iterator[Trajectory]:
+    """Drive trajectories from number `first` on, each from standing still, with its own generator: (seed, number)."""
+    for number in range(first, trajectories):
         rng = np.random.default_rng((seed, number))
         vehicle = vehicle_in_yard(robot, rng, conditions)
         states, inputs, paths, turned = [vehicle.measured], [], [], []
@@ -35,6 +35,11 @@ def record(robot: Robot, trajectories: int, seed: int, conditions: Conditions) -
 
 def dataset(robot: Robot, trajectories: list[Trajectory], seed: int, conditions: Conditions) -> Dataset:
     """The trajectories as a checked data set that says where it comes from."""
-    data = Dataset(robot, tuple(trajectories), conditions.describe() | {"seed": str(seed), "origin": "collect"})
+    data = Dataset(robot, tuple(trajectories), origin(seed, conditions))
     data.check()
     return data
+
+
+def origin(seed: int, conditions: Conditions) -> dict[str, str]:
+    """What a recorded data set says of itself."""
+    return conditions.describe() | {"seed": str(seed), "origin": "collect"}

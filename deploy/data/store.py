@@ -8,18 +8,20 @@ data/<robot>/models/<version>.safetensors           every version a service has 
 
 from __future__ import annotations
 
+import math
 import os
+import time
 from dataclasses import replace
 from pathlib import Path
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn, track
 
 from deploy.data import collect
 from deploy.data import pretrain as rivals
+from deploy.progress import each, under_way
 from messaging.robots import Robot
 from messaging.tasks import task_of
-from safety.dataset import BadData, Dataset
+from safety.dataset import BadData, Dataset, Trajectory
 from safety.fitting import make
 from safety.methods import DDPC, Model
 from safety.model_set import BadModel, ModelSet, Recipe
@@ -27,10 +29,10 @@ from safety.rivals.pretrained import Pretrained
 from safety.statement import Statement, state
 from sim.conditions import Conditions
 
+PACE = 0.25  # s a trajectory, on a core that is not quite its own
+SAVE_EVERY = 20.0  # s: no more of a recording is lost when it is killed
 HELD_OUT = 0.3  # of the trajectories, for the statement about a model set
 SEED = 20260
-
-COLUMNS = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
 
 console = Console(stderr=True, highlight=False, soft_wrap=True)
 
@@ -61,20 +63,63 @@ def recorded(
     conditions: Conditions | None = None,
     again: bool = False,
 ) -> Dataset:
-    """The data set at `path`, recorded first if it is not there (or `again`)."""
+    """The data set at `path`, recorded first if it is not there (or `again`).
+
+    What was driven before an interruption lies beside it, and is gone on from: every trajectory has a generator of its
+    own, so the data are the same as in one go.
+    """
     path = path or record_path(robot)
     if path.exists() and not again:
         return Dataset.load(path)
     conditions, trajectories = conditions or Conditions(), trajectories or task_of(robot).trajectories
-    driven = track(
-        collect.record(robot, trajectories, seed, conditions),
-        f"recording {trajectories} trajectories of {robot.name}",
-        total=trajectories,
-        console=console,
+    part = path.with_name(f"{path.stem}.part{path.suffix}")
+    driven = _begun(part, robot, trajectories, seed, conditions)
+    console.print(
+        f"recording {robot.name} once, into {path}: {trajectories} trajectories, "
+        + (f"{len(driven)} of them there already" if driven else about(PACE * trajectories))
+        + "; interrupted, it goes on from there the next time",
+        markup=False,
     )
-    data = collect.dataset(robot, list(driven), seed, conditions)
+    rest = collect.record(robot, trajectories, seed, conditions, len(driven))
+    saved = time.monotonic()
+    try:
+        for trajectory in each(rest, f"recording {robot.name}", trajectories, len(driven)):
+            driven.append(trajectory)
+            if time.monotonic() - saved > SAVE_EVERY:
+                collect.dataset(robot, driven, seed, conditions).save(part)
+                saved = time.monotonic()
+    except KeyboardInterrupt:
+        if driven:
+            collect.dataset(robot, driven, seed, conditions).save(part)
+            console.print(f"[yellow]kept {len(driven)} of {trajectories} trajectories[/]: the same command goes on")
+        raise
+    data = collect.dataset(robot, driven, seed, conditions)
     data.save(path)
+    part.unlink(missing_ok=True)
     return data
+
+
+def _begun(part: Path, robot: Robot, trajectories: int, seed: int, conditions: Conditions) -> list[Trajectory]:
+    """What an interrupted recording of the same kind had driven."""
+    if not part.exists():
+        return []
+    try:
+        kept = Dataset.load(part)
+    except BadData:
+        return []
+    same = kept.robot == robot and kept.about == collect.origin(seed, conditions)
+    return list(kept.trajectories[:trajectories]) if same else []
+
+
+def about(seconds: float) -> str:
+    """How long something will take, roughly."""
+    return f"about {seconds / 60.0:.0f} min" if seconds > 90.0 else f"about {10 * math.ceil(seconds / 10.0)} s"
+
+
+def data_for(robot: Robot) -> Dataset:
+    """The data set in use of a robot, recorded first if it is not there: one record serves, whether questions are late
+    or not."""
+    return replace(recorded(robot.in_lockstep()), robot=robot)
 
 
 def certified(data: Dataset, recipe: Recipe) -> tuple[ModelSet, Statement]:
@@ -99,14 +144,13 @@ def model_for(robot: Robot, recipe: Recipe) -> ModelSet:
             return ModelSet.load(path)
         except BadModel as error:
             console.print(f"[yellow]making the model set again:[/] {error}")
-    base = robot.in_lockstep()  # one record serves, whether questions are late or not
     try:
-        data = recorded(base)
+        data = data_for(robot)
     except BadData as error:
         console.print(f"[yellow]recording again:[/] {error}")
-        data = recorded(base, again=True)
-    data = replace(data, robot=robot)
-    with console.status(f"certifying {robot.name}: {recipe.certificate}, {recipe.mode}"):
+        recorded(robot.in_lockstep(), again=True)
+        data = data_for(robot)
+    with under_way(f"certifying {robot.name}: {recipe.certificate}, {recipe.mode}"):
         model, statement = certified(data, recipe)
     console.print(
         f"{robot.name}: {recipe.certificate} ({recipe.mode}) {model.version}: {statement.violations} violations in "
@@ -142,9 +186,8 @@ def pretrained(robot: Robot, method: str, recipe: rivals.Recipe, again: bool = F
             console.print(f"[yellow]pre-training {method} again:[/] {path} is of another recipe")
         except BadModel as error:
             console.print(f"[yellow]pre-training {method} again:[/] {error}")
-    with Progress(*COLUMNS, console=console, transient=True) as progress:
-        task = progress.add_task(f"pre-training {method} for {robot.name}", total=recipe.samples)
-        model = rivals.pretrain(robot, recipe, lambda: progress.advance(task))
+    with under_way(f"pre-training {method} for {robot.name}", recipe.samples) as advance:
+        model = rivals.pretrain(robot, recipe, advance)
     model.save(path)
     about = model.about
     console.print(

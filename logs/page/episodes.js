@@ -3,7 +3,7 @@
 function why(episode, k) {
   const t = episode.tubes[k];
   if (!t) return KINDS[episode.kinds[k]].name;
-  return `${KINDS[episode.kinds[k]].name}; proposed ${t.proposed.join(", ")}, executed ${t.plan.join(", ")}; margin ${figure(100 * t.margin)} cm${t.reason ? `; ${t.reason}` : ""}`;
+  return `${KINDS[episode.kinds[k]].name}; proposed ${t.proposed.join(", ")}, executed ${t.plan.join(", ")}; margin ${t.at_least ? "> " : ""}${figure(100 * t.margin)} cm${t.reason ? `; ${t.reason}` : ""}`;
 }
 
 function near(target, galleries, choose) {

@@ -38,6 +38,7 @@ class Card:
     kind: str = ""
     tube: list[list[float]] = field(default_factory=list)  # per period: center x, y, half-width x, y
     margin: float | None = None
+    at_least: bool = False  # nothing in sight is as near as the margin
     trail: deque[tuple[float, float]] = field(default_factory=lambda: deque(maxlen=TRAIL))
     marks: deque[tuple[float, float, str]] = field(default_factory=lambda: deque(maxlen=TRAIL))  # interventions
     reward: float = 0.0
@@ -69,7 +70,7 @@ class Card:
         if len(centers) != len(halves) or len(centers) % d or len(centers) > self.robot.horizon * d:
             raise ValueError(f"a tube of {len(centers)} and {len(halves)} numbers")
         self.tube = [[*centers[i : i + 2], *halves[i : i + 2]] for i in range(0, len(centers), d)]
-        self.margin = decision.margin
+        self.margin, self.at_least = decision.margin, decision.at_least
 
     def step(self, step: pb.Step) -> None:
         self._stand(list(step.state))
@@ -90,7 +91,7 @@ class Card:
         self.height = state[2] if self.robot.position_dim == 3 else None
 
     def view(self) -> dict[str, Any]:
-        names = ("actor", "number", "arena", "pose", "height", "kind", "tube", "margin", "reward", "ended")
+        names = ("actor", "number", "arena", "pose", "height", "kind", "tube", "margin", "at_least", "reward", "ended")
         about = {name: getattr(self, name) for name in names}
         lists = {"trail": list(self.trail), "marks": list(self.marks)}
         return about | lists | {"robot": self.robot.name, "footprint": self.robot.footprint}

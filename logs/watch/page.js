@@ -55,7 +55,7 @@ function drawRobot(robot) {
   const { episode, map, near, note } = card(robot);
   episode.textContent = `episode ${robot.number}`;
   const words = [robot.kind || "no filter", `reward ${number(robot.reward, 1)}`, `stepped in ${robot.marks.length} ×`];
-  if (robot.margin !== null) words.push(`margin ${number(100 * robot.margin, 1)} cm`);
+  if (robot.margin !== null) words.push(`margin ${robot.at_least ? "> " : ""}${number(100 * robot.margin, 1)} cm`);
   if (robot.height !== null) words.push(`height ${number(robot.height, 1)} m`);
   if (robot.ended) words.push(`before: ${robot.ended}`);
   note.textContent = words.join(" · ");

@@ -1,15 +1,20 @@
 """The commands as they are typed: help, errors, and JSON."""
 
+import io
 import json
 import shlex
 
 import pytest
+from rich.console import Console
 
+from deploy import progress
 from deploy.cli import COMMANDS, find, main
+from deploy.commands.data import table
 from deploy.commands.service import obstacle_of
 from logs.report import analyse
 from logs.segment import open_segment
 from messaging.shapes import Obstacle
+from safety.statement import Statement
 
 SHARED = {
     *("episodes", "goals", "collisions", "timeouts", "steps", "interventions", "failsafes", "mean_speed", "max_speed"),
@@ -184,3 +189,40 @@ def test_the_same_seed_gives_the_same_figures(figures, data_folder):
             del said["decision_ms"][name]
     assert one == same
     assert one["mean_reward"] != other["mean_reward"]
+
+
+def test_a_mistyped_data_set_is_not_recorded_anew(command, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    status, out, err = command("certify", "nothere.safetensors")
+    assert (status, out) == (1, "") and "no data set at nothere.safetensors" in err and err.count("\n") == 1
+    assert not list(tmp_path.iterdir())
+
+
+def said(**figures):
+    """A statement with figures as a recursion that feeds on itself gives them."""
+    plain = {"samples": 1000, "rank": 6, "smallest_singular": 1.0, "condition": 12.0, "windows": 300, "violations": 0}
+    plain |= {"step_violations": 0, "bound_step": 0.01, "bound_plan": 0.02, "bound_episode": 0.9}
+    sizes = {"half_width_rest": 0.0012, "half_width_full": 149810.138, "comfort": 1.5}
+    about = {"certificate": "matrix-zonotope", "mode": "recursion", "version": "a"}
+    return Statement(**{**plain, **sizes, **about, **figures})
+
+
+@pytest.mark.parametrize("columns", [60, 80, 160])
+def test_certificates_are_told_whole_at_any_width(columns):
+    file = io.StringIO()
+    console = Console(file=file, width=columns, force_terminal=True, color_system=None, soft_wrap=True)
+    console.print(table([said(), said(half_width_full=float("nan"), certificate="residual")]))
+    shown = file.getvalue()
+    assert "…" not in shown and max(map(len, shown.splitlines())) <= columns
+    for word in ("certificate", "matrix-zonotope", "≤ per plan", "2.000%", "1.2 mm", "1.5 m"):
+        assert word in shown, word
+    assert shown.count("diverges") == 2 and "149810" not in shown
+
+
+def test_certify_says_what_it_does_and_keeps_the_conditions_for_those_who_ask(command, data_folder, monkeypatch):
+    monkeypatch.setattr(progress, "FIRST", 0.01)
+    words = ("certify", data_folder / "ground" / "record.safetensors", "--certificates", "residual", "--mode", "direct")
+    status, out, err = command(*words)
+    assert status == 0 and "{" not in out and "encoder" not in out
+    assert "certifying residual, direct: 0 of 1" in err
+    assert "encoder ticks" in command(*words, "--verbose")[1]

@@ -50,7 +50,18 @@ def same(one, other):
             return False
     if one.predicted.center.tobytes() != other.predicted.center.tobytes():
         return False
-    names = ("kind", "margin", "model", "reason", "verified", "contained", "compared", "solver", "iterations")
+    names = (
+        "kind",
+        "margin",
+        "at_least",
+        "model",
+        "reason",
+        "verified",
+        "contained",
+        "compared",
+        "solver",
+        "iterations",
+    )
     return all(getattr(one, name) == getattr(other, name) for name in names)
 
 
@@ -94,10 +105,29 @@ def test_far_from_everything_the_proposal_is_allowed(ready):
     assert decision.kind == ALLOWED
     assert decision.reason == decision.solver == ""
     assert np.array_equal(decision.plan, [[0.2, -0.3], [0, 0], [0, 0]])
-    assert decision.margin == ready.reach
     assert decision.verified
     assert decision.contained
     assert not decision.compared
+
+
+@pytest.mark.parametrize("way", [0.28, 0.35, 0.45, 0.7])
+def test_the_margin_is_the_way_to_the_obstacle_however_far_it_is(model, ready, way):
+    """Obstacles beyond the reach of any plan decide nothing, but they are what is near."""
+    ask = request(obstacles=[cylinder(way, 0.0)])
+    decision = ready.decide(ask)
+    clear = fits(model, ask, decision.action)
+    assert clear - 0.01 <= decision.margin <= clear + 1e-3
+    assert not decision.at_least
+
+
+def test_where_nothing_is_near_the_margin_says_that_it_is_only_a_bound(ready):
+    for obstacles in ([], [cylinder(2.0, 0.0)]):
+        decision = ready.decide(request(action=(0.2, -0.3), obstacles=obstacles))
+        assert decision.at_least
+        assert ready.reach < decision.margin < GROUND.sight - GROUND.footprint
+    behind = ready.decide(request(action=(0.2, -0.3), obstacles=[cylinder(-0.31, 0.0), cylinder(0.34, 0.0)]))
+    alone = ready.decide(request(action=(0.2, -0.3), obstacles=[cylinder(0.34, 0.0)]))
+    assert behind.margin == alone.margin < ready.reach, "near but behind, one farther away is closer to the tube"
 
 
 def test_allowed_is_the_proposal_clipped_to_the_bounds(ready):

@@ -107,3 +107,23 @@ def test_the_last_steps_of_a_log(tmp_path):
     open_segment(tmp_path / "none.mcap", {}).finish()
     with pytest.raises(BadData, match="no trajectory of ground"):
         from_log(tmp_path / "none.mcap", GROUND, last=60)
+
+
+def test_an_interrupted_recording_is_gone_on_from(elsewhere, monkeypatch, capsys):
+    drive = store.collect.record
+
+    def interrupted(*given):
+        yield from itertools.islice(drive(*given), 7)
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(store.collect, "record", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            store.recorded(GROUND)
+    assert not store.record_path(GROUND).exists()
+    assert "recording ground once" in (told := capsys.readouterr().err) and "kept 7 of 20" in told
+    whole = store.recorded(GROUND)
+    assert elsewhere[-1][-1] == 7, "only what was missing is driven"
+    assert [path.name for path in store.record_path(GROUND).parent.iterdir()] == ["record.safetensors"]
+    fresh = store.recorded(GROUND, store.record_path(GROUND).with_name("fresh.safetensors"))
+    assert whole.digest() == fresh.digest(), "the same data as in one go"

@@ -1,0 +1,43 @@
+"""Tables for a console that stay whole: where a row does not fit, its cells are put below each other."""
+
+from __future__ import annotations
+
+import os
+from typing import Any
+
+from rich.console import Console, ConsoleOptions, RenderResult
+from rich.table import Table
+from rich.text import Text
+
+PLAIN: dict[str, Any] = {"box": None, "padding": (0, 2, 0, 0)}
+UNLIMITED = 10_000  # columns
+
+
+class Stacking(Table):
+    """A table that is never cut: too wide for the terminal, every row becomes a block of `column: cell` lines.
+
+    Into a file it goes as wide as it is, unless $COLUMNS says how wide the reader is.
+    """
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        wide = options.update(width=UNLIMITED, max_width=UNLIMITED)
+        needed = self.__rich_measure__(console, wide).maximum
+        bounded = console.is_terminal or "COLUMNS" in os.environ
+        if needed <= options.max_width or not bounded:
+            yield from super().__rich_console__(console, options.update(width=needed))
+        else:
+            yield from self._stacked()
+
+    def _stacked(self) -> RenderResult:
+        if self.title:
+            yield Text.assemble((str(self.title), "italic"))
+        heads = [str(column.header) for column in self.columns]
+        cells = [list(column.cells) for column in self.columns]
+        for row in zip(*cells, strict=True):
+            first, *rest = (Text.from_markup(cell) if isinstance(cell, str) else cell for cell in row)
+            yield Text.assemble((f"{heads[0]}: " if heads[0] else "", "dim"), first)
+            for head, cell in zip(heads[1:], rest, strict=True):
+                if str(cell):
+                    yield Text.assemble((f"  {head}: " if head else "  ", "dim"), cell)
+        if self.caption:
+            yield Text.assemble((str(self.caption), "dim italic"))
