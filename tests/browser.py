@@ -67,6 +67,7 @@ class Page:
         self._session = self.call("Target.attachToTarget", targetId=target, flatten=True)["sessionId"]
         for domain in ("Page", "Runtime", "Network", "Log"):
             self.call(f"{domain}.enable")
+        self.size(*self._size)
 
     def call(self, method: str, **parameters: Any) -> dict[str, Any]:
         """The result of one command of the protocol; what else comes meanwhile is taken note of."""
@@ -82,6 +83,19 @@ class Page:
                 result: dict[str, Any] = answer["result"]
                 return result
             self._note(answer)
+
+    def size(self, width: int, height: int) -> None:
+        """What the page has room for [px]; a window is never as narrow as a phone."""
+        self.call("Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=False)
+
+    def media(self, kind: str = "screen", scheme: str = "light") -> None:
+        """As on a screen or in print, light or dark."""
+        features = [{"name": "prefers-color-scheme", "value": scheme}]
+        self.call("Emulation.setEmulatedMedia", media=kind, features=features)
+
+    def pdf(self) -> bytes:
+        """The page as it is printed, on A4."""
+        return base64.b64decode(self.call("Page.printToPDF", paperWidth=8.27, paperHeight=11.69)["data"])
 
     def open(self, url: str) -> None:
         self.call("Page.navigate", url=url)

@@ -16,6 +16,7 @@ from deploy.run.places import CONFIG, LOG, places, say_where
 from deploy.run.view import View
 from deploy.run.watched import Child, LaunchError, last_line
 from logs.metrics import Metrics
+from logs.watch.totals import told, totals
 from messaging.bus import BusError, BusSettings, Sample
 from messaging.process import Process
 from messaging.robots import robot_named
@@ -72,9 +73,7 @@ class Launcher:
             self._claim_folder()
             for topic in RECORDED:
                 process.bus.subscribe(topic, self._inbox.append)
-            process.refresh = lambda: process.figures.update(
-                {f"restarts {child.place.name}": child.restarts for child in self.children}
-            )
+            process.refresh = lambda: self._tell(process)
             try:
                 if self.config.record:
                     self._start_recorder(process)
@@ -93,12 +92,30 @@ class Launcher:
                 view.ending = True
                 show(view)
                 self._end()
+                self._drain()
+                outcome = "finished" if self.finished else "stopped before its last step"
+                process.notes["outcome"] = f"failed: {failure}" if failure is not None else outcome
         self._drain()
         figures = self.figures()
         (self.folder / FIGURES).write_text(json.dumps(figures, indent=2))
         if failure is not None:
             raise failure
         return figures
+
+    def _tell(self, process: Process) -> None:
+        """Of the whole run, with each sign of life: who watches may have come in its middle."""
+        config = self.config
+        process.figures.update({f"restarts {child.place.name}": child.restarts for child in self.children})
+        process.figures.update(told(totals(self.metrics)))
+        process.notes.update(
+            {
+                "run": self.folder.name,
+                "method": config.method,
+                "arena": config.arena,
+                "seed": str(config.seed),
+                "steps": str(config.steps * len(config.robots)),
+            }
+        )
 
     def figures(self) -> dict[str, Any]:
         """As `analyse` would give them for the log, with what only the launcher knows."""

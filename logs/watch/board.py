@@ -8,8 +8,9 @@ from collections import deque
 from dataclasses import dataclass, field
 from typing import Any
 
-from logs.metrics import Crowded, Metrics
+from logs.metrics import SILENT, Crowded, Metrics
 from logs.scene import half_width
+from logs.watch.totals import heard, totals
 from messaging import brakeline_pb2 as pb
 from messaging.bus import Sample
 from messaging.robots import Robot, UnknownRobot, robot_named
@@ -22,7 +23,8 @@ TRAIL = 600  # positions of the running episode
 FIGURES_EVERY = 1.0  # s
 MOST_CARDS = 200
 KINDS = {pb.ALLOWED: "allowed", pb.ADJUSTED: "adjusted", pb.FAILSAFE: "failsafe"}
-SHOWN = ("steps", "episodes", "goals", "collisions", "interventions", "failsafes", "fallbacks", "mean_reward")
+LAUNCHER = "launcher"  # the process that knows the run from its beginning
+SETUP = ("run", "method", "arena", "seed", "steps")  # its notes about it
 
 
 @dataclass
@@ -104,8 +106,8 @@ class Board:
         self.metrics = Metrics()
         self._cards: dict[str, Card] = {}
         self._lines: deque[str] = deque(maxlen=LINES)
-        self._returns: deque[float] = deque(maxlen=EPISODES)
-        self._heard = time.monotonic()
+        self._returns: dict[str, deque[float]] = {}  # by robot kind
+        self._begun = self._heard = time.monotonic()
         self._figures: dict[str, Any] = {}
         self._figures_at = -1e9
         self._lock = threading.Lock()
@@ -145,7 +147,7 @@ class Board:
             return
         card.step(message)
         if message.terminated or message.truncated:
-            self._returns.append(card.reward)
+            self._returns.setdefault(card.robot.name, deque(maxlen=EPISODES)).append(card.reward)
 
     def view(self) -> dict[str, Any]:
         """All that the page shows, as JSON can hold it."""
@@ -163,11 +165,40 @@ class Board:
             for name, about in figures["learners"].items()
         }
         times = figures.get("decision_ms") or {}
+        launcher = self.metrics.processes.get(LAUNCHER)
+        whole = heard(launcher.figures) if launcher is not None else {}
+        counted = whole or totals(self.metrics)
         return {
-            "figures": {name: figures[name] for name in SHOWN}
-            | {"decide_p50": times.get("p50"), "decide_p99": times.get("p99")},
+            "run": self._run(),
+            # Counts of the whole run, or only of what was seen here.
+            "since": None if whole else time.monotonic() - self._begun,
+            "totals": {robot: _means(counts) for robot, counts in sorted(counted.items())},
+            "decide": {"p50": times.get("p50"), "p99": times.get("p99")},
             "learners": learners,
-            "processes": {name: bool(about["alive"]) for name, about in figures["processes"].items()},
-            "returns": list(self._returns),
+            "processes": {name: self._state(name) for name in sorted(figures["processes"])},
+            "returns": {robot: list(returns) for robot, returns in sorted(self._returns.items())},
             "lines": list(self._lines),
         }
+
+    def _run(self) -> dict[str, str]:
+        """What the launcher says of the run; `outcome` once it has ended. Without one, nothing."""
+        launcher = self.metrics.processes.get(LAUNCHER)
+        if launcher is None:
+            return {}
+        about = {name: launcher.notes[name] for name in SETUP if name in launcher.notes}
+        return about if launcher.alive else about | {"outcome": launcher.notes.get("outcome", "ended")}
+
+    def _state(self, name: str) -> str:
+        """alive; ended: it said goodbye; silent: it did not, and nothing is heard of it."""
+        processes = self.metrics.processes
+        if not processes[name].alive:
+            return "ended"
+        latest = max(process.heard_at for process in processes.values())  # by their clock, which may not be ours
+        quiet = (latest - processes[name].heard_at) * 1e-9 + time.monotonic() - self._heard
+        return "silent" if quiet > SILENT else "alive"
+
+
+def _means(counts: dict[str, float]) -> dict[str, float | None]:
+    """Counts with the mean reward in place of its sum."""
+    mean = counts["reward"] / counts["episodes"] if counts["episodes"] else None
+    return {name: value for name, value in counts.items() if name != "reward"} | {"mean_reward": mean}

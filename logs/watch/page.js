@@ -150,33 +150,74 @@ function drawBody(pen, robot, scale) {
   pen.stroke();
 }
 
-function drawFigures(view) {
-  const figures = view.figures;
-  const learners = Object.values(view.learners);
-  const sum = (name) => learners.reduce((total, learner) => total + learner[name], 0);
+/** A tile for each figure of a robot kind: counts of the whole run where the launcher tells them. */
+function tiles(robot, counts, learner) {
   const pairs = [
-    ["steps", figures.steps],
-    ["episodes", figures.episodes],
-    ["goals", share(figures.goals, figures.episodes)],
-    ["collisions", figures.collisions],
-    ["interventions", share(figures.interventions, figures.steps)],
-    ["of these failsafe", figures.failsafes],
-    ["mean reward", number(figures.mean_reward, 1)],
-    ["decide p50 / p99", `${number(figures.decide_p50, 2)} / ${number(figures.decide_p99, 2)} ms`],
-    ["steps learned", learners.length ? `${sum("steps")} (${number(sum("steps_per_s"))}/s)` : "–"],
-    ["updates", learners.length ? `${sum("updates")} (${number(sum("updates_per_s"))}/s)` : "–"],
+    ["steps driven", number(counts.steps)],
+    ["episodes", number(counts.episodes)],
+    ["goals", share(counts.goals, counts.episodes)],
+    ["collisions", number(counts.collisions)],
+    ["interventions", share(counts.interventions, counts.steps)],
+    ["of these failsafe", number(counts.failsafes)],
+    ["mean reward of an episode", number(counts.mean_reward, 1)],
   ];
-  at("figures").replaceChildren(
-    ...pairs.map(([name, value]) => {
-      const box = element("div", "", name === "collisions" && value > 0 ? "bad" : "");
-      box.append(element("dt", name), element("dd", String(value)));
-      return box;
-    }),
-  );
+  if (learner) {
+    pairs.push(["steps learned from", `${learner.steps} (${number(learner.steps_per_s)}/s)`]);
+    pairs.push(["updates", `${learner.updates} (${number(learner.updates_per_s)}/s)`]);
+  }
+  return pairs.map(([name, value]) => {
+    const box = element("div", "", name === "collisions" && counts.collisions > 0 ? "bad" : "");
+    box.append(element("dt", name), element("dd", value));
+    return box;
+  });
 }
 
-function drawCurve(returns) {
-  const { pen, width, height } = fresh(at("curve"));
+function drawFigures(view) {
+  const robots = Object.entries(view.totals);
+  at("figures").replaceChildren(
+    ...robots.map(([robot, counts]) => {
+      const group = element("div", "", "group");
+      group.dataset.robot = robot;
+      const grid = element("dl");
+      grid.append(...tiles(robot, counts, view.learners[robot]));
+      group.append(element("h2", robot), grid);
+      return group;
+    }),
+  );
+  const times = `decision p50 / p99: ${number(view.decide.p50, 2)} / ${number(view.decide.p99, 2)} ms, since this page's server listens`;
+  const scope = view.since === null ? "Counts are of the whole run since it was started." : `Counts are of the ${view.since.toFixed(0)} s that were watched: no launcher tells of what was before.`;
+  at("scope").textContent = view.decide.p50 === null ? scope : `${scope} ${times}.`;
+}
+
+/** The run's name, how it is set up, and how far it is. */
+function drawRun(view) {
+  const { run, method, arena, seed, steps } = view.run;
+  at("run").textContent = run ? `${run}: method ${method}, arena ${arena}, seed ${seed}` : "";
+  const learners = Object.values(view.learners);
+  const counted = learners.length ? learners : Object.values(view.totals);
+  const done = counted.reduce((total, one) => total + one.steps, 0);
+  at("progress").hidden = !steps;
+  at("progress").max = steps || 1;
+  at("progress").value = done;
+  at("done").textContent = steps ? `${done} of ${steps} steps (${((100 * done) / steps).toFixed(0)} %)` : "";
+}
+
+/** A curve for each robot kind: rewards of different tasks are not compared. */
+function drawCurves(all) {
+  for (const [robot, returns] of Object.entries(all)) {
+    let canvas = document.querySelector(`canvas[data-rewards="${CSS.escape(robot)}"]`);
+    if (!canvas) {
+      canvas = element("canvas");
+      canvas.dataset.rewards = robot;
+      canvas.setAttribute("aria-label", `reward of the latest episodes of ${robot}, and its mean over ${WINDOW}`);
+      at("curves").append(element("h3", robot), canvas);
+    }
+    drawCurve(canvas, returns);
+  }
+}
+
+function drawCurve(canvas, returns) {
+  const { pen, width, height } = fresh(canvas);
   if (returns.length < 2) return;
   const low = Math.min(...returns, 0), high = Math.max(...returns, 1), foot = 14;
   const x = (i) => (i / (returns.length - 1)) * (width - 44) + 40;
@@ -206,12 +247,14 @@ function drawCurve(returns) {
 
 function drawLists(view) {
   const processes = Object.entries(view.processes);
-  at("processes").replaceChildren(...processes.map(([name, alive]) => element("li", name, alive ? "alive" : "gone")));
+  at("processes").replaceChildren(
+    ...processes.map(([name, state]) => element("li", state === "alive" ? name : `${name}: ${state}`, state)),
+  );
   at("lines").replaceChildren(...view.lines.map((line) => element("li", line)));
 }
 
-function say(up, words) {
-  at("link").className = up ? "up" : "down";
+function say(state, words) {
+  at("link").className = state;
   at("link").textContent = words;
 }
 
@@ -220,11 +263,16 @@ const events = new EventSource("/events");
 events.onmessage = ({ data }) => {
   const view = JSON.parse(data);
   const quiet = view.silent > SILENT;
-  say(!quiet, quiet ? `nothing on the bus for ${view.silent.toFixed(0)} s` : "live");
+  if (view.run.outcome) say("ended", `the run has ended: ${view.run.outcome}`);
+  else if (quiet) say("down", `nothing on the bus for ${view.silent.toFixed(0)} s`);
+  else say("up", "live");
   view.robots.forEach(drawRobot);
+  drawRun(view);
   drawFigures(view);
-  drawCurve(view.returns);
+  drawCurves(view.returns);
   drawLists(view);
   document.body.dataset.drawn = String((drawn += 1));
 };
-events.onerror = () => say(false, "`brakeline watch` does not answer; trying again");
+events.onerror = () => {
+  if (at("link").className !== "ended") say("down", "`brakeline watch` does not answer; trying again");
+};

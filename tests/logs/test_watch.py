@@ -1,0 +1,131 @@
+"""What the live page says: of the whole run, of each robot kind apart, and that a run has ended rather than died."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from logs.metrics import Metrics
+from logs.watch.board import Board
+from logs.watch.server import Server
+from logs.watch.totals import heard, told, totals
+from messaging import brakeline_pb2 as pb
+from tests.browser import CHROMIUM, Page
+from tests.logs.conftest import Say
+
+
+def step(robot: str, actor: str, number: int, reward: float, last: bool = False) -> pb.Step:
+    size = {"ground": 5, "quadrotor": 9}[robot]
+    return pb.Step(
+        robot=robot, actor=actor, step=number, reward=reward, state=[0.1] * size, terminated=last, goal=last, speed=0.1
+    )
+
+
+def health(name: str, last: bool = False, **told: Any) -> pb.Health:
+    return pb.Health(process=name, last=last, **told)
+
+
+@pytest.fixture
+def mixed(say: Say) -> Board:
+    """A board in the middle of a run with two robot kinds, of which each ends an episode while it is watched."""
+    board = Board()
+    for number in range(3):
+        board.take(say("step/ground/a", step("ground", "a", number, 10.0, number == 2)))
+        board.take(say("step/quadrotor/b", step("quadrotor", "b", number, -1.0, number == 2)))
+    board.take(say("health/learner", health("learner")))
+    return board
+
+
+def launched(say: Say, board: Board, last: bool = False, outcome: str = "") -> None:
+    """What the launcher says: ten times as many steps as were watched."""
+    notes = {"run": "crossing", "method": "ddpc", "arena": "dense", "seed": "3", "steps": "600"}
+    counts = {"steps": 30.0, "episodes": 10.0, "goals": 9.0, "collisions": 0.0, "interventions": 3.0, "failsafes": 1.0}
+    figures = told({"ground": counts | {"reward": 290.0}, "quadrotor": counts | {"reward": -30.0}})
+    notes |= {"outcome": outcome} if outcome else {}
+    board.take(say("health/launcher", health("launcher", last, figures=figures, notes=notes)))
+
+
+def test_rewards_of_different_robots_are_not_mixed(mixed: Board) -> None:
+    shown = mixed.view()
+    assert {robot: counts["mean_reward"] for robot, counts in shown["totals"].items()} == {
+        "ground": 30.0,
+        "quadrotor": -3.0,
+    }
+    assert shown["returns"] == {"ground": [30.0], "quadrotor": [-3.0]}
+
+
+def test_counts_are_of_the_whole_run_or_it_is_said_that_they_are_not(say: Say, mixed: Board) -> None:
+    shown = mixed.view()
+    assert shown["since"] is not None and shown["totals"]["ground"]["steps"] == 3
+    launched(say, mixed)
+    mixed._figures_at = -1e9
+    shown = mixed.view()
+    assert shown["since"] is None and shown["totals"]["ground"]["steps"] == 30
+    assert shown["totals"]["ground"]["mean_reward"] == 29.0
+    assert shown["run"] == {"run": "crossing", "method": "ddpc", "arena": "dense", "seed": "3", "steps": "600"}
+
+
+def test_a_run_that_ended_in_order_is_not_a_run_that_died(say: Say, mixed: Board) -> None:
+    launched(say, mixed)
+    assert mixed.view()["processes"] == {"launcher": "alive", "learner": "alive"}
+    mixed.take(say("health/learner", health("learner", last=True)))
+    launched(say, mixed, last=True, outcome="finished")
+    mixed._heard -= 1000.0
+    mixed._figures_at = -1e9
+    shown = mixed.view()
+    assert shown["run"]["outcome"] == "finished"
+    assert shown["processes"] == {"launcher": "ended", "learner": "ended"}
+
+
+def test_who_said_no_goodbye_is_silent(say: Say, mixed: Board) -> None:
+    launched(say, mixed)
+    mixed._heard -= 1000.0
+    shown = mixed.view()
+    assert "outcome" not in shown["run"] and shown["processes"] == {"launcher": "silent", "learner": "silent"}
+
+
+def test_what_a_launcher_tells_is_what_it_counted() -> None:
+    metrics = Metrics()
+    for number in range(4):
+        metrics.add("step/ground/a", step("ground", "a", number, 2.5, number == 3))
+    counted = totals(metrics)
+    assert counted["ground"]["reward"] == 10.0 and counted["ground"]["goals"] == 1
+    odd = {
+        "restarts actor-0": 1.0,
+        "ground steps2": 1.0,
+        "air steps": 4.0,
+        "air reward": float("nan"),
+        "passed over": 0.0,
+    }
+    assert heard(told(counted) | odd) == counted
+
+
+@pytest.fixture
+def page(mixed: Board, tmp_path: Path) -> Iterator[Page]:
+    if CHROMIUM is None:
+        pytest.skip("there is no Chromium: the live page was not looked at")
+    with Server(mixed.view) as server, Page(tmp_path / "profile", 390, 844) as page:
+        page.open(server.url)
+        page.until("document.body.dataset.drawn > 0")
+        yield page
+
+
+def test_the_page_says_so(say: Say, mixed: Board, page: Page) -> None:
+    tiles = "[...document.querySelectorAll('#figures .group')].map(g => g.dataset.robot + ': ' + g.textContent)"
+    page.until(f"{tiles}.length === 2")
+    assert "that were watched" in page.value("document.getElementById('scope').textContent")
+    page.until("document.getElementById('link').textContent === 'live'")
+    launched(say, mixed)
+    mixed.take(say("health/learner", health("learner", last=True)))
+    launched(say, mixed, last=True, outcome="finished")
+    page.until("document.getElementById('link').textContent === 'the run has ended: finished'")
+    page.until("document.getElementById('scope').textContent.startsWith('Counts are of the whole run')")
+    page.until("document.getElementById('done').textContent === '60 of 600 steps (10 %)'")
+    mixed._heard -= 1000.0
+    page.until("document.querySelectorAll('#processes .ended').length === 2")
+    assert page.value("document.getElementById('link').className") == "ended"
+    rewards = "[...document.querySelectorAll('#figures .group')].map(g => g.querySelectorAll('dd')[6].textContent)"
+    assert page.value(rewards) == ["29.0", "-3.0"]
+    assert page.value("document.documentElement.scrollWidth") <= 390, "nothing sticks out of a phone"
+    assert page.complaints == []
