@@ -5,13 +5,13 @@ from __future__ import annotations
 import contextlib
 import json
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 from logs.container import Series
 from logs.gallery import Gallery, Source
-from logs.metrics import Metrics, closed_loop, covered
+from logs.metrics import Metrics, closed_loop, together
 from logs.places import Places
 from logs.reader import Log, Paths, by_run, find
 from logs.tally import Figures
@@ -33,53 +33,29 @@ class Look:
 
 
 class Analysis:
-    """Takes whole runs; `figures` and `pictures` are what they come to, together."""
+    """Takes the log of one run; `figures` and `pictures` are what it comes to."""
 
-    def __init__(self, look: Look | None = None) -> None:
+    def __init__(self, label: str, log: Log, look: Look | None = None, prefix: str = "") -> None:
+        """`prefix` goes before the names of actors in episodes: it tells runs apart."""
+        self.label, self.log, self.prefix = label, log, prefix
         self.look = look or Look()
         self.metrics = Metrics()
         self.training: dict[str, Training] = {}  # by robot kind
         self.places: dict[str, Places] = {}
         self.galleries: dict[str, Gallery] = {}
         self.timeline = Timeline()
-        self.runs: dict[str, Figures] = {}
-        self.logs: list[Log] = []
         self._drawn: dict[Series, tuple[Places, Gallery, Source]] = {}
         self._kept: dict[Series, deque[Any]] = {}
         self._tolerance = Tolerance()
-
-    def run(self, label: str, log: Log, alone: bool) -> None:
-        """Take the log of a run. If it is not `alone`, `label` goes before the names of its actors and processes."""
-        prefix = "" if alone else f"{label}/"
-        self.metrics.prefix = prefix
-        for training in self.training.values():
-            training.begins()
-        for gallery in self.galleries.values():
-            gallery.label = prefix
-        before = set(self.metrics.streams)
         self._take(log)
         for gallery in self.galleries.values():
             gallery.close()
         self._drawn.clear()
         self._kept.clear()
-        self.logs.append(log)
-        self.runs[label] = self._about(log, prefix, before)
 
     def figures(self) -> Figures:
-        """All figures of all runs; `runs` has those that differ, by run."""
-        cuts = [str(cut) for log in self.logs for cut in log.cuts]
-        return {
-            **_common([{name: run[name] for name in SETUP} for run in self.runs.values()], SETUP),
-            **self.metrics.figures(),
-            "training": {robot: self.training[robot].figures() for robot in sorted(self.training)},
-            "runs": self.runs,
-            "metadata": _common([run["metadata"] for run in self.runs.values()]),
-            "log": [str(path) for log in self.logs for path in log.paths],
-            "segments": [_segment(segment) for log in self.logs for segment in log.segments],
-            "cuts": cuts,
-            "malformed": sum(log.malformed for log in self.logs),
-            **self._episode(),
-        }
+        """All figures of the run."""
+        return Analyses([self]).figures()
 
     def pictures(self) -> Figures:
         """What the report draws besides the figures."""
@@ -148,59 +124,92 @@ class Analysis:
         gallery = self.galleries.get(robot)
         if gallery is None:
             gallery = self.galleries[robot] = Gallery(robot, self.look.episode, self.look.actor)
-            gallery.label = self.metrics.prefix
+            gallery.label = self.prefix
         return gallery
 
     def _learner(self, _: Series, message: Any) -> None:
         self.training.setdefault(message.robot, Training()).known(message.weights_version)
 
     def _health(self, _: Series, message: Any) -> None:
-        self.timeline.health(self.metrics.prefix + message.process, message)
+        self.timeline.health(message.process, message)
 
     def _line(self, _: Series, message: Any) -> None:
-        self.timeline.line(self.metrics.prefix + message.process, message)
+        self.timeline.line(message.process, message)
 
-    def _about(self, log: Log, prefix: str, before: set[tuple[str, int]]) -> Figures:
-        """A run's row: how it was set up, what came of it, and what is missing."""
-        metrics = self.metrics
-        names = sorted(name for name in metrics.actors if name.startswith(prefix))
-        streams = {place: stream for place, stream in metrics.streams.items() if place not in before}
-        spans = metrics.spans(streams)
+    def about(self) -> Figures:
+        """The run's row: how it was set up, what came of it, and what is missing."""
+        metrics, log = self.metrics, self.log
         about = log.metadata.get("run", {})
         setup: Figures = {name: about.get(name) for name in SETUP}
         if setup["seed"] is not None and setup["seed"].lstrip("-").isdigit():
             setup["seed"] = int(setup["seed"])
         return {
             **setup,
-            **closed_loop([metrics.actors[name] for name in names]),
-            "seconds": covered(spans.values()),
-            "messages": sum(stream.received for stream in streams.values()),
-            "missing": sum(stream.missing for stream in streams.values()),
-            "duplicates": sum(stream.duplicates for stream in streams.values()),
+            **closed_loop([metrics.actors[name] for name in sorted(metrics.actors)]),
+            "seconds": metrics.seconds(),
+            "messages": sum(stream.received for stream in metrics.streams.values()),
+            "missing": sum(stream.missing for stream in metrics.streams.values()),
+            "duplicates": sum(stream.duplicates for stream in metrics.streams.values()),
             "files": len(log.paths),
             "cuts": [str(cut) for cut in log.cuts],
             "metadata": _metadata(log),
         }
 
+
+class Analyses:
+    """Several runs beside each other: counts are summed up, curves and processes stay each run's own."""
+
+    def __init__(self, parts: Sequence[Analysis]) -> None:
+        self.parts = parts
+
+    def figures(self) -> Figures:
+        """All figures; `runs` has those of each run. With several runs, their labels go before the names of actors,
+        learners, processes and of the robot kinds in `training`."""
+        rows = {part.label: part.about() for part in self.parts}
+        logs = [part.log for part in self.parts]
+        every = together({part.prefix: part.metrics for part in self.parts})
+        return {
+            **_common([{name: run[name] for name in SETUP} for run in rows.values()], SETUP),
+            **every,
+            "training": {
+                part.prefix + robot: part.training[robot].figures()
+                for part in self.parts
+                for robot in sorted(part.training)
+            },
+            "runs": rows,
+            "metadata": _common([run["metadata"] for run in rows.values()]),
+            "log": [str(path) for log in logs for path in log.paths],
+            "segments": [_segment(segment) for log in logs for segment in log.segments],
+            "cuts": [str(cut) for log in logs for cut in log.cuts],
+            "malformed": sum(log.malformed for log in logs),
+            **self._episode(),
+        }
+
+    def pictures(self) -> Figures:
+        """What the report draws of each run, by its label."""
+        return {part.label: part.pictures() for part in self.parts}
+
     def _episode(self) -> Figures:
-        if self.look.episode is None:
+        """The episode that was asked for, of every run."""
+        wanted = next((part.look.episode for part in self.parts), None)
+        if wanted is None:
             return {}
-        found = [episode for robot in sorted(self.galleries) for episode in self.galleries[robot].found]
-        return {"episode": self.look.episode, "episode_detail": found}
+        galleries = [part.galleries[robot] for part in self.parts for robot in sorted(part.galleries)]
+        return {"episode": wanted, "episode_detail": [episode for gallery in galleries for episode in gallery.found]}
 
 
-def analysed(paths: Paths, look: Look | None = None) -> Analysis:
-    """Everything about the logs at `paths`, all runs together.
+def analysed(paths: Paths, look: Look | None = None) -> Analyses:
+    """Everything about the logs at `paths`, run by run.
 
     Raises:
         NoLog: there is none.
         NotALog: a file is something else.
     """
-    analysis = Analysis(look)
     runs = by_run(find(paths))
-    for label, files in runs.items():
-        analysis.run(label, Log(files), alone=len(runs) == 1)
-    return analysis
+    several = len(runs) > 1
+    return Analyses(
+        [Analysis(label, Log(files), look, f"{label}/" if several else "") for label, files in runs.items()]
+    )
 
 
 def _metadata(log: Log) -> Figures:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
@@ -74,7 +74,6 @@ class Metrics:
     """
 
     def __init__(self, topics: Iterable[Topic] = RECORDED) -> None:
-        self.prefix = ""  # before the names of actors, learners and processes: tells runs apart
         self.actors: dict[str, Tally] = {}
         self.decisions: dict[str, Decisions] = {}  # by actor
         self.streams: dict[tuple[str, int], Stream] = {}  # by key and start of the process
@@ -121,25 +120,7 @@ class Metrics:
 
     def figures(self) -> Figures:
         """All figures; None where nothing was measured."""
-        seconds = self.seconds()
-        names = sorted(self.actors)
-        figures = closed_loop([self.actors[name] for name in names])
-        robots = sorted({tally.robot for tally in self.actors.values()})
-        by_robot = {
-            robot: [self.actors[name] for name in names if self.actors[name].robot == robot] for robot in robots
-        }
-        return figures | {
-            "seconds": seconds,
-            "steps_per_s": figures["steps"] / seconds if seconds > 0.0 else None,
-            "driven_s": self.seconds(STEP),
-            "robots": {robot: closed_loop(tallies) for robot, tallies in by_robot.items()},
-            "actors": {name: closed_loop([self.actors[name]]) for name in names},
-            "learners": {robot: learner(self.learners[robot]) for robot in sorted(self.learners)},
-            **joined([self.decisions[name] for name in sorted(self.decisions)]).figures(),
-            "topics": self.topics(),
-            "processes": {name: self._process(self.processes[name]) for name in sorted(self.processes)},
-            "log_lines": dict(sorted(self.log_lines.items())),
-        }
+        return together({"": self})
 
     def seconds(self, topic: Topic | None = None) -> float:
         """How long at least one process was heard of (of the topic: from its first to its last message); a pause before
@@ -174,7 +155,9 @@ class Metrics:
                 spans[run] = min(first, stream.first_at), max(last, stream.last_at)
         return spans
 
-    def _process(self, process: ProcessFigures) -> Figures:
+    def process(self, name: str) -> Figures:
+        """The figures of a process; how it ended is seen from the last message of all."""
+        process = self.processes[name]
         spans = self.spans(self.streams)
         seconds = math.fsum((spans[run][1] - spans[run][0]) * 1e-9 for run in process.runs if run in spans)
         messages = sum(stream.received for (_, run), stream in self.streams.items() if run in process.runs)
@@ -198,22 +181,22 @@ class Metrics:
         return _entered(self.streams, (key, run), Stream)
 
     def _step(self, step: pb.Step) -> None:
-        name = self.prefix + step.actor
+        name = step.actor
         tally = self.actors.get(name) or _entered(self.actors, name, Tally)
         tally.step(step)
 
     def _exchange(self, exchange: pb.Exchange) -> None:
-        name = self.prefix + exchange.request.actor
+        name = exchange.request.actor
         decisions = self.decisions.get(name) or _entered(self.decisions, name, Decisions)
         decisions.exchange(exchange)
 
     def _learner(self, metrics: pb.LearnerMetrics) -> None:
-        name = self.prefix + metrics.robot
+        name = metrics.robot
         _entered(self.learners, name, pb.LearnerMetrics)
         self.learners[name] = metrics
 
     def _health(self, health: pb.Health) -> None:
-        process = _entered(self.processes, self.prefix + health.process, ProcessFigures)
+        process = _entered(self.processes, health.process, ProcessFigures)
         now = health.header.wall_time
         if health.header.run == process.run:
             silence = (now - process.heard_at) * 1e-9
@@ -242,6 +225,47 @@ def _entered(table: dict[K, V], name: K, make: Callable[[], V]) -> V:
             raise Crowded(f"{name} is one more than {MOST_STREAMS}")
         table[name] = make()
     return table[name]
+
+
+def together(runs: Mapping[str, Metrics]) -> Figures:
+    """The figures of runs, by the prefix that tells apart the names of their actors, learners and processes.
+
+    Counts and histograms are those of all; each process is seen against its own run, so that who ended with an earlier
+    one is not missed.
+    """
+    actors = {prefix + name: tally for prefix, run in runs.items() for name, tally in run.actors.items()}
+    names = sorted(actors)
+    figures = closed_loop([actors[name] for name in names])
+    robots = sorted({tally.robot for tally in actors.values()})
+    by_robot = {robot: [actors[name] for name in names if actors[name].robot == robot] for robot in robots}
+    decisions = {prefix + name: part for prefix, run in runs.items() for name, part in run.decisions.items()}
+    learners = {prefix + robot: last for prefix, run in runs.items() for robot, last in run.learners.items()}
+    seconds = covered(span for run in runs.values() for span in run.spans(run.streams).values())
+    return figures | {
+        "seconds": seconds,
+        "steps_per_s": figures["steps"] / seconds if seconds > 0.0 else None,
+        "driven_s": math.fsum(run.seconds(STEP) for run in runs.values()),
+        "robots": {robot: closed_loop(tallies) for robot, tallies in by_robot.items()},
+        "actors": {name: closed_loop([actors[name]]) for name in names},
+        "learners": {robot: learner(learners[robot]) for robot in sorted(learners)},
+        **joined([decisions[name] for name in sorted(decisions)]).figures(),
+        "topics": _summed([run.topics() for run in runs.values()]),
+        "processes": {
+            prefix + name: run.process(name) for prefix, run in runs.items() for name in sorted(run.processes)
+        },
+        "log_lines": dict(sorted(sum((run.log_lines for run in runs.values()), Counter[str]()).items())),
+    }
+
+
+def _summed(parts: Iterable[dict[str, dict[str, int]]]) -> dict[str, dict[str, int]]:
+    """Counts by key and name, added up."""
+    totals: dict[str, dict[str, int]] = {}
+    for part in parts:
+        for key, counts in part.items():
+            known = totals.setdefault(key, dict.fromkeys(counts, 0))
+            for name, count in counts.items():
+                known[name] += count
+    return dict(sorted(totals.items()))
 
 
 def covered(spans: Iterable[tuple[int, int]]) -> float:

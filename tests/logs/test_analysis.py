@@ -136,7 +136,7 @@ def test_an_episode_in_detail_is_what_was_recorded(log: Path) -> None:
 
 
 def test_the_nearest_misses_are_the_nearest(log: Path) -> None:
-    pictures = analysed(log, Look(pictures=True)).pictures()
+    pictures = analysed(log, Look(pictures=True)).pictures()["mixed"]
     closest: dict[tuple[str, int, int], float] = {}
     for key, step in once(decoded(find(log))):
         if key.startswith("step/ground"):
