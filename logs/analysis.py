@@ -128,7 +128,7 @@ class Analysis:
         return gallery
 
     def _learner(self, _: Series, message: Any) -> None:
-        self.training.setdefault(message.robot, Training()).known(message.weights_version)
+        self.training.setdefault(message.robot, Training()).learner(message)
 
     def _health(self, _: Series, message: Any) -> None:
         self.timeline.health(message.process, message)
@@ -167,13 +167,14 @@ class Analyses:
         learners, processes and of the robot kinds in `training`."""
         rows = {part.label: part.about() for part in self.parts}
         logs = [part.log for part in self.parts]
-        every = together({part.prefix: part.metrics for part in self.parts})
+        prefixes = [part.prefix if len(self.parts) > 1 else "" for part in self.parts]
+        every = together({prefix: part.metrics for prefix, part in zip(prefixes, self.parts, strict=True)})
         return {
             **_common([{name: run[name] for name in SETUP} for run in rows.values()], SETUP),
             **every,
             "training": {
-                part.prefix + robot: part.training[robot].figures()
-                for part in self.parts
+                prefix + robot: part.training[robot].figures()
+                for prefix, part in zip(prefixes, self.parts, strict=True)
                 for robot in sorted(part.training)
             },
             "runs": rows,
@@ -185,9 +186,9 @@ class Analyses:
             **self._episode(),
         }
 
-    def pictures(self) -> Figures:
-        """What the report draws of each run, by its label."""
-        return {part.label: part.pictures() for part in self.parts}
+    def each(self) -> dict[str, tuple[Figures, Figures]]:
+        """Figures and pictures of every run by itself, by its label."""
+        return {part.label: (part.figures(), part.pictures()) for part in self.parts}
 
     def _episode(self) -> Figures:
         """The episode that was asked for, of every run."""

@@ -11,9 +11,9 @@ from rich.text import Text
 from logs.analysis import SETUP, analysed
 from logs.metrics import Figures
 from logs.reader import Paths
+from logs.tables import PLAIN, Stacking
 
 BLOCKS = "▁▂▃▄▅▆▇█"
-PLAIN: dict[str, Any] = {"box": None, "padding": (0, 2, 0, 0)}
 
 
 def analyse(paths: Paths) -> Figures:
@@ -27,24 +27,29 @@ def analyse(paths: Paths) -> Figures:
     return analysed(paths).figures()
 
 
-def show(figures: Figures) -> RenderableType:
-    """The figures that `analyse`, `Metrics` or `closed_loop` gave, as tables for a rich console."""
-    parts: list[RenderableType] = [_summary(figures)]
-    if len(figures.get("runs", {})) > 1:
-        parts.append(_runs(figures["runs"]))
-    if any(part for parts in figures.get("latency_ms", {}).values() for part in parts.values()):
-        parts.append(_latency(figures["latency_ms"]))
-    elif figures.get("decision_ms"):
-        parts.append(_decisions(figures["decision_ms"]))
+def show(figures: Figures, verbose: bool = False) -> RenderableType:
+    """The figures that `analyse`, `Metrics` or `closed_loop` gave, as tables for a rich console. Several runs stand
+    beside each other, and nothing of them is pooled; `verbose`: with all that the log says of its making."""
+    several = len(figures.get("runs", {})) > 1
+    parts: list[RenderableType] = [_runs(figures["runs"]) if several else _summary(figures)]
+    if not several:
+        parts += _times(figures)
     parts += [_training(robot, training) for robot, training in figures.get("training", {}).items()]
     if figures.get("processes") and figures.get("topics"):
         parts.append(_processes(figures["processes"]))
     if figures.get("topics"):
         parts.append(_topics(figures["topics"]))
-    if figures.get("metadata"):
+    if verbose and figures.get("metadata"):
         parts.append(_metadata(figures["metadata"]))
     parts += [Text(cut, "yellow") for cut in figures.get("cuts", ())]
     return Group(*parts)
+
+
+def _times(figures: Figures) -> list[RenderableType]:
+    """How long decisions took: by part where the exchanges were recorded."""
+    if any(part for parts in figures.get("latency_ms", {}).values() for part in parts.values()):
+        return [_latency(figures["latency_ms"])]
+    return [_decisions(figures["decision_ms"])] if figures.get("decision_ms") else []
 
 
 def show_episode(episode: Figures) -> RenderableType:
@@ -54,7 +59,7 @@ def show_episode(episode: Figures) -> RenderableType:
         f"{episode['actor']}, episode {episode['episode']} ({episode['arena'] or 'its beginning is in no file'}): "
         f"{episode['outcome']} after {episode['steps']} steps, reward {episode['reward']:.2f}{closest}"
     )
-    table = Table(
+    table = Stacking(
         "step", "x, y [m]", "proposed", "executed", "decision", "ms", "margin [m]", "clear [m]", "why", **PLAIN
     )
     for row in episode["rows"]:
@@ -77,7 +82,7 @@ def _vector(values: list[float]) -> str:
 
 
 def _summary(figures: Figures) -> Table:
-    table = Table(show_header=False, **PLAIN)
+    table = Stacking(show_header=False, **PLAIN)
     episodes, steps = figures["episodes"], figures["steps"]
     within = figures.get("intervals") or {}
     setup = [f"{name} {figures[name]}" for name in SETUP if figures.get(name) is not None]
@@ -91,7 +96,8 @@ def _summary(figures: Figures) -> Table:
     interventions = _share(figures["interventions"], steps, within.get("interventions"))
     table.add_row("interventions", f"{interventions}, of these failsafe {figures['failsafes']}")
     table.add_row(
-        "speed", _optional("{:.3f} m/s", figures["mean_speed"]) + _optional(", at most {:.3f}", figures["max_speed"])
+        "speed",
+        _optional("{:.3f} m/s", figures["mean_speed"]) + _optional(", at most {:.3f} m/s", figures["max_speed"]),
     )
     table.add_row("closest approach", _optional("{:.3f} m", figures.get("closest_approach")))
     containment = figures["containment"]
@@ -134,7 +140,7 @@ LEARNER = (
 def _runs(runs: dict[str, Figures]) -> Table:
     """One row for each run, where there are several."""
     columns = ("method", "certificate", "seed", "steps", "episodes", "goals", "collisions", "interventions", "reward")
-    table = Table("run", *columns, **PLAIN)
+    table = Stacking("run", *columns, **PLAIN)
     for label, run in runs.items():
         setup = ["-" if run[name] is None else str(run[name]) for name in ("method", "certificate", "seed")]
         episodes = run["episodes"]
@@ -146,7 +152,7 @@ def _runs(runs: dict[str, Figures]) -> Table:
 
 
 def _decisions(times: Figures) -> Table:
-    table = Table("decision [ms]", "mean", "std", "p50", "p99", **PLAIN)
+    table = Stacking("decision [ms]", "mean", "std", "p50", "p99", **PLAIN)
     for kind in ("all", "allowed", "adjusted", "failsafe"):
         row = times if kind == "all" else times[kind]
         if row is not None:
@@ -157,7 +163,7 @@ def _decisions(times: Figures) -> Table:
 def _latency(latency: Figures) -> Table:
     """Where the time of a decision goes, by its kind."""
     columns = ("mean", "std", "p50", "p90", "p99", "max")
-    table = Table("decision [ms]", "part", *columns, **PLAIN)
+    table = Stacking("decision [ms]", "part", *columns, **PLAIN)
     for kind, parts in latency.items():
         for part, row in parts.items():
             if row is not None:
@@ -169,7 +175,7 @@ def _latency(latency: Figures) -> Table:
 def _training(robot: str, training: Figures) -> Table:
     """Rates over the training, as rows of characters."""
     bins = _coarse(training["bins"], 60)
-    table = Table(f"{robot} over training", "first", "last", "", **PLAIN)
+    table = Stacking(f"{robot} over training", "first", "last", "", **PLAIN)
     for label, name in (("interventions", "interventions"), ("goals", "goals"), ("reward", "reward")):
         values = [row[name] for row in bins if row[name] is not None]
         if values:
@@ -207,7 +213,7 @@ def _sparkline(values: list[float]) -> str:
 
 
 def _processes(processes: Figures) -> Table:
-    table = Table("process", "starts", "seconds", "messages/s", "silences", "ended", **PLAIN)
+    table = Stacking("process", "starts", "lived, s", "messages/s", "silences", "ended", **PLAIN)
     for name, process in processes.items():
         rate = _optional("{:.1f}", process["messages_per_s"])
         longest = process["longest_silence"]
@@ -218,7 +224,7 @@ def _processes(processes: Figures) -> Table:
 
 
 def _topics(topics: dict[str, dict[str, int]]) -> Table:
-    table = Table("topic", "messages", "missing", "duplicates", **PLAIN)
+    table = Stacking("topic", "messages", "missing", "duplicates", **PLAIN)
     for key, counts in topics.items():
         table.add_row(key, *(str(counts[name]) for name in ("messages", "missing", "duplicates")))
     return table
@@ -226,7 +232,7 @@ def _topics(topics: dict[str, dict[str, int]]) -> Table:
 
 def _metadata(metadata: Figures) -> Table:
     """What the log says of its run; the configuration is long, and left to --json and --html."""
-    table = Table("metadata", "", **PLAIN)
+    table = Stacking("metadata", "", **PLAIN)
     for name, values in metadata.items():
         if name != "configuration" and isinstance(values, dict):
             table.add_row(name, Text(", ".join(f"{key} {value}" for key, value in values.items())))

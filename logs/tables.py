@@ -31,10 +31,13 @@ class Stacking(Table):
     def _stacked(self) -> RenderResult:
         if self.title:
             yield Text.assemble((str(self.title), "italic"))
-        heads = [str(column.header) for column in self.columns]
+        heads = [str(column.header) if self.show_header else "" for column in self.columns]
         cells = [list(column.cells) for column in self.columns]
         for row in zip(*cells, strict=True):
             first, *rest = (Text.from_markup(cell) if isinstance(cell, str) else cell for cell in row)
+            if not self.show_header:
+                yield Text.assemble(first, ": ", *rest)
+                continue
             yield Text.assemble((f"{heads[0]}: " if heads[0] else "", "dim"), first)
             for head, cell in zip(heads[1:], rest, strict=True):
                 if str(cell):

@@ -95,6 +95,7 @@ class Page:
 
     def pdf(self) -> bytes:
         """The page as it is printed, on A4."""
+        self.call("Emulation.setEmulatedMedia", media="", features=[])
         return base64.b64decode(self.call("Page.printToPDF", paperWidth=8.27, paperHeight=11.69)["data"])
 
     def open(self, url: str) -> None:

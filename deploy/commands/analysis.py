@@ -11,6 +11,7 @@ from typing import Annotated, Any
 import tyro
 
 from deploy.commands.common import console, errors, say_json
+from deploy.progress import under_way
 from logs.analysis import Look, analysed
 from logs.figures import draw
 from logs.page import write
@@ -31,6 +32,8 @@ class Analyse:
     """Show the episode of this number step by step, of every actor."""
     actor: str | None = None
     """With --episode: of this actor only."""
+    verbose: bool = False
+    """Say also how the run was made: sensors' errors, model sets, versions."""
     json: bool = False
     csv: bool = False
     """Print a table with a row for each run (with --episode: for each step)."""
@@ -38,13 +41,14 @@ class Analyse:
     def run(self) -> int:
         if self.json and self.csv:
             raise ValueError("--json or --csv: one of them")
-        analysis = analysed(list(self.logs), Look(self.html is not None, self.episode, self.actor))
+        with under_way("reading " + ", ".join(map(str, self.logs))):
+            analysis = analysed(list(self.logs), Look(self.html is not None, self.episode, self.actor))
         figures = analysis.figures()
         if self.episode is not None and not figures["episode_detail"]:
             whose = f" of {self.actor}" if self.actor else ""
             raise ValueError(f"there is no episode {self.episode}{whose} in {', '.join(figures['log'])}")
         if self.html is not None:
-            write(self.html, figures, analysis.pictures())
+            write(self.html, figures, analysis.each())
             errors.print(f"report: {self.html}", markup=False)
         if self.png is not None:
             draw(figures["training"], self.png)
@@ -64,7 +68,7 @@ class Analyse:
             for episode in detail:
                 console.print(show_episode(episode))
         else:
-            console.print(show(figures))
+            console.print(show(figures, self.verbose))
 
 
 @dataclass(frozen=True)

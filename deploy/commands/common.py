@@ -10,11 +10,13 @@ from typing import Annotated, Any, Literal, TypeVar
 
 import tyro
 from rich.console import Console
+from rich.table import Table
 
 from actors.flight import FlightSettings
 from deploy.run.configurations import RunConfig
 from deploy.run.keys import own_keys
 from deploy.run.places import client_of
+from logs.tables import PLAIN, Stacking
 from messaging.bus import BusSettings
 from messaging.ports import free_endpoint
 from safety.model_set import Recipe
@@ -170,3 +172,11 @@ console = Console(highlight=False, soft_wrap=True)
 errors = Console(stderr=True, highlight=False, soft_wrap=True)
 
 Robot = Annotated[str, tyro.conf.Positional]
+
+
+def conditions(about: dict[str, str]) -> Table:
+    """How data were recorded, a line each."""
+    shown = Stacking(show_header=False, **PLAIN)
+    for name, value in about.items():
+        shown.add_row(name.replace("_", " "), value)
+    return shown

@@ -10,11 +10,11 @@ from typing import Annotated, Any
 import tyro
 from rich.table import Table
 
-from deploy.commands.common import Endpoints, Flags, Mode, Physics, Robot, console, errors, say_json
+from deploy.commands.common import Endpoints, Flags, Mode, Physics, Robot, conditions, console, errors, say_json
 from deploy.data.logged import Recorded, from_log
 from deploy.data.store import SEED, certified, data_for, model_path, record_path, recorded
 from deploy.progress import under_way
-from logs.tables import PLAIN, Stacking
+from logs.tables import Stacking
 from messaging import brakeline_pb2 as pb
 from messaging.bus import Bus
 from messaging.tasks import learnt
@@ -152,11 +152,3 @@ def width(metres: float) -> str:
     if not metres < DIVERGES:
         return "diverges"
     return f"{1e3 * metres:.1f} mm" if metres < 1.0 else f"{metres:.1f} m"
-
-
-def conditions(about: dict[str, str]) -> Table:
-    """How data were recorded, a line each."""
-    shown = Stacking(show_header=False, **PLAIN)
-    for name, value in about.items():
-        shown.add_row(name.replace("_", " "), value)
-    return shown

@@ -5,9 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
-from deploy.commands.common import Filtering, Flags, Physics, Robot, console, errors, say_json
+from deploy.commands.common import Filtering, Flags, Physics, Robot, conditions, console, errors, say_json
+from deploy.progress import under_way
 from deploy.study.evaluate import Evaluation, evaluate, prepared
 from logs.metrics import Tally
 from logs.report import show
@@ -30,6 +29,8 @@ class Evaluate:
     """Also draw an episode from above, with tube and plan, into this file (.png, .gif, .mp4)."""
     episode: int = 0
     """Which one to draw."""
+    verbose: bool = False
+    """Say also the conditions: sensors' errors, wind, load."""
     json: bool = False
 
     def run(self) -> int:
@@ -45,20 +46,19 @@ class Evaluate:
         )
         if self.render is not None:
             self._draw(robot, what, self.render)
-        columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
-        with Progress(*columns, console=errors, transient=True, disable=not errors.is_terminal) as progress:
-            task = progress.add_task("episodes", total=self.episodes)
+        with under_way("driving episodes", self.episodes) as advance:
 
             def each(tally: Tally) -> None:
                 told = f"goals {tally.goals}, collisions {tally.collisions}, interventions {tally.interventions}"
-                progress.update(task, advance=1, description=told)
+                advance(what=told)
 
             figures = evaluate(robot, what, each)
         if self.json:
             say_json(figures)
         else:
             console.print(show(figures))
-            console.print("[dim]conditions: " + ", ".join(f"{k} {v}" for k, v in figures["conditions"].items()) + "[/]")
+            if self.verbose:
+                console.print(conditions(figures["conditions"]))
         return 0
 
     def _draw(self, robot: RobotKind, what: Evaluation, path: Path) -> None:

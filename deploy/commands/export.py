@@ -8,7 +8,8 @@ from typing import Annotated, Any
 
 import tyro
 
-from deploy.commands.common import LATEST, console, errors, say_json
+from deploy.commands.common import LATEST, console, say_json
+from deploy.progress import under_way
 from messaging.tasks import learnt
 
 
@@ -35,7 +36,7 @@ class Export:
             raise ValueError(f"export to what? Give {', '.join(f'--{name}' for name in wanted)}, or several of them")
         figures: dict[str, Any] = {}
         for name in asked:
-            with errors.status(f"writing {getattr(self, name)}"):
+            with under_way(f"writing {getattr(self, name)}"):
                 figures[name] = wanted[name]()
         if self.json:
             say_json(figures)

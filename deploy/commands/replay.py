@@ -11,11 +11,11 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import tyro
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
-from deploy.commands.common import LATEST, Certificate, Mode, console, errors, say_json
+from deploy.commands.common import LATEST, Certificate, Mode, console, say_json
 from deploy.data.store import certified, model_for
+from deploy.progress import under_way
 from deploy.run.replay import Instead, replay
 from logs.extent import count
 from messaging.tasks import learnt
@@ -56,11 +56,11 @@ class Replay:
     def run(self) -> int:
         instead = self._instead()
         total = count(list(self.logs), EXCHANGE)
-        columns = TextColumn("requests"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
-        with Progress(*columns, console=errors, transient=True, disable=not errors.is_terminal) as progress:
-            task = progress.add_task("requests", total=total)
-            with quiet("brakeline.safety"):  # its warnings were about the robots of then
-                result = replay(list(self.logs), instead, lambda: progress.advance(task))
+        with (
+            under_way("asking every question again", total) as advance,
+            quiet("brakeline.safety"),  # its warnings were about the robots of then
+        ):
+            result = replay(list(self.logs), instead, advance)
         figures = result.figures() | {"log": [str(path) for path in self.logs], "instead": self._words()}
         if self.json:
             say_json(figures)

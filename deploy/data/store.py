@@ -107,8 +107,9 @@ def _begun(part: Path, robot: Robot, trajectories: int, seed: int, conditions: C
         kept = Dataset.load(part)
     except BadData:
         return []
-    same = kept.robot == robot and kept.about == collect.origin(seed, conditions)
-    return list(kept.trajectories[:trajectories]) if same else []
+    if kept.robot != robot or kept.about != collect.origin(seed, conditions):
+        return []
+    return [replace(t, before=None) for t in kept.trajectories[:trajectories]]  # as driven: from standing still
 
 
 def about(seconds: float) -> str:

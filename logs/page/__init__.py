@@ -11,22 +11,22 @@ import json
 import math
 import time
 from base64 import b64encode
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from hashlib import sha256
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-from jinja2 import Environment, StrictUndefined
+from jinja2 import Environment, FunctionLoader, StrictUndefined
 
+from logs.analysis import SETUP
 from logs.decisions import PARTS
 from logs.tally import Figures
 
 STYLES = ("report.css",)
-SCRIPTS = ("svg.js", "charts.js", "arena.js", "episodes.js", "main.js")
-
-# What the drawings need of the figures; the whole of them is what `analyse --json` is for.
-DRAWN = ("episodes", "steps", "intervals", "training", "runs", "containment")
+PAGE = "report.html.j2"
+PIECES = ("headline.html.j2", "details.html.j2")
+SCRIPTS = ("svg.js", "save.js", "learning.js", "charts.js", "arena.js", "episodes.js", "main.js")
 
 RATES = (  # name, of what, in words
     ("goals", "episodes", "goals reached"),
@@ -36,29 +36,44 @@ RATES = (  # name, of what, in words
 )
 
 
-def render(figures: Figures, pictures: Figures) -> str:
-    """The page about what an `Analysis` gave."""
-    environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+def render(figures: Figures, runs: Mapping[str, tuple[Figures, Figures]]) -> str:
+    """The page about runs, as `Analyses` gives them: what they share, their curves over each other, and each by itself
+    with its figures and pictures."""
+    environment = Environment(
+        loader=FunctionLoader(_text), autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
+    )
     environment.filters.update(number=number, percent=percent, moment=moment, pretty=pretty, raw=raw, hashed=hashed)
-    template = environment.from_string(_text("report.html.j2"))
-    drawn = {name: figures[name] for name in DRAWN} | pictures
-    drawn["runs"] = {label: {"seconds": run["seconds"]} for label, run in figures["runs"].items()}
-    return template.render(
+    environment.filters.update(within=within)
+    return environment.get_template(PAGE).render(
         f=figures,
+        several=len(runs) > 1,
         title=", ".join(figures["runs"]) or "no run",
-        rates=rates(figures),
-        parts=PARTS,
         missing=missing(figures),
+        parts=PARTS,
+        runs=[
+            {
+                "label": label,
+                "mark": f"run{place}-" if place else "",  # before names that a page has once
+                "f": own | {"rates": rates(own)},
+                "kept": sum(len(gallery["episodes"]) for gallery in pictures["galleries"].values()),
+            }
+            for place, (label, (own, pictures)) in enumerate(runs.items())
+        ],
         style="\n".join(map(_text, STYLES)),
         script="\n".join(['"use strict";', *map(_text, SCRIPTS)]),
-        data=embedded(drawn),
-        kept=sum(len(gallery["episodes"]) for gallery in pictures["galleries"].values()),
+        data=embedded([_drawn(label, own, pictures) for label, (own, pictures) in runs.items()]),
     )
 
 
-def write(path: Path, figures: Figures, pictures: Figures) -> None:
+def _drawn(label: str, figures: Figures, pictures: Figures) -> Figures:
+    """What the drawings need of a run; the whole of it is what `analyse --json` is for."""
+    setup = {name: figures[name] for name in SETUP}
+    return {"run": label, "setup": setup, "training": figures["training"]} | pictures
+
+
+def write(path: Path, figures: Figures, runs: Mapping[str, tuple[Figures, Figures]]) -> None:
     """Write the page to a file; its folder is made if it is missing."""
-    page = render(figures, pictures)
+    page = render(figures, runs)
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(page, encoding="utf-8")
 
@@ -125,6 +140,11 @@ def percent(share: float | None) -> str:
     return f"{value:.1f} %" if value >= 1.0 or value == 0.0 else f"{value:.2g} %"
 
 
+def within(interval: tuple[float, float] | None) -> str:
+    """An interval of a share, to stand behind it."""
+    return "" if interval is None else f" [{percent(interval[0])}, {percent(interval[1])}]"
+
+
 def moment(seconds: float | None) -> str:
     """A time since the Unix epoch, in UTC."""
     return "–" if seconds is None else time.strftime("%Y-%m-%d %H:%M:%S UTC", time.gmtime(seconds))
@@ -145,4 +165,4 @@ def _text(name: str) -> str:
 
 def names() -> Iterable[str]:
     """The files that a page is made of."""
-    return ("report.html.j2", *STYLES, *SCRIPTS)
+    return (PAGE, *PIECES, *STYLES, *SCRIPTS)

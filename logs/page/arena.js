@@ -66,23 +66,23 @@ function tube(v, t, footprint) {
 
 function robot(v, episode, k) {
   const x = v.x(episode.x[k]), y = v.y(episode.y[k]), r = Math.max(4, v.per * episode.footprint);
-  const parts = [tag("circle", { cx: x, cy: y, r, fill: "#1b2430", "fill-opacity": 0.12, stroke: "#1b2430", "stroke-width": 1.3 })];
-  if (episode.heading) parts.push(tag("line", { x1: x, y1: y, x2: x + r * Math.cos(episode.heading[k]), y2: y - r * Math.sin(episode.heading[k]), stroke: "#1b2430", "stroke-width": 1.6 }));
+  const parts = [tag("circle", { cx: x, cy: y, r, "fill-opacity": 0.12, class: "ink", "stroke-width": 1.3 })];
+  if (episode.heading) parts.push(tag("line", { x1: x, y1: y, x2: x + r * Math.cos(episode.heading[k]), y2: y - r * Math.sin(episode.heading[k]), class: "ink", "stroke-width": 1.6 }));
   return parts;
 }
 
 /** The episode at step `k`, within `box` or all of it. */
 function arena(episode, k, size, box = null) {
   const v = view(box || bounds(episode), size);
-  const parts = [tag("rect", { x: 0, y: 0, width: v.width, height: v.height, fill: "#fcfdfe" })];
+  const parts = [tag("rect", { x: 0, y: 0, width: v.width, height: v.height, class: "paper" })];
   parts.push(...episode.obstacles.map((o) => obstacle(v, o)));
   if (episode.goal) parts.push(tag("circle", { cx: v.x(episode.goal[0]), cy: v.y(episode.goal[1]), r: v.per * episode.goal_radius, fill: "#1d7f4e", "fill-opacity": 0.18, stroke: "#1d7f4e", "stroke-dasharray": "4 3" }));
-  if (episode.start) parts.push(tag("circle", { cx: v.x(episode.start[0]), cy: v.y(episode.start[1]), r: 3.5, fill: "#fff", stroke: "#1b2430", "stroke-width": 1.4 }));
+  if (episode.start) parts.push(tag("circle", { cx: v.x(episode.start[0]), cy: v.y(episode.start[1]), r: 3.5, fill: "#fff", class: "ink", "stroke-width": 1.4 }));
   parts.push(path(v, episode, episode.steps - 1, true), path(v, episode, Math.min(k, episode.x.length - 1), false));
   if (episode.tubes[k]) parts.push(tube(v, episode.tubes[k], episode.footprint));
   parts.push(robot(v, episode, k));
   const quarter = v.width / v.per / 4, power = 10 ** Math.floor(Math.log10(quarter));
   const length = power * [5, 2, 1].find((m) => m * power <= quarter);
-  parts.push(tag("path", { d: `M8 ${v.height - 12} v4 h${v.per * length} v-4`, fill: "none", stroke: "#1b2430" }), label(10, v.height - 14, `${figure(length)} m`));
+  parts.push(tag("path", { d: `M8 ${v.height - 12} v4 h${v.per * length} v-4`, fill: "none", class: "ink" }), label(10, v.height - 14, `${figure(length)} m`));
   return drawing(v.width, v.height, `${episode.actor}, episode ${episode.episode}, step ${episode.first + k}`, parts);
 }

@@ -1,7 +1,7 @@
-// Rates, learning curves, latencies, the map of interventions, the timeline of processes.
+// Rates, latencies, the map of interventions, the timeline of processes.
 
-function whiskers() {
-  for (const cell of document.querySelectorAll("td.whisker")) {
+function whiskers(root) {
+  for (const cell of root.querySelectorAll("td.whisker")) {
     const { rate, low, high } = cell.dataset;
     if (rate === "") continue;
     const most = Math.max(+high || 0, +rate) > 0.2 ? 1 : Math.max(+high || 0, +rate, 1e-9) * 1.15;
@@ -12,61 +12,6 @@ function whiskers() {
     parts.push(label(310, 14, `of ${percent(most)}`, { "text-anchor": "end" }));
     cell.innerHTML = drawing(312, 20, `${percent(+rate)}, interval ${percent(+low)} to ${percent(+high)}`, parts);
   }
-}
-
-const CURVES = [
-  { title: "goals reached", lines: [[(b) => b.goals, "#1d7f4e"]], form: percents, low: 0, high: 1, weight: "episodes" },
-  { title: "reward of an episode", lines: [[(b) => b.reward, "#2b6cb8"]], form: figure, weight: "episodes" },
-  { title: "interventions, share of steps", areas: true, form: percents, low: 0, weight: "steps",
-    lines: [[(b) => b.adjusted + b.failsafes, KINDS.d.color], [(b) => b.failsafes, KINDS.a.color]] },
-  { title: "closest approach in the bin [cm]", lines: [[(b) => b.closest === null ? null : 100 * b.closest, "#5d6b7c"]], form: figure, low: 0 },
-];
-
-/** Means over a few neighbours, weighted by how much is in each: bins with few episodes are noisy. */
-function smoothed(bins, value, weight, reach) {
-  return bins.map((_, k) => {
-    let sum = 0, total = 0;
-    for (let i = Math.max(0, k - reach); i <= Math.min(bins.length - 1, k + reach); i++) {
-      const v = value(bins[i]), w = weight ? bins[i][weight] : 1;
-      if (v !== null && w > 0) { sum += v * w; total += w; }
-    }
-    return total > 0 ? sum / total : null;
-  });
-}
-
-function curve(bins, what) {
-  const frame = { left: 52, right: 486, top: 30, bottom: 178 };
-  const reach = what.weight ? Math.ceil(bins.length / 50) : 0;
-  const rows = what.lines.map(([value]) => smoothed(bins, value, what.weight, reach));
-  const seen = rows.flat().filter((v) => v !== null);
-  if (!seen.length) return null;
-  const low = what.low ?? Math.min(...seen), high = what.high ?? (Math.max(...seen) * (what.low === 0 ? 1.1 : 1) || 1);
-  const x = scale(0, bins.at(-1).until, frame.left, frame.right), y = scale(low, high > low ? high : low + 1, frame.bottom, frame.top);
-  const parts = [label(4, 14, what.title, { class: "title" }), axes(frame, x, y, ticks(0, bins.at(-1).until, 4), ticks(low, high, 4), { y: what.form, x: (v) => v >= 1000 ? `${figure(v / 1000)}k` : figure(v) })];
-  rows.forEach((values, k) => {
-    const points = values.map((v, i) => [v, i]).filter(([v]) => v !== null).map(([v, i]) => [x(bins[i].until - bins[i].steps / 2), y(v)]);
-    const line = points.map(([px, py]) => `${px.toFixed(1)},${py.toFixed(1)}`).join(" ");
-    const color = what.lines[k][1];
-    if (what.areas) parts.push(tag("polygon", { points: `${points[0][0]},${y(0)} ${line} ${points.at(-1)[0]},${y(0)}`, fill: color, opacity: 0.25 }));
-    parts.push(tag("polyline", { points: line, fill: "none", stroke: color, "stroke-width": 1.8, "stroke-linejoin": "round" }));
-  });
-  parts.push(label(frame.right, 206, "steps of all actors", { "text-anchor": "end" }));
-  const box = element("div");
-  box.innerHTML = drawing(496, 212, what.title, parts);
-  hovers(box, (px) => {
-    const k = bins.findIndex((b) => x(b.until) >= px);
-    if (k < 0 || px < frame.left) return null;
-    return `to step ${figure(bins[k].until, 6)}\n` + rows.map((values) => what.form(values[k])).join(", of these failsafe ");
-  });
-  return box;
-}
-
-function learning(target, training) {
-  for (const [robot, { bins }] of Object.entries(training)) {
-    if (Object.keys(training).length > 1) target.append(element("h3", { style: "grid-column:1/-1;margin:0" }, robot));
-    if (bins.length) target.append(...CURVES.map((what) => curve(bins, what)).filter(Boolean));
-  }
-  if (!target.children.length) target.append(nothing("No steps were recorded."));
 }
 
 function latency(target, kinds) {
@@ -99,13 +44,14 @@ function bars(kinds, part) {
       const tall = count ? Math.max(1.2, (height - 12) * count / most) : 0;
       out.push(tag("rect", { x: at(from), y: base - tall, width: Math.max(0.5, at(to) - at(from) - 1), height: tall, fill: kind.color }, tag("title", {}, `${figure(from)} to ${figure(to)} ms: ${count}`)));
     }
-    out.push(tag("line", { x1: frame.left, x2: frame.right, y1: base, y2: base, stroke: "#aab4c0" }));
+    out.push(tag("line", { x1: frame.left, x2: frame.right, y1: base, y2: base, class: "axis" }));
   });
   const bottom = frame.top + rows.length * height;
-  for (const v of marks.filter((v) => v >= low && v <= high)) out.push(label(at(v), bottom + 16, figure(v), { "text-anchor": "middle" }), tag("line", { x1: at(v), x2: at(v), y1: bottom, y2: bottom + 4, stroke: "#aab4c0" }));
+  for (const v of marks.filter((v) => v >= low && v <= high)) out.push(label(at(v), bottom + 16, figure(v), { "text-anchor": "middle" }), tag("line", { x1: at(v), x2: at(v), y1: bottom, y2: bottom + 4, class: "axis" }));
   out.push(label(frame.right, bottom + 32, "ms, logarithmic; each kind to its own height", { "text-anchor": "end" }));
   const box = element("div");
   box.innerHTML = drawing(1040, bottom + 38, `latency of decisions, ${part}`, out, { "data-part": part });
+  saves(box, `latency, ${part}`, () => rows.flatMap(([kind, given]) => given.map(([from, to, count]) => ({ decision: kind.name, from_ms: from, to_ms: to, count }))));
   return box;
 }
 
@@ -133,8 +79,9 @@ function map(cells, cell, what, value, most, form) {
   for (const v of ticks(box.x0, box.x1, 5)) out.push(label(x(v), frame.bottom + 15, figure(v), { "text-anchor": "middle" }));
   for (const v of ticks(box.y0, box.y1, 5)) out.push(label(frame.left - 6, y(v) + 4, figure(v), { "text-anchor": "end" }));
   for (let k = 0; k <= 20; k++) out.push(tag("rect", { x: frame.right + 12, y: frame.bottom - 8 - k * 8, width: 12, height: 8.3, fill: heat(k / 20) }));
+  out.push(label(frame.right, frame.bottom + 30, "x [m]", { "text-anchor": "end" }), label(frame.left - 6, frame.top - 2, "y [m]", { "text-anchor": "end" }));
   for (const k of [0, 10, 20]) out.push(label(frame.right + 29, frame.bottom - k * 8, form(most * k / 20)));
-  return drawing(frame.right + 76, frame.bottom + 24, `${what}, from above`, out);
+  return drawing(frame.right + 76, frame.bottom + 34, `${what}, from above`, out);
 }
 
 function places(target, robots) {
@@ -146,6 +93,9 @@ function places(target, robots) {
     const made = element("div", { class: "charts", "data-robot": robot }, element("div"), element("div"));
     made.children[0].innerHTML = map(cells, cell, `interventions, share of the steps in a cell of ${figure(cell)} m`, share, Math.max(0.02, high(share, often)), percents);
     made.children[1].innerHTML = map(cells, cell, "steps in a cell", steps, Math.max(2, high(steps, cells)), (v) => figure(Math.round(v)));
+    const rows = () => cells.map(([cx, cy, steps, adjusted, failsafe, collisions]) => ({ x_m: cx * cell, y_m: cy * cell, steps, adjusted, failsafe, collisions }));
+    saves(made.children[0], `interventions of ${robot} by place`, rows);
+    saves(made.children[1], `steps of ${robot} by place`, rows);
     if (Object.keys(robots).length > 1) target.append(element("h3", {}, robot));
     target.append(made);
   }
@@ -162,21 +112,22 @@ function timeline(target, { lives, lines, bin_s, steps }) {
   if (steps.length) {
     const most = Math.max(...steps.map((s) => s[1])), y = scale(0, most, 70, 8);
     for (const [from, rate] of steps) out.push(tag("rect", { x: at(from), width: Math.max(0.5, at(from + bin_s) - at(from)), y: y(rate), height: 70 - y(rate), fill: "#9db8d8" }, tag("title", {}, `${figure(rate)} steps/s after ${figure(from - begin)} s`)));
-    out.push(label(frame.left - 6, 18, figure(most), { "text-anchor": "end" }), tag("line", { x1: frame.left, x2: frame.right, y1: 70, y2: 70, stroke: "#aab4c0" }));
+    out.push(label(frame.left - 6, 18, figure(most), { "text-anchor": "end" }), tag("line", { x1: frame.left, x2: frame.right, y1: 70, y2: 70, class: "axis" }));
   }
   names.forEach((name, k) => {
     const y = frame.top + 24 * k;
-    out.push(label(4, y + 12, name.length > 20 ? `…${name.slice(-19)}` : name), tag("rect", { x: frame.left, y, width: frame.right - frame.left, height: 16, fill: "#f1f3f6" }));
+    out.push(label(4, y + 12, name.length > 20 ? `…${name.slice(-19)}` : name), tag("rect", { x: frame.left, y, width: frame.right - frame.left, height: 16, class: "paper" }));
     for (const life of lives.filter((l) => l.process === name)) {
       const said = `${name}: ${figure(life.start - begin)} to ${figure(life.end - begin)} s, ${life.goodbye ? "ended in order" : end - life.end > 3 ? "then not heard of" : "lived at the log's end"}`;
       out.push(tag("rect", { x: at(life.start), y, width: Math.max(2, at(life.end) - at(life.start)), height: 16, fill: "#4f9d78", rx: 2 }, tag("title", {}, said)));
       if (!life.goodbye && end - life.end > 3) out.push(tag("rect", { x: at(life.end) - 1.5, y: y - 2, width: 3, height: 20, fill: KINDS.a.color }, tag("title", {}, said)));
-      if (life.restart) out.push(tag("path", { d: `M${at(life.start)} ${y - 2} l6 10 l-6 10 z`, fill: "#1b2430" }, tag("title", {}, `${name} was started again`)));
+      if (life.restart) out.push(tag("path", { d: `M${at(life.start)} ${y - 2} l6 10 l-6 10 z`, class: "solid" }, tag("title", {}, `${name} was started again`)));
     }
     for (const line of lines.filter((l) => l.process === name)) out.push(tag("circle", { cx: at(line.t), cy: y + 8, r: 3.2, fill: line.level === "ERROR" ? KINDS.a.color : "#f2c14e", stroke: "#fff" }, tag("title", {}, `${line.level}: ${line.text}`)));
   });
   for (const t of ticks(0, end - begin, 8)) out.push(label(x(t), frame.bottom + 14, `${figure(t, 6)} s`, { "text-anchor": "middle" }));
   const box = element("div");
   box.innerHTML = drawing(1040, frame.bottom + 22, "health of the processes", out);
+  saves(box, "health of the processes", () => lives.map((life) => ({ process: life.process, from_s: life.start - begin, to_s: life.end - begin, goodbye: life.goodbye, restart: life.restart })));
   target.append(box, legend([["#4f9d78", "alive"], [KINDS.a.color, "not heard of from here on; an error"], ["#f2c14e", "a warning"], ["#1b2430", "started again"]]));
 }

@@ -6,19 +6,19 @@ function why(episode, k) {
   return `${KINDS[episode.kinds[k]].name}; proposed ${t.proposed.join(", ")}, executed ${t.plan.join(", ")}; margin ${t.at_least ? "> " : ""}${figure(100 * t.margin)} cm${t.reason ? `; ${t.reason}` : ""}`;
 }
 
+/** The nearest misses of all robot kinds, worst first. */
 function near(target, galleries, choose) {
-  for (const [robot, { near: orders, episodes }] of Object.entries(galleries)) {
-    for (const order of orders) {
-      const episode = episodes.find((e) => e.order === order), k = episode.closest_at;
-      const reach = Math.max(0.1, 3.4 * episode.footprint, 1.3 * Math.max(0, ...(episode.tubes[k]?.boxes ?? []).map(([x, y]) => Math.hypot(x - episode.x[k], y - episode.y[k]))));
-      const box = [episode.x[k] - reach, episode.y[k] - reach, episode.x[k] + reach, episode.y[k] + reach];
-      const picture = element("div");
-      picture.innerHTML = arena(episode, k, 260, box);
-      picture.querySelector("svg").setAttribute("width", "100%");
-      const facts = element("p", {}, element("b", {}, `${figure(100 * episode.closest)} cm`), ` ${episode.actor}, episode ${episode.episode}, step ${episode.first + k} (${episode.outcome}) `);
-      facts.append(element("button", { onclick: () => choose(robot, order, k) }, "show"));
-      target.append(element("div", { class: "card" }, picture, facts, element("p", { class: "why" }, why(episode, k))));
-    }
+  const found = Object.entries(galleries).flatMap(([robot, { near: orders, episodes }]) => orders.map((order) => ({ robot, order, episode: episodes.find((e) => e.order === order) })));
+  for (const { robot, order, episode } of found.sort((a, b) => a.episode.closest - b.episode.closest)) {
+    const k = episode.closest_at;
+    const reach = Math.max(0.1, 3.4 * episode.footprint, 1.3 * Math.max(0, ...(episode.tubes[k]?.boxes ?? []).map(([x, y]) => Math.hypot(x - episode.x[k], y - episode.y[k]))));
+    const box = [episode.x[k] - reach, episode.y[k] - reach, episode.x[k] + reach, episode.y[k] + reach];
+    const picture = element("div");
+    picture.innerHTML = arena(episode, k, 260, box);
+    picture.querySelector("svg").setAttribute("width", "100%");
+    const facts = element("p", {}, element("b", {}, `${figure(100 * episode.closest)} cm`), ` ${episode.actor}, episode ${episode.episode}, step ${episode.first + k} (${episode.outcome}) `);
+    facts.append(element("button", { onclick: () => choose(robot, order, k) }, "show"));
+    target.append(element("div", { class: "card", "data-closest": episode.closest }, picture, facts, element("p", { class: "why" }, why(episode, k))));
   }
   if (!target.children.length) target.append(nothing("No episode was recorded with its clearance."));
 }
@@ -31,12 +31,15 @@ function strip(episode, k) {
   const parts = [label(4, 12, "clearance [m] over steps", { class: "title" }), axes(frame, x, y, ticks(0, episode.steps - 1, 5).filter(Number.isInteger), ticks(0, most, 3))];
   parts.push(tag("polyline", { points: episode.clearance.map((c, i) => `${x(i).toFixed(1)},${y(c).toFixed(1)}`).join(" "), fill: "none", stroke: "#5d6b7c", "stroke-width": 1.3 }));
   episode.clearance.forEach((c, i) => { if ("da".includes(episode.kinds[i])) parts.push(tag("circle", { cx: x(i), cy: y(c), r: 2.3, fill: KINDS[episode.kinds[i]].color })); });
-  parts.push(tag("line", { x1: x(k), x2: x(k), y1: frame.top, y2: frame.bottom, stroke: "#1b2430", "stroke-dasharray": "3 3" }));
+  parts.push(tag("line", { x1: x(k), x2: x(k), y1: frame.top, y2: frame.bottom, class: "ink", "stroke-dasharray": "3 3" }));
   return drawing(400, 132, "clearance over the episode", parts);
 }
 
 class Picker {
-  constructor(target, galleries) {
+  /** `mark` goes before names that the page has once; `said(order, step)` hears what is shown. */
+  constructor(target, galleries, mark, said) {
+    this.target = target;
+    this.said = said;
     this.all = Object.entries(galleries).flatMap(([robot, { near: nearest, episodes }]) => episodes.map((episode) => ({ robot, episode, near: nearest.indexOf(episode.order) })));
     if (!this.all.length) return void target.append(nothing("No episode was recorded."));
     this.select = element("select", { "aria-label": "episode", onchange: () => this.show(+this.select.value) });
@@ -48,8 +51,8 @@ class Picker {
     this.slider = element("input", { type: "range", min: 0, "aria-label": "step", oninput: () => this.step(+this.slider.value) });
     this.play = element("button", { onclick: () => this.toggle() }, "play");
     target.append(element("div", { class: "bar" }, element("button", { onclick: () => move(-1), "aria-label": "previous episode" }, "‹"), this.select, element("button", { onclick: () => move(1), "aria-label": "next episode" }, "›"), this.play, this.slider));
-    this.map = element("div", { id: "episode-map" });
-    this.facts = element("dl", { class: "facts", id: "episode-facts" });
+    this.map = element("div", { id: `${mark}episode-map`, class: "episode-map", tabindex: 0, "aria-label": "an episode: arrow keys step through it, space plays it", onkeydown: (event) => this.key(event) });
+    this.facts = element("dl", { class: "facts", id: `${mark}episode-facts` });
     this.strip = element("div");
     target.append(element("div", { class: "split" }, this.map, element("div", {}, this.facts, this.strip)));
     target.append(legend([...["l", "d", "a"].map((k) => [KINDS[k].color, KINDS[k].name]), ["#7a4fc0", "tube, and the plan in it"], ["#1d7f4e", "goal"], ["#c9d1da", "obstacles"]]));
@@ -59,7 +62,7 @@ class Picker {
 
   choose(robot, order, k) {
     this.show(this.all.findIndex((item) => item.robot === robot && item.episode.order === order), k);
-    document.getElementById("picker-section").scrollIntoView({ behavior: "smooth" });
+    this.target.closest("section").scrollIntoView({ behavior: "smooth" });
   }
 
   show(index, k = null) {
@@ -82,7 +85,35 @@ class Picker {
       interventions: `${e.interventions}, of these failsafe ${e.failsafes}`, "closest approach": e.closest === null ? "–" : `${figure(100 * e.closest)} cm at step ${e.first + e.closest_at}`,
       step: e.first + k, position: `${figure(e.x[k])}, ${figure(e.y[k])} m`, speed: `${figure(e.speed[k])} m/s`, clearance: `${figure(100 * e.clearance[k])} cm`, decision: why(e, k),
     };
+    this.said(e.order, e.first + k);
     this.facts.replaceChildren(...Object.entries(facts).flatMap(([name, value]) => [element("dt", {}, name), element("dd", { "data-fact": name }, String(value))]));
+  }
+
+  /** Steps to the sides, episodes up and down, space plays. */
+  key(event) {
+    const steps = this.all[this.at].episode.steps;
+    const moves = {
+      ArrowRight: () => this.step(Math.min(steps - 1, this.k + 1)),
+      ArrowLeft: () => this.step(Math.max(0, this.k - 1)),
+      ArrowDown: () => this.show((this.at + 1) % this.all.length),
+      ArrowUp: () => this.show((this.at + this.all.length - 1) % this.all.length),
+      Home: () => this.step(0),
+      End: () => this.step(steps - 1),
+      " ": () => this.toggle(),
+    };
+    if (!moves[event.key]) return;
+    event.preventDefault();
+    if (event.key !== " ") this.stop();
+    moves[event.key]();
+  }
+
+  /** The episode of that number in the log's order, at a step; false: it is not in the page. */
+  jump(order, step) {
+    const place = this.all?.findIndex(({ episode }) => episode.order === order) ?? -1;
+    if (place < 0) return false;
+    const { first, steps } = this.all[place].episode;
+    this.show(place, Math.min(steps - 1, Math.max(0, step - first)));
+    return true;
   }
 
   toggle() {

@@ -1,13 +1,35 @@
-// Draws everything once the page is there.
+// Draws everything once the page is there; a run's own part when it is chosen. `#run=0&episode=12&step=40` is a link.
 
 const data = JSON.parse(document.getElementById("data").textContent);
-const place = (name) => document.getElementById(name);
+const pickers = new Map(); // by place of the run
 document.body.append(tip);
-whiskers();
-learning(place("learning"), data.training);
-places(place("places"), data.places);
-const picker = new Picker(place("picker"), data.galleries);
-near(place("near"), data.galleries, (robot, order, k) => picker.choose(robot, order, k));
-latency(place("latency"), data.latency);
-timeline(place("timeline"), data.timeline);
+learning(document.getElementById("learning"), document.getElementById("learning-controls"), data);
+whiskers(document.querySelector("main"));
+
+/** Show the run at a place, and draw it if that has not been done. */
+function show(place) {
+  document.querySelectorAll("div.run").forEach((box, k) => { box.hidden = k !== place; });
+  const chosen = document.getElementById("run");
+  if (chosen) chosen.value = String(place);
+  if (pickers.has(place) || !data[place]) return;
+  const run = data[place], mark = place ? `run${place}-` : "", at = (name) => document.getElementById(mark + name);
+  const said = (order, step) => { if (document.documentElement.dataset.drawn) history.replaceState(null, "", `#run=${place}&episode=${order}&step=${step}`); };
+  places(at("places"), run.places);
+  const picker = new Picker(at("picker"), run.galleries, mark, said);
+  pickers.set(place, picker);
+  near(at("near"), run.galleries, (robot, order, k) => picker.choose(robot, order, k));
+  latency(at("latency"), run.latency);
+  timeline(at("timeline"), run.timeline);
+}
+
+/** Go where the address points to. */
+function follow() {
+  const wanted = new URLSearchParams(location.hash.slice(1)), place = Number(wanted.get("run") ?? 0);
+  show(data[place] ? place : 0);
+  if (wanted.has("episode")) pickers.get(place)?.jump(Number(wanted.get("episode")), Number(wanted.get("step") ?? 0));
+}
+
+document.getElementById("run")?.addEventListener("change", (event) => show(Number(event.target.value)));
+window.addEventListener("hashchange", follow);
+follow();
 document.documentElement.dataset.drawn = "yes";

@@ -84,14 +84,14 @@ function axes(frame, x, y, xs, ys, form = {}) {
   const { left, right, top, bottom } = frame;
   const parts = [];
   for (const value of ys) {
-    parts.push(tag("line", { x1: left, x2: right, y1: y(value), y2: y(value), stroke: "#e6eaef" }));
+    parts.push(tag("line", { x1: left, x2: right, y1: y(value), y2: y(value), class: "grid" }));
     parts.push(label(left - 6, y(value) + 4, (form.y || figure)(value), { "text-anchor": "end" }));
   }
   for (const value of xs) {
-    parts.push(tag("line", { x1: x(value), x2: x(value), y1: bottom, y2: bottom + 4, stroke: "#aab4c0" }));
+    parts.push(tag("line", { x1: x(value), x2: x(value), y1: bottom, y2: bottom + 4, class: "axis" }));
     parts.push(label(x(value), bottom + 16, (form.x || figure)(value), { "text-anchor": "middle" }));
   }
-  parts.push(tag("line", { x1: left, x2: right, y1: bottom, y2: bottom, stroke: "#aab4c0" }));
+  parts.push(tag("line", { x1: left, x2: right, y1: bottom, y2: bottom, class: "axis" }));
   return parts;
 }
 

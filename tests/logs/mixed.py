@@ -122,9 +122,10 @@ class Writer:
         return segment.path
 
 
-def mixed(folder: Path, seed: int = 0, episodes: int = 30) -> Path:
-    """The log of a run of three actors, two robot kinds, with a restart and a second segment."""
+def mixed(folder: Path, seed: int = 0, episodes: int = 30, later: float = 0.0) -> Path:
+    """The log of a run of three actors, two robot kinds, with a restart and a second segment, begun `later` [s]."""
     writer = Writer(seed)
+    writer.now += round(later * SECOND)
     for number in range(episodes):
         if number == episodes // 2:
             line = pb.LogLine(process="actor-1", level="WARNING", text="killed soon")

@@ -1,7 +1,9 @@
 """All figures against a count by another reader; many logs at once; memory that does not grow."""
 
+import io
 import itertools
 import json
+import re
 import tracemalloc
 from pathlib import Path
 
@@ -94,6 +96,24 @@ def test_many_runs_are_told_apart_and_joined(tmp_path: Path) -> None:
     ]
 
 
+def test_who_ended_with_an_earlier_run_is_not_missed_by_a_later_one(tmp_path: Path) -> None:
+    folders = [mixed(tmp_path / "one", 1, 8), mixed(tmp_path / "two", 2, 8, later=1e4)]
+    both, single = analyse(folders), analyse(folders[0])
+    for name, process in single["processes"].items():
+        assert both["processes"][f"one/{name}"]["ended"] == process["ended"]
+    assert {p["ended"] for p in both["processes"].values()} == {"in order", "lived at the log's end"}
+    for label, folder in zip(("one", "two"), folders, strict=True):
+        assert both["training"][f"{label}/ground"] == analyse(folder)["training"]["ground"], "curves are not joined"
+
+
+def test_the_headline_is_about_the_last_episodes(log: Path) -> None:
+    steps = [step for key, step in once(decoded(find(log))) if key.startswith("step/ground")]
+    ended = [step for step in steps if step.terminated or step.truncated]
+    last = analyse(log)["training"]["ground"]["last"]
+    assert last["episodes"] == min(100, len(ended)) > 20
+    assert last["goals"] == pytest.approx(sum(step.goal for step in ended[-100:]) / last["episodes"])
+
+
 def test_names_of_runs() -> None:
     paths = ["a/run.mcap", "a/run_0001.mcap", "a/other.mcap", "b/run.mcap", "c/a/run.mcap"]
     runs = by_run([Path(path) for path in paths])
@@ -136,7 +156,7 @@ def test_an_episode_in_detail_is_what_was_recorded(log: Path) -> None:
 
 
 def test_the_nearest_misses_are_the_nearest(log: Path) -> None:
-    pictures = analysed(log, Look(pictures=True)).pictures()["mixed"]
+    pictures = analysed(log, Look(pictures=True)).each()["mixed"][1]
     closest: dict[tuple[str, int, int], float] = {}
     for key, step in once(decoded(find(log))):
         if key.startswith("step/ground"):
@@ -156,7 +176,7 @@ def test_the_nearest_misses_are_the_nearest(log: Path) -> None:
 
 def test_it_is_shown_whole(log: Path) -> None:
     console = Console(record=True, width=160)
-    console.print(show(analyse(log)))
+    console.print(show(analyse(log), verbose=True))
     text = console.export_text()
     words = (
         "closest approach",
@@ -185,7 +205,7 @@ def test_memory_does_not_grow_with_the_log(tmp_path: Path) -> None:
         analysis = analysed(tmp_path / name, Look(pictures=True))
         held.append(tracemalloc.get_traced_memory()[1])
         tracemalloc.stop()
-        pictures = analysis.pictures()
+        _, pictures = analysis.each()[name]
         assert len(pictures["galleries"]["ground"]["episodes"]) <= SPREAD + 8 + 8 + 4 + 1
     assert held[1] - held[0] < 2**20
 
@@ -236,3 +256,15 @@ def test_a_damaged_chunk_in_the_middle_is_skipped_and_the_rest_is_read(tmp_path:
     (cut,) = log.cuts
     assert cut.lost > 0 and "byte" in str(cut) and len(list(itertools.pairwise(numbers))) == len(numbers) - 1
     assert log.segments[0].messages == sum(1 for _ in open_log(path))
+
+
+@pytest.mark.parametrize("columns", [60, 80, 160])
+def test_what_the_terminal_says_is_whole_at_any_width(tmp_path: Path, columns: int) -> None:
+    folders = [mixed(tmp_path / name, seed, 6) for seed, name in enumerate(("one", "two"), 1)]
+    for figures in (analyse(folders[0]), analyse(folders)):
+        file = io.StringIO()
+        Console(file=file, width=columns, force_terminal=True, color_system=None).print(show(figures))
+        shown = file.getvalue()
+        assert "…" not in shown and max(map(len, shown.splitlines())) <= columns
+        assert "flight_" not in shown and "bound_step" not in shown, "noise and model sets are for --verbose"
+    assert str(analyse(folders)["goals"]) not in re.findall(r"(?m)^goals +(\d+)", shown), "several runs are not pooled"

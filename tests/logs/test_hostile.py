@@ -107,7 +107,7 @@ def test_an_analysis_counts_what_it_cannot_handle_and_goes_on(say: Say, tmp_path
     found = analysed(tmp_path, Look(pictures=True))
     figures = found.figures()
     assert figures["actors"]["b"]["episodes"] == 1 and figures["malformed"] >= 5
-    found.pictures()
+    found.each()
 
 
 def chunk_of(size: int, compression: str, frame: bytes) -> bytes:

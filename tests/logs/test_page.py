@@ -1,11 +1,15 @@
 """The report in a real browser: it draws without a complaint and without a request, and says what `--json` says."""
 
+import csv
+import io
 import json
+import math
 import re
 from collections.abc import Iterator
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import pytest
 
@@ -13,7 +17,7 @@ from deploy.cli import main
 from logs.analysis import Look, analysed
 from logs.page import embedded, names, number, percent, render
 from tests.browser import CHROMIUM, Page
-from tests.logs.mixed import mixed
+from tests.logs.mixed import ABOUT, mixed
 
 TRICKS = "</script><script>alert(1)</script><!-- \u2028"
 
@@ -25,7 +29,7 @@ def report(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, An
     log = mixed(folder / "<b>mixed")
     analysis = analysed(log, Look(pictures=True))
     path = folder / "report.html"
-    path.write_text(render(analysis.figures(), analysis.pictures()), encoding="utf-8")
+    path.write_text(render(analysis.figures(), analysis.each()), encoding="utf-8")
     return path, json.loads(json.dumps(analysis.figures()))
 
 
@@ -114,7 +118,7 @@ def test_everything_is_drawn(page: Page, report: tuple[Path, dict[str, Any]]) ->
             .match(/NaN|undefined|Infinity/g),
     })""")
     assert drawn["rates"] == 5 and drawn["near"] == 16 and drawn["tubes"] > 20 and drawn["bars"] > 20
-    assert len(drawn["curves"]) == 8 and "goals reached" in drawn["curves"], "four for each robot kind"
+    assert len(drawn["curves"]) == 10 and "goals reached" in drawn["curves"], "of both robot kinds"
     assert drawn["maps"] > 50 and set(figures["processes"]) <= set(drawn["lanes"])
     assert drawn["broken"] is None
 
@@ -127,7 +131,10 @@ def test_parts_of_the_latency_are_chosen(page: Page) -> None:
 
 
 def test_the_picker_shows_the_episode_that_was_picked(page: Page, report: tuple[Path, dict[str, Any]]) -> None:
-    data = page.value("data.galleries")
+    assert page.value("[...document.querySelectorAll('#near .card')].map(c => Number(c.dataset.closest))") == sorted(
+        page.value("[...document.querySelectorAll('#near .card')].map(c => Number(c.dataset.closest))")
+    ), "worst first, of all robots"
+    data = page.value("data[0].galleries")
     every = [episode for gallery in data.values() for episode in gallery["episodes"]]
     assert page.value("document.querySelectorAll('#picker option').length") == len(every) > 10
 
@@ -150,12 +157,146 @@ def test_the_picker_shows_the_episode_that_was_picked(page: Page, report: tuple[
     page.value("document.querySelector('#picker button[aria-label=\"next episode\"]').click()")
     assert facts()["episode"] == str(every[4]["episode"])
     page.value("document.querySelectorAll('#near .card button')[2].click()")
-    order = data["ground"]["near"][2]
-    near = next(episode for episode in data["ground"]["episodes"] if episode["order"] == order)
+    found = [(robot, order) for robot in data for order in data[robot]["near"]]
+    missed = [next(e for e in data[robot]["episodes"] if e["order"] == order) for robot, order in found]
+    near = sorted(missed, key=lambda episode: episode["closest"])[2]
     assert (facts()["actor"], facts()["episode"]) == (near["actor"], str(near["episode"]))
-    page.value("document.querySelector('#picker button:not([aria-label])').click()")
-    page.until("document.querySelector('#picker button:not([aria-label])').textContent === 'play'")
+    page.value("document.querySelector('#picker .bar button:not([aria-label])').click()")
+    page.until("document.querySelector('#picker .bar button:not([aria-label])').textContent === 'play'")
     assert page.complaints == []
+
+
+@pytest.fixture(scope="module")
+def compared(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[dict[str, Any]]]:
+    """The page of three runs, of which the last is another method's; and what `analyse --json` says of each."""
+    folder = tmp_path_factory.mktemp("compared")
+    logs = [mixed(folder / name, seed, 12 + 4 * seed, later=1e4 * seed) for seed, name in enumerate(("a", "b"), 1)]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(ABOUT, "run", ABOUT["run"] | {"method": "none", "certificate": ""})
+        logs.append(mixed(folder / "c", 3, 10, later=5e4))
+    assert main(["analyse", *map(str, logs), "--html", str(folder / "page.html"), "--json"]) == 0
+    return folder / "page.html", [json.loads(json.dumps(analysed(log).figures())) for log in logs]
+
+
+@pytest.fixture(scope="module")
+def comparison(compared: tuple[Path, list[dict[str, Any]]], tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
+    if CHROMIUM is None:
+        pytest.skip("there is no Chromium: the report was not driven in a browser")
+    with Page(tmp_path_factory.mktemp("browser")) as page:
+        page.open(compared[0].as_uri())
+        page.until("document.documentElement.dataset.drawn === 'yes'")
+        yield page
+
+
+def test_runs_are_laid_over_each_other_and_never_joined(
+    comparison: Page, compared: tuple[Path, list[dict[str, Any]]]
+) -> None:
+    page, runs = comparison, compared[1]
+    assert page.value("data.map(run => run.training.ground.bins.at(-1).until)") == [
+        run["robots"]["ground"]["steps"] for run in runs
+    ]
+    lines = "[...document.querySelectorAll('[data-robot=ground] [data-chart=\"goals reached\"] polyline')]"
+    assert page.value(f"{lines}.map(line => line.dataset.run)") == ["a", "b", "c"]
+    edges = page.value(f"{lines}.map(line => Number(line.getAttribute('points').split(' ').at(-1).split(',')[0]))")
+    steps = [run["robots"]["ground"]["steps"] for run in runs]
+    assert sorted(range(3), key=lambda k: edges[k]) == sorted(range(3), key=lambda k: steps[k]), "each from its own 0"
+    said = page.value("[...document.querySelectorAll('.tile [data-figure=goals]')].map(t => Number(t.dataset.value))")
+    assert said == [run["goals"] for run in runs], "nothing is pooled"
+    page.value("document.querySelector('#learning-controls input[data-run=b]').click()")
+    assert page.value(f"{lines}.map(line => line.dataset.run)") == ["a", "c"]
+    page.value("document.querySelector('#learning-controls input[data-run=b]').click()")
+
+
+def test_seeds_of_a_method_become_a_band(comparison: Page) -> None:
+    page, chart = comparison, "document.querySelector('[data-robot=ground] [data-chart=\"goals reached\"]')"
+    assert page.value(f"{chart}.querySelectorAll('.raw').length") == 3, "raw values beside smoothed ones"
+    page.value("document.getElementById('raw').click()")
+    assert page.value(f"{chart}.querySelectorAll('.raw').length") == 0
+    page.value("document.getElementById('raw').click()")
+    page.value("document.getElementById('bands').click()")
+    names = page.value(f"[...{chart}.querySelectorAll('polyline')].map(line => line.dataset.run)")
+    assert names == ["ddpc, residual, learning, default, 2 seeds", "c"]
+    assert page.value(f"{chart}.querySelectorAll('.band').length") == 1
+    low, mean, high = page.value("""(() => {
+        const curve = (at) => [{ step: 0, smooth: at }, { step: 100, smooth: at }];
+        const p = bandOf([curve(1), curve(2), curve(6)]).at(-1);
+        return [p.low, p.mean, p.high];
+    })()""")
+    assert (low, mean, high) == pytest.approx((3 - 4.3 * math.sqrt(7 / 3), 3, 3 + 4.3 * math.sqrt(7 / 3)))
+    page.value("document.getElementById('bands').click()")
+    assert page.complaints == []
+
+
+def test_a_run_is_chosen_and_its_own_parts_are_shown(comparison: Page, compared: tuple[Path, Any]) -> None:
+    page = comparison
+    visible = "[...document.querySelectorAll('div.run')].filter(d => d.offsetHeight > 0).map(d => d.dataset.run)"
+    assert page.value(visible) == ["a"]
+    choose = "(s => { s.value = '2'; s.dispatchEvent(new Event('change')) })(document.getElementById('run'))"
+    page.value(choose)
+    assert page.value(visible) == ["c"]
+    assert page.value("document.querySelectorAll('#run2-near .card svg').length") > 4
+    assert page.value("document.querySelectorAll('#run2-rates .whisker svg').length") == 5
+    page.value("location.hash = '#run=1&episode=3&step=1'")
+    page.until("document.getElementById('run').value === '1'")
+    facts = "[...document.querySelectorAll('#run1-episode-facts dd')].find(d => d.dataset.fact === 'step').textContent"
+    page.until(f"{facts} === '1'")
+    assert page.complaints == []
+
+
+def test_figures_and_their_data_are_saved(page: Page, report: tuple[Path, dict[str, Any]]) -> None:
+    page.value("window.save = (name, kind, text) => { window.saved = { name, kind, text }; }")
+    buttons = "document.querySelector('[data-robot=ground] [data-chart=\"goals reached\"] .saves').children"
+    page.value(f"{buttons}[0].click()")
+    saved = page.value("saved")
+    picture = ElementTree.fromstring(saved["text"])
+    assert saved["name"] == "goals-reached.svg" and picture.tag == "{http://www.w3.org/2000/svg}svg"
+    words = [text.text for text in picture.iter("{http://www.w3.org/2000/svg}text")]
+    assert "goals reached [share of episodes]" in words and "steps of all actors of the run" in words
+    page.value(f"{buttons}[1].click()")
+    saved = page.value("saved")
+    rows = list(csv.DictReader(io.StringIO(saved["text"])))
+    bins = [row for row in report[1]["training"]["ground"]["bins"] if row["goals"] is not None]
+    raw = [float(row["raw"]) for row in rows if row["raw"]]
+    assert saved["kind"] == "text/csv" and raw == pytest.approx([row["goals"] for row in bins])
+
+
+def test_keys_step_through_an_episode(page: Page) -> None:
+    step = (
+        "Number([...document.querySelectorAll('#episode-facts dd')].find(d => d.dataset.fact === 'step').textContent)"
+    )
+    press = "document.getElementById('episode-map').dispatchEvent(new KeyboardEvent('keydown', {{ key: '{}' }}))"
+    page.value(press.format("Home"))
+    first = page.value(step)
+    page.value(press.format("ArrowRight"))
+    assert page.value(step) == first + 1 and page.value("location.hash").endswith(f"step={first + 1}")
+
+
+@pytest.mark.parametrize("which", ["page", "comparison"])
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize("width", [390, 1400])
+def test_layouts_hold(request: pytest.FixtureRequest, which: str, width: int, scheme: str, tmp_path: Path) -> None:
+    page: Page = request.getfixturevalue(which)
+    page.size(width, 900)
+    page.media("screen", scheme)
+    assert page.value("document.documentElement.scrollWidth") <= width, "nothing sticks out"
+    shade = page.value("getComputedStyle(document.querySelector('section')).backgroundColor.match(/\\d+/g).map(Number)")
+    ink = page.value("getComputedStyle(document.body).color.match(/\\d+/g).map(Number)")
+    assert (sum(shade) < 150 and sum(ink) > 600) if scheme == "dark" else (sum(shade) > 700 and sum(ink) < 150)
+    narrow = "[...document.querySelectorAll('.charts svg')].filter(s => s.getBoundingClientRect().width > 0)"
+    assert page.value(f"{narrow}.every(s => s.getBoundingClientRect().width >= 300)")
+    page.media()
+    page.size(1280, 900)
+
+
+def test_on_paper_pages_are_full(page: Page) -> None:
+    pages = len(re.findall(rb"/Type\s*/Page\b", page.pdf()))
+    page.size(680, 1000)  # what A4 has room for
+    page.media("print")
+    height = page.value("document.documentElement.scrollHeight")
+    page.media()
+    page.size(1280, 900)
+    assert 1 < pages <= 1 + height / 850, f"{height} px on {pages} pages: some are half-empty"
+    assert pages <= 9
 
 
 def test_an_empty_log_has_a_page_too(tmp_path: Path, report: tuple[Path, dict[str, Any]]) -> None:
@@ -198,7 +339,7 @@ def hostile(folder: Path) -> Path:
     """A page of figures in which every text that a log can choose is a script."""
 
     analysis = analysed(mixed(folder / "log"), Look(pictures=True))
-    figures, pictures = (json.loads(json.dumps(part)) for part in (analysis.figures(), analysis.pictures()))
+    figures, pictures = json.loads(json.dumps(analysis.each()["log"]))
     figures["processes"] |= {HOSTILE: next(iter(figures["processes"].values()))}
     figures["topics"] |= {HOSTILE: {"messages": 1, "missing": 1, "duplicates": 1}}
     figures["training"] = {HOSTILE: next(iter(figures["training"].values()))} | figures["training"]
@@ -212,7 +353,7 @@ def hostile(folder: Path) -> Path:
             for tube in episode["tubes"].values():
                 tube["reason"] = HOSTILE
     path = folder / "hostile.html"
-    path.write_text(render(figures, pictures), encoding="utf-8")
+    path.write_text(render(figures, {HOSTILE: (figures, pictures)}), encoding="utf-8")
     return path
 
 

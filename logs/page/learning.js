@@ -1,0 +1,152 @@
+// Learning curves: each run on its own steps, over each other; raw values beside smoothed ones; seeds as bands.
+
+const COLORS = ["#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#5d6b7c"]; // told apart by every eye
+const GRID = 60; // places at which seeds are compared
+
+const CURVES = [
+  { title: "goals reached", unit: "share of episodes", of: "bins", value: (b) => b.goals, form: percents, low: 0, high: 1, weight: "episodes" },
+  { title: "reward of an episode", unit: "without the penalty", of: "bins", value: (b) => b.reward, form: figure, weight: "episodes" },
+  { title: "interventions", unit: "share of steps", of: "bins", value: (b) => b.adjusted + b.failsafes, form: percents, low: 0, weight: "steps" },
+  { title: "closest approach", unit: "cm, the least in a bin", of: "bins", value: (b) => b.closest === null ? null : 100 * b.closest, form: figure, low: 0 },
+  { title: "critic loss", unit: "as the learner says", of: "learner", value: (b) => b.critic_loss, form: figure },
+  { title: "mean Q", unit: "discounted reward", of: "learner", value: (b) => b.mean_q, form: figure },
+];
+
+/** Means over neighbours, weighted by how much is in each: bins with few episodes are noisy. */
+function smoothed(rows, value, weight, reach) {
+  return rows.map((_, k) => {
+    let sum = 0, total = 0;
+    for (let i = Math.max(0, k - reach); i <= Math.min(rows.length - 1, k + reach); i++) {
+      const v = value(rows[i]), w = weight ? rows[i][weight] : 1;
+      if (v !== null && w > 0) { sum += v * w; total += w; }
+    }
+    return total > 0 ? sum / total : null;
+  });
+}
+
+/** Points of one run's curve: step, raw and smoothed value, `share` of all bins on each side put together. */
+function pointsOf(run, robot, what, share) {
+  const rows = run.training[robot]?.[what.of] ?? [];
+  const reach = what.weight || what.of === "learner" ? Math.round(share * rows.length) : 0;
+  const soft = smoothed(rows, what.value, what.weight, reach);
+  const at = (b) => what.of === "bins" ? b.until - b.steps / 2 : b.steps;
+  return rows.map((b, k) => ({ step: at(b), raw: what.value(b), smooth: soft[k] })).filter((p) => p.smooth !== null && Number.isFinite(p.smooth));
+}
+
+function between(points, step) {
+  const k = points.findIndex((p) => p.step >= step);
+  if (k < 0) return null;
+  if (k === 0) return points[0].step - step > 0.05 * points.at(-1).step ? null : points[0].smooth;
+  const [a, b] = [points[k - 1], points[k]];
+  return a.smooth + ((b.smooth - a.smooth) * (step - a.step)) / Math.max(1e-9, b.step - a.step);
+}
+
+/** Student's t for 95 %, by degrees of freedom. */
+const T95 = [12.71, 4.3, 3.18, 2.78, 2.57, 2.45, 2.36, 2.31, 2.26];
+
+/** Mean and interval over runs that differ in their seed alone, as far as all of them go. */
+function bandOf(curves) {
+  const end = Math.min(...curves.map((points) => points.at(-1).step)), n = curves.length;
+  const band = [];
+  for (let k = 1; k <= GRID; k++) {
+    const step = (end * k) / GRID, values = curves.map((points) => between(points, step)).filter((v) => v !== null);
+    if (values.length < n) continue;
+    const mean = values.reduce((a, b) => a + b, 0) / n;
+    const half = (T95[n - 2] ?? 1.96) * Math.sqrt(values.reduce((a, v) => a + (v - mean) ** 2, 0) / (n - 1) / n);
+    band.push({ step, mean, low: mean - half, high: mean + half });
+  }
+  return band;
+}
+
+/** Lines of a chart: a run each, or a band for each set-up of which there are several seeds. */
+function linesOf(runs, robot, what, view) {
+  const single = (run, color) => ({ name: run.run, color, points: pointsOf(run, robot, what, view.share) });
+  if (!view.bands) return runs.map((run) => single(run, run.color)).filter((line) => line.points.length > 1);
+  const groups = new Map();
+  for (const run of runs) groups.set(run.group, [...(groups.get(run.group) ?? []), run]);
+  return [...groups].map(([group, members]) => {
+    const lines = members.map((run) => single(run, members[0].color)).filter((line) => line.points.length > 1);
+    if (lines.length < 2) return lines[0];
+    return { name: `${group}, ${lines.length} seeds`, color: members[0].color, band: bandOf(lines.map((line) => line.points)), points: [] };
+  }).filter(Boolean);
+}
+
+function chart(lines, what, view) {
+  const frame = { left: 56, right: 486, top: 30, bottom: 178 };
+  const values = lines.flatMap((line) => line.band ? line.band.flatMap((p) => [p.low, p.high]) : line.points.flatMap((p) => view.raw && p.raw !== null ? [p.raw, p.smooth] : [p.smooth]));
+  if (!values.length) return null;
+  const end = Math.max(...lines.flatMap((line) => (line.band ?? line.points).map((p) => p.step)));
+  const low = what.low ?? Math.min(...values), high = what.high ?? (Math.max(...values) * (what.low === 0 ? 1.1 : 1) || 1);
+  const x = scale(0, end, frame.left, frame.right), y = scale(low, high > low ? high : low + 1, frame.bottom, frame.top);
+  const spot = (px, py) => `${px.toFixed(1)},${Math.min(frame.bottom, Math.max(frame.top, py)).toFixed(1)}`;
+  const parts = [label(4, 14, [what.title, ` [${what.unit}]`].join(""), { class: "title" })];
+  parts.push(axes(frame, x, y, ticks(0, end, 4), ticks(low, high, 4), { y: what.form, x: (v) => v >= 1000 ? `${figure(v / 1000)}k` : figure(v) }));
+  for (const line of lines) {
+    const drawn = line.band ?? line.points;
+    if (line.band) {
+      const edge = [...line.band.map((p) => spot(x(p.step), y(p.high))), ...line.band.toReversed().map((p) => spot(x(p.step), y(p.low)))];
+      parts.push(tag("polygon", { points: edge.join(" "), fill: line.color, opacity: 0.2, class: "band" }));
+    } else if (view.raw && (what.weight || what.of === "learner")) {
+      const raw = line.points.filter((p) => p.raw !== null).map((p) => tag("circle", { cx: x(p.step), cy: Math.min(frame.bottom, Math.max(frame.top, y(p.raw))), r: 1.5, fill: line.color }));
+      parts.push(tag("g", { opacity: 0.35, class: "raw" }, raw));
+    }
+    const path = drawn.map((p) => spot(x(p.step), y(line.band ? p.mean : p.smooth))).join(" ");
+    parts.push(tag("polyline", { points: path, fill: "none", stroke: line.color, "stroke-width": 1.8, "stroke-linejoin": "round", "data-run": line.name }));
+  }
+  parts.push(label(frame.right, 208, "steps of all actors of the run", { "text-anchor": "end" }));
+  const box = element("figure", { class: "chart", "data-chart": what.title });
+  box.innerHTML = drawing(496, 214, what.title, parts);
+  hovers(box, (px) => {
+    if (px < frame.left) return null;
+    const step = ((px - frame.left) / (frame.right - frame.left)) * end;
+    const said = lines.map((line) => {
+      const drawn = line.band ?? line.points, p = drawn.find((p) => p.step >= step);
+      return p && `${lines.length > 1 ? `${line.name}: ` : ""}${what.form(line.band ? p.mean : p.smooth)}${line.band ? ` (${what.form(p.low)} to ${what.form(p.high)})` : ""}`;
+    }).filter(Boolean);
+    return said.length ? `step ${figure(step, 6)}\n${said.join("\n")}` : null;
+  });
+  saves(box, what.title, () => lines.flatMap((line) => line.band ? line.band.map((p) => ({ run: line.name, step: p.step, mean: p.mean, low: p.low, high: p.high })) : line.points.map((p) => ({ run: line.name, ...p }))));
+  return box;
+}
+
+/** Curves with their controls; `runs` as the page's data has them. */
+function learning(target, controls, runs) {
+  const robots = [...new Set(runs.flatMap((run) => Object.keys(run.training)))].sort();
+  const setups = runs.map((run) => ["method", "certificate", "policy", "arena"].map((name) => run.setup[name]).filter(Boolean).join(", ") || "run");
+  runs.forEach((run, k) => { run.group = setups[k]; run.color = COLORS[(setups.length === new Set(setups).size ? k : [...new Set(setups)].indexOf(setups[k])) % COLORS.length]; });
+  if (runs.length > 1 && new Set(setups).size < runs.length) runs.forEach((run, k) => { run.color = COLORS[k % COLORS.length]; });
+  const view = { share: 0.02, raw: true, bands: false, shown: new Set(runs) };
+  const draw = () => {
+    target.replaceChildren();
+    const shown = runs.filter((run) => view.shown.has(run));
+    for (const robot of robots) {
+      const drawn = CURVES.map((what) => [what, linesOf(shown, robot, what, view)]).map(([what, lines]) => lines.length ? chart(lines, what, view) : null).filter(Boolean);
+      if (!drawn.length) continue;
+      if (robots.length > 1) target.append(element("h3", {}, robot));
+      const grid = element("div", { class: "charts", "data-robot": robot });
+      grid.append(...drawn);
+      target.append(grid);
+    }
+    if (!target.children.length) target.append(nothing("No steps were recorded."));
+  };
+  if (runs.length > 1) controls.append(picker(runs, view, draw));
+  const smooth = element("select", { id: "smoothing", "aria-label": "smoothing", onchange: () => { view.share = +smooth.value; draw(); } });
+  for (const [share, words] of [[0, "not smoothed"], [0.02, "smoothed over 4 % of the run"], [0.05, "smoothed over 10 % of the run"]]) smooth.append(element("option", { value: share, ...(share === view.share ? { selected: "" } : {}) }, words));
+  const raw = element("input", { type: "checkbox", id: "raw", checked: "", onchange: () => { view.raw = raw.checked; draw(); } });
+  controls.append(smooth, element("label", {}, raw, " raw values as dots"));
+  if (setups.length > new Set(setups).size) {
+    const bands = element("input", { type: "checkbox", id: "bands", onchange: () => { view.bands = bands.checked; draw(); } });
+    controls.append(element("label", {}, bands, " seeds as mean and 95 % interval"));
+  }
+  draw();
+}
+
+/** Which runs are drawn. */
+function picker(runs, view, draw) {
+  const box = element("span", { class: "runs", role: "group", "aria-label": "runs that are drawn" });
+  for (const run of runs) {
+    const tick = element("input", { type: "checkbox", checked: "", "data-run": run.run, onchange: () => { if (tick.checked) view.shown.add(run); else view.shown.delete(run); draw(); } });
+    box.append(element("label", {}, tick, element("i", { style: `background:${run.color}` }), run.run));
+  }
+  return box;
+}
