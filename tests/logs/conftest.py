@@ -8,6 +8,7 @@ import pytest
 
 from messaging import brakeline_pb2 as pb
 from messaging.bus import Sample
+from messaging.bus.keys import names_of
 from messaging.topics import TOPICS
 
 Say = Callable[..., Sample]
@@ -23,7 +24,8 @@ def say() -> Say:
         topic = next(topic for topic in TOPICS if type(message) is topic.message)
         now = next(seconds) * 10**9
         number = next(numbers.setdefault(key, itertools.count(1)))
-        message.header.MergeFrom(pb.Header(sequence=number, source="a", run=run, wall_time=now, time=time))
+        source = names_of(topic, key).get("source", "a")
+        message.header.MergeFrom(pb.Header(sequence=number, source=source, run=run, wall_time=now, time=time))
         return Sample(topic, key, message.SerializeToString(), now + 1000)
 
     return make
