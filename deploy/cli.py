@@ -10,6 +10,7 @@ import importlib
 import os
 import sys
 from dataclasses import dataclass
+from importlib.metadata import version
 from typing import Any
 
 import tyro
@@ -41,6 +42,11 @@ COMMANDS: dict[str, Command] = {
         "keys:KeysCommand",
         "keys for processes on several machines: who they are, who certifies models, what plans were verified",
         "brakeline keys keys safety learner recorder actor-0 actor-1 --host 10.0.0.1",
+    ),
+    "robot": Command(
+        "robots:RobotCommand",
+        "a robot is a file: write a new description, check it, look at it",
+        "brakeline robot new my.toml",
     ),
     "safety": Command(
         "processes:Safety", "the safety service alone", "brakeline safety ground --listen tls/0.0.0.0:7447 --keys keys"
@@ -145,6 +151,9 @@ def main(arguments: list[str] | None = None) -> int:
     if not given or given[0] in ("-h", "--help"):
         overview(Console())
         return 0 if given else 2
+    if given[0] == "--version":
+        print(f"brakeline {version('brakeline')}")
+        return 0
     name = given[0]
     if name not in COMMANDS:
         near = difflib.get_close_matches(name, COMMANDS, 1)

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
 
 from messaging.robots import FEEDBACK, HOLD, LATE, RAMP, Disc, Limit, Robot, UnknownRobot
 
@@ -24,6 +24,15 @@ UNITS = ("m", "rad", "m/s", "rad/s", "m/s2", "rad/s2", "N", "N m", "V", "A", "1"
 UNIT_OF = {"position": "m", "heading": "rad"}
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
+
+
+def _si(unit: str) -> str:
+    if unit not in UNITS:
+        raise ValueError(f"one of {', '.join(UNITS)} (SI)")
+    return unit
+
+
+Unit = Annotated[str, AfterValidator(_si)]
 
 
 class BadDescription(UnknownRobot):
@@ -42,7 +51,7 @@ class _Strict(BaseModel):
 class Coordinate(_Strict):
     """One of the state."""
 
-    unit: str
+    unit: Unit
     role: Literal["position", "heading", "other"] = "other"
     error: Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
     follows: str | None = None
@@ -50,7 +59,7 @@ class Coordinate(_Strict):
 
 
 class Input(_Strict):
-    unit: str
+    unit: Unit
     low: Finite
     high: Finite
     moves: bool = True
@@ -223,6 +232,7 @@ def _problem(detail: Any, values: Any) -> tuple[str, str]:
     elif detail["type"] == "missing":
         text = "missing"
     else:
+        text = text.removeprefix("Value error, ")
         text = f"{text[:1].lower()}{text[1:]}, not {detail['input']!r:.80}"
     return field, text
 
@@ -283,9 +293,7 @@ def _bad_state(said: Description) -> list[tuple[str, str]]:
         found.append(("state", "a speed or whatever else matters for the next step is needed besides the pose"))
     for name, c in said.state.items():
         where = f"state.{name}"
-        if c.unit not in UNITS:
-            found.append((f"{where}.unit", f"one of {', '.join(UNITS)} (SI), not {c.unit!r}"))
-        elif c.unit != UNIT_OF.get(c.role, c.unit):
+        if c.unit != UNIT_OF.get(c.role, c.unit):
             found.append((f"{where}.unit", f"a {c.role} is in {UNIT_OF[c.role]}, not {c.unit!r}"))
         if c.role != "other" and c.regressor:
             found.append((f"{where}.regressor", "displacement is what is regressed: a pose is no regressor"))
@@ -301,8 +309,6 @@ def _bad_state(said: Description) -> list[tuple[str, str]]:
 def _bad_input(said: Description, name: str, one: Input) -> list[tuple[str, str]]:
     """Bounds, slew and stop rule of one input, against each other and the plan."""
     found = []
-    if one.unit not in UNITS:
-        found.append(("unit", f"one of {', '.join(UNITS)} (SI), not {one.unit!r}"))
     if not one.low < one.high:
         found.append(("high", f"above low ({one.low:g}), not {one.high:g}"))
     rule = one.stop

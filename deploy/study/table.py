@@ -22,7 +22,7 @@ Result = dict[str, Any]
 Row = dict[str, Any]
 
 NAMES = {DDPC: "ours", "sailr": "SAILR", "secas": "SECAS", NONE: "TD3"}
-PAPER = Path(__file__).parents[2] / "results" / "paper.json"
+PAPER = Path(__file__).with_name("paper.json")
 WINDOW = 50  # episodes of training over which a goal rate is taken
 LEARNED = 0.9  # the goal rate that counts as learned
 

@@ -8,7 +8,7 @@ import pytest
 ROOT = Path(__file__).parents[2]
 
 
-@pytest.mark.parametrize("name", ["messaging", "sim", "safety", "actors", "learner", "logs", "deploy"])
+@pytest.mark.parametrize("name", ["brakeline", "messaging", "sim", "safety", "actors", "learner", "logs", "deploy"])
 def test_the_package_is_this_checkouts(name: str) -> None:
     file = importlib.import_module(name).__file__
     assert file is not None

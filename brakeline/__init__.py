@@ -1,0 +1,107 @@
+"""Brakeline's public names: the filter in front of your own policy and robot, in process or as a service.
+
+with SafetyClient.open("tcp/127.0.0.1:7447", "ground") as safety:      # ask a running service
+    answer = safety.decide(state, action, [Obstacle("cylinder", (0.4, 0.0), (0.1,))])
+
+env = SafetyWrapper(env, Filter(ModelSet.load(path)))                  # in process, for any RL library
+
+Names are imported when they are first used, so that an asker needs no simulator and no solver.
+"""
+
+from __future__ import annotations
+
+import importlib
+from importlib.metadata import PackageNotFoundError, version
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from messaging.bus import BusError, BusSettings, Late, NoReply, Refused, Unreachable
+    from messaging.descriptions import BadDescription
+    from messaging.robots import Disc, Limit, Robot, UnknownRobot, robot_named
+    from messaging.shapes import BadShape, Obstacle, Shapes
+    from messaging.tasks import Task, task_of
+    from safety.certificates import CertificateError
+    from safety.client import Answer, SafetyClient, SafetyError
+    from safety.commitment import Commitment, Prediction
+    from safety.dataset import BadData, Dataset, Trajectory
+    from safety.filter import Filter
+    from safety.fitting import make
+    from safety.gym import SafetyWrapper
+    from safety.model_set import BadModel, ModelSet, Recipe
+    from safety.request import BadRequest, Decision, Request
+    from safety.statement import Statement, state
+
+PLACES = {
+    "messaging.bus": ("BusError", "BusSettings", "Late", "NoReply", "Refused", "Unreachable"),
+    "messaging.descriptions": ("BadDescription",),
+    "messaging.robots": ("Disc", "Limit", "Robot", "UnknownRobot", "robot_named"),
+    "messaging.shapes": ("BadShape", "Obstacle", "Shapes"),
+    "messaging.tasks": ("Task", "task_of"),
+    "safety.certificates": ("CertificateError",),
+    "safety.client": ("Answer", "SafetyClient", "SafetyError"),
+    "safety.commitment": ("Commitment", "Prediction"),
+    "safety.dataset": ("BadData", "Dataset", "Trajectory"),
+    "safety.filter": ("Filter",),
+    "safety.fitting": ("make",),
+    "safety.gym": ("SafetyWrapper",),
+    "safety.model_set": ("BadModel", "ModelSet", "Recipe"),
+    "safety.request": ("BadRequest", "Decision", "Request"),
+    "safety.statement": ("Statement", "state"),
+}
+_PLACE_OF = {name: module for module, names in PLACES.items() for name in names}
+
+__all__ = [
+    "Answer",
+    "BadData",
+    "BadDescription",
+    "BadModel",
+    "BadRequest",
+    "BadShape",
+    "BusError",
+    "BusSettings",
+    "CertificateError",
+    "Commitment",
+    "Dataset",
+    "Decision",
+    "Disc",
+    "Filter",
+    "Late",
+    "Limit",
+    "ModelSet",
+    "NoReply",
+    "Obstacle",
+    "Prediction",
+    "Recipe",
+    "Refused",
+    "Request",
+    "Robot",
+    "SafetyClient",
+    "SafetyError",
+    "SafetyWrapper",
+    "Shapes",
+    "Statement",
+    "Task",
+    "Trajectory",
+    "UnknownRobot",
+    "Unreachable",
+    "__version__",
+    "make",
+    "robot_named",
+    "state",
+    "task_of",
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name == "__version__":
+        try:
+            return version("brakeline")
+        except PackageNotFoundError:  # a checkout that nobody installed
+            return "0+unknown"
+    if name not in _PLACE_OF:
+        raise AttributeError(f"brakeline has no {name!r}; it has: {', '.join(__all__)}")
+    return getattr(importlib.import_module(_PLACE_OF[name]), name)
+
+
+def __dir__() -> list[str]:
+    return __all__

@@ -1,0 +1,90 @@
+"""`brakeline robot`: a robot's description: a new one, a check, a picture."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+from rich.markup import escape
+from rich.table import Table
+
+from deploy.commands.common import console, errors, say_json
+from deploy.data.portrait import picture, summary
+from messaging.descriptions import NAME, BadDescription
+from messaging.robots import FOLDER, Robot, robot_named
+from messaging.tasks import UnknownTask, learnt, task_of
+
+
+@dataclass(frozen=True)
+class RobotCommand:
+    action: Annotated[Literal["new", "check", "show"], tyro.conf.Positional]
+    """new: write a commented description; check: tell every mistake; show: what it amounts to."""
+    file: Annotated[str, tyro.conf.Positional]
+    """The description (.toml), or the name of a robot that comes with the program."""
+    picture: Path | None = None
+    """Draw the body and the stop into this image."""
+    json: bool = False
+
+    def run(self) -> int:
+        return {"new": self._new, "check": self._check, "show": self._show}[self.action]()
+
+    def _new(self) -> int:
+        path = Path(self.file)
+        if path.suffix != ".toml" or not NAME.fullmatch(path.stem):
+            raise ValueError(f"{self.file}: a description is a file NAME.toml, NAME of letters, digits, '_' and '-'")
+        if path.exists():
+            raise ValueError(f"{path} exists: `brakeline robot check {path}`")
+        path.write_text((FOLDER / "template.txt").read_text().replace('"NAME"', f'"{path.stem}"'))
+        if self.json:
+            say_json({"file": str(path)})
+        else:
+            console.print(f"{path}: fill it in, then `brakeline robot check {path}`")
+        return 0
+
+    def _check(self) -> int:
+        try:
+            robot = learnt(self.file)
+        except BadDescription as error:
+            if self.json:
+                say_json({"file": self.file, "problems": [list(problem) for problem in error.problems]})
+            else:
+                errors.print(str(error), markup=False)
+            return 1
+        found = summary(robot)
+        if self.json:
+            say_json({"file": self.file, "problems": [], "remarks": found["remarks"]})
+            return 0
+        console.print(f"{robot.name}: {len(robot.state)} coordinates, {len(robot.action)} inputs, no mistake")
+        for remark in found["remarks"]:
+            console.print(f"  {remark}", markup=False)
+        console.print(f"  {_task(robot)}", markup=False)
+        console.print(f"next: `brakeline import LOG --robot {self.file}`, or `brakeline collect {self.file}`")
+        return 0
+
+    def _show(self) -> int:
+        robot = robot_named(self.file)
+        found = summary(robot)
+        if self.picture is not None:
+            picture(robot, self.picture)
+            found["picture"] = str(self.picture)
+        if self.json:
+            say_json(found)
+            return 0
+        table = Table(box=None, show_header=False, padding=(0, 2, 0, 0))
+        for label, one in found.pop("inputs").items():
+            table.add_row(escape(f"input {label}"), f"{one['low']:g} to {one['high']:g}, stop: {one['stop']}")
+        for name, value in found.items():
+            shown = "\n".join(value) if isinstance(value, list) else f"{value:g}" if isinstance(value, float) else value
+            table.add_row(name.replace("_", " "), escape(str(shown)))
+        console.print(table)
+        return 0
+
+
+def _task(robot: Robot) -> str:
+    try:
+        task = task_of(robot)
+    except UnknownTask:
+        return "no task beside it: enough to certify and to filter; to train, write NAME.task.toml (docs/your_robot.md)"
+    return f"its task: {task.observation_dim} observed values, arenas {', '.join(task.arenas)}"

@@ -1,0 +1,55 @@
+"""`brakeline robot`: a new description, a check, a look."""
+
+import json
+
+import pytest
+
+from deploy import cli
+
+
+def run(capsys, *words):
+    code = cli.main(["robot", *map(str, words)])
+    return code, capsys.readouterr()
+
+
+def test_a_new_description_is_right_as_it_stands(tmp_path, capsys):
+    path = tmp_path / "rover.toml"
+    code, said = run(capsys, "new", path)
+    assert code == 0 and f"robot check {path}" in said.out.replace("\n", "")
+    assert 'name = "rover"' in path.read_text()
+    code, said = run(capsys, "check", path)
+    assert code == 0 and "no mistake" in said.out
+    code, said = run(capsys, "new", path)
+    assert code == 1 and "exists" in said.err
+
+
+def test_every_mistake_is_told_and_the_exit_status_says_so(tmp_path, capsys):
+    path = tmp_path / "rover.toml"
+    run(capsys, "new", path)
+    path.write_text(path.read_text().replace("brake = 3", "brakes = 3").replace('"m/s"', '"km/h"', 1))
+    code, said = run(capsys, "check", path)
+    assert code == 1
+    assert "plan.brakes: unknown; did you mean 'brake'?" in said.err and "state.speed.unit" in said.err
+    code, said = run(capsys, "check", path, "--json")
+    assert code == 1 and {"plan.brakes", "plan.brake", "state.speed.unit"} <= {
+        f for f, _ in json.loads(said.out)["problems"]
+    }
+
+
+def test_a_short_sight_is_remarked(tmp_path, capsys):
+    path = tmp_path / "rover.toml"
+    run(capsys, "new", path)
+    path.write_text(path.read_text().replace("sight = 3.0", "sight = 0.2"))
+    _, said = run(capsys, "check", path, "--json")
+    assert any(remark.startswith("sight") for remark in json.loads(said.out)["remarks"])
+
+
+@pytest.mark.parametrize("robot", ["ground", "quadrotor"])
+def test_it_can_be_looked_at(tmp_path, capsys, robot):
+    picture = tmp_path / "robot.png"
+    code, said = run(capsys, "show", robot, "--picture", picture, "--json")
+    shown = json.loads(said.out)
+    assert code == 0 and picture.read_bytes().startswith(b"\x89PNG")
+    assert shown["name"] == robot and shown["footprint_m"] in (0.105, 0.3)
+    code, said = run(capsys, "show", robot)
+    assert "[m/s]" in said.out and "layout" in said.out

@@ -1,0 +1,205 @@
+"""A robot's description: what is right comes back the same, and every mistake is told by its field."""
+
+import copy
+import json
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from messaging.descriptions import UNITS, BadDescription, describe, read, robot_of
+from messaging.robots import FOLDER, Robot, UnknownRobot, known, robot_named
+from messaging.tasks import UnknownTask, task_of
+from messaging.tasks import read as read_task
+from tests.robots import GROUND, QUADROTOR, ROBOTS
+
+CAR = {
+    "name": "car",
+    "period": 0.1,
+    "sight": 3.0,
+    "state": {
+        "x": {"unit": "m", "role": "position", "error": 0.01},
+        "y": {"unit": "m", "role": "position", "error": 0.01},
+        "heading": {"unit": "rad", "role": "heading", "error": 0.02},
+        "speed": {"unit": "m/s", "error": 0.02, "follows": "speed"},
+        "steering": {"unit": "rad", "error": 0.02, "follows": "steering"},
+    },
+    "input": {
+        "speed": {"unit": "m/s", "low": -0.5, "high": 1.0, "slew": 0.25},
+        "steering": {"unit": "rad", "low": -0.5, "high": 0.5, "moves": False, "stop": "hold"},
+    },
+    "plan": {"horizon": 8, "free": 1, "brake": 5},
+    "body": [{"at": [0.0, 0.0], "radius": 0.15}, {"at": [0.25, 0.0], "radius": 0.15}],
+    "limit": [{"name": "keep in", "weights": {"x": 1.0}, "most": 5.0}],
+}
+
+
+def changed(*path_and_value):
+    *path, last, value = path_and_value
+    said = copy.deepcopy(CAR)
+    place = said
+    for part in path:
+        place = place[part]
+    if value is ...:
+        del place[last]
+    else:
+        place[last] = value
+    return said
+
+
+@pytest.mark.parametrize("robot", ROBOTS.values(), ids=ROBOTS)
+def test_a_description_makes_the_same_robot_again(robot):
+    assert robot_of(json.loads(json.dumps(robot.description))) == robot
+    assert robot.in_real_time().in_lockstep() == robot
+    assert read(FOLDER / f"{robot.name}.toml") == robot
+
+
+def test_what_a_description_says_is_what_the_robot_has():
+    car = robot_of(CAR)
+    assert car.state == ("x [m]", "y [m]", "heading [rad]", "speed [m/s]", "steering [rad]")
+    assert (car.position_dim, car.heading, car.regressor, car.follows) == (2, 2, (3, 4), (3, 4))
+    assert car.stop == ("ramp", "hold") and list(car.stopping) == [True, False]
+    assert car.footprint == pytest.approx(0.4)
+    plan = (car.schedule() @ [1.0, 0.3]).reshape(8, 2)
+    assert plan[:, 0] == pytest.approx([1.0, 0.8, 0.6, 0.4, 0.2, 0.0, 0.0, 0.0])
+    assert plan[:, 1] == pytest.approx(0.3), "a car keeps its steering while it brakes"
+    assert car.rests(plan[-1]) and not car.rests(plan[3])
+    assert robot_of(describe(car)) == car
+
+
+@pytest.mark.parametrize(
+    ("said", "field", "word"),
+    [
+        (changed("period", ...), "period", "missing"),
+        (changed("period", 0.0), "period", "greater"),
+        (changed("period", "fast"), "period", "number"),
+        (changed("periods", 0.1), "periods", "did you mean 'period'"),
+        (changed("name", "a/b"), "name", "letters"),
+        (changed("name", "car-late"), "name", "-late"),
+        (changed("sight", math.inf), "sight", "finite"),
+        (changed("state", "x", "unit", "cm"), "state.x.unit", "SI"),
+        (changed("state", "x", "unit", "rad"), "state.x.unit", "position is in m"),
+        (changed("state", "heading", "unit", "deg"), "state.heading.unit", "SI"),
+        (changed("state", "x", "role", "place"), "state.x.role", "position"),
+        (changed("state", "x", "error", -1.0), "state.x.error", "greater"),
+        (changed("state", "x", "error", ...), "state.x.error", "missing"),
+        (changed("state", "x", "regressor", True), "state.x.regressor", "displacement"),
+        (changed("state", "speed", "follows", "throttle"), "state.speed.follows", "one of the inputs"),
+        (changed("state", "speed", "follows", "steering"), "state.speed.follows", "in 'm/s'"),
+        (changed("state", "y", "role", "other"), "state", "two or three"),
+        (changed("input", "speed", "low", 2.0), "input.speed.high", "above low"),
+        (changed("input", "speed", "low", 0.2), "input.speed.low", "zero input"),
+        (changed("input", "speed", "slew", 0.1), "input.speed.slew", "can't follow the ramp"),
+        (changed("input", "speed", "slew", -0.1), "input.speed.slew", "greater"),
+        (changed("input", "speed", "stop", [0.5, 0.2]), "input.speed.stop", "ends in 0"),
+        (changed("input", "speed", "stop", [-2.0, 0.0]), "input.speed.stop", "leaves the bounds"),
+        (changed("input", "speed", "stop", {"x": -4.0}), "input.speed.stop", "gains on speeds"),
+        (changed("input", "speed", "stop", {"speed": -4.0}), "input.speed.stop", "`stopped`"),
+        (changed("input", "speed", "stop", "coast"), "input.speed.stop", "ramp"),
+        (changed("input", "speed", "unit", "km/h"), "input.speed.unit", "SI"),
+        (changed("plan", "horizon", 5), "plan.horizon", "at least 6"),
+        (changed("plan", "brake", 0), "plan.brake", "greater"),
+        (changed("plan", "horizon", 4.5), "plan.horizon", "integer"),
+        (changed("body", []), "body", "at least 1"),
+        (changed("body", 0, "radius", 0.0), "body.0.radius", "greater"),
+        (changed("body", 0, "at", [0.0, 0.0, 0.0]), "body.0.at", "the position has 2"),
+        (changed("limit", 0, "weights", {"z": 1.0}), "limit.0.weights", "names of state coordinates"),
+        (changed("limit", 0, "weights", {}), "limit.0.weights", "names of state coordinates"),
+    ],
+)
+def test_a_mistake_is_told_by_its_field(said, field, word):
+    with pytest.raises(BadDescription) as caught:
+        robot_of(said, "my.toml")
+    told = [text for place, text in caught.value.problems if place == field or place.startswith(f"{field}.")]
+    assert any(word in text for text in told), caught.value.problems
+    assert field in str(caught.value) and "my.toml" in str(caught.value)
+
+
+def test_all_mistakes_are_told_at_once():
+    said = changed("period", -1.0)
+    said["state"]["x"]["unit"] = 3
+    del said["plan"]
+    with pytest.raises(BadDescription) as caught:
+        robot_of(said)
+    assert {"period", "state.x.unit", "plan"} <= {field for field, _ in caught.value.problems}
+
+
+VALUES = (
+    st.none() | st.booleans() | st.floats() | st.integers() | st.text(max_size=5) | st.lists(st.floats(), max_size=3)
+)
+PLACES = [
+    *[(name,) for name in CAR],
+    *[("state", name, field) for name in CAR["state"] for field in ("unit", "role", "error", "follows", "regressor")],
+    *[("input", name, field) for name in CAR["input"] for field in ("unit", "low", "high", "moves", "slew", "stop")],
+    *[("plan", field) for field in CAR["plan"]],
+    *[("body", 0, field) for field in ("at", "radius")],
+    *[("limit", 0, field) for field in ("name", "weights", "most")],
+]
+
+
+@given(st.sampled_from(PLACES), VALUES)
+def test_whatever_stands_in_a_field_makes_a_sound_robot_or_is_told(place, value):
+    said = changed(*place, value)
+    try:
+        robot = robot_of(said)
+    except BadDescription as error:
+        assert error.problems
+        return
+    assert robot_of(describe(robot)) == robot
+    assert np.isfinite(robot.schedule()).all() and robot.rests(
+        (robot.schedule() @ np.tile(robot.high(), 1)).reshape(robot.horizon, -1)[-1]
+    )
+    assert robot.horizon >= robot.free_steps + robot.brake_steps and robot.footprint > 0.0
+    assert all(label.endswith("]") and label[label.rindex("[") + 1 : -1] in UNITS for label in robot.state)
+
+
+def test_a_file_is_found_by_its_path_and_then_by_its_name(tmp_path):
+    text = (FOLDER / "ground.toml").read_text().replace('name = "ground"', 'name = "minted"')
+    (tmp_path / "my.toml").write_text(text)
+    robot = robot_named(str(tmp_path / "my.toml"))
+    assert robot.name == "minted" and robot_named("minted") is robot
+    assert robot_named("minted-late").late
+    with pytest.raises(UnknownTask, match="minted has no task"):
+        task_of(robot)
+    with pytest.raises(UnknownRobot, match=r"nowhere\.toml"):
+        robot_named(str(tmp_path / "nowhere.toml"))
+    (tmp_path / "broken.toml").write_text("name = ")
+    with pytest.raises(BadDescription, match="not TOML"):
+        robot_named(str(tmp_path / "broken.toml"))
+
+
+def test_nobody_takes_the_name_of_a_robot_that_comes_with_the_program():
+    said = copy.deepcopy(GROUND.description)
+    said["sight"] = 0.1
+    with pytest.raises(UnknownRobot, match="choose another"):
+        known(robot_of(said))
+    assert robot_named("ground") is GROUND
+
+
+def test_a_task_says_what_is_wrong_in_it(tmp_path):
+    text = (FOLDER / "ground.task.toml").read_text()
+    (tmp_path / "a.task.toml").write_text(text.replace("half_width = 2.5", 'half_width = "wide"'))
+    with pytest.raises(UnknownTask, match=r"arenas\.default\.half_width"):
+        read_task(tmp_path / "a.task.toml")
+    (tmp_path / "a.task.toml").write_text(text.replace("[lidar]", "[radar]"))
+    with pytest.raises(UnknownTask, match="radar"):
+        read_task(tmp_path / "a.task.toml")
+
+
+def test_observations_are_what_they_were():
+    assert (task_of(GROUND).observation_dim, task_of(QUADROTOR).observation_dim) == (26, 189)
+
+
+def test_a_robot_that_stops_by_feedback_brakes_by_what_is_measured():
+    said = changed("input", "speed", "stop", {"speed": -1.0})
+    said["stopped"] = 0.05
+    del said["input"]["speed"]["slew"]
+    robot: Robot = robot_of(said)
+    state = np.array([9.0, 9.0, 1.0, 0.3, 0.1])
+    assert robot.braked(np.array([0.0, 0.2]), state, np.zeros(2)) == pytest.approx([-0.3, 0.2])
+    assert robot.braked(np.zeros(2), np.array([0, 0, 0, 9.0, 0]), np.zeros(2))[0] == -0.5, "within bounds"
+    assert not robot.stands(state) and robot.stands(np.array([9.0, 9.0, 1.0, 0.04, 0.0]))
+    with pytest.raises(UnknownRobot, match="no real-time mode"):
+        robot.in_real_time()
