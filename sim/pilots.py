@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from messaging.robots import Robot
+from messaging.shapes import Shapes
 from sim.planner import Routes
 from sim.world import Arena
 
@@ -20,6 +21,16 @@ def full_speed(robot: Robot, direction: Array) -> Array:
     """The fastest setpoint within the robot's bounds in a direction (3,); zero when there is none."""
     largest = float(np.abs(direction).max())
     return robot.high() * direction / largest if largest > 0.0 else np.zeros_like(direction)
+
+
+def way_to_nearest(info: dict[str, Any]) -> Array:
+    """From the measured position to the closest point of anything, what moves included, (d,) m."""
+    arena: Arena = info["arena"]
+    position = info["state"][: arena.dim]
+    ways = arena.shapes.towards(position)
+    if moving := [obstacle for obstacle in info["obstacles"] if obstacle.motion is not None]:
+        ways = np.concatenate([ways, Shapes.of(moving, arena.dim).towards(position)])
+    return np.asarray(ways[np.argmin(np.einsum("ni,ni->n", ways, ways))])
 
 
 class GreedyPilot:
@@ -33,14 +44,13 @@ class GreedyPilot:
 
 
 class HostilePilot:
-    """Full speed straight at the nearest obstacle, floor and ceiling included."""
+    """Full speed straight at the nearest obstacle, floor and ceiling and what moves included."""
 
     def __init__(self, robot: Robot, rng: np.random.Generator) -> None:
         self._robot = robot
 
     def __call__(self, observation: NDArray[np.float32], info: dict[str, Any]) -> Array:
-        ways = info["arena"].shapes.towards(info["state"][:3])
-        return full_speed(self._robot, ways[np.argmin(np.einsum("ni,ni->n", ways, ways))])
+        return full_speed(self._robot, way_to_nearest(info))
 
 
 class StopModel:

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from messaging.robots import Robot
 from messaging.tasks import task_of
 from sim.estimator import wrap
+from sim.pilots import way_to_nearest
 from sim.planner import Routes
 from sim.world import Arena
 
@@ -79,7 +80,7 @@ class Greedy:
 
 
 class Adversary:
-    """Turns to the nearest obstacle on the spot, then drives at it at full speed."""
+    """Turns to the nearest obstacle on the spot, be it one that moves, then drives at it at full speed."""
 
     AIMED = 0.5  # rad; a larger bearing is turned off first, else it could circle the obstacle for ever
 
@@ -87,9 +88,7 @@ class Adversary:
         self._robot = robot
 
     def __call__(self, observation: NDArray[np.float32], info: dict[str, Any]) -> Array:
-        arena: Arena = info["arena"]
-        ways = arena.shapes.towards(info["state"][:2])
-        nearest = ways[np.argmin(np.linalg.norm(ways, axis=1))]
+        nearest = way_to_nearest(info)
         angle = bearing(info["state"], info["state"][:2] + nearest)
         speed = self._robot.high()[0] if abs(angle) < self.AIMED else 0.0
         return bounded(self._robot, speed, angle / self._robot.period)
