@@ -45,13 +45,13 @@ def half_spaces(near: Shapes, start: Array, nominal: Array, keep_off: float, mea
     level = np.einsum("nqd,nqd->nq", unit, towards + seen_from)
     inside = ~(gap > TOUCHING)  # true for NaN, too
     level[inside | inside[:, :1]] = -np.inf
-    choice = _roomiest(unit, level, between)
+    choice = roomiest(unit, level, between)
     each = np.arange(len(choice))[:, None]
     normal = unit[each, choice]
     return normal, level[each, choice] - (keep_off + near.margin)[:, None] - np.abs(normal) @ measured
 
 
-def _roomiest(unit: Array, level: Array, ends: Array) -> NDArray[np.intp]:
+def roomiest(unit: Array, level: Array, ends: Array) -> NDArray[np.intp]:
     """Which of the planes (n, 2N+1) serves which period, the ends (N+1, d) of which are nominal: (n, N).
 
     From the first period on whose ends no plane keeps apart from the obstacle, the nominal plan goes through it: the

@@ -1,0 +1,80 @@
+"""What a ranging sensor saw in one turn: the raw material of free space where there is no map.
+
+A beam that reports a range ρ says: free from the sensor up to ρ, within its error. One that reports nothing (0, or NaN)
+says nothing: too near, dropped, blind. Memory fills such beams in (`safety/memory.py`) with what was seen free before.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+MOST_BEAMS = 1000
+
+
+class BadScan(ValueError):
+    """A scan that is none."""
+
+    field = "scan"
+
+
+@dataclass(frozen=True, eq=False)
+class Scan:
+    """A fan in the plane. ranges (R,) m, `far` where nothing was hit, 0: not known; angles (R,) rad in the sensor's frame,
+    ascending, less than a turn. Nothing that it may meet is narrower than `least_width`.
+
+    pose: the robot's measured x, y [m] and heading [rad] when it was taken; mount: the sensor's place in the robot, m.
+    What counts as wide enough: from every point of an obstacle's surface two edges of that length at right angles lie in
+    it, as in every corner of a box with such edges, or in a disc of √½ of it or more in radius.
+    """
+
+    ranges: Array
+    angles: Array
+    pose: tuple[float, float, float]
+    mount: tuple[float, float] = (0.0, 0.0)
+    far: float = 3.5  # m
+    range_error: float = 0.02  # m, largest error of a range
+    position_error: float = 0.0  # m, of the pose
+    heading_error: float = 0.0  # rad, of the pose
+    least_width: float = 0.1  # m
+    doubt: int = 0  # this many beams on either side must agree that something is free: lone false ranges do no harm
+    speed: float = 0.0  # m/s: whatever was hit may move as fast; 0: the world stands
+    age: float = 0.0  # s since it was taken
+
+    def __post_init__(self) -> None:
+        n = len(self.ranges)
+        if self.ranges.shape != (n,) or self.angles.shape != (n,) or n > MOST_BEAMS:
+            raise BadScan(f"a scan has as many ranges as angles, {MOST_BEAMS} at most")
+        if not np.isfinite(self.angles).all() or (np.diff(self.angles) <= 0.0).any():
+            raise BadScan("a scan's angles must be finite and ascend")
+        if n and self.angles[-1] - self.angles[0] >= 2.0 * math.pi:
+            raise BadScan("a scan's angles span less than a turn")
+        if (np.nan_to_num(self.ranges, nan=0.0) < 0.0).any() or np.isinf(self.ranges).any():
+            raise BadScan("a scan's ranges are 0 or more")
+        if len(self.pose) != 3 or len(self.mount) != 2:
+            raise BadScan("a scan's pose has 3 coordinates, its mount 2")
+        values = (*self.pose, *self.mount)
+        bounds = (self.far, self.range_error, self.position_error, self.heading_error, self.speed, self.age, self.doubt)
+        if not all(math.isfinite(value) for value in values):
+            raise BadScan("a scan's pose and mount must be finite")
+        if not all(math.isfinite(value) and value >= 0.0 for value in bounds):
+            raise BadScan("a scan's errors, speed and age must be finite and not negative")
+        if not (math.isfinite(self.least_width) and self.least_width > 0.0):
+            raise BadScan("a scan's least width must be positive")
+
+    @property
+    def known(self) -> NDArray[np.bool_]:
+        """Which beams say something."""
+        return np.asarray(self.ranges > 0.0)
+
+    def sensor(self) -> tuple[Array, float]:
+        """Where the sensor was, by the measured pose: place (2,) and heading."""
+        x, y, heading = self.pose
+        cos, sin = math.cos(heading), math.sin(heading)
+        mx, my = self.mount
+        return np.array([x + cos * mx - sin * my, y + sin * mx + cos * my]), heading

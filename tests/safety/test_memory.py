@@ -1,0 +1,79 @@
+"""What is remembered as free is free: in random scenes, with the errors of every pose."""
+
+import math
+
+import numpy as np
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from messaging.scans import Scan
+from messaging.shapes import Shapes
+from safety.memory import Memory
+from safety.scan import gaps
+from tests.safety.test_scan import FAN, FAR, WIDTH, cast, scene
+
+BODY, BLIND = 0.02, math.radians(30.0)  # rad on either side of straight behind
+
+
+def taken(obstacles, pose, rng, error=0.01, turn=0.02, speed=0.0):
+    """A scan at the true pose, blind behind, with a measured pose that is off."""
+    ranges = cast(obstacles, np.array(pose[:2]), FAN + pose[2])
+    ranges[np.abs(FAN) > math.pi - BLIND] = 0.0
+    off = rng.normal(size=2)
+    off *= error / np.linalg.norm(off)
+    seen = (pose[0] + off[0], pose[1] + off[1], pose[2] + rng.uniform(-turn, turn))
+    known = {"position_error": error, "heading_error": turn, "range_error": 0.005}
+    return Scan(ranges, FAN, seen, far=FAR, least_width=WIDTH, speed=speed, **known)
+
+
+@settings(max_examples=15, deadline=None)
+@given(st.integers(0, 100_000))
+def test_what_is_remembered_is_free(seed):
+    rng = np.random.default_rng(seed)
+    obstacles = scene(rng, 8)
+    shapes = Shapes.of(obstacles, 2)
+    memory, pose, remembered = Memory(BODY), np.array([0.0, 0.0, rng.uniform(-3, 3)]), 0
+    for _ in range(12):
+        scan = taken(obstacles, pose, rng)
+        filled = memory.fill(scan, 0.2)
+        new = ~scan.known & filled.known
+        remembered += int(new.sum())
+        true = cast(obstacles, pose[:2], FAN[new] + pose[2])
+        assert (filled.ranges[new] - scan.range_error <= true + 1e-9).all()
+        assert np.array_equal(filled.ranges[scan.known], scan.ranges[scan.known])
+        ahead = pose + 0.05 * np.array([math.cos(pose[2]), math.sin(pose[2]), 0.0])
+        if shapes.distance(ahead[:2]).min() > BODY:
+            pose = ahead
+        pose[2] += rng.uniform(-0.3, 0.3)
+    assert remembered > 0
+
+
+def test_who_drives_ahead_knows_what_is_behind():
+    rng = np.random.default_rng(0)
+    memory = Memory(0.105)
+    for k in range(20):
+        filled = memory.fill(_open(0.05 * k, rng), 0.2)
+    behind = gaps(filled)[2][np.abs(gaps(filled)[0]) > math.pi - 0.3]
+    assert behind.min() > 0.3
+
+
+def test_a_world_that_moves_takes_it_back():
+    rng = np.random.default_rng(0)
+    memory = Memory(0.105)
+    for k in range(20):
+        filled = memory.fill(_open(0.05 * k, rng, speed=1.6), 0.2)
+    assert not filled.known[np.abs(FAN) > math.pi - BLIND].any()
+
+
+def test_at_the_start_there_is_room_about_the_body_and_no_more():
+    filled = Memory(0.105).fill(_open(0.0, np.random.default_rng(0)), 0.0)
+    behind = filled.ranges[np.abs(FAN) > math.pi - BLIND] - filled.range_error
+    assert (behind > 0.17).all() and (behind <= 0.205).all()
+
+
+def _open(x, rng, speed=0.0):
+    """Nothing anywhere, blind behind."""
+    ranges = np.where(np.abs(FAN) > math.pi - BLIND, 0.0, FAR)
+    pose = (x + rng.uniform(-0.005, 0.005), rng.uniform(-0.005, 0.005), rng.uniform(-0.01, 0.01))
+    known = {"position_error": 0.01, "heading_error": 0.02, "range_error": 0.02}
+    return Scan(ranges, FAN, pose, far=FAR, least_width=WIDTH, speed=speed, **known)

@@ -1,0 +1,152 @@
+"""Free space from scans of random scenes: no point of anything in them is in it. Rays are cast by the shapes' own words."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from messaging.scans import BadScan, Scan
+from messaging.shapes import Obstacle, Shapes
+from safety.scan import cells, gaps, half_spaces
+from tests.messaging.test_shapes import sample
+
+FAR, WIDTH = 3.5, 0.1
+FAN = np.linspace(-math.pi, math.pi, 360, endpoint=False)
+
+
+def cast(obstacles, at, angles, far=FAR):
+    """Ranges by marching: the step is the distance to the nearest obstacle."""
+    shapes = Shapes.of(obstacles, 2)
+    ranges = np.zeros(len(angles))
+    directions = np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    for _ in range(400):
+        ranges = np.minimum(ranges + shapes.distance(at + ranges[:, None] * directions).min(axis=0), far)
+    return ranges
+
+
+def scene(rng, count=6):
+    """Boxes with edges of `WIDTH` or more and discs of √½ of it or more in radius, none of them at the sensor."""
+    found = []
+    while len(found) < count:
+        at = tuple(rng.uniform(-1.5, 1.5, 2))
+        if rng.random() < 0.5:
+            candidate = Obstacle("box", at, tuple(rng.uniform(WIDTH, 0.5, 2)), rng.uniform(-3, 3))
+        else:
+            candidate = Obstacle("cylinder", at, (rng.uniform(WIDTH / math.sqrt(2), 0.3),))
+        if Shapes.of([candidate], 2).distance(np.zeros(2))[0] > 0.12:
+            found.append(candidate)
+    return found
+
+
+def taken(rng, obstacles, drop=0.0, noise=0.0, pose=(0.0, 0.0, 0.0), **more):
+    """A scan of these at the pose, by a sensor at the robot's middle; some beams say nothing."""
+    ranges = cast(obstacles, np.array(pose[:2]), FAN + pose[2])
+    ranges = np.where(ranges < FAR, np.clip(ranges + rng.uniform(-noise, noise, len(ranges)), 1e-3, FAR), FAR)
+    ranges[rng.random(len(ranges)) < drop] = 0.0
+    return Scan(ranges, FAN, pose, far=FAR, range_error=noise, least_width=WIDTH, **more)
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.integers(0, 100_000), st.sampled_from([0.0, 0.1, 0.5]), st.sampled_from([0.0, 0.02]))
+def test_nothing_is_where_it_is_said_to_be_free(seed, drop, noise):
+    rng = np.random.default_rng(seed)
+    obstacles = scene(rng)
+    angles, width, free = gaps(taken(rng, obstacles, drop, noise))
+    solid = np.concatenate([sample(o, rng, 3000) for o in obstacles])
+    range_, angle = np.linalg.norm(solid, axis=1), np.arctan2(solid[:, 1], solid[:, 0])
+    gap = (np.searchsorted(angles, angle, side="right") - 1) % len(angles)
+    assert (range_ >= free[gap] - 1e-9).all()
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.integers(0, 100_000), st.sampled_from([0.0, 0.2]))
+def test_every_point_within_is_beyond_some_half_space(seed, drop):
+    """In the world, whatever the pose, for errors of the pose as large as they may be."""
+    rng = np.random.default_rng(seed)
+    obstacles = scene(rng)
+    scan = taken(rng, obstacles, drop, 0.01, position_error=0.02, heading_error=0.02)
+    measured = np.array([*rng.uniform(-5, 5, 2), rng.uniform(-3, 3)])
+    error = rng.normal(size=2)
+    error *= 0.02 / np.linalg.norm(error)
+    turn = measured[2] + rng.uniform(-0.02, 0.02)  # of the robot's frame in the world, truly
+    moved = Scan(scan.ranges, FAN, tuple(measured), far=FAR, range_error=0.01, position_error=0.02, heading_error=0.02)
+    within = 1.0
+    near = cells(moved, within)
+    start = measured[:2]
+    nominal = start + np.cumsum(rng.uniform(-0.1, 0.1, (3, 2)), axis=0)
+    normals, offsets = half_spaces(near, start, nominal, 0.0, np.zeros(2), 0.2)
+    solid = np.concatenate([sample(o, rng, 1500) for o in obstacles])
+    solid = solid[np.linalg.norm(solid, axis=1) < within]
+    cos, sin = math.cos(turn), math.sin(turn)
+    world = solid @ np.array([[cos, sin], [-sin, cos]]) + measured[:2] + error
+    for k in range(3):
+        beyond = (world - start) @ normals[:, k].T >= offsets[:, k] - 1e-9
+        assert beyond.any(axis=1).all()
+
+
+def test_a_wall_is_a_handful_of_cells_and_leaves_its_room():
+    wall = [Obstacle("wall", (0.5, 0.0), yaw=math.pi)]
+    near = cells(taken(np.random.default_rng(0), wall), 1.0)
+    assert 5 <= len(near) <= 14
+    normals, offsets = half_spaces(near, np.zeros(2), np.array([[0.1, 0.0]] * 3), 0.0, np.zeros(2), 0.2)
+    assert offsets.max(axis=1).min() > 0.48
+    assert ((normals[:, 0] @ [0.3, 0.3]) < offsets[:, 0]).all()
+
+
+def test_what_was_not_seen_is_not_free():
+    blind = Scan(np.zeros(360), FAN, (0.0, 0.0, 0.0))
+    assert (gaps(blind)[2] == 0.0).all() and len(cells(blind, 1.0)) > 0
+    none = Scan(np.zeros(0), np.zeros(0), (0.0, 0.0, 0.0))
+    ahead = np.where(np.abs(FAN) < math.pi / 6, 0.0, FAR)
+    for scan in (blind, none, Scan(ahead, FAN, (0.0, 0.0, 0.0))):
+        _, offsets = half_spaces(cells(scan, 1.0), np.zeros(2), np.array([[0.05, 0.0]]), 0.1, np.zeros(2), 0.2)
+        assert offsets.min() < 0.0
+
+
+def test_one_dropped_beam_costs_nothing_near_by():
+    ranges = np.full(360, FAR)
+    ranges[[10, 100]] = 0.0
+    assert gaps(Scan(ranges, FAN, (0.0, 0.0, 0.0)))[2].min() > 1.8
+
+
+def test_lone_false_ranges_do_no_harm_where_they_are_doubted():
+    rng = np.random.default_rng(0)
+    wall = [Obstacle("wall", (0.5, 0.0), yaw=math.pi)]
+    scan = taken(rng, wall)
+    for first in (178, 179, 180):
+        broken = scan.ranges.copy()
+        broken[first : first + 3] = FAR
+        free = gaps(Scan(broken, FAN, (0.0, 0.0, 0.0), doubt=1))[2]
+        assert free[170:190].max() < 0.55
+        assert gaps(Scan(broken, FAN, (0.0, 0.0, 0.0)))[2][170:190].max() > 2.0
+
+
+def test_what_may_move_takes_room_with_time():
+    wall = [Obstacle("wall", (0.5, 0.0), yaw=math.pi)]
+    still, moving = (cells(taken(np.random.default_rng(0), wall, speed=s, age=0.1), 1.0) for s in (0.0, 1.6))
+    at = (np.zeros(2), np.zeros((3, 2)), 0.0, np.zeros(2), 0.2)
+    lost = half_spaces(still, *at)[1] - half_spaces(moving, *at)[1]
+    assert np.allclose(lost, 1.6 * (0.1 + 0.2 * np.arange(1, 4)))
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"ranges": np.ones(3)},
+        {"ranges": np.full(360, -1.0)},
+        {"ranges": np.full(360, np.inf)},
+        {"angles": FAN[::-1]},
+        {"angles": np.linspace(0, 7, 360)},
+        {"pose": (0.0, 0.0, math.nan)},
+        {"least_width": 0.0},
+        {"speed": -1.0},
+        {"age": math.inf},
+    ],
+)
+def test_a_scan_that_is_none_is_refused(wrong):
+    right = {"ranges": np.ones(360), "angles": FAN, "pose": (0.0, 0.0, 0.0)}
+    Scan(**right)
+    with pytest.raises(BadScan):
+        Scan(**right | wrong)
