@@ -14,6 +14,7 @@ from messaging.robots import Robot
 from messaging.tasks import task_of
 from safety.client import obstacle_messages, request_message
 from safety.commitment import Array, Commitment, Prediction, correction_penalty
+from safety.memory import Memory
 
 EPISODE_STRIDE = 4096  # episodes of different robots of a run never share a seed: seed = episode · stride + number
 
@@ -67,6 +68,7 @@ class Driver:
         self.robot, self.env, self.identity, self.penalty, self.filtered = robot, env, identity, penalty, filtered
         self.cuts, self._goes_on = cuts, goes_on
         self.commitment = Commitment(robot)
+        self._memory = Memory(robot.footprint)
         self.index = 0  # steps so far
         self.running = False
 
@@ -76,6 +78,8 @@ class Driver:
         self.observation, self.info = self.env.reset(options={"episode_seed": seed})
         if not self._goes_on:
             self.commitment.reset()
+            self._memory.reset()
+        self._remember()
         self.episode, self.step, self.running = episode, 0, True
         self.rng = self.identity.noise(episode)
         arena = self.info["arena"]
@@ -100,12 +104,18 @@ class Driver:
             self.info["state"],
             proposal,
             self.info["obstacles"],
+            self._scan,
             actor=self.identity.actor,
             episode=self.episode,
             step=self.step,
             time=self.info["time"],
             observation=self.observation.tolist(),
         )
+
+    def _remember(self) -> None:
+        """Fill in the scan, if there is one, with what was seen free before."""
+        scan = self.info["scan"]
+        self._scan = None if scan is None else self._memory.fill(scan, self.robot.period)
 
     def may_wait(self, outcome: Outcome) -> bool:
         """No answer, and nothing moves: better to ask again than to let the episode pass."""
@@ -119,6 +129,7 @@ class Driver:
             action = next_input(self.commitment, outcome)
         before, held = self.observation, self.info["input_in_force"]
         self.observation, reward, terminated, truncated, self.info = self.env.step(action)
+        self._remember()
         self.running = not (terminated or truncated)
         if outcome is None:
             action = self.info["input_in_force"]  # the vehicle kept to its slew

@@ -78,7 +78,8 @@ def environment(
     c = conditions or Conditions()
     make = factory(robot, c, tap)
     arena_kind(robot, arena)
-    return NavigationEnv(robot, arena, make, c.lidar_noise(robot.position_dim == 3), seed_key=seed)
+    noise = c.lidar_noise(robot.position_dim == 3)
+    return NavigationEnv(robot, arena, make, noise, seed_key=seed, perception=c.perception)
 
 
 def vehicle_in_yard(robot: Robot, rng: np.random.Generator, conditions: Conditions) -> Vehicle:

@@ -34,6 +34,8 @@ class _KindEnumTypeWrapper(_enum_type_wrapper._EnumTypeWrapper[_Kind.ValueType],
     """the closest input that could be verified"""
     FAILSAFE: _Kind.ValueType  # 3
     """the next input of the committed plan"""
+    RECOVERING: _Kind.ValueType  # 4
+    """never verified: out of where nothing can be"""
 
 class Kind(_Kind, metaclass=_KindEnumTypeWrapper): ...
 
@@ -44,6 +46,8 @@ ADJUSTED: Kind.ValueType  # 2
 """the closest input that could be verified"""
 FAILSAFE: Kind.ValueType  # 3
 """the next input of the committed plan"""
+RECOVERING: Kind.ValueType  # 4
+"""never verified: out of where nothing can be"""
 Global___Kind: _TypeAlias = Kind  # noqa: Y015
 
 @_typing.final
@@ -196,6 +200,80 @@ class Motion(_message.Message):
 Global___Motion: _TypeAlias = Motion  # noqa: Y015
 
 @_typing.final
+class Scan(_message.Message):
+    """One turn of a ranging sensor in the plane (messaging/scans.py): free space where there is no map."""
+
+    DESCRIPTOR: _descriptor.Descriptor
+
+    RANGES_FIELD_NUMBER: _builtins.int
+    ANGLES_FIELD_NUMBER: _builtins.int
+    POSE_FIELD_NUMBER: _builtins.int
+    MOUNT_FIELD_NUMBER: _builtins.int
+    FAR_FIELD_NUMBER: _builtins.int
+    RANGE_ERROR_FIELD_NUMBER: _builtins.int
+    POSITION_ERROR_FIELD_NUMBER: _builtins.int
+    HEADING_ERROR_FIELD_NUMBER: _builtins.int
+    LEAST_WIDTH_FIELD_NUMBER: _builtins.int
+    DOUBT_FIELD_NUMBER: _builtins.int
+    SPEED_FIELD_NUMBER: _builtins.int
+    AGE_FIELD_NUMBER: _builtins.int
+    far: _builtins.float
+    """m"""
+    range_error: _builtins.float
+    """m"""
+    position_error: _builtins.float
+    """m"""
+    heading_error: _builtins.float
+    """rad"""
+    least_width: _builtins.float
+    """m: nothing that it may meet is narrower"""
+    doubt: _builtins.int
+    """beams on either side that must agree that something is free"""
+    speed: _builtins.float
+    """m/s: whatever was hit may move as fast"""
+    age: _builtins.float
+    """s since it was taken"""
+    @_builtins.property
+    def ranges(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]:
+        """m; `far`: nothing was hit; 0: not known"""
+
+    @_builtins.property
+    def angles(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]:
+        """rad, in the sensor's frame, ascending"""
+
+    @_builtins.property
+    def pose(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]:
+        """the robot's measured x, y [m] and heading [rad] when it was taken"""
+
+    @_builtins.property
+    def mount(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]:
+        """m, the sensor's place in the robot"""
+
+    def __init__(
+        self,
+        *,
+        ranges: _abc.Iterable[_builtins.float] | None = ...,
+        angles: _abc.Iterable[_builtins.float] | None = ...,
+        pose: _abc.Iterable[_builtins.float] | None = ...,
+        mount: _abc.Iterable[_builtins.float] | None = ...,
+        far: _builtins.float = ...,
+        range_error: _builtins.float = ...,
+        position_error: _builtins.float = ...,
+        heading_error: _builtins.float = ...,
+        least_width: _builtins.float = ...,
+        doubt: _builtins.int = ...,
+        speed: _builtins.float = ...,
+        age: _builtins.float = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["age", b"age", "angles", b"angles", "doubt", b"doubt", "far", b"far", "heading_error", b"heading_error", "least_width", b"least_width", "mount", b"mount", "pose", b"pose", "position_error", b"position_error", "range_error", b"range_error", "ranges", b"ranges", "speed", b"speed"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    def WhichOneof(self, oneof_group: _Never) -> None: ...
+
+Global___Scan: _TypeAlias = Scan  # noqa: Y015
+
+@_typing.final
 class Request(_message.Message):
     """--- the safety service -------------------------------------------------------------------------------------------
 
@@ -219,6 +297,7 @@ class Request(_message.Message):
     PREDICTED_CENTER_FIELD_NUMBER: _builtins.int
     PREDICTED_HALF_WIDTH_FIELD_NUMBER: _builtins.int
     PREDICTED_HEADING_FIELD_NUMBER: _builtins.int
+    SCAN_FIELD_NUMBER: _builtins.int
     robot: _builtins.str
     actor: _builtins.str
     episode: _builtins.int
@@ -257,6 +336,10 @@ class Request(_message.Message):
 
     @_builtins.property
     def predicted_half_width(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]: ...
+    @_builtins.property
+    def scan(self) -> Global___Scan:
+        """in the place of obstacles, or beside them: what is not seen free in it is occupied"""
+
     def __init__(
         self,
         *,
@@ -275,10 +358,11 @@ class Request(_message.Message):
         predicted_center: _abc.Iterable[_builtins.float] | None = ...,
         predicted_half_width: _abc.Iterable[_builtins.float] | None = ...,
         predicted_heading: _builtins.float = ...,
+        scan: Global___Scan | None = ...,
     ) -> None: ...
-    _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
+    _HasFieldArgType: _TypeAlias = _typing.Literal["scan", b"scan"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["action", b"action", "actor", b"actor", "episode", b"episode", "input_in_force", b"input_in_force", "model", b"model", "observation", b"observation", "obstacles", b"obstacles", "plan", b"plan", "predicted_center", b"predicted_center", "predicted_half_width", b"predicted_half_width", "predicted_heading", b"predicted_heading", "robot", b"robot", "state", b"state", "step", b"step", "time", b"time"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["action", b"action", "actor", b"actor", "episode", b"episode", "input_in_force", b"input_in_force", "model", b"model", "observation", b"observation", "obstacles", b"obstacles", "plan", b"plan", "predicted_center", b"predicted_center", "predicted_half_width", b"predicted_half_width", "predicted_heading", b"predicted_heading", "robot", b"robot", "scan", b"scan", "state", b"state", "step", b"step", "time", b"time"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 

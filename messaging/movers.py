@@ -67,7 +67,7 @@ class Movers:
         t = self.age + within
         way = np.sqrt(np.einsum("nd,nd->n", self.drift, self.drift)) * t
         way += self.growth[:, 0] + self.growth[:, 1] * t + self.growth[:, 2] * t * t
-        return np.asarray(self.shapes.distance(point) - way)
+        return np.asarray(self.shapes.distance(point) - self.shapes.margin - way)
 
 
 def parted(obstacles: Sequence[Obstacle], dim: int) -> tuple[Shapes, Movers | None]:

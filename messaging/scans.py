@@ -25,12 +25,13 @@ class BadScan(ValueError):
 
 @dataclass(frozen=True, eq=False)
 class Scan:
-    """A fan in the plane. ranges (R,) m, `far` where nothing was hit, 0: not known; angles (R,) rad in the sensor's frame,
-    ascending, less than a turn. Nothing that it may meet is narrower than `least_width`.
+    """A fan in the plane.
 
-    pose: the robot's measured x, y [m] and heading [rad] when it was taken; mount: the sensor's place in the robot, m.
-    What counts as wide enough: from every point of an obstacle's surface two edges of that length at right angles lie in
-    it, as in every corner of a box with such edges, or in a disc of √½ of it or more in radius.
+    ranges (R,): m, `far` where nothing was hit, 0: not known; angles (R,): rad in the sensor's frame, ascending, less
+    than a turn; pose: the robot's measured x, y [m] and heading [rad] when it was taken; mount: the sensor's place in
+    the robot, m. Nothing that it may meet is narrower than `least_width`: from every point of an obstacle's surface two
+    edges of that length at right angles lie in it, as in every corner of a box with such edges, or in a disc of √½ of
+    it or more in radius.
     """
 
     ranges: Array

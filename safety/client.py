@@ -20,6 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 from messaging import brakeline_pb2 as pb
 from messaging.bus import Bus, BusError, BusSettings
 from messaging.robots import Robot, robot_named
+from messaging.scans import Scan
 from messaging.shapes import Obstacle
 from messaging.topics import DECIDE
 from safety.commitment import Commitment, Prediction
@@ -73,8 +74,30 @@ def _motion(obstacle: Obstacle) -> pb.Motion | None:
     return message
 
 
+def scan_message(scan: Scan) -> pb.Scan:
+    return pb.Scan(
+        ranges=scan.ranges.astype(np.float32).tolist(),
+        angles=scan.angles.astype(np.float32).tolist(),
+        pose=scan.pose,
+        mount=scan.mount,
+        far=scan.far,
+        range_error=scan.range_error,
+        position_error=scan.position_error,
+        heading_error=scan.heading_error,
+        least_width=scan.least_width,
+        doubt=scan.doubt,
+        speed=scan.speed,
+        age=scan.age,
+    )
+
+
 def request_message(
-    commitment: Commitment, state: ArrayLike, action: ArrayLike, obstacles: Iterable[Obstacle], **more: Any
+    commitment: Commitment,
+    state: ArrayLike,
+    action: ArrayLike,
+    obstacles: Iterable[Obstacle],
+    scan: Scan | None = None,
+    **more: Any,
 ) -> pb.Request:
     """A request; `more`: actor, episode, step, time, observation."""
     commitment.seen = np.asarray(state, float)
@@ -86,6 +109,7 @@ def request_message(
         plan=commitment.plan.ravel().tolist(),
         model=commitment.model,
         obstacles=obstacle_messages(obstacles),
+        scan=None if scan is None else scan_message(scan),
         **more,
     )
     if commitment.predicted is not None:

@@ -15,7 +15,9 @@ from numpy.typing import NDArray
 
 from messaging.movers import Movers
 from messaging.robots import Robot
+from messaging.scans import Scan
 from messaging.shapes import Shapes
+from safety import scan as seen
 from safety.commitment import Prediction
 from safety.freespace import half_spaces
 from safety.limits import Limits, stacked
@@ -81,6 +83,11 @@ class _Scene:
     near: Shapes
     away: Array
     moving: Movers | None = None  # that may meet the tube
+    unseen: seen.Cells | None = None  # what a scan does not show to be free
+
+    @property
+    def empty(self) -> bool:
+        return not len(self.near) and self.moving is None and self.unseen is None
 
 
 @dataclass(frozen=True)
@@ -206,7 +213,7 @@ class Filter:
         """The proposal if its tube is verified, else the QP's answer if that is, else nothing."""
         known, m = len(z_0), len(proposal)
         z = self._regressors(z_0, proposal)
-        if not len(scene.near) and scene.moving is None and not self.far and self.limits is None:
+        if scene.empty and not self.far and self.limits is None:
             return _Found(ALLOWED, self._plan(z), z, self.reach, True)
         rows = self._rows(scene, z)
         slack = rows.bound - rows.support(self.tube, z)
@@ -286,6 +293,9 @@ class Filter:
             if scene.moving is not None:
                 swept = swept_half_spaces(scene.moving, start, nominal, disc.radius, measured, self.robot.period)
                 normals, offsets = np.concatenate([normals, swept[0]]), np.concatenate([offsets, swept[1]])
+            if scene.unseen is not None:
+                beside = seen.half_spaces(scene.unseen, start, nominal, disc.radius, measured, self.robot.period)
+                normals, offsets = np.concatenate([normals, beside[0]]), np.concatenate([offsets, beside[1]])
             parts.append(disc.layout.rows(normals @ scene.turn, offsets))
         if self.limits is not None:
             parts.append(self.limits.rows(scene.start, scene.heading, scene.turn))
@@ -417,4 +427,13 @@ class Filter:
         if moving is not None:
             within = robot.horizon * robot.period
             moving = moving.take(~(moving.least_distance(start, within) > self.reach))
-        return _Scene(start, heading, turn, near, away, moving if moving is not None and len(moving) else None)
+            moving = moving if len(moving) else None
+        unseen = None if request.scan is None else self._unseen(request.scan, start)
+        return _Scene(start, heading, turn, near, away, moving, unseen)
+
+    def _unseen(self, scan: Scan, start: Array) -> seen.Cells | None:
+        """What is not known to be free within reach, or may come there before a plan ends."""
+        within = self.reach + scan.speed * (scan.age + self.robot.horizon * self.robot.period)
+        within += float(np.linalg.norm(scan.sensor()[0] - start)) + scan.position_error
+        cells = seen.cells(scan, within + scan.heading_error * within)
+        return cells if len(cells) else None

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from messaging.movers import parted
 from messaging.tasks import UnknownTask, task_of
 from safety.commitment import Commitment, correction_penalty
+from safety.memory import Memory
 from safety.methods import Method
 from safety.request import Decision, Request
 
@@ -25,7 +26,8 @@ class SafetyWrapper(gymnasium.Wrapper[Any, Any, Any, Any]):
     """Replaces each action by the filter's decision on it.
 
     The environment's `info` must hold, after `reset` and `step`: `state`, the measured state (n,), and `obstacles`,
-    a list of `messaging.shapes.Obstacle` with at least those within `filter.reach`. The wrapper adds `safety` (the
+    a list of `messaging.shapes.Obstacle` with at least those within `filter.reach`; it may hold `scan`, a
+    `messaging.scans.Scan` that takes their place. The wrapper adds `safety` (the
     `Decision`), `proposed` and `penalty`; the penalty is subtracted from the reward.
     """
 
@@ -33,18 +35,22 @@ class SafetyWrapper(gymnasium.Wrapper[Any, Any, Any, Any]):
         super().__init__(env)
         self.filter, self.penalty = filter, penalty
         self.commitment = Commitment(filter.robot)
+        self._memory = Memory(filter.robot.footprint)
         self._info: dict[str, Any] = {}
         self._seen: Any = None  # the last observation, which some methods need
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         self._seen, self._info = self.env.reset(seed=seed, options=options)
         self.commitment.reset()
+        self._memory.reset()
+        self._remember()
         return self._seen, self._info
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         decision, before = self.decide(np.asarray(action, dtype=float)), self.commitment.input_in_force
         executed = self.commitment.accept(decision.plan, decision.model, decision.predicted, decision.verified)
         self._seen, reward, terminated, truncated, self._info = self.env.step(executed.astype(np.float32))
+        self._remember()
         cost = correction_penalty(self.filter.robot, action, before, executed, self.penalty)
         self._info |= {"safety": decision, "proposed": action, "penalty": cost}
         return self._seen, float(reward) - cost, terminated, truncated, self._info
@@ -63,11 +69,16 @@ class SafetyWrapper(gymnasium.Wrapper[Any, Any, Any, Any]):
                 plan=kept.plan,
                 obstacles=obstacles,
                 movers=movers,
+                scan=self._scan,
                 model=kept.model,
                 predicted=kept.predicted,
                 observation=self._observed(),
             )
         )
+
+    def _remember(self) -> None:
+        scan = self._info.get("scan")
+        self._scan = None if scan is None else self._memory.fill(scan, self.filter.robot.period)
 
     def _observed(self) -> Observation:
         """The observation, if it is the robot's own: another environment has none that a method could read."""

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from messaging.movers import Movers
 from messaging.robots import Robot
+from messaging.scans import Scan
 from messaging.shapes import FARTHEST, Shapes
 from messaging.tasks import UnknownTask, task_of
 from safety.commitment import Prediction
@@ -39,7 +40,8 @@ class Request:
     plan's tail (of a late robot: from the input on that is in force now), verified by model set `model` (empty:
     standing still; `UNVERIFIED`: by none); obstacles: at least those within `Filter.reach`; predicted: what the last
     decision said of this state, if there was one; movers: obstacles that move, at least those that may come within
-    reach before the plan ends."""
+    reach before the plan ends; scan: in the place of obstacles, or beside them: what is not seen free in it counts as
+    occupied."""
 
     state: Array
     action: Array
@@ -49,6 +51,7 @@ class Request:
     model: str = ""
     predicted: Prediction | None = None
     movers: Movers | None = None
+    scan: Scan | None = None
     observation: NDArray[np.float32] = field(default_factory=lambda: np.zeros(0, np.float32))
 
     def still(self, robot: Robot) -> bool:
@@ -105,6 +108,8 @@ def check_for_filter(robot: Robot, request: Request) -> None:
         raise BadRequest("obstacles", f"a {robot.name} robot's obstacles have {robot.position_dim} coordinates")
     if request.movers is not None and request.movers.drift.shape[1] != robot.position_dim:
         raise BadRequest("obstacles", f"a {robot.name} robot's movers have {robot.position_dim} coordinates")
+    if request.scan is not None and (robot.position_dim != 2 or robot.heading is None):
+        raise BadRequest("scan", f"a {robot.name} robot has no fan in the plane: give obstacles")
     if request.observation.size:
         _finite(robot, "observation", request.observation, (_observed(robot, request),))
     if request.predicted is not None:

@@ -13,6 +13,7 @@ from messaging import brakeline_pb2 as pb
 from messaging.motion import Motion, Sighting
 from messaging.movers import parted
 from messaging.robots import Robot
+from messaging.scans import BadScan, Scan
 from messaging.shapes import BadShape, Obstacle
 from safety.commitment import Prediction
 from safety.request import ADJUSTED, ALLOWED, FAILSAFE, BadRequest, Decision, Request
@@ -57,6 +58,7 @@ def request_of(message: pb.Request, robot: Robot) -> Request:
         plan=plan.reshape(robot.horizon, robot.action_dim),
         obstacles=obstacles,
         movers=movers,
+        scan=scan_of(message.scan) if message.HasField("scan") else None,
         model=message.model,
         predicted=predicted,
         observation=np.fromiter(message.observation, np.float32, len(message.observation)),
@@ -82,6 +84,30 @@ def obstacles_of(messages: Sequence[pb.Obstacle], dim: int) -> list[Obstacle]:
         except BadShape as error:
             raise BadRequest(f"obstacles[{i}].{error.field}", str(error)) from error
     return obstacles
+
+
+def scan_of(m: pb.Scan) -> Scan:
+    """Raises BadRequest: it is none."""
+    if len(m.pose) != 3 or len(m.mount) != 2:
+        raise BadRequest("scan", "a scan's pose has 3 coordinates, its mount 2")
+    x, y, heading = m.pose
+    try:
+        return Scan(
+            numbers(m.ranges),
+            numbers(m.angles),
+            (x, y, heading),
+            (m.mount[0], m.mount[1]),
+            far=m.far,
+            range_error=m.range_error,
+            position_error=m.position_error,
+            heading_error=m.heading_error,
+            least_width=m.least_width,
+            doubt=m.doubt,
+            speed=m.speed,
+            age=m.age,
+        )
+    except BadScan as error:
+        raise BadRequest("scan", str(error)) from error
 
 
 def motion_of(m: pb.Motion) -> Motion:

@@ -6,6 +6,7 @@ from dataclasses import asdict, dataclass, field
 
 from sim.estimator import NoiseLevels
 from sim.flight_estimator import QuadrotorNoise
+from sim.scanner import Perception
 from sim.wind import Wind
 
 
@@ -18,13 +19,18 @@ class Conditions:
     floor_friction: float = 1.0
     flight_noise: QuadrotorNoise = field(default_factory=QuadrotorNoise)
     wind: Wind = field(default_factory=Wind)
+    perception: Perception = field(default_factory=Perception)
 
     def describe(self) -> dict[str, str]:
         """For metadata and printed results: every level with its value."""
         values = asdict(self.noise) | {"payload_kg": self.payload_kg, "floor_friction": self.floor_friction}
         values |= {f"flight_{name}": value for name, value in asdict(self.flight_noise).items()}
         values |= {f"wind_{name}": value for name, value in asdict(self.wind).items()}
-        return {name: "drawn" if value is None else f"{value:g}" for name, value in values.items()}
+        said = {name: "drawn" if value is None else f"{value:g}" for name, value in values.items()}
+        if self.perception.kind == "map":
+            return said
+        faults = {f"scan_{name}": f"{value:g}" for name, value in asdict(self.perception.faults).items()}
+        return said | {"perception": self.perception.kind} | faults
 
     def lidar_noise(self, flies: bool) -> float:
         """Sigma of a range, m."""

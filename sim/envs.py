@@ -19,6 +19,7 @@ from sim.arenas import draw_arena
 from sim.conditions import Conditions
 from sim.estimator import wrap
 from sim.movers import Watch
+from sim.scanner import Perception, Scanner
 from sim.senses import LIDAR_NOISE, Senses
 from sim.vehicle import MakeVehicle, Period, Vehicle
 from sim.world import Arena
@@ -50,7 +51,9 @@ class NavigationEnv(gymnasium.Env[Observation, Any]):
     outside            the true state is farther from the measured one than `robot.measurement_bound`
     input_in_force     (m,) the input executed last, within bounds and slew; zero at the start
     obstacles          list[Obstacle]: those with their surface within `robot.sight` of the measured position; those
-                       that move, as measured, with their motion, if they may come as near within a plan
+                       that move, as measured, with their motion, if they may come as near within a plan;
+                       none where free space comes from scans
+    scan               Scan | None: the newest there is, where free space comes from scans
     arena              Arena: the whole map
     goal               (d,) m
     time               s since the episode's start
@@ -75,11 +78,12 @@ class NavigationEnv(gymnasium.Env[Observation, Any]):
         seed_key: int = 0,
         reward: Reward | None = None,
         draw: DrawArena = draw_arena,
+        perception: Perception | None = None,
     ) -> None:
         """make_vehicle: puts a vehicle of that robot kind at an arena's start, for one episode (None: the task's
         own, under usual conditions); lidar_noise: m, sigma
         of a range; seed_key: sets apart the episodes of two environments whose episode seeds are the same, 0 or more;
-        draw: makes an episode's arena.
+        draw: makes an episode's arena; perception: where free space comes from; from the map, unless given.
         """
         self.robot, self.arena_name, self.seed_key = robot, arena, seed_key
         self.task = task_of(robot)
@@ -91,6 +95,7 @@ class NavigationEnv(gymnasium.Env[Observation, Any]):
         self._make_vehicle: MakeVehicle = make_vehicle or self.task.code(self.task.simulator)(Conditions(), None)
         self._lidar_noise, self._draw = lidar_noise, draw
         self._bound = np.asarray(robot.measurement_bound)
+        self._perception = perception or Perception()
         self._changes: dict[str, float] = {}
         self._vehicle: Vehicle | None = None
 
@@ -119,6 +124,9 @@ class NavigationEnv(gymnasium.Env[Observation, Any]):
         if self._changes:
             self._vehicle.alter(**self._changes)
         self._senses: Senses = self._make_senses(self.robot, self._arena, rng, self._lidar_noise)
+        self._scanner = None
+        if self._perception.kind == "scan":
+            self._scanner = Scanner(self.robot, self._arena, rng, self._lidar_noise, self._perception.faults)
         self._watch = None if self._arena.crowd is None else Watch(self._arena.crowd, rng)
         self._steps = 0
         self._distance = self._goal_distance(self._vehicle.true)
@@ -168,18 +176,24 @@ class NavigationEnv(gymnasium.Env[Observation, Any]):
         return [seen[i] for i in np.flatnonzero(nearest <= self.robot.sight)]
 
     def _info(self, period: Period) -> Info:
-        near = self._arena.shapes.distance(period.measured[: self.robot.position_dim]) <= self.robot.sight
+        position, time = period.measured[: self.robot.position_dim], self._steps * self.robot.period
+        obstacles, scan = [], None
+        if self._scanner is not None:
+            scan = self._scanner.scan(period.true, period.measured, time)
+        else:
+            near = self._arena.shapes.distance(position) <= self.robot.sight
+            obstacles = [self._arena.obstacles[i] for i in np.flatnonzero(near)] + self._moving(position)
         return {
             "robot": self.robot.name,
             "state": period.measured,
             "true_state": period.true,
             "outside": self._outside(period),
             "input_in_force": self.vehicle.input,
-            "obstacles": [self._arena.obstacles[i] for i in np.flatnonzero(near)]
-            + self._moving(period.measured[: self.robot.position_dim]),
+            "obstacles": obstacles,
+            "scan": scan,
             "arena": self._arena,
             "goal": self._arena.goal,
-            "time": self._steps * self.robot.period,
+            "time": time,
             "collision": period.collision,
             "contact_moving": period.contact_moving,
             "contact_standing": period.contact_standing,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,6 +24,7 @@ from safety.model_set import Recipe
 from sim.conditions import Conditions
 from sim.estimator import NoiseLevels
 from sim.flight_estimator import QuadrotorNoise
+from sim.scanner import Faults, Perception
 from sim.wind import Wind
 from sim.world import Arena
 
@@ -64,6 +66,18 @@ class Physics:
     """m/s on average, on the quadrotor, from a side that is drawn anew each episode."""
     gust: float = 0.0
     """m/s, standard deviation of the wind on each axis."""
+    perception: Literal["map", "scan"] = "map"
+    """Where free space comes from: the arena's map, or what a sensor of 360 beams shows (ground robot)."""
+    dropped: float = 0.0
+    """Share of the scan's beams that say nothing."""
+    false_far: float = 0.0
+    """Share of the scan's beams that see through what is there."""
+    ghosts: float = 0.0
+    """Share of the scan's beams that return from where nothing is."""
+    blind: float = 0.0
+    """Degrees about straight behind that the sensor does not see."""
+    late: int = 0
+    """Periods until a scan is there."""
 
     def conditions(self) -> Conditions:
         return Conditions(
@@ -72,6 +86,10 @@ class Physics:
             self.friction,
             QuadrotorNoise(scale=self.noise),
             Wind(self.wind, gust=self.gust),
+            Perception(
+                self.perception,
+                Faults(self.dropped, self.false_far, self.ghosts, math.radians(self.blind), self.late),
+            ),
         )
 
 

@@ -1,4 +1,4 @@
-"""Free space from scans of random scenes: no point of anything in them is in it. Rays are cast by the shapes' own words."""
+"""Free space from scans of random scenes: no point of anything in them is in it."""
 
 import math
 
@@ -53,7 +53,7 @@ def taken(rng, obstacles, drop=0.0, noise=0.0, pose=(0.0, 0.0, 0.0), **more):
 def test_nothing_is_where_it_is_said_to_be_free(seed, drop, noise):
     rng = np.random.default_rng(seed)
     obstacles = scene(rng)
-    angles, width, free = gaps(taken(rng, obstacles, drop, noise))
+    angles, _, free = gaps(taken(rng, obstacles, drop, noise))
     solid = np.concatenate([sample(o, rng, 3000) for o in obstacles])
     range_, angle = np.linalg.norm(solid, axis=1), np.arctan2(solid[:, 1], solid[:, 0])
     gap = (np.searchsorted(angles, angle, side="right") - 1) % len(angles)
@@ -121,6 +121,15 @@ def test_lone_false_ranges_do_no_harm_where_they_are_doubted():
         free = gaps(Scan(broken, FAN, (0.0, 0.0, 0.0), doubt=1))[2]
         assert free[170:190].max() < 0.55
         assert gaps(Scan(broken, FAN, (0.0, 0.0, 0.0)))[2][170:190].max() > 2.0
+
+
+def test_a_lone_ghost_is_none_and_a_thing_as_narrow_as_things_may_be_is_no_ghost():
+    ranges = np.full(360, FAR)
+    ranges[[50, 100, 102]] = 0.4
+    assert gaps(Scan(ranges, FAN, (0.0, 0.0, 0.0)))[2].min() > 1.0
+    for turn in np.linspace(0.0, 0.02, 7):  # wherever the beams fall on it
+        post = [Obstacle("box", (0.6 * math.cos(turn), 0.6 * math.sin(turn)), (WIDTH, WIDTH), turn + math.pi / 4)]
+        assert gaps(taken(np.random.default_rng(0), post))[2][178:182].max() < 0.6
 
 
 def test_what_may_move_takes_room_with_time():

@@ -32,6 +32,7 @@ INFO_KEYS = {
     "goal",
     "time",
     "collision",
+    "scan",
     "contact_moving",
     "contact_standing",
     "at_goal",

@@ -1,0 +1,100 @@
+"""Decisions from scans alone: what is not seen free is kept off, in the closed loop too."""
+
+import math
+from dataclasses import fields, replace
+
+import numpy as np
+import pytest
+
+from messaging.scans import Scan
+from messaging.shapes import Obstacle, Shapes
+from safety.client import request_message, scan_message
+from safety.commitment import Commitment
+from safety.memory import Memory
+from safety.request import ALLOWED, FAILSAFE, BadRequest, check_for_filter
+from safety.wire import request_of, scan_of
+from tests.robots import GROUND, QUADROTOR
+from tests.safety.test_filter import request
+from tests.safety.test_scan import FAN, FAR, WIDTH, cast
+from tests.safety.unicycle import FIX, Unicycle
+
+ROOM = [
+    *(Obstacle("wall", (-math.cos(a), -math.sin(a)), yaw=a) for a in (0.0, math.pi / 2, math.pi, -math.pi / 2)),
+    Obstacle("box", (0.5, 0.3), (0.2, 0.2), 0.4),
+    Obstacle("cylinder", (-0.4, -0.5), (0.1,)),
+]
+
+
+def taken(true, measured, rng, blind=0.0):
+    ranges = cast(ROOM, true[:2], FAN + true[2])
+    ranges = np.where(ranges < FAR, ranges + rng.uniform(-0.01, 0.01, len(FAN)), FAR)
+    ranges[np.abs(FAN) > math.pi - blind] = 0.0
+    error = {"range_error": 0.01, "position_error": math.sqrt(2) * FIX, "heading_error": FIX}
+    return Scan(ranges, FAN, tuple(measured[:3].tolist()), far=FAR, least_width=WIDTH, **error)
+
+
+def test_nothing_seen_is_nothing_free(ready):
+    blind = Scan(np.zeros(360), FAN, (0.0, 0.0, 0.0))
+    decision = ready.decide(request(scan=blind))
+    assert decision.kind == FAILSAFE and not decision.plan.any()
+    assert ready.decide(request(scan=replace(blind, ranges=np.full(360, FAR)))).kind == ALLOWED
+
+
+def test_obstacles_count_beside_a_scan(ready):
+    clear = Scan(np.full(360, FAR), FAN, (0.0, 0.0, 0.0))
+    ahead = [Obstacle("cylinder", (0.25, 0.0), (0.1,))]
+    assert ready.decide(request(scan=clear, obstacles=ahead)).kind != ALLOWED
+
+
+@pytest.mark.parametrize("blind", [0.0, math.radians(30.0)])
+def test_a_hostile_driver_touches_nothing_and_is_not_held_for_good(ready, blind):
+    rng = np.random.default_rng(1)
+    robot, kept, memory = Unicycle((0.0, 0.0, 0.5), rng), Commitment(GROUND), Memory(GROUND.footprint)
+    shapes, closest, turned = Shapes.of(ROOM, 2), math.inf, 0.0
+    for k in range(100):
+        state = robot.measure()
+        way = shapes.towards(state[:2])
+        nearest = way[np.argmin(np.linalg.norm(way, axis=1))]
+        turn = math.remainder(math.atan2(nearest[1], nearest[0]) - state[2], math.tau)
+        action = (0.25, np.clip(turn / 0.2, -0.5, 0.5)) if k % 40 < 25 else (0.25, 0.5)
+        decision = ready.decide(
+            request(
+                state,
+                action,
+                scan=memory.fill(taken(robot.state, state, rng, blind), GROUND.period),
+                input_in_force=kept.input_in_force,
+                plan=kept.plan,
+                model=kept.model,
+                predicted=kept.predicted,
+            )
+        )
+        before = robot.state[2]
+        robot.step(kept.accept(decision.plan, decision.model, decision.predicted, decision.verified))
+        turned += abs(robot.state[2] - before)
+        closest = min(closest, shapes.distance(robot.state[:2]).min())
+    assert closest > GROUND.footprint
+    assert closest < GROUND.footprint + 0.1 and turned > 1.5
+
+
+def test_a_scan_crosses_the_wire():
+    ranges = np.linspace(0.2, 3.5, 360)
+    sent = Scan(ranges, FAN, (1.0, 2.0, 3.0), (-0.03, 0.01), 3.4, 0.03, 0.01, 0.02, 0.15, 2, 1.6, 0.2)
+    got = scan_of(scan_message(sent))
+    assert np.allclose(got.ranges, sent.ranges) and np.allclose(got.angles, sent.angles)
+    names = [field.name for field in fields(Scan) if field.name not in ("ranges", "angles")]
+    assert [getattr(got, name) for name in names] == [getattr(sent, name) for name in names]
+    message = request_message(Commitment(GROUND), np.zeros(5), np.zeros(2), [], sent)
+    assert request_of(message, GROUND).scan is not None and message.ByteSize() < 3500
+
+
+def test_scans_that_are_none_are_refused(ready):
+    message = request_message(Commitment(GROUND), np.zeros(5), np.zeros(2), [], Scan(np.ones(360), FAN, (0.0,) * 3))
+    message.scan.ranges[5] = -1.0
+    with pytest.raises(BadRequest) as error:
+        request_of(message, GROUND)
+    assert error.value.field == "scan"
+    message = request_message(Commitment(QUADROTOR), np.zeros(9), np.zeros(3), [])
+    message.scan.CopyFrom(scan_message(Scan(np.ones(360), FAN, (0.0,) * 3)))
+    with pytest.raises(BadRequest) as error:
+        check_for_filter(QUADROTOR, request_of(message, QUADROTOR))
+    assert error.value.field == "scan"
