@@ -114,7 +114,7 @@ class Driver:
 
     def _remember(self) -> None:
         """Fill in the scan, if there is one, with what was seen free before."""
-        scan = self.info["scan"]
+        scan = self.info.get("scan")
         self._scan = None if scan is None else self._memory.fill(scan, self.robot.period)
 
     def may_wait(self, outcome: Outcome) -> bool:
