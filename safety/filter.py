@@ -368,10 +368,10 @@ class Filter:
         if found.margin + self.widest <= self.reach:
             return found.margin, False
         most = self.robot.sight - self.widest
-        seen = request.obstacles.take(~(scene.away > self.robot.sight))
-        if not len(seen) and request.movers is None:
+        in_sight = request.obstacles.take(~(scene.away > self.robot.sight))
+        if not len(in_sight) and request.movers is None and scene.unseen is None:
             return most, True
-        rows = self._rows(replace(scene, near=seen, moving=request.movers), found.z)
+        rows = self._rows(replace(scene, near=in_sight, moving=request.movers), found.z)
         margin = float((rows.bound - rows.support(self.tube, found.z)).min(initial=most))
         return margin, margin == most
 
