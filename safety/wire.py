@@ -19,21 +19,56 @@ from safety.commitment import Prediction
 from safety.request import ADJUSTED, ALLOWED, FAILSAFE, BadRequest, Decision, Request
 
 KINDS = {ALLOWED: pb.ALLOWED, ADJUSTED: pb.ADJUSTED, FAILSAFE: pb.FAILSAFE}
-LARGEST = 1 << 20  # bytes of a request batch
-MOST_OBSTACLES = 1000
+# What a batch may cost, known before it is worked on: its bytes to decode, its requests and obstacles to decide on.
+LARGEST = 2**18  # bytes of a request batch
+MOST_REQUESTS = 64
+FIXED_64, LENGTH, FIXED_32 = 1, 2, 5  # how protobuf writes a field; else as one number
+MOST_OBSTACLES = 1000  # of all its requests
 
 
 def batch_of(payload: bytes) -> pb.RequestBatch:
     """Raises BadRequest for anything that is not a batch of a sensible size."""
     if len(payload) > LARGEST:
         raise BadRequest("payload", f"{len(payload)} bytes; a request batch has at most {LARGEST}")
+    if _fields(payload, MOST_REQUESTS) > MOST_REQUESTS:
+        raise BadRequest("requests", f"a batch has at most {MOST_REQUESTS} requests")
     try:
         batch = pb.RequestBatch.FromString(payload)
     except DecodeError as error:
         raise BadRequest("payload", f"not a request batch: {error}") from error
     if not batch.requests:
         raise BadRequest("requests", "the batch holds no request")
+    obstacles = sum(len(request.obstacles) for request in batch.requests)
+    if obstacles > MOST_OBSTACLES:
+        raise BadRequest("obstacles", f"{obstacles} obstacles; at most {MOST_OBSTACLES} can be decided on at once")
     return batch
+
+
+def _fields(payload: bytes, most: int) -> int:
+    """How many fields a message has on the wire, counted no further than one beyond `most`: decoding half a million
+    empty requests would take longer than a robot can wait."""
+    at = count = 0
+    while at < len(payload) and count <= most:
+        count += 1
+        tag, at = _varint(payload, at)
+        kind = tag & 7
+        if kind in (FIXED_64, FIXED_32):
+            at += 8 if kind == FIXED_64 else 4
+        else:
+            value, at = _varint(payload, at)
+            at += value if kind == LENGTH else 0
+    return count
+
+
+def _varint(payload: bytes, at: int) -> tuple[int, int]:
+    """A number and where it ends; a cut one as far as it goes."""
+    value = shift = 0
+    while at < len(payload):
+        byte = payload[at]
+        value, shift, at = value | (byte & 127) << shift, shift + 7, at + 1
+        if byte < 128 or shift > 63:
+            break
+    return value, at
 
 
 def request_of(message: pb.Request, robot: Robot) -> Request:
@@ -72,8 +107,6 @@ def numbers(field: Collection[float]) -> NDArray[np.float64]:
 
 def obstacles_of(messages: Sequence[pb.Obstacle], dim: int) -> list[Obstacle]:
     """Raises BadRequest naming the obstacle and its field."""
-    if len(messages) > MOST_OBSTACLES:
-        raise BadRequest("obstacles", f"{len(messages)} obstacles; at most {MOST_OBSTACLES} can be within reach")
     obstacles = []
     for i, o in enumerate(messages):
         try:

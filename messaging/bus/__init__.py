@@ -4,7 +4,18 @@ A process that is given `listen` is a router; the others are clients of one of t
 show who they are, and the router lets each say and hear what the table of topics grants it.
 """
 
-from messaging.bus.errors import BadKeys, BusError, Insecure, Late, Malformed, NoReply, Refused, Unreachable
+from messaging.bus.errors import (
+    BadKeys,
+    BusError,
+    Busy,
+    Expired,
+    Insecure,
+    Late,
+    Malformed,
+    NoReply,
+    Refused,
+    Unreachable,
+)
 from messaging.bus.publisher import Publisher
 from messaging.bus.session import Bus
 from messaging.bus.settings import BusSettings, configuration
@@ -15,6 +26,8 @@ __all__ = [
     "Bus",
     "BusError",
     "BusSettings",
+    "Busy",
+    "Expired",
     "Insecure",
     "Late",
     "Listener",

@@ -34,6 +34,14 @@ class Late(BusError):
     """The deadline passed without an answer."""
 
 
+class Busy(BusError):
+    """So many questions of this asker wait, or of so many askers, that this one can't."""
+
+
+class Expired(BusError):
+    """A question that came to its turn when nobody waited for the answer any more."""
+
+
 class Malformed(BusError, ValueError):
     """The bytes are not a message of the topic's type, or it says what no honest sender would."""
 

@@ -12,7 +12,6 @@ import logging
 import secrets
 import threading
 from collections.abc import Callable, Iterable
-from functools import partial
 from typing import Any, Self
 
 import zenoh
@@ -23,6 +22,7 @@ from messaging.bus.access import ALIVE
 from messaging.bus.errors import Late, NoReply, Refused, typed
 from messaging.bus.keys import exact_key, key_of
 from messaging.bus.publisher import Publisher
+from messaging.bus.service import Service
 from messaging.bus.settings import BusSettings, open_session
 from messaging.bus.subscription import Listener, Sample, Subscription
 from messaging.plausible import NAME
@@ -126,15 +126,15 @@ class Bus:
         return listener
 
     def serve(self, topic: Topic, handler: Callable[[bytes], bytes], **names: str) -> Subscription:
-        """Answer the questions of `topic`, one at a time, in a thread of its own.
+        """Answer the questions of `topic`, one at a time and every asker's in turn, in a thread of its own.
 
         What the handler raises goes back to who asked as `Refused` (with the exception's `field`, if it has one) and is
-        logged. Several processes may serve one topic: a question goes to one of them, and to another if that one is
-        gone.
+        logged. A question whose asker waits no longer is dropped. Several processes may serve one topic: a question
+        goes to one of them, and to another if that one is gone.
         """
         key = key_of(topic, names)
         receiver = self._queries.declare_queryable(self._full(key), FifoChannel(FIFO), complete=True)
-        return self._keep(Subscription(key, receiver, partial(_answer, handler), self.tolerance))
+        return self._keep(Service(key, receiver, handler, self.tolerance))
 
     def ask(self, topic: Topic, payload: bytes, timeout: float, **names: str) -> bytes:
         """The answer to a question, within `timeout` s.
@@ -149,7 +149,9 @@ class Bus:
         refusal: Refused | None = None
         late = False
         with typed(f"cannot ask {key}"):
-            for reply in self._querier(key, timeout).get(payload=payload):
+            querier = self._querier(key, timeout)
+            source = zenoh.SourceInfo(querier.id, 0)  # whose turn it is
+            for reply in querier.get(payload=payload, attachment=f"{timeout:.6g}", source_info=source):
                 if reply.ok is not None:
                     return reply.ok.payload.to_bytes()
                 assert reply.err is not None
@@ -207,14 +209,3 @@ class Bus:
         closables: list[Any] = [self._queries, self._telemetry]  # Any: their stubs are untyped here
         for session in closables:
             session.close()  # which undeclares all that it declared; closing twice does nothing
-
-
-def _answer(handler: Callable[[bytes], bytes], query: zenoh.Query) -> None:
-    """Answer one query; without an answer of some kind the service would look dead."""
-    with query:
-        try:
-            query.reply(query.key_expr, handler(query.payload.to_bytes() if query.payload else b""), express=True)
-        except Exception as error:
-            refusal = pb.Error(type=type(error).__name__, field=str(getattr(error, "field", "")), message=str(error))
-            query.reply_err(refusal.SerializeToString(), encoding=zenoh.Encoding.APPLICATION_PROTOBUF)
-            raise

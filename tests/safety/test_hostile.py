@@ -2,13 +2,17 @@
 
 from fractions import Fraction
 from math import isqrt, pi
+from time import perf_counter
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from messaging import brakeline_pb2 as pb
 from messaging.shapes import BOX, CYLINDER, FARTHEST, SPHERE, WALL, BadShape, Obstacle, Shapes
+from safety.request import BadRequest
+from safety.wire import LARGEST, MOST_REQUESTS, _fields, batch_of
 
 NEAR = 1e-6  # m: what rounding may hide of a distance
 
@@ -66,3 +70,43 @@ def test_what_is_beyond_all_bounds_is_no_obstacle(far: float, field: str) -> Non
     with pytest.raises(BadShape) as refused:
         Obstacle(SPHERE, **place)
     assert refused.value.field == field
+
+
+# --- cost before work ------------------------------------------------------------------------------------------------
+
+
+def refused(payload: bytes) -> tuple[str, float]:
+    """The field that is wrong, and the seconds that saying so took."""
+    start = perf_counter()
+    with pytest.raises(BadRequest) as error:
+        batch_of(payload)
+    return error.value.field, perf_counter() - start
+
+
+EMPTY = b"\x0a\x00"  # a request
+ODD = b"\x10\x01\x19" + bytes(8) + b"\x25" + bytes(4)  # fields that nobody knows: a number, 8 bytes, 4 bytes
+
+
+@pytest.mark.parametrize("before", [b"", ODD], ids=["plain", "odd"])
+def test_half_a_million_empty_requests_are_refused_at_once(before: bytes) -> None:
+    assert refused(before + EMPTY * 2**19)[0] == "payload"
+    field, seconds = refused(before + EMPTY * (LARGEST // 2 - len(before)))
+    assert field == "requests" and seconds < 0.02
+
+
+def test_16_requests_with_1000_obstacles_are_refused_before_they_are_worked_on() -> None:
+    sphere = pb.Obstacle(kind="sphere", position=[1.0, 0.0], size=[0.1])
+    many = pb.RequestBatch(requests=[pb.Request(robot="ground", obstacles=[sphere] * 400)] * 16)
+    field, seconds = refused(many.SerializeToString())
+    assert field == "obstacles" and seconds < 0.2
+
+
+@given(st.binary(max_size=200))
+def test_counting_fields_ends_and_raises_nothing(payload: bytes) -> None:
+    assert 0 <= _fields(payload, MOST_REQUESTS) <= MOST_REQUESTS + 1
+
+
+@given(st.integers(0, MOST_REQUESTS + 5), st.binary(max_size=20).map(lambda data: pb.Request(robot=data.hex())))
+def test_fields_are_counted_as_the_decoder_does(count: int, request: pb.Request) -> None:
+    payload = pb.RequestBatch(requests=[request] * count).SerializeToString()
+    assert _fields(payload, MOST_REQUESTS) == min(count, MOST_REQUESTS + 1)

@@ -18,7 +18,7 @@ from safety.gym import SafetyWrapper
 from safety.model_set import ModelSet
 from safety.request import BadRequest
 from safety.service import Counts, Models, answerer
-from safety.wire import LARGEST, MOST_OBSTACLES, request_of
+from safety.wire import LARGEST, request_of
 from tests.messaging.conftest import endpoint, join  # noqa: F401 - fixtures
 from tests.robots import GROUND
 from tests.safety.unicycle import Unicycle
@@ -128,7 +128,6 @@ def with_obstacle(**changes):
         ("obstacles[1].position", with_obstacle(position=[])),
         ("obstacles[1].kind", with_obstacle(kind="cloud")),
         ("obstacles[1].yaw", with_obstacle(kind="wall", size=[], yaw=INF)),
-        ("obstacles", bad(obstacles=[pb.Obstacle(kind="sphere", position=[1, 1], size=[0.1])] * (MOST_OBSTACLES + 1))),
     ],
 )
 def test_bad_requests_get_an_error_that_names_the_field(service, field, message):

@@ -1,0 +1,103 @@
+"""Who answers questions: each asker's in turn, none for which nobody waits any more."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import zenoh
+
+from messaging import brakeline_pb2 as pb
+from messaging.bus.errors import Busy, Expired
+from messaging.bus.subscription import Subscription
+from messaging.bus.turns import Turns
+from messaging.tolerant import Tolerance
+
+LONGEST = 10.0  # s that a question waits which does not say for how long it is of use
+
+
+@dataclass(frozen=True)
+class Question:
+    """A query, and until when (time.monotonic) an answer is of use."""
+
+    query: zenoh.Query
+    until: float
+
+
+class Service(Subscription):
+    """Two threads: one notes when questions come in, one answers them. How long an answer is of use stands in a
+    question's attachment: seconds from when it was asked, as text; they count from its receipt, for the clocks of two
+    machines agree on durations only."""
+
+    def __init__(self, name: str, receiver: Any, handler: Callable[[bytes], bytes], tolerance: Tolerance) -> None:
+        self._handler, self._turns, self._news = handler, Turns[Question](), threading.Condition()
+        self._closed = False
+        self._worker = threading.Thread(target=self._serve, name=f"service {name}", daemon=True)
+        super().__init__(name, receiver, self._admit, tolerance)
+        self._worker.start()
+
+    def join(self, timeout: float) -> None:
+        super().join(timeout)
+        if self._worker is not threading.current_thread():
+            self._worker.join(timeout)
+
+    def _run(self) -> None:
+        super()._run()
+        with self._news:
+            self._closed = True
+            self._news.notify()
+
+    def _admit(self, query: zenoh.Query) -> None:
+        question = Question(query, time.monotonic() + _patience(query))
+        with self._news:
+            left_out = self._turns.add(_asker(query), question)
+            self._news.notify()
+        if left_out is not None:
+            with left_out.query as one:
+                _refuse(one, Busy("too many questions wait"))
+                raise Busy("too many questions wait")
+
+    def _serve(self) -> None:
+        while True:
+            with self._news:
+                self._news.wait_for(lambda: len(self._turns) or self._closed)
+                if self._closed:
+                    return
+                question = self._turns.next()
+            with self._tolerance.over(self._name):
+                self._answer(question)
+
+    def _answer(self, question: Question) -> None:
+        """Answer one query; without an answer of some kind the service would look dead."""
+        with question.query as query:
+            try:
+                if time.monotonic() > question.until:
+                    raise Expired("nobody waits for this answer any more")
+                answer = self._handler(query.payload.to_bytes() if query.payload else b"")
+                query.reply(query.key_expr, answer, express=True)
+            except Exception as error:
+                _refuse(query, error)
+                raise
+
+
+def _refuse(query: zenoh.Query, error: Exception) -> None:
+    refusal = pb.Error(type=type(error).__name__, field=str(getattr(error, "field", "")), message=str(error))
+    query.reply_err(refusal.SerializeToString(), encoding=zenoh.Encoding.APPLICATION_PROTOBUF)
+
+
+def _asker(query: zenoh.Query) -> str:
+    """Whose turn it is: the session's; all that do not say so share one."""
+    source = query.source_info
+    return "" if source is None else str(source.source_id.zid)
+
+
+def _patience(query: zenoh.Query) -> float:
+    """[s]"""
+    try:
+        said = float(query.attachment.to_string()) if query.attachment is not None else LONGEST
+    except (ValueError, zenoh.ZError):
+        return LONGEST
+    return said if 0.0 < said < LONGEST else LONGEST

@@ -1,0 +1,85 @@
+"""Whose turn it is, and that nobody answers where nobody waits."""
+
+import contextlib
+import threading
+import time
+
+import pytest
+
+from messaging.bus import BusError
+from messaging.bus import turns as module
+from messaging.bus.turns import EACH, Turns
+from messaging.topics import DECIDE
+from tests.messaging.test_bus import Join, eventually
+
+
+def test_each_askers_questions_are_answered_in_turn() -> None:
+    turns = Turns[str]()
+    for question in ("a1", "a2", "a3", "b1", "c1", "c2"):
+        assert turns.add(question[0], question) is None
+    assert len(turns) == 6
+    assert [turns.next() for _ in range(4)] == ["a1", "b1", "c1", "a2"]
+    turns.add("b", "b2")
+    assert [turns.next() for _ in range(3)] == ["c2", "a3", "b2"]
+    assert not len(turns)
+
+
+def test_of_too_many_the_oldest_of_the_same_asker_goes(monkeypatch: pytest.MonkeyPatch) -> None:
+    turns = Turns[int]()
+    gone = [turns.add("a", number) for number in range(EACH + 3)]
+    assert gone == [None] * EACH + [0, 1, 2]
+    monkeypatch.setattr(module, "MOST", 1)
+    assert turns.add("b", 7) == 7 and turns.add("a", 99) == 3
+
+
+def test_an_asker_is_not_delayed_by_the_many_questions_of_another(join: Join) -> None:
+    router, patient, flood = join("launcher", listen=True), join("actor-0"), join("actor-1")
+    order: list[bytes] = []
+
+    def work(payload: bytes) -> bytes:
+        order.append(payload)
+        time.sleep(0.05)
+        return payload
+
+    router.serve(DECIDE, work)
+    eventually(lambda: patient.ask(DECIDE, b"ready", timeout=2.0, robot="ground") == b"ready")
+
+    def ask(number: int) -> None:
+        with contextlib.suppress(BusError):
+            flood.ask(DECIDE, b"flood", timeout=5.0, robot="ground")
+
+    threads = [threading.Thread(target=ask, args=(number,)) for number in range(EACH)]
+    for thread in threads:
+        thread.start()
+    eventually(lambda: b"flood" in order)
+    assert patient.ask(DECIDE, b"patient", timeout=5.0, robot="ground") == b"patient"
+    ahead = order[order.index(b"flood") : order.index(b"patient")]
+    assert len(ahead) <= 3, "the one in hand, and one whose turn had come"
+    for thread in threads:
+        thread.join()
+
+
+def test_a_question_for_which_nobody_waits_is_dropped(join: Join) -> None:
+    router, actor = join("launcher", listen=True), join("actor-0")
+    answered: list[bytes] = []
+    held, release = threading.Event(), threading.Event()
+
+    def work(payload: bytes) -> bytes:
+        if payload == b"slow":
+            held.set()
+            release.wait(5.0)
+        answered.append(payload)
+        return payload
+
+    router.serve(DECIDE, work)
+    eventually(lambda: actor.ask(DECIDE, b"ready", timeout=2.0, robot="ground") == b"ready")
+    slow = threading.Thread(target=lambda: actor.ask(DECIDE, b"slow", timeout=6.0, robot="ground"))
+    slow.start()
+    assert held.wait(5.0)
+    with pytest.raises(BusError):
+        actor.ask(DECIDE, b"dead", timeout=0.1, robot="ground")
+    release.set()
+    slow.join()
+    eventually(lambda: actor.ask(DECIDE, b"after", timeout=2.0, robot="ground") == b"after")
+    assert b"dead" not in answered and {b"slow", b"after"} <= {*answered}
+    assert router.tolerance.count == 1
