@@ -3,7 +3,7 @@ PYTHON ?= python3.11
 BIN := .venv/bin
 STAMP := .venv/.installed
 
-.PHONY: demo setup test check unit bench messages clean
+.PHONY: demo setup test test-fast check unit bench messages clean
 
 demo: setup
 	$(BIN)/brakeline demo
@@ -26,6 +26,14 @@ check: setup
 
 unit: setup
 	$(BIN)/python -m pytest -m "not long"
+
+# For every save: no whole runs, no flights, no trainings.
+test-fast: setup
+	$(BIN)/ruff check .
+	$(BIN)/python -m pytest -m "not long" tests/messaging/test_descriptions.py tests/messaging/test_robots.py \
+		tests/messaging/test_shapes.py tests/messaging/test_topics.py tests/messaging/test_weights.py \
+		tests/safety/test_zonotope.py tests/safety/test_certificates.py tests/safety/test_dataset.py \
+		tests/safety/test_freespace.py tests/safety/test_tube.py tests/deploy/run/test_stored.py tests/front
 
 bench: setup
 	$(BIN)/python -m deploy.bench
