@@ -24,6 +24,7 @@ from actors.live import LiveVehicle, Truth, Turn
 from actors.loop import ActorSettings, Make, Rider, Tally, cycle
 from actors.mavlink import Tap
 from actors.proposers import MakePolicy
+from actors.settings import FlightSettings as FlightSettings
 from actors.tape import Puts
 from messaging.bus import BusError
 from messaging.links import open_link
@@ -44,17 +45,6 @@ PATIENCE = 0.2  # s between questions to a service that does not answer yet
 
 class Unfiltered(ValueError):
     """In real time nobody flies without the filter: its plan is what is flown when nothing else comes."""
-
-
-@dataclass(frozen=True)
-class FlightSettings:
-    """Which autopilot, and where it is."""
-
-    url: str
-    system: int = 1  # MAVLink system id
-    truth: int = 0  # UDP port at which a simulator tells collisions; 0: none does
-    height: float = 3.0  # m above the ground that it climbs to, unless it flies already
-    origin: tuple[float, float, float] = (0.0, 0.0, 0.0)  # m: where the autopilot's local frame begins
 
 
 class Outbox:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
@@ -13,6 +13,7 @@ import numpy as np
 from actors.driver import Driver, Environment, Identity
 from actors.guard import Ask, Outcome, consult
 from actors.proposers import Fixed, FlyingPupil, MakePolicy, Proposer, Pupil, finite
+from actors.settings import Change as Change
 from actors.student import Student
 from actors.tape import Puts, Tape
 from messaging import brakeline_pb2 as pb
@@ -29,25 +30,6 @@ if TYPE_CHECKING:
 log = logging.getLogger("brakeline.actor")
 
 PATIENCE = 0.05  # s between questions of a standing robot that got no answer
-
-
-@dataclass(frozen=True)
-class Change:
-    """What becomes of each robot after so many steps: the robot that was recorded is not the one that drives on.
-
-    What is None stays as it is; a robot kind refuses what it does not have.
-    """
-
-    after: int = -1  # -1: never
-    payload_kg: float | None = None
-    floor_friction: float | None = None
-    wind_speed: float | None = None  # m/s
-    gust: float | None = None  # m/s
-
-    def changes(self) -> dict[str, float]:
-        """What a vehicle's `alter` takes."""
-        values = {name: value for name, value in asdict(self).items() if name != "after"}
-        return {name: value for name, value in values.items() if value is not None}
 
 
 @dataclass(frozen=True)

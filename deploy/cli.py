@@ -9,17 +9,14 @@ import difflib
 import importlib
 import os
 import sys
-from dataclasses import dataclass
+from dataclasses import MISSING, dataclass, field, fields
 from importlib.metadata import version
-from typing import Any
+from typing import Annotated, Any, get_type_hints
 
 import tyro
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
-
-from logs.reader import LogError
-from messaging.bus import BusError
 
 
 @dataclass(frozen=True)
@@ -143,6 +140,28 @@ def find(name: str) -> Any:
     return getattr(importlib.import_module(f"deploy.commands.{module}"), kind)
 
 
+def abridged(kind: Any) -> Any:
+    """A command's dataclass whose help leaves its expert options out; they are understood all the same."""
+    hints = get_type_hints(kind, include_extras=True)
+    hidden = {name: Annotated[hints[name], tyro.conf.Suppress] for name in kind.expert}
+    known = {item.name: item for item in fields(kind)}
+    values = {
+        name: field(default_factory=known[name].default_factory)
+        if known[name].default is MISSING
+        else known[name].default
+        for name in kind.expert
+    }
+    return dataclass(frozen=True)(type(kind.__name__, (kind,), {"__annotations__": hidden, **values}))
+
+
+def expected() -> tuple[type[Exception], ...]:
+    """Errors whose message says enough. Who raised them has imported their modules."""
+    from logs.reader import LogError
+    from messaging.bus import BusError
+
+    return BusError, LogError, ValueError, OSError, RuntimeError
+
+
 def main(arguments: list[str] | None = None) -> int:
     """Exit status: 0; 1: it failed, with the reason on stderr; 2: not understood; 130: ^C before it was done."""
     os.environ.setdefault("OMP_NUM_THREADS", "1")  # two processes with two threads each on two cores are slower
@@ -161,14 +180,17 @@ def main(arguments: list[str] | None = None) -> int:
         errors.print(f"brakeline: no command is called {name!r}{hint} (`brakeline --help` lists them)", markup=False)
         return 2
     try:
-        kind = find(name)
-        defaults = {"default": kind.defaults(given[1:])} if hasattr(kind, "defaults") else {}
+        kind, told = find(name), f"{COMMANDS[name].what}\n\nExample: {COMMANDS[name].example}"
+        words = ["--help" if word == "--help-all" else word for word in given[1:]]
+        if hasattr(kind, "expert") and words == given[1:] and {"-h", "--help"} & set(words):
+            kind, told = abridged(kind), f"{told}\n\nAll options: brakeline {name} --help-all"
+        defaults = {"default": kind.defaults(words)} if hasattr(kind, "defaults") else {}
         command = tyro.cli(
             kind,
             **defaults,
             prog=f"brakeline {name}",
-            description=f"{COMMANDS[name].what}\n\nExample: {COMMANDS[name].example}",
-            args=given[1:],
+            description=told,
+            args=words,
         )
         return int(command.run())
     except KeyboardInterrupt:
@@ -176,7 +198,9 @@ def main(arguments: list[str] | None = None) -> int:
     except BrokenPipeError:  # who read the output has seen enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
-    except (BusError, LogError, ValueError, OSError, RuntimeError) as error:
+    except Exception as error:
+        if not isinstance(error, expected()):
+            raise
         errors.print(f"[red]brakeline {name}:[/] {escape(str(error))}", soft_wrap=True)
         return 1
 

@@ -12,10 +12,10 @@ import threading
 import time
 from collections import Counter, deque
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
+from logs.rotation import Rotation as Rotation
 from logs.segment import Attachments, Entry, Metadata, Segment, open_segment
 from messaging.bus import BusSettings, Sample
 from messaging.process import Process
@@ -34,24 +34,6 @@ PORTION = 2**20  # bytes saved at once: what fits on a nearly full disk is saved
 
 Open = Callable[[Path, Metadata], Segment]
 Derive = Callable[[Sample], Iterable[Entry]]  # what is stored of a sample besides itself: Foxglove's pictures
-
-
-@dataclass(frozen=True)
-class Rotation:
-    """When a file is finished and the log goes on in the next one. What is finished can be moved away."""
-
-    mib: float = 512.0
-    """MiB in a file of the log; then the next one is begun."""
-    seconds: float = 3600.0
-    """s that a file of the log covers; then the next one is begun."""
-
-    def __post_init__(self) -> None:
-        if not self.mib > 0.0 or not self.seconds > 0.0:
-            raise ValueError(f"a log's files have a size and a duration above 0, not {self.mib} MiB, {self.seconds} s")
-
-    def due(self, segment: Segment, age: float) -> bool:
-        """Has the file had enough? One without a message never has."""
-        return not segment.empty and (segment.size >= self.mib * 2**20 or age >= self.seconds)
 
 
 def weight(sample: Sample) -> int:

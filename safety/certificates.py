@@ -15,10 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linprog
 
+from safety.recipe import KINDS as KINDS
+from safety.recipe import MATRIX_ZONOTOPE as MATRIX_ZONOTOPE
+from safety.recipe import RESIDUAL as RESIDUAL
+from safety.recipe import SET_MEMBERSHIP as SET_MEMBERSHIP
+
 Array = NDArray[np.float64]
 
-RESIDUAL, SET_MEMBERSHIP, MATRIX_ZONOTOPE = "residual", "set-membership", "matrix-zonotope"
-KINDS = (RESIDUAL, SET_MEMBERSHIP, MATRIX_ZONOTOPE)
 ROWS_A_ROUND = 64  # constraints added a round when an LP over all samples is solved on few of them
 
 

@@ -12,13 +12,12 @@ from typing import Protocol
 from messaging.robots import Robot
 from safety.filter import Filter
 from safety.model_set import BadModel, ModelSet
+from safety.recipe import DDPC as DDPC
 from safety.request import Decision, Request
 from safety.rivals.pretrained import ENTRY, Pretrained
 from safety.rivals.sailr import SAILR, Sailr
 from safety.rivals.secas import SECAS, Secas
 from safety.tensors import holds
-
-DDPC = "ddpc"
 
 Model = ModelSet | Pretrained
 

@@ -15,51 +15,24 @@ from numpy.typing import NDArray
 from messaging.descriptions import robot_of
 from messaging.files import write_whole
 from messaging.robots import FORMER_LAYOUTS, LATE, Robot, UnknownRobot, known, robot_named
-from safety.certificates import (
-    KINDS,
-    RESIDUAL,
-    Certificate,
-)
+from safety.certificates import Certificate
+from safety.recipe import DIRECT as DIRECT
+from safety.recipe import FREE, PLAN
+from safety.recipe import MODES as MODES
+from safety.recipe import RECURSION as RECURSION
+from safety.recipe import Recipe as Recipe
 from safety.tensors import content, pack, unpack
 from safety.tube import Tube, recursion_of, stack_direct, stack_recursive
-from safety.windows import (
-    FREE,
-    PLAN,
-    specialised,
-)
-from safety.windows import KINDS as WINDOWS
+from safety.windows import specialised
 
 Array = NDArray[np.float64]
 
-DIRECT, RECURSION = "direct", "recursion"
-MODES = (DIRECT, RECURSION)
 ENTRY = "model_set"
 TENSORS = ("C", "W", "M", "kappa", "w", "generators")
 
 
 class BadModel(ValueError):
     """A model set that must not be used; the message says why."""
-
-
-@dataclass(frozen=True)
-class Recipe:
-    """How a model set is made from a data set."""
-
-    certificate: str = RESIDUAL
-    mode: str = DIRECT
-    inflation: float = 1.15  # of every envelope: what the next data may exceed the recorded ones by
-    seed: int = 0  # of the recursion's heading offsets
-    windows: str = PLAN  # FREE: from driving that follows no plan
-
-    def __post_init__(self) -> None:
-        if self.certificate not in KINDS:
-            raise ValueError(f"no certificate is called {self.certificate!r}; there are: {', '.join(KINDS)}")
-        if self.mode not in MODES:
-            raise ValueError(f"no mode is called {self.mode!r}; there are: {', '.join(MODES)}")
-        if self.windows not in WINDOWS:
-            raise ValueError(f"no windows are called {self.windows!r}; there are: {', '.join(WINDOWS)}")
-        if not 1.0 <= self.inflation < np.inf:
-            raise ValueError(f"an envelope scaled by {self.inflation} bounds nothing")
 
 
 @dataclass(frozen=True)

@@ -15,11 +15,11 @@ from numpy.typing import NDArray
 from messaging.robots import FOLLOWED, Robot
 from messaging.shapes import rotate
 from safety.dataset import BadData, Dataset, Trajectory
+from safety.recipe import FREE as FREE
+from safety.recipe import PLAN as PLAN
 
 Array = NDArray[np.float64]
 
-PLAN, FREE = "plan", "free"
-KINDS = (PLAN, FREE)
 FEWEST_WINDOWS = 200  # of a length; below it nothing useful is bounded
 WORST_CONDITION = 1e4  # of the whitened regressors' second moment
 

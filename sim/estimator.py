@@ -8,27 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from sim.conditions import NoiseLevels as NoiseLevels
+
 Array = NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class NoiseLevels:
-    """Sensor errors of the ground robot. All are normal, cut off at `CUT` sigma; `scale` = 0 switches them off.
-
-    The encoders' ticks stay: they are the sensor's grid, not noise.
-    """
-
-    scale: float = 1.0  # multiplies every sigma below
-    encoder_ticks: int = 4096  # a turn of the wheel
-    wheel_scale: float = 0.003  # 1, error of each wheel's radius, constant over an episode
-    wheel_slip: float = 0.01  # 1, share of the way that a wheel slips, anew each sample
-    gyro: float = 0.005  # rad/s, anew each sample
-    gyro_bias: float = 0.001  # rad/s, constant over an episode
-    fix_position: float = 0.005  # m, x and y each, anew each period
-    fix_heading: float = 0.01  # rad, anew each period
-    lidar: float = 0.01  # m, each ray
-    drift_position: float = 0.001  # m, what the filter takes odometry to lose in a period
-    drift_heading: float = 0.0015  # rad, likewise
 
 
 CUT = 2.0  # sigma

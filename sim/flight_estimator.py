@@ -6,28 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from sim.conditions import QuadrotorNoise as QuadrotorNoise
 from sim.estimator import cut_normal
 from sim.flight import GRAVITY, Vector
 
 Quaternion = tuple[float, float, float, float]  # w, x, y, z; world from body
-
-
-@dataclass(frozen=True)
-class QuadrotorNoise:
-    """Errors of the quadrotor's estimate and sensors. All are normal, cut off at `CUT` sigma; `scale` = 0: none.
-
-    With scale 1 they stay within QUADROTOR.measurement_bound: position and velocity by their cut; acceleration, in
-    which the accelerometer's error adds to a wrong attitude's share of up to 30 m/s², by √3·CUT·(0.04 + 0.001·30),
-    less than 0.25 m/s².
-    """
-
-    scale: float = 1.0  # multiplies every sigma below
-    position: float = 0.0145  # m, each axis
-    velocity: float = 0.0145  # m/s, each axis
-    attitude: float = 0.001  # rad, about each axis
-    accelerometer: float = 0.04  # m/s², each axis, anew at each reading
-    gyro: float = 0.005  # rad/s, each axis, anew at each reading
-    lidar: float = 0.02  # m, each ray
 
 
 @dataclass(frozen=True)

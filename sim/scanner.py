@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 from messaging.rays import Rays
 from messaging.robots import Robot
 from messaging.scans import Scan
+from sim.conditions import Faults as Faults
+from sim.conditions import Perception as Perception
 from sim.lidar import Lidar
 from sim.world import Arena
 
@@ -20,35 +22,6 @@ BEAMS, FAR, NEAR = 360, 3.5, 0.12  # LDS-01: beams, and m that it measures from 
 MOUNT = (-0.032, 0.0)  # m in the robot's frame
 LEAST_WIDTH = 0.1  # m: of everything in the arenas
 CUT = 2.0  # sigma: the noise of a range is cut off there
-
-
-@dataclass(frozen=True)
-class Faults:
-    """What ails the beams. Shares are of beams, anew each scan."""
-
-    dropped: float = 0.0  # share that says nothing
-    far: float = 0.0  # share that sees through what is there
-    ghosts: float = 0.0  # share that returns from where nothing is
-    blind: float = 0.0  # rad about straight behind that is hidden
-    late: int = 0  # periods until a scan is there
-
-    def __post_init__(self) -> None:
-        if not all(0.0 <= share <= 1.0 for share in (self.dropped, self.far, self.ghosts)):
-            raise ValueError("the shares of dropped, false and ghost beams are between 0 and 1")
-        if not 0.0 <= self.blind <= 2.0 * math.pi or self.late < 0:
-            raise ValueError("a blind sector is between 0 and a turn, scans are late by 0 periods or more")
-
-
-@dataclass(frozen=True)
-class Perception:
-    """Where free space comes from: `map`, the arena's obstacles as they are, or `scan`, what the sensor shows."""
-
-    kind: str = "map"
-    faults: Faults = Faults()
-
-    def __post_init__(self) -> None:
-        if self.kind not in ("map", "scan"):
-            raise ValueError(f"free space comes from a map or from scans, not from {self.kind!r}")
 
 
 class Scanner:

@@ -3,25 +3,12 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 
+from sim.conditions import Wind as Wind
+
 GUST_CUT = 3.0  # sigma at which a gust is cut off
-
-
-@dataclass(frozen=True)
-class Wind:
-    """The air about a vehicle. Gusts are a first-order Gauss-Markov process on each axis (Dryden's along the wind)."""
-
-    speed: float = 0.0  # m/s, mean, horizontal
-    direction: float | None = None  # rad from east, where it blows to; None: drawn anew for each vehicle
-    gust: float = 0.0  # m/s, standard deviation on each axis, cut off at `GUST_CUT` of it
-    correlation: float = 1.5  # s
-
-    @property
-    def calm(self) -> bool:
-        return self.speed == 0.0 and self.gust == 0.0
 
 
 class Air:

@@ -1,4 +1,7 @@
-"""Options and small things that several commands share."""
+"""Options and small things that several commands share.
+
+Nothing heavy is imported before it is used: `--help` and a typing mistake are answered at once.
+"""
 
 from __future__ import annotations
 
@@ -7,26 +10,21 @@ import math
 import os
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
 import tyro
 from rich.console import Console
 from rich.table import Table
 
-from actors.flight import FlightSettings
-from deploy.run.configurations import RunConfig
-from deploy.run.keys import own_keys
-from deploy.run.places import client_of
+from actors.settings import FlightSettings
 from logs.tables import PLAIN, Stacking
-from messaging.bus import BusSettings
-from messaging.ports import free_endpoint
-from safety.model_set import Recipe
-from sim.conditions import Conditions
-from sim.estimator import NoiseLevels
-from sim.flight_estimator import QuadrotorNoise
-from sim.scanner import Faults, Perception
-from sim.wind import Wind
-from sim.world import Arena
+from safety.recipe import Recipe
+from sim.conditions import Conditions, Faults, NoiseLevels, Perception, QuadrotorNoise, Wind
+
+if TYPE_CHECKING:
+    from deploy.run.configurations import RunConfig
+    from messaging.bus import BusSettings
+    from sim.world import Arena
 
 Certificate = Literal["residual", "set-membership", "matrix-zonotope"]
 Mode = Literal["direct", "recursion"]
@@ -130,6 +128,8 @@ class Endpoints:
 
     def bus(self) -> BusSettings:
         """Raises ValueError when there is neither an endpoint nor a run."""
+        from messaging.bus import BusSettings
+
         if self.connect or self.listen:
             keys = self.keys or default_keys()
             return BusSettings(connect=self.connect, listen=self.listen, keys=keys, insecure=self.insecure)
@@ -151,6 +151,10 @@ class Meeting:
 
     def settings(self, config: RunConfig, folder: Path) -> BusSettings:
         """The launcher's place on the bus."""
+        from deploy.run.keys import own_keys
+        from messaging.bus import BusSettings
+        from messaging.ports import free_endpoint
+
         keys = self.keys or default_keys() or (own_keys(config, folder) if self.secured else None)
         endpoint = self.listen or free_endpoint("tcp" if keys is None else "tls")
         return BusSettings(listen=(endpoint,), keys=keys, insecure=self.insecure)
@@ -164,6 +168,8 @@ def default_keys() -> Path | None:
 
 def bus_of(run: Path) -> BusSettings:
     """How a client gets on the bus of a run on this machine. Raises ValueError with what to do."""
+    from deploy.run.places import client_of
+
     try:
         return client_of(run)
     except (OSError, ValueError, KeyError) as error:

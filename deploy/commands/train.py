@@ -5,26 +5,27 @@ from __future__ import annotations
 import time
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, ClassVar, Self
 
 import tyro
 
-from actors.loop import Change
+from actors.settings import Change
 from deploy.commands.common import Filtering, Flags, Meeting, Physics, console, errors, say_json
+from deploy.progress import under_way
 from deploy.run.configurations import EXPERIMENTS, RunConfig, load
-from deploy.run.display import Display, summary
-from deploy.run.feed import count
-from deploy.run.launcher import Launcher, prepare
-from deploy.run.places import CONFIG
 from learner.config import LearnerConfig
-from logs.recorder import Rotation
-from messaging.tasks import address, learnt
+from logs.rotation import Rotation
 
 
 def launch(config: RunConfig, folder: Path, resume: bool, meeting: Meeting, as_json: bool) -> int:
     """Prepare and run, with a display on stderr (when JSON is asked for) or stdout; returns the exit status."""
-    prepare(config, folder, resume)
     shown = errors if as_json else console
+    what = f"{', '.join(config.robots)}, method {config.method}, arena {config.arena}, {config.steps} steps"
+    with under_way(f"{folder}: {what}"):  # seconds go into these alone
+        from deploy.run.display import Display, summary
+        from deploy.run.launcher import Launcher, prepare
+
+    prepare(config, folder, resume)
     if resume:
         shown.print(f"resuming {folder} from the learner's last checkpoint; the log goes on in a new segment")
     with Display(shown, config.steps * len(config.robots)) as display:
@@ -90,8 +91,14 @@ class Train:
     json: bool = False
     """Print the final figures as one JSON object on stdout; the display goes to stderr."""
 
+    # What `--help` leaves to `--help-all`.
+    expert: ClassVar[tuple[str, ...]] = (
+        *("physics", "robots_per_actor", "penalty", "deadline", "replicas", "from_logs", "practice", "change"),
+        *("deterministic", "record", "rotation", "pictures", "mavlink", "meeting", "learner"),
+    )
+
     @classmethod
-    def defaults(cls, arguments: list[str]) -> Train:
+    def defaults(cls, arguments: list[str]) -> Self:
         """The options before any is given: those of the experiment that is.
 
         Raises:
@@ -111,9 +118,13 @@ class Train:
     def config(self) -> RunConfig:
         """The run's configuration; a resumed run's is its own, but for the steps."""
         if self.resume is not None:
+            from deploy.run.places import CONFIG
+
             resumed = load(self.resume / CONFIG)
             from_logs = tuple(map(str, self.from_logs)) or resumed.from_logs
             return replace(resumed, steps=self.steps or resumed.steps, from_logs=from_logs)
+        from messaging.tasks import address
+
         return RunConfig(
             robots=tuple(address(name) for name in self.robots),
             method=self.filtering.method,
@@ -141,8 +152,11 @@ class Train:
     def _steps(self) -> int:
         """As given; offline the logs have an end; else the experiment's."""
         if self.steps is None and self.from_logs and self.actors == 0:
+            from deploy.run.feed import count
+            from messaging.tasks import learnt
+
             logs = [str(path) for path in self.from_logs]
-            with errors.status("counting the logs' steps"):
+            with under_way("counting the logs' steps"):
                 return max(count(logs, learnt(name)) for name in self.robots)
         return EXPERIMENTS[self.experiment].steps if self.steps is None else self.steps
 

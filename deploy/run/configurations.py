@@ -10,14 +10,11 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from actors.flight import FlightSettings
-from actors.loop import Change
+from actors.settings import Change, FlightSettings
 from learner.config import LearnerConfig, TD3Config
-from logs.recorder import Rotation
-from messaging.tasks import learnt
-from safety.methods import METHODS as FILTERS
-from safety.model_set import Recipe
-from sim.arenas import arena_kind
+from logs.rotation import Rotation
+from safety.recipe import METHODS as FILTERS
+from safety.recipe import Recipe
 from sim.conditions import Conditions
 
 METHODS = (*FILTERS, "none")
@@ -63,8 +60,8 @@ class RunConfig:
     def __post_init__(self) -> None:
         if self.method not in METHODS:
             raise ValueError(f"no method is called {self.method!r}; there are: {', '.join(METHODS)}")
-        for robot in self.robots:
-            arena_kind(learnt(robot), self.arena)
+        if (self.robots, self.arena) != (RunConfig.robots, RunConfig.arena):
+            _check_arenas(self.robots, self.arena)
         if min(self.robots_per_actor, self.replicas, self.steps) < 1 or self.actors < (0 if self.from_logs else 1):
             raise ValueError(
                 "actors (unless there are logs to learn from), robots per actor, replicas, steps: 1 or more"
@@ -84,6 +81,16 @@ class RunConfig:
     def learning(self) -> LearnerConfig:
         """The learner's part, with what it shares with the others."""
         return replace(self.learner, seed=self.seed, steps=self.steps, lockstep=self.deterministic)
+
+
+def _check_arenas(robots: tuple[str, ...], arena: str) -> None:
+    """Raises ValueError: a robot or its arena does not exist. Other than the defaults', which need no look: what
+    `train --help` reads has no simulator to wait for."""
+    from messaging.tasks import learnt
+    from sim.arenas import arena_kind
+
+    for robot in robots:
+        arena_kind(learnt(robot), arena)
 
 
 EXPERIMENTS: dict[str, RunConfig] = {

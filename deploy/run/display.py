@@ -32,6 +32,7 @@ class Display:
         self._task = self._bar.add_task("steps", total=steps)
         self._live = Live(console=console, auto_refresh=False, transient=True) if console.is_terminal else None
         self._last = -1e9 if self._live is not None else time.monotonic()
+        self._said = ""  # what was being done, as it was last said where there is no terminal
 
     def __enter__(self) -> Self:
         if self._live is not None:
@@ -43,6 +44,9 @@ class Display:
             self._live.stop()
 
     def __call__(self, view: View) -> None:
+        if self._live is None and (now := doing(view)) != self._said:
+            self._said = now
+            self.console.print(now, markup=False)
         spacing = REFRESH if self._live is not None else PLAIN
         if time.monotonic() - self._last < spacing and not (view.ending and self._live is not None):
             return
@@ -54,6 +58,19 @@ class Display:
             self._live.update(live(view, figures, self._bar), refresh=True)
         else:
             self.console.print(line(figures))
+
+
+def doing(view: View) -> str:
+    """What the run is at: most of its first half minute goes into starting processes."""
+    if view.ending:
+        return "ending every process in order"
+    heard = view.metrics.processes.copy()
+    starting = [child.place.name for child in view.children if child.place.name not in heard and not child.finished]
+    if starting:
+        return f"starting {', '.join(starting)}"
+    if not any(tally.steps for tally in view.metrics.actors.copy().values()) and view.config.actors:
+        return "waiting for the first step"
+    return "driving" if view.config.policy else "driving and learning" if view.config.actors else "learning from logs"
 
 
 def line(figures: dict[str, Any]) -> str:
@@ -70,7 +87,7 @@ def line(figures: dict[str, Any]) -> str:
 
 def live(view: View, figures: dict[str, Any], bar: Progress) -> RenderableType:
     """The whole picture: progress, the learning, the safety, the processes, the latest warnings."""
-    parts: list[RenderableType] = [bar, _run(figures), _processes(view)]
+    parts: list[RenderableType] = [Text(doing(view), "bold"), bar, _run(figures), _processes(view)]
     if view.lines:
         parts += [Text(text, "yellow", no_wrap=True, overflow="ellipsis") for text in list(view.lines)[-LINES:]]
     subtitle = "ending" if view.ending else "^C ends every process in order"
@@ -114,6 +131,8 @@ def _processes(view: View) -> Table:
         table.add_column(column, style="dim" if column != "process" else "")
     for child in view.children:
         state = "[green]runs[/]" if child.alive else "done" if child.finished else "[red]down[/]"
+        if child.place.name not in view.metrics.processes and not child.restarts and not child.finished:
+            state = "[yellow]starts[/]"
         table.add_row(child.place.name, state, str(child.restarts))
     return table
 

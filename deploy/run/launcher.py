@@ -76,7 +76,7 @@ class Launcher:
             process.refresh = lambda: self._tell(process)
             try:
                 if self.config.record:
-                    self._start_recorder(process)
+                    self._start_recorder(process, lambda: show(view))
                 process.announce()
                 while not process.stop.is_set() and not self.finished:
                     for child in self.children:
@@ -176,7 +176,7 @@ class Launcher:
             latest.unlink(missing_ok=True)
             latest.symlink_to(self.folder.name)
 
-    def _start_recorder(self, process: Process) -> None:
+    def _start_recorder(self, process: Process, show: Callable[[], Any]) -> None:
         """The recorder first, and not a word, of the launcher's either, before it listens: no message shall be missing
         in the log."""
         recorder = self.children[0]
@@ -184,6 +184,7 @@ class Launcher:
         while not process.stop.is_set() and time.monotonic() < deadline:
             recorder.watch()
             self._drain()
+            show()
             known = self.metrics.processes.get("recorder")
             if known is not None and known.notes.get("file"):
                 break

@@ -22,12 +22,11 @@ from messaging.tasks import task_of
 from safety.backup import brake, braking_plan, within
 from safety.commitment import NO_PREDICTION
 from safety.model_set import BadModel
+from safety.recipe import SAILR as SAILR
 from safety.request import ALLOWED, FAILSAFE, Decision, Request, check_for_rival
 from safety.rivals.pretrained import Pretrained
 
 Array = NDArray[np.float64]
-
-SAILR = "sailr"
 
 
 def normalised(robot: Robot, action: Array) -> Array:

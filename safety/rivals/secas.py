@@ -23,13 +23,13 @@ from messaging.tasks import task_of
 from safety.backup import braking_plan, within
 from safety.commitment import NO_PREDICTION
 from safety.model_set import BadModel
+from safety.recipe import SECAS as SECAS
 from safety.request import ADJUSTED, ALLOWED, Decision, Request, check_for_rival
 from safety.rivals.pretrained import Pretrained
 from safety.solver import Program, solve
 
 Array = NDArray[np.float64]
 
-SECAS = "secas"
 SECTOR = 0.55  # rad, about the width of a sector of rays
 LAG = 0.5  # periods that an input needs to take hold
 BESIDE = 0.3  # m beside the footprint, and twice the way to a stop: what is farther is far

@@ -2,7 +2,10 @@
 
 import io
 import json
+import re
 import shlex
+import subprocess
+import sys
 
 import pytest
 from rich.console import Console
@@ -14,6 +17,7 @@ from deploy.commands.service import obstacle_of
 from logs.report import analyse
 from logs.segment import open_segment
 from messaging.shapes import Obstacle
+from safety import methods, recipe
 from safety.statement import Statement
 
 SHARED = {
@@ -226,3 +230,46 @@ def test_certify_says_what_it_does_and_keeps_the_conditions_for_those_who_ask(co
     assert status == 0 and "{" not in out and "encoder" not in out
     assert "certifying residual, direct: 0 of 1" in err
     assert "encoder ticks" in command(*words, "--verbose")[1]
+
+
+HEAVY = ("torch", "mujoco", "zenoh", "scipy", "numpy", "pymavlink", "proxsuite", "google.protobuf", "pydantic")
+
+
+@pytest.mark.parametrize("words, status", [(["train", "--help"], 0), (["train", "--stps", "3"], 2), (["--version"], 0)])
+def test_help_and_typing_mistakes_wait_for_nothing_heavy(words, status):
+    script = f"""
+import sys
+from deploy.cli import main
+try:
+    status = main({words!r})
+except SystemExit as end:
+    status = end.code
+print("loaded:", status, [name for name in {HEAVY!r} if name in sys.modules])
+"""
+    done = subprocess.run([sys.executable, "-c", script], check=False, capture_output=True, text=True, timeout=60)
+    assert done.stdout.splitlines()[-1] == f"loaded: {status} []", done.stderr
+
+
+def test_help_has_what_one_needs_first_and_all_of_it_when_asked(command, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "80")
+    status, short, _ = command("train", "--help")
+    first = short[short.index("─ options ─") :]
+    first = first[: first.index("╰")]
+    assert status == 0 and first.count("\n") <= 24, "a screen"
+    for option in ("--steps", "--seed", "--actors", "--method", "--resume", "--help-all"):
+        assert option in short
+    assert "--learner.td3.batch" not in short and "--rotation" not in short
+    status, whole, _ = command("train", "--help-all")
+    assert status == 0
+    for option in ("--steps", "--learner.td3.batch", "--rotation.mib", "--payload", "--deterministic"):
+        assert option in whole
+    assert command("train", "--payload", "heavy")[0] == 2, "what is not shown is understood all the same"
+
+
+def test_the_version_is_told(command):
+    status, out, _ = command("--version")
+    assert status == 0 and re.fullmatch(r"brakeline \d+\.\d+\S*, Python 3\.\d+\.\d+\n", out)
+
+
+def test_a_configuration_may_say_every_method_that_can_be_served():
+    assert recipe.METHODS == methods.METHODS

@@ -1,16 +1,18 @@
 """What is written is what was received, readable by anyone's MCAP tools."""
 
 import itertools
+import json
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from mcap.exceptions import DecoderNotFoundError
 from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 
 from logs.reader import NoLog, NotALog, find, open_log, read
 from logs.recorder import as_it_came, entry
-from logs.segment import Segment, number_of, open_segment, segments
+from logs.segment import Entry, Segment, number_of, open_segment, segments
 from messaging import brakeline_pb2 as pb
 from messaging.bus import Sample
 from messaging.topics import STEP
@@ -134,3 +136,24 @@ def test_what_is_no_log_is_said(tmp_path: Path) -> None:
     (tmp_path / "text.mcap").write_text("a long story, but not a log")
     with pytest.raises(NotALog, match="not an MCAP file"):
         list(read(tmp_path / "text.mcap"))
+
+
+def test_the_two_lines_of_the_documentation_read_json_channels_too(tmp_path: Path) -> None:
+    """A flight's log: the plain reader stops at its JSON channels."""
+    text = json.dumps({"type": 2}).encode()
+    segment = open_segment(tmp_path / "run.mcap", {})
+    segment.save(
+        [
+            Entry("log/a", pb.LogLine, pb.LogLine(process="a").SerializeToString(), 1, 1, 1),
+            Entry("mavlink/1/1/HEARTBEAT", "application/json;mavlink", text, 2, 2, 0),
+        ]
+    )
+    segment.finish()
+    with (tmp_path / "run.mcap").open("rb") as file, pytest.raises(DecoderNotFoundError):
+        list(make_reader(file, decoder_factories=[DecoderFactory()]).iter_decoded_messages())
+    page = (Path(__file__).parents[2] / "docs" / "logs.md").read_text()
+    code = page[page.index("```python") :].removeprefix("```python").split("```", 1)[0]
+    code = code.replace("runs/latest/run.mcap", str(tmp_path / "run.mcap"))
+    seen: list[tuple[str, object]] = []
+    exec(code.replace("print(channel.topic, value)", "seen.append((channel.topic, value))"), {"seen": seen})
+    assert [topic for topic, _ in seen] == ["log/a", "mavlink/1/1/HEARTBEAT"] and seen[1][1] == {"type": 2}

@@ -10,7 +10,7 @@ from rich.progress import Progress
 
 from deploy.commands import common
 from deploy.run.configurations import RunConfig
-from deploy.run.display import Display, line, live, summary
+from deploy.run.display import Display, doing, line, live, summary
 from deploy.run.places import places
 from deploy.run.view import View
 from deploy.run.watched import Child
@@ -67,13 +67,15 @@ def test_without_a_terminal_it_says_a_line_now_and_then(view: View, monkeypatch:
     with Display(console, 1000) as display:
         for _ in range(100):
             display(view)
-        assert console.file.getvalue() == ""  # type: ignore[attr-defined]
+        said = console.file.getvalue()  # type: ignore[attr-defined]
+        assert said.startswith("starting recorder, safety-0,") and said.count("\n") == 1, "what it does, at once"
         monkeypatch.setattr("deploy.run.display.PLAIN", 0.0)
         display(view)
         monkeypatch.undo()
         view.ending = True
         display(view)
-    assert console.file.getvalue().splitlines() == [line(view.metrics.figures())]  # type: ignore[attr-defined]
+    rows = console.file.getvalue().splitlines()  # type: ignore[attr-defined]
+    assert rows[1:] == [line(view.metrics.figures()), "ending every process in order"]
 
 
 def test_the_summary_has_the_paths_whole(view: View) -> None:
@@ -85,3 +87,19 @@ def test_the_summary_has_the_paths_whole(view: View) -> None:
     assert f"log:    {folder}/run.mcap" in rows and f"policy: {folder}/policy.safetensors" in rows
     assert any(row.endswith("restarts: learner 2, safety-0 1") for row in rows)
     assert any(f"brakeline train --resume {folder}" in row for row in rows)
+
+
+def test_what_a_run_is_at_is_said_from_the_first_second(view: View) -> None:
+    young = View(view.config, view.folder, Metrics(), view.children, deque())
+    console = Console(file=io.StringIO(), force_terminal=True, width=80, color_system=None)
+    console.print(live(young, young.metrics.figures(), Progress()))
+    shown = console.file.getvalue()  # type: ignore[attr-defined]
+    assert "starting recorder, safety-0" in shown and shown.count(" starts ") == len(view.children)
+    for number, child in enumerate(view.children):
+        name = child.place.name
+        young.metrics.add(f"health/{name}", pb.Health(header=pb.Header(sequence=1, run=number + 1), process=name))
+    assert doing(young) == "waiting for the first step"
+    young.metrics.add("step/ground/actor-0", step(0))
+    assert doing(young) == "driving and learning"
+    young.ending = True
+    assert doing(young) == "ending every process in order"

@@ -1,0 +1,36 @@
+"""How a model set is made, and what there is to choose from. Nothing heavy here: whoever starts a run reads it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+RESIDUAL, SET_MEMBERSHIP, MATRIX_ZONOTOPE = "residual", "set-membership", "matrix-zonotope"
+KINDS = (RESIDUAL, SET_MEMBERSHIP, MATRIX_ZONOTOPE)  # of certificates
+DIRECT, RECURSION = "direct", "recursion"
+MODES = (DIRECT, RECURSION)
+PLAN, FREE = "plan", "free"
+WINDOWS = (PLAN, FREE)
+DDPC, SECAS, SAILR = "ddpc", "secas", "sailr"
+METHODS = (DDPC, SECAS, SAILR)  # of a safety service
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """How a model set is made from a data set."""
+
+    certificate: str = RESIDUAL
+    mode: str = DIRECT
+    inflation: float = 1.15  # of every envelope: what the next data may exceed the recorded ones by
+    seed: int = 0  # of the recursion's heading offsets
+    windows: str = PLAN  # FREE: from driving that follows no plan
+
+    def __post_init__(self) -> None:
+        if self.certificate not in KINDS:
+            raise ValueError(f"no certificate is called {self.certificate!r}; there are: {', '.join(KINDS)}")
+        if self.mode not in MODES:
+            raise ValueError(f"no mode is called {self.mode!r}; there are: {', '.join(MODES)}")
+        if self.windows not in WINDOWS:
+            raise ValueError(f"no windows are called {self.windows!r}; there are: {', '.join(WINDOWS)}")
+        if not 1.0 <= self.inflation < math.inf:
+            raise ValueError(f"an envelope scaled by {self.inflation} bounds nothing")
