@@ -85,7 +85,8 @@ class Recover:
             raise ValueError(f"--out takes what is in one file, and there are {len(paths)}")
         found = []
         for path in paths:
-            found.append(recover(path, self.out))
+            with under_way(f"reading {path}"):
+                found.append(recover(path, self.out))
             if not self.json:
                 console.print(str(found[-1]), markup=False)
         if self.json:

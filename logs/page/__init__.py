@@ -141,8 +141,8 @@ def percent(share: float | None) -> str:
 
 
 def within(interval: tuple[float, float] | None) -> str:
-    """An interval of a share, to stand behind it."""
-    return "" if interval is None else f" [{percent(interval[0])}, {percent(interval[1])}]"
+    """An interval of a share, to stand below it."""
+    return "" if interval is None else f"[{percent(interval[0])}, {percent(interval[1])}]"
 
 
 def moment(seconds: float | None) -> str:
