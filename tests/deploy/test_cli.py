@@ -270,7 +270,7 @@ def test_help_has_what_one_needs_first_and_all_of_it_when_asked(command, monkeyp
 
 def test_the_version_is_told(command):
     status, out, _ = command("--version")
-    assert status == 0 and re.fullmatch(r"brakeline \d+\.\d+\S*, Python 3\.\d+\.\d+\n", out)
+    assert status == 0 and re.fullmatch(r"brakeline \d+\.\d+\S*\n", out)
 
 
 def test_a_configuration_may_say_every_method_that_can_be_served():
