@@ -68,6 +68,16 @@ COMMANDS: dict[str, Command] = {
         "quadrotors behind MAVLink in real time, with PX4's or ArduPilot's rules",
         "brakeline autopilot --rules px4 --url udpout:127.0.0.1:14540 --arena default",
     ),
+    "ros2": Command(
+        "ros2:Ros2",
+        "the filter in front of a ROS 2 robot's base: cmd_vel_raw in, cmd_vel out; needs no ROS here",
+        "brakeline ros2 ground --router tcp/localhost:7447",
+    ),
+    "bridge-sim": Command(
+        "ros2:BridgeSim",
+        "a simulated ground robot as a ROS 2 robot: odom, scan, tf, clock, cmd_vel",
+        "brakeline bridge-sim --arena dense --seed 3",
+    ),
     "recorder": Command(
         "processes:Recorder",
         "the recorder alone",

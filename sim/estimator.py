@@ -114,13 +114,17 @@ class Estimator:
 
     def _correct(self, moved: Array, turned: float, pose: Array) -> None:
         """Move the pose by (2,) metres in the old body frame and an angle, then towards the fix."""
-        x, y, heading = self.pose
-        cos, sin = math.cos(heading), math.sin(heading)
-        guess = np.array([x + cos * moved[0] - sin * moved[1], y + sin * moved[0] + cos * moved[1], heading + turned])
+        guess = self._moved(moved, turned)
         error = self._fix(pose) - guess
         error[2] = wrap(error[2])
         self.pose = guess + self._gain * error
         self.pose[2] = wrap(self.pose[2])
+
+    def _moved(self, moved: Array, turned: float) -> Array:
+        """The pose (3,) after that."""
+        x, y, heading = self.pose
+        cos, sin = math.cos(heading), math.sin(heading)
+        return np.array([x + cos * moved[0] - sin * moved[1], y + sin * moved[0] + cos * moved[1], heading + turned])
 
     def _fix(self, pose: Array) -> Array:
         """A pose fix, (3,)."""

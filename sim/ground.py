@@ -125,25 +125,14 @@ class GroundRobot:
 
     def _run(self, input: Array) -> tuple[Array, Array, Array, bool]:
         """One period of physics: position (S, 2), wheel angles (S, 2), turn rate (S,) at each sample; any collision."""
-        model, data = self._model, self._data
-        speed, turn = input
-        data.ctrl[:] = (speed - 0.5 * TRACK * turn) / WHEEL_RADIUS, (speed + 0.5 * TRACK * turn) / WHEEL_RADIUS
+        data = self._data
+        self._set_wheels(input)
         positions, wheels, headings = np.empty((SAMPLES, 2)), np.empty((SAMPLES, 2)), np.empty(SAMPLES + 1)
         headings[0] = self._true_heading()
         collision, self._contacts = False, [False, False]
         driven = bool(input.any())
         for i in range(SAMPLES):
-            for _ in range(self._physics_steps):
-                moving = driven or math.hypot(*data.qvel[:2].tolist()) > STANDING
-                if self._moving:
-                    self._time += model.opt.timestep
-                    self._moving.place(self._time)
-                # step2 before step1: contacts are then those of the position just reached
-                mujoco.mj_step2(model, data)
-                mujoco.mj_step1(model, data)
-                collision = collision or self._touching()
-                if self._moving:
-                    self._meet(moving)
+            collision |= self._run_sample(driven)
             positions[i], wheels[i], headings[i + 1] = data.qpos[:2], self._wheels(), self._true_heading()
         rates = np.diff(np.unwrap(headings)) * (SAMPLES / GROUND.period)
         return positions, wheels, rates, collision
@@ -154,6 +143,27 @@ class GroundRobot:
         if touched and not self._meeting:
             self._contacts[0 if moving else 1] = True
         self._meeting = touched
+
+    def _set_wheels(self, input: Array) -> None:
+        """Setpoints of the wheels for an input (speed [m/s], turn rate [rad/s])."""
+        speed, turn = input
+        self._data.ctrl[:] = (speed - 0.5 * TRACK * turn) / WHEEL_RADIUS, (speed + 0.5 * TRACK * turn) / WHEEL_RADIUS
+
+    def _run_sample(self, driven: bool) -> bool:
+        """Physics up to the next sample; any collision. driven: the input is not zero."""
+        model, data, collision = self._model, self._data, False
+        for _ in range(self._physics_steps):
+            moving = driven or math.hypot(*data.qvel[:2].tolist()) > STANDING
+            if self._moving:
+                self._time += model.opt.timestep
+                self._moving.place(self._time)
+            # step2 before step1: contacts are then those of the position just reached
+            mujoco.mj_step2(model, data)
+            mujoco.mj_step1(model, data)
+            collision = collision or self._touching()
+            if self._moving:
+                self._meet(moving)
+        return collision
 
     def _touching(self) -> bool:
         """Whether any contact now is with an obstacle that stands. Else, but for what moves, it touches only the floor,

@@ -1,0 +1,1 @@
+"""The filter between a ROS 2 robot's raw commands and its base."""

@@ -1,0 +1,117 @@
+"""One robot's committed plan between its raw commands and its base: what goes out in each period, and why.
+
+The world does not wait: while a period's input is carried out the next one's is decided on, by a model set of the robot
+in real time. `begin` gives the input of the period that begins; `decide`, late in it, asks about the command that is
+the newest then, with the state that was measured at its beginning.
+"""
+
+from __future__ import annotations
+
+from collections import Counter, deque
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from actors.guard import Ask, Outcome, consult, next_input
+from actors.ros2.senses import Command
+from messaging.robots import Robot
+from messaging.shapes import Obstacle
+from safety.client import request_message
+from safety.commitment import Commitment
+
+Array = NDArray[np.float64]
+
+KEPT = 10_000  # latest delays that are remembered
+NO_ANSWER, LATE, BLIND = "no answer", "late", "blind"
+
+
+@dataclass
+class Tally:
+    """What became of the periods so far."""
+
+    periods: int = 0
+    kinds: Counter[str] = field(default_factory=Counter)  # allowed, adjusted, failsafe; no answer, late, blind
+    commands: int = 0  # that were decided on
+    compared: int = 0  # measured states with a prediction
+    outside: int = 0  # of them: not in the predicted set
+    slips: int = 0  # periods that began a period late or more
+    delays: deque[float] = field(default_factory=lambda: deque(maxlen=KEPT))  # s from a command's coming to its going
+    decide_ms: deque[float] = field(default_factory=lambda: deque(maxlen=KEPT))
+
+    def figures(self) -> dict[str, float]:
+        kinds = ("allowed", "adjusted", "failsafe", NO_ANSWER, LATE, BLIND)
+        delays, decide = 1e3 * np.array([*self.delays] or [0.0]), np.array([*self.decide_ms] or [0.0])
+        return {
+            "periods": self.periods,
+            **{kind: self.kinds[kind] for kind in kinds},
+            "commands": self.commands,
+            "left the predicted set": self.outside,
+            "periods slipped": self.slips,
+            "delay p50 ms": float(np.percentile(delays, 50)),
+            "delay p99 ms": float(np.percentile(delays, 99)),
+            "delay worst ms": float(delays.max()),
+            "decide p50 ms": float(np.percentile(decide, 50)),
+            "decide p99 ms": float(np.percentile(decide, 99)),
+        }
+
+
+class Gate:
+    """The committed plan, and who is asked about the next one."""
+
+    def __init__(self, robot: Robot, ask: Ask, name: str = "ros2") -> None:
+        """robot: in real time (`Robot.late`)."""
+        assert robot.late, "in real time an answer counts from the next period on"
+        self.robot, self.commitment, self.tally = robot, Commitment(robot), Tally()
+        self.input = np.zeros(robot.action_dim)  # of the running period
+        self.reason = "not begun"  # why the next input is not the command; empty: it is
+        self.kind = BLIND
+        self.outcome: Outcome | None = None  # of this period's question
+        self._ask, self._name = ask, name
+        self._command: Command | None = None  # that was asked about
+        self._known = 0  # number of the last command whose delay is known
+
+    def decide(
+        self, state: Array, obstacles: Sequence[Obstacle], command: Command | None, time: float, step: int
+    ) -> None:
+        """Ask about a command (None: to stand) in the state of the period's beginning."""
+        proposal = np.zeros(self.robot.action_dim) if command is None else command.action
+        request = request_message(
+            self.commitment, state, proposal, obstacles, actor=self._name, step=step & 0xFFFFFFFF, time=time
+        )
+        self.outcome, self._command = consult(self._ask, [request], self.robot)[0], command
+
+    def begin(self, now: float, in_time: bool = True, why: str = "") -> Array:
+        """The input (m,) of the period that begins now. in_time: False if the answer came after its beginning; why:
+        there was no question, or no answer can count, and this is the reason."""
+        tally, outcome, command = self.tally, None if why else self.outcome, self._command
+        self.outcome = self._command = None
+        tally.periods += 1
+        if outcome is not None and outcome.answer is not None and in_time:
+            message = outcome.answer.message
+            tally.compared += message.compared
+            tally.outside += message.compared and not message.contained
+            tally.decide_ms.append(message.time_ms)
+            self.kind, self.reason = outcome.answer.kind, message.reason
+            self.input = next_input(self.commitment, outcome)
+            if command is None:
+                self.reason = self.reason or "no command"
+            else:
+                self._note(command, now)
+        else:
+            if outcome is None:
+                self.kind, self.reason = BLIND, why or "nothing was asked"
+            elif outcome.answer is None:
+                self.kind, self.reason = NO_ANSWER, outcome.failure
+            else:
+                self.kind, self.reason = LATE, "the answer came after its period had begun"
+            self.input = self.commitment.fallback()
+        tally.kinds[self.kind] += 1
+        return self.input
+
+    def _note(self, command: Command, now: float) -> None:
+        self.tally.commands += command.number != self._known
+        if command.number != self._known:
+            self._known = command.number
+            self.tally.delays.append(now - command.at)

@@ -1,0 +1,10 @@
+"""Other people's robots: a node in a ROS 2 graph, by rmw_zenoh's conventions, without ROS.
+
+A room beside the bus, with a session of its own. The bus is ours from end to end: one schema, one table of topics, who
+may say what. Here names, types, QoS and who speaks are the graph's, and none of the bus's rules can hold.
+"""
+
+from messaging.ros2.names import LATCHED, SENSOR, BadName, Entity, Qos
+from messaging.ros2.node import ROUTER, Node, Publisher, RosSettings, Tap
+
+__all__ = ["LATCHED", "ROUTER", "SENSOR", "BadName", "Entity", "Node", "Publisher", "Qos", "RosSettings", "Tap"]
