@@ -1,7 +1,7 @@
 """From a laser scan to obstacles that hold all it may have seen (method §10).
 
-A beam that hits at range r becomes a disc of radius `(increment / 2) r + range error + heading error r + position
-error`: half the gap to the next beam, and how wrong the hit's place may be. Neighbouring hits that the body can't pass
+A beam that hits at range r becomes a disc of radius `increment r + range error + heading error r + position error`: the
+gap to the next beam, before which an edge may lie anywhere, and how wrong the hit's place may be. Neighbouring hits that the body can't pass
 between are joined to boxes along them, so that a wall is one obstacle and not a hundred. A beam without a hit is free
 up to the sensor's range. One that tells nothing (too near, NaN), and directions that no beam looks in, may have
 something standing right at the body: they count as occupied there, and there is no memory of what was seen free before.
@@ -109,7 +109,7 @@ def obstacles(
     beside = np.stack([np.cos(angles), np.sin(angles)], axis=1)
     with np.errstate(invalid="ignore"):
         points = sensor + beams.ranges[:, None] * beside
-        radii = (0.5 * beams.gap + errors.heading) * beams.ranges + errors.range + errors.position
+        radii = (beams.gap + errors.heading) * beams.ranges + errors.range + errors.position
         near = np.linalg.norm(points - around, axis=1) <= robot.sight + SLACK + radii
     chosen = np.flatnonzero(near)
     order = chosen[np.argsort(beams.angles[chosen], kind="stable")]

@@ -36,6 +36,7 @@ from messaging.ros2.messages import (
     twist,
 )
 from messaging.shapes import Obstacle
+from safety.client import KINDS
 
 Array = NDArray[np.float64]
 
@@ -196,11 +197,10 @@ class Steering:
         """Diagnostics: each second, and when something changes."""
         gate, now = self.gate, self.clock.now()
         when, *said = self._told
-        if [gate.kind, gate.reason] != said:
-            bad = gate.kind not in ("allowed", "adjusted")
-            if gate.kind != said[0]:
-                log.log(logging.WARNING if bad else logging.INFO, "%s %s", gate.kind, gate.reason)
-        elif now - when < TELL:
+        if gate.kind != said[0]:
+            lost = gate.kind not in KINDS.values()
+            log.log(logging.WARNING if lost else logging.INFO, "%s: %s", gate.kind, gate.reason)
+        if [gate.kind, gate.reason] == said and now - when < TELL:
             return
         self._told = (now, gate.kind, gate.reason)
         self._diagnostics.put(

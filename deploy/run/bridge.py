@@ -115,6 +115,8 @@ class Bridge:
     def run(self, stop: threading.Event) -> None:
         """Until asked to stop, or its time is over."""
         settings = self.settings
+        if not settings.sim_time:
+            self._begun = time.time() - self._samples * SAMPLE
         anchor, since = time.monotonic(), self.now
         while not stop.is_set() and not 0.0 < settings.seconds <= self.outcome.seconds:
             self._sample()

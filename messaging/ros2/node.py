@@ -124,6 +124,7 @@ class Node:
         self._tap = tap
         self._lock = threading.Lock()
         self._tokens: list[Any] = []
+        self._senders: list[Any] = []  # one that nobody holds would be gone
         self._subscriptions: list[Subscription] = []
         try:
             self._session = zenoh.open(settings.configuration())
@@ -180,6 +181,7 @@ class Node:
             )
         else:
             sender = self._session.declare_publisher(key, **options)
+        self._senders.append(sender)
         self._declare(entity)
         return Publisher(entity, kind, qos, sender, self._tap)
 

@@ -1,0 +1,124 @@
+"""A ROS 2 node that we did not write the ROS part of (zenoh-ros2-sdk): rams whatever its scan shows, through topics alone.
+
+python ros2_driver.py PORT DOMAIN [--stamped]. It turns to the nearest hit of /scan, drives at it at full speed, and after
+a while picks another one. On stdout, one JSON object a line: what it heard of /cmd_vel, and how long [s] a change of
+its raw command took to come out of there. Run it with a HOME of its own.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import random
+import sys
+import threading
+import time
+
+import numpy as np
+from rosbags.typesys import Stores, get_typestore
+from zenoh_ros2_sdk import ROS2Publisher, ROS2Subscriber
+from zenoh_ros2_sdk.session import ZenohSession
+
+PORT, DOMAIN, STAMPED = int(sys.argv[1]), int(sys.argv[2]), "--stamped" in sys.argv
+PERSISTENCE = 30  # scans that one thing is rammed for
+PAUSE = 0.02  # s between raw commands
+
+STORE = get_typestore(Stores.ROS2_JAZZY)
+
+
+def definition(name: str) -> str:
+    """The text of one type's .msg: the SDK would fetch it with git."""
+    return STORE.generate_msgdef(name, ros_version=2)[0].split("=" * 80)[0]
+
+
+def register(*names: str) -> None:
+    session = ZenohSession.get_instance("127.0.0.1", PORT)
+    for name in names:
+        session.register_message_type(definition(name), name)
+
+
+def digest(name: str) -> str:
+    return STORE.hash_rihs01(name)
+
+
+class Driver:
+    def __init__(self) -> None:
+        self.rng = random.Random(1)
+        self.scans = self.heard = 0
+        self.wanted = (0.0, 0.0)
+        self.aim = 0.0  # rad in the scan's frame, of what is rammed
+        self.asked: tuple[float, float] | None = None  # when a turn rate was asked for, and which
+        self.delays: list[float] = []
+        self.lock = threading.Lock()
+
+    def scan(self, message: object) -> None:
+        ranges = np.asarray(message.ranges, float)
+        ranges = np.where(np.isfinite(ranges), ranges, 9.0)
+        angles = message.angle_min + message.angle_increment * np.arange(len(ranges))
+        angles = (angles + math.pi) % (2.0 * math.pi) - math.pi
+        self.scans += 1
+        if self.scans % PERSISTENCE == 1:
+            self.aim = self.rng.uniform(-math.pi, math.pi)
+        # The nearest thing in the half that it looks to; it keeps aiming at it as it turns.
+        off = np.abs((angles - self.aim + math.pi) % (2.0 * math.pi) - math.pi)
+        target = angles[np.argmin(np.where(off < 0.6, ranges, 99.0))]
+        turn = max(-0.5, min(0.5, 2.0 * target))
+        self.aim = target - 0.2 * turn
+        with self.lock:
+            self.wanted = (0.25 if abs(target) < 0.5 else 0.0, turn)
+
+    def command(self, message: object) -> None:
+        twist = message.twist if STAMPED else message
+        with self.lock:
+            self.heard += 1
+            if self.asked is not None and abs(twist.angular.z - self.asked[1]) < 1e-9:
+                self.delays.append(time.monotonic() - self.asked[0])
+                self.asked = None
+
+
+def main() -> None:
+    register(
+        "builtin_interfaces/msg/Time", "std_msgs/msg/Header", "geometry_msgs/msg/Vector3", "geometry_msgs/msg/Twist"
+    )
+    driver = Driver()
+    kind = "geometry_msgs/msg/TwistStamped" if STAMPED else "geometry_msgs/msg/Twist"
+    place = {"router_ip": "127.0.0.1", "router_port": PORT, "domain_id": DOMAIN}
+    scans = ROS2Subscriber(
+        "/scan",
+        "sensor_msgs/msg/LaserScan",
+        driver.scan,
+        definition("sensor_msgs/msg/LaserScan"),
+        type_hash=digest("sensor_msgs/msg/LaserScan"),
+        **place,
+    )
+    commands = ROS2Subscriber("/cmd_vel", kind, driver.command, definition(kind), type_hash=digest(kind), **place)
+    raw = ROS2Publisher("/cmd_vel_raw", kind, definition(kind), node_name="rammer", type_hash=digest(kind), **place)
+    store = raw.session_mgr.store
+    vector, twist = store.types["geometry_msgs/msg/Vector3"], store.types["geometry_msgs/msg/Twist"]
+    told = time.monotonic()
+    number = 0
+    while True:
+        number += 1
+        with driver.lock:
+            speed, turn = driver.wanted
+            turn += 1e-6 * (number % 1000)  # each command can be told from the others
+            if driver.asked is None or time.monotonic() - driver.asked[0] > 2.0:
+                driver.asked = (time.monotonic(), turn)
+        linear, angular = vector(x=speed, y=0.0, z=0.0), vector(x=0.0, y=0.0, z=turn)
+        if STAMPED:
+            header, stamp = store.types["std_msgs/msg/Header"], store.types["builtin_interfaces/msg/Time"]
+            head = header(stamp=stamp(sec=0, nanosec=0), frame_id="")
+            raw.publish(header=head, twist=twist(linear=linear, angular=angular))
+        else:
+            raw.publish(linear=linear, angular=angular)
+        if time.monotonic() - told > 0.5:
+            told = time.monotonic()
+            with driver.lock:
+                said = {"raw": number, "scans": driver.scans, "commands": driver.heard, "delays": driver.delays[-200:]}
+            print(json.dumps(said), flush=True)
+        time.sleep(PAUSE)
+    del scans, commands
+
+
+if __name__ == "__main__":
+    main()
