@@ -1,13 +1,15 @@
 """From a laser scan to obstacles that hold all it may have seen (method §10).
 
-A beam that hits at range r becomes a disc of radius `increment r + range error + heading error r + position error`: the
-gap to the next beam, before which an edge may lie anywhere, and how wrong the hit's place may be. Neighbouring hits that the body can't pass
-between are joined to boxes along them, so that a wall is one obstacle and not a hundred. A beam without a hit is free
-up to the sensor's range. One that tells nothing (too near, NaN), and directions that no beam looks in, may have
-something standing right at the body: they count as occupied there, and there is no memory of what was seen free before.
+A beam that hits at range r becomes a disc of radius `increment r + range error + heading error r + position error`:
+the gap to the next beam, before which an edge may lie anywhere, and how wrong the hit's place may be. Neighbouring hits
+that the body can't pass between are joined to boxes along them, so that a wall is one obstacle and not a hundred. A
+beam without a hit is free up to the sensor's range. One that tells nothing (too near, NaN), and directions that no beam
+looks in, may have something standing right at the body: they count as occupied there, and there is no memory of what
+was seen free before.
 
 What it assumes: nothing moves, and nothing is narrower than the gap between two beams where it matters (at 360 beams
-7 mm in 0.4 m).
+7 mm in 0.4 m). What stands behind an edge, within the one gap between the beams on both sides of it, is seen when the
+robot has come round.
 """
 
 from __future__ import annotations
@@ -71,7 +73,7 @@ def read(scan: LaserScan, zero_is_free: bool = False) -> Beams:
     ranges = np.asarray(scan.ranges, dtype=float)
     n, gap = len(ranges), float(scan.angle_increment)
     limits = (scan.range_min, scan.range_max, scan.angle_min, gap, scan.time_increment)
-    if not (2 <= n <= MOST and all(map(math.isfinite, limits)) and gap != 0.0):
+    if not (2 <= n <= MOST and all(map(math.isfinite, limits)) and abs(gap) > 1.0 / MOST):
         raise BadScan(f"{n} beams, {gap:g} rad apart")
     if not 0.0 <= scan.range_min < scan.range_max:
         raise BadScan(f"ranges from {scan.range_min:g} m to {scan.range_max:g} m")

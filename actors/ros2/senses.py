@@ -15,8 +15,11 @@ from actors.ros2.odometry import Track
 from messaging.robots import Robot
 from messaging.ros2.messages import LaserScan, Odometry, TFMessage, Twist, TwistStamped, seconds, yaw_of
 from messaging.shapes import Obstacle
+from messaging.tolerant import headline
 
 Array = NDArray[np.float64]
+
+LONGEST_FRAME = 100  # characters of a frame's name
 
 
 class Blind(Exception):
@@ -74,8 +77,8 @@ class Senses:
     def hear_odometry(self, message: Odometry) -> None:
         pose, twist = message.pose.pose, message.twist.twist
         with self._lock:
-            self.frame = message.header.frame_id or self.frame
-            self._base = message.child_frame_id or self._base
+            self.frame = headline(message.header.frame_id, LONGEST_FRAME) or self.frame
+            self._base = headline(message.child_frame_id, LONGEST_FRAME) or self._base
             self._track.add(
                 seconds(message.header.stamp),
                 *(pose.position.x, pose.position.y, yaw_of(pose.orientation)),
@@ -101,7 +104,8 @@ class Senses:
 
     def hear_scan(self, message: LaserScan) -> None:
         try:
-            scan, bad = (read(message, self.sensing.zero_is_free), message.header.frame_id), ""
+            frame = headline(message.header.frame_id, LONGEST_FRAME)
+            scan, bad = (read(message, self.sensing.zero_is_free), frame), ""
         except BadScan as error:
             scan, bad = None, str(error)
         with self._lock:

@@ -32,12 +32,14 @@ from messaging.bus.subscription import Subscription
 from messaging.ros2.attachment import Attachment, gid_of
 from messaging.ros2.messages import decode, digest_of, encode, type_of
 from messaging.ros2.names import NODE, PUBLISHER, SPACE, SUBSCRIPTION, BadName, Entity, Qos, full_name, topic_key
+from messaging.tolerant import Tolerance
 
 log = logging.getLogger("brakeline.ros2")
 
 M = TypeVar("M")
 ROUTER = "tcp/localhost:7447"  # where rmw_zenoh's router listens, and its nodes look for it
 RELIABLE = Qos()
+LARGEST = 2**20  # bytes of a message that is listened to
 
 
 class Tap(Protocol):
@@ -113,6 +115,8 @@ class Publisher(Generic[M]):
 class Node:
     """A node of that name; it is in the graph until `close`.
 
+    What its handlers can't handle is passed over, and counted in `tolerance`.
+
     Raises:
         Unreachable: no router answered within `patience`, or an endpoint cannot be listened on.
         BadName: the name or the namespace is none.
@@ -121,6 +125,7 @@ class Node:
     def __init__(self, settings: RosSettings, name: str, tap: Tap | None = None) -> None:
         self.settings, self.name = settings, name
         full_name(f"/{name}")  # is it one?
+        self.tolerance = Tolerance()
         self._tap = tap
         self._lock = threading.Lock()
         self._tokens: list[Any] = []
@@ -188,7 +193,7 @@ class Node:
     def subscribe(self, topic: str, kind: type[M], handler: Callable[[M], None], qos: Qos = RELIABLE) -> Subscription:
         """Call `handler` with every message, in a thread of its own; one that is slow misses the oldest.
 
-        What is no message of that type is lost, and said in the log, as is what the handler raises. Raises BadName.
+        What is no message of that type is passed over, as is one at which the handler raises. Raises BadName.
         """
         entity = self._entity(SUBSCRIPTION, self.full_name(topic), kind, qos)
         key = topic_key(self.settings.domain, entity.topic, entity.type)
@@ -206,16 +211,14 @@ class Node:
             receiver = self._session.declare_subscriber(key, channel)
 
         def take(sample: zenoh.Sample) -> None:
+            if len(sample.payload) > LARGEST:
+                raise Malformed(f"{len(sample.payload)} bytes; a message has at most {LARGEST}")
             payload = sample.payload.to_bytes()
             if self._tap is not None:
                 self._tap(entity.topic, kind, payload, time.time_ns(), qos)
-            try:
-                message = decode(kind, payload)
-            except Malformed as error:
-                raise Malformed(f"{entity.topic}: {error}") from error
-            handler(message)
+            handler(decode(kind, payload))
 
-        subscription = Subscription(entity.topic, receiver, take)
+        subscription = Subscription(entity.topic, receiver, take, self.tolerance)
         self._subscriptions.append(subscription)
         self._declare(entity)
         return subscription

@@ -1,8 +1,9 @@
-"""A ROS 2 node that we did not write the ROS part of (zenoh-ros2-sdk): rams whatever its scan shows, through topics alone.
+"""A ROS 2 node by somebody else's implementation (zenoh-ros2-sdk): rams what its scan shows, through topics alone.
 
-python ros2_driver.py PORT DOMAIN [--stamped]. It turns to the nearest hit of /scan, drives at it at full speed, and after
-a while picks another one. On stdout, one JSON object a line: what it heard of /cmd_vel, and how long [s] a change of
-its raw command took to come out of there. Run it with a HOME of its own.
+python ros2_driver.py PORT DOMAIN [--stamped] [--direct]. It turns to the nearest hit of /scan in a direction, drives at
+it at full speed, and after a while picks another direction. On stdout, a JSON object every half second: how many raw
+commands, scans and commands went by, and how long [s] raw commands took to come out of /cmd_vel. --direct: it commands
+the base itself, with nothing between. Run it with a HOME of its own: the SDK may edit git's configuration.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from zenoh_ros2_sdk import ROS2Publisher, ROS2Subscriber
 from zenoh_ros2_sdk.session import ZenohSession
 
 PORT, DOMAIN, STAMPED = int(sys.argv[1]), int(sys.argv[2]), "--stamped" in sys.argv
+RAW = "/cmd_vel" if "--direct" in sys.argv else "/cmd_vel_raw"
 PERSISTENCE = 30  # scans that one thing is rammed for
 PAUSE = 0.02  # s between raw commands
 

@@ -1,0 +1,100 @@
+"""A period's input: the answer's if it came in time, else the committed plan's; with askers that answer at will."""
+
+import numpy as np
+import pytest
+
+from actors.ros2.gate import BLIND, LATE, NO_ANSWER, Gate
+from actors.ros2.process import Ros2Settings, Unfit, driven
+from actors.ros2.senses import Command
+from actors.ros2.views import diagnostics, markers
+from messaging import brakeline_pb2 as pb
+from messaging.bus import NoReply
+from messaging.robots import GROUND
+from messaging.ros2.messages import DiagnosticArray, DiagnosticStatus, MarkerArray, decode, encode
+from messaging.shapes import Obstacle
+
+ROBOT = GROUND.in_real_time()
+STATE = np.zeros(ROBOT.state_dim)
+
+
+def allow(requests):
+    """Allows every command: in force, the command, half of it, stop."""
+    replies = []
+    for request in requests:
+        action = np.clip(request.action, ROBOT.low(), ROBOT.high())
+        plan = [*request.input_in_force, *action]
+        for k in range(ROBOT.horizon - 2):
+            plan += list(action * max(0.0, 1.0 - (k + 1) / ROBOT.brake_steps))
+        decision = pb.Decision(kind=pb.ALLOWED, plan=plan, model="m", verified=True, contained=True)
+        decision.tube_center.extend([0.0] * 2 * ROBOT.horizon)
+        decision.tube_half_width.extend([0.1] * 2 * ROBOT.horizon)
+        replies.append(pb.Reply(decision=decision))
+    return replies
+
+
+def refuse(requests):
+    raise NoReply("nobody")
+
+
+def command(speed, turn=0.0, at=0.0, number=1):
+    return Command(np.array([speed, turn]), at, number)
+
+
+def test_a_command_goes_out_one_period_after_it_was_asked_about():
+    gate = Gate(ROBOT, allow)
+    assert gate.begin(0.0).tolist() == [0.0, 0.0] and gate.kind == BLIND
+    gate.decide(STATE, (), command(0.2, at=0.1), 0.0, 0)
+    assert gate.begin(0.2).tolist() == [0.2, 0.0] and gate.kind == "allowed" and gate.reason == ""
+    assert list(gate.tally.delays) == [pytest.approx(0.1)] and gate.tally.commands == 1
+
+
+def test_without_an_answer_it_brakes_along_the_plan():
+    gate = Gate(ROBOT, allow)
+    gate.decide(STATE, (), command(0.25), 0.0, 0)
+    gate.begin(0.2)
+    gate._ask = refuse
+    inputs = []
+    for k in range(4):
+        gate.decide(STATE, (), command(0.25), 0.2, 1 + k)
+        inputs.append(gate.begin(0.4 + 0.2 * k)[0])
+        assert gate.kind == NO_ANSWER and "nobody" in gate.reason
+    assert inputs == [0.0] * 4 and not gate.commitment.plan.any()
+
+
+@pytest.mark.parametrize(
+    ("in_time", "why", "kind", "reason"),
+    [(False, "", LATE, "after its period"), (True, "no scan yet", BLIND, "no scan yet")],
+)
+def test_an_answer_that_cannot_count_is_not_executed(in_time, why, kind, reason):
+    gate = Gate(ROBOT, allow)
+    gate.decide(STATE, (), command(0.25), 0.0, 0)
+    assert gate.begin(0.2, in_time, why).tolist() == [0.0, 0.0]
+    assert gate.kind == kind and reason in gate.reason and gate.tally.kinds[kind] == 1
+
+
+def test_without_a_command_it_is_asked_to_stand():
+    gate = Gate(ROBOT, allow)
+    gate.decide(STATE, (), None, 0.0, 0)
+    assert gate.begin(0.2).tolist() == [0.0, 0.0] and gate.reason == "no command"
+    assert gate.tally.commands == 0
+
+
+def test_only_what_a_twist_can_drive_is_taken():
+    assert driven("ground") == driven("ground-late") == ROBOT
+    with pytest.raises(Unfit, match="quadrotor"):
+        driven("quadrotor")
+    assert Ros2Settings().lead < ROBOT.period
+
+
+def test_views_are_messages():
+    decision = allow([pb.Request(action=[0.2, 0.0], input_in_force=[0.0, 0.0])])[0].decision
+    things = (Obstacle("box", (1.0, 0.0), (0.1, 0.5), 0.3), Obstacle("cylinder", (0.0, 1.0), (0.1,)))
+    drawn = decode(MarkerArray, encode(markers(3.0, "odom", decision, things)))
+    groups = [marker.ns for marker in drawn.markers]
+    assert groups.count("tube") == ROBOT.horizon and groups.count("plan") == 1 and groups.count("obstacles") == 2
+    assert {marker.header.frame_id for marker in drawn.markers} == {"odom"}
+    for kind, level in (("allowed", 0), ("adjusted", 1), ("failsafe", 1), (BLIND, 2), (LATE, 2), (NO_ANSWER, 2)):
+        told = decode(DiagnosticArray, encode(diagnostics(3.0, "brakeline", "ground", kind, "why", {"periods": 3.0})))
+        (status,) = told.status
+        assert (status.level, status.message, status.values[0].key) == (level, f"{kind}: why", "periods")
+    assert DiagnosticStatus.ERROR == 2
