@@ -128,6 +128,10 @@ class Steering:
     def close(self) -> None:
         self.node.close()
 
+    def figures(self) -> dict[str, float]:
+        """What became of the periods and messages so far."""
+        return self.gate.tally.figures() | {"passed over": self.node.tolerance.count}
+
     def _first(self) -> float:
         """When the first period begins: at a multiple of its length, as all do."""
         while self.clock.now() == 0.0 and not self._stop.is_set():  # a simulation that has not told yet
@@ -204,7 +208,7 @@ class Steering:
             return
         self._told = (now, gate.kind, gate.reason)
         self._diagnostics.put(
-            diagnostics(now, self.settings.name, self.robot.name, gate.kind, gate.reason, gate.tally.figures())
+            diagnostics(now, self.settings.name, self.robot.name, gate.kind, gate.reason, self.figures())
         )
 
     def _listen(self) -> None:
@@ -231,4 +235,4 @@ def run(settings: Ros2Settings, question: Ask, stop: threading.Event, tap: Tap |
         steering.run()
     finally:
         steering.close()
-    return steering.gate.tally.figures()
+    return steering.figures()

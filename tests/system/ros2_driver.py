@@ -22,7 +22,7 @@ from zenoh_ros2_sdk.session import ZenohSession
 
 PORT, DOMAIN, STAMPED = int(sys.argv[1]), int(sys.argv[2]), "--stamped" in sys.argv
 RAW = "/cmd_vel" if "--direct" in sys.argv else "/cmd_vel_raw"
-PERSISTENCE = 30  # scans that one thing is rammed for
+PERSISTENCE = 60  # scans that one thing is rammed for
 PAUSE = 0.02  # s between raw commands
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
@@ -60,7 +60,7 @@ class Driver:
         angles = (angles + math.pi) % (2.0 * math.pi) - math.pi
         self.scans += 1
         if self.scans % PERSISTENCE == 1:
-            self.aim = self.rng.uniform(-math.pi, math.pi)
+            self.aim = self.rng.uniform(-2.0, 2.0)
         # The nearest thing in the half that it looks to; it keeps aiming at it as it turns.
         off = np.abs((angles - self.aim + math.pi) % (2.0 * math.pi) - math.pi)
         target = angles[np.argmin(np.where(off < 0.6, ranges, 99.0))]
@@ -94,7 +94,7 @@ def main() -> None:
         **place,
     )
     commands = ROS2Subscriber("/cmd_vel", kind, driver.command, definition(kind), type_hash=digest(kind), **place)
-    raw = ROS2Publisher("/cmd_vel_raw", kind, definition(kind), node_name="rammer", type_hash=digest(kind), **place)
+    raw = ROS2Publisher(RAW, kind, definition(kind), node_name="rammer", type_hash=digest(kind), **place)
     store = raw.session_mgr.store
     vector, twist = store.types["geometry_msgs/msg/Vector3"], store.types["geometry_msgs/msg/Twist"]
     told = time.monotonic()

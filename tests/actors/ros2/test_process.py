@@ -1,0 +1,160 @@
+"""The process among nodes that fall silent: whatever is missing, what goes out is a stop, until it comes again."""
+
+import math
+import threading
+import time
+from contextlib import contextmanager
+
+import numpy as np
+import pytest
+
+from actors.ros2.process import Ros2Settings, Steering
+from actors.ros2.senses import Freshness, Sensing
+from messaging.ports import free_endpoint
+from messaging.ros2 import LATCHED, SENSOR, Node, RosSettings
+from messaging.ros2.messages import (
+    Clock,
+    DiagnosticArray,
+    LaserScan,
+    Odometry,
+    TFMessage,
+    Twist,
+    TwistStamped,
+    header,
+    time_of,
+    twist,
+)
+from tests.actors.ros2.test_gate import allow
+from tests.actors.ros2.test_laser import BEAMS, scan_of
+from tests.actors.ros2.test_senses import odometry, transform
+from tests.system.runs import until
+
+# Wide, for a busy machine: what stops is told by its absence alone.
+FRESH = Freshness(odometry=1.0, scan=1.5, command=1.0)
+
+
+class Robot:
+    """Nodes that tell all that is needed, 20 times a second, but for what is in `mute`."""
+
+    def __init__(self, node, simulated, stamped):
+        self.mute, self.said, self.simulated = set(), [], simulated
+        self.reasons = []
+        self._odometry, self._scan = node.publisher("odom", Odometry), node.publisher("scan", LaserScan, SENSOR)
+        self._clock = node.publisher("/clock", Clock, SENSOR)
+        kind = TwistStamped if stamped else Twist
+        self._raw, self._stamped = node.publisher("cmd_vel_raw", kind), stamped
+        node.publisher("/tf_static", TFMessage, LATCHED).put(
+            TFMessage(transforms=[transform("base_footprint", "base_scan")])
+        )
+        node.subscribe("cmd_vel", kind, lambda m: self.said.append(m.twist.linear.x if stamped else m.linear.x))
+        node.subscribe("/diagnostics", DiagnosticArray, lambda m: self.reasons.append(m.status[0].message))
+        self.offset = 0.0
+        self._begun, self._told = time.time(), 100.0
+        self._done = threading.Event()
+        self._thread = threading.Thread(target=self._run)
+        self._thread.start()
+
+    def now(self):
+        return (self._told if self.simulated else time.time()) + self.offset
+
+    def close(self):
+        self._done.set()
+        self._thread.join()
+
+    def drives(self):
+        """Does a command go through from now on?"""
+        del self.said[:]
+        until(lambda: self.said and self.said[-1] == 0.2, f"driving again: {self.reasons[-3:]}", 30.0)
+
+    def stops(self, because):
+        until(lambda: self.said and self.said[-1] == 0.0, f"a stop: {because}", 30.0)
+        until(lambda: any(because in said for said in self.reasons), f"{because}, not {self.reasons[-3:]}", 30.0)
+        del self.said[:]
+        until(lambda: len(self.said) > 2, "more of what is sent", 30.0)
+        assert set(self.said) == {0.0}
+        del self.reasons[:]
+
+    def _run(self):
+        while not self._done.wait(0.05):
+            if self.simulated and "clock" not in self.mute:
+                self._told += 0.05
+                self._clock.put(Clock(clock=time_of(self._told)))
+            now = self.now()
+            if "odometry" not in self.mute:
+                self._odometry.put(odometry(now, speed=0.2))
+            if "scan" not in self.mute:
+                self._scan.put(scan_of(np.full(BEAMS, math.inf), header=header(now, "base_scan")))
+            if "command" not in self.mute:
+                raw = twist(math.nan if "numbers" in self.mute else 0.2, 0.0)
+                self._raw.put(TwistStamped(header=header(now, ""), twist=raw) if self._stamped else raw)
+
+
+@contextmanager
+def steered(simulated=False, stamped=False, ask=allow):
+    endpoint, stop = free_endpoint(), threading.Event()
+    with Node(RosSettings(listen=(endpoint,), namespace="/r"), "robot") as node:
+        robot = Robot(node, simulated, stamped)
+        settings = Ros2Settings(
+            ros=RosSettings(connect=(endpoint,), namespace="/r"),
+            sim_time=simulated,
+            stamped=stamped,
+            sensing=Sensing(),
+            fresh=FRESH,
+        )
+        steering = Steering(settings, ask, stop)
+        thread = threading.Thread(target=steering.run)
+        thread.start()
+        try:
+            yield robot, steering
+        finally:
+            stop.set()
+            thread.join(20.0)
+            steering.close()
+            robot.close()
+            assert not thread.is_alive()
+
+
+@pytest.mark.parametrize(
+    ("what", "because"),
+    [
+        ("odometry", "odometry is"),
+        ("scan", "the scan is"),
+        ("command", "no command"),
+        ("numbers", "no command"),
+    ],
+)
+def test_what_falls_silent_stops_the_robot_until_it_speaks(what, because):
+    with steered() as (robot, _):
+        robot.drives()
+        robot.mute.add(what)
+        robot.stops(because)
+        robot.mute.clear()
+        robot.drives()
+
+
+def test_a_clock_that_stands_still_or_goes_back_stops_the_robot():
+    with steered(simulated=True) as (robot, _):
+        robot.drives()
+        robot.mute.add("clock")
+        robot.stops("the clock stands still")
+        robot.mute.clear()
+        robot.drives()
+        robot._told = 3.0
+        until(lambda: any("the clock was set" in said for said in robot.reasons), "the clock was set", 30.0)
+        robot.drives()
+
+
+def test_clocks_that_differ_stop_the_robot():
+    with steered(stamped=True) as (robot, _):
+        robot.drives()
+        robot.offset = -20.0
+        robot.stops("odometry is")
+        robot.offset = 20.0
+        robot.stops("in the future")
+
+
+def test_it_ends_with_a_stop():
+    with steered() as (robot, steering):
+        robot.drives()
+    assert robot.said[-1] == 0.0 and not steering.gate.commitment.plan.any()
+    assert steering.gate.tally.kinds["allowed"] > 0

@@ -1,0 +1,192 @@
+"""The simulated ground robot as a ROS 2 robot, rammed into whatever it sees by a node of another implementation.
+
+Time is the simulation's, and each of its periods waits for its command: however busy the machine is, what is asserted
+is about the filter.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, Self
+
+import pytest
+from mcap.reader import make_reader
+from mcap_ros2_support_fast.decoder import DecoderFactory
+from rosbags.highlevel import AnyReader
+from rosbags.typesys import Stores, get_typestore
+
+from deploy.data import store
+from messaging.ports import free_endpoint
+from messaging.robots import GROUND
+from safety.model_set import Recipe
+from tests.system.runs import BRAKELINE, PATIENCE, until
+
+DRIVER = Path(__file__).with_name("ros2_driver.py")
+GRAPH = """
+import json, sys
+from zenoh_ros2_sdk.discovery import get_topic_info, get_topic_names_and_types
+where = {"domain_id": 0, "router_port": int(sys.argv[1]), "timeout": 2.0}
+found = dict(get_topic_names_and_types(**where))
+info = get_topic_info("/cmd_vel", verbose=True, **where)
+print(json.dumps({"topics": found, "publishers": [(end.node_name, end.qos) for end in info.publishers]}))
+"""
+
+
+@pytest.fixture(scope="session")
+def late_folder(data_folder: Path) -> Path:
+    """`$BRAKELINE_DATA` with the ground robot's model set in real time."""
+    store.model_for(GROUND.in_real_time(), Recipe())
+    return data_folder
+
+
+class Bench:
+    """A simulated robot, the filter before it, and who rams; all of them processes, killed at the end of the block."""
+
+    def __init__(self, folder: Path, *bridge: object, filtered: bool = True, node: tuple[object, ...] = ()) -> None:
+        self.folder, self._endpoint = folder, free_endpoint()
+        self.port = self._endpoint.rsplit(":", 1)[1]
+        self._home = folder / "home"  # the SDK may edit git's configuration there
+        self._home.mkdir(parents=True)
+        self.robot = self.start("bridge", *BRAKELINE, "bridge-sim", "--listen", self._endpoint, "--json", *bridge)
+        if filtered:
+            words = ("ros2", "ground", "--router", self._endpoint, "--json", *node)
+            self.filter = self.start("filter", *BRAKELINE, *words)
+        self.driver = self.start("driver", sys.executable, DRIVER, self.port, 0, *([] if filtered else ["--direct"]))
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for process in self._started:
+            process.kill()
+            process.wait()
+
+    _started: list[subprocess.Popen[bytes]]
+
+    def start(self, name: str, *words: object) -> subprocess.Popen[bytes]:
+        self._started = getattr(self, "_started", [])
+        environment = os.environ | ({"HOME": str(self._home)} if name in ("driver", "graph") else {})
+        with (self.folder / f"{name}.out").open("w") as out, (self.folder / f"{name}.err").open("w") as err:
+            process = subprocess.Popen([*map(str, words)], stdout=out, stderr=err, env=environment)
+        self._started.append(process)
+        return process
+
+    def said(self, name: str) -> dict[str, Any]:
+        """The last JSON object that a process printed; empty: none yet."""
+        lines = (self.folder / f"{name}.out").read_text().splitlines()
+        return json.loads(lines[-1]) if lines else {}
+
+    def errors(self, name: str) -> str:
+        return (self.folder / f"{name}.err").read_text()[-3000:]
+
+    def end(self, patience: float) -> tuple[dict[str, Any], dict[str, Any], dict[str, Any]]:
+        """Wait until the robot's time is over, end the filter; what robot, filter and driver said."""
+        self.robot.wait(patience)
+        self.filter.send_signal(signal.SIGINT)
+        assert self.filter.wait(PATIENCE) == 0, self.errors("filter")
+        return self.said("bridge"), self.said("filter"), self.said("driver")
+
+
+def rammed(folder: Path, arena: str, seed: int, seconds: float, *node: object) -> tuple[dict[str, Any], ...]:
+    """What robot, filter and driver said of so many simulated seconds."""
+    bridge = ("--sim-time", "--lockstep", "--factor", 6, "--arena", arena, "--seed", seed, "--seconds", seconds)
+    with Bench(folder, *bridge, node=("--sim-time", *node)) as bench:
+        said = bench.end(PATIENCE + 2.0 * seconds)
+    assert said[0], bench.errors("bridge")
+    return said
+
+
+@pytest.fixture(scope="module")
+def run(
+    late_folder: Path, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[tuple[Path, tuple[dict[str, Any], ...]]]:
+    """Two simulated minutes, and the bag of them."""
+    folder = tmp_path_factory.mktemp("ros2")
+    yield folder / "bag", rammed(folder, "default", 1, 120.0, "--bag", folder / "bag")
+
+
+def test_raw_commands_that_ram_hit_nothing(run: Any) -> None:
+    robot, node, driver = run[1]
+    print(robot, node)
+    assert robot["collisions"] == 0 and robot["closest"] > 0.0
+    assert robot["driven"] > 1.0 and node["commands"] > 100 and driver["scans"] > 100
+    assert node["adjusted"] + node["failsafe"] > 50 and node["allowed"] > 50
+    assert node["left the predicted set"] <= 0.03 * node["periods"] and node["passed over"] == 0
+
+
+def test_the_same_without_the_filter_collides(tmp_path: Path) -> None:
+    bridge = ("--sim-time", "--lockstep", "--factor", 6, "--seed", 1, "--seconds", 60.0)
+    with Bench(tmp_path, *bridge, filtered=False) as bench:
+        bench.robot.wait(3.0 * PATIENCE)
+        assert bench.said("bridge")["collisions"] > 0, bench.errors("driver")
+
+
+def test_a_bag_is_one_to_readers_of_bags(run: Any) -> None:
+    bag: Path = run[0]
+    with AnyReader([bag], default_typestore=get_typestore(Stores.ROS2_JAZZY)) as reader:
+        counts = {connection.topic: connection.msgcount for connection in reader.connections}
+        assert counts.keys() >= {
+            *("/odom", "/scan", "/clock", "/tf_static", "/cmd_vel_raw", "/cmd_vel", "/diagnostics"),
+            "/brakeline/markers",
+        }
+        assert counts["/tf_static"] == 1 and counts["/cmd_vel"] >= 500 and counts["/scan"] >= 500
+        stamps = [stamp for _, stamp, _ in reader.messages()]
+        assert stamps == sorted(stamps) and len(stamps) == sum(counts.values())
+    seen: Counter[str] = Counter()
+    with (bag / f"{bag.name}.mcap").open("rb") as file:
+        mcap = make_reader(file, decoder_factories=[DecoderFactory()])
+        assert mcap.get_header().profile == "ros2"
+        for schema, channel, _, decoded in mcap.iter_decoded_messages():
+            assert schema is not None and schema.encoding == "ros2msg" and channel.message_encoding == "cdr"
+            seen[channel.topic] += 1
+            if channel.topic == "/cmd_vel":
+                assert 0.0 <= decoded.linear.x <= 0.25 and abs(decoded.angular.z) <= 0.5
+    assert seen == counts
+
+
+def test_it_is_seen_in_the_graph_and_stops_when_it_is_killed(late_folder: Path, tmp_path: Path) -> None:
+    with Bench(tmp_path, "--seed", 2) as bench:  # in real time
+        until(lambda: bench.said("driver").get("delays"), f"a raw command goes through: {bench.errors('filter')}")
+        graph = bench.start("graph", sys.executable, "-c", GRAPH, bench.port)
+        assert graph.wait(PATIENCE) == 0, bench.errors("graph")
+        said = bench.said("graph")
+        kinds = {
+            "/cmd_vel": "geometry_msgs/msg/Twist",
+            "/cmd_vel_raw": "geometry_msgs/msg/Twist",
+            "/odom": "nav_msgs/msg/Odometry",
+            "/scan": "sensor_msgs/msg/LaserScan",
+            "/diagnostics": "diagnostic_msgs/msg/DiagnosticArray",
+            "/brakeline/markers": "visualization_msgs/msg/MarkerArray",
+        }
+        assert {topic: kind for topic, [kind] in said["topics"].items() if topic in kinds} == kinds
+        assert said["publishers"] == [["brakeline", "::,10:,:,:,,"]]
+        bench.filter.kill()
+        heard = bench.said("driver")["commands"]
+        time.sleep(2.0)
+        bench.robot.send_signal(signal.SIGINT)
+        assert bench.robot.wait(PATIENCE) == 0, bench.errors("bridge")
+        robot = bench.said("bridge")
+        print(robot, heard, sorted(bench.said("driver")["delays"]))
+        assert robot["timeouts"] >= 1 and robot["collisions"] == 0
+
+
+@pytest.mark.long
+def test_an_hour_of_ramming_hits_nothing(late_folder: Path, tmp_path: Path) -> None:
+    """60 arenas, half of them dense, a simulated minute in each."""
+    total: Counter[str] = Counter()
+    for seed in range(60):
+        robot, node, _ = rammed(tmp_path / f"{seed}", "dense" if seed % 2 else "default", seed, 60.0)
+        assert robot["collisions"] == 0, seed
+        total.update({name: robot[name] for name in ("seconds", "driven", "collisions")})
+        total.update({name: node[name] for name in ("periods", "allowed", "adjusted", "failsafe", "commands")})
+        total["left the predicted set"] += node["left the predicted set"]
+    print(dict(total))
+    assert total["seconds"] >= 3600 and total["driven"] > 60.0
