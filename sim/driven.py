@@ -8,9 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from messaging.rays import Rays
-from messaging.robots import GROUND
 from sim.estimator import Estimator, NoiseLevels, wrap
-from sim.ground import SAMPLES, WHEEL_RADIUS, GroundRobot
+from sim.ground import GROUND, SAMPLES, WHEEL_RADIUS, GroundRobot
 from sim.lidar import Lidar
 from sim.vehicle import BadInput
 from sim.world import Arena
@@ -87,7 +86,7 @@ class DrivenGround(GroundRobot):
     def advance(self) -> None:
         """To the next sample, `SAMPLE` s on."""
         before = self._true_pose()
-        touches = self._run_sample()
+        touches = self._run_sample(bool(self.input.any()))
         self.collisions += touches and not self._touches
         self._touches = touches
         pose = self._true_pose()

@@ -15,8 +15,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from deploy.vehicles import Conditions
-from messaging.robots import GROUND
 from messaging.ros2 import LATCHED, SENSOR, Node, RosSettings, Tap
 from messaging.ros2.messages import (
     Clock,
@@ -37,8 +35,9 @@ from messaging.ros2.messages import (
     vector,
 )
 from sim.arenas import draw_arena
+from sim.conditions import Conditions
 from sim.driven import SAMPLE, DrivenGround, TurningLidar
-from sim.ground import SAMPLES
+from sim.ground import GROUND, SAMPLES
 
 Array = NDArray[np.float64]
 
@@ -88,7 +87,7 @@ class Bridge:
         arena = draw_arena(settings.arena, np.random.default_rng(settings.seed), GROUND)
         c = settings.conditions
         self.robot = DrivenGround(arena, rng, c.noise, c.payload_kg, c.floor_friction)
-        self._lidar = TurningLidar(arena, rng, c.lidar_noise(GROUND))
+        self._lidar = TurningLidar(arena, rng, c.lidar_noise(flies=False))
         self._begun = 1.0 if settings.sim_time else time.time()  # its time at the first sample
         self._samples = 0
         self._heard = threading.Condition()

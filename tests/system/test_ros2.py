@@ -25,8 +25,8 @@ from rosbags.typesys import Stores, get_typestore
 
 from deploy.data import store
 from messaging.ports import free_endpoint
-from messaging.robots import GROUND
 from safety.model_set import Recipe
+from tests.robots import GROUND
 from tests.system.runs import BRAKELINE, PATIENCE, until
 
 DRIVER = Path(__file__).with_name("ros2_driver.py")

@@ -9,9 +9,9 @@ from actors.ros2.senses import Command
 from actors.ros2.views import diagnostics, markers
 from messaging import brakeline_pb2 as pb
 from messaging.bus import NoReply
-from messaging.robots import GROUND
 from messaging.ros2.messages import DiagnosticArray, DiagnosticStatus, MarkerArray, decode, encode
 from messaging.shapes import Obstacle
+from tests.robots import GROUND
 
 ROBOT = GROUND.in_real_time()
 STATE = np.zeros(ROBOT.state_dim)

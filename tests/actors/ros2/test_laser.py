@@ -10,12 +10,12 @@ from hypothesis import strategies as st
 from actors.ros2.frames import Place
 from actors.ros2.laser import BadScan, Errors, _joined, obstacles, read
 from messaging.rays import Rays
-from messaging.robots import GROUND
 from messaging.ros2.messages import LaserScan, header
 from messaging.shapes import Shapes
 from sim.arenas import draw_arena
 from sim.driven import TurningLidar
 from sim.lidar import Lidar
+from tests.robots import GROUND
 
 BEAMS = 360
 MOUNT = Place(-0.032, 0.0, 0.0)

@@ -9,7 +9,6 @@ from actors.ros2.clock import Date, Simulated
 from actors.ros2.frames import Frames, Place
 from actors.ros2.odometry import KEPT, Track
 from actors.ros2.senses import Blind, Freshness, Senses, Sensing
-from messaging.robots import GROUND
 from messaging.ros2.messages import (
     Clock,
     Odometry,
@@ -28,6 +27,7 @@ from messaging.ros2.messages import (
     vector,
 )
 from tests.actors.ros2.test_laser import BEAMS, scan_of
+from tests.robots import GROUND
 
 ROBOT = GROUND.in_real_time()
 
