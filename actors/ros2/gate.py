@@ -9,22 +9,30 @@ from __future__ import annotations
 
 from collections import Counter, deque
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from actors.guard import Ask, Outcome, consult, next_input
 from actors.ros2.senses import Command
+from messaging import brakeline_pb2 as pb
 from messaging.robots import Robot
-from messaging.shapes import Obstacle
-from safety.client import request_message
+from messaging.shapes import BOX, Obstacle, Shapes
+from safety.client import KINDS, request_message
 from safety.commitment import Commitment
 
 Array = NDArray[np.float64]
 
+ROOM = 0.035  # m: by how much two scans of one thing may differ, roughly
 KEPT = 10_000  # latest delays that are remembered
 NO_ANSWER, LATE, BLIND = "no answer", "late", "blind"
+
+
+def grown(obstacle: Obstacle, room: float) -> Obstacle:
+    """A box or a disc with that much [m] around it."""
+    more = 2.0 * room if obstacle.kind == BOX else room
+    return replace(obstacle, size=tuple(size + more for size in obstacle.size))
 
 
 @dataclass
@@ -32,7 +40,7 @@ class Tally:
     """What became of the periods so far."""
 
     periods: int = 0
-    kinds: Counter[str] = field(default_factory=Counter)  # allowed, adjusted, failsafe; no answer, late, blind
+    kinds: Counter[str] = field(default_factory=Counter)  # as decided; or no answer, late, blind
     commands: int = 0  # that were decided on
     compared: int = 0  # measured states with a prediction
     outside: int = 0  # of them: not in the predicted set
@@ -41,7 +49,7 @@ class Tally:
     decide_ms: deque[float] = field(default_factory=lambda: deque(maxlen=KEPT))
 
     def figures(self) -> dict[str, float]:
-        kinds = ("allowed", "adjusted", "failsafe", NO_ANSWER, LATE, BLIND)
+        kinds = (*KINDS.values(), NO_ANSWER, LATE, BLIND)
         delays, decide = 1e3 * np.array([*self.delays] or [0.0]), np.array([*self.decide_ms] or [0.0])
         return {
             "periods": self.periods,
@@ -75,12 +83,26 @@ class Gate:
     def decide(
         self, state: Array, obstacles: Sequence[Obstacle], command: Command | None, time: float, step: int
     ) -> None:
-        """Ask about a command (None: to stand) in the state of the period's beginning."""
+        """Ask about a command (None: to stand) in the state of the period's beginning.
+
+        First with `ROOM` around the obstacles: the next scan will show them somewhat nearer or farther, and who stopped
+        where this one just allowed it could not even turn by the next. If nothing is verified there, then without; but
+        then nothing that leads nearer.
+        """
         proposal = np.zeros(self.robot.action_dim) if command is None else command.action
-        request = request_message(
-            self.commitment, state, proposal, obstacles, actor=self._name, step=step & 0xFFFFFFFF, time=time
-        )
-        self.outcome, self._command = consult(self._ask, [request], self.robot)[0], command
+
+        def ask(action: Array, around: Sequence[Obstacle]) -> Outcome:
+            request = request_message(
+                self.commitment, state, action, around, actor=self._name, step=step & 0xFFFFFFFF, time=time
+            )
+            return consult(self._ask, [request], self.robot)[0]
+
+        outcome = ask(proposal, [grown(obstacle, ROOM) for obstacle in obstacles])
+        if self._stuck(outcome) and obstacles:
+            outcome = ask(proposal, obstacles)
+            if not self._stuck(outcome) and self._nearer(outcome, state, obstacles):
+                outcome = ask(np.where(self.robot.translates, 0.0, proposal), obstacles)
+        self.outcome, self._command = outcome, command
 
     def begin(self, now: float, in_time: bool = True, why: str = "") -> Array:
         """The input (m,) of the period that begins now. in_time: False if the answer came after its beginning; why:
@@ -109,6 +131,18 @@ class Gate:
             self.input = self.commitment.fallback()
         tally.kinds[self.kind] += 1
         return self.input
+
+    def _stuck(self, outcome: Outcome) -> bool:
+        """Was there an answer, and is it to brake?"""
+        return outcome.answer is not None and outcome.answer.message.kind == pb.FAILSAFE
+
+    def _nearer(self, outcome: Outcome, state: Array, obstacles: Sequence[Obstacle]) -> bool:
+        """Does the answer's plan end nearer to what stands around than the robot is now?"""
+        assert outcome.answer is not None
+        d = self.robot.position_dim
+        ends = np.stack([state[:d], np.array(outcome.answer.message.tube_center[-d:])])
+        here, there = Shapes.of(obstacles, d).distance(ends).min(axis=0)
+        return bool(there < here)
 
     def _note(self, command: Command, now: float) -> None:
         self.tally.commands += command.number != self._known

@@ -27,6 +27,7 @@ from messaging.ros2.messages import (
     vector,
 )
 from messaging.shapes import BOX, CYLINDER, Obstacle
+from safety.client import KINDS
 
 Array = NDArray[np.float64]
 
@@ -39,6 +40,7 @@ COLORS = {
     pb.ADJUSTED: (0.94, 0.59, 0.12),
     pb.FAILSAFE: (0.84, 0.19, 0.24),
 }
+OTHER = (0.5, 0.3, 0.7)
 CUBE, ROUND, LINE = Marker.CUBE, Marker.CYLINDER, Marker.LINE_STRIP
 
 
@@ -46,7 +48,7 @@ def markers(time: float, frame: str, decision: pb.Decision, obstacles: Sequence[
     """The tube's boxes, the way through their middles, and what was taken to stand around."""
     centers = np.reshape(decision.tube_center, (-1, 2))
     halves = np.reshape(decision.tube_half_width, (-1, 2))
-    red, green, blue = COLORS[decision.kind]
+    red, green, blue = COLORS.get(decision.kind, OTHER)
     tube, plan = ColorRGBA(r=red, g=green, b=blue, a=0.35), ColorRGBA(r=red, g=green, b=blue, a=1.0)
     drawn = [
         _marker(time, frame, "tube", i, CUBE, pose(*center), (*(2.0 * half), THIN), tube)
@@ -116,9 +118,9 @@ def diagnostics(
 ) -> DiagnosticArray:
     """OK: the command went through; WARN: another input or the committed plan did; ERROR: there was nothing to decide
     on, or nobody to do it, and the robot brakes."""
-    level = {"allowed": DiagnosticStatus.OK, "adjusted": DiagnosticStatus.WARN, "failsafe": DiagnosticStatus.WARN}
+    decided = DiagnosticStatus.OK if kind == KINDS[pb.ALLOWED] else DiagnosticStatus.WARN
     status = DiagnosticStatus(
-        level=level.get(kind, DiagnosticStatus.ERROR),
+        level=decided if kind in KINDS.values() else DiagnosticStatus.ERROR,
         name=f"{node}: safety filter",
         message=f"{kind}: {reason}" if reason else kind,
         hardware_id=robot,

@@ -105,7 +105,7 @@ class Ros2:
         if not self.connect:
             yield in_process(model_for(robot, self.filtering.recipe()))
             return
-        deadline = 0.8 * settings.lead
+        deadline = 0.3 * settings.lead  # there may be three questions
 
         def question(requests: Sequence[pb.Request]) -> list[pb.Reply]:
             return ask(bus, requests, deadline)

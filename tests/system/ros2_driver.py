@@ -22,7 +22,7 @@ from zenoh_ros2_sdk.session import ZenohSession
 
 PORT, DOMAIN, STAMPED = int(sys.argv[1]), int(sys.argv[2]), "--stamped" in sys.argv
 RAW = "/cmd_vel" if "--direct" in sys.argv else "/cmd_vel_raw"
-PERSISTENCE = 60  # scans that one thing is rammed for
+PERSISTENCE = 40  # scans that one thing is rammed for, or driven away from
 PAUSE = 0.02  # s between raw commands
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
@@ -61,9 +61,12 @@ class Driver:
         self.scans += 1
         if self.scans % PERSISTENCE == 1:
             self.aim = self.rng.uniform(-2.0, 2.0)
-        # The nearest thing in the half that it looks to; it keeps aiming at it as it turns.
         off = np.abs((angles - self.aim + math.pi) % (2.0 * math.pi) - math.pi)
-        target = angles[np.argmin(np.where(off < 0.6, ranges, 99.0))]
+        if self.scans // PERSISTENCE % 2:  # away, to where there is most room; what is beside the way is in the way
+            room = np.array([np.roll(ranges, k) for k in range(-15, 16)]).min(axis=0)
+            target = angles[np.argmax(np.where(off < 1.5, room, 0.0))]
+        else:  # the nearest thing where it looks; it keeps aiming at it as it turns
+            target = angles[np.argmin(np.where(off < 0.6, ranges, 99.0))]
         turn = max(-0.5, min(0.5, 2.0 * target))
         self.aim = target - 0.2 * turn
         with self.lock:

@@ -3,14 +3,14 @@
 import numpy as np
 import pytest
 
-from actors.ros2.gate import BLIND, LATE, NO_ANSWER, Gate
+from actors.ros2.gate import BLIND, LATE, NO_ANSWER, ROOM, Gate, grown
 from actors.ros2.process import Ros2Settings, Unfit, driven
 from actors.ros2.senses import Command
 from actors.ros2.views import diagnostics, markers
 from messaging import brakeline_pb2 as pb
 from messaging.bus import NoReply
 from messaging.ros2.messages import DiagnosticArray, DiagnosticStatus, MarkerArray, decode, encode
-from messaging.shapes import Obstacle
+from messaging.shapes import Obstacle, Shapes
 from tests.robots import GROUND
 
 ROBOT = GROUND.in_real_time()
@@ -98,3 +98,54 @@ def test_views_are_messages():
         (status,) = told.status
         assert (status.level, status.message, status.values[0].key) == (level, f"{kind}: why", "periods")
     assert DiagnosticStatus.ERROR == 2
+
+
+class Wary:
+    """Lets nothing but turning pass where obstacles are near; remembers what it was asked. leads: m that plans go on."""
+
+    def __init__(self, near, leads=0.0):
+        self.near, self.leads, self.asked = near, leads, []
+
+    def __call__(self, requests):
+        (request,) = requests
+        self.asked.append(request)
+        (reply,) = allow(requests)
+        size = max((obstacle.size[0] for obstacle in request.obstacles), default=0.0)
+        if size > self.near:
+            reply.decision.kind = pb.FAILSAFE
+        reply.decision.tube_center[-2] = self.leads if request.action[0] else 0.0
+        return [reply]
+
+
+DISC = (Obstacle("cylinder", (0.5, 0.0), (0.1,)),)
+
+
+def test_with_room_around_what_stands_there_one_question_is_enough():
+    wary = Wary(near=1.0)
+    gate = Gate(ROBOT, wary)
+    gate.decide(STATE, DISC, command(0.2, 0.1), 0.0, 0)
+    (asked,) = wary.asked
+    assert asked.obstacles[0].size[0] == pytest.approx(0.1 + ROOM)
+
+
+def test_where_only_the_room_is_missing_it_may_leave_and_turn_but_not_come_nearer():
+    for leads, speed in ((0.1, 0.0), (-0.1, 0.2)):
+        wary = Wary(near=0.1 + 0.5 * ROOM, leads=leads)
+        gate = Gate(ROBOT, wary)
+        gate.decide(STATE, DISC, command(0.2, 0.1), 0.0, 0)
+        assert gate.begin(0.2).tolist() == pytest.approx([speed, 0.1]) and gate.kind == "allowed"
+        assert wary.asked[-1].obstacles[0].size[0] == pytest.approx(0.1)
+
+
+def test_where_nothing_is_verified_it_brakes():
+    gate = Gate(ROBOT, Wary(near=0.01))
+    gate.decide(STATE, DISC, command(0.2), 0.0, 0)
+    gate.begin(0.2)
+    assert gate.kind == "failsafe"
+
+
+def test_room_is_around_all_of_an_obstacle():
+    box = Obstacle("box", (1.0, 0.0), (0.2, 0.4), 0.3)
+    rim = Shapes.of([box], 2).distance(np.array([[1.0, 0.6]]))
+    assert Shapes.of([grown(box, 0.05)], 2).distance(np.array([[1.0, 0.6]])) <= rim - 0.05 + 1e-9
+    assert grown(DISC[0], 0.05).size == (pytest.approx(0.15),)
