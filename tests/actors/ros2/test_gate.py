@@ -101,7 +101,7 @@ def test_views_are_messages():
 
 
 class Wary:
-    """Lets nothing but turning pass where obstacles are near; remembers what it was asked. leads: m that plans go on."""
+    """Verifies nothing where obstacles are larger than `near` [m]; its plans lead `leads` m towards them."""
 
     def __init__(self, near, leads=0.0):
         self.near, self.leads, self.asked = near, leads, []
