@@ -49,7 +49,7 @@ def _outcome(request: pb.Request, reply: pb.Reply | None, failure: str, elapsed:
     answer = None
     if reply is not None:
         try:
-            answer = read(reply, robot)
+            answer = read(reply, request, robot)
         except SafetyError as error:
             failure = str(error)
     return Outcome(request, reply, answer, failure, elapsed)

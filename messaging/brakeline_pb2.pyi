@@ -297,6 +297,7 @@ class Request(_message.Message):
     PREDICTED_CENTER_FIELD_NUMBER: _builtins.int
     PREDICTED_HALF_WIDTH_FIELD_NUMBER: _builtins.int
     PREDICTED_HEADING_FIELD_NUMBER: _builtins.int
+    VOUCHER_FIELD_NUMBER: _builtins.int
     SCAN_FIELD_NUMBER: _builtins.int
     robot: _builtins.str
     actor: _builtins.str
@@ -308,6 +309,8 @@ class Request(_message.Message):
     """version that verified it; empty: standing still; "unverified": none did"""
     predicted_heading: _builtins.float
     """rad, of the frame in which that set's position part is a box"""
+    voucher: _builtins.bytes
+    """the service's word that `model` verified `plan` (safety/vouch.py)"""
     @_builtins.property
     def state(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]:
         """measured"""
@@ -358,11 +361,12 @@ class Request(_message.Message):
         predicted_center: _abc.Iterable[_builtins.float] | None = ...,
         predicted_half_width: _abc.Iterable[_builtins.float] | None = ...,
         predicted_heading: _builtins.float = ...,
+        voucher: _builtins.bytes = ...,
         scan: Global___Scan | None = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _typing.Literal["scan", b"scan"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["action", b"action", "actor", b"actor", "episode", b"episode", "input_in_force", b"input_in_force", "model", b"model", "observation", b"observation", "obstacles", b"obstacles", "plan", b"plan", "predicted_center", b"predicted_center", "predicted_half_width", b"predicted_half_width", "predicted_heading", b"predicted_heading", "robot", b"robot", "scan", b"scan", "state", b"state", "step", b"step", "time", b"time"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["action", b"action", "actor", b"actor", "episode", b"episode", "input_in_force", b"input_in_force", "model", b"model", "observation", b"observation", "obstacles", b"obstacles", "plan", b"plan", "predicted_center", b"predicted_center", "predicted_half_width", b"predicted_half_width", "predicted_heading", b"predicted_heading", "robot", b"robot", "scan", b"scan", "state", b"state", "step", b"step", "time", b"time", "voucher", b"voucher"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 
@@ -373,16 +377,20 @@ class RequestBatch(_message.Message):
     DESCRIPTOR: _descriptor.Descriptor
 
     REQUESTS_FIELD_NUMBER: _builtins.int
+    NONCE_FIELD_NUMBER: _builtins.int
+    nonce: _builtins.bytes
+    """drawn anew for each question, so that no two have the same digest"""
     @_builtins.property
     def requests(self) -> _containers.RepeatedCompositeFieldContainer[Global___Request]: ...
     def __init__(
         self,
         *,
         requests: _abc.Iterable[Global___Request] | None = ...,
+        nonce: _builtins.bytes = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["requests", b"requests"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["nonce", b"nonce", "requests", b"requests"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 
@@ -412,6 +420,8 @@ class Decision(_message.Message):
     QUEUE_MS_FIELD_NUMBER: _builtins.int
     SOLVER_FIELD_NUMBER: _builtins.int
     ITERATIONS_FIELD_NUMBER: _builtins.int
+    VOUCHERS_FIELD_NUMBER: _builtins.int
+    UNVOUCHED_FIELD_NUMBER: _builtins.int
     BROKEN_FIELD_NUMBER: _builtins.int
     kind: Global___Kind.ValueType
     predicted_heading: _builtins.float
@@ -439,6 +449,8 @@ class Decision(_message.Message):
     solver: _builtins.str
     """status of the last QP; empty: none was solved"""
     iterations: _builtins.int
+    unvouched: _builtins.bool
+    """it was not believed that the request's model verified its plan"""
     broken: _builtins.int
     """obstacles seen outside of what their bounds allowed since they were seen before"""
     @_builtins.property
@@ -459,6 +471,10 @@ class Decision(_message.Message):
 
     @_builtins.property
     def predicted_half_width(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]: ...
+    @_builtins.property
+    def vouchers(self) -> _containers.RepeatedScalarFieldContainer[_builtins.bytes]:
+        """for the requests of the next periods, in their order"""
+
     def __init__(
         self,
         *,
@@ -482,11 +498,13 @@ class Decision(_message.Message):
         queue_ms: _builtins.float = ...,
         solver: _builtins.str = ...,
         iterations: _builtins.int = ...,
+        vouchers: _abc.Iterable[_builtins.bytes] | None = ...,
+        unvouched: _builtins.bool = ...,
         broken: _builtins.int = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["at_least", b"at_least", "broken", b"broken", "compared", b"compared", "contained", b"contained", "iterations", b"iterations", "kind", b"kind", "margin", b"margin", "model", b"model", "plan", b"plan", "predicted_center", b"predicted_center", "predicted_half_width", b"predicted_half_width", "predicted_heading", b"predicted_heading", "queue_ms", b"queue_ms", "reason", b"reason", "solve_ms", b"solve_ms", "solver", b"solver", "time_ms", b"time_ms", "tube_center", b"tube_center", "tube_half_width", b"tube_half_width", "verified", b"verified", "verify_ms", b"verify_ms"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["at_least", b"at_least", "broken", b"broken", "compared", b"compared", "contained", b"contained", "iterations", b"iterations", "kind", b"kind", "margin", b"margin", "model", b"model", "plan", b"plan", "predicted_center", b"predicted_center", "predicted_half_width", b"predicted_half_width", "predicted_heading", b"predicted_heading", "queue_ms", b"queue_ms", "reason", b"reason", "solve_ms", b"solve_ms", "solver", b"solver", "time_ms", b"time_ms", "tube_center", b"tube_center", "tube_half_width", b"tube_half_width", "unvouched", b"unvouched", "verified", b"verified", "verify_ms", b"verify_ms", "vouchers", b"vouchers"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 
@@ -525,6 +543,9 @@ class Reply(_message.Message):
 
     DECISION_FIELD_NUMBER: _builtins.int
     ERROR_FIELD_NUMBER: _builtins.int
+    ROBOT_FIELD_NUMBER: _builtins.int
+    robot: _builtins.str
+    """as in the request"""
     @_builtins.property
     def decision(self) -> Global___Decision: ...
     @_builtins.property
@@ -534,10 +555,11 @@ class Reply(_message.Message):
         *,
         decision: Global___Decision | None = ...,
         error: Global___Error | None = ...,
+        robot: _builtins.str = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _typing.Literal["decision", b"decision", "error", b"error", "result", b"result"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["decision", b"decision", "error", b"error", "result", b"result"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["decision", b"decision", "error", b"error", "result", b"result", "robot", b"robot"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     _WhichOneofReturnType_result: _TypeAlias = _typing.Literal["decision", "error"]  # noqa: Y015
     _WhichOneofArgType_result: _TypeAlias = _typing.Literal["result", b"result"]  # noqa: Y015
@@ -550,16 +572,20 @@ class ReplyBatch(_message.Message):
     DESCRIPTOR: _descriptor.Descriptor
 
     REPLIES_FIELD_NUMBER: _builtins.int
+    REQUEST_FIELD_NUMBER: _builtins.int
+    request: _builtins.bytes
+    """digest of the question's bytes: SHA-256, 16 bytes"""
     @_builtins.property
     def replies(self) -> _containers.RepeatedCompositeFieldContainer[Global___Reply]: ...
     def __init__(
         self,
         *,
         replies: _abc.Iterable[Global___Reply] | None = ...,
+        request: _builtins.bytes = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["replies", b"replies"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["replies", b"replies", "request", b"request"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 
@@ -575,10 +601,16 @@ class Model(_message.Message):
     ROBOT_FIELD_NUMBER: _builtins.int
     VERSION_FIELD_NUMBER: _builtins.int
     FILE_FIELD_NUMBER: _builtins.int
+    CLAIM_FIELD_NUMBER: _builtins.int
+    SIGNATURE_FIELD_NUMBER: _builtins.int
     robot: _builtins.str
     version: _builtins.str
     file: _builtins.bytes
     """as safety/model_set.py writes it (safetensors)"""
+    claim: _builtins.bytes
+    """what is said of the file (safety/sign.py), ..."""
+    signature: _builtins.bytes
+    """... and who says it"""
     @_builtins.property
     def header(self) -> Global___Header: ...
     def __init__(
@@ -588,10 +620,12 @@ class Model(_message.Message):
         robot: _builtins.str = ...,
         version: _builtins.str = ...,
         file: _builtins.bytes = ...,
+        claim: _builtins.bytes = ...,
+        signature: _builtins.bytes = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _typing.Literal["header", b"header"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["file", b"file", "header", b"header", "robot", b"robot", "version", b"version"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["claim", b"claim", "file", b"file", "header", b"header", "robot", b"robot", "signature", b"signature", "version", b"version"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 

@@ -7,6 +7,8 @@ with SafetyClient.open("tcp/127.0.0.1:7447", "ground") as safety:
 
 from __future__ import annotations
 
+import math
+import secrets
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,16 +21,19 @@ from numpy.typing import ArrayLike, NDArray
 
 from messaging import brakeline_pb2 as pb
 from messaging.bus import Bus, BusError, BusSettings
-from messaging.robots import Robot, robot_named
+from messaging.robots import FEEDBACK, Robot, robot_named
 from messaging.scans import Scan
 from messaging.shapes import Obstacle
 from messaging.topics import DECIDE
 from safety.commitment import Commitment, Prediction
+from safety.digest import digest
 
 Array = NDArray[np.float64]
 
 KINDS = {pb.ALLOWED: "allowed", pb.ADJUSTED: "adjusted", pb.FAILSAFE: "failsafe"}
 DEADLINE = 0.1  # s
+NONCE = 16  # bytes
+SAME_INPUT = 1e-9  # rounding allowed where inputs are compared
 
 
 class SafetyError(BusError):
@@ -108,6 +113,7 @@ def request_message(
         input_in_force=commitment.input_in_force.tolist(),
         plan=commitment.plan.ravel().tolist(),
         model=commitment.model,
+        voucher=commitment.voucher,
         obstacles=obstacle_messages(obstacles),
         scan=None if scan is None else scan_message(scan),
         **more,
@@ -119,14 +125,17 @@ def request_message(
     return message
 
 
-def read(reply: pb.Reply, robot: Robot) -> Answer:
-    """The decision in a reply.
+def read(reply: pb.Reply, request: pb.Request, robot: Robot) -> Answer:
+    """The decision in a reply to a request.
 
     Raises:
-        SafetyError: it is an error, or its plan or prediction is not one of this robot's.
+        SafetyError: it is an error, or its plan or prediction is not one of this robot's, or not one that follows the
+            input in force.
     """
     if reply.WhichOneof("result") != "decision":
         raise SafetyError(reply.error)
+    if reply.robot != robot.name:
+        raise _bad_reply("robot", f"a decision about {reply.robot[:100]!r}")
     decision = reply.decision
     if decision.kind not in KINDS:
         raise _bad_reply("kind", f"kind {decision.kind}")
@@ -138,10 +147,29 @@ def read(reply: pb.Reply, robot: Robot) -> Answer:
         raise _bad_reply("plan", "an input out of bounds")
     if not robot.rests(plan[-1]):
         raise _bad_reply("plan", "a plan that does not end in a stop")
+    if not _follows(plan, request, robot):
+        raise _bad_reply("plan", "a plan that does not follow the input in force")
     sizes = {len(decision.predicted_center), len(decision.predicted_half_width)}
     if sizes not in ({robot.state_dim}, {0}):  # the rivals predict nothing
         raise _bad_reply("predicted_center", "a predicted state of the wrong size")
+    said = [*decision.predicted_center, *decision.predicted_half_width, decision.predicted_heading, decision.margin]
+    if not all(map(math.isfinite, said)) or min(decision.predicted_half_width, default=0.0) < 0.0:
+        raise _bad_reply("predicted_center", "a predicted state or a margin that is none")
     return Answer(KINDS[decision.kind], plan[0], plan, decision)
+
+
+def _follows(plan: Array, request: pb.Request, robot: Robot) -> bool:
+    """Does a plan (N, m) go on from the input in force, and from step to step, within the slew? A late robot's begins
+    with the input that is in force meanwhile. What feedback will make of a state to come is not in the plan."""
+    m, slew = robot.action_dim, np.asarray(robot.action_slew) + SAME_INPUT
+    begun = np.array(request.plan[:m] if robot.late else request.input_in_force)
+    if begun.shape != (m,):
+        return False
+    if robot.late and (np.abs(plan[0] - begun) > SAME_INPUT).any():
+        return False
+    planned = [rule != FEEDBACK for rule in robot.stop]
+    steps = np.abs(np.diff(plan, axis=0))[:, planned]
+    return bool((np.abs(plan[0] - begun) <= slew).all() and (steps <= slew[planned]).all())
 
 
 def _bad_reply(field: str, message: str) -> SafetyError:
@@ -154,7 +182,7 @@ def accept(commitment: Commitment, answer: Answer) -> Array:
     predicted = Prediction(
         np.array(message.predicted_center), np.array(message.predicted_half_width), message.predicted_heading
     )
-    return commitment.accept(answer.plan, message.model, predicted, message.verified)
+    return commitment.accept(answer.plan, message.model, predicted, message.verified, message.vouchers)
 
 
 class SafetyClient:
@@ -201,7 +229,7 @@ class SafetyClient:
             NoReply, Late, Refused, SafetyError: no decision; execute `fallback()` instead.
         """
         request = request_message(self.commitment, state, action, obstacles, **more)
-        answer = read(ask(self.bus, [request], self.deadline)[0], self.robot)
+        answer = read(ask(self.bus, [request], self.deadline)[0], request, self.robot)
         accept(self.commitment, answer)
         return answer
 
@@ -225,14 +253,16 @@ def ask(bus: Bus, requests: Sequence[pb.Request], deadline: float) -> list[pb.Re
 
     Raises:
         NoReply, Late, Refused: nobody serves, too late, or not understood at all.
-        SafetyError: no batch of replies, or not as many as requests.
+        SafetyError: no batch of replies, or not as many as requests, or not to this question.
     """
-    payload = pb.RequestBatch(requests=requests).SerializeToString()
+    payload = pb.RequestBatch(requests=requests, nonce=secrets.token_bytes(NONCE)).SerializeToString()
     answer = bus.ask(DECIDE, payload, deadline, robot=requests[0].robot)
     try:
         batch = pb.ReplyBatch.FromString(answer)
     except DecodeError as error:
         raise _bad_reply("", f"not a reply batch: {error}") from error
+    if batch.request != digest(payload):
+        raise _bad_reply("request", "replies to another question")
     if len(batch.replies) != len(requests):
         raise _bad_reply("", f"{len(batch.replies)} replies to {len(requests)} requests")
     return list(batch.replies)

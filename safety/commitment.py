@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -45,7 +46,8 @@ class Commitment:
 
     plan (N, m) is its tail: the first row is what to execute if no better answer comes; of a late robot what is being
     executed, and `accept` and `fallback` return the input of the next period. model is the version of the
-    model set that verified it, empty when the robot stands still, `UNVERIFIED` if none did.
+    model set that verified it, empty when the robot stands still, `UNVERIFIED` if none did; voucher is the service's
+    word for that, if it gave one.
     """
 
     def __init__(self, robot: Robot) -> None:
@@ -60,9 +62,23 @@ class Commitment:
         self.predicted: Prediction | None = None
         self.seen: Array = np.zeros(self.robot.state_dim)  # the last measured state: of feedback, a stop is made of it
         self._still = self.robot.horizon  # periods of a stop's inputs
+        self._vouchers: tuple[bytes, ...] = ()  # of this period and those to come; the last stays
 
-    def accept(self, plan: Array, model: str, predicted: Prediction | None, verified: bool) -> Array:
+    @property
+    def voucher(self) -> bytes:
+        """For the next request; empty: the service gave none."""
+        return self._vouchers[0] if self._vouchers else b""
+
+    def accept(
+        self,
+        plan: Array,
+        model: str,
+        predicted: Prediction | None,
+        verified: bool,
+        vouchers: Iterable[bytes] = (),
+    ) -> Array:
         """A decision's plan becomes the committed one; returns the input to execute next."""
+        self._vouchers = (b"", *vouchers)
         self.plan, self.model = plan, model if verified else UNVERIFIED
         self.predicted = predicted if predicted is not None and len(predicted.center) else None
         return self._advance()
@@ -77,6 +93,7 @@ class Commitment:
     def _advance(self) -> Array:
         robot = self.robot
         now: Array = self.plan[0].copy()
+        self._vouchers = self._vouchers[1:] or self._vouchers
         rests = bool(robot.rests(now)) or (bool(robot.feedback) and robot.stands(self.seen))
         last = np.where(robot.stopping, 0.0, self.plan[-1])
         self.plan = np.vstack([self.plan[1:], last[None]])

@@ -15,9 +15,12 @@ from messaging.process import Process
 from messaging.robots import UnknownRobot, robot_named
 from messaging.topics import DECIDE, MODEL
 from safety.commitment import UNVERIFIED
-from safety.methods import Method, Model, decode, load, ready
+from safety.digest import digest
+from safety.methods import Method, Model, load, ready
 from safety.model_set import BadModel
 from safety.request import BadRequest, StaleModel
+from safety.sign import Signed, Trust, Untrusted
+from safety.vouch import Notary
 from safety.wire import batch_of, error_of, message_of, request_of
 
 log = logging.getLogger("brakeline.safety")
@@ -36,8 +39,8 @@ class Models:
     known: set[str] = field(default_factory=set)
     _lock: Lock = field(default_factory=Lock)
 
-    def install(self, model: Model) -> None:
-        """Put a model to use; requests in hand finish with the one before.
+    def install(self, model: Model, signed: Signed | None = None) -> None:
+        """Put a model to use; requests in hand finish with the one before. signed: as it came, to be archived so.
 
         Raises:
             BadModel: it does not fit its robot.
@@ -48,7 +51,7 @@ class Models:
             self.known.add(method.version)
         log.info("%s: model %s in use (%s)", model.robot.name, method.version, type(method).__name__)
         if self.archive is not None:
-            model.save(self.archive / model.robot.name / "models" / f"{method.version}.safetensors")
+            (signed or model).save(archive_path(self.archive, model.robot.name, method.version))
 
     def filter_for(self, request: pb.Request) -> Method:
         """Raises UnknownRobot, NoModel or StaleModel."""
@@ -65,10 +68,15 @@ class Models:
     def _archived(self, robot: str, version: str) -> bool:
         if self.archive is None or not version.isalnum():
             return False
-        if (self.archive / robot / "models" / f"{version}.safetensors").exists():
+        if archive_path(self.archive, robot, version).exists():
             self.known.add(version)
             return True
         return False
+
+
+def archive_path(archive: Path, robot: str, version: str) -> Path:
+    """Where a version is kept."""
+    return archive / robot / "models" / f"{version}.safetensors"
 
 
 @dataclass
@@ -78,6 +86,7 @@ class Counts:
     violations: int = 0
     compared: int = 0
     unverified: int = 0
+    unvouched: int = 0
     decide_ms: float = 0.0
 
     def figures(self) -> dict[str, float]:
@@ -88,16 +97,25 @@ class Counts:
             "compared": self.compared,
             "violations": self.violations,
             "unverified": self.unverified,
+            "unvouched": self.unvouched,
             "decide_ms": mean,
         }
 
 
-def answerer(models: Models, counts: Counts) -> Callable[[bytes], bytes]:
-    """The service's core: bytes of a RequestBatch to bytes of a ReplyBatch. Raises BadRequest for no batch at all."""
+def answerer(models: Models, counts: Counts, notary: Notary | None = None) -> Callable[[bytes], bytes]:
+    """The service's core: bytes of a RequestBatch to bytes of a ReplyBatch. Raises BadRequest for no batch at all.
+
+    notary: who knows which plans were verified; without one (in process, and when a log is replayed) what requests say
+    of theirs is believed.
+    """
 
     def one(message: pb.Request, received: int) -> pb.Reply:
         try:
             chosen = models.filter_for(message)
+            believed = notary is None or notary.vouches(message, chosen.robot)
+            if not believed:
+                counts.unvouched += 1
+                message.model = UNVERIFIED
             request = request_of(message, chosen.robot)
             queue_ms = (perf_counter_ns() - received) * 1e-6
             decision = chosen.decide(request)
@@ -115,12 +133,17 @@ def answerer(models: Models, counts: Counts) -> Callable[[bytes], bytes]:
         if not decision.contained:
             counts.violations += 1
             log.warning("%s, step %d: outside the predicted set", message.actor or message.robot, message.step)
-        return message_of(decision, queue_ms)
+        reply = message_of(decision, queue_ms)
+        reply.robot, reply.decision.unvouched = chosen.robot.name, not believed
+        if notary is not None and decision.verified:
+            reply.decision.vouchers.extend(notary.vouchers(message, reply.decision, chosen.robot))
+        return reply
 
     def answer(payload: bytes) -> bytes:
         received = perf_counter_ns()
         batch = batch_of(payload)
-        return pb.ReplyBatch(replies=[one(request, received) for request in batch.requests]).SerializeToString()
+        replies = [one(request, received) for request in batch.requests]
+        return pb.ReplyBatch(replies=replies, request=digest(payload)).SerializeToString()
 
     return answer
 
@@ -131,22 +154,33 @@ class SafetySettings:
     models: tuple[Path, ...]  # model files, one a robot; each says which method it is of
     archive: Path | None = None  # where versions that come over the bus are kept
     name: str = "safety"
+    secrets: Path | None = None  # folder with the key of vouchers, where the bus has no keys
 
 
 def main(settings: SafetySettings) -> None:
     """Serve until SIGINT or SIGTERM.
 
     Raises:
-        BadModel: a file is no model: a service without one would only refuse.
+        BadModel: a file is no model, or with keys none that is signed: a service without one would only refuse.
     """
+    keys = settings.bus.keys
     models, counts = Models(settings.archive), Counts()
     with Process(settings.bus, settings.name) as process:
+        trust = Trust.load(keys) if keys is not None else None
+        notary = Notary.of(keys or settings.secrets)
         for path in settings.models:
-            models.install(load(path))
+            if trust is None:
+                models.install(load(path))
+            else:
+                models.install(trust.load_model(path), Signed.load(path))
 
         def replace(sample: Sample) -> None:
             try:
-                models.install(decode(sample.message().file))
+                said = sample.message()
+                if trust is None:
+                    raise Untrusted("models are taken over the bus by a service with keys only: who signed it?")
+                signed = Signed(said.file, said.claim, said.signature)
+                models.install(trust.open(signed, said.robot), signed)
             except (BadModel, BusError) as error:
                 log.error("a model was refused: %s", error)
             except OSError as error:
@@ -158,6 +192,6 @@ def main(settings: SafetySettings) -> None:
 
         process.refresh = refresh
         process.bus.subscribe(MODEL, replace)
-        process.bus.serve(DECIDE, answerer(models, counts))
+        process.bus.serve(DECIDE, answerer(models, counts, notary))
         log.info("ready")
         process.stop.wait()

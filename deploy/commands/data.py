@@ -10,7 +10,18 @@ from typing import Annotated, Any
 import tyro
 from rich.table import Table
 
-from deploy.commands.common import Endpoints, Flags, Mode, Physics, Robot, conditions, console, errors, say_json
+from deploy.commands.common import (
+    Endpoints,
+    Flags,
+    Mode,
+    Physics,
+    Robot,
+    conditions,
+    console,
+    default_keys,
+    errors,
+    say_json,
+)
 from deploy.data.logged import Recorded, from_log
 from deploy.data.store import SEED, certified, data_for, model_path, record_path, recorded
 from deploy.progress import under_way
@@ -22,6 +33,7 @@ from messaging.topics import MODEL
 from safety.certificates import KINDS, RESIDUAL, CertificateError
 from safety.dataset import BadData, Dataset
 from safety.model_set import MODES, ModelSet, Recipe
+from safety.sign import KEY, Signer, seal_of
 from safety.statement import Statement
 
 DIVERGES = 100.0  # m, of a stop's half-width: wider than any arena
@@ -92,7 +104,7 @@ class Certify:
                 statements.append(statement)
                 results.setdefault(kind, {})[mode] = statement.figures()
                 if self.use:
-                    model.save(model_path(source.data.robot, model.recipe))
+                    self._keep(model, source.data)
         if self.json:
             # The figures of a certificate are those of the direct mode; the recursion's stand beside them.
             flat = {k: modes.get("direct", next(iter(modes.values()))) | modes for k, modes in results.items()}
@@ -105,8 +117,17 @@ class Certify:
         if chosen is None:
             return 1
         if self.publish:
-            self._publish(chosen)
+            self._publish(chosen, source.data)
         return 0
+
+    def _keep(self, model: ModelSet, data: Dataset) -> None:
+        """Where the other commands look for it; with a key to sign with, signed."""
+        path, keys = model_path(model.robot, model.recipe), self.endpoints.keys or default_keys()
+        seal_of(path).unlink(missing_ok=True)
+        if keys is not None and (keys / KEY).exists():
+            Signer.load(keys).sign(model, data).save(path)
+        else:
+            model.save(path)
 
     def _load(self) -> tuple[Path, Recorded]:
         """Raises ValueError when there is no such file: what was mistyped is not recorded anew."""
@@ -121,9 +142,13 @@ class Certify:
             return self.data, from_log(self.data, learnt(self.robot), self.last)
         return path, Recorded(data, f"{data.periods} recorded periods of {data.robot.name}")
 
-    def _publish(self, model: ModelSet) -> None:
-        with Bus(self.endpoints.bus(), "certify") as bus:
+    def _publish(self, model: ModelSet, data: Dataset) -> None:
+        settings = self.endpoints.bus()
+        with Bus(settings, "certify") as bus:
             message = pb.Model(robot=model.robot.name, version=model.version, file=model.encode())
+            if settings.keys is not None:
+                signed = Signer.load(settings.keys).sign(model, data)
+                message.file, message.claim, message.signature = signed.file, signed.claim, signed.signature
             bus.publisher(MODEL, robot=model.robot.name).put(message)
         errors.print(f"published {model.recipe.certificate} {model.version} for {model.robot.name}")
 

@@ -36,20 +36,18 @@ def _recorder(place: Place, folder: Path, config: RunConfig, bus: BusSettings) -
 
 def _safety(place: Place, folder: Path, config: RunConfig, bus: BusSettings) -> bool:
     from deploy.data.store import method_path
+    from deploy.run.keys import KEYS, newest_model
     from safety.service import SafetySettings, main
+    from safety.sign import Trust
 
     models = tuple(method_path(robot_named(robot), config.method, config.recipe) for robot in config.robots)
+    trust = None if bus.keys is None else Trust.load(bus.keys)
     newest = (
-        newest_model(folder, robot_named(robot).name) or path for robot, path in zip(config.robots, models, strict=True)
+        newest_model(folder, robot_named(robot).name, trust) or path
+        for robot, path in zip(config.robots, models, strict=True)
     )
-    main(SafetySettings(bus, tuple(newest), folder, place.name))
+    main(SafetySettings(bus, tuple(newest), folder, place.name, secrets=folder / KEYS))
     return False
-
-
-def newest_model(folder: Path, robot: str) -> Path | None:
-    """The version that a service of this run used last: a restarted one goes on with it."""
-    versions = list((folder / robot / "models").glob("*.safetensors"))
-    return max(versions, key=lambda path: path.stat().st_mtime_ns, default=None)
 
 
 def _learner(place: Place, folder: Path, config: RunConfig, bus: BusSettings) -> bool:

@@ -1,12 +1,23 @@
-"""The keys of a run that makes its own: for one machine and one user, in the run's folder."""
+"""The keys of a run that makes its own, for one machine and one user, in the run's folder; and the models that it
+starts with, signed."""
 
 from __future__ import annotations
 
+import logging
 from pathlib import Path
 
+from deploy.data.store import method_path
 from deploy.run.configurations import RunConfig
 from deploy.run.places import places
 from messaging.bus.authority import Authority
+from messaging.robots import robot_named
+from safety.methods import load
+from safety.model_set import BadModel
+from safety.service import archive_path
+from safety.sign import KEY, Signer, Trust, seal_of, write_signer
+from safety.vouch import write_key
+
+log = logging.getLogger("brakeline.launcher")
 
 KEYS = "keys"  # under the run's folder
 OTHERS = ("launcher", "viewer", "client", "certify")  # who may join in, besides the run's processes
@@ -18,4 +29,39 @@ def own_keys(config: RunConfig, folder: Path) -> Path:
     authority = Authority(keys)
     for name in (*OTHERS, *(place.name for place in places(config) if place.kind != "autopilot")):
         authority.issue(name)
+    write_signer(keys)
+    write_key(keys)
     return keys
+
+
+def seal_models(config: RunConfig, folder: Path, keys: Path) -> None:
+    """Whoever can certify signs the models that the run is to start with, in the run's archive.
+
+    Where the key to sign with is elsewhere, the models have to bring their seals along.
+    """
+    if not (keys / KEY).exists():
+        return
+    signer = Signer.load(keys)
+    for name in config.robots if config.filtered else ():
+        model = load(method_path(robot_named(name), config.method, config.recipe))
+        archived = archive_path(folder, model.robot.name, model.version)
+        if not seal_of(archived).exists():
+            signer.sign(model).save(archived)
+
+
+def newest_model(folder: Path, robot: str, trust: Trust | None) -> Path | None:
+    """The version that a service of this run used last: a restarted one goes on with it.
+
+    trust: with keys, whoever may have signed it; others' versions are passed over.
+    """
+    versions = archive_path(folder, robot, "*")
+    newest = sorted(versions.parent.glob(versions.name), key=lambda path: path.stat().st_mtime_ns, reverse=True)
+    for path in newest:
+        try:
+            if trust is not None:
+                trust.load_model(path)
+        except BadModel as error:
+            log.warning("not used: %s", error)
+            continue
+        return path
+    return None

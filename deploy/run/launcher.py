@@ -12,6 +12,7 @@ from typing import Any
 
 from deploy.data.store import method_for
 from deploy.run.configurations import RunConfig, encode
+from deploy.run.keys import KEYS, seal_models
 from deploy.run.places import CONFIG, LOG, places, say_where
 from deploy.run.view import View
 from deploy.run.watched import Child, LaunchError, last_line
@@ -22,6 +23,7 @@ from messaging.process import Process
 from messaging.robots import robot_named
 from messaging.tolerant import Tolerance, headline
 from messaging.topics import RECORDED
+from safety.vouch import write_key
 
 log = logging.getLogger("brakeline.launcher")
 
@@ -171,6 +173,10 @@ class Launcher:
         """Write what the processes read, and that this is the latest run."""
         (self.folder / CONFIG).write_text(encode(self.config))
         say_where(self.folder, self.bus)
+        if self.bus.keys is None:
+            write_key(self.folder / KEYS)  # a plan that one service verified is so for the next
+        else:
+            seal_models(self.config, self.folder, self.bus.keys)
         latest = self.folder.parent / "latest"
         if latest.is_symlink() or not latest.exists():
             latest.unlink(missing_ok=True)

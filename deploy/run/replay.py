@@ -25,6 +25,7 @@ from safety.methods import Method, decode, load, ready
 from safety.service import Counts, Models, answerer
 
 TIMES = ("time_ms", "solve_ms", "verify_ms", "queue_ms")
+WORDS = ("vouchers", "unvouched")  # what a service says to itself, with a key that no log holds
 EXAMPLES = 20  # decisions that are told in full: those with the largest differences
 NAMES = {pb.ALLOWED: "allowed", pb.ADJUSTED: "adjusted", pb.FAILSAFE: "failsafe", pb.UNKNOWN: "error"}
 
@@ -86,7 +87,7 @@ class Comparison:
         """Compare two replies to a request, but for their times and what else is to be ignored."""
         self.requests += 1
         self.kinds[NAMES[logged.decision.kind], NAMES[now.decision.kind]] += 1
-        found = differences(logged, now, robot_named(request.robot).action_dim, (*TIMES, *ignored))
+        found = differences(logged, now, robot_named(request.robot).action_dim, (*TIMES, *WORDS, *ignored))
         self.identical += not found
         for name, size in found.items():
             self.fields.setdefault(name, []).append(size)
@@ -112,7 +113,9 @@ class Comparison:
         return counts | {"kinds": kinds, "fields": fields, "examples": worst}
 
 
-def differences(logged: pb.Reply, now: pb.Reply, inputs: int, ignored: tuple[str, ...] = TIMES) -> dict[str, float]:
+def differences(
+    logged: pb.Reply, now: pb.Reply, inputs: int, ignored: tuple[str, ...] = (*TIMES, *WORDS)
+) -> dict[str, float]:
     """The fields of two replies that differ, with the largest difference of their numbers; inf if they have none.
 
     `input` is the plan's first row, `inputs` numbers: what the robot is told to do now.
@@ -159,6 +162,8 @@ def replay(paths: Paths, instead: Instead | None = None, each: Callable[[], Any]
         if record.topic != "exchange":
             continue
         request, logged = record.message.request, record.message.reply
+        if logged.decision.unvouched:  # by the log's own word; else what the request says is believed
+            request.model = UNVERIFIED
         if logged.WhichOneof("result") is None:
             result.requests += 1
             result.unanswered += 1

@@ -11,13 +11,13 @@ from safety.commitment import Commitment
 from tests.robots import GROUND
 
 PLAN = np.array([[0.2, 0.3], [0.1, 0.15], [0.0, 0.0]])
-REQUEST = pb.Request(robot="ground")
+REQUEST = pb.Request(robot="ground", input_in_force=[0.0, 0.0])
 
 
 def decision(plan=PLAN, **fields):
     values = {"kind": pb.ALLOWED, "plan": np.ravel(plan), "model": "abc", "verified": True}
     predicted = {"predicted_center": [0.0] * 5, "predicted_half_width": [1.0] * 5}
-    return pb.Reply(decision=pb.Decision(**(values | predicted | fields)))
+    return pb.Reply(robot="ground", decision=pb.Decision(**(values | predicted | fields)))
 
 
 def outcome_of(reply):
@@ -52,6 +52,7 @@ FAILURES = {
     "backwards": decision(-PLAN),
     "no stop at its end": decision(np.ones((3, 2)) * 0.1),
     "no prediction": decision(predicted_center=[]),
+    "another robot's": pb.Reply(robot="quadrotor", decision=decision().decision),
 }
 
 

@@ -59,7 +59,7 @@ def test_a_batch_is_answered_in_its_order(service, model):
     replies = service.replies(*(good(step=i) for i in range(5)), good(time=2.0))
     assert len(replies) == 6
     for reply in replies:
-        answer = read(reply, GROUND)
+        answer = read(reply, good(), GROUND)
         assert answer.kind in ("allowed", "adjusted")
         assert answer.message.model == model.version
         assert answer.message.verified
@@ -71,7 +71,7 @@ def test_a_batch_is_answered_in_its_order(service, model):
 def test_the_wire_changes_no_decision(service, ready):
     message = good()
     direct = ready.decide(request_of(message, GROUND))
-    answer = read(service.replies(message)[0], GROUND)
+    answer = read(service.replies(message)[0], message, GROUND)
     assert np.array_equal(answer.plan, direct.plan)
     assert answer.kind == direct.kind
     assert answer.message.margin == direct.margin
@@ -136,7 +136,7 @@ def test_bad_requests_get_an_error_that_names_the_field(service, field, message)
     assert error.type in ("BadRequest", "StaleModel", "UnknownRobot")
     assert error.message
     assert service.counts.errors == 1
-    assert read(service.replies(good())[0], GROUND).message.verified
+    assert read(service.replies(good())[0], good(), GROUND).message.verified
 
 
 def test_a_bad_request_spoils_no_other_of_its_batch(service):
@@ -151,7 +151,7 @@ def test_what_is_no_batch_is_refused_and_the_service_goes_on(service):
         with pytest.raises(BadRequest) as caught:
             service.answer(payload)
         assert caught.value.field in ("payload", "requests")
-        assert read(service.replies(good())[0], GROUND).message.verified
+        assert read(service.replies(good())[0], good(), GROUND).message.verified
 
 
 def test_random_damage_never_gets_an_unchecked_decision(service):
@@ -167,7 +167,7 @@ def test_random_damage_never_gets_an_unchecked_decision(service):
             continue
         for reply in replies:
             if reply.WhichOneof("result") == "decision":
-                read(reply, GROUND)
+                read(reply, good(), GROUND)
             else:
                 assert reply.error.type in ("BadRequest", "StaleModel", "UnknownRobot")
 
@@ -187,7 +187,7 @@ def test_an_unexpected_failure_is_an_error_reply(service, monkeypatch, caplog):
     assert error.type == "ArithmeticError"
     assert "decide failed for actor-0" in caplog.text
     monkeypatch.undo()
-    assert read(service.replies(good())[0], GROUND)
+    assert read(service.replies(good())[0], good(), GROUND)
 
 
 def test_a_model_is_replaced_while_the_service_runs(model, models, tmp_path):
@@ -196,33 +196,33 @@ def test_a_model_is_replaced_while_the_service_runs(model, models, tmp_path):
     moving = good()
     moving.ClearField("obstacles")
     moving.model, moving.input_in_force[0], moving.plan[0] = model.version, 0.2, 0.1
-    assert read(service.replies(moving)[0], GROUND).message.model == model.version
+    assert read(service.replies(moving)[0], moving, GROUND).message.model == model.version
     service.models.install(newer)
-    answer = read(service.replies(moving)[0], GROUND)
+    answer = read(service.replies(moving)[0], moving, GROUND)
     assert answer.message.model == newer.version
     assert answer.message.verified
     moving.model = UNVERIFIED
-    assert read(service.replies(moving)[0], GROUND).message.model == newer.version
+    assert read(service.replies(moving)[0], moving, GROUND).message.model == newer.version
     stale = good()
     stale.model = models["matrix-zonotope", "direct"].version
     assert service.error(stale).type == "StaleModel"
     # another replica that shares the archive knows what this one has used
     other = Service(newer, archive=tmp_path)
-    assert read(other.replies(moving)[0], GROUND)
+    assert read(other.replies(moving)[0], moving, GROUND)
     moving.model = model.version
-    assert read(other.replies(moving)[0], GROUND)
+    assert read(other.replies(moving)[0], moving, GROUND)
 
 
 def test_violations_and_what_could_not_be_verified_are_counted(service, caplog):
     message = good()
     message.predicted_center.extend([9.0] * 5)
     message.predicted_half_width.extend([0.1] * 5)
-    answer = read(service.replies(message)[0], GROUND)
+    answer = read(service.replies(message)[0], message, GROUND)
     assert answer.message.compared
     assert not answer.message.contained
     assert "outside the predicted set" in caplog.text
     message.obstacles.append(pb.Obstacle(kind="cylinder", position=[0.2, 0.0], size=[0.1]))
-    assert not read(service.replies(message)[0], GROUND).message.verified
+    assert not read(service.replies(message)[0], message, GROUND).message.verified
     figures = service.counts.figures()
     assert (figures["violations"], figures["compared"], figures["unverified"]) == (2, 2, 1)
 
@@ -239,15 +239,19 @@ def test_the_client_believes_no_bad_reply(service):
         (lambda d: d.plan.__setitem__(4, 0.1), "plan"),
         (lambda d: setattr(d, "kind", pb.UNKNOWN), "kind"),
         (lambda d: d.predicted_center.pop(), "predicted_center"),
+        (lambda d: d.predicted_center.__setitem__(0, INF), "predicted_center"),
+        (lambda d: d.predicted_half_width.__setitem__(0, NAN), "predicted_center"),
+        (lambda d: d.predicted_half_width.__setitem__(0, -0.1), "predicted_center"),
+        (lambda d: setattr(d, "margin", NAN), "predicted_center"),
     ):
         damaged = pb.Reply()
         damaged.CopyFrom(reply)
         change(damaged.decision)
         with pytest.raises(SafetyError) as caught:
-            read(damaged, GROUND)
+            read(damaged, good(), GROUND)
         assert caught.value.field == field
     with pytest.raises(SafetyError):
-        read(pb.Reply(), GROUND)
+        read(pb.Reply(), good(), GROUND)
 
 
 class FakeBus:
@@ -259,7 +263,7 @@ class FakeBus:
 
 
 def test_replies_that_are_none_are_typed_errors():
-    for answer in (b"\xff\xff", pb.ReplyBatch().SerializeToString()):
+    for answer in (b"\xff\xff", pb.ReplyBatch().SerializeToString(), b""):
         with pytest.raises(SafetyError, match="BadReply"):
             ask(FakeBus(answer), [good()], 0.1)
 

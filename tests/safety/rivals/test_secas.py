@@ -194,7 +194,7 @@ def test_the_service_answers_with_it_and_the_asker_brakes_when_it_falls_silent()
     for _ in range(2):  # the second request carries a plan that nobody vouches for
         message = request_message(commitment, np.zeros(5), [0.25, 0.3], [], observation=seen(0.25).tolist())
         payload = pb.RequestBatch(requests=[message]).SerializeToString()
-        reply = read(pb.ReplyBatch.FromString(answer(payload)).replies[0], GROUND)
+        reply = read(pb.ReplyBatch.FromString(answer(payload)).replies[0], message, GROUND)
         executed = accept(commitment, reply)
         assert reply.kind == "adjusted" and executed == pytest.approx((0.25 * 0.05 / 0.06, 0.3), abs=1e-5)
         assert commitment.model == UNVERIFIED and commitment.predicted is None
