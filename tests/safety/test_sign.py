@@ -1,0 +1,175 @@
+"""A service takes only models that somebody signed whom it was told to trust, of what they were signed for."""
+
+import json
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from cryptography.hazmat.primitives.serialization import load_pem_private_key
+
+from deploy.run.keys import newest_model
+from messaging import brakeline_pb2 as pb
+from messaging.bus import Bus, BusSettings
+from messaging.ports import free_endpoint
+from messaging.topics import HEALTH, MODEL
+from safety.certificates import Certificate
+from safety.model_set import BadModel, ModelSet
+from safety.service import SafetySettings, archive_path, main
+from safety.sign import CONTEXT, Signed, Signer, Trust, Untrusted, recorded_domain, seal_of, write_signer
+from tests.messaging.keyring import keyring
+
+
+@pytest.fixture
+def keys(tmp_path: Path) -> Path:
+    write_signer(tmp_path / "keys")
+    return tmp_path / "keys"
+
+
+def shrunken(model: ModelSet) -> ModelSet:
+    """The attack: sets a tenth as wide, and a hash that is right."""
+    steps = tuple(Certificate(s.C, s.W, 0.1 * s.M, 0.1 * s.kappa, 0.1 * s.w, s.generators) for s in model.steps)
+    return replace(model, steps=steps)
+
+
+def test_what_was_signed_is_taken(model: ModelSet, keys: Path, tmp_path: Path) -> None:
+    signed = Signer.load(keys).sign(model)
+    assert Trust.load(keys).open(signed, "ground").version == model.version
+    path = tmp_path / "model.safetensors"
+    signed.save(path)
+    assert Trust.load(keys).load_model(path).version == model.version
+    assert Signed.load(path) == signed
+    assert (keys / "signer.key").stat().st_mode & 0o077 == 0
+
+
+def test_a_hash_that_one_computes_oneself_proves_nothing(model: ModelSet, keys: Path) -> None:
+    signed, trust = Signer.load(keys).sign(model), Trust.load(keys)
+    evil = shrunken(model)
+    assert ModelSet.decode(evil.encode()).version == evil.version, "its own hash is right: yesterday it was taken"
+    with pytest.raises(Untrusted, match="not the one that was signed"):
+        trust.open(replace(signed, file=evil.encode()), "ground")
+    claim = json.loads(signed.claim) | {"version": evil.version}
+    with pytest.raises(Untrusted, match="nobody who is trusted"):
+        trust.open(replace(signed, file=evil.encode(), claim=json.dumps(claim).encode()), "ground")
+    with pytest.raises(Untrusted, match="nobody who is trusted"):
+        trust.open(Signed(evil.encode(), b"", b""), "ground")
+    write_signer(keys.parent / "rogue")
+    with pytest.raises(Untrusted, match="nobody who is trusted"):
+        trust.open(Signer.load(keys.parent / "rogue").sign(evil), "ground")
+    assert Trust().signers == ()
+    with pytest.raises(Untrusted):
+        Trust().open(signed, "ground")
+
+
+def test_it_is_of_the_robot_that_topic_and_key_say(model: ModelSet, tmp_path: Path) -> None:
+    write_signer(tmp_path / "any")
+    signed = Signer.load(tmp_path / "any").sign(model)
+    with pytest.raises(Untrusted, match="published as one of quadrotor"):
+        Trust.load(tmp_path / "any").open(signed, "quadrotor")
+    write_signer(tmp_path / "other", robots=("quadrotor",))
+    with pytest.raises(Untrusted, match="may not speak about ground"):
+        Trust.load(tmp_path / "other").open(Signer.load(tmp_path / "other").sign(model), "ground")
+
+
+@pytest.mark.parametrize("field", ["robot", "layout", "version", "domain"])
+def test_the_claim_is_what_the_file_is(model: ModelSet, keys: Path, field: str) -> None:
+    """Even where the right key signed something else: the file has to agree with every word."""
+    signed = Signer.load(keys).sign(model)
+    claim = json.loads(signed.claim) | {field: "quadrotor" if field != "domain" else (0.5 * model.domain).tolist()}
+    words = json.dumps(claim, sort_keys=True).encode()
+    key = load_pem_private_key((keys / "signer.key").read_bytes(), None)
+    other = replace(signed, claim=words, signature=key.sign(CONTEXT + words))
+    with pytest.raises(Untrusted):
+        Trust.load(keys).open(other)
+    assert Trust.load(keys).open(replace(signed, signature=key.sign(CONTEXT + signed.claim)))
+
+
+def test_nobody_signs_for_more_than_was_recorded(model: ModelSet, data, keys: Path) -> None:
+    signer, recorded = Signer.load(keys), recorded_domain(data)
+    assert (model.domain[0] >= recorded[0]).all() and (model.domain[1] <= recorded[1]).all()
+    assert Trust.load(keys).open(signer.sign(model, data))
+    wider = replace(model, domain=np.stack([recorded[0], recorded[1] + 0.1]))
+    with pytest.raises(Untrusted, match="wider"):
+        signer.sign(wider, data)
+    nothing = Signer.load(keys).sign(model)
+    claim = json.loads(nothing.claim) | {"domain": None}
+    words = json.dumps(claim).encode()
+    key = load_pem_private_key((keys / "signer.key").read_bytes(), None)
+    with pytest.raises(BadModel):
+        Trust.load(keys).open(Signed(nothing.file, words, key.sign(CONTEXT + words)))
+
+
+def test_a_restart_goes_on_with_the_newest_that_somebody_signed(model: ModelSet, keys: Path, tmp_path: Path) -> None:
+    trust, evil = Trust.load(keys), shrunken(model)
+    good, bad = (archive_path(tmp_path, "ground", m.version) for m in (model, evil))
+    Signer.load(keys).sign(model).save(good)
+    time.sleep(0.01)
+    evil.save(bad)
+    assert newest_model(tmp_path, "ground", None) == bad, "without keys the newest is taken"
+    assert newest_model(tmp_path, "ground", trust) == good
+    seal_of(bad).write_bytes(seal_of(good).read_bytes())
+    assert newest_model(tmp_path, "ground", trust) == good
+
+
+def eventually(condition: Callable[[], bool], seconds: float = 60.0) -> None:
+    deadline = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < deadline, "it did not come about"
+        time.sleep(0.02)
+
+
+SERVICE = """
+import sys
+from pathlib import Path
+from messaging.bus import BusSettings
+from safety.service import SafetySettings, main
+endpoint, keys, model, archive = sys.argv[1:]
+main(SafetySettings(BusSettings(connect=(endpoint,), keys=Path(keys)), (Path(model),), Path(archive)))
+"""
+
+
+def test_a_service_takes_over_the_bus_only_what_is_signed(
+    model: ModelSet, models: dict[tuple[str, str], ModelSet], tmp_path: Path
+) -> None:
+    """A certificate of `certify` gets a message through; what is in it has to be signed all the same."""
+    keys, archive = keyring(tmp_path / "keys"), tmp_path / "archive"
+    write_signer(keys)
+    path, newer, evil = tmp_path / "model.safetensors", models["set-membership", "direct"], shrunken(model)
+    Signer.load(keys).sign(model).save(path)
+    endpoint, notes = free_endpoint("tls"), dict[str, str]()
+    settings = BusSettings(connect=(endpoint,), keys=keys)
+    with Bus(BusSettings(listen=(endpoint,), keys=keys), "launcher") as router:
+        router.subscribe(HEALTH, lambda sample: notes.update(sample.message().notes))
+        words = [sys.executable, "-c", SERVICE, endpoint, keys, path, archive]
+        service = subprocess.Popen([str(word) for word in words], stderr=subprocess.DEVNULL)
+        try:
+            eventually(lambda: notes.get("model ground") == model.version)
+            with Bus(settings, "certify") as certify:
+                publisher = certify.publisher(MODEL, robot="ground")
+                rest = {"robot": "ground", "version": evil.version}
+                publisher.put(pb.Model(file=evil.encode(), **rest))
+                signed = Signer.load(keys).sign(model)
+                publisher.put(pb.Model(file=evil.encode(), claim=signed.claim, signature=signed.signature, **rest))
+                signed = Signer.load(keys).sign(newer)
+                said = {"claim": signed.claim, "signature": signed.signature}
+                publisher.put(pb.Model(robot="ground", version=newer.version, file=signed.file, **said))
+                eventually(lambda: notes.get("model ground") == newer.version)
+        finally:
+            service.terminate()
+            service.wait(20.0)
+    kept = {path.stem for path in archive_path(archive, "ground", "*").parent.glob("*.safetensors")}
+    assert kept == {model.version, newer.version}, "what was refused is not in the archive either"
+    assert newest_model(archive, "ground", Trust.load(keys)) == archive_path(archive, "ground", newer.version)
+
+
+def test_with_keys_a_file_that_the_user_names_is_signed_too(model: ModelSet, tmp_path: Path) -> None:
+    keys, endpoint = keyring(tmp_path / "keys"), free_endpoint("tls")
+    write_signer(keys)
+    unsigned = tmp_path / "unsigned.safetensors"
+    model.save(unsigned)
+    with pytest.raises(Untrusted, match="no seal"):
+        main(SafetySettings(BusSettings(listen=(endpoint,), keys=keys), (unsigned,)))

@@ -1,0 +1,149 @@
+"""Nobody but the service can say that a plan was verified: not by making it up, and not with another plan's voucher."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from messaging import brakeline_pb2 as pb
+from messaging.robots import GROUND, QUADROTOR, Robot
+from messaging.shapes import Obstacle
+from safety.client import Answer, accept, read, request_message
+from safety.commitment import UNVERIFIED, Commitment
+from safety.model_set import ModelSet
+from safety.service import Counts, Models, answerer
+from safety.vouch import SIZE, BadKey, Notary, write_key
+
+KEY = bytes(range(32))
+WALL = Obstacle("cylinder", (0.24, 0.0), (0.1,))  # so near that nothing but a stop could be verified before it
+LATE = QUADROTOR.in_real_time()
+
+
+class Service:
+    def __init__(self, model: ModelSet, key: bytes = KEY) -> None:
+        self.counts, models = Counts(), Models()
+        models.install(model)
+        self._answer = answerer(models, self.counts, Notary(key))
+
+    def __call__(self, request: pb.Request) -> pb.Reply:
+        payload = pb.RequestBatch(requests=[request]).SerializeToString()
+        return pb.ReplyBatch.FromString(self._answer(payload)).replies[0]
+
+
+def driving(service: Service) -> tuple[Commitment, pb.Request]:
+    """A robot that drives, and its next honest question, before a wall that has come up."""
+    commitment = Commitment(GROUND)
+    request = request_message(commitment, np.zeros(5), [0.25, 0.1], [], actor="actor-0")
+    accept(commitment, read(service(request), request, GROUND))
+    state = np.array(commitment.predicted.center)
+    return commitment, request_message(commitment, state, [0.25, 0.0], [WALL], actor="actor-0")
+
+
+def test_an_honest_question_is_believed(model: ModelSet) -> None:
+    service = Service(model)
+    _, request = driving(service)
+    assert len(request.voucher) == SIZE
+    decision = service(request).decision
+    assert (decision.kind, decision.verified, decision.unvouched) == (pb.FAILSAFE, True, False)
+    assert service.counts.unvouched == 0
+
+
+FORGERIES = {
+    "made up": {"voucher": b"\0" * SIZE},
+    "none": {"voucher": b""},
+    "short": {"voucher": b"\0"},
+    "another actor's": {"actor": "actor-1"},
+    "another plan": {"plan": [0.1, 0.0, 0.0, 0.0, 0.0, 0.0]},
+    "from another input": {"input_in_force": [0.2, 0.1]},
+    "another prediction": {"predicted_half_width": [9.0] * 5},
+    "no prediction": {"predicted_half_width": [], "predicted_center": [], "predicted_heading": 0.0},
+    "of another heading": {"predicted_heading": 0.5},
+}
+
+
+@pytest.mark.parametrize("changes", FORGERIES.values(), ids=FORGERIES.keys())
+def test_what_no_service_verified_does_not_count_as_verified(model: ModelSet, changes: dict[str, object]) -> None:
+    """Before a wall, where nothing can be verified anew: today's attack gave `failsafe, verified=True`."""
+    service = Service(model)
+    _, request = driving(service)
+    for name, value in changes.items():
+        if isinstance(value, list):
+            request.ClearField(name)
+            getattr(request, name).extend(value)
+        else:
+            setattr(request, name, value)
+    decision = service(request).decision
+    assert (decision.kind, decision.verified, decision.unvouched) == (pb.FAILSAFE, False, True)
+    assert not decision.vouchers, "and nobody vouches for what was not verified"
+    assert service.counts.unvouched == 1
+    trusting = Models()
+    trusting.install(model)
+    payload = pb.RequestBatch(requests=[request]).SerializeToString()
+    believed = pb.ReplyBatch.FromString(answerer(trusting, Counts())(payload)).replies[0].decision
+    assert believed.verified, "without a key it would have counted"
+
+
+def test_replicas_share_the_key_and_others_do_not(model: ModelSet) -> None:
+    first, replica, stranger = Service(model), Service(model), Service(model, KEY[::-1])
+    _, request = driving(first)
+    assert replica(request).decision.verified
+    assert not stranger(request).decision.verified
+
+
+def test_standing_still_needs_nobodys_word(model: ModelSet) -> None:
+    request = request_message(Commitment(GROUND), np.zeros(5), [0.0, 0.0], [WALL], actor="actor-0")
+    decision = Service(model)(request).decision
+    assert decision.verified and not decision.unvouched
+
+
+def plan_of(robot: Robot, rng: np.random.Generator) -> np.ndarray:
+    """A plan that ends in a stop, with zeros in between, some of them negative."""
+    plan = rng.uniform(robot.low(), robot.high(), (robot.horizon, robot.action_dim)) * rng.integers(0, 2, (1,))
+    plan[rng.integers(1, robot.horizon) :] = 0.0
+    return np.where(rng.random(plan.shape) < 0.2, -0.0, plan)
+
+
+@pytest.mark.parametrize("robot", [GROUND, QUADROTOR, LATE], ids=lambda robot: robot.name)
+def test_each_period_has_its_voucher_until_the_robot_stands(robot: Robot) -> None:
+    """Law: without a better answer the commitment goes on, and every request on the way is vouched for."""
+    notary, rng = Notary(KEY), np.random.default_rng(0)
+    for _ in range(50):
+        commitment, plan = Commitment(robot), plan_of(robot, rng)
+        request = pb.Request(robot=robot.name, actor="a")
+        decision = pb.Decision(plan=plan.ravel().tolist(), model="abc", verified=True, predicted_heading=-0.0)
+        decision.predicted_center.extend(rng.normal(size=robot.state_dim).tolist())
+        decision.predicted_half_width.extend(rng.random(robot.state_dim).tolist())
+        decision.vouchers.extend(notary.vouchers(request, decision, robot))
+        wire = pb.Decision.FromString(decision.SerializeToString())
+        reply = pb.Reply(robot=robot.name, decision=wire)
+        accept(commitment, Answer("allowed", plan[0], plan, reply.decision))
+        for _ in range(robot.horizon + 2):
+            asked = request_message(commitment, np.zeros(robot.state_dim), plan[0], [], actor="a")
+            asked = pb.Request.FromString(asked.SerializeToString())
+            assert notary.vouches(asked)
+            assert bool(asked.model) == bool(np.any(commitment.plan) or np.any(commitment.input_in_force))
+            assert len(asked.voucher) == SIZE or not asked.model
+            commitment.fallback()
+
+
+def test_a_plan_that_nobody_verified_gets_no_voucher_and_needs_none(model: ModelSet) -> None:
+    service = Service(model)
+    _, request = driving(service)
+    request.model, request.voucher = UNVERIFIED, b""
+    decision = service(request).decision
+    assert not decision.verified and not decision.unvouched and not decision.vouchers
+
+
+def test_the_key_is_kept_where_the_keys_are(tmp_path: Path) -> None:
+    write_key(tmp_path)
+    first = (tmp_path / "vouchers.key").read_bytes()
+    write_key(tmp_path)
+    assert (tmp_path / "vouchers.key").read_bytes() == first, "it is not drawn anew"
+    assert (tmp_path / "vouchers.key").stat().st_mode & 0o077 == 0
+    said = pb.Decision(plan=[0.1, 0, 0, 0, 0, 0], model="abc")
+    asked = pb.Request(robot="ground")
+    made = [Notary.of(folder).vouchers(asked, said, GROUND) for folder in (tmp_path, tmp_path, None, None)]
+    assert made[0] == made[1] and made[2] != made[3] and made[0] != made[2]
+    (tmp_path / "vouchers.key").write_bytes(b"short")
+    with pytest.raises(BadKey):
+        Notary.of(tmp_path)
