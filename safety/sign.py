@@ -28,9 +28,10 @@ from cryptography.hazmat.primitives.serialization import (
 )
 
 from messaging.files import write_secret, write_whole
-from safety.dataset import Dataset, windows
+from safety.dataset import Dataset
 from safety.methods import Model, decode
 from safety.model_set import Array, BadModel, ModelSet
+from safety.windows import windows
 
 CONTEXT = b"brakeline model 1\n"  # what a signature of ours is about, so that it is good for nothing else
 KEY, SIGNERS = "signer.key", "signers"

@@ -74,10 +74,7 @@ class Notary:
         predicted = _prediction(decision)
         return [
             self._mac(
-                said
-                + held[(k - 1) * row : k * row]
-                + tails[k * row : (k + n) * row]
-                + (predicted if k == 1 else b"")
+                said + held[(k - 1) * row : k * row] + tails[k * row : (k + n) * row] + (predicted if k == 1 else b"")
             )
             for k in range(1, periods + 1)
         ]
@@ -108,9 +105,7 @@ def _planned(robot: Robot) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
 
 
 def _prediction(message: pb.Request | pb.Decision) -> bytes:
-    return _numbers(
-        message.predicted_center, message.predicted_half_width, [message.predicted_heading]
-    ).tobytes()
+    return _numbers(message.predicted_center, message.predicted_half_width, [message.predicted_heading]).tobytes()
 
 
 def _numbers(*fields: object) -> np.ndarray[tuple[int], np.dtype[np.float64]]:

@@ -69,7 +69,7 @@ class BusSettings:
 def local(endpoint: str) -> bool:
     """Is it within this machine?"""
     protocol, _, address = endpoint.partition("/")
-    if protocol.startswith("unix"):
+    if protocol.startswith("unix") or not address:  # a file's name, or no endpoint at all
         return True
     host = address.split("#")[0].rpartition(":")[0].strip("[]")
     try:

@@ -109,8 +109,13 @@ def test_a_typing_error_is_answered_with_a_suggestion(command):
         ("analyse {folder}/none", "no log at"),
         ("certify {folder}/none.mcap", "no log at"),
         ("query ground --connect tcp/127.0.0.1:1 --obstacle ball", "an obstacle is: cylinder X Y RADIUS"),
-        ("status", "no run at runs/latest: give --connect tcp/HOST:PORT"),
+        ("status", "no run at runs/latest: give --connect tls/HOST:PORT"),
         ("query ground", "no run at runs/latest"),
+        ("safety ground --listen tcp/0.0.0.0:7447", "is open to other machines: give --keys FOLDER"),
+        ("query ground --connect tcp/127.0.0.1:1 --keys {folder}", "with keys a bus is at tls/HOST:PORT"),
+        ("query ground --connect tls/127.0.0.1:1 --keys {folder}", "ca.pem is missing: no keys of client here"),
+        ("keys {folder}/keys bob", "'bob' begins with no role"),
+        ("keys {folder}/none --sign {folder}/none", "no key to sign models with"),
     ],
 )
 def test_what_cannot_be_is_said_in_a_line(command, data_folder, tmp_path, monkeypatch, words, said):

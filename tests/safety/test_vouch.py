@@ -6,13 +6,14 @@ import numpy as np
 import pytest
 
 from messaging import brakeline_pb2 as pb
-from messaging.robots import GROUND, QUADROTOR, Robot
+from messaging.robots import Robot
 from messaging.shapes import Obstacle
 from safety.client import Answer, accept, read, request_message
 from safety.commitment import UNVERIFIED, Commitment
 from safety.model_set import ModelSet
 from safety.service import Counts, Models, answerer
 from safety.vouch import SIZE, BadKey, Notary, write_key
+from tests.robots import GROUND, QUADROTOR
 
 KEY = bytes(range(32))
 WALL = Obstacle("cylinder", (0.24, 0.0), (0.1,))  # so near that nothing but a stop could be verified before it
@@ -120,9 +121,9 @@ def test_each_period_has_its_voucher_until_the_robot_stands(robot: Robot) -> Non
         for _ in range(robot.horizon + 2):
             asked = request_message(commitment, np.zeros(robot.state_dim), plan[0], [], actor="a")
             asked = pb.Request.FromString(asked.SerializeToString())
-            assert notary.vouches(asked)
-            assert bool(asked.model) == bool(np.any(commitment.plan) or np.any(commitment.input_in_force))
-            assert len(asked.voucher) == SIZE or not asked.model
+            assert notary.vouches(asked, robot)
+            moving = bool(np.any(commitment.plan) or np.any(commitment.input_in_force))
+            assert bool(asked.model) == moving and len(asked.voucher) == SIZE
             commitment.fallback()
 
 
