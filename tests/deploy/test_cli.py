@@ -91,8 +91,8 @@ def test_a_typing_error_is_answered_with_a_suggestion(command):
     "words, said",
     [
         ("safety ground --listen nonsense", "cannot listen on nonsense"),
-        ("recorder {folder}/x.mcap --listen smoke/signals", "cannot listen on smoke/signals"),
-        ("train ground --listen tcp/127.0.0.1 --out {folder}/run", "cannot listen on tcp/127.0.0.1: invalid"),
+        ("recorder {folder}/x.mcap --listen smoke/signals", "smoke/signals is open to other machines"),
+        ("train ground --listen tls/127.0.0.1 --out {folder}/run", "cannot listen on tls/127.0.0.1: invalid"),
         ("actor ground --listen tcp/127.0.0.1:0 --arena ballroom", "no arena is called 'ballroom'; there are: default"),
         (
             "train ground --arena ballroom --out {folder}/run",
