@@ -85,11 +85,15 @@ class Notary:
             return True
         if len(request.input_in_force) != robot.action_dim:
             return False
+        return hmac.compare_digest(self.voucher(request, robot), request.voucher)
+
+    def voucher(self, request: pb.Request, robot: Robot) -> bytes:
+        """The one that a request needs."""
         held = (_numbers(request.input_in_force) * _planned(robot)).tobytes()
         said = _words(robot.name, request.actor, request.model) + held + _numbers(request.plan).tobytes()
         if request.predicted_center or request.predicted_half_width:
             said += _prediction(request)
-        return hmac.compare_digest(self._mac(said), request.voucher)
+        return self._mac(said)
 
     def _mac(self, message: bytes) -> bytes:
         return hmac.digest(self._key, message, "sha256")[:SIZE]

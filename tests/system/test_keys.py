@@ -1,0 +1,38 @@
+"""Keys made by the command, carried in parts, and used by processes that are started alone."""
+
+import os
+
+from deploy.data.store import method_path
+from messaging.bus import Bus, BusSettings
+from messaging.ports import free_endpoint
+from safety.model_set import Recipe
+from tests.robots import GROUND
+from tests.system.runs import brakeline, until
+from tests.system.test_alone import start  # noqa: F401 - a fixture
+
+
+def test_a_service_with_the_keys_that_were_handed_out_to_it(start, data_folder, tmp_path, monkeypatch):  # noqa: F811
+    keys, parts, endpoint = tmp_path / "keys", tmp_path / "parts", free_endpoint("tls")
+    made = brakeline("keys", keys, "safety", "client", "viewer", "actor-0", "certify", "--hand-out", parts)
+    assert made.returncode == 0, made.stderr
+    names = {"ca.pem", "safety.pem", "safety.key", "names", "vouchers.key", "signers"}
+    assert {path.name for path in (parts / "safety").iterdir()} == names
+    assert {path.name for path in (parts / "actor-0").iterdir()} == {"ca.pem", "actor-0.pem", "actor-0.key"}
+    assert not list(parts.rglob("ca.key")) and (parts / "certify" / "signer.key").exists()
+
+    model = method_path(GROUND, "ddpc", Recipe())
+    unsigned = brakeline("safety", "ground", "--listen", endpoint, "--keys", parts / "safety")
+    assert unsigned.returncode == 1 and "no seal" in unsigned.stderr and "Traceback" not in unsigned.stderr
+    signed = brakeline("keys", parts / "certify", "--sign", model)
+    assert signed.returncode == 0, signed.stderr
+    try:
+        start("safety", "ground", "--listen", endpoint, "--keys", parts / "safety")
+        with Bus(BusSettings(connect=(endpoint,), keys=parts / "viewer", patience=60.0), "viewer") as bus:
+            until(lambda: "safety" in bus.living(), "the service lives")
+        monkeypatch.setitem(os.environ, "BRAKELINE_KEYS", str(parts / "client"))
+        answer = brakeline("query", "ground", "--connect", endpoint, "--timeout", 10, "--json")
+        assert answer.returncode == 0 and '"decision": "allowed"' in answer.stdout, answer.stderr
+        stranger = brakeline("query", "ground", "--connect", endpoint, "--keys", parts / "actor-0")
+        assert stranger.returncode == 1 and "no keys of client" in stranger.stderr
+    finally:
+        model.with_suffix(".seal").unlink()
