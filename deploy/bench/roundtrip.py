@@ -29,7 +29,7 @@ from safety.client import ask
 from safety.service import Counts, Models, answerer
 from safety.vouch import Notary, write_key
 
-QUESTIONS = 1500
+QUESTIONS = 500
 PLAIN, KEYS, SOCKET = "TCP", "with keys", "Unix socket"
 
 
