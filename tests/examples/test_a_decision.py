@@ -16,6 +16,6 @@ def test_the_notebook_runs_from_top_to_bottom(data_folder, capsys):
             exec("".join(cell["source"]), names)
     printed = capsys.readouterr().out
     assert "0.60 m: allowed" in printed
-    assert "0.27 m: adjusted" in printed
+    assert "0.25 m: adjusted" in printed
     assert "0.21 m: failsafe" in printed
     assert len(names["axes"]) == 3
