@@ -156,3 +156,16 @@ def summary(console: Console, figures: dict[str, Any]) -> None:
     console.print(f"log:    {figures['log'] or 'none was recorded'}", markup=False)
     for path in figures["policies"]:
         console.print(f"policy: {path}", markup=False)
+    for command in following(figures):
+        console.print(f"next:   {command}", markup=False)
+
+
+def following(figures: dict[str, Any]) -> list[str]:
+    """Commands that one may want after a run."""
+    found = []
+    if figures["log"]:
+        found += [f"brakeline analyse {figures['folder']} --html report.html", f"brakeline replay {figures['folder']}"]
+    robots = list(figures["robots"])
+    if figures["policies"] and len(robots) == 1:
+        found.append(f"brakeline evaluate {robots[0]} --policy {figures['policies'][0]}")
+    return found

@@ -87,6 +87,7 @@ def test_the_summary_has_the_paths_whole(view: View) -> None:
     assert f"log:    {folder}/run.mcap" in rows and f"policy: {folder}/policy.safetensors" in rows
     assert any(row.endswith("restarts: learner 2, safety-0 1") for row in rows)
     assert any(f"brakeline train --resume {folder}" in row for row in rows)
+    assert f"next:   brakeline analyse {folder} --html report.html" in rows, "and what comes next"
 
 
 def test_what_a_run_is_at_is_said_from_the_first_second(view: View) -> None:
