@@ -86,6 +86,16 @@ COMMANDS: dict[str, Command] = {
     "collect": Command(
         "data:Collect", "record the data that the filter learns a robot from", "brakeline collect ground --seed 1"
     ),
+    "import": Command(
+        "sources:Import",
+        "a data set from a log of any robot: CSV, Parquet, ROS 2 bags, ArduPilot, PX4, runs",
+        "brakeline import drive.csv --robot my.toml --picture driven.png",
+    ),
+    "excite": Command(
+        "sources:Excite",
+        "print the inputs that a robot is best driven with to be learned, within a region",
+        "brakeline excite my.toml --keep -2 -2 2 2 --minutes 10 > inputs.csv",
+    ),
     "certify": Command(
         "data:Certify",
         "what held-out data say about each certificate; make and publish model sets",

@@ -106,7 +106,8 @@ class ModelSet:
             steps = [step.through(T) for step in steps] if self.recipe.mode == DIRECT else steps
         if self.recipe.mode == DIRECT:
             return stack_direct(steps, d, bulges, latch, more)
-        return stack_recursive(steps, recursion_of(self.robot), d, bulges, latch, more=more)
+        how = recursion_of(self.robot, plans or self.recipe.windows == PLAN)
+        return stack_recursive(steps, how, d, bulges, latch, more=more)
 
     @property
     def version(self) -> str:

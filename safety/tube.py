@@ -116,14 +116,16 @@ class Recursion:
         return pick
 
 
-def recursion_of(robot: Robot) -> Recursion:
-    """y = (position, heading, speeds ...), all relative to the frame of now."""
+def recursion_of(robot: Robot, plans: bool = True) -> Recursion:
+    """y = (position, heading, speeds ...), all relative to the frame of now; z ends in a plan's chosen inputs, or in
+    all of its inputs, one by one."""
     reg = list(robot.regressor)
-    nz = robot.regressor_dim + robot.free_steps * robot.action_dim
+    S = robot.schedule() if plans else np.eye(robot.horizon * robot.action_dim)
+    nz = robot.regressor_dim + S.shape[1]
     first = np.zeros((robot.state_dim, nz))
     first[reg, np.arange(len(reg))] = 1.0
     E = tuple(range(robot.position_dim, robot.state_dim))
-    return Recursion(E, robot.position_dim, robot.action_dim, robot.schedule(), first)
+    return Recursion(E, robot.position_dim, robot.action_dim, S, first)
 
 
 def stack_recursive(

@@ -5,9 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from itertools import product
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import tyro
+from rich.markup import escape
 from rich.table import Table
 
 from deploy.commands.common import (
@@ -23,15 +24,16 @@ from deploy.commands.common import (
     say_json,
 )
 from deploy.data.logged import Recorded, from_log
-from deploy.data.store import SEED, certified, data_for, model_path, record_path, recorded
+from deploy.data.store import SEED, data_for, model_path, record_path, recorded
+from deploy.data.support import Unsupported, supported
 from deploy.progress import under_way
 from logs.tables import Stacking
 from messaging import brakeline_pb2 as pb
 from messaging.bus import Bus
 from messaging.tasks import learnt
 from messaging.topics import MODEL
-from safety.certificates import KINDS, RESIDUAL, CertificateError
-from safety.dataset import BadData, Dataset
+from safety.certificates import KINDS, RESIDUAL
+from safety.dataset import Dataset
 from safety.model_set import MODES, ModelSet, Recipe
 from safety.sign import KEY, Signer, seal_of
 from safety.statement import Statement
@@ -70,6 +72,8 @@ class Certify:
     certificates: tuple[str, ...] = KINDS
     mode: Mode | None = None
     """Only this one; default: both."""
+    windows: Literal["plan", "free", "auto"] = "auto"
+    """From which driving: plans as the filter makes them, any, or any where there are too few plans."""
     robot: str = "ground"
     """Whose data set in use; of a log: whose steps are taken."""
     last: int = 20_000
@@ -86,23 +90,26 @@ class Certify:
     def run(self) -> int:
         path, source = self._load()
         results: dict[str, Any] = {}
-        statements: list[Statement] = []
+        rows: list[tuple[Statement, str]] = []
+        passed: list[str] = []
         chosen: ModelSet | None = None
         modes = (self.mode,) if self.mode else MODES
         with under_way("certifying", len(self.certificates) * len(modes)) as advance:
             for kind, mode in product(self.certificates, modes):
                 advance(0, f"certifying {kind}, {mode}")
                 try:
-                    model, statement = certified(source.data, Recipe(kind, mode))
-                except (BadData, CertificateError) as error:
+                    model, statement, not_of = supported(source.data, Recipe(kind, mode), self.windows)
+                except Unsupported as error:
                     results.setdefault(kind, {})[mode] = {"refused": str(error)}
-                    errors.print(f"[red]{kind}, {mode}: refused:[/] {error}")
+                    errors.print(f"[red]{kind}, {mode}: refused:[/] {escape(str(error))}")
                     continue
                 finally:
                     advance()
                 chosen = chosen or model
-                statements.append(statement)
-                results.setdefault(kind, {})[mode] = statement.figures()
+                rows.append((statement, model.recipe.windows))
+                passed += [f"{other} windows: {reason}" for other, reason in not_of.items()]
+                told = {"windows_of": model.recipe.windows, "not_of": not_of}
+                results.setdefault(kind, {})[mode] = statement.figures() | told
                 if self.use:
                     self._keep(model, source.data)
         if self.json:
@@ -110,7 +117,9 @@ class Certify:
             flat = {k: modes.get("direct", next(iter(modes.values()))) | modes for k, modes in results.items()}
             say_json(flat | {"source": str(path), "periods": source.data.periods, "note": source.note})
         else:
-            console.print(table(statements))
+            console.print(table(rows))
+            for text in dict.fromkeys(passed):
+                console.print(f"not supported: {text}", markup=False)
             console.print(f"{path}: {source.note}", markup=False)
             if self.verbose:
                 console.print(conditions(source.data.about))
@@ -153,17 +162,18 @@ class Certify:
         errors.print(f"published {model.recipe.certificate} {model.version} for {model.robot.name}")
 
 
-def table(statements: list[Statement]) -> Table:
+def table(rows: list[tuple[Statement, str]]) -> Table:
     shown = Stacking(title="what held-out plans say (bounds at 99 % confidence)")
     for column in (
-        *("certificate", "mode", "samples", "rank", "condition", "plans", "violations"),
+        *("certificate", "mode", "driving", "samples", "rank", "condition", "plans", "violations"),
         *("≤ per step", "≤ per plan", "stop from rest", "from full speed", "comfort"),
     ):
-        shown.add_column(column, justify="left" if column in ("certificate", "mode") else "right")
-    for s in statements:
+        shown.add_column(column, justify="left" if column in ("certificate", "mode", "driving") else "right")
+    for s, windows in rows:
         shown.add_row(
             s.certificate,
             s.mode + ("" if s.certificate != RESIDUAL or s.mode != "direct" else " *"),
+            windows,
             *(str(s.samples), str(s.rank), f"{s.condition:.0f}", str(s.windows), str(s.violations)),
             *(f"{s.bound_step:.3%}", f"{s.bound_plan:.3%}"),
             *(width(value) for value in (s.half_width_rest, s.half_width_full, s.comfort)),

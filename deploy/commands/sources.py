@@ -1,0 +1,92 @@
+"""`brakeline import` and `brakeline excite`: data of a robot that somebody drives."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+from rich.markup import escape
+from rich.table import Table
+
+from deploy.commands.common import Robot, console, errors, say_json
+from deploy.data import bring, planned
+from deploy.data.coverage import Coverage, coverage
+from deploy.data.picture import draw
+from deploy.data.resample import HOLD
+from deploy.data.sources.quantities import columns_of
+from deploy.data.store import record_path
+from messaging.tasks import learnt
+
+
+@dataclass(frozen=True)
+class Import:
+    sources: Annotated[tuple[Path, ...], tyro.conf.Positional]
+    """CSV, Parquet, ROS 2 bags, ArduPilot's .bin and .tlog, PX4's .ulg, logs of runs (docs/data.md)."""
+    robot: str = "ground"
+    """Name, or path of a description (.toml)."""
+    out: Path | None = None
+    """File; default: the data set in use (data/ROBOT/record.safetensors), replaced."""
+    map: tuple[str, ...] = ()
+    """NAME=TABLE/FIELD: where a coordinate or input is, if not where it usually is."""
+    delay: float = 0.0
+    """s by which inputs are stamped too early; the report says how much later than its inputs the robot moves."""
+    hold: float = HOLD
+    """s that an input counts for after its last message."""
+    picture: Path | None = None
+    """PNG of what was driven."""
+    json: bool = False
+
+    def run(self) -> int:
+        robot = learnt(self.robot)
+        made = bring.bring(self.sources, robot, self.map, self.delay, self.hold)
+        told = coverage(made.data)
+        path = self.out or record_path(robot)
+        if self.picture is not None:
+            draw(made.data, told, self.picture)
+        if not told.refused:
+            made.data.save(path)
+        figures = {"path": None if told.refused else str(path), "digest": made.data.digest()}
+        if self.json:
+            say_json(figures | {"report": asdict(made.report), "coverage": asdict(told), "refused": told.refused})
+            return int(bool(told.refused))
+        for note in made.report.notes:
+            console.print(note, markup=False)
+        console.print(covered(told))
+        for text in told.missing:
+            console.print(f"[yellow]missing:[/] {escape(text)}")
+        if told.refused:
+            errors.print(f"[red]refused:[/] no model set can be made of this: {escape(told.refused)}")
+            return 1
+        console.print(f"{path}: {made.data.periods} periods in {made.report.trajectories} trajectories", markup=False)
+        console.print(f"next: brakeline certify {path} --use", markup=False)
+        return 0
+
+
+def covered(told: Coverage) -> Table:
+    shown = Table(box=None, padding=(0, 2, 0, 0))
+    for column in ("", "least", "most", "bounds", "covered"):
+        shown.add_column(column, justify="left" if not column else "right")
+    for one in told.seen:
+        bounds = f"{one.low:g} to {one.high:g} {one.unit}"
+        shown.add_row(one.name, f"{one.least:.3g}", f"{one.most:.3g}", bounds, f"{one.share:.0%}")
+    shown.add_row("stops", str(told.stops))
+    shown.add_row("windows", f"{told.plans} of plans", f"{told.windows} free")
+    return shown
+
+
+@dataclass(frozen=True)
+class Excite:
+    robot: Robot = "ground"
+    keep: tuple[float, float, float, float] = (-2.0, -2.0, 2.0, 2.0)
+    """x and y, least and most [m], that the robot stays within; each run begins in the middle, along x."""
+    minutes: float = 10.0
+    seed: int = 0
+
+    def run(self) -> int:
+        robot = learnt(self.robot)
+        print(",".join(("time", "run", *columns_of(robot)[1])))
+        for row in planned.rows(robot, self.keep, self.minutes, self.seed):
+            print(",".join((f"{row.time:.9g}", str(row.run), *(f"{value:.6g}" for value in row.input))))
+        return 0

@@ -1,0 +1,39 @@
+"""Which model sets a data set supports: from plans where there are enough of them, else from free driving."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from deploy.data.store import certified
+from safety.certificates import CertificateError
+from safety.dataset import BadData, Dataset
+from safety.model_set import ModelSet, Recipe
+from safety.statement import Statement
+from safety.windows import FREE, PLAN
+
+AUTO = "auto"
+
+
+class Unsupported(BadData):
+    """No kind of windows serves; the message has each with its reason, `reasons` too."""
+
+    def __init__(self, reasons: dict[str, str]) -> None:
+        super().__init__("; ".join(f"{kind} windows: {reason}" for kind, reason in reasons.items()))
+        self.reasons = reasons
+
+
+def supported(data: Dataset, recipe: Recipe, windows: str = AUTO) -> tuple[ModelSet, Statement, dict[str, str]]:
+    """The model set of the first kind of windows that serves, its statement, and why the kinds before it did not.
+
+    Raises:
+        Unsupported: none does.
+    """
+    reasons: dict[str, str] = {}
+    for kind in (PLAN, FREE) if windows == AUTO else (windows,):
+        try:
+            model, statement = certified(data, replace(recipe, windows=kind))
+        except (BadData, CertificateError) as error:
+            reasons[kind] = str(error)
+        else:
+            return model, statement, reasons
+    raise Unsupported(reasons)

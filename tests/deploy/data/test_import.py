@@ -1,0 +1,252 @@
+"""Recordings of any robot, in any format, become the same data set; and what they lack is said."""
+
+import json
+
+import numpy as np
+import pytest
+from rosbags.rosbag2 import StoragePlugin
+
+from deploy.cli import main
+from deploy.data.bring import bring, tables_of
+from deploy.data.resample import resample
+from deploy.data.sources.table import NoSource, Table
+from messaging.descriptions import robot_of
+from safety.dataset import Dataset
+from safety.windows import _off_chord
+from tests.deploy.data.bags import write_bag, write_bin, write_parquet, write_tlog, write_ulg
+from tests.deploy.data.porter import COLUMNS, FILE, STEP, Porter, drive, porter, write_csv
+
+
+@pytest.fixture(scope="module")
+def driven():
+    return drive(seconds=120.0)
+
+
+@pytest.fixture(scope="module")
+def as_csv(driven, tmp_path_factory):
+    return write_csv(tmp_path_factory.mktemp("logs") / "drive.csv", *driven)
+
+
+def same(one: Dataset, other: Dataset, within: float) -> None:
+    assert len(one.trajectories) == len(other.trajectories)
+    for a, b in zip(one.trajectories, other.trajectories, strict=True):
+        for name in ("states", "inputs", "paths", "turned", "before"):
+            assert np.allclose(getattr(a, name), getattr(b, name), rtol=0.0, atol=within), name
+    assert one.bulge == pytest.approx(other.bulge, abs=within)
+
+
+@pytest.mark.parametrize("storage", StoragePlugin)
+def test_a_bag_and_a_csv_of_the_same_drive_are_the_same_data(driven, as_csv, tmp_path, storage):
+    bag = write_bag(tmp_path / "bag", *driven, storage)
+    same(bring([as_csv], porter()).data, bring([bag], porter()).data, 1e-9)
+    if storage is StoragePlugin.MCAP:  # the file alone does, too
+        same(bring([as_csv], porter()).data, bring([bag / "bag.mcap"], porter()).data, 1e-9)
+
+
+def test_parquet_is_as_good_as_csv(driven, as_csv, tmp_path):
+    same(bring([as_csv], porter()).data, bring([write_parquet(tmp_path / "a.parquet", *driven)], porter()).data, 1e-9)
+
+
+def test_a_rovers_log_of_ardupilot_is_the_same_drive(driven, as_csv, tmp_path):
+    same(bring([as_csv], porter()).data, bring([write_bin(tmp_path / "a.bin", *driven)], porter()).data, 1e-5)
+
+
+PUCK = {
+    "name": "puck",
+    "period": 0.2,
+    "sight": 3.0,
+    "state": {
+        "x": {"unit": "m", "role": "position", "error": 0.01},
+        "y": {"unit": "m", "role": "position", "error": 0.01},
+        "vx": {"unit": "m/s", "error": 0.05, "follows": "ux"},
+        "vy": {"unit": "m/s", "error": 0.05, "follows": "uy"},
+    },
+    "input": {"ux": {"unit": "m/s", "low": -1, "high": 1}, "uy": {"unit": "m/s", "low": -1, "high": 1}},
+    "plan": {"horizon": 3, "brake": 1},
+    "body": [{"at": [0.0, 0.0], "radius": 0.1}],
+}
+
+
+@pytest.mark.parametrize("write, ending", [(write_tlog, "tlog"), (write_ulg, "ulg")])
+def test_a_flight_in_ned_is_read_in_enu(tmp_path, write, ending):
+    rng = np.random.default_rng(2)
+    time = 0.05 * np.arange(2000)
+    u = np.repeat(rng.uniform(-1, 1, (500, 2)), 4, 0)  # each for a period
+    position = np.cumsum(np.vstack([np.zeros(2), 0.05 * u[:-1]]), 0)
+    seen = np.hstack([position, u, u])
+    robot = robot_of(PUCK)
+    data = bring([write(tmp_path / f"a.{ending}", time, seen)], robot).data
+    csv = write_csv(tmp_path / "a.csv", time, seen, ("x", "y", "vx", "vy", "ux", "uy"))
+    same(bring([csv], robot).data, data, 1e-4)
+
+
+# --- periods out of columns --------------------------------------------------------------------------------------
+
+
+def table(time, values, **columns) -> Table:
+    named = dict(zip(COLUMNS, values.T, strict=True)) | columns
+    run = named.pop("run", np.zeros(len(time))).astype(np.intp)
+    return Table("", np.asarray(time), named, run)
+
+
+def steady(seconds=20.0, step=0.2, speed=0.3, turn=0.0):
+    """A robot that drives steadily, without noise: (time, values)."""
+    time = step * np.arange(round(seconds / step) + 1)
+    heading = turn * time
+    x = np.cumsum(speed * step * np.cos(heading))
+    y = np.cumsum(speed * step * np.sin(heading))
+    one = np.ones(len(time))
+    wrapped = (heading + np.pi) % (2 * np.pi) - np.pi
+    return time, np.column_stack([x, y, wrapped, speed * one, turn * one, speed * one, turn * one])
+
+
+def lengths(imported) -> list[int]:
+    """Of the pieces, put together again where one was dealt out in parts."""
+    found, last = [], None
+    for t in imported.data.trajectories:
+        joined = last is not None and np.array_equal(last, t.states[0])
+        found = [*found[:-1], found[-1] + len(t.inputs)] if joined else [*found, len(t.inputs)]
+        last = t.states[-1]
+    return found
+
+
+def test_a_recording_at_the_robots_period_is_taken_as_it_is():
+    time, values = steady()
+    made = resample([table(time, values)], porter(), {})
+    states = np.vstack([t.states[:-1] for t in made.data.trajectories] + [made.data.trajectories[-1].states[-1:]])
+    assert np.allclose(states, values[1:, :5]) and made.report.samples == 1
+    assert lengths(made) == [99], "the first period tells the input in force"
+
+
+def test_cut_at_gaps_jumps_runs_and_inputs_out_of_bounds():
+    time, values = steady()
+    kept = np.r_[0:30, 31:101]
+    assert lengths(resample([table(time[kept], values[kept])], porter(), {})) == [28, 68]
+    jumped = values + np.where(np.arange(101)[:, None] >= 40, [2.0, 0, 0, 0, 0, 0, 0], 0.0)
+    made = resample([table(time, jumped)], porter(), {})
+    assert lengths(made) == [38, 59] and "1 jumps of the pose" in made.report.notes
+    runs = resample([table(np.r_[time, time], np.vstack([values, values]), run=np.repeat([0, 1], 101))], porter(), {})
+    assert lengths(runs) == [99, 99]
+    with pytest.raises(NoSource, match="time goes back from 20 to 0 s"):
+        resample([table(np.r_[time, time], np.vstack([values, values]))], porter(), {})
+    values[50, 5] = 0.7
+    made = resample([table(time, values)], porter(), {})
+    assert lengths(made) == [49, 48] and "1 periods left out: an input was out" in made.report.notes[0]
+
+
+def test_angles_are_unwrapped_before_they_are_looked_at_in_between():
+    time, values = steady(step=0.06, turn=1.0)
+    made = resample([table(time, values)], porter(), {})
+    turned = np.concatenate([t.turned for t in made.data.trajectories])
+    assert np.allclose(turned, 0.2, atol=1e-9)
+
+
+def test_an_input_is_held_and_forgotten_after_a_while():
+    time, values = steady()
+    values[20:40, 5:] = np.nan  # nobody spoke for 4 s
+    made = resample([table(time, values)], porter(), {}, hold=1.0)
+    assert lengths(made) == [23, 59], "5 periods after its last word it is forgotten"
+    assert lengths(resample([table(time, values)], porter(), {}, hold=10.0)) == [99]
+
+
+def test_periods_begin_where_inputs_change_and_an_input_that_changed_within_counts_by_its_mean():
+    time, values = steady(step=0.02)
+    beat = np.floor((time - 0.06 + 1e-9) / 0.2)
+    values[:, 5] = 0.1 + 0.05 * (beat % 3)
+    made = resample([table(time, values)], porter(), {})
+    inputs = np.concatenate([t.inputs[:, 0] for t in made.data.trajectories])
+    assert set(np.round(inputs, 9)) == {0.1, 0.15, 0.2} and made.report.uneven == 0.0
+    values[:, 5] = np.where((time % 0.2) < 0.049, 0.2, 0.4)
+    values[:, 6] = np.repeat(np.arange(len(time) // 10 + 1), 10)[: len(time)] % 2  # the beat is this one's
+    made = resample([table(time, values)], porter(), {})
+    inputs = np.concatenate([t.inputs[:, 0] for t in made.data.trajectories])
+    assert np.allclose(inputs, 0.35, atol=0.03) and made.report.uneven > 0.5
+
+
+@pytest.mark.parametrize("late", [0.0, 0.08, 0.16])
+def test_the_delay_from_input_to_motion_is_found(driven, late):
+    time, values = drive(seconds=120.0, seed=3)
+    told = table(time - late, values)  # as if commands were stamped earlier than they reached the robot
+    inputs = Table("", told.time, {name: told.columns[name] for name in COLUMNS[5:]}, told.run)
+    seen = table(time, values)
+    states = Table("", time, {name: seen.columns[name] for name in COLUMNS[:5]}, seen.run)
+    made = resample([states, inputs], porter(), {})
+    for found in made.report.delays.values():
+        assert found == pytest.approx(late, abs=0.03)
+    shifted = resample([states, inputs], porter(), {}, delay=late)
+    assert max(shifted.report.delays.values()) <= 0.021
+
+
+def test_paths_between_samples_are_within_the_bound_that_is_said():
+    """Seen once a period only, by a robot that changes its mind within one: the bulge holds what was not seen."""
+    rng = np.random.default_rng(5)
+    robot, rows, truth = Porter(rng), [], []
+    for _ in range(400):
+        u = rng.uniform([0.0, -1.5], [0.6, 1.5])
+        rows.append([*robot.true, *u])
+        before = robot.true[:2].copy()
+        truth.append(robot.step(u, 0.2) - before)
+    made = resample([table(0.2 * np.arange(400), np.array(rows))], porter(), {})
+    assert made.report.samples == 1 and "one position a period" in " ".join(made.report.notes)
+    away = _off_chord(np.array(truth))
+    assert away.max() <= made.data.bulge < 0.08, (away.max(), made.data.bulge)
+
+
+def test_what_is_missing_is_named_with_what_there_is(tmp_path, driven):
+    path = write_csv(tmp_path / "a.csv", *driven)
+    path.write_text(path.read_text().replace("time,x,y,heading,v,", "time,x,why,heading,v,", 1))
+    with pytest.raises(NoSource, match=r"y: there is no column 'y' .*\nthere is: columns: x, why, heading"):
+        bring([path], porter())
+    assert bring([path], porter(), ["y=why"]).report.periods > 500
+    with pytest.raises(NoSource, match="one of x, y, heading, v, w, speed, turn rate"):
+        bring([path], porter(), ["z=why"])
+    slow = write_csv(tmp_path / "slow.csv", driven[0][::25], driven[1][::25])
+    with pytest.raises(NoSource, match=r"a sample every 0.5 s: the robot's period of 0.2 s"):
+        bring([slow], porter())
+    bad = tmp_path / "bad.csv"
+    bad.write_text("time,x\n0.0,1.0\n0.1,one\n")
+    with pytest.raises(NoSource, match=r"bad.csv, line 3: could not convert string to float: 'one'"):
+        bring([bad], porter())
+    with pytest.raises(NoSource, match=r"what can be read is \.csv, \.parquet"):
+        tables_of(FILE)
+
+
+# --- what is said of it ------------------------------------------------------------------------------------------
+
+
+def test_a_bag_without_stops_is_refused_with_what_to_drive(tmp_path, capsys):
+    bag = write_bag(tmp_path / "bag", *drive(seconds=60.0, stops=False))
+    out = tmp_path / "none.safetensors"
+    assert main(["import", str(bag), "--robot", str(FILE), "--out", str(out)]) == 1
+    said = capsys.readouterr().err
+    assert "no stops" in said and "give zero speed and turn rate and let the robot stand for" in said
+    assert not out.exists()
+
+
+def test_the_report_says_what_is_missing_and_draws_it(tmp_path, capsys):
+    time, values = drive(seconds=200.0, seed=4)
+    values[:, [3, 5]] *= 0.5  # never faster than 0.3 m/s
+    values[:, 0] = np.cumsum(STEP * values[:, 3] * np.cos(values[:, 2]))
+    values[:, 1] = np.cumsum(STEP * values[:, 3] * np.sin(values[:, 2]))
+    path = write_csv(tmp_path / "slow.csv", time, values)
+    out, picture = tmp_path / "a.safetensors", tmp_path / "a.png"
+    words = ["import", str(path), "--robot", str(FILE), "--out", str(out), "--picture", str(picture), "--json"]
+    assert main(words) == 0
+    said = json.loads(capsys.readouterr().out)
+    missing = said["coverage"]["missing"]
+    assert "speed never above 0.3 m/s (bound 0.6): drive this" in missing
+    assert any(text.startswith("no braking above 0.3 m/s of speed") for text in missing), missing
+    assert picture.read_bytes().startswith(b"\x89PNG") and said["coverage"]["stops"] > 5
+    assert Dataset.load(out).digest() == said["digest"]
+
+
+def test_excitation_fills_what_is_missing_and_stays_inside(capsys):
+    assert main(["excite", str(FILE), "--keep", "-1.5", "-1", "1.5", "1", "--minutes", "3"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0] == "time,run,speed,turn rate"
+    rows = np.array([[float(cell) for cell in line.split(",")] for line in lines[1:]])
+    assert len(np.unique(rows[:, 1])) == 3 and rows[:, 2].max() == 0.6 and abs(rows[:, 3]).max() == 1.5
+    for run in np.unique(rows[:, 1]):
+        robot = Porter(np.random.default_rng(0))
+        way = [robot.step(u, 0.2) for u in rows[rows[:, 1] == run, 2:]]
+        assert (np.abs(np.concatenate(way)) < [1.5, 1.0]).all(), "in a simulator that has a lag"
