@@ -12,6 +12,7 @@ from safety.statement import Statement
 from safety.windows import FREE, PLAN
 
 AUTO = "auto"
+NO_PLANS = " (of driving like the filter's plans: a chosen input, then the stop rules of the description)"
 
 
 class Unsupported(BadData):
@@ -33,7 +34,7 @@ def supported(data: Dataset, recipe: Recipe, windows: str = AUTO) -> tuple[Model
         try:
             model, statement = certified(data, replace(recipe, windows=kind))
         except (BadData, CertificateError) as error:
-            reasons[kind] = str(error)
+            reasons[kind] = str(error) + (NO_PLANS if kind == PLAN else "")
         else:
             return model, statement, reasons
     raise Unsupported(reasons)

@@ -1,0 +1,131 @@
+"""Model sets from driving that follows no plan: what they say of plans, against windows of these and rollouts."""
+
+import itertools
+
+import numpy as np
+import pytest
+
+from deploy.data.excite import excitation
+from messaging.descriptions import robot_of
+from safety.certificates import KINDS, RESIDUAL
+from safety.dataset import BadData, Dataset, Trajectory
+from safety.fitting import make
+from safety.model_set import MODES, Recipe
+from safety.statement import state
+from safety.windows import FREE, PLAN, specialised, windows
+
+ROBOT = robot_of(
+    {
+        "name": "lagging-puck",
+        "period": 0.2,
+        "sight": 3.0,
+        "state": {
+            "x": {"unit": "m", "role": "position", "error": 0.002},
+            "y": {"unit": "m", "role": "position", "error": 0.002},
+            "vx": {"unit": "m/s", "error": 0.01, "follows": "ux"},
+            "vy": {"unit": "m/s", "error": 0.01, "follows": "uy"},
+        },
+        "input": {"ux": {"unit": "m/s", "low": -1, "high": 1}, "uy": {"unit": "m/s", "low": -0.5, "high": 0.5}},
+        "plan": {"horizon": 4, "brake": 3},
+        "body": [{"at": [0.0, 0.0], "radius": 0.1}],
+    }
+)
+ALL = [*((kind, "direct") for kind in KINDS), (RESIDUAL, "recursion")]
+KEEP = np.exp(-0.2 / 0.15)  # of a speed, after a period
+
+
+def moved(x, u):
+    """One period of a linear robot, written out: (state after it, position half-way)."""
+    half = np.exp(-0.1 / 0.15)
+    way = [u * t + 0.15 * (x[2:] - u) * (1.0 - keep) for t, keep in ((0.1, half), (0.2, KEEP))]
+    return np.concatenate([x[:2] + way[1], u + KEEP * (x[2:] - u)]), x[:2] + way[0]
+
+
+def driven(inputs, rng, noise):
+    x, states, paths = np.zeros(4), [], []
+    bound = noise * np.array([0.001, 0.001, 0.004, 0.004])
+    states.append(x + rng.uniform(-bound, bound))
+    for u in inputs:
+        after, half = moved(x, u)
+        paths.append([half - x[:2], after[:2] - x[:2]])
+        x = after
+        states.append(x + rng.uniform(-bound, bound))
+    return Trajectory(np.array(states), np.array(inputs), np.array(paths), np.zeros(len(inputs)), np.zeros(2))
+
+
+def wandering(rng, count):
+    """Inputs that follow no plan, and now and then stop."""
+    while count > 0:
+        for _ in range(rng.integers(4, 12)):
+            yield rng.uniform(ROBOT.low(), ROBOT.high())
+        for _ in range(rng.integers(3, 8)):
+            yield np.zeros(2)
+        count -= 1
+
+
+def free_data(seed, noise=1.0, count=40):
+    rngs = [np.random.default_rng((seed, i)) for i in range(count)]
+    return Dataset(ROBOT, tuple(driven(list(wandering(rng, 6)), rng, noise) for rng in rngs))
+
+
+@pytest.fixture(scope="module")
+def planned():
+    """Of plans, without noise."""
+    rngs = [np.random.default_rng((0, i)) for i in range(40)]
+    return Dataset(ROBOT, tuple(driven(list(itertools.islice(excitation(ROBOT, r), 80)), r, 0.0) for r in rngs))
+
+
+def test_a_plans_regressors_are_a_free_windows(planned):
+    plans, free = windows(planned, ROBOT.horizon, PLAN), windows(planned, ROBOT.horizon, FREE)
+    place = {tuple(start): i for i, start in enumerate(free.start)}
+    rows = [place[tuple(start)] for start in plans.start]
+    assert len(plans) > 200 and len(free) > 2 * len(plans)
+    assert np.allclose(plans.z @ specialised(ROBOT).T, free.z[rows], rtol=0.0, atol=1e-12)
+    assert np.array_equal(plans.y, free.y[rows])
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_of_a_linear_robot_both_are_the_same_predictor(planned, mode):
+    plans = make(planned, Recipe(mode=mode)).tube()
+    free = make(free_data(1, noise=0.0), Recipe(mode=mode, windows=FREE)).tube()
+    z = np.random.default_rng(2).uniform(-1, 1, (50, plans.position.shape[2]))
+    for one in z:
+        assert np.allclose(plans.centers(one), free.centers(one), rtol=0.0, atol=1e-7)
+
+
+@pytest.mark.parametrize("which", ALL, ids="-".join)
+def test_tubes_from_free_driving_hold_plans_that_were_never_driven(which):
+    model = make(free_data(3), Recipe(*which, windows=FREE))
+    tube, S = model.tube(), ROBOT.schedule()
+    rng = np.random.default_rng(4)
+    outside = 0
+    for _ in range(300):
+        before = rng.uniform(ROBOT.low(), ROBOT.high())
+        start = np.concatenate(
+            [np.zeros(2), moved(np.concatenate([np.zeros(2), rng.uniform(-1, 1, 2) / 2]), before)[0][2:]]
+        )
+        chosen = rng.uniform(ROBOT.low(), ROBOT.high())
+        plan = (S @ chosen).reshape(-1, 2)
+        z = np.concatenate([start[2:] + rng.uniform(-0.004, 0.004, 2), before, chosen])
+        centers, half = tube.centers(z), tube.half_widths(z)
+        x = start
+        for k, u in enumerate(plan):
+            x, _ = moved(x, u)
+            outside += (np.abs(x[:2] - centers[k]) > half[k] + 0.002).any()
+    assert outside <= 6, f"{outside} of 1200 positions"
+
+
+def test_the_statement_is_about_windows_like_those_it_was_made_from():
+    fitted, held_out = free_data(5), free_data(6, count=40)
+    said = state(make(fitted, Recipe(windows=FREE)), fitted, held_out)
+    assert said.windows > 300 and said.bound_step < 0.05 and said.bound_plan < 0.1
+    shaken = free_data(6, noise=10.0, count=40)
+    worse = state(make(fitted, Recipe(windows=FREE)), fitted, shaken)
+    assert worse.step_violations > 0.3 * worse.windows
+
+
+def test_driving_without_stops_says_what_to_drive():
+    rng = np.random.default_rng(7)
+    inputs = [driven(list(rng.uniform(ROBOT.low(), ROBOT.high(), (60, 2))), rng, 1.0) for _ in range(30)]
+    with pytest.raises(BadData, match=r"0 stops in the data.*from every speed give zero input and let the robot stand"):
+        make(Dataset(ROBOT, tuple(inputs)), Recipe(windows=FREE))
