@@ -21,7 +21,7 @@ def main() -> None:
         robot.write_text(small_log.DESCRIPTION)
         bag = small_log.write_bag(folder / "bag")  # /odom and /cmd_vel
 
-        # Positions, heading and speeds are found by what they are; another topic is named by --map v=/wheels/twist.linear.x
+        # Topics are found by what they hold; another one is named so: --map v=/wheels/twist.linear.x
         brakeline(["import", str(bag), "--robot", str(robot)])
         brakeline(["certify", "--robot", str(robot), "--certificates", "residual", "--mode", "direct", "--use"])
 
