@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 RATIO = 1.01  # of a bin's edges
 RESOLUTION = 0.005  # largest relative error of a percentile
 TINY = 1e-9  # values closer to zero than this are zero
+HUGE = 1e15  # no second, metre or count of ours is as large, and the square of none may overflow a sum
 BATCH = 1024  # values sorted into bins at once
 
 _PER_E = 1.0 / math.log(RATIO)  # bins per factor e
@@ -32,7 +33,8 @@ def _middle(place: int) -> float:
 
 @dataclass
 class Histogram:
-    """At most some 3,000 bins for values over twelve decades; those that are not finite are only counted apart.
+    """At most some 3,000 bins for values over twelve decades; those that are no numbers, or as good as infinite, are
+    only counted apart.
 
     Values wait until `BATCH` of them can be sorted into bins at once, several times as fast as one by one. Looking at
     the figures does not change when that is: so sums come out the same, however often somebody looks.
@@ -43,7 +45,7 @@ class Histogram:
     squares: float = 0.0
     low: float = math.inf
     high: float = -math.inf
-    strange: int = 0  # infinite, or no numbers
+    strange: int = 0  # as good as infinite, or no numbers
     bins: dict[int, int] = field(default_factory=dict)
     waiting: array[float] = field(default_factory=lambda: array("d"))
 
@@ -65,7 +67,7 @@ class Histogram:
 
     def take(self, given: NDArray[np.float64]) -> None:
         """Sort values (n,) into bins at once."""
-        values = given[np.isfinite(given)]
+        values = given[np.abs(given) < HUGE]  # of NaN, too, this is false
         self.strange += len(given) - len(values)
         if not len(values):
             return

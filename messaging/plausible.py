@@ -47,6 +47,8 @@ def _checks(kind: Descriptor) -> tuple[Callable[[Any], None], ...]:
             found.append(_size_check(name, MOST_NUMBERS))
     if "obstacles" in fields:
         found.append(_size_check("obstacles", MOST_OBSTACLES))
+    if "reward" in fields:
+        found.append(_check_figures)
     if "request" in fields:
         found.append(lambda message: check(message.request))
     return tuple(found)
@@ -60,6 +62,13 @@ def _check_header(message: Any) -> None:
         raise Implausible(f"time {header.time} s")
     if header.source and not NAME.fullmatch(header.source):
         raise Implausible(f"source {header.source[:100]!r}")
+
+
+def _check_figures(message: Any) -> None:
+    """Those of a step, which are added up."""
+    for value in (message.reward, message.penalty, message.speed):
+        if not abs(value) < LONGEST:  # NaN fails too
+            raise Implausible(f"reward {message.reward}, penalty {message.penalty}, speed {message.speed}")
 
 
 def _check_names(message: Any, names: tuple[str, ...]) -> None:

@@ -16,7 +16,18 @@ import sys
 from rich.console import Console
 from rich.table import Table
 
-from deploy.bench import decide, environment, learning, linkloss, logs, reachability, recording, roundtrip, solvers
+from deploy.bench import (
+    decide,
+    environment,
+    fuzz,
+    learning,
+    linkloss,
+    logs,
+    reachability,
+    recording,
+    roundtrip,
+    solvers,
+)
 from deploy.bench.timing import Figures
 
 BENCHMARKS = {
@@ -30,8 +41,9 @@ BENCHMARKS = {
     "logs": logs.run,
     "recording": recording.run,
     "logs-2gb": logs.run_large,
+    "fuzz": fuzz.run,
 }
-WHEN_ASKED = {"logs-2gb"}  # it writes as much
+WHEN_ASKED = {"logs-2gb", "fuzz"}  # one writes as much, the other takes a quarter of an hour
 
 
 def show(console: Console, name: str, figures: Figures) -> None:

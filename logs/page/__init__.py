@@ -125,8 +125,8 @@ def finite(value: Any) -> Any:
 
 
 def number(value: float | None, digits: int = 3) -> str:
-    """For people: thousands apart, no more digits than matter; a dash for None."""
-    if value is None:
+    """For people: thousands apart, no more digits than matter; a dash for None, and for what is no number."""
+    if value is None or not math.isfinite(value):
         return "–"
     if isinstance(value, int) or (value == int(value) and abs(value) >= 1000):
         return f"{int(value):,}".replace(",", "\u202f")
@@ -134,7 +134,7 @@ def number(value: float | None, digits: int = 3) -> str:
 
 
 def percent(share: float | None) -> str:
-    if share is None:
+    if share is None or not math.isfinite(share):
         return "–"
     value = 100.0 * share
     return f"{value:.1f} %" if value >= 1.0 or value == 0.0 else f"{value:.2g} %"

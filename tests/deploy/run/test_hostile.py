@@ -11,13 +11,13 @@ from deploy.run.launcher import Launcher
 from deploy.run.places import UNFINISHED, Place
 from deploy.run.watched import Child
 from messaging import brakeline_pb2 as pb
-from messaging.bus import Sample
+from messaging.bus import BusSettings, Sample
 from messaging.topics import EPISODE, EXCHANGE, HEALTH, LOG, STEP, Topic
 
 
 @pytest.fixture
 def launcher(tmp_path: Path) -> Launcher:
-    return Launcher(RunConfig(), tmp_path, "tcp/127.0.0.1:7447")
+    return Launcher(RunConfig(), tmp_path, BusSettings(listen=("tcp/127.0.0.1:7447",)))
 
 
 def say(launcher: Launcher, topic: Topic, message: object) -> None:

@@ -1,0 +1,420 @@
+"""Messages of all kinds against every process that listens to them, in this process: does anything raise, or grow?
+
+Of each topic: valid messages with every field drawn (extremes, wrong sizes, names that are none), such messages with
+bits turned, bytes cut off or doubled, and noise. What a process can't handle it must pass over; what it says of itself
+and shows must still come. `python -m deploy.bench fuzz` sends a million, the tests some thousands.
+"""
+
+from __future__ import annotations
+
+import itertools
+import logging
+import math
+import tempfile
+import time
+import traceback
+from collections import Counter, deque
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from random import Random
+from threading import Event
+from types import SimpleNamespace
+from typing import Any
+
+import psutil
+from google.protobuf.message import DecodeError, Message
+
+from actors.student import Student
+from deploy.bench.timing import Figures
+from deploy.commands.watch import _show
+from deploy.run.configurations import RunConfig
+from deploy.run.display import line
+from deploy.run.frames import as_json, both
+from deploy.run.launcher import Launcher
+from learner.config import LearnerConfig
+from learner.core import Learner
+from learner.service import LearnerLoop, LearnerSettings
+from logs.analysis import Analysis, Look
+from logs.foxglove import Pictures
+from logs.page import render
+from logs.reader import Log
+from logs.recorder import Inbox, Recording, Rotation
+from logs.segment import Metadata, Segment
+from logs.watch.board import Board
+from logs.watch.server import encode
+from messaging import brakeline_pb2 as pb
+from messaging.bus import BusError, BusSettings, Sample
+from messaging.robots import Robot, robot_named
+from messaging.tasks import layout
+from messaging.tolerant import Tolerance
+from messaging.topics import DECIDE, FLOW, JOIN, MODEL, RECORDED, TOPICS, WEIGHTS, Topic
+from safety.client import read
+from safety.methods import decode
+from safety.model_set import BadModel
+from safety.request import BadRequest
+from safety.service import Counts, Models, answerer
+
+MESSAGES = 1_000_000
+LOOK = 25_000  # messages between two looks at what the processes say and show
+CORPUS = 200  # valid messages of each topic, that the mutated ones are made of
+SETTLED = 0.3  # of the messages: by then tables are as full as they get
+
+NUMBERS = (0.0, 1.0, -1.0, 0.1, 1e-300, 1e300, -1e300, 1e9, math.inf, -math.inf, math.nan)
+INTEGERS = (0, 1, 2, 3, 7, 1000, 2**31 - 1, 2**31, 2**32 - 1, 2**53, 2**62, 2**63 - 1, 2**63, 2**64 - 1, -1, -(2**63))
+TEXTS = ("", "ground", "ground", "quadrotor", "actor-0", "actor-0", "ERROR", "box", "wall", "sphere", "cylinder")
+STRANGE = ("a/b", "../../etc", "\x1b[2J\n", "<script>", "\n", "é" * 40, "a" * 101)
+# By the wire's kind of number: C++'s int32, int64, uint32, uint64.
+LIMITS = {1: (-(2**31), 2**31 - 1), 2: (-(2**63), 2**63 - 1), 3: (0, 2**32 - 1), 4: (0, 2**64 - 1)}
+
+
+class Mill:
+    """Draws messages."""
+
+    def __init__(self, seed: int) -> None:
+        self.random, self._numbers = Random(seed), itertools.count(1)
+        self._corpus = {topic.name: [self._message(topic.message()) for _ in range(CORPUS)] for topic in TOPICS}
+
+    def sample(self, topic: Topic) -> Sample:
+        """One message of a topic, received now, most of them from an actor that everybody knows."""
+        random = self.random
+        key = topic.at(robot="ground", source="actor-0")
+        if random.random() < 0.3:
+            key = topic.at(robot=self._text(), source=f"actor-{random.randrange(3000)}")
+        return Sample(topic, key, self.payload(topic), time.time_ns())
+
+    def payload(self, topic: Topic) -> bytes:
+        random, corpus = self.random, self._corpus[topic.name]
+        kind, at = random.random(), random.randrange(CORPUS)
+        if kind < 0.1:
+            return random.randbytes(random.randrange(200))
+        if kind < 0.4:
+            corpus[at] = self._altered(topic, corpus[at])
+            return corpus[at]
+        data = bytearray(corpus[at])
+        for _ in range(random.randrange(3)):
+            if not data:
+                break
+            place, what = random.randrange(len(data)), random.randrange(4)
+            if what == 0:
+                data[place] ^= 1 << random.randrange(8)
+            elif what == 1:
+                data[place] = random.choice((0, 127, 128, 255))
+            elif what == 2:
+                del data[place:]
+            else:
+                data += data[place : place + 100]
+        return bytes(data[:4096])
+
+    def _altered(self, topic: Topic, payload: bytes) -> bytes:
+        """A valid message with some fields drawn anew."""
+        message = topic.message.FromString(payload)
+        if self.random.random() < 0.02:
+            return self._message(topic.message())
+        for _ in range(self.random.randrange(1, 4)):
+            fields: list[Any] = list(message.DESCRIPTOR.fields)
+            chosen = self.random.choice(fields)
+            message.ClearField(chosen.name)
+            self.fill(message, chosen, 0)
+        return self._honest(message)
+
+    def _message(self, message: Message) -> bytes:
+        self._filled(message, 0)
+        return self._honest(message)
+
+    def _honest(self, message: Any) -> bytes:
+        """Mostly one whose sender says who it is, so that more than its beginning is looked at."""
+        names = message.DESCRIPTOR.fields_by_name
+        if self.random.random() < 0.8:
+            for name, value in (("robot", "ground"), ("actor", "actor-0"), ("process", "actor-0")):
+                if name in names:
+                    setattr(message, name, value)
+            if "header" in names:
+                header = pb.Header(sequence=next(self._numbers), source="actor-0", time=1.0, wall_time=time.time_ns())
+                message.header.CopyFrom(header)
+        data: bytes = message.SerializeToString()
+        return data if len(data) < 4096 else b""
+
+    def _filled(self, message: Message, depth: int) -> None:
+        for one in message.DESCRIPTOR.fields:
+            if self.random.random() < 0.8:
+                self.fill(message, one, depth)
+
+    def fill(self, message: Any, one: Any, depth: int = 0) -> None:
+        """Draw one field of a message."""
+        random = self.random
+        kind = one.message_type
+        if kind is not None and kind.GetOptions().map_entry:
+            table = getattr(message, one.name)
+            for _ in range(random.randrange(3)):
+                table[self._text()] = self._value(kind.fields_by_name["value"])
+        elif kind is not None and one.is_repeated:
+            for _ in range(random.randrange(4) if depth < 2 else 0):
+                self._filled(getattr(message, one.name).add(), depth + 1)
+        elif kind is not None:
+            getattr(message, one.name).SetInParent()
+            self._filled(getattr(message, one.name), depth + 1)
+        elif one.is_repeated:
+            values = [self._value(one) for _ in range(3)]
+            size = random.choice((0, 1, 2, 3, 5, 5, 5, 9, 10, 20, 26, 70))
+            getattr(message, one.name).extend(random.choices(values, k=size))
+        else:
+            setattr(message, one.name, self._value(one))
+
+    def _value(self, one: Any) -> Any:
+        random, kind = self.random, one.cpp_type
+        if kind in (one.CPPTYPE_DOUBLE, one.CPPTYPE_FLOAT):
+            return random.gauss() if random.random() < 0.8 else random.choice(NUMBERS)
+        if kind == one.CPPTYPE_BOOL:
+            return random.random() < 0.5
+        if kind == one.CPPTYPE_ENUM:
+            return random.randrange(6)
+        if kind == one.CPPTYPE_STRING:
+            return self._text() if one.type == one.TYPE_STRING else random.randbytes(random.randrange(60))
+        low, high = LIMITS[kind]
+        value = random.choice(INTEGERS) if random.random() < 0.2 else random.randrange(100)
+        return value if low <= value <= high else 0
+
+    def _text(self) -> str:
+        random = self.random
+        if random.random() < 0.1:
+            return random.choice(STRANGE)
+        return random.choice(TEXTS) if random.random() < 0.7 else f"name-{random.randrange(3000)}"
+
+
+class Wire:
+    """A bus that goes nowhere: what is published is dropped, handlers are kept."""
+
+    run = 1
+
+    def __init__(self) -> None:
+        self.tolerance = Tolerance()
+        self.handlers: dict[str, Callable[[Sample], None]] = {}
+
+    def publisher(self, topic: Topic, **names: str) -> Any:
+        return SimpleNamespace(put=lambda message: message.SerializeToString(), count=0)
+
+    def subscribe(self, topic: Topic, handler: Callable[[Sample], None], **names: str) -> None:
+        self.handlers[topic.name] = handler
+
+    def serve(self, topic: Topic, handler: Callable[[bytes], bytes], **names: str) -> None: ...
+
+
+@dataclass
+class Party:
+    """A process: what it does with a sample, what it says of itself and shows, and what it passed over."""
+
+    topics: tuple[Topic, ...]
+    take: Callable[[Sample], None]
+    look: Callable[[], object]
+    tolerance: Tolerance = field(default_factory=Tolerance)
+    close: Callable[[], object] = lambda: None
+    names: frozenset[str] = frozenset()
+    messages: int = 0
+    crashes: Counter[str] = field(default_factory=Counter)
+
+    def __post_init__(self) -> None:
+        self.names = frozenset(topic.name for topic in self.topics)
+
+    def try_(self, work: Callable[[], object]) -> None:
+        try:
+            work()
+        except Exception as error:  # it would have ended the process
+            place = traceback.extract_tb(error.__traceback__)[-1]
+            self.crashes[f"{type(error).__name__} at {Path(place.filename).name}:{place.lineno}: {error}"[:200]] += 1
+
+
+def launcher(folder: Path) -> Party:
+    one = Launcher(RunConfig(), folder, BusSettings(listen=("tcp/127.0.0.1:1",)))
+
+    def take(sample: Sample) -> None:
+        one._inbox.append(sample)
+        one._drain()
+
+    return Party(RECORDED, take, lambda: (line(one.metrics.figures()), one.figures()), one._tolerance)
+
+
+def recorder(folder: Path) -> Party:
+    """Into a file that is begun anew all the time, so that the disk does not fill up."""
+    path, tolerance, inbox = folder / "fuzz.mcap", Tolerance(), Inbox()
+
+    def open_one(run: Path, metadata: Metadata) -> Segment:
+        path.unlink(missing_ok=True)
+        return Segment(path, path.open("wb", buffering=0), metadata)
+
+    derive = both(Pictures().of_sample, as_json)
+    recording = Recording(path, {}, inbox, open_one, derive, Rotation(mib=16.0), tolerance)
+
+    def take(sample: Sample) -> None:
+        inbox.put(sample)
+        if inbox.bytes > 2**16:
+            recording.save()
+
+    return Party(RECORDED, take, recording.save, tolerance, recording.finish)
+
+
+def watch() -> Party:
+    board, tolerance = Board(), Tolerance()
+
+    def take(sample: Sample) -> None:
+        _show(deque([sample]), board, None, tolerance)
+
+    return Party(RECORDED, take, lambda: encode(board.view()), tolerance)
+
+
+def learning(robot: Robot, folder: Path) -> Party:
+    """The learner's loop; it takes steps in and joins, and makes no updates."""
+    wire = Wire()
+    config = LearnerConfig(steps=10**9, capacity=1000)
+    learner = Learner(robot, config)
+    learner.join(pb.Join(robot=robot.name, actor="actor-0", layout=layout(robot)))
+    process: Any = SimpleNamespace(bus=wire, stop=Event(), figures={}, notes={})
+    loop = LearnerLoop(process, learner, LearnerSettings(BusSettings(), robot.name, folder, learner=config))
+
+    def take(sample: Sample) -> None:
+        if sample.topic is JOIN:
+            try:
+                join = pb.Join.FromString(sample.payload)
+            except DecodeError:
+                return
+            learner.join(join).SerializeToString()
+        else:
+            with wire.tolerance.over(sample.key):
+                wire.handlers[sample.topic.name](sample)
+            loop._take_steps()
+
+    topics = tuple(topic for topic in TOPICS if "learner" in topic.subscribers)
+
+    def look() -> None:
+        loop._say_flow()
+        loop._say_metrics()
+
+    return Party(topics, take, look, wire.tolerance)
+
+
+def actor(robot: Robot) -> Party:
+    wire: Any = Wire()
+    student = Student(wire, robot, "actor-0")
+
+    def take(sample: Sample) -> None:
+        with wire.tolerance.over(sample.key):
+            wire.handlers[sample.topic.name](sample)
+
+    return Party((WEIGHTS, FLOW), take, lambda: (student.welcome, student.done), wire.tolerance)
+
+
+def safety() -> Party:
+    """Questions and models; what is refused goes back to who asked."""
+    models, tolerance = Models(), Tolerance()
+    answer = answerer(models, Counts())
+
+    def take(sample: Sample) -> None:
+        try:
+            if sample.topic is DECIDE:
+                answer(sample.payload)
+            else:
+                with tolerance.over(sample.key):
+                    models.install(decode(sample.message().file))
+        except (BadRequest, BadModel):
+            return
+
+    return Party((DECIDE, MODEL), take, lambda: models.filters, tolerance)
+
+
+def asker(robot: Robot, mill: Mill) -> Party:
+    """Who asked, and gets an answer of whoever answers."""
+
+    def take(sample: Sample) -> None:
+        message = pb.Reply()
+        mill.fill(message, mill.random.choice(message.DESCRIPTOR.fields))
+        try:
+            read(message, robot)
+        except BusError:
+            return
+
+    return Party((DECIDE,), take, lambda: None)
+
+
+def parties(folder: Path, mill: Mill) -> dict[str, Party]:
+    robot = robot_named("ground")
+    return {
+        "launcher": launcher(folder),
+        "recorder": recorder(folder),
+        "watch": watch(),
+        "learner": learning(robot, folder),
+        "actor": actor(robot),
+        "safety": safety(),
+        "asker": asker(robot, mill),
+    }
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """A line about each message that is passed over would be most of the work."""
+    log = logging.getLogger("brakeline")
+    level = log.level
+    log.setLevel(logging.CRITICAL)
+    try:
+        yield
+    finally:
+        log.setLevel(level)
+
+
+def fuzz(messages: int, seed: int = 0) -> Figures:
+    """Draw so many messages, and hand each to all that listen to its topic; then read a log of the last ones."""
+    mill, begun = Mill(seed), time.monotonic()
+    with tempfile.TemporaryDirectory() as name, _quiet():
+        folder = Path(name)
+        everybody = parties(folder, mill)
+        settled, process = 0, psutil.Process()
+        for number in range(messages):
+            sample = mill.sample(mill.random.choice(TOPICS))
+            for party in everybody.values():
+                if sample.topic.name in party.names:
+                    party.messages += 1
+                    party.try_(partial(party.take, sample))
+            if number % LOOK == LOOK - 1 or number == messages - 1:
+                for party in everybody.values():
+                    party.try_(party.look)
+            if number == int(SETTLED * messages):
+                settled = process.memory_info().rss
+        grown = process.memory_info().rss - settled
+        for party in everybody.values():
+            party.try_(party.close)
+        everybody["analyse"] = reader(folder)
+    rows: Figures = {
+        name: {"messages": party.messages, "passed over": party.tolerance.count, "crashes": party.crashes.total()}
+        for name, party in everybody.items()
+    }
+    rows["all"] = {
+        "messages": messages,
+        "crashes": sum(party.crashes.total() for party in everybody.values()),
+        "RSS grown MiB": grown / 2**20,
+        "RSS settled MiB": settled / 2**20,
+        "seconds": time.monotonic() - begun,
+    }
+    for name, party in everybody.items():
+        for crash, count in party.crashes.items():
+            rows[f"{name}: {crash}"] = {"crashes": count}
+    return rows
+
+
+def reader(folder: Path) -> Party:
+    """What the recorder has left, as a report."""
+    party = Party(RECORDED, lambda sample: None, lambda: None)
+
+    def look() -> None:
+        log = Log((folder / "fuzz.mcap",))
+        analysis = Analysis("fuzz", log, Look(pictures=True), "")
+        render(analysis.figures(), {"fuzz": (analysis.figures(), analysis.pictures())})
+        party.messages = sum(segment.messages for segment in log.segments)
+        party.tolerance.count = log.malformed
+
+    party.try_(look)
+    return party
+
+
+def run() -> Figures:
+    return fuzz(MESSAGES)
