@@ -51,7 +51,8 @@ from messaging.robots import Robot, robot_named
 from messaging.tasks import layout
 from messaging.tolerant import Tolerance
 from messaging.topics import DECIDE, FLOW, JOIN, MODEL, RECORDED, TOPICS, WEIGHTS, Topic
-from safety.client import read
+from safety.client import read, request_message
+from safety.commitment import Commitment
 from safety.methods import decode
 from safety.model_set import BadModel
 from safety.request import BadRequest
@@ -325,12 +326,13 @@ def safety() -> Party:
 
 def asker(robot: Robot, mill: Mill) -> Party:
     """Who asked, and gets an answer of whoever answers."""
+    request = request_message(Commitment(robot), [0.0] * robot.state_dim, [0.0] * robot.action_dim, [])
 
     def take(sample: Sample) -> None:
-        message = pb.Reply()
+        message = pb.Reply(robot=robot.name)
         mill.fill(message, mill.random.choice(message.DESCRIPTOR.fields))
         try:
-            read(message, robot)
+            read(message, request, robot)
         except BusError:
             return
 
