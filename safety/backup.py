@@ -1,6 +1,7 @@
 """The backup policy μ that every robot has, and the plans that rest on it: brake as fast as the slew allows.
 
-    μ(u_before) = u_before − clip(u_before, −slew, slew)      (the ground robot has no slew: zero at once)
+    μ(u_before) = u_before − clip(u_before, −slew, slew)      (the ground robot has no slew: zero at once;
+                                                               what a stop holds is held)
 
 A plan here is only what to do when no answer comes; the rivals verify nothing.
 """
@@ -15,7 +16,7 @@ from messaging.robots import Array, Robot
 def brake(robot: Robot, before: Array) -> Array:
     """μ: the input (m,) that follows the input `before` (m,) while braking."""
     slew = np.asarray(robot.action_slew)
-    return np.asarray(before - np.clip(before, -slew, slew))
+    return np.where(robot.stopping, before - np.clip(before, -slew, slew), before)
 
 
 def within(robot: Robot, wanted: Array, before: Array) -> Array:

@@ -82,6 +82,32 @@ class GroundSenses:
         return np.concatenate((self._lidar.ranges(mount, true[2]) / self._lidar.max_range, own))
 
 
+class PlanarSenses:
+    """Of any robot with a heading: beams at its position; the goal by distance and bearing; all that is no pose, and
+    the last input, each as a share of the most there can be of it."""
+
+    DISTANCE_SCALE = 5.0  # m, the goal distance that is observed as 1
+
+    def __init__(self, robot: Robot, arena: Arena, rng: np.random.Generator, lidar_noise: float) -> None:
+        self._robot, self._goal = robot, arena.goal
+        self._lidar = Lidar(arena, task_of(robot).rays, lidar_noise, rng)
+        self._most = np.maximum(np.abs(robot.low()), robot.high())
+        full = robot.driving(self._most)[3:]
+        self._scales = np.where(full > 0.0, full, 1.0)
+
+    def speed(self, state: Array) -> float:
+        speeds = [i for i in self._robot.follows if i >= 0 and self._robot.state[i].endswith("[m/s]")]
+        return math.hypot(*state[speeds])
+
+    def observe(self, true: Array, measured: Array, input: Array, time: float = 0.0) -> Array:
+        x, y, heading = measured[:3]
+        bearing = math.atan2(self._goal[1] - y, self._goal[0] - x) - heading
+        goal = math.hypot(self._goal[0] - x, self._goal[1] - y) / self.DISTANCE_SCALE
+        own = (goal, math.sin(bearing), math.cos(bearing), *(measured[3:] / self._scales), *(input / self._most))
+        self._lidar.at(time)
+        return np.concatenate((self._lidar.ranges(true[:2], float(true[2])) / self._lidar.max_range, own))
+
+
 class AirSenses:
     """180 beams all round from a lidar that is kept level; the goal by its offset.
 

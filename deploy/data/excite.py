@@ -55,8 +55,9 @@ def excitation(robot: Robot, rng: np.random.Generator) -> Iterator[Array]:
         for _ in range(robot.free_steps):
             before = towards(robot, before, random_target(robot, rng))
             free.append(before)
-        yield from (schedule @ np.concatenate(free)).reshape(robot.horizon, -1)
-        before = np.zeros(robot.action_dim)
+        plan = (schedule @ np.concatenate(free)).reshape(robot.horizon, -1)
+        yield from plan
+        before = np.where(robot.stopping, 0.0, plan[-1])
         longest = LONG_STOP if rng.random() < LONG_STOPS else SHORT_STOP
         for _ in range(rng.integers(longest + 1)):
             yield before

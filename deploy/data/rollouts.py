@@ -167,5 +167,5 @@ def _braking(robot: Robot, before: Array) -> Iterator[Array]:
     standing = 0
     while standing < STAND:
         before = brake(robot, before)
-        standing += not before.any()
+        standing += bool(robot.rests(before))
         yield before

@@ -1,0 +1,178 @@
+"""A robot on the floor in MuJoCo, whatever moves it: what is left to say of one is how its inputs drive it."""
+
+from __future__ import annotations
+
+import math
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from messaging.robots import Robot
+from sim.estimator import NoiseLevels, cut_normal, wrap
+from sim.scene import Moving, add_movers, add_obstacles
+from sim.vehicle import BadInput, Period
+from sim.world import Arena
+
+Array = NDArray[np.float64]
+
+SAMPLES = 10  # of the position in a period
+SLIP = 0.003  # 1, sigma of the share of a way that odometry gets wrong, constant over an episode
+DRIFT = 0.002  # rad, sigma of the error of a period's change of heading
+STANDING = 0.02  # m/s; no faster, and at a stop's input, it stands
+
+
+class PlanarRobot:
+    """One robot in one arena, whose model (MJCF) has a body `base` with a free joint, and a floor as its first geom.
+
+    State: (x [m], y [m], heading [rad]) of the base's origin, then `speeds()`. A collision is any contact, at any
+    physics step, with anything but the floor. The model's geoms answer to contact bit 1 (floor) and 2 (obstacles) and
+    offer none themselves. Measurements are off by a normal error cut off at the bounds of the description.
+    """
+
+    def __init__(
+        self, robot: Robot, model: str, height: float, arena: Arena, rng: np.random.Generator, noise: NoiseLevels
+    ) -> None:
+        """model: MJCF; height [m]: of the base's origin above the floor; noise: its `scale` counts."""
+        self.robot, self.arena = robot, arena
+        self.model = _build(model, height, arena)
+        self.data = mujoco.MjData(self.model)
+        self._moving = Moving(self.model, self.data, arena.crowd)
+        self._time = -robot.period  # s; the episode's first is 0
+        self._meeting = False  # something that moves is touched now
+        self._contacts = [False, False]  # in this period one began while moving, while standing
+        self._steps = round(robot.period / SAMPLES / self.model.opt.timestep)
+        self._bound = np.asarray(robot.measurement_bound)
+        self._rng, self._noise = rng, noise.scale
+        self._scale = 1.0 + float(cut_normal(rng, self._noise * SLIP, ()))
+        self.input = np.zeros(robot.action_dim)
+        mujoco.mj_forward(self.model, self.data)
+        self._run()  # sink onto the wheels
+        self.true = self._state()
+        self.measured = self._measure()
+
+    # --- of each robot ------------------------------------------------------------------------------------------
+
+    def drive(self) -> None:
+        """Set the actuators for one physics step of `self.input`."""
+        raise NotImplementedError
+
+    def speeds(self) -> Array:
+        """The state's coordinates after the pose, as they are."""
+        raise NotImplementedError
+
+    # --- of all of them (`sim.vehicle.Vehicle`) -----------------------------------------------------------------
+
+    def step(self, input: Array) -> Period:
+        """Carry out an input for one period.
+
+        Raises:
+            BadInput: when it is not as many finite numbers as the robot has inputs.
+        """
+        robot, input = self.robot, np.asarray(input, dtype=np.float64)
+        if input.shape != (robot.action_dim,) or not np.isfinite(input).all():
+            raise BadInput(f"an input is {robot.action_dim} finite numbers, not {input!r}")
+        slew = np.asarray(robot.action_slew)
+        self.input = np.clip(np.clip(input, robot.low(), robot.high()), self.input - slew, self.input + slew)
+        before = self.true
+        positions, collision = self._run()
+        self.true = self._state()
+        self.measured = self._measure()
+        distances = self._clearance(positions)
+        path = self._scale * _turned(positions - before[:2], -float(before[2]))
+        turned = wrap(float(self.true[2] - before[2])) + float(cut_normal(self._rng, self._noise * DRIFT, ()))
+        return Period(
+            self.measured,
+            self.true,
+            collision,
+            float(distances.min()),
+            float(distances[-1]),
+            path,
+            turned,
+            *self._contacts,
+        )
+
+    def standing(self) -> Period:
+        """The present state as a period in which nothing happened: what there is to say before the first step."""
+        clearance = float(self._clearance(self.true[:2]))
+        return Period(self.measured, self.true, False, clearance, clearance, np.zeros((SAMPLES, 2)), 0.0)
+
+    def alter(self, **changes: float) -> None:
+        """Raises ValueError: there is nothing to change, unless a robot says so."""
+        if changes:
+            raise ValueError(f"a {self.robot.kind} has no {', '.join(sorted(changes))}")
+
+    def body_velocity(self) -> Array:
+        """Velocity of the base's origin in its own frame, (2,) m/s."""
+        return _turned(self.data.qvel[:2], -self.heading())
+
+    def heading(self) -> float:
+        """rad"""
+        w, x, y, z = self.data.qpos[3:7].tolist()
+        return math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+
+    def _run(self) -> tuple[Array, bool]:
+        """One period of physics: positions (S, 2) at the samples; any collision."""
+        model, data = self.model, self.data
+        positions = np.empty((SAMPLES, 2))
+        collision, self._contacts = False, [False, False]
+        rests = bool(self.robot.rests(self.input))
+        for i in range(SAMPLES):
+            for _ in range(self._steps):
+                moving = not rests or math.hypot(*data.qvel[:2].tolist()) > STANDING
+                if self._moving:
+                    self._time += model.opt.timestep
+                    self._moving.place(self._time)
+                self.drive()
+                # step2 before step1: contacts are then those of the position just reached
+                mujoco.mj_step2(model, data)
+                mujoco.mj_step1(model, data)
+                collision = self._touches(moving) or collision
+            positions[i] = data.qpos[:2]
+        return positions, collision
+
+    def _touches(self, moving: bool) -> bool:
+        """Whether any contact now is with an obstacle that stands; what moves is noted apart.
+
+        A plane is the lowest type of geom, and a contact names the geom of lower type first.
+        """
+        first = self.data.contact.geom[:, 0]
+        if not self._moving:
+            return bool(np.count_nonzero(first))
+        movers = self._moving.touched()
+        if movers.any() and not self._meeting:
+            self._contacts[0 if moving else 1] = True
+        self._meeting = bool(movers.any())
+        return bool((first * ~movers).any())
+
+    def _state(self) -> Array:
+        return np.array([*self.data.qpos[:2], self.heading(), *self.speeds()])
+
+    def _measure(self) -> Array:
+        """The true state, each coordinate off by half its bound (sigma; cut off at the bound)."""
+        measured = self.true + cut_normal(self._rng, 0.5 * self._noise, self._bound.shape) * self._bound
+        measured[2] = wrap(float(measured[2]))
+        return np.asarray(measured)
+
+    def _clearance(self, positions: Array) -> Array:
+        """From the footprint's disc at positions (..., 2) to the nearest obstacle, m."""
+        return np.asarray(self.arena.shapes.distance(positions).min(axis=0) - self.robot.footprint)
+
+
+def _turned(vectors: Array, angle: float) -> Array:
+    """Vectors (..., 2) turned by an angle, rad."""
+    cos, sin = math.cos(angle), math.sin(angle)
+    x, y = vectors[..., 0], vectors[..., 1]
+    return np.stack([cos * x - sin * y, sin * x + cos * y], axis=-1)
+
+
+def _build(model: str, height: float, arena: Arena) -> mujoco.MjModel:
+    """Compile robot and arena, the robot standing at the start."""
+    spec = mujoco.MjSpec.from_string(model)
+    add_obstacles(spec, arena)
+    add_movers(spec, arena.crowd)
+    base = spec.body("base")
+    x, y, heading = arena.start
+    base.pos = (x, y, height)
+    base.quat = (math.cos(0.5 * heading), 0.0, 0.0, math.sin(0.5 * heading))
+    return spec.compile()
