@@ -87,7 +87,7 @@ class LearnerLoop:
         self._wake = Event()
         self._said: object = None  # the content of the last flow
         self._flow_at = self._metrics_at = self._retry_at = -1e9
-        bus, robot = process.bus, settings.robot
+        bus, robot = process.bus, robot_named(settings.robot).name
         self._weights, self._flow = bus.publisher(WEIGHTS, robot=robot), bus.publisher(FLOW, robot=robot)
         self._metrics = bus.publisher(LEARNER, robot=robot)
         self._weights.put(learner.weights())

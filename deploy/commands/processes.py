@@ -57,7 +57,7 @@ class LearnerProcess:
         from learner.service import LearnerSettings, main
 
         config = replace(self.learner, seed=self.seed, steps=self.steps)
-        main(LearnerSettings(self.endpoints.bus(), self.robot, self.out, self.resume, self.name, config))
+        main(LearnerSettings(self.endpoints.bus(), learnt(self.robot).name, self.out, self.resume, self.name, config))
         return 0
 
 

@@ -19,7 +19,7 @@ from rich.console import Console
 from deploy.data import collect
 from deploy.data import pretrain as rivals
 from deploy.progress import each, under_way
-from messaging.robots import Robot
+from messaging.robots import Robot, known
 from messaging.tasks import task_of
 from safety.dataset import BadData, Dataset, Trajectory
 from safety.fitting import make
@@ -119,8 +119,15 @@ def about(seconds: float) -> str:
 
 def data_for(robot: Robot) -> Dataset:
     """The data set in use of a robot, recorded first if it is not there: one record serves, whether questions are late
-    or not."""
-    return replace(recorded(robot.in_lockstep()), robot=robot)
+    or not.
+
+    Raises:
+        BadData: it was recorded of a robot that differs in more than its body, limits and sight.
+    """
+    data, now = recorded(robot.in_lockstep()), known(robot.in_lockstep())
+    if replace(data.robot, body=now.body, limits=now.limits, sight=now.sight) != now:
+        raise BadData(f"{record_path(now)} was recorded before the description of {now.name} changed")
+    return replace(data, robot=robot)
 
 
 def certified(data: Dataset, recipe: Recipe) -> tuple[ModelSet, Statement]:
@@ -142,7 +149,11 @@ def model_for(robot: Robot, recipe: Recipe) -> ModelSet:
     path = model_path(robot, recipe)
     if path.exists():
         try:
-            return ModelSet.load(path)
+            model = ModelSet.load(path)
+            if model.robot == robot:
+                return model
+            known(robot)  # and not what the file says of it
+            console.print(f"[yellow]making the model set again:[/] the description of {robot.name} has changed")
         except BadModel as error:
             console.print(f"[yellow]making the model set again:[/] {error}")
     try:

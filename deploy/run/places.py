@@ -35,16 +35,15 @@ def places(config: RunConfig) -> list[Place]:
     if config.autopilot is not None:
         table.append(Place("autopilot", "autopilot"))
     one = len(config.robots) == 1
-    for robot in config.robots:
-        kind = robot_named(robot).name
+    for kind in (robot_named(robot).name for robot in config.robots):
         if not config.policy:
-            table.append(Place("learner" if one else f"learner-{kind}", "learner", robot, nice=10))
+            table.append(Place("learner" if one else f"learner-{kind}", "learner", kind, nice=10))
         if config.from_logs:
-            table.append(Place("feeder" if one else f"feeder-{kind}", "feeder", robot, nice=2))
+            table.append(Place("feeder" if one else f"feeder-{kind}", "feeder", kind, nice=2))
         for i in range(config.actors):
             name = f"actor-{i}" if one else f"actor-{kind}-{i}"
             nice = 0 if config.flight is not None else 2
-            table.append(Place(name, "actor", robot, i * config.robots_per_actor, nice))
+            table.append(Place(name, "actor", kind, i * config.robots_per_actor, nice))
     return table
 
 

@@ -1,0 +1,215 @@
+"""Robots that are nothing but files beside a simulator: what `docs/your_robot.md` says of them."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+
+from actors.driver import Driver, Identity
+from deploy.data import collect, store
+from deploy.data.store import certified
+from deploy.policies import policy_named
+from deploy.run.configurations import RunConfig
+from deploy.run.places import places
+from deploy.study.evaluate import FRESH, episode, in_process
+from deploy.vehicles import environment
+from messaging.robots import Robot, known
+from messaging.shapes import BOX, Obstacle
+from messaging.tasks import address, learnt, task_of
+from safety.backup import braking_plan
+from safety.dataset import BadData, Dataset
+from safety.model_set import ModelSet, Recipe
+from sim.conditions import Conditions
+from sim.estimator import NoiseLevels
+from sim.policies import scripted
+from sim.vehicle import Vehicle
+from sim.world import staged_arena
+
+EXAMPLES = Path(__file__).parents[2] / "examples"
+NAMES = ("car", "omni")
+TRAJECTORIES = 24  # a few seconds of recording each; enough for windows in both parts
+
+
+def robot(name: str) -> Robot:
+    return learnt(str(EXAMPLES / name / f"{name}.toml"))
+
+
+@pytest.fixture(scope="module", params=NAMES)
+def kind(request: pytest.FixtureRequest) -> Robot:
+    return robot(request.param)
+
+
+@pytest.fixture(scope="module")
+def recorded(kind: Robot) -> Dataset:
+    return collect.dataset(kind, list(collect.record(kind, TRAJECTORIES, 1, Conditions())), 1, Conditions())
+
+
+@pytest.fixture(scope="module")
+def model(recorded: Dataset) -> ModelSet:
+    return certified(recorded, Recipe())[0]
+
+
+def exact(name: str) -> Vehicle:
+    """Its vehicle, heading east, far from everything, without measurement errors."""
+    made = task_of(robot(name)).code(task_of(robot(name)).simulator)(Conditions(NoiseLevels(scale=0.0)), None)
+    return made(staged_arena(), np.random.default_rng(0))
+
+
+def drive(vehicle: Vehicle, *inputs: list[float]) -> np.ndarray:
+    for wanted in inputs:
+        vehicle.step(np.array(wanted))
+    return vehicle.true
+
+
+def test_a_task_observes_what_its_file_names(kind: Robot) -> None:
+    env = environment(kind, "default", 0)
+    observation, info = env.reset(seed=0)
+    assert observation.shape == (task_of(kind).observation_dim,) == env.observation_space.shape
+    assert np.allclose(
+        observation[task_of(kind).rays.directions.shape[0] + 1 :][:2].sum(), sum(_to_goal(info)), atol=0.1
+    )
+    assert info["speed"] == pytest.approx(0.0, abs=0.01)
+
+
+def _to_goal(info: dict) -> tuple[float, float]:
+    x, y, heading = info["true_state"][:3]
+    angle = math.atan2(info["goal"][1] - y, info["goal"][0] - x) - heading
+    return math.sin(angle), math.cos(angle)
+
+
+def test_the_car_drives_round_the_circle_of_its_steering() -> None:
+    """Ackermann: the rear axle's middle turns about a point wheelbase / tan(steering) aside."""
+    car = exact("car")
+    drive(car, [0.0, 0.3], [0.0, 0.5], [0.0, 0.5], [0.4, 0.5], [0.4, 0.5])
+    before = car.true.copy()
+    after = drive(car, *[[0.4, 0.5]] * 5)
+    turned, way = after[2] - before[2], 0.4 * 5 * 0.2
+    assert turned == pytest.approx(way * math.tan(0.5) / 0.26, rel=0.03)
+    backwards = drive(exact("car"), *[[-0.4, 0.3]] * 5)
+    assert backwards[0] < -0.25 and backwards[2] < -0.1  # steered left, it turns right when it backs
+
+
+def test_the_car_keeps_its_steering_while_it_brakes() -> None:
+    car = robot("car")
+    assert (braking_plan(car, np.array([0.4, 0.5]))[1:] == [0.0, 0.5]).all()
+    vehicle = exact("car")
+    drive(vehicle, [0.4, 0.3], [0.4, 0.5], [0.4, 0.5], [0.0, 0.5], [0.0, 0.5], [0.0, 0.5])
+    assert vehicle.true[3] == pytest.approx(0.0, abs=0.005) and vehicle.true[4] == pytest.approx(0.5, abs=0.01)
+
+
+def test_the_base_goes_aside_while_it_turns() -> None:
+    omni = exact("omni")
+    after = drive(omni, *[[0.0, 0.4, 0.8]] * 6)
+    assert after[3:] == pytest.approx([0.0, 0.4, 0.8], abs=0.03)
+    stopped = drive(omni, *[[0.0, 0.0, 0.0]] * 4)
+    assert np.abs(stopped[3:]).max() < 0.002
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_every_geom_lies_in_the_discs_of_the_description(name: str) -> None:
+    """Corner by corner, as MuJoCo has placed them, with the car's wheels turned to the stop."""
+    vehicle, body = exact(name), robot(name).body
+    if name == "car":
+        drive(vehicle, [0.0, 0.3], [0.0, 0.5], [0.0, 0.5])
+    model, data = vehicle.model, vehicle.data
+    frame = data.body("base")
+    turn = frame.xmat.reshape(3, 3)
+    for i in range(model.ngeom):
+        if model.geom_conaffinity[i] & 2:
+            points = (_surface(model, i) @ data.geom_xmat[i].reshape(3, 3).T + data.geom_xpos[i] - frame.xpos) @ turn
+            reach = [np.linalg.norm(points[:, :2] - np.array(disc.at), axis=1) - disc.radius for disc in body]
+            assert np.min(reach, axis=0).max() <= 0.0, model.geom(i).name
+
+
+def _surface(model: mujoco.MjModel, i: int) -> np.ndarray:
+    """Points on a geom, in its frame."""
+    size, kind = model.geom_size[i], model.geom_type[i]
+    around = np.linspace(0.0, 2.0 * np.pi, 60)
+    if kind == mujoco.mjtGeom.mjGEOM_BOX:
+        return np.array(np.meshgrid(*([-s, s] for s in size))).reshape(3, -1).T
+    if kind == mujoco.mjtGeom.mjGEOM_CYLINDER:
+        return np.column_stack([size[0] * np.cos(around), size[0] * np.sin(around), np.zeros(60)])
+    assert kind == mujoco.mjtGeom.mjGEOM_ELLIPSOID
+    a, b = (grid.ravel() for grid in np.meshgrid(around, 0.5 * around))
+    return size * np.column_stack([np.cos(a) * np.sin(b), np.sin(a) * np.sin(b), np.cos(b)])
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_driving_into_something_is_a_collision(name: str) -> None:
+    """The physics' own contacts judge: the robot stops at a box in its way, with its nose there."""
+    made = task_of(robot(name)).code(task_of(robot(name)).simulator)(Conditions(NoiseLevels(scale=0.0)), None)
+    vehicle = made(staged_arena(Obstacle(BOX, (0.6, 0.0), (0.2, 1.0))), np.random.default_rng(0))
+    ahead = np.zeros(robot(name).action_dim)
+    ahead[0] = 0.4
+    periods = [vehicle.step(ahead) for _ in range(12)]
+    touched = [period.collision for period in periods]
+    assert any(touched) and not touched[0]
+    assert 0.5 - vehicle.true[0] < 0.2
+
+
+def test_recorded_inputs_keep_the_steering_at_a_stop() -> None:
+    car = robot("car")
+    (part,) = collect.record(car, 1, 3, Conditions())
+    stands = car.rests(part.inputs)
+    assert stands.any() and (np.abs(np.diff(part.inputs[:, 1])) <= 0.3 + 1e-9).all()
+    assert np.abs(part.inputs[stands, 1]).max() > 0.05
+
+
+def test_what_was_not_fitted_keeps_to_the_tubes(recorded: Dataset) -> None:
+    """The share of held-out plans that leave their tubes is what the statement says it can be; narrower tubes fail."""
+    model, statement = certified(recorded, Recipe())
+    assert statement.windows > 50 and statement.violations <= 0.05 * statement.windows
+    assert statement.bound_plan < 0.2
+    assert model.robot == recorded.robot
+
+
+def test_nothing_is_touched_in_adversarial_episodes(kind: Robot, model: ModelSet) -> None:
+    """Behind the filter; the same drive without it does collide."""
+    assert _collisions(kind, in_process(model)) == (0, 0)
+    assert _collisions(kind, None)[0] > 0
+
+
+def _collisions(kind: Robot, question: object) -> tuple[int, int]:
+    """Collisions and steps outside of the predicted sets, in some periods of two adversarial episodes."""
+    env = environment(kind, "default", FRESH)
+    driver = Driver(kind, env, Identity("test", 0, 0), filtered=question is not None)
+    policy = scripted("adversary", kind, np.random.default_rng(0))
+    touched = left = 0
+    for number in range(2):
+        for count, step in enumerate(episode(driver, policy, question, number)):
+            touched, left = touched + step.collision, left + (step.compared and not step.contained)
+            if count == 50:
+                break
+    return touched, left
+
+
+def test_a_description_that_changed_makes_the_model_set_again(
+    kind: Robot, recorded: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A model set of a narrower body is never used for a wider one; the recording is, and not for another clock."""
+    monkeypatch.setenv("BRAKELINE_DATA", str(tmp_path))
+    recorded.save(store.record_path(kind))
+    before = store.model_for(kind, Recipe())
+    assert store.model_for(kind, Recipe()).version == before.version
+    wider = replace(kind, body=tuple(replace(disc, radius=disc.radius + 0.05) for disc in kind.body))
+    assert store.model_for(wider, Recipe()).robot.body == wider.body
+    with pytest.raises(BadData, match="changed"):
+        store.data_for(replace(kind, period=0.1))
+    known(kind)
+
+
+def test_a_run_names_its_processes_by_the_robot_and_not_by_its_path() -> None:
+    config = RunConfig(robots=(address(str(EXAMPLES / "car" / "car.toml")),))
+    assert {place.robot for place in places(config) if place.robot} == {"car"}
+
+
+def test_the_trained_policy_lies_beside_the_task() -> None:
+    policy = policy_named("trained", robot("omni"), 0)
+    env = environment(robot("omni"), "default", FRESH)
+    observation, info = env.reset(seed=0)
+    assert policy(observation, info).shape == (3,)
