@@ -34,9 +34,9 @@ class Bag:
 
     def __init__(self, folder: Path) -> None:
         self.folder, self.count = folder, 0
-        self._writer = Writer(folder, version=9, storage_plugin=StoragePlugin.MCAP)
-        self._writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
         try:
+            self._writer = Writer(folder, version=9, storage_plugin=StoragePlugin.MCAP)
+            self._writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
             self._writer.open()
         except WriterError as error:
             raise FileExistsError(str(error)) from error
@@ -51,7 +51,10 @@ class Bag:
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None) -> None:
         with self._lock:
             self._failed = True  # nothing comes after the end
-            self._writer.close()
+            try:
+                self._writer.close()
+            except OSError as failure:
+                log.error("%s has no end: %s", self.folder, failure)
 
     def __call__(self, topic: str, kind: type, payload: bytes, at: int, qos: ros2.Qos) -> None:
         """One message. A disk that is full ends the recording, and is said once; the robot drives on."""

@@ -133,8 +133,8 @@ class Gate:
         return self.input
 
     def _stuck(self, outcome: Outcome) -> bool:
-        """Was there an answer, and is it to brake?"""
-        return outcome.answer is not None and outcome.answer.message.kind == pb.FAILSAFE
+        """Was there an answer, and was nothing verified?"""
+        return outcome.answer is not None and outcome.answer.message.kind not in (pb.ALLOWED, pb.ADJUSTED)
 
     def _nearer(self, outcome: Outcome, state: Array, obstacles: Sequence[Obstacle]) -> bool:
         """Does the answer's plan end nearer to what stands around than the robot is now?"""
