@@ -13,9 +13,9 @@ from messaging.robots import Robot
 MOST_TUBES = 40  # of a picture
 NEAR = 8  # steps before and after the closest approach whose tubes are drawn
 
-# Of decisions, one for each step: none, a(l)lowed, a(d)justed, f(a)ilsafe.
+# Of decisions, one for each step: none, a(l)lowed, a(d)justed, f(a)ilsafe, r(e)covering.
 LETTERS: dict[int, str] = {int(pb.UNKNOWN): "n", **{kind: name[1] for kind, name in KINDS.items()}}
-STEPPED_IN = (pb.ADJUSTED, pb.FAILSAFE)
+STEPPED_IN = (pb.ADJUSTED, pb.FAILSAFE, pb.RECOVERING)
 
 
 class Seen(Protocol):

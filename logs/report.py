@@ -103,6 +103,8 @@ def _summary(figures: Figures) -> Table:
     containment = figures["containment"]
     outside = _share(containment["violations"], containment["steps"], within.get("violations"), digits=3)
     table.add_row("outside the predicted set", outside)
+    if figures["recovering"]:
+        table.add_row("recovering", _share(figures["recovering"], steps))
     if figures["broken"]:
         table.add_row("obstacles outside their bounds", str(figures["broken"]))
     table.add_row("outside the measurement's bound", _share(figures["outside"], steps))
@@ -153,7 +155,7 @@ def _runs(runs: dict[str, Figures]) -> Table:
 
 def _decisions(times: Figures) -> Table:
     table = Stacking("decision [ms]", "mean", "std", "p50", "p99", **PLAIN)
-    for kind in ("all", "allowed", "adjusted", "failsafe"):
+    for kind in ("all", "allowed", "adjusted", "failsafe", "recovering"):
         row = times if kind == "all" else times[kind]
         if row is not None:
             table.add_row(kind, *(f"{row[name]:.3f}" for name in ("mean", "std", "p50", "p99")))

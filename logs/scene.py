@@ -50,8 +50,9 @@ KINDS: dict[int, tuple[int, int, int]] = {
     pb.ALLOWED: (52, 168, 100),
     pb.ADJUSTED: (240, 150, 30),
     pb.FAILSAFE: (214, 48, 60),
+    pb.RECOVERING: (142, 68, 173),
 }
-WORDS = {pb.ADJUSTED: "adjusted", pb.FAILSAFE: "failsafe"}
+WORDS = {pb.ADJUSTED: "adjusted", pb.FAILSAFE: "failsafe", pb.RECOVERING: "recovering"}
 
 
 def body_frame(actor: str) -> str:

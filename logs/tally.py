@@ -20,8 +20,14 @@ from messaging import brakeline_pb2 as pb
 
 Figures = dict[str, Any]  # what JSON can hold
 
-KINDS: dict[int, str] = {pb.ALLOWED: "allowed", pb.ADJUSTED: "adjusted", pb.FAILSAFE: "failsafe"}
+KINDS: dict[int, str] = {
+    pb.ALLOWED: "allowed",
+    pb.ADJUSTED: "adjusted",
+    pb.FAILSAFE: "failsafe",
+    pb.RECOVERING: "recovering",
+}
 _UNKNOWN, _ADJUSTED, _FAILSAFE = int(pb.UNKNOWN), int(pb.ADJUSTED), int(pb.FAILSAFE)
+_RECOVERING = int(pb.RECOVERING)
 
 
 @dataclass
@@ -38,6 +44,7 @@ class Tally:
     timeouts: int = 0
     interventions: int = 0  # steps whose action was not the proposed one
     failsafes: int = 0  # of these, steps along the committed plan
+    recovering: int = 0  # of these, steps out of where nothing could be verified
     fallbacks: int = 0  # of these, because no decision came
     outside: int = 0  # steps whose true state was outside the stated bound of the measurement
     compared: int = 0  # steps whose measured state was compared with the predicted set
@@ -83,6 +90,9 @@ class Tally:
             self.failsafes += 1
             self.interventions += 1
         elif kind == _ADJUSTED:
+            self.interventions += 1
+        elif kind == _RECOVERING:
+            self.recovering += 1
             self.interventions += 1
         if propose_ms := step.propose_ms:
             self.propose_ms.add(propose_ms)
@@ -134,6 +144,7 @@ def closed_loop(tallies: Iterable[Tally]) -> Figures:
         "steps": steps,
         "interventions": total("interventions"),
         "failsafes": total("failsafes"),
+        "recovering": total("recovering"),
         "fallbacks": total("fallbacks"),
         "mean_speed": math.fsum(tally.speed for tally in tallies) / steps if steps else None,
         "max_speed": max(tally.max_speed for tally in tallies) if steps else None,

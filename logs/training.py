@@ -91,7 +91,7 @@ class Training:
             episode = self._running[actor] = Episode()
         episode.reward += step.reward
         episode.steps += 1
-        episode.interventions += step.fallback or kind in (_ADJUSTED, _FAILSAFE)
+        episode.interventions += step.fallback or kind in (_ADJUSTED, _FAILSAFE, int(pb.RECOVERING))
         episode.collision = episode.collision or step.collision
         if step.terminated or step.truncated:
             episode.goal = step.goal

@@ -30,7 +30,7 @@ from safety.digest import digest
 
 Array = NDArray[np.float64]
 
-KINDS = {pb.ALLOWED: "allowed", pb.ADJUSTED: "adjusted", pb.FAILSAFE: "failsafe"}
+KINDS = {pb.ALLOWED: "allowed", pb.ADJUSTED: "adjusted", pb.FAILSAFE: "failsafe", pb.RECOVERING: "recovering"}
 DEADLINE = 0.1  # s
 NONCE = 16  # bytes
 SAME_INPUT = 1e-9  # rounding allowed where inputs are compared

@@ -18,12 +18,13 @@ from messaging.robots import Robot
 from messaging.scans import Scan
 from messaging.shapes import Shapes
 from safety import scan as seen
-from safety.commitment import Prediction
+from safety.commitment import UNVERIFIED, Prediction
 from safety.freespace import half_spaces
 from safety.limits import Limits, stacked
 from safety.model_set import ModelSet, needed
 from safety.program import SHARPEN, Builder, Layout, Rows
-from safety.request import ADJUSTED, ALLOWED, FAILSAFE, Decision, Request, check_for_filter
+from safety.recovery import SLOW, least_violating, slow_inputs, turn_towards
+from safety.request import ADJUSTED, ALLOWED, FAILSAFE, RECOVERING, Decision, Request, check_for_filter
 from safety.solver import INFEASIBLE, solve
 from safety.sweep import swept_half_spaces
 from safety.tube import Tube
@@ -207,6 +208,8 @@ class Filter:
             attempt.reason = "the state is outside the domain that was recorded"
         if found is None:
             found = self._committed(request, scene, z_0, attempt, in_domain)
+            if in_domain and not attempt.broken:
+                found = self._recovered(request, scene, z_0) or found
         return self._decision(request, scene, found, attempt)
 
     def _search(self, scene: _Scene, z_0: Array, proposal: Array, attempt: _Attempt) -> _Found | None:
@@ -328,6 +331,43 @@ class Filter:
             if in_domain and margin >= 0.0:
                 return _Found(FAILSAFE, self._plan(z), z, margin, True)
         return _Found(FAILSAFE, self._plan(brake), brake, margin, False)
+
+    def _recovered(self, request: Request, scene: _Scene, z_0: Array) -> _Found | None:
+        """A slow way out, if it stands (or is on such a way) where not even standing can be verified: by more than
+        the errors of two measurements could make it seem so."""
+        robot, m = self.robot, self.robot.action_dim
+        slow = np.where(robot.translates, SLOW + 0.05, 1.0) * np.maximum(self.high, -self.low)
+        going = request.input_in_force
+        on_a_way = request.model == UNVERIFIED and bool(going.any() and (np.abs(going) <= slow).all())
+        if not (request.still(robot) or on_a_way):
+            return None
+        before = z_0[-m:]
+        stand = self._regressors(z_0, self._stop(request.state, before))
+        parked = replace(scene, moving=None)  # what moves may stand by: that is its affair
+        seeming = 0.0 if on_a_way else 2.0 * float(np.linalg.norm(self.measured)) + self.comfort
+        if self._margin(self._rows(parked, stand), stand) >= -seeming:
+            return None
+        rows = self._rows(scene, stand)
+        standing = rows.support(self.tube, stand) - rows.bound
+        inputs = np.array([self._limited(wanted, before) for wanted in slow_inputs(robot)])
+        plans = [self._regressors(z_0, action) for action in inputs]
+        violated = np.array([rows.support(self.tube, z) - rows.bound for z in plans])
+        ends = np.zeros(len(rows.bound), dtype=bool)
+        obstacles = len(scene.near) + (len(scene.moving) if scene.moving is not None else 0)
+        obstacles += len(scene.unseen) if scene.unseen is not None else 0
+        each = 2 * robot.horizon + 1
+        ends[each - 1 : len(self.discs) * obstacles * each : each] = True
+        known = np.isfinite(rows.bound)
+        best = least_violating(violated[:, known], standing[known], ends[known], self.comfort)
+        if best is not None:
+            z = plans[best]
+        elif robot.heading is not None and len(scene.near):
+            ways = scene.near.towards(scene.start)
+            away = -ways[np.argmin(np.einsum("nd,nd->n", ways, ways))]
+            z = self._regressors(z_0, self._limited(turn_towards(robot, scene.heading, away), before))
+        else:
+            return None
+        return _Found(RECOVERING, self._plan(z), z, self._margin(rows, z), False)
 
     def _decision(self, request: Request, scene: _Scene, found: _Found, attempt: _Attempt) -> Decision:
         z = found.z

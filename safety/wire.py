@@ -16,9 +16,9 @@ from messaging.robots import Robot
 from messaging.scans import BadScan, Scan
 from messaging.shapes import BadShape, Obstacle
 from safety.commitment import Prediction
-from safety.request import ADJUSTED, ALLOWED, FAILSAFE, BadRequest, Decision, Request
+from safety.request import ADJUSTED, ALLOWED, FAILSAFE, RECOVERING, BadRequest, Decision, Request
 
-KINDS = {ALLOWED: pb.ALLOWED, ADJUSTED: pb.ADJUSTED, FAILSAFE: pb.FAILSAFE}
+KINDS = {ALLOWED: pb.ALLOWED, ADJUSTED: pb.ADJUSTED, FAILSAFE: pb.FAILSAFE, RECOVERING: pb.RECOVERING}
 # What a batch may cost, known before it is worked on: its bytes to decode, its requests and obstacles to decide on.
 LARGEST = 2**18  # bytes of a request batch
 MOST_REQUESTS = 64

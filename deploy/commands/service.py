@@ -58,7 +58,7 @@ class Query:
             message = SafetyClient(bus, robot.name, self.timeout).decide(state, action, near).message
         d = robot.position_dim
         figures: dict[str, Any] = {
-            "decision": {1: "allowed", 2: "adjusted", 3: "failsafe"}[message.kind],
+            "decision": {1: "allowed", 2: "adjusted", 3: "failsafe", 4: "recovering"}[message.kind],
             "plan": _rows(message.plan, robot.action_dim),
             "tube": {"center": _rows(message.tube_center, d), "half_width": _rows(message.tube_half_width, d)},
             "margin": message.margin,

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from actors.driver import Driver
 from actors.guard import Ask, consult
+from logs.tally import KINDS as DECISIONS
 from messaging import brakeline_pb2 as pb
 from messaging.robots import Robot
 from messaging.shapes import BOX, WALL, Obstacle
@@ -27,8 +28,9 @@ from sim.policies import Policy
 
 Array = NDArray[np.float64]
 
-KINDS = {pb.UNKNOWN: "no filter", pb.ALLOWED: "allowed", pb.ADJUSTED: "adjusted", pb.FAILSAFE: "failsafe"}
+KINDS = {pb.UNKNOWN: "no filter", **DECISIONS}
 COLOURS = {"no filter": "#444444", "allowed": "#0072b2", "adjusted": "#e69f00", "failsafe": "#d55e00"}
+COLOURS["recovering"] = "#8e44ad"
 FORMATS = (".png", ".gif", ".mp4")
 SPEED = 3.0  # times as fast as the robot
 REST = 8  # frames that the last picture stands

@@ -18,6 +18,7 @@ import numpy as np
 from deploy.data.store import data_root
 from logs.container import attachment
 from logs.reader import Log, Paths, open_log
+from logs.tally import KINDS
 from messaging import brakeline_pb2 as pb
 from messaging.robots import robot_named
 from safety.commitment import UNVERIFIED
@@ -27,7 +28,7 @@ from safety.service import Counts, Models, answerer
 TIMES = ("time_ms", "solve_ms", "verify_ms", "queue_ms")
 WORDS = ("vouchers", "unvouched")  # what a service says to itself, with a key that no log holds
 EXAMPLES = 20  # decisions that are told in full: those with the largest differences
-NAMES = {pb.ALLOWED: "allowed", pb.ADJUSTED: "adjusted", pb.FAILSAFE: "failsafe", pb.UNKNOWN: "error"}
+NAMES = {pb.UNKNOWN: "error", **KINDS}
 
 Instead = Callable[[str], Method]  # by the robot's name: what is asked in place of what was in use
 

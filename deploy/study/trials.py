@@ -90,7 +90,7 @@ class Episodes:
         row[4] += step.reward
         row[5] += step.speed
         row[6] = max(row[6], step.speed)
-        row[7] += failsafe or step.decision == pb.ADJUSTED
+        row[7] += failsafe or step.decision in (pb.ADJUSTED, pb.RECOVERING)
         row[8] += spent
         self.decisions += 1
         self.milliseconds += spent

@@ -4,6 +4,7 @@ const KINDS = {
   l: { name: "allowed", color: "#2b6cb8" },
   d: { name: "adjusted", color: "#e08600" },
   a: { name: "failsafe", color: "#c2312a" },
+  e: { name: "recovering", color: "#8e44ad" },
   n: { name: "no filter", color: "#7b8794" },
 };
 

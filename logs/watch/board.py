@@ -22,7 +22,7 @@ EPISODES = 300  # whose rewards are drawn
 TRAIL = 600  # positions of the running episode
 FIGURES_EVERY = 1.0  # s
 MOST_CARDS = 200
-KINDS = {pb.ALLOWED: "allowed", pb.ADJUSTED: "adjusted", pb.FAILSAFE: "failsafe"}
+KINDS = {pb.ALLOWED: "allowed", pb.ADJUSTED: "adjusted", pb.FAILSAFE: "failsafe", pb.RECOVERING: "recovering"}
 LAUNCHER = "launcher"  # the process that knows the run from its beginning
 SETUP = ("run", "method", "arena", "seed", "steps")  # its notes about it
 
@@ -80,7 +80,7 @@ class Card:
         self.reward += step.reward
         x, y, _ = self.pose
         self.trail.append((x, y))
-        if self.kind in ("adjusted", "failsafe"):
+        if self.kind in ("adjusted", "failsafe", "recovering"):
             self.marks.append((x, y, self.kind))
         if step.terminated or step.truncated:
             self.ended = "collision" if step.collision else "goal" if step.goal else "time limit"

@@ -1,7 +1,7 @@
 // Draws what /events says: a map for each robot, figures, rewards, processes, warnings.
 "use strict";
 
-const COLORS = { allowed: "#34a864", adjusted: "#f0961e", failsafe: "#d6303c", "": "#8a93a3" };
+const COLORS = { allowed: "#34a864", adjusted: "#f0961e", failsafe: "#d6303c", recovering: "#8e44ad", "": "#8a93a3" };
 const SILENT = 3; // s without a message on the bus after which the run counts as quiet
 const CLOSE = 6; // footprints from the robot to the edge of the close view
 const WINDOW = 20; // episodes that the reward's mean is over
