@@ -1,8 +1,8 @@
 """Out of where nothing can be verified, not even standing (method §11).
 
 Of slow inputs, each followed by braking, the one whose worst violated half-space is violated least at the plan's end,
-then the next worst, and so on; none may violate any half-space more than standing does, but for its tube's own width. A robot that has to turn first
-turns on the spot towards where it can get away. Never verified: it is the least bad that is known.
+then the next worst, and so on; none may violate any half-space more than standing does, but for its tube's own width. A
+robot that has to turn first turns on the spot towards where it can get away. Never verified: only the least bad.
 """
 
 from __future__ import annotations

@@ -140,7 +140,7 @@ class GroundRobot:
     def _meet(self, moving: bool) -> None:
         """Note when something that moves begins to be touched, and whether this robot was moving until then."""
         touched = bool(self._moving.touched().any())
-        if touched and not self._meeting:
+        if touched and not self._meeting and not any(self._contacts):  # the push that follows is that contact's
             self._contacts[0 if moving else 1] = True
         self._meeting = touched
 
@@ -160,7 +160,7 @@ class GroundRobot:
             # step2 before step1: contacts are then those of the position just reached
             mujoco.mj_step2(model, data)
             mujoco.mj_step1(model, data)
-            collision = collision or self._touching()
+            collision = collision or (self._touching() and not any(self._contacts))
             if self._moving:
                 self._meet(moving)
         return collision

@@ -230,12 +230,13 @@ class Quadrotor:
         floor = self._floor_geom
         if self._moving:
             movers = self._moving.touched()
-            if movers.any() and not self._meeting:
+            if movers.any() and not self._meeting and not any(self._contacts):
                 speed = math.hypot(*self._data.qvel[:3].tolist())
                 self._contacts[0 if speed > STANDING or any(self.controller.setpoint) else 1] = True
             self._meeting, first = bool(movers.any()), first[~movers]
         self.on_floor = bool((first == floor).any())
-        self.collided = self.collided or bool((first != floor).any())
+        if not any(self._contacts):  # what is touched after a push is that contact's
+            self.collided = self.collided or bool((first != floor).any())
 
 
 def slewed(input: Array, before: Array) -> Array:
