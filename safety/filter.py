@@ -348,6 +348,8 @@ class Filter:
         if self._margin(self._rows(parked, stand), stand) >= -seeming:
             return None
         rows = self._rows(scene, stand)
+        if not np.isfinite(rows.bound).all():  # of one that is touched, or is no number, no side is known
+            return None
         standing = rows.support(self.tube, stand) - rows.bound
         inputs = np.array([self._limited(wanted, before) for wanted in slow_inputs(robot)])
         plans = [self._regressors(z_0, action) for action in inputs]
@@ -357,8 +359,7 @@ class Filter:
         obstacles += len(scene.unseen) if scene.unseen is not None else 0
         each = 2 * robot.horizon + 1
         ends[each - 1 : len(self.discs) * obstacles * each : each] = True
-        known = np.isfinite(rows.bound)
-        best = least_violating(violated[:, known], standing[known], ends[known], self.comfort)
+        best = least_violating(violated, standing, ends, self.comfort)
         if best is not None:
             z = plans[best]
         elif robot.heading is not None and len(scene.near):
