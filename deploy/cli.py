@@ -94,7 +94,7 @@ COMMANDS: dict[str, Command] = {
     "excite": Command(
         "sources:Excite",
         "print the inputs that a robot is best driven with to be learned, within a region",
-        "brakeline excite my.toml --keep -2 -2 2 2 --minutes 10 > inputs.csv",
+        "brakeline excite my.toml --keep -2 -2 2 2 --minutes 10",
     ),
     "certify": Command(
         "data:Certify",
