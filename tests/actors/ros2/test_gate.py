@@ -28,7 +28,7 @@ def allow(requests):
         decision = pb.Decision(kind=pb.ALLOWED, plan=plan, model="m", verified=True, contained=True)
         decision.tube_center.extend([0.0] * 2 * ROBOT.horizon)
         decision.tube_half_width.extend([0.1] * 2 * ROBOT.horizon)
-        replies.append(pb.Reply(decision=decision))
+        replies.append(pb.Reply(decision=decision, robot=request.robot))
     return replies
 
 
