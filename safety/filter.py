@@ -122,7 +122,7 @@ class Filter:
         driven = np.tile(robot.translates, robot.free_steps)
         self.translating = np.concatenate([np.zeros(robot.regressor_dim), driven])
         self.low, self.high, self.slew = robot.low(), robot.high(), np.asarray(robot.action_slew)
-        self.nothing = np.minimum(np.maximum(0.0, self.low), self.high)
+        self.nothing = robot.at_zero()
         self.braking = robot.fractions()[: robot.free_steps - robot.given]
         self.regressor = list(robot.regressor)
         self.comfort = self._comfort() if comfort is None else comfort
@@ -467,7 +467,8 @@ class Filter:
         moving = request.movers
         if moving is not None:
             within = robot.horizon * robot.period
-            moving = moving.take(~(moving.least_distance(start, within) > self.reach))
+            nearest = moving.least_distance(start, within) - moving.shapes.margin
+            moving = moving.take(~(nearest > self.reach))
             moving = moving if len(moving) else None
         unseen = None if request.scan is None else self._unseen(request.scan, start)
         return _Scene(start, heading, turn, near, away, moving, unseen)
