@@ -38,8 +38,8 @@ def excitation(robot: Robot, rng: np.random.Generator, held: int = MOST_HELD) ->
     """Inputs without end: lead-in, plan (chosen inputs, then braking), stop, and again.
 
     A lead-in goes for one target after the other, and may leave each before it gets there: every speed comes with
-    every acceleration. `held`: periods that a target is held for at most; more where a robot needs longer to come to its
-    speed. To a robot that stops by feedback the measured state (n,) is sent after each period,
+    every acceleration. `held`: periods that a target is held for at most, more of them where a robot needs longer to
+    come to its speed. To a robot that stops by feedback the measured state (n,) is sent after each period,
     `u = inputs.send(state)`: its braking follows from it.
     """
     before = np.zeros(robot.action_dim)
