@@ -467,8 +467,7 @@ class Filter:
         moving = request.movers
         if moving is not None:
             within = robot.horizon * robot.period
-            nearest = moving.least_distance(start, within) - moving.shapes.margin
-            moving = moving.take(~(nearest > self.reach))
+            moving = moving.take(~(moving.least_distance(start, within) > self.reach))
             moving = moving if len(moving) else None
         unseen = None if request.scan is None else self._unseen(request.scan, start)
         return _Scene(start, heading, turn, near, away, moving, unseen)

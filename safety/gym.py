@@ -38,10 +38,10 @@ UNANSWERED = "unanswered"  # in place of a decision's kind: the service was not 
 class SafetyWrapper(gymnasium.Wrapper[Any, Any, Any, Any]):
     """Replaces each action by the filter's decision on it.
 
-    `info` may hold `scan`, a `messaging.scans.Scan` that takes the obstacles' place. To `info`, after `step`, are added: `safety` (the `Decision`; of a service the `Answer`, None if there was none),
-    `proposed` (the action given), `penalty`, and `diagnostics`, a dict of plain values: kind, verified, contained,
-    margin [m], time_ms, model, reason, and proposed and executed as inputs of the robot. The penalty is
-    subtracted from the reward.
+    `info` may hold `scan`, a `messaging.scans.Scan` that takes the obstacles' place. The wrapper adds to it, after
+    `step`: `safety` (the `Decision`; of a service the `Answer`, None if there was none), `proposed` (the action given),
+    `penalty`, and `diagnostics`, a dict of plain values: kind, verified, contained, margin [m], time_ms, model, reason,
+    and proposed and executed as inputs of the robot. The penalty is subtracted from the reward.
     """
 
     def __init__(
