@@ -162,7 +162,7 @@ class Robot:
 
     def at_zero(self) -> Array:
         """The input (m,) nearest to none: that of a robot that has not been given any."""
-        return np.clip(0.0, self.low(), self.high())
+        return np.asarray(np.clip(0.0, self.low(), self.high()))
 
     def rests(self, inputs: Array) -> NDArray[np.bool_]:
         """Are these inputs (..., m) those of a stop?"""

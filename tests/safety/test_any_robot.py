@@ -34,10 +34,9 @@ _made = {}
 def ready(name):
     if name not in _made:
         robot = ROBOTS[name]
-        held = 12 if robot.feedback else 5
-        data = collect(
-            Toy(robot, steps=10_000), robot, 4000, held=held, state=seen, actions=normalised(robot), shown=False
-        )
+        periods, held = (9000, 6) if robot.feedback else (6000, 5)
+        env = Toy(robot, steps=10_000)
+        data = collect(env, robot, periods, held=held, state=seen, actions=normalised(robot), shown=False)
         _made[name] = Filter(make(data, Recipe()))
     return _made[name]
 

@@ -53,7 +53,7 @@ def puck(name, limit=()):
                 "fy": {"unit": "N", "low": -1.0, "high": 1.0, "stop": {"vy": -2.0}},
             },
             "stopped": 0.03,
-            "plan": {"horizon": 16, "free": 1, "brake": 1},
+            "plan": {"horizon": 12, "free": 1, "brake": 1},
             "body": [{"at": [0.0, 0.0], "radius": 0.1}],
             "limit": list(limit),
         }
