@@ -85,7 +85,7 @@ class Toy(gymnasium.Env):
     def step(self, action):
         assert action.dtype == np.float32, "cast to the environment's type"
         u = self.low + 0.5 * self.width * (np.clip(action.astype(float), -1.0, 1.0) + 1.0)
-        h = self.robot.period / SUBSTEPS
+        h, least = self.robot.period / SUBSTEPS, np.inf
         for _ in range(SUBSTEPS):
             x, y, a, b = self.state
             if self.robot.heading is not None:
@@ -95,10 +95,9 @@ class Toy(gymnasium.Env):
                 vx, vy = a + h * (u[0] - a), b + h * (u[1] - b)
                 self.state = np.array([x + h * vx, y + h * vy, vx, vy])
             self.trace.append(self.state)
-            self.worst = min(self.worst, self.clearance())
-        self.count += 1
-        hits = self.worst < 0.0
-        return self.state.copy(), 0.0, hits, self.count >= self.steps, {}
+            least = min(least, self.clearance())
+        self.count, self.worst = self.count + 1, min(self.worst, least)
+        return self.state.copy(), 0.0, bool(least < 0.0), self.count >= self.steps, {}
 
     def clearance(self):
         """m between body and the nearest disc, signed."""
