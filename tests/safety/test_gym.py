@@ -174,7 +174,7 @@ def test_collecting_leaves_out_what_ended_in_a_collision(data):
 def test_collecting_cuts_where_something_else_moved_it():
     pushed = lambda env, observation, info: env.unwrapped.count % 10 == 0  # noqa: E731
     cut = collect(Toy(CAR), CAR, 54, state=seen, actions=normalised(CAR), disturbed=pushed, shown=False)
-    assert {len(t.inputs) for t in cut.trajectories} == {9}
+    assert [len(t.inputs) for t in cut.trajectories] == [9, 9, 9, 9, 9, 4, 5]
     assert cut.trajectories[0].before is None and cut.trajectories[1].before is not None
 
 
