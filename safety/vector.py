@@ -53,9 +53,7 @@ class VectorSafetyWrapper(VectorWrapper):
         self._ended = np.zeros(env.num_envs, dtype=bool)
         self._now: tuple[Any, dict[str, Any]] | None = None
 
-    def reset(
-        self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Any, dict[str, Any]]:
+    def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         self._now = self.env.reset(seed=seed, options=options)
         self._begin((options or {}).get("reset_mask", np.ones(self.num_envs, dtype=bool)))
         return self._now

@@ -153,8 +153,8 @@ class _Record:
 
     def done(self) -> Iterator[Trajectory]:
         if self.inputs:
-            arrays = (np.array(values) for values in (self.states, self.inputs, self.paths, self.turned))
-            yield Trajectory(*arrays, before=self.before)
+            states, inputs, paths = np.array(self.states), np.array(self.inputs), np.array(self.paths)
+            yield Trajectory(states, inputs, paths, np.array(self.turned), self.before)
 
 
 def _bulge(robot: Robot, trajectories: list[Trajectory]) -> float:
