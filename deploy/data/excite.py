@@ -16,7 +16,7 @@ MOST_LEAD = 4  # random targets before a plan, each held for up to
 MOST_HELD = 3  # periods, and as many more as it takes to get there
 SHORT_STOP, LONG_STOP = 2, 15  # periods of standing still after a plan, mostly short
 LONG_STOPS = 0.1  # share of long stops
-HASTE = 0.5  # share of targets that a robot with a slew leaves as soon as one without: learners change their mind a lot
+HASTE = 0.5  # share of targets that are left as soon as by a robot that follows at once: learners change their mind a lot
 EXTREMES = 0.45  # share of inputs that are at a bound or zero: driving has more of them than a uniform draw
 
 
@@ -50,8 +50,8 @@ def excitation(robot: Robot, rng: np.random.Generator, held: int = MOST_HELD) ->
     while True:
         for _ in range(rng.integers(MOST_LEAD + 1)):
             target = random_target(robot, rng)
-            hasty = longest_lead > held and rng.random() < HASTE
-            for _ in range(rng.integers(1, (held if hasty else longest_lead) + 1)):
+            hasty = longest_lead > MOST_HELD and rng.random() < HASTE
+            for _ in range(rng.integers(1, (MOST_HELD if hasty else longest_lead) + 1)):
                 before = towards(robot, before, target)
                 state = yield before
         free = []
