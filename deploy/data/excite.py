@@ -16,7 +16,7 @@ MOST_LEAD = 4  # random targets before a plan, each held for up to
 MOST_HELD = 3  # periods, and as many more as it takes to get there
 SHORT_STOP, LONG_STOP = 2, 15  # periods of standing still after a plan, mostly short
 LONG_STOPS = 0.1  # share of long stops
-HASTE = 0.5  # share of targets that are left as soon as by a robot that follows at once: learners change their mind a lot
+HASTE = 0.5  # share of targets that are left as soon as by a robot without a slew: learners change their mind a lot
 EXTREMES = 0.45  # share of inputs that are at a bound or zero: driving has more of them than a uniform draw
 
 
