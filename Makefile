@@ -43,5 +43,10 @@ messages: setup
 	$(BIN)/python -m grpc_tools.protoc -I. --python_out=. --mypy_out=. \
 		--plugin=protoc-gen-mypy=$(BIN)/protoc-gen-mypy messaging/brakeline.proto
 
+# Other people's environments, each in a virtual environment of its own (docs/environments.md).
+safety-gymnasium: examples/safety_gymnasium/.venv
+examples/safety_gymnasium/.venv: examples/safety_gymnasium/requirements.txt
+	PYTHON=$(PYTHON) sh examples/safety_gymnasium/setup.sh
+
 clean:
 	rm -rf .venv build *.egg-info

@@ -155,6 +155,15 @@ class Robot:
         """(m,) which inputs are zero when it stands: all but those that are held."""
         return np.array([rule != HOLD for rule in self.stop])
 
+    @cached_property
+    def by_state(self) -> NDArray[np.bool_]:
+        """(m,) which inputs stop by feedback."""
+        return np.array([rule == FEEDBACK for rule in self.stop])
+
+    def at_zero(self) -> Array:
+        """The input (m,) nearest to none: that of a robot that has not been given any."""
+        return np.asarray(np.clip(0.0, self.low(), self.high()))
+
     def rests(self, inputs: Array) -> NDArray[np.bool_]:
         """Are these inputs (..., m) those of a stop?"""
         return np.asarray((np.abs(inputs) < 1e-9)[..., self.stopping].all(-1))
@@ -189,8 +198,7 @@ class Robot:
         and slew after the input `before` (..., m)."""
         if not self.feedback:
             return planned
-        by_state = np.array([rule == FEEDBACK for rule in self.stop])
-        wanted = np.where(by_state, state @ np.asarray(self.feedback).T, planned)
+        wanted = np.where(self.by_state, state @ np.asarray(self.feedback).T, planned)
         slew = np.asarray(self.action_slew)
         low, high = np.maximum(self.low(), before - slew), np.minimum(self.high(), before + slew)
         return np.asarray(np.clip(wanted, low, high))
@@ -198,6 +206,23 @@ class Robot:
     def stands(self, state: Array) -> bool:
         """Is no measured speed more than counts as stopped?"""
         return bool((np.abs(state[list(self.regressor)]) <= self.stopped).all())
+
+    def keeps_still(self, inputs: Array, state: Array, before: Array) -> bool:
+        """Are these the inputs (m,) of a stop, given in that measured state (n,) after the input `before` (m,)?"""
+        if not self.feedback:
+            return bool(self.rests(inputs))
+        near = FOLLOWED * (self.high() - self.low())
+        off = np.abs(inputs - self.braked(np.where(self.stopping, 0.0, inputs), state, before))
+        return self.stands(state) and bool((off <= near).all())
+
+    def may_stand(self, inputs: Array) -> bool:
+        """May a robot that stands have been given these inputs (m,)? By feedback it is given what its residual speed
+        makes of it."""
+        if not self.feedback:
+            return bool(self.rests(inputs))
+        gains = np.abs(np.asarray(self.feedback))[:, list(self.regressor)]
+        most = np.where(self.by_state, gains.sum(1) * self.stopped, 0.0) + FOLLOWED * (self.high() - self.low())
+        return bool((np.abs(inputs) <= most)[self.stopping].all())
 
     @cached_property
     def description(self) -> dict[str, Any]:

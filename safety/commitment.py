@@ -56,13 +56,18 @@ class Commitment:
 
     def reset(self) -> None:
         """At an episode's start: standing still."""
-        self.plan: Array = np.zeros((self.robot.horizon, self.robot.action_dim))
-        self.input_in_force: Array = np.zeros(self.robot.action_dim)
+        self.input_in_force: Array = self.robot.at_zero()
+        self.plan: Array = np.tile(self.input_in_force, (self.robot.horizon, 1))
         self.model = ""
         self.predicted: Prediction | None = None
         self.seen: Array = np.zeros(self.robot.state_dim)  # the last measured state: of feedback, a stop is made of it
         self._still = self.robot.horizon  # periods of a stop's inputs
         self._vouchers: tuple[bytes, ...] = ()  # of this period and those to come; the last stays
+
+    @property
+    def due(self) -> Array:
+        """(m,) the input to execute in the coming period, after `accept` or `fallback`."""
+        return self.plan[0].copy() if self.robot.late else self.input_in_force
 
     @property
     def voucher(self) -> bytes:
@@ -94,7 +99,7 @@ class Commitment:
         robot = self.robot
         now: Array = self.plan[0].copy()
         self._vouchers = self._vouchers[1:] or self._vouchers
-        rests = bool(robot.rests(now)) or (bool(robot.feedback) and robot.stands(self.seen))
+        rests = robot.keeps_still(now, self.seen, self.input_in_force)
         last = np.where(robot.stopping, 0.0, self.plan[-1])
         self.plan = np.vstack([self.plan[1:], last[None]])
         self.input_in_force = now
@@ -102,7 +107,7 @@ class Commitment:
         stopped = self.model != UNVERIFIED or self._still >= robot.horizon
         if stopped and rests and robot.rests(self.plan).all():
             self.model = ""  # standing still needs nobody's word
-        return self.plan[0].copy() if self.robot.late else now
+        return self.due
 
 
 def correction_penalty(

@@ -122,7 +122,7 @@ class Filter:
         driven = np.tile(robot.translates, robot.free_steps)
         self.translating = np.concatenate([np.zeros(robot.regressor_dim), driven])
         self.low, self.high, self.slew = robot.low(), robot.high(), np.asarray(robot.action_slew)
-        self.nothing = np.minimum(np.maximum(0.0, self.low), self.high)
+        self.nothing = robot.at_zero()
         self.braking = robot.fractions()[: robot.free_steps - robot.given]
         self.regressor = list(robot.regressor)
         self.comfort = self._comfort() if comfort is None else comfort

@@ -48,7 +48,7 @@ def half_spaces(near: Shapes, start: Array, nominal: Array, keep_off: float, mea
     choice = roomiest(unit, level, between)
     each = np.arange(len(choice))[:, None]
     normal = unit[each, choice]
-    return normal, level[each, choice] - (keep_off + near.margin)[:, None] - np.abs(normal) @ measured
+    return normal, level[each, choice] - np.maximum(keep_off + near.margin, 0.0)[:, None] - np.abs(normal) @ measured
 
 
 def roomiest(unit: Array, level: Array, ends: Array) -> NDArray[np.intp]:

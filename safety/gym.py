@@ -1,90 +1,143 @@
-"""The filter (or a rival: `safety/methods.py`) in front of any policy, in process, as a Gymnasium wrapper.
+"""The filter (or a rival: `safety/methods.py`) in front of any policy, as a Gymnasium wrapper.
 
-env = SafetyWrapper(NavigationEnv(), Filter(ModelSet.load(path)))
+env = SafetyWrapper(NavigationEnv(robot), Filter(ModelSet.load(path)))
 model = AnyLibrary("MlpPolicy", env).learn(...)
+
+Of an environment that knows nothing of this:
+
+env = SafetyWrapper.load(env, path, state=state, obstacles=obstacles, actions=normalised(robot))
 """
 
 from __future__ import annotations
 
-from typing import Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Self
 
 import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from messaging.movers import parted
-from messaging.tasks import UnknownTask, task_of
-from safety.commitment import Commitment, correction_penalty
+from messaging.bus import BusError
+from messaging.scans import Scan
+from safety.client import Answer, SafetyClient
+from safety.commitment import correction_penalty
+from safety.inprocess import InProcess
 from safety.memory import Memory
-from safety.methods import Method
-from safety.request import Decision, Request
+from safety.request import Decision
+from safety.spaces import Actions, actions_of, cast
+from safety.views import OBSTACLES, STATE, View
 
-Observation = NDArray[np.float32]
+if TYPE_CHECKING:
+    from safety.methods import Method
+
+Array = NDArray[np.float64]
+
+UNANSWERED = "unanswered"  # in place of a decision's kind: the service was not there, and the committed plan went on
 
 
 class SafetyWrapper(gymnasium.Wrapper[Any, Any, Any, Any]):
     """Replaces each action by the filter's decision on it.
 
-    The environment's `info` must hold, after `reset` and `step`: `state`, the measured state (n,), and `obstacles`,
-    a list of `messaging.shapes.Obstacle` with at least those within `filter.reach`; it may hold `scan`, a
-    `messaging.scans.Scan` that takes their place. The wrapper adds `safety` (the
-    `Decision`), `proposed` and `penalty`; the penalty is subtracted from the reward.
+    `info` may hold `scan`, a `messaging.scans.Scan` that takes the obstacles' place. The wrapper adds to it, after
+    `step`: `safety` (the `Decision`; of a service the `Answer`, None if there was none), `proposed` (the action given),
+    `penalty`, and `diagnostics`, a dict of plain values: kind, verified, contained, margin [m], time_ms, model, reason,
+    and proposed and executed as inputs of the robot. The penalty is subtracted from the reward.
     """
 
-    def __init__(self, env: gymnasium.Env[Any, Any], filter: Method, penalty: float = 0.0) -> None:
+    def __init__(
+        self,
+        env: gymnasium.Env[Any, Any],
+        filter: Method | InProcess | SafetyClient,
+        penalty: float = 0.0,
+        *,
+        state: View = STATE,
+        obstacles: View = OBSTACLES,
+        actions: Actions | None = None,
+    ) -> None:
+        """
+        Args:
+            filter: or one that asks: `SafetyClient` asks a service, and brakes along the committed plan without an
+                answer.
+            penalty: of leaning on the filter, in reward (`correction_penalty`).
+            state: (env, observation, info) -> measured state (n,); unless given, `info["state"]`.
+            obstacles: likewise -> a list of `Obstacle` with at least those within `filter.reach`.
+            actions: between the environment's actions and the robot's inputs; unless given they are the same.
+
+        Raises:
+            Mismatch: the action space is not that of the robot's inputs, and `actions` is not given.
+        """
         super().__init__(env)
-        self.filter, self.penalty = filter, penalty
-        self.commitment = Commitment(filter.robot)
-        self._memory = Memory(filter.robot.footprint)
-        self._info: dict[str, Any] = {}
-        self._seen: Any = None  # the last observation, which some methods need
+        self.asker = filter if isinstance(filter, InProcess | SafetyClient) else InProcess(filter)
+        self.penalty, self.commitment = penalty, self.asker.commitment
+        self._state, self._obstacles = state, obstacles
+        self._actions = actions_of(env.action_space, self.asker.robot, actions)
+        self._now: tuple[Any, dict[str, Any]] | None = None
+        self._memory = Memory(self.asker.robot.footprint)
+        self._scan: Scan | None = None
+
+    @classmethod
+    def load(cls, env: gymnasium.Env[Any, Any], model: Path | str, penalty: float = 0.0, **how: Any) -> Self:
+        """With the model in a file.
+
+        Raises:
+            BadModel: it is none; Mismatch: see above.
+        """
+        from safety.methods import load, ready  # what only asks a service needs no solver
+
+        return cls(env, ready(load(Path(model))), penalty, **how)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        self._seen, self._info = self.env.reset(seed=seed, options=options)
+        self._now = self.env.reset(seed=seed, options=options)
         self.commitment.reset()
         self._memory.reset()
         self._remember()
-        return self._seen, self._info
+        return self._now
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        decision, before = self.decide(np.asarray(action, dtype=float)), self.commitment.input_in_force
-        executed = self.commitment.accept(decision.plan, decision.model, decision.predicted, decision.verified)
-        self._seen, reward, terminated, truncated, self._info = self.env.step(executed.astype(np.float32))
+        if self._now is None:
+            raise gymnasium.error.ResetNeeded("reset the environment before anything else")
+        before = self.commitment.input_in_force
+        wanted = np.asarray(self._actions.action_to_control(action), dtype=float)
+        answer, reason = self._decide(wanted)
+        executed = self.commitment.due
+        made = cast(self._actions.control_to_action(executed), self.env.action_space)
+        observation, reward, terminated, truncated, info = self.env.step(made)
+        cost = correction_penalty(self.asker.robot, wanted, before, executed, self.penalty)
+        told = diagnostics(answer, reason) | {"proposed": wanted, "executed": executed}
+        info = info | {"safety": answer, "proposed": action, "penalty": cost, "diagnostics": told}
+        self._now = observation, info
         self._remember()
-        cost = correction_penalty(self.filter.robot, action, before, executed, self.penalty)
-        self._info |= {"safety": decision, "proposed": action, "penalty": cost}
-        return self._seen, float(reward) - cost, terminated, truncated, self._info
+        return observation, float(reward) - cost, terminated, truncated, info
 
-    def decide(self, action: NDArray[np.float64]) -> Decision:
-        """The decision on an action in the current state; a proposal that is no number becomes standing still."""
-        kept, robot = self.commitment, self.filter.robot
-        obstacles, movers = parted(self._info["obstacles"], robot.position_dim)
-        kept.seen = np.asarray(self._info["state"], dtype=float)
-        proposal = action if np.isfinite(action).all() else np.zeros(robot.action_dim)
-        return self.filter.decide(
-            Request(
-                state=np.asarray(self._info["state"], dtype=float),
-                action=proposal,
-                input_in_force=kept.input_in_force,
-                plan=kept.plan,
-                obstacles=obstacles,
-                movers=movers,
-                scan=self._scan,
-                model=kept.model,
-                predicted=kept.predicted,
-                observation=self._observed(),
-            )
-        )
+    def _decide(self, wanted: Array) -> tuple[Decision | Answer | None, str]:
+        """The decision, committed to, or None and why there is none: then the committed plan goes on."""
+        assert self._now is not None
+        seen = self._now[0], self._now[1]
+        state, near = self._state(self.env, *seen), self._obstacles(self.env, *seen)
+        if isinstance(self.asker, InProcess):
+            return self.asker.decide(state, wanted, near, seen[0], self._scan), ""
+        wanted = wanted if np.isfinite(wanted).all() else np.zeros(wanted.shape)
+        try:
+            return self.asker.decide(state, wanted, near, scan=self._scan), ""
+        except BusError as error:
+            self.asker.fallback()
+            return None, str(error)
 
     def _remember(self) -> None:
-        scan = self._info.get("scan")
-        self._scan = None if scan is None else self._memory.fill(scan, self.filter.robot.period)
+        """The scan, if there is one, with what was seen free before."""
+        assert self._now is not None
+        scan = self._now[1].get("scan")
+        self._scan = None if scan is None else self._memory.fill(scan, self.asker.robot.period)
 
-    def _observed(self) -> Observation:
-        """The observation, if it is the robot's own: another environment has none that a method could read."""
-        seen = np.asarray(self._seen, np.float32) if isinstance(self._seen, np.ndarray) else np.zeros(0, np.float32)
-        try:
-            wanted = task_of(self.filter.robot).observation_dim
-        except UnknownTask:  # then no method reads it
-            wanted = 0
-        return seen if seen.shape == (wanted,) else np.zeros(0, np.float32)
+
+def diagnostics(answer: Decision | Answer | None, reason: str = "") -> dict[str, Any]:
+    """The figures of a decision as a dict."""
+    if answer is None:
+        return {"kind": UNANSWERED, "verified": False, "contained": False, "margin": np.nan, "time_ms": np.nan} | {
+            "model": "",
+            "reason": reason,
+        }
+    said: Any = answer if isinstance(answer, Decision) else answer.message
+    return {"kind": answer.kind} | {
+        name: getattr(said, name) for name in ("verified", "contained", "margin", "time_ms", "model", "reason")
+    }

@@ -56,7 +56,7 @@ class Request:
 
     def still(self, robot: Robot) -> bool:
         """Is the robot said to stand, and to be committed to that? Needs no model's word."""
-        committed = not self.model and bool(robot.rests(self.plan).all() and robot.rests(self.input_in_force))
+        committed = not self.model and bool(robot.rests(self.plan).all()) and robot.may_stand(self.input_in_force)
         return committed and robot.stands(self.state)
 
 

@@ -12,7 +12,7 @@ from time import perf_counter_ns
 from messaging import brakeline_pb2 as pb
 from messaging.bus import BusError, BusSettings, Sample
 from messaging.process import Process
-from messaging.robots import UnknownRobot, robot_named
+from messaging.robots import UnknownRobot, known, robot_named
 from messaging.topics import DECIDE, MODEL
 from safety.commitment import UNVERIFIED
 from safety.digest import digest
@@ -43,9 +43,13 @@ class Models:
         """Put a model to use; requests in hand finish with the one before. signed: as it came, to be archived so.
 
         Raises:
-            BadModel: it does not fit its robot.
+            BadModel: it does not fit its robot, or its robot has the name of another that comes with the program.
         """
         method = ready(model)
+        try:
+            known(model.robot)
+        except UnknownRobot as error:
+            raise BadModel(str(error)) from error
         with self._lock:
             self.filters[model.robot.name] = method
             self.known.add(method.version)

@@ -51,9 +51,6 @@ def swept_half_spaces(
     last = np.where(before > 0, choice[each, before - 1], 0)
     choice = np.where(met, last[:, None], choice)
     normal = unit[each[:, None], choice]
-    offset = (
-        bound[each[:, None], choice, np.arange(N)]
-        - (keep_off + near.shapes.margin)[:, None]
-        - np.abs(normal) @ measured
-    )
+    offset = bound[each[:, None], choice, np.arange(N)] - np.maximum(keep_off + near.shapes.margin, 0.0)[:, None]
+    offset -= np.abs(normal) @ measured
     return normal, np.where(np.isnan(offset), -np.inf, offset)

@@ -83,7 +83,10 @@ def _plans_of(robot: Robot, t: Trajectory, k: int) -> tuple[NDArray[np.intp], Ar
     planned = chosen @ robot.schedule()[: k * m].T
     actual = np.hstack([t.inputs[j : j + count] for j in range(k)]).reshape(count, k * m)
     if robot.feedback:
-        planned = np.hstack([chosen[:, :m], *(_braked(robot, t)[j : j + count] for j in range(1, k))])
+        made = _braked(robot, t)
+        for j in range(1, k):
+            row = slice(j * m, (j + 1) * m)
+            planned[:, row] = np.where(robot.by_state, made[j : j + count], planned[:, row])
         near = np.tile(FOLLOWED * (robot.high() - robot.low()), k)
     else:
         near = np.full(k * m, 1e-9)
@@ -125,7 +128,7 @@ def resting(robot: Robot, t: Trajectory) -> NDArray[np.bool_]:
     if not robot.feedback:
         return robot.rests(t.inputs)
     near = FOLLOWED * (robot.high() - robot.low())
-    return np.asarray((np.abs(t.inputs - _braked(robot, t)) < near).all(1))
+    return np.asarray((np.abs(t.inputs - _braked(robot, t)) < near)[:, robot.stopping].all(1))
 
 
 def outputs(robot: Robot, y: Array) -> Array:

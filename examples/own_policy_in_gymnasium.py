@@ -1,0 +1,57 @@
+"""A policy of your own in an environment of your own, kept off a wall by what the environment's own data say."""
+
+import gymnasium
+import numpy as np
+
+from deploy.data.episodes import collect
+from messaging.descriptions import robot_of
+from messaging.shapes import Obstacle
+from safety.filter import Filter
+from safety.fitting import make
+from safety.gym import SafetyWrapper
+from safety.model_set import Recipe
+from safety.spaces import normalised
+
+
+class Cart(gymnasium.Env):
+    """A cart that comes to the given velocity, ±1 m/s, within some tenths of a second. The wall is at x = 1 m."""
+
+    observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (4,))
+    action_space = gymnasium.spaces.Box(-1.0, 1.0, (2,))
+
+    def reset(self, *, seed=None, options=None):
+        self.state = np.zeros(4)  # x, y [m], vx, vy [m/s]
+        return self.state, {}
+
+    def step(self, action):
+        velocity = 0.5 * (self.state[2:] + action)
+        self.state = np.concatenate([self.state[:2] + 0.1 * velocity, velocity])
+        return self.state, 0.0, False, False, {}
+
+
+def speed(**more):
+    return {"unit": "m/s"} | more
+
+
+robot = robot_of(
+    {
+        "name": "cart",
+        "period": 0.1,
+        "sight": 3.0,
+        "state": {axis: {"unit": "m", "role": "position", "error": 0.0} for axis in "xy"}
+        | {"vx": speed(error=0.0, follows="to vx"), "vy": speed(error=0.0, follows="to vy")},
+        "input": {"to vx": speed(low=-1.0, high=1.0), "to vy": speed(low=-1.0, high=1.0)},
+        "plan": {"horizon": 6, "brake": 1},
+        "body": [{"at": [0.0, 0.0], "radius": 0.2}],
+    }
+)
+how = {"state": lambda env, seen, info: seen, "actions": normalised(robot)}
+data = collect(Cart(), robot, 3000, **how)
+env = SafetyWrapper(
+    Cart(), Filter(make(data, Recipe())), obstacles=lambda *_: [Obstacle("wall", (1.0, 0.0), yaw=np.pi)], **how
+)
+
+observation, _ = env.reset()
+for _ in range(50):
+    observation, reward, terminated, truncated, info = env.step(np.array([1.0, 0.2]))  # your policy: at the wall
+print(f"asked to drive through the wall, it stands {1.0 - observation[0]:.3f} m from it: {info['diagnostics']['kind']}")

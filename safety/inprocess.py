@@ -1,0 +1,117 @@
+"""The filter (or a rival) without a service and without an environment: what a program asks in its own process.
+
+safety = InProcess(Filter(ModelSet.load(path)))
+decision = safety.decide(state, action, obstacles)
+drive(safety.commitment.due)          # and next period again; `safety.reset()` where an episode begins, standing still
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from messaging.movers import parted
+from messaging.robots import Robot
+from messaging.scans import Scan
+from messaging.shapes import Obstacle
+from messaging.tasks import UnknownTask, task_of
+from safety.commitment import Commitment
+from safety.request import Decision, Request
+
+if TYPE_CHECKING:
+    from safety.methods import Method
+
+Array = NDArray[np.float64]
+
+
+class InProcess:
+    """Asks a method about one robot, and keeps its committed plan: `SafetyClient` without a service."""
+
+    def __init__(self, method: Method) -> None:
+        self.method = method
+        self.commitment = Commitment(method.robot)
+
+    @property
+    def robot(self) -> Robot:
+        return self.method.robot
+
+    def decide(
+        self,
+        state: ArrayLike,
+        action: ArrayLike,
+        obstacles: Iterable[Obstacle],
+        observation: object = None,
+        scan: Scan | None = None,
+    ) -> Decision:
+        """The decision on an action; its plan is committed to, so execute `commitment.due`.
+
+        Args:
+            state: measured; action: proposed, one that is no number becomes standing still; obstacles: at least those
+            within reach; observation: the robot's own, which the rivals read; scan: in the obstacles' place.
+
+        Raises:
+            BadRequest, BadShape: a value is missing, not finite or of the wrong size, with the field's name.
+        """
+        return self.decide_all([self.commitment], [state], [action], [obstacles], [observation], [scan])[0]
+
+    def decide_all(
+        self,
+        commitments: Sequence[Commitment],
+        states: Sequence[ArrayLike],
+        actions: Sequence[ArrayLike],
+        obstacles: Sequence[Iterable[Obstacle]],
+        observations: Sequence[object],
+        scans: Sequence[Scan | None],
+    ) -> list[Decision]:
+        """The same of several robots of the kind, each with a commitment of its own. Raises as `decide` does, before
+        any plan is committed to."""
+        asked = zip(commitments, states, actions, obstacles, observations, scans, strict=True)
+        decisions = [self.method.decide(self._request(*one)) for one in asked]
+        for kept, decision in zip(commitments, decisions, strict=True):
+            kept.accept(decision.plan, decision.model, decision.predicted, decision.verified)
+        return decisions
+
+    def fallback(self) -> Array:
+        """The committed plan's next input, for when there is no decision."""
+        return self.commitment.fallback()
+
+    def reset(self) -> None:
+        """An episode begins, standing still."""
+        self.commitment.reset()
+
+    def _request(
+        self,
+        kept: Commitment,
+        state: ArrayLike,
+        action: ArrayLike,
+        obstacles: Iterable[Obstacle],
+        observation: object,
+        scan: Scan | None,
+    ) -> Request:
+        kept.seen = np.asarray(state, dtype=float)
+        wanted = np.asarray(action, dtype=float)
+        standing, moving = parted(list(obstacles), self.robot.position_dim)
+        return Request(
+            state=kept.seen,
+            action=wanted if np.isfinite(wanted).all() else np.zeros(wanted.shape),
+            input_in_force=kept.input_in_force,
+            plan=kept.plan,
+            obstacles=standing,
+            movers=moving,
+            scan=scan,
+            model=kept.model,
+            predicted=kept.predicted,
+            observation=self._own(observation),
+        )
+
+    def _own(self, observation: object) -> NDArray[np.float32]:
+        """The observation, if it is the robot's own: another environment has none that a method could read."""
+        try:
+            wanted = task_of(self.robot).observation_dim
+        except UnknownTask:  # then no method reads it
+            wanted = 0
+        fits = isinstance(observation, np.ndarray) and observation.shape == (wanted,)
+        return np.asarray(observation if fits else np.zeros(0), np.float32)

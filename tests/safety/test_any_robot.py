@@ -1,0 +1,108 @@
+"""Robots of every kind of description, from data collected through their environment to a closed loop with an
+adversary; whether anything was hit is the simulator's word."""
+
+import numpy as np
+import pytest
+
+from deploy.data.episodes import collect
+from safety.filter import Filter
+from safety.fitting import make
+from safety.gym import SafetyWrapper
+from safety.model_set import Recipe
+from safety.spaces import normalised
+from tests.safety.toys import Toy, car, discs, hostile, near, puck, seen
+
+LONG = (((0.15, 0.0), 0.12), ((-0.15, 0.0), 0.12))
+KEEP_IN = [
+    {"name": f"{sign}{axis}", "weights": {axis: 1.0 if sign == "+" else -1.0}, "most": 0.8}
+    for axis in ("x", "y")
+    for sign in ("+", "-")
+]
+ROBOTS = {
+    "hold": car("toy-hold"),
+    "profile": car("toy-profile", stop=([0.7, 0.2, 0.0], "ramp")),
+    "discs": car("toy-discs", body=LONG),
+    "feedback": puck("toy-feedback"),
+    "boxed car": car("toy-boxed", limit=[*KEEP_IN, {"name": "slow", "weights": {"speed": 1.0}, "most": 0.35}]),
+    "boxed puck": puck(
+        "toy-boxed-puck", limit=[*KEEP_IN, {"name": "slow", "weights": {"vx": 0.6, "vy": 0.8}, "most": 0.4}]
+    ),
+}
+_made = {}
+
+
+def ready(name):
+    if name not in _made:
+        robot = ROBOTS[name]
+        periods, held = (9000, 6) if robot.feedback else (6000, 5)
+        env = Toy(robot, steps=10_000)
+        data = collect(env, robot, periods, held=held, state=seen, actions=normalised(robot), shown=False)
+        _made[name] = Filter(make(data, Recipe()))
+    return _made[name]
+
+
+def drive(env, filter, episodes=8, target=None):
+    """An adversary at the obstacles in turn (or at targets); returns the kinds of decisions and the farthest way."""
+    robot, kinds, farthest = filter.robot, [], 0.0
+    for episode in range(episodes):
+        observation, _ = env.reset(seed=episode)
+        aims = target or [disc.position for disc in env.unwrapped.obstacles]
+        aim = aims[episode % len(aims)]
+        if robot.heading is not None and target is None:  # the one ahead: it can't turn on the spot
+            aim = max(aims, key=lambda at: np.cos(np.arctan2(at[1], at[0]) - observation[2]))
+        ended = False
+        while not ended:
+            action = hostile(robot, aim, observation)
+            observation, _, terminated, truncated, info = env.step(action.astype(np.float32))
+            ended = terminated or truncated
+            if "safety" in info:
+                kinds.append(info["diagnostics"]["kind"])
+                assert info["safety"].verified, f"{name_of(info)}"
+                assert info["safety"].contained
+            farthest = max(farthest, float(np.linalg.norm(observation[:2])))
+    return kinds, farthest
+
+
+def name_of(info):
+    return f"{info['safety'].kind}: {info['safety'].reason}"
+
+
+def filtered(env, filter):
+    return SafetyWrapper(env, filter, state=seen, obstacles=near, actions=normalised(filter.robot))
+
+
+@pytest.mark.parametrize("name", ["hold", "profile", "discs", "feedback"])
+def test_no_stop_rule_and_no_body_lets_an_adversary_hit_anything(name):
+    capsule = (LONG[0][0], LONG[1][0], 0.12) if name == "discs" else ((0.0, 0.0), (0.0, 0.0), 0.1)
+    bare = Toy(ROBOTS[name], discs(), capsule)
+    drive(bare, ready(name), 3)
+    assert bare.worst < 0.0, "without the filter it hits"
+    env = Toy(ROBOTS[name], discs(), capsule)
+    kinds, farthest = drive(filtered(env, ready(name)), ready(name))
+    assert 0.0 < env.worst < 0.15, "it comes near, and no nearer"
+    assert farthest > 0.3
+    assert {"allowed", "adjusted"} <= set(kinds)
+
+
+@pytest.mark.parametrize("name", ["boxed car", "boxed puck"])
+def test_limits_hold_between_periods_and_in_the_stop(name):
+    robot = ROBOTS[name]
+    corners = [(3.0, 0.0), (3.0, 3.0), (0.0, -3.0), (-3.0, 1.0)]
+    weights, most = np.array([one.weights for one in robot.limits]), np.array([one.most for one in robot.limits])
+    bare = Toy(robot)
+    drive(bare, ready(name), 4, corners)
+    assert ((np.array(bare.trace) @ weights.T - most).max(0)[[0, -1]] > 0.05).all(), "without the filter it leaves"
+    env = Toy(robot)
+    _, farthest = drive(filtered(env, ready(name)), ready(name), 4, corners)
+    worst = (np.array(env.trace) @ weights.T - most).max(0)
+    assert (worst <= 0.0).all()
+    assert worst[-1] > -0.15, "the limit of speed is used"
+    assert farthest > 0.6, "so is the room"
+
+
+@pytest.mark.parametrize("margin", [0.2, -0.1])
+def test_a_margin_is_kept_or_spared(margin):
+    robot = ROBOTS["feedback"]
+    env = Toy(robot, discs(margin), capsule=((0.0, 0.0), (0.0, 0.0), 0.1 + margin))
+    drive(filtered(env, ready("feedback")), ready("feedback"), 5)
+    assert 0.0 < env.worst < 0.12

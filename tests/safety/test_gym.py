@@ -1,0 +1,208 @@
+"""The wrapper, its vector form, the filter without an environment, and data collected through environments."""
+
+import gymnasium
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from deploy.data.episodes import collect
+from messaging.shapes import Obstacle
+from safety.client import SafetyClient
+from safety.commitment import Commitment
+from safety.dataset import BadData
+from safety.filter import Filter
+from safety.fitting import make
+from safety.gym import UNANSWERED, SafetyWrapper
+from safety.inprocess import InProcess
+from safety.model_set import ModelSet, Recipe
+from safety.spaces import Actions, Mismatch, actions_of, normalised
+from safety.vector import VectorSafetyWrapper, each
+from safety.views import STATE
+from tests.safety.toys import Toy, car, discs, near, puck, seen
+
+CAR, PUCK = car("gym-car"), puck("gym-puck")
+HOW = {"state": seen, "obstacles": near, "actions": normalised(CAR)}
+
+
+@pytest.fixture(scope="module")
+def data():
+    return collect(Toy(CAR, steps=10_000), CAR, 2500, state=seen, actions=normalised(CAR), shown=False)
+
+
+@pytest.fixture(scope="module")
+def model(data):
+    return make(data, Recipe())
+
+
+@pytest.fixture(scope="module")
+def ready(model):
+    return Filter(model)
+
+
+@given(st.lists(st.floats(-1.0, 1.0), min_size=2, max_size=2))
+def test_normalised_actions_and_back(action):
+    between = normalised(CAR)
+    control = between.action_to_control(np.array(action))
+    assert (control >= CAR.low()).all() and (control <= CAR.high()).all()
+    assert np.allclose(between.control_to_action(control), action, atol=1e-12)
+
+
+@given(st.lists(st.floats(0.0, 1.0), min_size=2, max_size=2))
+def test_inputs_as_normalised_actions_and_back(share):
+    between, control = normalised(CAR), CAR.low() + np.array(share) * (CAR.high() - CAR.low())
+    action = between.control_to_action(control)
+    assert (np.abs(action) <= 1.0).all()
+    assert np.allclose(between.action_to_control(action), control, atol=1e-12)
+
+
+def test_normalised_actions_are_never_taken_for_metres_a_second(ready):
+    with pytest.raises(Mismatch, match=r"speed \[m/s\] from 0 to 0.6.*actions=normalised\(robot\)"):
+        SafetyWrapper(Toy(CAR), ready)
+    with pytest.raises(Mismatch, match="normalised"):
+        collect(Toy(CAR), CAR, 10, state=seen, shown=False)
+
+
+@pytest.mark.parametrize("space", [gymnasium.spaces.Discrete(4), gymnasium.spaces.Box(-1.0, 1.0, (3,))])
+def test_an_action_space_of_another_kind_is_refused_unless_mapped(space):
+    with pytest.raises(Mismatch, match="action_to_control"):
+        actions_of(space, CAR, None)
+    mapped = Actions(lambda action: action, lambda control: control)
+    assert actions_of(space, CAR, mapped) is mapped
+
+
+def test_what_is_missing_is_said_by_name(ready):
+    env = SafetyWrapper(Toy(CAR), ready, actions=normalised(CAR))
+    with pytest.raises(gymnasium.error.ResetNeeded):
+        env.step(np.zeros(2))
+    env.reset(seed=0)
+    with pytest.raises(Mismatch, match=r"no 'state' \(the measured state.*give state=, a callable"):
+        env.step(np.zeros(2))
+    env = SafetyWrapper(Toy(CAR), ready, state=seen, actions=normalised(CAR))
+    env.reset(seed=0)
+    with pytest.raises(Mismatch, match="no 'obstacles'"):
+        env.step(np.zeros(2))
+    assert STATE(None, None, {"state": 3}) == 3
+
+
+def test_the_wrapper_from_a_file_tells_what_it_did(tmp_path, model):
+    model.save(tmp_path / "model.safetensors")
+    env = SafetyWrapper.load(Toy(CAR, discs()), tmp_path / "model.safetensors", penalty=1.0, **HOW)
+    env.reset(seed=0)
+    _, reward, _, _, info = env.step(np.array([-1.0, 0.0]))
+    told = info["diagnostics"]
+    assert told["kind"] == info["safety"].kind == "allowed" and told["verified"] and told["margin"] > 0.0
+    assert np.array_equal(told["executed"], [0.0, 0.0]) and np.array_equal(told["proposed"], [0.0, 0.0])
+    assert reward == -info["penalty"] == 0.0
+    assert ModelSet.load(tmp_path / "model.safetensors").version == told["model"]
+
+
+def test_without_an_environment_it_decides_the_same(ready):
+    env, alone = SafetyWrapper(Toy(CAR, discs()), ready, **HOW), InProcess(ready)
+    observation, _ = env.reset(seed=1)
+    for _ in range(30):
+        alone.decide(observation, [0.6, 0.0], discs())
+        observation, _, _, _, info = env.step(np.array([1.0, 0.0]))
+        assert np.array_equal(alone.commitment.due, info["diagnostics"]["executed"])
+    assert np.array_equal(alone.fallback(), alone.commitment.input_in_force)
+    alone.reset()
+    assert not alone.commitment.input_in_force.any()
+
+
+class Silent(SafetyClient):
+    """A client whose service is away."""
+
+    def __init__(self):
+        self.robot, self.commitment = CAR, Commitment(CAR)
+
+    def decide(self, *asked, **more):
+        from messaging.bus import NoReply
+
+        raise NoReply("nobody serves")
+
+
+def test_without_a_service_the_committed_plan_goes_on():
+    env = SafetyWrapper(Toy(CAR), Silent(), **HOW)
+    env.reset(seed=0)
+    *_, info = env.step(np.array([1.0, 0.0]))
+    assert info["diagnostics"]["kind"] == UNANSWERED and "nobody serves" in info["diagnostics"]["reason"]
+    assert not info["diagnostics"]["executed"].any(), "that is standing still"
+
+
+@pytest.mark.parametrize("mode", list(gymnasium.vector.AutoresetMode))
+def test_a_vector_decides_as_its_environments_do_alone(ready, mode):
+    count, policy = 3, np.random.default_rng(5)
+    make_one = lambda: Toy(CAR, discs(), steps=12)  # noqa: E731
+    vector = gymnasium.vector.SyncVectorEnv([make_one] * count, autoreset_mode=mode)
+    views = {"state": seen, "obstacles": each(near), "actions": normalised(CAR)}
+    many = VectorSafetyWrapper(vector, ready, 0.5, **views)
+    observations, _ = many.reset(seed=[0, 1, 2])
+    alone = [Commitment(CAR) for _ in range(count)]
+    fresh = np.zeros(count, dtype=bool)  # environments that the next step resets
+    for _ in range(30):
+        actions = policy.uniform(-1.0, 1.0, (count, 2)).astype(np.float32)
+        resets = fresh if mode == gymnasium.vector.AutoresetMode.NEXT_STEP else np.zeros(count, dtype=bool)
+        wanted = []
+        for i in np.flatnonzero(~resets):
+            one = InProcess(ready)
+            one.commitment = alone[i]
+            wanted.append((i, one.decide(observations[i], normalised(CAR).action_to_control(actions[i]), discs())))
+        observations, rewards, terminated, truncated, infos = many.step(actions)
+        for i, decision in wanted:
+            assert np.array_equal(infos["safety"][i].plan, decision.plan)
+            assert rewards[i] == -infos["penalty"][i]
+        assert [one is None for one in infos["safety"]] == resets.tolist()
+        ended = terminated | truncated
+        if mode == gymnasium.vector.AutoresetMode.DISABLED and ended.any():
+            observations, _ = many.reset(options={"reset_mask": ended})
+        for i in np.flatnonzero(resets if mode == gymnasium.vector.AutoresetMode.NEXT_STEP else ended):
+            alone[i].reset()
+        fresh = ended
+    assert infos["diagnostics"]["kind"].shape == (count,)
+
+
+def test_collecting_leaves_out_what_ended_in_a_collision(data):
+    assert data.periods == 2500 and len(data.trajectories) == 9
+    env = Toy(CAR, discs(away=0.45), steps=10_000)
+    cut = collect(env, CAR, 200, held=8, state=seen, actions=normalised(CAR), shown=False)
+    assert len(cut.trajectories) > 3, "it ran into something, and began again"
+    bumps = [t for t in cut.trajectories if len(t.inputs) > 1]
+    gaps = [np.linalg.norm(t.states[:, None, :2] - [d.position for d in discs(away=0.45)], axis=2).min() for t in bumps]
+    assert min(gaps) > 0.3 - 1e-9, "no state in which it touched one is in the data"
+
+
+def test_collecting_cuts_where_something_else_moved_it():
+    pushed = lambda env, observation, info: env.unwrapped.count % 10 == 0  # noqa: E731
+    cut = collect(Toy(CAR), CAR, 54, state=seen, actions=normalised(CAR), disturbed=pushed, shown=False)
+    assert [len(t.inputs) for t in cut.trajectories] == [9, 9, 9, 9, 9, 4, 5]
+    assert cut.trajectories[0].before is None and cut.trajectories[1].before is not None
+
+
+def test_collecting_gives_up_where_every_episode_ends_at_once():
+    with pytest.raises(BadData, match="nothing to learn from"):
+        collect(Toy(CAR, [Obstacle("cylinder", (0.0, 0.0), (0.1,))]), CAR, 10, state=seen, actions=normalised(CAR))
+
+
+def test_a_stop_by_feedback_follows_the_measured_state():
+    data = collect(Toy(PUCK), PUCK, 300, held=8, state=seen, actions=normalised(PUCK), shown=False)
+    t = data.trajectories[0]
+    braked = PUCK.braked(np.zeros_like(t.inputs), t.states[:-1], np.vstack([np.zeros((1, 2)), t.inputs[:-1]]))
+    follows = (np.abs(t.inputs - braked) < 1e-9).all(1)
+    assert 0.3 < follows.mean() < 0.95
+
+
+@given(st.floats(0.0, 0.05), st.floats(-1.0, 1.0))
+def test_a_puck_keeps_still_only_by_its_feedback(residual, push):
+    state = np.array([0.0, 0.0, residual, 0.0])
+    kept = Commitment(PUCK)
+    kept.seen = state
+    plan = np.zeros((PUCK.horizon, 2))
+    plan[0] = PUCK.braked(plan[0], state, plan[0])
+    moving = plan.copy()
+    moving[0, 1] = push
+    kept.accept(plan, "v", None, True)
+    assert (kept.model == "") == (residual <= PUCK.stopped)
+    other = Commitment(PUCK)
+    other.seen = state
+    other.accept(moving, "v", None, True)
+    assert other.model == ("" if residual <= PUCK.stopped and abs(push) <= 2e-6 else "v"), "a push is no standing"
