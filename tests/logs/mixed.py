@@ -191,7 +191,7 @@ def counted(messages: list[tuple[str, Any]]) -> dict[str, Any]:
     ended = [part for part in episodes.values() if part[-1].terminated or part[-1].truncated]
     failsafe = [s for s in steps if s.fallback or s.decision == 3]
     answered = [e for e in exchanges if not e.failure]
-    kinds = {"allowed": 1, "adjusted": 2, "failsafe": 3}
+    kinds = {"allowed": 1, "adjusted": 2, "failsafe": 3, "recovering": 4}
     inside = {
         name: [s.decide_ms for s in steps if s.decision == kind and not s.fallback] for name, kind in kinds.items()
     }
@@ -204,7 +204,10 @@ def counted(messages: list[tuple[str, Any]]) -> dict[str, Any]:
         "goals": sum(part[-1].goal for part in ended),
         "timeouts": sum(part[-1].truncated for part in ended),
         "collisions": sum(any(s.collision for s in part) for part in episodes.values()),
-        "interventions": len(failsafe) + sum(s.decision == 2 and not s.fallback for s in steps),
+        "interventions": len(failsafe) + sum(s.decision in (2, 4) and not s.fallback for s in steps),
+        "recovering": sum(s.decision == 4 and not s.fallback for s in steps),
+        "contacts_moving": sum(s.contact_moving for s in steps),
+        "contacts_standing": sum(s.contact_standing for s in steps),
         "failsafes": len(failsafe),
         "fallbacks": sum(s.fallback for s in steps),
         "mean_speed": float(np.mean([s.speed for s in steps])),
