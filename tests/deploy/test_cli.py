@@ -104,7 +104,7 @@ def test_a_typing_error_is_answered_with_a_suggestion(command):
         ("train ground --actors 0", "1 or more"),
         ("train ground --experiment sleep", "there are: default, demo, debug"),
         ("evaluate submarine", "there are: ground"),
-        ("evaluate ground --arena ballroom", "there are: default, dense, open"),
+        ("evaluate ground --arena ballroom", "there are: default, dense, few-walkers"),
         ("evaluate ground --policy [bold]", "no policy is called '[bold]' and no such file exists"),
         ("analyse {folder}/none", "no log at"),
         ("certify {folder}/none.mcap", "no log at"),
@@ -133,7 +133,9 @@ def test_a_wrong_choice_is_answered_with_the_choices(command, words):
 
 def test_a_run_that_could_not_listen_can_be_started_again(command, data_folder, tmp_path):
     for _ in range(2):
-        status, _, err = command("train", "--experiment", "debug", "--out", tmp_path / "run", "--listen", "nonsense")
+        status, _, err = command(
+            "train", "--experiment", "debug", "--out", tmp_path / "run", "--listen", "nonsense", "--no-secured"
+        )
         assert status == 1 and "cannot listen" in err
 
 
@@ -175,7 +177,7 @@ def test_evaluate_and_analyse_share_their_keys(figures, data_folder, tmp_path):
     assert evaluated.keys() >= SHARED
     assert (evaluated["arena"], evaluated["seed"], evaluated["policy"]) == ("dense", 4, "random")
     times = evaluated["decision_ms"]
-    assert times.keys() == {"mean", "std", "p50", "p99", "allowed", "adjusted", "failsafe"}
+    assert times.keys() == {"mean", "std", "p50", "p99", "allowed", "adjusted", "failsafe", "recovering"}
     assert evaluated["containment"].keys() == {"steps", "violations"}
     open_segment(tmp_path / "empty.mcap", {}).finish()
     assert figures("analyse", tmp_path / "empty.mcap").keys() >= SHARED
@@ -220,7 +222,7 @@ def said(**figures):
 def test_certificates_are_told_whole_at_any_width(columns):
     file = io.StringIO()
     console = Console(file=file, width=columns, force_terminal=True, color_system=None, soft_wrap=True)
-    console.print(table([said(), said(half_width_full=float("nan"), certificate="residual")]))
+    console.print(table([(said(), "plan"), (said(half_width_full=float("nan"), certificate="residual"), "free")]))
     shown = file.getvalue()
     assert "…" not in shown and max(map(len, shown.splitlines())) <= columns
     for word in ("certificate", "matrix-zonotope", "≤ per plan", "2.000%", "1.2 mm", "1.5 m"):

@@ -13,6 +13,7 @@ from mcap_protobuf.decoder import DecoderFactory
 
 from deploy import cli
 from messaging import brakeline_pb2 as pb
+from messaging.tasks import task_of
 from tests.robots import GROUND
 
 STEPS = 150
@@ -40,7 +41,11 @@ def test_csv_has_every_step_with_every_field(log: Path, tmp_path: Path, capsys: 
         assert (row["actor"], int(row["episode"]), int(row["step"])) == (step.actor, step.episode, step.step)
         assert float(row["reward"]) == step.reward and int(row["terminated"]) == step.terminated
         assert row["decision"] == pb.Kind.Name(step.decision) and float(row["header.time"]) == step.header.time
-        for name, parts in (("observation", GROUND.observation), ("action", GROUND.action), ("state", GROUND.state)):
+        for name, parts in (
+            ("observation", task_of(GROUND).observed),
+            ("action", GROUND.action),
+            ("state", GROUND.state),
+        ):
             assert [float(row[f"{name}.{part}"]) for part in parts] == list(getattr(step, name)), name
     missing = {f.name for f in pb.Step.DESCRIPTOR.fields} - {name.split(".")[0] for name in rows[0]}
     assert missing == {"path"}
