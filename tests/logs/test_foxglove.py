@@ -43,9 +43,9 @@ def episode(actor: str = "actor-0", robot: str = "ground", number: int = 0, **mo
     return pb.Episode(robot=robot, actor=actor, episode=number, **(about | more))
 
 
-def step(number: int, kind: int = pb.ALLOWED, actor: str = "actor-0", **more: Any) -> pb.Step:
+def step(number: int, kind: int = pb.ALLOWED, actor: str = "actor-0", robot: str = "ground", **more: Any) -> pb.Step:
     about: dict[str, Any] = {"state": (0.1 * number, -0.5, math.pi / 2, 0.2, 0.0), "next_observation": [1.0] * 26}
-    return pb.Step(robot="ground", actor=actor, step=number, decision=kind, **(about | more))
+    return pb.Step(robot=robot, actor=actor, step=number, decision=kind, **(about | more))
 
 
 def exchange(number: int, kind: int = pb.ALLOWED, actor: str = "actor-0") -> pb.Exchange:
@@ -191,7 +191,7 @@ def test_the_quadrotors_rays_are_a_cloud_of_the_points_that_were_hit() -> None:
 def test_a_robot_in_real_time_is_drawn_as_any_other(studio: Studio) -> None:
     key = "ground-late/actor-0"
     studio(f"episode/{key}", episode(robot="ground-late"))
-    assert f"foxglove/lidar/{key}" in studio(f"step/{key}", step(0, pb.UNKNOWN))
+    assert f"foxglove/lidar/{key}" in studio(f"step/{key}", step(0, pb.UNKNOWN, robot="ground-late"))
     assert studio.pictures.failures == 0
 
 

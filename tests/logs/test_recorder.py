@@ -204,7 +204,8 @@ def test_a_full_disk_keeps_what_is_recorded_and_goes_on_when_there_is_space(
     assert sorted(path.name for path in tmp_path.glob("*.mcap")) == ["run.mcap", "run_0001.mcap"]
     assert "NOT RECORDING" in caplog.text and "No space left" in caplog.text
     assert "messages were dropped" in caplog.text
-    assert [line.levelname for line in caplog.records if "recording to" in line.message] == ["INFO", "WARNING"]
+    levels = [line.levelname for line in caplog.records if "recording to" in line.message]
+    assert levels[0] == "INFO" and set(levels[1:]) == {"WARNING"}  # more than one where only a header still fitted
 
 
 def test_a_disk_that_stays_full_is_said_at_the_end(tmp_path: Path, say: Say, caplog: pytest.LogCaptureFixture) -> None:
