@@ -1,5 +1,6 @@
 """examples/own_robot_from_csv.py, as it stands."""
 
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -8,7 +9,9 @@ EXAMPLE = Path(__file__).parents[2] / "examples" / "own_robot_from_csv.py"
 
 
 def test_it_comes_to_decisions():
-    ran = subprocess.run([sys.executable, str(EXAMPLE)], capture_output=True, text=True, timeout=300, check=False)
+    alone = {name: value for name, value in os.environ.items() if name != "PYTHONSAFEPATH"}  # as a person starts it
+    words = [sys.executable, str(EXAMPLE)]
+    ran = subprocess.run(words, env=alone, capture_output=True, text=True, timeout=300, check=False)
     said = ran.stdout
     assert ran.returncode == 0, ran.stderr
     assert "pillar at 2.0 m: allowed, 0.40 m/s" in said and "pillar at 0.45 m: allowed" not in said, said
