@@ -125,11 +125,11 @@ class Student:
         """Weights that are a little newer, or, on joining, whatever the learner has; anything else is refused aloud.
 
         Raises:
-            Implausible: they do not go on from ours, or there are none yet that they could go on from.
+            Implausible: they do not go on from ours.
         """
         if not joined:
             if self.policy is None:
-                raise Implausible(f"weights {message.version} before a learner has taken {self.actor} in")
+                return  # another's: what to go on from comes with the learner's answer to our joining
             if message.version > self.policy.version + LEAP:
                 self._doubtful = True
                 raise Implausible(f"weights {message.version}, after {self.policy.version}")
