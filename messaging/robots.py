@@ -272,8 +272,9 @@ def robot_named(name: str) -> Robot:
     if robot is None:
         path = Path(base) if base.endswith(".toml") else FOLDER / f"{base}.toml"
         if path.parent == FOLDER and path.stem not in shipped():
-            there = ", ".join(sorted({*shipped(), *_known}))
-            raise UnknownRobot(f"no robot is called {name!r}; there are: {there}, or the path of a description (.toml)")
+            raise UnknownRobot(
+                f"no robot is called {name!r}; there are: {', '.join(shipped())}, or the path of a description (.toml)"
+            )
         robot = _known[base] = known(read(path))
     return robot.in_real_time() if name.endswith(LATE) else robot
 

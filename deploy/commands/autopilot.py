@@ -54,7 +54,7 @@ class Autopilot:
         if self.json:
             say_json(asdict(tally))
         else:
-            errors.print(f"{tally.ticks} ticks, {tally.late} late, {tally.slips} slips, {tally.collisions} collisions")
+            errors.print(str(tally))
         return 0
 
     def _begun(self, arena: Arena) -> None:

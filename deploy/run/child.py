@@ -93,7 +93,7 @@ def _autopilot(place: Place, folder: Path, config: RunConfig, bus: BusSettings) 
     from deploy.run.autopilot import AutopilotSettings, fly
 
     assert config.autopilot is not None and config.flight is not None
-    fly(
+    tally = fly(
         AutopilotSettings(
             url=config.flight.url.replace("udpin:0.0.0.0", "udpout:127.0.0.1").replace("udpin", "udpout"),
             rules=config.autopilot.rules,
@@ -105,6 +105,7 @@ def _autopilot(place: Place, folder: Path, config: RunConfig, bus: BusSettings) 
             truth=f"127.0.0.1:{config.flight.truth}",
         )
     )
+    print(tally, file=sys.stderr)  # into its log
     return False
 
 

@@ -61,6 +61,9 @@ class Tally:
     slips: int = 0  # times it gave up catching up
     collisions: int = 0
 
+    def __str__(self) -> str:
+        return f"{self.ticks} ticks, {self.late} late, {self.slips} slips, {self.collisions} collisions"
+
 
 def serve(
     autopilots: Sequence[Autopilot], link: Link, clock: Clock, stop: Callable[[], bool], truth: Truth | None = None

@@ -212,18 +212,28 @@ def test_a_step_before_reset_is_refused() -> None:
 
 
 @pytest.mark.parametrize(
-    ("env", "least"),
-    [(environment(GROUND, "default", 0), 500), (NavigationEnv(QUADROTOR, "default", Quadrotor), 350)],
+    ("env", "most"),
+    [(environment(GROUND, "default", 0), 4.0), (NavigationEnv(QUADROTOR, "default", Quadrotor), 5.0)],
     ids=["ground", "quadrotor"],
 )
-def test_it_is_fast(env: NavigationEnv, least: float) -> None:
+def test_it_is_fast(env: NavigationEnv, most: float) -> None:
+    """Measured against this machine's own pace in plain Python, then and there: steps a second say as much about it."""
     low, high = env.robot.low(), env.robot.high()
-    rates = []
-    for seed in range(3):
+    costs = []
+    for seed in range(4):
         env.reset(options={"episode_seed": seed})
         begin = time.process_time()  # of this process alone: others may be busy
-        for i in range(150):
+        _plain_python()
+        middle = time.process_time()
+        for i in range(100):
             env.step(0.1 * high if i % 2 else np.maximum(low, -0.1 * high))
-        rates.append(150 / (time.process_time() - begin))
-    print(f"environment: {max(rates):.0f} steps/s")
-    assert max(rates) > least  # twice that and more on an idle core
+        costs.append((time.process_time() - middle) / (middle - begin))
+    print(f"100 steps of the environment: {min(costs):.2f} times 1,000,000 rounds of a loop")
+    assert min(costs) < most  # about half of it when it was written
+
+
+def _plain_python() -> int:
+    total = 0
+    for i in range(1_000_000):
+        total += i * i
+    return total

@@ -143,18 +143,17 @@ def _is_asked(there: tuple[object, ...]) -> None:
 
 def test_what_fails_again_and_again_ends_the_run_and_says_why(data_folder, tmp_path):
     folder = tmp_path / "run"
-    archive = folder / "ground" / "models"
-    archive.mkdir(parents=True)
-    (archive / "0123456789ab.safetensors").write_bytes(b"no model set")
+    (folder / "learner" / "checkpoint").mkdir(parents=True)
+    (folder / "learner" / "checkpoint" / "latest").write_text("000042\n")  # it is not there: never a fresh start
     with Run(folder) as run:
         run.popen.wait(120.0)
         errors = run.errors.read_text()
         assert run.popen.returncode == 1
-        assert "safety-0 ended with 1" in errors and "5th time in a row" in errors and "BadModel" in errors
+        assert "learner ended with 1" in errors and "5th time in a row" in errors and "'latest' is missing" in errors
         assert "Traceback" not in errors and run.children() == {}
-    words = (folder / "logs" / "safety-0.log").read_text()
+    words = (folder / "logs" / "learner.log").read_text()
     assert len(re.findall(r"deploy/run/child.py\", line \d+, in <module>", words)) == 5, "one traceback for each start"
-    assert json.loads((folder / "figures.json").read_text())["restarts"]["safety-0"] == 4
+    assert json.loads((folder / "figures.json").read_text())["restarts"]["learner"] == 4
 
 
 def test_a_second_interrupt_leaves_nothing_either(data_folder, tmp_path):
