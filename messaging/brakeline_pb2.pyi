@@ -423,6 +423,7 @@ class Decision(_message.Message):
     VOUCHERS_FIELD_NUMBER: _builtins.int
     UNVOUCHED_FIELD_NUMBER: _builtins.int
     BROKEN_FIELD_NUMBER: _builtins.int
+    STOPPED_FIELD_NUMBER: _builtins.int
     kind: Global___Kind.ValueType
     predicted_heading: _builtins.float
     """rad, of the frame in which its position part is a box"""
@@ -475,6 +476,10 @@ class Decision(_message.Message):
     def vouchers(self) -> _containers.RepeatedScalarFieldContainer[_builtins.bytes]:
         """for the requests of the next periods, in their order"""
 
+    @_builtins.property
+    def stopped(self) -> Global___Stopped:
+        """what a proposal that was not allowed would have come too near to"""
+
     def __init__(
         self,
         *,
@@ -501,14 +506,57 @@ class Decision(_message.Message):
         vouchers: _abc.Iterable[_builtins.bytes] | None = ...,
         unvouched: _builtins.bool = ...,
         broken: _builtins.int = ...,
+        stopped: Global___Stopped | None = ...,
     ) -> None: ...
-    _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
+    _HasFieldArgType: _TypeAlias = _typing.Literal["stopped", b"stopped"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["at_least", b"at_least", "broken", b"broken", "compared", b"compared", "contained", b"contained", "iterations", b"iterations", "kind", b"kind", "margin", b"margin", "model", b"model", "plan", b"plan", "predicted_center", b"predicted_center", "predicted_half_width", b"predicted_half_width", "predicted_heading", b"predicted_heading", "queue_ms", b"queue_ms", "reason", b"reason", "solve_ms", b"solve_ms", "solver", b"solver", "time_ms", b"time_ms", "tube_center", b"tube_center", "tube_half_width", b"tube_half_width", "unvouched", b"unvouched", "verified", b"verified", "verify_ms", b"verify_ms", "vouchers", b"vouchers"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["at_least", b"at_least", "broken", b"broken", "compared", b"compared", "contained", b"contained", "iterations", b"iterations", "kind", b"kind", "margin", b"margin", "model", b"model", "plan", b"plan", "predicted_center", b"predicted_center", "predicted_half_width", b"predicted_half_width", "predicted_heading", b"predicted_heading", "queue_ms", b"queue_ms", "reason", b"reason", "solve_ms", b"solve_ms", "solver", b"solver", "stopped", b"stopped", "time_ms", b"time_ms", "tube_center", b"tube_center", "tube_half_width", b"tube_half_width", "unvouched", b"unvouched", "verified", b"verified", "verify_ms", b"verify_ms", "vouchers", b"vouchers"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 
 Global___Decision: _TypeAlias = Decision  # noqa: Y015
+
+@_typing.final
+class Stopped(_message.Message):
+    """A half-space, and how near to it a proposal's tube comes."""
+
+    DESCRIPTOR: _descriptor.Descriptor
+
+    BY_FIELD_NUMBER: _builtins.int
+    ROOM_FIELD_NUMBER: _builtins.int
+    AFTER_FIELD_NUMBER: _builtins.int
+    NORMAL_FIELD_NUMBER: _builtins.int
+    AT_FIELD_NUMBER: _builtins.int
+    by: _builtins.str
+    """cylinder, box, sphere, wall, "moving " before it; unseen; sight; or a limit's name"""
+    room: _builtins.float
+    """m (of a limit: in its own units) that the tube stays off it; negative: beyond it"""
+    after: _builtins.float
+    """s from now"""
+    @_builtins.property
+    def normal(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]:
+        """(position), world, from the free side on; empty: it has no place"""
+
+    @_builtins.property
+    def at(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]:
+        """(position) of the half-space's edge, world, at the obstacle"""
+
+    def __init__(
+        self,
+        *,
+        by: _builtins.str = ...,
+        room: _builtins.float = ...,
+        after: _builtins.float = ...,
+        normal: _abc.Iterable[_builtins.float] | None = ...,
+        at: _abc.Iterable[_builtins.float] | None = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["after", b"after", "at", b"at", "by", b"by", "normal", b"normal", "room", b"room"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    def WhichOneof(self, oneof_group: _Never) -> None: ...
+
+Global___Stopped: _TypeAlias = Stopped  # noqa: Y015
 
 @_typing.final
 class Error(_message.Message):

@@ -129,6 +129,12 @@ class Shapes:
             np.array([obstacle.margin for obstacle in obstacles], dtype=float),
         )
 
+    def kind(self, i: int) -> str:
+        """What the i-th is; in the plane a disc is a cylinder."""
+        if self.rho[i] > 0.0:
+            return SPHERE if self.round.shape[1] == 3 and self.round[i].all() else CYLINDER
+        return WALL if self.half[i, 0] >= WALL_DEPTH else BOX
+
     def take(self, index: NDArray[np.intp] | NDArray[np.bool_]) -> Shapes:
         """The chosen obstacles."""
         parts = self.center, self.axes, self.half, self.rho, self.round, self.margin

@@ -19,6 +19,7 @@ from messaging.scans import Scan
 from messaging.shapes import Shapes
 from safety import scan as seen
 from safety.commitment import UNVERIFIED, Prediction
+from safety.explain import SIGHT, Around, Stopped, worst
 from safety.freespace import half_spaces
 from safety.limits import Limits, stacked
 from safety.model_set import ModelSet, needed
@@ -71,6 +72,7 @@ class _Attempt:
     reason: str = ""
     contained: bool = True
     broken: int = 0
+    stopped: Stopped | None = None
 
 
 @dataclass(frozen=True)
@@ -227,6 +229,7 @@ class Filter:
         if margin >= 0.0 and self._margin(kept, z) >= 0.0:
             return _Found(ALLOWED, self._plan(z), z, margin, True)
         attempt.reason = f"the proposal's tube comes within {margin:.3g} m of the free space's edge"
+        attempt.stopped = self._worst(scene, z, slack)
         # Keeping the comfort margin, or at least not driving into it; else free space alone: from here even standing
         # still would not do.
         for choice in (kept, rows):
@@ -241,6 +244,19 @@ class Filter:
             return _Found(ADJUSTED, self._plan(candidate), candidate, self._margin(rows, candidate), True)
         attempt.reason += "; no verified input was found"
         return None
+
+    def _worst(self, scene: _Scene, z: Array, slack: Array) -> Stopped:
+        """What the proposal, regressors z, comes nearest to."""
+        beyond = self.reach - self._extent(z) if self.far else np.inf
+        if not len(slack) or beyond < slack.min():
+            return Stopped.nowhere(SIGHT, beyond, self.robot.period * self.robot.horizon)
+        nominal = []
+        for disc in self.discs:
+            start = scene.start + scene.turn @ disc.at
+            nominal.append((start, start + disc.position @ z @ scene.turn.T))
+        row = int(np.argmin(slack))
+        around = Around(scene.near, scene.moving, scene.unseen)
+        return worst(row, max(float(slack[row]), -self.reach), self.robot, around, nominal)
 
     def _closest(self, rows: Rows, z_0: Array, proposal: Array, attempt: _Attempt) -> Array | None:
         """The QP's answer, clipped to bounds and slew, as regressors; None if there is no number in it."""
@@ -397,6 +413,7 @@ class Filter:
             solver=attempt.solver,
             iterations=attempt.iterations,
             broken=attempt.broken,
+            stopped=None if found.kind == ALLOWED else attempt.stopped,
         )
 
     def _clear(self, request: Request, scene: _Scene, found: _Found) -> tuple[float, bool]:

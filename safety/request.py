@@ -15,6 +15,7 @@ from messaging.scans import Scan
 from messaging.shapes import FARTHEST, Shapes
 from messaging.tasks import UnknownTask, task_of
 from safety.commitment import Prediction
+from safety.explain import Stopped
 
 Array = NDArray[np.float64]
 
@@ -87,6 +88,7 @@ class Decision:
     solver: str = ""
     iterations: int = 0
     broken: int = 0  # movers that were seen outside of what their bounds allowed
+    stopped: Stopped | None = None  # of a proposal that was not allowed: what it would have come too near to
 
     @property
     def action(self) -> Array:

@@ -45,6 +45,10 @@ class Cells:
     def __len__(self) -> int:
         return len(self.corners)
 
+    def take(self, index: NDArray[np.intp]) -> Cells:
+        """The chosen ones."""
+        return Cells(self.corners[index], self.error[index], self.speed, self.age)
+
 
 def gaps(scan: Scan) -> tuple[Array, Array, Array]:
     """Of each gap between two beams that say something: its first angle, its width [rad], and F [m] of the measured

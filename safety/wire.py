@@ -183,6 +183,10 @@ def message_of(decision: Decision, queue_ms: float) -> pb.Reply:
         iterations=decision.iterations,
         broken=decision.broken,
     )
+    if (stopped := decision.stopped) is not None:
+        message.stopped.by, message.stopped.room, message.stopped.after = stopped.by, stopped.room, stopped.after
+        message.stopped.normal.extend(stopped.normal.tolist())
+        message.stopped.at.extend(stopped.at.tolist())
     return pb.Reply(decision=message)
 
 

@@ -1,0 +1,86 @@
+"""What a proposal was not allowed for: of all half-spaces the one that its tube comes nearest to, or crosses most."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from messaging.movers import Movers
+from messaging.robots import Robot
+from messaging.shapes import Shapes
+from safety.freespace import half_spaces
+from safety.scan import Cells
+from safety.scan import half_spaces as unseen_half_spaces
+from safety.sweep import swept_half_spaces
+
+Array = NDArray[np.float64]
+
+UNSEEN, SIGHT = "unseen", "sight"
+
+
+@dataclass(frozen=True)
+class Stopped:
+    """by: cylinder | box | sphere | wall, `moving ` before it where it moves, `unseen`, `sight` (the tube leaves what
+    can be seen), or a limit's name; room [m, of a limit in its own units]: from the tube to the half-space, negative:
+    beyond it; after [s]: when, from now. normal (d,), at (d,): of the half-space, world, from the free side on, through
+    the obstacle's nearest point; empty where there is none."""
+
+    by: str
+    room: float
+    after: float
+    normal: Array
+    at: Array
+
+    @staticmethod
+    def nowhere(by: str, room: float, after: float) -> Stopped:
+        return Stopped(by, room, after, np.zeros(0), np.zeros(0))
+
+
+@dataclass(frozen=True)
+class Around:
+    """What half-spaces are about, in the order of their rows, one disc of the body after the other."""
+
+    near: Shapes
+    moving: Movers | None
+    unseen: Cells | None
+
+    def __len__(self) -> int:
+        return sum(len(part) for part in (self.near, self.moving, self.unseen) if part is not None)
+
+
+def worst(row: int, room: float, robot: Robot, around: Around, nominal: list[tuple[Array, Array]]) -> Stopped:
+    """What a row is about. nominal: of each disc where it is (d,) and will be (N, d), world, under the proposal."""
+    N, T = robot.horizon, robot.period
+    each = 2 * N + 1
+    disc, rest = divmod(row, max(len(around) * each, 1))
+    if disc >= len(nominal) or not len(around):
+        number = row - len(nominal) * len(around) * each
+        period, limit = divmod(number, len(robot.limits))
+        return Stopped.nowhere(robot.limits[limit].name, room, T * min(period + 1, N))
+    which, end = divmod(rest, each)
+    period = end if end < N else min(end - N, N - 1)
+    when = end if end < N else min(end - N + 1, N)
+    start, ends = nominal[disc]
+    by, normals, offsets = _planes(which, robot, around, start, ends)
+    normal, level = normals[0, period], float(offsets[0, period])
+    if not np.isfinite(level):
+        return Stopped.nowhere(by, room, T * when)
+    there = (ends[when - 1] if when else start) - start
+    return Stopped(by, room, T * when, normal, start + there + normal * (level - normal @ there))
+
+
+def _planes(which: int, robot: Robot, around: Around, start: Array, ends: Array) -> tuple[str, Array, Array]:
+    """The name of that obstacle, and its half-spaces (1, N, d), (1, N) themselves, whatever is to be kept to them."""
+    one, exact = np.array([which]), np.zeros(len(start))
+    if which < len(around.near):
+        return around.near.kind(which), *half_spaces(around.near.take(one), start, ends, 0.0, exact)
+    one -= len(around.near)
+    if around.moving is not None:
+        if one[0] < len(around.moving):
+            mover = around.moving.take(one)
+            return f"moving {mover.shapes.kind(0)}", *swept_half_spaces(mover, start, ends, 0.0, exact, robot.period)
+        one -= len(around.moving)
+    assert around.unseen is not None
+    return UNSEEN, *unseen_half_spaces(around.unseen.take(one), start, ends, 0.0, exact, robot.period)
