@@ -149,7 +149,7 @@ class Gallery:
                 self._stride *= 2
                 self._spread = {k: item for k, item in self._spread.items() if k % self._stride == 0}
         if held.number == self.wanted and self.actor in (None, held.actor):
-            self.found.append(self._picture(held, order) | {"rows": list(rows(held))})
+            self.found.append(self._picture(held, order) | {"rows": list(rows(held, self.robot))})
 
     def _push(self, heap: list[tuple[float, int, Figures]], worth: float, most: int, held: Held, order: int) -> None:
         if len(heap) < most:

@@ -8,6 +8,7 @@ from typing import Protocol
 
 from logs.tally import KINDS, Figures
 from messaging import brakeline_pb2 as pb
+from messaging.explained import explain, fell_back, fits
 from messaging.robots import Robot
 
 MOST_TUBES = 40  # of a picture
@@ -59,16 +60,17 @@ def picture(seen: Seen, robot: Robot | None) -> Figures:
         "heading": _headings(steps, robot),
         "clearance": _rounded(step.clearance for step in steps),
         "speed": _rounded(step.speed for step in steps),
-        "tubes": _tubes(steps, exchanges, closest),
+        "tubes": _tubes(steps, exchanges, closest, robot),
     }
 
 
-def rows(seen: Seen) -> Iterable[Figures]:
+def rows(seen: Seen, robot: Robot | None) -> Iterable[Figures]:
     """One row for each step of the episode."""
     exchanges = seen.exchanges()
     for step in seen.steps:
         exchange = exchanges.get(step.step)
         decision = exchange.reply.decision if exchange is not None else None
+        why = fell_back() if step.fallback else _said(exchange, robot)
         yield {
             "actor": seen.actor,
             "episode": seen.number,
@@ -79,6 +81,7 @@ def rows(seen: Seen) -> Iterable[Figures]:
             "action": list(step.action),
             "decision": "no decision" if step.fallback else KINDS.get(step.decision),
             "reason": decision.reason if decision is not None else None,
+            "said": why,
             "margin": decision.margin if decision is not None and decision.tube_center else None,
             "at_least": decision.at_least if decision is not None else False,
             "decide_ms": decision.time_ms if decision is not None else None,
@@ -109,7 +112,17 @@ def _arena(about: pb.Episode | None, exchanges: Mapping[int, pb.Exchange]) -> Fi
     }
 
 
-def _tubes(steps: Sequence[pb.Step], exchanges: Mapping[int, pb.Exchange], closest: int) -> dict[int, Figures]:
+def _said(exchange: pb.Exchange | None, robot: Robot | None) -> str:
+    """Why it was not as proposed; empty if it was, or nobody knows."""
+    if exchange is None or robot is None or exchange.reply.decision.kind not in STEPPED_IN:
+        return ""
+    request, decision = exchange.request, exchange.reply.decision
+    return explain(robot, request, decision).said if fits(robot, request, decision) else ""
+
+
+def _tubes(
+    steps: Sequence[pb.Step], exchanges: Mapping[int, pb.Exchange], closest: int, robot: Robot | None
+) -> dict[int, Figures]:
     """By place in the picture: those about the closest approach, then those of the nearest interventions."""
     near = [k for k in range(len(steps)) if abs(k - closest) <= NEAR]
     others = [k for k, step in enumerate(steps) if step.decision in STEPPED_IN and k not in near]
@@ -118,8 +131,8 @@ def _tubes(steps: Sequence[pb.Step], exchanges: Mapping[int, pb.Exchange], close
     for k in sorted(near + others[: MOST_TUBES - len(near)]):
         exchange = exchanges.get(steps[k].step)
         tube = None if exchange is None else _tube(exchange.request, exchange.reply.decision)
-        if tube is not None:
-            found[k] = tube
+        if exchange is not None and tube is not None:
+            found[k] = tube | _explained(exchange, robot)
     return found
 
 
@@ -140,6 +153,21 @@ def _tube(request: pb.Request, decision: pb.Decision) -> Figures | None:
         "margin": _rounded([decision.margin])[0],
         "at_least": decision.at_least,
         "reason": decision.reason,
+    }
+
+
+def _explained(exchange: pb.Exchange, robot: Robot | None) -> Figures:
+    """The sentence; inputs with names and units; arrows; the edge of what stopped the proposal. Nothing where the robot
+    is not known, or the log holds what does not fit it."""
+    request, decision = exchange.request, exchange.reply.decision
+    if robot is None or not fits(robot, request, decision):
+        return {}
+    about = explain(robot, request, decision)
+    return {
+        "said": about.said,
+        "inputs": [[name, unit, *_rounded((proposed, executed))] for name, unit, proposed, executed in about.inputs],
+        "arrows": [_rounded(about.proposed[:2]), _rounded(about.executed[:2])],
+        "edge": [*_rounded(about.at[:2]), *_rounded(about.normal[:2])] if len(about.at) else None,
     }
 
 

@@ -72,7 +72,7 @@ def show_episode(episode: Figures) -> RenderableType:
             _optional("{:.2f}", row["decide_ms"]),
             _optional("> {:.4f}" if row["at_least"] else "{:.4f}", row["margin"]),
             f"{row['clearance']:.3f}",
-            row["reason"] or "",
+            row["said"] or row["reason"] or "",
         )
     return Group(Text(title, "bold"), table)
 

@@ -9,6 +9,7 @@ import math
 from collections.abc import Iterable, Sequence
 
 import numpy as np
+from foxglove_schemas_protobuf.ArrowPrimitive_pb2 import ArrowPrimitive
 from foxglove_schemas_protobuf.Color_pb2 import Color
 from foxglove_schemas_protobuf.CubePrimitive_pb2 import CubePrimitive
 from foxglove_schemas_protobuf.CylinderPrimitive_pb2 import CylinderPrimitive
@@ -30,6 +31,7 @@ from foxglove_schemas_protobuf.Vector3_pb2 import Vector3
 from google.protobuf.timestamp_pb2 import Timestamp
 
 from messaging import brakeline_pb2 as pb
+from messaging.explained import Explanation, explain, fell_back, fits
 from messaging.rays import Rays
 from messaging.robots import Robot
 from messaging.shapes import BOX, CYLINDER, SPHERE, WALL
@@ -45,6 +47,7 @@ def _color(red: int, green: int, blue: int, alpha: float = 1.0) -> Color:
 
 
 SOLID, WALLS, GOAL = _color(120, 128, 140), _color(120, 128, 140, 0.25), _color(52, 168, 100, 0.35)
+PROPOSED, EXECUTED, EDGE = _color(199, 125, 0), _color(31, 95, 191), _color(192, 32, 48, 0.5)
 BODY, NOSE = _color(40, 96, 190), _color(250, 250, 250)
 KINDS: dict[int, tuple[int, int, int]] = {
     pb.ALLOWED: (52, 168, 100),
@@ -145,7 +148,7 @@ def decision(robot: Robot, step: pb.Step, exchange: pb.Exchange | None, time: in
     kind = pb.FAILSAFE if step.fallback else step.decision
     entity = SceneEntity(timestamp=stamp(time), frame_id=step.actor, id="decision")
     color = KINDS.get(kind, (120, 120, 120))
-    d = robot.position_dim
+    d, said = robot.position_dim, ""
     if exchange is not None and exchange.reply.HasField("decision"):
         made = exchange.reply.decision
         centers = [made.tube_center[i : i + d] for i in range(0, len(made.tube_center), d)]
@@ -160,11 +163,42 @@ def decision(robot: Robot, step: pb.Step, exchange: pb.Exchange | None, time: in
         way.points.extend(points)
         way.color.CopyFrom(_color(*color))
         entity.lines.append(way)
+        if kind in WORDS and not step.fallback and fits(robot, exchange.request, made):
+            about = explain(robot, exchange.request, made)
+            said = f"{WORDS[kind]}: {about.said}"
+            _explained(entity, exchange.request.state[:d], about, robot.footprint)
     if kind in WORDS:
-        word = "no answer: braking" if step.fallback else WORDS[kind]
+        word = fell_back() if step.fallback else said or WORDS[kind]
         above = HEIGHT + 3.0 * robot.footprint
         entity.texts.append(_text(word, step.state[:d], _color(*color), above))
     return SceneUpdate(entities=[entity])
+
+
+def _explained(entity: SceneEntity, start: Sequence[float], about: Explanation, size: float) -> None:
+    """Add the proposed and the executed input as arrows, and the edge of the half-space that stopped the proposal."""
+    for way, color in ((about.proposed, PROPOSED), (about.executed, EXECUTED)):
+        length = float(np.linalg.norm(way))
+        if length > 0.0:
+            thick = 0.15 * size
+            shape = ArrowPrimitive(pose=_along(start, way / length), color=color)
+            shape.shaft_length, shape.head_length = 0.8 * length, 0.2 * length
+            shape.shaft_diameter, shape.head_diameter = thick, 2.0 * thick
+            entity.arrows.append(shape)
+    if len(about.at):
+        edge = CubePrimitive(pose=_along(about.at, about.normal), color=EDGE)
+        across = 5.0 * size
+        edge.size.CopyFrom(_vector(FLAT, across, across if len(about.at) == 3 else FLAT))
+        entity.cubes.append(edge)
+
+
+def _along(at: Iterable[float], way: Sequence[float] | np.ndarray) -> Pose:
+    """A pose whose x axis points along a unit vector."""
+    x, y, z = [*way, 0.0, 0.0][:3]
+    yaw, pitch = math.atan2(y, x), -math.asin(max(-1.0, min(1.0, z)))
+    cy, sy, cp, sp = math.cos(0.5 * yaw), math.sin(0.5 * yaw), math.cos(0.5 * pitch), math.sin(0.5 * pitch)
+    pose = _pose(at)
+    pose.orientation.CopyFrom(Quaternion(x=-sy * sp, y=cy * sp, z=sy * cp, w=cy * cp))
+    return pose
 
 
 def _stop(entity: SceneEntity, center: Sequence[float], across: float, color: Color) -> None:

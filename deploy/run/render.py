@@ -5,6 +5,7 @@ What flies is drawn from above too: colours say how high things are.
 
 from __future__ import annotations
 
+import textwrap
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,7 @@ from matplotlib.animation import AbstractMovieWriter, FFMpegWriter, PillowWriter
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection, PatchCollection
 from matplotlib.figure import Figure
-from matplotlib.patches import Circle, FancyBboxPatch, Patch, Polygon, Rectangle
+from matplotlib.patches import Circle, FancyArrow, FancyBboxPatch, Patch, Polygon, Rectangle
 from matplotlib.transforms import Affine2D
 from numpy.typing import NDArray
 
@@ -22,6 +23,7 @@ from actors.driver import Driver
 from actors.guard import Ask, consult
 from logs.tally import KINDS as DECISIONS
 from messaging import brakeline_pb2 as pb
+from messaging.explained import Explanation, explain
 from messaging.robots import Robot
 from messaging.shapes import BOX, WALL, Obstacle
 from sim.policies import Policy
@@ -31,6 +33,8 @@ Array = NDArray[np.float64]
 KINDS = {pb.UNKNOWN: "no filter", **DECISIONS}
 COLOURS = {"no filter": "#444444", "allowed": "#0072b2", "adjusted": "#e69f00", "failsafe": "#d55e00"}
 COLOURS["recovering"] = "#8e44ad"
+ARROWS = {"proposed": "#c77d00", "executed": "#1f5fbf"}
+EDGE = "#c02030"  # of what the proposal would have crossed
 FORMATS = (".png", ".gif", ".mp4")
 SPEED = 3.0  # times as fast as the robot
 REST = 8  # frames that the last picture stands
@@ -51,6 +55,7 @@ class Frame:
     high: Array
     center: Array
     margin: float
+    why: Explanation | None = None  # of a decision, one that was not as proposed or not
 
 
 @dataclass(frozen=True)
@@ -71,7 +76,8 @@ def record(driver: Driver, policy: Policy, question: Ask | None, number: int) ->
     frames, step = [], pb.Step()
     while driver.running:
         proposal = np.asarray(policy(driver.observation, driver.info), dtype=float)
-        outcome = consult(question, [driver.request(proposal)], driver.robot)[0] if question is not None else None
+        asked = driver.request(proposal)
+        outcome = consult(question, [asked], driver.robot)[0] if question is not None else None
         decision = outcome.answer.message if outcome is not None and outcome.answer is not None else pb.Decision()
         before = np.asarray(driver.info["true_state"])
         step = driver.execute(proposal, outcome)
@@ -79,7 +85,8 @@ def record(driver: Driver, policy: Policy, question: Ask | None, number: int) ->
         half = np.reshape(decision.tube_half_width, (-1, d))
         heading = 0.0 if driver.robot.heading is None else float(before[driver.robot.heading])
         kind = KINDS.get(step.decision, "no filter")
-        frames.append(Frame(before[:d], heading, kind, center - half, center + half, center, decision.margin))
+        why = explain(driver.robot, asked, decision) if len(center) else None
+        frames.append(Frame(before[:d], heading, kind, center - half, center + half, center, decision.margin, why))
     end = "goal" if step.goal else "collision" if step.collision else "out of time"
     return Film(driver.robot, driver.info["arena"], frames, np.asarray(step.true_state[:d]), end)
 
@@ -169,8 +176,28 @@ class _Stage:
                 points[:, 0], points[:, 1], color=COLOURS[frame.kind], linewidth=1.2, zorder=5
             )
         self._draw_way(k)
-        seconds = k * self.robot.period
-        self.axes.set_title(f"{self._heading()}{seconds:5.1f} s, {frame.kind}", fontsize=11, loc="left")
+        said = frame.kind
+        if frame.why is not None:
+            self._moving += self._explained(frame, frame.why)
+            said = frame.kind if frame.kind == "allowed" else textwrap.fill(f"{frame.kind}: {frame.why.said}", 80)
+        self.axes.set_title(f"{self._heading()}{k * self.robot.period:5.1f} s\n{said}", fontsize=10, loc="left")
+
+    def _explained(self, frame: Frame, why: Explanation) -> list[Any]:
+        """The proposed and the executed input as arrows, and the edge of what stopped the proposal."""
+        drawn: list[Any] = []
+        x, y = frame.position[:2]
+        for label, way in (("proposed", why.proposed), ("executed", why.executed)):
+            wide = 0.12 * self.robot.footprint
+            arrow = FancyArrow(
+                x, y, way[0], way[1], width=wide, length_includes_head=True, color=ARROWS[label], zorder=9
+            )
+            drawn.append(self.axes.add_patch(arrow))
+        flat = float(np.hypot(*why.normal[:2])) if len(why.at) else 0.0
+        if flat > 0.2 and frame.kind != "allowed":
+            along = 3.0 * self.robot.footprint * np.array([-why.normal[1], why.normal[0]]) / flat
+            ends = np.stack([why.at[:2] - along, why.at[:2] + along])
+            drawn += self.axes.plot(ends[:, 0], ends[:, 1], color=EDGE, linewidth=2.5, zorder=9)
+        return drawn
 
     def all_at_once(self) -> None:
         """The whole way; the tubes of a few plans; where it was corrected."""

@@ -64,6 +64,36 @@ function tube(v, t, footprint) {
   return parts;
 }
 
+const ARROWS = ["#c77d00", "#1f5fbf"]; // proposed, executed
+const EDGE = "#c02030";
+
+/** From where it was asked to where an input would take the robot in some periods. */
+function arrow(v, [x, y], [dx, dy], attributes) {
+  const from = [v.x(x), v.y(y)], to = [v.x(x + dx), v.y(y + dy)], length = Math.hypot(to[0] - from[0], to[1] - from[1]);
+  if (length < 2) return tag("circle", { cx: from[0], cy: from[1], r: 2.5, fill: attributes.stroke });
+  const [ux, uy] = [(to[0] - from[0]) / length, (to[1] - from[1]) / length], head = Math.min(7, 0.5 * length);
+  const side = (s) => `${(to[0] - head * ux + s * 0.5 * head * uy).toFixed(1)} ${(to[1] - head * uy - s * 0.5 * head * ux).toFixed(1)}`;
+  return tag("path", { d: `M${from[0].toFixed(1)} ${from[1].toFixed(1)} L${to[0].toFixed(1)} ${to[1].toFixed(1)} M${side(1)} L${to[0].toFixed(1)} ${to[1].toFixed(1)} L${side(-1)}`, fill: "none", "stroke-width": 2, "stroke-linecap": "round", ...attributes });
+}
+
+/** The edge of a half-space, with strokes on the side where the robot may not be. */
+function edge(v, [x, y, nx, ny], reach) {
+  const flat = Math.hypot(nx, ny);
+  if (flat < 0.2) return []; // it is above or below
+  const [ux, uy] = [nx / flat, ny / flat], parts = [], at = (a, b) => [v.x(x - a * uy + b * ux), v.y(y + a * ux + b * uy)];
+  const line = ([x1, y1], [x2, y2], width) => parts.push(tag("line", { x1, y1, x2, y2, stroke: EDGE, "stroke-width": width, class: "edge" }));
+  line(at(-reach, 0), at(reach, 0), 2);
+  for (let i = -4; i <= 4; i++) line(at((i / 4.5) * reach, 0), at((i / 4.5 + 0.12) * reach, 0.16 * reach), 1);
+  return parts;
+}
+
+/** What was asked for and what was done, and what stood in the way. */
+function explained(v, t, footprint) {
+  if (!t.arrows) return [];
+  const parts = t.edge ? edge(v, t.edge, 2.5 * footprint) : [];
+  return [...parts, arrow(v, t.from, t.arrows[0], { stroke: ARROWS[0], class: "proposed" }), arrow(v, t.from, t.arrows[1], { stroke: ARROWS[1], class: "executed" })];
+}
+
 function robot(v, episode, k) {
   const x = v.x(episode.x[k]), y = v.y(episode.y[k]), r = Math.max(4, v.per * episode.footprint);
   const parts = [tag("circle", { cx: x, cy: y, r, "fill-opacity": 0.12, class: "ink", "stroke-width": 1.3 })];
@@ -81,6 +111,7 @@ function arena(episode, k, size, box = null) {
   parts.push(path(v, episode, episode.steps - 1, true), path(v, episode, Math.min(k, episode.x.length - 1), false));
   if (episode.tubes[k]) parts.push(tube(v, episode.tubes[k], episode.footprint));
   parts.push(robot(v, episode, k));
+  if (episode.tubes[k]) parts.push(explained(v, episode.tubes[k], episode.footprint));
   const quarter = v.width / v.per / 4, power = 10 ** Math.floor(Math.log10(quarter));
   const length = power * [5, 2, 1].find((m) => m * power <= quarter);
   parts.push(tag("path", { d: `M8 ${v.height - 12} v4 h${v.per * length} v-4`, fill: "none", class: "ink" }), label(10, v.height - 14, `${figure(length)} m`));

@@ -3,7 +3,9 @@
 function why(episode, k) {
   const t = episode.tubes[k];
   if (!t) return KINDS[episode.kinds[k]].name;
-  return `${KINDS[episode.kinds[k]].name}; proposed ${t.proposed.join(", ")}, executed ${t.plan.join(", ")}; margin ${t.at_least ? "> " : ""}${figure(100 * t.margin)} cm${t.reason ? `; ${t.reason}` : ""}`;
+  const inputs = t.inputs?.map(([name, unit, proposed, executed]) => `${name} ${figure(proposed)} → ${figure(executed)} ${unit}`) ?? [`${t.proposed.join(", ")} → ${t.plan.join(", ")}`];
+  const said = (episode.kinds[k] !== "l" && t.said) || t.reason;
+  return `${KINDS[episode.kinds[k]].name}${said ? `: ${said}` : ""}; proposed → executed: ${inputs.join(", ")}; margin ${t.at_least ? "> " : ""}${figure(100 * t.margin)} cm`;
 }
 
 /** The nearest misses of all robot kinds, worst first. */
@@ -55,7 +57,7 @@ class Picker {
     this.facts = element("dl", { class: "facts", id: `${mark}episode-facts` });
     this.strip = element("div");
     target.append(element("div", { class: "split" }, this.map, element("div", {}, this.facts, this.strip)));
-    target.append(legend([...["l", "d", "a"].map((k) => [KINDS[k].color, KINDS[k].name]), ["#7a4fc0", "tube, and the plan in it"], ["#1d7f4e", "goal"], ["#c9d1da", "obstacles"]]));
+    target.append(legend([...["l", "d", "a"].map((k) => [KINDS[k].color, KINDS[k].name]), ["#7a4fc0", "tube, and the plan in it"], [ARROWS[0], "→ proposed"], [ARROWS[1], "→ executed"], [EDGE, "what the proposal would have crossed"], ["#1d7f4e", "goal"], ["#c9d1da", "obstacles"]]));
     const wanted = this.all.findIndex(({ episode }) => episode.rows);
     this.show(wanted >= 0 ? wanted : Math.max(0, this.all.findIndex(({ near: rank }) => rank === 0)));
   }

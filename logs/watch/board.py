@@ -13,6 +13,7 @@ from logs.scene import half_width
 from logs.watch.totals import heard, totals
 from messaging import brakeline_pb2 as pb
 from messaging.bus import Sample
+from messaging.explained import explain, fits
 from messaging.robots import Robot, UnknownRobot, robot_named
 from messaging.shapes import WALL
 from messaging.tolerant import headline
@@ -41,6 +42,10 @@ class Card:
     tube: list[list[float]] = field(default_factory=list)  # per period: center x, y, half-width x, y
     margin: float | None = None
     at_least: bool = False  # nothing in sight is as near as the margin
+    said: str = ""  # why it was not as proposed
+    inputs: list[tuple[str, str, float, float]] = field(default_factory=list)  # name, unit, proposed, executed
+    arrows: list[list[float]] = field(default_factory=list)  # of the proposed and the executed input, m
+    edge: list[float] = field(default_factory=list)  # of what stopped the proposal: a point, and the normal there
     trail: deque[tuple[float, float]] = field(default_factory=lambda: deque(maxlen=TRAIL))
     marks: deque[tuple[float, float, str]] = field(default_factory=lambda: deque(maxlen=TRAIL))  # interventions
     reward: float = 0.0
@@ -66,6 +71,7 @@ class Card:
     def decide(self, exchange: pb.Exchange) -> None:
         if not exchange.reply.HasField("decision"):
             self.tube, self.margin = [], None
+            self._unexplained()
             return
         decision, d = exchange.reply.decision, self.robot.position_dim
         centers, halves = decision.tube_center, decision.tube_half_width
@@ -73,6 +79,19 @@ class Card:
             raise ValueError(f"a tube of {len(centers)} and {len(halves)} numbers")
         self.tube = [[*centers[i : i + 2], *halves[i : i + 2]] for i in range(0, len(centers), d)]
         self.margin, self.at_least = decision.margin, decision.at_least
+        self._explain(exchange.request, decision)
+
+    def _explain(self, request: pb.Request, decision: pb.Decision) -> None:
+        if not fits(self.robot, request, decision):
+            self._unexplained()
+            return
+        about = explain(self.robot, request, decision)
+        self.said = "" if decision.kind == pb.ALLOWED else about.said
+        self.inputs, self.arrows = about.inputs, [about.proposed[:2].tolist(), about.executed[:2].tolist()]
+        self.edge = [*about.at[:2].tolist(), *about.normal[:2].tolist()] if len(about.at) else []
+
+    def _unexplained(self) -> None:
+        self.said, self.inputs, self.arrows, self.edge = "", [], [], []
 
     def step(self, step: pb.Step) -> None:
         self._stand(list(step.state))
@@ -93,7 +112,10 @@ class Card:
         self.height = state[2] if self.robot.position_dim == 3 else None
 
     def view(self) -> dict[str, Any]:
-        names = ("actor", "number", "arena", "pose", "height", "kind", "tube", "margin", "at_least", "reward", "ended")
+        names = (
+            *("actor", "number", "arena", "pose", "height", "kind", "tube", "margin", "at_least", "reward", "ended"),
+            *("said", "inputs", "arrows", "edge"),
+        )
         about = {name: getattr(self, name) for name in names}
         lists = {"trail": list(self.trail), "marks": list(self.marks)}
         return about | lists | {"robot": self.robot.name, "footprint": self.robot.footprint}

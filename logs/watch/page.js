@@ -2,6 +2,8 @@
 "use strict";
 
 const COLORS = { allowed: "#34a864", adjusted: "#f0961e", failsafe: "#d6303c", recovering: "#8e44ad", "": "#8a93a3" };
+const ARROWS = ["#c77d00", "#1f5fbf"]; // proposed, executed
+const EDGE = "#c02030"; // of what the proposal would have crossed
 const SILENT = 3; // s without a message on the bus after which the run counts as quiet
 const CLOSE = 6; // footprints from the robot to the edge of the close view
 const WINDOW = 20; // episodes that the reward's mean is over
@@ -38,13 +40,13 @@ function card(robot) {
     const box = element("article", "", "card");
     box.dataset.actor = robot.actor;
     const title = element("h2", robot.actor);
-    const made = { episode: element("span"), note: element("p"), map: element("canvas"), near: element("canvas") };
+    const made = { episode: element("span"), note: element("p"), why: element("p", "", "why"), map: element("canvas"), near: element("canvas") };
     made.map.setAttribute("aria-label", `the arena of ${robot.actor}`);
     made.near.setAttribute("aria-label", `what is about ${robot.actor}`);
     const maps = element("div", "", "maps");
     maps.append(made.map, made.near);
     title.append(made.episode);
-    box.append(title, maps, made.note);
+    box.append(title, maps, made.note, made.why);
     at("robots").append(box);
     cards.set(robot.actor, made);
   }
@@ -52,13 +54,15 @@ function card(robot) {
 }
 
 function drawRobot(robot) {
-  const { episode, map, near, note } = card(robot);
+  const { episode, map, near, note, why } = card(robot);
   episode.textContent = `episode ${robot.number}`;
   const words = [robot.kind || "no filter", `reward ${number(robot.reward, 1)}`, `stepped in ${robot.marks.length} ×`];
   if (robot.margin !== null) words.push(`margin ${robot.at_least ? "> " : ""}${number(100 * robot.margin, 1)} cm`);
   if (robot.height !== null) words.push(`height ${number(robot.height, 1)} m`);
   if (robot.ended) words.push(`before: ${robot.ended}`);
   note.textContent = words.join(" · ");
+  const inputs = robot.inputs.map(([name, unit, proposed, executed]) => `${name} ${number(proposed, 2)} → ${number(executed, 2)} ${unit}`);
+  why.textContent = robot.kind === "" ? "" : [robot.said, inputs.join(", ")].filter(Boolean).join(" · ");
   if (!robot.arena.half) return;
   drawMap(map, robot, [0, 0], 1.04 * robot.arena.half);
   drawMap(near, robot, robot.pose, CLOSE * robot.footprint);
@@ -76,6 +80,41 @@ function drawMap(canvas, robot, [x, y], half) {
   drawWay(pen, robot, scale);
   drawBody(pen, robot, scale);
   drawTube(pen, robot, scale);
+  drawExplained(pen, robot, scale);
+}
+
+/** What was asked for and what was done as arrows, and the edge of what stood in the way. */
+function drawExplained(pen, robot, scale) {
+  const [x, y] = robot.pose, reach = 2.5 * robot.footprint;
+  if (robot.edge.length && Math.hypot(robot.edge[2], robot.edge[3]) > 0.2) {
+    const [px, py, nx, ny] = robot.edge;
+    const flat = Math.hypot(nx, ny), ux = nx / flat, uy = ny / flat;
+    const stroke = (a1, b1, a2, b2, width) => {
+      pen.lineWidth = width / scale;
+      pen.beginPath();
+      pen.moveTo(px - a1 * uy + b1 * ux, py + a1 * ux + b1 * uy);
+      pen.lineTo(px - a2 * uy + b2 * ux, py + a2 * ux + b2 * uy);
+      pen.stroke();
+    };
+    pen.strokeStyle = EDGE;
+    stroke(-reach, 0, reach, 0, 2);
+    for (let i = -4; i <= 4; i++) stroke((i / 4.5) * reach, 0, (i / 4.5 + 0.12) * reach, 0.16 * reach, 1);
+  }
+  robot.arrows.forEach(([dx, dy], i) => {
+    const length = Math.hypot(dx, dy);
+    pen.strokeStyle = ARROWS[i];
+    pen.lineWidth = 2 / scale;
+    pen.beginPath();
+    pen.moveTo(x, y);
+    pen.lineTo(x + dx, y + dy);
+    if (length > 3 / scale) {
+      const head = Math.min(7 / scale, 0.5 * length), ux = dx / length, uy = dy / length;
+      pen.moveTo(x + dx - head * ux + 0.5 * head * uy, y + dy - head * uy - 0.5 * head * ux);
+      pen.lineTo(x + dx, y + dy);
+      pen.lineTo(x + dx - head * ux - 0.5 * head * uy, y + dy - head * uy + 0.5 * head * ux);
+    }
+    pen.stroke();
+  });
 }
 
 function drawArena(pen, arena, scale) {

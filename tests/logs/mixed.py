@@ -15,6 +15,7 @@ from mcap_protobuf.decoder import DecoderFactory
 
 from logs.segment import Entry, open_segment
 from messaging import brakeline_pb2 as pb
+from messaging.robots import robot_named
 
 SECOND = 10**9
 BEGIN = 1_700_000_000 * SECOND
@@ -76,7 +77,7 @@ class Writer:
         step.decide_ms, step.propose_ms = (0.0 if fallback else chance.lognormvariate(-1.0, 0.5)), 0.1
         step.outside, step.compared = chance.random() < 0.01, chance.random() < 0.9
         step.contained = step.compared and chance.random() < 0.99
-        step.state[:] = [0.05 * k] * dim + [0.1] * 3
+        step.state[:] = [0.05 * k] * dim + [0.1] * (robot_named(robot).state_dim - dim)
         step.proposed[:], step.action[:] = [0.2] * dim, [0.1] * dim
         return step
 
@@ -97,9 +98,12 @@ class Writer:
             decision.solve_ms, decision.iterations = 0.4 * decision.time_ms, chance.randrange(1, 60)
             decision.verified = chance.random() < 0.95
             decision.reason = "too near"
-        decision.plan[:] = [0.1] * dim * 3
-        decision.tube_center[:] = [0.05 * step.step + 0.01 * i for i in range(3) for _ in range(dim)]
-        decision.tube_half_width[:] = [chance.uniform(0.01, 0.03) for _ in range(3 * dim)]
+            normal, at = [1.0] + [0.0] * (dim - 1), [0.05 * step.step + 0.2] * dim
+            decision.stopped.CopyFrom(pb.Stopped(by="box", room=-0.03, after=0.2, normal=normal, at=at))
+        periods = robot_named(step.robot).horizon
+        decision.plan[:] = [0.1] * dim * periods
+        decision.tube_center[:] = [0.05 * step.step + 0.01 * i for i in range(periods) for _ in range(dim)]
+        decision.tube_half_width[:] = [chance.uniform(0.01, 0.03) for _ in range(periods * dim)]
         decision.margin = chance.gauss(0.01, 0.01)
         exchange = pb.Exchange(
             request=request, round_trip_ms=decision.time_ms + decision.queue_ms + chance.expovariate(1.0)

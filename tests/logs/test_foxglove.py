@@ -138,7 +138,7 @@ def test_without_a_filter_and_without_an_answer_there_is_a_picture_too(studio: S
     lost.ClearField("reply")
     studio("exchange/ground/actor-0", lost)
     shown = studio("step/ground/actor-0", step(1, pb.FAILSAFE, fallback=True))["foxglove/decision/ground/actor-0"]
-    assert shown.entities[0].texts[0].text == "no answer: braking"
+    assert shown.entities[0].texts[0].text == "no answer in time: braked along the plan verified before"
 
 
 def test_calm_steps_are_thinned_out_and_interventions_are_not(say: Say) -> None:

@@ -104,6 +104,21 @@ def test_it_loads_without_a_complaint_or_a_request(page: Page, report: tuple[Pat
     assert page.value("document.querySelectorAll('h1 b').length") == 0, "names are text, whatever is in them"
 
 
+def test_a_decision_is_explained_by_a_sentence_arrows_and_an_edge(page: Page) -> None:
+    shown = page.value("""({
+        words: [...document.querySelectorAll('#near .why')].map(p => p.textContent),
+        proposed: document.querySelectorAll('#near path.proposed').length,
+        executed: document.querySelectorAll('#near path.executed').length,
+        edges: document.querySelectorAll('#near line.edge').length,
+        legend: document.querySelector('#picker').textContent,
+    })""")
+    stepped_in = [words for words in shown["words"] if "too close to the box" in words]
+    assert stepped_in and all("it (after 0.2 s) would have come 3 cm too close" in words for words in stepped_in)
+    assert any("speed 0.2 → 0.1 m/s, turn rate 0.2 → 0.1 rad/s" in words for words in shown["words"])
+    assert shown["proposed"] == shown["executed"] > 0 and shown["edges"] > 0
+    assert "→ proposed" in shown["legend"] and "what the proposal would have crossed" in shown["legend"]
+
+
 def test_everything_is_drawn(page: Page, report: tuple[Path, dict[str, Any]]) -> None:
     figures = report[1]
     drawn = page.value("""({

@@ -1,0 +1,124 @@
+"""A decision in a sentence: what was done, why, and where it was, for robots of several kinds."""
+
+import numpy as np
+import pytest
+
+from messaging import brakeline_pb2 as pb
+from messaging.explained import arrow, explain, fits, sentence
+from tests.robots import GROUND, QUADROTOR
+
+
+def asked(robot, action, heading=0.0):
+    state = [0.0] * robot.state_dim
+    if robot.heading is not None:
+        state[robot.heading] = heading
+    return pb.Request(state=state, action=action)
+
+
+def answered(robot, kind, action, by="cylinder", room=-0.03, after=None, normal=(), verified=True):
+    d, end = robot.position_dim, robot.horizon * robot.period
+    rest = [0.0] * (robot.horizon - 1) * robot.action_dim
+    decision = pb.Decision(kind=kind, plan=[*action, *rest], verified=verified, reason="why not")
+    if by:
+        at = [0.3 * value for value in normal]
+        decision.stopped.CopyFrom(
+            pb.Stopped(by=by, room=room, after=end if after is None else after, normal=normal, at=at)
+        )
+    assert fits(robot, asked(robot, action), decision) or len(normal) not in (0, d)
+    return decision
+
+
+@pytest.mark.parametrize(
+    ("action", "instead", "normal", "said"),
+    [
+        (
+            (0.25, 0.0),
+            (0.25, 0.4),
+            (1, 0),
+            "turned left: straight on, the stop would have come 3 cm too close to the cylinder ahead",
+        ),
+        (
+            (0.25, 0.2),
+            (0.25, -0.4),
+            (0, 1),
+            "turned right: as proposed, the stop would have come 3 cm too",
+        ),
+        ((0.25, 0.0), (0.1, 0.0), (0.6, -0.8), "slowed down: as proposed, the stop"),
+        ((0.25, 0.0), (0.0, 0.0), (1, 0), "stopped: going on, the stop would"),
+    ],
+)
+def test_a_robot_on_wheels(action, instead, normal, said):
+    decision = answered(GROUND, pb.ADJUSTED, instead, normal=normal)
+    assert sentence(GROUND, asked(GROUND, action), decision).startswith(said)
+
+
+@pytest.mark.parametrize(
+    ("heading", "normal", "where"),
+    [
+        (0.0, (1, 0), "to the wall ahead"),
+        (0.0, (0, 1), "to the wall on the left"),
+        (np.pi / 2, (1, 0), "to the wall on the right"),
+        (3.0, (1, 0), "to the wall behind"),
+    ],
+)
+def test_where_it_is_is_told_as_the_robot_looks(heading, normal, where):
+    decision = answered(GROUND, pb.FAILSAFE, (0.0, 0.0), "wall", normal=normal)
+    said = sentence(GROUND, asked(GROUND, (0.25, 0.0), heading), decision)
+    assert (
+        said == f"braked along the plan verified before: as proposed, the stop would have come 3 cm too close {where}"
+    )
+
+
+@pytest.mark.parametrize(
+    ("instead", "normal", "said"),
+    [
+        ((3.0, 0.0, 0.0), (1, 0, 0), "slowed down: as proposed, the stop would have come 3 cm too close to the box in"),
+        ((4.0, 3.0, 0.0), (1, 0, 0), "turned aside to the left: straight on"),
+        ((4.0, 0.0, 2.5), (1, 0, 0), "climbed: straight on"),
+        ((0.0, 0.0, 0.0), (0, 0, -1), "stopped: going on, the stop would have come 3 cm too close to the box below"),
+    ],
+)  # fmt: skip
+def test_what_flies(instead, normal, said):
+    decision = answered(QUADROTOR, pb.ADJUSTED, instead, "box", normal=normal)
+    assert sentence(QUADROTOR, asked(QUADROTOR, (5.0, 0.0, 0.0)), decision).startswith(said)
+
+
+def test_what_is_near_but_not_too_near_what_is_not_seen_and_what_is_unverified():
+    def said(**more):
+        return sentence(GROUND, asked(GROUND, (0.25, 0.0)), answered(GROUND, **{"action": (0.0, 0.0), **more}))
+
+    assert "within 4 mm of the cylinder ahead, too near to move from there" in said(
+        kind=pb.ADJUSTED, room=0.004, normal=(1, 0)
+    )
+    assert "it (after 0.2 s) would have come 12 cm too close to what is not seen on the left" in said(
+        kind=pb.ADJUSTED, by="unseen", room=-0.12, after=0.2, normal=(0, 1)
+    )
+    assert said(kind=pb.FAILSAFE, by="", verified=False) == "braked, though no plan is verified: why not"
+    assert "the moving cylinder is touched already" in said(kind=pb.FAILSAFE, by="moving cylinder")
+    assert said(kind=pb.RECOVERING, by="").startswith("slowly backs out")
+    assert said(kind=pb.ALLOWED, by="") == "as proposed"
+
+
+def test_arrows_go_where_the_inputs_go():
+    ahead = arrow(GROUND, np.pi / 2, np.array([0.2, 0.0]))
+    assert ahead == pytest.approx([0.0, 0.2 * 3 * GROUND.period])
+    left = arrow(GROUND, 0.0, np.array([0.2, 0.5]))
+    assert left[1] > 0.0 and np.hypot(*left) == pytest.approx(0.2 * 3 * GROUND.period)
+    assert arrow(QUADROTOR, 0.0, np.array([1.0, -2.0, 0.5]))[1:] == pytest.approx(
+        3 * QUADROTOR.period * np.array([-2.0, 0.5])
+    )
+
+
+def test_all_that_a_picture_needs_is_named_with_its_unit():
+    decision = answered(GROUND, pb.ADJUSTED, (0.1, 0.2), normal=(1, 0))
+    about = explain(GROUND, asked(GROUND, (0.25, 0.0)), decision)
+    assert about.inputs == [("speed", "m/s", 0.25, 0.1), ("turn rate", "rad/s", 0.0, 0.2)]
+    assert about.at == pytest.approx([0.3, 0.0]) and about.normal == pytest.approx([1.0, 0.0])
+
+
+def test_what_has_another_robots_sizes_fits_not():
+    request, decision = asked(GROUND, (0.25, 0.0)), answered(GROUND, pb.ADJUSTED, (0.1, 0.2), normal=(1, 0))
+    assert fits(GROUND, request, decision)
+    assert not fits(QUADROTOR, request, decision)
+    decision.stopped.at.append(1.0)
+    assert not fits(GROUND, request, decision)

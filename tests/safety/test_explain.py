@@ -1,0 +1,69 @@
+"""What stopped a proposal: the right obstacle, where its edge truly is, and as far as the tube truly comes."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from messaging.motion import Motion
+from messaging.movers import Movers
+from messaging.robots import Limit
+from messaging.shapes import Obstacle
+from safety.explain import SIGHT
+from safety.filter import Filter
+from safety.request import ALLOWED
+from tests.safety.test_filter import cylinder, random_request, request
+
+
+def blocked(ready, requests):
+    for question in requests:
+        decision = ready.decide(question)
+        if decision.kind != ALLOWED and decision.stopped is not None:
+            yield question, decision
+        else:
+            assert decision.stopped is None
+
+
+def test_the_edge_touches_the_obstacle_that_is_in_the_way_and_holds_all_of_it(ready):
+    rng, seen = np.random.default_rng(0), 0
+    for question, decision in blocked(ready, (random_request(rng, 6, 0.22) for _ in range(120))):
+        stopped, shapes = decision.stopped, question.obstacles
+        assert stopped.by == "cylinder" and 0.0 <= stopped.after <= ready.robot.horizon * ready.robot.period + 1e-9
+        levels = (shapes.center - stopped.at) @ stopped.normal - shapes.rho  # of the nearest point of each
+        assert np.abs(levels).min() < 1e-6, "it is the supporting half-space of one of them"
+        assert np.linalg.norm(stopped.normal) == pytest.approx(1.0)
+        assert (question.state[:2] - stopped.at) @ stopped.normal < 0.0, "the robot is on the free side"
+        seen += 1
+    assert seen > 30
+
+
+def test_the_room_is_that_of_the_proposals_tube(ready):
+    rng = np.random.default_rng(1)
+    for question, decision in blocked(ready, (random_request(rng) for _ in range(60))):
+        z = ready._regressors(
+            np.concatenate([question.state[ready.regressor], question.input_in_force]),
+            ready._limited(question.action, question.input_in_force),
+        )
+        scene = ready._scene(question)
+        assert decision.stopped.room == pytest.approx(ready._margin(ready._rows(scene, z), z))
+
+
+def test_a_wall_a_box_a_mover_and_a_limit_have_their_names(ready):
+    def by(filter=ready, movers=None, obstacles=(), action=(0.25, 0.0), state=(0, 0, 0, 0.25, 0)):
+        found = filter.decide(request(state, action, obstacles, movers=movers)).stopped
+        assert found is not None
+        return found.by
+
+    assert by(obstacles=[Obstacle("wall", (0.16, 0.0), (), np.pi), cylinder(-1.0, 0.0)]) == "wall"
+    assert by(obstacles=[cylinder(-1.0, 0.0), Obstacle("box", (0.3, 0.0), (0.3, 0.3))]) == "box"
+    walker = Obstacle("cylinder", (0.45, 0.0), (0.1,), motion=Motion((0.0, 0.0), 0.0, 0.0, speed=0.5))
+    assert by(movers=Movers.of([walker], 2), obstacles=[cylinder(-1.0, 0.0)]) == "moving cylinder"
+    slow = replace(ready.robot, limits=(Limit("walking pace", (0.0, 0.0, 0.0, 1.0, 0.0), 0.1),))
+    limited = Filter(replace(ready.model, robot=slow))
+    assert by(limited, state=(0, 0, 0, 0.05, 0)) == "walking pace"
+
+
+def test_a_short_sight_has_its_name(ready):
+    near_sighted = Filter(replace(ready.model, robot=replace(ready.robot, sight=0.15)))
+    decision = near_sighted.decide(request((0, 0, 0, 0.25, 0), (0.25, 0.0)))
+    assert decision.stopped is not None and decision.stopped.by == SIGHT
