@@ -48,6 +48,11 @@ COMMANDS: dict[str, Command] = {
     "safety": Command(
         "processes:Safety", "the safety service alone", "brakeline safety ground --listen tls/0.0.0.0:7447 --keys keys"
     ),
+    "router": Command(
+        "router:Router",
+        "where the processes of several machines meet; linked routers are one bus",
+        "brakeline router --listen tls/0.0.0.0:7447 --connect tls/10.0.0.2:7447 --keys keys",
+    ),
     "learner": Command(
         "processes:LearnerProcess",
         "a learner alone",

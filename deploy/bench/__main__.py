@@ -1,6 +1,7 @@
 """`make bench`: every benchmark, each beside its peer in the same run.
 
 python -m deploy.bench [NAME ...] [--json]
+python -m deploy.bench chaos --kills 30 --seed 1
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from rich.console import Console
 from rich.table import Table
 
 from deploy.bench import (
+    chaos,
     decide,
     environment,
     fuzz,
@@ -42,8 +44,9 @@ BENCHMARKS = {
     "recording": recording.run,
     "logs-2gb": logs.run_large,
     "fuzz": fuzz.run,
+    "chaos": chaos.run,
 }
-WHEN_ASKED = {"logs-2gb", "fuzz"}  # one writes as much, the other takes a quarter of an hour
+WHEN_ASKED = {"logs-2gb", "fuzz", "chaos"}  # one writes as much, the others take a quarter of an hour or more
 
 
 def show(console: Console, name: str, figures: Figures) -> None:
@@ -58,7 +61,7 @@ def show(console: Console, name: str, figures: Figures) -> None:
 
 
 def main() -> int:
-    names = [word for word in sys.argv[1:] if not word.startswith("-")]
+    names = [word for word in sys.argv[1:] if not word.startswith("-") and not word.isdecimal()]
     names = names or [name for name in BENCHMARKS if name not in WHEN_ASKED]
     unknown = [name for name in names if name not in BENCHMARKS]
     if unknown:

@@ -48,16 +48,20 @@ class LearnerProcess:
     """Folder of its checkpoint and policy."""
     resume: bool = False
     """From the checkpoint there."""
+    resume_if_any: bool = False
+    """From the checkpoint there, if there is one: for who starts it again and again."""
     name: str = "learner"
     seed: int = 0
     steps: int = 100_000
     learner: LearnerConfig = field(default_factory=lambda: RunConfig().learner)
 
     def run(self) -> int:
-        from learner.service import LearnerSettings, main
+        from learner.checkpoint import exists
+        from learner.service import CHECKPOINT, LearnerSettings, main
 
+        resume = self.resume or (self.resume_if_any and exists(self.out / CHECKPOINT))
         config = replace(self.learner, seed=self.seed, steps=self.steps)
-        main(LearnerSettings(self.endpoints.bus(), learnt(self.robot).name, self.out, self.resume, self.name, config))
+        main(LearnerSettings(self.endpoints.bus(), learnt(self.robot).name, self.out, resume, self.name, config))
         return 0
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ipaddress
 import json
 import re
+import time
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,6 +15,7 @@ from messaging.bus.access import access
 from messaging.bus.errors import Insecure, Unreachable
 from messaging.bus.identity import names_in, tls
 
+FIRST_PAUSE, LONGEST_PAUSE = 0.1, 1.0  # s between two attempts to find a router
 SOURCE = re.compile(r" at /\S+\.rs:\d+\.?")  # where in Zenoh's source an error arose
 
 
@@ -91,7 +93,8 @@ def configuration(settings: BusSettings, source: str) -> zenoh.Config:
         "mode": "client" if client else "router",
         "connect/endpoints": settings.connect,
         "connect/exit_on_failure": client,
-        "connect/timeout_ms": int(settings.patience * 1e3) if client else -1,
+        # Of a client 0: each endpoint once, and `open_session` does it again; else it goes on with the first alone.
+        "connect/timeout_ms": 0 if client else -1,
         "connect/retry": {"period_init_ms": 100, "period_max_ms": 1000, "period_increase_factor": 1.5},
         "listen/endpoints": settings.listen,
         "scouting/multicast/enabled": False,
@@ -119,14 +122,26 @@ def open_session(settings: BusSettings, source: str) -> zenoh.Session:
         Unreachable: no router answered, or an endpoint cannot be listened on.
         ValueError, Insecure, BadKeys: as `configuration` says.
     """
-    try:
-        return zenoh.open(configuration(settings, source))
-    except zenoh.ZError as error:
-        why = SOURCE.sub("", str(error))
-        if settings.listen:
-            raise Unreachable(f"cannot listen on {', '.join(settings.listen)}: {why}") from error
-        keys = "" if settings.keys is None else ", and that its keys and these are of one authority"
-        raise Unreachable(
-            f"no router at {', '.join(settings.connect)} within {settings.patience:.0f} s; start one there "
-            f"(any process with --listen), or check --connect{keys}: {why}"
-        ) from error
+    until = time.monotonic() + (0.0 if settings.listen else settings.patience)
+    pause = FIRST_PAUSE
+    while True:
+        try:
+            return zenoh.open(configuration(settings, source))
+        except zenoh.ZError as error:
+            left = until - time.monotonic()
+            if left <= 0.0:
+                raise _unreachable(settings, error) from error
+        time.sleep(min(pause, left))
+        pause = min(2.0 * pause, LONGEST_PAUSE)
+
+
+def _unreachable(settings: BusSettings, error: zenoh.ZError) -> Unreachable:
+    """With what to do."""
+    why = SOURCE.sub("", str(error))
+    if settings.listen:
+        return Unreachable(f"cannot listen on {', '.join(settings.listen)}: {why}")
+    keys = "" if settings.keys is None else ", and that its keys and these are of one authority"
+    return Unreachable(
+        f"no router at {', '.join(settings.connect)} within {settings.patience:.0f} s; start one there "
+        f"(any process with --listen), or check --connect{keys}: {why}"
+    )

@@ -11,6 +11,7 @@ import pytest
 
 from messaging import brakeline_pb2 as pb
 from messaging.bus import Bus, BusError, BusSettings, Late, Malformed, NoReply, Refused, Sample, Unreachable
+from messaging.ports import free_endpoint
 from messaging.topics import DECIDE, HEALTH, LOG, STEP, WEIGHTS
 
 Join = Callable[..., Bus]
@@ -288,6 +289,12 @@ def test_a_client_waits_for_its_router(join: Join) -> None:
     join("launcher", listen=True)
     waiting.join(5.0)
     assert opened[0].connected
+
+
+def test_a_client_that_starts_finds_the_router_that_there_is(join: Join, endpoint: str) -> None:
+    join("launcher", listen=True)
+    with Bus(BusSettings(connect=(free_endpoint(), endpoint), patience=5.0), "actor-0") as bus:
+        assert "launcher" in bus.living()
 
 
 def test_an_endpoint_in_use_cannot_be_listened_on(join: Join) -> None:

@@ -1,0 +1,73 @@
+"""A run over five hosts whose clocks are hours apart: robots that are cut off brake, everybody finds another router and
+another replica, the learner moves, and every step counts once. The long form is `python -m deploy.bench chaos`."""
+
+from collections import Counter
+
+import pytest
+
+from deploy.bench.fleet import MOVED, Fleet
+from deploy.bench.hosts import Hosts, NoHosts
+from learner.checkpoint import exists
+from learner.config import LearnerConfig
+from logs.reader import read
+from tests.system.runs import until
+
+STEPS, WINDOW = 700, LearnerConfig().window
+CLOCKS = {2: -7.0, 3: 5.0}
+ACTOR = "actor-ground-0"
+
+
+@pytest.fixture
+def hosts():
+    try:
+        with Hosts(5, CLOCKS) as made:
+            made.join(1, 2)
+            yield made
+    except NoHosts as error:
+        pytest.skip(f"no network namespaces here: {error}")
+
+
+def test_hosts_are_cut_off_killed_and_left_and_the_run_ends_with_every_step_counted_once(hosts, data_folder, tmp_path):
+    with Fleet(tmp_path, hosts, steps=STEPS) as fleet:
+        fleet.start()
+
+        def go_on(steps, what):
+            target = fleet.taken("ground") + steps
+            until(lambda: fleet.taken("ground") >= target or fleet.spots["learner-ground"].done, what)
+
+        go_on(30, "the first steps")
+        for _ in range(3):  # it may just have waited for the learner, with nothing to ask
+            before = fleet.taken("ground")
+            hosts.cut(3)
+            until(lambda: ACTOR not in fleet.living(), "the actor is cut off")
+            assert fleet.taken("ground") - before <= 2 * WINDOW
+            hosts.heal(3)
+            go_on(20, "it comes back")
+            if fleet.said(ACTOR)["waits"]:
+                break
+        assert fleet.said(ACTOR)["waits"] and fleet.said(ACTOR)["fallbacks"] <= 3 * 10, "it braked, stood, and waited"
+
+        fleet.kill("router-0")
+        go_on(30, "through the other router")
+        fleet.kill("safety-1")
+        go_on(30, "with the other replica")
+        until(lambda: exists(tmp_path / "learner-ground" / "checkpoint"), "a checkpoint")
+        fleet.kill("learner-ground")
+        fleet.launch("learner-ground", host=MOVED)
+        until(lambda: fleet.spots["learner-ground"].done, "the learner's end, on another host")
+        learned = fleet.metrics.learners["ground"]
+        fleet.end()
+
+    logs = [list(read(fleet.log(recorder))) for recorder in (0, 1)]
+    for log in logs:
+        steps = Counter((r.message.header.run, r.message.header.sequence) for r in log if r.topic == "step")
+        assert len(steps) > STEPS / 2 and max(steps.values()) == 1
+        assert not any(r.message.collision for r in log if r.topic == "step")
+    index = max(r.message.index for log in logs for r in log if r.topic == "step")
+    assert (learned.steps, learned.duplicates, learned.done) == (STEPS, 0, True)
+    assert learned.missing > 0, "what was learned after the checkpoint is lost, once"
+    assert 0 <= index - (learned.steps + learned.missing) <= WINDOW, "and nothing twice"
+    assert (tmp_path / "learner-ground" / "policy.safetensors").exists()
+    if hosts.clock is not None:
+        apart = [r.log_time - r.message.header.wall_time for r in logs[1] if r.key == f"step/ground/{ACTOR}"]
+        assert max(apart) * 1e-9 < -11 * 3600.0
