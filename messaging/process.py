@@ -19,12 +19,14 @@ from typing import Any, Self
 
 from messaging import brakeline_pb2 as pb
 from messaging.bus import Bus, BusError, BusSettings, Publisher
+from messaging.exposition import Exposition, State
 from messaging.topics import HEALTH, LOG
 
 log = logging.getLogger("brakeline.process")
 
 # s; signals this close are one: the kernel tells of a parent's death once for each thread that it had.
 ECHO = 1.0
+SILENT = 10.0  # s without a beat after which a process does not live any more: its threads are stuck
 LEVELS = {"CRITICAL": "ERROR"}  # names that LogLine does not know
 
 
@@ -35,10 +37,12 @@ class Process:
     and `notes` go out with the next Health, and how many messages were passed over; `refresh`, if set, is called before
     each to bring them up to date. All that is logged goes to stderr (unless `stderr` is False) and to the LOG topic. An
     exception that leaves the block goes to the LOG topic with its traceback, is noted in the last Health, and goes on
-    its way: stderr is for who catches it. The first Health follows `announce`, or a second (not if `reserved`).
+    its way: stderr is for who catches it. The first Health follows `announce`, or a second (not if `reserved`). With
+    `settings.metrics` all of it is to be had over HTTP too (messaging/exposition.py).
 
     Raises:
         Unreachable, Insecure, BadKeys: on entering, when there is no bus at `settings`, or not such a one.
+        ValueError, OSError: on entering, when nothing can be served at `settings.metrics`.
     """
 
     def __init__(self, settings: BusSettings, source: str, stderr: bool = True, reserved: bool = False) -> None:
@@ -54,9 +58,18 @@ class Process:
         self._ended = False
         self._asked_at: float | None = None
         self._due = threading.Event()
+        self._announced = False
+        self._beat_at = time.monotonic()
+        self._exposition: Exposition | None = None
 
     def __enter__(self) -> Self:
         self.bus = Bus(self.settings, self.source)
+        try:
+            if self.settings.metrics:
+                self._exposition = Exposition(self.settings.metrics, self._state)
+        except (ValueError, OSError):
+            self.bus.close()
+            raise
         if self.settings.warning:
             self.notes["security"] = self.settings.warning
         self._health = self.bus.publisher(HEALTH)
@@ -79,6 +92,8 @@ class Process:
         self._ended = True
         self._due.set()
         self._pulse.join(2.0)
+        if self._exposition is not None:
+            self._exposition.close()
         self._stop_logging()
         try:
             self._report(last=True)
@@ -90,6 +105,7 @@ class Process:
 
     def announce(self) -> None:
         """Send a Health now: the process is ready, or something changed that cannot wait."""
+        self._announced = True
         self._due.set()
 
     def _asked(self, number: int, _: FrameType | None) -> None:
@@ -107,12 +123,24 @@ class Process:
             self._due.wait(waiting)
             waiting = period
             self._due.clear()
+            self._beat_at = time.monotonic()
             if self._ended:
                 return
             try:
                 self._report()
             except Exception:
                 log.exception("no sign of life")
+
+    def _state(self) -> State:
+        connected = bool(self.settings.listen) or self.bus.connected
+        return State(
+            self.source,
+            live=time.monotonic() - self._beat_at < SILENT,
+            ready=self._announced and connected and not self.stop.is_set(),
+            connected=connected,
+            figures=dict(self.figures) | {"passed over": self.bus.tolerance.count},
+            published=self.bus.published(),
+        )
 
     def _report(self, last: bool = False) -> None:
         if self.refresh is not None:

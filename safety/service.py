@@ -92,6 +92,7 @@ class Counts:
     unverified: int = 0
     unvouched: int = 0
     decide_ms: float = 0.0
+    answering: float = 0.0  # s
 
     def figures(self) -> dict[str, float]:
         mean = self.decide_ms / max(self.decisions, 1)
@@ -147,7 +148,9 @@ def answerer(models: Models, counts: Counts, notary: Notary | None = None) -> Ca
         received = perf_counter_ns()
         batch = batch_of(payload)
         replies = [one(request, received) for request in batch.requests]
-        return pb.ReplyBatch(replies=replies, request=digest(payload)).SerializeToString()
+        reply = pb.ReplyBatch(replies=replies, request=digest(payload)).SerializeToString()
+        counts.answering += (perf_counter_ns() - received) * 1e-9
+        return reply
 
     return answer
 
@@ -190,12 +193,19 @@ def main(settings: SafetySettings) -> None:
             except OSError as error:
                 log.error("a model is in use but could not be archived: %s", error)
 
+        before = perf_counter_ns() * 1e-9, 0.0  # when figures were last told, and how long it had answered by then
+
         def refresh() -> None:
-            process.figures.update(counts.figures())
+            nonlocal before
+            now = perf_counter_ns() * 1e-9, counts.answering
+            busy = (now[1] - before[1]) / max(now[0] - before[0], 1e-9)
+            before = now
+            process.figures.update(counts.figures() | {"busy": busy})
             process.notes.update({f"model {name}": method.version for name, method in models.filters.items()})
 
         process.refresh = refresh
         process.bus.subscribe(MODEL, replace)
         process.bus.serve(DECIDE, answerer(models, counts, notary))
+        process.announce()
         log.info("ready")
         process.stop.wait()

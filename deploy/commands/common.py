@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 import math
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
@@ -125,6 +125,8 @@ class Endpoints:
     """Folder with this process's keys (`brakeline keys` makes them); default: $BRAKELINE_KEYS, else none."""
     insecure: bool = False
     """Listen beyond this machine without keys. Whoever reaches the bus can command the robots; every Health says so."""
+    metrics: str = ""
+    """PORT of this machine, or HOST:PORT, for /metrics (Prometheus), /live and /ready; without one: nowhere."""
 
     def bus(self) -> BusSettings:
         """Raises ValueError when there is neither an endpoint nor a run."""
@@ -132,8 +134,10 @@ class Endpoints:
 
         if self.connect or self.listen:
             keys = self.keys or default_keys()
-            return BusSettings(connect=self.connect, listen=self.listen, keys=keys, insecure=self.insecure)
-        return bus_of(LATEST)
+            return BusSettings(
+                connect=self.connect, listen=self.listen, keys=keys, insecure=self.insecure, metrics=self.metrics
+            )
+        return replace(bus_of(LATEST), metrics=self.metrics)
 
 
 @dataclass(frozen=True)
@@ -148,6 +152,8 @@ class Meeting:
     """Make keys of the run's own where none are given; without, whoever reaches the bus can command the robots."""
     insecure: bool = False
     """Let --listen be beyond this machine without keys. Every Health says so."""
+    metrics: str = ""
+    """PORT of this machine, or HOST:PORT, for the launcher's /metrics; its processes have the ports after it."""
 
     def settings(self, config: RunConfig, folder: Path) -> BusSettings:
         """The launcher's place on the bus."""
@@ -157,7 +163,7 @@ class Meeting:
 
         keys = self.keys or default_keys() or (own_keys(config, folder) if self.secured else None)
         endpoint = self.listen or free_endpoint("tcp" if keys is None else "tls")
-        return BusSettings(listen=(endpoint,), keys=keys, insecure=self.insecure)
+        return BusSettings(listen=(endpoint,), keys=keys, insecure=self.insecure, metrics=self.metrics)
 
 
 def default_keys() -> Path | None:

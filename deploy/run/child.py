@@ -11,11 +11,12 @@ import os
 import signal
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
 from deploy.run.configurations import RunConfig, load
-from deploy.run.places import CONFIG, LOG, UNFINISHED, Place, client_of, launcher_of, places
+from deploy.run.places import CONFIG, LOG, UNFINISHED, Place, client_of, launcher_of, metrics_of, places
 from messaging.bus import BusError, BusSettings
 from messaging.robots import robot_named
 
@@ -134,11 +135,12 @@ def main() -> int:
     if os.getppid() != launcher_of(folder):  # it died before we could ask to be told
         return UNFINISHED
     config = load(folder / CONFIG)
-    place = next(place for place in places(config) if place.name == name)
+    number, place = next(row for row in enumerate(places(config)) if row[1].name == name)
     if place.nice:
         os.nice(place.nice)
     try:
-        done = KINDS[place.kind](place, folder, config, client_of(folder))
+        bus = replace(client_of(folder), metrics=metrics_of(folder, number))
+        done = KINDS[place.kind](place, folder, config, bus)
     except BusError as error:
         print(f"{name}: {type(error).__name__}: {error}", file=sys.stderr)
         return 1

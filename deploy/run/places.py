@@ -49,7 +49,8 @@ def places(config: RunConfig) -> list[Place]:
 
 def say_where(folder: Path, bus: BusSettings) -> None:
     """Write down where the run's router is; `client_of` reads it."""
-    said = {"endpoint": bus.listen[0], "pid": os.getpid(), "keys": bus.keys and str(bus.keys.absolute())}
+    keys = bus.keys and str(bus.keys.absolute())
+    said = {"endpoint": bus.listen[0], "pid": os.getpid(), "keys": keys, "metrics": bus.metrics}
     write_whole(folder / ENDPOINT, json.dumps(said).encode())
 
 
@@ -62,6 +63,12 @@ def client_of(folder: Path) -> BusSettings:
     said = json.loads((folder / ENDPOINT).read_text())
     keys = said.get("keys")
     return BusSettings(connect=(said["endpoint"],), keys=Path(keys) if keys else None)
+
+
+def metrics_of(folder: Path, number: int) -> str:
+    """Where the process of that row in the table serves its metrics: behind the launcher; empty: nowhere."""
+    host, colon, port = json.loads((folder / ENDPOINT).read_text()).get("metrics", "").rpartition(":")
+    return f"{host}{colon}{int(port) + 1 + number}" if port else ""
 
 
 def launcher_of(folder: Path) -> int:

@@ -39,6 +39,7 @@ class BusSettings:
     stall: float = 1.0  # s, the longest a publisher waits for a receiver that does not drain, before the link is closed
     keys: Path | None = None
     insecure: bool = False
+    metrics: str = ""  # PORT or HOST:PORT at which a process serves its metrics; empty: nowhere
 
     @property
     def warning(self) -> str:
