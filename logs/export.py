@@ -13,7 +13,7 @@ from google.protobuf.message import DecodeError
 from logs.foxglove import Pictures
 from logs.reader import TYPES, Log, Paths, Record, open_log
 from logs.segment import Entry, Segment, open_segment
-from logs.trajectories import ExportError
+from logs.trajectories import ExportError, nothing_of
 from messaging import brakeline_pb2 as pb
 from messaging.robots import Robot
 from messaging.tasks import task_of
@@ -34,13 +34,13 @@ def columns(robot: Robot) -> dict[str, tuple[str, ...]]:
 
 
 def to_csv(paths: Paths, robot: Robot, file: TextIO) -> int:
-    """Write every step of a robot kind in the log as a line, in the order of receipt; returns how many.
+    """Write every step of a robot kind in the log as a line, in the order of receipt; returns how many, at least one.
 
     Columns: log_time [ns], header.time [s], header.source, header.run, header.sequence, the message's fields by their
     names; those that are vectors as `field.name [unit]`, the decision by its name.
 
     Raises:
-        NoLog, NotALog: there is no log.
+        ExportError: there is no step of this robot; it says whose there are. NoLog, NotALog: there is no log.
     """
     vectors = columns(robot)
     plain = [f.name for f in pb.Step.DESCRIPTOR.fields if not f.is_repeated and f.message_type is None]
@@ -48,11 +48,14 @@ def to_csv(paths: Paths, robot: Robot, file: TextIO) -> int:
     table = csv.writer(file, lineterminator="\n")
     titles = [f"{name}.{part}" for name, parts in vectors.items() for part in parts]
     table.writerow(["log_time", *(f"header.{name}" for name in header), *plain, *titles])
-    count = 0
+    count, others = 0, set()
     for record in open_log(paths):
-        if record.topic != "step" or record.message.robot != robot.name:
+        if record.topic != "step":
             continue
         step = record.message
+        if step.robot != robot.name:
+            others.add(step.robot)
+            continue
         values: list[Any] = [record.log_time, *(getattr(step.header, name) for name in header)]
         values += [pb.Kind.Name(step.decision) if name == "decision" else _plain(step, name) for name in plain]
         for name, parts in vectors.items():
@@ -60,6 +63,8 @@ def to_csv(paths: Paths, robot: Robot, file: TextIO) -> int:
             values += row if len(row) == len(parts) else [""] * len(parts)
         table.writerow(values)
         count += 1
+    if not count:
+        raise ExportError(nothing_of(robot, others))
     return count
 
 

@@ -46,6 +46,7 @@ def picture(seen: Seen, robot: Robot | None) -> Figures:
         "episode": seen.number,
         **_arena(about, exchanges),
         "footprint": robot.footprint if robot is not None else 0.0,
+        "discs": discs(robot) if robot is not None else [],
         "outcome": seen.outcome(),
         "steps": len(steps),
         "first": first.step,
@@ -62,6 +63,11 @@ def picture(seen: Seen, robot: Robot | None) -> Figures:
         "speed": _rounded(step.speed for step in steps),
         "tubes": _tubes(steps, exchanges, closest, robot),
     }
+
+
+def discs(robot: Robot) -> list[list[float]]:
+    """x and y in the robot's frame, and the radius, of each disc of its body, m."""
+    return [[*disc.at[:2], disc.radius] for disc in robot.body]
 
 
 def rows(seen: Seen, robot: Robot | None) -> Iterable[Figures]:

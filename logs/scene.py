@@ -126,18 +126,22 @@ def _draw(room: SceneEntity, obstacle: pb.Obstacle, half: float, height: float) 
 
 
 def _body(robot: Robot, actor: str, time: int) -> SceneEntity:
-    """The footprint; it moves with the robot's frame."""
+    """Its discs or spheres; they move with the robot's frame."""
     body = SceneEntity(timestamp=stamp(time), frame_id=body_frame(actor), id="body", frame_locked=True)
-    edge = 2.0 * robot.footprint
-    if robot.position_dim == 3:
-        body.spheres.append(SpherePrimitive(pose=_pose(()), size=_vector(edge, edge, edge), color=BODY))
-    else:
-        tall = 0.5 * HEIGHT
-        disc = CylinderPrimitive(pose=_pose((0.0, 0.0, 0.5 * tall)), size=_vector(edge, edge, tall), color=BODY)
-        disc.bottom_scale = disc.top_scale = 1.0
-        body.cylinders.append(disc)
-        nose = _pose((0.5 * robot.footprint, 0.0, tall))
-        body.cubes.append(CubePrimitive(pose=nose, size=_vector(robot.footprint, 2.0 * FLAT, FLAT), color=NOSE))
+    tall = 0.5 * HEIGHT
+    for disc in robot.body:
+        edge = 2.0 * disc.radius
+        if robot.position_dim == 3:
+            body.spheres.append(SpherePrimitive(pose=_pose(disc.at), size=_vector(edge, edge, edge), color=BODY))
+            continue
+        place = _pose((*disc.at, 0.5 * tall))
+        drum = CylinderPrimitive(
+            pose=place, size=_vector(edge, edge, tall), color=BODY, bottom_scale=1.0, top_scale=1.0
+        )
+        body.cylinders.append(drum)
+    if robot.position_dim == 2:
+        nose = _pose((0.5 * robot.front, 0.0, tall))
+        body.cubes.append(CubePrimitive(pose=nose, size=_vector(robot.front, 2.0 * FLAT, FLAT), color=NOSE))
     body.texts.append(_text(actor, (0.0, 0.0, HEIGHT + robot.footprint), _color(60, 60, 60)))
     return body
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
@@ -23,6 +23,14 @@ INFOS = ("penalty", "goal", "collision", "decision", "clearance", "speed", "weig
 
 class ExportError(ValueError):
     """Nothing can be written; the message says why."""
+
+
+def nothing_of(robot: Robot, others: Collection[str]) -> str:
+    """What to say of a log without a step of this robot, and what to give instead."""
+    if not others:
+        return f"no step of {robot.name} in the log, nor of any other robot"
+    names = ", ".join(sorted(others))
+    return f"no step of {robot.name} in the log; it has those of {names}: give --robot NAME, or its description's path"
 
 
 def episodes(paths: Paths, robot: Robot) -> Iterator[list[pb.Step]]:
@@ -100,7 +108,8 @@ def to_minari(paths: Paths, robot: Robot, name: str) -> Written:
         count += len(batch)
         steps += sum(len(buffer.rewards) for buffer in batch)
     if dataset is None:
-        raise ExportError(f"no step of {robot.name} in the log")
+        there = {record.message.robot for record in open_log(paths) if record.topic == "step"}
+        raise ExportError(nothing_of(robot, there))
     return Written(path, count, steps)
 
 

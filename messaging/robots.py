@@ -131,6 +131,12 @@ class Robot:
         """m, radius of the disc (sphere) about the position that holds the body in every attitude."""
         return max(disc.arm + disc.radius for disc in self.body)
 
+    @cached_property
+    def front(self) -> float:
+        """m from the position straight ahead to where the discs of the body end."""
+        ends = [d.at[0] + math.sqrt(d.radius**2 - d.at[1] ** 2) for d in self.body if abs(d.at[1]) <= d.radius]
+        return max(ends, default=self.footprint)
+
     @property
     def speeds(self) -> list[int]:
         """The state coordinates that come to the inputs, in the order of those that any comes to."""

@@ -163,6 +163,14 @@ class Dataset:
         data.check()
         return data
 
+    @staticmethod
+    def about_of(path: Path) -> dict[str, str]:
+        """What a data set says of where it comes from, whatever robot it is of; nothing if the file is none."""
+        try:
+            return dict(unpack(path.read_bytes(), ENTRY)[1].get("about", {}))
+        except (OSError, ValueError, TypeError):
+            return {}
+
     def digest(self) -> str:
         """Hash of the recorded numbers."""
         sha = hashlib.sha256()

@@ -26,7 +26,7 @@ class Export:
     tlog: Path | None = None
     """Every MAVLink frame, as ground stations and pymavlink read it."""
     robot: str = "ground"
-    """Whose steps --csv and --minari take."""
+    """Whose steps --csv and --minari take: a name, or the path of a description (.toml)."""
     json: bool = False
 
     def run(self) -> int:
@@ -48,11 +48,18 @@ class Export:
 
     def _csv(self) -> dict[str, Any]:
         from logs.export import to_csv
+        from logs.trajectories import ExportError
 
         assert self.csv is not None
+        robot = learnt(self.robot)
         self.csv.parent.mkdir(parents=True, exist_ok=True)
-        with self.csv.open("w", newline="") as file:
-            return {"path": str(self.csv), "steps": to_csv(list(self.logs), learnt(self.robot), file)}
+        try:
+            with self.csv.open("w", newline="") as file:
+                return {"path": str(self.csv), "steps": to_csv(list(self.logs), robot, file)}
+        except ExportError:
+            if self.csv.is_file():  # with a headline alone; a pipe stays
+                self.csv.unlink()
+            raise
 
     def _minari(self) -> dict[str, Any]:
         from logs.trajectories import to_minari

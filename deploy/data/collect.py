@@ -14,6 +14,7 @@ from safety.dataset import Dataset, Trajectory
 from sim.conditions import Conditions
 
 PERIODS = 300  # a trajectory
+ORIGIN = "collect"
 
 
 def record(robot: Robot, trajectories: int, seed: int, conditions: Conditions, first: int = 0) -> Iterator[Trajectory]:
@@ -42,4 +43,4 @@ def dataset(robot: Robot, trajectories: list[Trajectory], seed: int, conditions:
 
 def origin(seed: int, conditions: Conditions) -> dict[str, str]:
     """What a recorded data set says of itself."""
-    return conditions.describe() | {"seed": str(seed), "origin": "collect"}
+    return conditions.describe() | {"seed": str(seed), "origin": ORIGIN}

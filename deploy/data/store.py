@@ -67,10 +67,15 @@ def recorded(
 
     What was driven before an interruption lies beside it, and is gone on from: every trajectory has a generator of its
     own, so the data are the same as in one go.
+
+    Raises:
+        BadData: there are data that no simulator could bring back (`again`): these are kept.
     """
     path = path or record_path(robot)
     if path.exists() and not again:
         return Dataset.load(path)
+    if path.exists():
+        _spare(path, robot)
     conditions, trajectories = conditions or Conditions(), trajectories or task_of(robot).trajectories
     part = path.with_name(f"{path.stem}.part{path.suffix}")
     driven = _begun(part, robot, trajectories, seed, conditions)
@@ -97,6 +102,19 @@ def recorded(
     data.save(path)
     part.unlink(missing_ok=True)
     return data
+
+
+def _spare(path: Path, robot: Robot) -> None:
+    """Raises BadData if somebody drove what lies at the path: a recording in a simulator must not replace it."""
+    about = Dataset.about_of(path)
+    origin = about.get("origin", collect.ORIGIN)
+    if origin != collect.ORIGIN:
+        source = about.get("sources", about.get("source", ""))
+        raise BadData(
+            f"{path} is kept: it was not recorded in the simulator ({origin}{f': {source}' if source else ''}). If the "
+            f"description of {robot.name} has changed, import the log again (`brakeline import LOG --robot ...`); to "
+            f"record in the simulator, move the file away first, or give `collect` another --out"
+        )
 
 
 def _begun(part: Path, robot: Robot, trajectories: int, seed: int, conditions: Conditions) -> list[Trajectory]:

@@ -246,13 +246,15 @@ class _Stage:
         return drawn
 
     def _body(self, position: Array, heading: float, kind: str, alpha: float = 1.0) -> list[Any]:
-        radius = self.robot.footprint
-        disc = Circle(
-            (position[0], position[1]), radius, facecolor=COLOURS[kind], edgecolor="black", alpha=alpha, zorder=7
-        )
-        drawn: list[Any] = [self.axes.add_patch(disc)]
+        """All discs of the body, and a line to its front."""
+        turn = np.array([[np.cos(heading), -np.sin(heading)], [np.sin(heading), np.cos(heading)]])
+        drawn: list[Any] = []
+        for disc in self.robot.body:
+            middle = tuple(position[:2] + turn @ disc.at[:2])
+            circle = Circle(middle, disc.radius, facecolor=COLOURS[kind], edgecolor="black", alpha=alpha, zorder=7)
+            drawn.append(self.axes.add_patch(circle))
         if self.robot.heading is not None:
-            nose = position[:2] + radius * np.array([np.cos(heading), np.sin(heading)])
+            nose = position[:2] + self.robot.front * turn[:, 0]
             line = np.stack([position[:2], nose])
             drawn += self.axes.plot(line[:, 0], line[:, 1], color="white", linewidth=1.5, alpha=alpha, zorder=8)
         return drawn

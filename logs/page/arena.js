@@ -96,8 +96,10 @@ function explained(v, t, footprint) {
 
 function robot(v, episode, k) {
   const x = v.x(episode.x[k]), y = v.y(episode.y[k]), r = Math.max(4, v.per * episode.footprint);
-  const parts = [tag("circle", { cx: x, cy: y, r, "fill-opacity": 0.12, class: "ink", "stroke-width": 1.3 })];
-  if (episode.heading) parts.push(tag("line", { x1: x, y1: y, x2: x + r * Math.cos(episode.heading[k]), y2: y - r * Math.sin(episode.heading[k]), class: "ink", "stroke-width": 1.6 }));
+  const heading = episode.heading?.[k] ?? 0, cos = Math.cos(heading), sin = Math.sin(heading);
+  const discs = episode.discs.length ? episode.discs : [[0, 0, 0]]; // of an unknown robot: a dot
+  const parts = discs.map(([ahead, aside, radius]) => tag("circle", { cx: x + v.per * (ahead * cos - aside * sin), cy: y - v.per * (ahead * sin + aside * cos), r: Math.max(4, v.per * radius), "fill-opacity": 0.12, class: "ink", "stroke-width": 1.3 }));
+  if (episode.heading) parts.push(tag("line", { x1: x, y1: y, x2: x + r * cos, y2: y - r * sin, class: "ink", "stroke-width": 1.6 }));
   return parts;
 }
 

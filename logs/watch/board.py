@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from logs.metrics import SILENT, Crowded, Metrics
+from logs.picture import discs
 from logs.scene import half_width
 from logs.watch.totals import heard, totals
 from messaging import brakeline_pb2 as pb
@@ -118,7 +119,7 @@ class Card:
         )
         about = {name: getattr(self, name) for name in names}
         lists = {"trail": list(self.trail), "marks": list(self.marks)}
-        return about | lists | {"robot": self.robot.name, "footprint": self.robot.footprint}
+        return about | lists | {"robot": self.robot.name, "footprint": self.robot.footprint, "discs": discs(self.robot)}
 
 
 class Board:

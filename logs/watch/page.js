@@ -176,16 +176,18 @@ function drawTube(pen, robot, scale) {
 
 function drawBody(pen, robot, scale) {
   const [x, y, heading] = robot.pose;
-  const radius = Math.max(robot.footprint, 3 / scale);
+  const cos = Math.cos(heading), sin = Math.sin(heading), radius = Math.max(robot.footprint, 3 / scale);
   pen.fillStyle = "#2860be";
-  pen.beginPath();
-  pen.arc(x, y, radius, 0, 2 * Math.PI);
-  pen.fill();
+  for (const [ahead, aside, size] of robot.discs) {
+    pen.beginPath();
+    pen.arc(x + ahead * cos - aside * sin, y + ahead * sin + aside * cos, Math.max(size, 3 / scale), 0, 2 * Math.PI);
+    pen.fill();
+  }
   pen.strokeStyle = "#fff";
   pen.lineWidth = 2 / scale;
   pen.beginPath();
   pen.moveTo(x, y);
-  pen.lineTo(x + radius * Math.cos(heading), y + radius * Math.sin(heading));
+  pen.lineTo(x + radius * cos, y + radius * sin);
   pen.stroke();
 }
 

@@ -99,4 +99,6 @@ def test_what_cannot_be_exported_is_said(log: Path, tmp_path: Path, capsys: pyte
     assert "--csv, --minari, --foxglove" in capsys.readouterr().err
     assert cli.main(["export", str(tmp_path), "--csv", str(tmp_path / "a.csv")]) == 1
     assert "no log" in capsys.readouterr().err
-    assert run(capsys, log, "--csv", tmp_path / "q.csv", "--robot", "quadrotor")["csv"]["steps"] == 0
+    assert cli.main(["export", str(log), "--csv", str(tmp_path / "q.csv"), "--robot", "quadrotor"]) == 1
+    assert "it has those of ground: give --robot NAME" in capsys.readouterr().err
+    assert not list(tmp_path.glob("q.csv*")), "no file with a headline alone"

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from actors.driver import Driver, Identity
+from deploy.cli import main
 from deploy.data import collect, store
 from deploy.data.store import certified
 from deploy.policies import policy_named
@@ -201,6 +202,22 @@ def test_a_description_that_changed_makes_the_model_set_again(
     with pytest.raises(BadData, match="changed"):
         store.data_for(replace(kind, period=0.1))
     known(kind)
+
+
+def test_what_was_not_recorded_here_is_never_recorded_over(
+    kind: Robot, recorded: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Whether the description changes, or somebody asks for a recording outright."""
+    monkeypatch.setenv("BRAKELINE_DATA", str(tmp_path))
+    path = store.record_path(kind)
+    replace(recorded, about={"origin": "import", "sources": "drive.csv"}).save(path)
+    before = path.read_bytes()
+    with pytest.raises(BadData, match=r"kept: .* \(import: drive.csv\).*import the log again"):
+        store.model_for(replace(kind, period=0.1), Recipe())
+    known(kind)
+    assert main(["collect", str(EXAMPLES / kind.name / f"{kind.name}.toml"), "--trajectories", "1"]) == 1
+    assert "drive.csv" in capsys.readouterr().err
+    assert path.read_bytes() == before
 
 
 def test_a_run_names_its_processes_by_the_robot_and_not_by_its_path() -> None:
