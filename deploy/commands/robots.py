@@ -23,6 +23,8 @@ class RobotCommand:
     """new: write a commented description; check: tell every mistake; show: what it amounts to."""
     file: Annotated[str, tyro.conf.Positional]
     """The description (.toml), or the name of a robot that comes with the program."""
+    from_: Annotated[Path | None, tyro.conf.arg(name="from")] = None
+    """With new: fill in what this log tells (CSV, Parquet, ROS 2 bags, autopilots' logs)."""
     picture: Path | None = None
     """Draw the body and the stop into this image."""
     json: bool = False
@@ -36,11 +38,22 @@ class RobotCommand:
             raise ValueError(f"{self.file}: a description is a file NAME.toml, NAME of letters, digits, '_' and '-'")
         if path.exists():
             raise ValueError(f"{path} exists: `brakeline robot check {path}`")
-        path.write_text((FOLDER / "template.txt").read_text().replace('"NAME"', f'"{path.stem}"'))
+        template = (FOLDER / "template.txt").read_text().replace('"NAME"', f'"{path.stem}"')
+        notes: tuple[str, ...] = ()
+        if self.from_ is not None:
+            from deploy.data.bring import tables_of
+            from deploy.data.draft import draft
+            from deploy.data.told import told
+
+            found = told(tables_of(self.from_))
+            template, notes = draft(template, found, self.from_.name), found.notes
+        path.write_text(template)
         if self.json:
-            say_json({"file": str(path)})
-        else:
-            console.print(f"{path}: fill it in, then `brakeline robot check {path}`")
+            say_json({"file": str(path), "notes": list(notes)})
+            return 0
+        for note in notes:
+            console.print(note, markup=False)
+        console.print(f"{path}: fill it in, then `brakeline robot check {path}`")
         return 0
 
     def _check(self) -> int:

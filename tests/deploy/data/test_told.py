@@ -1,0 +1,105 @@
+"""A description's first draft is what a log tells, and says of the rest that it does not."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+
+from deploy.cli import main
+from deploy.data.bring import bring, tables_of
+from deploy.data.sources.table import NoSource, Table
+from deploy.data.told import told
+from messaging.robots import robot_named
+from tests.deploy.data.bags import write_bag
+from tests.deploy.data.porter import COLUMNS, drive, write_csv
+
+
+@pytest.fixture(scope="module")
+def driven():
+    return drive(seconds=120.0)
+
+
+def table(time, values, names=COLUMNS) -> Table:
+    return Table("", np.asarray(time), dict(zip(names, values.T, strict=True)))
+
+
+@pytest.mark.parametrize("kind", ["csv", "bag"])
+def test_a_drafted_description_is_checked_and_reads_the_log_it_was_made_from(driven, tmp_path, capsys, kind):
+    write = {"csv": write_csv, "bag": write_bag}[kind]
+    log, path = write(tmp_path / {"csv": "drive.csv", "bag": "drive"}[kind], *driven), tmp_path / f"drafted-{kind}.toml"
+    assert main(["robot", "new", str(path), "--from", str(log)]) == 0
+    text = path.read_text()
+    assert "# The body can't be told from the log: measure it." in text and "# error: can't be told" in text
+    path.write_text(text.replace("radius = 0.2", "radius = 0.15").replace("sight = 3.0", "sight = 2.5"))
+    capsys.readouterr()
+    assert main(["robot", "check", str(path), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["problems"] == []
+    robot = robot_named(str(path))
+    speeds = ("v [m/s]", "w [rad/s]") if kind == "csv" else ("speed [m/s]", "turn rate [rad/s]")
+    assert robot.state == ("x [m]", "y [m]", "heading [rad]", *speeds) and robot.heading == 2
+    assert robot.action == ("speed [m/s]", "turn rate [rad/s]") and robot.follows == (3, 4)
+    assert robot.period == pytest.approx(0.1) and robot.brake_steps == 3
+    assert robot.action_low == (0.0, -1.5) and robot.action_high == (0.6, 1.5)
+    assert len(bring([log], robot).data.trajectories) > 5
+
+
+def test_what_is_what_is_seen_by_the_motion_whatever_the_names(driven):
+    time, values = driven
+    names = ("x", "y", "a", "b", "c", "d", "e")
+    found = told([table(time, values, names)])
+    assert [(c.name, c.role, c.unit, c.follows) for c in found.states[2:]] == [
+        ("a", "heading", "rad", ""),
+        ("b", "other", "m/s", "d"),
+        ("c", "other", "rad/s", "e"),
+    ]
+    assert [(c.name, c.unit) for c in found.inputs] == [("d", "m/s"), ("e", "rad/s")]
+    shuffled = np.random.default_rng(0).permuted(values[:, 2])
+    found = told([table(time, np.column_stack([values[:, :2], shuffled, values[:, 3:]]), names)])
+    assert all(c.role != "heading" for c in found.states)
+    assert any("no column is the heading for certain" in note for note in found.notes)
+
+
+def test_a_delay_is_told_and_makes_the_plan_longer(driven, tmp_path):
+    time, values = driven
+    late = np.column_stack([values[:-10, :5], values[10:, 5:]])  # states of 0.2 s before
+    prompt, delayed = told([table(time, values)]), told([table(time[: len(late)], late)])
+    for before, after in zip(prompt.states[3:], delayed.states[3:], strict=True):
+        assert after.delay == pytest.approx(before.delay + 0.2, abs=0.03)
+    paths = [write_csv(tmp_path / "a.csv", time, values), write_csv(tmp_path / "b.csv", time[: len(late)], late)]
+    horizons = []
+    for path in paths:
+        assert main(["robot", "new", str(path.with_suffix(".toml")), "--from", str(path)]) == 0
+        horizons.append(robot_named(str(path.with_suffix(".toml"))).horizon)
+    assert horizons[1] == horizons[0] + 2
+
+
+def test_an_input_of_the_same_name_a_slew_and_one_that_only_turns(tmp_path):
+    """Each speed by itself: `speed` is the coordinate, `command speed` the input; the speed changes by 0.05 at most."""
+    step, rows, pose, speed = 0.1, [], np.zeros(3), 0.0
+    rng = np.random.default_rng(1)
+    for k in range(1200):
+        target, turn = ((0.4, 0.0), (0.0, 0.0), (0.0, 0.8), (0.0, -0.8))[k // 25 % 4]
+        speed += float(np.clip(target - speed, -0.05, 0.05))
+        noise = rng.uniform(-0.003, 0.003, 5)
+        rows.append([*(np.array([*pose, speed, turn]) + noise), speed, turn])
+        pose += step * np.array([speed * math.cos(pose[2]), speed * math.sin(pose[2]), turn])
+    names = ("x", "y", "yaw", "speed", "turn", "command speed", "command turn")
+    found = told(tables_of(write_csv(tmp_path / "a.csv", step * np.arange(1200), np.array(rows), names)))
+    ahead, turning = found.inputs
+    assert (ahead.name, turning.name) == ("speed", "turn") and [c.follows for c in found.states[3:]] == [
+        "speed",
+        "turn",
+    ]
+    assert ahead.change == pytest.approx(0.05) and (ahead.moves, turning.moves) == (True, False)
+
+
+def test_without_positions_or_inputs_it_says_what_is_missing(driven, tmp_path):
+    time, values = driven
+    with pytest.raises(NoSource, match="no columns `x` and `y` of a position; there are: a, b"):
+        told([table(time, values[:, :2], ("a", "b"))])
+    path = write_csv(tmp_path / "a.csv", time, values[:, :5], COLUMNS[:5])
+    out = tmp_path / "seen.toml"
+    assert main(["robot", "new", str(out), "--from", str(path)]) == 0
+    text = out.read_text()
+    assert "# no column is an input for certain" in text and "# Inputs can't be told from the log" in text
