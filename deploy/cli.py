@@ -98,7 +98,7 @@ COMMANDS: dict[str, Command] = {
     ),
     "excite": Command(
         "sources:Excite",
-        "print the inputs that a robot is best driven with to be learned, within a region",
+        "print, or drive in its simulator, the inputs that a robot is best driven with to be learned, within a region",
         "brakeline excite my.toml --keep -2 -2 2 2 --minutes 10",
     ),
     "certify": Command(

@@ -1,11 +1,16 @@
-"""A policy by its name or file: scripted, trained and stored with the program, untrained, or a person's own."""
+"""A policy by its name or file: scripted, trained and stored with the program, untrained, a person's own weights, or
+inputs that were written down."""
 
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
+from deploy.data.sources.quantities import columns_of
+from deploy.data.sources.table import NoSource
 from messaging.robots import Robot
 from messaging.tasks import task_of
 from messaging.weights import MLP
@@ -16,7 +21,8 @@ POLICY_FOLDER = Path(__file__).parents[1] / "policies"
 
 
 def policy_named(name: str, robot: Robot, seed: int) -> Policy:
-    """A scripted policy, the trained one (in policies/, or beside the robot's own task), an untrained one, or a file's.
+    """A scripted policy, the trained one (in policies/, or beside the robot's own task), an untrained one, or a file's:
+    weights, or inputs as `brakeline excite` prints them (.csv).
 
     Raises:
         ValueError: neither a name nor a file; BadWeights: a file that is no policy of this robot.
@@ -26,6 +32,8 @@ def policy_named(name: str, robot: Robot, seed: int) -> Policy:
         return scripted(name, robot, np.random.default_rng(seed))
     if name == UNTRAINED:
         return driving(MLP.untrained(robot, seed))
+    if name.endswith(".csv"):
+        return replayed(Path(name), robot)
     path = _trained(robot) if name == TRAINED else Path(name)
     if not path.is_file():
         names = ", ".join([TRAINED, UNTRAINED, *policies])
@@ -44,3 +52,27 @@ def _trained(robot: Robot) -> Path:
 def driving(mlp: MLP) -> Policy:
     """The network as a policy, without exploration."""
     return lambda observation, info: mlp(observation)
+
+
+def replayed(path: Path, robot: Robot) -> Policy:
+    """The inputs in a file of columns, one a period; an episode is a run of it, and after the last row it stands.
+
+    Raises:
+        NoSource: it is no such file, or has not all inputs of the robot.
+    """
+    from deploy.data.sources.columns import read_csv  # pyarrow with it, which no other policy needs
+
+    (table,) = read_csv(path)
+    names = columns_of(robot)[1]
+    if missing := [name for name in names if name not in table.columns]:
+        raise NoSource(f"{path}: no column {', '.join(missing)}; there are: {', '.join(table.columns)}")
+    inputs = np.stack([table.columns[name] for name in names], axis=1)
+    runs = iter([inputs[table.run == run] for run in np.unique(table.run)])
+    left: list[NDArray[np.float64]] = []
+
+    def policy(observation: NDArray[np.float32], info: dict[str, Any]) -> NDArray[np.float64]:
+        if info["time"] == 0.0:
+            left[:] = list(next(runs, np.zeros((0, len(names)))))
+        return left.pop(0) if left else np.where(robot.stopping, 0.0, info["input_in_force"])
+
+    return policy

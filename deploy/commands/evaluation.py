@@ -18,7 +18,8 @@ from messaging.tasks import learnt
 class Evaluate:
     robot: Robot = "ground"
     policy: str = "astar"
-    """A policy file, or trained (the one in policies/) | untrained | random | greedy | adversary | astar."""
+    """A policy file, inputs (.csv, as `excite` prints them), or trained (the one in policies/) | untrained | random |
+    greedy | adversary | astar."""
     filtering: Flags[Filtering] = field(default_factory=Filtering)
     physics: Flags[Physics] = field(default_factory=Physics)
     arena: str = "default"

@@ -17,6 +17,8 @@ from deploy.data.picture import draw
 from deploy.data.resample import HOLD
 from deploy.data.sources.quantities import columns_of
 from deploy.data.store import record_path
+from deploy.progress import under_way
+from messaging.robots import Robot as RobotKind
 from messaging.tasks import learnt
 
 
@@ -83,10 +85,37 @@ class Excite:
     """x and y, least and most [m], that the robot stays within; each run begins in the middle, along x."""
     minutes: float = 10.0
     seed: int = 0
+    drive: Path | None = None
+    """Drive them in the robot's simulator instead of printing them, and record that into this log (.mcap); it keeps to
+    the region by where the robot is measured to be."""
+    json: bool = False
+    """With --drive: one JSON object on stdout."""
 
     def run(self) -> int:
         robot = learnt(self.robot)
+        if self.drive is not None:
+            return self._drive(robot, self.drive)
         print(",".join(("time", "run", *columns_of(robot)[1])))
         for row in planned.rows(robot, self.keep, self.minutes, self.seed):
             print(",".join((f"{row.time:.9g}", str(row.run), *(f"{value:.6g}" for value in row.input))))
+        return 0
+
+    def _drive(self, robot: RobotKind, path: Path) -> int:
+        from deploy.run.excited import drive
+
+        with under_way(f"driving {robot.name}", round(60.0 * self.minutes / robot.period)) as advance:
+            done = 0
+
+            def each(periods: int) -> None:
+                nonlocal done
+                advance(periods - done)
+                done = periods
+
+            driven = drive(robot, self.keep, self.minutes, self.seed, path, each=each)
+        if self.json:
+            say_json(asdict(driven))
+            return 0
+        edge = f"{-driven.outside:.2f} m inside the region" if driven.outside <= 0.0 else f"{driven.outside:.2f} m OUT"
+        console.print(f"{path}: {driven.periods} periods in {driven.runs} runs; the body came to {edge}", markup=False)
+        console.print(f"next: brakeline import LOG {path} --robot {self.robot}", markup=False)
         return 0

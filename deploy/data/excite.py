@@ -34,15 +34,17 @@ def towards(robot: Robot, before: Array, target: Array) -> Array:
     return np.asarray(np.clip(target, before - slew, before + slew))
 
 
-def excitation(robot: Robot, rng: np.random.Generator, held: int = MOST_HELD) -> Generator[Array, Array | None, None]:
+def excitation(
+    robot: Robot, rng: np.random.Generator, held: int = MOST_HELD, before: Array | None = None
+) -> Generator[Array, Array | None, None]:
     """Inputs without end: lead-in, plan (chosen inputs, then braking), stop, and again.
 
     A lead-in goes for one target after the other, and may leave each before it gets there: every speed comes with
     every acceleration. `held`: periods that a target is held for at most, more of them where a robot needs longer to
     come to its speed. To a robot that stops by feedback the measured state (n,) is sent after each period,
-    `u = inputs.send(state)`: its braking follows from it.
+    `u = inputs.send(state)`: its braking follows from it. before (m,): the input in force; none, unless given.
     """
-    before = np.zeros(robot.action_dim)
+    before = np.zeros(robot.action_dim) if before is None else before
     schedule = robot.schedule()
     across = (robot.high() - robot.low()) / np.asarray(robot.action_slew)  # periods from bound to bound
     longest_lead = held + math.ceil(across.max())

@@ -15,7 +15,7 @@ import numpy as np
 
 from logs.reader import read
 from messaging import brakeline_pb2 as pb
-from messaging.robots import Robot
+from messaging.robots import FOLLOWED, Robot
 from safety.dataset import BadData, Dataset, Trajectory
 
 FEWEST_STEPS = 5  # of a trajectory that is worth keeping
@@ -64,7 +64,7 @@ def _trajectory(run: list[pb.Step], robot: Robot) -> Trajectory:
     """
     given = robot.given
     first, rest = run[given], run[1 + given :]
-    actions = np.array([s.action for s in run], dtype=float)
+    actions = _within(np.array([s.action for s in run], dtype=float), robot)
     paths = np.array([s.path for s in rest], dtype=float).reshape(len(rest), -1, robot.position_dim)
     return Trajectory(
         states=np.array([first.state, *(s.state for s in rest)]),
@@ -73,3 +73,10 @@ def _trajectory(run: list[pb.Step], robot: Robot) -> Trajectory:
         turned=np.array([s.turned for s in rest]),
         before=actions[0],
     )
+
+
+def _within(inputs: np.ndarray, robot: Robot) -> np.ndarray:
+    """Inputs (T, m), those at a bound exactly there: a step's were rounded to single precision."""
+    inside = np.clip(inputs, robot.low(), robot.high())
+    rounded = np.abs(inputs - inside) <= FOLLOWED * (robot.high() - robot.low())
+    return np.where(rounded, inside, inputs)

@@ -225,8 +225,7 @@ def test_a_run_names_its_processes_by_the_robot_and_not_by_its_path() -> None:
     assert {place.robot for place in places(config) if place.robot} == {"car"}
 
 
-def test_the_trained_policy_lies_beside_the_task() -> None:
-    policy = policy_named("trained", robot("omni"), 0)
-    env = environment(robot("omni"), "default", FRESH)
-    observation, info = env.reset(seed=0)
-    assert policy(observation, info).shape == (3,)
+def test_the_trained_policy_lies_beside_the_task(kind: Robot) -> None:
+    policy = policy_named("trained", kind, 0)
+    observation, info = environment(kind, "default", FRESH).reset(seed=0)
+    assert policy(observation, info).shape == (kind.action_dim,)

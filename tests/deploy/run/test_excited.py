@@ -1,0 +1,75 @@
+"""Excitation that is driven: it stays inside by what is measured, and what is recorded is data of the robot."""
+
+import json
+from itertools import islice
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from actors.driver import Driver, Identity
+from deploy.cli import main
+from deploy.data.planned import Excited
+from deploy.policies import policy_named
+from deploy.study.evaluate import episode
+from deploy.vehicles import environment
+from logs.reader import read
+from messaging.tasks import learnt
+from safety.dataset import BadData, Dataset
+from safety.windows import PLAN, windows
+from tests.robots import GROUND
+
+CAR = str(Path(__file__).parents[3] / "examples" / "car" / "car.toml")
+KEEP = (-1.6, -1.4, 1.8, 1.4)
+
+
+def test_a_car_is_driven_inside_the_region_and_its_log_is_imported(tmp_path, capsys):
+    """Its inputs do not tell where it turns to: only measuring keeps it inside."""
+    log, data = tmp_path / "excited.mcap", tmp_path / "data.safetensors"
+    words = ["excite", CAR, "--keep", *map(str, KEEP), "--minutes", "2", "--drive", str(log), "--json"]
+    assert main(words) == 0
+    said = json.loads(capsys.readouterr().out)
+    steps = [record.message for record in read(log) if record.topic == "step"]
+    assert len(steps) == said["periods"] == 600 and said["runs"] == 2 and said["collisions"] == 0
+    robot = learnt(CAR)
+    truth = np.array([step.true_state for step in steps])
+    for disc in robot.body:
+        ahead = np.stack([np.cos(truth[:, 2]), np.sin(truth[:, 2])], 1) * disc.at[0]
+        centre = truth[:, :2] + ahead
+        assert (centre - disc.radius > KEEP[:2]).all() and (centre + disc.radius < KEEP[2:]).all()
+    assert np.ptp(truth[:, :2], axis=0).min() > 0.8, "and yet it went about"
+    assert main(["import", str(log), "--robot", CAR, "--out", str(data)]) == 0
+    driven = Dataset.load(data)
+    assert driven.periods > 580 and len(windows(driven, robot.horizon, PLAN)) > 60
+    assert main(words) == 1 and "is there already" in capsys.readouterr().err
+    assert main(["excite", CAR]) == 1 and "how it turns can't be told" in capsys.readouterr().err
+
+
+def test_who_goes_outwards_near_the_edge_brakes_by_the_robots_own_rule():
+    policy = Excited(learnt(CAR), KEEP, np.random.default_rng(0))
+    at = {"time": 0.0, "state": np.zeros(5), "input_in_force": np.zeros(2)}
+    policy(None, at)
+    driven = np.array([0.4, 0.2])
+    near = {"time": 0.2, "state": np.array([1.45, 0.0, 0.0, 0.4, 0.2]), "input_in_force": driven}
+    assert policy(None, near).tolist() == [0.0, 0.2], "its steering is held"
+    inwards = near | {"state": np.array([1.42, 0.0, np.pi, 0.4, 0.2])}
+    policy._left = [driven]
+    assert policy(None, inwards).tolist() == [0.4, 0.2]
+
+
+def test_a_region_without_room_to_stop_is_refused():
+    with pytest.raises(BadData, match="no room to stop in"):
+        Excited(GROUND, (-0.2, -0.2, 0.2, 0.2), np.random.default_rng(0))
+
+
+def test_printed_inputs_are_a_policy_of_any_actor(tmp_path):
+    path = tmp_path / "inputs.csv"
+    path.write_text("time,run,command speed,command turn rate\n0,0,0.1,0\n0.2,0,0.2,0.1\n0,1,0.05,-0.2\n")
+    driver = Driver(GROUND, environment(GROUND, "open", 0), Identity("test", 0, 0), filtered=False)
+    policy = policy_named(str(path), GROUND, 0)
+    driven = [[list(step.action) for step in islice(episode(driver, policy, None, n), 3)] for n in (0, 1)]
+    assert np.allclose(driven[0], [(0.1, 0), (0.2, 0.1), (0, 0)])
+    assert np.allclose(driven[1], [(0.05, -0.2), (0, 0), (0, 0)])
+    path.write_text("time,command speed\n0,0.1\n")
+    with pytest.raises(BadData, match="no column command turn rate; there are: command speed"):
+        policy_named(str(path), GROUND, 0)
