@@ -1,0 +1,130 @@
+"""What engines are told is checked by their own tools or schemas, and its commands by our command line.
+
+`stored/compose_spec.json` is the Compose specification's schema as docker-compose 1.29.2 (Apache-2.0) has it.
+"""
+
+import json
+import re
+import shlex
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+import tyro
+
+from deploy.cli import find
+
+ROOT = Path(__file__).parents[2]
+DEPLOY = ROOT / "deploy"
+yaml = pytest.importorskip("yaml")
+BUILT = {"$POD": "router-1", "${POD##*-}": "1", "$number": "7", "${links:+--connect $links}": "--connect tls/a:1"}
+UNIT = {"%i": "7", "$ROUTERS": "tls/a:1 tls/b:1", "$LINKS": "", "$ROBOTS": "ground", "$ROBOT": "ground"}
+
+
+def manifests():
+    texts = [path.read_text() for path in sorted((DEPLOY / "kubernetes").glob("*.yaml"))]
+    return [part for text in texts for part in yaml.safe_load_all(text)]
+
+
+def containers(manifest):
+    pod = manifest.get("spec", {}).get("template", {}).get("spec", {})
+    return [*pod.get("initContainers", ()), *pod.get("containers", ())]
+
+
+def commands():
+    """(where, words) of each `brakeline ...` that an engine starts."""
+    for manifest in manifests():
+        for container in containers(manifest):
+            text = "\n".join(container.get("args", ())).replace("\\\n", " ")
+            for name, value in BUILT.items():
+                text = text.replace(name, value)
+            for line in re.findall(r"exec brakeline (.*)", text):
+                yield f"kubernetes {manifest['metadata']['name']}/{container['name']}", shlex.split(line)
+    for name, service in yaml.safe_load((DEPLOY / "compose.yaml").read_text())["services"].items():
+        yield f"compose {name}", shlex.split(service["command"])[1:]
+    for path in sorted((DEPLOY / "systemd").glob("*.service")):
+        (line,) = re.findall(r"^ExecStart=\S+/brakeline (.*)$", path.read_text(), re.M)
+        for name, value in UNIT.items():
+            line = line.replace(name, value)
+        yield f"systemd {path.name}", shlex.split(line)
+
+
+@pytest.mark.parametrize(("where", "words"), [pytest.param(*command, id=command[0]) for command in commands()])
+def test_each_command_is_one(where, words):
+    command = tyro.cli(find(words[0]), args=words[1:])
+    assert command.endpoints.keys is not None
+    assert all(endpoint.startswith("tls/") for endpoint in (*command.endpoints.connect, *command.endpoints.listen))
+
+
+def test_every_kind_of_process_is_started_by_every_engine():
+    kinds = {"router", "safety", "learner", "actor", "recorder"}
+    for engine in ("kubernetes", "compose", "systemd"):
+        assert {words[0] for where, words in commands() if where.startswith(engine)} == kinds
+
+
+@pytest.mark.parametrize(
+    "manifest", [pytest.param(m, id=f"{m['kind']} {m.get('metadata', {}).get('name', '')}") for m in manifests()]
+)
+def test_kubernetes_manifests_are_of_its_schema(manifest):
+    validate = pytest.importorskip("kubernetes_validate")
+    if manifest["kind"] != "Kustomization":
+        validate.validate(manifest, validate.latest_version(), strict=True)
+
+
+def test_kubernetes_manifests_hang_together():
+    by = {(m["kind"], m["metadata"]["name"]): m for m in manifests() if m["kind"] != "Kustomization"}
+    target = by["HorizontalPodAutoscaler", "safety"]["spec"]["scaleTargetRef"]
+    assert (target["kind"], target["name"]) in by
+    for manifest in by.values():
+        for container in containers(manifest):
+            probed = [probe for name, probe in container.items() if name.endswith("Probe")]
+            assert probed or container["name"] == "models", container["name"]
+            ports = {port["name"] for port in container.get("ports", ())}
+            assert all(p["httpGet"]["port"] in ports and p["httpGet"]["path"] in ("/live", "/ready") for p in probed)
+            volumes = {volume["name"] for volume in manifest["spec"]["template"]["spec"]["volumes"]}
+            assert {mount["name"] for mount in container["volumeMounts"]} <= volumes
+
+
+def test_kustomize_builds_all_of_it():
+    if shutil.which("kubectl") is None:
+        pytest.skip("no kubectl here")
+    done = subprocess.run(["kubectl", "kustomize", DEPLOY / "kubernetes"], check=False, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    built = list(yaml.safe_load_all(done.stdout))
+    assert len(built) == len(manifests()) - 1
+    assert {part["metadata"].get("namespace", "brakeline") for part in built} == {"brakeline"}
+    images = {c["image"] for part in built for c in containers(part)}
+    assert len(images) == 1 and re.fullmatch(r"brakeline:[\d.]+", images.pop())
+
+
+def test_compose_file_is_of_its_schema():
+    jsonschema = pytest.importorskip("jsonschema")
+    said = yaml.safe_load((DEPLOY / "compose.yaml").read_text())
+    del said["name"]  # newer than the schema
+    schema = json.loads((ROOT / "tests" / "stored" / "compose_spec.json").read_text())
+    jsonschema.Draft201909Validator(schema).validate(said)
+    named = {volume.split(":")[0] for s in said["services"].values() for volume in s["volumes"]}
+    assert {name for name in named if not name.startswith(".")} == set(said["volumes"])
+
+
+def test_systemd_takes_the_units(tmp_path):
+    if shutil.which("systemd-analyze") is None:
+        pytest.skip("no systemd-analyze here")
+    units = []
+    for path in (DEPLOY / "systemd").glob("*.service"):
+        units.append(tmp_path / path.name.replace("@", "@7"))
+        units[-1].write_text(path.read_text().replace("/opt/brakeline/.venv/bin/brakeline", "/bin/true"))
+    done = subprocess.run(
+        ["systemd-analyze", "verify", "--man=no", *units], check=False, capture_output=True, text=True
+    )
+    ours = [line for line in done.stderr.splitlines() if "brakeline" in line]
+    assert len(units) == 5 and not ours, done.stderr
+
+
+def test_container_has_every_package():
+    lines = (DEPLOY / "Containerfile").read_text().splitlines()
+    copied = {word for line in lines if line.startswith("COPY") for word in line.split()[1:-1]}
+    assert all((ROOT / name).exists() for name in copied)
+    packages = re.search(r"^packages = \[(.*)\]$", (ROOT / "pyproject.toml").read_text(), re.M).group(1)
+    assert {json.loads(name).split(".")[0] for name in packages.split(", ")} <= copied
