@@ -16,6 +16,7 @@ from safety.client import obstacle_messages, request_message
 from safety.commitment import Array, Commitment, Prediction, correction_penalty
 from safety.memory import Memory
 
+Result = tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]  # of a step
 EPISODE_STRIDE = 4096  # episodes of different robots of a run never share a seed: seed = episode · stride + number
 
 
@@ -26,7 +27,7 @@ class Environment(Protocol):
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[NDArray[np.float32], dict[str, Any]]: ...
 
-    def step(self, action: Array) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]: ...
+    def step(self, action: Array) -> Result: ...
 
     def alter(self, **changes: float) -> None:
         """Change the robot's physics, from now on."""
@@ -71,6 +72,8 @@ class Driver:
         self._memory = Memory(robot.footprint)
         self.index = 0  # steps so far
         self.running = False
+        self.size = 0  # robots in its world; 0: it is alone
+        self.fleet: tuple[str, ...] = ()  # their actors, if they promise each other something
 
     def begin(self, episode: int) -> pb.Episode:
         """Reset to an episode of that number."""
@@ -110,6 +113,7 @@ class Driver:
             step=self.step,
             time=self.info["time"],
             observation=self.observation.tolist(),
+            fleet=self.fleet,
         )
 
     def _remember(self) -> None:
@@ -123,12 +127,27 @@ class Driver:
 
     def execute(self, proposal: Array, outcome: Outcome | None, weights_version: int = 0) -> pb.Step:
         """Do what the outcome says (without a filter: the proposal) for one period."""
+        action = self.command(proposal, outcome)
+        return self.took(proposal, outcome, action, self.env.step(action), weights_version)
+
+    def command(self, proposal: Array, outcome: Outcome | None) -> Array:
+        """The input of the coming period; the committed plan moves on."""
         if outcome is None:
-            action = np.clip(proposal, self.robot.low(), self.robot.high())
-        else:
-            action = next_input(self.commitment, outcome)
+            return np.asarray(np.clip(proposal, self.robot.low(), self.robot.high()))
+        return next_input(self.commitment, outcome)
+
+    def stood(self, result: Result) -> None:
+        """A period passed in which it had nothing to do: its episode is over, its world is not."""
+        self.observation, _, _, _, self.info = result
+        self._remember()
+        self.step += 1
+
+    def took(
+        self, proposal: Array, outcome: Outcome | None, action: Array, result: Result, weights_version: int = 0
+    ) -> pb.Step:
+        """The step that came of a command."""
         before, held = self.observation, self.info["input_in_force"]
-        self.observation, reward, terminated, truncated, self.info = self.env.step(action)
+        self.observation, reward, terminated, truncated, self.info = result
         self._remember()
         self.running = not (terminated or truncated)
         if outcome is None:
@@ -139,6 +158,7 @@ class Driver:
         step.terminated, step.truncated = terminated, truncated
         step.goal, step.collision = self.info["at_goal"], self.info["collision"]
         step.contact_moving, step.contact_standing = self.info["contact_moving"], self.info["contact_standing"]
+        step.contact_robot, step.fleet = self.info["contact_robot"], self.size
         step.weights_version = weights_version
         if outcome is not None:
             self._note(step, outcome)

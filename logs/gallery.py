@@ -60,6 +60,8 @@ class Held:
             return "collision"
         if last.contact_moving or last.contact_standing:
             return "run into" if last.contact_standing else "contact"
+        if last.contact_robot:
+            return "contact"
         if last.goal:
             return "goal"
         return "timeout" if last.truncated else "unfinished"

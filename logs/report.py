@@ -12,6 +12,7 @@ from logs.analysis import SETUP, analysed
 from logs.metrics import Figures
 from logs.reader import Paths
 from logs.tables import PLAIN, Stacking
+from logs.tally import CONTACTS
 
 BLOCKS = "▁▂▃▄▅▆▇█"
 
@@ -90,7 +91,7 @@ def _summary(figures: Figures) -> Table:
         table.add_row("set-up", ", ".join(setup))
     table.add_row("steps", f"{steps}" + _optional(", {:.1f}/s", figures.get("steps_per_s")))
     table.add_row("episodes", f"{episodes}" + _optional(", mean reward {:.2f}", figures["mean_reward"]))
-    touched = [name for name in ("contacts_moving", "contacts_standing") if figures[name]]
+    touched = [name for name in CONTACTS if figures[name]]
     for name in ("goals", "collisions", *touched, "timeouts"):
         table.add_row(name.replace("_", " "), _share(figures[name], episodes, within.get(name)))
     interventions = _share(figures["interventions"], steps, within.get("interventions"))

@@ -20,6 +20,8 @@ from messaging import brakeline_pb2 as pb
 
 Figures = dict[str, Any]  # what JSON can hold
 
+CONTACTS = ("contacts_moving", "contacts_standing", "contacts_robots")  # not with what stands still
+
 KINDS: dict[int, str] = {
     pb.ALLOWED: "allowed",
     pb.ADJUSTED: "adjusted",
@@ -40,6 +42,8 @@ class Tally:
     collisions: int = 0  # episodes with one
     contacts_moving: int = 0  # episodes in which it touched something that moves, itself moving when that began
     contacts_standing: int = 0  # the same, but it had been standing: it was run into
+    contacts_robots: int = 0  # episodes in which it touched another robot of its world
+    fleet: int = 0  # robots in its world; 0: it is alone
     broken: int = 0  # times that an obstacle was seen outside of what its bounds allowed
     timeouts: int = 0
     interventions: int = 0  # steps whose action was not the proposed one
@@ -68,6 +72,7 @@ class Tally:
             self._episode, self._return, self._collided = episode, 0.0, False
             self._begun_at = self.steps, self.interventions
             self.robot = self.robot or step.robot
+            self.fleet = max(self.fleet, step.fleet)
         self.steps += 1
         speed = step.speed
         self.speed += speed
@@ -109,6 +114,7 @@ class Tally:
             self.collisions += 1
         self.contacts_moving += step.contact_moving  # a contact ends its episode
         self.contacts_standing += step.contact_standing
+        self.contacts_robots += step.contact_robot
         self.broken += step.broken
 
     def _ended(self, step: pb.Step) -> None:
@@ -140,6 +146,7 @@ def closed_loop(tallies: Iterable[Tally]) -> Figures:
         "collisions": total("collisions"),
         "contacts_moving": total("contacts_moving"),
         "contacts_standing": total("contacts_standing"),
+        "contacts_robots": total("contacts_robots"),
         "timeouts": total("timeouts"),
         "steps": steps,
         "interventions": total("interventions"),
@@ -166,7 +173,7 @@ def intervals(figures: Figures, tallies: Iterable[Tally]) -> dict[str, list[floa
     shares = Clustered()
     for tally in tallies:
         shares.join(tally.shares)
-    ends = {name: figures[name] for name in ("goals", "collisions", "contacts_moving", "contacts_standing", "timeouts")}
+    ends = {name: figures[name] for name in ("goals", "collisions", *CONTACTS, "timeouts")}
     found = {
         **{name: clopper_pearson(count, max(episodes, count)) for name, count in ends.items()},
         "interventions": shares.interval(),

@@ -200,6 +200,42 @@ class Motion(_message.Message):
 Global___Motion: _TypeAlias = Motion  # noqa: Y015
 
 @_typing.final
+class Promise(_message.Message):
+    """Where a robot will be, period by period, and then for ever (safety/promise.py): boxes in the world."""
+
+    DESCRIPTOR: _descriptor.Descriptor
+
+    CENTER_FIELD_NUMBER: _builtins.int
+    HALF_WIDTH_FIELD_NUMBER: _builtins.int
+    RADIUS_FIELD_NUMBER: _builtins.int
+    @_builtins.property
+    def center(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]:
+        """(periods, position), m"""
+
+    @_builtins.property
+    def half_width(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]:
+        """(periods, position), m"""
+
+    @_builtins.property
+    def radius(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]:
+        """(periods), m added about every box: the body, and what it leaves its chord by"""
+
+    def __init__(
+        self,
+        *,
+        center: _abc.Iterable[_builtins.float] | None = ...,
+        half_width: _abc.Iterable[_builtins.float] | None = ...,
+        radius: _abc.Iterable[_builtins.float] | None = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["center", b"center", "half_width", b"half_width", "radius", b"radius"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    def WhichOneof(self, oneof_group: _Never) -> None: ...
+
+Global___Promise: _TypeAlias = Promise  # noqa: Y015
+
+@_typing.final
 class Scan(_message.Message):
     """One turn of a ranging sensor in the plane (messaging/scans.py): free space where there is no map."""
 
@@ -298,6 +334,8 @@ class Request(_message.Message):
     PREDICTED_HALF_WIDTH_FIELD_NUMBER: _builtins.int
     PREDICTED_HEADING_FIELD_NUMBER: _builtins.int
     VOUCHER_FIELD_NUMBER: _builtins.int
+    FLEET_FIELD_NUMBER: _builtins.int
+    PROMISE_FIELD_NUMBER: _builtins.int
     SCAN_FIELD_NUMBER: _builtins.int
     robot: _builtins.str
     actor: _builtins.str
@@ -340,6 +378,14 @@ class Request(_message.Message):
     @_builtins.property
     def predicted_half_width(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]: ...
     @_builtins.property
+    def fleet(self) -> _containers.RepeatedScalarFieldContainer[_builtins.str]:
+        """the actors of all robots of its world; empty: it is alone"""
+
+    @_builtins.property
+    def promise(self) -> Global___Promise:
+        """what is left of what the last decision promised; none: it stands"""
+
+    @_builtins.property
     def scan(self) -> Global___Scan:
         """in the place of obstacles, or beside them: what is not seen free in it is occupied"""
 
@@ -362,11 +408,13 @@ class Request(_message.Message):
         predicted_half_width: _abc.Iterable[_builtins.float] | None = ...,
         predicted_heading: _builtins.float = ...,
         voucher: _builtins.bytes = ...,
+        fleet: _abc.Iterable[_builtins.str] | None = ...,
+        promise: Global___Promise | None = ...,
         scan: Global___Scan | None = ...,
     ) -> None: ...
-    _HasFieldArgType: _TypeAlias = _typing.Literal["scan", b"scan"]  # noqa: Y015
+    _HasFieldArgType: _TypeAlias = _typing.Literal["promise", b"promise", "scan", b"scan"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["action", b"action", "actor", b"actor", "episode", b"episode", "input_in_force", b"input_in_force", "model", b"model", "observation", b"observation", "obstacles", b"obstacles", "plan", b"plan", "predicted_center", b"predicted_center", "predicted_half_width", b"predicted_half_width", "predicted_heading", b"predicted_heading", "robot", b"robot", "scan", b"scan", "state", b"state", "step", b"step", "time", b"time", "voucher", b"voucher"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["action", b"action", "actor", b"actor", "episode", b"episode", "fleet", b"fleet", "input_in_force", b"input_in_force", "model", b"model", "observation", b"observation", "obstacles", b"obstacles", "plan", b"plan", "predicted_center", b"predicted_center", "predicted_half_width", b"predicted_half_width", "predicted_heading", b"predicted_heading", "promise", b"promise", "robot", b"robot", "scan", b"scan", "state", b"state", "step", b"step", "time", b"time", "voucher", b"voucher"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 
@@ -422,6 +470,7 @@ class Decision(_message.Message):
     ITERATIONS_FIELD_NUMBER: _builtins.int
     VOUCHERS_FIELD_NUMBER: _builtins.int
     UNVOUCHED_FIELD_NUMBER: _builtins.int
+    PROMISE_FIELD_NUMBER: _builtins.int
     BROKEN_FIELD_NUMBER: _builtins.int
     STOPPED_FIELD_NUMBER: _builtins.int
     kind: Global___Kind.ValueType
@@ -477,6 +526,10 @@ class Decision(_message.Message):
         """for the requests of the next periods, in their order"""
 
     @_builtins.property
+    def promise(self) -> Global___Promise:
+        """of a fleet's robot, from now on"""
+
+    @_builtins.property
     def stopped(self) -> Global___Stopped:
         """what a proposal that was not allowed would have come too near to"""
 
@@ -505,12 +558,13 @@ class Decision(_message.Message):
         iterations: _builtins.int = ...,
         vouchers: _abc.Iterable[_builtins.bytes] | None = ...,
         unvouched: _builtins.bool = ...,
+        promise: Global___Promise | None = ...,
         broken: _builtins.int = ...,
         stopped: Global___Stopped | None = ...,
     ) -> None: ...
-    _HasFieldArgType: _TypeAlias = _typing.Literal["stopped", b"stopped"]  # noqa: Y015
+    _HasFieldArgType: _TypeAlias = _typing.Literal["promise", b"promise", "stopped", b"stopped"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["at_least", b"at_least", "broken", b"broken", "compared", b"compared", "contained", b"contained", "iterations", b"iterations", "kind", b"kind", "margin", b"margin", "model", b"model", "plan", b"plan", "predicted_center", b"predicted_center", "predicted_half_width", b"predicted_half_width", "predicted_heading", b"predicted_heading", "queue_ms", b"queue_ms", "reason", b"reason", "solve_ms", b"solve_ms", "solver", b"solver", "stopped", b"stopped", "time_ms", b"time_ms", "tube_center", b"tube_center", "tube_half_width", b"tube_half_width", "unvouched", b"unvouched", "verified", b"verified", "verify_ms", b"verify_ms", "vouchers", b"vouchers"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["at_least", b"at_least", "broken", b"broken", "compared", b"compared", "contained", b"contained", "iterations", b"iterations", "kind", b"kind", "margin", b"margin", "model", b"model", "plan", b"plan", "predicted_center", b"predicted_center", "predicted_half_width", b"predicted_half_width", "predicted_heading", b"predicted_heading", "promise", b"promise", "queue_ms", b"queue_ms", "reason", b"reason", "solve_ms", b"solve_ms", "solver", b"solver", "stopped", b"stopped", "time_ms", b"time_ms", "tube_center", b"tube_center", "tube_half_width", b"tube_half_width", "unvouched", b"unvouched", "verified", b"verified", "verify_ms", b"verify_ms", "vouchers", b"vouchers"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 
@@ -760,6 +814,8 @@ class Step(_message.Message):
     PROPOSE_MS_FIELD_NUMBER: _builtins.int
     CONTACT_MOVING_FIELD_NUMBER: _builtins.int
     CONTACT_STANDING_FIELD_NUMBER: _builtins.int
+    CONTACT_ROBOT_FIELD_NUMBER: _builtins.int
+    FLEET_FIELD_NUMBER: _builtins.int
     BROKEN_FIELD_NUMBER: _builtins.int
     robot: _builtins.str
     actor: _builtins.str
@@ -806,6 +862,10 @@ class Step(_message.Message):
     """it touched something that moves, and was moving itself when that began"""
     contact_standing: _builtins.bool
     """the same, but it had been standing: it was run into"""
+    contact_robot: _builtins.bool
+    """it touched another robot of its world"""
+    fleet: _builtins.int
+    """robots in its world; 0: it is alone"""
     broken: _builtins.int
     """obstacles seen outside of what their bounds allowed"""
     @_builtins.property
@@ -868,11 +928,13 @@ class Step(_message.Message):
         propose_ms: _builtins.float = ...,
         contact_moving: _builtins.bool = ...,
         contact_standing: _builtins.bool = ...,
+        contact_robot: _builtins.bool = ...,
+        fleet: _builtins.int = ...,
         broken: _builtins.int = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _typing.Literal["header", b"header"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["action", b"action", "actor", b"actor", "broken", b"broken", "clearance", b"clearance", "collision", b"collision", "compared", b"compared", "contact_moving", b"contact_moving", "contact_standing", b"contact_standing", "contained", b"contained", "cut", b"cut", "decide_ms", b"decide_ms", "decision", b"decision", "episode", b"episode", "fallback", b"fallback", "goal", b"goal", "header", b"header", "index", b"index", "next_observation", b"next_observation", "observation", b"observation", "outside", b"outside", "path", b"path", "penalty", b"penalty", "propose_ms", b"propose_ms", "proposed", b"proposed", "reward", b"reward", "robot", b"robot", "speed", b"speed", "state", b"state", "step", b"step", "terminated", b"terminated", "true_state", b"true_state", "truncated", b"truncated", "turned", b"turned", "weights_version", b"weights_version"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["action", b"action", "actor", b"actor", "broken", b"broken", "clearance", b"clearance", "collision", b"collision", "compared", b"compared", "contact_moving", b"contact_moving", "contact_robot", b"contact_robot", "contact_standing", b"contact_standing", "contained", b"contained", "cut", b"cut", "decide_ms", b"decide_ms", "decision", b"decision", "episode", b"episode", "fallback", b"fallback", "fleet", b"fleet", "goal", b"goal", "header", b"header", "index", b"index", "next_observation", b"next_observation", "observation", b"observation", "outside", b"outside", "path", b"path", "penalty", b"penalty", "propose_ms", b"propose_ms", "proposed", b"proposed", "reward", b"reward", "robot", b"robot", "speed", b"speed", "state", b"state", "step", b"step", "terminated", b"terminated", "true_state", b"true_state", "truncated", b"truncated", "turned", b"turned", "weights_version", b"weights_version"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 

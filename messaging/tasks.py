@@ -78,6 +78,7 @@ class ArenaKind:
     spheres: tuple[int, int] = (0, 0)
     ball: tuple[float, float] = (0.0, 0.0)  # m, radius of a sphere
     movers: MoverKind | None = None
+    ring: float | None = None  # m: starts are on a circle of this radius, goals opposite: who shares it has to pass
 
 
 @dataclass(frozen=True)

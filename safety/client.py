@@ -27,6 +27,8 @@ from messaging.shapes import Obstacle
 from messaging.topics import DECIDE
 from safety.commitment import Commitment, Prediction
 from safety.digest import digest
+from safety.request import BadRequest
+from safety.wire import promise_message, promise_of
 
 Array = NDArray[np.float64]
 
@@ -104,7 +106,7 @@ def request_message(
     scan: Scan | None = None,
     **more: Any,
 ) -> pb.Request:
-    """A request; `more`: actor, episode, step, time, observation."""
+    """A request; `more`: actor, episode, step, time, observation, fleet."""
     commitment.seen = np.asarray(state, float)
     message = pb.Request(
         robot=commitment.robot.name,
@@ -122,6 +124,8 @@ def request_message(
         message.predicted_center.extend(commitment.predicted.center.tolist())
         message.predicted_half_width.extend(commitment.predicted.half_width.tolist())
         message.predicted_heading = commitment.predicted.heading
+    if message.fleet and commitment.promise is not None:
+        message.promise.CopyFrom(promise_message(commitment.promise))
     return message
 
 
@@ -155,6 +159,11 @@ def read(reply: pb.Reply, request: pb.Request, robot: Robot) -> Answer:
     said = [*decision.predicted_center, *decision.predicted_half_width, decision.predicted_heading, decision.margin]
     if not all(map(math.isfinite, said)) or min(decision.predicted_half_width, default=0.0) < 0.0:
         raise _bad_reply("predicted_center", "a predicted state or a margin that is none")
+    try:
+        if request.fleet:
+            promise_of(decision.promise, robot)
+    except BadRequest as error:
+        raise _bad_reply("promise", str(error)) from error
     return Answer(KINDS[decision.kind], plan[0], plan, decision)
 
 
@@ -182,7 +191,8 @@ def accept(commitment: Commitment, answer: Answer) -> Array:
     predicted = Prediction(
         np.array(message.predicted_center), np.array(message.predicted_half_width), message.predicted_heading
     )
-    return commitment.accept(answer.plan, message.model, predicted, message.verified, message.vouchers)
+    promise = promise_of(message.promise, commitment.robot) if message.HasField("promise") else None
+    return commitment.accept(answer.plan, message.model, predicted, message.verified, message.vouchers, promise)
 
 
 class SafetyClient:

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from messaging.robots import Robot
+from safety.promise import Promise
 
 Array = NDArray[np.float64]
 
@@ -47,7 +48,7 @@ class Commitment:
     plan (N, m) is its tail: the first row is what to execute if no better answer comes; of a late robot what is being
     executed, and `accept` and `fallback` return the input of the next period. model is the version of the
     model set that verified it, empty when the robot stands still, `UNVERIFIED` if none did; voucher is the service's
-    word for that, if it gave one.
+    word for that, if it gave one. promise: of a robot that others share its world with, what is left of it.
     """
 
     def __init__(self, robot: Robot) -> None:
@@ -60,6 +61,7 @@ class Commitment:
         self.plan: Array = np.tile(self.input_in_force, (self.robot.horizon, 1))
         self.model = ""
         self.predicted: Prediction | None = None
+        self.promise: Promise | None = None
         self.seen: Array = np.zeros(self.robot.state_dim)  # the last measured state: of feedback, a stop is made of it
         self._still = self.robot.horizon  # periods of a stop's inputs
         self._vouchers: tuple[bytes, ...] = ()  # of this period and those to come; the last stays
@@ -81,8 +83,10 @@ class Commitment:
         predicted: Prediction | None,
         verified: bool,
         vouchers: Iterable[bytes] = (),
+        promise: Promise | None = None,
     ) -> Array:
         """A decision's plan becomes the committed one; returns the input to execute next."""
+        self.promise = promise
         self._vouchers = (b"", *vouchers)
         self.plan, self.model = plan, model if verified else UNVERIFIED
         self.predicted = predicted if predicted is not None and len(predicted.center) else None
@@ -99,6 +103,7 @@ class Commitment:
         robot = self.robot
         now: Array = self.plan[0].copy()
         self._vouchers = self._vouchers[1:] or self._vouchers
+        self.promise = None if self.promise is None else self.promise.later()
         rests = robot.keeps_still(now, self.seen, self.input_in_force)
         last = np.where(robot.stopping, 0.0, self.plan[-1])
         self.plan = np.vstack([self.plan[1:], last[None]])

@@ -11,18 +11,19 @@ from messaging.movers import Movers
 from messaging.robots import Robot
 from messaging.shapes import Shapes
 from safety.freespace import half_spaces
+from safety.promise import Promises
 from safety.scan import Cells
 from safety.scan import half_spaces as unseen_half_spaces
 from safety.sweep import swept_half_spaces
 
 Array = NDArray[np.float64]
 
-UNSEEN, SIGHT = "unseen", "sight"
+UNSEEN, SIGHT, ROBOT = "unseen", "sight", "robot"
 
 
 @dataclass(frozen=True)
 class Stopped:
-    """by: cylinder | box | sphere | wall, `moving ` before it where it moves, `unseen`, `sight` (the tube leaves what
+    """by: cylinder | box | sphere | wall, `moving ` before it where it moves, `unseen`, `robot`, `sight` (the tube leaves what
     can be seen), or a limit's name; room [m, of a limit in its own units]: from the tube to the half-space, negative:
     beyond it; after [s]: when, from now. normal (d,), at (d,): of the half-space, world, from the free side on, through
     the obstacle's nearest point; empty where there is none."""
@@ -45,6 +46,7 @@ class Around:
     near: Shapes
     moving: Movers | None
     unseen: Cells | None
+    promised: Promises | None = None  # these come last, once for the whole body
 
     def __len__(self) -> int:
         return sum(len(part) for part in (self.near, self.moving, self.unseen) if part is not None)
@@ -57,6 +59,12 @@ def worst(row: int, room: float, robot: Robot, around: Around, nominal: list[tup
     disc, rest = divmod(row, max(len(around) * each, 1))
     if disc >= len(nominal) or not len(around):
         number = row - len(nominal) * len(around) * each
+        if around.promised is not None:
+            each = (N + 1) << robot.position_dim  # of a robot
+            if number < len(around.promised) * each:
+                period = (number % each) >> robot.position_dim
+                return Stopped.nowhere(ROBOT, room, T * min(period + 1, N))
+            number -= len(around.promised) * each
         period, limit = divmod(number, len(robot.limits))
         return Stopped.nowhere(robot.limits[limit].name, room, T * min(period + 1, N))
     which, end = divmod(rest, each)

@@ -24,6 +24,7 @@ from safety.freespace import half_spaces
 from safety.limits import Limits, stacked
 from safety.model_set import ModelSet, needed
 from safety.program import SHARPEN, Builder, Layout, Rows
+from safety.promise import Boxes, Promise, Promises, promised_half_spaces
 from safety.recovery import SLOW, least_violating, slow_inputs, turn_towards
 from safety.request import ADJUSTED, ALLOWED, FAILSAFE, RECOVERING, Decision, Request, check_for_filter
 from safety.solver import INFEASIBLE, solve
@@ -87,10 +88,11 @@ class _Scene:
     away: Array
     moving: Movers | None = None  # that may meet the tube
     unseen: seen.Cells | None = None  # what a scan does not show to be free
+    promised: Promises | None = None  # to other robots
 
     @property
     def empty(self) -> bool:
-        return not len(self.near) and self.moving is None and self.unseen is None
+        return not len(self.near) and self.moving is None and self.unseen is None and self.promised is None
 
 
 @dataclass(frozen=True)
@@ -102,6 +104,7 @@ class _Found:
     z: Array
     margin: float
     verified: bool
+    kept: bool = False  # the committed plan goes on as it was verified before
 
 
 class Filter:
@@ -114,6 +117,7 @@ class Filter:
         self.robot = robot = model.robot
         self.tube, outer = model.tube(), model.outer_tube()
         self.discs = _discs(robot, self.tube)
+        self.boxes = Boxes(self.tube.position, self.tube.directions)
         self.limits = Limits(robot, self.tube) if robot.limits else None
         self.builder = Builder(robot, outer)
         self.schedule = robot.schedule()
@@ -210,7 +214,7 @@ class Filter:
             attempt.reason = "the state is outside the domain that was recorded"
         if found is None:
             found = self._committed(request, scene, z_0, attempt, in_domain)
-            if in_domain and not attempt.broken:
+            if in_domain and not attempt.broken and request.promise is None:  # others rely on a promise
                 found = self._recovered(request, scene, z_0) or found
         return self._decision(request, scene, found, attempt)
 
@@ -255,7 +259,7 @@ class Filter:
             start = scene.start + scene.turn @ disc.at
             nominal.append((start, start + disc.position @ z @ scene.turn.T))
         row = int(np.argmin(slack))
-        around = Around(scene.near, scene.moving, scene.unseen)
+        around = Around(scene.near, scene.moving, scene.unseen, scene.promised)
         return worst(row, max(float(slack[row]), -self.reach), self.robot, around, nominal)
 
     def _closest(self, rows: Rows, z_0: Array, proposal: Array, attempt: _Attempt) -> Array | None:
@@ -316,6 +320,11 @@ class Filter:
                 beside = seen.half_spaces(scene.unseen, start, nominal, disc.radius, measured, self.robot.period)
                 normals, offsets = np.concatenate([normals, beside[0]]), np.concatenate([offsets, beside[1]])
             parts.append(disc.layout.rows(normals @ scene.turn, offsets))
+        if scene.promised is not None:
+            nominal = scene.start + self.tube.centers(z) @ scene.turn.T
+            body = self.robot.footprint
+            kept = promised_half_spaces(scene.promised, scene.start, nominal, body, self.measured)
+            parts.append(self.boxes.rows(*kept, scene.turn))
         if self.limits is not None:
             parts.append(self.limits.rows(scene.start, scene.heading, scene.turn))
         return stacked(parts)
@@ -339,7 +348,7 @@ class Filter:
         as_committed = np.concatenate([z_0, chosen])
         if attempt.contained and vouched:
             margin = self._margin(self._rows(scene, as_committed), as_committed)
-            return _Found(FAILSAFE, tail, as_committed, margin, True)
+            return _Found(FAILSAFE, tail, as_committed, margin, True, kept=True)
         brake = self._regressors(z_0, self._stop(request.state, before))
         as_committed[len(z_0) :] = self._within(chosen, before)
         for z in (as_committed, brake):
@@ -391,6 +400,9 @@ class Filter:
         centers = scene.start + self.tube.centers(z) @ scene.turn.T
         sizes = self.tube.magnitudes(z)[: self.tube.generators]
         half = np.abs(scene.turn @ self.tube.directions) @ sizes + self.measured
+        promise = request.promise
+        if promise is not None and not found.kept:
+            promise = self._promise(scene.start, centers, half, z)
         predicted = self._predict(scene, z)
         margin, at_least = self._clear(request, scene, found)
         total, solved = (perf_counter_ns() - attempt.started) * 1e-6, attempt.solve_ns * 1e-6
@@ -414,7 +426,24 @@ class Filter:
             iterations=attempt.iterations,
             broken=attempt.broken,
             stopped=None if found.kind == ALLOWED else attempt.stopped,
+            promise=promise,
         )
+
+    def rest(self, state: Array) -> Promise:
+        """What a robot promises that stands, and goes on standing, in a measured state (n,)."""
+        z = np.concatenate([state[self.regressor], np.tile(self.nothing, 1 + self.robot.free_steps)])
+        heading = float(state[self.robot.heading]) if self.robot.heading is not None else 0.0
+        turn, start = self._turn(heading), state[: self.robot.position_dim]
+        sizes = self.tube.magnitudes(z)[: self.tube.generators]
+        half = np.abs(turn @ self.tube.directions) @ sizes + self.measured
+        return self._promise(start, start + self.tube.centers(z) @ turn.T, half, z)
+
+    def _promise(self, start: Array, centers: Array, half: Array, z: Array) -> Promise:
+        """Of a tube with these sets (N, d), world, and regressors z."""
+        about = self.tube.magnitudes(z)[self.tube.generators : -1]
+        about[-1] = max(about[-1], float(self.tube.magnitudes(z)[-1]))
+        centers, half = np.vstack([start, centers]), np.vstack([self.measured, half])
+        return Promise.of(centers, half, self.robot.footprint + about)
 
     def _clear(self, request: Request, scene: _Scene, found: _Found) -> tuple[float, bool]:
         """Smallest distance [m] of the tube to what is in sight; True: nothing is, the end of sight is as near.
@@ -427,9 +456,9 @@ class Filter:
             return found.margin, False
         most = self.robot.sight - self.widest
         in_sight = request.obstacles.take(~(scene.away > self.robot.sight))
-        if not len(in_sight) and request.movers is None and scene.unseen is None:
+        if not len(in_sight) and request.movers is None and scene.unseen is None and request.promised is None:
             return most, True
-        rows = self._rows(replace(scene, near=in_sight, moving=request.movers), found.z)
+        rows = self._rows(replace(scene, near=in_sight, moving=request.movers, promised=request.promised), found.z)
         margin = float((rows.bound - rows.support(self.tube, found.z)).min(initial=most))
         return margin, margin == most
 
@@ -474,9 +503,7 @@ class Filter:
         d, robot = self.robot.position_dim, self.robot
         start, near = request.state[:d], request.obstacles
         heading = float(request.state[robot.heading]) if robot.heading is not None else 0.0
-        turn = np.eye(d)
-        cos, sin = math.cos(heading), math.sin(heading)
-        turn[0, 0], turn[0, 1], turn[1, 0], turn[1, 1] = cos, -sin, sin, cos
+        turn = self._turn(heading)
         away = near.distance(start) - near.margin if len(near) else np.zeros(0)
         if len(near):
             # One whose distance is no number stays.
@@ -487,7 +514,15 @@ class Filter:
             moving = moving.take(~(moving.least_distance(start, within) > self.reach))
             moving = moving if len(moving) else None
         unseen = None if request.scan is None else self._unseen(request.scan, start)
-        return _Scene(start, heading, turn, near, away, moving, unseen)
+        promised = None if request.promised is None else request.promised.within(start, self.reach)
+        return _Scene(start, heading, turn, near, away, moving, unseen, promised)
+
+    def _turn(self, heading: float) -> Array:
+        """(d, d), world from the frame of now."""
+        turn = np.eye(self.robot.position_dim)
+        cos, sin = math.cos(heading), math.sin(heading)
+        turn[0, 0], turn[0, 1], turn[1, 0], turn[1, 1] = cos, -sin, sin, cos
+        return turn
 
     def _unseen(self, scan: Scan, start: Array) -> seen.Cells | None:
         """What is not known to be free within reach, or may come there before a plan ends."""

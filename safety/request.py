@@ -16,6 +16,7 @@ from messaging.shapes import FARTHEST, Shapes
 from messaging.tasks import UnknownTask, task_of
 from safety.commitment import Prediction
 from safety.explain import Stopped
+from safety.promise import Promise, Promises
 
 Array = NDArray[np.float64]
 
@@ -42,7 +43,7 @@ class Request:
     standing still; `UNVERIFIED`: by none); obstacles: at least those within `Filter.reach`; predicted: what the last
     decision said of this state, if there was one; movers: obstacles that move, at least those that may come within
     reach before the plan ends; scan: in the place of obstacles, or beside them: what is not seen free in it counts as
-    occupied."""
+    occupied; promise: its own, if other robots share its world, and promised: theirs, to be kept off."""
 
     state: Array
     action: Array
@@ -53,6 +54,8 @@ class Request:
     predicted: Prediction | None = None
     movers: Movers | None = None
     scan: Scan | None = None
+    promise: Promise | None = None
+    promised: Promises | None = None
     observation: NDArray[np.float32] = field(default_factory=lambda: np.zeros(0, np.float32))
 
     def still(self, robot: Robot) -> bool:
@@ -89,6 +92,7 @@ class Decision:
     iterations: int = 0
     broken: int = 0  # movers that were seen outside of what their bounds allowed
     stopped: Stopped | None = None  # of a proposal that was not allowed: what it would have come too near to
+    promise: Promise | None = None  # to the other robots of its world
 
     @property
     def action(self) -> Array:

@@ -16,12 +16,15 @@ from messaging.robots import UnknownRobot, known, robot_named
 from messaging.topics import DECIDE, MODEL
 from safety.commitment import UNVERIFIED
 from safety.digest import digest
+from safety.filter import Filter
+from safety.fleet import Together, together, worlds
 from safety.methods import Method, Model, load, ready
 from safety.model_set import BadModel
-from safety.request import BadRequest, StaleModel
+from safety.promise import Promise
+from safety.request import BadRequest, StaleModel, check_for_filter
 from safety.sign import Signed, Trust, Untrusted
 from safety.vouch import Notary
-from safety.wire import batch_of, error_of, message_of, request_of
+from safety.wire import batch_of, error_of, message_of, promise_of, request_of
 
 log = logging.getLogger("brakeline.safety")
 
@@ -114,14 +117,18 @@ def answerer(models: Models, counts: Counts, notary: Notary | None = None) -> Ca
     of theirs is believed.
     """
 
-    def one(message: pb.Request, received: int) -> pb.Reply:
+    def one(message: pb.Request, received: int, shared: Together | None = None) -> pb.Reply:
         try:
             chosen = models.filter_for(message)
             believed = notary is None or notary.vouches(message, chosen.robot)
             if not believed:
                 counts.unvouched += 1
                 message.model = UNVERIFIED
-            request = request_of(message, chosen.robot)
+            if shared is None:
+                request = request_of(message, chosen.robot)
+            else:
+                own = shared.promises[message.actor]
+                request = request_of(message, chosen.robot, own, shared.to(message.actor))
             queue_ms = (perf_counter_ns() - received) * 1e-6
             decision = chosen.decide(request)
         except (BadRequest, UnknownRobot) as error:
@@ -138,16 +145,45 @@ def answerer(models: Models, counts: Counts, notary: Notary | None = None) -> Ca
         if not decision.contained:
             counts.violations += 1
             log.warning("%s, step %d: outside the predicted set", message.actor or message.robot, message.step)
+        if shared is not None and decision.promise is not None:
+            shared.promises[message.actor] = decision.promise
         reply = message_of(decision, queue_ms)
         reply.robot, reply.decision.unvouched = chosen.robot.name, not believed
         if notary is not None and decision.verified:
             reply.decision.vouchers.extend(notary.vouchers(message, reply.decision, chosen.robot))
         return reply
 
+    def committed(message: pb.Request) -> Promise:
+        """What a fleet's robot has promised; one that stands and has not: to go on standing."""
+        method = models.filter_for(message)
+        if not isinstance(method, Filter):
+            raise BadRequest("fleet", "only our own filter makes promises: the rivals predict nothing")
+        robot = method.robot
+        if robot.late:
+            raise BadRequest("fleet", f"{robot.name}: what is asked in real time is decided too late for promises")
+        if message.HasField("promise"):
+            return promise_of(message.promise, robot)
+        request = request_of(message, robot)
+        check_for_filter(robot, request)
+        if not request.still(robot):
+            raise BadRequest("promise", f"{message.actor} moves and has promised nothing: nobody can keep off it")
+        return method.rest(request.state)
+
     def answer(payload: bytes) -> bytes:
         received = perf_counter_ns()
         batch = batch_of(payload)
-        replies = [one(request, received) for request in batch.requests]
+        replies: list[pb.Reply] = [pb.Reply()] * len(batch.requests)
+        for world in worlds(batch.requests):
+            members = [batch.requests[i] for i in world]
+            try:
+                shared = together(members, committed) if members[0].fleet else None
+            except (BadRequest, UnknownRobot) as error:
+                counts.errors += len(members)
+                for i in world:
+                    replies[i] = error_of(error)
+                continue
+            for i, request in zip(world, members, strict=True):
+                replies[i] = one(request, received, shared)
         reply = pb.ReplyBatch(replies=replies, request=digest(payload)).SerializeToString()
         counts.answering += (perf_counter_ns() - received) * 1e-9
         return reply

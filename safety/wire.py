@@ -14,8 +14,9 @@ from messaging.motion import Motion, Sighting
 from messaging.movers import parted
 from messaging.robots import Robot
 from messaging.scans import BadScan, Scan
-from messaging.shapes import BadShape, Obstacle
+from messaging.shapes import FARTHEST, BadShape, Obstacle
 from safety.commitment import Prediction
+from safety.promise import Promise, Promises
 from safety.request import ADJUSTED, ALLOWED, FAILSAFE, RECOVERING, BadRequest, Decision, Request
 
 KINDS = {ALLOWED: pb.ALLOWED, ADJUSTED: pb.ADJUSTED, FAILSAFE: pb.FAILSAFE, RECOVERING: pb.RECOVERING}
@@ -71,8 +72,10 @@ def _varint(payload: bytes, at: int) -> tuple[int, int]:
     return value, at
 
 
-def request_of(message: pb.Request, robot: Robot) -> Request:
-    """The request in a message.
+def request_of(
+    message: pb.Request, robot: Robot, promise: Promise | None = None, promised: Promises | None = None
+) -> Request:
+    """The request in a message; promise, promised: of a fleet's robot, its own and the others'.
 
     Raises:
         BadRequest: an obstacle, a size or a value is wrong, with the field's name.
@@ -96,6 +99,8 @@ def request_of(message: pb.Request, robot: Robot) -> Request:
         scan=scan_of(message.scan) if message.HasField("scan") else None,
         model=message.model,
         predicted=predicted,
+        promise=promise,
+        promised=promised,
         observation=np.fromiter(message.observation, np.float32, len(message.observation)),
     )
 
@@ -159,6 +164,18 @@ def motion_of(m: pb.Motion) -> Motion:
     )
 
 
+def promise_of(m: pb.Promise, robot: Robot) -> Promise:
+    """Raises BadRequest: it is none of this robot's."""
+    shape = robot.horizon, robot.position_dim
+    if {len(m.center), len(m.half_width)} != {shape[0] * shape[1]} or len(m.radius) != shape[0]:
+        raise BadRequest("promise", f"a {robot.name} robot's promise has {shape[0]} boxes in {shape[1]} coordinates")
+    center, half, radius = numbers(m.center), numbers(m.half_width), numbers(m.radius)
+    within = all((np.abs(part) <= FARTHEST).all() for part in (center, half, radius))  # NaN fails too
+    if not within or (half < 0.0).any() or (radius < 0.0).any():
+        raise BadRequest("promise", "a promise's boxes are within reason and not negative")
+    return Promise(center.reshape(shape), half.reshape(shape), radius)
+
+
 def message_of(decision: Decision, queue_ms: float) -> pb.Reply:
     message = pb.Decision(
         kind=KINDS[decision.kind],
@@ -187,7 +204,17 @@ def message_of(decision: Decision, queue_ms: float) -> pb.Reply:
         message.stopped.by, message.stopped.room, message.stopped.after = stopped.by, stopped.room, stopped.after
         message.stopped.normal.extend(stopped.normal.tolist())
         message.stopped.at.extend(stopped.at.tolist())
+    if decision.promise is not None:
+        message.promise.CopyFrom(promise_message(decision.promise))
     return pb.Reply(decision=message)
+
+
+def promise_message(promise: Promise) -> pb.Promise:
+    return pb.Promise(
+        center=promise.center.ravel().tolist(),
+        half_width=promise.half_width.ravel().tolist(),
+        radius=promise.radius.tolist(),
+    )
 
 
 def error_of(error: Exception) -> pb.Reply:

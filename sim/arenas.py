@@ -18,7 +18,7 @@ from messaging.robots import Robot
 from messaging.shapes import BOX, CYLINDER, SPHERE, WALL, Obstacle, Shapes
 from messaging.tasks import ArenaKind, MoverKind, task_of
 from sim.movers import Crowd
-from sim.world import Arena, closing, room_bounds
+from sim.world import Arena, alike, closing, room_bounds
 
 Array = NDArray[np.float64]
 
@@ -58,6 +58,8 @@ def draw_arena(name: str, rng: np.random.Generator, robot: Robot) -> Arena:
         NoArena: when a kind's numbers leave no solvable arena.
     """
     kind = arena_kind(robot, name)
+    if kind.ring is not None:
+        return draw_fleet(name, rng, robot, 1)[0]
     for _ in range(ATTEMPTS):
         obstacles = _place(kind, rng, robot)
         if obstacles is None:
@@ -72,6 +74,58 @@ def draw_arena(name: str, rng: np.random.Generator, robot: Robot) -> Arena:
         if arena.clearance_map.connected(start[: arena.dim], goal, robot.footprint + kind.path_clearance):
             return arena if kind.movers is None else _with_movers(arena, kind.movers, rng)
     raise NoArena(f"no arena {name!r} with a way from start to goal in {ATTEMPTS} draws")
+
+
+def draw_fleet(name: str, rng: np.random.Generator, robot: Robot, size: int) -> tuple[Arena, ...]:
+    """The same arena for several robots, each with a start and a goal of its own.
+
+    Raises:
+        UnknownArena: with the names there are.
+        NoArena: when a kind's numbers leave no room for so many.
+    """
+    kind = arena_kind(robot, name)
+    for _ in range(ATTEMPTS):
+        obstacles = _place(kind, rng, robot)
+        if obstacles is None:
+            continue
+        ends = _ends(kind, Shapes.of(obstacles, robot.position_dim), rng, robot, size)
+        if ends is None:
+            continue
+        starts, goals = (tuple(map(tuple, points.tolist())) for points in ends)
+        first = Arena(name, obstacles, starts[0], goals[0], kind.goal_radius, kind.step_limit, bounds_of(kind))
+        wide = robot.footprint + kind.path_clearance
+        if not all(first.clearance_map.connected(*way, wide) for way in zip(starts, goals, strict=True)):
+            continue
+        headings = rng.uniform(-math.pi, math.pi, size)
+        return tuple(
+            alike(first, start=(*start, float(heading)), goal=goal)
+            for start, goal, heading in zip(starts, goals, headings, strict=True)
+        )
+    raise NoArena(f"no arena {name!r} with ways for {size} robots in {ATTEMPTS} draws")
+
+
+def _ends(
+    kind: ArenaKind, shapes: Shapes, rng: np.random.Generator, robot: Robot, size: int
+) -> tuple[Array, Array] | None:
+    """Starts and goals (size, d) of a fleet: opposite each other on the kind's ring, else anywhere; None: no room."""
+    low, high = np.array(bounds_of(kind)).T
+    clear = robot.footprint + kind.start_clearance
+    apart = 2.0 * clear
+    if kind.ring is not None:
+        angles = rng.uniform(0.0, math.tau) + math.tau * (np.arange(size) / size)
+        starts = kind.ring * np.column_stack([np.cos(angles), np.sin(angles)])
+        goals = -starts
+    else:
+        starts, goals = rng.uniform(low, high, (2, size, len(low)))
+        if (np.linalg.norm(starts - goals, axis=1) < kind.goal_distance).any():
+            return None
+    for points, least in ((starts, apart), (goals, apart + 2.0 * kind.goal_radius)):
+        if (shapes.distance(points).min(axis=0) < clear).any():
+            return None
+        between = np.linalg.norm(points[:, None] - points, axis=-1) + np.diag(np.full(size, np.inf))
+        if between.min() < (least if kind.ring is None else apart):
+            return None
+    return starts, goals
 
 
 def _with_movers(arena: Arena, kind: MoverKind, rng: np.random.Generator) -> Arena:
@@ -101,9 +155,7 @@ def tour(arena: Arena, goals: int, rng: np.random.Generator, robot: Robot) -> tu
         far = np.linalg.norm(points - start, axis=1) >= kind.goal_distance
         for goal in (tuple(point) for point in points[free & far].tolist()):
             if arena.clearance_map.connected(start, goal, robot.footprint + kind.path_clearance):
-                stage = replace(arena, start=start, goal=goal)
-                vars(stage).update(shapes=arena.shapes, clearance_map=arena.clearance_map)  # they cost a period
-                stages.append(stage)
+                stages.append(alike(arena, start=start, goal=goal))
                 start = goal
                 break
     raise NoArena(f"no {goals} goals that a way leads to in {arena.name!r}")

@@ -18,7 +18,7 @@ from messaging.tasks import Reward, task_of
 from sim.arenas import draw_arena
 from sim.conditions import Conditions
 from sim.estimator import wrap
-from sim.movers import Watch
+from sim.movers import Crowd, Watch
 from sim.scanner import Perception, Scanner
 from sim.senses import LIDAR_NOISE, Senses
 from sim.vehicle import MakeVehicle, Period, Vehicle
@@ -60,6 +60,7 @@ class NavigationEnv(gymnasium.Env[Observation, Any]):
     collision          some part of the robot touched an obstacle that stands during the last period
     contact_moving     it touched something that moves, and was moving itself when that began
     contact_standing   it was run into while it stood
+    contact_robot      it touched another robot of its world (`sim.fleet`)
     at_goal            the goal is reached
     clearance          m from the robot's footprint disc (sphere) to the nearest obstacle, true
     speed              m/s, true
@@ -127,20 +128,25 @@ class NavigationEnv(gymnasium.Env[Observation, Any]):
         self._scanner = None
         if self._perception.kind == "scan":
             self._scanner = Scanner(self.robot, self._arena, rng, self._lidar_noise, self._perception.faults)
-        self._watch = None if self._arena.crowd is None else Watch(self._arena.crowd, rng)
+        crowd = self._arena.crowd
+        self._watch = Watch(crowd, rng) if isinstance(crowd, Crowd) else None  # other robots promise where they will be
         self._steps = 0
         self._distance = self._goal_distance(self._vehicle.true)
         return self._observe(), self._info(self._vehicle.standing())
 
     def step(self, action: Array) -> tuple[Observation, float, bool, bool, Info]:
-        period = self.vehicle.step(action)
+        return self.after(self.vehicle.step(action))
+
+    def after(self, period: Period) -> tuple[Observation, float, bool, bool, Info]:
+        """What `step` returns of a period that was driven."""
         self._steps += 1
         before, self._distance = self._distance, self._goal_distance(period.true)
         at_goal = self._at_goal(period)
         reward = self.reward.progress * (before - self._distance)
-        reward += self.reward.goal * at_goal + self.reward.collision * (period.collision or period.contact_moving)
+        hit = period.collision or period.contact_moving or period.contact_robot
+        reward += self.reward.goal * at_goal + self.reward.collision * hit
         reward += self.reward.run_into * period.contact_standing
-        terminated = at_goal or period.collision or period.contact_moving or period.contact_standing
+        terminated = at_goal or hit or period.contact_standing
         truncated = not terminated and self._steps >= self._arena.step_limit
         return self._observe(), float(reward), terminated, truncated, self._info(period)
 
@@ -149,7 +155,7 @@ class NavigationEnv(gymnasium.Env[Observation, Any]):
 
     def _at_goal(self, period: Period) -> bool:
         return self._distance <= self._arena.goal_radius and not (
-            period.collision or period.contact_moving or period.contact_standing
+            period.collision or period.contact_moving or period.contact_standing or period.contact_robot
         )
 
     def _observe(self) -> Observation:
@@ -197,6 +203,7 @@ class NavigationEnv(gymnasium.Env[Observation, Any]):
             "collision": period.collision,
             "contact_moving": period.contact_moving,
             "contact_standing": period.contact_standing,
+            "contact_robot": period.contact_robot,
             "at_goal": self._at_goal(period),
             "clearance": period.clearance,
             "speed": self._senses.speed(period.true),

@@ -23,17 +23,112 @@ GROUND = robot_named("ground")
 MODEL = Path(__file__).with_name("ground.xml").read_text()
 WHEEL_RADIUS = 0.033  # m
 TRACK = 0.160  # m between the wheels
+COORDINATES, SPEEDS = 9, 8  # of one robot in a model: a free body and two wheels
 SAMPLES = 10  # of encoders and gyro in a period
 STANDING = 0.02  # m/s; no faster, and at no input, it stands
 PAYLOAD_GYRATION = 0.05  # m, radius of gyration of what is loaded
 
 
-class GroundRobot:
-    """One TurtleBot3 in one arena.
+class Turtle:
+    """One TurtleBot3 of a world, whoever moves the world on.
 
     true, measured: states (x [m], y [m], heading [rad], speed [m/s], turn rate [rad/s]) of the axle's midpoint;
     input: what was executed last (speed [m/s], turn rate [rad/s]), after clipping.
     """
+
+    def __init__(self, arena: Arena, data: mujoco.MjData, number: int = 0) -> None:
+        """data: of a model whose robots are alike and come first; number: which of them it is."""
+        q, v, u = COORDINATES * number, SPEEDS * number, GROUND.action_dim * number
+        self.arena = arena
+        self._qpos, self._qvel = data.qpos[q : q + COORDINATES], data.qvel[v : v + SPEEDS]  # views of the world's
+        self._ctrl = data.ctrl[u : u + GROUND.action_dim]
+
+    def wake(self, noise: NoiseLevels | None, rng: np.random.Generator) -> None:
+        """It stands on its wheels: from here on it is measured."""
+        self.estimator = Estimator(
+            noise or NoiseLevels(), rng, self._true_pose(), self._wheels(), WHEEL_RADIUS, GROUND.period / SAMPLES
+        )
+        self.true = self._true_state()
+        self.measured = np.array([*self.estimator.pose, 0.0, 0.0])
+        self.input = np.zeros(GROUND.action_dim)
+
+    def take(self, input: Array) -> None:
+        """The next period's input, clipped to the robot's bounds.
+
+        Raises:
+            BadInput: when the input is not two finite numbers.
+        """
+        input = np.asarray(input, dtype=np.float64)
+        if input.shape != (GROUND.action_dim,) or not np.isfinite(input).all():
+            raise BadInput(f"an input is {GROUND.action_dim} finite numbers, not {input!r}")
+        self.input = np.clip(input, GROUND.low(), GROUND.high())
+
+    def begin(self, input: Array) -> None:
+        """A period with this input begins."""
+        self._set_wheels(input)
+        self._positions, self._angles = np.empty((SAMPLES, 2)), np.empty((SAMPLES, 2))
+        self._headings = np.empty(SAMPLES + 1)
+        self._headings[0] = self._true_heading()
+
+    def sample(self, i: int) -> None:
+        """The period's i-th sample of where it is."""
+        self._positions[i], self._angles[i] = self._qpos[:2], self._wheels()
+        self._headings[i + 1] = self._true_heading()
+
+    def report(
+        self, collision: bool, contact_moving: bool = False, contact_standing: bool = False, contact_robot: bool = False
+    ) -> Period:
+        """What came of the period: see there."""
+        rates = np.diff(np.unwrap(self._headings)) * (SAMPLES / GROUND.period)
+        reading = self.estimator.update(self._angles, rates, self._true_pose())
+        self.true, self.measured = self._true_state(), reading.measured
+        distances = self._clearance(self._positions)
+        return Period(
+            self.measured,
+            self.true,
+            collision,
+            float(distances.min()),
+            float(distances[-1]),
+            reading.path,
+            reading.turned,
+            contact_moving,
+            contact_standing,
+            contact_robot,
+        )
+
+    def standing(self) -> Period:
+        """The present state as a period in which nothing happened: what there is to say before the first step."""
+        clearance = float(self._clearance(self.true[:2]))
+        return Period(self.measured, self.true, False, clearance, clearance, np.zeros((SAMPLES, 2)), 0.0)
+
+    def _clearance(self, positions: Array) -> Array:
+        """From the footprint's disc at positions (..., 2) to the nearest obstacle, m."""
+        return np.asarray(self.arena.shapes.distance(positions).min(axis=0) - GROUND.footprint)
+
+    def _set_wheels(self, input: Array) -> None:
+        """Setpoints of the wheels for an input (speed [m/s], turn rate [rad/s])."""
+        speed, turn = input
+        self._ctrl[:] = (speed - 0.5 * TRACK * turn) / WHEEL_RADIUS, (speed + 0.5 * TRACK * turn) / WHEEL_RADIUS
+
+    def _wheels(self) -> Array:
+        return np.asarray(self._qpos[7:9])
+
+    def _true_heading(self) -> float:
+        w, x, y, z = self._qpos[3:7]
+        return math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+
+    def _true_pose(self) -> Array:
+        return np.array([*self._qpos[:2], self._true_heading()])
+
+    def _true_state(self) -> Array:
+        x, y, heading = self._true_pose()
+        vx, vy = self._qvel[:2]
+        speed = vx * math.cos(heading) + vy * math.sin(heading)
+        return np.array([x, y, heading, speed, self._qvel[5]])
+
+
+class GroundRobot(Turtle):
+    """One TurtleBot3 in one arena of its own."""
 
     def __init__(
         self,
@@ -43,9 +138,9 @@ class GroundRobot:
         payload_kg: float = 0.0,
         floor_friction: float = 1.0,
     ) -> None:
-        self.arena = arena
         self._model = _build(arena)
         self._data = mujoco.MjData(self._model)
+        super().__init__(arena, self._data)
         base = self._model.body("base").id
         self._base = base
         self._bare_mass = float(self._model.body_mass[base])
@@ -60,12 +155,7 @@ class GroundRobot:
         self.set_friction(floor_friction)
         mujoco.mj_forward(self._model, self._data)
         self._run(np.zeros(2))  # sink onto the wheels
-        self.estimator = Estimator(
-            noise or NoiseLevels(), rng, self._true_pose(), self._wheels(), WHEEL_RADIUS, GROUND.period / SAMPLES
-        )
-        self.true = self._true_state()
-        self.measured = np.array([*self.estimator.pose, 0.0, 0.0])
-        self.input = np.zeros(GROUND.action_dim)
+        self.wake(noise, rng)
 
     def alter(self, **changes: float) -> None:
         """Change `payload_kg`, `floor_friction` or both, from now on. Raises ValueError for any other name."""
@@ -95,47 +185,18 @@ class GroundRobot:
         Raises:
             BadInput: when the input is not two finite numbers.
         """
-        input = np.asarray(input, dtype=np.float64)
-        if input.shape != (GROUND.action_dim,) or not np.isfinite(input).all():
-            raise BadInput(f"an input is {GROUND.action_dim} finite numbers, not {input!r}")
-        self.input = np.clip(input, GROUND.low(), GROUND.high())
-        positions, wheels, rates, collision = self._run(self.input)
-        reading = self.estimator.update(wheels, rates, self._true_pose())
-        self.true, self.measured = self._true_state(), reading.measured
-        distances = self._clearance(positions)
-        return Period(
-            self.measured,
-            self.true,
-            collision,
-            float(distances.min()),
-            float(distances[-1]),
-            reading.path,
-            reading.turned,
-            *self._contacts,
-        )
+        self.take(input)
+        return self.report(self._run(self.input), *self._contacts)
 
-    def standing(self) -> Period:
-        """The present state as a period in which nothing happened: what there is to say before the first step."""
-        clearance = float(self._clearance(self.true[:2]))
-        return Period(self.measured, self.true, False, clearance, clearance, np.zeros((SAMPLES, 2)), 0.0)
-
-    def _clearance(self, positions: Array) -> Array:
-        """From the footprint's disc at positions (..., 2) to the nearest obstacle, m."""
-        return np.asarray(self.arena.shapes.distance(positions).min(axis=0) - GROUND.footprint)
-
-    def _run(self, input: Array) -> tuple[Array, Array, Array, bool]:
-        """One period of physics: position (S, 2), wheel angles (S, 2), turn rate (S,) at each sample; any collision."""
-        data = self._data
-        self._set_wheels(input)
-        positions, wheels, headings = np.empty((SAMPLES, 2)), np.empty((SAMPLES, 2)), np.empty(SAMPLES + 1)
-        headings[0] = self._true_heading()
+    def _run(self, input: Array) -> bool:
+        """One period of physics; any collision."""
+        self.begin(input)
         collision, self._contacts = False, [False, False]
         driven = bool(input.any())
         for i in range(SAMPLES):
             collision |= self._run_sample(driven)
-            positions[i], wheels[i], headings[i + 1] = data.qpos[:2], self._wheels(), self._true_heading()
-        rates = np.diff(np.unwrap(headings)) * (SAMPLES / GROUND.period)
-        return positions, wheels, rates, collision
+            self.sample(i)
+        return collision
 
     def _meet(self, moving: bool) -> None:
         """Note when something that moves begins to be touched, and whether this robot was moving until then."""
@@ -143,11 +204,6 @@ class GroundRobot:
         if touched and not self._meeting and not any(self._contacts):  # the push that follows is that contact's
             self._contacts[0 if moving else 1] = True
         self._meeting = touched
-
-    def _set_wheels(self, input: Array) -> None:
-        """Setpoints of the wheels for an input (speed [m/s], turn rate [rad/s])."""
-        speed, turn = input
-        self._data.ctrl[:] = (speed - 0.5 * TRACK * turn) / WHEEL_RADIUS, (speed + 0.5 * TRACK * turn) / WHEEL_RADIUS
 
     def _run_sample(self, driven: bool) -> bool:
         """Physics up to the next sample; any collision. driven: the input is not zero."""
@@ -175,22 +231,6 @@ class GroundRobot:
         if self._moving:
             return bool((first * ~self._moving.touched()).any())
         return bool(np.count_nonzero(first))
-
-    def _wheels(self) -> Array:
-        return np.asarray(self._data.qpos[7:9])
-
-    def _true_heading(self) -> float:
-        w, x, y, z = self._data.qpos[3:7]
-        return math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
-
-    def _true_pose(self) -> Array:
-        return np.array([*self._data.qpos[:2], self._true_heading()])
-
-    def _true_state(self) -> Array:
-        x, y, heading = self._true_pose()
-        vx, vy = self._data.qvel[:2]
-        speed = vx * math.cos(heading) + vy * math.sin(heading)
-        return np.array([x, y, heading, speed, self._data.qvel[5]])
 
 
 def _build(arena: Arena) -> mujoco.MjModel:

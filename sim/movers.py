@@ -7,6 +7,8 @@ can. So it keeps to its acceleration and speed at all times, whatever it wants. 
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -89,6 +91,26 @@ class Crowd:
         clear = self._still.distance(places).min(axis=0)  # (n, CHECKED)
         between = 0.5 * np.linalg.norm(way, axis=1, keepdims=True) / (CHECKED - 1)
         return np.asarray((clear >= self.kind.radius + between + AIR).all(axis=1))
+
+
+class Others:
+    """The other robots of a world, where a lidar sees them: as discs about where they are now."""
+
+    def __init__(self, now: Callable[[], Array], radius: float) -> None:
+        """now: their true positions (n, 2), none for n = 0; radius [m]."""
+        self._now, self._radius = now, radius
+
+    def __len__(self) -> int:
+        return len(self._now())
+
+    def at(self, time: float) -> tuple[Array, Array]:
+        """Positions (n, 2), whatever the time is; velocities are not known."""
+        places = self._now().reshape(-1, 2)
+        return places, np.zeros_like(places)
+
+    def obstacles(self, time: float) -> tuple[Obstacle, ...]:
+        """As they are."""
+        return tuple(Obstacle(CYLINDER, tuple(place), (self._radius,)) for place in self.at(time)[0].tolist())
 
 
 class Watch:

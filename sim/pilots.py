@@ -30,6 +30,8 @@ def way_to_nearest(info: dict[str, Any]) -> Array:
     ways = arena.shapes.towards(position)
     if moving := [obstacle for obstacle in info["obstacles"] if obstacle.motion is not None]:
         ways = np.concatenate([ways, Shapes.of(moving, arena.dim).towards(position)])
+    if len(others := info.get("others", ())):
+        ways = np.concatenate([ways, others[:, : arena.dim] - position])
     return np.asarray(ways[np.argmin(np.einsum("ni,ni->n", ways, ways))])
 
 

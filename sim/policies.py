@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from messaging.robots import Robot
 from messaging.tasks import task_of
 from sim.estimator import wrap
+from sim.passing import Passing
 from sim.pilots import way_to_nearest
 from sim.planner import Routes
 from sim.world import Arena
@@ -80,7 +81,7 @@ class Greedy:
 
 
 class Adversary:
-    """Turns to the nearest obstacle on the spot, be it one that moves, then drives at it at full speed."""
+    """Turns to the nearest obstacle on the spot, be it one that moves or a robot, then drives at it at full speed."""
 
     AIMED = 0.5  # rad; a larger bearing is turned off first, else it could circle the obstacle for ever
 
@@ -98,7 +99,8 @@ class MapDriver:
     """Knows the map: follows the best way of `Routes` by pure pursuit of a point ahead that can be driven at straight.
 
     The larger the bearing of that point, the slower it drives; a point far to the side is turned to on the spot.
-    Leaving the way needs no new search: `Routes` has one from every cell.
+    Leaving the way needs no new search: `Routes` has one from every cell. Where other robots drive, it gets past them
+    as `Passing` says.
     """
 
     COMFORT = 0.25  # m beside the footprint: more clearance than this is worth no detour
@@ -109,16 +111,20 @@ class MapDriver:
     ALIGNED = 0.35  # rad; at larger bearings it turns on the spot
 
     def __init__(self, robot: Robot, rng: np.random.Generator) -> None:
-        self._robot = robot
+        self._robot, self._rng = robot, rng
         self._arena: Arena | None = None
 
     def __call__(self, observation: NDArray[np.float32], info: dict[str, Any]) -> Array:
         if info["arena"] is not self._arena:
             self._arena = info["arena"]
+            self._passing = Passing(self._robot, info["arena"].clearance_map, self._rng)
             self._routes = Routes(
                 info["arena"].clearance_map, info["goal"], self._robot.footprint, self._robot.footprint + self.COMFORT
             )
         target = self._target(info["state"][:2])
+        if len(others := info.get("others", ())):
+            way = self._passing.direction(info["state"], target, others)
+            return self._pursue(wrap(way - float(info["state"][2])))
         return self._pursue(bearing(info["state"], target))
 
     def _target(self, position: Array) -> Array:

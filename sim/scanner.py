@@ -14,6 +14,7 @@ from messaging.scans import Scan
 from sim.conditions import Faults as Faults
 from sim.conditions import Perception as Perception
 from sim.lidar import Lidar
+from sim.movers import Crowd
 from sim.world import Arena
 
 Array = NDArray[np.float64]
@@ -40,7 +41,7 @@ class Scanner:
         bound = robot.measurement_bound
         self._position_error, self._heading_error = math.hypot(*bound[:2]), bound[robot.heading]
         self._period, self._heading = robot.period, robot.heading
-        self._speed = 0.0 if arena.crowd is None else arena.crowd.kind.speed
+        self._speed = arena.crowd.kind.speed if isinstance(arena.crowd, Crowd) else 0.0
         self._waiting: list[Scan] = []
 
     def scan(self, true: Array, measured: Array, time: float) -> Scan:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from messaging.shapes import BOX, CYLINDER, SPHERE, Obstacle
-from sim.movers import Crowd
+from sim.movers import Crowd, Others
 from sim.world import Arena
 
 HEIGHT = 0.4  # m, of every obstacle of an arena in the plane: taller than the robot
@@ -38,7 +38,7 @@ def add_obstacles(spec: mujoco.MjSpec, arena: Arena) -> None:
         )
 
 
-def add_movers(spec: mujoco.MjSpec, crowd: Crowd | None) -> None:
+def add_movers(spec: mujoco.MjSpec, crowd: Crowd | Others | None) -> None:
     """Add what moves as bodies that nothing pushes, `mover 0`, `mover 1`, …; `Movers` puts them in their places."""
     for i, mover in enumerate(() if crowd is None else crowd.obstacles(0.0)):
         flat = len(mover.position) == 2
@@ -57,7 +57,7 @@ def add_movers(spec: mujoco.MjSpec, crowd: Crowd | None) -> None:
 class Moving:
     """The movers of a compiled model."""
 
-    def __init__(self, model: mujoco.MjModel, data: mujoco.MjData, crowd: Crowd | None) -> None:
+    def __init__(self, model: mujoco.MjModel, data: mujoco.MjData, crowd: Crowd | Others | None) -> None:
         self._data, self._crowd = data, crowd
         names = [f"mover {i}" for i in range(0 if crowd is None else len(crowd))]
         self._bodies = [int(model.body_mocapid[model.body(name).id]) for name in names]

@@ -31,6 +31,7 @@ class Period:
     turned: float  # rad, estimated change of heading; 0 for a robot whose state has none
     contact_moving: bool = False  # it touched something that moves, and was moving itself when that began
     contact_standing: bool = False  # it was run into while it stood
+    contact_robot: bool = False  # it began to touch another robot of its world
 
 
 class Vehicle(Protocol):

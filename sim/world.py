@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import Any
 
 from messaging.shapes import BOX, WALL, Obstacle, Shapes
-from sim.movers import Crowd
+from sim.movers import Crowd, Others
 from sim.planner import ClearanceMap
 
 SLAB = 2.0  # m, thickness of floors and ceilings
@@ -27,7 +28,7 @@ class Arena:
     goal_radius: float
     step_limit: int  # periods until the episode is cut off
     bounds: tuple[tuple[float, float], ...]  # lowest and highest coordinate inside the room, for each of the d axes
-    crowd: Crowd | None = field(default=None, compare=False)  # what moves in it
+    crowd: Crowd | Others | None = field(default=None, compare=False)  # what moves in it
 
     @property
     def dim(self) -> int:
@@ -40,6 +41,13 @@ class Arena:
     @cached_property
     def clearance_map(self) -> ClearanceMap:
         return ClearanceMap(self.obstacles, self.bounds)
+
+
+def alike(arena: Arena, **changes: Any) -> Arena:
+    """The same room with another start, goal or crowd; what was made of its obstacles is kept: it costs a period."""
+    other = replace(arena, **changes)
+    vars(other).update(shapes=arena.shapes, clearance_map=arena.clearance_map)
+    return other
 
 
 def room_bounds(half_width: float, height: float | None) -> tuple[tuple[float, float], ...]:

@@ -23,8 +23,11 @@ class Evaluate:
     filtering: Flags[Filtering] = field(default_factory=Filtering)
     physics: Flags[Physics] = field(default_factory=Physics)
     arena: str = "default"
-    """default | open | dense."""
+    """default | open | dense | crossing."""
     episodes: int = 100
+    """Of a fleet: of all its robots, in whole worlds."""
+    fleet: int = 0
+    """So many robots in one world; 0: each is alone."""
     seed: int = 0
     render: Path | None = None
     """Also draw an episode from above, with tube and plan, into this file (.png, .gif, .mp4)."""
@@ -44,7 +47,10 @@ class Evaluate:
             episodes=self.episodes,
             seed=self.seed,
             conditions=self.physics.conditions(),
+            fleet=self.fleet,
         )
+        if self.render is not None and self.fleet:
+            raise ValueError("a fleet is not drawn: leave out --render")
         if self.render is not None:
             self._draw(robot, what, self.render)
         with under_way("driving episodes", self.episodes) as advance:

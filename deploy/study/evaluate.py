@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 
 from actors.driver import Driver, Identity
-from actors.guard import Ask, consult
+from actors.fleet import Fleet
+from actors.guard import Ask, Outcome, consult
 from deploy.data.store import method_for
 from deploy.policies import policy_named
 from deploy.vehicles import environment
@@ -20,6 +21,7 @@ from safety.methods import DDPC, Model
 from safety.model_set import Recipe
 from safety.service import Counts, Models, answerer
 from sim.conditions import Conditions
+from sim.fleet import FleetEnv
 from sim.policies import Policy
 
 FRESH = 1_000_000  # added to the seed: no training run draws its episodes from there
@@ -36,6 +38,7 @@ class Evaluation:
     episodes: int = 100
     seed: int = 0
     conditions: Conditions = field(default_factory=Conditions)
+    fleet: int = 0  # robots in one world; 0: each episode's robot is alone
 
 
 def in_process(model: Model) -> Ask:
@@ -71,15 +74,83 @@ def prepared(robot: Robot, what: Evaluation) -> tuple[Driver, Policy, Ask | None
     return driver, policy, question
 
 
+def round_of(fleet: Fleet, policies: Sequence[Policy], question: Ask | None, number: int) -> Iterator[list[pb.Step]]:
+    """The steps of one episode of every robot of a world, period by period."""
+    fleet.begin(number)
+    while fleet.running:
+        proposals = [
+            np.asarray(policy(driver.observation, driver.info), dtype=float)
+            if driver.running
+            else driver.robot.at_zero()
+            for driver, policy in zip(fleet.drivers, policies, strict=True)
+        ]
+        outcomes: list[Outcome | None] = [None] * len(proposals)
+        if question is not None:
+            outcomes = list(consult(question, fleet.requests(proposals), fleet.drivers[0].robot))
+        yield [step for step in fleet.execute(proposals, outcomes) if step is not None]
+
+
+def prepared_fleet(robot: Robot, what: Evaluation) -> tuple[Fleet, FleetEnv, list[Policy], Ask | None]:
+    """The same for several robots in one world.
+
+    Raises:
+        NoFleet: there is none of this kind, or in that arena; ValueError: this method makes no promises.
+    """
+    if what.method not in (DDPC, "none"):
+        raise ValueError(f"{what.method} makes no promises: a fleet's method is {DDPC} or none")
+    world = FleetEnv(robot, what.arena, what.fleet, FRESH + what.seed, what.conditions)
+    policies = [policy_named(what.policy, robot, what.seed + i) for i in range(what.fleet)]
+    question = None if what.method == "none" else in_process(method_for(robot, what.method, what.recipe))
+    drivers = [
+        Driver(robot, member, Identity(f"evaluate.{i}", i, what.seed), filtered=question is not None)
+        for i, member in enumerate(world.members)
+    ]
+    return Fleet(world, drivers, question is not None), world, policies, question
+
+
 def evaluate(robot: Robot, what: Evaluation, each: Callable[[Tally], Any] = lambda tally: None) -> dict[str, Any]:
-    """The shared figures of `what.episodes` episodes; `each` is called after every one."""
+    """The shared figures of `what.episodes` episodes (of a fleet: of at least so many, each robot's counted); `each` is
+    called after every one."""
+    if what.fleet:
+        return _together(robot, what, each) | _about(what)
     driver, policy, question = prepared(robot, what)
     tally = Tally()
     for number in range(what.episodes):
         for step in episode(driver, policy, question, number):
             tally.step(step)
         each(tally)
-    return closed_loop([tally]) | {
+    return closed_loop([tally]) | _about(what)
+
+
+def _together(robot: Robot, what: Evaluation, each: Callable[[Tally], Any]) -> dict[str, Any]:
+    """A fleet's figures: of all, by kind and by robot as `analyse` has them, and of its worlds."""
+    fleet, world, policies, question = prepared_fleet(robot, what)
+    tallies = {driver.identity.actor: Tally() for driver in fleet.drivers}
+    rounds, periods = -(-what.episodes // what.fleet), 0
+    for number in range(rounds):
+        for steps in round_of(fleet, policies, question, number):
+            periods += 1
+            for step in steps:
+                tallies[step.actor].step(step)
+        for tally in tallies.values():
+            each(tally)
+    figures = closed_loop(tallies.values())
+    seconds = periods * robot.period
+    return figures | {
+        "robots": {robot.name: figures},
+        "actors": {name: closed_loop([tally]) for name, tally in tallies.items()},
+        "fleet": {
+            "size": what.fleet,
+            "worlds": rounds,
+            "robot_steps": periods * what.fleet,  # of those that stand at their goals, too
+            "touches": world.touches,  # of two robots, whatever they did
+            "goals_per_minute": 60.0 * figures["goals"] / seconds if seconds else None,
+        },
+    }
+
+
+def _about(what: Evaluation) -> dict[str, Any]:
+    return {
         "method": what.method,
         "certificate": what.recipe.certificate if what.method == DDPC else None,
         "mode": what.recipe.mode if what.method == DDPC else None,

@@ -212,6 +212,7 @@ def counted(messages: list[tuple[str, Any]]) -> dict[str, Any]:
         "recovering": sum(s.decision == 4 and not s.fallback for s in steps),
         "contacts_moving": sum(s.contact_moving for s in steps),
         "contacts_standing": sum(s.contact_standing for s in steps),
+        "contacts_robots": sum(s.contact_robot for s in steps),
         "failsafes": len(failsafe),
         "fallbacks": sum(s.fallback for s in steps),
         "mean_speed": float(np.mean([s.speed for s in steps])),

@@ -34,6 +34,7 @@ INFO_KEYS = {
     "collision",
     "scan",
     "contact_moving",
+    "contact_robot",
     "contact_standing",
     "at_goal",
     "clearance",

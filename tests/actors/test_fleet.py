@@ -1,0 +1,216 @@
+"""Robots that share a world: promises stay disjoint whatever comes, and nobody touches anybody."""
+
+from dataclasses import replace
+from itertools import combinations
+
+import numpy as np
+import pytest
+
+from actors.driver import Driver, Identity
+from actors.fleet import Fleet
+from actors.guard import Outcome, consult
+from deploy.data.store import model_for
+from deploy.study.evaluate import in_process
+from messaging import brakeline_pb2 as pb
+from messaging.bus import NoReply
+from safety.filter import Filter
+from safety.model_set import Recipe
+from safety.promise import Promises
+from sim.fleet import FleetEnv
+from sim.policies import scripted
+from tests.robots import GROUND
+
+SIZE = 4
+ROUNDING = 1e-6  # m
+
+
+@pytest.fixture(scope="module")
+def ask(data_folder):
+    return in_process(model_for(GROUND, Recipe()))
+
+
+def fleet_of(size=SIZE, arena="crossing", promising=True):
+    world = FleetEnv(GROUND, arena, size, 0)
+    drivers = [Driver(GROUND, member, Identity(f"robot.{i}", i, 0)) for i, member in enumerate(world.members)]
+    return Fleet(world, drivers, promising)
+
+
+def policies(name, size=SIZE, seed=0):
+    return [scripted(name, GROUND, np.random.default_rng(seed + i)) for i in range(size)]
+
+
+def gathered(fleet, seed=0):
+    """Begin, with everybody close to everybody: a ring of 0.5 m about a free place."""
+    fleet.begin(seed)
+    arena = fleet.world.world.robots[0].arena
+    spots = np.random.default_rng(seed).uniform(-1.5, 1.5, (2000, 2))
+    spot = spots[np.argmax(arena.shapes.distance(spots).min(axis=0))]
+    size = len(fleet.drivers)
+    for i, robot in enumerate(fleet.world.world.robots):
+        angle = 2.0 * np.pi * i / size
+        robot._qpos[:2] = spot + 0.4 * np.array([np.cos(angle), np.sin(angle)])
+        robot.wake(None, np.random.default_rng(i))
+        driver = fleet.drivers[i]
+        driver.info = driver.info | {"state": robot.measured, "others": fleet.world.others(i)}
+
+
+def disjoint(fleet):
+    made = [d.commitment.promise for d in fleet.drivers if d.commitment.promise is not None]
+    return min((a.apart(b) for a, b in combinations(made, 2)), default=np.inf)
+
+
+def drive(fleet, ask, policy, periods, lost=0.0, seed=0):
+    """Least distance of promises (m) and the kinds of decisions; lost: share of questions that get no answer."""
+    rng, proposers, least, kinds = np.random.default_rng(seed), policies(policy, len(fleet.drivers), seed), np.inf, []
+    gone = 0
+    for _ in range(periods):
+        proposals = [p(d.observation, d.info) for p, d in zip(proposers, fleet.drivers, strict=True)]
+        gone = gone - 1 if gone else int(rng.integers(1, 4)) * (rng.random() < lost)
+
+        def answer(requests, gone=gone):
+            if gone:
+                raise NoReply("out of order")
+            return ask(requests)
+
+        outcomes = consult(answer, fleet.requests(proposals), GROUND)
+        steps = fleet.execute(proposals, outcomes)
+        kinds += [step.decision for step in steps if step is not None]
+        least = min(least, disjoint(fleet))
+        for driver in fleet.drivers:
+            driver.running = True  # beyond goals and timeouts: this is about what is in between
+    return least, kinds
+
+
+@pytest.mark.parametrize("policy", ["adversary", "random"])
+def test_nobody_touches_anybody_and_promises_stay_disjoint_though_answers_fail(ask, policy):
+    fleet = fleet_of()
+    gathered(fleet)
+    least, kinds = drive(fleet, ask, policy, 100, lost=0.15)
+    assert fleet.world.touches == 0
+    assert least >= -ROUNDING
+    assert {pb.ALLOWED, pb.ADJUSTED, pb.FAILSAFE} <= set(kinds)
+
+
+def test_without_promises_the_same_robots_touch(ask):
+    fleet = fleet_of(promising=False)
+    gathered(fleet)
+    drive(fleet, ask, "adversary", 60)
+    assert fleet.world.touches > 0
+
+
+def test_who_forgets_the_others_promises_touches_them(data_folder, monkeypatch):
+    """The mutant: promises are made, and nobody keeps off them."""
+    ask = in_process(model_for(GROUND, Recipe()))
+    monkeypatch.setattr(Promises, "within", lambda self, point, reach: None)
+    fleet = fleet_of()
+    gathered(fleet)
+    least, _ = drive(fleet, ask, "adversary", 60)
+    assert least < -ROUNDING and fleet.world.touches > 0
+
+
+def test_when_nobody_answers_all_stop_within_what_they_promised(ask):
+    fleet = fleet_of()
+    gathered(fleet)
+    drive(fleet, ask, "random", 15)
+    promised = [driver.commitment.promise for driver in fleet.drivers]
+    silent = consult(
+        lambda requests: (_ for _ in ()).throw(NoReply("gone")), fleet.requests([np.zeros(2)] * SIZE), GROUND
+    )
+    for k in range(6):
+        fleet.execute([np.zeros(2)] * SIZE, silent)
+        for promise, robot in zip(promised, fleet.world.world.robots, strict=True):
+            at = min(k, len(promise.center) - 1)
+            body = promise.radius[at] - GROUND.footprint
+            assert (np.abs(robot.true[:2] - promise.center[at]) <= promise.half_width[at] + body).all()
+    assert all(abs(robot.true[3]) < 0.01 for robot in fleet.world.world.robots) and fleet.world.touches == 0
+
+
+def test_robots_take_turns(ask):
+    asked = []
+    original = Filter.decide
+
+    class Heard(Filter):
+        def decide(self, request):
+            asked.append(tuple(request.state[:2]))
+            return original(self, request)
+
+    Filter.decide, kept = Heard.decide, Filter.decide
+    try:
+        fleet = fleet_of(3)
+        fleet.begin(0)
+        for turn in range(4):
+            asked.clear()
+            requests = fleet.requests([np.zeros(2)] * 3)
+            ask(requests)
+            states = [tuple(request.state[:2]) for request in requests]
+            assert asked == states[turn % 3 :] + states[: turn % 3]
+            fleet.execute([np.zeros(2)] * 3, consult(ask, requests, GROUND))
+    finally:
+        Filter.decide = kept
+
+
+def replies(ask, requests):
+    return [reply.error.type if reply.HasField("error") else "decided" for reply in ask(requests)]
+
+
+def test_who_is_asked_apart_is_promised_nothing_and_told_why(ask):
+    fleet = fleet_of()
+    fleet.begin(0)
+    requests = fleet.requests([np.array([0.2, 0.0])] * SIZE)
+    assert replies(ask, requests) == ["decided"] * SIZE
+    apart = ask(requests[:3])
+    assert [reply.error.type for reply in apart] == ["AskedApart"] * 3
+    assert "robot.3" in apart[0].error.message and apart[0].error.field == "fleet"
+    # The others of a batch are no worse off for it.
+    alone = pb.Request()
+    alone.CopyFrom(requests[3])
+    alone.fleet[:] = []
+    assert replies(ask, [*requests[:2], alone]) == ["AskedApart"] * 2 + ["decided"]
+    twice = [*requests, requests[0]]
+    assert set(replies(ask, twice)) == {"AskedApart"}
+    late = [pb.Request.FromString(request.SerializeToString()) for request in requests]
+    late[1].step += 1
+    assert set(replies(ask, late)) == {"AskedApart"}
+
+
+def test_who_moves_and_has_promised_nothing_is_refused(ask):
+    fleet = fleet_of(2)
+    fleet.begin(0)
+    requests = fleet.requests([np.array([0.2, 0.0])] * 2)
+    moving = pb.Request.FromString(requests[0].SerializeToString())
+    moving.input_in_force[0], moving.model = 0.2, "unverified"
+    refused = ask([moving, requests[1]])
+    assert {reply.error.field for reply in refused} == {"promise"} and "robot.0 moves" in refused[1].error.message
+    for change in ({"center": [0.0]}, {"radius": [float("nan")] * 3}, {"half_width": [-1.0] * 6}):
+        bad = pb.Request.FromString(requests[1].SerializeToString())
+        bad.promise.center[:], bad.promise.half_width[:] = [0.0] * 6, [0.0] * 6
+        bad.promise.radius[:] = [0.1] * 3
+        assert replies(ask, [requests[0], bad]) == ["decided"] * 2
+        for name, value in change.items():
+            getattr(bad.promise, name)[:] = value
+        assert [reply.error.field for reply in ask([requests[0], bad])] == ["promise"] * 2
+        assert set(replies(ask, [requests[0], bad])) == {"BadRequest"}
+
+
+def test_no_answer_about_one_is_no_answer_about_any(ask):
+    """The others' new plans may rest on a plan that one never heard of."""
+    fleet = fleet_of()
+    gathered(fleet)
+    drive(fleet, ask, "random", 8)
+    outcomes = consult(ask, fleet.requests([np.array([0.2, 0.1])] * SIZE), GROUND)
+    before = [driver.commitment.plan.copy() for driver in fleet.drivers]
+    outcomes[2] = replace(outcomes[2], answer=None, reply=None, failure="garbled")
+    steps = fleet.execute([np.zeros(2)] * SIZE, outcomes)
+    assert all(step.fallback for step in steps)
+    assert all(np.allclose(step.action, plan[0]) for step, plan in zip(steps, before, strict=True))
+    assert isinstance(outcomes[0], Outcome) and disjoint(fleet) >= -ROUNDING
+
+
+def test_who_is_done_stands_and_is_kept_off(ask):
+    fleet = fleet_of(2, arena="open")
+    fleet.begin(0)
+    first, second = fleet.drivers
+    first.running = False
+    results = fleet.execute([np.zeros(2)] * 2, consult(ask, fleet.requests([np.zeros(2)] * 2), GROUND))
+    assert results[0] is None and results[1].actor == "robot.1" and results[1].fleet == 2
+    assert (first.step, second.step) == (1, 1) and first.commitment.promise is not None
