@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
-from actors.driver import Driver, Environment, Identity
+from actors.driver import EPISODE_STRIDE, Driver, Environment, Identity
+from actors.fleet import Fleet, World, as_one
 from actors.guard import Ask, Outcome, consult
 from actors.proposers import Fixed, FlyingPupil, MakePolicy, Proposer, Pupil, finite
 from actors.settings import Change as Change
@@ -39,6 +41,7 @@ class ActorSettings:
     name: str = "actor-0"
     number: int = 0  # of the first robot of this process
     robots: int = 1  # in this process; their requests share a question
+    fleet: bool = False  # they share a world, too
     seed: int = 0
     arena: str = "default"
     method: str = "ddpc"
@@ -56,6 +59,8 @@ class Make(Protocol):
 
     def __call__(self, robot: Robot, arena: str, seed: int, *, tap: Tap | None = None) -> Environment: ...
 
+
+MakeWorld = Callable[[Robot, str, int, int], World]  # of robots of a kind in an arena, so many, from a seed
 
 STANDING = 2  # periods that a practised stop lasts beyond its plan
 
@@ -90,15 +95,17 @@ class Rider:
         make: Make,
         propose: MakePolicy | None = None,
         goes_on: bool = False,
+        env: Environment | None = None,
     ) -> None:
-        """propose: instead of learning; goes_on: see Driver."""
+        """propose: instead of learning; goes_on: see Driver; env: its place in a world that others share."""
         robot = robot_named(settings.robot)
         actor = settings.name if settings.robots == 1 else f"{settings.name}.{offset}"
         identity = Identity(actor, settings.number + offset, settings.seed)
         publisher: Callable[..., Publisher] = process.bus.publisher
         frames = publisher(FRAMES, robot=robot.name, source=actor)
         self.tape = Tape(frames, robot.name, actor)
-        env = make(robot, settings.arena, settings.seed, tap=self.tape.take if settings.mavlink else None)
+        tap = self.tape.take if settings.mavlink else None
+        env = env or make(robot, settings.arena, settings.seed, tap=tap)
         filtered, cuts = settings.method != "none", settings.method == "sailr"
         self.driver = Driver(robot, env, identity, settings.penalty, filtered, cuts, goes_on)
         if propose is None:
@@ -169,6 +176,13 @@ class Tally:
     waits: int = 0
     round_trip_ms: float = 0.0  # sum
     collisions: int = 0
+    contacts_robots: int = 0
+
+    def count(self, step: pb.Step) -> None:
+        self.steps += 1
+        self.fallbacks += step.fallback
+        self.collisions += step.collision
+        self.contacts_robots += step.contact_robot
 
     def figures(self, seconds: float) -> dict[str, float]:
         """For Health."""
@@ -178,6 +192,7 @@ class Tally:
             "fallbacks": self.fallbacks,
             "waits": self.waits,
             "collisions": self.collisions,
+            "contacts_robots": self.contacts_robots,
             "round_trip_ms": self.round_trip_ms / max(self.steps, 1),
         }
 
@@ -203,16 +218,55 @@ def cycle(riders: list[Rider], question: Ask | None, tally: Tally, stop: Callabl
                 time.sleep(PATIENCE)
                 continue
             rider.waiting = False
-        step = rider.act(proposal, outcome)
-        tally.steps += 1
-        tally.fallbacks += step.fallback
-        tally.collisions += step.collision
+        tally.count(rider.act(proposal, outcome))
     return True
 
 
-def run(settings: ActorSettings, make: Make, propose: MakePolicy | None = None) -> bool:
+def cycle_together(
+    fleet: Fleet, riders: list[Rider], question: Ask | None, tally: Tally, stop: Callable[[], bool]
+) -> bool:
+    """One period of the robots of one world; False: the end. Time passes for all of them or for none."""
+    if not fleet.running:
+        episode = max(rider.next_episode for rider in riders)
+        if not all(rider.proposer.ready(rider.driver.index + 1, episode, stop) for rider in riders):
+            return False
+        for rider, message in zip(riders, fleet.begin(episode), strict=True):
+            rider.episodes.put(message)
+            rider.next_episode = episode + 1
+            rider.proposer.begin(rider.driver.rng)
+    if not all(rider.ready(stop) for rider in riders if rider.driver.running):
+        return False
+    proposals = [rider.propose() if rider.driver.running else rider.driver.robot.at_zero() for rider in riders]
+    outcomes: list[Outcome | None] = [None] * len(riders)
+    if question is not None:
+        outcomes = as_one(consult(question, fleet.requests(proposals), riders[0].driver.robot))
+    told = list(zip(riders, outcomes, strict=True))
+    waits = all(outcome is not None and rider.driver.may_wait(outcome) for rider, outcome in told)
+    for rider in riders:
+        if waits and not rider.waiting:
+            log.warning("%s: standing and waiting for the safety service", rider.driver.identity.actor)
+        rider.waiting = waits
+    if waits:
+        tally.waits += 1
+        time.sleep(PATIENCE)
+        return True
+    for rider, outcome in told:
+        if outcome is not None:
+            tally.round_trip_ms += outcome.round_trip_ms
+            rider.exchanges.put(rider.settle(outcome).exchange(rider.driver.info["time"]))
+    versions = [rider.proposer.version for rider in riders]
+    for rider, step in zip(riders, fleet.execute(proposals, outcomes, versions), strict=True):
+        if step is not None:
+            rider.steps.put(step)
+            tally.count(step)
+    return True
+
+
+def run(
+    settings: ActorSettings, make: Make, propose: MakePolicy | None = None, make_world: MakeWorld | None = None
+) -> bool:
     """Drive until the learner says the run is done (True), or SIGINT or SIGTERM. propose: a policy instead of learning,
-    for as many steps as the settings say.
+    for as many steps as the settings say (of a fleet: until one robot has taken them); make_world: of a fleet.
 
     Raises:
         RefusedByLearner, Unreachable: with what to do.
@@ -220,7 +274,16 @@ def run(settings: ActorSettings, make: Make, propose: MakePolicy | None = None) 
     tally = Tally()
     with Process(settings.bus, settings.name) as process:
         stop = process.stop.is_set
-        riders = [Rider(process, settings, offset, make, propose) for offset in range(settings.robots)]
+        world = None
+        if settings.fleet and make_world is not None:
+            number = settings.seed * EPISODE_STRIDE + settings.number
+            world = make_world(robot_named(settings.robot), settings.arena, settings.robots, number)
+        places: Sequence[Environment | None] = [None] * settings.robots if world is None else world.members
+        riders = [Rider(process, settings, i, make, propose, env=env) for i, env in enumerate(places)]
+        one_period: Callable[[list[Rider], Ask | None, Tally, Callable[[], bool]], bool] = cycle
+        if world is not None:
+            fleet = Fleet(world, [rider.driver for rider in riders], settings.method != "none")
+            one_period = partial(cycle_together, fleet)
         started = time.monotonic()
 
         process.refresh = lambda: process.figures.update(tally.figures(time.monotonic() - started))
@@ -229,7 +292,7 @@ def run(settings: ActorSettings, make: Make, propose: MakePolicy | None = None) 
         if settings.method != "none":
             question = lambda requests: ask(process.bus, requests, settings.deadline)  # noqa: E731
         if all(rider.join(stop) for rider in riders):
-            while not stop() and cycle(riders, question, tally, stop):
+            while not stop() and one_period(riders, question, tally, stop):
                 pass
         log.info("%s: %d steps, %d fallbacks, %d waits", settings.name, tally.steps, tally.fallbacks, tally.waits)
         return not stop()

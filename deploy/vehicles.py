@@ -15,6 +15,7 @@ from sim.autopilot.endpoint import Autopilot
 from sim.autopilot.rules import SETPOINT_TIMEOUT
 from sim.conditions import Conditions
 from sim.envs import NavigationEnv
+from sim.fleet import FleetEnv
 from sim.flight_estimator import QuadrotorNoise
 from sim.late import late
 from sim.quadrotor import QUADROTOR, Quadrotor
@@ -80,6 +81,11 @@ def environment(
     arena_kind(robot, arena)
     noise = c.lidar_noise(robot.position_dim == 3)
     return NavigationEnv(robot, arena, make, noise, seed_key=seed, perception=c.perception)
+
+
+def fleet_world(robot: Robot, arena: str, size: int, seed: int, conditions: Conditions | None = None) -> FleetEnv:
+    """A world of several robots: see there."""
+    return FleetEnv(robot, arena, size, seed, conditions)
 
 
 def vehicle_in_yard(robot: Robot, rng: np.random.Generator, conditions: Conditions) -> Vehicle:

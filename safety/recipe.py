@@ -34,3 +34,9 @@ class Recipe:
             raise ValueError(f"no windows are called {self.windows!r}; there are: {', '.join(WINDOWS)}")
         if not 1.0 <= self.inflation < math.inf:
             raise ValueError(f"an envelope scaled by {self.inflation} bounds nothing")
+
+
+def check_promises(method: str) -> None:
+    """Raises ValueError: robots that share a world are promised nothing by this method."""
+    if method not in (DDPC, "none"):
+        raise ValueError(f"{method} predicts nothing, so it makes no promises: a fleet's method is {DDPC} or none")

@@ -15,10 +15,11 @@ from deploy.commands.common import Endpoints, Filtering, Flags, Flight, Physics,
 from deploy.data.store import data_root, method_for, method_path
 from deploy.policies import policy_named
 from deploy.run.configurations import RunConfig
-from deploy.vehicles import environment, flight_arena
+from deploy.vehicles import environment, fleet_world, flight_arena
 from learner.config import LearnerConfig
 from logs.recorder import Rotation
 from messaging.tasks import learnt
+from safety.recipe import check_promises
 
 
 @dataclass(frozen=True)
@@ -77,6 +78,8 @@ class Actor:
     """Of its first robot in the run: two robots of one number and seed see the same episodes."""
     robots: int = 1
     """In this process; their requests share a question."""
+    fleet: int = 0
+    """So many robots in this process and in one world; 0: each is alone in its own."""
     seed: int = 0
     arena: str = "default"
     penalty: float = RunConfig.penalty
@@ -100,12 +103,15 @@ class Actor:
 
         robot = learnt(self.robot)
         robot = robot.in_real_time() if self.url and not robot.late else robot
+        if self.fleet:
+            check_promises(self.filtering.method)
         settings = ActorSettings(
             bus=self.endpoints.bus(),
             robot=robot.name,
             name=self.name,
             number=self.number,
-            robots=self.robots,
+            robots=self.fleet or self.robots,
+            fleet=self.fleet > 0,
             seed=self.seed,
             arena=self.arena,
             method=self.filtering.method,
@@ -119,7 +125,9 @@ class Actor:
             arena = flight_arena(self.arena, self.seed)
             flight.run(settings, self.flight.settings(self.url, arena), arena, propose)
         else:
-            run(settings, partial(environment, conditions=self.physics.conditions()), propose)
+            about = self.physics.conditions()
+            worlds = partial(fleet_world, conditions=about)
+            run(settings, partial(environment, conditions=about), propose, worlds)
         return 0
 
 

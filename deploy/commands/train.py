@@ -54,6 +54,8 @@ class Train:
     """Actor processes a robot kind."""
     robots_per_actor: int = 1
     """Robots in each of them; their requests share a question."""
+    fleet: int = 0
+    """So many robots in each actor process, and in one world that they share; 0: each is alone in its own."""
     experiment: str = "default"
     """The configuration that the other options start from: default | demo | debug."""
     steps: int | None = None
@@ -124,14 +126,18 @@ class Train:
             from_logs = tuple(map(str, self.from_logs)) or resumed.from_logs
             return replace(resumed, steps=self.steps or resumed.steps, from_logs=from_logs)
         from messaging.tasks import address
+        from safety.recipe import check_promises
 
+        if self.fleet:
+            check_promises(self.filtering.method)
         return RunConfig(
             robots=tuple(address(name) for name in self.robots),
             method=self.filtering.method,
             recipe=self.filtering.recipe(),
             arena=self.arena,
             actors=1 if self.deterministic else self.actors,
-            robots_per_actor=self.robots_per_actor,
+            robots_per_actor=self.fleet or self.robots_per_actor,
+            fleet=self.fleet,
             steps=self._steps(),
             from_logs=tuple(map(str, self.from_logs)),
             seed=self.seed,

@@ -63,7 +63,7 @@ def _actor(place: Place, folder: Path, config: RunConfig, bus: BusSettings) -> b
     from actors import flight
     from actors.loop import ActorSettings, run
     from deploy.policies import policy_named
-    from deploy.vehicles import environment, flight_arena
+    from deploy.vehicles import environment, fleet_world, flight_arena
 
     settings = ActorSettings(
         bus=bus,
@@ -71,6 +71,7 @@ def _actor(place: Place, folder: Path, config: RunConfig, bus: BusSettings) -> b
         name=place.name,
         number=place.number,
         robots=config.robots_per_actor,
+        fleet=config.fleet > 0,
         seed=config.seed,
         arena=config.arena,
         method=config.method,
@@ -87,7 +88,8 @@ def _actor(place: Place, folder: Path, config: RunConfig, bus: BusSettings) -> b
         return flight.run(
             settings, config.flight, flight_arena(config.arena, config.seed, robot_named(place.robot)), propose
         )
-    return run(settings, partial(environment, conditions=config.conditions), propose)
+    worlds = partial(fleet_world, conditions=config.conditions)
+    return run(settings, partial(environment, conditions=config.conditions), propose, worlds)
 
 
 def _autopilot(place: Place, folder: Path, config: RunConfig, bus: BusSettings) -> bool:

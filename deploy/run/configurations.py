@@ -38,6 +38,7 @@ class RunConfig:
     arena: str = "default"
     actors: int = 2  # processes a robot kind
     robots_per_actor: int = 1  # robots in a process; they share a question to the safety service
+    fleet: int = 0  # as many, if they share a world too
     steps: int = 100_000  # a robot kind
     seed: int = 0
     penalty: float = 1.0  # for a correction by the whole range of an input

@@ -13,12 +13,13 @@ from actors.fleet import Fleet
 from actors.guard import Ask, Outcome, consult
 from deploy.data.store import method_for
 from deploy.policies import policy_named
-from deploy.vehicles import environment
+from deploy.vehicles import environment, fleet_world
 from logs.metrics import Tally, closed_loop
 from messaging import brakeline_pb2 as pb
 from messaging.robots import Robot
 from safety.methods import DDPC, Model
 from safety.model_set import Recipe
+from safety.recipe import check_promises
 from safety.service import Counts, Models, answerer
 from sim.conditions import Conditions
 from sim.fleet import FleetEnv
@@ -96,9 +97,8 @@ def prepared_fleet(robot: Robot, what: Evaluation) -> tuple[Fleet, FleetEnv, lis
     Raises:
         NoFleet: there is none of this kind, or in that arena; ValueError: this method makes no promises.
     """
-    if what.method not in (DDPC, "none"):
-        raise ValueError(f"{what.method} makes no promises: a fleet's method is {DDPC} or none")
-    world = FleetEnv(robot, what.arena, what.fleet, FRESH + what.seed, what.conditions)
+    check_promises(what.method)
+    world = fleet_world(robot, what.arena, what.fleet, FRESH + what.seed, what.conditions)
     policies = [policy_named(what.policy, robot, what.seed + i) for i in range(what.fleet)]
     question = None if what.method == "none" else in_process(method_for(robot, what.method, what.recipe))
     drivers = [

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from actors.loop import ActorSettings, run
-from deploy.vehicles import environment
+from deploy.vehicles import environment, fleet_world
 from messaging import brakeline_pb2 as pb
 from messaging.bus import Bus, BusSettings
 from messaging.topics import DECIDE, EXCHANGE, STEP
@@ -60,7 +60,7 @@ def scene(buses, data_folder):
         teacher.flow.limit.update(dict.fromkeys(names, limit))
         bus = BusSettings(connect=learner.settings.listen)
         values = ActorSettings(bus, robots=robots, deadline=2.0, **settings)
-        threads.append(threading.Thread(target=run, args=(values, partial(environment)), daemon=True))
+        threads.append(threading.Thread(target=run, args=(values, partial(environment), None, fleet_world), daemon=True))
         threads[0].start()
 
     def end() -> None:
@@ -119,3 +119,26 @@ def test_without_the_service_it_brakes_along_its_plan_waits_and_goes_on(scene):
     until(lambda: len(steps) > quiet + 20)
     assert not any(step.fallback for step in steps[quiet:])
     assert not any(step.collision for step in steps)
+
+
+def test_a_fleet_stops_together_when_the_service_is_gone_and_goes_on_together(scene):
+    service, steps, exchanges, start = scene
+    start(robots=3, limit=1000, fleet=True, arena="crossing")
+    names = ["actor-0.0", "actor-0.1", "actor-0.2"]
+    until(lambda: len(steps) >= 30)
+    service.fails_when_moving = True
+    until(lambda: service.failing)
+    quiet = -1
+    while quiet != len(steps):  # time passes for all of them or for none
+        quiet = len(steps)
+        time.sleep(1.0)
+    last = {name: [step for step in steps if step.actor == name][-1] for name in names}
+    assert len({step.step for step in last.values()}) == 1
+    assert all(step.fallback and not any(step.action) for step in last.values())
+    service.fails_when_moving = service.failing = False
+    until(lambda: len(steps) >= quiet + 30)
+    assert not any(step.contact_robot or step.collision for step in steps)
+    assert {step.fleet for step in steps} == {3} and not any(step.fallback for step in steps[quiet:])
+    assert all(batch == names for batch in service.batches)
+    asked = [e.request for e in list(exchanges) if e.request.step and not e.failure]
+    assert asked and all(list(request.fleet) == names and request.HasField("promise") for request in asked)
