@@ -104,7 +104,7 @@ def test_a_typing_error_is_answered_with_a_suggestion(command):
         ("train ground --actors 0", "1 or more"),
         ("train ground --experiment sleep", "there are: default, demo, debug"),
         ("evaluate submarine", "there are: ground"),
-        ("evaluate ground --arena ballroom", "there are: default, dense, few-walkers"),
+        ("evaluate ground --arena ballroom", "there are: crossing, default, dense"),
         ("evaluate ground --policy [bold]", "no policy is called '[bold]' and no such file exists"),
         ("analyse {folder}/none", "no log at"),
         ("certify {folder}/none.mcap", "no log at"),
