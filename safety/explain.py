@@ -23,10 +23,10 @@ UNSEEN, SIGHT, ROBOT = "unseen", "sight", "robot"
 
 @dataclass(frozen=True)
 class Stopped:
-    """by: cylinder | box | sphere | wall, `moving ` before it where it moves, `unseen`, `robot`, `sight` (the tube leaves what
-    can be seen), or a limit's name; room [m, of a limit in its own units]: from the tube to the half-space, negative:
-    beyond it; after [s]: when, from now. normal (d,), at (d,): of the half-space, world, from the free side on, through
-    the obstacle's nearest point; empty where there is none."""
+    """by: cylinder | box | sphere | wall, `moving ` before it where it moves, `unseen`, `robot` (its promise),
+    `sight` (the tube leaves what can be seen), or a limit's name; room [m, of a limit in its own units]: from the tube
+    to the half-space, negative: beyond it; after [s]: when, from now. normal (d,), at (d,): of the half-space, world,
+    from the free side on, through the obstacle's nearest point; empty where there is none."""
 
     by: str
     room: float

@@ -60,7 +60,8 @@ def scene(buses, data_folder):
         teacher.flow.limit.update(dict.fromkeys(names, limit))
         bus = BusSettings(connect=learner.settings.listen)
         values = ActorSettings(bus, robots=robots, deadline=2.0, **settings)
-        threads.append(threading.Thread(target=run, args=(values, partial(environment), None, fleet_world), daemon=True))
+        arguments = (values, partial(environment), None, fleet_world)
+        threads.append(threading.Thread(target=run, args=arguments, daemon=True))
         threads[0].start()
 
     def end() -> None:

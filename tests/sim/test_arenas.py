@@ -140,7 +140,7 @@ def test_the_generator_decides() -> None:
 def test_an_unknown_name_is_refused_with_the_names_there_are() -> None:
     with pytest.raises(
         UnknownArena,
-        match="no arena is called 'moon'; there are: crossing, default, dense, few-walkers, many-walkers, open, walkers",
+        match="no arena is called 'moon'; there are: crossing, default, dense, few-walkers, many-walkers, open, walk",
     ):
         arena("moon", 0)
     with pytest.raises(UnknownArena, match="default, dense, tall"):
