@@ -3,7 +3,7 @@ PYTHON ?= python3.11
 BIN := .venv/bin
 STAMP := .venv/.installed
 
-.PHONY: demo setup test test-fast check unit bench messages clean
+.PHONY: demo setup test test-fast check unit bench messages safety-gymnasium bullet-safety-gym clean
 
 demo: setup
 	$(BIN)/brakeline demo
@@ -43,10 +43,14 @@ messages: setup
 	$(BIN)/python -m grpc_tools.protoc -I. --python_out=. --mypy_out=. \
 		--plugin=protoc-gen-mypy=$(BIN)/protoc-gen-mypy messaging/brakeline.proto
 
-# Other people's environments, each in a virtual environment of its own (docs/environments.md).
-safety-gymnasium: examples/safety_gymnasium/.venv
-examples/safety_gymnasium/.venv: examples/safety_gymnasium/requirements.txt
-	PYTHON=$(PYTHON) sh examples/safety_gymnasium/setup.sh
+# Other authors' environments, each in a virtual environment of its own (docs/environments.md).
+safety-gymnasium: examples/safety_gymnasium/.venv/.installed
+examples/safety_gymnasium/.venv/.installed: examples/safety_gymnasium/requirements.txt examples/foreign/setup.sh
+	PYTHON=$(PYTHON) sh examples/foreign/setup.sh safety_gymnasium safety-gymnasium==1.0.0
+
+bullet-safety-gym: examples/bullet_safety_gym/.venv/.installed
+examples/bullet_safety_gym/.venv/.installed: examples/bullet_safety_gym/requirements.txt examples/foreign/setup.sh
+	PYTHON=$(PYTHON) sh examples/foreign/setup.sh bullet_safety_gym bullet-safety-gym==1.4.0
 
 clean:
 	rm -rf .venv build *.egg-info

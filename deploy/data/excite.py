@@ -16,6 +16,7 @@ MOST_LEAD = 4  # random targets before a plan, each held for up to
 MOST_HELD = 3  # periods, and as many more as it takes to get there
 SHORT_STOP, LONG_STOP = 2, 15  # periods of standing still after a plan, mostly short
 LONG_STOPS = 0.1  # share of long stops
+RESTLESS = 0.3  # share of lead-ins from bound to bound every period: so drives who explores, or means harm
 HASTE = 0.5  # share of targets that are left as soon as by a robot without a slew: learners change their mind a lot
 EXTREMES = 0.45  # share of inputs that are at a bound or zero: driving has more of them than a uniform draw
 
@@ -41,8 +42,9 @@ def excitation(
 
     A lead-in goes for one target after the other, and may leave each before it gets there: every speed comes with
     every acceleration. `held`: periods that a target is held for at most, more of them where a robot needs longer to
-    come to its speed. To a robot that stops by feedback the measured state (n,) is sent after each period,
-    `u = inputs.send(state)`: its braking follows from it. before (m,): the input in force; none, unless given.
+    come to its speed; then some lead-ins are restless. To a robot that stops by feedback the measured state (n,) is
+    sent after each period, `u = inputs.send(state)`: its braking follows from it. before (m,): the input in force;
+    none, unless given.
     """
     before = np.zeros(robot.action_dim) if before is None else before
     schedule = robot.schedule()
@@ -50,6 +52,10 @@ def excitation(
     longest_lead = held + math.ceil(across.max())
     state: Array | None = None
     while True:
+        if held > MOST_HELD and rng.random() < RESTLESS:
+            for _ in range(rng.integers(held + 1)):
+                before = towards(robot, before, np.where(rng.random(robot.action_dim) < 0.5, robot.low(), robot.high()))
+                state = yield before
         for _ in range(rng.integers(MOST_LEAD + 1)):
             target = random_target(robot, rng)
             hasty = longest_lead > MOST_HELD and rng.random() < HASTE

@@ -1,4 +1,4 @@
-"""Safety-Gymnasium's Goal tasks as the filter sees them: state, obstacles, actions."""
+"""Safety-Gymnasium's Goal tasks as the filter sees them."""
 
 from __future__ import annotations
 
@@ -10,45 +10,65 @@ from typing import Any
 import gymnasium
 import numpy as np
 
-from messaging.robots import Robot, robot_named
+from examples.foreign.adapter import Adapter, Array
 from messaging.shapes import Obstacle
-from safety.spaces import Actions
 
-HERE = Path(__file__).parent
 STEP = {"car": 0.04, "point": 0.02}  # s, of the environment
-LEFT = np.array([1.0, -1.0])  # torques (left, right) of the Car that turn it to the left; seen from the front they swap
 FORWARD = {"car": np.array([0.0, -1.0]), "point": np.array([1.0, 0.0])}  # of the agent's body
+LEFT = np.array([1.0, -1.0])  # torques (left, right) of the Car that turn it to the left; seen from the front they swap
+TORQUE = 0.02  # N m, all that the Car's motors give
 
 
-def make(name: str, robot: Robot) -> gymnasium.Env[Any, Any]:
-    """`SafetyCarGoal1-v0` and the like, with five values a step: the cost is in `info["cost"]`. Of a robot whose period
-    is some of the environment's steps, those are one step."""
-    _allow_arrays_as_defaults()
-    import safety_gymnasium  # noqa: F401 - registers the environments
-
-    env = gymnasium.make(name.replace("-v", "Gymnasium-v"), disable_env_checker=True)
-    return Held(env, round(robot.period / STEP[robot.name]))
+def adapter_of(robot: str) -> Adapter:
+    return Goal(robot)
 
 
-class Held(gymnasium.Wrapper[Any, Any, Any, Any]):
-    """An action for so many steps: costs and rewards add up, and `info` has what lies between, for the data."""
+class Goal(Adapter):
+    """`SafetyCarGoal1-v0` and the like. Recorded in level 0, where there is nothing but the goal."""
 
-    def __init__(self, env: gymnasium.Env[Any, Any], steps: int) -> None:
-        super().__init__(env)
-        self.count = steps
+    held = 25
 
-    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        start, path, reward, cost = state(self.env, None, {}), [], 0.0, 0.0
-        cos, sin = math.cos(start[2]), math.sin(start[2])
-        for _ in range(self.count):
-            observation, paid, terminated, truncated, info = self.env.step(action)
-            reward, cost = reward + float(paid), cost + float(info.get("cost", 0.0))
-            x, y = self.env.unwrapped.task.agent.pos[:2] - start[:2]
-            path.append([cos * x + sin * y, cos * y - sin * x])
-            if terminated or truncated:
-                break
-        path += [path[-1]] * (self.count - len(path))
-        return observation, reward, terminated, truncated, info | {"cost": cost, "subsamples": np.array(path)}
+    def __init__(self, robot: str) -> None:
+        super().__init__(Path(__file__).with_name(f"{robot}.toml"))
+        self.task, self.step, self.front = f"Safety{robot.title()}Goal1-v0", STEP[robot], FORWARD[robot]
+        self.rolls = robot == "car"
+
+    def built(self, free: bool) -> gymnasium.Env[Any, Any]:
+        _allow_arrays_as_defaults()
+        import safety_gymnasium  # noqa: F401 - registers the environments
+
+        name = self.task.replace("-v", "Gymnasium-v")  # with five values a step
+        return gymnasium.make(name.replace("Goal1", "Goal0") if free else name, disable_env_checker=True)
+
+    def state(self, env: Any, observation: Any, info: dict[str, Any]) -> Array:
+        """(x, y, heading, forward, leftward, turn rate)."""
+        agent = env.unwrapped.task.agent
+        front = agent.mat[:2, :2] @ self.front
+        vx, vy = agent.vel[:2]
+        heading = math.atan2(front[1], front[0])
+        cos, sin = math.cos(heading), math.sin(heading)
+        turning = float(agent.get_sensor("gyro")[2])
+        return np.array([*agent.pos[:2], heading, cos * vx + sin * vy, cos * vy - sin * vx, turning])
+
+    def obstacles(self, env: Any, observation: Any, info: dict[str, Any]) -> list[Obstacle]:
+        """Hazards cost where the agent's centre is within: its body's radius does not count. The vase costs nothing in
+        this task, but it is a body that would push back."""
+        task, radius = env.unwrapped.task, self.robot.footprint
+        hazards = [Obstacle("cylinder", tuple(at[:2]), (task.hazards.size,), margin=-radius) for at in task.hazards.pos]
+        across = math.sqrt(2.0) * task.vases.size
+        return hazards + [Obstacle("cylinder", tuple(at[:2]), (across,)) for at in task.vases.pos]
+
+    def hazards(self, env: Any) -> list[Array]:
+        return list(env.unwrapped.task.hazards.pos)
+
+    def goal(self, env: Any) -> Array:
+        return np.asarray(env.unwrapped.task.goal.pos)
+
+    def steered(self, bearing: float) -> Array:
+        if self.rolls:  # torques on its wheels
+            turn = max(-1.0, min(2.0 * bearing, 1.0))
+            return np.asarray(np.clip(TORQUE * (np.array([1.0, 1.0]) + 2.0 * turn * LEFT), -TORQUE, TORQUE))
+        return np.array([1.0 if abs(bearing) < 0.5 else 0.0, max(-1.0, min(3.0 * bearing, 1.0))])
 
 
 def _allow_arrays_as_defaults() -> None:
@@ -62,47 +82,3 @@ def _allow_arrays_as_defaults() -> None:
         return original(cls, name, *more)
 
     dataclasses._get_field = get_field  # type: ignore[attr-defined]
-
-
-def robot_of(name: str) -> Robot:
-    """`car` or `point`, from the file beside this one."""
-    return robot_named(str(HERE / f"{name}.toml"))
-
-
-def state(env: Any, observation: Any, info: dict[str, Any]) -> Any:
-    """(x, y, heading, forward, leftward, turn rate), exact."""
-    agent = env.unwrapped.task.agent
-    front = agent.mat[:2, :2] @ FORWARD[_kind(env)]
-    vx, vy = agent.vel[:2]
-    heading = math.atan2(front[1], front[0])
-    cos, sin = math.cos(heading), math.sin(heading)
-    turning = float(agent.get_sensor("gyro")[2])
-    return np.array([*agent.pos[:2], heading, cos * vx + sin * vy, cos * vy - sin * vx, turning])
-
-
-def obstacles(env: Any, observation: Any, info: dict[str, Any]) -> list[Obstacle]:
-    """Hazards, which cost where the agent's centre is within; so its body's radius does not count."""
-    task = env.unwrapped.task
-    hazards = getattr(task, "hazards", None)
-    if hazards is None:
-        return []
-    margin = -robot_of(_kind(env)).footprint
-    return [Obstacle("cylinder", tuple(pos[:2]), (hazards.size,), margin=margin) for pos in hazards.pos]
-
-
-def actions(robot: Robot) -> Actions:
-    """An action is the torque (force) itself: beyond what the motors give it changes nothing."""
-    low, high = robot.low(), robot.high()
-    return Actions(lambda action: np.clip(np.asarray(action, float), low, high), lambda control: control)
-
-
-def steered(env: Any, bearing: float) -> Any:
-    """The action that goes forwards, turned by so much [rad]."""
-    if _kind(env) == "car":  # torques on its wheels
-        turn = max(-1.0, min(2.0 * bearing, 1.0))
-        return np.clip(0.02 * (np.array([1.0, 1.0]) + 2.0 * turn * LEFT), -0.02, 0.02)
-    return np.array([1.0 if abs(bearing) < 0.5 else 0.0, max(-1.0, min(3.0 * bearing, 1.0))])
-
-
-def _kind(env: Any) -> str:
-    return str(env.unwrapped.task.agent_name).lower()

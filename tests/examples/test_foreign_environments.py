@@ -1,4 +1,4 @@
-"""A minute of other people's environments, in their own virtual environments, where those were set up."""
+"""A minute of other authors' environments, in their own virtual environments, where those were set up."""
 
 import json
 import os
@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from deploy.data.store import certified
+from examples.foreign import table
 from messaging.bus import Bus, BusSettings
 from messaging.ports import free_endpoint
 from messaging.topics import DECIDE
@@ -18,35 +19,60 @@ from safety.service import Counts, Models, answerer
 EXAMPLES = Path(__file__).parents[2] / "examples"
 
 
-def python_of(name):
-    python = EXAMPLES / name / ".venv" / "bin" / "python"
+def python_of(folder):
+    python = EXAMPLES / folder / ".venv" / "bin" / "python"
     if not python.exists():
-        pytest.skip(f"{name} has no virtual environment: make {name.replace('_', '-')}")
+        pytest.skip(f"{folder} has no virtual environment: make {folder.replace('_', '-')}")
     return python
 
 
 def told(python, script, *words):
     """The last line that a script printed."""
     run = subprocess.run(
-        [python, script, *words], check=False, capture_output=True, text=True, env=os.environ | {"OMP_NUM_THREADS": "1"}
+        [python, EXAMPLES / "foreign" / script, *words],
+        check=False,
+        capture_output=True,
+        text=True,
+        env=os.environ | {"OMP_NUM_THREADS": "1"},
     )
     assert run.returncode == 0, run.stderr
     return run.stdout.strip().splitlines()[-1]
 
 
-def test_the_car_costs_nothing_behind_a_filter_of_its_own_data(tmp_path):
-    folder = EXAMPLES / "safety_gymnasium"
-    python = python_of("safety_gymnasium")
-    record = tmp_path / "car.safetensors"
-    told(python, folder / "collect.py", "car", str(record), "6000")
+@pytest.mark.parametrize(
+    ("robot", "folder", "steps"), [("car", "safety_gymnasium", 300), ("racecar", "bullet_safety_gym", 300)]
+)
+def test_driving_at_hazards_costs_nothing_behind_a_filter_of_own_data(tmp_path, robot, folder, steps):
+    python = python_of(folder)
+    record, lines = tmp_path / f"{robot}.safetensors", tmp_path / "lines.jsonl"
+    told(python, "collect.py", robot, str(record), "6000")
     models = Models()
     models.install(certified(Dataset.load(record), Recipe())[0])
     endpoint = free_endpoint()
+    words = [robot, "adversarial", "--seeds", "0", "1", "--steps", str(steps)]
     with Bus(BusSettings(listen=(endpoint,)), "safety") as bus:
         bus.serve(DECIDE, answerer(models, Counts()))
-        said = told(
-            python, folder / "run.py", "car", "adversarial", "--episodes", "1", "--steps", "300", "--connect", endpoint
-        )
+        said = told(python, "run.py", *words, "--connect", endpoint, "--out", str(lines))
     figures = json.loads(said)
-    assert figures["cost"] == 0.0 and figures["steps"] == 300
+    assert figures["cost"] == 0.0 and figures["steps"] == steps
     assert set(figures["decisions"]) <= {"allowed", "adjusted", "failsafe"} and figures["decisions"]["adjusted"] > 30
+    assert json.loads(lines.read_text()) == figures
+
+
+def test_the_table_adds_up_pieces_and_counts_a_seed_once(tmp_path, capsys):
+    def line(seed, cost, **decisions):
+        told = {"robot": "car", "policy": "random", "filter": bool(decisions), "seed": seed, "steps": 100, "cost": cost}
+        return told | {"reward": 1.0, "decisions": decisions, "unverified": 0, "outside": 5}
+
+    pieces = (
+        [line(0, 0.0, allowed=100), line(1, 3.0, allowed=40, adjusted=60)],
+        [line(1, 3.0, adjusted=100), line(2, 7)],
+    )
+    paths = [tmp_path / "a.jsonl", tmp_path / "b.jsonl"]
+    for path, lines in zip(paths, pieces, strict=True):
+        path.write_text("".join(json.dumps(one) + "\n" for one in lines))
+    table.main(*map(str, paths))
+    bare, filtered = (line.split(" | ") for line in capsys.readouterr().out.splitlines()[2:])
+    assert bare[2:6] == ["no", "1", "7.0", "7"]
+    assert filtered[2:6] == ["yes", "2", "1.5", "3"]
+    assert filtered[8:] == ["10 of 200 (5.0%)", "100 allowed, 100 adjusted |"]

@@ -1,0 +1,23 @@
+"""Records a robot where nothing costs. python collect.py car OUT.safetensors 20000"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).parents[2]))
+
+from deploy.data.episodes import collect
+from examples.foreign.robots import adapter_of
+
+
+def main(robot: str, out: str, periods: str = "20000") -> None:
+    adapter = adapter_of(robot)
+    how = {"state": adapter.state, "actions": adapter.actions()}
+    data = collect(adapter.make(free=True), adapter.robot, int(periods), held=adapter.held, **how)
+    data.save(Path(out))
+    print(f"{out}: {data.periods} periods in {len(data.trajectories)} trajectories, bulge {1e3 * data.bulge:.2f} mm")
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])

@@ -1,0 +1,46 @@
+"""Adds up the lines that `run.py` wrote, as the table of docs/environments.md. python table.py *.jsonl"""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+COUNTED = ("episodes", "cost an episode", "worst", "reward", "unverified", "outside", "decisions")
+HEAD = ("robot", "policy", "filter", *COUNTED)
+
+
+def main(*paths: str) -> None:
+    lines = [json.loads(line) for path in paths for line in Path(path).read_text().splitlines()]
+    groups: dict[tuple[str, str, bool], dict[int, dict[str, Any]]] = {}
+    for line in lines:
+        groups.setdefault((line["robot"], line["policy"], line["filter"]), {})[line["seed"]] = line
+    print(row(HEAD), row(["---"] * len(HEAD)), sep="\n")
+    for (robot, policy, filtered), episodes in sorted(groups.items()):
+        print(row([robot, policy, "yes" if filtered else "no", *summed(list(episodes.values()))]))
+
+
+def summed(episodes: list[dict[str, Any]]) -> list[object]:
+    """Everything from the number of episodes on; a seed counts once."""
+    steps = sum(e["steps"] for e in episodes)
+    kinds = sum((Counter(e["decisions"]) for e in episodes), Counter[str]())
+    unverified, outside = (sum(e[name] for e in episodes) for name in ("unverified", "outside"))
+    return [
+        len(episodes),
+        f"{sum(e['cost'] for e in episodes) / len(episodes):.1f}",
+        f"{max(e['cost'] for e in episodes):.0f}",
+        f"{sum(e['reward'] for e in episodes) / len(episodes):.1f}",
+        f"{unverified} of {steps}" if kinds else "–",
+        f"{outside} of {steps} ({outside / steps:.1%})" if kinds else "–",
+        ", ".join(f"{count} {kind}" for kind, count in kinds.most_common()) or "–",
+    ]
+
+
+def row(cells: Any) -> str:
+    return "| " + " | ".join(map(str, cells)) + " |"
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])
