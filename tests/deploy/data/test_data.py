@@ -15,6 +15,7 @@ from safety.dataset import BadData, Dataset
 from safety.model_set import ModelSet, Recipe
 from safety.windows import windows
 from tests.robots import GROUND
+from tests.safety.toys import car
 
 
 def test_excitation_stays_in_bounds_and_slew_and_holds_plans_of_the_schedule():
@@ -29,6 +30,15 @@ def test_excitation_stays_in_bounds_and_slew_and_holds_plans_of_the_schedule():
     assert (edges > 0.1).all(), "inputs at their bounds, as when driving"
     lengths = [len(list(group)) for still, group in itertools.groupby(~moving) if still]
     assert max(lengths) >= 10, "some long stops, for the latch"
+
+
+@pytest.mark.parametrize(("held", "least", "most"), [(25, 0.06, 0.2), (3, 0.0, 0.03)])
+def test_lead_ins_of_inputs_held_for_long_are_sometimes_restless(held, least, most):
+    robot = car("restless", stop=("ramp", "hold"))
+    inputs = np.array(list(itertools.islice(excitation(robot, np.random.default_rng(1), held), 20_000)))
+    at_bounds = ((inputs == robot.low()) | (inputs == robot.high())).all(1)
+    restless = at_bounds[:-1] & at_bounds[1:] & (inputs[1:, 1] == -inputs[:-1, 1])
+    assert least < restless.mean() < most
 
 
 def test_recorded_plans_are_found_as_windows(data_folder):
