@@ -13,6 +13,7 @@ from examples.foreign.adapter import Adapter, Array
 from messaging.shapes import Obstacle
 
 ROOM = 9.9  # m from the middle to each wall
+WANDER = 0.1  # m: its simulated joints creep, so that the car never quite stands, whatever throttle it is given
 WALLS = [
     Obstacle("wall", (ROOM * math.cos(yaw), ROOM * math.sin(yaw)), yaw=yaw + math.pi)
     for yaw in (0.0, 0.5 * math.pi, math.pi, 1.5 * math.pi)
@@ -53,7 +54,7 @@ class Reach(Adapter):
     def obstacles(self, env: Any, observation: Any, info: dict[str, Any]) -> list[Obstacle]:
         """Puddles cost where the car's centre is nearer than its collision radius to them. Walls cost nothing, but
         push back."""
-        margin = env.unwrapped.agent.collision_radius - self.robot.footprint
+        margin = env.unwrapped.agent.collision_radius + WANDER - self.robot.footprint
         round_ = [
             Obstacle("cylinder", tuple(puddle.get_position()[:2]), (puddle.radius,), margin=margin)
             for puddle in env.unwrapped.obstacles
