@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from deploy.commands.common import Filtering, Flags, Physics, Robot, conditions, console, errors, say_json
@@ -33,11 +33,15 @@ class Evaluate:
     """Also draw an episode from above, with tube and plan, into this file (.png, .gif, .mp4)."""
     episode: int = 0
     """Which one to draw."""
+    beside: bool = False
+    """Draw the same episode without the filter beside it."""
     verbose: bool = False
     """Say also the conditions: sensors' errors, wind, load."""
     json: bool = False
 
     def run(self) -> int:
+        if self.beside and self.render is None:
+            raise ValueError("--beside draws: give --render FILE too")
         robot = learnt(self.robot)
         what = Evaluation(
             policy=self.policy,
@@ -71,7 +75,11 @@ class Evaluate:
     def _draw(self, robot: RobotKind, what: Evaluation, path: Path) -> None:
         from deploy.run.render import record, save
 
-        driver, policy, question = prepared(robot, what)
-        film = record(driver, policy, question, self.episode)
-        save(film, path)
-        errors.print(f"{path}: episode {self.episode}, {film.end} after {len(film.frames) * robot.period:.1f} s")
+        films = []
+        for method in (what.method, "none") if self.beside else (what.method,):
+            driver, policy, question = prepared(robot, replace(what, method=method))
+            film = record(driver, policy, question, self.episode)
+            films.append(film)
+            how = f"method {method}, {film.end} after {len(film.frames) * robot.period:.1f} s"
+            errors.print(f"{path}: episode {self.episode}, {how}")
+        save(films, path)

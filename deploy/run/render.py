@@ -6,6 +6,7 @@ What flies is drawn from above too: colours say how high things are.
 from __future__ import annotations
 
 import textwrap
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -91,8 +92,8 @@ def record(driver: Driver, policy: Policy, question: Ask | None, number: int) ->
     return Film(driver.robot, driver.info["arena"], frames, np.asarray(step.true_state[:d]), end)
 
 
-def save(film: Film, path: Path) -> None:
-    """Draw the film: one picture of all of it (.png), or a moving one (.gif, .mp4).
+def save(films: Sequence[Film], path: Path) -> None:
+    """Draw the films side by side: one picture of all of each (.png), or a moving one (.gif, .mp4).
 
     Raises:
         ValueError: another ending.
@@ -100,15 +101,21 @@ def save(film: Film, path: Path) -> None:
     if path.suffix not in FORMATS:
         raise ValueError(f"{path}: a picture ends in {', '.join(FORMATS)}")
     path.parent.mkdir(parents=True, exist_ok=True)
-    stage = _Stage(film)
+    figure = Figure(figsize=(7.0 * len(films), 7.4), layout="constrained")
+    stages = [_Stage(film, axes) for film, axes in zip(films, np.ravel(figure.subplots(1, len(films))), strict=True)]
     if path.suffix == ".png":
-        stage.all_at_once()
-        stage.figure.savefig(path, dpi=130)
+        for stage in stages:
+            stage.all_at_once()
+        figure.savefig(path, dpi=130)
         return
-    with (writer := _writer(path, round(SPEED / film.robot.period))).saving(stage.figure, str(path), dpi=90):
-        for k in range(len(film.frames)):
-            stage.show(k)
+    dpi, last = 90 // len(films), max(len(film.frames) for film in films)
+    with (writer := _writer(path, round(SPEED / films[0].robot.period))).saving(figure, str(path), dpi=dpi):
+        for k in range(last):
+            for stage in stages:
+                stage.show(k)
             writer.grab_frame()
+        for stage in stages:
+            stage.ended()
         for _ in range(REST):
             writer.grab_frame()
 
@@ -126,11 +133,10 @@ def _writer(path: Path, rate: int) -> AbstractMovieWriter:
 class _Stage:
     """The room, and what moves in it."""
 
-    def __init__(self, film: Film) -> None:
+    def __init__(self, film: Film, axes: Axes) -> None:
         self.film, self.robot = film, film.robot
         self.flies = film.robot.position_dim == 3
-        self.figure = Figure(figsize=(7.0, 7.4), layout="constrained")
-        self.axes: Axes = self.figure.subplots()
+        self.axes = axes
         self.way = np.array([frame.position for frame in film.frames] + [film.last])
         self._room()
         self.lines = LineCollection([], linewidths=2.2, zorder=4)
@@ -150,7 +156,7 @@ class _Stage:
         if self.flies:
             drawn.set_array(np.array([_top(o) for o in inside]))
             drawn.set(cmap=HEIGHTS, clim=arena.bounds[2], alpha=0.45)
-            self.figure.colorbar(drawn, ax=axes, label="height: tops of obstacles, and of the way [m]", shrink=0.7)
+            axes.figure.colorbar(drawn, ax=axes, label="height: tops of obstacles, and of the way [m]", shrink=0.7)
         else:
             drawn.set_facecolor("#9a9a9a")
         axes.add_collection(drawn)
@@ -165,7 +171,9 @@ class _Stage:
         return obstacle.kind == BOX and obstacle.size[0] >= right - left
 
     def show(self, k: int) -> None:
-        """The state before period k, with its plan."""
+        """The state before period k, with its plan; after the last one, how it ended."""
+        if k >= len(self.film.frames):
+            return self.ended()
         frame = self.film.frames[k]
         for artist in self._moving:
             artist.remove()
@@ -181,6 +189,18 @@ class _Stage:
             self._moving += self._explained(frame, frame.why)
             said = frame.kind if frame.kind == "allowed" else textwrap.fill(f"{frame.kind}: {frame.why.said}", 80)
         self.axes.set_title(f"{self._heading()}{k * self.robot.period:5.1f} s\n{said}", fontsize=10, loc="left")
+
+    def ended(self) -> None:
+        """The end of the way, and how it ended."""
+        for artist in self._moving:
+            artist.remove()
+        frames = self.film.frames
+        self._moving = self._body(self.film.last, frames[-1].heading, frames[-1].kind)
+        if self.film.end == "collision":
+            self._moving += self.axes.plot(*self.film.last[:2], marker="x", color=EDGE, markersize=18, mew=4, zorder=10)
+        self._draw_way(len(frames))
+        seconds = len(frames) * self.robot.period
+        self.axes.set_title(f"{self._heading()}{seconds:5.1f} s\n{self.film.end}", fontsize=10, loc="left")
 
     def _explained(self, frame: Frame, why: Explanation) -> list[Any]:
         """The proposed and the executed input as arrows, and the edge of what stopped the proposal."""
@@ -224,7 +244,8 @@ class _Stage:
             )
 
     def _heading(self) -> str:
-        return f"{self.robot.name}, {self.film.arena.name}: "
+        unfiltered = all(frame.kind == "no filter" for frame in self.film.frames)
+        return f"{self.robot.name}, {self.film.arena.name}{', without the filter' if unfiltered else ''}: "
 
     def _draw_way(self, k: int) -> None:
         """The way up to period k; on the ground in the colour of each decision, in the air in that of its height."""

@@ -146,7 +146,7 @@ def test_what_fails_again_and_again_ends_the_run_and_says_why(data_folder, tmp_p
     (folder / "learner" / "checkpoint").mkdir(parents=True)
     (folder / "learner" / "checkpoint" / "latest").write_text("000042\n")  # it is not there: never a fresh start
     with Run(folder) as run:
-        run.popen.wait(120.0)
+        run.popen.wait(3.0 * PATIENCE)  # five starts of a process that imports torch
         errors = run.errors.read_text()
         assert run.popen.returncode == 1
         assert "learner ended with 1" in errors and "5th time in a row" in errors and "'latest' is missing" in errors

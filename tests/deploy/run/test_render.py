@@ -31,7 +31,7 @@ def test_without_a_filter_there_is_no_tube(data_folder):
 
 
 def test_a_picture_shows_the_way_in_the_decisions_colours(film, tmp_path):
-    save(film, tmp_path / "deep" / "way.png")
+    save([film], tmp_path / "deep" / "way.png")
     pixels = np.asarray(Image.open(tmp_path / "deep" / "way.png").convert("RGB"), int)
     blue = (np.abs(pixels - (0x00, 0x72, 0xB2)).sum(-1) < 40).sum()
     green = (np.abs(pixels - (0x00, 0x9E, 0x73)).sum(-1) < 40).sum()
@@ -39,16 +39,24 @@ def test_a_picture_shows_the_way_in_the_decisions_colours(film, tmp_path):
 
 
 def test_moving_pictures_have_a_frame_a_period(film, tmp_path):
-    save(film, tmp_path / "way.gif")
+    save([film], tmp_path / "way.gif")
     with Image.open(tmp_path / "way.gif") as gif:
         assert gif.n_frames >= 12
         first = np.asarray(gif.convert("L"), int)
         gif.seek(11)
         assert np.abs(np.asarray(gif.convert("L"), int) - first).max() > 50, "it moves"
-    save(film, tmp_path / "way.mp4")
+    save([film], tmp_path / "way.mp4")
     assert (tmp_path / "way.mp4").read_bytes()[4:8] == b"ftyp"
 
 
 def test_another_ending_is_refused_with_those_there_are(film, tmp_path):
     with pytest.raises(ValueError, match=r"\.png, \.gif, \.mp4"):
-        save(film, tmp_path / "way.bmp")
+        save([film], tmp_path / "way.bmp")
+
+
+def test_two_films_side_by_side_last_as_long_as_the_longer(film, tmp_path):
+    short = Film(film.robot, film.arena, film.frames[:5], film.frames[5].position, "collision")
+    save([film, short], tmp_path / "beside.gif")
+    with Image.open(tmp_path / "beside.gif") as gif:
+        width, height = gif.size
+        assert gif.n_frames >= 12 and width > 1.5 * height
