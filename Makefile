@@ -3,7 +3,7 @@ PYTHON ?= python3.11
 BIN := .venv/bin
 STAMP := .venv/.installed
 
-.PHONY: demo setup test test-fast check unit bench messages safety-gymnasium bullet-safety-gym clean
+.PHONY: demo setup test test-fast check unit bench messages docs safety-gymnasium bullet-safety-gym clean
 
 demo: setup
 	$(BIN)/brakeline demo
@@ -38,6 +38,10 @@ test-fast: setup
 bench: setup
 	$(BIN)/python -m deploy.bench
 
+# docs/ as a static site with a search, in site/; to search in it, serve it: `.venv/bin/mkdocs serve`.
+docs: setup
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
+
 # Regenerates messaging/brakeline_pb2.py and its stubs from the schema.
 messages: setup
 	$(BIN)/python -m grpc_tools.protoc -I. --python_out=. --mypy_out=. \
@@ -53,4 +57,4 @@ examples/bullet_safety_gym/.venv/.installed: examples/bullet_safety_gym/requirem
 	PYTHON=$(PYTHON) sh examples/foreign/setup.sh bullet_safety_gym bullet-safety-gym==1.4.0
 
 clean:
-	rm -rf .venv build *.egg-info
+	rm -rf .venv build site *.egg-info
