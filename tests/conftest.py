@@ -1,4 +1,5 @@
-"""A small recording of the ground robot, made once a session, for the tests that need a model set."""
+"""A small recording of the ground robot, made once a session, for the tests that need a model set; and who runs what
+where tests run side by side (`pytest -n 2`)."""
 
 import os
 import threading
@@ -7,6 +8,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+from filelock import FileLock
 
 from deploy.data import store
 from safety.model_set import Recipe
@@ -16,14 +18,34 @@ FLIGHTS = 80  # trajectories of the quadrotor, recorded in half a minute
 TRAJECTORIES = 50  # enough for every check of the certificates, recorded in ten seconds
 
 
+WHOLE_RUNS = "tests/system/"  # each is several processes: one of them at a time
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Whole runs first, one after the other, beside them the rest, module by module: what a module shares is made once."""
+    items.sort(key=lambda item: not item.nodeid.startswith(WHOLE_RUNS))  # stable
+    for item in items:
+        module = item.nodeid.partition("::")[0]
+        item.add_marker(pytest.mark.xdist_group(WHOLE_RUNS if module.startswith(WHOLE_RUNS) else module))
+
+
 @pytest.fixture(scope="session")
-def data_folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+def shared_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The session's, for all who run its tests side by side."""
+    own = tmp_path_factory.getbasetemp()
+    return own.parent if "PYTEST_XDIST_WORKER" in os.environ else own
+
+
+@pytest.fixture(scope="session")
+def data_folder(shared_folder: Path) -> Iterator[Path]:
     """What `$BRAKELINE_DATA` is from here on, for this process and its children: a data set and the default model."""
     before = os.environ.get("BRAKELINE_DATA")
-    folder = tmp_path_factory.mktemp("data")
+    folder = shared_folder / "recorded"
+    folder.mkdir(exist_ok=True)
     os.environ["BRAKELINE_DATA"] = str(folder)
-    store.recorded(GROUND, trajectories=TRAJECTORIES)
-    store.model_for(GROUND, Recipe())
+    with FileLock(folder / "ground.lock"):
+        store.recorded(GROUND, trajectories=TRAJECTORIES)
+        store.model_for(GROUND, Recipe())
     yield folder
     if before is None:
         del os.environ["BRAKELINE_DATA"]
@@ -34,9 +56,10 @@ def data_folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
 @pytest.fixture(scope="session")
 def flight_folder(data_folder: Path) -> Path:
     """The same, with a data set of the quadrotor, and its models in lockstep and in real time."""
-    store.recorded(QUADROTOR, trajectories=FLIGHTS)
-    for robot in (QUADROTOR, QUADROTOR.in_real_time()):
-        store.model_for(robot, Recipe())
+    with FileLock(data_folder / "flight.lock"):
+        store.recorded(QUADROTOR, trajectories=FLIGHTS)
+        for robot in (QUADROTOR, QUADROTOR.in_real_time()):
+            store.model_for(robot, Recipe())
     return data_folder
 
 
