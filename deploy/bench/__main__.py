@@ -18,7 +18,9 @@ from rich.console import Console
 from rich.table import Table
 
 from deploy.bench import (
+    askers,
     chaos,
+    costs,
     decide,
     environment,
     fuzz,
@@ -44,9 +46,12 @@ BENCHMARKS = {
     "recording": recording.run,
     "logs-2gb": logs.run_large,
     "fuzz": fuzz.run,
+    "askers": askers.run,
+    "costs": costs.run,
     "chaos": chaos.run,
 }
-WHEN_ASKED = {"logs-2gb", "fuzz", "chaos"}  # one writes as much, the others take a quarter of an hour or more
+# One writes as much, others take a quarter of an hour or more, or need root.
+WHEN_ASKED = {"logs-2gb", "fuzz", "chaos", "costs"}
 
 
 def show(console: Console, name: str, figures: Figures) -> None:

@@ -177,27 +177,22 @@ def chaos(kills: int, seed: int, folder: Path) -> Figures:
             learned = {robot: fleet.metrics.learners[robot] for robot in ROBOTS}
             policies = sum((folder / f"learner-{robot}" / "policy.safetensors").exists() for robot in ROBOTS)
     recovery = sorted(run.recovery) or [0.0]
-    figures: Figures = {
-        "faults": {"count": float(kills)} | {name: float(count) for name, count in sorted(run.counts.items())},
-        "the run": {
-            "collisions": judged.collisions,
-            "steps": judged.steps,
-            "twice in a log": judged.twice,
-            "learners' duplicates": float(sum(m.duplicates for m in learned.values())),
-            "ended, policies": float(policies),
-        },
-        "the log": {
-            "most s unsaved by a kill": max(run.unsaved, default=0.0),
-            "steps in neither": judged.lost,
-            "in a row": judged.longest,
-        },
-        "s until all go on": {
-            "the start": begun,
-            "p50": recovery[len(recovery) // 2],
-            "longest": recovery[-1],
-        },
+    said: dict[str, float] = {
+        "faults": kills,
+        **{f"faults: {name}": count for name, count in sorted(run.counts.items())},
+        "steps": judged.steps,
+        "collisions": judged.collisions,
+        "steps twice in a log": judged.twice,
+        "duplicates, as the learners say": sum(m.duplicates for m in learned.values()),
+        "learners that ended, with a policy": policies,
+        "most s of the log unsaved by a kill": max(run.unsaved, default=0.0),
+        "steps in neither log": judged.lost,
+        "of them in a row": judged.longest,
+        "s of the start": begun,
+        "s until all go on, p50": recovery[len(recovery) // 2],
+        "s until all go on, longest": recovery[-1],
     }
-    return figures
+    return {name: {"value": float(value)} for name, value in said.items()}
 
 
 def option(name: str, otherwise: int) -> int:

@@ -70,6 +70,7 @@ class Fleet:
     steps: int = 100_000  # of each robot
     seed: int = 0
     recorders: int = 2
+    learning: tuple[object, ...] = SMALL
     metrics: Metrics = field(default_factory=Metrics)
     spots: dict[str, Spot] = field(default_factory=dict)
     learners: Counter[str] = field(default_factory=Counter)  # LearnerMetrics heard
@@ -89,7 +90,7 @@ class Fleet:
             self._add(
                 f"learner-{robot}", LEARNERS, "learner", robot, "--out", self.folder / f"learner-{robot}",
                 "--resume-if-any", "--steps", self.steps, "--seed", self.seed,
-                "--learner.checkpoint-every", 300, *SMALL, *self._to(1 + i),
+                "--learner.checkpoint-every", 300, *self.learning, *self._to(1 + i),
             )  # fmt: skip
             self._add(f"actor-{robot}-0", 3 + i, "actor", robot, "--seed", self.seed, *self._to(1 + i))
 

@@ -1,0 +1,15 @@
+"""Where the processes of a run serve their metrics."""
+
+import pytest
+
+from deploy.run.places import client_of, metrics_of, say_where
+from messaging.bus import BusSettings
+
+
+@pytest.mark.parametrize(
+    ("launcher", "third"), [("9100", "9103"), ("0.0.0.0:9100", "0.0.0.0:9103"), ("", "")], ids=["here", "there", "none"]
+)
+def test_processes_have_the_ports_behind_their_launchers(launcher, third, tmp_path):
+    say_where(tmp_path, BusSettings(listen=("tcp/127.0.0.1:7447",), metrics=launcher))
+    assert metrics_of(tmp_path, 2) == third
+    assert client_of(tmp_path).metrics == "", "who looks on does not take a port"
