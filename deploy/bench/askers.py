@@ -41,9 +41,10 @@ from safety.vouch import Notary, write_key
 REPLICAS = (1, 2, 4)
 ASKERS = (50, 200, 1000)
 RATE = 5.0  # Hz
-SECONDS = 6.0  # of asking
+SECONDS = 4.0  # of asking
 DEADLINE = 0.1  # s
 CROWD = 2  # processes that askers are in
+SESSIONS = 6  # of each of them: a service lets eight questions of one session wait
 THREADS = 24  # of each: questions that are on their way at once
 
 
@@ -77,14 +78,15 @@ def _crowd(settings: BusSettings, questions: list[bytes], askers: int, out: Conn
     """Askers with phases of their own, until `SECONDS` are over."""
     requests = [pb.Request.FromString(payload) for payload in questions]
     rng, lock = np.random.default_rng(askers), threading.Lock()
-    with Bus(settings, "client") as bus:
+    with ExitStack() as stack:
+        buses = [stack.enter_context(Bus(settings, f"client.{i}")) for i in range(SESSIONS)]
         begun = time.monotonic() + 0.5
         due = [(begun + float(phase), number) for number, phase in enumerate(rng.uniform(0.0, 1.0 / RATE, askers))]
         heapq.heapify(due)
         answered: list[float] = []
         counts = {"late": 0, "unanswered": 0, "skipped": 0}
 
-        def work() -> None:
+        def work(bus: Bus) -> None:
             while True:
                 with lock:
                     at, number = heapq.heappop(due)
@@ -104,7 +106,7 @@ def _crowd(settings: BusSettings, questions: list[bytes], askers: int, out: Conn
                 else:
                     answered.append(time.perf_counter() - before)
 
-        threads = [threading.Thread(target=work) for _ in range(THREADS)]
+        threads = [threading.Thread(target=work, args=(buses[i % SESSIONS],)) for i in range(THREADS)]
         for thread in threads:
             thread.start()
         for thread in threads:
