@@ -22,7 +22,7 @@ WHOLE_RUNS = "tests/system/"  # each is several processes: one of them at a time
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Whole runs first, one after the other, beside them the rest, module by module: what a module shares is made once."""
+    """Whole runs first, one after the other; beside them the rest, a module at a time: what it shares is made once."""
     items.sort(key=lambda item: not item.nodeid.startswith(WHOLE_RUNS))  # stable
     for item in items:
         module = item.nodeid.partition("::")[0]
