@@ -3,6 +3,7 @@
 import json
 import os
 import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -39,22 +40,29 @@ def told(python, script, *words):
     return run.stdout.strip().splitlines()[-1]
 
 
+def test_who_asks_and_records_needs_no_solver_and_no_simulator():
+    """Their virtual environments have neither."""
+    missing = "import sys; sys.modules |= dict.fromkeys(('proxsuite', 'scipy', 'torch', 'mcap'))"
+    needed = "import safety.client, safety.gym, deploy.data.episodes"
+    subprocess.run([sys.executable, "-c", f"{missing}; {needed}"], check=True, cwd=EXAMPLES.parent)
+
+
 @pytest.mark.parametrize(
-    ("robot", "folder", "steps"), [("car", "safety_gymnasium", 300), ("racecar", "bullet_safety_gym", 300)]
+    ("robot", "folder", "periods"), [("car", "safety_gymnasium", 6000), ("racecar", "bullet_safety_gym", 9000)]
 )
-def test_driving_at_hazards_costs_nothing_behind_a_filter_of_own_data(tmp_path, robot, folder, steps):
+def test_driving_at_hazards_costs_nothing_behind_a_filter_of_own_data(tmp_path, robot, folder, periods):
     python = python_of(folder)
     record, lines = tmp_path / f"{robot}.safetensors", tmp_path / "lines.jsonl"
-    told(python, "collect.py", robot, str(record), "6000")
+    told(python, "collect.py", robot, str(record), str(periods))
     models = Models()
     models.install(certified(Dataset.load(record), Recipe())[0])
     endpoint = free_endpoint()
-    words = [robot, "adversarial", "--seeds", "0", "1", "--steps", str(steps)]
+    words = [robot, "adversarial", "--seeds", "0", "1", "--steps", "300"]
     with Bus(BusSettings(listen=(endpoint,)), "safety") as bus:
         bus.serve(DECIDE, answerer(models, Counts()))
         said = told(python, "run.py", *words, "--connect", endpoint, "--out", str(lines))
     figures = json.loads(said)
-    assert figures["cost"] == 0.0 and figures["steps"] == steps
+    assert figures["cost"] == 0.0 and figures["steps"] == 300
     assert set(figures["decisions"]) <= {"allowed", "adjusted", "failsafe"} and figures["decisions"]["adjusted"] > 30
     assert json.loads(lines.read_text()) == figures
 
