@@ -63,7 +63,7 @@ def test_driving_at_hazards_costs_nothing_behind_a_filter_of_own_data(tmp_path, 
         said = told(python, "run.py", *words, "--connect", endpoint, "--out", str(lines))
     figures = json.loads(said)
     assert figures["cost"] == 0.0 and figures["steps"] == 300
-    assert set(figures["decisions"]) <= {"allowed", "adjusted", "failsafe"} and figures["decisions"]["adjusted"] > 30
+    assert set(figures["decisions"]) <= {"allowed", "adjusted", "failsafe"} and figures["decisions"]["allowed"] < 270
     assert json.loads(lines.read_text()) == figures
 
 
