@@ -160,6 +160,7 @@ def closed_loop(tallies: Iterable[Tally]) -> Figures:
         "propose_ms": spread(*(tally.propose_ms for tally in tallies)),
         "containment": {"steps": total("compared"), "violations": total("violations")},
         "broken": total("broken"),
+        "fleet": max((tally.fleet for tally in tallies), default=0),
         "outside": total("outside"),
         "closest_approach": clearance and clearance["min"],
         "clearance": clearance,

@@ -19,13 +19,14 @@ Array = NDArray[np.float64]
 
 OFFSETS = np.radians(np.array([0, -12, 12, -24, 24, -36, 36, -50, 50, -70, 70, -95, 95, -130, 130, 180], dtype=float))
 LEFT = 0.08  # rad that a turn to the left costs more
+TURNING = 0.25  # of the angle that it has to turn: it does not waver between two ways that are alike
 HORIZON = 6.0  # s
 BERTH = 0.14  # m beside the two bodies: what the filter keeps between them, and some
 SOON = 4.0  # rad·s: cost of meeting somebody, over the time until then
 BESIDE = 0.04  # m beside the body that must be free along a direction
 AHEAD = np.linspace(0.1, 0.8, 8)  # m, where that is looked at
 BLOCKED = 10.0  # rad
-PATIENCE = 20  # periods
+PATIENCE = 40  # periods; turning round on the spot takes 32
 MOVED = 0.08  # m; less in that time is standing
 ASIDE = (0.4, 1.0)  # m
 TRIES = 12
@@ -47,14 +48,15 @@ class Passing:
         if self._left:
             self._left -= 1
         elif len(self._been) == PATIENCE and np.linalg.norm(position - self._been[0]) < MOVED:
-            self._aside, self._left = self._place(position), int(self._rng.integers(PATIENCE // 2, 2 * PATIENCE))
+            self._aside, self._left = self._place(position), int(self._rng.integers(PATIENCE // 2, PATIENCE))
             self._been.clear()
         if self._left and self._aside is not None:
             target = self._aside
         wanted = float(np.arctan2(target[1] - position[1], target[0] - position[0]))
         directions = wanted + OFFSETS
         unit = np.column_stack([np.cos(directions), np.sin(directions)])
-        cost = np.abs(OFFSETS) + LEFT * (OFFSETS > 0.0) + self._meeting(position, unit, others)
+        cost = TURNING * np.abs(np.remainder(directions - state[2] + np.pi, 2.0 * np.pi) - np.pi)
+        cost += np.abs(OFFSETS) + LEFT * (OFFSETS > 0.0) + self._meeting(position, unit, others)
         line = position + AHEAD[:, None, None] * unit
         cost += BLOCKED * (self._grid.at(line) < self._robot.footprint + BESIDE).mean(axis=0)
         return float(directions[np.argmin(cost)])

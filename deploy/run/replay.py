@@ -9,11 +9,12 @@ from __future__ import annotations
 import heapq
 import math
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+from google.protobuf.message import Message
 
 from deploy.data.store import data_root
 from logs.container import attachment
@@ -30,6 +31,7 @@ WORDS = ("vouchers", "unvouched")  # what a service says to itself, with a key t
 EXAMPLES = 20  # decisions that are told in full: those with the largest differences
 NAMES = {pb.UNKNOWN: "error", **KINDS}
 
+Waiting = dict[tuple[tuple[str, ...], int, int], dict[str, tuple[pb.Request, pb.Reply]]]  # fleets not yet whole
 Instead = Callable[[str], Method]  # by the robot's name: what is asked in place of what was in use
 
 
@@ -140,6 +142,10 @@ def differences(
 def _size(one: Any, other: Any) -> float:
     if isinstance(one, str | bool):
         return math.inf
+    if isinstance(one, pb.Promise):
+        one, other = ([*p.center, *p.half_width, *p.radius] for p in (one, other))
+    elif isinstance(one, Message):
+        return math.inf
     first, second = np.atleast_1d(np.array(one, float)), np.atleast_1d(np.array(other, float))
     if first.shape != second.shape:
         return math.inf
@@ -157,6 +163,7 @@ def replay(paths: Paths, instead: Instead | None = None, each: Callable[[], Any]
     log = open_log(paths)
     archive, models, result = Archive(log), Models(), Comparison()
     answer = answerer(models, Counts())
+    waiting: Waiting = {}
     for record in log:
         if record.topic == "model":
             archive.add(record.message.file)
@@ -165,20 +172,36 @@ def replay(paths: Paths, instead: Instead | None = None, each: Callable[[], Any]
         request, logged = record.message.request, record.message.reply
         if logged.decision.unvouched:  # by the log's own word; else what the request says is believed
             request.model = UNVERIFIED
-        if logged.WhichOneof("result") is None:
-            result.requests += 1
-            result.unanswered += 1
-        elif instead is not None:
-            _put_to_use(models, request, instead(request.robot))
-            if request.model not in ("", UNVERIFIED):
-                request.model = models.filters[request.robot].version
-            result.add(request, logged, _asked(answer, request), ("model",))
-        else:
-            if logged.decision.model:  # else it is an error, of whatever was in use
-                _put_to_use(models, request, archive.method(request.robot, logged.decision.model))
-            result.add(request, logged, _asked(answer, request))
         each()
+        questions = _question(waiting, request, logged)
+        if any(reply.WhichOneof("result") is None for _, reply in questions):
+            result.requests += len(questions)
+            result.unanswered += len(questions)
+            continue
+        for request, logged in questions:
+            if instead is not None:
+                _put_to_use(models, request, instead(request.robot))
+                if request.model not in ("", UNVERIFIED):
+                    request.model = models.filters[request.robot].version
+            elif logged.decision.model:  # else it is an error, of whatever was in use
+                _put_to_use(models, request, archive.method(request.robot, logged.decision.model))
+        replies = _asked(answer, [request for request, _ in questions]) if questions else []
+        for (request, logged), reply in zip(questions, replies, strict=True):
+            result.add(request, logged, reply, () if instead is None else ("model",))
     return result
+
+
+def _question(waiting: Waiting, request: pb.Request, logged: pb.Reply) -> list[tuple[pb.Request, pb.Reply]]:
+    """What was one question with this request: itself; of a fleet all its robots', once the last of them is there."""
+    if not request.fleet:
+        return [(request, logged)]
+    key = tuple(request.fleet), request.episode, request.step
+    group = waiting.setdefault(key, {})
+    group[request.actor] = request, logged
+    if group.keys() != set(request.fleet):
+        return []
+    del waiting[key]
+    return [group[name] for name in request.fleet]
 
 
 def _put_to_use(models: Models, request: pb.Request, method: Method) -> None:
@@ -187,7 +210,6 @@ def _put_to_use(models: Models, request: pb.Request, method: Method) -> None:
     models.known |= {method.version, request.model}
 
 
-def _asked(answer: Callable[[bytes], bytes], request: pb.Request) -> pb.Reply:
+def _asked(answer: Callable[[bytes], bytes], requests: Sequence[pb.Request]) -> list[pb.Reply]:
     """The service's own core is asked: the same bytes, no bus."""
-    replies = pb.ReplyBatch.FromString(answer(pb.RequestBatch(requests=[request]).SerializeToString())).replies
-    return replies[0]
+    return list(pb.ReplyBatch.FromString(answer(pb.RequestBatch(requests=requests).SerializeToString())).replies)

@@ -139,9 +139,8 @@ def _together(robot: Robot, what: Evaluation, each: Callable[[Tally], Any]) -> d
     return figures | {
         "robots": {robot.name: figures},
         "actors": {name: closed_loop([tally]) for name, tally in tallies.items()},
-        "fleet": {
-            "size": what.fleet,
-            "worlds": rounds,
+        "worlds": {
+            "count": rounds,
             "robot_steps": periods * what.fleet,  # of those that stand at their goals, too
             "touches": world.touches,  # of two robots, whatever they did
             "goals_per_minute": 60.0 * figures["goals"] / seconds if seconds else None,

@@ -213,6 +213,7 @@ def counted(messages: list[tuple[str, Any]]) -> dict[str, Any]:
         "contacts_moving": sum(s.contact_moving for s in steps),
         "contacts_standing": sum(s.contact_standing for s in steps),
         "contacts_robots": sum(s.contact_robot for s in steps),
+        "fleet": max(s.fleet for s in steps),
         "failsafes": len(failsafe),
         "fallbacks": sum(s.fallback for s in steps),
         "mean_speed": float(np.mean([s.speed for s in steps])),
