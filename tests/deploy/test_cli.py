@@ -93,10 +93,10 @@ def test_a_typing_error_is_answered_with_a_suggestion(command):
         ("safety ground --listen nonsense", "cannot listen on nonsense"),
         ("recorder {folder}/x.mcap --listen smoke/signals", "smoke/signals is open to other machines"),
         ("train ground --listen tls/127.0.0.1 --out {folder}/run", "cannot listen on tls/127.0.0.1: invalid"),
-        ("actor ground --listen tcp/127.0.0.1:0 --arena ballroom", "no arena is called 'ballroom'; there are: default"),
+        ("actor ground --listen tcp/127.0.0.1:0 --arena ballroom", "there are: crossing, default"),
         (
             "train ground --arena ballroom --out {folder}/run",
-            "no arena is called 'ballroom'; there are: default, dense",
+            "no arena is called 'ballroom'; there are: crossing, default, dense",
         ),
         ("train submarine --out {folder}/run", "no robot is called 'submarine'; there are: ground"),
         ("train ground --resume {folder}/none", "is no run's configuration"),
