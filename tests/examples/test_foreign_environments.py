@@ -48,7 +48,7 @@ def test_who_asks_and_records_needs_no_solver_and_no_simulator():
 
 
 @pytest.mark.parametrize(
-    ("robot", "folder", "periods"), [("car", "safety_gymnasium", 6000), ("racecar", "bullet_safety_gym", 12000)]
+    ("robot", "folder", "periods"), [("car", "safety_gymnasium", 9000), ("racecar", "bullet_safety_gym", 12000)]
 )
 def test_driving_at_hazards_costs_nothing_behind_a_filter_of_own_data(tmp_path, robot, folder, periods):
     python = python_of(folder)
