@@ -11,7 +11,7 @@ from messaging.rays import Rays
 from sim.estimator import Estimator, NoiseLevels, wrap
 from sim.ground import GROUND, SAMPLES, WHEEL_RADIUS, GroundRobot
 from sim.lidar import Lidar
-from sim.vehicle import BadInput
+from sim.vehicle import executed
 from sim.world import Arena
 
 Array = NDArray[np.float64]
@@ -77,10 +77,7 @@ class DrivenGround(GroundRobot):
         Raises:
             BadInput: when the input is not two finite numbers.
         """
-        wanted = np.asarray(input, dtype=np.float64)
-        if wanted.shape != (GROUND.action_dim,) or not np.isfinite(wanted).all():
-            raise BadInput(f"an input is {GROUND.action_dim} finite numbers, not {wanted!r}")
-        self.input = np.clip(wanted, GROUND.low(), GROUND.high())
+        self.input = executed(GROUND, input, self.input)
         self._set_wheels(self.input)
 
     def advance(self) -> None:

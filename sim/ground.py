@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from messaging.robots import robot_named
 from sim.conditions import Conditions
 from sim.estimator import Estimator, NoiseLevels
-from sim.scene import Moving, add_movers, add_obstacles
-from sim.vehicle import BadInput, MakeVehicle, Period
+from sim.scene import Moving, standing
+from sim.vehicle import MakeVehicle, Period, executed
 from sim.world import Arena
 
 Array = NDArray[np.float64]
@@ -58,10 +58,7 @@ class Turtle:
         Raises:
             BadInput: when the input is not two finite numbers.
         """
-        input = np.asarray(input, dtype=np.float64)
-        if input.shape != (GROUND.action_dim,) or not np.isfinite(input).all():
-            raise BadInput(f"an input is {GROUND.action_dim} finite numbers, not {input!r}")
-        self.input = np.clip(input, GROUND.low(), GROUND.high())
+        self.input = executed(GROUND, input, self.input)
 
     def begin(self, input: Array) -> None:
         """A period with this input begins."""
@@ -138,7 +135,7 @@ class GroundRobot(Turtle):
         payload_kg: float = 0.0,
         floor_friction: float = 1.0,
     ) -> None:
-        self._model = _build(arena)
+        self._model = standing(MODEL, arena, WHEEL_RADIUS)
         self._data = mujoco.MjData(self._model)
         super().__init__(arena, self._data)
         base = self._model.body("base").id
@@ -231,18 +228,6 @@ class GroundRobot(Turtle):
         if self._moving:
             return bool((first * ~self._moving.touched()).any())
         return bool(np.count_nonzero(first))
-
-
-def _build(arena: Arena) -> mujoco.MjModel:
-    """Compile robot and arena, the robot standing at the start."""
-    spec = mujoco.MjSpec.from_string(MODEL)
-    add_obstacles(spec, arena)
-    add_movers(spec, arena.crowd)
-    base = spec.body("base")
-    x, y, heading = arena.start
-    base.pos = (x, y, WHEEL_RADIUS)
-    base.quat = (math.cos(0.5 * heading), 0.0, 0.0, math.sin(0.5 * heading))
-    return spec.compile()
 
 
 def simulated(conditions: Conditions, tap: object = None) -> MakeVehicle:

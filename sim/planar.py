@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from messaging.robots import Robot
 from sim.estimator import NoiseLevels, cut_normal, wrap
-from sim.scene import Moving, add_movers, add_obstacles
-from sim.vehicle import BadInput, Period
+from sim.scene import Moving, standing
+from sim.vehicle import Period, executed
 from sim.world import Arena
 
 Array = NDArray[np.float64]
@@ -35,7 +35,7 @@ class PlanarRobot:
     ) -> None:
         """model: MJCF; height [m]: of the base's origin above the floor; noise: its `scale` counts."""
         self.robot, self.arena = robot, arena
-        self.model = _build(model, height, arena)
+        self.model = standing(model, arena, height)
         self.data = mujoco.MjData(self.model)
         self._moving = Moving(self.model, self.data, arena.crowd)
         self._time = -robot.period  # s; the episode's first is 0
@@ -69,11 +69,8 @@ class PlanarRobot:
         Raises:
             BadInput: when it is not as many finite numbers as the robot has inputs.
         """
-        robot, input = self.robot, np.asarray(input, dtype=np.float64)
-        if input.shape != (robot.action_dim,) or not np.isfinite(input).all():
-            raise BadInput(f"an input is {robot.action_dim} finite numbers, not {input!r}")
-        slew = np.asarray(robot.action_slew)
-        self.input = np.clip(np.clip(input, robot.low(), robot.high()), self.input - slew, self.input + slew)
+        robot = self.robot
+        self.input = executed(robot, input, self.input)
         before = self.true
         positions, collision = self._run()
         self.true = self._state()
@@ -164,15 +161,3 @@ def _turned(vectors: Array, angle: float) -> Array:
     cos, sin = math.cos(angle), math.sin(angle)
     x, y = vectors[..., 0], vectors[..., 1]
     return np.stack([cos * x - sin * y, sin * x + cos * y], axis=-1)
-
-
-def _build(model: str, height: float, arena: Arena) -> mujoco.MjModel:
-    """Compile robot and arena, the robot standing at the start."""
-    spec = mujoco.MjSpec.from_string(model)
-    add_obstacles(spec, arena)
-    add_movers(spec, arena.crowd)
-    base = spec.body("base")
-    x, y, heading = arena.start
-    base.pos = (x, y, height)
-    base.quat = (math.cos(0.5 * heading), 0.0, 0.0, math.sin(0.5 * heading))
-    return spec.compile()

@@ -15,7 +15,7 @@ from messaging.robots import robot_named
 from sim.flight import GRAVITY, Body, FlightController, Gains, Vector
 from sim.flight_estimator import Estimate, FlightEstimator, QuadrotorNoise
 from sim.scene import Moving, add_movers, add_obstacles
-from sim.vehicle import BadInput, Period
+from sim.vehicle import Period, executed
 from sim.wind import Air, Wind
 from sim.world import Arena
 
@@ -245,11 +245,7 @@ def slewed(input: Array, before: Array) -> Array:
     Raises:
         BadInput: when the input is not three finite numbers.
     """
-    input = np.asarray(input, dtype=np.float64)
-    if input.shape != (QUADROTOR.action_dim,) or not np.isfinite(input).all():
-        raise BadInput(f"an input is {QUADROTOR.action_dim} finite numbers, not {input!r}")
-    slew = np.asarray(QUADROTOR.action_slew)
-    return np.clip(np.clip(input, QUADROTOR.low(), QUADROTOR.high()), before - slew, before + slew)
+    return executed(QUADROTOR, input, before)
 
 
 def _build(arena: Arena, floor: float | None) -> mujoco.MjModel:

@@ -19,6 +19,19 @@ OBSTACLE_BIT = 2  # the contact bit that the robots' geoms answer to
 Geom = tuple[mujoco.mjtGeom, tuple[float, float, float], tuple[float, float, float]]
 
 
+def standing(model: str, arena: Arena, height: float) -> mujoco.MjModel:
+    """Compile a robot in the plane (MJCF with a body `base`) and an arena, the robot standing at the start, its base at
+    that height [m]."""
+    spec = mujoco.MjSpec.from_string(model)
+    add_obstacles(spec, arena)
+    add_movers(spec, arena.crowd)
+    base = spec.body("base")
+    x, y, heading = arena.start
+    base.pos = (x, y, height)
+    base.quat = (math.cos(0.5 * heading), 0.0, 0.0, math.sin(0.5 * heading))
+    return spec.compile()
+
+
 def add_obstacles(spec: mujoco.MjSpec, arena: Arena) -> None:
     """Add an arena's obstacles to the world body, in their order, named `obstacle 0`, `obstacle 1`, …
 

@@ -9,6 +9,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from messaging.robots import Robot
 from sim.world import Arena
 
 Array = NDArray[np.float64]
@@ -16,6 +17,19 @@ Array = NDArray[np.float64]
 
 class BadInput(ValueError):
     """An input that is not a finite vector of the robot's length."""
+
+
+def executed(robot: Robot, input: Array, before: Array) -> Array:
+    """What is executed of an input (m,) after `before`: within the robot's bounds and slew.
+
+    Raises:
+        BadInput: when it is not as many finite numbers as the robot has inputs.
+    """
+    input = np.asarray(input, dtype=np.float64)
+    if input.shape != (robot.action_dim,) or not np.isfinite(input).all():
+        raise BadInput(f"an input is {robot.action_dim} finite numbers, not {input!r}")
+    slew = np.asarray(robot.action_slew)
+    return np.clip(np.clip(input, robot.low(), robot.high()), before - slew, before + slew)
 
 
 @dataclass(frozen=True)
