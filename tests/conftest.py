@@ -21,6 +21,7 @@ TRAJECTORIES = 50  # enough for every check of the certificates, recorded in ten
 WHOLE_RUNS = "tests/system/"  # each is several processes: one of them at a time
 
 
+@pytest.hookimpl(tryfirst=True)  # before who hands them out reads the groups
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Whole runs first, one after the other; beside them the rest, a module at a time: what it shares is made once."""
     items.sort(key=lambda item: not item.nodeid.startswith(WHOLE_RUNS))  # stable
