@@ -8,8 +8,9 @@ import pytest
 from deploy.vehicles import environment
 from messaging.shapes import BOX, CYLINDER, Obstacle
 from sim.estimator import NoiseLevels
-from sim.ground import BadInput, GroundRobot, Period
+from sim.ground import GroundRobot
 from sim.policies import scripted
+from sim.vehicle import BadInput, Period
 from sim.world import Arena
 from sim.world import staged_arena as room
 from tests.robots import GROUND
