@@ -26,7 +26,7 @@ check: setup
 
 # Whole runs one after the other in one process, the rest beside them in another (tests/conftest.py); what was skipped, and why.
 unit: setup
-	$(BIN)/python -m pytest -m "not long" -n 2 --dist loadgroup --no-loadscope-reorder -rs
+	$(BIN)/python -m pytest -m "not long" -n 2 --dist loadscope --no-loadscope-reorder -rs
 
 # For every save: no whole runs, no flights, no trainings.
 test-fast: setup

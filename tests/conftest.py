@@ -6,9 +6,11 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 from filelock import FileLock
+from xdist.scheduler import LoadScopeScheduling
 
 from deploy.data import store
 from safety.model_set import Recipe
@@ -21,13 +23,22 @@ TRAJECTORIES = 50  # enough for every check of the certificates, recorded in ten
 WHOLE_RUNS = "tests/system/"  # each is several processes: one of them at a time
 
 
-@pytest.hookimpl(tryfirst=True)  # before who hands them out reads the groups
+class Rooms(LoadScopeScheduling):
+    """Whole runs go to one process, one after the other; beside them the rest, a module at a time: what it shares is made
+    once."""
+
+    def _split_scope(self, nodeid: str) -> str:
+        module = nodeid.partition("::")[0]
+        return WHOLE_RUNS if module.startswith(WHOLE_RUNS) else module
+
+
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Rooms:
+    return Rooms(config, log)
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Whole runs first, one after the other; beside them the rest, a module at a time: what it shares is made once."""
+    """Whole runs first: they take as long as all the rest."""
     items.sort(key=lambda item: not item.nodeid.startswith(WHOLE_RUNS))  # stable
-    for item in items:
-        module = item.nodeid.partition("::")[0]
-        item.add_marker(pytest.mark.xdist_group(WHOLE_RUNS if module.startswith(WHOLE_RUNS) else module))
 
 
 @pytest.fixture(scope="session")
