@@ -24,8 +24,8 @@ WHOLE_RUNS = "tests/system/"  # each is several processes: one of them at a time
 
 
 class Rooms(LoadScopeScheduling):
-    """Whole runs go to one process, one after the other; beside them the rest, a module at a time: what it shares is made
-    once."""
+    """Whole runs go to one process, one after the other; the rest to the other, a module at a time: what it shares is
+    made once."""
 
     def _split_scope(self, nodeid: str) -> str:
         module = nodeid.partition("::")[0]
