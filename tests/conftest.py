@@ -20,7 +20,8 @@ FLIGHTS = 80  # trajectories of the quadrotor, recorded in half a minute
 TRAJECTORIES = 50  # enough for every check of the certificates, recorded in ten seconds
 
 
-WHOLE_RUNS = "tests/system/"  # each is several processes: one of them at a time
+# Each is several processes, or flies in real time: one of them at a time.
+WHOLE_RUNS = ("tests/system/", "tests/actors/test_live.py")
 
 
 class Rooms(LoadScopeScheduling):
@@ -29,7 +30,7 @@ class Rooms(LoadScopeScheduling):
 
     def _split_scope(self, nodeid: str) -> str:
         module = nodeid.partition("::")[0]
-        return WHOLE_RUNS if module.startswith(WHOLE_RUNS) else module
+        return WHOLE_RUNS[0] if module.startswith(WHOLE_RUNS) else module
 
 
 def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Rooms:

@@ -63,7 +63,8 @@ def test_it_takes_off_flies_brakes_and_lands(stalled: Callable[[], float], live:
     for _ in range(12):
         period = vehicle.step(np.array([2.0, 1.0, 0.0]))
     assert period.measured[3:6] == pytest.approx([2.0, 1.0, 0.0], abs=0.3)
-    assert period.measured[:3] == pytest.approx(period.true[:3], abs=0.3)  # the truth's word is of a moment before
+    late = 3.0 * stalled()  # m flown meanwhile: the truth's word is of a moment before, or of one before a stall
+    assert period.measured[:3] == pytest.approx(period.true[:3], abs=0.3 + late)
     assert period.subsamples[-1] == pytest.approx([0.4, 0.2, 0.0], abs=0.15)
     assert vehicle.timing.worst_gap < GAP + stalled() and not vehicle.turn.lost and not period.collision
     assert vehicle.turn.number >= 12
