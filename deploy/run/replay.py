@@ -27,7 +27,7 @@ from safety.methods import Method, decode, load, ready
 from safety.service import Counts, Models, answerer
 
 TIMES = ("time_ms", "solve_ms", "verify_ms", "queue_ms")
-WORDS = ("vouchers", "unvouched")  # what a service says to itself, with a key that no log holds
+WORDS = ("vouchers", "unvouched", "stopped")  # what a service says to itself, with a key that no log holds
 EXAMPLES = 20  # decisions that are told in full: those with the largest differences
 NAMES = {pb.UNKNOWN: "error", **KINDS}
 
