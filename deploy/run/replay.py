@@ -27,7 +27,8 @@ from safety.methods import Method, decode, load, ready
 from safety.service import Counts, Models, answerer
 
 TIMES = ("time_ms", "solve_ms", "verify_ms", "queue_ms")
-WORDS = ("vouchers", "unvouched", "stopped")  # what a service says to itself, with a key that no log holds
+# What a service says to itself, with a key that no log holds; and what explains a decision, and changes none.
+WORDS = ("vouchers", "unvouched", "stopped")
 EXAMPLES = 20  # decisions that are told in full: those with the largest differences
 NAMES = {pb.UNKNOWN: "error", **KINDS}
 
