@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 
 from deploy.run.render import Film, Frame, _Stage
 from logs import scene
@@ -28,7 +29,7 @@ def test_foxglove_has_a_drum_a_disc() -> None:
 def test_a_film_has_them_at_the_heading() -> None:
     none = np.zeros((0, 2))
     film = Film(CAR, staged_arena(), [Frame(AT, HEADING, "allowed", none, none, none, 0.0)], AT, "cut")
-    drawn = _Stage(film)._body(AT, HEADING, "allowed")
+    drawn = _Stage(film, Figure().subplots())._body(AT, HEADING, "allowed")
     middles = np.array([circle.center for circle in drawn[:2]])
     assert np.allclose(middles, [(1.0, 2.11), (1.0, 1.89)]) and [c.radius for c in drawn[:2]] == [0.155, 0.155]
     assert np.allclose(drawn[2].get_xydata()[1], (1.0, 2.0 + CAR.front)) and pytest.approx(0.265) == CAR.front
