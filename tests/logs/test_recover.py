@@ -48,7 +48,8 @@ def whole(path: Path) -> list[int]:
         summary = reader.get_summary()
         assert summary is not None and summary.statistics is not None
         assert summary.statistics.message_count == sum(1 for _ in reader.iter_messages())
-        assert len(list(reader.iter_metadata())) >= 2
+        about = len(list(reader.iter_metadata()))
+        assert about >= 2 or not numbers, "but for a file killed at its first moment"
     return numbers
 
 
