@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from messaging.robots import robot_named
 from sim.flight import GRAVITY, Body, FlightController, Gains, Vector
-from sim.flight_estimator import Estimate, FlightEstimator, QuadrotorNoise
+from sim.flight_estimator import Estimate, FlightEstimator, QuadrotorNoise, rotate
 from sim.scene import Moving, add_movers, add_obstacles
 from sim.vehicle import Period, executed
 from sim.wind import Air, Wind
@@ -167,6 +167,11 @@ class Quadrotor:
         self.flying = False
         self._data.ctrl[:] = 0.0
 
+    def spin(self, thrusts: tuple[float, ...]) -> None:
+        """Another controller has the rotors: thrusts [N] in the order of the model's, until told otherwise."""
+        self.flying = False
+        self._data.ctrl[:] = thrusts  # clipped to what a rotor can give
+
     def launch(self) -> None:
         """The controller takes the rotors, holding the heading as it is."""
         w, x, y, z = self._data.qpos[3:7].tolist()
@@ -185,6 +190,14 @@ class Quadrotor:
         px, py, pz, qw, qx, qy, qz = self._data.qpos.tolist()
         vx, vy, vz, p, q, r = self._data.qvel.tolist()
         return self._estimator.read((px, py, pz), (vx, vy, vz), (qw, qx, qy, qz), (p, q, r), self._acceleration)
+
+    def truth(self) -> Estimate:
+        """What sensors without any error would say now."""
+        px, py, pz, qw, qx, qy, qz = self._data.qpos.tolist()
+        vx, vy, vz, p, q, r = self._data.qvel.tolist()
+        ax, ay, az = self._acceleration
+        felt = rotate((qw, -qx, -qy, -qz), (ax, ay, az + GRAVITY))
+        return Estimate((px, py, pz), (vx, vy, vz), (qw, qx, qy, qz), (p, q, r), felt)
 
     def state(self) -> Array:
         """The true state (9,); its acceleration is the mean over the last physics step."""

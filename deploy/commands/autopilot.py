@@ -1,12 +1,19 @@
-"""`brakeline autopilot`: quadrotors behind MAVLink, in real time, for any ground station or companion."""
+"""`brakeline autopilot`: quadrotors behind MAVLink, in real time, for any ground station or companion; with `--px4` the
+autopilot is a real one, and only the physics are ours."""
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
 from typing import Literal
 
 from deploy.commands.common import errors, say_json
 from deploy.run.autopilot import AutopilotSettings, fly
+from deploy.run.hil import HilSettings
+from deploy.run.hil import fly as fly_px4
+from sim.autopilot.rules import SETPOINT_TIMEOUT
+from sim.autopilot.sensors import SensorNoise
+from sim.quadrotor import Quadrotor
 from sim.wind import Wind
 from sim.world import Arena
 
@@ -35,9 +42,45 @@ class Autopilot:
     """Where states and collisions go, as JSON in UDP datagrams; empty: nowhere."""
     seconds: float = 0.0
     """Until it ends; 0: on ^C."""
+    px4: Path | None = None
+    """Folder of a PX4 that was built for SITL: it flies our vehicle, in lockstep, with its own rules and estimator."""
+    speed: float = 1.0
+    """Of a real PX4: times real time; 0: as fast as it goes."""
+    sensors: float = SensorNoise.scale
+    """Of a real PX4: factor on the errors of IMU, magnetometer, barometer and GPS."""
+    gps: float = SensorNoise.gps_position
+    """Of a real PX4: m, sigma of its GPS on each axis."""
+    parameters: dict[str, float] = field(default_factory=dict)
+    """Of a real PX4: NAME VALUE ..."""
     json: bool = False
 
     def run(self) -> int:
+        return self._embedded() if self.px4 is None else self._real(self.px4)
+
+    def _real(self, folder: Path) -> int:
+        if self.vehicles != 1 or self.airborne or self.rules != "px4":
+            raise ValueError("a real PX4 flies one vehicle, by its own rules, and starts on the ground")
+        timeout = {} if self.setpoint_timeout is None else {SETPOINT_TIMEOUT["px4"]: self.setpoint_timeout}
+        settings = HilSettings(
+            folder,
+            self.url,
+            self.arena,
+            self.seed,
+            SensorNoise(scale=self.sensors, gps_position=self.gps),
+            Wind(self.wind, gust=self.gust),
+            timeout | self.parameters,
+            self.truth,
+            self.speed,
+            self.seconds,
+        )
+        flown = fly_px4(settings, self._answered)
+        if self.json:
+            say_json(asdict(flown))
+        else:
+            errors.print(str(flown))
+        return 0
+
+    def _embedded(self) -> int:
         settings = AutopilotSettings(
             self.url,
             self.rules,
@@ -60,3 +103,9 @@ class Autopilot:
     def _begun(self, arena: Arena) -> None:
         if not self.json:
             errors.print(f"{self.rules} on {self.url}, {self.vehicles} vehicle(s), {arena.name}; ^C ends it")
+
+    def _answered(self, vehicle: Quadrotor) -> None:
+        if not self.json:
+            x, y, z = vehicle.true[:3]
+            where = f"its local frame begins at {x:.2f} {y:.2f} {z:.2f}"
+            errors.print(f"PX4 on {self.url}, {vehicle.arena.name}; {where}; ^C ends it")

@@ -20,6 +20,7 @@ from dataclasses import dataclass
 from messaging.clock import Clock
 from messaging.links import Link
 from sim.autopilot.endpoint import TICK, Autopilot
+from sim.quadrotor import Quadrotor
 
 TRUTH_RATE = 25.0  # Hz
 PATIENCE = 0.25  # s that it may be late before it gives up catching up
@@ -32,13 +33,13 @@ class Truth:
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._address = (host, port)
 
-    def send(self, autopilot: Autopilot, collisions: int) -> None:
-        vehicle = autopilot.vehicle
+    def send(self, system: int, time: float, vehicle: Quadrotor, collisions: int) -> None:
+        """time: s since the autopilot was switched on; collisions: touches of an obstacle since then."""
         state = vehicle.state()
         clearance = float(vehicle.clearance(state[:3]))
         told = {
-            "system": autopilot.system,
-            "time": round(autopilot.pilot.time, 3),
+            "system": system,
+            "time": round(time, 3),
             "state": state.tolist(),
             "collisions": collisions,
             "clearance": clearance if math.isfinite(clearance) else None,
@@ -94,6 +95,6 @@ def serve(
             if out := autopilot.take():
                 link.send(out)
             if truth is not None and (begun or tally.ticks % every == 0):
-                truth.send(autopilot, touches[i])
+                truth.send(autopilot.system, autopilot.pilot.time, autopilot.vehicle, touches[i])
         tally.ticks += 1
     return tally
