@@ -34,7 +34,6 @@ class Hil:
     """
 
     def __init__(self, connection: socket.socket, vehicle: Quadrotor, sensors: Sensors) -> None:
-        connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         self.vehicle, self.shift = vehicle, (0.0, 0.0, 0.0)
         self.armed = False  # it lets the rotors turn
         self.unanswered = 0  # steps on which no answer came in time
@@ -72,9 +71,6 @@ class Hil:
             raise AutopilotGone("the autopilot closed the connection") from error
         self._wait()
         vehicle.fly(1)
-
-    def close(self) -> None:
-        self._connection.close()
 
     def _wait(self) -> None:
         """For the command that belongs to the newest sensors; before the first one ever, not for long."""

@@ -18,10 +18,9 @@ from sim.flight import GRAVITY, Body
 AIRFRAME = "none_iris"  # the one of PX4's own that expects its simulator at a TCP port
 FIRST_PORT = 4560  # of the simulator of instance 0; PX4's scripts add the instance
 INSTANCES = range(10, 200)  # PX4's own tools start with 0
-# Becomes PX4, and ends with us: without a simulator it would wait forever (1: PR_SET_PDEATHSIG, 15: SIGTERM)
-LAUNCH = "import ctypes, os, sys; ctypes.CDLL(None).prctl(1, 15); os.execv(sys.argv[1], sys.argv[1:])"
+# Becomes PX4, and ends with us: without a simulator it would wait forever (1: PR_SET_PDEATHSIG, 9: SIGKILL)
+LAUNCH = "import ctypes, os, sys; ctypes.CDLL(None).prctl(1, 9); os.execv(sys.argv[1], sys.argv[1:])"
 STARTS_IN = 30.0  # s until it must have connected
-ENDS_IN = 5.0  # s
 ALIAS = re.compile(r"^alias (\w+)='px4-", re.MULTILINE)
 
 BODY = Body()
@@ -79,13 +78,10 @@ class Px4:
         (root / "bin" / "px4-rc.mavlink").write_text("#!/bin/sh\n" + mavlink)
         instance, self._listener = _free_instance()
         environment = os.environ | {"PX4_SIM_MODEL": AIRFRAME, "PATH": f"{root / 'bin'}:{os.environ['PATH']}"}
-        command = [
-            sys.executable, "-I", "-c", LAUNCH, str(root / "bin" / "px4"), "-d", "-i", str(instance), "-w", str(root / "rootfs"), str(etc),
-            "-s", "etc/init.d-posix/rcS",
-        ]  # fmt: skip
+        program = [str(root / "bin" / "px4"), "-d", "-i", str(instance), "-w", str(root / "rootfs"), str(etc)]
         with self.log.open("wb") as output:
             self._process = subprocess.Popen(
-                command,
+                [sys.executable, "-I", "-c", LAUNCH, *program, "-s", "etc/init.d-posix/rcS"],
                 cwd=root / "rootfs",
                 env=environment,
                 stdin=subprocess.DEVNULL,
@@ -96,8 +92,9 @@ class Px4:
         try:
             self.connection = self._accept()
         except BaseException:
-            self.close()
+            self._end()
             raise
+        self.connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
 
     @property
     def alive(self) -> bool:
@@ -109,12 +106,12 @@ class Px4:
 
     def close(self) -> None:
         """End it, and leave nothing behind."""
-        self._process.terminate()
-        try:
-            self._process.wait(ENDS_IN)
-        except subprocess.TimeoutExpired:  # in lockstep its clock stands still, and with it whatever it waits for
-            self._process.kill()
-            self._process.wait()
+        self.connection.close()
+        self._end()
+
+    def _end(self) -> None:
+        self._process.kill()  # asked kindly it would wait for a clock that stands still
+        self._process.wait()
         self._listener.close()
         self._place.cleanup()
 

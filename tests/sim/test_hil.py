@@ -1,0 +1,128 @@
+"""What a real autopilot is told of our vehicle, and that time waits for its answer; the autopilot is a stand-in."""
+
+from __future__ import annotations
+
+import math
+import socket
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sim.autopilot import frames
+from sim.autopilot.dialect import mavlink
+from sim.autopilot.hil import AutopilotGone, Hil
+from sim.autopilot.px4 import Px4, Px4Error
+from sim.autopilot.sensors import DECLINATION, INCLINATION, SensorNoise, Sensors
+from sim.flight import GRAVITY
+from sim.flight_estimator import Estimate, QuadrotorNoise
+from sim.quadrotor import Quadrotor
+from sim.world import Arena, staged_arena
+
+HOVER = 1.2 * 9.81 / 4.0 / 8.8  # of a rotor's full thrust
+
+
+def field() -> Arena:
+    return staged_arena(start=(0.0, 0.0, 10.0), goal=(9.0, 9.0, 9.0), half_width=500.0, height=500.0)
+
+
+def told(truth: Estimate, scale: float = 0.0, readings: int = 1) -> list[Any]:
+    sensors = Sensors(SensorNoise(scale=scale), np.random.default_rng(0), 0.005)
+    return [m for i in range(readings) for m in sensors.read(truth, truth.position, 5000 * (i + 1))]
+
+
+def at_rest(heading: float) -> Estimate:
+    """heading: rad from east, counterclockwise."""
+    q = (math.cos(0.5 * heading), 0.0, 0.0, math.sin(0.5 * heading))
+    return Estimate((30.0, 40.0, 7.0), (1.0, 2.0, 0.5), q, (0.1, 0.2, 0.3), (0.0, 0.0, GRAVITY))
+
+
+@pytest.mark.parametrize(("heading", "from_north"), [(0.0, 90.0), (0.5 * math.pi, 0.0), (math.pi, -90.0)])
+def test_sensors_without_errors_tell_the_truth_in_their_own_frames(heading: float, from_north: float) -> None:
+    imu, fix = told(at_rest(heading))
+    assert (imu.xacc, imu.yacc, imu.zacc) == pytest.approx((0.0, 0.0, -GRAVITY))
+    assert (imu.xgyro, imu.ygyro, imu.zgyro) == pytest.approx((0.1, -0.2, -0.3))
+    compass = math.degrees(math.atan2(-imu.ymag, imu.xmag) + DECLINATION)  # of a level body, from true north
+    assert math.remainder(compass - from_north, 360.0) == pytest.approx(0.0, abs=1e-6)
+    assert math.atan2(imu.zmag, math.hypot(imu.xmag, imu.ymag)) == pytest.approx(INCLINATION)
+    height = (1.0 - (imu.abs_pressure / 1013.25) ** (1.0 / 5.25588)) / 2.25577e-5
+    assert height == pytest.approx(frames.ALTITUDE + 7.0) and imu.pressure_alt == pytest.approx(height)
+
+    north = math.radians(1e-7 * fix.lat - frames.LATITUDE) * 6371000.0
+    east = math.radians(1e-7 * fix.lon - frames.LONGITUDE) * 6371000.0 * math.cos(math.radians(frames.LATITUDE))
+    assert (east, north, 1e-3 * fix.alt) == pytest.approx((30.0, 40.0, frames.ALTITUDE + 7.0), abs=0.02)
+    assert (fix.vn, fix.ve, fix.vd) == (200, 100, -50)
+    assert fix.cog == round(100.0 * math.degrees(math.atan2(1.0, 2.0)))
+
+
+def test_errors_are_as_large_as_is_said_and_come_from_the_seed() -> None:
+    messages = told(at_rest(0.0), scale=1.0, readings=4000)
+    noise = SensorNoise()
+    force = np.array([m.xacc for m in messages if m.get_type() == "HIL_SENSOR"])
+    fixes = np.array([m.alt for m in messages if m.get_type() == "HIL_GPS"]) * 1e-3
+    assert force.std() == pytest.approx(noise.accelerometer, rel=0.1)
+    assert abs(force.mean()) < 4.0 * noise.accelerometer_bias and abs(force.mean()) > 1e-4
+    assert len(fixes) == 200 and fixes.std() == pytest.approx(noise.gps_position, rel=0.3)
+    again = told(at_rest(0.0), scale=1.0, readings=4000)
+    assert [m.to_dict() for m in again] == [m.to_dict() for m in messages]
+
+
+@contextmanager
+def stand_in(share: float = HOVER, lockstep: int = 1, answers: float = math.inf) -> Iterator[tuple[Hil, list[int]]]:
+    """A simulator's end, and the times that an autopilot at its other end has heard; that one answers every IMU reading
+    with the same share of full thrust, so many times."""
+    ours, theirs = socket.socketpair()
+    vehicle = Quadrotor(field(), np.random.default_rng(0), QuadrotorNoise(scale=0.0))
+    hil = Hil(ours, vehicle, Sensors(SensorNoise(), np.random.default_rng(0), vehicle.timestep))
+    heard: list[int] = []
+
+    def answer() -> None:
+        parser, packer = mavlink.MAVLink(None), mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
+        while data := theirs.recv(65536):
+            for message in parser.parse_buffer(data) or ():
+                if message.get_type() == "HIL_SENSOR" and len(heard) < answers:
+                    heard.append(message.time_usec)
+                    controls = [share] * 4 + [0.0] * 12
+                    reply = mavlink.MAVLink_hil_actuator_controls_message(message.time_usec, controls, 129, lockstep)
+                    theirs.sendall(reply.pack(packer))
+
+    thread = threading.Thread(target=answer)
+    thread.start()
+    try:
+        yield hil, heard
+    finally:
+        ours.shutdown(socket.SHUT_RDWR)
+        thread.join(10.0)
+        ours.close()
+        theirs.close()
+
+
+def test_the_command_of_every_step_moves_the_vehicle_and_time_waits_for_it() -> None:
+    with stand_in() as (hil, heard):
+        for _ in range(200):
+            hil.tick()
+        assert heard == [5000 * (i + 1) for i in range(200)] and hil.unanswered == 0 and hil.armed
+        assert hil.time == pytest.approx(1.0)
+        assert np.abs(hil.vehicle.state()[:6] - [0, 0, 10, 0, 0, 0]).max() < 1e-6  # it hovers
+    with stand_in(share=2.0 * HOVER) as (hil, _):
+        for _ in range(200):
+            hil.tick()
+        assert 8.2 < hil.vehicle.state()[5] < 9.0  # a second at twice its weight, less drag
+
+
+def test_an_autopilot_without_lockstep_or_without_answers_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    with stand_in(lockstep=0) as (hil, _), pytest.raises(AutopilotGone, match="lockstep"):
+        hil.tick()
+    monkeypatch.setattr("sim.autopilot.hil.PATIENCE", 0.02)
+    with stand_in(answers=3) as (hil, _), pytest.raises(AutopilotGone, match="has not answered"):
+        for _ in range(100):
+            hil.tick()
+    assert hil.unanswered == 5
+
+
+def test_a_folder_without_px4_is_said_to_hold_none(tmp_path: Any) -> None:
+    with pytest.raises(Px4Error, match="holds no PX4"):
+        Px4(tmp_path, 14540)

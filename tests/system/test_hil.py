@@ -1,0 +1,140 @@
+"""The real PX4 flies our quadrotor: skipped where neither `$BRAKELINE_PX4` nor `../shared/px4` holds one."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import socket
+import subprocess
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import psutil
+import pytest
+
+from actors.mavlink import Client
+from deploy.run.autopilot import PAD, open_field
+from messaging.shapes import CYLINDER, Obstacle
+from sim.autopilot.hil import Hil
+from sim.autopilot.px4 import Px4
+from sim.autopilot.sensors import SensorNoise, Sensors
+from sim.flight_estimator import QuadrotorNoise
+from sim.quadrotor import Quadrotor
+from tests.system.runs import BRAKELINE, until
+
+PX4 = Path(os.environ.get("BRAKELINE_PX4", Path(__file__).parents[3] / "shared" / "px4"))
+EVERY = 10  # physics steps between two setpoints: 20 Hz
+HEARTBEAT = 200
+POST = Obstacle(CYLINDER, (0.0, -12.0, 5.0), (0.8, 20.0))
+
+pytestmark = pytest.mark.skipif(not (PX4 / "etc").is_dir(), reason="no PX4: neither $BRAKELINE_PX4 nor ../shared/px4")
+
+
+class Flight:
+    """A client that flies PX4 over UDP; time passes only in `run`."""
+
+    def __init__(self, hil: Hil, link: socket.socket, port: int) -> None:
+        self.hil, self.link = hil, link
+        self.client = Client(lambda data: link.sendto(data, ("127.0.0.1", port)))
+        self.setpoint = np.zeros(3)
+        self.count = 0
+
+    def run(self, seconds: float, *setpoint: float) -> None:
+        if setpoint:
+            self.setpoint = np.array(setpoint)
+        for _ in range(round(seconds / self.hil.vehicle.timestep)):
+            if self.count % EVERY == 0:
+                self.client.setpoint(self.setpoint)
+            if self.count % HEARTBEAT == 0:
+                self.client.heartbeat()
+            self.count += 1
+            self.hil.tick()
+            try:
+                self.client.feed(self.link.recv(65536))
+            except BlockingIOError:
+                continue
+
+    def wait(self, condition: Callable[[], bool], seconds: float) -> bool:
+        end = self.hil.time + seconds
+        while not condition() and self.hil.time < end:
+            self.run(0.05)
+        return condition()
+
+    def goes_at(self, *velocity: float) -> bool:
+        """What the simulator knows of it."""
+        return bool(np.abs(self.hil.vehicle.state()[3:6] - velocity).max() < 0.25)
+
+
+@pytest.fixture
+def flight() -> Iterator[Flight]:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as link:
+        link.bind(("127.0.0.1", 0))
+        link.setblocking(False)
+        px4 = Px4(PX4, link.getsockname()[1])
+        try:
+            field = open_field()
+            arena = replace(field, obstacles=(POST, *field.obstacles))
+            rng = np.random.default_rng(0)
+            vehicle = Quadrotor(arena, rng, QuadrotorNoise(scale=0.0), floor=PAD)
+            hil = Hil(px4.connection, vehicle, Sensors(SensorNoise(), rng, vehicle.timestep))
+            yield Flight(hil, link, px4.local)
+        finally:
+            px4.close()
+
+
+def test_px4_flies_our_vehicle_by_its_own_estimate(flight: Flight) -> None:
+    client, hil, vehicle = flight.client, flight.hil, flight.hil.vehicle
+    while not hil.answering:
+        hil.tick()
+    assert flight.wait(lambda: client.position is not None, 60.0), client.texts
+    client.follow_setpoints(flight.wait)
+    client.arm(flight.wait)
+
+    flight.run(0.1, 0.0, 0.0, 1.5)
+    assert flight.wait(lambda: vehicle.state()[2] > 3.0, 20.0), client.texts
+    flight.run(0.1, 0.0, 0.0, 0.0)
+    assert flight.wait(lambda: flight.goes_at(0.0, 0.0, 0.0), 10.0)
+    flight.run(2.0)
+    assert hil.armed and not vehicle.on_floor
+    assert np.linalg.norm(vehicle.state()[3:6]) < 0.15  # it hovers
+    assert client.position is not None
+    start = np.array([0.0, 0.0, PAD + 0.05])  # where its local frame begins
+    assert np.abs(client.position + start - vehicle.state()[:3]).max() < 0.4  # it knows where it is
+
+    for velocity in ((3.0, 0.0, 0.0), (0.0, 2.0, 0.5), (-3.0, 0.0, 0.0)):
+        flight.run(0.1, *velocity)
+        assert flight.wait(lambda v=velocity: flight.goes_at(*v), 10.0), (velocity, vehicle.state())
+    assert not vehicle.collided
+
+    flight.run(0.1, 0.0, 0.0, 0.0)
+    assert flight.wait(lambda: flight.goes_at(0.0, 0.0, 0.0), 10.0)
+    across = -vehicle.state()[0] / 4.0  # m/s, back over the start within four seconds
+    flight.run(4.0, across, 0.0, 0.0)
+    flight.run(0.1, 0.0, -3.0, 0.0)
+    assert flight.wait(lambda: vehicle.collided, 15.0)  # the post is in MuJoCo alone: nobody else could know
+    assert np.linalg.norm(vehicle.state()[:2] - np.array(POST.position[:2])) < 1.5
+    assert hil.unanswered == 0
+
+
+def test_the_command_says_how_fast_it_was_and_leaves_nothing_behind() -> None:
+    words = [*BRAKELINE, "autopilot", "--px4", PX4, "--speed", 0, "--truth", "", "--arena", "default"]
+    begun = subprocess.Popen([*map(str, words)], stderr=subprocess.PIPE, text=True)
+    assert begun.stderr is not None
+    try:
+        assert "its local frame begins at" in begun.stderr.readline()
+        children = psutil.Process(begun.pid).children()
+        begun.send_signal(signal.SIGINT)
+        assert begun.wait(30.0) == 0
+        assert "x real time, 0 steps without an answer" in begun.stderr.read()
+    finally:
+        begun.kill()
+        begun.stderr.close()
+    assert children
+    until(lambda: not any(child.is_running() for child in children), "no PX4 left")
+
+    done = subprocess.run([*map(str, words), "--seconds", "3", "--json"], capture_output=True, text=True, check=True)
+    figures = json.loads(done.stdout)
+    assert figures["simulated"] > 2.5 and figures["speed"] > 0.0 and figures["unanswered"] == 0
