@@ -45,8 +45,9 @@ def policy_named(name: str, robot: Robot, seed: int) -> Policy:
 
 def _trained(robot: Robot) -> Path:
     """Beside the task's file, as robots of other people have it, or in the folder of this repository."""
-    beside = task_of(robot).folder / "trained.safetensors"
-    return beside if beside.is_file() else POLICY_FOLDER / robot.kind / "trained.safetensors"
+    task = task_of(robot)
+    beside = task.folder / "trained.safetensors"
+    return beside if beside.is_file() else POLICY_FOLDER / (task.name or robot.kind) / "trained.safetensors"
 
 
 def driving(mlp: MLP) -> Policy:

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 LATE = "-late"  # ends the name of a robot in real time
+WITH = "+"  # stands between a robot's name and that of another task than its usual one (`messaging.tasks`)
 RAMP, HOLD, FEEDBACK = "ramp", "hold", "feedback"
 FOLLOWED = 1e-6  # of an input's range: two inputs this close are the same (they were rounded to single precision)
 FOLDER = Path(__file__).parents[1] / "robots"
@@ -264,7 +265,8 @@ def shipped() -> tuple[str, ...]:
 
 
 def robot_named(name: str) -> Robot:
-    """The robot of that name, or in the file at that path; with `LATE` at the end, the same in real time.
+    """The robot of that name, or in the file at that path; with `LATE` at the end, the same in real time. Which of its
+    tasks is named too (`ground+tracks`) makes no other robot of it.
 
     A name is one that comes with the program, or one whose file, or model set, was read before.
 
@@ -274,6 +276,8 @@ def robot_named(name: str) -> Robot:
     from messaging.descriptions import read
 
     base = name.removesuffix(LATE)
+    if not base.endswith(".toml"):
+        base = base.partition(WITH)[0]
     robot = _known.get(base)
     if robot is None:
         path = Path(base) if base.endswith(".toml") else FOLDER / f"{base}.toml"

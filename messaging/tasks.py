@@ -1,8 +1,9 @@
 """What is learned with a robot: what its policy observes and is paid, in which arenas, and what stands for the robot.
 
-A task is a file beside the robot's: `robots/NAME.task.toml`, or `my.task.toml` beside `my.toml`. What a task names as
-code (`simulator`, `senses`, `policies`) is `module:name`, or `file.py:name` beside the task; only `deploy` and `sim`
-load it.
+A task is a file beside the robot's: `robots/NAME.task.toml`, or `my.task.toml` beside `my.toml`. A robot that comes
+with the program may have further ones, `robots/NAME+OTHER.task.toml`, each of which says what it is `like`; who asks for
+the robot as `NAME+OTHER` gets it. What a task names as code (`simulator`, `senses`, `policies`) is `module:name`, or
+`file.py:name` beside the task; only `deploy` and `sim` load it.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from typing import Any, Literal
 from pydantic import ConfigDict, TypeAdapter, ValidationError
 
 from messaging.rays import Rays, fan, sphere
-from messaging.robots import FOLDER, FORMER_LAYOUTS, Robot, robot_named
+from messaging.robots import FOLDER, FORMER_LAYOUTS, LATE, WITH, Robot, robot_named
 
 _STRICT = ConfigDict(extra="forbid")
 
@@ -120,6 +121,7 @@ class Task:
     symmetry: Literal["none", "turns"] = "none"  # turns: the world turned by quarters and mirrored is as true
     rivals: Rivals = field(default_factory=Rivals)
     folder: Path = Path()  # where its file lies
+    name: str = ""  # of its file; empty: it has none
 
     @cached_property
     def rays(self) -> Rays:
@@ -186,16 +188,43 @@ def task_of(robot: Robot) -> Task:
 
 
 def learnt(name: str) -> Robot:
-    """`robot_named`, and its task is the file beside the description, if the name is a path."""
+    """`robot_named`, and from now on its task is the one that the name says: the file beside the description, if the
+    name is a path; another than the usual one, if it has a `+`.
+
+    Raises:
+        UnknownRobot; UnknownTask: there is no such other task.
+    """
     robot = robot_named(name)
     if name.endswith(".toml"):
-        _files[robot.kind] = Path(name).with_suffix(".task.toml")
+        _choose(robot, Path(name).with_suffix(".task.toml"))
+    elif WITH in name:
+        path = FOLDER / f"{name.removesuffix(LATE)}.task.toml"
+        if not path.is_file():
+            there = sorted(p.name.removesuffix(".task.toml") for p in FOLDER.glob(f"{robot.kind}{WITH}*.task.toml"))
+            raise UnknownTask(f"there is no {name}; of {robot.kind} there are, besides itself: {', '.join(there)}")
+        _choose(robot, path)
+    elif WITH in _files.get(robot.kind, Path()).name:
+        _choose(robot, None)
     return robot
 
 
+def _choose(robot: Robot, path: Path | None) -> None:
+    """The robot's task is that of this file; None: its usual one."""
+    if _files.get(robot.kind) == path:
+        return
+    _tasks.pop(robot.kind, None)
+    if path is None:
+        del _files[robot.kind]
+    else:
+        _files[robot.kind] = path
+
+
 def address(name: str) -> str:
-    """What another process finds the robot by: the name, or the path made absolute."""
-    return str(Path(name).resolve()) if name.endswith(".toml") else learnt(name).name
+    """What another process finds the robot and its task by: the name, or the path made absolute."""
+    if name.endswith(".toml"):
+        return str(Path(name).resolve())
+    robot = learnt(name)
+    return name if WITH in name else robot.name
 
 
 def enlist(robot: Robot, task: Task) -> None:
@@ -210,15 +239,24 @@ def read(path: Path) -> Task:
         UnknownTask: with every mistake in it.
     """
     try:
-        values = tomllib.loads(path.read_text())
+        values = _with_base(path)
         arenas = values.get("arenas", {})
         values["arenas"] = {name: _alike(arenas, name) for name in arenas}
-        return TypeAdapter(Task).validate_python(values | {"folder": path.parent})
+        return TypeAdapter(Task).validate_python(
+            values | {"folder": path.parent, "name": path.name.removesuffix(".task.toml")}
+        )
     except ValidationError as error:
         lines = "".join(f"\n  {'.'.join(map(str, e['loc']))}: {e['msg']}" for e in error.errors())
         raise UnknownTask(f"{path} is no task:{lines}") from error
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise UnknownTask(f"{path} is no task: {error}") from error
+
+
+def _with_base(path: Path) -> dict[str, Any]:
+    """What a task's file says, with what the one beside it says that it is `like` where it says nothing itself."""
+    own = tomllib.loads(path.read_text())
+    base = own.pop("like", None)
+    return ({} if base is None else _with_base(path.with_name(f"{base}.task.toml"))) | own
 
 
 def _alike(arenas: dict[str, Any], name: str) -> dict[str, Any]:

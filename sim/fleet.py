@@ -147,8 +147,15 @@ class _Member(NavigationEnv):
     def __init__(self, fleet: FleetEnv, i: int, lidar_noise: float) -> None:
         def draw(name: str, rng: np.random.Generator, robot: Robot) -> Arena:
             there = fleet.world.robots
-            others = Others(lambda: np.array([o.true[:2] for j, o in enumerate(there) if j != i]), robot.footprint)
-            return alike(there[i].arena, crowd=others)
+
+            def now() -> Array:
+                return np.array([other.true[:2] for j, other in enumerate(there) if j != i])
+
+            def told() -> tuple[Array, Array]:
+                states = fleet.others(i)
+                return states[:, :2], states[:, 3:4] * np.column_stack([np.cos(states[:, 2]), np.sin(states[:, 2])])
+
+            return alike(there[i].arena, crowd=Others(now, robot.footprint, told))
 
         def make(arena: Arena, rng: np.random.Generator) -> FleetRobot:
             return fleet.world.robots[i]

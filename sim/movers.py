@@ -96,9 +96,10 @@ class Crowd:
 class Others:
     """The other robots of a world, where a lidar sees them: as discs about where they are now."""
 
-    def __init__(self, now: Callable[[], Array], radius: float) -> None:
-        """now: their true positions (n, 2), none for n = 0; radius [m]."""
-        self._now, self._radius = now, radius
+    def __init__(self, now: Callable[[], Array], radius: float, told: Callable[[], tuple[Array, Array]]) -> None:
+        """now: their true positions (n, 2), none for n = 0; radius [m]; told: positions and velocities (n, 2) as they
+        measure them themselves, and say to each other."""
+        self._now, self._radius, self.told = now, radius, told
 
     def __len__(self) -> int:
         return len(self._now())
