@@ -1,9 +1,9 @@
 """What is learned with a robot: what its policy observes and is paid, in which arenas, and what stands for the robot.
 
 A task is a file beside the robot's: `robots/NAME.task.toml`, or `my.task.toml` beside `my.toml`. A robot that comes
-with the program may have further ones, `robots/NAME+OTHER.task.toml`, each of which says what it is `like`; who asks for
-the robot as `NAME+OTHER` gets it. What a task names as code (`simulator`, `senses`, `policies`) is `module:name`, or
-`file.py:name` beside the task; only `deploy` and `sim` load it.
+with the program may have further ones, `robots/NAME+OTHER.task.toml`, each of which says what it is `like`; who asks
+for the robot as `NAME+OTHER` gets it. What a task names as code (`simulator`, `senses`, `policies`) is `module:name`,
+or `file.py:name` beside the task; only `deploy` and `sim` load it.
 """
 
 from __future__ import annotations

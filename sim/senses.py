@@ -91,9 +91,9 @@ class TrackingSenses(GroundSenses):
 
         near·p/d (2), v/`PACE` (2), soon, soon·aside     near = 1 - d/`REACH`,  soon = exp(-t/`SOON`)
 
-    t: seconds until it is nearest to where the robot is now (soon = 0 if that is past); aside: m by which it leaves that
-    place on its right, clipped to ± 1. Differences of the rays would tell less: beams are 10° apart and see what is
-    ahead, the robot itself turns by up to 6° a period, and who is faster than it comes from behind.
+    t: seconds until it is nearest to where the robot is now (soon = 0 if that is past); aside: m by which it leaves
+    that place on its right, clipped to ± 1. Differences of the rays would tell less: beams are 10° apart and see what
+    is ahead, the robot itself turns by up to 6° a period, and who is faster than it comes from behind.
     """
 
     MOST = 4
@@ -134,9 +134,8 @@ class TrackingSenses(GroundSenses):
         soon = np.where(moves & (until > 0.0), np.exp(-np.maximum(until, 0.0) / self.SOON), 0.0)
         aside = np.clip((p[:, 1] * v[:, 0] - p[:, 0] * v[:, 1]) / np.sqrt(square), -1.0, 1.0)
         told = np.zeros((self.MOST, 6))
-        told[: len(p)] = np.column_stack(
-            [(1.0 - distance / self.REACH) * p / distance, v / self.PACE, soon, soon * aside]
-        )
+        near = (1.0 - distance / self.REACH) * p / distance
+        told[: len(p)] = np.column_stack([near, v / self.PACE, soon, soon * aside])
         return told.ravel()
 
 
