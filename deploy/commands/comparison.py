@@ -14,13 +14,13 @@ from deploy.commands.common import Robot, console, errors, say_json
 from deploy.data.pretrain import recipe_for
 from deploy.data.store import method_for, method_path, pretrained
 from deploy.study import compare, conservatism
-from deploy.study.cells import METHODS, NONE, quick
+from deploy.study.cells import METHODS, NONE, Study, quick
 from deploy.study.compare import RESULTS, RUNS, SEEDS, Cell, Job
 from deploy.study.curves import learning_curves, seeds_as_points
 from deploy.study.table import markdown, plain, table
 from deploy.study.tune import Tried, best, try_all, values_for
 from learner.config import TD3Config
-from messaging.tasks import learnt
+from messaging.tasks import address, learnt
 from safety.model_set import Recipe
 from safety.rivals.pretrained import Pretrained
 
@@ -79,6 +79,8 @@ class Compare:
     """Of training; default: the comparison's own for each robot."""
     episodes: int | None = None
     """Of evaluation, a seed and arena."""
+    arenas: tuple[str, ...] = Study.arenas
+    """Of the evaluation; training is in the first. Give other --results where there are some of others."""
     methods: tuple[str, ...] = METHODS
     quick: bool = False
     """A minute or two with the same code: few steps, small networks, one seed; into runs/quick, always anew."""
@@ -106,7 +108,7 @@ class Compare:
             )
         told: dict[str, Any] = {}
         for name in self.robots:
-            robot = learnt(name).name
+            robot = learnt(name).name if name.endswith(".toml") else address(name)
             self._prepare(robot)
             jobs = self._jobs(robot)
             found = compare.complete(jobs, results, runs, self.workers, again, self._say)
@@ -127,7 +129,7 @@ class Compare:
         seeds = self.seeds[:1] if self.quick else self.seeds
         wanted = [study for study in compare.studies(robot, seeds) if study.method in self.methods]
         given = {name: value for name in ("steps", "episodes") if (value := getattr(self, name)) is not None}
-        wanted = [replace(study, penalty=self.penalty, td3=self.td3) for study in wanted]
+        wanted = [replace(study, penalty=self.penalty, td3=self.td3, arenas=self.arenas) for study in wanted]
         jobs: list[Job] = [Cell(replace(quick(study) if self.quick else study, **given)) for study in wanted]
         if self.conservatism and not self.quick:
             jobs.append(conservatism.Conservatism(robot))

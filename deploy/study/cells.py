@@ -22,7 +22,8 @@ from deploy.vehicles import environment
 from learner.config import LearnerConfig, TD3Config
 from learner.core import Learner
 from logs.report import analyse
-from messaging.robots import Robot, robot_named
+from messaging.robots import Robot
+from messaging.tasks import learnt
 from safety.methods import DDPC, Model
 from safety.model_set import Recipe
 from safety.rivals.pretrained import Pretrained
@@ -56,7 +57,7 @@ class Trial:
 class Study:
     """What a cell depends on, besides the version of the code."""
 
-    robot: str
+    robot: str  # and its task, where that is another than the usual one: ground+tracks
     method: str
     seed: int
     steps: int
@@ -98,7 +99,7 @@ def run(study: Study, folder: Path, say: Report = lambda text: None) -> dict[str
         Unconfirmed: a log says something else than was counted.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    robot = robot_named(study.robot)
+    robot = learnt(study.robot)
     models: dict[str, Model] = {}
     for method in {study.method, *(trial.method for trial in study.trials())} - {NONE}:
         models[method] = method_for(robot, method, study.recipe)
@@ -177,6 +178,8 @@ def _confirmed(found: Episodes, log_file: Path) -> dict[str, Any]:
         ("episodes", len(found.rows)),
         ("goals", sum(columns["goal"])),
         ("timeouts", sum(columns["timeout"])),
+        ("contacts_moving", sum(columns["contact_moving"])),
+        ("contacts_standing", sum(columns["contact_standing"])),
     ):
         if logged[name] != counted:
             raise Unconfirmed(f"{log_file} says {logged[name]} {name}, the run counted {counted}")

@@ -24,8 +24,7 @@ from deploy.interpreter import spawning
 from deploy.study import cells
 from deploy.study.cells import METHODS, NONE, Study
 from messaging.files import write_whole
-from messaging.robots import robot_named
-from messaging.tasks import task_of
+from messaging.tasks import learnt, task_of
 
 RESULTS, RUNS = Path("results"), Path("runs/compare")
 EPISODES = 500
@@ -70,7 +69,7 @@ class Cell:
 
 def studies(robot: str, seeds: Iterable[int] = SEEDS, quick: bool = False) -> list[Study]:
     """All cells of a robot's table, seed by seed, so that an interrupted comparison has whole seeds."""
-    steps = task_of(robot_named(robot)).steps
+    steps = task_of(learnt(robot)).steps
     wanted = [Study(robot, method, seed, steps, EPISODES) for seed in seeds for method in METHODS]
     return [cells.quick(study) for study in wanted] if quick else wanted
 

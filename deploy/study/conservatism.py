@@ -19,7 +19,8 @@ from deploy.policies import policy_named
 from deploy.study.evaluate import FRESH, in_process
 from deploy.study.trials import Episodes, evaluate
 from deploy.vehicles import environment
-from messaging.robots import Robot, robot_named
+from messaging.robots import Robot
+from messaging.tasks import learnt
 from safety.certificates import KINDS, CertificateError
 from safety.dataset import BadData
 from safety.model_set import MODES, Recipe
@@ -47,7 +48,7 @@ class Conservatism:
 
     def run(self, folder: Path, say: Callable[[str], object] = lambda text: None) -> dict[str, Any]:
         """A row for each certificate and mode, the refused ones with the reason."""
-        robot = robot_named(self.robot)
+        robot = learnt(self.robot)
         data = recorded(robot)
         rows = []
         for certificate in KINDS:

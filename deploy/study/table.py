@@ -16,6 +16,7 @@ import numpy as np
 from deploy.policies import TRAINED, UNTRAINED
 from deploy.study.cells import METHODS, NONE
 from deploy.study.intervals import Estimate, mean, ratio
+from deploy.study.trials import CONTACTS
 from safety.methods import DDPC
 
 Result = dict[str, Any]
@@ -25,6 +26,7 @@ NAMES = {DDPC: "ours", "sailr": "SAILR", "secas": "SECAS", NONE: "TD3"}
 PAPER = Path(__file__).with_name("paper.json")
 WINDOW = 50  # episodes of training over which a goal rate is taken
 LEARNED = 0.9  # the goal rate that counts as learned
+TOUCHED = ("run into while moving", "run into while standing")  # CONTACTS as a table names them
 
 
 def steps_to_learn(episodes: dict[str, list[float]], steps: int) -> float:
@@ -52,6 +54,7 @@ def evaluation_rows(results: Sequence[Result], trial: str) -> Row:
     return {
         "goal rate": mean(_episodes(results, trial, "goal")),
         "collision rate": mean(_episodes(results, trial, "collision")),
+        **_contacts(results, trial),
         "mean speed [m/s]": ratio(_episodes(results, trial, "speed"), steps),
         "max speed [m/s]": max(max(values) for values in _episodes(results, trial, "fastest")),
         "mean reward": mean(_episodes(results, trial, "reward")),
@@ -59,6 +62,13 @@ def evaluation_rows(results: Sequence[Result], trial: str) -> Row:
         "decision [ms]": float(np.mean([t["mean"] for t in times])),
         "its std [ms]": float(np.mean([t["std"] for t in times])),
     }
+
+
+def _contacts(results: Sequence[Result], trial: str) -> Row:
+    """Contacts with what moves; results that were made before there was any have none."""
+    if any(name not in result["evaluations"][trial]["episodes"] for result in results for name in CONTACTS):
+        return {}
+    return dict(zip(TOUCHED, (mean(_episodes(results, trial, name)) for name in CONTACTS), strict=True))
 
 
 def training_rows(results: Sequence[Result]) -> Row:
@@ -131,7 +141,7 @@ def without_times(value: Any) -> Any:
     return value
 
 
-PERCENT = ("goal rate", "collision rate", "interventions")
+PERCENT = ("goal rate", "collision rate", "interventions", *TOUCHED)
 
 
 def written(name: str, value: Any) -> str:

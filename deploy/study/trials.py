@@ -28,7 +28,11 @@ from sim.policies import Policy, scripted
 
 FLUSH = 2000  # messages between two writes
 RUN = 1  # in place of a process's random number
-COLUMNS = ("steps", "goal", "collision", "timeout", "reward", "speed", "fastest", "interventions", "milliseconds")
+CONTACTS = ("contact_moving", "contact_standing")
+COLUMNS = (
+    *("steps", "goal", "collision", "timeout", "reward", "speed", "fastest", "interventions", "milliseconds"),
+    *CONTACTS,
+)
 
 
 class TrialLog:
@@ -70,7 +74,7 @@ class Episodes:
     """One row per finished episode, and the times of every decision.
 
     steps; goal, collision, timeout (0 or 1); reward without penalties; speed [m/s] summed over steps, and the highest;
-    interventions; milliseconds of policy and method, summed over steps.
+    interventions; milliseconds of policy and method, summed over steps; contact with what moves, moving and standing.
     """
 
     rows: list[tuple[float, ...]] = field(default_factory=list)
@@ -92,6 +96,8 @@ class Episodes:
         row[6] = max(row[6], step.speed)
         row[7] += failsafe or step.decision in (pb.ADJUSTED, pb.RECOVERING)
         row[8] += spent
+        row[9] += step.contact_moving
+        row[10] += step.contact_standing
         self.decisions += 1
         self.milliseconds += spent
         self.squares += spent * spent
@@ -102,7 +108,7 @@ class Episodes:
     def columns(self) -> dict[str, list[float]]:
         """Rounded to what a table could ever show; counts are integers."""
         table = np.array(self.rows).reshape(-1, len(COLUMNS)).T
-        whole = {"steps", "goal", "collision", "timeout", "interventions"}
+        whole = {"steps", "goal", "collision", "timeout", "interventions", *CONTACTS}
         return {
             name: [int(v) for v in values] if name in whole else [round(float(v), 4) for v in values]
             for name, values in zip(COLUMNS, table, strict=True)
