@@ -1,13 +1,19 @@
 """What is observed: the documented order, from the measured state; the lidar from the true one."""
 
+from collections.abc import Iterator
+
 import numpy as np
 import pytest
 
+from messaging.robots import FOLDER, Robot, robot_named
 from messaging.shapes import CYLINDER, Obstacle
-from messaging.tasks import task_of
+from messaging.tasks import MoverKind, UnknownTask, address, learnt, read, task_of
+from messaging.weights import MLP, BadWeights, decode
+from sim.fleet import FleetEnv
 from sim.lidar import Lidar
-from sim.senses import AirSenses, GroundSenses, TurnMemory
-from sim.world import staged_arena
+from sim.movers import Crowd
+from sim.senses import AirSenses, GroundSenses, TrackingSenses, TurnMemory
+from sim.world import alike, staged_arena
 from tests.robots import GROUND, QUADROTOR
 
 RNG = np.random.default_rng(0)
@@ -60,3 +66,79 @@ def test_turn_memory_forgets_within_seconds() -> None:
     for _ in range(10):  # 2 s
         memory.update(0.5, 0.2)
     assert memory.value == pytest.approx(0.5 * (1.0 - np.exp(-1.0)))
+
+
+TRACKS = read(FOLDER / "ground+tracks.task.toml")
+
+
+def test_tracks_say_where_something_is_and_where_it_passes() -> None:
+    senses = TrackingSenses(GROUND, staged_arena(), RNG, 0.0)
+    facing_up = np.array([1.0, 1.0, 0.5 * np.pi, 0.0, 0.0])
+    # 2 m ahead and 0.3 m to the left, coming straight back at 1 m/s; one that stands 1 m to the right; one too far off
+    places, paces = np.array([[0.7, 3.0], [2.0, 1.0], [1.0, -4.0]]), np.array([[0.0, -1.0], [0.0, 0.0], [0.0, 1.0]])
+    told = senses.tracks(facing_up, places, paces)
+    names = TRACKS.observation[-len(told) :]
+    named = dict(zip(names, told.tolist(), strict=True))
+    assert named["track 1 near·left"] == pytest.approx(-(1.0 - 1.0 / 3.5)) and named["track 1 soon"] == 0.0
+    away = np.hypot(2.0, 0.3)
+    assert named["track 2 near·ahead"] == pytest.approx((1.0 - away / 3.5) * 2.0 / away)
+    assert named["track 2 near·left"] == pytest.approx((1.0 - away / 3.5) * 0.3 / away)
+    assert named["track 2 speed ahead [1.2 m/s]"] == pytest.approx(-1.0 / 1.2)
+    assert named["track 2 speed to the left [1.2 m/s]"] == pytest.approx(0.0)
+    assert named["track 2 soon"] == pytest.approx(np.exp(-2.0 / 2.0))
+    # it goes down in the world, 0.3 m to the left of the robot: the robot is on its left
+    assert named["track 2 soon·aside"] == pytest.approx(-0.3 * np.exp(-1.0))
+    assert not told[12:].any()
+    # and once it has passed it comes no more
+    assert senses.tracks(facing_up, np.array([[0.7, 0.5]]), paces[:1])[4] == 0.0
+
+
+def test_what_follows_the_rays_is_the_usual_tasks_and_then_tracks() -> None:
+    usual = task_of(GROUND)
+    assert TRACKS.observed[: usual.observation_dim] == usual.observed and TRACKS.arenas == usual.arenas
+    kind = MoverKind((1, 1), 0.2, 1.2, 1.0, 1.0)
+    arena = alike(staged_arena(), crowd=Crowd(kind, np.array([[2.0, 0.0]]), staged_arena().shapes, 0))
+    state, input = np.zeros(5), np.zeros(2)
+    told = TrackingSenses(GROUND, arena, np.random.default_rng(0), 0.0).observe(state, state, input, 0.0)
+    seen = GroundSenses(GROUND, arena, np.random.default_rng(0), 0.0).observe(state, state, input, 0.0)
+    assert np.array_equal(told[: len(seen)], seen) and len(told) == TRACKS.observation_dim
+    assert told[len(seen)] == pytest.approx(1.0 - 2.0 / 3.5, abs=0.02) and not told[len(seen) + 6 :].any()
+
+
+@pytest.fixture
+def tracking() -> Iterator[Robot]:
+    """The ground robot with its other task, for a while."""
+    yield learnt("ground+tracks")
+    learnt("ground")
+
+
+def test_robots_of_a_fleet_are_tracks_to_each_other(tracking) -> None:
+    env = FleetEnv(tracking, "crossing", 3, 0)
+    env.draw(5)
+    for member in env.members:
+        member.reset(options={"episode_seed": 5})
+    results = [env.step([np.array([0.25, 0.0])] * 3) for _ in range(10)][-1]
+    observation, info = results[0][0], results[0][4]
+    own, others = info["state"], info["others"]
+    nearest = min(others, key=lambda other: np.hypot(*(other[:2] - own[:2])))
+    p, heading = nearest[:2] - own[:2], nearest[2] - own[2]
+    named = dict(zip(task_of(tracking).observed, observation.tolist(), strict=True))
+    near = (1.0 - np.hypot(*p) / 3.5) * np.cos(np.arctan2(p[1], p[0]) - own[2])
+    assert named["track 1 near·ahead"] == pytest.approx(near, abs=1e-5)
+    assert named["track 1 speed ahead [1.2 m/s]"] == pytest.approx(nearest[3] * np.cos(heading) / 1.2, abs=1e-5)
+    assert nearest[3] > 0.2, "it drives"
+    seen = sum(np.hypot(*(other[:2] - own[:2])) < 3.5 for other in others)
+    assert [bool(named[f"track {i} near·ahead"]) for i in (1, 2, 3)] == [i <= seen for i in (1, 2, 3)]
+
+
+def test_a_robots_other_task_is_asked_for_by_name(tracking) -> None:
+    assert tracking is GROUND and task_of(tracking).observation_dim == 50
+    assert address("ground+tracks") == "ground+tracks" and robot_named("ground+tracks-late").late
+    ours = MLP.untrained(tracking, 0).encode()
+    assert learnt("ground") is GROUND and task_of(GROUND).observation_dim == 26, (
+        "by its plain name it has the usual one"
+    )
+    with pytest.raises(BadWeights, match="layout"):
+        decode(ours, GROUND)
+    with pytest.raises(UnknownTask, match=r"of ground there are, besides itself: ground\+tracks"):
+        learnt("ground+trucks")

@@ -21,6 +21,7 @@ from deploy.study.intervals import mean, ratio
 from deploy.study.table import markdown, plain, steps_to_learn, table, without_times
 from learner.pretrain import Fit
 from logs.report import analyse
+from messaging.tasks import learnt
 from messaging.weights import MLP
 from safety.model_set import Recipe
 from tests.robots import GROUND
@@ -185,6 +186,23 @@ def test_methods_share_the_episodes_that_they_are_evaluated_on(cells):
         log = cells[method]["folder"] / f"trained-{method}-default.mcap"
         arenas.append([(r.message.start, r.message.goal) for r in records(log) if r.topic == "episode"])
     assert arenas[0] and all(list(map(str, arena)) == list(map(str, arenas[0])) for arena in arenas)
+
+
+def test_another_task_in_another_arena_has_its_contacts_in_the_table(rivals, tmp_path):
+    """Of its own observation, in `many-walkers`; results from before there were walkers have no such rows."""
+    study = replace(TINY, robot="ground+tracks", method="ddpc", arenas=("many-walkers",), steps=400)
+    try:
+        cell = run(study, tmp_path)
+        assert MLP.load(tmp_path / "policy.safetensors", GROUND).sizes == (50, 16, 16, 2)
+    finally:
+        learnt("ground")
+    episodes = cell["evaluations"]["trained-ddpc-many-walkers"]["episodes"]
+    episodes["contact_standing"] = [1]
+    rows = table([cell])["parts"]["many-walkers"]["ddpc"]
+    assert rows["run into while standing"].value == 1.0 and rows["run into while moving"].value == 0.0
+    assert "| run into while standing | 100.0 % [100.0, 100.0] |" in markdown(table([cell]))
+    del episodes["contact_moving"]
+    assert "run into while standing" not in table([cell])["parts"]["many-walkers"]["ddpc"]
 
 
 def test_only_where_a_policy_and_a_filter_are_crossed_there_are_more_trials():
