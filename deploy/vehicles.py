@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+import atexit
+import os
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 
 from actors.flying import MavlinkVehicle
 from actors.mavlink import Tap
+from actors.px4 import QUIET, Px4Flight, Px4Vehicle
 from messaging.robots import Robot
 from messaging.tasks import task_of
 from sim.arenas import arena_kind, draw_arena
 from sim.autopilot.endpoint import Autopilot
 from sim.autopilot.rules import SETPOINT_TIMEOUT
+from sim.autopilot.sensors import SensorNoise
 from sim.conditions import Conditions
 from sim.envs import NavigationEnv
 from sim.fleet import FleetEnv
@@ -60,6 +65,24 @@ def embedded_quadrotor(
     parameters = {SETPOINT_TIMEOUT[rules]: QUADROTOR.period}
     autopilot = Autopilot(Quadrotor(arena, rng, noise, wind), rules, parameters=parameters, quiet=True)
     return MavlinkVehicle(autopilot, QUADROTOR, tap)
+
+
+def behind_px4(conditions: Conditions, tap: Tap | None = None) -> MakeVehicle:
+    """Makes quadrotors behind the real PX4 in the folder `$BRAKELINE_PX4`: one process flies all their episodes.
+
+    Raises:
+        ValueError: there is no such folder.
+    """
+    folder = os.environ.get("BRAKELINE_PX4")
+    if not folder:
+        raise ValueError("set BRAKELINE_PX4 to the folder of a PX4 that was built for SITL")
+    flight = Px4Flight(Path(folder), SensorNoise(scale=conditions.flight_noise.scale), tap=tap)
+    atexit.register(flight.close)
+
+    def make(arena: Arena, rng: np.random.Generator) -> Px4Vehicle:
+        return Px4Vehicle(flight, Quadrotor(arena, rng, QUIET, conditions.wind), QUADROTOR)
+
+    return make
 
 
 def flight_arena(name: str, seed: int, robot: Robot = QUADROTOR) -> Arena:

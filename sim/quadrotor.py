@@ -178,6 +178,14 @@ class Quadrotor:
         self.controller.reset(math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z)))
         self.flying = True
 
+    def resume(self, other: Quadrotor) -> None:
+        """Go on as another one flies, but from here: its attitude, speeds and rotors."""
+        mine, theirs = self._data, other._data
+        mine.qpos[3:], mine.qvel[:] = theirs.qpos[3:], theirs.qvel
+        mine.act[:], mine.ctrl[:] = theirs.act, theirs.ctrl
+        self.flying, self._acceleration = other.flying, other._acceleration
+        mujoco.mj_forward(self._model, mine)
+
     def seen(self) -> tuple[Vector, Vector]:
         """Position [m] and velocity [m/s] as estimated now: the cheap part of `estimate`, with the same errors."""
         x, y, z = self._data.qpos[:3].tolist()
