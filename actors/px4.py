@@ -22,8 +22,8 @@ from sim.vehicle import Period
 from sim.world import Arena, closing, room_bounds
 
 LISTEN_EVERY, TELL_EVERY = 4, 20  # physics steps between two looks, two setpoints
-INTERVAL = 0.01  # s between two messages of a kind
-FRESH, LATEST = 0.015, 0.02  # s; an estimate that is older is waited for, so long in real time
+INTERVALS = {POSITION: 0.01, ATTITUDE: 0.005, IMU: 0.005}  # s between two messages of a kind, as often as each is made
+FRESH, LATEST = 0.015, 0.25  # s; an estimate that is older is waited for, so long in real time
 READY_IN, UP_IN, STANDS_IN = 90.0, 20.0, 10.0  # s until it knows where it is, has climbed, has come to a stop
 HEIGHT, CLIMB = 3.0, 1.5  # m, m/s, of the takeoff
 STANDING, LEVEL = 0.1, 0.1  # m/s, rad: slower and more upright than that, it hovers
@@ -123,8 +123,8 @@ class Px4Flight:
             self.hil.tick()
         if not self.wait(lambda: self.client.position is not None, READY_IN):
             raise MavlinkError(f"PX4 does not know where it is; its last words:\n{px4.last_words()}")
-        for kind in (POSITION, ATTITUDE, IMU):
-            self.client.stream(kind, INTERVAL, self.wait)
+        for kind, interval in INTERVALS.items():
+            self.client.stream(kind, interval, self.wait)
         self.client.follow_setpoints(self.wait)
         self.client.arm(self.wait)
         self.tell(np.array([0.0, 0.0, CLIMB]))

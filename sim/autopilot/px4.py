@@ -20,6 +20,7 @@ FIRST_PORT = 4560  # of the simulator of instance 0; PX4's scripts add the insta
 INSTANCES = range(10, 200)  # PX4's own tools start with 0
 # Becomes PX4, and ends with us: without a simulator it would wait forever (1: PR_SET_PDEATHSIG, 9: SIGKILL)
 LAUNCH = "import ctypes, os, sys; ctypes.CDLL(None).prctl(1, 9); os.execv(sys.argv[1], sys.argv[1:])"
+TRACES = ("px4-sock-{}", "px4_lock-{}")  # files of an instance in the folder for such
 STARTS_IN = 30.0  # s until it must have connected
 ALIAS = re.compile(r"^alias (\w+)='px4-", re.MULTILINE)
 
@@ -77,6 +78,7 @@ class Px4:
         mavlink = f"mavlink start -x -u {self.local} -r 4000000 -f -m onboard -o {remote}\n"
         (root / "bin" / "px4-rc.mavlink").write_text("#!/bin/sh\n" + mavlink)
         instance, self._listener = _free_instance()
+        self._traces = [Path(tempfile.gettempdir(), name.format(instance)) for name in TRACES]
         environment = os.environ | {"PX4_SIM_MODEL": AIRFRAME, "PATH": f"{root / 'bin'}:{os.environ['PATH']}"}
         program = [str(root / "bin" / "px4"), "-d", "-i", str(instance), "-w", str(root / "rootfs"), str(etc)]
         with self.log.open("wb") as output:
@@ -113,6 +115,8 @@ class Px4:
         self._process.kill()  # asked kindly it would wait for a clock that stands still
         self._process.wait()
         self._listener.close()
+        for trace in self._traces:
+            trace.unlink(missing_ok=True)
         self._place.cleanup()
 
     def _accept(self) -> socket.socket:
@@ -140,7 +144,7 @@ def _parts(folder: Path) -> tuple[Path, Path, Path]:
 def _free_instance() -> tuple[int, socket.socket]:
     """One that no other PX4 of this machine has, and where its simulator is to listen."""
     for instance in INSTANCES:
-        with Path(tempfile.gettempdir(), f"px4_lock-{instance}").open("a") as lock:
+        with Path(tempfile.gettempdir(), TRACES[1].format(instance)).open("a") as lock:
             try:
                 fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
                 return instance, socket.create_server(("127.0.0.1", FIRST_PORT + instance))

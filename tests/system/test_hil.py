@@ -17,18 +17,20 @@ import psutil
 import pytest
 
 from actors.mavlink import Client
+from actors.px4 import FIELD, QUIET, Px4Flight, Px4Vehicle
 from deploy.run.autopilot import PAD, open_field
 from messaging.shapes import CYLINDER, Obstacle
+from messaging.tasks import learnt
 from sim.autopilot.hil import Hil
 from sim.autopilot.px4 import Px4
 from sim.autopilot.sensors import SensorNoise, Sensors
-from sim.flight_estimator import QuadrotorNoise
 from sim.quadrotor import Quadrotor
 from tests.system.runs import BRAKELINE, until
 
 PX4 = Path(os.environ.get("BRAKELINE_PX4", Path(__file__).parents[3] / "shared" / "px4"))
 EVERY = 10  # physics steps between two setpoints: 20 Hz
 HEARTBEAT = 200
+ROBOT = Path(__file__).parents[2] / "examples" / "px4" / "quadrotor_px4.toml"
 POST = Obstacle(CYLINDER, (0.0, -12.0, 5.0), (0.8, 20.0))
 
 pytestmark = pytest.mark.skipif(not (PX4 / "etc").is_dir(), reason="no PX4: neither $BRAKELINE_PX4 nor ../shared/px4")
@@ -77,6 +79,10 @@ class Flight:
         return bool(np.abs(self.hil.vehicle.state()[3:6] - velocity).max() < 0.25)
 
 
+def px4s(process: psutil.Process) -> list[psutil.Process]:
+    return [child for child in process.children() if "px4" in child.name()]
+
+
 @pytest.fixture
 def flight() -> Iterator[Flight]:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as link:
@@ -87,7 +93,7 @@ def flight() -> Iterator[Flight]:
             field = open_field()
             arena = replace(field, obstacles=(POST, *field.obstacles))
             rng = np.random.default_rng(0)
-            vehicle = Quadrotor(arena, rng, QuadrotorNoise(scale=0.0), floor=PAD)
+            vehicle = Quadrotor(arena, rng, QUIET, floor=PAD)
             hil = Hil(px4.connection, vehicle, Sensors(SensorNoise(), rng, vehicle.timestep))
             yield Flight(hil, link, px4.local)
         finally:
@@ -127,13 +133,39 @@ def test_px4_flies_our_vehicle_by_its_own_estimate(flight: Flight) -> None:
     assert hil.unanswered == 0
 
 
+def test_episodes_follow_each_other_in_the_air_and_after_a_crash_px4_starts_again() -> None:
+    robot = learnt(str(ROBOT))
+    flight = Px4Flight(PX4, SensorNoise())
+    try:
+        for episode, wanted in enumerate(((2.0, -1.0, 0.5), (-4.0, 3.0, 0.0), (0.0, 0.0, -3.0))):
+            if episode == 2:
+                for process in px4s(psutil.Process()):
+                    process.kill()
+                    process.wait()
+            start = (50.0 * episode, -20.0, 400.0)
+            vehicle = Px4Vehicle(
+                flight, Quadrotor(replace(FIELD, start=start), np.random.default_rng(episode), QUIET), robot
+            )
+            assert np.abs(vehicle.true[:6] - [*start, 0.0, 0.0, 0.0]).max() < 0.2
+            before = vehicle.measured
+            for _ in range(15):
+                period = vehicle.step(np.array(wanted))
+                assert (np.abs(period.measured - period.true) < robot.measurement_bound).all()
+                assert np.abs(period.subsamples[-1] - (period.measured - before)[:3]).max() < 1e-6
+                before = period.measured
+            assert np.abs(vehicle.true[3:6] - wanted).max() < 0.3
+        assert flight.starts == 2
+    finally:
+        flight.close()
+
+
 def test_the_command_says_how_fast_it_was_and_leaves_nothing_behind() -> None:
     words = [*BRAKELINE, "autopilot", "--px4", PX4, "--speed", 0, "--truth", "", "--arena", "default"]
     begun = subprocess.Popen([*map(str, words)], stderr=subprocess.PIPE, text=True)
     assert begun.stderr is not None
     try:
         assert "its local frame begins at" in begun.stderr.readline()
-        children = psutil.Process(begun.pid).children()
+        children = px4s(psutil.Process(begun.pid))
         begun.send_signal(signal.SIGINT)
         assert begun.wait(30.0) == 0
         assert "x real time, 0 steps without an answer" in begun.stderr.read()
