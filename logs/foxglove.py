@@ -14,6 +14,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
+import numpy as np
 from google.protobuf.message import Message
 
 from logs import scene
@@ -22,6 +23,7 @@ from logs.segment import Entry
 from messaging import brakeline_pb2 as pb
 from messaging.bus import Sample
 from messaging.robots import Robot, robot_named
+from messaging.surroundings import promised
 from messaging.tasks import task_of
 from messaging.topics import EPISODE, EXCHANGE, LOG, STEP
 
@@ -61,6 +63,7 @@ class _Actor:
     site: tuple[float, float]
     exchange: Decode | None = None  # the latest; decoded if it is drawn
     waiting: tuple[pb.Step, int] | None = None  # a step to be drawn, and when it came
+    last: pb.Exchange | None = None  # the latest that was decoded
     drawn: float = -math.inf  # s
 
 
@@ -137,6 +140,7 @@ class Pictures:
         exchange: pb.Exchange | None = None
         if step.decision != pb.UNKNOWN:
             exchange = actor.exchange() if actor.exchange is not None else None
+            actor.last = exchange or actor.last
             asked = (-1, -1) if exchange is None else (exchange.request.episode, exchange.request.step)
             if asked < (step.episode, step.step):
                 return []
@@ -146,9 +150,17 @@ class Pictures:
         robot, name = actor.robot, actor.name
         return [
             _entry(actor, "frames", scene.frames(robot, name, actor.site, step.state, time), time),
-            _entry(actor, "decision", scene.decision(robot, step, exchange, time), time),
+            _entry(actor, "decision", scene.decision(robot, step, exchange, time, self._promises(exchange)), time),
             _entry(actor, "lidar", scene.lidar(task_of(robot).rays, name, step.next_observation, time), time),
         ]
+
+    def _promises(self, exchange: pb.Exchange | None) -> list[np.ndarray]:
+        """What the other robots of its world promised last, as far as it was drawn."""
+        if exchange is None:
+            return []
+        others = set(exchange.request.fleet) - {exchange.request.actor}
+        told = [(a.robot, a.last) for a in self._actors.values() if a.name in others and a.last is not None]
+        return [promised(robot, last) for robot, last in told]
 
     def _log_line(self, key: str, decode: Decode, time: int) -> list[Entry]:
         return [_stored(f"{ROOT}/log", scene.log_line(decode(), time), time)]

@@ -36,6 +36,7 @@ class Held:
     closest: float = math.inf  # m
     failsafes: int = 0
     questions: Iterable[pb.Exchange] = ()  # some of which belong to it
+    others: Iterable[pb.Exchange] = ()  # of the other robots of its world, some of which belong to it
 
     def take(self, step: pb.Step) -> None:
         if len(self.steps) < MOST_STEPS:
@@ -49,6 +50,14 @@ class Held:
     def exchanges(self) -> dict[int, pb.Exchange]:
         """Its questions and their answers, by step."""
         return {e.request.step: e for e in self.questions if e.request.episode == self.number}
+
+    def beside(self) -> dict[int, list[pb.Exchange]]:
+        """The others' questions and their answers, by step."""
+        found: dict[int, list[pb.Exchange]] = {}
+        for e in self.others:
+            if e.request.episode == self.number:
+                found.setdefault(e.request.step, []).append(e)
+        return found
 
     @property
     def actor(self) -> str:
@@ -137,7 +146,7 @@ class Gallery:
     def _ended(self, source: Source, held: Held) -> None:
         """Keep the episode if it is worth it. Its picture is made only then."""
         order, self._count = self._count, self._count + 1
-        held.questions = source.exchanges
+        held.questions, held.others = source.exchanges, self._others(source, held)
         self.last = replace(held, questions=list(source.exchanges))
         if math.isfinite(held.closest):
             self._push(self._nearest, -held.closest, NEAREST, held, order)
@@ -152,6 +161,12 @@ class Gallery:
                 self._spread = {k: item for k, item in self._spread.items() if k % self._stride == 0}
         if held.number == self.wanted and self.actor in (None, held.actor):
             self.found.append(self._picture(held, order) | {"rows": list(rows(held, self.robot))})
+
+    def _others(self, source: Source, held: Held) -> list[pb.Exchange]:
+        """What the other robots of its world asked and were answered; alone: nothing."""
+        own = next((e.request for e in source.exchanges if e.request.episode == held.number), None)
+        names = [] if own is None else [self.label + name for name in own.fleet if name != own.actor]
+        return [e for name in names if name in self._sources for e in self._sources[name].exchanges]
 
     def _push(self, heap: list[tuple[float, int, Figures]], worth: float, most: int, held: Held, order: int) -> None:
         if len(heap) < most:

@@ -10,8 +10,10 @@ from logs.tally import KINDS, Figures
 from messaging import brakeline_pb2 as pb
 from messaging.explained import explain, fell_back, fits
 from messaging.robots import Robot
+from messaging.surroundings import promised, surroundings
 
 MOST_TUBES = 40  # of a picture
+CORNERS, HITS = 48, 90  # of the outline of free space, and beams that hit, in a picture of a step
 NEAR = 8  # steps before and after the closest approach whose tubes are drawn
 
 # Of decisions, one for each step: none, a(l)lowed, a(d)justed, f(a)ilsafe, r(e)covering.
@@ -32,6 +34,8 @@ class Seen(Protocol):
     def actor(self) -> str: ...
 
     def exchanges(self) -> dict[int, pb.Exchange]: ...
+
+    def beside(self) -> dict[int, list[pb.Exchange]]: ...
 
     def outcome(self) -> str: ...
 
@@ -61,7 +65,7 @@ def picture(seen: Seen, robot: Robot | None) -> Figures:
         "heading": _headings(steps, robot),
         "clearance": _rounded(step.clearance for step in steps),
         "speed": _rounded(step.speed for step in steps),
-        "tubes": _tubes(steps, exchanges, closest, robot),
+        "tubes": _tubes(seen, exchanges, closest, robot),
     }
 
 
@@ -126,10 +130,9 @@ def _said(exchange: pb.Exchange | None, robot: Robot | None) -> str:
     return explain(robot, request, decision).said if fits(robot, request, decision) else ""
 
 
-def _tubes(
-    steps: Sequence[pb.Step], exchanges: Mapping[int, pb.Exchange], closest: int, robot: Robot | None
-) -> dict[int, Figures]:
+def _tubes(seen: Seen, exchanges: Mapping[int, pb.Exchange], closest: int, robot: Robot | None) -> dict[int, Figures]:
     """By place in the picture: those about the closest approach, then those of the nearest interventions."""
+    steps, beside = seen.steps, seen.beside()
     near = [k for k in range(len(steps)) if abs(k - closest) <= NEAR]
     others = [k for k, step in enumerate(steps) if step.decision in STEPPED_IN and k not in near]
     others.sort(key=lambda k: steps[k].clearance)
@@ -138,7 +141,7 @@ def _tubes(
         exchange = exchanges.get(steps[k].step)
         tube = None if exchange is None else _tube(exchange.request, exchange.reply.decision)
         if exchange is not None and tube is not None:
-            found[k] = tube | _explained(exchange, robot)
+            found[k] = tube | _explained(exchange, robot) | _told(exchange, beside.get(steps[k].step, ()), robot)
     return found
 
 
@@ -175,6 +178,20 @@ def _explained(exchange: pb.Exchange, robot: Robot | None) -> Figures:
         "arrows": [_rounded(about.proposed[:2]), _rounded(about.executed[:2])],
         "edge": [*_rounded(about.at[:2]), *_rounded(about.normal[:2])] if len(about.at) else None,
     }
+
+
+def _told(exchange: pb.Exchange, beside: Iterable[pb.Exchange], robot: Robot | None) -> Figures:
+    """What the filter was told of the surroundings, of which there is any; and where others promised to be."""
+    if robot is None:
+        return {}
+    try:
+        around = surroundings(robot, exchange.request, CORNERS).flat(HITS)
+    except ValueError:  # it tells of what can't be: it was refused
+        return {}
+    d = robot.position_dim
+    boxes = [box for other in beside for box in promised(robot, other)]
+    promises = [_rounded((*box[:2], *(box[d : d + 2] + box[-1]))) for box in boxes]
+    return {name: told for name, told in (around | {"promises": promises}).items() if told}
 
 
 def _obstacle(item: pb.Obstacle) -> Figures:

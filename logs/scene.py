@@ -35,6 +35,7 @@ from messaging.explained import Explanation, explain, fell_back, fits
 from messaging.rays import Rays
 from messaging.robots import Robot
 from messaging.shapes import BOX, CYLINDER, SPHERE, WALL
+from messaging.surroundings import Surroundings, surroundings
 
 WORLD = "world"
 HEIGHT = 0.4  # m, of what is drawn of a plane's obstacles
@@ -48,6 +49,8 @@ def _color(red: int, green: int, blue: int, alpha: float = 1.0) -> Color:
 
 SOLID, WALLS, GOAL = _color(120, 128, 140), _color(120, 128, 140, 0.25), _color(52, 168, 100, 0.35)
 PROPOSED, EXECUTED, EDGE = _color(199, 125, 0), _color(31, 95, 191), _color(192, 32, 48, 0.5)
+FREE, HIT, PROMISE = _color(20, 140, 120), _color(90, 40, 140), _color(40, 96, 190, 0.18)
+MOVER, SWEPT = _color(170, 90, 40), _color(170, 90, 40, 0.15)
 BODY, NOSE = _color(40, 96, 190), _color(250, 250, 250)
 KINDS: dict[int, tuple[int, int, int]] = {
     pb.ALLOWED: (52, 168, 100),
@@ -146,9 +149,12 @@ def _body(robot: Robot, actor: str, time: int) -> SceneEntity:
     return body
 
 
-def decision(robot: Robot, step: pb.Step, exchange: pb.Exchange | None, time: int) -> SceneUpdate:
+def decision(
+    robot: Robot, step: pb.Step, exchange: pb.Exchange | None, time: int, promises: Iterable[np.ndarray] = ()
+) -> SceneUpdate:
     """What was decided for the period that ended with this step: the tube's boxes, that of standstill with the body
-    about it, the plan's way through their middles, and a word if the filter stepped in."""
+    about it, the plan's way through their middles, a word if the filter stepped in; and what the filter was told of the
+    surroundings. promises: of the other robots of its world, as `messaging.surroundings.promised`."""
     kind = pb.FAILSAFE if step.fallback else step.decision
     entity = SceneEntity(timestamp=stamp(time), frame_id=step.actor, id="decision")
     color = KINDS.get(kind, (120, 120, 120))
@@ -171,6 +177,8 @@ def decision(robot: Robot, step: pb.Step, exchange: pb.Exchange | None, time: in
             about = explain(robot, exchange.request, made)
             said = f"{WORDS[kind]}: {about.said}"
             _explained(entity, exchange.request.state[:d], about, robot.footprint)
+    if exchange is not None:
+        _told(entity, surroundings(robot, exchange.request), promises)
     if kind in WORDS:
         word = fell_back() if step.fallback else said or WORDS[kind]
         above = HEIGHT + 3.0 * robot.footprint
@@ -193,6 +201,35 @@ def _explained(entity: SceneEntity, start: Sequence[float], about: Explanation, 
         across = 5.0 * size
         edge.size.CopyFrom(_vector(FLAT, across, across if len(about.at) == 3 else FLAT))
         entity.cubes.append(edge)
+
+
+def _told(entity: SceneEntity, about: Surroundings, promises: Iterable[np.ndarray]) -> None:
+    """Add where beams ended, the outline of what they showed to be free, what moves with where it may come to, and the
+    boxes that others promise to be in."""
+    if len(about.free):
+        free = LinePrimitive(type=LinePrimitive.LINE_LOOP, pose=_pose(()), thickness=2.0, scale_invariant=True)
+        free.points.extend(map(_point, about.free))
+        free.color.CopyFrom(FREE)
+        hits = LinePrimitive(type=LinePrimitive.LINE_LIST, pose=_pose(()), thickness=4.0, scale_invariant=True)
+        hits.points.extend(_point((*at, z)) for at in about.hits for z in (0.0, FLAT))
+        hits.color.CopyFrom(HIT)
+        entity.lines.extend([free, hits])
+    swept = about.swept.reshape(-1, about.swept.shape[-1])
+    for discs, color, tall in ((about.movers, MOVER, HEIGHT), (swept, SWEPT, FLAT)):
+        for *at, radius in discs:
+            if len(at) == 3:
+                ball = _vector(*[2.0 * radius] * 3)
+                entity.spheres.append(SpherePrimitive(pose=_pose(at), size=ball, color=color))
+                continue
+            size, place = _vector(2.0 * radius, 2.0 * radius, tall), _pose((*at, 0.5 * tall))
+            entity.cylinders.append(
+                CylinderPrimitive(pose=place, size=size, color=color, bottom_scale=1.0, top_scale=1.0)
+            )
+    for boxes in promises:
+        for box in boxes:
+            d = len(box) // 2
+            edges = [2.0 * (half + box[-1]) for half in box[d:-1]] + [FLAT] * (3 - d)
+            entity.cubes.append(CubePrimitive(pose=_pose(box[:d]), size=_vector(*edges), color=PROMISE))
 
 
 def _along(at: Iterable[float], way: Sequence[float] | np.ndarray) -> Pose:

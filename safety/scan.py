@@ -1,16 +1,8 @@
 """Free space from a scan, as convex cells that hold all that is not known to be free (method §10).
 
-Between two neighbouring beams Δ < 45° apart, free up to ρ from the sensor, everything nearer than
-
-    F = min( ρ / (cos Δ + sin Δ tan(45° + Δ)),  W cos(45° + Δ) / sin Δ )
-
-is free: from a point at d two edges of length W at right angles start, one of them at 45° or less to the beams' normal.
-The gap there is at most d sin Δ wide; if that edge is long enough to leave it, it meets a beam at most at
-d (cos Δ + sin Δ tan(45° + Δ)) from the sensor, where that is free if d < F.
-So a dropped beam costs little near by (2 m for W = 0.1 m), and a blind sector everything. A beam that returns from
-where, by its neighbours, nothing can be is a ghost, and says nothing. Beyond F, and behind every hit, nothing is known:
-occupied. Neighbouring gaps of about the same F make a cell, the convex hull of their near ends and their far ones: a
-wall within reach is a handful of cells.
+Up to F from the sensor a gap between two beams is free (`messaging/gaps.py`). Beyond F, and behind every hit, nothing
+is known: occupied. Neighbouring gaps of about the same F make a cell, the convex hull of their near ends and their far
+ones: a wall within reach is a handful of cells.
 """
 
 from __future__ import annotations
@@ -21,13 +13,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from messaging.gaps import gaps as gaps
 from messaging.scans import Scan
 from safety.freespace import TOUCHING, roomiest
 
 Array = NDArray[np.float64]
 
 SPAN = math.radians(12.0)  # of a cell, about
-STEEPEST = math.radians(89.0)  # 45° and a gap: beyond it an edge may lie along the beams
 JUMP = 0.1  # m between the F of two gaps that do not share a cell
 WIDEST = math.radians(15.0)  # a wider gap is cut into several of the same F, so that hulls stay near the arcs
 
@@ -48,42 +40,6 @@ class Cells:
     def take(self, index: NDArray[np.intp]) -> Cells:
         """The chosen ones."""
         return Cells(self.corners[index], self.error[index], self.speed, self.age)
-
-
-def gaps(scan: Scan) -> tuple[Array, Array, Array]:
-    """Of each gap between two beams that say something: its first angle, its width [rad], and F [m] of the measured
-    ranges, less their error. In the sensor's frame; all round."""
-    known = scan.known
-    angles = scan.angles[known]
-    ranges = np.maximum(np.minimum(scan.ranges[known], scan.far) - scan.range_error, 0.0)
-    if len(angles) > 2 * scan.doubt + 2:
-        lone = _lone(angles, ranges, scan)
-        angles, ranges = angles[~lone], ranges[~lone]
-    if not len(angles):
-        return np.array([-math.pi]), np.array([2.0 * math.pi]), np.zeros(1)
-    width = np.diff(angles, append=angles[0] + 2.0 * math.pi)
-    least = np.minimum(ranges, np.roll(ranges, -1))
-    for k in range(1, min(scan.doubt, len(ranges)) + 1):
-        least = np.minimum(least, np.minimum(np.roll(ranges, k), np.roll(ranges, -1 - k)))
-    return angles, width, _free(least, width, scan.least_width)
-
-
-def _free(least: Array, width: Array, least_width: float) -> Array:
-    """F [m] of gaps of that width [rad] between beams that are free up to `least`."""
-    steep = np.minimum(0.25 * math.pi + width, STEEPEST)
-    free = np.minimum(
-        least / (np.cos(width) + np.sin(width) * np.tan(steep)), least_width * np.cos(steep) / np.sin(width)
-    )
-    return np.where(steep < STEEPEST, free, 0.0)
-
-
-def _lone(angles: Array, ranges: Array, scan: Scan) -> NDArray[np.bool_]:
-    """Beams that return from where, by their neighbours and the least width, nothing can be: ghosts."""
-    width = (np.roll(angles, -1) - np.roll(angles, 1)) % (2.0 * math.pi)
-    beside = np.minimum(np.roll(ranges, 1), np.roll(ranges, -1))
-    for k in range(2, scan.doubt + 2):
-        beside = np.minimum(beside, np.minimum(np.roll(ranges, k), np.roll(ranges, -k)))
-    return np.asarray(ranges + 2.0 * scan.range_error < _free(beside, width, scan.least_width))
 
 
 def cells(scan: Scan, within: float) -> Cells:

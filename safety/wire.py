@@ -10,7 +10,7 @@ from google.protobuf.message import DecodeError
 from numpy.typing import NDArray
 
 from messaging import brakeline_pb2 as pb
-from messaging.motion import Motion, Sighting
+from messaging import surroundings
 from messaging.movers import parted
 from messaging.robots import Robot
 from messaging.scans import BadScan, Scan
@@ -117,7 +117,7 @@ def obstacles_of(messages: Sequence[pb.Obstacle], dim: int) -> list[Obstacle]:
         try:
             if len(o.position) != dim:
                 raise BadShape("position", f"{len(o.position)} coordinates; this robot's obstacles have {dim}")
-            motion = motion_of(o.motion) if o.HasField("motion") else None
+            motion = surroundings.motion_of(o.motion) if o.HasField("motion") else None
             obstacles.append(Obstacle(o.kind, tuple(o.position), tuple(o.size), o.yaw, o.margin, motion))
         except BadShape as error:
             raise BadRequest(f"obstacles[{i}].{error.field}", str(error)) from error
@@ -126,42 +126,10 @@ def obstacles_of(messages: Sequence[pb.Obstacle], dim: int) -> list[Obstacle]:
 
 def scan_of(m: pb.Scan) -> Scan:
     """Raises BadRequest: it is none."""
-    if len(m.pose) != 3 or len(m.mount) != 2:
-        raise BadRequest("scan", "a scan's pose has 3 coordinates, its mount 2")
-    x, y, heading = m.pose
     try:
-        return Scan(
-            numbers(m.ranges),
-            numbers(m.angles),
-            (x, y, heading),
-            (m.mount[0], m.mount[1]),
-            far=m.far,
-            range_error=m.range_error,
-            position_error=m.position_error,
-            heading_error=m.heading_error,
-            least_width=m.least_width,
-            doubt=m.doubt,
-            speed=m.speed,
-            age=m.age,
-        )
+        return surroundings.scan_of(m)
     except BadScan as error:
         raise BadRequest("scan", str(error)) from error
-
-
-def motion_of(m: pb.Motion) -> Motion:
-    """What an obstacle's message says of how it moves."""
-    before = None
-    if m.before_position or m.before_velocity:
-        before = Sighting(tuple(m.before_position), tuple(m.before_velocity), m.since)
-    return Motion(
-        tuple(m.velocity),
-        m.position_error,
-        m.velocity_error,
-        acceleration=m.acceleration if m.HasField("acceleration") else None,
-        speed=m.speed if m.HasField("speed") else None,
-        age=m.age,
-        before=before,
-    )
 
 
 def promise_of(m: pb.Promise, robot: Robot) -> Promise:

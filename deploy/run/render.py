@@ -27,6 +27,7 @@ from messaging import brakeline_pb2 as pb
 from messaging.explained import Explanation, explain
 from messaging.robots import Robot
 from messaging.shapes import BOX, WALL, Obstacle
+from messaging.surroundings import Surroundings, surroundings
 from sim.policies import Policy
 
 Array = NDArray[np.float64]
@@ -36,6 +37,7 @@ COLOURS = {"no filter": "#444444", "allowed": "#0072b2", "adjusted": "#e69f00", 
 COLOURS["recovering"] = "#8e44ad"
 ARROWS = {"proposed": "#c77d00", "executed": "#1f5fbf"}
 EDGE = "#c02030"  # of what the proposal would have crossed
+FREE, HIT, MOVER = "#148c78", "#5a288c", "#aa5a28"  # what the filter was told: a scan, and what moves
 FORMATS = (".png", ".gif", ".mp4")
 SPEED = 3.0  # times as fast as the robot
 REST = 8  # frames that the last picture stands
@@ -57,6 +59,7 @@ class Frame:
     center: Array
     margin: float
     why: Explanation | None = None  # of a decision, one that was not as proposed or not
+    around: Surroundings | None = None  # what the filter, or whoever might have been asked, was told
 
 
 @dataclass(frozen=True)
@@ -87,8 +90,11 @@ def record(driver: Driver, policy: Policy, question: Ask | None, number: int) ->
         heading = 0.0 if driver.robot.heading is None else float(before[driver.robot.heading])
         kind = KINDS.get(step.decision, "no filter")
         why = explain(driver.robot, asked, decision) if len(center) else None
-        frames.append(Frame(before[:d], heading, kind, center - half, center + half, center, decision.margin, why))
-    end = "goal" if step.goal else "collision" if step.collision else "out of time"
+        boxes = center - half, center + half, center
+        around = surroundings(driver.robot, asked)
+        frames.append(Frame(before[:d], heading, kind, *boxes, decision.margin, why, around))
+    touched = step.contact_moving or step.contact_standing
+    end = "goal" if step.goal else "collision" if step.collision else "run into" if touched else "out of time"
     return Film(driver.robot, driver.info["arena"], frames, np.asarray(step.true_state[:d]), end)
 
 
@@ -177,7 +183,11 @@ class _Stage:
         frame = self.film.frames[k]
         for artist in self._moving:
             artist.remove()
-        self._moving = [*self._tube(frame, 0.35), *self._body(frame.position, frame.heading, frame.kind)]
+        self._moving = [
+            *self._told(frame.around),
+            *self._tube(frame, 0.35),
+            *self._body(frame.position, frame.heading, frame.kind),
+        ]
         if len(frame.center):
             points = np.vstack([frame.position, frame.center])
             self._moving += self.axes.plot(
@@ -219,10 +229,26 @@ class _Stage:
             drawn += self.axes.plot(ends[:, 0], ends[:, 1], color=EDGE, linewidth=2.5, zorder=9)
         return drawn
 
+    def _told(self, about: Surroundings | None, alpha: float = 1.0) -> list[Any]:
+        """Where beams ended, what they showed to be free, what moves and where it may come to while a plan lasts."""
+        if about is None:
+            return []
+        drawn: list[Any] = []
+        if len(about.free):
+            outline = Polygon(about.free, closed=True, facecolor=FREE, edgecolor=FREE, alpha=0.12 * alpha, zorder=1)
+            drawn.append(self.axes.add_patch(outline))
+            drawn += self.axes.plot(*about.hits.T, ".", color=HIT, markersize=2, alpha=alpha, zorder=5)
+        for discs, faint in ((about.swept.reshape(-1, about.swept.shape[-1]), 0.12), (about.movers, 0.8)):
+            for disc in discs:
+                circle = Circle(disc[:2], disc[-1], color=MOVER, alpha=faint * alpha, linewidth=0, zorder=3)
+                drawn.append(self.axes.add_patch(circle))
+        return drawn
+
     def all_at_once(self) -> None:
         """The whole way; the tubes of a few plans; where it was corrected."""
         frames = self.film.frames
         for k in np.unique(np.linspace(0, len(frames) - 1, 16).astype(int)):
+            self._told(frames[k].around, 0.2)
             self._tube(frames[k], 0.18)
             self._body(frames[k].position, frames[k].heading, frames[k].kind, alpha=0.25)
         self._body(self.film.last, frames[-1].heading, frames[-1].kind)

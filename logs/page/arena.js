@@ -45,7 +45,7 @@ function path(v, episode, last, faint) {
     const here = [x[k], y[k]];
     if (run?.kind !== kinds[k]) { flush(); run = { kind: kinds[k], points: [point(previous)] }; }
     run.points.push(point(here));
-    if (!faint && (kinds[k] === "d" || kinds[k] === "a")) parts.push(tag("circle", { cx: v.x(here[0]), cy: v.y(here[1]), r: kinds[k] === "a" ? 3.4 : 2.2, fill: KINDS[kinds[k]].color }));
+    if (!faint && "dae".includes(kinds[k])) parts.push(tag("circle", { cx: v.x(here[0]), cy: v.y(here[1]), r: kinds[k] === "a" ? 3.4 : 2.2, fill: KINDS[kinds[k]].color }));
     previous = here;
   }
   flush();
@@ -61,6 +61,18 @@ function tube(v, t, footprint) {
   }
   const points = [t.from, ...t.boxes].map(([x, y]) => `${v.x(x).toFixed(1)},${v.y(y).toFixed(1)}`).join(" ");
   parts.push(tag("polyline", { points, fill: "none", stroke: "#4b2a8c", "stroke-width": 1.6, "stroke-dasharray": "3 2" }));
+  return parts;
+}
+
+const FREE = "#148c78", HIT = "#5a288c", MOVER = "#aa5a28", PROMISE = "#2860be"; // what the filter was told
+
+/** What a scan hit and showed to be free, what moves and may come to where, where other robots promise to be. */
+function told(v, { free = [], hits = [], movers = [], swept = [], promises = [] }) {
+  const parts = free.length ? [polygon(v, free, { fill: FREE, "fill-opacity": 0.07, stroke: FREE, "stroke-width": 1, class: "free" })] : [];
+  parts.push(...hits.map(([x, y]) => tag("circle", { cx: v.x(x), cy: v.y(y), r: 1.3, fill: HIT, class: "hit" })));
+  parts.push(...swept.flat().map(([x, y, radius]) => tag("circle", { cx: v.x(x), cy: v.y(y), r: v.per * radius, fill: MOVER, "fill-opacity": 0.12, class: "swept" })));
+  parts.push(...movers.map(([x, y, radius]) => tag("circle", { cx: v.x(x), cy: v.y(y), r: v.per * radius, fill: MOVER, "fill-opacity": 0.8, class: "mover" })));
+  parts.push(...promises.map(([x, y, dx, dy]) => tag("rect", { x: v.x(x - dx), y: v.y(y + dy), width: 2 * v.per * dx, height: 2 * v.per * dy, fill: PROMISE, "fill-opacity": 0.12, stroke: PROMISE, "stroke-opacity": 0.5, class: "promise" })));
   return parts;
 }
 
@@ -108,6 +120,7 @@ function arena(episode, k, size, box = null) {
   const v = view(box || bounds(episode), size);
   const parts = [tag("rect", { x: 0, y: 0, width: v.width, height: v.height, class: "paper" })];
   parts.push(...episode.obstacles.map((o) => obstacle(v, o)));
+  if (episode.tubes[k]) parts.push(told(v, episode.tubes[k]));
   if (episode.goal) parts.push(tag("circle", { cx: v.x(episode.goal[0]), cy: v.y(episode.goal[1]), r: v.per * episode.goal_radius, fill: "#1d7f4e", "fill-opacity": 0.18, stroke: "#1d7f4e", "stroke-dasharray": "4 3" }));
   if (episode.start) parts.push(tag("circle", { cx: v.x(episode.start[0]), cy: v.y(episode.start[1]), r: 3.5, fill: "#fff", class: "ink", "stroke-width": 1.4 }));
   parts.push(path(v, episode, episode.steps - 1, true), path(v, episode, Math.min(k, episode.x.length - 1), false));

@@ -32,7 +32,7 @@ function strip(episode, k) {
   const x = scale(0, Math.max(1, episode.steps - 1), frame.left, frame.right), y = scale(0, most, frame.bottom, frame.top);
   const parts = [label(4, 12, "clearance [m] over steps", { class: "title" }), axes(frame, x, y, ticks(0, episode.steps - 1, 5).filter(Number.isInteger), ticks(0, most, 3))];
   parts.push(tag("polyline", { points: episode.clearance.map((c, i) => `${x(i).toFixed(1)},${y(c).toFixed(1)}`).join(" "), fill: "none", stroke: "#5d6b7c", "stroke-width": 1.3 }));
-  episode.clearance.forEach((c, i) => { if ("da".includes(episode.kinds[i])) parts.push(tag("circle", { cx: x(i), cy: y(c), r: 2.3, fill: KINDS[episode.kinds[i]].color })); });
+  episode.clearance.forEach((c, i) => { if ("dae".includes(episode.kinds[i])) parts.push(tag("circle", { cx: x(i), cy: y(c), r: 2.3, fill: KINDS[episode.kinds[i]].color })); });
   parts.push(tag("line", { x1: x(k), x2: x(k), y1: frame.top, y2: frame.bottom, class: "ink", "stroke-dasharray": "3 3" }));
   return drawing(400, 132, "clearance over the episode", parts);
 }
@@ -57,9 +57,15 @@ class Picker {
     this.facts = element("dl", { class: "facts", id: `${mark}episode-facts` });
     this.strip = element("div");
     target.append(element("div", { class: "split" }, this.map, element("div", {}, this.facts, this.strip)));
-    target.append(legend([...["l", "d", "a"].map((k) => [KINDS[k].color, KINDS[k].name]), ["#7a4fc0", "tube, and the plan in it"], [ARROWS[0], "→ proposed"], [ARROWS[1], "→ executed"], [EDGE, "what the proposal would have crossed"], ["#1d7f4e", "goal"], ["#c9d1da", "obstacles"]]));
+    target.append(legend([...["l", "d", "a", "e"].map((k) => [KINDS[k].color, KINDS[k].name]), ["#7a4fc0", "tube, and the plan in it"], [ARROWS[0], "→ proposed"], [ARROWS[1], "→ executed"], [EDGE, "what the proposal would have crossed"], ["#1d7f4e", "goal"], ["#c9d1da", "obstacles"], ...this.told()]));
     const wanted = this.all.findIndex(({ episode }) => episode.rows);
     this.show(wanted >= 0 ? wanted : Math.max(0, this.all.findIndex(({ near: rank }) => rank === 0)));
+  }
+
+  /** Of what the filter was told, the parts that any picture here shows. */
+  told() {
+    const parts = [["free", FREE, "what the scan showed to be free"], ["hits", HIT, "where beams ended"], ["movers", MOVER, "what moves, and where it may come to"], ["promises", PROMISE, "where other robots promise to be"]];
+    return parts.filter(([name]) => this.all.some(({ episode }) => Object.values(episode.tubes).some((t) => t[name]))).map(([, color, said]) => [color, said]);
   }
 
   choose(robot, order, k) {

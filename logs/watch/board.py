@@ -17,6 +17,7 @@ from messaging.bus import Sample
 from messaging.explained import explain, fits
 from messaging.robots import Robot, UnknownRobot, robot_named
 from messaging.shapes import WALL
+from messaging.surroundings import promised, surroundings
 from messaging.tolerant import headline
 
 LINES = 8  # of warnings
@@ -47,6 +48,9 @@ class Card:
     inputs: list[tuple[str, str, float, float]] = field(default_factory=list)  # name, unit, proposed, executed
     arrows: list[list[float]] = field(default_factory=list)  # of the proposed and the executed input, m
     edge: list[float] = field(default_factory=list)  # of what stopped the proposal: a point, and the normal there
+    around: dict[str, list[Any]] = field(default_factory=dict)  # `Surroundings.flat`
+    fleet: list[str] = field(default_factory=list)  # the actors of its world
+    promise: list[list[float]] = field(default_factory=list)  # boxes: center x, y, half-width x, y with the radius
     trail: deque[tuple[float, float]] = field(default_factory=lambda: deque(maxlen=TRAIL))
     marks: deque[tuple[float, float, str]] = field(default_factory=lambda: deque(maxlen=TRAIL))  # interventions
     reward: float = 0.0
@@ -80,6 +84,10 @@ class Card:
             raise ValueError(f"a tube of {len(centers)} and {len(halves)} numbers")
         self.tube = [[*centers[i : i + 2], *halves[i : i + 2]] for i in range(0, len(centers), d)]
         self.margin, self.at_least = decision.margin, decision.at_least
+        self.around = surroundings(self.robot, exchange.request).flat()
+        self.fleet = list(exchange.request.fleet)
+        boxes = promised(self.robot, exchange)
+        self.promise = [[*box[:2].tolist(), *(box[d : d + 2] + box[-1]).tolist()] for box in boxes]
         self._explain(exchange.request, decision)
 
     def _explain(self, request: pb.Request, decision: pb.Decision) -> None:
@@ -115,7 +123,7 @@ class Card:
     def view(self) -> dict[str, Any]:
         names = (
             *("actor", "number", "arena", "pose", "height", "kind", "tube", "margin", "at_least", "reward", "ended"),
-            *("said", "inputs", "arrows", "edge"),
+            *("said", "inputs", "arrows", "edge", "around"),
         )
         about = {name: getattr(self, name) for name in names}
         lists = {"trail": list(self.trail), "marks": list(self.marks)}
@@ -178,8 +186,13 @@ class Board:
             now = time.monotonic()
             if now - self._figures_at > FIGURES_EVERY:
                 self._figures, self._figures_at = self._count(), now
-            cards = [self._cards[name].view() for name in sorted(self._cards)]
+            cards = [self._cards[name].view() | {"promises": self._promises(name)} for name in sorted(self._cards)]
             return {"robots": cards, "silent": now - self._heard} | self._figures
+
+    def _promises(self, name: str) -> list[list[float]]:
+        """The boxes in which the other robots of its world promise to be."""
+        others = (self._cards[actor] for actor in self._cards[name].fleet if actor != name and actor in self._cards)
+        return [box for card in others for box in card.promise]
 
     def _count(self) -> dict[str, Any]:
         figures = self.metrics.figures()

@@ -4,6 +4,7 @@
 const COLORS = { allowed: "#34a864", adjusted: "#f0961e", failsafe: "#d6303c", recovering: "#8e44ad", "": "#8a93a3" };
 const ARROWS = ["#c77d00", "#1f5fbf"]; // proposed, executed
 const EDGE = "#c02030"; // of what the proposal would have crossed
+const FREE = "#148c78", HIT = "#5a288c", MOVER = "#aa5a28", PROMISE = "#2860be"; // what the filter was told
 const SILENT = 3; // s without a message on the bus after which the run counts as quiet
 const CLOSE = 6; // footprints from the robot to the edge of the close view
 const WINDOW = 20; // episodes that the reward's mean is over
@@ -77,6 +78,7 @@ function drawMap(canvas, robot, [x, y], half) {
   pen.translate(-x, -y);
   pen.lineWidth = 1.5 / scale;
   drawArena(pen, robot.arena, scale);
+  drawAround(pen, robot, scale);
   drawWay(pen, robot, scale);
   drawBody(pen, robot, scale);
   drawTube(pen, robot, scale);
@@ -139,6 +141,41 @@ function drawArena(pen, arena, scale) {
   pen.strokeStyle = COLORS.allowed;
   pen.lineWidth = 2 / scale;
   pen.stroke();
+}
+
+/** What a scan hit and showed to be free, what moves and may come to where, where other robots promise to be. */
+function drawAround(pen, { around, promises }, scale) {
+  const { hits = [], free = [], movers = [], swept = [] } = around;
+  pen.lineWidth = 1.5 / scale;
+  if (free.length) {
+    pen.beginPath();
+    free.forEach(([x, y]) => pen.lineTo(x, y));
+    pen.closePath();
+    pen.strokeStyle = FREE;
+    pen.stroke();
+    pen.fillStyle = "rgba(20, 140, 120, 0.07)";
+    pen.fill();
+  }
+  pen.fillStyle = HIT;
+  for (const [x, y] of hits) pen.fillRect(x - 1.2 / scale, y - 1.2 / scale, 2.4 / scale, 2.4 / scale);
+  const disc = ([x, y, radius]) => {
+    pen.beginPath();
+    pen.arc(x, y, radius, 0, 2 * Math.PI);
+    pen.fill();
+  };
+  pen.fillStyle = MOVER;
+  pen.globalAlpha = 0.12;
+  swept.flat().forEach(disc);
+  pen.globalAlpha = 0.8;
+  movers.forEach(disc);
+  pen.fillStyle = pen.strokeStyle = PROMISE;
+  for (const [x, y, dx, dy] of promises) {
+    pen.globalAlpha = 0.12;
+    pen.fillRect(x - dx, y - dy, 2 * dx, 2 * dy);
+    pen.globalAlpha = 0.5;
+    pen.strokeRect(x - dx, y - dy, 2 * dx, 2 * dy);
+  }
+  pen.globalAlpha = 1;
 }
 
 function drawWay(pen, robot, scale) {

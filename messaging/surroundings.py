@@ -1,0 +1,137 @@
+"""What the filter was told of a robot's surroundings, for whoever draws them: what a scan hit and showed to be free,
+what moves and may come to where, and what robots of a fleet promise each other."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from messaging import brakeline_pb2 as pb
+from messaging.gaps import gaps
+from messaging.motion import Motion, Sighting
+from messaging.movers import Movers
+from messaging.robots import Robot
+from messaging.scans import BadScan, Scan
+from messaging.shapes import Obstacle
+
+Array = NDArray[np.float64]
+
+OUTLINE = 120  # corners of what is drawn of free space, about
+
+
+@dataclass(frozen=True)
+class Surroundings:
+    """Of one question, in the world's frame, m.
+
+    hits (k, 2): where beams ended; free (c, 2): the outline of what they showed to be free, as the filter takes it;
+    both empty without a scan. movers (n, d+1): of each that moves its place as measured and the radius of a disc (ball)
+    that holds it; swept (n, N, d+1): one for the end of every period of a plan, which holds wherever it may be then.
+    """
+
+    hits: Array
+    free: Array
+    movers: Array
+    swept: Array
+
+    def flat(self, hits: int = OUTLINE) -> dict[str, list[Any]]:
+        """From above, as JSON can hold it: points x, y and discs x, y, radius, in mm; so many hits at the most."""
+        some = self.hits[:: max(1, -(-len(self.hits) // hits))]
+        return {
+            "hits": some.round(3).tolist(),
+            "free": self.free.round(3).tolist(),
+            "movers": self.movers[..., [0, 1, -1]].round(3).tolist(),
+            "swept": self.swept[..., [0, 1, -1]].round(3).tolist(),
+        }
+
+
+def surroundings(robot: Robot, request: pb.Request, corners: int = OUTLINE) -> Surroundings:
+    """What the request tells; corners: of the outline, about.
+
+    Raises BadShape, BadScan: the request tells of none that are.
+    """
+    hits = free = np.zeros((0, 2))
+    if request.HasField("scan"):
+        scan = scan_of(request.scan)
+        hits, free = _hits(scan), outline(scan, corners)
+    moving = Movers.of([_obstacle(o) for o in request.obstacles if o.HasField("motion")], robot.position_dim)
+    shapes, ends = moving.shapes, robot.period * np.arange(1.0, robot.horizon + 1.0)
+    across: Array = shapes.rho + np.sqrt((shapes.half**2).sum(axis=1))
+    swept = shapes.center[:, None] + moving.moved(ends), (across[:, None] + moving.radius(ends))[..., None]
+    return Surroundings(hits, free, np.column_stack([shapes.center, across]), np.concatenate(swept, axis=2))
+
+
+def _obstacle(o: pb.Obstacle) -> Obstacle:
+    return Obstacle(o.kind, tuple(o.position), tuple(o.size), o.yaw, o.margin, motion_of(o.motion))
+
+
+def motion_of(m: pb.Motion) -> Motion:
+    """What an obstacle's message says of how it moves."""
+    before = None
+    if m.before_position or m.before_velocity:
+        before = Sighting(tuple(m.before_position), tuple(m.before_velocity), m.since)
+    return Motion(
+        tuple(m.velocity),
+        m.position_error,
+        m.velocity_error,
+        acceleration=m.acceleration if m.HasField("acceleration") else None,
+        speed=m.speed if m.HasField("speed") else None,
+        age=m.age,
+        before=before,
+    )
+
+
+def scan_of(m: pb.Scan) -> Scan:
+    """Raises BadScan: it is none."""
+    if len(m.pose) != 3 or len(m.mount) != 2:
+        raise BadScan("a scan's pose has 3 coordinates, its mount 2")
+    x, y, heading = m.pose
+    return Scan(
+        np.fromiter(m.ranges, np.float64, len(m.ranges)),  # `np.array` takes five times as long
+        np.fromiter(m.angles, np.float64, len(m.angles)),
+        (x, y, heading),
+        (m.mount[0], m.mount[1]),
+        far=m.far,
+        range_error=m.range_error,
+        position_error=m.position_error,
+        heading_error=m.heading_error,
+        least_width=m.least_width,
+        doubt=m.doubt,
+        speed=m.speed,
+        age=m.age,
+    )
+
+
+def _hits(scan: Scan) -> Array:
+    """(k, 2)"""
+    at, heading = scan.sensor()
+    hit = scan.known & (scan.ranges < scan.far)
+    angles = heading + scan.angles[hit]
+    return np.asarray(at + scan.ranges[hit, None] * np.column_stack([np.cos(angles), np.sin(angles)]))
+
+
+def outline(scan: Scan, most: int = OUTLINE) -> Array:
+    """Corners (c, 2) of a part of what the scan shows to be free, all round the sensor: neighbouring gaps in groups,
+    each up to the least F of its group."""
+    at, heading = scan.sensor()
+    angles, width, free = gaps(scan)
+    first = np.arange(0, len(free), max(1, 2 * len(free) // most))
+    reach = np.minimum.reduceat(free, first)
+    ends = np.append(angles[first[1:]], angles[-1] + width[-1])
+    sides = heading + np.column_stack([angles[first], ends]).ravel()
+    return np.asarray(at + np.repeat(reach, 2)[:, None] * np.column_stack([np.cos(sides), np.sin(sides)]))
+
+
+def promised(robot: Robot, exchange: pb.Exchange) -> Array:
+    """What a robot of a fleet promises the others from this question on, boxes (N, 2d+1): center, half-widths, and the
+    radius about them; (0, 2d+1): nothing."""
+    decision = exchange.reply.decision
+    promise = decision.promise if decision.HasField("promise") else exchange.request.promise
+    d = robot.position_dim
+    sizes = len(promise.center), len(promise.half_width), d * len(promise.radius)
+    if len(set(sizes)) != 1:
+        return np.zeros((0, 2 * d + 1))
+    boxes = np.reshape(promise.center, (-1, d)), np.reshape(promise.half_width, (-1, d))
+    return np.column_stack([*boxes, np.asarray(promise.radius, float)])

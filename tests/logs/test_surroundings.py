@@ -1,0 +1,95 @@
+"""What the filter was told is in Foxglove's scene, on the live page and in the report, with the promises of others."""
+
+import numpy as np
+import pytest
+
+from logs import scene
+from logs.foxglove import Pictures
+from logs.gallery import Gallery
+from logs.watch.board import Board
+from messaging import brakeline_pb2 as pb
+from messaging.motion import Motion
+from messaging.scans import Scan
+from messaging.shapes import CYLINDER, Obstacle
+from messaging.surroundings import surroundings
+from safety.client import obstacle_messages, scan_message
+from tests.logs.test_foxglove import Say, Studio, episode, step
+from tests.robots import GROUND
+
+FAN = np.linspace(-np.pi, np.pi, 360, endpoint=False)
+WALKER = Obstacle(CYLINDER, (1.0, 0.5), (0.2,), motion=Motion((0.5, 0.0), 0.03, 0.05, acceleration=1.0))
+
+
+def told(actor: str, number: int = 0, x: float = 0.0) -> pb.Exchange:
+    """A robot of a fleet of two that has a scan and sees a walker, and promises to be about x."""
+    promise = pb.Promise(center=[x, 0.0] * 3, half_width=[0.1, 0.2] * 3, radius=[0.15] * 3)
+    decision = pb.Decision(kind=pb.RECOVERING, tube_center=[x, 0.0] * 3, tube_half_width=[0.01] * 6, promise=promise)
+    decision.plan[:] = [0.0] * 6
+    request = pb.Request(
+        robot="ground",
+        actor=actor,
+        step=number,
+        state=[x, 0.0, 0.0, 0.0, 0.0],
+        action=[0.0, 0.0],
+        fleet=["a", "b"],
+        obstacles=obstacle_messages([WALKER]),
+        scan=scan_message(Scan(np.full(360, 2.0), FAN, (x, 0.0, 0.0))),
+    )
+    return pb.Exchange(request=request, reply=pb.Reply(decision=decision))
+
+
+def test_foxgloves_scene_has_it(say: Say) -> None:
+    studio = Studio(say)
+    for actor, x in (("a", 0.0), ("b", 2.0)):
+        studio(f"episode/ground/{actor}", episode(actor))
+        studio(f"exchange/ground/{actor}", told(actor, x=x))
+        drawn = studio(f"step/ground/{actor}", step(0, pb.RECOVERING, actor))
+    shown = drawn["foxglove/decision/ground/b"].entities[0]
+    free, hits = shown.lines[1:]
+    assert max(np.hypot(p.x - 2.0, p.y) for p in free.points) <= 2.0 and len(hits.points) == 2 * 360
+    discs = [round(0.5 * cylinder.size.x, 3) for cylinder in shown.cylinders]
+    swept = surroundings(GROUND, told("b").request).swept[0, :, 2].round(3).tolist()
+    assert 0.2 in discs and set(swept) <= set(discs)
+    boxes = [
+        (c.pose.position.x, round(c.size.x, 6), round(c.size.y, 6)) for c in shown.cubes if c.color == scene.PROMISE
+    ]
+    assert boxes == [(0.0, 0.5, 0.7)] * 3, "the other's alone"
+    assert shown.texts[0].color.r == pytest.approx(142 / 255), "recovering is violet"
+
+
+def test_a_scan_that_is_none_costs_its_picture_only(say: Say) -> None:
+    pictures = Pictures(float("inf"))
+    broken = told("a")
+    broken.request.scan.pose.append(1.0)
+    for key, message in (("episode", episode("a")), ("exchange", broken), ("step", step(0, pb.RECOVERING, "a"))):
+        pictures.of_sample(say(f"{key}/ground/a", message))
+    assert pictures.failures == 1
+
+
+def test_the_live_page_is_told(say: Say) -> None:
+    board = Board()
+    for actor, x in (("a", 0.0), ("b", 2.0)):
+        board.take(say(f"episode/ground/{actor}", episode(actor)))
+        board.take(say(f"exchange/ground/{actor}", told(actor, x=x)))
+    a, b = board.view()["robots"]
+    assert np.allclose(a["promises"], [[2.0, 0.0, 0.25, 0.35]] * 3) and np.allclose(b["promises"][0][0], 0.0)
+    assert a["around"]["movers"] == [[1.0, 0.5, 0.2]] and len(a["around"]["swept"][0]) == 3
+    assert len(a["around"]["free"]) > 50 < len(a["around"]["hits"])
+
+
+def test_a_picture_of_the_report_has_it() -> None:
+    gallery = Gallery("ground")
+    for actor, x in (("a", 0.0), ("b", 2.0)):
+        source = gallery.source(actor)
+        source.about.append(episode(actor))
+        source.exchanges.extend(told(actor, k, x) for k in range(3))
+    for k in range(3):
+        for actor in ("a", "b"):
+            gallery.step(gallery.source(actor), step(k, pb.RECOVERING, actor, clearance=0.5))
+    gallery.close()
+    figures = gallery.figures()
+    pictures = {item["actor"]: item for item in figures["episodes"]}
+    tube = pictures["a"]["tubes"][1]
+    assert tube["promises"] == [[2.0, 0.0, 0.25, 0.35]] * 3 and pictures["b"]["tubes"][1]["promises"][0][0] == 0.0
+    assert tube["movers"] == [[1.0, 0.5, 0.2]] and 20 < len(tube["free"]) <= 48 and len(tube["hits"]) <= 90
+    assert pictures["a"]["kinds"] == "eee"

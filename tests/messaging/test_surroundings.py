@@ -1,0 +1,83 @@
+"""What is drawn of a robot's surroundings: never more free space than there is, and no mover outside of its discs."""
+
+import math
+
+import numpy as np
+import pytest
+
+from messaging import brakeline_pb2 as pb
+from messaging.motion import Motion
+from messaging.shapes import BOX, CYLINDER, Obstacle
+from messaging.surroundings import promised, surroundings
+from safety.client import obstacle_messages, scan_message
+from sim.scanner import Scanner
+from sim.world import staged_arena
+from tests.robots import GROUND, QUADROTOR
+
+
+def scanned(seed: int) -> tuple[pb.Request, object]:
+    """A question with a scan without errors, from the middle of a room with a few obstacles."""
+    rng = np.random.default_rng(seed)
+    angles = np.arange(4) * 0.5 * math.pi + rng.uniform(0.0, 1.0, 4)
+    places = [
+        tuple(r * np.array([math.cos(a), math.sin(a)])) for r, a in zip(rng.uniform(0.6, 2.5, 4), angles, strict=True)
+    ]
+    obstacles = [Obstacle(CYLINDER, place, (0.15,)) for place in places[:2]]
+    obstacles += [Obstacle(BOX, place, (0.3, 0.2), yaw=float(rng.uniform(0.0, 3.0))) for place in places[2:]]
+    arena, state = staged_arena(*obstacles, half_width=3.0), np.array([0.0, 0.0, 0.7, 0.0, 0.0])
+    scan = Scanner(GROUND, arena, rng, 0.0).scan(state, state, 0.0)
+    return pb.Request(state=state, scan=scan_message(scan)), arena
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_what_is_drawn_as_free_is_free_and_hits_lie_on_surfaces(seed: int) -> None:
+    request, arena = scanned(seed)
+    about = surroundings(GROUND, request, corners=60)
+    assert 20 < len(about.free) <= 60 and len(about.hits) > 100
+    assert np.abs(arena.shapes.distance(about.hits).min(axis=0)).max() < 1e-5
+    corners, sensor = about.free, np.array([-0.032 * math.cos(0.7), -0.032 * math.sin(0.7)])
+    rng = np.random.default_rng(seed)
+    k, share = rng.integers(len(corners), size=2000), rng.random((2000, 1))
+    edge = corners[k] + share * (np.roll(corners, -1, axis=0)[k] - corners[k])
+    inside = sensor + np.sqrt(rng.random((2000, 1))) * (edge - sensor)
+    assert arena.shapes.distance(inside).min() > 0.0
+    assert np.linalg.norm(corners - sensor, axis=1).max() > 1.5, "and that is not nothing"
+
+
+def test_without_a_scan_there_is_none_of_it() -> None:
+    about = surroundings(GROUND, pb.Request(state=[0.0] * 5))
+    assert all(told == [] for told in about.flat().values())
+
+
+def test_discs_hold_wherever_a_mover_may_be() -> None:
+    motion = Motion((0.5, -0.2), 0.03, 0.05, acceleration=1.0, age=0.1)
+    crate = Obstacle(BOX, (1.0, 0.5), (0.4, 0.3), yaw=0.4, motion=motion)
+    request = pb.Request(obstacles=obstacle_messages([crate, Obstacle(CYLINDER, (0.0, 1.0), (0.2,))]))
+    about = surroundings(GROUND, request)
+    assert about.movers.shape == (1, 3) and about.swept.shape == (1, GROUND.horizon, 3)
+    assert about.movers[0] == pytest.approx((1.0, 0.5, math.hypot(0.2, 0.15)))
+    rng = np.random.default_rng(0)
+    for k, (x, y, radius) in enumerate(about.swept[0], 1):
+        t = 0.1 + k * GROUND.period
+        ways = rng.normal(size=(3, 500, 2))
+        ways /= np.linalg.norm(ways, axis=2, keepdims=True)
+        place = np.array([1.0, 0.5]) + 0.03 * ways[0]
+        place += t * (np.array([0.5, -0.2]) + 0.05 * ways[1]) + 0.5 * t * t * ways[2]
+        away = np.linalg.norm(place - (x, y), axis=1) + math.hypot(0.2, 0.15)
+        assert away.max() <= radius + 1e-9 and away.max() > radius - 0.1
+
+
+def test_a_flat_view_of_what_flies_has_the_radius_last() -> None:
+    plane = Obstacle("sphere", (1.0, 2.0, 3.0), (0.5,), motion=Motion((0.0, 1.0, 0.0), 0.1, speed=1.0))
+    request = pb.Request(obstacles=obstacle_messages([plane]))
+    assert surroundings(QUADROTOR, request).flat()["movers"] == [[1.0, 2.0, 0.5]]
+
+
+def test_a_promise_is_the_new_one_or_what_is_left_of_the_old() -> None:
+    old, new = (pb.Promise(center=[x, 0.0], half_width=[0.1, 0.2], radius=[0.15]) for x in (1.0, 2.0))
+    asked = pb.Exchange(request=pb.Request(promise=old))
+    assert promised(GROUND, asked).tolist() == [[1.0, 0.0, 0.1, 0.2, 0.15]]
+    asked.reply.decision.promise.CopyFrom(new)
+    assert promised(GROUND, asked)[0, 0] == 2.0
+    asked.reply.decision.promise.radius.append(1.0)
+    assert len(promised(GROUND, asked)) == 0, "that is none"
