@@ -27,6 +27,7 @@ from deploy.bench import (
     learning,
     linkloss,
     logs,
+    perception,
     reachability,
     recording,
     roundtrip,
@@ -36,6 +37,7 @@ from deploy.bench.timing import Figures
 
 BENCHMARKS = {
     "decide": decide.run,
+    "perception": perception.run,
     "solvers": solvers.run,
     "reachability": reachability.run,
     "environment": environment.run,
