@@ -13,7 +13,7 @@ import numpy as np
 
 from actors.mavlink import ATTITUDE, IMU, POSITION, Array, Client, MavlinkError, Tap
 from messaging.robots import Robot
-from sim.autopilot.hil import Hil
+from sim.autopilot.hil import AutopilotGone, Hil
 from sim.autopilot.px4 import Px4
 from sim.autopilot.sensors import SensorNoise, Sensors
 from sim.flight_estimator import QuadrotorNoise
@@ -59,9 +59,13 @@ class Px4Flight:
         """Hover at the start of that vehicle's arena, as that vehicle.
 
         Raises:
-            Px4Error, MavlinkError: PX4 does not start, or does not take off; AutopilotGone.
+            Px4Error, MavlinkError: PX4 does not start, or does not take off; AutopilotGone: nor does it answer.
         """
-        if not self.flies or not self._stop():
+        try:
+            hovers = self.flies and self._stop()
+        except AutopilotGone:
+            hovers = False
+        if not hovers:
             self._begin()
         self._become(vehicle)
 
