@@ -29,6 +29,21 @@ class NoFleet(ValueError):
     """There is no world for several robots of this kind."""
 
 
+def check_fleet(robot: Robot, arena: str, size: int, conditions: Conditions) -> None:
+    """
+    Raises:
+        NoFleet: there is no such world, for robots of this kind, in that arena, under these conditions; UnknownArena.
+    """
+    if robot != GROUND:
+        raise NoFleet(f"several {robot.name} robots in one world are not there: ground robots are")
+    if arena_kind(robot, arena).movers is not None:
+        raise NoFleet(f"{arena} has things that move: a fleet's arena has none but its robots")
+    if size < 1:
+        raise NoFleet("a fleet has a robot at least")
+    if conditions.perception.kind != "map":
+        raise NoFleet("a fleet drives by the map: a scan shows other robots as walls")
+
+
 class FleetRobot(Turtle):
     """One of a world; only the world can move time on."""
 
@@ -108,16 +123,9 @@ class FleetEnv:
         Raises:
             NoFleet: for robots of this kind, or in that arena, there is no such world; UnknownArena.
         """
-        if robot != GROUND:
-            raise NoFleet(f"several {robot.name} robots in one world are not there: ground robots are")
-        if arena_kind(robot, arena).movers is not None:
-            raise NoFleet(f"{arena} has things that move: a fleet's arena has none but its robots")
-        if size < 1:
-            raise NoFleet("a fleet has a robot at least")
         self.robot, self.arena_name, self.size, self.seed = robot, arena, size, seed
         self.conditions = conditions or Conditions()
-        if self.conditions.perception.kind != "map":
-            raise NoFleet("a fleet drives by the map: a scan shows other robots as walls")
+        check_fleet(robot, arena, size, self.conditions)
         noise = self.conditions.lidar_noise(flies=False)
         self.members = [_Member(self, i, noise) for i in range(size)]
         self.touches = 0  # over all worlds

@@ -23,7 +23,7 @@ class Evaluate:
     filtering: Flags[Filtering] = field(default_factory=Filtering)
     physics: Flags[Physics] = field(default_factory=Physics)
     arena: str = "default"
-    """default | open | dense | crossing."""
+    """default | open | dense | few-walkers | walkers | many-walkers | crossing; in the air also tall | traffic."""
     episodes: int = 100
     """Of a fleet: of all its robots, in whole worlds."""
     fleet: int = 0

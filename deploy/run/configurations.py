@@ -63,6 +63,8 @@ class RunConfig:
             raise ValueError(f"no method is called {self.method!r}; there are: {', '.join(METHODS)}")
         if (self.robots, self.arena) != (RunConfig.robots, RunConfig.arena):
             _check_arenas(self.robots, self.arena)
+        if self.fleet:
+            _check_fleets(self)
         if min(self.robots_per_actor, self.replicas, self.steps) < 1 or self.actors < (0 if self.from_logs else 1):
             raise ValueError(
                 "actors (unless there are logs to learn from), robots per actor, replicas, steps: 1 or more"
@@ -90,8 +92,20 @@ def _check_arenas(robots: tuple[str, ...], arena: str) -> None:
     from messaging.tasks import learnt
     from sim.arenas import arena_kind
 
-    for robot in robots:
-        arena_kind(learnt(robot), arena)
+    kinds = [learnt(robot) for robot in robots]
+    for robot in kinds:
+        arena_kind(robot, arena)
+    if len({robot.name for robot in kinds}) < len(kinds):
+        raise ValueError(f"each robot once, with one task: not {', '.join(robots)}")
+
+
+def _check_fleets(config: RunConfig) -> None:
+    """Raises NoFleet."""
+    from messaging.tasks import learnt
+    from sim.fleet import check_fleet
+
+    for robot in config.robots:
+        check_fleet(learnt(robot), config.arena, config.fleet, config.conditions)
 
 
 EXPERIMENTS: dict[str, RunConfig] = {

@@ -11,8 +11,10 @@ from deploy.commands.train import Train
 from deploy.run.configurations import EXPERIMENTS, RunConfig, decode, encode, load
 from deploy.run.places import places
 from learner.config import LearnerConfig, TD3Config
+from messaging.robots import robot_named
+from messaging.tasks import learnt, task_of
 from safety.model_set import Recipe
-from sim.conditions import Conditions
+from sim.conditions import Conditions, Perception
 from sim.estimator import NoiseLevels
 
 CHANGED = RunConfig(
@@ -92,3 +94,23 @@ def test_a_resumed_run_keeps_its_configuration_but_for_the_steps(tmp_path: Path)
     (tmp_path / "config.json").write_text(encode(CHANGED))
     assert Train(resume=tmp_path, arena="open").config() == CHANGED
     assert Train(resume=tmp_path, steps=5).config() == replace(CHANGED, steps=5)
+
+
+def test_what_no_world_is_made_for_is_refused_before_anything_starts() -> None:
+    scans = Conditions(perception=Perception("scan"))
+    for wrong, said in (
+        ({"fleet": 2, "arena": "walkers"}, "things that move"),
+        ({"fleet": 2, "arena": "crossing", "conditions": scans}, "a scan shows other robots as walls"),
+        ({"fleet": 2, "robots": ("quadrotor",), "arena": "default"}, "several quadrotor robots"),
+        ({"robots": ("ground", "ground+tracks")}, "each robot once, with one task"),
+        ({"robots": ("ground+trucks",)}, r"there is no ground\+trucks"),
+    ):
+        with pytest.raises(ValueError, match=said):
+            RunConfig(**wrong)
+    try:
+        config = RunConfig(robots=("ground+tracks",), arena="walkers")
+        assert decode(RunConfig, json.loads(encode(config))) == config
+        assert [place.robot for place in places(config) if place.kind == "learner"] == ["ground"]
+        assert task_of(robot_named("ground")).observation_dim == 50, "whoever reads it has the task"
+    finally:
+        learnt("ground")
