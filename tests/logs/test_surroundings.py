@@ -1,18 +1,26 @@
 """What the filter was told is in Foxglove's scene, on the live page and in the report, with the promises of others."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
+from PIL import Image
 
 from logs import scene
+from logs.analysis import Look, analysed
 from logs.foxglove import Pictures
 from logs.gallery import Gallery
+from logs.page import render
 from logs.watch.board import Board
+from logs.watch.server import Server
 from messaging import brakeline_pb2 as pb
 from messaging.motion import Motion
 from messaging.scans import Scan
 from messaging.shapes import CYLINDER, Obstacle
 from messaging.surroundings import surroundings
 from safety.client import obstacle_messages, scan_message
+from tests.browser import CHROMIUM, Page
+from tests.logs.mixed import Writer
 from tests.logs.test_foxglove import Say, Studio, episode, step
 from tests.robots import GROUND
 
@@ -93,3 +101,39 @@ def test_a_picture_of_the_report_has_it() -> None:
     assert tube["promises"] == [[2.0, 0.0, 0.25, 0.35]] * 3 and pictures["b"]["tubes"][1]["promises"][0][0] == 0.0
     assert tube["movers"] == [[1.0, 0.5, 0.2]] and 20 < len(tube["free"]) <= 48 and len(tube["hits"]) <= 90
     assert pictures["a"]["kinds"] == "eee"
+
+
+def drawn(page: Page, name: str) -> int:
+    return int(page.value(f"document.querySelectorAll('#picker .{name}, .episode-map .{name}').length"))
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="there is no Chromium: the pages were not looked at")
+def test_browsers_draw_it(say: Say, tmp_path: Path) -> None:
+    writer, board = Writer(losses=0.0), Board()
+    for actor in ("a", "b"):
+        writer.put(f"episode/ground/{actor}", episode(actor))
+        board.take(say(f"episode/ground/{actor}", episode(actor)))
+    for k in range(3):
+        for actor, x in (("a", 0.0), ("b", 2.0)):
+            after = step(k, pb.RECOVERING, actor, clearance=0.5, truncated=k == 2)
+            for topic, message in (("exchange", told(actor, k, x)), ("step", after)):
+                writer.put(f"{topic}/ground/{actor}", message)
+                board.take(say(f"{topic}/ground/{actor}", message))
+    analysis = analysed(writer.write(tmp_path / "run.mcap"), Look(pictures=True))
+    path = tmp_path / "report.html"
+    path.write_text(render(analysis.figures(), analysis.each()), encoding="utf-8")
+    with Server(board.view) as server, Page(tmp_path / "profile") as page:
+        page.open(path.as_uri())
+        page.until("document.documentElement.dataset.drawn === 'yes'")
+        shown = {name: drawn(page, name) for name in ("free", "hit", "mover", "swept", "promise")}
+        assert shown == {"free": 1, "hit": 90, "mover": 1, "swept": 3, "promise": 3}
+        legend = page.value("document.querySelector('#picker').textContent")
+        assert "where other robots promise to be" in legend and "recovering" in legend
+        page.open(server.url)
+        page.until("document.body.dataset.drawn > 0")
+        page.picture(tmp_path / "live.png")
+        assert page.complaints == []
+    with Image.open(tmp_path / "live.png") as picture:
+        pixels = np.asarray(picture.convert("RGB"), int)
+    for color in ((0x5A, 0x28, 0x8C), (0x14, 0x8C, 0x78)):  # beams' ends, and the outline of what is free
+        assert (np.abs(pixels - color).sum(-1) < 60).sum() > 10
