@@ -76,11 +76,13 @@ class Promises:
         margin = np.concatenate([p.radius for p in others])
         return Promises(Shapes(center, axes, half, np.zeros(count), np.ones((count, d)), margin), periods)
 
-    def within(self, point: Array, reach: float) -> Promises | None:
-        """Those that come as near to a point (d,); None: none does."""
-        nearest = (self.shapes.distance(point) - self.shapes.margin).reshape(-1, self.periods).min(axis=1)
-        near = ~(nearest > reach)
-        return Promises(self.shapes.take(np.repeat(near, self.periods)), self.periods) if near.any() else None
+    def nearest(self, point: Array) -> Array:
+        """(n,) m: how near each comes to a point (d,)."""
+        return np.asarray((self.shapes.distance(point) - self.shapes.margin).reshape(-1, self.periods).min(axis=1))
+
+    def take(self, chosen: NDArray[np.bool_]) -> Promises:
+        """The chosen (n,) ones."""
+        return Promises(self.shapes.take(np.repeat(chosen, self.periods)), self.periods)
 
 
 def promised_half_spaces(

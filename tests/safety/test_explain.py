@@ -40,12 +40,12 @@ def test_the_edge_touches_the_obstacle_that_is_in_the_way_and_holds_all_of_it(re
 def test_the_room_is_that_of_the_proposals_tube(ready):
     rng = np.random.default_rng(1)
     for question, decision in blocked(ready, (random_request(rng) for _ in range(60))):
-        z = ready._regressors(
+        z = ready.inputs.regressors(
             np.concatenate([question.state[ready.regressor], question.input_in_force]),
-            ready._limited(question.action, question.input_in_force),
+            ready.inputs.limited(question.action, question.input_in_force),
         )
-        scene = ready._scene(question)
-        assert decision.stopped.room == pytest.approx(ready._margin(ready._rows(scene, z), z))
+        scene = ready.around.scene(question)
+        assert decision.stopped.room == pytest.approx(ready.around.margin(ready.around.rows(scene, z), z))
 
 
 def test_a_wall_a_box_a_mover_and_a_limit_have_their_names(ready):

@@ -117,7 +117,7 @@ def test_the_margin_is_the_way_to_the_obstacle_however_far_it_is(model, ready, w
     decision = ready.decide(ask)
     clear = fits(model, ask, decision.action)
     assert clear - 0.01 <= decision.margin <= clear + 1e-3
-    assert not decision.at_least
+    assert decision.at_least == (way - 0.1 > ready.reach), "beyond the reach it is a lower bound, and said to be"
 
 
 def test_where_nothing_is_near_the_margin_says_that_it_is_only_a_bound(ready):
@@ -183,13 +183,13 @@ def test_adjusted_is_the_closest_input_that_can_be_verified(ready):
             continue
         adjusted += 1
         z_0 = np.concatenate([ask.state[3:], ask.input_in_force])
-        scene = ready._scene(ask)
-        rows = ready._rows(scene, np.concatenate([z_0, ready._limited(ask.action, ask.input_in_force)]))
-        kept = ready._comfortable(rows, z_0, ready._limited(ask.action, ask.input_in_force))
+        scene = ready.around.scene(ask)
+        rows = ready.around.rows(scene, np.concatenate([z_0, ready.inputs.limited(ask.action, ask.input_in_force)]))
+        kept = ready._comfortable(rows, z_0, ready.inputs.limited(ask.action, ask.input_in_force))
         taken = np.linalg.norm((decision.action - ask.action) / width)
         best = np.inf
         for u in grid:
-            if ready._margin(kept, np.concatenate([z_0, u])) >= 0.0:
+            if ready.around.margin(kept, np.concatenate([z_0, u])) >= 0.0:
                 best = min(best, np.linalg.norm((u - ask.action) / width))
         assert taken <= best + 2e-3
         if adjusted == 12:
@@ -371,7 +371,7 @@ def test_an_older_models_tail_is_verified_anew(ready, version):
     for x, in_domain, verified in ((0.6, True, True), (0.6, False, False), (0.215, True, False)):
         ask = moving(((0.1, 0.2), (0, 0), (0, 0)), x, model=version)
         z_0 = np.concatenate([ask.state[3:], ask.input_in_force])
-        found = ready._committed(ask, ready._scene(ask), z_0, _Attempt(0), in_domain)
+        found = ready._committed(ask, ready.around.scene(ask), z_0, _Attempt(0), in_domain)
         assert found.verified == verified
         assert np.array_equal(found.plan, ask.plan if verified else STILL)
 

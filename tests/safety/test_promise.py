@@ -74,6 +74,6 @@ def test_a_promise_that_is_touched_leaves_no_room():
 @pytest.mark.parametrize("away", [0.2, 0.5, 2.0])
 def test_only_what_is_within_reach_counts(away):
     other = Promise.of(np.full((4, 2), [away + 0.1, 0.0]), np.zeros((4, 2)), np.full(3, 0.1))
-    assert (Promises.to([other]).within(np.zeros(2), 1.0) is not None) == (away < 1.0)
+    assert (Promises.to([other]).nearest(np.zeros(2))[0] < 1.0) == (away < 1.0)
     assert Promises.to([]) is None
     assert other.apart(Promise.of(np.zeros((4, 2)), np.zeros((4, 2)), np.full(3, 0.05))) == pytest.approx(away - 0.05)

@@ -1,0 +1,237 @@
+"""What is around a robot, as half-spaces that its tube is held against (method §3, §8-§10)."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from messaging.movers import Movers
+from messaging.robots import Robot
+from messaging.scans import Scan
+from messaging.shapes import Shapes
+from safety import scan as seen
+from safety.explain import SIGHT, Around, Stopped, worst
+from safety.freespace import half_spaces
+from safety.limits import Limits, stacked
+from safety.model_set import needed
+from safety.program import Layout, Rows
+from safety.promise import Boxes, Promises, promised_half_spaces
+from safety.request import Request
+from safety.sweep import swept_half_spaces
+from safety.tube import Tube
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class _Disc:
+    """A disc of the body with the tube of its centre. at (d,): in the robot's frame; swing [m]: what an error of the
+    measured heading adds to where it is."""
+
+    at: Array
+    radius: float
+    swing: float
+    position: Array
+    layout: Layout
+
+
+def _discs(robot: Robot, tube: Tube) -> list[_Disc]:
+    d, found = robot.position_dim, []
+    after = len(needed(robot)) - d * sum(disc.arm > 0.0 for disc in robot.body)
+    for disc in robot.body:
+        position, directions, swing = tube.position, tube.directions, 0.0
+        if disc.arm and robot.heading is not None:
+            position, directions = tube.more[:, after : after + d], tube.more_directions[:, after : after + d]
+            swing = disc.arm * robot.measurement_bound[robot.heading]
+            after += d
+        found.append(_Disc(np.asarray(disc.at), disc.radius, swing, position, Layout(position, directions)))
+    return found
+
+
+@dataclass(frozen=True)
+class Scene:
+    """start (d,): the measured position; turn (d, d): world from the frame of now; near: the obstacles that
+    count; beyond [m]: no other that was told of is nearer, nor the end of sight."""
+
+    start: Array
+    heading: float
+    turn: Array
+    near: Shapes
+    beyond: float
+    moving: Movers | None = None  # that may meet the tube
+    unseen: seen.Cells | None = None  # what a scan does not show to be free
+    promised: Promises | None = None  # to other robots
+
+    @property
+    def empty(self) -> bool:
+        return not len(self.near) and self.moving is None and self.unseen is None and self.promised is None
+
+
+class Surroundings:
+    """A robot's tube, ready to be held against scenes."""
+
+    def __init__(self, robot: Robot, tube: Tube, outer: Tube, domain: Array, comfort: float | None) -> None:
+        """`outer`: the tube over-approximated with fewer atoms; domain (2, r): of the recorded regressors; `comfort`
+        [m]: what is kept to obstacles beyond the tube; as wide as it needs be, unless given."""
+        self.robot, self.tube = robot, tube
+        self.discs = _discs(robot, tube)
+        self.boxes = Boxes(tube.position, tube.directions)
+        self.limits = Limits(robot, tube) if robot.limits else None
+        self.measured = np.asarray(robot.measurement_bound[: robot.position_dim])
+        self.body = robot.footprint + float(np.linalg.norm(self.measured))  # m about where the center was measured
+        self.comfort = self._comfort() if comfort is None else comfort
+        self.widest = self._widest(outer, domain)
+        wanted = self.widest + self.comfort
+        self.reach = min(wanted, robot.sight)  # m from the measured position: an obstacle beyond it decides nothing
+        self.far = wanted > robot.sight  # a tube may leave what can be seen: every candidate must be looked at
+
+    # --- what is known before any request ---------------------------------------------------------------------
+
+    def _comfort(self) -> float:
+        """[m]: as wide as the tube of moving in place ever gets, so that wherever the robot stopped it can still turn.
+
+        Without it a robot may stop so close to an obstacle that no motion can be verified from there, for good.
+        """
+        robot = self.robot
+        in_place = np.where([not moves for moves in robot.translates], robot.high(), 0.0)
+        state = robot.driving(in_place)
+        z = np.concatenate([state[list(robot.regressor)], in_place, np.tile(in_place, robot.free_steps)])
+        sizes = self.tube.magnitudes(z)
+        L, d = self.tube.generators, robot.position_dim
+        directions = np.random.default_rng(0).normal(size=(64, d))
+        directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+        width = np.abs(directions[:, None, None, :] @ self.tube.directions)[:, :, 0] @ sizes[:L]
+        drift = np.abs((directions[:, None, None, :] @ self.tube.position)[:, :, 0] @ z)
+        return float((width + drift).max() + sizes[L:].max())
+
+    def _widest(self, tube: Tube, domain: Array) -> float:
+        """[m] from the robot's measured position: no plan's tube, with the body about it, goes beyond.
+
+        By interval arithmetic over the box of all regressors, so wide for certificates whose atoms mix them.
+        """
+        robot, F = self.robot, self.robot.free_steps
+        low = np.concatenate([domain[0], np.tile(robot.low(), F)])
+        high = np.concatenate([domain[1], np.tile(robot.high(), F)])
+        z = np.maximum(np.abs(low), np.abs(high))
+        sizes = tube.M @ (np.abs(tube.W) @ z) + tube.m_0
+        way = np.abs(tube.position) @ z + np.abs(tube.directions) @ sizes[: tube.generators]
+        return float(np.linalg.norm(way, axis=1).max() + self.body + sizes[tube.generators :].max())
+
+    def extent(self, z: Array) -> float:
+        """[m] from the measured position to the farthest point that the body may reach under regressors z."""
+        sizes = self.tube.magnitudes(z)
+        L = self.tube.generators
+        way = np.abs(self.tube.centers(z)) + np.abs(self.tube.directions) @ sizes[:L]
+        return math.sqrt(np.einsum("kd,kd->k", way, way).max()) + self.body + float(sizes[L:].max())
+
+    # --- one scene ---------------------------------------------------------------------------------------------
+
+    def scene(self, request: Request) -> Scene:
+        d, robot = self.robot.position_dim, self.robot
+        start, near = request.state[:d], request.obstacles
+        heading = float(request.state[robot.heading]) if robot.heading is not None else 0.0
+        turn = self.turn(heading)
+        beyond = robot.sight
+        if len(near):
+            beyond, counts = self._parted(near.distance(start) - near.margin, beyond)
+            near = near.take(counts)
+        moving = request.movers
+        if moving is not None:
+            beyond, counts = self._parted(moving.least_distance(start, robot.horizon * robot.period), beyond)
+            moving = moving.take(counts) if counts.any() else None
+        promised = request.promised
+        if promised is not None:
+            beyond, counts = self._parted(promised.nearest(start), beyond)
+            promised = promised.take(counts) if counts.any() else None
+        unseen = None if request.scan is None else self._unseen(request.scan, start)
+        return Scene(start, heading, turn, near, beyond, moving, unseen, promised)
+
+    def _parted(self, away: Array, beyond: float) -> tuple[float, NDArray[np.bool_]]:
+        """How near [m] the nearest beyond reach is, of these and what was looked at before, and which (n,) are within;
+        one whose distance is no number is."""
+        counts = ~(away > self.reach)
+        return float(away[~counts].min(initial=beyond)), counts
+
+    def turn(self, heading: float) -> Array:
+        """(d, d), world from the frame of now."""
+        turn = np.eye(self.robot.position_dim)
+        cos, sin = math.cos(heading), math.sin(heading)
+        turn[0, 0], turn[0, 1], turn[1, 0], turn[1, 1] = cos, -sin, sin, cos
+        return turn
+
+    def _unseen(self, scan: Scan, start: Array) -> seen.Cells | None:
+        """What is not known to be free within reach, or may come there before a plan ends."""
+        within = self.reach + scan.speed * (scan.age + self.robot.horizon * self.robot.period)
+        within += float(np.linalg.norm(scan.sensor()[0] - start)) + scan.position_error
+        cells = seen.cells(scan, within + scan.heading_error * within)
+        return cells if len(cells) else None
+
+    def margin(self, rows: Rows, z: Array) -> float:
+        """Smallest distance [m] of the exact tube to a half-space (of a limit: in its own units)."""
+        return self.least(rows.bound - rows.support(self.tube, z), z)
+
+    def least(self, slack: Array, z: Array, comfort: float = 0.0) -> float:
+        """The smallest slack, within ± the reach (less the comfort); NaN never counts as inside."""
+        most = self.reach - comfort
+        margin = float(slack.min(initial=most))
+        if self.far:
+            margin = min(margin, most - self.extent(z))
+        return max(margin, -self.reach) if margin == margin else -self.reach
+
+    def rows(self, scene: Scene, z: Array) -> Rows:
+        """Half-spaces about the rollout of regressors z, as rows of the tube (and of the QP's: its generators are the
+        same, only their magnitudes are not)."""
+        parts = []
+        for disc in self.discs:
+            start, measured = scene.start + scene.turn @ disc.at, self.measured + disc.swing
+            nominal = start + disc.position @ z @ scene.turn.T
+            normals, offsets = half_spaces(scene.near, start, nominal, disc.radius, measured)
+            if scene.moving is not None:
+                swept = swept_half_spaces(scene.moving, start, nominal, disc.radius, measured, self.robot.period)
+                normals, offsets = np.concatenate([normals, swept[0]]), np.concatenate([offsets, swept[1]])
+            if scene.unseen is not None:
+                beside = seen.half_spaces(scene.unseen, start, nominal, disc.radius, measured, self.robot.period)
+                normals, offsets = np.concatenate([normals, beside[0]]), np.concatenate([offsets, beside[1]])
+            parts.append(disc.layout.rows(normals @ scene.turn, offsets))
+        if scene.promised is not None:
+            nominal = scene.start + self.tube.centers(z) @ scene.turn.T
+            body = self.robot.footprint
+            kept = promised_half_spaces(scene.promised, scene.start, nominal, body, self.measured)
+            parts.append(self.boxes.rows(*kept, scene.turn))
+        if self.limits is not None:
+            parts.append(self.limits.rows(scene.start, scene.heading, scene.turn))
+        return stacked(parts)
+
+    def worst_of(self, scene: Scene, z: Array, slack: Array) -> Stopped:
+        """What the proposal, regressors z, comes nearest to."""
+        beyond = self.reach - self.extent(z) if self.far else np.inf
+        if not len(slack) or beyond < slack.min():
+            return Stopped.nowhere(SIGHT, beyond, self.robot.period * self.robot.horizon)
+        nominal = []
+        for disc in self.discs:
+            start = scene.start + scene.turn @ disc.at
+            nominal.append((start, start + disc.position @ z @ scene.turn.T))
+        row = int(np.argmin(slack))
+        around = Around(scene.near, scene.moving, scene.unseen, scene.promised)
+        return worst(row, max(float(slack[row]), -self.reach), self.robot, around, nominal)
+
+    def clear(self, request: Request, scene: Scene, z: Array, margin: float) -> tuple[float, bool]:
+        """Smallest distance [m] of the tube to what is in sight, given that to what is within reach; True: it is only a
+        lower bound.
+
+        What is beyond the reach decides nothing, but it may be what is nearest to the tube. Of it the bound is told:
+        how far it is, less how far the tube goes.
+        """
+        if not self.far and margin + self.widest <= self.reach:
+            return margin, False
+        extent = self.extent(z)
+        if self.far:
+            return margin, margin >= self.reach - extent
+        if margin < self.reach and margin <= scene.beyond - extent:
+            return margin, False
+        # Of what is within reach no more is known than that; a scan was not looked at beyond it.
+        most = self.robot.sight - self.widest if scene.empty and request.scan is None else self.reach
+        return min(scene.beyond - extent, most), True
