@@ -1,8 +1,4 @@
-"""`make bench`: every benchmark, each beside its peer in the same run.
-
-python -m deploy.bench [NAME ...] [--json]
-python -m deploy.bench chaos --kills 30 --seed 1
-"""
+"""`make bench`: every benchmark, each beside its peer in the same run."""
 
 from __future__ import annotations
 
@@ -13,7 +9,12 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import json
 import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from types import ModuleType
+from typing import Annotated
 
+import tyro
 from rich.console import Console
 from rich.table import Table
 
@@ -35,25 +36,57 @@ from deploy.bench import (
 )
 from deploy.bench.timing import Figures
 
+
+@dataclass(frozen=True)
+class Bench:
+    """Every benchmark that needs neither root nor a quarter of an hour, or the named ones."""
+
+    names: Annotated[tuple[str, ...], tyro.conf.Positional] = ()
+    """Which; all that do not have to be asked for, unless given."""
+    json: bool = False
+    """One JSON object on stdout."""
+    seed: int = 0
+    """Of chaos and fuzz."""
+    kills: int = 100
+    """Of chaos."""
+    messages: int = 1_000_000
+    """Of fuzz."""
+
+
+@dataclass(frozen=True)
+class Benchmark:
+    module: ModuleType  # its documentation says what is measured
+    run: Callable[[Bench], Figures]
+    asked: bool = False  # only when it is named: it writes gigabytes, takes a quarter of an hour, or needs root
+
+
 BENCHMARKS = {
-    "decide": decide.run,
-    "perception": perception.run,
-    "solvers": solvers.run,
-    "reachability": reachability.run,
-    "environment": environment.run,
-    "learning": learning.run,
-    "roundtrip": roundtrip.run,
-    "linkloss": linkloss.run,
-    "logs": logs.run,
-    "recording": recording.run,
-    "logs-2gb": logs.run_large,
-    "fuzz": fuzz.run,
-    "askers": askers.run,
-    "costs": costs.run,
-    "chaos": chaos.run,
+    "decide": Benchmark(decide, lambda _: decide.run()),
+    "perception": Benchmark(perception, lambda _: perception.run()),
+    "solvers": Benchmark(solvers, lambda _: solvers.run()),
+    "reachability": Benchmark(reachability, lambda _: reachability.run()),
+    "environment": Benchmark(environment, lambda _: environment.run()),
+    "learning": Benchmark(learning, lambda _: learning.run()),
+    "roundtrip": Benchmark(roundtrip, lambda _: roundtrip.run()),
+    "linkloss": Benchmark(linkloss, lambda _: linkloss.run()),
+    "logs": Benchmark(logs, lambda _: logs.run()),
+    "recording": Benchmark(recording, lambda _: recording.run()),
+    "askers": Benchmark(askers, lambda _: askers.run()),
+    "logs-2gb": Benchmark(logs, lambda _: logs.run_large(), asked=True),
+    "fuzz": Benchmark(fuzz, lambda given: fuzz.fuzz(given.messages, given.seed), asked=True),
+    "costs": Benchmark(costs, lambda _: costs.run(), asked=True),
+    "chaos": Benchmark(chaos, lambda given: chaos.chaos(given.kills, given.seed), asked=True),
 }
-# One writes as much, others take a quarter of an hour or more, or need root.
-WHEN_ASKED = {"logs-2gb", "fuzz", "chaos", "costs"}
+
+
+def overview() -> str:
+    """What each measures, and examples."""
+    lines = []
+    for name, one in BENCHMARKS.items():
+        what = (one.module.__doc__ or "").partition("\n\n")[0].replace("\n", " ")
+        lines.append(f"  {name}: {what}{' (only when named)' if one.asked else ''}")
+    examples = "  python -m deploy.bench decide --json\n  python -m deploy.bench chaos --kills 30 --seed 1"
+    return "\n".join([Bench.__doc__ or "", "", *lines, "", "examples:", examples])
 
 
 def show(console: Console, name: str, figures: Figures) -> None:
@@ -68,18 +101,18 @@ def show(console: Console, name: str, figures: Figures) -> None:
 
 
 def main() -> int:
-    names = [word for word in sys.argv[1:] if not word.startswith("-") and not word.isdecimal()]
-    names = names or [name for name in BENCHMARKS if name not in WHEN_ASKED]
+    given = tyro.cli(Bench, prog="python -m deploy.bench", description=overview())
+    names = given.names or tuple(name for name, one in BENCHMARKS.items() if not one.asked)
     unknown = [name for name in names if name not in BENCHMARKS]
     if unknown:
         print(f"no benchmark is called {', '.join(unknown)}; there are: {', '.join(BENCHMARKS)}", file=sys.stderr)
         return 2
     results = {}
     for name in names:
-        results[name] = BENCHMARKS[name]()
-        if "--json" not in sys.argv:
+        results[name] = BENCHMARKS[name].run(given)
+        if not given.json:
             show(Console(), name, results[name])
-    if "--json" in sys.argv:
+    if given.json:
         print(json.dumps(results))
     return 0
 

@@ -25,7 +25,6 @@ from deploy.bench.timing import Figures
 from logs.reader import Record, open_log
 
 ROBOTS = ("ground", "quadrotor")
-KILLS = 100
 CUT = (0.3, 6.0)  # s that a cable is out
 PROGRESS = 20  # steps of each robot between two faults
 PATIENCE = 120.0  # s until all goes on after a fault
@@ -155,12 +154,13 @@ class Judged:
         seen[name].add(header.sequence)
 
 
-def chaos(kills: int, seed: int, folder: Path) -> Figures:
+def chaos(kills: int, seed: int) -> Figures:
     """
     Raises:
         NoHosts: namespaces can't be made here; Stuck: the run did not survive.
     """
-    with Hosts(5, CLOCKS) as hosts:
+    with tempfile.TemporaryDirectory(prefix="chaos") as name, Hosts(5, CLOCKS) as hosts:
+        folder = Path(name)
         hosts.join(1, 2)
         with Fleet(folder, hosts, ROBOTS, seed=seed) as fleet:
             fleet.start()
@@ -193,14 +193,3 @@ def chaos(kills: int, seed: int, folder: Path) -> Figures:
         "s until all go on, longest": recovery[-1],
     }
     return {name: {"value": float(value)} for name, value in said.items()}
-
-
-def option(name: str, otherwise: int) -> int:
-    """The number after --NAME on the command line."""
-    words = sys.argv[1:]
-    return int(words[words.index(name) + 1]) if name in words else otherwise
-
-
-def run() -> Figures:
-    with tempfile.TemporaryDirectory(prefix="chaos") as name:
-        return chaos(option("--kills", KILLS), option("--seed", 0), Path(name))

@@ -6,7 +6,8 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from deploy.bench.fuzz import Mill, Party, fuzz, parties
+from deploy.bench.fuzz import Party, fuzz, parties
+from deploy.bench.mill import Mill
 from messaging.topics import TOPICS
 
 
