@@ -10,9 +10,11 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
-from actors.mavlink import ATTITUDE, IMU, POSITION, Array, Client, MavlinkError, Tap
+from actors.mavlink import Client, MavlinkError, Tap
 from messaging.robots import Robot
+from sim.autopilot.dialect import mavlink
 from sim.autopilot.hil import AutopilotGone, Hil
 from sim.autopilot.px4 import Px4
 from sim.autopilot.sensors import SensorNoise, Sensors
@@ -21,8 +23,14 @@ from sim.quadrotor import SAMPLES, Quadrotor, slewed
 from sim.vehicle import Period
 from sim.world import Arena, closing, room_bounds
 
+Array = NDArray[np.float64]
+
 LISTEN_EVERY, TELL_EVERY = 4, 20  # physics steps between two looks, two setpoints
-INTERVALS = {POSITION: 0.01, ATTITUDE: 0.005, IMU: 0.005}  # s between two messages of a kind, as often as each is made
+INTERVALS = {
+    mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED: 0.01,
+    mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION: 0.005,
+    mavlink.MAVLINK_MSG_ID_HIGHRES_IMU: 0.005,
+}  # s between two messages of a kind, as often as each is made
 FRESH, LATEST = 0.015, 0.25  # s; an estimate that is older is waited for, so long in real time
 READY_IN, UP_IN, STANDS_IN = 90.0, 20.0, 10.0  # s until it knows where it is, has climbed, has come to a stop
 HEIGHT, CLIMB = 3.0, 1.5  # m, m/s, of the takeoff
