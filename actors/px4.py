@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import math
+import select
 import socket
 import time
 from collections.abc import Callable
@@ -105,7 +106,8 @@ class Px4Flight:
         """Time stands still, but threads of PX4 may not have said yet what they know."""
         end = time.monotonic() + LATEST
         self._listen()
-        while self.client.time < self.hil.time - FRESH and time.monotonic() < end:
+        while self.client.time < self.hil.time - FRESH and (left := end - time.monotonic()) > 0.0:
+            select.select([self._link], [], [], left)
             self._listen()
 
     def close(self) -> None:
