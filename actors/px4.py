@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from actors.mavlink import Client, MavlinkError, Tap
+from actors.mavlink import Client, Frame, MavlinkError, Tap
 from messaging.robots import Robot
 from sim.autopilot.dialect import mavlink
 from sim.autopilot.hil import AutopilotGone, Hil
@@ -32,8 +32,9 @@ INTERVALS = {
     mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION: 0.005,
     mavlink.MAVLINK_MSG_ID_HIGHRES_IMU: 0.005,
 }  # s between two messages of a kind, as often as each is made
-FRESH, LATEST = 0.015, 0.25  # s; an estimate that is older is waited for, so long in real time
+FRESH, LATEST = 0.0125, 0.25  # s; a message that is older is waited for, so long in real time
 READY_IN, UP_IN, STANDS_IN = 90.0, 20.0, 10.0  # s until it knows where it is, has climbed, has come to a stop
+SETTLES_IN = 15.0  # s of hovering until what a takeoff does to its estimate is forgotten
 HEIGHT, CLIMB = 3.0, 1.5  # m, m/s, of the takeoff
 STANDING, LEVEL = 0.1, 0.1  # m/s, rad: slower and more upright than that, it hovers
 FAR = 500.0  # m to whatever closes the field
@@ -56,6 +57,7 @@ class Px4Flight:
         self._folder, self._noise, self._parameters, self._tap = folder, noise, parameters, tap
         self._px4: Px4 | None = None
         self._count = 0
+        self._told = dict.fromkeys(INTERVALS, 0.0)  # s, time of the newest message of a kind
         self.setpoint = np.zeros(3)
         self.starts = 0  # of PX4
 
@@ -106,7 +108,7 @@ class Px4Flight:
         """Time stands still, but threads of PX4 may not have said yet what they know."""
         end = time.monotonic() + LATEST
         self._listen()
-        while self.client.time < self.hil.time - FRESH and (left := end - time.monotonic()) > 0.0:
+        while min(self._told.values()) < self.hil.time - FRESH and (left := end - time.monotonic()) > 0.0:
             select.select([self._link], [], [], left)
             self._listen()
 
@@ -131,7 +133,8 @@ class Px4Flight:
         rng = np.random.default_rng(self.starts)
         vehicle = Quadrotor(FIELD, rng, QUIET, floor=FAR)
         self.hil = Hil(px4.connection, vehicle, Sensors(self._noise, rng, vehicle.timestep))
-        self.client = Client(lambda data: link.sendto(data, ("127.0.0.1", px4.local)), tap=self._tap)
+        self.client = Client(lambda data: link.sendto(data, ("127.0.0.1", px4.local)), tap=self._hear)
+        self._told = dict.fromkeys(INTERVALS, 0.0)
         self.tell(np.zeros(3))
         while not self.hil.answering:
             self.hil.tick()
@@ -144,6 +147,7 @@ class Px4Flight:
         self.tell(np.array([0.0, 0.0, CLIMB]))
         if not self.wait(lambda: vehicle.state()[2] > FAR + HEIGHT, UP_IN) or not self._stop():
             raise MavlinkError(f"PX4 does not take off; its last words:\n{px4.last_words()}")
+        self.advance(SETTLES_IN)
 
     def _stop(self) -> bool:
         """Come to a stop where there is nothing to touch; whether it did."""
@@ -162,6 +166,14 @@ class Px4Flight:
         (x, y, z), (a, b, c), (p, q, r) = hil.shift, hil.vehicle.truth().position, vehicle.truth().position
         vehicle.resume(hil.vehicle)
         hil.vehicle, hil.shift = vehicle, (x + a - p, y + b - q, z + c - r)
+
+    def _hear(self, frame: Frame) -> None:
+        message = frame.message
+        if not frame.outgoing and message.get_msgId() in self._told:
+            micro = getattr(message, "time_usec", None)
+            self._told[message.get_msgId()] = 1e-3 * message.time_boot_ms if micro is None else 1e-6 * micro
+        if self._tap is not None:
+            self._tap(frame)
 
     def _listen(self) -> None:
         with contextlib.suppress(BlockingIOError):
