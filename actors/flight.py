@@ -267,8 +267,9 @@ def run(settings: ActorSettings, flight: FlightSettings, arena: Arena, propose: 
         question = partial(ask, process.bus, deadline=settings.deadline)
         if not (rider.join(stop) and answered(question, robot, stages[0].start, stop)):
             return False
+        link, tap = open_link(flight.url), rider.tape.take
         vehicle = LiveVehicle(
-            open_link(flight.url), robot, flight.system, flight.height, flight.origin, truth, rider.tape.take, tolerance
+            link, robot, flight.system, flight.height, flight.origin, truth, tap, tolerance, stop, flight.raise_limits
         )
         try:
             rider.take(vehicle)

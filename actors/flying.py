@@ -7,7 +7,8 @@ from typing import Protocol
 
 import numpy as np
 
-from actors.mavlink import ATTITUDE, IMU, POSITION, Array, Client, Tap
+from actors.mavlink import Client, Tap, message_id
+from actors.telemetry import Array
 from messaging.robots import Robot
 from sim.quadrotor import SAMPLES, Quadrotor, slewed
 from sim.vehicle import Period
@@ -38,9 +39,10 @@ class MavlinkVehicle:
         self._period = period = robot.period
         self.input = np.zeros(robot.action_dim)
         wait = self._wait
-        for message, interval in ((POSITION, period / SAMPLES), (ATTITUDE, period), (IMU, period)):
-            self._client.stream(message, interval, wait)
-            self._client.request(message, wait)
+        wanted = {"LOCAL_POSITION_NED": period / SAMPLES, "ATTITUDE_QUATERNION": period, "HIGHRES_IMU": period}
+        for message, interval in wanted.items():
+            self._client.stream(message_id(message), interval, wait)
+            self._client.request(message_id(message), wait)
         self._client.follow_setpoints(wait)
         self.true, self.measured = endpoint.vehicle.state(), self._measured()
 

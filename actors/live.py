@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import logging
 import math
@@ -15,7 +16,9 @@ from typing import Any
 
 import numpy as np
 
-from actors.mavlink import ATTITUDE, IMU, POSITION, STATE, Array, Client, MavlinkError, Tap
+from actors.ceilings import CEILINGS, FIXED_TIMEOUT, SHORTEST, TIMEOUTS, demand, too_low
+from actors.mavlink import Client, MavlinkError, NotTold, Tap, message_id
+from actors.telemetry import ATTITUDE, FORCE, IN_FLIGHT, LANDED, MOTION, Array, missing
 from messaging.links import Link
 from messaging.robots import Robot
 from messaging.tolerant import Tolerance
@@ -26,7 +29,14 @@ log = logging.getLogger("brakeline.flight")
 
 POLL = 0.005  # s between two looks at a link
 RESEND = 0.05  # s after which a setpoint is sent again
-STALE = 0.2  # s without a position after which telemetry counts as lost
+TELEMETRY = 0.02  # s from one message to the next, as it is asked for
+READINGS = 10  # of the accelerometer, at most, the mean of which counts: those of one period
+STALE = 0.2  # s without a position, an attitude or an acceleration after which telemetry counts as lost
+SILENT = 3.0  # s without a heartbeat after which nobody knows its mode
+ESTIMATING = 300.0  # s that an estimator may take to know where it is
+PROGRESS = 5.0  # s between two lines about that
+HURRY = 1.0  # s between two questions about the autopilot's clock
+LOW = 20.0  # % of the battery from which it is spoken of
 LATE = 0.02  # s after its time at which a period's beginning counts as late
 REST = 0.1  # m/s: slower is hovering
 CLIMB = np.array([0.0, 0.0, 1.0])  # m/s
@@ -43,6 +53,8 @@ class Timing:
     late: int = 0  # begun more than `LATE` after their time
     slips: int = 0  # begun so late that the clock was set anew: the one before lasted two periods or more
     worst_gap: float = 0.0  # s between two setpoints
+    round_trip: float = math.inf  # s to the autopilot and back, the fastest
+    lost: int = 0  # periods whose telemetry, or whose mode, did not count
     lateness: deque[float] = field(default_factory=lambda: deque(maxlen=KEPT))  # s, of the beginnings of periods
 
     def figures(self) -> dict[str, float]:
@@ -56,6 +68,8 @@ class Timing:
             "lateness p99 ms": float(np.percentile(lateness, 99)),
             "lateness worst ms": float(lateness.max()),
             "worst setpoint gap ms": 1e3 * self.worst_gap,
+            "periods without telemetry": self.lost,
+            **({"link round trip ms": 1e3 * self.round_trip} if math.isfinite(self.round_trip) else {}),
         }
 
 
@@ -143,7 +157,8 @@ class LiveVehicle:
     Periods follow each other by the clock, whoever decides. `commit` hands over a plan: one input for each period from
     one on that has not begun. Its thread sends each at its time, again every `RESEND` seconds, and reads telemetry. So
     a plan that nobody replaces is carried out to its end, and then zero: hover. If the process dies, the autopilot's
-    own timeout brakes.
+    own timeout brakes. A vehicle that leaves offboard or guided mode, for a pilot, a failsafe, its battery or its
+    fence, is not fought for: the periods until it comes back by itself are `lost`.
 
     Collisions and clearance are what the simulator's truth channel says, where there is one.
     """
@@ -158,20 +173,28 @@ class LiveVehicle:
         truth: Truth | None = None,
         tap: Tap | None = None,
         tolerance: Tolerance | None = None,
+        stop: Callable[[], bool] = lambda: False,
+        raise_limits: bool = False,
     ) -> None:
         """Take control, climb to that height [m] above the ground unless it flies already, and begin the first period.
 
-        origin: where the autopilot's local frame begins, in ours, m.
+        origin: where the autopilot's local frame begins, in ours, m; stop: told to, it waits for nothing any more;
+        raise_limits: set those parameters that hold it below what the robot's description asks for.
 
         Raises:
-            MavlinkError: nobody there, or it refuses.
+            MavlinkError: nobody there, or it refuses, or told to stop.
         """
-        self._robot = robot
-        self._link, self._client, self._truth = link, Client(link.send, system, tap), truth
+        self._robot, self._told_to_stop, self._raise_limits = robot, stop, raise_limits
+        self._link, self._truth = link, truth
+        self._client = Client(link.send, system, tap, lambda text: log.info("it says: %s", text))
         self._origin, self._tolerance = np.asarray(origin), tolerance or Tolerance()
         self.timing = Timing()
         self._plan: list[Array] = []  # the inputs after the one in force
-        self._sent_at = self._beaten_at = self._heard_at = -math.inf
+        self._sent_at = self._beaten_at = self._asked_at = -math.inf
+        self._counted: dict[str, int] = {}  # messages, by what they tell
+        self._heard_at: dict[str, float] = {}  # s, when the latest of them came
+        self._said_lost, self._said_low = "", False
+        self.notes: list[str] = []  # which messages are used, which parameters are too low
         self._velocity: Array | None = None  # the setpoint to be repeated
         self._offsets = Offset()
         self._turned, self._ended, self._failure = threading.Condition(), threading.Event(), ""
@@ -224,8 +247,17 @@ class LiveVehicle:
     def land(self) -> None:
         """Give up control: land and disarm. Raises MavlinkError."""
         self._stop()
-        self._velocity = None
+        self._velocity, self._told_to_stop = None, lambda: False
         self._client.land(self._wait)
+
+    @property
+    def armed(self) -> bool:
+        """By its last heartbeat."""
+        return self._client.armed
+
+    def listen(self, seconds: float) -> None:
+        """Once it was told to land: hear what it says."""
+        self._wait(lambda: False, seconds)
 
     def close(self) -> None:
         """Send nothing any more: unless it has landed, the autopilot's timeout brakes it."""
@@ -237,10 +269,16 @@ class LiveVehicle:
     def _take_off(self, height: float) -> None:
         client, wait = self._client, self._wait
         kind = client.identify(wait)
-        for message, interval in ((POSITION, POLL * 4), (ATTITUDE, POLL * 4), (IMU, POLL * 4), (STATE, 0.2)):
-            client.stream(message, interval, wait)
-        if not wait(lambda: client.position is not None and client.airborne is not None, 10.0):
-            raise MavlinkError("it does not tell its position, or whether it flies")
+        self._note(f"{kind}, in {client.mode}")
+        self._await_estimate()
+        for what, interval in ((LANDED, 0.2), (ATTITUDE, TELEMETRY), (FORCE, TELEMETRY), (MOTION, TELEMETRY)):
+            self._note(client.choose(what, interval, wait))
+        if not wait(lambda: client.position is not None and client.airborne is not None, 3.0):
+            raise NotTold("it does not tell its position, or whether it flies")
+        self._smooth()
+        with contextlib.suppress(MavlinkError):
+            client.stream(message_id("SYS_STATUS"), 2.0, wait)
+        self._compare_limits(kind)
         self._velocity = np.zeros(3)
         client.follow_setpoints(wait)
         if not client.armed:
@@ -252,6 +290,63 @@ class LiveVehicle:
             raise MavlinkError("it does not come to rest")
         if not wait(lambda: client.offboard and client.armed, 3.0):
             raise MavlinkError("it says that it follows setpoints, and its heartbeat that it does not")
+
+    def _await_estimate(self) -> None:
+        """Wait until the estimator knows where it is, if it says so; with progress."""
+        client, wait = self._client, self._wait
+        if not client.watch_estimator(wait):
+            return
+        began = said_at = time.monotonic()
+        ready = lambda: client.estimator is not None and not missing(client.estimator)  # noqa: E731
+        while not wait(ready, max(0.0, said_at + PROGRESS - time.monotonic())):
+            said_at, lacking = time.monotonic(), ", ".join(missing(client.estimator or 0))
+            if said_at - began > ESTIMATING:
+                raise MavlinkError(f"its estimator does not know, after {ESTIMATING:.0f} s: {lacking}")
+            log.info("waiting for the position estimate: %.0f s, it does not know: %s", said_at - began, lacking)
+
+    def _smooth(self) -> None:
+        """Take the mean of as many readings of the accelerometer as it takes to come within the description's error."""
+        client = self._client
+        felt: list[Array] = []
+
+        def another() -> bool:
+            if client.heard[FORCE] != len(felt) + heard:
+                felt.append(client.acceleration)
+                return len(felt) >= 2 * READINGS
+            return False
+
+        heard = client.heard[FORCE]
+        self._wait(another, 1.0)
+        noise = 2.0 * float(np.std(felt, axis=0).max()) if felt else 0.0
+        bound = float(np.min(np.asarray(self._robot.measurement_bound)[-self._robot.position_dim :]))
+        readings = min(max(1, math.ceil((noise / bound) ** 2)), READINGS)
+        client.smooth(readings)
+        if readings > 1:
+            self._note(f"its accelerometer is off by {noise:.1f} m/s²: the mean of {readings} readings is taken")
+
+    def _compare_limits(self, kind: str) -> None:
+        """What its parameters allow, beside what may be asked of it."""
+        client, wait = self._client, self._wait
+        told = {c.parameter: client.parameter(c.parameter, wait) for c in CEILINGS[kind]}
+        values = {name: value for name, value in told.items() if value is not None}
+        for ceiling, value in too_low(kind, values, self._robot):
+            wanted = ceiling.value(demand(self._robot))
+            short = f"{ceiling.parameter} is {value:g} ({ceiling.what}), and up to {wanted:g} may be asked for"
+            if self._raise_limits:
+                done = client.set_parameter(ceiling.parameter, wanted, wait)
+                self._note(f"{ceiling.parameter}: {value:g} -> {wanted:g}" + ("" if done else ", which it refuses"))
+            else:
+                self._note(f"{short}: raise it (--raise-limits), or it cannot do what is asked of it")
+        name = TIMEOUTS[kind]
+        timeout = client.parameter(name, wait)
+        if timeout is None and kind in FIXED_TIMEOUT:
+            self._note(f"no {name} here: it flies on for {FIXED_TIMEOUT[kind]:g} s when setpoints stop")
+        elif timeout is not None and timeout > SHORTEST[kind]:
+            self._note(f"{name} is {timeout:g}: so many seconds it flies on when setpoints stop")
+
+    def _note(self, line: str) -> None:
+        self.notes.append(line)
+        log.info("%s", line)
 
     def _climb(self, kind: str, height: float) -> None:
         client, wait = self._client, self._wait
@@ -291,6 +386,7 @@ class LiveVehicle:
         start, state = self.turn.report.measured[:3], self._state(now)
         report = self._report(state, self._path(now, state) - start)
         self.turn = Turn(self.turn.number + 1, self._velocity, report, self._lost(now))
+        self._say_lost(self.turn.lost)
         self._client.path = self._client.path[-1:]
         self._turned.notify_all()
 
@@ -305,17 +401,46 @@ class LiveVehicle:
 
     def _lost(self, now: float) -> str:
         """Why what is measured, or asked of the autopilot, does not count."""
-        if now - self._heard_at > STALE:
-            return f"no telemetry for {now - self._heard_at:.2f} s"
-        if not (self._client.offboard and self._client.armed):
-            return "the autopilot does not follow our setpoints"
-        return ""
+        client = self._client
+        for what in IN_FLIGHT:
+            silent = now - self._heard_at.get(what, -math.inf)
+            if silent > STALE:
+                return f"no telemetry of {what} for {silent:.2f} s"
+        if now - self._heard_at.get("mode", -math.inf) > SILENT:
+            return f"no heartbeat for more than {SILENT:.0f} s"
+        if not (client.offboard and client.armed):
+            state = client.mode if client.armed else "it is disarmed"
+            return f"the autopilot does not follow our setpoints ({state})"
+        return "the autopilot says that it is in an emergency" if client.emergency else ""
+
+    def _say_lost(self, why: str) -> None:
+        """Once, when it begins or has another reason, and when it ends."""
+        self.timing.lost += bool(why)
+        kind, said = why.split(" for ")[0], self._said_lost
+        if kind != said:
+            self._said_lost = kind
+            texts = "; ".join(self._client.texts[-2:])
+            if why:
+                log.warning("braking: %s%s", why, f"; it says: {texts}" if texts else "")
+            else:
+                log.warning("flying again, after: %s", said)
+        battery = self._client.battery
+        if battery is not None and battery < LOW and not self._said_low:
+            self._said_low = True
+            log.warning("its battery is at %.0f %%", battery)
+
+    @property
+    def _offset(self) -> float:
+        """s, our clock less the autopilot's: by the messages that came soonest, less their way, which is half of what
+        TIMESYNC takes at the least; what is within our own polling is not counted."""
+        way = 0.5 * self.timing.round_trip - POLL
+        return self._offsets.value - (way if 0.0 < way < STALE else 0.0)
 
     def _state(self, now: float) -> Array:
         """The state (9,) at a moment of ours: the latest telemetry, carried on by its own velocity and acceleration."""
         client = self._client
         assert client.position is not None
-        ahead = min(max(now - self._offsets.value - client.time, 0.0), STALE)
+        ahead = min(max(now - self._offset - client.time, 0.0), STALE)
         v, a = client.velocity, client.acceleration
         position = client.position + self._origin + ahead * v + 0.5 * ahead**2 * a
         return np.concatenate((position, v + ahead * a, a))
@@ -323,7 +448,7 @@ class LiveVehicle:
     def _path(self, now: float, state: Array) -> Array:
         """Positions (S, 3) at even times of the period that ends now, in that state."""
         heard = self._client.path
-        times = [t + self._offsets.value for t, _ in heard] + [now]
+        times = [t + self._offset for t, _ in heard] + [now]
         places = np.array([p + self._origin for _, p in heard] + [state[:3]])
         at = now - self._robot.period + self._robot.period / SAMPLES * np.arange(1, SAMPLES + 1)
         return np.stack([np.interp(at, times, places[:, axis]) for axis in range(3)], axis=1)
@@ -341,9 +466,17 @@ class LiveVehicle:
         before = len(client.path), client.time
         with self._tolerance.over("mavlink"):
             client.feed(self._link.receive())
+        for what, count in client.heard.items():
+            if self._counted.get(what) != count:
+                self._counted[what], self._heard_at[what] = count, now
         if (len(client.path), client.time) != before:
-            self._heard_at = now
             self._offsets.note(now, client.time)
+        for asked, _ in client.answers:
+            self.timing.round_trip = min(self.timing.round_trip, 1e-9 * (time.monotonic_ns() - asked))
+        client.answers.clear()
+        if now - self._asked_at >= HURRY:
+            self._asked_at = now
+            client.ask_time(time.monotonic_ns())
         if self._truth is not None:
             self._truth.poll()
         if now - self._beaten_at >= 1.0:
@@ -363,6 +496,8 @@ class LiveVehicle:
         """While no thread does: exchange until it holds."""
         deadline = time.monotonic() + seconds
         while not condition():
+            if self._told_to_stop():
+                raise MavlinkError("told to stop before it flew")
             if time.monotonic() > deadline:
                 return False
             self._exchange(time.monotonic())

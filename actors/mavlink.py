@@ -6,28 +6,33 @@ are fed in, bytes are handed to `send`, and who waits for something brings a way
 
 from __future__ import annotations
 
+import contextlib
 import math
 import os
+import struct
+from collections import Counter, deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 os.environ.setdefault("MAVLINK20", "1")  # read when pymavlink is imported
 
-from pymavlink.dialects.v20 import common as mavlink
+from pymavlink.dialects.v20 import ardupilotmega as mavlink  # `common`, and what ArduPilot adds
 
-Array = NDArray[np.float64]
+from actors import telemetry
+from actors.telemetry import ATTITUDE, ESTIMATORS, FORCE, GRAVITY, LANDED, MOTION, SOURCES, Array, Motion
 
 STATION, COMPONENT = 245, int(mavlink.MAV_COMP_ID_ONBOARD_COMPUTER)  # who we are
 AUTOPILOT = int(mavlink.MAV_COMP_ID_AUTOPILOT1)
 VELOCITY_ONLY = 0x0DC7  # type mask: position, acceleration, yaw and yaw rate are to be ignored
-GRAVITY = 9.81  # m/s²
 ANSWER = 0.5  # s for a COMMAND_ACK, then it is sent again
 TRIES = 5
-ARMINGS = 20  # times that arming may be refused at first
+ARMINGS = 120  # times that arming may be refused at first
+FIRST, WATCHED = 1.0, 0.5  # s until a message that was granted comes, and for how long its rate is then watched
+PROMPT, SLOWEST = 0.6, 10.0  # share of the rate asked for that is good, and Hz without which nobody can fly
+FULL = 100.0  # %
 KINDS = {int(mavlink.MAV_AUTOPILOT_PX4): "px4", int(mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA): "ardupilot"}
 OFFBOARD = {"px4": (6, 6 << 16), "ardupilot": (4, 4)}  # DO_SET_MODE's param2, and HEARTBEAT's custom mode
 RESULTS = {
@@ -47,6 +52,10 @@ class NoAutopilot(MavlinkError):
 
 class CommandRefused(MavlinkError):
     """A COMMAND_ACK with another result than accepted, or none."""
+
+
+class NotTold(MavlinkError):
+    """Something that is needed comes by none of the messages that could tell it."""
 
 
 @dataclass(frozen=True)
@@ -91,29 +100,47 @@ def decoded(raw: bytes, outgoing: bool) -> Frame | None:
 class Client:
     """What is known of one autopilot, and the messages to it.
 
-    path: (time [s since its boot], position (3,)) of each LOCAL_POSITION_NED since it was last emptied; the rest is the
-    latest. `position`, `velocity` [m, m/s] are (3,) or None before the first; `acceleration` [m/s²] is the
-    accelerometer's reading (HIGHRES_IMU) turned into the world by the attitude (ATTITUDE_QUATERNION), gravity taken
-    out: all autopilots have these two, and few LOCAL_POSITION_NED_COV.
+    path: (time [s since its boot], position (3,)) of each position since it was last emptied; the rest is the latest.
+    `position`, `velocity` [m, m/s] are (3,) or None before the first; `acceleration` [m/s²] is the accelerometer's
+    reading turned into the world by the attitude, gravity taken out: few autopilots tell it themselves. Until `choose`
+    has found out what comes, everything is taken from the best message that did.
+
+    received, missed: frames of the autopilot, by their sequence numbers.
     """
 
-    def __init__(self, send: Callable[[bytes], object], system: int = 1, tap: Tap | None = None) -> None:
-        """system: the autopilot's; tap: is called with every frame from it and to it."""
+    def __init__(
+        self,
+        send: Callable[[bytes], object],
+        system: int = 1,
+        tap: Tap | None = None,
+        say: Callable[[str], object] | None = None,
+    ) -> None:
+        """system: the autopilot's; tap: is called with every frame from it and to it; say: with its texts."""
         self.system = system
         self.kind: str | None = None
         self.armed = False
         self.custom_mode = 0
+        self.emergency = False
         self.airborne: bool | None = None  # None: it has not said
-        self.heartbeats = 0
+        self.heard: Counter[str] = Counter()  # messages by what they told: a key of SOURCES; heartbeats: "mode"
         self.time = 0.0  # s since its boot, of the latest position
         self.position: Array | None = None
         self.velocity = np.zeros(3)
         self.path: list[tuple[float, Array]] = []
         self.texts: list[str] = []
-        self._attitude = (1.0, 0.0, 0.0, 0.0)  # NED from forward-right-down
-        self._force = (0.0, 0.0, -GRAVITY)
+        self.estimator: int | None = None  # flags, see telemetry.ESTIMATED
+        self.battery: float | None = None  # %, if it tells
+        self.answers: list[tuple[int, int]] = []  # ns, of TIMESYNC: what we sent, and the autopilot's clock then
+        self.chosen: dict[str, str] = {}  # message by key of SOURCES
+        self.received = self.missed = 0
+        self._sequence: int | None = None
+        self._came: Counter[str] = Counter()  # messages by name
+        self._best: dict[str, int] = {}  # place in SOURCES of the best message that came, until one is chosen
+        self._attitude: telemetry.Quaternion = (1.0, 0.0, 0.0, 0.0)  # NED from forward-right-down
+        self._forces: deque[telemetry.Triple] = deque([(0.0, 0.0, -GRAVITY)], 1)
         self._acks: dict[int, int] = {}
-        self._tap = tap
+        self._parameters: dict[str, float] = {}
+        self._tap, self._say = tap, say
         self._mav = mavlink.MAVLink(_Pipe(send), srcSystem=STATION, srcComponent=COMPONENT)
         self._mav.robust_parsing = True
         if tap is not None:
@@ -122,27 +149,104 @@ class Client:
     @property
     def acceleration(self) -> Array:
         """(3,) m/s², ENU."""
-        w, x, y, z = self._attitude
-        a, b, c = self._force
-        tx, ty, tz = 2.0 * (y * c - z * b), 2.0 * (z * a - x * c), 2.0 * (x * b - y * a)
-        north, east, down = a + w * tx + y * tz - z * ty, b + w * ty + z * tx - x * tz, c + w * tz + x * ty - y * tx
-        return np.array([east, north, -down - GRAVITY])
+        count = len(self._forces)
+        x, y, z = (sum(force[axis] for force in self._forces) / count for axis in range(3))
+        return telemetry.acceleration(self._attitude, (x, y, z))
 
     @property
     def offboard(self) -> bool:
         """It follows setpoints, by its last heartbeat."""
         return self.kind is not None and self.custom_mode == OFFBOARD[self.kind][1]
 
+    @property
+    def mode(self) -> str:
+        """As people call it, by its last heartbeat."""
+        return "no mode yet" if self.kind is None else telemetry.mode_name(self.kind, self.custom_mode)
+
     def feed(self, data: bytes) -> None:
         """Bytes from the link, in pieces of any size."""
         for message in self._mav.parse_buffer(data) or ():
             if message.get_srcSystem() != self.system or message.get_srcComponent() != AUTOPILOT:
                 continue
+            self._count(message.get_seq())
             if self._tap is not None:
                 self._tap(Frame(False, bytes(message.get_msgbuf()), message))
+            name = message.get_type()
+            self._came[name] += 1
+            for what, place in SENDERS.get(name, ()):
+                self._take(what, place, message)
             handler = HANDLERS.get(message.get_msgId())
             if handler is not None:
                 handler(self, message)
+
+    def choose(self, what: str, interval: float, wait: Wait) -> str:
+        """Find out which message tells something, and have it sent every so many seconds: a line about it for people.
+
+        Asked for one after the other, the best first; a grant counts for nothing until the message comes, at its rate.
+
+        Raises:
+            NotTold: with what became of each.
+        """
+        kind, tried, rates = self.identify(wait), [], dict[str, float]()
+        for source in SOURCES[what]:
+            if kind not in source.kinds:
+                continue
+            self.chosen[what] = name = source.message
+            try:
+                self.stream(message_id(name), interval, wait)
+            except CommandRefused:
+                tried.append(f"{name} is refused")
+                continue
+            rates[name] = self._rate(what, wait)
+            if rates[name] * interval >= PROMPT:
+                break
+            tried.append(f"{name} comes at {rates[name]:.0f} Hz" if rates[name] else f"{name} is granted, never comes")
+        best = max(rates, key=lambda name: rates[name], default="")
+        if not best or rates[best] < min(SLOWEST, PROMPT / interval):
+            del self.chosen[what]
+            raise NotTold(f"it does not tell its {what}: {', '.join(tried)}")
+        self.chosen[what] = best
+        for name in rates.keys() - set(self.chosen.values()):
+            with contextlib.suppress(CommandRefused):
+                self.stream(message_id(name), 0.0, wait)
+        return f"{what} from {best} at {rates[best]:.0f} Hz" + (f" ({', '.join(tried)})" if tried else "")
+
+    def smooth(self, readings: int) -> None:
+        """From now on the mean of so many readings of the accelerometer counts."""
+        self._forces = deque(self._forces, readings)
+
+    def watch_estimator(self, wait: Wait) -> bool:
+        """Have it tell how its estimate is; False: it does not."""
+        for name in ESTIMATORS:
+            try:
+                self.stream(message_id(name), 0.5, wait)
+            except CommandRefused:
+                continue
+            if wait(lambda: self.estimator is not None, 2.0 * FIRST):
+                return True
+        return False
+
+    def parameter(self, name: str, wait: Wait) -> float | None:
+        """A parameter's value; None: it has none of that name, or does not say."""
+        self._parameters.pop(name, None)
+        for _ in range(3):
+            self._mav.param_request_read_send(self.system, AUTOPILOT, name.encode(), -1)
+            if wait(lambda: name in self._parameters, ANSWER):
+                return self._parameters[name]
+        return None
+
+    def set_parameter(self, name: str, value: float, wait: Wait) -> bool:
+        """Whether it then has that value."""
+        for _ in range(3):
+            self._parameters.pop(name, None)
+            self._mav.param_set_send(self.system, AUTOPILOT, name.encode(), value, mavlink.MAV_PARAM_TYPE_REAL32)
+            if wait(lambda: name in self._parameters, ANSWER) and abs(self._parameters[name] - value) < 0.01:
+                return True
+        return False
+
+    def ask_time(self, now: int) -> None:
+        """TIMESYNC; now: our clock, ns. The answer goes to `answers`."""
+        self._mav.timesync_send(0, now)
 
     def heartbeat(self) -> None:
         """We live; once a second is expected."""
@@ -225,52 +329,112 @@ class Client:
         """Raises CommandRefused."""
         self.command(mavlink.MAV_CMD_NAV_LAND, wait=wait)
 
+    def _count(self, sequence: int) -> None:
+        if self._sequence is not None:
+            self.missed += (sequence - self._sequence - 1) % 256
+        self._sequence = sequence
+        self.received += 1
+
+    def _rate(self, what: str, wait: Wait) -> float:
+        """Hz at which the message chosen for it comes, once it does; 0: it does not."""
+        began = self.heard[what]
+        if not wait(lambda: self.heard[what] > began, FIRST):
+            return 0.0
+        began = self.heard[what]
+        wait(lambda: False, WATCHED)
+        return (self.heard[what] - began) / WATCHED
+
+    def _take(self, what: str, place: int, message: Any) -> None:
+        """What a message says of something, unless another is relied on for that."""
+        source = SOURCES[what][place]
+        if self.kind is not None and self.kind not in source.kinds:
+            return
+        chosen = self.chosen.get(what)
+        if (chosen or source.message) != source.message or (not chosen and place > self._best.get(what, place)):
+            return
+        told = source.read(message)
+        if told is None:
+            return
+        self._best[what] = place
+        self.heard[what] += 1
+        TAKERS[what](self, told)
+
+    def _move(self, motion: Motion) -> None:
+        self.time, self.position, self.velocity = motion.time, motion.position, motion.velocity
+        self.path.append((motion.time, motion.position))
+
+    def _turn(self, attitude: telemetry.Quaternion) -> None:
+        self._attitude = attitude
+
+    def _feel(self, force: telemetry.Triple) -> None:
+        self._forces.append(force)
+
+    def _lift(self, airborne: bool) -> None:
+        self.airborne = airborne
+
     def _on_heartbeat(self, message: Any) -> None:
         if message.autopilot not in KINDS:
             return
         self.kind = KINDS[message.autopilot]
         self.armed = bool(message.base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED)
+        self.emergency = message.system_status in (mavlink.MAV_STATE_CRITICAL, mavlink.MAV_STATE_EMERGENCY)
         self.custom_mode = message.custom_mode
-        self.heartbeats += 1
-
-    def _on_position(self, message: Any) -> None:
-        self.time = 1e-3 * message.time_boot_ms
-        self.position = np.array([message.y, message.x, -message.z])
-        self.velocity = np.array([message.vy, message.vx, -message.vz])
-        self.path.append((self.time, self.position))
-
-    def _on_attitude(self, message: Any) -> None:
-        self._attitude = (message.q1, message.q2, message.q3, message.q4)
-
-    def _on_imu(self, message: Any) -> None:
-        self._force = (message.xacc, message.yacc, message.zacc)
-
-    def _on_state(self, message: Any) -> None:
-        if message.landed_state != mavlink.MAV_LANDED_STATE_UNDEFINED:
-            self.airborne = message.landed_state != mavlink.MAV_LANDED_STATE_ON_GROUND
+        self.heard["mode"] += 1
 
     def _on_ack(self, message: Any) -> None:
         if message.result != mavlink.MAV_RESULT_IN_PROGRESS:
             self._acks[message.command] = message.result
 
     def _on_text(self, message: Any) -> None:
+        fresh = not self.texts or self.texts[-1] != message.text
         self.texts.append(message.text)
+        if fresh and self._say is not None:
+            self._say(message.text)
+
+    def _on_estimator(self, message: Any) -> None:
+        self.estimator = message.flags
+
+    def _on_status(self, message: Any) -> None:
+        if 0 <= message.battery_remaining <= FULL:
+            self.battery = float(message.battery_remaining)
+
+    def _on_parameter(self, message: Any) -> None:
+        value = message.param_value
+        if self.kind == "px4" and message.param_type == mavlink.MAV_PARAM_TYPE_INT32:  # its bits, not its value
+            value = struct.unpack("<i", struct.pack("<f", value))[0]
+        self._parameters[message.param_id] = float(value)
+
+    def _on_time(self, message: Any) -> None:
+        if message.tc1 == 0:
+            return  # it asks: its own estimate of our clock is of no use to what we send
+        self.answers.append((message.ts1, message.tc1))
 
 
 HANDLERS: dict[int, Callable[[Client, Any], None]] = {
     mavlink.MAVLINK_MSG_ID_HEARTBEAT: Client._on_heartbeat,
-    mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED: Client._on_position,
-    mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION: Client._on_attitude,
-    mavlink.MAVLINK_MSG_ID_HIGHRES_IMU: Client._on_imu,
-    mavlink.MAVLINK_MSG_ID_EXTENDED_SYS_STATE: Client._on_state,
     mavlink.MAVLINK_MSG_ID_COMMAND_ACK: Client._on_ack,
     mavlink.MAVLINK_MSG_ID_STATUSTEXT: Client._on_text,
+    mavlink.MAVLINK_MSG_ID_EKF_STATUS_REPORT: Client._on_estimator,
+    mavlink.MAVLINK_MSG_ID_ESTIMATOR_STATUS: Client._on_estimator,
+    mavlink.MAVLINK_MSG_ID_SYS_STATUS: Client._on_status,
+    mavlink.MAVLINK_MSG_ID_PARAM_VALUE: Client._on_parameter,
+    mavlink.MAVLINK_MSG_ID_TIMESYNC: Client._on_time,
 }
+TAKERS: dict[str, Callable[[Client, Any], None]] = {
+    MOTION: Client._move,
+    ATTITUDE: Client._turn,
+    FORCE: Client._feel,
+    LANDED: Client._lift,
+}
+SENDERS: dict[str, list[tuple[str, int]]] = {}  # by message: what it can tell, and its place there
+for _what, _sources in SOURCES.items():
+    for _place, _source in enumerate(_sources):
+        SENDERS.setdefault(_source.message, []).append((_what, _place))
 
-POSITION = int(mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED)
-ATTITUDE = int(mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION)
-IMU = int(mavlink.MAVLINK_MSG_ID_HIGHRES_IMU)
-STATE = int(mavlink.MAVLINK_MSG_ID_EXTENDED_SYS_STATE)
+
+def message_id(name: str) -> int:
+    """Of a message by its name."""
+    return int(getattr(mavlink, f"MAVLINK_MSG_ID_{name}"))
 
 
 @dataclass(frozen=True)

@@ -33,3 +33,4 @@ class FlightSettings:
     truth: int = 0  # UDP port at which a simulator tells collisions; 0: none does
     height: float = 3.0  # m above the ground that it climbs to, unless it flies already
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0)  # m: where the autopilot's local frame begins
+    raise_limits: bool = False  # set the parameters that hold the vehicle below what the filter may ask for

@@ -105,11 +105,14 @@ class Flight:
     """m: where in the arena the autopilot's local frame begins."""
     at_start: bool = False
     """Its local frame begins on the floor below the arena's start: a simulator on its home position."""
+    raise_limits: bool = False
+    """Set those of its parameters that hold it below what the filter may ask for: speeds, accelerations, tilt."""
 
     def settings(self, url: str, arena: Arena) -> FlightSettings:
         """For the flight in an arena."""
         x, y, *_ = arena.start
-        return FlightSettings(url, self.system, self.truth, self.height, (x, y, 0.0) if self.at_start else self.origin)
+        origin = (x, y, 0.0) if self.at_start else self.origin
+        return FlightSettings(url, self.system, self.truth, self.height, origin, self.raise_limits)
 
 
 @dataclass(frozen=True)

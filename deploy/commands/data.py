@@ -42,6 +42,22 @@ DIVERGES = 100.0  # m, of a stop's half-width: wider than any arena
 
 
 @dataclass(frozen=True)
+class First:
+    """The first flight of a vehicle."""
+
+    minutes: float = 15.0
+    """Of flight, without takeoff and landing."""
+    height: float = 30.0
+    """m that it climbs to; it stays between a third of it and five thirds."""
+    room: float = 80.0
+    """m, the side of the square that it stays in."""
+    system: int = 1
+    """MAVLink system id of the vehicle."""
+    raise_limits: bool = False
+    """Set those of its parameters that hold it below what its description says: speeds, accelerations, tilt."""
+
+
+@dataclass(frozen=True)
 class Collect:
     robot: Robot = "ground"
     trajectories: int | None = None
@@ -50,9 +66,15 @@ class Collect:
     physics: Flags[Physics] = field(default_factory=Physics)
     out: Path | None = None
     """File; default: the data set in use (data/ROBOT/record.safetensors), replaced."""
+    url: str = ""
+    """The first flight of a vehicle behind udpin:HOST:PORT, udpout:HOST:PORT or tcp:HOST:PORT. It takes off, is excited
+    in a box, slow first, and lands; nothing is filtered: nothing may be there."""
+    first: Flags[First] = field(default_factory=First)
     json: bool = False
 
     def run(self) -> int:
+        if self.url:
+            return self._first_flight()
         robot = learnt(self.robot)
         path = self.out or record_path(robot)
         data = recorded(robot, path, self.trajectories, self.seed, self.physics.conditions(), again=True)
@@ -63,6 +85,39 @@ class Collect:
             console.print(f"{path}: {data.periods} periods in {len(data.trajectories)} trajectories, {data.digest()}")
             console.print("next: " + f"brakeline certify {path}")
         return 0
+
+    def _first_flight(self) -> int:
+        """Raises ValueError for a robot that does not fly."""
+        from deploy.run.maiden import MaidenSettings, fly
+
+        robot = learnt(self.robot)
+        if robot.position_dim != 3:
+            raise ValueError(f"a {robot.kind} robot does not fly")
+        first = self.first
+        path = self.out or record_path(robot).with_name("flown.safetensors")
+        found = fly(
+            robot.in_lockstep().in_real_time(),
+            MaidenSettings(
+                self.url, first.system, first.minutes, first.height, first.room, self.seed, first.raise_limits
+            ),
+        )
+        found.data.save(path)
+        figures: dict[str, Any] = {"path": str(path), "periods": found.data.periods, "minutes": found.seconds / 60.0}
+        figures |= {"level": found.level, "missing": found.missing}
+        if found.model is not None and found.statement is not None:
+            model = model_path(found.model.robot, found.model.recipe)
+            found.model.save(model)
+            figures |= {"model": str(model), "windows_of": found.model.recipe.windows} | found.statement.figures()
+        if self.json:
+            say_json(figures)
+            return 0 if found.model is not None else 1
+        console.print(f"{path}: {found.data.periods} periods in {found.seconds / 60.0:.1f} min of flight", markup=False)
+        if found.statement is not None and found.model is not None:
+            console.print(table([(found.statement, found.model.recipe.windows)]))
+            console.print(f"{figures['model']}: in use from now on", markup=False)
+        for line in found.missing:
+            console.print(f"missing: {line}", markup=False)
+        return 0 if found.model is not None else 1
 
 
 @dataclass(frozen=True)

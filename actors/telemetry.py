@@ -1,0 +1,168 @@
+"""What an autopilot can tell about its vehicle, and by which messages: their units and frames end here.
+
+Autopilots differ in what they grant, and in what then comes: a list for each thing needed, the best first. What goes
+out is ENU and SI, but for two that only make sense together: an attitude turns forward-right-down into NED, a force is
+felt along forward-right-down.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Quaternion = tuple[float, float, float, float]  # w, x, y, z
+Triple = tuple[float, float, float]
+
+GRAVITY = 9.81  # m/s²
+MILLIGRAVITY = 9.80665e-3  # m/s², the unit of some accelerometers
+MOTION, ATTITUDE, FORCE, LANDED = "position and velocity", "attitude", "acceleration", "landed state"
+LOCAL, BODY = (1,), (8, 12)  # MAV_FRAME: LOCAL_NED; BODY_NED and BODY_FRD of a velocity
+ON_GROUND, UNKNOWN = 1, 0  # MAV_LANDED_STATE
+
+Message = Any  # pymavlink is untyped
+
+
+@dataclass(frozen=True)
+class Motion:
+    """time [s] by the autopilot's clock, position [m] in its local frame, velocity [m/s]; (3,) each, ENU."""
+
+    time: float
+    position: Array
+    velocity: Array
+
+
+@dataclass(frozen=True)
+class Source:
+    """A message that tells something; `read` gives None when it does not this time."""
+
+    message: str
+    read: Callable[[Message], Any]
+    kinds: tuple[str, ...] = ("px4", "ardupilot")  # whose it is to be understood so
+
+
+def turned(q: Quaternion, vector: Triple) -> Triple:
+    """A vector in the frame that the attitude turns into."""
+    w, x, y, z = q
+    a, b, c = vector
+    tx, ty, tz = 2.0 * (y * c - z * b), 2.0 * (z * a - x * c), 2.0 * (x * b - y * a)
+    return (a + w * tx + y * tz - z * ty, b + w * ty + z * tx - x * tz, c + w * tz + x * ty - y * tx)
+
+
+def world(ned: Triple) -> Array:
+    """NED to ENU."""
+    north, east, down = ned
+    return np.array([east, north, -down])
+
+
+def acceleration(attitude: Quaternion, force: Triple) -> Array:
+    """(3,) m/s², ENU: what an accelerometer feels, turned into the world, gravity taken out."""
+    north, east, down = turned(attitude, force)
+    return np.array([east, north, -down - GRAVITY])
+
+
+def _position(m: Message) -> Motion:
+    return Motion(1e-3 * m.time_boot_ms, world((m.x, m.y, m.z)), world((m.vx, m.vy, m.vz)))
+
+
+def _odometry(m: Message) -> Motion | None:
+    """Only in the local frame; its velocity may be along the body."""
+    velocity = (m.vx, m.vy, m.vz)
+    if m.frame_id not in LOCAL or m.child_frame_id not in LOCAL + BODY:
+        return None
+    if m.child_frame_id in BODY:
+        velocity = turned(tuple(m.q), velocity)
+    return Motion(1e-6 * m.time_usec, world((m.x, m.y, m.z)), world(velocity))
+
+
+def _quaternion(m: Message) -> Quaternion:
+    return (m.q1, m.q2, m.q3, m.q4)
+
+
+def _odometry_attitude(m: Message) -> Quaternion | None:
+    return tuple(m.q) if m.frame_id in LOCAL else None
+
+
+def _euler(m: Message) -> Quaternion:
+    """Yaw, then pitch, then roll."""
+    cr, sr = math.cos(0.5 * m.roll), math.sin(0.5 * m.roll)
+    cp, sp = math.cos(0.5 * m.pitch), math.sin(0.5 * m.pitch)
+    cy, sy = math.cos(0.5 * m.yaw), math.sin(0.5 * m.yaw)
+    return (
+        cr * cp * cy + sr * sp * sy,
+        sr * cp * cy - cr * sp * sy,
+        cr * sp * cy + sr * cp * sy,
+        cr * cp * sy - sr * sp * cy,
+    )
+
+
+def _metric(m: Message) -> Triple:
+    return (m.xacc, m.yacc, m.zacc)
+
+
+def _milligravities(m: Message) -> Triple:
+    return (MILLIGRAVITY * m.xacc, MILLIGRAVITY * m.yacc, MILLIGRAVITY * m.zacc)
+
+
+def _airborne(m: Message) -> bool | None:
+    return None if m.landed_state == UNKNOWN else m.landed_state != ON_GROUND
+
+
+SOURCES: dict[str, tuple[Source, ...]] = {
+    ATTITUDE: (
+        Source("ATTITUDE_QUATERNION", _quaternion),
+        Source("ODOMETRY", _odometry_attitude),
+        Source("ATTITUDE", _euler),
+    ),
+    FORCE: (
+        Source("HIGHRES_IMU", _metric),
+        Source("SCALED_IMU", _milligravities),
+        Source("RAW_IMU", _milligravities, ("ardupilot",)),  # raw by the book; there it is what SCALED_IMU has
+        Source("SCALED_IMU2", _milligravities),
+    ),
+    LANDED: (Source("EXTENDED_SYS_STATE", _airborne),),
+    MOTION: (Source("LOCAL_POSITION_NED", _position), Source("ODOMETRY", _odometry)),
+}
+IN_FLIGHT = (MOTION, ATTITUDE, FORCE)  # what is lost when it stops coming
+
+# EKF_STATUS_REPORT (ArduPilot) and ESTIMATOR_STATUS (PX4) have the same flags.
+ESTIMATED = {
+    "attitude": 1,
+    "horizontal velocity": 2,
+    "vertical velocity": 4,
+    "horizontal position": 8 | 16,
+    "height": 32,
+}
+CONSTANT_POSITION = 128  # it only assumes that it stands still
+ESTIMATORS = ("EKF_STATUS_REPORT", "ESTIMATOR_STATUS")
+
+
+def missing(flags: int) -> list[str]:
+    """What the estimator does not know yet, by its flags."""
+    lacking = [name for name, bits in ESTIMATED.items() if not flags & bits]
+    return lacking + ["anything but that it stands still"] * bool(flags & CONSTANT_POSITION)
+
+
+# --- modes ----------------------------------------------------------------------------------------------------------
+
+COPTER_MODES = {
+    0: "STABILIZE", 1: "ACRO", 2: "ALT_HOLD", 3: "AUTO", 4: "GUIDED", 5: "LOITER", 6: "RTL", 7: "CIRCLE", 9: "LAND",
+    11: "DRIFT", 13: "SPORT", 14: "FLIP", 15: "AUTOTUNE", 16: "POSHOLD", 17: "BRAKE", 18: "THROW", 19: "AVOID_ADSB",
+    20: "GUIDED_NOGPS", 21: "SMART_RTL",
+}  # fmt: skip
+PX4_MODES = {1: "MANUAL", 2: "ALTCTL", 3: "POSCTL", 5: "ACRO", 6: "OFFBOARD", 7: "STABILIZED"}
+PX4_AUTO = {1: "READY", 2: "TAKEOFF", 3: "HOLD", 4: "MISSION", 5: "RETURN", 6: "LAND", 8: "FOLLOW", 9: "PRECLAND"}
+
+
+def mode_name(kind: str, custom: int) -> str:
+    """What people call a HEARTBEAT's custom mode."""
+    if kind == "ardupilot":
+        return COPTER_MODES.get(custom, f"mode {custom}")
+    main, sub = custom >> 16 & 0xFF, custom >> 24 & 0xFF
+    names, number = (PX4_AUTO, sub) if main == 4 else (PX4_MODES, main)
+    return names.get(number, f"mode {main}.{sub}")

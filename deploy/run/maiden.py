@@ -1,0 +1,66 @@
+"""A vehicle's first flight, from the link to the landing."""
+
+from __future__ import annotations
+
+import logging
+import signal
+import threading
+import time
+from dataclasses import dataclass
+
+import numpy as np
+
+from actors.live import LiveVehicle
+from deploy.data.maiden import Box, Found, Maiden
+from messaging.links import open_link
+from messaging.robots import Robot
+
+LANDING = 120.0  # s that a landing may take
+
+
+@dataclass(frozen=True)
+class MaidenSettings:
+    url: str
+    system: int = 1
+    minutes: float = 15.0
+    height: float = 30.0  # m
+    room: float = 80.0  # m, the side of the square
+    seed: int = 0
+    raise_limits: bool = False
+
+
+def fly(robot: Robot, settings: MaidenSettings) -> Found:
+    """Take off, fly, land. SIGINT or SIGTERM: land at once; what was flown counts.
+
+    Raises:
+        BadLink, MavlinkError: with what to do; BadData: nothing was flown.
+    """
+    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s", datefmt="%H:%M:%S")
+    stop = threading.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: stop.set())
+    vehicle = LiveVehicle(
+        open_link(settings.url),
+        robot,
+        settings.system,
+        settings.height,
+        stop=stop.is_set,
+        raise_limits=settings.raise_limits,
+    )
+    try:
+        middle = vehicle.turn.report.measured[:3]
+        box = Box(middle, np.array([0.5 * settings.room, 0.5 * settings.room, settings.height * 2.0 / 3.0]))
+        about = {"autopilot": "; ".join(vehicle.notes), "url": settings.url}
+        found = Maiden(vehicle, robot, box, settings.seed, stop.is_set).fly(settings.minutes, about)
+        vehicle.wait(vehicle.turn.number + robot.horizon)
+        vehicle.land()
+        _await_landing(vehicle)
+    finally:
+        vehicle.close()
+    return found
+
+
+def _await_landing(vehicle: LiveVehicle) -> None:
+    deadline = time.monotonic() + LANDING
+    while vehicle.armed and time.monotonic() < deadline:
+        vehicle.listen(1.0)
