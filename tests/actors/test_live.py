@@ -11,6 +11,7 @@ import pytest
 
 from actors.live import LiveVehicle, Offset, Truth
 from actors.mavlink import Frame
+from actors.telemetry import ATTITUDE
 from messaging.clock import WallClock
 from messaging.links import open_link
 from messaging.ports import free_udp_port
@@ -118,11 +119,21 @@ def test_without_telemetry_it_says_so_and_goes_on(live: Live) -> None:
     assert not vehicle.wait(vehicle.turn.number + 2).lost
 
 
+def test_what_stops_coming_alone_is_lost_telemetry_too(live: Live) -> None:
+    vehicle, _, _ = live
+    vehicle._client.chosen[ATTITUDE] = "ODOMETRY"  # of which there is none; the position goes on coming
+    assert "no telemetry of attitude" in vehicle.wait(vehicle.turn.number + 3).lost
+    vehicle._client.chosen[ATTITUDE] = "ATTITUDE_QUATERNION"
+    assert not vehicle.wait(vehicle.turn.number + 2).lost
+    assert vehicle.timing.figures()["periods without telemetry"] >= 1
+
+
 def test_a_pilot_may_take_over(live: Live) -> None:
     vehicle, autopilot, _ = live
     autopilot.pilot.change(Mode.HOLD)
     time.sleep(1.3)  # a heartbeat
-    assert "does not follow" in vehicle.wait(vehicle.turn.number + 1).lost
+    turn = vehicle.wait(vehicle.turn.number + 1)
+    assert "does not follow" in turn.lost and {"px4": "HOLD", "ardupilot": "LOITER"}[vehicle._client.kind] in turn.lost
     assert autopilot.pilot.mode is Mode.HOLD, "who took it keeps it"
 
 

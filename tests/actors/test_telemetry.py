@@ -1,0 +1,215 @@
+"""Who can tell what: units and frames of every message, and what is used when an autopilot grants and does not send."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+
+from actors.ceilings import CEILINGS, demand, too_low
+from actors.mavlink import Client, NotTold, mavlink, message_id
+from actors.telemetry import ATTITUDE, ESTIMATED, FORCE, LANDED, MOTION, SOURCES, missing, mode_name, turned
+from sim.autopilot import frames
+from tests.robots import QUADROTOR
+
+ROLL, PITCH, YAW = 0.2, -0.3, 1.1  # rad
+DOWN = -1.02  # g, what an accelerometer that hovers feels downwards
+KINDS = {"px4": mavlink.MAV_AUTOPILOT_PX4, "ardupilot": mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA}
+
+
+def quaternion() -> tuple[float, float, float, float]:
+    """By the product of three turns, as the book has it: about down, then right, then ahead."""
+    half = [(math.cos(angle / 2.0), math.sin(angle / 2.0)) for angle in (ROLL, PITCH, YAW)]
+    (cr, sr), (cp, sp), (cy, sy) = half
+    yaw, pitch, roll = (cy, 0, 0, sy), (cp, 0, sp, 0), (cr, sr, 0, 0)
+    return times(times(yaw, pitch), roll)
+
+
+def times(a: Any, b: Any) -> tuple[float, float, float, float]:
+    (w, x, y, z), (s, t, u, v) = a, b
+    return (
+        w * s - x * t - y * u - z * v,
+        w * t + x * s + y * v - z * u,
+        w * u - x * v + y * s + z * t,
+        w * v + x * u - y * t + z * s,
+    )
+
+
+def odometry(frame: int = 1, child: int = 1, velocity: tuple[float, float, float] = (4.0, 5.0, 6.0)) -> Any:
+    nothing = [math.nan] + [0.0] * 20
+    return mavlink.MAVLink_odometry_message(
+        12_500_000, frame, child, 1.0, 2.0, 3.0, quaternion(), *velocity, 0, 0, 0, nothing, nothing
+    )
+
+
+SAID: dict[str, Any] = {
+    "LOCAL_POSITION_NED": mavlink.MAVLink_local_position_ned_message(12_500, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0),
+    "ODOMETRY": odometry(),
+    "ATTITUDE_QUATERNION": mavlink.MAVLink_attitude_quaternion_message(0, *quaternion(), 0, 0, 0),
+    "ATTITUDE": mavlink.MAVLink_attitude_message(0, ROLL, PITCH, YAW, 0, 0, 0),
+    "HIGHRES_IMU": mavlink.MAVLink_highres_imu_message(0, 0.1, 0.2, 9.80665 * DOWN, *[0] * 10, 0),
+    "SCALED_IMU": mavlink.MAVLink_scaled_imu_message(0, 10, 20, -1020, *[0] * 6),
+    "RAW_IMU": mavlink.MAVLink_raw_imu_message(0, 10, 20, -1020, *[0] * 6),
+    "SCALED_IMU2": mavlink.MAVLink_scaled_imu2_message(0, 10, 20, -1020, *[0] * 6),
+    "EXTENDED_SYS_STATE": mavlink.MAVLink_extended_sys_state_message(0, mavlink.MAV_LANDED_STATE_IN_AIR),
+}
+
+
+@pytest.mark.parametrize(("what", "name"), [(what, s.message) for what in SOURCES for s in SOURCES[what]])
+def test_every_message_says_the_same_in_its_own_units_and_frame(what: str, name: str) -> None:
+    read = next(source.read for source in SOURCES[what] if source.message == name)
+    told = read(SAID[name])
+    if what == MOTION:
+        assert told.time == pytest.approx(12.5)
+        assert told.position == pytest.approx([2.0, 1.0, -3.0]) and told.velocity == pytest.approx([5.0, 4.0, -6.0])
+    elif what == ATTITUDE:
+        assert told == pytest.approx(quaternion(), abs=1e-6)
+    elif what == FORCE:
+        assert told == pytest.approx([0.1, 0.2, 9.80665 * DOWN], abs=0.005)
+    else:
+        assert told is True
+
+
+def test_odometry_along_the_body_is_turned_and_of_another_frame_is_nothing() -> None:
+    read = SOURCES[MOTION][1].read
+    ahead = read(odometry(child=12, velocity=(1.0, 0.0, 0.0))).velocity
+    level = math.cos(PITCH)
+    assert ahead == pytest.approx([level * math.sin(YAW), level * math.cos(YAW), math.sin(PITCH)], abs=1e-6)
+    assert read(odometry(frame=20)) is None and SOURCES[ATTITUDE][1].read(odometry(frame=20)) is None
+
+
+def test_the_turn_agrees_with_the_autopilots_own_edge() -> None:
+    """What is felt along its body, turned by what it says of its attitude, is what the simulator knows."""
+    body = (0.3, -0.2, 9.0)  # forward-left-up
+    own = quaternion()  # taken for ENU from forward-left-up
+    there = np.array(frames.rotate(own, body))
+    north, east, down = turned(frames.attitude(own), frames.body(body))
+    assert [east, north, -down] == pytest.approx(there)
+
+
+class Pretender:
+    """An autopilot that answers as it is told to, in a time of its own.
+
+    grants: messages, and the rate [Hz] at which each then comes; all others are refused."""
+
+    def __init__(self, kind: str, grants: dict[str, float], parameters: dict[str, float] | None = None) -> None:
+        self.grants, self.parameters, self.now = grants, parameters or {}, 0.0
+        self.client, self.switched_off = Client(self.receive), list[str]()
+        self._out = bytearray()
+        self._mav = mavlink.MAVLink(self, srcSystem=1, srcComponent=1)
+        self._asked: dict[str, float] = {}
+        self._mav.heartbeat_send(mavlink.MAV_TYPE_QUADROTOR, KINDS[kind], 1, 0, mavlink.MAV_STATE_ACTIVE)
+
+    def write(self, data: bytes) -> None:
+        self._out += data
+
+    def receive(self, data: bytes) -> None:
+        for message in mavlink.MAVLink(None).parse_buffer(data) or ():
+            if message.get_type() == "COMMAND_LONG" and message.command == mavlink.MAV_CMD_SET_MESSAGE_INTERVAL:
+                name = mavlink.mavlink_map[int(message.param1)].msgname
+                if message.param2 < 0:
+                    self.switched_off.append(name)
+                    self._asked.pop(name, None)
+                elif name in self.grants:
+                    self._asked[name] = self.now
+                self._mav.command_ack_send(message.command, 0 if name in self.grants else 4)
+            if message.get_type() == "PARAM_REQUEST_READ" and message.param_id in self.parameters:
+                value = self.parameters[message.param_id]
+                self._mav.param_value_send(message.param_id.encode(), value, mavlink.MAV_PARAM_TYPE_REAL32, 1, 0)
+
+    def wait(self, condition: Callable[[], bool], seconds: float) -> bool:
+        end = self.now + seconds
+        while True:
+            self.client.feed(bytes(self._out))
+            self._out.clear()
+            if condition():
+                return True
+            if self.now >= end - 1e-9:
+                return False
+            self.now += 0.01
+            for name, since in self._asked.items():
+                rate = self.grants[name]
+                if rate and int((self.now - since) * rate) > int((self.now - 0.01 - since) * rate):
+                    self._mav.send(SAID[name])
+
+
+def test_what_is_granted_and_never_comes_is_not_relied_on() -> None:
+    """PX4 before its heading is known, as it was met."""
+    there = Pretender("px4", {"ATTITUDE_QUATERNION": 0.0, "ODOMETRY": 50.0, "HIGHRES_IMU": 50.0})
+    line = there.client.choose(ATTITUDE, 0.02, there.wait)
+    assert line.startswith("attitude from ODOMETRY at 5") and "ATTITUDE_QUATERNION is granted, never comes" in line
+    assert there.switched_off == ["ATTITUDE_QUATERNION"]
+    there.client.choose(FORCE, 0.02, there.wait)
+    hovering = times(quaternion(), times((0.0, *[0.1, 0.2, 9.80665 * DOWN]), conjugate(quaternion())))
+    assert there.client.acceleration == pytest.approx([hovering[2], hovering[1], -hovering[3] - 9.81], abs=1e-4)
+
+
+def conjugate(q: Any) -> tuple[float, float, float, float]:
+    return (q[0], -q[1], -q[2], -q[3])
+
+
+def test_what_is_refused_is_replaced_as_arducopter_needs_it() -> None:
+    grants = ("ATTITUDE", "RAW_IMU", "EXTENDED_SYS_STATE", "LOCAL_POSITION_NED")
+    there = Pretender("ardupilot", dict.fromkeys(grants, 50.0))
+    lines = [there.client.choose(what, 0.02, there.wait) for what in (ATTITUDE, FORCE, LANDED, MOTION)]
+    assert list(there.client.chosen.values()) == list(grants), lines
+    assert there.client.airborne and there.client.position == pytest.approx([2.0, 1.0, -3.0])
+
+
+def test_raw_units_are_believed_only_where_they_are_known() -> None:
+    there = Pretender("px4", {"RAW_IMU": 50.0})
+    with pytest.raises(NotTold, match="HIGHRES_IMU is refused"):
+        there.client.choose(FORCE, 0.02, there.wait)
+
+
+def test_the_faster_of_two_slow_ones_is_taken_and_one_too_slow_to_fly_is_none() -> None:
+    there = Pretender("px4", {"ATTITUDE_QUATERNION": 4.0, "ATTITUDE": 20.0})
+    assert there.client.choose(ATTITUDE, 0.02, there.wait).startswith("attitude from ATTITUDE at 2")
+    there = Pretender("px4", {"ATTITUDE_QUATERNION": 4.0})
+    with pytest.raises(NotTold, match="comes at 4 Hz"):
+        there.client.choose(ATTITUDE, 0.02, there.wait)
+
+
+def test_once_chosen_another_message_says_nothing() -> None:
+    there = Pretender("px4", {"ATTITUDE_QUATERNION": 0.0, "ATTITUDE": 50.0})
+    there.client.choose(ATTITUDE, 0.02, there.wait)
+    heard = there.client.heard[ATTITUDE]
+    there._mav.send(SAID["ATTITUDE_QUATERNION"])
+    there.wait(lambda: False, 0.0)
+    assert there.client.heard[ATTITUDE] == heard
+
+
+def test_frames_that_are_missing_are_counted() -> None:
+    there = Pretender("px4", {})
+    there.wait(lambda: False, 0.0)
+    for skipped in (0, 3):
+        there._mav.seq = (there._mav.seq + skipped) % 256
+        there._mav.send(SAID["ATTITUDE"])
+    there.wait(lambda: False, 0.0)
+    assert (there.client.received, there.client.missed) == (3, 3)
+
+
+def test_parameters_that_hold_it_below_what_may_be_asked_for() -> None:
+    there = Pretender("ardupilot", {}, {"WPNAV_ACCEL": 100.0, "WPNAV_SPEED": 800.0})
+    there.client.identify(there.wait)
+    values = {c.parameter: there.client.parameter(c.parameter, there.wait) for c in CEILINGS["ardupilot"]}
+    known = {name: value for name, value in values.items() if value is not None}
+    assert known == {"WPNAV_ACCEL": 100.0, "WPNAV_SPEED": 800.0}
+    assert [ceiling.parameter for ceiling, _ in too_low("ardupilot", known, QUADROTOR)] == ["WPNAV_ACCEL"]
+    asked = demand(QUADROTOR)
+    assert (asked.speed, asked.climb, asked.across) == pytest.approx((50**0.5, 5.0, 32**0.5))
+
+
+def test_what_the_estimator_lacks_has_a_name() -> None:
+    assert missing(sum({1, 2, 4, 16, 32})) == [] and missing(sum({1, 2, 4, 8, 32})) == []
+    assert missing(165) == ["horizontal velocity", "horizontal position", "anything but that it stands still"]
+    assert missing(0) == list(ESTIMATED)
+
+
+def test_modes_have_names() -> None:
+    assert mode_name("ardupilot", 6) == "RTL" and mode_name("ardupilot", 99) == "mode 99"
+    assert mode_name("px4", 6 << 16) == "OFFBOARD" and mode_name("px4", 4 << 16 | 5 << 24) == "RETURN"
+    assert message_id("EXTENDED_SYS_STATE") == 245

@@ -1,0 +1,88 @@
+"""ArduCopter and PX4 as they are, where there are any (tests/real.py): from switching on to flying and to landing."""
+
+from __future__ import annotations
+
+import logging
+import math
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from actors.live import LiveVehicle
+from actors.mavlink import OFFBOARD, Frame, mavlink, message_id
+from messaging.links import open_link
+from tests.real import KINDS, autopilot
+from tests.robots import QUADROTOR
+
+DEGREE = 111_319.5  # m, of latitude
+TRUTH = {"ardupilot": "SIMSTATE", "px4": "HIL_STATE_QUATERNION"}  # what its own simulator knows
+LAND = {"ardupilot": (9, 0), "px4": (4, 6)}  # DO_SET_MODE
+USED = {"ardupilot": {"ATTITUDE", "SCALED_IMU", "LOCAL_POSITION_NED", "EXTENDED_SYS_STATE"}}
+OFF = 1.5  # m that an estimate may be off after a few metres: it is made of a simulated GPS
+
+
+def place(message: Any) -> np.ndarray:
+    """East and north, m, by the truth."""
+    longitude = message.lng if message.get_type() == "SIMSTATE" else message.lon
+    east = longitude * math.cos(math.radians(1e-7 * message.lat))
+    return 1e-7 * DEGREE * np.array([east, message.lat])
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_it_is_found_out_flown_and_given_back(kind: str, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.INFO)
+    frames: list[Frame] = []
+    with autopilot(kind, tmp_path) as (url, system):
+        vehicle = LiveVehicle(open_link(url), QUADROTOR, system, height=5.0, tap=frames.append, raise_limits=True)
+        try:
+            client = vehicle._client
+            assert client.kind == kind and set(client.chosen.values()) >= USED.get(kind, set()), vehicle.notes
+            client._mav.command_long_send(
+                system, 1, mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, 0, message_id(TRUTH[kind]), 20_000, *[0] * 5
+            )
+
+            def truth() -> np.ndarray:
+                names = [frame for frame in reversed(frames[-2000:]) if frame.name.endswith(TRUTH[kind])]
+                return place(names[0].message)
+
+            hovering = [vehicle.step(np.zeros(3)) for _ in range(8)][-1].measured
+            began = truth()
+            flown = [vehicle.step(np.array([2.0, -1.0, 0.3])) for _ in range(15)][-1].measured
+            there = truth()
+            assert flown[:2] - hovering[:2] == pytest.approx(there - began, abs=OFF), "in our axes, by its own truth"
+            assert flown[0] - hovering[0] > 2.0 and flown[1] - hovering[1] < -0.8 and flown[5] > 0.0
+            assert flown[3:5] == pytest.approx([2.0, -1.0], abs=0.6)
+            braked = [vehicle.step(np.zeros(3)) for _ in range(15)][-1].measured
+            assert np.linalg.norm(braked[3:6]) < 0.7 and not vehicle.turn.lost
+            assert vehicle.timing.round_trip < 0.2 and client.missed < 0.1 * client.received
+
+            main, sub = LAND[kind]  # somebody else takes it
+            client._mav.command_long_send(
+                system,
+                1,
+                mavlink.MAV_CMD_DO_SET_MODE,
+                0,
+                mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED,
+                main,
+                sub,
+                *[0] * 4,
+            )
+            _until(lambda: "LAND" in vehicle.turn.lost)
+            vehicle.wait(vehicle.turn.number + 10)
+            assert client.custom_mode != OFFBOARD[kind][1], "who took it keeps it"
+            assert any("braking" in record.message and "LAND" in record.message for record in caplog.records)
+            _until(lambda: "disarmed" in vehicle.turn.lost, 40.0)
+        finally:
+            vehicle.close()
+    waited = any("waiting for the position estimate" in record.message for record in caplog.records)
+    assert waited or kind == "px4", "its estimator needs longer than a line takes"
+
+
+def _until(condition: Any, seconds: float = 10.0) -> None:
+    deadline = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.1)
