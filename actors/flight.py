@@ -26,6 +26,7 @@ from actors.mavlink import Tap
 from actors.proposers import MakePolicy
 from actors.settings import FlightSettings as FlightSettings
 from actors.tape import Puts
+from actors.witness import Witness
 from messaging.bus import BusError
 from messaging.links import open_link
 from messaging.process import Process
@@ -199,6 +200,7 @@ class FlightRider(Rider):
             "answers in time share": self.answers["in time"] / asked,
             "periods skipped": self._flight.skipped,
             **self._flight.vehicle.timing.figures(),
+            **self._flight.vehicle.judged(),
         }
 
     def _environment(self, stages: Sequence[Arena]) -> Make:
@@ -268,8 +270,19 @@ def run(settings: ActorSettings, flight: FlightSettings, arena: Arena, propose: 
         if not (rider.join(stop) and answered(question, robot, stages[0].start, stop)):
             return False
         link, tap = open_link(flight.url), rider.tape.take
+        witness = Witness(lambda position: float(arena.shapes.distance(position).min()) - robot.footprint)
         vehicle = LiveVehicle(
-            link, robot, flight.system, flight.height, flight.origin, truth, tap, tolerance, stop, flight.raise_limits
+            link,
+            robot,
+            flight.system,
+            flight.height,
+            flight.origin,
+            truth,
+            tap,
+            tolerance,
+            stop,
+            flight.raise_limits,
+            witness,
         )
         try:
             rider.take(vehicle)

@@ -18,7 +18,8 @@ import numpy as np
 
 from actors.ceilings import CEILINGS, FIXED_TIMEOUT, SHORTEST, TIMEOUTS, demand, too_low
 from actors.mavlink import Client, MavlinkError, NotTold, Tap, message_id
-from actors.telemetry import ATTITUDE, FORCE, IN_FLIGHT, LANDED, MOTION, Array, missing
+from actors.telemetry import ATTITUDE, FORCE, IN_FLIGHT, LANDED, MOTION, TRUTH, Array, missing
+from actors.witness import Witness
 from messaging.links import Link
 from messaging.robots import Robot
 from messaging.tolerant import Tolerance
@@ -175,17 +176,20 @@ class LiveVehicle:
         tolerance: Tolerance | None = None,
         stop: Callable[[], bool] = lambda: False,
         raise_limits: bool = False,
+        witness: Witness | None = None,
     ) -> None:
         """Take control, climb to that height [m] above the ground unless it flies already, and begin the first period.
 
         origin: where the autopilot's local frame begins, in ours, m; stop: told to, it waits for nothing any more;
-        raise_limits: set those parameters that hold it below what the robot's description asks for.
+        raise_limits: set those parameters that hold it below what the robot's description asks for; witness: the judge
+        of the flight, if there is no truth channel and the autopilot has a simulator inside that tells.
 
         Raises:
             MavlinkError: nobody there, or it refuses, or told to stop.
         """
         self._robot, self._told_to_stop, self._raise_limits = robot, stop, raise_limits
         self._link, self._truth = link, truth
+        self._witness = witness if truth is None else None
         self._client = Client(link.send, system, tap, lambda text: log.info("it says: %s", text))
         self._origin, self._tolerance = np.asarray(origin), tolerance or Tolerance()
         self.timing = Timing()
@@ -200,6 +204,8 @@ class LiveVehicle:
         self._turned, self._ended, self._failure = threading.Condition(), threading.Event(), ""
         self._take_off(height)
         self._collisions = 0 if truth is None else truth.collisions
+        if self._witness is not None:
+            self._call_witness()
         state = self._state(time.monotonic())
         standing = Period(state, state, False, math.inf, math.inf, np.zeros((SAMPLES, 3)), 0.0)
         self.turn = Turn(0, np.zeros(self._robot.action_dim), standing)
@@ -254,6 +260,17 @@ class LiveVehicle:
     def armed(self) -> bool:
         """By its last heartbeat."""
         return self._client.armed
+
+    def judged(self) -> dict[str, float]:
+        """For Health, once a witness told something."""
+        witness = self._witness
+        if witness is None or witness.state is None:
+            return {}
+        return {
+            "true collisions": witness.collisions,
+            "true clearance least m": witness.clearance,
+            "estimate off truth at most m": witness.worst,
+        }
 
     def listen(self, seconds: float) -> None:
         """Once it was told to land: hear what it says."""
@@ -343,6 +360,12 @@ class LiveVehicle:
             self._note(f"no {name} here: it flies on for {FIXED_TIMEOUT[kind]:g} s when setpoints stop")
         elif timeout is not None and timeout > SHORTEST[kind]:
             self._note(f"{name} is {timeout:g}: so many seconds it flies on when setpoints stop")
+
+    def _call_witness(self) -> None:
+        try:
+            self._note(self._client.choose(TRUTH, TELEMETRY, self._wait))
+        except NotTold:
+            self._witness = None
 
     def _note(self, line: str) -> None:
         self.notes.append(line)
@@ -454,7 +477,7 @@ class LiveVehicle:
         return np.stack([np.interp(at, times, places[:, axis]) for axis in range(3)], axis=1)
 
     def _report(self, state: Array, path: Array) -> Period:
-        truth = self._truth
+        truth = self._truth or self._witness
         if truth is None or truth.state is None:
             return Period(state, state, False, math.inf, math.inf, path, 0.0)
         collision, self._collisions = truth.collisions > self._collisions, truth.collisions
@@ -469,6 +492,9 @@ class LiveVehicle:
         for what, count in client.heard.items():
             if self._counted.get(what) != count:
                 self._counted[what], self._heard_at[what] = count, now
+        if self._witness is not None and client.truth is not None and client.position is not None:
+            self._witness.take(client.truth, client.position + self._origin, client.velocity)
+            client.truth = None
         if (len(client.path), client.time) != before:
             self._offsets.note(now, client.time)
         for asked, _ in client.answers:

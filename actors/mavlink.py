@@ -22,7 +22,19 @@ os.environ.setdefault("MAVLINK20", "1")  # read when pymavlink is imported
 from pymavlink.dialects.v20 import ardupilotmega as mavlink  # `common`, and what ArduPilot adds
 
 from actors import telemetry
-from actors.telemetry import ATTITUDE, ESTIMATORS, FORCE, GRAVITY, LANDED, MOTION, SOURCES, Array, Motion
+from actors.telemetry import (
+    ATTITUDE,
+    ESTIMATORS,
+    FORCE,
+    GRAVITY,
+    LANDED,
+    MOTION,
+    SOURCES,
+    TRUTH,
+    Array,
+    Motion,
+    Place,
+)
 
 STATION, COMPONENT = 245, int(mavlink.MAV_COMP_ID_ONBOARD_COMPUTER)  # who we are
 AUTOPILOT = int(mavlink.MAV_COMP_ID_AUTOPILOT1)
@@ -127,6 +139,7 @@ class Client:
         self.position: Array | None = None
         self.velocity = np.zeros(3)
         self.path: list[tuple[float, Array]] = []
+        self.truth: Place | None = None  # by a simulator inside it
         self.texts: list[str] = []
         self.estimator: int | None = None  # flags, see telemetry.ESTIMATED
         self.battery: float | None = None  # %, if it tells
@@ -372,6 +385,9 @@ class Client:
     def _lift(self, airborne: bool) -> None:
         self.airborne = airborne
 
+    def _witness(self, place: Place) -> None:
+        self.truth = place
+
     def _on_heartbeat(self, message: Any) -> None:
         if message.autopilot not in KINDS:
             return
@@ -425,6 +441,7 @@ TAKERS: dict[str, Callable[[Client, Any], None]] = {
     ATTITUDE: Client._turn,
     FORCE: Client._feel,
     LANDED: Client._lift,
+    TRUTH: Client._witness,
 }
 SENDERS: dict[str, list[tuple[str, int]]] = {}  # by message: what it can tell, and its place there
 for _what, _sources in SOURCES.items():

@@ -22,6 +22,7 @@ Triple = tuple[float, float, float]
 GRAVITY = 9.81  # m/s²
 MILLIGRAVITY = 9.80665e-3  # m/s², the unit of some accelerometers
 MOTION, ATTITUDE, FORCE, LANDED = "position and velocity", "attitude", "acceleration", "landed state"
+TRUTH = "truth"  # of a simulator inside the autopilot
 LOCAL, BODY = (1,), (8, 12)  # MAV_FRAME: LOCAL_NED; BODY_NED and BODY_FRD of a velocity
 ON_GROUND, UNKNOWN = 1, 0  # MAV_LANDED_STATE
 
@@ -35,6 +36,24 @@ class Motion:
     time: float
     position: Array
     velocity: Array
+
+
+@dataclass(frozen=True)
+class Place:
+    """Latitude and longitude [1e-7 degrees], altitude [m] if it is told, and how many m of latitude one of these is:
+    each simulator has an Earth of its own."""
+
+    latitude: int
+    longitude: int
+    altitude: float | None
+    metres: float
+
+    def since(self, first: Place) -> Array:
+        """(3,) m, ENU, from another; a height that is not told is 0."""
+        narrow = math.cos(math.radians(1e-7 * first.latitude))
+        up = 0.0 if self.altitude is None or first.altitude is None else self.altitude - first.altitude
+        east, north = self.longitude - first.longitude, self.latitude - first.latitude
+        return np.array([self.metres * narrow * east, self.metres * north, up])
 
 
 @dataclass(frozen=True)
@@ -113,6 +132,14 @@ def _airborne(m: Message) -> bool | None:
     return None if m.landed_state == UNKNOWN else m.landed_state != ON_GROUND
 
 
+def _simstate(m: Message) -> Place:
+    return Place(m.lat, m.lng, None, 0.011131884502145034)
+
+
+def _hil_state(m: Message) -> Place:
+    return Place(m.lat, m.lon, 1e-3 * m.alt, 1e-7 * math.radians(1.0) * 6371000.0)
+
+
 SOURCES: dict[str, tuple[Source, ...]] = {
     ATTITUDE: (
         Source("ATTITUDE_QUATERNION", _quaternion),
@@ -127,6 +154,7 @@ SOURCES: dict[str, tuple[Source, ...]] = {
     ),
     LANDED: (Source("EXTENDED_SYS_STATE", _airborne),),
     MOTION: (Source("LOCAL_POSITION_NED", _position), Source("ODOMETRY", _odometry)),
+    TRUTH: (Source("SIMSTATE", _simstate, ("ardupilot",)), Source("HIL_STATE_QUATERNION", _hil_state, ("px4",))),
 }
 IN_FLIGHT = (MOTION, ATTITUDE, FORCE)  # what is lost when it stops coming
 

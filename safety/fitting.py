@@ -48,7 +48,7 @@ def make(data: Dataset, recipe: Recipe) -> ModelSet:
         seen, rest = windows(fit, k, kind), windows(bound, k, kind)
         columns = _columns(robot, k, kind)
         for part in (seen, rest):
-            quality(part.z[:, columns], f"windows of {k} periods")
+            quality(part.z[:, columns], f"windows of {k} periods", recipe.fewest)
         every = windows(data, k, kind)  # no predictor is fitted to bulges: both parts may bound them
         bulges.append(envelope(np.abs(every.z), every.bulge, recipe.inflation))
         if recipe.mode == DIRECT:

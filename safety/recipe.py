@@ -24,6 +24,7 @@ class Recipe:
     inflation: float = 1.15  # of every envelope: what the next data may exceed the recorded ones by
     seed: int = 0  # of the recursion's heading offsets
     windows: str = PLAN  # FREE: from driving that follows no plan
+    fewest: int = 200  # windows of a length, below which nothing useful is bounded
 
     def __post_init__(self) -> None:
         if self.certificate not in KINDS:

@@ -63,7 +63,7 @@ def state(model: ModelSet, fitted: Dataset, held_out: Dataset) -> Statement:
     robot, ready, kind = model.robot, Filter(model), model.recipe.windows
     tube = model.tube_of_windows()
     used = windows(fitted, robot.horizon, kind)
-    figures: Quality = quality(used.z, "plan windows")
+    figures: Quality = quality(used.z, "plan windows", model.recipe.fewest)
     whole = windows(held_out, robot.horizon, kind)
     plans = apart(whole.take(~np.isnan(whole.latch)) if kind == PLAN else whole, robot.horizon)
     ends = {tuple(start): row for row, start in enumerate(plans.start)}

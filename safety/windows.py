@@ -17,10 +17,11 @@ from messaging.shapes import rotate
 from safety.dataset import BadData, Dataset, Trajectory
 from safety.recipe import FREE as FREE
 from safety.recipe import PLAN as PLAN
+from safety.recipe import Recipe
 
 Array = NDArray[np.float64]
 
-FEWEST_WINDOWS = 200  # of a length; below it nothing useful is bounded
+FEWEST_WINDOWS = Recipe.fewest
 WORST_CONDITION = 1e4  # of the whitened regressors' second moment
 
 
@@ -208,10 +209,10 @@ class Quality:
     condition: float
 
 
-def quality(z: Array, name: str) -> Quality:
+def quality(z: Array, name: str, fewest: int = FEWEST_WINDOWS) -> Quality:
     """Raises BadData when regressors (T, nz) are too few, rank-deficient or nearly collinear."""
-    if len(z) < FEWEST_WINDOWS:
-        raise BadData(f"{name}: {len(z)} windows, at least {FEWEST_WINDOWS} are needed: record more")
+    if len(z) < fewest:
+        raise BadData(f"{name}: {len(z)} windows, at least {fewest} are needed: record more")
     scaled = z / np.maximum(np.abs(z).max(0), 1e-12)
     singular = np.linalg.svd(scaled / np.sqrt(len(z)), compute_uv=False)
     rank = int((singular > 1e-6).sum())

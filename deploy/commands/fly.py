@@ -20,6 +20,7 @@ from messaging.tasks import learnt
 
 LEARN = "learn"
 ACTOR = "actor-0"
+TOLD = ("periods ", "lateness", "worst", "link", "true", "estimate")  # beginnings of figures' names
 
 
 @dataclass(frozen=True)
@@ -98,7 +99,7 @@ def flown(figures: dict[str, Any]) -> dict[str, Any]:
     """How real time was kept, and what it came to, of a finished run's figures."""
     actor = figures["processes"].get(ACTOR, {}).get("figures", {})
     names = ("periods", "answers in time", "answers in time share", "answers late", "answers none", "answers lost")
-    timing = {name: value for name, value in actor.items() if name.startswith(("periods ", "lateness", "worst"))}
+    timing = {name: value for name, value in actor.items() if name.startswith(TOLD)}
     return {
         **{name: actor.get(name) for name in names},
         **timing,

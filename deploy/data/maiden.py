@@ -31,15 +31,16 @@ LEVELS = (0.2, 0.5, 0.75, 1.0)  # shares of the largest inputs
 SHARES = (0.12, 0.13, 0.2, 0.55)  # of the time, a level
 TRIES = 2  # times that a level is flown on when no model predicts it
 AHEAD = 5  # periods
-OFF = (
-    0.2,
-    0.1,
-)  # m, and s times the level's speed: what 95 % of predictions that far ahead may be off by, to go faster
+# m, and s times the level's speed: what 95 % of predictions that far ahead may be off by, besides what the estimate
+# wanders by while it hovers, to go faster
+OFF = (0.2, 0.1)
+HOVER = 15.0  # s, for that
 PIECE = 60  # periods of a trajectory: whole ones are held out
 REACTION, BRAKING = 1.0, 1.5  # s and m/s²: a worse vehicle than any
 HOMEWARD = 0.5  # of a level, towards the middle, when the box ends
 NEAR = 0.3  # of the way to the wall from which the next stretch leads back
 OUTSIDE = 10.0  # m beyond the box at which the flight is over
+INFLATION, FEWEST = 1.5, 60  # of every envelope, and windows of a length: minutes of data bound less than hours
 AIMED = 0.01  # violating plans that are to be excluded at 99 % confidence, for what is still missing
 ORIGIN = "maiden flight"
 
@@ -145,12 +146,14 @@ class Maiden:
         """Level after level; the last until the time is up."""
         missing, reached = list[str](), 0.0
         try:
+            wander = self._hover()
+            log.info("while it hovers its estimate wanders by %.2f m a second", wander)
             for level, share in zip(LEVELS, SHARES, strict=True):
                 for _ in range(TRIES):
                     self._record(level, 60.0 * minutes * share)
                     speed, off = level * float(self._robot.high().max()), self._off()
                     log.info("a model of it so far is off by %.2f m, a second ahead", off)
-                    if off < OFF[0] + OFF[1] * speed:
+                    if off < wander + OFF[0] + OFF[1] * speed:
                         break
                 else:
                     missing.append(f"no model predicts it at {level:.0%} of its speed: it was not flown faster")
@@ -165,6 +168,15 @@ class Maiden:
             missing.append(f"nothing is known beyond {reached:.0%} of its speed")
         missing += _missing(statement, data)
         return Found(data, model, statement, reached, tuple(missing), self._periods * self._robot.period)
+
+    def _hover(self) -> float:
+        """m, what 95 % of the ways of `AHEAD` periods are shorter than. Raises Ended."""
+        places, still = [], np.zeros(self._robot.action_dim)
+        for _ in range(round(HOVER / self._robot.period)):
+            self._period(still, self._robot.high())
+            places.append(self._vehicle.turn.report.measured[:3])
+        away = np.linalg.norm(np.array(places)[AHEAD:] - np.array(places)[:-AHEAD], axis=1)
+        return float(np.quantile(away, 0.95))
 
     def _record(self, level: float, seconds: float) -> None:
         """Raises Ended."""
@@ -242,7 +254,8 @@ class Maiden:
     def _model(self, data: Dataset, missing: list[str]) -> tuple[ModelSet, Statement] | tuple[None, None]:
         """While the vehicle hovers."""
         try:
-            model, statement, _ = supported(replace(data, robot=self._robot), Recipe())
+            recipe = Recipe(inflation=INFLATION, fewest=FEWEST)
+            model, statement, _ = supported(replace(data, robot=self._robot), recipe)
         except (BadData, Unsupported) as error:
             missing.append(f"there is no model set: {error}")
             return None, None

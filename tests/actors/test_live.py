@@ -121,7 +121,7 @@ def test_without_telemetry_it_says_so_and_goes_on(live: Live) -> None:
 
 def test_what_stops_coming_alone_is_lost_telemetry_too(live: Live) -> None:
     vehicle, _, _ = live
-    vehicle._client.chosen[ATTITUDE] = "ODOMETRY"  # of which there is none; the position goes on coming
+    vehicle._client.chosen[ATTITUDE] = "AHRS2"  # which does not come; the position goes on coming
     assert "no telemetry of attitude" in vehicle.wait(vehicle.turn.number + 3).lost
     vehicle._client.chosen[ATTITUDE] = "ATTITUDE_QUATERNION"
     assert not vehicle.wait(vehicle.turn.number + 2).lost

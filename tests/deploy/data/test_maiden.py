@@ -1,0 +1,110 @@
+"""The first flight of an unknown vehicle, with one that needs no time: it stays in its box; faster by levels."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from actors.live import Turn
+from deploy.data.maiden import LEVELS, Box, Maiden, homeward, stretch
+from safety.dataset import Dataset
+from safety.windows import PLAN, windows
+from sim.quadrotor import SAMPLES, slewed
+from sim.vehicle import Period
+from tests.robots import QUADROTOR
+
+LATE = QUADROTOR.in_real_time()
+BOX = Box(np.array([1.0, -2.0, 30.0]), np.array([40.0, 40.0, 20.0]))
+
+
+class Sluggish:
+    """A vehicle that comes to its setpoint by a time constant; a turn passes whenever somebody waits for it."""
+
+    def __init__(self, constant: float = 0.4, drift: float = 0.0, fickle: bool = False) -> None:
+        self.fickle = fickle  # does what it is told to or the opposite
+        self.constant, self.drift, self.rng = constant, drift, np.random.default_rng(0)
+        self.position, self.velocity, self.acceleration = BOX.middle.copy(), np.zeros(3), np.zeros(3)
+        self.plan: list[np.ndarray] = []
+        self.farthest, self.fastest = -np.inf, 0.0
+        self.turn = Turn(0, np.zeros(3), self._report(np.zeros((SAMPLES, 3))))
+
+    def commit(self, plan: np.ndarray, number: int) -> bool:
+        self.plan = [slewed(row, row) for row in plan]
+        return True
+
+    def wait(self, number: int) -> Turn:
+        while self.turn.number < number:
+            self._pass()
+        return self.turn
+
+    def _pass(self) -> None:
+        path, start = [], self.position.copy()
+        told = self.turn.input * (self.rng.choice([-1.0, 1.0]) if self.fickle else 1.0)
+        for _ in range(SAMPLES):
+            self.acceleration = (told - self.velocity) / self.constant
+            self.velocity = self.velocity + self.acceleration * 0.2 / SAMPLES
+            self.position = self.position + (self.velocity + self.drift) * 0.2 / SAMPLES
+            path.append(self.position - start)
+        self.farthest = max(self.farthest, BOX.outside(self.position))
+        self.fastest = max(self.fastest, float(np.abs(self.velocity).max()))
+        following = self.plan.pop(0) if self.plan else np.zeros(3)
+        self.turn = Turn(self.turn.number + 1, slewed(following, self.turn.input), self._report(np.array(path)))
+
+    def _report(self, path: np.ndarray) -> Period:
+        state = np.concatenate([self.position, self.velocity, self.acceleration])
+        measured = state + self.rng.uniform(-0.01, 0.01, 9)
+        return Period(measured, state, False, np.inf, np.inf, path, 0.0)
+
+
+def test_an_obedient_vehicle_is_flown_at_every_level_and_stays_inside(tmp_path: Path) -> None:
+    vehicle = Sluggish()
+    found = Maiden(vehicle, LATE, BOX, 0).fly(4.5, {"autopilot": "none"})
+    assert found.level == LEVELS[-1] and vehicle.fastest > 4.0 and vehicle.farthest < 0.0
+    assert found.model is not None and found.model.robot == LATE
+    assert found.statement is not None and found.statement.violations <= 0.2 * found.statement.windows
+    assert 4.5 * 60.0 <= found.seconds < 6.0 * 60.0
+    assert any("more minutes like these" in line for line in found.missing)
+    found.data.save(tmp_path / "flown.safetensors")
+    assert Dataset.load(tmp_path / "flown.safetensors").digest() == found.data.digest()
+    assert len(windows(found.data, QUADROTOR.horizon, PLAN)) > 20, "it brakes as the filter plans to"
+
+
+def test_the_recorded_inputs_are_those_of_the_recorded_periods() -> None:
+    """The velocity follows the input of its own period, not of the next."""
+    found = Maiden(Sluggish(constant=0.05), LATE, BOX, 1).fly(2.0, {})
+    for t in found.data.trajectories:
+        assert t.states[1:, 3:6] == pytest.approx(t.inputs, abs=0.1)
+
+
+def test_a_vehicle_that_nothing_predicts_is_not_flown_faster() -> None:
+    vehicle = Sluggish(fickle=True)
+    found = Maiden(vehicle, LATE, BOX, 0).fly(2.0, {})
+    assert found.level == 0.0 and vehicle.fastest < 1.5
+    assert any("not flown faster" in line for line in found.missing)
+
+
+def test_a_vehicle_that_leaves_its_box_ends_the_flight() -> None:
+    found = Maiden(Sluggish(drift=2.0), LATE, BOX, 0).fly(4.0, {})
+    assert any("left its box" in line for line in found.missing) and found.seconds < 120.0
+
+
+def test_the_rule_turns_back_before_the_wall_and_lets_go_of_the_rest() -> None:
+    level = QUADROTOR.high()
+    near = np.array([31.0, -2.0, 30.0, 5.0, *[0.0] * 5])
+    assert BOX.kept(near, np.array([5.0, 3.0, 0.0]), level) == pytest.approx([-2.5, 3.0, 0.0])
+    assert BOX.kept(near * [1, 1, 1, -1, 1, 1, 1, 1, 1], np.array([-5.0, 0.0, 0.0]), level)[0] == -5.0, "it leads back"
+    middle = np.concatenate([BOX.middle, np.full(3, 5.0), np.zeros(3)])
+    assert BOX.kept(middle, level, level) == pytest.approx(level)
+
+
+def test_a_stretch_keeps_the_slew_and_leads_back_from_a_wall() -> None:
+    rng, slew = np.random.default_rng(2), np.asarray(QUADROTOR.action_slew)
+    near = np.array([26.0, -27.0, 30.0, *[0.0] * 6])
+    for _ in range(50):
+        inputs = np.array(stretch(LATE, 0.5, np.zeros(3), rng))
+        assert (np.abs(np.diff(inputs, axis=0, prepend=np.zeros((1, 3)))) <= slew + 1e-9).all()
+        assert np.abs(inputs).max() <= 2.5 and not inputs[-1].any()
+        back = np.array(homeward(list(inputs), near, BOX, 0.2, rng)).sum(0)
+        assert back[0] <= 1e-9 and back[1] >= -1e-9
