@@ -31,10 +31,9 @@ LEVELS = (0.2, 0.5, 0.75, 1.0)  # shares of the largest inputs
 SHARES = (0.12, 0.13, 0.2, 0.55)  # of the time, a level
 TRIES = 2  # times that a level is flown on when no model predicts it
 AHEAD = 5  # periods
-# m, and s times the level's speed: what 95 % of predictions that far ahead may be off by, besides what the estimate
-# wanders by while it hovers, to go faster
+# m, and s times the level's speed: what 95 % of predictions that far ahead may be off by, to go faster, besides what
+# the vehicle's own estimate wanders by
 OFF = (0.2, 0.1)
-HOVER = 15.0  # s, for that
 PIECE = 60  # periods of a trajectory: whole ones are held out
 REACTION, BRAKING = 1.0, 1.5  # s and m/s²: a worse vehicle than any
 HOMEWARD = 0.5  # of a level, towards the middle, when the box ends
@@ -146,13 +145,12 @@ class Maiden:
         """Level after level; the last until the time is up."""
         missing, reached = list[str](), 0.0
         try:
-            wander = self._hover()
-            log.info("while it hovers its estimate wanders by %.2f m a second", wander)
             for level, share in zip(LEVELS, SHARES, strict=True):
                 for _ in range(TRIES):
                     self._record(level, 60.0 * minutes * share)
                     speed, off = level * float(self._robot.high().max()), self._off()
-                    log.info("a model of it so far is off by %.2f m, a second ahead", off)
+                    wander = _wander(self._flown.trajectories, self._robot.period)
+                    log.info("a model is off by %.2f m a second ahead, its own estimate by %.2f m", off, wander)
                     if off < wander + OFF[0] + OFF[1] * speed:
                         break
                 else:
@@ -168,15 +166,6 @@ class Maiden:
             missing.append(f"nothing is known beyond {reached:.0%} of its speed")
         missing += _missing(statement, data)
         return Found(data, model, statement, reached, tuple(missing), self._periods * self._robot.period)
-
-    def _hover(self) -> float:
-        """m, what 95 % of the ways of `AHEAD` periods are shorter than. Raises Ended."""
-        places, still = [], np.zeros(self._robot.action_dim)
-        for _ in range(round(HOVER / self._robot.period)):
-            self._period(still, self._robot.high())
-            places.append(self._vehicle.turn.report.measured[:3])
-        away = np.linalg.norm(np.array(places)[AHEAD:] - np.array(places)[:-AHEAD], axis=1)
-        return float(np.quantile(away, 0.95))
 
     def _record(self, level: float, seconds: float) -> None:
         """Raises Ended."""
@@ -260,6 +249,17 @@ class Maiden:
             missing.append(f"there is no model set: {error}")
             return None, None
         return model, statement
+
+
+def _wander(trajectories: list[Trajectory], period: float) -> float:
+    """m, what 95 % of the ways of `AHEAD` periods are off the way by its own velocity: no model can be better."""
+    off = [np.zeros((1, 3))]
+    for t in trajectories:
+        position, velocity = t.states[:, :3], t.states[:, 3:6]
+        by_velocity = np.cumsum(0.5 * period * (velocity[1:] + velocity[:-1]), axis=0)
+        error = position[1:] - by_velocity
+        off.append(error[AHEAD:] - error[:-AHEAD])
+    return float(np.quantile(np.linalg.norm(np.concatenate(off), axis=1), 0.95))
 
 
 def _missing(statement: Statement | None, data: Dataset) -> Iterator[str]:
