@@ -11,7 +11,19 @@ import pytest
 
 from actors.ceilings import CEILINGS, demand, too_low
 from actors.mavlink import Client, NotTold, mavlink, message_id
-from actors.telemetry import ATTITUDE, ESTIMATED, FORCE, LANDED, MOTION, SOURCES, missing, mode_name, turned
+from actors.telemetry import (
+    ATTITUDE,
+    ESTIMATED,
+    FORCE,
+    LANDED,
+    MOTION,
+    SOURCES,
+    TRUTH,
+    Place,
+    missing,
+    mode_name,
+    turned,
+)
 from sim.autopilot import frames
 from tests.robots import QUADROTOR
 
@@ -54,6 +66,10 @@ SAID: dict[str, Any] = {
     "SCALED_IMU": mavlink.MAVLink_scaled_imu_message(0, 10, 20, -1020, *[0] * 6),
     "RAW_IMU": mavlink.MAVLink_raw_imu_message(0, 10, 20, -1020, *[0] * 6),
     "SCALED_IMU2": mavlink.MAVLink_scaled_imu2_message(0, 10, 20, -1020, *[0] * 6),
+    "SIMSTATE": mavlink.MAVLink_simstate_message(*[0] * 9, 473977420, 85455940),
+    "HIL_STATE_QUATERNION": mavlink.MAVLink_hil_state_quaternion_message(
+        0, (1, 0, 0, 0), 0, 0, 0, 473977420, 85455940, 488_500, *[0] * 8
+    ),
     "EXTENDED_SYS_STATE": mavlink.MAVLink_extended_sys_state_message(0, mavlink.MAV_LANDED_STATE_IN_AIR),
 }
 
@@ -67,6 +83,12 @@ def test_every_message_says_the_same_in_its_own_units_and_frame(what: str, name:
         assert told.position == pytest.approx([2.0, 1.0, -3.0]) and told.velocity == pytest.approx([5.0, 4.0, -6.0])
     elif what == ATTITUDE:
         assert told == pytest.approx(quaternion(), abs=1e-6)
+    elif what == TRUTH:
+        north = Place(told.latitude + 9000, told.longitude, told.altitude, told.metres).since(told)
+        east = Place(told.latitude, told.longitude + 9000, told.altitude, told.metres).since(told)
+        assert north == pytest.approx([0.0, 100.0, 0.0], abs=0.3), "an Earth's quarter is 10,000 km"
+        assert east == pytest.approx([100.0 * math.cos(math.radians(47.4)), 0.0, 0.0], abs=0.3)
+        assert told.altitude in (None, 488.5)
     elif what == FORCE:
         assert told == pytest.approx([0.1, 0.2, 9.80665 * DOWN], abs=0.005)
     else:

@@ -60,11 +60,11 @@ class Sluggish:
 
 def test_an_obedient_vehicle_is_flown_at_every_level_and_stays_inside(tmp_path: Path) -> None:
     vehicle = Sluggish()
-    found = Maiden(vehicle, LATE, BOX, 0).fly(4.5, {"autopilot": "none"})
+    found = Maiden(vehicle, LATE, BOX, 0).fly(11.0, {"autopilot": "none"})
     assert found.level == LEVELS[-1] and vehicle.fastest > 4.0 and vehicle.farthest < 0.0
     assert found.model is not None and found.model.robot == LATE
-    assert found.statement is not None and found.statement.violations <= 0.2 * found.statement.windows
-    assert 4.5 * 60.0 <= found.seconds < 6.0 * 60.0
+    assert found.statement is not None and found.statement.violations <= 0.25 * found.statement.windows
+    assert found.model.recipe.windows == PLAN and 11.0 * 60.0 <= found.seconds < 13.0 * 60.0
     assert any("more minutes like these" in line for line in found.missing)
     found.data.save(tmp_path / "flown.safetensors")
     assert Dataset.load(tmp_path / "flown.safetensors").digest() == found.data.digest()
