@@ -4,10 +4,12 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from actors.loop import Change
 from deploy.commands.train import Train
+from deploy.policies import policy_named
 from deploy.run.configurations import EXPERIMENTS, RunConfig, decode, encode, load
 from deploy.run.places import places
 from learner.config import LearnerConfig, TD3Config
@@ -112,5 +114,7 @@ def test_what_no_world_is_made_for_is_refused_before_anything_starts() -> None:
         assert decode(RunConfig, json.loads(encode(config))) == config
         assert [place.robot for place in places(config) if place.kind == "learner"] == ["ground"]
         assert task_of(robot_named("ground")).observation_dim == 50, "whoever reads it has the task"
+        stored = policy_named("trained", robot_named("ground"), 0)
+        assert stored(np.zeros(50, np.float32), {}).shape == (2,), "of its own observation, in a folder of its own"
     finally:
         learnt("ground")
