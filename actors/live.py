@@ -36,6 +36,7 @@ STALE = 0.2  # s without a position, an attitude or an acceleration after which 
 SILENT = 3.0  # s without a heartbeat after which nobody knows its mode
 ESTIMATING = 300.0  # s that an estimator may take to know where it is
 PROGRESS = 5.0  # s between two lines about that
+SPEECHLESS = 30.0  # s after which one that grants to tell and does not is no longer waited for
 HURRY = 1.0  # s between two questions about the autopilot's clock
 LOW = 20.0  # % of the battery from which it is spoken of
 LATE = 0.02  # s after its time at which a period's beginning counts as late
@@ -202,7 +203,11 @@ class LiveVehicle:
         self._velocity: Array | None = None  # the setpoint to be repeated
         self._offsets = Offset()
         self._turned, self._ended, self._failure = threading.Condition(), threading.Event(), ""
-        self._take_off(height)
+        try:
+            self._take_off(height)
+        except BaseException:
+            link.close()
+            raise
         self._collisions = 0 if truth is None else truth.collisions
         if self._witness is not None:
             self._call_witness()
@@ -317,6 +322,8 @@ class LiveVehicle:
         ready = lambda: client.estimator is not None and not missing(client.estimator)  # noqa: E731
         while not wait(ready, max(0.0, said_at + PROGRESS - time.monotonic())):
             said_at, lacking = time.monotonic(), ", ".join(missing(client.estimator or 0))
+            if client.estimator is None and said_at - began > SPEECHLESS:
+                return
             if said_at - began > ESTIMATING:
                 raise MavlinkError(f"its estimator does not know, after {ESTIMATING:.0f} s: {lacking}")
             log.info("waiting for the position estimate: %.0f s, it does not know: %s", said_at - began, lacking)

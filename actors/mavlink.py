@@ -229,14 +229,13 @@ class Client:
         self._forces = deque(self._forces, readings)
 
     def watch_estimator(self, wait: Wait) -> bool:
-        """Have it tell how its estimate is; False: it does not."""
+        """Have it tell how its estimate is; False: it will not. Just switched on it may be silent for a while."""
         for name in ESTIMATORS:
             try:
                 self.stream(message_id(name), 0.5, wait)
             except CommandRefused:
                 continue
-            if wait(lambda: self.estimator is not None, 2.0 * FIRST):
-                return True
+            return True
         return False
 
     def parameter(self, name: str, wait: Wait) -> float | None:
