@@ -20,7 +20,7 @@ from safety.request import BadRequest
 from safety.service import Counts, Models, answerer
 from safety.wire import LARGEST, request_of
 from tests.messaging.conftest import endpoint, join  # noqa: F401 - fixtures
-from tests.robots import GROUND
+from tests.robots import GROUND, QUADROTOR
 from tests.safety.unicycle import Unicycle
 
 NAN, INF = float("nan"), float("inf")
@@ -266,6 +266,48 @@ def test_replies_that_are_none_are_typed_errors():
     for answer in (b"\xff\xff", pb.ReplyBatch().SerializeToString(), b""):
         with pytest.raises(SafetyError, match="BadReply"):
             ask(FakeBus(answer), [good()], 0.1)
+
+
+def test_a_recorded_reply_is_no_answer_at_another_place(service):
+    """Not even to the same question: each has a nonce, which the reply names with it."""
+    recorded = []
+
+    class Recording(FakeBus):
+        def ask(self, topic, payload, timeout, **names):
+            recorded.append(service.answer(payload))
+            return recorded[-1]
+
+    assert read(ask(Recording(b""), [good()], 0.1)[0], good(), GROUND).message.verified
+    elsewhere = request_message(Commitment(GROUND), np.ones(5) * 0.1, [0.2, 0.1], [AHEAD])
+    for question in (good(), elsewhere):
+        with pytest.raises(SafetyError) as caught:
+            ask(FakeBus(recorded[0]), [question], 0.1)
+        assert caught.value.field == "request"
+
+
+def test_a_plan_that_no_actuator_could_follow_is_not_believed():
+    """Its first input must follow the one in force within the slew, every other the one before; and it is about this
+    robot."""
+    flying = Commitment(QUADROTOR)
+    question = request_message(flying, np.zeros(QUADROTOR.state_dim), [1.0, 0.0, 0.0], [])
+    zero = np.zeros(QUADROTOR.state_dim)
+
+    def reply(plan, robot="quadrotor"):
+        said = pb.Decision(kind=pb.ALLOWED, plan=plan.ravel(), predicted_center=zero, predicted_half_width=zero)
+        return pb.Reply(decision=said, robot=robot)
+
+    plan = np.zeros((QUADROTOR.horizon, QUADROTOR.action_dim))
+    plan[:3, 0] = 0.7, 0.7, 0.1
+    assert read(reply(plan), question, QUADROTOR).action[0] == 0.7
+    for row, value in ((0, 0.9), (1, 1.6), (2, -0.2)):
+        broken = plan.copy()
+        broken[row, 0] = value
+        with pytest.raises(SafetyError, match="does not follow") as caught:
+            read(reply(broken), question, QUADROTOR)
+        assert caught.value.field == "plan"
+    with pytest.raises(SafetyError) as caught:
+        read(reply(plan, robot="ground"), question, QUADROTOR)
+    assert caught.value.field == "robot"
 
 
 def test_a_client_over_the_bus(join, endpoint, service):  # noqa: F811
