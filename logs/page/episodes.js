@@ -56,10 +56,19 @@ class Picker {
     this.map = element("div", { id: `${mark}episode-map`, class: "episode-map", tabindex: 0, "aria-label": "an episode: arrow keys step through it, space plays it", onkeydown: (event) => this.key(event) });
     this.facts = element("dl", { class: "facts", id: `${mark}episode-facts` });
     this.strip = element("div");
-    target.append(element("div", { class: "split" }, this.map, element("div", {}, this.facts, this.strip)));
+    const seen = element("div", {}, this.map), course = element("div", { class: "course" }, this.strip);
+    saves(seen, "an episode from above");
+    saves(course, "clearance over the episode", () => this.rows());
+    target.append(element("div", { class: "split" }, seen, element("div", {}, this.facts, course)));
     target.append(legend([...["l", "d", "a", "e"].map((k) => [KINDS[k].color, KINDS[k].name]), ["#7a4fc0", "tube, and the plan in it"], [ARROWS[0], "→ proposed"], [ARROWS[1], "→ executed"], [EDGE, "what the proposal would have crossed"], ["#1d7f4e", "goal"], ["#c9d1da", "obstacles"], ...this.told()]));
     const wanted = this.all.findIndex(({ episode }) => episode.rows);
     this.show(wanted >= 0 ? wanted : Math.max(0, this.all.findIndex(({ near: rank }) => rank === 0)));
+  }
+
+  /** The steps of the episode that is shown, for a CSV. */
+  rows() {
+    const { episode: e } = this.all[this.at];
+    return e.clearance.map((clearance, k) => ({ step: e.first + k, x_m: e.x[k], y_m: e.y[k], speed_m_s: e.speed[k], clearance_m: clearance, decision: KINDS[e.kinds[k]].name }));
   }
 
   /** Of what the filter was told, the parts that any picture here shows. */

@@ -1,15 +1,21 @@
-"""Samples as the bus hands them to a recorder."""
+"""Samples as the bus hands them to a recorder; a report, and a browser that shows it."""
 
 import itertools
-from collections.abc import Callable
+import json
+from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 import pytest
 
+from logs.analysis import Look, analysed
+from logs.page import render
 from messaging import brakeline_pb2 as pb
 from messaging.bus import Sample
 from messaging.bus.keys import names_of
 from messaging.topics import TOPICS
+from tests.browser import CHROMIUM, Page
+from tests.logs.mixed import mixed
 
 Say = Callable[..., Sample]
 
@@ -29,3 +35,24 @@ def say() -> Say:
         return Sample(topic, key, message.SerializeToString(), now + 1000)
 
     return make
+
+
+@pytest.fixture(scope="module")
+def report(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]]:
+    """The page of a log, and the figures that `analyse --json` gives for it."""
+    folder = tmp_path_factory.mktemp("page")
+    log = mixed(folder / "<b>mixed")
+    analysis = analysed(log, Look(pictures=True))
+    path = folder / "report.html"
+    path.write_text(render(analysis.figures(), analysis.each()), encoding="utf-8")
+    return path, json.loads(json.dumps(analysis.figures()))
+
+
+@pytest.fixture(scope="module")
+def page(report: tuple[Path, dict[str, Any]], tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
+    if CHROMIUM is None:
+        pytest.skip("there is no Chromium: the report was not driven in a browser")
+    with Page(tmp_path_factory.mktemp("browser")) as page:
+        page.open(report[0].as_uri())
+        page.until("document.documentElement.dataset.drawn === 'yes'")
+        yield page

@@ -1,7 +1,5 @@
 """The report in a real browser: it draws without a complaint and without a request, and says what `--json` says."""
 
-import csv
-import io
 import json
 import math
 import re
@@ -9,7 +7,6 @@ from collections.abc import Iterator
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
-from xml.etree import ElementTree
 
 import pytest
 
@@ -20,27 +17,6 @@ from tests.browser import CHROMIUM, Page
 from tests.logs.mixed import ABOUT, mixed
 
 TRICKS = "</script><script>alert(1)</script><!-- \u2028"
-
-
-@pytest.fixture(scope="module")
-def report(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]]:
-    """The page of a log, and the figures that `analyse --json` gives for it."""
-    folder = tmp_path_factory.mktemp("page")
-    log = mixed(folder / "<b>mixed")
-    analysis = analysed(log, Look(pictures=True))
-    path = folder / "report.html"
-    path.write_text(render(analysis.figures(), analysis.each()), encoding="utf-8")
-    return path, json.loads(json.dumps(analysis.figures()))
-
-
-@pytest.fixture(scope="module")
-def page(report: tuple[Path, dict[str, Any]], tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
-    if CHROMIUM is None:
-        pytest.skip("there is no Chromium: the report was not driven in a browser")
-    with Page(tmp_path_factory.mktemp("browser")) as page:
-        page.open(report[0].as_uri())
-        page.until("document.documentElement.dataset.drawn === 'yes'")
-        yield page
 
 
 class Cells(HTMLParser):
@@ -256,23 +232,6 @@ def test_a_run_is_chosen_and_its_own_parts_are_shown(comparison: Page, compared:
     facts = "[...document.querySelectorAll('#run1-episode-facts dd')].find(d => d.dataset.fact === 'step').textContent"
     page.until(f"{facts} === '1'")
     assert page.complaints == []
-
-
-def test_figures_and_their_data_are_saved(page: Page, report: tuple[Path, dict[str, Any]]) -> None:
-    page.value("window.save = (name, kind, text) => { window.saved = { name, kind, text }; }")
-    buttons = "document.querySelector('[data-robot=ground] [data-chart=\"goals reached\"] .saves').children"
-    page.value(f"{buttons}[0].click()")
-    saved = page.value("saved")
-    picture = ElementTree.fromstring(saved["text"])
-    assert saved["name"] == "goals-reached.svg" and picture.tag == "{http://www.w3.org/2000/svg}svg"
-    words = [text.text for text in picture.iter("{http://www.w3.org/2000/svg}text")]
-    assert "goals reached [share of episodes]" in words and "steps of all actors of the run" in words
-    page.value(f"{buttons}[1].click()")
-    saved = page.value("saved")
-    rows = list(csv.DictReader(io.StringIO(saved["text"])))
-    bins = [row for row in report[1]["training"]["ground"]["bins"] if row["goals"] is not None]
-    raw = [float(row["raw"]) for row in rows if row["raw"]]
-    assert saved["kind"] == "text/csv" and raw == pytest.approx([row["goals"] for row in bins])
 
 
 def test_keys_step_through_an_episode(page: Page) -> None:
