@@ -7,6 +7,7 @@ import math
 import select
 import socket
 import time
+import weakref
 from collections.abc import Callable
 from pathlib import Path
 
@@ -113,9 +114,9 @@ class Px4Flight:
             self._listen()
 
     def close(self) -> None:
+        """Also when nobody refers to it any more, and at the end of the program."""
         if self._px4 is not None:
-            self._px4.close()
-            self._link.close()
+            self._shut()
             self._px4 = None
 
     def _begin(self) -> None:
@@ -129,6 +130,7 @@ class Px4Flight:
         except BaseException:
             link.close()
             raise
+        self._shut = weakref.finalize(self, _shut, px4, link)
         self.starts += 1
         rng = np.random.default_rng(self.starts)
         vehicle = Quadrotor(FIELD, rng, QUIET, floor=FAR)
@@ -179,6 +181,11 @@ class Px4Flight:
         with contextlib.suppress(BlockingIOError):
             while True:
                 self.client.feed(self._link.recv(65536))
+
+
+def _shut(px4: Px4, link: socket.socket) -> None:
+    px4.close()
+    link.close()
 
 
 class Px4Vehicle:

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import atexit
 import os
-from functools import partial
+from functools import lru_cache, partial
 from pathlib import Path
 
 import numpy as np
@@ -77,7 +76,6 @@ def behind_px4(conditions: Conditions, tap: Tap | None = None) -> MakeVehicle:
     if not folder:
         raise ValueError("set BRAKELINE_PX4 to the folder of a PX4 that was built for SITL")
     flight = Px4Flight(Path(folder), SensorNoise(scale=conditions.flight_noise.scale), tap=tap)
-    atexit.register(flight.close)
 
     def make(arena: Arena, rng: np.random.Generator) -> Px4Vehicle:
         return Px4Vehicle(flight, Quadrotor(arena, rng, QUIET, conditions.wind), QUADROTOR)
@@ -118,4 +116,10 @@ def vehicle_in_yard(robot: Robot, rng: np.random.Generator, conditions: Conditio
     start = (0.0, 0.0, float(rng.uniform(-np.pi, np.pi)) if height is None else yard)
     goal = (0.5 * yard, 0.0) if height is None else (0.5 * yard, 0.0, yard)
     arena = Arena("yard", closing(yard, height), start, goal, 0.25, 10**9, room_bounds(yard, height))
-    return factory(robot, conditions)(arena, rng)
+    return _maker(robot, conditions)(arena, rng)
+
+
+@lru_cache(maxsize=1)
+def _maker(robot: Robot, conditions: Conditions) -> MakeVehicle:
+    """The same for one trajectory after the other: what starts a real autopilot starts it once."""
+    return factory(robot, conditions)

