@@ -479,7 +479,7 @@ class Decision(_message.Message):
     margin: _builtins.float
     """m, smallest distance of the tube to a half-space; negative: violated"""
     at_least: _builtins.bool
-    """nothing in sight is as near as the margin"""
+    """the margin is a lower bound: what is nearest is beyond reach"""
     model: _builtins.str
     """version of the model set"""
     reason: _builtins.str

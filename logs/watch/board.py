@@ -43,7 +43,7 @@ class Card:
     kind: str = ""
     tube: list[list[float]] = field(default_factory=list)  # per period: center x, y, half-width x, y
     margin: float | None = None
-    at_least: bool = False  # nothing in sight is as near as the margin
+    at_least: bool = False  # the margin is a lower bound
     said: str = ""  # why it was not as proposed
     inputs: list[tuple[str, str, float, float]] = field(default_factory=list)  # name, unit, proposed, executed
     arrows: list[list[float]] = field(default_factory=list)  # of the proposed and the executed input, m
