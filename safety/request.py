@@ -69,9 +69,9 @@ class Decision:
     """kind: allowed | adjusted | failsafe | recovering (never verified); plan (N, m), its first row is for now (of a
     late robot: is in force, and the second is for the next period); tube: true positions at the N periods' ends,
     centers and half-widths (N, d), world, of the plan's free inputs and the ramp after them; predicted: the next
-    measured state; margin [m] of that tube to the nearest obstacle's half-space, `at_least`: it is a lower bound, for what is
-    nearest is beyond reach. A failsafe's may be negative though it is verified: it was so when it was made, this is how it
-    looks from the new measurement."""
+    measured state; margin [m] of that tube to the nearest obstacle's half-space, `at_least`: it is a lower bound, for
+    what is nearest is beyond reach. A failsafe's may be negative though it is verified: it was so when it was made,
+    this is how it looks from the new measurement."""
 
     kind: str
     plan: Array
