@@ -273,7 +273,7 @@ class LiveVehicle:
             return {}
         return {
             "true collisions": witness.collisions,
-            "true clearance least m": witness.clearance,
+            "true clearance least m": witness.least,
             "estimate off truth at most m": witness.worst,
         }
 

@@ -22,7 +22,8 @@ class Witness:
     clearance_of: Callable[[Array], float]
     state: Array | None = None  # (9,), its acceleration unknown: zeros
     collisions: int = 0  # times that a touch began
-    clearance: float = math.inf  # m, the least of all
+    clearance: float = math.inf  # m, now
+    least: float = math.inf  # m, of all clearances
     worst: float = 0.0  # m, the farthest the estimate was off the truth since the beginning, across the ground
     _start: tuple[Place, Array] | None = None
     _touching: bool = False
@@ -38,7 +39,7 @@ class Witness:
             position[2] = estimate[2]
         self.worst = max(self.worst, math.hypot(*(position - estimate)[:2]))
         self.state = np.concatenate((position, velocity, np.zeros(3)))
-        now = self.clearance_of(position)
-        self.clearance = min(self.clearance, now)
+        self.clearance = now = self.clearance_of(position)
+        self.least = min(self.least, now)
         self.collisions += now < 0.0 and not self._touching
         self._touching = now < 0.0

@@ -21,7 +21,8 @@ def test_a_touch_is_judged_by_the_truth_and_counted_once() -> None:
     for north in (0.0, 3.0, 4.9, 5.2, 5.4, 4.0, 5.1):
         estimate = np.array([1.0, 0.5 * north, 3.0])
         witness.take(at(north), estimate, np.zeros(3))
-    assert witness.collisions == 2 and witness.clearance == pytest.approx(-0.4, abs=0.01)
+    assert witness.collisions == 2 and witness.least == pytest.approx(-0.4, abs=0.01)
+    assert witness.clearance == pytest.approx(-0.1, abs=0.01)
     assert witness.worst == pytest.approx(2.7, abs=0.01)
     assert witness.state is not None and witness.state[:3] == pytest.approx([1.0, 5.1, 3.0], abs=0.02)
 
