@@ -20,12 +20,13 @@ import numpy as np
 from google.protobuf.message import Message
 
 from actors.guard import Ask, Outcome, consult
-from actors.live import LiveVehicle, Truth, Turn
+from actors.live import LiveVehicle, Turn
 from actors.loop import ActorSettings, Make, Rider, Tally, cycle
 from actors.mavlink import Tap
 from actors.proposers import MakePolicy
 from actors.settings import FlightSettings as FlightSettings
 from actors.tape import Puts
+from actors.truth import Truth
 from actors.witness import Witness
 from messaging.bus import BusError
 from messaging.links import open_link

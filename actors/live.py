@@ -2,77 +2,36 @@
 
 from __future__ import annotations
 
-import contextlib
-import json
 import logging
 import math
-import socket
 import threading
 import time
-from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass, field
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 
-from actors.ceilings import CEILINGS, FIXED_TIMEOUT, SHORTEST, TIMEOUTS, demand, too_low
-from actors.mavlink import Client, MavlinkError, NotTold, Tap, message_id
-from actors.telemetry import ATTITUDE, FORCE, IN_FLIGHT, LANDED, MOTION, TRUTH, Array, missing
+from actors.mavlink import Client, MavlinkError, NotTold, Tap
+from actors.takeoff import TELEMETRY, Takeoff
+from actors.telemetry import IN_FLIGHT, TRUTH, Array
+from actors.timing import Offset, Timing
+from actors.truth import Truth
 from actors.witness import Witness
 from messaging.links import Link
 from messaging.robots import Robot
 from messaging.tolerant import Tolerance
-from sim.quadrotor import QUADROTOR, SAMPLES, slewed
+from sim.quadrotor import SAMPLES, slewed
 from sim.vehicle import Period
 
 log = logging.getLogger("brakeline.flight")
 
 POLL = 0.005  # s between two looks at a link
 RESEND = 0.05  # s after which a setpoint is sent again
-TELEMETRY = 0.02  # s from one message to the next, as it is asked for
-READINGS = 10  # of the accelerometer, at most, the mean of which counts: those of one period
 STALE = 0.2  # s without a position, an attitude or an acceleration after which telemetry counts as lost
 SILENT = 3.0  # s without a heartbeat after which nobody knows its mode
-ESTIMATING = 300.0  # s that an estimator may take to know where it is
-PROGRESS = 5.0  # s between two lines about that
-SPEECHLESS = 30.0  # s after which one that grants to tell and does not is no longer waited for
 HURRY = 1.0  # s between two questions about the autopilot's clock
 LOW = 20.0  # % of the battery from which it is spoken of
 LATE = 0.02  # s after its time at which a period's beginning counts as late
-REST = 0.1  # m/s: slower is hovering
-CLIMB = np.array([0.0, 0.0, 1.0])  # m/s
-FARTHEST = 1e5  # m, m/s, ...: no vehicle is farther off, or as fast
-MOST_TOLD = 100  # datagrams read at one look
-KEPT = 10_000  # latest beginnings whose lateness is remembered
-
-
-@dataclass
-class Timing:
-    """How real time was kept."""
-
-    periods: int = 0
-    late: int = 0  # begun more than `LATE` after their time
-    slips: int = 0  # begun so late that the clock was set anew: the one before lasted two periods or more
-    worst_gap: float = 0.0  # s between two setpoints
-    round_trip: float = math.inf  # s to the autopilot and back, the fastest
-    lost: int = 0  # periods whose telemetry, or whose mode, did not count
-    lateness: deque[float] = field(default_factory=lambda: deque(maxlen=KEPT))  # s, of the beginnings of periods
-
-    def figures(self) -> dict[str, float]:
-        """For Health, in ms where it says so."""
-        lateness = 1e3 * np.array([*self.lateness] or [0.0])
-        return {
-            "periods": self.periods,
-            "periods late": self.late,
-            "periods slipped": self.slips,
-            "lateness p50 ms": float(np.percentile(lateness, 50)),
-            "lateness p99 ms": float(np.percentile(lateness, 99)),
-            "lateness worst ms": float(lateness.max()),
-            "worst setpoint gap ms": 1e3 * self.worst_gap,
-            "periods without telemetry": self.lost,
-            **({"link round trip ms": 1e3 * self.round_trip} if math.isfinite(self.round_trip) else {}),
-        }
 
 
 @dataclass(frozen=True)
@@ -86,71 +45,6 @@ class Turn:
     input: Array  # (3,) m/s, in force from now on
     report: Period
     lost: str = ""
-
-
-class Offset:
-    """Our clock less the autopilot's [s], by the messages that came soonest.
-
-    It falls at once and rises with the clocks' drift: milliseconds on a busy machine must not move it, for at 7 m/s
-    each is 7 mm. Only when every message of a second is `JUMP` late the other clock has jumped: a simulator slips.
-    """
-
-    DRIFT = 1e-4  # s a second, at most, between two clocks
-    JUMP = 0.05  # s
-
-    def __init__(self) -> None:
-        self.value = math.inf  # before the first message
-        self._noted = self._second = -math.inf  # when the last message came, and when this second began
-        self._soonest = math.inf  # in this second
-
-    def note(self, now: float, theirs: float) -> None:
-        """A message of their time `theirs` has come."""
-        if now - self._second > 1.0:
-            if self._soonest > self.value + self.JUMP:
-                self.value = self._soonest
-            self._second, self._soonest = now, math.inf
-        late = now - theirs
-        drifted = self.value + self.DRIFT * (now - self._noted) if math.isfinite(self.value) else math.inf
-        self.value, self._noted, self._soonest = min(drifted, late), now, min(self._soonest, late)
-
-
-class Truth:
-    """What a simulator on this machine tells about a vehicle beside MAVLink (sim.autopilot.server): its last word."""
-
-    def __init__(self, port: int, system: int, tolerance: Tolerance | None = None) -> None:
-        """Listen on a UDP port for this machine alone. Raises OSError when it is taken."""
-        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self._socket.bind(("127.0.0.1", port))
-        self._socket.setblocking(False)
-        self._system, self._tolerance = system, tolerance or Tolerance()
-        self.state: Array | None = None
-        self.collisions = 0
-        self.clearance = math.inf
-
-    def poll(self) -> None:
-        """Take what has come, but not for ever: whoever sends without end must not hold up the flight."""
-        for _ in range(MOST_TOLD):
-            try:
-                data = self._socket.recv(4096)
-            except BlockingIOError:
-                return
-            with self._tolerance.over("truth"):
-                self._take(json.loads(data))
-
-    def _take(self, told: Any) -> None:
-        """Raises ValueError, TypeError, KeyError: it is not what a simulator tells."""
-        if told["system"] != self._system:
-            return
-        state, clearance = np.array(told["state"], float), told["clearance"]
-        clearance = math.inf if clearance is None else float(clearance)
-        if state.shape != (QUADROTOR.state_dim,) or not (np.abs(state) < FARTHEST).all() or math.isnan(clearance):
-            raise ValueError(f"state {told['state']}, clearance {clearance}")
-        if type(told["collisions"]) is not int:
-            raise ValueError(f"collisions {told['collisions']!r}")
-        self.state, self.collisions, self.clearance = state, told["collisions"], clearance
-
-    def close(self) -> None:
-        self._socket.close()
 
 
 class LiveVehicle:
@@ -188,7 +82,7 @@ class LiveVehicle:
         Raises:
             MavlinkError: nobody there, or it refuses, or told to stop.
         """
-        self._robot, self._told_to_stop, self._raise_limits = robot, stop, raise_limits
+        self._robot, self._told_to_stop = robot, stop
         self._link, self._truth = link, truth
         self._witness = witness if truth is None else None
         self._client = Client(link.send, system, tap, lambda text: log.info("it says: %s", text))
@@ -199,12 +93,13 @@ class LiveVehicle:
         self._counted: dict[str, int] = {}  # messages, by what they tell
         self._heard_at: dict[str, float] = {}  # s, when the latest of them came
         self._said_lost, self._said_low = "", False
-        self.notes: list[str] = []  # which messages are used, which parameters are too low
+        self._takeoff = Takeoff(self._client, robot, self._wait, self._hold, raise_limits)
+        self.notes = self._takeoff.notes
         self._velocity: Array | None = None  # the setpoint to be repeated
         self._offsets = Offset()
         self._turned, self._ended, self._failure = threading.Condition(), threading.Event(), ""
         try:
-            self._take_off(height)
+            self._takeoff.fly(height)
         except BaseException:
             link.close()
             raise
@@ -288,108 +183,11 @@ class LiveVehicle:
         if self._truth is not None:
             self._truth.close()
 
-    def _take_off(self, height: float) -> None:
-        client, wait = self._client, self._wait
-        kind = client.identify(wait)
-        self._note(f"{kind}, in {client.mode}")
-        self._await_estimate()
-        for what, interval in ((LANDED, 0.2), (ATTITUDE, TELEMETRY), (FORCE, TELEMETRY), (MOTION, TELEMETRY)):
-            self._note(client.choose(what, interval, wait))
-        if not wait(lambda: client.position is not None and client.airborne is not None, 3.0):
-            raise NotTold("it does not tell its position, or whether it flies")
-        self._smooth()
-        with contextlib.suppress(MavlinkError):
-            client.stream(message_id("SYS_STATUS"), 2.0, wait)
-        self._compare_limits(kind)
-        self._velocity = np.zeros(3)
-        client.follow_setpoints(wait)
-        if not client.armed:
-            client.arm(wait)
-        if not client.airborne:
-            self._climb(kind, height)
-        self._velocity = np.zeros(3)
-        if not wait(lambda: float(np.linalg.norm(client.velocity)) < REST, 8.0):  # it may have flown when we came
-            raise MavlinkError("it does not come to rest")
-        if not wait(lambda: client.offboard and client.armed, 3.0):
-            raise MavlinkError("it says that it follows setpoints, and its heartbeat that it does not")
-
-    def _await_estimate(self) -> None:
-        """Wait until the estimator knows where it is, if it says so; with progress."""
-        client, wait = self._client, self._wait
-        if not client.watch_estimator(wait):
-            return
-        began = said_at = time.monotonic()
-        ready = lambda: client.estimator is not None and not missing(client.estimator)  # noqa: E731
-        while not wait(ready, max(0.0, said_at + PROGRESS - time.monotonic())):
-            said_at, lacking = time.monotonic(), ", ".join(missing(client.estimator or 0))
-            if client.estimator is None and said_at - began > SPEECHLESS:
-                return
-            if said_at - began > ESTIMATING:
-                raise MavlinkError(f"its estimator does not know, after {ESTIMATING:.0f} s: {lacking}")
-            log.info("waiting for the position estimate: %.0f s, it does not know: %s", said_at - began, lacking)
-
-    def _smooth(self) -> None:
-        """Take the mean of as many readings of the accelerometer as it takes to come within the description's error."""
-        client = self._client
-        felt: list[Array] = []
-
-        def another() -> bool:
-            if client.heard[FORCE] != len(felt) + heard:
-                felt.append(client.acceleration)
-                return len(felt) >= 2 * READINGS
-            return False
-
-        heard = client.heard[FORCE]
-        self._wait(another, 1.0)
-        noise = 2.0 * float(np.std(felt, axis=0).max()) if felt else 0.0
-        bound = float(np.min(np.asarray(self._robot.measurement_bound)[-self._robot.position_dim :]))
-        readings = min(max(1, math.ceil((noise / bound) ** 2)), READINGS)
-        client.smooth(readings)
-        if readings > 1:
-            self._note(f"its accelerometer is off by {noise:.1f} m/s²: the mean of {readings} readings is taken")
-
-    def _compare_limits(self, kind: str) -> None:
-        """What its parameters allow, beside what may be asked of it."""
-        client, wait = self._client, self._wait
-        told = {c.parameter: client.parameter(c.parameter, wait) for c in CEILINGS[kind]}
-        values = {name: value for name, value in told.items() if value is not None}
-        for ceiling, value in too_low(kind, values, self._robot):
-            wanted = ceiling.value(demand(self._robot))
-            short = f"{ceiling.parameter} is {value:g} ({ceiling.what}), and up to {wanted:g} may be asked for"
-            if self._raise_limits:
-                done = client.set_parameter(ceiling.parameter, wanted, wait)
-                self._note(f"{ceiling.parameter}: {value:g} -> {wanted:g}" + ("" if done else ", which it refuses"))
-            else:
-                self._note(f"{short}: raise it (--raise-limits), or it cannot do what is asked of it")
-        name = TIMEOUTS[kind]
-        timeout = client.parameter(name, wait)
-        if timeout is None and kind in FIXED_TIMEOUT:
-            self._note(f"no {name} here: it flies on for {FIXED_TIMEOUT[kind]:g} s when setpoints stop")
-        elif timeout is not None and timeout > SHORTEST[kind]:
-            self._note(f"{name} is {timeout:g}: so many seconds it flies on when setpoints stop")
-
     def _call_witness(self) -> None:
         try:
-            self._note(self._client.choose(TRUTH, TELEMETRY, self._wait))
+            self._takeoff.note(self._client.choose(TRUTH, TELEMETRY, self._wait))
         except NotTold:
             self._witness = None
-
-    def _note(self, line: str) -> None:
-        self.notes.append(line)
-        log.info("%s", line)
-
-    def _climb(self, kind: str, height: float) -> None:
-        client, wait = self._client, self._wait
-        assert client.position is not None
-        top = client.position[2] + height
-        if kind == "ardupilot":
-            self._velocity = None  # a setpoint would end the takeoff
-            client.take_off(height, wait)
-        else:
-            self._velocity = CLIMB
-        if not wait(lambda: client.position is not None and client.position[2] > top - 0.3, 10.0 + 3.0 * height):
-            raise MavlinkError("it does not climb")
-        self._sent_at = -math.inf
 
     # --- in the thread, once it runs --------------------------------------------------------------------------
 
@@ -517,6 +315,12 @@ class LiveVehicle:
             client.heartbeat()
         if self._velocity is not None and now - self._sent_at >= RESEND:
             self._send_setpoint(now)
+
+    def _hold(self, velocity: Array | None) -> None:
+        """Repeat that setpoint from now on; None: send none."""
+        if self._velocity is None:  # while none was to be sent there was no gap between two
+            self._sent_at = -math.inf
+        self._velocity = velocity
 
     def _send_setpoint(self, now: float) -> None:
         assert self._velocity is not None

@@ -101,7 +101,7 @@ def test_without_promises_the_same_robots_touch(ask):
 def test_who_forgets_the_others_promises_touches_them(data_folder, monkeypatch):
     """The mutant: promises are made, and nobody keeps off them."""
     ask = in_process(model_for(GROUND, Recipe()))
-    monkeypatch.setattr(Promises, "within", lambda self, point, reach: None)
+    monkeypatch.setattr(Promises, "nearest", lambda self, point: np.full(len(self), np.inf))
     fleet = fleet_of()
     gathered(fleet)
     least, _ = drive(fleet, ask, "adversary", 60)

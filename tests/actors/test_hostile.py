@@ -7,8 +7,8 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from actors.live import MOST_TOLD, Truth
 from actors.mavlink import Client
+from actors.truth import MOST_TOLD, Truth
 from messaging.ports import free_udp_port
 from messaging.tolerant import Tolerance
 

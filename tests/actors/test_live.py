@@ -9,9 +9,11 @@ from collections.abc import Callable, Iterator
 import numpy as np
 import pytest
 
-from actors.live import LiveVehicle, Offset, Truth
+from actors.live import LiveVehicle
 from actors.mavlink import Frame
 from actors.telemetry import ATTITUDE
+from actors.timing import Offset
+from actors.truth import Truth
 from messaging.clock import WallClock
 from messaging.links import open_link
 from messaging.ports import free_udp_port
