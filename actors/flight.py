@@ -19,10 +19,10 @@ from typing import Any
 import numpy as np
 from google.protobuf.message import Message
 
+from actors.frames import Tap
 from actors.guard import Ask, Outcome, consult
 from actors.live import LiveVehicle, Turn
 from actors.loop import ActorSettings, Make, Rider, Tally, cycle
-from actors.mavlink import Tap
 from actors.proposers import MakePolicy
 from actors.settings import FlightSettings as FlightSettings
 from actors.tape import Puts

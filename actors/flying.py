@@ -7,7 +7,8 @@ from typing import Protocol
 
 import numpy as np
 
-from actors.mavlink import Client, Tap, message_id
+from actors.frames import Tap
+from actors.mavlink import Client, message_id
 from actors.telemetry import Array
 from messaging.robots import Robot
 from sim.quadrotor import SAMPLES, Quadrotor, slewed

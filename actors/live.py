@@ -11,7 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from actors.mavlink import Client, MavlinkError, NotTold, Tap
+from actors.frames import Tap
+from actors.mavlink import Client, MavlinkError, NotTold
 from actors.takeoff import TELEMETRY, Takeoff
 from actors.telemetry import IN_FLIGHT, TRUTH, Array
 from actors.timing import Offset, Timing

@@ -27,7 +27,7 @@ from safety.client import ask
 from safety.commitment import Array
 
 if TYPE_CHECKING:
-    from actors.mavlink import Tap
+    from actors.frames import Tap
 
 log = logging.getLogger("brakeline.actor")
 

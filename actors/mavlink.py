@@ -7,7 +7,6 @@ are fed in, bytes are handed to `send`, and who waits for something brings a way
 from __future__ import annotations
 
 import contextlib
-import math
 import os
 import struct
 from collections import Counter, deque
@@ -22,6 +21,7 @@ os.environ.setdefault("MAVLINK20", "1")  # read when pymavlink is imported
 from pymavlink.dialects.v20 import ardupilotmega as mavlink  # `common`, and what ArduPilot adds
 
 from actors import telemetry
+from actors.frames import Frame, Tap
 from actors.telemetry import (
     ATTITUDE,
     ESTIMATORS,
@@ -68,45 +68,6 @@ class CommandRefused(MavlinkError):
 
 class NotTold(MavlinkError):
     """Something that is needed comes by none of the messages that could tell it."""
-
-
-@dataclass(frozen=True)
-class Frame:
-    """One MAVLink frame as it was sent or received."""
-
-    outgoing: bool
-    raw: bytes
-    message: Any
-
-    @property
-    def name(self) -> str:
-        """Such as `mavlink/1/1/HEARTBEAT`: system, component, message."""
-        m = self.message
-        return f"mavlink/{m.get_srcSystem()}/{m.get_srcComponent()}/{m.get_type()}"
-
-    @property
-    def fields(self) -> dict[str, Any]:
-        """For JSON: numbers that are not finite become None."""
-        return {key: _plain(value) for key, value in self.message.to_dict().items()}
-
-    @property
-    def described(self) -> dict[str, Any]:
-        """Header and fields, for JSON."""
-        m, fields = self.message, self.fields
-        header = {"system_id": m.get_srcSystem(), "component_id": m.get_srcComponent(), "sequence": m.get_seq()}
-        return {"header": header, "message": {"type": fields.pop("mavpackettype"), **fields}}
-
-
-Tap = Callable[[Frame], None]
-
-
-def decoded(raw: bytes, outgoing: bool) -> Frame | None:
-    """A frame from its bytes; None if they are none."""
-    try:
-        message = mavlink.MAVLink(None).decode(bytearray(raw))
-    except mavlink.MAVError:
-        return None
-    return Frame(outgoing, raw, message)
 
 
 class Client:
@@ -458,13 +419,3 @@ class _Pipe:
     """What pymavlink takes for a file."""
 
     write: Callable[[bytes], object]
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    if isinstance(value, bytes | bytearray):
-        return value.hex()
-    if isinstance(value, list | tuple):
-        return [_plain(inner) for inner in value]
-    return value

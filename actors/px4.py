@@ -14,7 +14,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from actors.mavlink import Client, Frame, MavlinkError, Tap
+from actors.frames import Frame, Tap
+from actors.mavlink import Client, MavlinkError
 from messaging.robots import Robot
 from sim.autopilot.dialect import mavlink
 from sim.autopilot.hil import AutopilotGone, Hil

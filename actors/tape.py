@@ -11,7 +11,7 @@ from google.protobuf.message import Message
 from messaging import brakeline_pb2 as pb
 
 if TYPE_CHECKING:
-    from actors.mavlink import Frame
+    from actors.frames import Frame
 
 
 class Puts(Protocol):

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from actors.flying import MavlinkVehicle
-from actors.mavlink import Tap
+from actors.frames import Tap
 from actors.px4 import QUIET, Px4Flight, Px4Vehicle
 from messaging.robots import Robot
 from messaging.tasks import task_of

@@ -9,7 +9,7 @@ import json
 import logging
 from collections.abc import Callable, Iterable
 
-from actors.mavlink import decoded
+from actors.frames import decoded
 from logs.segment import Entry
 from messaging.bus import Sample
 from messaging.topics import FRAMES

@@ -9,8 +9,8 @@ from collections.abc import Callable, Iterator
 import numpy as np
 import pytest
 
+from actors.frames import Frame
 from actors.live import LiveVehicle
-from actors.mavlink import Frame
 from actors.telemetry import ATTITUDE
 from actors.timing import Offset
 from actors.truth import Truth

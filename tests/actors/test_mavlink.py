@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from actors.flying import MavlinkVehicle
-from actors.mavlink import Client, CommandRefused, Frame, NoAutopilot, mavlink
+from actors.frames import Frame
+from actors.mavlink import Client, CommandRefused, NoAutopilot, mavlink
 from messaging.shapes import CYLINDER, Obstacle
 from sim.autopilot.endpoint import Autopilot
 from sim.autopilot.pilot import Mode

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from pymavlink import mavutil
 
-from actors.mavlink import decoded
+from actors.frames import decoded
 from deploy import cli
 from logs.reader import Record, read
 from messaging import brakeline_pb2 as pb

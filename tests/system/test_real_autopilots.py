@@ -11,8 +11,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from actors.frames import Frame
 from actors.live import LiveVehicle
-from actors.mavlink import OFFBOARD, Frame, mavlink, message_id
+from actors.mavlink import OFFBOARD, mavlink, message_id
 from messaging.links import open_link
 from tests.real import KINDS, autopilot
 from tests.robots import QUADROTOR
