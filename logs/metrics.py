@@ -25,7 +25,8 @@ V = TypeVar("V")
 
 __all__ = ["KINDS", "Figures", "Metrics", "Tally", "closed_loop", "spread"]
 
-MOST_STREAMS = 20_000  # and of names as many: what would be one more is nobody's
+MOST_STREAMS = 20_000  # what would be one more is nobody's
+MOST_NAMES = 4_000  # of actors, learners, processes; an actor's histograms take 10 kB and more
 LEVELS = ("DEBUG", "INFO", "WARNING", "ERROR")
 SILENT = HEALTH.stale_after or 3.0  # s without a sign of life after which a process counts as gone
 
@@ -221,8 +222,9 @@ class Metrics:
 def _entered(table: dict[K, V], name: K, make: Callable[[], V]) -> V:
     """What the table has under the name, made anew if it is the first time. Raises Crowded."""
     if name not in table:
-        if len(table) >= MOST_STREAMS:
-            raise Crowded(f"{name} is one more than {MOST_STREAMS}")
+        most = MOST_STREAMS if make is Stream else MOST_NAMES
+        if len(table) >= most:
+            raise Crowded(f"{name} is one more than {most}")
         table[name] = make()
     return table[name]
 

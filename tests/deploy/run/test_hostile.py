@@ -44,6 +44,7 @@ def test_what_it_cannot_handle_is_passed_over(launcher: Launcher) -> None:
 
 def test_its_figures_stay_bounded(launcher: Launcher, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("logs.metrics.MOST_STREAMS", 100)
+    monkeypatch.setattr("logs.metrics.MOST_NAMES", 100)
     for number in range(300):
         header = pb.Header(run=number)
         say(launcher, STEP, pb.Step(header=header, actor=f"a{number}"))
