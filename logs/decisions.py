@@ -77,7 +77,8 @@ class Decisions:
         rows, self.waiting = np.asarray(self.waiting).reshape(-1, WIDTH), array("d")
         kind, round_trip, queue, decide, verify, solve, iterations, width, margin = rows.T
         self.round_trip_ms.take(round_trip)
-        network = np.maximum(0.0, round_trip - queue - decide)
+        with np.errstate(invalid="ignore"):  # between infinities, which anybody may send, there is no difference
+            network = np.maximum(0.0, round_trip - queue - decide)
         values = {
             "round_trip": round_trip, "network": network, "queue": queue, "decide": decide, "solve": solve,
             "verify": verify,

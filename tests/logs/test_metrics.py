@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
+from logs.decisions import Decisions
 from logs.figures import draw
 from logs.metrics import Metrics, Tally, closed_loop, spread
 from logs.recorder import entry
@@ -197,3 +198,10 @@ def test_learning_curves_are_drawn(tmp_path: Path, say: Say) -> None:
     draw({"ground": training.figures()}, tmp_path / "pictures" / "curve.png")
     draw({}, tmp_path / "pictures" / "none.png")
     assert (tmp_path / "pictures" / "curve.png").stat().st_size > 10_000
+
+
+def test_times_that_are_none_warn_nobody() -> None:
+    decisions = Decisions()
+    said = pb.Decision(kind=pb.ALLOWED, queue_ms=math.inf, time_ms=math.inf)
+    decisions.exchange(pb.Exchange(round_trip_ms=math.inf, reply=pb.Reply(decision=said)))
+    assert decisions.figures()["latency_ms"]["allowed"]["network"] is None
