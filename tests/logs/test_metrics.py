@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from logs.decisions import Decisions
+from logs.decisions import Decisions, joined
 from logs.figures import draw
 from logs.metrics import Metrics, Tally, closed_loop, spread
 from logs.recorder import entry
@@ -204,4 +204,4 @@ def test_times_that_are_none_warn_nobody() -> None:
     decisions = Decisions()
     said = pb.Decision(kind=pb.ALLOWED, queue_ms=math.inf, time_ms=math.inf)
     decisions.exchange(pb.Exchange(round_trip_ms=math.inf, reply=pb.Reply(decision=said)))
-    assert decisions.figures()["latency_ms"]["allowed"]["network"] is None
+    assert joined([decisions]).figures()["latency_ms"]["allowed"]["network"] is None
