@@ -22,6 +22,7 @@ Triple = tuple[float, float, float]
 GRAVITY = 9.81  # m/s²
 MILLIGRAVITY = 9.80665e-3  # m/s², the unit of some accelerometers
 MOTION, ATTITUDE, FORCE, LANDED = "position and velocity", "attitude", "acceleration", "landed state"
+COPTER_EARTH, PX4_EARTH = 6378100.0, 6371000.0  # m, the radius that each lays its map with
 TRUTH = "truth"  # of a simulator inside the autopilot
 LOCAL, BODY = (1,), (8, 12)  # MAV_FRAME: LOCAL_NED; BODY_NED and BODY_FRD of a velocity
 ON_GROUND, UNKNOWN = 1, 0  # MAV_LANDED_STATE
@@ -133,11 +134,11 @@ def _airborne(m: Message) -> bool | None:
 
 
 def _simstate(m: Message) -> Place:
-    return Place(m.lat, m.lng, None, 0.011131884502145034)
+    return Place(m.lat, m.lng, None, 1e-7 * math.radians(1.0) * COPTER_EARTH)
 
 
 def _hil_state(m: Message) -> Place:
-    return Place(m.lat, m.lon, 1e-3 * m.alt, 1e-7 * math.radians(1.0) * 6371000.0)
+    return Place(m.lat, m.lon, 1e-3 * m.alt, 1e-7 * math.radians(1.0) * PX4_EARTH)
 
 
 SOURCES: dict[str, tuple[Source, ...]] = {

@@ -7,11 +7,13 @@ import json
 import shutil
 import subprocess
 import time
-from contextlib import ExitStack
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
+import pytest
 from websockets.sync.client import connect
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
@@ -130,6 +132,17 @@ class Page:
             self.complaints.append(json.dumps(about["args"]))
         elif method == "Log.entryAdded" and about["entry"]["level"] == "error":
             self.complaints.append(about["entry"]["text"])
+
+
+@contextmanager
+def drawn(report: Path, folder: Path) -> Iterator[Page]:
+    """A report in a browser, once it is drawn. Skips the test where there is no browser."""
+    if CHROMIUM is None:
+        pytest.skip("there is no Chromium: the report was not driven in a browser")
+    with Page(folder) as page:
+        page.open(report.as_uri())
+        page.until("document.documentElement.dataset.drawn === 'yes'")
+        yield page
 
 
 def _end(process: subprocess.Popen[bytes]) -> None:

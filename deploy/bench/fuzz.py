@@ -8,7 +8,6 @@ and shows must still come. `python -m deploy.bench fuzz` sends a million, the te
 from __future__ import annotations
 
 import logging
-import math
 import tempfile
 import time
 import traceback
@@ -59,13 +58,6 @@ from safety.service import Counts, Models, answerer
 
 LOOK = 25_000  # messages between two looks at what the processes say and show
 SETTLED = 0.3  # of the messages: by then tables are as full as they get
-
-NUMBERS = (0.0, 1.0, -1.0, 0.1, 1e-300, 1e300, -1e300, 1e9, math.inf, -math.inf, math.nan)
-INTEGERS = (0, 1, 2, 3, 7, 1000, 2**31 - 1, 2**31, 2**32 - 1, 2**53, 2**62, 2**63 - 1, 2**63, 2**64 - 1, -1, -(2**63))
-TEXTS = ("", "ground", "ground", "quadrotor", "actor-0", "actor-0", "ERROR", "box", "wall", "sphere", "cylinder")
-STRANGE = ("a/b", "../../etc", "\x1b[2J\n", "<script>", "\n", "é" * 40, "a" * 101)
-# By the wire's kind of number: C++'s int32, int64, uint32, uint64.
-LIMITS = {1: (-(2**31), 2**31 - 1), 2: (-(2**63), 2**63 - 1), 3: (0, 2**32 - 1), 4: (0, 2**64 - 1)}
 
 
 class Wire:

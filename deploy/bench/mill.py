@@ -15,7 +15,6 @@ from messaging.bus import Sample
 from messaging.topics import TOPICS, Topic
 
 CORPUS = 200  # valid messages of each topic, that the mutated ones are made of
-
 NUMBERS = (0.0, 1.0, -1.0, 0.1, 1e-300, 1e300, -1e300, 1e9, math.inf, -math.inf, math.nan)
 INTEGERS = (0, 1, 2, 3, 7, 1000, 2**31 - 1, 2**31, 2**32 - 1, 2**53, 2**62, 2**63 - 1, 2**63, 2**64 - 1, -1, -(2**63))
 TEXTS = ("", "ground", "ground", "quadrotor", "actor-0", "actor-0", "ERROR", "box", "wall", "sphere", "cylinder")

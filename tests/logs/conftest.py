@@ -14,7 +14,7 @@ from messaging import brakeline_pb2 as pb
 from messaging.bus import Sample
 from messaging.bus.keys import names_of
 from messaging.topics import TOPICS
-from tests.browser import CHROMIUM, Page
+from tests.browser import Page, drawn
 from tests.logs.mixed import mixed
 
 Say = Callable[..., Sample]
@@ -50,9 +50,5 @@ def report(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, An
 
 @pytest.fixture(scope="module")
 def page(report: tuple[Path, dict[str, Any]], tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
-    if CHROMIUM is None:
-        pytest.skip("there is no Chromium: the report was not driven in a browser")
-    with Page(tmp_path_factory.mktemp("browser")) as page:
-        page.open(report[0].as_uri())
-        page.until("document.documentElement.dataset.drawn === 'yes'")
+    with drawn(report[0], tmp_path_factory.mktemp("browser")) as page:
         yield page

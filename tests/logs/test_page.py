@@ -13,7 +13,7 @@ import pytest
 from deploy.cli import main
 from logs.analysis import Look, analysed
 from logs.page import embedded, names, number, percent, render
-from tests.browser import CHROMIUM, Page
+from tests.browser import CHROMIUM, Page, drawn
 from tests.logs.mixed import ABOUT, mixed
 
 TRICKS = "</script><script>alert(1)</script><!-- \u2028"
@@ -171,11 +171,7 @@ def compared(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[dict[
 
 @pytest.fixture(scope="module")
 def comparison(compared: tuple[Path, list[dict[str, Any]]], tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
-    if CHROMIUM is None:
-        pytest.skip("there is no Chromium: the report was not driven in a browser")
-    with Page(tmp_path_factory.mktemp("browser")) as page:
-        page.open(compared[0].as_uri())
-        page.until("document.documentElement.dataset.drawn === 'yes'")
+    with drawn(compared[0], tmp_path_factory.mktemp("browser")) as page:
         yield page
 
 
