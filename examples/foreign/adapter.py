@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from messaging.robots import robot_named
-from messaging.shapes import Obstacle
+from messaging.shapes import WALL, Obstacle
 from safety.spaces import Actions
 
 Array = NDArray[np.float64]
@@ -31,6 +31,7 @@ class Adapter(ABC):
 
     def __init__(self, description: Path) -> None:
         self.robot = robot_named(str(description))
+        self.trained = description.with_suffix(".trained.safetensors")  # where `train.py` leaves its policy
 
     @abstractmethod
     def built(self, free: bool) -> gymnasium.Env[Any, Any]:
@@ -60,6 +61,16 @@ class Adapter(ABC):
         """Of a robot whose period is some of the environment's steps, those are one step."""
         return Held(self.built(free), self, round(self.robot.period / self.step))
 
+    def near(self, env: Any, observation: Any, info: dict[str, Any]) -> list[Obstacle]:
+        """Those in the robot's sight: what a service wants to be told of, and all that it has to read."""
+        x, y = info["state"][:2]
+        sight = self.robot.sight
+        return [
+            o
+            for o in self.obstacles(env, observation, info)
+            if o.kind == WALL or math.dist(o.position, (x, y)) - o.size[0] - max(o.margin, 0.0) <= sight
+        ]
+
     def actions(self) -> Actions:
         """An action is the input itself, clipped."""
         low, high = self.robot.low(), self.robot.high()
@@ -77,21 +88,29 @@ class Adapter(ABC):
 
 
 class Held(gymnasium.Wrapper[Any, Any, Any, Any]):
-    """An action for so many steps: costs and rewards add up, and `info` has what lies between, for the data."""
+    """An action for so many steps: costs and rewards add up. `info` has the state and what lies between."""
 
     def __init__(self, env: gymnasium.Env[Any, Any], adapter: Adapter, steps: int) -> None:
         super().__init__(env)
         self.adapter, self.steps = adapter, steps
+        self._state: Array = np.zeros(0)
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        observation, info = self.env.reset(seed=seed, options=options)
+        self._state = self.adapter.state(self.env, observation, info)
+        return observation, info | {"state": self._state}
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        start, path, reward, cost = self.adapter.state(self.env, None, {}), [], 0.0, 0.0
+        start, path, reward, cost = self._state, [], 0.0, 0.0
         cos, sin = math.cos(start[2]), math.sin(start[2])
         for _ in range(self.steps):
             observation, paid, terminated, truncated, info = self.env.step(action)
             reward, cost = reward + float(paid), cost + float(info.get("cost", 0.0))
-            x, y = self.adapter.state(self.env, observation, info)[:2] - start[:2]
+            self._state = self.adapter.state(self.env, observation, info)
+            x, y = self._state[:2] - start[:2]
             path.append([cos * x + sin * y, cos * y - sin * x])
             if terminated or truncated:
                 break
         path += [path[-1]] * (self.steps - len(path))
-        return observation, reward, terminated, truncated, info | {"cost": cost, "subsamples": np.array(path)}
+        told = {"state": self._state, "cost": cost, "subsamples": np.array(path)}
+        return observation, reward, terminated, truncated, info | told

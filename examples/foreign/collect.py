@@ -13,8 +13,8 @@ from examples.foreign.robots import adapter_of
 
 def main(robot: str, out: str, periods: str = "20000") -> None:
     adapter = adapter_of(robot)
-    how = {"state": adapter.state, "actions": adapter.actions()}
-    data = collect(adapter.make(free=True), adapter.robot, int(periods), held=adapter.held, **how)
+    env, how = adapter.make(free=True), {"held": adapter.held, "actions": adapter.actions()}
+    data = collect(env, adapter.robot, int(periods), **how)
     data.save(Path(out))
     print(f"{out}: {data.periods} periods in {len(data.trajectories)} trajectories, bulge {1e3 * data.bulge:.2f} mm")
 

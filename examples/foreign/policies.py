@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from examples.foreign.adapter import Adapter
+from examples.foreign.trained import Trained
 
 Policy = Callable[[Any], Any]
 
@@ -34,4 +35,9 @@ def goal(env: Any, adapter: Adapter, rng: np.random.Generator) -> Policy:
     return lambda seen: adapter.at(env, adapter.goal(env))
 
 
-POLICIES = {policy.__name__: policy for policy in (untrained, random, adversarial, goal)}
+def trained(env: Any, adapter: Adapter, rng: np.random.Generator) -> Policy:
+    """What `train.py` left, without noise."""
+    return Trained.load(adapter.trained, adapter.robot)
+
+
+POLICIES = {policy.__name__: policy for policy in (untrained, random, adversarial, goal, trained)}

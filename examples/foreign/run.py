@@ -12,7 +12,9 @@ import argparse
 import json
 import sys
 import time
+from collections import Counter
 from contextlib import nullcontext
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +27,8 @@ from examples.foreign.policies import POLICIES
 from examples.foreign.robots import FOLDERS, adapter_of
 from safety.client import SafetyClient
 from safety.gym import SafetyWrapper
+
+DEADLINE = 1.0  # s: the environment waits, a busy machine must not count
 
 
 def main() -> None:
@@ -41,10 +45,10 @@ def main() -> None:
     adapter = adapter_of(given.robot)
     client = None
     if given.connect != "none":
-        client = SafetyClient.open(given.connect, given.robot, deadline=1.0, name="client.episodes")
+        client = SafetyClient.open(given.connect, given.robot, DEADLINE, name="client.episodes")
     env = behind(adapter, client)
     with client or nullcontext():
-        for seed in range(*given.seeds):
+        for seed in missing(given, client is not None):
             told = {"robot": given.robot, "policy": given.policy, "filter": client is not None, "seed": seed}
             line = json.dumps(told | episode(env, adapter, given.policy, seed, given.steps))
             print(line, flush=True)
@@ -53,34 +57,61 @@ def main() -> None:
                     file.write(line + "\n")
 
 
-def behind(adapter: Adapter, client: SafetyClient | None) -> Any:
-    """The adapter's task, behind the filter where there is one."""
+def missing(given: argparse.Namespace, filtered: bool) -> list[int]:
+    """The seeds that the file does not have yet."""
+    told = given.out.read_text().splitlines() if given.out is not None and given.out.exists() else []
+    lines = [json.loads(line) for line in told]
+    asked = given.robot, given.policy, filtered
+    have = {line["seed"] for line in lines if (line["robot"], line["policy"], line["filter"]) == asked}
+    return [seed for seed in range(*given.seeds) if seed not in have]
+
+
+def behind(adapter: Adapter, client: SafetyClient | None, penalty: float = 0.0) -> Any:
+    """The adapter's task, behind the filter where there is one; penalty: of leaning on it, taken off the reward."""
     env = adapter.make()
     if client is None:
         return env
-    return SafetyWrapper(env, client, state=adapter.state, obstacles=adapter.obstacles, actions=adapter.actions())
+    return SafetyWrapper(env, client, penalty, obstacles=adapter.near, actions=adapter.actions())
+
+
+@dataclass
+class Tally:
+    """The environment's own figures of one episode, and what was decided in it."""
+
+    started: float = field(default_factory=time.perf_counter)
+    steps: int = 0
+    cost: float = 0.0
+    reward: float = 0.0
+    unverified: int = 0
+    outside: int = 0
+    decisions: Counter[str] = field(default_factory=Counter)
+
+    def add(self, reward: float, info: dict[str, Any]) -> None:
+        """A step."""
+        self.steps, self.cost, self.reward = self.steps + 1, self.cost + info["cost"], self.reward + reward
+        if "diagnostics" in info:
+            told = info["diagnostics"]
+            self.decisions[told["kind"]] += 1
+            self.unverified += not told["verified"]
+            self.outside += not told["contained"]
+
+    def told(self) -> dict[str, Any]:
+        """As a line of JSON has it."""
+        figures = {"steps": self.steps, "cost": self.cost, "reward": round(float(self.reward), 2)}
+        decided = {"decisions": self.decisions, "unverified": self.unverified, "outside": self.outside}
+        return figures | decided | {"seconds": round(time.perf_counter() - self.started, 1)}
 
 
 def episode(env: Any, adapter: Adapter, policy: str, seed: int, steps: int) -> dict[str, Any]:
-    """The environment's own figures of one episode, and what was decided in it."""
-    started = time.perf_counter()
+    tally = Tally()
     observation, _ = env.reset(seed=seed)
     choose = POLICIES[policy](env, adapter, np.random.default_rng(seed))
-    cost = reward = 0.0
-    kinds: dict[str, int] = {}
-    driven = unverified = outside = 0
     for _ in range(steps):
         observation, paid, terminated, truncated, info = env.step(choose(observation))
-        cost, reward, driven = cost + info["cost"], reward + paid, driven + 1
-        if "diagnostics" in info:
-            told = info["diagnostics"]
-            kinds[told["kind"]] = kinds.get(told["kind"], 0) + 1
-            unverified, outside = unverified + (not told["verified"]), outside + (not told["contained"])
+        tally.add(paid, info)
         if terminated or truncated:
             break
-    seconds = round(time.perf_counter() - started, 1)
-    figures = {"steps": driven, "cost": cost, "reward": round(float(reward), 2), "decisions": kinds}
-    return figures | {"unverified": unverified, "outside": outside, "seconds": seconds}
+    return tally.told()
 
 
 if __name__ == "__main__":

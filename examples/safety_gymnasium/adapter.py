@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import gymnasium
@@ -36,6 +37,8 @@ class Goal(Adapter):
     def built(self, free: bool) -> gymnasium.Env[Any, Any]:
         _allow_arrays_as_defaults()
         import safety_gymnasium  # noqa: F401 - registers the environments
+
+        _without_sky()
 
         name = self.task.replace("-v", "Gymnasium-v")  # with five values a step
         return gymnasium.make(name.replace("Goal1", "Goal0") if free else name, disable_env_checker=True)
@@ -69,6 +72,19 @@ class Goal(Adapter):
             turn = max(-1.0, min(2.0 * bearing, 1.0))
             return np.asarray(np.clip(TORQUE * (np.array([1.0, 1.0]) + 2.0 * turn * LEFT), -TORQUE, TORQUE))
         return np.array([1.0 if abs(bearing) < 0.5 else 0.0, max(-1.0, min(3.0 * bearing, 1.0))])
+
+
+def _without_sky() -> None:
+    """Every reset reads six large pictures of stars, twice, for seconds. Here nothing is drawn."""
+    import safety_gymnasium.world as world
+    import xmltodict
+
+    def unparse(xml: dict[str, Any]) -> str:
+        assets = xml["mujoco"]["asset"]
+        assets["texture"] = [texture for texture in assets["texture"] if texture["@type"] != "skybox"]
+        return str(xmltodict.unparse(xml))
+
+    world.xmltodict = SimpleNamespace(parse=xmltodict.parse, unparse=unparse)
 
 
 def _allow_arrays_as_defaults() -> None:
