@@ -13,7 +13,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import linprog
 
 from safety.recipe import KINDS as KINDS
 from safety.recipe import MATRIX_ZONOTOPE as MATRIX_ZONOTOPE
@@ -105,6 +104,8 @@ def envelope(features: Array, values: Array, inflation: float) -> tuple[Array, f
     Minimises the mean of the bound over the samples, by an LP to which violated samples are added until none is; what
     the solver's tolerance leaves violated is added to w.
     """
+    from scipy.optimize import linprog  # half a second, and nothing that a service needs
+
     if not len(values):
         raise CertificateError("no sample to bound")
     cost = np.append(features.mean(0), 1.0)
@@ -172,6 +173,8 @@ def _row_box(white: Array, y: Array, size: Array) -> tuple[Array, Array]:
 
     Leaving samples out only widens it, so it holds whatever the loop stops at.
     """
+    from scipy.optimize import linprog
+
     nz, unit = white.shape[1], float(size.mean()) or 1.0
     y, size = y / unit, size / unit  # the solver's tolerances are absolute
     active = np.unique(np.concatenate([np.argsort(size)[:ROWS_A_ROUND], np.abs(white).argmax(0)]))

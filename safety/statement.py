@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import beta
+from scipy.special import betaincinv
 
 from safety.dataset import Dataset
 from safety.filter import Filter
@@ -55,7 +55,7 @@ def upper_bound(violations: int, count: int) -> float:
     """Clopper-Pearson: the largest probability with which so few violations are not surprising at 99 % confidence."""
     if count == 0 or violations >= count:
         return 1.0
-    return float(beta.ppf(CONFIDENCE, violations + 1, count - violations))
+    return float(betaincinv(violations + 1, count - violations, CONFIDENCE))
 
 
 def state(model: ModelSet, fitted: Dataset, held_out: Dataset) -> Statement:

@@ -7,7 +7,6 @@ from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import linprog
 
 Array = NDArray[np.float64]
 
@@ -58,6 +57,8 @@ class Zonotope:
 
     def norm(self, point: Array) -> float:
         """Smallest s with `point` in `c + s (Z - c)`, by one LP; inf outside the generators' span."""
+        from scipy.optimize import linprog  # half a second, and nothing that a service needs
+
         n, count = self.generators.shape
         cost = np.append(np.zeros(count), 1.0)
         equal = np.hstack([self.generators, np.zeros((n, 1))])

@@ -12,7 +12,7 @@ import pytest
 from filelock import FileLock
 from xdist.scheduler import LoadScopeScheduling
 
-from deploy.data import store
+from deploy.data import recording, store
 from safety.model_set import Recipe
 from tests.robots import GROUND, QUADROTOR
 
@@ -57,7 +57,7 @@ def data_folder(shared_folder: Path) -> Iterator[Path]:
     folder.mkdir(exist_ok=True)
     os.environ["BRAKELINE_DATA"] = str(folder)
     with FileLock(folder / "ground.lock"):
-        store.recorded(GROUND, trajectories=TRAJECTORIES)
+        recording.recorded(GROUND, trajectories=TRAJECTORIES)
         store.model_for(GROUND, Recipe())
     yield folder
     if before is None:
@@ -70,7 +70,7 @@ def data_folder(shared_folder: Path) -> Iterator[Path]:
 def flight_folder(data_folder: Path) -> Path:
     """The same, with a data set of the quadrotor, and its models in lockstep and in real time."""
     with FileLock(data_folder / "flight.lock"):
-        store.recorded(QUADROTOR, trajectories=FLIGHTS)
+        recording.recorded(QUADROTOR, trajectories=FLIGHTS)
         for robot in (QUADROTOR, QUADROTOR.in_real_time()):
             store.model_for(robot, Recipe())
     return data_folder

@@ -19,7 +19,8 @@ from types import TracebackType
 from typing import Self
 
 from deploy.bench.hosts import Hosts
-from deploy.data.store import method_for, method_path
+from deploy.data.paths import method_path
+from deploy.data.store import method_for
 from deploy.interpreter import PYTHON
 from logs.metrics import Metrics
 from messaging.bus import Bus, BusSettings, Sample

@@ -11,8 +11,9 @@ import tyro
 from rich.markdown import Markdown
 
 from deploy.commands.common import Robot, console, errors, say_json
+from deploy.data.paths import method_path
 from deploy.data.pretrain import recipe_for
-from deploy.data.store import method_for, method_path, pretrained
+from deploy.data.store import method_for, pretrained
 from deploy.study import compare, conservatism
 from deploy.study.cells import METHODS, NONE, Study, quick
 from deploy.study.compare import RESULTS, RUNS, SEEDS, Cell, Job

@@ -24,7 +24,8 @@ from deploy.commands.common import (
     say_json,
 )
 from deploy.data.logged import Recorded, from_log
-from deploy.data.store import SEED, data_for, model_path, record_path, recorded
+from deploy.data.paths import model_path, record_path
+from deploy.data.recording import SEED, data_for, recorded
 from deploy.data.support import Unsupported, supported
 from deploy.progress import under_way
 from logs.tables import Stacking

@@ -12,7 +12,8 @@ from typing import Annotated
 import tyro
 
 from deploy.commands.common import Endpoints, Filtering, Flags, Flight, Physics, Robot
-from deploy.data.store import data_root, method_for, method_path
+from deploy.data.paths import data_root, method_path
+from deploy.data.store import method_for
 from deploy.policies import policy_named
 from deploy.run.configurations import RunConfig
 from deploy.vehicles import environment, fleet_world, flight_arena

@@ -14,7 +14,8 @@ import tyro
 from rich.table import Table
 
 from deploy.commands.common import LATEST, Certificate, Mode, console, say_json
-from deploy.data.store import certified, model_for
+from deploy.data.certified import certified
+from deploy.data.store import model_for
 from deploy.progress import under_way
 from deploy.run.replay import Instead, replay
 from logs.extent import count

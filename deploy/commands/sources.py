@@ -13,10 +13,10 @@ from rich.table import Table
 from deploy.commands.common import Robot, console, errors, say_json
 from deploy.data import bring, planned
 from deploy.data.coverage import Coverage, coverage
+from deploy.data.paths import record_path
 from deploy.data.picture import draw
 from deploy.data.resample import HOLD
 from deploy.data.sources.quantities import columns_of
-from deploy.data.store import record_path
 from deploy.progress import under_way
 from messaging.robots import Robot as RobotKind
 from messaging.tasks import learnt

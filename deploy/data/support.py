@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from deploy.data.store import certified
+from deploy.data.certified import certified
 from safety.certificates import CertificateError
 from safety.dataset import BadData, Dataset
 from safety.model_set import ModelSet, Recipe

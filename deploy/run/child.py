@@ -36,7 +36,7 @@ def _recorder(place: Place, folder: Path, config: RunConfig, bus: BusSettings) -
 
 
 def _safety(place: Place, folder: Path, config: RunConfig, bus: BusSettings) -> bool:
-    from deploy.data.store import method_path
+    from deploy.data.paths import method_path
     from deploy.run.keys import KEYS, newest_model
     from safety.service import SafetySettings, main
     from safety.sign import Trust

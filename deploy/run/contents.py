@@ -6,7 +6,7 @@ import json
 from importlib.metadata import version
 from pathlib import Path
 
-from deploy.data.store import method_path
+from deploy.data.paths import method_path
 from deploy.run.configurations import RunConfig, encode
 from logs.container import attachment
 from messaging.robots import robot_named

@@ -6,7 +6,7 @@ from __future__ import annotations
 import logging
 from pathlib import Path
 
-from deploy.data.store import method_path
+from deploy.data.paths import method_path
 from deploy.run.configurations import RunConfig
 from deploy.run.places import places
 from messaging.bus.authority import Authority

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from google.protobuf.message import Message
 
-from deploy.data.store import data_root
+from deploy.data.paths import data_root
 from logs.container import attachment
 from logs.reader import Log, Paths, open_log
 from logs.tally import KINDS

@@ -14,7 +14,8 @@ from typing import Any
 
 from actors.driver import Driver, Identity
 from actors.guard import Ask
-from deploy.data.store import method_for, recorded
+from deploy.data.recording import recorded
+from deploy.data.store import method_for
 from deploy.policies import TRAINED, UNTRAINED, policy_named
 from deploy.study.evaluate import FRESH, in_process
 from deploy.study.trials import Episodes, Trainer, TrialLog, evaluate

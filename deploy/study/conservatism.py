@@ -14,7 +14,8 @@ from pathlib import Path
 from typing import Any
 
 from actors.driver import Driver, Identity
-from deploy.data.store import certified, recorded
+from deploy.data.certified import certified
+from deploy.data.recording import recorded
 from deploy.policies import policy_named
 from deploy.study.evaluate import FRESH, in_process
 from deploy.study.trials import Episodes, evaluate

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from deploy.data.store import certified
+from deploy.data.certified import certified
 from examples.foreign import table
 from messaging.bus import Bus, BusSettings
 from messaging.ports import free_endpoint

@@ -12,8 +12,8 @@ import pytest
 
 from actors.driver import Driver, Identity
 from deploy.cli import main
-from deploy.data import collect, store
-from deploy.data.store import certified
+from deploy.data import collect, paths, recording, store
+from deploy.data.certified import certified
 from deploy.policies import policy_named
 from deploy.run.configurations import RunConfig
 from deploy.run.places import places
@@ -194,13 +194,13 @@ def test_a_description_that_changed_makes_the_model_set_again(
 ) -> None:
     """A model set of a narrower body is never used for a wider one; the recording is, and not for another clock."""
     monkeypatch.setenv("BRAKELINE_DATA", str(tmp_path))
-    recorded.save(store.record_path(kind))
+    recorded.save(paths.record_path(kind))
     before = store.model_for(kind, Recipe())
     assert store.model_for(kind, Recipe()).version == before.version
     wider = replace(kind, body=tuple(replace(disc, radius=disc.radius + 0.05) for disc in kind.body))
     assert store.model_for(wider, Recipe()).robot.body == wider.body
     with pytest.raises(BadData, match="changed"):
-        store.data_for(replace(kind, period=0.1))
+        recording.data_for(replace(kind, period=0.1))
     known(kind)
 
 
@@ -209,7 +209,7 @@ def test_what_was_not_recorded_here_is_never_recorded_over(
 ) -> None:
     """Whether the description changes, or somebody asks for a recording outright."""
     monkeypatch.setenv("BRAKELINE_DATA", str(tmp_path))
-    path = store.record_path(kind)
+    path = paths.record_path(kind)
     replace(recorded, about={"origin": "import", "sources": "drive.csv"}).save(path)
     before = path.read_bytes()
     with pytest.raises(BadData, match=r"kept: .* \(import: drive.csv\).*import the log again"):

@@ -6,7 +6,7 @@ import subprocess
 import numpy as np
 import pytest
 
-from deploy.data import store
+from deploy.data import paths
 from messaging.movers import parted
 from messaging.ports import free_endpoint
 from messaging.shapes import Obstacle
@@ -38,7 +38,7 @@ def certified(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def ready(certified):
-    return Filter(ModelSet.load(store.model_path(porter(), Recipe())))
+    return Filter(ModelSet.load(paths.model_path(porter(), Recipe())))
 
 
 def test_four_commands_from_a_csv_to_an_answer(certified, tmp_path):

@@ -2,7 +2,7 @@
 
 import os
 
-from deploy.data.store import method_path
+from deploy.data.paths import method_path
 from messaging.bus import Bus, BusSettings
 from messaging.ports import free_endpoint
 from safety.model_set import Recipe

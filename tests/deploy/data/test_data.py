@@ -6,7 +6,7 @@ from functools import partial
 import numpy as np
 import pytest
 
-from deploy.data import store
+from deploy.data import paths, recording, store
 from deploy.data.excite import excitation
 from deploy.data.logged import from_log, trajectories_of
 from logs.segment import Entry, open_segment
@@ -42,7 +42,7 @@ def test_lead_ins_of_inputs_held_for_long_are_sometimes_restless(held, least, mo
 
 
 def test_recorded_plans_are_found_as_windows(data_folder):
-    data = Dataset.load(store.record_path(GROUND))
+    data = Dataset.load(paths.record_path(GROUND))
     assert len(windows(data, GROUND.horizon)) > 0.1 * data.periods
     assert all(len(t.inputs) == 300 for t in data.trajectories)
 
@@ -52,26 +52,26 @@ def elsewhere(tmp_path, monkeypatch):
     """An empty store, with small recordings only."""
     monkeypatch.setenv("BRAKELINE_DATA", str(tmp_path / "data"))
     recordings = []
-    original = store.collect.record
-    monkeypatch.setattr(store, "recorded", partial(store.recorded, trajectories=20))
-    monkeypatch.setattr(store.collect, "record", lambda *a: (recordings.append(a), original(*a))[1])
+    original = recording.collect.record
+    monkeypatch.setattr(recording, "recorded", partial(recording.recorded, trajectories=20))
+    monkeypatch.setattr(recording.collect, "record", lambda *a: (recordings.append(a), original(*a))[1])
     return recordings
 
 
 def test_the_store_makes_what_is_missing_and_only_that(elsewhere, capsys):
     model = store.model_for(GROUND, Recipe())
-    assert store.record_path(GROUND).exists() and len(elsewhere) == 1
-    assert ModelSet.load(store.model_path(GROUND, Recipe())).version == model.version
+    assert paths.record_path(GROUND).exists() and len(elsewhere) == 1
+    assert ModelSet.load(paths.model_path(GROUND, Recipe())).version == model.version
     assert store.model_for(GROUND, Recipe()).version == model.version
     other = store.model_for(GROUND, Recipe("set-membership"))
     assert other.version != model.version and len(elsewhere) == 1, "one recording for all"
     assert float(model.about["bound_step"]) <= float(model.about["bound_plan"]) < 1.0
-    store.model_path(GROUND, Recipe()).write_bytes(b"damaged")
+    paths.model_path(GROUND, Recipe()).write_bytes(b"damaged")
     assert store.model_for(GROUND, Recipe()).version == model.version
     said = capsys.readouterr()
     assert "making the model set again" in said.err and said.out == ""
-    store.model_path(GROUND, Recipe()).unlink()
-    store.record_path(GROUND).write_bytes(b"damaged")
+    paths.model_path(GROUND, Recipe()).unlink()
+    paths.record_path(GROUND).write_bytes(b"damaged")
     assert store.model_for(GROUND, Recipe()).version == model.version, "the same seed, the same data"
     assert len(elsewhere) == 2
 
@@ -120,20 +120,20 @@ def test_the_last_steps_of_a_log(tmp_path):
 
 
 def test_an_interrupted_recording_is_gone_on_from(elsewhere, monkeypatch, capsys):
-    drive = store.collect.record
+    drive = recording.collect.record
 
     def interrupted(*given):
         yield from itertools.islice(drive(*given), 7)
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(store.collect, "record", interrupted)
+        patch.setattr(recording.collect, "record", interrupted)
         with pytest.raises(KeyboardInterrupt):
-            store.recorded(GROUND)
-    assert not store.record_path(GROUND).exists()
+            recording.recorded(GROUND)
+    assert not paths.record_path(GROUND).exists()
     assert "recording ground once" in (told := capsys.readouterr().err) and "kept 7 of 20" in told
-    whole = store.recorded(GROUND)
+    whole = recording.recorded(GROUND)
     assert elsewhere[-1][-1] == 7, "only what was missing is driven"
-    assert [path.name for path in store.record_path(GROUND).parent.iterdir()] == ["record.safetensors"]
-    fresh = store.recorded(GROUND, store.record_path(GROUND).with_name("fresh.safetensors"))
+    assert [path.name for path in paths.record_path(GROUND).parent.iterdir()] == ["record.safetensors"]
+    fresh = recording.recorded(GROUND, paths.record_path(GROUND).with_name("fresh.safetensors"))
     assert whole.digest() == fresh.digest(), "the same data as in one go"

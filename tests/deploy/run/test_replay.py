@@ -9,7 +9,8 @@ from typing import Any
 import pytest
 
 from deploy import cli
-from deploy.data.store import model_for, record_path
+from deploy.data.paths import record_path
+from deploy.data.store import model_for
 from deploy.run.replay import ReplayError, differences, replay
 from messaging import brakeline_pb2 as pb
 from safety.filter import Filter
