@@ -16,8 +16,9 @@ from deploy.data.pretrain import recipe_for
 from deploy.data.store import method_for, pretrained
 from deploy.study import compare, conservatism
 from deploy.study.cells import METHODS, NONE, Study, quick
-from deploy.study.compare import RESULTS, RUNS, SEEDS, Cell, Job
+from deploy.study.compare import RESULTS, RUNS, SEEDS, Cell
 from deploy.study.curves import learning_curves, seeds_as_points
+from deploy.study.jobs import Job, complete
 from deploy.study.table import markdown, plain, table
 from deploy.study.tune import Tried, best, try_all, values_for
 from learner.config import TD3Config
@@ -112,7 +113,7 @@ class Compare:
             robot = learnt(name).name if name.endswith(".toml") else address(name)
             self._prepare(robot)
             jobs = self._jobs(robot)
-            found = compare.complete(jobs, results, runs, self.workers, again, self._say)
+            found = complete(jobs, results, runs, self.workers, again, self._say)
             cells = [result for result, job in zip(found, jobs, strict=True) if isinstance(job, Cell)]
             rest = [result for result, job in zip(found, jobs, strict=True) if not isinstance(job, Cell)]
             told[robot] = self._show(robot, cells, rest, results / robot)

@@ -41,6 +41,7 @@ class Child:
         logs = self.folder / "logs"
         logs.mkdir(exist_ok=True)
         environment = os.environ | {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
+        environment["MUJOCO_GL"] = "disable"  # nobody draws by it, and asking for a display is a process of its own
         with (logs / f"{self.place.name}.log").open("ab") as errors:
             self.popen = subprocess.Popen(
                 [*PYTHON, "-m", "deploy.run.child", str(self.folder), self.place.name],

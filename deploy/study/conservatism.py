@@ -32,7 +32,7 @@ ORACLE = "astar"
 
 @dataclass(frozen=True)
 class Conservatism:
-    """A job of `deploy/study/compare.py`."""
+    """A job of `deploy/study/jobs.py`."""
 
     robot: str
     episodes: int = 60

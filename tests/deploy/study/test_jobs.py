@@ -1,0 +1,108 @@
+"""Jobs that are skipped, refused, resumed; and workers that outlive nobody. Light, for workers import it too."""
+
+import json
+import os
+import subprocess
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import psutil
+import pytest
+
+from deploy.study.jobs import OtherConfiguration, complete, read, write
+from tests.system.runs import until
+
+
+@dataclass(frozen=True)
+class Errand:
+    """A job that leaves a mark where it was done."""
+
+    number: int
+    setting: int = 0
+    robot: str = "ground"
+
+    @property
+    def name(self) -> str:
+        return f"errand-{self.number}"
+
+    def config(self) -> dict:
+        return {"number": self.number, "setting": self.setting}
+
+    def run(self, folder: Path, say) -> dict:
+        if self.number < 0:
+            raise RuntimeError("no such number")
+        folder.mkdir(parents=True)
+        say("half way")
+        return {"study": self.config(), "square": self.number**2}
+
+
+def test_what_is_there_is_not_run_again(tmp_path):
+    jobs, told = [Errand(n) for n in (1, 2, 3)], []
+    write(tmp_path / "results", jobs[1], {"study": jobs[1].config(), "square": -1})
+    say = lambda name, text: told.append((name, text))  # noqa: E731
+    found = complete(jobs, tmp_path / "results", tmp_path / "runs", workers=1, say=say)
+    assert [result["square"] for result in found] == [1, -1, 9]
+    assert told == [("errand-1", "half way"), ("errand-3", "half way")]
+    assert complete(jobs, tmp_path / "results", tmp_path / "elsewhere", workers=2) == found
+    assert not (tmp_path / "elsewhere").exists(), "the results alone suffice, on any machine"
+    assert read(tmp_path / "results", Errand(4)) is None
+
+
+def test_side_by_side_they_give_the_same(tmp_path):
+    jobs = [Errand(n) for n in range(5)]
+    found = complete(jobs, tmp_path / "results", tmp_path / "runs", workers=2)
+    assert [result["square"] for result in found] == [0, 1, 4, 9, 16]
+    assert len(list((tmp_path / "results" / "ground").iterdir())) == 5
+
+
+@dataclass(frozen=True)
+class Nap(Errand):
+    """A job that says which process does it, and does not end."""
+
+    def run(self, folder: Path, say) -> dict:
+        folder.mkdir(parents=True)
+        write(folder, Errand(self.number), {"pid": os.getpid()})
+        time.sleep(600.0)
+        return {}
+
+
+NAPS = """
+from pathlib import Path
+from deploy.study.jobs import complete
+from tests.deploy.study.test_jobs import Nap
+if __name__ == "__main__":
+    complete([Nap(1), Nap(2)], Path({0!r}) / "results", Path({0!r}) / "runs", workers=2)
+"""
+
+
+def test_killed_it_leaves_no_worker_behind(tmp_path):
+    (tmp_path / "naps.py").write_text(NAPS.format(str(tmp_path)))
+    root = Path(__file__).parents[3]
+    popen = subprocess.Popen([sys.executable, tmp_path / "naps.py"], env=os.environ | {"PYTHONPATH": str(root)})
+    marks = [tmp_path / "runs" / "ground" / f"errand-{n}" / "ground" / f"errand-{n}.json" for n in (1, 2)]
+    until(lambda: all(mark.exists() for mark in marks), "both are at work")
+    workers = {json.loads(mark.read_text())["pid"] for mark in marks}
+    children = psutil.Process(popen.pid).children(recursive=True)
+    assert workers <= {child.pid for child in children}
+    popen.kill()
+    popen.wait()
+    until(lambda: not any(child.is_running() for child in children), "all have ended", 10.0)
+
+
+def test_a_job_that_fails_loses_nothing_that_was_done(tmp_path):
+    jobs = [Errand(1), Errand(-1), Errand(2)]
+    with pytest.raises(RuntimeError, match="no such number"):
+        complete(jobs, tmp_path / "results", tmp_path / "runs", workers=2)
+    assert read(tmp_path / "results", jobs[0]) is not None
+
+
+def test_a_result_of_other_settings_is_refused_unless_it_shall_be_run_again(tmp_path):
+    complete([Errand(1)], tmp_path / "results", tmp_path / "runs", workers=1)
+    with pytest.raises(OtherConfiguration, match="another setting") as refused:
+        complete([Errand(2), Errand(1, setting=5)], tmp_path / "results", tmp_path / "other", workers=1)
+    assert "errand-1.json" in str(refused.value)
+    assert not (tmp_path / "other").exists(), "nothing is run before everything was looked at"
+    complete([Errand(1, setting=5)], tmp_path / "results", tmp_path / "again", workers=1, again=True)
+    assert read(tmp_path / "results", Errand(1, setting=5)) is not None
