@@ -13,8 +13,6 @@ import tyro
 from deploy.commands.common import console, errors, say_json
 from deploy.progress import under_way
 from logs.analysis import Look, analysed
-from logs.figures import draw
-from logs.page import write
 from logs.reader import find
 from logs.recover import recover
 from logs.report import show, show_episode
@@ -48,9 +46,13 @@ class Analyse:
             whose = f" of {self.actor}" if self.actor else ""
             raise ValueError(f"there is no episode {self.episode}{whose} in {', '.join(figures['log'])}")
         if self.html is not None:
+            from logs.page import write
+
             write(self.html, figures, analysis.each())
             errors.print(f"report: {self.html}", markup=False)
         if self.png is not None:
+            from logs.figures import draw  # Matplotlib: a second that nobody else shall wait
+
             draw(figures["training"], self.png)
             errors.print(f"learning curves: {self.png}", markup=False)
         self._say(figures)

@@ -1,6 +1,7 @@
 """One finished run, for the tests that look at what it left."""
 
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -8,9 +9,15 @@ from tests.system.runs import Run
 
 
 @pytest.fixture(scope="session")
-def logged_run(data_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder of a run of the `debug` experiment with two actors."""
-    with Run(tmp_path_factory.mktemp("logged") / "run") as run:
+def whole_run(data_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]]:
+    """The folder of a finished run of the `debug` experiment with two actors, and the figures it printed."""
+    with Run(tmp_path_factory.mktemp("runs") / "whole") as run:
         figures = run.end()
-        assert figures["finished"], run.errors.read_text()
-    return run.folder
+        assert run.popen.returncode == 0, run.errors.read_text()
+    return run.folder, figures
+
+
+@pytest.fixture(scope="session")
+def logged_run(whole_run: tuple[Path, dict[str, Any]]) -> Path:
+    """Its folder."""
+    return whole_run[0]

@@ -21,15 +21,15 @@ from tests.system.runs import PATIENCE, Run, alive, brakeline, until
 
 
 def test_each_process_is_killed_in_turn_and_the_run_goes_on_to_its_end(data_folder, tmp_path):
-    with Run(tmp_path / "run", "--steps", 2500, "--learner.checkpoint-every", 600) as run:
-        run.until_steps(150)
+    with Run(tmp_path / "run", "--steps", 1400, "--learner.checkpoint-every", 400) as run:
+        run.until_steps(80)
         assert not exists(run.folder / "learner" / "checkpoint"), "the learner dies before its first checkpoint"
         run.kill("learner")
-        run.until_steps(150)
+        run.until_steps(80)
         run.kill("safety-0")
-        run.until_steps(150)
+        run.until_steps(80)
         run.kill("actor-1")
-        run.until_steps(150)
+        run.until_steps(80)
         run.kill("recorder")
         until(lambda: exists(run.folder / "learner" / "checkpoint"), "a checkpoint")
         run.until_steps(50)
@@ -37,7 +37,7 @@ def test_each_process_is_killed_in_turn_and_the_run_goes_on_to_its_end(data_fold
         figures = run.end()
         assert run.popen.returncode == 0, run.errors.read_text()
     assert figures["finished"] and figures["collisions"] == 0
-    assert figures["learners"]["ground"]["steps"] == 2500
+    assert figures["learners"]["ground"]["steps"] == 1400
     assert figures["restarts"] == {"learner": 2, "safety-0": 1, "actor-1": 1, "recorder": 1}
     starts = {name: process["starts"] for name, process in figures["processes"].items()}
     assert starts == {"launcher": 1, "recorder": 2, "safety-0": 2, "learner": 3, "actor-0": 1, "actor-1": 2}
@@ -75,12 +75,12 @@ def _braked_as_committed(records):
 
 
 def test_interrupted_it_ends_in_order_and_is_resumed(data_folder, tmp_path):
-    with Run(tmp_path / "run", "--steps", 1500) as run:
-        run.until_steps(500)
+    with Run(tmp_path / "run", "--steps", 900) as run:
+        run.until_steps(350)
         figures = run.end(signal.SIGINT)
         assert run.popen.returncode == 130, run.errors.read_text()
     learned = figures["learners"]["ground"]["steps"]
-    assert not figures["finished"] and 300 < learned < 1500
+    assert not figures["finished"] and 200 < learned < 900
     assert exists(run.folder / "learner" / "checkpoint") and figures["policies"]
     before = analyse(run.folder)
     assert (before["cuts"], before["steps"], before["seconds"] > 0) == ([], figures["steps"], True)
@@ -91,8 +91,8 @@ def test_interrupted_it_ends_in_order_and_is_resumed(data_folder, tmp_path):
     with Run(run.folder, fresh=False) as resumed:
         figures = resumed.end()
         assert resumed.popen.returncode == 0, resumed.errors.read_text()
-    assert figures["finished"] and figures["learners"]["ground"]["steps"] == 1500, "--steps is that of the run"
-    assert figures["steps"] < 1500 + 64 - learned + 64
+    assert figures["finished"] and figures["learners"]["ground"]["steps"] == 900, "--steps is that of the run"
+    assert figures["steps"] < 900 + 64 - learned + 64
     after = analyse(run.folder)
     assert [path.rsplit("/", 1)[1] for path in after["log"]] == ["run.mcap", "run_0001.mcap"]
     assert after["steps"] == before["steps"] + figures["steps"]
@@ -109,7 +109,7 @@ def test_two_replicas_and_then_no_launcher(data_folder, tmp_path):
         victims = run.children()
         assert {"safety-0", "safety-1", "recorder", "learner", "actor-0", "actor-1"} == victims.keys()
         victims["safety-0"].kill()
-        run.until_steps(300)  # some are taken before it is back
+        run.until_steps(200)  # some are taken before it is back
         assert not [e for e in run.metrics.failures if e not in ("NoReply", "Late")]
         until(lambda: run.children().get("safety-0", victims["safety-0"]).pid != victims["safety-0"].pid, "a new one")
         children = run.children()
@@ -120,7 +120,7 @@ def test_two_replicas_and_then_no_launcher(data_folder, tmp_path):
     log = open_log(run.folder)
     steps = [record.message for record in log if record.topic == "step"]
     assert log.cuts == [], "the recorder ended in order"
-    assert len(steps) > 500 and not any(step.collision for step in steps)
+    assert len(steps) > 350 and not any(step.collision for step in steps)
     assert exists(run.folder / "learner" / "checkpoint"), "and so did the learner"
 
 

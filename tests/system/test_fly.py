@@ -22,7 +22,7 @@ from tests.system.runs import Run
 
 pytestmark = pytest.mark.usefixtures("flight_folder")
 
-PERIODS = 105  # of a flight
+PERIODS = 70  # of a flight
 IN_TIME = 0.98  # of the answers
 GAP = 250.0  # ms between two setpoints, at most
 PX4_HOLD = 4 << 16 | 3 << 24  # custom mode
@@ -77,7 +77,7 @@ def test_it_flies_in_time_and_hits_nothing(
     assert flight["worst setpoint gap ms"] <= gap and flight["periods slipped"] == 0, flight
     assert follows_the_plan(records) == figures["fallbacks"]
     if policy == "astar":
-        assert figures["goals"] >= 2
+        assert figures["goals"] >= 1
 
     times = [at for at, message in sent(records) if message.get_type() == "SET_POSITION_TARGET_LOCAL_NED"]
     assert max(np.diff(times)) <= 1e-3 * gap and len(times) > 4 * PERIODS
@@ -101,12 +101,12 @@ def _read_by_mavutil(tlog: Path, frames: list[pb.MavlinkFrame]) -> None:
 
 
 def test_what_is_killed_in_flight_hurts_nobody(tmp_path: Path) -> None:
-    with Flight(tmp_path / "run", "--minutes", 0.7, "--policy", "adversary") as run:
+    with Flight(tmp_path / "run", "--minutes", 0.5, "--policy", "adversary") as run:
         run.until_steps(30)
         run.kill("safety-0")
-        run.until_steps(40)
+        run.until_steps(25)
         run.kill("actor-0")
-        run.until_steps(40)
+        run.until_steps(25)
         figures = run.end()
         assert figures["finished"], run.errors.read_text()
     assert figures["collisions"] == 0

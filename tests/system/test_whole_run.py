@@ -12,7 +12,7 @@ from deploy.run.configurations import EXPERIMENTS, load
 from logs.report import analyse
 from messaging.weights import MLP
 from tests.robots import GROUND
-from tests.system.runs import Run, brakeline
+from tests.system.runs import brakeline
 
 # What they say after the recorder has stopped is in no log.
 OUTLIVE_THE_LOG = {f"{topic}/{process}" for topic in ("health", "log") for process in ("launcher", "recorder")}
@@ -23,17 +23,8 @@ CLOSED_LOOP = (
 )
 
 
-@pytest.fixture(scope="module")
-def run(data_folder, tmp_path_factory) -> tuple[Path, dict]:
-    """The folder of a finished run with two actors, and the figures it printed."""
-    with Run(tmp_path_factory.mktemp("runs") / "whole") as run:
-        figures = run.end()
-        assert run.popen.returncode == 0, run.errors.read_text()
-    return run.folder, figures
-
-
-def test_it_ends_at_its_last_step_without_a_fault(run):
-    _, figures = run
+def test_it_ends_at_its_last_step_without_a_fault(whole_run):
+    _, figures = whole_run
     steps = EXPERIMENTS["debug"].steps
     assert figures["finished"] and figures["restarts"] == {}
     assert figures["collisions"] == 0 and figures["episodes"] > 0
@@ -48,8 +39,8 @@ def test_it_ends_at_its_last_step_without_a_fault(run):
     assert {process["starts"] for process in figures["processes"].values()} == {1}
 
 
-def test_every_message_that_was_published_is_in_the_log(run):
-    folder, _ = run
+def test_every_message_that_was_published_is_in_the_log(whole_run):
+    folder, _ = whole_run
     numbers: dict[str, list[int]] = {}
     published: Counter[str] = Counter()
     with (folder / "run.mcap").open("rb") as file:
@@ -74,8 +65,8 @@ def test_every_message_that_was_published_is_in_the_log(run):
     assert {topic: count for topic, count in by_channel.items() if not topic.startswith("foxglove/")} == recorded
 
 
-def test_analyse_gives_the_figures_that_the_display_ended_with(run):
-    folder, figures = run
+def test_analyse_gives_the_figures_that_the_display_ended_with(whole_run):
+    folder, figures = whole_run
     assert json.loads((folder / "figures.json").read_text()) == figures
     analysed = json.loads(brakeline("analyse", folder, "--json").stdout)
     assert analysed == json.loads(json.dumps(analyse(folder)))
@@ -91,8 +82,8 @@ def test_analyse_gives_the_figures_that_the_display_ended_with(run):
         assert topics[key] == shown[key] or key in OUTLIVE_THE_LOG, key
 
 
-def test_the_configuration_is_in_the_folder_and_in_the_log(run):
-    folder, _ = run
+def test_the_configuration_is_in_the_folder_and_in_the_log(whole_run):
+    folder, _ = whole_run
     config = load(folder / "config.json")
     assert config == EXPERIMENTS["debug"]
     with (folder / "run.mcap").open("rb") as file:
@@ -103,8 +94,8 @@ def test_the_configuration_is_in_the_folder_and_in_the_log(run):
     assert metadata["conditions"]["encoder_ticks"]
 
 
-def test_the_policy_loads_and_drives(run):
-    _, figures = run
+def test_the_policy_loads_and_drives(whole_run):
+    _, figures = whole_run
     (path,) = figures["policies"]
     assert MLP.load(Path(path), GROUND).sizes == (26, 32, 32, 2)
     done = brakeline("evaluate", "ground", "--policy", path, "--episodes", 2, "--json")
@@ -113,15 +104,15 @@ def test_the_policy_loads_and_drives(run):
     assert evaluated["episodes"] == 2 and evaluated["collisions"] == 0 and evaluated["policy"] == path
 
 
-def test_the_latest_run_is_linked_and_its_folder_is_not_used_again(run):
-    folder, _ = run
+def test_the_latest_run_is_linked_and_its_folder_is_not_used_again(whole_run):
+    folder, _ = whole_run
     assert (folder.parent / "latest").resolve() == folder.resolve()
     again = brakeline("train", "ground", "--experiment", "debug", "--out", folder)
     assert again.returncode == 1 and "holds a run already" in again.stderr and "Traceback" not in again.stderr
 
 
-def test_the_processes_logs_hold_no_errors(run):
-    folder, _ = run
+def test_the_processes_logs_hold_no_errors(whole_run):
+    folder, _ = whole_run
     for name in ("recorder", "safety-0", "learner", "actor-0", "actor-1"):
         lines = (folder / "logs" / f"{name}.log").read_text().splitlines()
         assert lines and not [line for line in lines if "ERROR" in line or "Traceback" in line], name

@@ -25,7 +25,7 @@ DEAR = ("decision_ms", "milliseconds")
 
 # --- studies -------------------------------------------------------------------------------------------------------
 
-TINY = Study("ground", "none", 3, steps=640, episodes=1, arenas=("default",), untrained=1)
+TINY = Study("ground", "none", 3, steps=400, episodes=1, arenas=("default",), untrained=1)
 TINY = replace(TINY, td3=replace(TINY.td3, hidden=(16, 16), batch=16, warmup=60))
 
 
