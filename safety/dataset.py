@@ -27,9 +27,9 @@ class BadData(ValueError):
     """A data set that must not be used; the message says which check failed."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Trajectory:
-    """One uninterrupted recording; nothing pairs its last sample with another's first.
+    """One uninterrupted recording; nothing pairs its last sample with another's first. Compared by identity.
 
     states: (T+1, n) measured; inputs: (T, m) executed.
     paths: (T, S, d) positions within each period relative to its start, in the frame of its start, from

@@ -8,6 +8,7 @@ taken in the robot's frame at the window's start, so position is no regressor.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import NDArray
@@ -111,11 +112,24 @@ def _windows_of(data: Dataset, t: Trajectory, k: int, number: int, start: NDArra
     before = np.vstack([earlier, t.inputs])[start]
     z = np.hstack([t.states[start][:, list(robot.regressor)], before, chosen])
     y = displacement(robot, t.states[start], t.states[start + k])
-    # The disc farthest from the regressed position goes off its chord by what turning does to it, too.
-    swing = max(disc.arm for disc in robot.body) * np.abs(t.turned)
-    bulge = (_off_chord(t.paths) + swing + data.bulge)[start + k - 1]
-    latch = _rest_travel(robot, t)[np.minimum(start + k, len(t.inputs))]
+    off, travel = _ways(robot, t)
+    bulge = (off + data.bulge)[start + k - 1]
+    latch = travel[np.minimum(start + k, len(t.inputs))]
     return Windows(z, y, bulge, latch, np.column_stack([np.full(len(start), number), start]))
+
+
+def _ways(robot: Robot, t: Trajectory) -> tuple[Array, Array]:
+    """Of each period the largest distance from its chord (T,) [m], and the way while stopping (T+1,) [m]; found once
+    for the windows of all lengths."""
+    known = _found.get(t)
+    if known is None or known[0] != robot:
+        # The disc farthest from the regressed position goes off its chord by what turning does to it, too.
+        swing = max(disc.arm for disc in robot.body) * np.abs(t.turned)
+        known = _found[t] = robot, _off_chord(t.paths) + swing, _rest_travel(robot, t)
+    return known[1:]
+
+
+_found: WeakKeyDictionary[Trajectory, tuple[Robot, Array, Array]] = WeakKeyDictionary()
 
 
 def _braked(robot: Robot, t: Trajectory) -> Array:
@@ -184,7 +198,7 @@ def stops_of(robot: Robot, t: Trajectory, rested: int) -> Array:
     lasted = np.zeros(len(still) + 1, dtype=int)
     for i, rests in enumerate(still):
         lasted[i + 1] = lasted[i] + 1 if rests else 0
-    travel = _rest_travel(robot, t)
+    travel = _ways(robot, t)[1]
     return np.asarray(travel[(lasted == rested) & ~np.isnan(travel)])
 
 
