@@ -20,17 +20,27 @@ FLIGHTS = 80  # trajectories of the quadrotor, recorded in half a minute
 TRAJECTORIES = 50  # enough for every check of the certificates, recorded in ten seconds
 
 
-# Each is several processes, or flies in real time: one of them at a time.
-WHOLE_RUNS = ("tests/system/", "tests/actors/test_live.py")
+# What flies or drives in real time mostly waits; whole runs keep both cores busy. One of each at a time.
+LIVE = (
+    *("tests/actors/test_live.py", "tests/actors/ros2/", "tests/system/test_fly.py", "tests/system/test_mavsdk.py"),
+    *("tests/system/test_hil.py", "tests/system/test_real_autopilots.py", "tests/system/test_ros2.py"),
+)
+WHOLE_RUNS = ("tests/system/",)
+LANES = (LIVE, WHOLE_RUNS)
+
+
+def lane(nodeid: str) -> int:
+    """Which of the lanes a test goes along; the number after the last one if it may be anywhere."""
+    return next((i for i, paths in enumerate(LANES) if nodeid.startswith(paths)), len(LANES))
 
 
 class Rooms(LoadScopeScheduling):
-    """Whole runs go to one process, one after the other; the rest to the other, a module at a time: what it shares is
-    made once."""
+    """A process for each lane, whose tests come one after the other; the rest, a module at a time, to the others and
+    to those that are through: what a module shares is made once."""
 
     def _split_scope(self, nodeid: str) -> str:
-        module = nodeid.partition("::")[0]
-        return WHOLE_RUNS[0] if module.startswith(WHOLE_RUNS) else module
+        number = lane(nodeid)
+        return f"lane {number}" if number < len(LANES) else nodeid.partition("::")[0]
 
 
 def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Rooms:
@@ -38,8 +48,8 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Rooms:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Whole runs first: they take as long as all the rest."""
-    items.sort(key=lambda item: not item.nodeid.startswith(WHOLE_RUNS))  # stable
+    """The lanes first: they take as long as all the rest."""
+    items.sort(key=lambda item: lane(item.nodeid))  # stable
 
 
 @pytest.fixture(scope="session")
