@@ -27,7 +27,7 @@ def adapter_of(robot: str) -> Adapter:
 class Reach(Adapter):
     """Recorded on a plane without obstacles and walls."""
 
-    task, step, held = "SafetyCarReach-v0", 4.0 / 60.0, 30
+    task, step, held, room = "SafetyCarReach-v0", 4.0 / 60.0, 30, ROOM
 
     def __init__(self, robot: str) -> None:
         super().__init__(Path(__file__).with_name(f"{robot}.toml"))

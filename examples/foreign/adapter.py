@@ -22,12 +22,13 @@ class Adapter(ABC):
     """Reads an environment: its robot's state, its obstacles, what an action means; the simulator's own figures, exact.
 
     step: s of the environment; task: the environment's name, where it costs; held: periods, enough for each input to
-    bring the robot to its highest speed.
+    bring the robot to its highest speed; room: m from the middle, as far as there is anything.
     """
 
     task: str
     step: float
     held: int
+    room: float
 
     def __init__(self, description: Path) -> None:
         self.robot = robot_named(str(description))

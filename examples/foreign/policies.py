@@ -10,6 +10,7 @@ import numpy as np
 
 from examples.foreign.adapter import Adapter
 from examples.foreign.trained import Trained
+from examples.foreign.ways import Ways
 
 Policy = Callable[[Any], Any]
 
@@ -35,9 +36,22 @@ def goal(env: Any, adapter: Adapter, rng: np.random.Generator) -> Policy:
     return lambda seen: adapter.at(env, adapter.goal(env))
 
 
+def around(env: Any, adapter: Adapter, rng: np.random.Generator) -> Policy:
+    """Drives at the goal by the shortest way around what costs, found anew for each goal."""
+    ways: dict[tuple[float, ...], Ways] = {}
+
+    def choose(seen: Any) -> Any:
+        target = tuple(adapter.goal(env)[:2])
+        if target not in ways:
+            ways[target] = Ways(adapter, adapter.obstacles(env, seen, {}), target)
+        return adapter.at(env, ways[target].ahead(adapter.state(env, None, {})[:2]))
+
+    return choose
+
+
 def trained(env: Any, adapter: Adapter, rng: np.random.Generator) -> Policy:
     """What `train.py` left, without noise."""
     return Trained.load(adapter.trained, adapter.robot)
 
 
-POLICIES = {policy.__name__: policy for policy in (untrained, random, adversarial, goal, trained)}
+POLICIES = {policy.__name__: policy for policy in (untrained, random, adversarial, goal, around, trained)}

@@ -27,7 +27,7 @@ def adapter_of(robot: str) -> Adapter:
 class Goal(Adapter):
     """`SafetyCarGoal1-v0` and the like. Recorded in level 0, where there is nothing but the goal."""
 
-    held = 25
+    held, room = 25, 2.5
 
     def __init__(self, robot: str) -> None:
         super().__init__(Path(__file__).with_name(f"{robot}.toml"))
