@@ -5,13 +5,20 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
 from deploy.data.certified import certified
 from examples.foreign import table
+from examples.foreign.run import missing
+from examples.foreign.trained import Trained, scale
+from examples.foreign.ways import Ways
 from messaging.bus import Bus, BusSettings
 from messaging.ports import free_endpoint
+from messaging.robots import robot_named
+from messaging.shapes import Obstacle
 from messaging.topics import DECIDE
 from safety.dataset import Dataset
 from safety.model_set import Recipe
@@ -84,3 +91,45 @@ def test_the_table_adds_up_pieces_and_counts_a_seed_once(tmp_path, capsys):
     assert bare[2:6] == ["no", "1", "7.0", "7"]
     assert filtered[2:6] == ["yes", "2", "1.5", "3"]
     assert filtered[8:] == ["10 of 200 (5.0%)", "100 allowed, 100 adjusted |"]
+
+
+def test_a_run_goes_on_from_the_seeds_that_are_missing(tmp_path):
+    lines = [
+        {"robot": "car", "policy": "goal", "filter": filtered, "seed": seed}
+        for filtered, seed in [(1, 0), (0, 1), (1, 3)]
+    ]
+    out = tmp_path / "car.jsonl"
+    out.write_text("".join(json.dumps(line) + "\n" for line in lines))
+    given = SimpleNamespace(robot="car", policy="goal", seeds=(0, 5), out=out)
+    assert missing(given, True) == [1, 2, 4]
+
+
+def test_a_way_leads_to_the_goal_through_the_gap_and_out_of_a_disc():
+    """A row of discs with one gap; the first place is within a disc."""
+    robot = SimpleNamespace(footprint=1.0)
+    discs = [
+        Obstacle("cylinder", (0.0, y), (1.0,), margin=-1.0) for y in (-7.5, -6.0, -4.5, -3.0, 1.5, 3.0, 4.5, 6.0, 7.5)
+    ]
+    ways = Ways(SimpleNamespace(robot=robot, room=8.0), discs, (6.0, 6.0))
+    here, seen = np.array([-0.8, 6.0]), []
+    while np.hypot(*(here - (6.0, 6.0))) > 0.5 and len(seen) < 400:
+        ahead = ways.ahead(here)
+        here = here + 0.1 * (ahead - here) / np.linalg.norm(ahead - here)
+        seen.append(min(np.hypot(*(here - disc.position)) for disc in discs))
+    assert len(seen) < 400, "it never came there"
+    assert min(seen[10:]) >= 0.7, "looking ahead cuts corners, and no more"
+
+
+def test_a_trained_policy_is_the_same_when_it_is_loaded(tmp_path):
+    robot, rng = robot_named(str(EXAMPLES / "safety_gymnasium" / "point.toml")), np.random.default_rng(0)
+    seen = rng.normal(3.0, 2.0, (200, 4))
+    layers = [(rng.normal(size=(8, 4)), rng.normal(size=8)), (9.0 * rng.normal(size=(2, 8)), rng.normal(size=2))]
+    policy = Trained(robot, [(w.astype(np.float32), b.astype(np.float32)) for w, b in layers], *scale(seen))
+    path = tmp_path / "point.trained.safetensors"
+    policy.save(path, {"steps": 7})
+    again = Trained.load(path, robot)
+    asked = np.array([policy(row) for row in seen])
+    np.testing.assert_array_equal([again(row) for row in seen], asked)
+    assert (asked >= robot.low()).all() and (asked <= robot.high()).all()
+    assert np.ptp(asked, axis=0) == pytest.approx(robot.high() - robot.low(), rel=0.1), "it uses their whole range"
+    assert json.loads((tmp_path / "point.trained.json").read_text()) == {"steps": 7}
