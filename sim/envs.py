@@ -62,7 +62,7 @@ class NavigationEnv(gymnasium.Env[Observation, Any]):
     contact_standing   it was run into while it stood
     contact_robot      it touched another robot of its world (`sim.fleet`)
     at_goal            the goal is reached
-    clearance          m from the robot's footprint disc (sphere) to the nearest obstacle, true
+    clearance          m from the nearest disc (sphere) of the body to the nearest obstacle, true
     speed              m/s, true
     subsamples         (S, d) m: estimated positions within the last period, in the robot's frame at its start
     turned             rad: estimated change of heading over the last period

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from messaging.robots import Robot
+from messaging.shapes import rotate
 from sim.estimator import NoiseLevels, cut_normal, wrap
 from sim.scene import Moving, standing
 from sim.vehicle import Period, executed
@@ -43,6 +44,8 @@ class PlanarRobot:
         self._contacts = [False, False]  # in this period one began while moving, while standing
         self._steps = round(robot.period / SAMPLES / self.model.opt.timestep)
         self._bound = np.asarray(robot.measurement_bound)
+        self._discs = np.array([disc.at[:2] for disc in robot.body])  # in the robot's frame
+        self._radii = np.array([disc.radius for disc in robot.body])
         self._rng, self._noise = rng, noise.scale
         self._scale = 1.0 + float(cut_normal(rng, self._noise * SLIP, ()))
         self.input = np.zeros(robot.action_dim)
@@ -72,11 +75,11 @@ class PlanarRobot:
         robot = self.robot
         self.input = executed(robot, input, self.input)
         before = self.true
-        positions, collision = self._run()
+        poses, collision = self._run()
         self.true = self._state()
         self.measured = self._measure()
-        distances = self._clearance(positions)
-        path = self._scale * _turned(positions - before[:2], -float(before[2]))
+        distances = self._clearance(poses)
+        path = self._scale * _turned(poses[:, :2] - before[:2], -float(before[2]))
         turned = wrap(float(self.true[2] - before[2])) + float(cut_normal(self._rng, self._noise * DRIFT, ()))
         return Period(
             self.measured,
@@ -91,7 +94,7 @@ class PlanarRobot:
 
     def standing(self) -> Period:
         """The present state as a period in which nothing happened: what there is to say before the first step."""
-        clearance = float(self._clearance(self.true[:2]))
+        clearance = float(self._clearance(self.true[:3]))
         return Period(self.measured, self.true, False, clearance, clearance, np.zeros((SAMPLES, 2)), 0.0)
 
     def alter(self, **changes: float) -> None:
@@ -109,9 +112,9 @@ class PlanarRobot:
         return math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
 
     def _run(self) -> tuple[Array, bool]:
-        """One period of physics: positions (S, 2) at the samples; any collision."""
+        """One period of physics: poses (S, 3) at the samples; any collision."""
         model, data = self.model, self.data
-        positions = np.empty((SAMPLES, 2))
+        poses = np.empty((SAMPLES, 3))
         collision, self._contacts = False, [False, False]
         rests = bool(self.robot.rests(self.input))
         for i in range(SAMPLES):
@@ -125,8 +128,8 @@ class PlanarRobot:
                 mujoco.mj_step2(model, data)
                 mujoco.mj_step1(model, data)
                 collision = self._touches(moving) or collision
-            positions[i] = data.qpos[:2]
-        return positions, collision
+            poses[i] = *data.qpos[:2], self.heading()
+        return poses, collision
 
     def _touches(self, moving: bool) -> bool:
         """Whether any contact now is with an obstacle that stands; what moves is noted apart.
@@ -151,9 +154,11 @@ class PlanarRobot:
         measured[2] = wrap(float(measured[2]))
         return np.asarray(measured)
 
-    def _clearance(self, positions: Array) -> Array:
-        """From the footprint's disc at positions (..., 2) to the nearest obstacle, m."""
-        return np.asarray(self.arena.shapes.distance(positions).min(axis=0) - self.robot.footprint)
+    def _clearance(self, poses: Array) -> Array:
+        """From the nearest of the body's discs at poses (..., 3) to the nearest obstacle, m."""
+        turned = rotate(np.broadcast_to(self._discs, (*poses.shape[:-1], *self._discs.shape)), poses[..., 2, None])
+        centres = poses[..., None, :2] + turned
+        return np.asarray((self.arena.shapes.distance(centres).min(axis=0) - self._radii).min(axis=-1))
 
 
 def _turned(vectors: Array, angle: float) -> Array:

@@ -39,7 +39,7 @@ class Period:
     measured: Array  # (n,) state at its end, as estimated
     true: Array  # (n,) state at its end, as it is
     collision: bool  # some geom of the robot touched an obstacle at some physics step
-    closest: float  # m, least distance from the footprint's disc (sphere) to an obstacle, at the samples
+    closest: float  # m, least distance from a disc (sphere) of the body to an obstacle, at the samples
     clearance: float  # m, the same at the period's end
     subsamples: Array  # (S, d) m, estimated positions from the period's start, in the robot's frame of that moment
     turned: float  # rad, estimated change of heading; 0 for a robot whose state has none

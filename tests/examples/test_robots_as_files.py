@@ -153,6 +153,17 @@ def test_driving_into_something_is_a_collision(name: str) -> None:
     assert 0.5 - vehicle.true[0] < 0.2
 
 
+@pytest.mark.parametrize("heading, nose", [(0.0, 0.0), (0.5 * math.pi, 0.11), (-0.5 * math.pi, 0.11)])
+def test_clearance_is_measured_from_the_discs_that_hold_the_body(heading: float, nose: float) -> None:
+    """A long car beside a wall is farther from it than one whose nose or tail points there."""
+    made = task_of(robot("car")).code(task_of(robot("car")).simulator)(Conditions(NoiseLevels(scale=0.0)), None)
+    wall = Obstacle(BOX, (0.0, 0.35), (4.0, 0.1))
+    vehicle = made(staged_arena(wall, start=(0.0, 0.0, heading)), np.random.default_rng(0))
+    for period in (vehicle.standing(), vehicle.step(np.zeros(2))):
+        assert period.closest == pytest.approx(0.3 - nose - 0.155, abs=1e-3)
+        assert period.clearance == pytest.approx(period.closest, abs=1e-3) and not period.collision
+
+
 def test_recorded_inputs_keep_the_steering_at_a_stop() -> None:
     car = robot("car")
     (part,) = collect.record(car, 1, 3, Conditions())
