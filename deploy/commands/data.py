@@ -23,6 +23,7 @@ from deploy.commands.common import (
     errors,
     say_json,
 )
+from deploy.data.coverage import more_to_drive
 from deploy.data.logged import Recorded, from_log
 from deploy.data.paths import model_path, record_path
 from deploy.data.recording import SEED, data_for, recorded
@@ -176,6 +177,8 @@ class Certify:
             console.print(table(rows))
             for text in dict.fromkeys(passed):
                 console.print(f"not supported: {text}", markup=False)
+            for text in more_to_drive(rows[0][0], source.data) if rows else ():
+                console.print(f"missing: {text}", markup=False)
             console.print(f"{path}: {source.note}", markup=False)
             if self.verbose:
                 console.print(conditions(source.data.about))

@@ -22,8 +22,8 @@ READERS = {
     ".csv": "columns:read_csv",
     ".parquet": "columns:read_parquet",
     ".db3": ROS2,
-    ".bin": "ardupilot:read_bin",
-    ".tlog": "ardupilot:read_tlog",
+    ".bin": "ardupilot:read",
+    ".tlog": "tlog:read",
     ".ulg": "px4:read",
 }
 KINDS = f"{', '.join(READERS)}, the folder of a ROS 2 bag, .mcap (a ROS 2 bag, or a log of a run)"

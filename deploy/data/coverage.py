@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,9 +11,11 @@ from deploy.data.sources.quantities import columns_of, split
 from messaging.robots import Array, Robot
 from safety.dataset import Dataset
 from safety.fitting import FEWEST_STOPS
+from safety.statement import CONFIDENCE, Statement
 from safety.windows import FREE, PLAN, standing_at_the_end, stops_of, windows
 
 NEAR = 0.05  # of its range: an input this near to a bound has been there
+AIMED = 0.01  # share of plans outside their sets that is to be excluded, with the statement's confidence
 FEWEST = 20  # periods beyond an eighth of the range: below it nothing was seen there
 
 
@@ -131,3 +134,15 @@ def _no_braking(one: Seen) -> list[str]:
     if one.low < 0.0 and one.least > one.low + room:
         found.append(f"no braking below {min(one.least, 0.0):.2g} {one.unit} of {one.name}: drive this")
     return found
+
+
+def more_to_drive(statement: Statement, data: Dataset) -> list[str]:
+    """What a statement can't say yet, and how much more driving like this it takes."""
+    if statement.bound_plan <= AIMED:
+        return []
+    wanted = math.ceil(math.log(1.0 - CONFIDENCE) / math.log(1.0 - AIMED))
+    minutes = data.periods * data.robot.period / 60.0 * (wanted / max(statement.windows, 1) - 1.0)
+    return [
+        f"at most {statement.bound_plan:.1%} of plans leave their sets (99 % confidence); to say {AIMED:.0%} it takes "
+        f"{wanted} held-out plans without one, {max(minutes, 0.0):.0f} more minutes like these"
+    ]

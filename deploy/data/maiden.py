@@ -8,19 +8,20 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from actors.live import LiveVehicle
+from deploy.data.coverage import more_to_drive
 from deploy.data.excite import random_target, towards
 from deploy.data.support import Unsupported, supported
 from messaging.robots import Robot
 from safety.dataset import BadData, Dataset, Trajectory
 from safety.model_set import ModelSet, Recipe
-from safety.statement import CONFIDENCE, Statement
+from safety.statement import Statement
 from safety.windows import FREE, windows
 
 Array = NDArray[np.float64]
@@ -40,7 +41,6 @@ HOMEWARD = 0.5  # of a level, towards the middle, when the box ends
 NEAR = 0.3  # of the way to the wall from which the next stretch leads back
 OUTSIDE = 10.0  # m beyond the box at which the flight is over
 INFLATION, FEWEST = 1.5, 60  # of every envelope, and windows of a length: minutes of data bound less than hours
-AIMED = 0.01  # violating plans that are to be excluded at 99 % confidence, for what is still missing
 ORIGIN = "maiden flight"
 
 
@@ -164,7 +164,7 @@ class Maiden:
         model, statement = self._model(data, missing)
         if reached < 1.0:
             missing.append(f"nothing is known beyond {reached:.0%} of its speed")
-        missing += _missing(statement, data)
+        missing += [] if statement is None else more_to_drive(statement, data)
         return Found(data, model, statement, reached, tuple(missing), self._periods * self._robot.period)
 
     def _record(self, level: float, seconds: float) -> None:
@@ -260,14 +260,3 @@ def _wander(trajectories: list[Trajectory], period: float) -> float:
         error = position[1:] - by_velocity
         off.append(error[AHEAD:] - error[:-AHEAD])
     return float(np.quantile(np.linalg.norm(np.concatenate(off), axis=1), 0.95))
-
-
-def _missing(statement: Statement | None, data: Dataset) -> Iterator[str]:
-    if statement is None or statement.bound_plan <= AIMED:
-        return
-    wanted = math.ceil(math.log(1.0 - CONFIDENCE) / math.log(1.0 - AIMED))
-    minutes = data.periods * data.robot.period / 60.0 * (wanted / max(statement.windows, 1) - 1.0)
-    yield (
-        f"at most {statement.bound_plan:.1%} of plans leave their sets (99 % confidence); to say {AIMED:.0%} it takes "
-        f"{wanted} held-out plans without one, {max(minutes, 0.0):.0f} more minutes like these"
-    )

@@ -77,7 +77,7 @@ def write_bin(path, time, values):
     """A rover's log, as ArduPilot writes it: FMT messages, then XKF1, IMU, THR, STER."""
     kinds = {
         "XKF1": (10, "QBffffffffff", "TimeUS,C,Roll,Pitch,Yaw,VN,VE,VD,dPD,PN,PE,PD"),
-        "IMU": (11, "QBfff", "TimeUS,I,GyrX,GyrY,GyrZ"),
+        "IMU": (11, "QBffffff", "TimeUS,I,GyrX,GyrY,GyrZ,AccX,AccY,AccZ"),
         "THR": (12, "Qf", "TimeUS,DesSpeed"),
         "STER": (13, "Qf", "TimeUS,DesTurnRate"),
     }
@@ -98,7 +98,7 @@ def write_bin(path, time, values):
             vx, vy = v * math.cos(heading), v * math.sin(heading)
             write(10, kinds["XKF1"][1], us, 0, 0, 0, yaw, vy, vx, 0, 0, y, x, 0)
             write(10, kinds["XKF1"][1], us, 1, 0, 0, 0, 9, 9, 9, 9, 9, 9, 9)  # another core
-            write(11, kinds["IMU"][1], us, 0, 0.0, 0.0, -w)
+            write(11, kinds["IMU"][1], us, 0, 0.0, 0.0, -w, 0.0, 0.0, -9.8)
             write(12, "Qf", us, speed)
             write(13, "Qf", us, -math.degrees(turn))
     return path
