@@ -9,23 +9,21 @@ from __future__ import annotations
 
 import logging
 import os
-import signal
 import sys
 import threading
 import time
 from collections.abc import Callable
-from types import FrameType, TracebackType
-from typing import Any, Self
+from types import TracebackType
+from typing import Self
 
 from messaging import brakeline_pb2 as pb
 from messaging.bus import Bus, BusError, BusSettings, Publisher
 from messaging.exposition import Exposition, State
+from messaging.signals import heeded
 from messaging.topics import HEALTH, LOG
 
 log = logging.getLogger("brakeline.process")
 
-# s; signals this close are one: the kernel tells of a parent's death once for each thread that it had.
-ECHO = 1.0
 SILENT = 10.0  # s without a beat after which a process does not live any more: its threads are stuck
 LEVELS = {"CRITICAL": "ERROR"}  # names that LogLine does not know
 
@@ -33,7 +31,7 @@ LEVELS = {"CRITICAL": "ERROR"}  # names that LogLine does not know
 class Process:
     """A process under the name `source`, from `with` to the end of the block.
 
-    `stop` is set by SIGINT and SIGTERM (and by whoever wants the process to end); a second one, later, kills. `figures`
+    `stop` is set by SIGINT and SIGTERM (and by whoever wants the process to end), see `messaging.signals`. `figures`
     and `notes` go out with the next Health, and how many messages were passed over; `refresh`, if set, is called before
     each to bring them up to date. All that is logged goes to stderr (unless `stderr` is False) and to the LOG topic. An
     exception that leaves the block goes to the LOG topic with its traceback, is noted in the last Health, and goes on
@@ -54,9 +52,8 @@ class Process:
         self.refresh: Callable[[], None] | None = None
         self._stderr, self._reserved = stderr, reserved
         self._handlers: list[logging.Handler] = []
-        self._signals: dict[int, Any] = {}
+        self._signals = heeded(self.stop)
         self._ended = False
-        self._asked_at: float | None = None
         self._due = threading.Event()
         self._announced = False
         self._beat_at = time.monotonic()
@@ -74,8 +71,7 @@ class Process:
             self.notes["security"] = self.settings.warning
         self._health = self.bus.publisher(HEALTH)
         self._start_logging()
-        if threading.current_thread() is threading.main_thread():
-            self._signals = {number: signal.signal(number, self._asked) for number in (signal.SIGINT, signal.SIGTERM)}
+        self._signals.__enter__()
         if self.settings.warning:
             log.warning("%s", self.settings.warning)
         self._pulse = threading.Thread(target=self._beat, name="health", daemon=True)
@@ -100,21 +96,12 @@ class Process:
         except Exception:
             log.exception("no goodbye")
         self.bus.close()
-        for number, handler in self._signals.items():
-            signal.signal(number, handler)
+        self._signals.__exit__(None, None, None)
 
     def announce(self) -> None:
         """Send a Health now: the process is ready, or something changed that cannot wait."""
         self._announced = True
         self._due.set()
-
-    def _asked(self, number: int, _: FrameType | None) -> None:
-        now = time.monotonic()
-        if self._asked_at is not None and now - self._asked_at > ECHO:  # asked twice: at once
-            signal.signal(number, signal.SIG_DFL)
-            os.kill(os.getpid(), number)
-        self._asked_at = self._asked_at or now
-        self.stop.set()
 
     def _beat(self) -> None:
         period = 1.0 / (HEALTH.rate or 1.0)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import logging
 import os
-import signal
 import threading
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
@@ -23,6 +22,7 @@ from logs.bag import Bag
 from messaging import brakeline_pb2 as pb
 from messaging.bus import Bus, BusSettings
 from messaging.ros2 import ROUTER, RosSettings
+from messaging.signals import heeded
 from safety.client import ask
 
 
@@ -91,8 +91,8 @@ class Ros2:
             seconds=self.seconds,
         )
         log_to_stderr(self.name)
-        with self._question(settings) as question, self._tap() as tap:
-            figures = run(settings, question, stopped(), tap)
+        with self._question(settings) as question, self._tap() as tap, heeded(threading.Event()) as stop:
+            figures = run(settings, question, stop, tap)
         if self.json:
             say_json(figures)
         else:
@@ -172,7 +172,7 @@ class BridgeSim:
             stack.callback(bridge.close)
             if not self.json:
                 errors.print(f"ground on {', '.join(self.router or self.listen)}, {self.arena}; ^C ends it")
-            bridge.run(stopped())
+            bridge.run(stack.enter_context(heeded(threading.Event())))
         figures = bridge.outcome.figures()
         if self.json:
             say_json(figures)
@@ -183,11 +183,3 @@ class BridgeSim:
 
 def log_to_stderr(name: str) -> None:
     logging.basicConfig(level=logging.INFO, format=f"%(asctime)s {name} %(levelname)s %(message)s")
-
-
-def stopped() -> threading.Event:
-    """Is set by SIGINT and SIGTERM."""
-    stop = threading.Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: stop.set())
-    return stop

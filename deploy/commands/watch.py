@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import json
-import signal
 import threading
 import time
 from collections import deque
-from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 
 from deploy.commands.common import Endpoints, Flags, console
@@ -16,6 +14,7 @@ from logs.watch.board import Board
 from logs.watch.live import ORIGINS, Live
 from logs.watch.server import Server
 from messaging.bus import Bus, Sample
+from messaging.signals import heeded
 from messaging.tolerant import Tolerance
 from messaging.topics import RECORDED
 
@@ -45,7 +44,7 @@ class Watch:
             server = stack.enter_context(Server(board.view, self.host, self.port))
             if self.foxglove_port >= 0:
                 live = stack.enter_context(Live(self.host, self.foxglove_port, origins=self.origins))
-            stop = stack.enter_context(asked())
+            stop = stack.enter_context(heeded(threading.Event()))
             for topic in RECORDED:
                 bus.subscribe(topic, inbox.append)
             self._say(server.url, live.url if live is not None else None)
@@ -73,15 +72,3 @@ def _show(inbox: deque[Sample], board: Board, live: Live | None, tolerance: Tole
                 live.take(sample)
     if live is not None:
         live.refresh()
-
-
-@contextmanager
-def asked() -> Iterator[threading.Event]:
-    """Set by SIGINT and SIGTERM within the block."""
-    stop = threading.Event()
-    before = {number: signal.signal(number, lambda *_: stop.set()) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield stop
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)

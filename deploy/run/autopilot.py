@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import signal
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -13,6 +12,7 @@ import numpy as np
 from deploy.vehicles import flight_arena
 from messaging.clock import WallClock
 from messaging.links import open_link
+from messaging.signals import heeded
 from messaging.tasks import task_of
 from sim.autopilot.endpoint import Autopilot
 from sim.autopilot.rules import SETPOINT_TIMEOUT
@@ -50,13 +50,11 @@ def fly(settings: AutopilotSettings, begun: Callable[[Arena], Any] = lambda aren
         host, _, port = settings.truth.rpartition(":")
         truth = Truth(host or "127.0.0.1", int(port))
     autopilots = [vehicle(settings, arena, system) for system in range(1, settings.vehicles + 1)]
-    stop = threading.Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: stop.set())
     clock = WallClock()
     begun(arena)
     try:
-        return serve(autopilots, link, clock, lambda: stop.is_set() or 0.0 < settings.seconds <= clock.now(), truth)
+        with heeded(threading.Event(), patient=True) as stop:
+            return serve(autopilots, link, clock, lambda: stop.is_set() or 0.0 < settings.seconds <= clock.now(), truth)
     finally:
         link.close()
 

@@ -3,7 +3,6 @@ vehicle, sensors and arena are ours."""
 
 from __future__ import annotations
 
-import signal
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -15,6 +14,7 @@ import numpy as np
 from deploy.run.autopilot import PAD, open_field
 from deploy.vehicles import flight_arena
 from messaging.clock import Clock, WallClock
+from messaging.signals import heeded
 from sim.autopilot.hil import AutopilotGone, Hil
 from sim.autopilot.px4 import Px4
 from sim.autopilot.sensors import SensorNoise, Sensors
@@ -67,25 +67,33 @@ def fly(settings: HilSettings, begun: Callable[[Quadrotor], Any] = lambda vehicl
     """
     port = _port(settings.url)
     arena = flight_arena(settings.arena, settings.seed) if settings.arena else open_field()
-    stop = threading.Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: stop.set())
     px4 = Px4(settings.folder, port, settings.parameters)
     truth = _truth(settings.truth)
     try:
-        hil = Hil(px4.connection, *_vehicle(settings, arena))
-        while not hil.answering and not stop.is_set():
-            hil.tick()
-        begun(hil.vehicle)
-        clock = WallClock()
-        over = settings.seconds or float("inf")
-        return serve(hil, clock, settings.speed, lambda: stop.is_set() or hil.time >= over, truth)
+        with heeded(threading.Event(), patient=True) as stop:
+            return _served(settings, px4, arena, truth, stop, begun)
     except AutopilotGone as error:
         raise AutopilotGone(f"{error}; PX4's last words:\n{px4.last_words()}") from error
     finally:
         px4.close()
         if truth is not None:
             truth.close()
+
+
+def _served(
+    settings: HilSettings,
+    px4: Px4,
+    arena: Arena,
+    truth: Truth | None,
+    stop: threading.Event,
+    begun: Callable[[Quadrotor], Any],
+) -> Flown:
+    hil = Hil(px4.connection, *_vehicle(settings, arena))
+    while not hil.answering and not stop.is_set():
+        hil.tick()
+    begun(hil.vehicle)
+    over = settings.seconds or float("inf")
+    return serve(hil, WallClock(), settings.speed, lambda: stop.is_set() or hil.time >= over, truth)
 
 
 def serve(hil: Hil, clock: Clock, speed: float, stop: Callable[[], bool], truth: Truth | None = None) -> Flown:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import signal
 import threading
 import time
 from dataclasses import dataclass
@@ -14,6 +13,7 @@ from actors.live import LiveVehicle
 from deploy.data.maiden import Box, Found, Maiden
 from messaging.links import open_link
 from messaging.robots import Robot
+from messaging.signals import heeded
 
 LANDING = 120.0  # s that a landing may take
 
@@ -36,9 +36,11 @@ def fly(robot: Robot, settings: MaidenSettings) -> Found:
         BadLink, MavlinkError: with what to do; BadData: nothing was flown.
     """
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s", datefmt="%H:%M:%S")
-    stop = threading.Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: stop.set())
+    with heeded(threading.Event(), patient=True) as stop:  # a second one must not leave it in the air
+        return _flown(robot, settings, stop)
+
+
+def _flown(robot: Robot, settings: MaidenSettings, stop: threading.Event) -> Found:
     vehicle = LiveVehicle(
         open_link(settings.url),
         robot,

@@ -71,7 +71,7 @@ def test_an_echo_of_the_signal_changes_nothing_and_a_second_one_kills(join: Join
     time.sleep(1.2)
     assert child.poll() is None, "it ends in order"
     child.terminate()
-    assert child.wait(5.0) == -signal.SIGTERM
+    assert child.wait(5.0) == 128 + signal.SIGTERM
     assert not any(said.last for said in health)
 
 

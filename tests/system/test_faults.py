@@ -8,6 +8,7 @@ import subprocess
 import time
 
 import numpy as np
+import psutil
 import pytest
 
 from deploy.interpreter import PYTHON
@@ -108,6 +109,7 @@ def test_two_replicas_and_then_no_launcher(data_folder, tmp_path):
         _is_asked(run.there)
         victims = run.children()
         assert {"safety-0", "safety-1", "recorder", "learner", "actor-0", "actor-1"} == victims.keys()
+        _imports_what_it_needs(victims)
         victims["safety-0"].kill()
         run.until_steps(200)  # some are taken before it is back
         assert not [e for e in run.metrics.failures if e not in ("NoReply", "Late")]
@@ -122,6 +124,13 @@ def test_two_replicas_and_then_no_launcher(data_folder, tmp_path):
     assert log.cuts == [], "the recorder ended in order"
     assert len(steps) > 350 and not any(step.collision for step in steps)
     assert exists(run.folder / "learner" / "checkpoint"), "and so did the learner"
+
+
+def _imports_what_it_needs(children: dict[str, psutil.Process]) -> None:
+    """Else each costs seconds at its start, and hundreds of megabytes."""
+    loaded = {name: " ".join(part.path for part in child.memory_maps()) for name, child in children.items()}
+    assert {name for name, paths in loaded.items() if "libtorch" in paths} == {"learner"}
+    assert {name for name, paths in loaded.items() if "libmujoco" in paths} == {"actor-0", "actor-1"}
 
 
 def _is_asked(there: tuple[object, ...]) -> None:

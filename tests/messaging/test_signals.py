@@ -1,0 +1,72 @@
+"""Signals that come in a volley, at any moment, to whichever thread: the event is set, and nobody waits for ever."""
+
+import signal
+import subprocess
+import sys
+import threading
+
+import pytest
+
+from messaging.signals import heeded
+
+WAITS = """
+import threading
+from messaging.signals import heeded
+print("born", flush=True)
+with heeded(threading.Event()) as stop:
+    print("ready", flush=True)
+    {wait}
+print("ended", flush=True)
+"""
+
+
+def child(wait: str) -> "subprocess.Popen[str]":
+    started = subprocess.Popen([sys.executable, "-c", WAITS.format(wait=wait)], stdout=subprocess.PIPE, text=True)
+    assert started.stdout is not None
+    assert [started.stdout.readline() for _ in range(2)] == ["born\n", "ready\n"]
+    return started
+
+
+def ended(process: "subprocess.Popen[str]") -> None:
+    said, _ = process.communicate(timeout=20.0)
+    assert (process.returncode, said) == (0, "ended\n")
+
+
+def test_a_volley_that_comes_while_it_waits_again_and_again() -> None:
+    """Python's handler would come within `Event.wait`, and wait for the lock that `wait` holds."""
+    process = child("while not stop.wait(1e-6): pass")
+    for _ in range(300):
+        process.send_signal(signal.SIGTERM)
+    ended(process)
+
+
+def test_a_signal_that_another_thread_was_handed() -> None:
+    """The main thread, asleep without a timeout, would never hear of it."""
+    hand_over = "signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGTERM})"
+    other = "threading.Thread(target=threading.Event().wait, daemon=True).start()"
+    process = child(f"import signal; {other}; {hand_over}; stop.wait()")
+    process.send_signal(signal.SIGTERM)
+    ended(process)
+
+
+def test_what_was_there_before_is_there_again() -> None:
+    before = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
+    with heeded(threading.Event()) as stop:
+        signal.raise_signal(signal.SIGINT)
+        assert stop.wait(10.0)
+    assert [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)] == before
+    with pytest.raises(KeyboardInterrupt):
+        signal.raise_signal(signal.SIGINT)
+
+
+def test_not_in_the_main_thread_nothing_is_changed() -> None:
+    before, seen = signal.getsignal(signal.SIGTERM), []
+
+    def elsewhere() -> None:
+        with heeded(threading.Event()):
+            seen.append(signal.getsignal(signal.SIGTERM))
+
+    thread = threading.Thread(target=elsewhere)
+    thread.start()
+    thread.join()
+    assert seen == [before]
