@@ -24,7 +24,7 @@ class RobotCommand:
     file: Annotated[str, tyro.conf.Positional]
     """The description (.toml), or the name of a robot that comes with the program."""
     from_: Annotated[Path | None, tyro.conf.arg(name="from")] = None
-    """With new: fill in what this log tells (CSV, Parquet, ROS 2 bags, autopilots' logs)."""
+    """With new: fill in what this log tells (CSV, Parquet, ROS 2 bags, autopilots' logs; that of a run tells all)."""
     picture: Path | None = None
     """Draw the body and the stop into this image."""
     json: bool = False
@@ -41,12 +41,7 @@ class RobotCommand:
         template = (FOLDER / "template.txt").read_text().replace('"NAME"', f'"{path.stem}"')
         notes: tuple[str, ...] = ()
         if self.from_ is not None:
-            from deploy.data.bring import tables_of
-            from deploy.data.draft import draft
-            from deploy.data.told import told
-
-            found = told(tables_of(self.from_))
-            template, notes = draft(template, found, self.from_.name), found.notes
+            template, notes = _from_log(self.from_, template, path.stem)
         path.write_text(template)
         if self.json:
             say_json({"file": str(path), "notes": list(notes)})
@@ -101,3 +96,16 @@ def _task(robot: Robot) -> str:
     except UnknownTask:
         return "no task beside it: enough to certify and to filter; to train, write NAME.task.toml (docs/your_robot.md)"
     return f"its task: {task.observation_dim} observed values, arenas {', '.join(task.arenas)}"
+
+
+def _from_log(source: Path, template: str, name: str) -> tuple[str, tuple[str, ...]]:
+    """A description's text, and what the log could not tell of it. Raises NoSource, LogError."""
+    from deploy.data.bring import own_log, tables_of
+    from deploy.data.carried import carried
+    from deploy.data.draft import draft
+    from deploy.data.told import told
+
+    if own_log(source):
+        return carried(source, name), ()
+    found = told(tables_of(source))
+    return draft(template, found, source.name), found.notes

@@ -59,6 +59,11 @@ def is_bag(path: Path) -> bool:
         return False  # damaged: only our own reader goes on from there
 
 
+def own_log(path: Path) -> bool:
+    """Is it the log of a run, a file or a folder?"""
+    return (path.suffix == ".mcap" or path.is_dir()) and path.exists() and not is_bag(path)
+
+
 def bring(
     paths: Sequence[Path], robot: Robot, words: Sequence[str] = (), delay: float = 0.0, hold: float = HOLD
 ) -> Imported:
@@ -89,7 +94,7 @@ def bring(
 
 
 def _one(path: Path, robot: Robot, chosen: dict[str, str], delay: float, hold: float) -> Imported:
-    if (path.suffix == ".mcap" or path.is_dir()) and path.exists() and not is_bag(path):
+    if own_log(path):
         recorded = from_log(path, robot, LAST)
         data = recorded.data
         samples = data.trajectories[0].paths.shape[1]

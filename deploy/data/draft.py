@@ -38,6 +38,9 @@ def draft(template: str, told: Told, source: str) -> str:
             lines.append(f"brake = {brake} # as strong as the log's strongest braking and quickest inputs; choose")
         elif line.startswith("[[body]]"):
             lines += [f"# The body {UNTOLD}: measure it.", line]
+        elif section == "body" and line.startswith("at ="):
+            zeros = ", ".join("0.0" for column in told.states if column.role == "position")
+            lines.append(line.replace("[0.0, 0.0]", f"[{zeros}]"))
         else:
             lines.append(line)
         if line == "[state]":
@@ -89,7 +92,7 @@ def _state(one: Column) -> list[str]:
     seen += [] if one.unit else [f"its unit {UNTOLD}"]
     seen += [f"{1e3 * one.delay:.0f} ms after its input"] if one.delay is not None else []
     seen += [f"brakes by {one.change:.2g} a period"] if one.follows and one.change else []
-    return [f"{_key(one.name)} = {{ {', '.join(words)} }}" + (f" # {'; '.join(seen)}" if seen else "")]
+    return [f"{key(one.name)} = {{ {', '.join(words)} }}" + (f" # {'; '.join(seen)}" if seen else "")]
 
 
 def _input(one: Column) -> list[str]:
@@ -102,7 +105,7 @@ def _input(one: Column) -> list[str]:
     seen = [] if one.unit else [f"its unit {UNTOLD}"]
     seen += [] if one.moves is not None else [f"moves: {UNTOLD}, it was never driven alone"]
     seen += ["it jumps: no slew"] if most is None else []
-    return [f"{_key(one.name)} = {{ {', '.join(words)} }}" + (f" # {'; '.join(seen)}" if seen else "")]
+    return [f"{key(one.name)} = {{ {', '.join(words)} }}" + (f" # {'; '.join(seen)}" if seen else "")]
 
 
 def _outwards(value: float) -> float:
@@ -113,5 +116,6 @@ def _outwards(value: float) -> float:
     return math.copysign(math.ceil(round(abs(value) / unit, 6)) * unit, value)
 
 
-def _key(name: str) -> str:
+def key(name: str) -> str:
+    """A name as TOML has it."""
     return name if BARE.fullmatch(name) else json.dumps(name)

@@ -24,7 +24,8 @@ HEADING = re.compile(r"heading|yaw|theta|psi", re.IGNORECASE)
 INPUT = re.compile(rf"(?:{COMMAND}|cmd|input|set(?:point)?|target)(?![a-z])", re.IGNORECASE)
 # Of a message's quantity: the name that a description gives it, and its unit.
 STATES = {"body.x": ("speed", "m/s"), "body.y": ("speed aside", "m/s"), "yaw rate": ("turn rate", "rad/s")}
-SPACE = {f"velocity.{axis}": (f"v{axis}", "m/s") for axis in AXES}
+FLYING = {f"velocity.{axis}": (f"v{axis}", "m/s") for axis in AXES}
+SPACE = FLYING | {f"acceleration.{axis}": (f"a{axis}", "m/s2") for axis in AXES}
 INPUTS = STATES | {"steering": ("steering", "rad"), "acceleration": ("acceleration", "m/s2")}
 HELD = 0.5  # share of rows with the value of the row before: so often only inputs that are held repeat
 SPAN = 0.3  # s over which motion is compared with a column: measurements differ by noise over less
@@ -145,7 +146,7 @@ def _from_messages(tables: Sequence[Table]) -> _Log:
     places = {axis: of(f"position.{axis}") for axis in AXES}
     flat = (up := places["z"]) is None or float(np.nanstd(up[0].columns[up[1]])) < 1e-3
     kinds = {q: (*named, of(q)) for q, named in (STATES if flat else SPACE).items()}
-    told = INPUTS if flat else SPACE
+    told = INPUTS if flat else FLYING
     commands = {q: (*named, of(f"{COMMAND}.{q}")) for q, named in told.items()}
     found = {axis: place for axis, place in places.items() if place is not None and (axis != "z" or not flat)}
     if len(found) < 2:
@@ -304,7 +305,9 @@ def _followers(log: _Log, others: Sequence[str]) -> tuple[dict[str, str], dict[s
             if log.units.get(name) and log.units.get(other) and log.units[name] != log.units[other]:
                 continue
             fits.append((_following(log, name, other), name, other))
-    pairs: dict[str, str] = {}
+    # `command NAME` is what NAME is to come to, however slowly it does.
+    named = {name: name.removeprefix(f"{COMMAND} ") for name in log.inputs}
+    pairs = {name: other for name, other in named.items() if other in others}
     for score, name, other in sorted(fits, reverse=True):
         if score > FOLLOWS and name not in pairs and other not in pairs.values():
             pairs[name] = other
@@ -349,7 +352,7 @@ def _moves(log: _Log, name: str) -> bool | None:
     alone, driving = [], []
     seconds = max(2.0 * log.period, SPAN)
     for run, i, j in log.spans(seconds):
-        way = np.hypot(*[run.columns[p][j] - run.columns[p][i] for p in log.places[:2]])
+        way = np.linalg.norm([run.columns[p][j] - run.columns[p][i] for p in log.places], axis=0)
         small = [np.abs(run.columns[n]) <= 0.05 * np.abs(log.all(n)).max() for n in log.inputs if n != name]
         large = np.abs(run.columns[name]) > 0.2 * np.abs(log.all(name)).max()
         calm = np.concatenate([[0], np.cumsum(large & np.all(small, axis=0) if small else large)])

@@ -2,14 +2,17 @@
 
 import json
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
+from mcap.writer import Writer
 
 from deploy.cli import main
 from deploy.data.bring import bring, tables_of
 from deploy.data.sources.table import NoSource, Table
 from deploy.data.told import told
+from messaging.robots import FOLDER as ROBOTS
 from messaging.robots import robot_named
 from tests.deploy.data.bags import write_bag
 from tests.deploy.data.porter import COLUMNS, drive, write_csv
@@ -103,3 +106,42 @@ def test_without_positions_or_inputs_it_says_what_is_missing(driven, tmp_path):
     assert main(["robot", "new", str(out), "--from", str(path)]) == 0
     text = out.read_text()
     assert "# no column is an input for certain" in text and "# Inputs can't be told from the log" in text
+
+
+@pytest.mark.parametrize("name", ["copter.bin", "copter.tlog", "px4.ulg"])
+def test_a_flight_drafts_what_flies(tmp_path, capsys, name):
+    """The description is right as it stands, reads the log that it was made from, and is the quadrotor's in kind."""
+    log, path = Path(__file__).parent / "flown" / name, tmp_path / "flier.toml"
+    assert main(["robot", "new", str(path), "--from", str(log)]) == 0
+    assert main(["robot", "check", str(path)]) == 0, capsys.readouterr().err
+    robot, known = robot_named(str(path)), robot_named("quadrotor")
+    assert robot.state == known.state and robot.follows == known.follows and robot.body[0].at == known.body[0].at
+    assert robot.action == ("vx [m/s]", "vy [m/s]", "vz [m/s]") and robot.period == pytest.approx(0.2, abs=0.005)
+    assert len(bring([log], robot).data.trajectories) > 0
+
+
+@pytest.mark.parametrize("name", ["ground", "quadrotor", "../examples/car/car.toml"])
+def test_a_log_of_a_run_carries_the_description(tmp_path, name):
+    robot = robot_named(str(ROBOTS / name) if "/" in name else name)
+    log, path = tmp_path / "run.mcap", tmp_path / "found.toml"
+    with log.open("wb") as file:
+        writer = Writer(file)
+        writer.start(library="brakeline")
+        writer.add_metadata("robots", {robot.name: json.dumps(robot.description)})
+        writer.finish()
+    assert main(["robot", "new", str(path), "--from", str(log)]) == 0
+    assert robot_named(str(path)).description == robot.description | {"name": "found"}
+
+
+def test_of_several_robots_in_a_log_the_files_name_chooses(tmp_path, capsys):
+    log = tmp_path / "run.mcap"
+    with log.open("wb") as file:
+        writer = Writer(file)
+        writer.start(library="brakeline")
+        texts = {name: json.dumps(robot_named(name).description) for name in ("ground", "quadrotor")}
+        writer.add_metadata("robots", texts)
+        writer.finish()
+    assert main(["robot", "new", str(tmp_path / "mine.toml"), "--from", str(log)]) == 1
+    assert "is of ground, quadrotor: name the file after the one" in capsys.readouterr().err.replace("\n", " ")
+    assert main(["robot", "new", str(tmp_path / "quadrotor.toml"), "--from", str(log)]) == 0
+    assert "horizon = 12" in (tmp_path / "quadrotor.toml").read_text()
