@@ -1,5 +1,6 @@
 """A minute of other authors' environments, in their own virtual environments, where those were set up."""
 
+import dataclasses
 import json
 import os
 import subprocess
@@ -11,7 +12,7 @@ import numpy as np
 import pytest
 
 from deploy.data.certified import certified
-from examples.foreign import table
+from examples.foreign import table, train
 from examples.foreign.run import missing
 from examples.foreign.trained import Trained, scale
 from examples.foreign.ways import Ways
@@ -133,3 +134,34 @@ def test_a_trained_policy_is_the_same_when_it_is_loaded(tmp_path):
     assert (asked >= robot.low()).all() and (asked <= robot.high()).all()
     assert np.ptp(asked, axis=0) == pytest.approx(robot.high() - robot.low(), rel=0.1), "it uses their whole range"
     assert json.loads((tmp_path / "point.trained.json").read_text()) == {"steps": 7}
+
+
+class Corrected:
+    """Whatever is proposed, nothing is done; 30 steps of cost 1, reward 1 and penalty 0.5."""
+
+    def reset(self, seed):
+        self.left, self.rng = 30, np.random.default_rng(seed)
+        return self.rng.normal(size=3), {}
+
+    def step(self, control):
+        self.left -= 1
+        told = {"executed": np.zeros(2), "kind": "adjusted", "verified": True, "contained": True}
+        info = {"cost": 1.0, "penalty": 0.5, "diagnostics": told}
+        return self.rng.normal(size=3), 1.0 - 0.5, False, self.left == 0, info
+
+
+def test_training_learns_from_what_was_executed_and_from_what_was_proposed(monkeypatch):
+    small = dataclasses.replace(train.CONFIG, hidden=(8, 8), batch=8, warmup=20, n_step=1)
+    monkeypatch.setattr(train, "CONFIG", small)
+    robot = robot_named(str(EXAMPLES / "safety_gymnasium" / "point.toml"))
+    pupil = train.Pupil(SimpleNamespace(robot=robot), size=3, steps=30, seed=0)
+    told = train.episode(Corrected(), pupil, 0).told()
+    assert (told["steps"], told["cost"], told["reward"]) == (30, 30.0, 30.0)
+    stored = pupil.replay.state().tensors
+    executed, proposed = stored["action"][0::2], stored["action"][1::2]
+    assert len(executed) == len(proposed) == 30
+    assert (executed == 0.0).all() and (np.abs(proposed).max(axis=1) > 0.0).all()
+    assert stored["reward"][0::2] == pytest.approx(1.0), "of what was executed: without the penalty"
+    assert stored["reward"][1::2] == pytest.approx(0.5)
+    assert pupil.policy is not None and pupil.td3.updates > 10
+    assert np.abs(pupil.proposed(np.ones(3))).max() <= 1.0
