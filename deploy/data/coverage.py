@@ -7,10 +7,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from deploy.data.certified import HELD_OUT
 from deploy.data.sources.quantities import columns_of, split
 from messaging.robots import Array, Robot
 from safety.dataset import Dataset
 from safety.fitting import FEWEST_STOPS
+from safety.model_set import Recipe
 from safety.statement import CONFIDENCE, Statement
 from safety.windows import FREE, PLAN, standing_at_the_end, stops_of, windows
 
@@ -77,14 +79,9 @@ def coverage(data: Dataset) -> Coverage:
     missing = _stops_missing(robot, stops, rested)
     missing += [text for one in seen[: len(inputs)] for text in _never(one)]
     missing += [text for one in braked for text in _no_braking(one)]
-    return Coverage(
-        tuple(seen),
-        stops,
-        tuple(braked),
-        len(windows(data, robot.horizon, PLAN)),
-        len(windows(data, robot.horizon, FREE)),
-        tuple(missing),
-    )
+    plans, free = (len(windows(data, robot.horizon, kind)) for kind in (PLAN, FREE))
+    missing += _windows_missing(plans, free)
+    return Coverage(tuple(seen), stops, tuple(braked), plans, free, tuple(missing))
 
 
 def _seen(name: str, label: str, low: float, high: float, values: Array) -> Seen:
@@ -134,6 +131,18 @@ def _no_braking(one: Seen) -> list[str]:
     if one.low < 0.0 and one.least > one.low + room:
         found.append(f"no braking below {min(one.least, 0.0):.2g} {one.unit} of {one.name}: drive this")
     return found
+
+
+def _windows_missing(plans: int, free: int) -> list[str]:
+    enough = math.ceil(Recipe().fewest / (1.0 - HELD_OUT))
+    if free < enough:
+        return [f"only {free} windows of a plan's length, about {enough} are needed: drive on"]
+    if plans < enough:
+        return [
+            f"{plans} windows brake as the filter's plans do; about {enough} would make narrower sets than all driving "
+            "does: hold an input for a period, then stop by the description's rules"
+        ]
+    return []
 
 
 def more_to_drive(statement: Statement, data: Dataset) -> list[str]:

@@ -15,6 +15,7 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 from pyulog import ULog
 
 from deploy.data.bring import bring, tables_of
+from deploy.data.coverage import coverage
 from deploy.data.sources.quantities import resolve
 from deploy.data.sources.table import NoSource
 from deploy.data.sources.tlog import _frames
@@ -124,6 +125,11 @@ def test_a_log_as_it_is_becomes_data(name):
     made = bring([FLOWN / name], QUADROTOR)
     assert made.report.periods > 60 and made.report.samples >= 2
     assert all(0.0 <= late < 0.7 for late in made.report.delays.values())
+
+
+def test_some_seconds_of_flight_are_said_to_be_too_few():
+    told = coverage(bring([FLOWN / "copter.tlog"], QUADROTOR).data)
+    assert f"only {told.windows} windows of a plan's length, about 286 are needed: drive on" in told.missing
 
 
 def test_a_late_link_does_not_shake_what_a_vehicle_told(tmp_path):
