@@ -134,8 +134,8 @@ def _where(robot: Robot, request: pb.Request, stopped: pb.Stopped) -> str:
         return " above" if normal[2] > 0.0 else " below"
     if robot.heading is not None:
         looks = request.state[robot.heading]
-        if len(request.action) and _forward(robot, np.array(request.action)) < 0.0:
-            looks += math.pi
+        if sum(robot.translates) == 1 and _moves(robot, np.array(request.action))[0] < 0.0:
+            looks += math.pi  # it sees, and is said to see, where it drives
     else:
         moves = _moves(robot, np.array(request.action))
         if np.hypot(*moves[:2]) < 1e-6:
@@ -168,18 +168,14 @@ def _of_wheels(robot: Robot, proposed: Array, executed: Array, difference: Array
         way = "turned left" if executed[most] > proposed[most] else "turned right"
         straight = abs(proposed[most]) < LEAST * (robot.high()[most] - robot.low()[most])
         return way, "straight on" if straight else "as proposed"
-    if sum(robot.translates) > 1:
-        return _of_input(robot, proposed, executed)
+    if sum(robot.translates) > 1:  # a vector, as it looks
+        return _of_vector(_moves(robot, proposed), _moves(robot, executed)) or _of_input(robot, proposed, executed)
     before, now = proposed[most], executed[most]
     if before * now < 0.0:
         return ("backed off" if now < 0.0 else "went forward"), "as proposed"
     if abs(now) < LEAST * (robot.high()[most] - robot.low()[most]):
         return "stopped", "going on"
     return ("slowed down" if abs(now) < abs(before) else "sped up"), "as proposed"
-
-
-def _forward(robot: Robot, inputs: Array) -> float:
-    return float(inputs[list(robot.translates).index(True)]) if any(robot.translates) else 0.0
 
 
 def _moves(robot: Robot, inputs: Array) -> Array:

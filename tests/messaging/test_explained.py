@@ -1,11 +1,16 @@
 """A decision in a sentence: what was done, why, and where it was, for robots of several kinds."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from messaging import brakeline_pb2 as pb
+from messaging.descriptions import read
 from messaging.explained import arrow, explain, fits, sentence
 from tests.robots import GROUND, QUADROTOR
+
+OMNI = read(Path(__file__).parents[2] / "examples" / "omni" / "omni.toml")
 
 
 def asked(robot, action, heading=0.0):
@@ -67,6 +72,21 @@ def test_where_it_is_is_told_as_the_robot_looks(heading, normal, where):
     assert (
         said == f"braked along the plan verified before: as proposed, the stop would have come 3 cm too close {where}"
     )
+
+
+@pytest.mark.parametrize(
+    ("action", "instead", "normal", "said"),
+    [
+        ((0.3, 0.0, 0.0), (0.2, 0.2, 0.0), (1, 0), "turned aside to the left: straight on, the stop would have come 3"),
+        ((0.0, -0.3, 0.0), (0.0, -0.1, 0.0), (0, -1), "slowed down: as proposed, the stop would have come 3 cm too cl"),
+        ((-0.1, 0.3, 0.0), (0.0, 0.0, 0.0), (0, 1), "stopped: going on, the stop would have come 3 cm too close to the "
+         "cylinder on the left"),
+        ((0.3, 0.0, 0.0), (0.3, 0.0, 0.5), (1, 0), "turned left: straight on"),
+    ],
+)  # fmt: skip
+def test_what_goes_anywhere_while_it_turns(action, instead, normal, said):
+    decision = answered(OMNI, pb.ADJUSTED, instead, normal=normal)
+    assert sentence(OMNI, asked(OMNI, action), decision).startswith(said)
 
 
 @pytest.mark.parametrize(
