@@ -28,13 +28,14 @@ from deploy.bench import (
     learning,
     linkloss,
     logs,
+    manners,
     perception,
     reachability,
     recording,
     roundtrip,
     solvers,
 )
-from deploy.bench.timing import Figures
+from deploy.bench.timing import Figures, Words
 
 
 @dataclass(frozen=True)
@@ -56,8 +57,8 @@ class Bench:
 @dataclass(frozen=True)
 class Benchmark:
     module: ModuleType  # its documentation says what is measured
-    run: Callable[[Bench], Figures]
-    asked: bool = False  # only when it is named: it writes gigabytes, takes a quarter of an hour, or needs root
+    run: Callable[[Bench], Figures | Words]
+    asked: bool = False  # only when it is named: it writes gigabytes, takes minutes, or needs root or other programs
 
 
 BENCHMARKS = {
@@ -74,6 +75,7 @@ BENCHMARKS = {
     "askers": Benchmark(askers, lambda _: askers.run()),
     "logs-2gb": Benchmark(logs, lambda _: logs.run_large(), asked=True),
     "fuzz": Benchmark(fuzz, lambda given: fuzz.fuzz(given.messages, given.seed), asked=True),
+    "manners": Benchmark(manners, lambda _: manners.run(), asked=True),
     "costs": Benchmark(costs, lambda _: costs.run(), asked=True),
     "chaos": Benchmark(chaos, lambda given: chaos.chaos(given.kills, given.seed), asked=True),
 }
@@ -89,14 +91,18 @@ def overview() -> str:
     return "\n".join([Bench.__doc__ or "", "", *lines, "", "examples:", examples])
 
 
-def show(console: Console, name: str, figures: Figures) -> None:
+def _cell(value: float | str) -> str:
+    return value if isinstance(value, str) else f"{value:.4g}"
+
+
+def show(console: Console, name: str, figures: Figures | Words) -> None:
     table = Table(title=name)
     table.add_column("what")
     columns = sorted({key for row in figures.values() for key in row}, key=str)
     for column in columns:
         table.add_column(column, justify="right")
     for what, row in figures.items():
-        table.add_row(what, *(f"{row[c]:.4g}" if c in row else "" for c in columns))
+        table.add_row(what, *(_cell(row.get(c, "")) for c in columns))
     console.print(table)
 
 

@@ -8,6 +8,7 @@ from time import perf_counter
 import numpy as np
 
 Figures = dict[str, dict[str, float]]
+Words = dict[str, dict[str, float | str]]  # of what is no figure alone
 
 WARM_UP = 20  # calls
 

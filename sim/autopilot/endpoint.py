@@ -10,7 +10,7 @@ from typing import Any
 from sim.autopilot import frames
 from sim.autopilot.dialect import mavlink
 from sim.autopilot.parameters import BadParameter
-from sim.autopilot.pilot import Mode, Pilot, Refused
+from sim.autopilot.pilot import Mode, Pilot, Refused, Unknown
 from sim.autopilot.rules import RULES
 from sim.autopilot.telemetry import BUILDERS, Reports, Schedule
 from sim.lidar import Lidar
@@ -20,6 +20,7 @@ TICK = 0.02  # s between two looks at modes, timeouts and streams; the vehicle's
 HEARTBEAT = mavlink.MAVLINK_MSG_ID_HEARTBEAT
 FORCED = 21196.0  # param2 of an arming command that is to be carried out regardless
 ACCEPTED, DENIED = int(mavlink.MAV_RESULT_ACCEPTED), int(mavlink.MAV_RESULT_DENIED)
+FAILED = int(mavlink.MAV_RESULT_FAILED)
 
 
 class UnknownRules(ValueError):
@@ -166,7 +167,8 @@ class Autopilot:
         try:
             result = mavlink.MAV_RESULT_UNSUPPORTED if action is None else action(self, command)
         except Refused as refusal:
-            result = self.rules.refusal
+            unknown = isinstance(refusal, Unknown)
+            result = mavlink.MAV_RESULT_UNSUPPORTED if unknown else self.rules.refusal
             self.say(str(refusal))
         self.mav.command_ack_send(command.number, result, 0, 0, message.get_srcSystem(), message.get_srcComponent())
         self._tell_news()
@@ -262,7 +264,7 @@ def _set_interval(autopilot: Autopilot, command: Command) -> int:
     """param1: message id; param2: µs; 0: the default rate; -1: none."""
     kind, microseconds = round(command.params[0]), command.params[1]
     if kind not in BUILDERS and kind != HEARTBEAT:
-        return DENIED
+        return FAILED
     interval = 1e-6 * microseconds
     if microseconds == 0.0:
         interval = 1.0 / autopilot.rules.rates[kind] if kind in autopilot.rules.rates else 0.0

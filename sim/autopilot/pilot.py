@@ -20,6 +20,10 @@ class Refused(Exception):
     """The vehicle does not do that now, and why."""
 
 
+class Unknown(Refused):
+    """There is no such thing at all."""
+
+
 class Mode(Enum):
     MANUAL = "manual"  # sticks, of which there are none
     HOLD = "hold"

@@ -11,7 +11,7 @@ from typing import Any, Protocol
 from sim.autopilot import frames
 from sim.autopilot.dialect import mavlink
 from sim.autopilot.parameters import ARDUPILOT, PX4, Parameters
-from sim.autopilot.pilot import Landed, Limits, Mode, Pilot, Refused, Setpoint
+from sim.autopilot.pilot import Landed, Limits, Mode, Pilot, Refused, Setpoint, Unknown
 from sim.flight import STILL, Vector
 
 POSITION, VELOCITY, ACCELERATION = 0x007, 0x038, 0x1C0  # bits of a type mask: these are to be ignored
@@ -20,6 +20,8 @@ FASTEST = 1000.0  # m/s, a velocity beyond which is no velocity to ArduCopter
 
 PX4_MODES = {(4, 2): Mode.TAKEOFF, (4, 3): Mode.HOLD, (4, 6): Mode.LAND, (6, 0): Mode.OFFBOARD}  # main, sub
 COPTER_MODES = {0: Mode.MANUAL, 4: Mode.OFFBOARD, 5: Mode.HOLD, 9: Mode.LAND, 17: Mode.BRAKE}
+
+COPTER_LAST = 27  # number of its modes
 
 Target = Any  # SET_POSITION_TARGET_LOCAL_NED: pymavlink is untyped
 
@@ -189,6 +191,8 @@ class ArduCopter:
 
     def change(self, pilot: Pilot, custom_mode: int) -> None:
         mode = COPTER_MODES.get(custom_mode)
+        if custom_mode not in range(COPTER_LAST + 1):
+            raise Unknown(f"No such mode {custom_mode}")
         if mode is None:
             raise Refused(f"Mode change to {custom_mode} failed: no sticks, no mission")
         if mode is Mode.MANUAL and pilot.landed is not Landed.ON_GROUND:

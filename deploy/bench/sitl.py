@@ -1,0 +1,75 @@
+"""Real autopilots with their own physics, where there are any: a folder whose `sitl FOLDER INSTANCE` runs one."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+KINDS = ("ardupilot", "px4")
+INSTANCES = range(1, 10)  # PX4 has no more ports
+STARTS_IN = 30.0  # s
+LISTENS = "0A"  # a socket's state in /proc/net/tcp
+# ArduCopter ends with its parent, and takes one of another user for gone: this one waits for it.
+KEEPER = "import subprocess, sys; sys.exit(subprocess.call(sys.argv[1:]))"
+
+
+class NoAutopilot(RuntimeError):
+    """There is none, or it did not start."""
+
+
+def variable(kind: str) -> str:
+    """Of the environment: the folder with `sitl` in it."""
+    return f"BRAKELINE_{kind.upper()}"
+
+
+def program(kind: str, default: Path | None = None) -> Path:
+    """What starts it. Raises NoAutopilot, naming the variable."""
+    folder = os.environ.get(variable(kind), default)
+    if folder is None or not (Path(folder) / "sitl").exists():
+        raise NoAutopilot(f"no real {kind}: set {variable(kind)} to a folder with `sitl` in it")
+    return Path(folder) / "sitl"
+
+
+@contextmanager
+def flying(kind: str, start: Path, folder: Path) -> Iterator[tuple[str, int]]:
+    """One that runs in a folder: (the URL for us, its system id).
+
+    Raises:
+        NoAutopilot: with what it said.
+    """
+    instance = next(i for i in reversed(INSTANCES) if not _taken(kind, i))
+    said = folder / "sitl.log"
+    with said.open("wb") as output:
+        command = [sys.executable, "-c", KEEPER, str(start), str(folder / kind), str(instance)]
+        process = subprocess.Popen(
+            command, stdin=subprocess.DEVNULL, stdout=output, stderr=output, start_new_session=True
+        )
+        try:
+            if kind == "px4":
+                yield f"udpin:127.0.0.1:{14540 + instance}", instance + 1
+                return
+            deadline = time.monotonic() + STARTS_IN
+            while not _taken(kind, instance):  # looked at, not tried: its first connection is its only one
+                if time.monotonic() > deadline:
+                    raise NoAutopilot(f"{kind} does not listen: {said.read_text(errors='replace')[-500:]}")
+                time.sleep(0.1)
+            yield f"tcp:127.0.0.1:{5760 + 10 * instance}", 1
+        finally:
+            os.killpg(process.pid, signal.SIGKILL)
+            process.wait()
+
+
+def _taken(kind: str, instance: int) -> bool:
+    """Does one of that number run, or somebody who expects it?"""
+    table, ports = "tcp", [5760 + 10 * instance]
+    if kind == "px4":
+        table, ports = "udp", [14540 + instance, 14580 + instance, 18570 + instance]
+    rows = [line.split() for line in Path(f"/proc/net/{table}").read_text().splitlines()[1:]]
+    used = {int(row[1].split(":")[1], 16) for row in rows if table == "udp" or row[3] == LISTENS}
+    return bool(used.intersection(ports))
