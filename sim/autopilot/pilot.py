@@ -97,6 +97,8 @@ class Pilot:
         self.armed, self._since = True, self.time
         self.home = self.vehicle.seen()[0]
         self.news.append("Armed")
+        if self.mode is Mode.TAKEOFF:  # asked for before
+            self._leave_floor(Landed.TAKING_OFF)
 
     def disarm(self, force: bool = False) -> None:
         """Raises Refused in the air, unless forced."""
@@ -120,7 +122,7 @@ class Pilot:
     def take_off(self, height: float) -> None:
         """Climb to a height [m, in the world] and hold it."""
         self._height = height
-        if self.landed is Landed.ON_GROUND:
+        if self.armed and self.landed is Landed.ON_GROUND:
             self._leave_floor(Landed.TAKING_OFF)
 
     def hear(self, setpoint: Setpoint) -> None:

@@ -21,7 +21,7 @@ FASTEST = 1000.0  # m/s, a velocity beyond which is no velocity to ArduCopter
 PX4_MODES = {(4, 2): Mode.TAKEOFF, (4, 3): Mode.HOLD, (4, 6): Mode.LAND, (6, 0): Mode.OFFBOARD}  # main, sub
 COPTER_MODES = {0: Mode.MANUAL, 4: Mode.OFFBOARD, 5: Mode.HOLD, 9: Mode.LAND, 17: Mode.BRAKE}
 
-COPTER_LAST = 27  # number of its modes
+PX4_LAST, COPTER_LAST = 10, 27  # number of the last main mode, of the last mode
 
 Target = Any  # SET_POSITION_TARGET_LOCAL_NED: pymavlink is untyped
 
@@ -37,6 +37,7 @@ class Rules(Protocol):
     rates: dict[int, float]  # Hz of messages that are sent without being asked for
 
     groups: dict[int, tuple[int, ...]]  # messages of each group of REQUEST_DATA_STREAM
+    refused: frozenset[int]  # messages that it does not send at an interval
 
     def limits(self) -> Limits:
         """From the parameters as they are."""
@@ -84,6 +85,7 @@ class Px4:
             mavlink.MAVLINK_MSG_ID_OBSTACLE_DISTANCE: 5.0,
         }
         self.groups: dict[int, tuple[int, ...]] = {}  # it takes no REQUEST_DATA_STREAM
+        self.refused: frozenset[int] = frozenset()
 
     def limits(self) -> Limits:
         p = self.parameters
@@ -109,9 +111,11 @@ class Px4:
     def change(self, pilot: Pilot, custom_mode: int) -> None:
         main, sub = custom_mode >> 16 & 0xFF, custom_mode >> 24 & 0xFF
         mode = PX4_MODES.get((main, sub if main == 4 else 0))
+        if main > PX4_LAST:
+            return  # accepted, and nothing happens
         if mode is None:
             raise Refused(f"mode {main}.{sub} is not available: no sticks, no mission")
-        if mode is Mode.OFFBOARD and not pilot.streaming:
+        if mode is Mode.OFFBOARD and pilot.armed and not pilot.streaming:
             raise Refused("offboard: no offboard signal")
         if mode is Mode.TAKEOFF:
             self.take_off(pilot, math.nan)
@@ -126,8 +130,6 @@ class Px4:
         pilot.arm()
 
     def take_off(self, pilot: Pilot, altitude: float) -> None:
-        if not pilot.armed:
-            raise Refused("Takeoff denied: disarmed")
         above_home = pilot.home[2] + self.parameters["MIS_TAKEOFF_ALT"]
         pilot.change(Mode.TAKEOFF)
         pilot.take_off(altitude - frames.ALTITUDE if math.isfinite(altitude) else above_home)
@@ -148,7 +150,7 @@ class Px4:
 
 
 class ArduCopter:
-    """Guided: armed first, then taken off, then velocities; without new ones it stops. Nonsense stops it at once."""
+    """Guided: armed first, then taken off, then velocities; without new ones it stops."""
 
     name, autopilot = "ardupilot", mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA
     refusal = mavlink.MAV_RESULT_FAILED
@@ -161,12 +163,15 @@ class ArduCopter:
         self.rates: dict[int, float] = {}
         m = mavlink
         self.groups: dict[int, tuple[int, ...]] = {
-            m.MAV_DATA_STREAM_RAW_SENSORS: (m.MAVLINK_MSG_ID_HIGHRES_IMU,),
+            m.MAV_DATA_STREAM_RAW_SENSORS: (m.MAVLINK_MSG_ID_SCALED_IMU,),
             m.MAV_DATA_STREAM_EXTENDED_STATUS: (m.MAVLINK_MSG_ID_SYS_STATUS, m.MAVLINK_MSG_ID_GPS_RAW_INT),
             m.MAV_DATA_STREAM_POSITION: (m.MAVLINK_MSG_ID_LOCAL_POSITION_NED, m.MAVLINK_MSG_ID_GLOBAL_POSITION_INT),
             m.MAV_DATA_STREAM_EXTRA1: (m.MAVLINK_MSG_ID_ATTITUDE,),
             m.MAV_DATA_STREAM_EXTRA2: (m.MAVLINK_MSG_ID_VFR_HUD,),
         }
+        self.refused = frozenset(
+            (m.MAVLINK_MSG_ID_ATTITUDE_QUATERNION, m.MAVLINK_MSG_ID_HIGHRES_IMU, m.MAVLINK_MSG_ID_ODOMETRY)
+        )
         self.groups[m.MAV_DATA_STREAM_ALL] = tuple(kind for kinds in self.groups.values() for kind in kinds)
 
     def limits(self) -> Limits:
@@ -223,7 +228,9 @@ class ArduCopter:
         sane = all(math.isfinite(v) and abs(v) <= FASTEST for v in velocity)
         force = mask & FORCE and not mask & ACCELERATION
         ignores = mask & POSITION and not mask & VELOCITY and mask & ACCELERATION
-        if frame not in self.FRAMES or force or not ignores or not sane:
+        if frame not in self.FRAMES or force or not ignores:
+            return  # and flies on until no other has come for long
+        if not sane:
             pilot.hear(Setpoint(STILL))
         elif pilot.landed is not Landed.ON_GROUND:
             pilot.hear(_setpoint(target, frame in self.BODY, heading, relative=True))

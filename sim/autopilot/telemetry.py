@@ -30,6 +30,7 @@ SENSORS = (
     | mavlink.MAV_SYS_STATUS_PREARM_CHECK
 )
 VOLTAGE, CHARGE = 16.2, 100  # V, %: the battery is no part of the simulation
+MILLIGRAVITY = 9.80665e-3  # m/s²
 NO_COVARIANCE = [math.nan, *[0.0] * 20]
 LANDED = {
     Landed.ON_GROUND: mavlink.MAV_LANDED_STATE_ON_GROUND,
@@ -136,6 +137,12 @@ class Reports:
             self.microseconds, *acceleration, *rates, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, fields
         )
 
+    def scaled_imu(self) -> Message:
+        """In thousandths of g and of rad/s."""
+        acceleration, rates = frames.body(self.estimate.specific_force), frames.body(self.estimate.rates)
+        felt, turning = (round(value / MILLIGRAVITY) for value in acceleration), (round(1e3 * rate) for rate in rates)
+        return mavlink.MAVLink_scaled_imu_message(self.milliseconds, *felt, *turning, 0, 0, 0)
+
     def odometry(self) -> Message:
         """Position in NED, velocity along the body's axes, as PX4 sends them."""
         position, velocity = self._pilot.vehicle.seen()
@@ -193,6 +200,7 @@ BUILDERS: dict[int, Callable[[Reports], Message | None]] = {
     mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT: Reports.global_position_int,
     mavlink.MAVLINK_MSG_ID_GPS_RAW_INT: Reports.gps_raw_int,
     mavlink.MAVLINK_MSG_ID_HIGHRES_IMU: Reports.highres_imu,
+    mavlink.MAVLINK_MSG_ID_SCALED_IMU: Reports.scaled_imu,
     mavlink.MAVLINK_MSG_ID_ODOMETRY: Reports.odometry,
     mavlink.MAVLINK_MSG_ID_VFR_HUD: Reports.vfr_hud,
     mavlink.MAVLINK_MSG_ID_HOME_POSITION: Reports.home_position,

@@ -161,7 +161,8 @@ def test_unused_it_disarms_by_itself(station: Station) -> None:
 def test_px4_wants_setpoints_before_offboard() -> None:
     station = Station("px4")
     station.wait(2.0)
-    assert station.command(MODE, 1, OFFBOARD) == REJECTED
+    assert station.command(MODE, 1, OFFBOARD) == ACCEPTED  # disarmed: it may be any
+    assert station.command(ARM, 1) == REJECTED
     assert "no offboard signal" in station.texts()
     station.setpoint(0, 0, 0)
     assert station.command(MODE, 1, OFFBOARD) == ACCEPTED
@@ -170,7 +171,22 @@ def test_px4_wants_setpoints_before_offboard() -> None:
     assert station.command(ARM, 1) == REJECTED  # the stream has dried up
     assert station.command(MODE, 1, 1) == REJECTED  # manual: no sticks
     assert station.command(MODE, 0, OFFBOARD) == DENIED  # no custom mode
-    assert station.command(TAKEOFF, *[0.0] * 6, math.nan) == REJECTED  # disarmed
+    assert station.command(MODE, 1, 99) == ACCEPTED  # there is no such mode: nothing happens
+    assert station.pilot.mode is Mode.OFFBOARD
+
+
+def test_px4_takes_off_when_it_is_armed_if_that_was_asked_for_before() -> None:
+    station = Station("px4")
+    station.wait(2.0)
+    assert station.command(TAKEOFF, *[0.0] * 6, math.nan) == ACCEPTED
+    station.wait(1.0)
+    assert station.autopilot.vehicle.state()[2] < 0.1
+    assert station.command(ARM, 1) == ACCEPTED
+    station.wait(5.0)
+    assert station.autopilot.vehicle.state()[2] > 2.0
+    station.setpoint(0, 0, 0)
+    station.wait(2.0)
+    assert station.command(MODE, 1, OFFBOARD) == REJECTED  # in the air it wants setpoints
 
 
 def test_px4_lifts_off_by_an_upward_setpoint() -> None:
@@ -249,8 +265,8 @@ def test_wrong_frames_and_masks_are_not_flown(
 ) -> None:
     flying.fly(0, 1.5, 0)
     flying.heard.clear()
-    reached = flying.fly(*velocity, frame=frame, mask=mask, seconds=3.0)
-    assert reached == pytest.approx(np.zeros(3), abs=0.1)  # PX4 heard nothing it knew, and ArduPilot stops at nonsense
+    reached = flying.fly(*velocity, frame=frame, mask=mask, seconds=6.0)
+    assert reached == pytest.approx(np.zeros(3), abs=0.1)  # nothing was heard for long
     if flying.autopilot.rules.name == "px4":
         assert "SET_POSITION_TARGET_LOCAL_NED" in flying.texts()
         assert flying.pilot.mode is Mode.HOLD
@@ -310,8 +326,8 @@ def test_every_message_can_be_asked_for() -> None:
     station = Station("px4", airborne=True, lidar=lidar)
     for name in (
         "ATTITUDE", "ATTITUDE_QUATERNION", "LOCAL_POSITION_NED", "HIGHRES_IMU", "OBSTACLE_DISTANCE", "SYS_STATUS",
-        "EXTENDED_SYS_STATE", "GLOBAL_POSITION_INT", "GPS_RAW_INT", "HOME_POSITION", "BATTERY_STATUS", "ODOMETRY",
-        "VFR_HUD", "AUTOPILOT_VERSION",
+        "EXTENDED_SYS_STATE", "GLOBAL_POSITION_INT", "SCALED_IMU", "GPS_RAW_INT", "HOME_POSITION", "BATTERY_STATUS",
+        "ODOMETRY", "VFR_HUD", "AUTOPILOT_VERSION",
     ):  # fmt: skip
         assert station.command(512, getattr(mavlink, f"MAVLINK_MSG_ID_{name}")) == ACCEPTED
         assert station.last(name)
