@@ -205,6 +205,10 @@ class Launcher:
             with self._tolerance.over(sample.key):
                 message = sample.message()
                 self.metrics.add(sample.key, message)
+                if sample.topic.name == "health":
+                    for child in self.children:
+                        if child.place.name == message.process:
+                            child.heard(message.pid)
                 if sample.topic.name == "log" and message.level in ("WARNING", "ERROR"):
                     self.lines.append(f"{message.process}: {headline(message.text)}")
 

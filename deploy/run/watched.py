@@ -16,8 +16,9 @@ from deploy.run.places import UNFINISHED, Place
 log = logging.getLogger("brakeline.launcher")
 
 FIRST_BACKOFF, LONGEST_BACKOFF = 0.5, 10.0  # s before a restart, doubled each time ...
-HEALTHY_AFTER = 20.0  # s of life after which the next backoff is the first one again
-MOST_FAILURES = 5  # in a row, each before HEALTHY_AFTER: then it is no accident
+HEALTHY_AFTER = 20.0  # s from its first sign of life on after which the next backoff is the first one again
+SPEAKS_AFTER = 60.0  # s from its start: a busy machine takes long to import what it needs, and not everybody speaks
+MOST_FAILURES = 5  # in a row, none of them healthy: then it is no accident
 
 
 class LaunchError(RuntimeError):
@@ -34,6 +35,7 @@ class Child:
     failures: int = 0  # in a row
     popen: subprocess.Popen[bytes] | None = None
     started: float = 0.0
+    spoke: float | None = None  # when its first sign of life was heard
     due: float = 0.0  # when to start it (again)
     finished: bool = False  # it ended with 0: its work is done
 
@@ -51,11 +53,16 @@ class Child:
                 env=environment,
                 start_new_session=True,  # ^C goes to the launcher alone, which ends them in order
             )
-        self.started = time.monotonic()
+        self.started, self.spoke = time.monotonic(), None
 
     @property
     def alive(self) -> bool:
         return self.popen is not None and self.popen.poll() is None
+
+    def heard(self, pid: int) -> None:
+        """A process of this name gave a sign of life."""
+        if self.popen is not None and self.popen.pid == pid and self.spoke is None:
+            self.spoke = time.monotonic()
 
     def watch(self) -> None:
         """Start it if that is due; see how it ended if it did.
@@ -75,7 +82,8 @@ class Child:
         if code == 0:
             self.finished = True
             return
-        self.failures = 1 if lived > HEALTHY_AFTER else self.failures + 1
+        since = self.started + SPEAKS_AFTER if self.spoke is None else self.spoke
+        self.failures = 1 if now - since > HEALTHY_AFTER else self.failures + 1
         how = ended(code, lived)
         log_file = self.folder / "logs" / f"{self.place.name}.log"
         words = f"its last words: {last_line(log_file) or 'none'}"

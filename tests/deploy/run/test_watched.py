@@ -1,0 +1,62 @@
+"""What fails again and again is told from an accident, however long a busy machine takes to start it."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from deploy.run import watched
+from deploy.run.places import Place
+from deploy.run.watched import HEALTHY_AFTER, MOST_FAILURES, SPEAKS_AFTER, Child, LaunchError
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> list[float]:
+    """Its one entry is what time it is, s."""
+    now = [1000.0]
+    monkeypatch.setattr(watched.time, "monotonic", lambda: now[0])
+    return now
+
+
+class Failing(Child):
+    """Ends with 1 at once; by the clock, when the test says."""
+
+    def start(self) -> None:
+        self.popen = subprocess.Popen([sys.executable, "-c", "raise SystemExit(1)"])
+        self.popen.wait()
+        self.started, self.spoke = watched.time.monotonic(), None
+
+
+def lives(child: Child, clock: list[float], until_it_speaks: float | None, after: float) -> None:
+    """One life: how long until its first sign of life, None: it gives none; and how long after that."""
+    clock[0] = max(clock[0], child.due)
+    child.watch()
+    assert child.popen is not None
+    clock[0] += until_it_speaks or 0.0
+    child.heard(child.popen.pid + 1)  # the one before it: too late to count
+    if until_it_speaks is not None:
+        child.heard(child.popen.pid)
+    clock[0] += after
+    child.watch()
+
+
+@pytest.mark.parametrize("speaks", [0.5, 200.0])
+def test_however_slowly_it_starts_the_fifth_failure_in_a_row_ends_the_run(
+    speaks: float, clock: list[float], tmp_path: Path
+) -> None:
+    child = Failing(Place("learner", "learner", "ground"), tmp_path)
+    for _ in range(MOST_FAILURES - 1):
+        lives(child, clock, speaks, 2.0)
+    with pytest.raises(LaunchError, match="5th time in a row"):
+        lives(child, clock, speaks, 2.0)
+
+
+@pytest.mark.parametrize(("speaks", "after"), [(5.0, HEALTHY_AFTER + 1.0), (None, SPEAKS_AFTER + HEALTHY_AFTER + 1.0)])
+def test_who_was_healthy_before_may_fail_as_often_as_it_likes(
+    speaks: float | None, after: float, clock: list[float], tmp_path: Path
+) -> None:
+    child = Failing(Place("autopilot", "autopilot"), tmp_path)
+    for _ in range(3 * MOST_FAILURES):
+        lives(child, clock, speaks, after)
+    assert child.restarts == 3 * MOST_FAILURES and child.failures == 1
