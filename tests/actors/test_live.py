@@ -123,9 +123,10 @@ def test_without_telemetry_it_says_so_and_goes_on(live: Live) -> None:
 
 def test_what_stops_coming_alone_is_lost_telemetry_too(live: Live) -> None:
     vehicle, _, _ = live
+    chosen = vehicle._client.chosen[ATTITUDE]
     vehicle._client.chosen[ATTITUDE] = "AHRS2"  # which does not come; the position goes on coming
     assert "no telemetry of attitude" in vehicle.wait(vehicle.turn.number + 3).lost
-    vehicle._client.chosen[ATTITUDE] = "ATTITUDE_QUATERNION"
+    vehicle._client.chosen[ATTITUDE] = chosen
     assert not vehicle.wait(vehicle.turn.number + 2).lost
     assert vehicle.timing.figures()["periods without telemetry"] >= 1
 
