@@ -263,7 +263,7 @@ def _set_mode(autopilot: Autopilot, command: Command) -> int:
 def _set_interval(autopilot: Autopilot, command: Command) -> int:
     """param1: message id; param2: µs; 0: the default rate; -1: none."""
     kind, microseconds = round(command.params[0]), command.params[1]
-    if kind in autopilot.rules.refused or (kind not in BUILDERS and kind != HEARTBEAT):
+    if kind not in BUILDERS and kind != HEARTBEAT:
         return FAILED
     interval = 1e-6 * microseconds
     if microseconds == 0.0:

@@ -37,7 +37,6 @@ class Rules(Protocol):
     rates: dict[int, float]  # Hz of messages that are sent without being asked for
 
     groups: dict[int, tuple[int, ...]]  # messages of each group of REQUEST_DATA_STREAM
-    refused: frozenset[int]  # messages that it does not send at an interval
 
     def limits(self) -> Limits:
         """From the parameters as they are."""
@@ -85,7 +84,6 @@ class Px4:
             mavlink.MAVLINK_MSG_ID_OBSTACLE_DISTANCE: 5.0,
         }
         self.groups: dict[int, tuple[int, ...]] = {}  # it takes no REQUEST_DATA_STREAM
-        self.refused: frozenset[int] = frozenset()
 
     def limits(self) -> Limits:
         p = self.parameters
@@ -163,15 +161,12 @@ class ArduCopter:
         self.rates: dict[int, float] = {}
         m = mavlink
         self.groups: dict[int, tuple[int, ...]] = {
-            m.MAV_DATA_STREAM_RAW_SENSORS: (m.MAVLINK_MSG_ID_SCALED_IMU,),
+            m.MAV_DATA_STREAM_RAW_SENSORS: (m.MAVLINK_MSG_ID_SCALED_IMU, m.MAVLINK_MSG_ID_HIGHRES_IMU),
             m.MAV_DATA_STREAM_EXTENDED_STATUS: (m.MAVLINK_MSG_ID_SYS_STATUS, m.MAVLINK_MSG_ID_GPS_RAW_INT),
             m.MAV_DATA_STREAM_POSITION: (m.MAVLINK_MSG_ID_LOCAL_POSITION_NED, m.MAVLINK_MSG_ID_GLOBAL_POSITION_INT),
             m.MAV_DATA_STREAM_EXTRA1: (m.MAVLINK_MSG_ID_ATTITUDE,),
             m.MAV_DATA_STREAM_EXTRA2: (m.MAVLINK_MSG_ID_VFR_HUD,),
         }
-        self.refused = frozenset(
-            (m.MAVLINK_MSG_ID_ATTITUDE_QUATERNION, m.MAVLINK_MSG_ID_HIGHRES_IMU, m.MAVLINK_MSG_ID_ODOMETRY)
-        )
         self.groups[m.MAV_DATA_STREAM_ALL] = tuple(kind for kinds in self.groups.values() for kind in kinds)
 
     def limits(self) -> Limits:
