@@ -135,7 +135,8 @@ class Takeoff:
         else:
             self._hold(CLIMB)
         if not wait(lambda: client.position is not None and client.position[2] > top - 0.3, 10.0 + 3.0 * height):
-            raise MavlinkError("it does not climb")
+            why = "" if client.offboard else f": it went to {client.mode}, as after setpoints that came too late"
+            raise MavlinkError(f"it does not climb{why}")
 
     def note(self, line: str) -> None:
         """Keep a line, and log it."""

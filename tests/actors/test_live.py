@@ -35,7 +35,7 @@ def live(request: pytest.FixtureRequest) -> Iterator[Live]:
     """A vehicle, its autopilot in a thread, on the floor at first, and the frames between them."""
     link, stop, frames = open_link("udpin:127.0.0.1:0"), threading.Event(), list[Frame]()
     truth_port = free_udp_port()
-    autopilot = Autopilot(quadrotor(floor=0.02), request.param, parameters={TIMEOUT[request.param]: 0.3})
+    autopilot = Autopilot(quadrotor(floor=0.02), request.param, parameters={TIMEOUT[request.param]: 1.0})
     channel = server.Truth("127.0.0.1", truth_port)
     thread = threading.Thread(target=server.serve, args=([autopilot], link, WallClock(), stop.is_set, channel))
     thread.start()
@@ -145,7 +145,7 @@ def test_the_autopilot_brakes_when_the_link_dies(live: Live) -> None:
     for _ in range(8):
         vehicle.step(np.array([2.0, 0.0, 0.0]))
     vehicle.close()
-    time.sleep(2.5)
+    time.sleep(3.2)
     assert np.linalg.norm(autopilot.vehicle.state()[3:6]) < 0.1
 
 
