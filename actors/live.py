@@ -331,15 +331,17 @@ class LiveVehicle:
         self._client.setpoint(self._velocity)
 
     def _wait(self, condition: Callable[[], bool], seconds: float) -> bool:
-        """While no thread does: exchange until it holds."""
-        deadline = time.monotonic() + seconds
+        """While no thread does: exchange until it holds. A stall of ours is no silence of the autopilot's."""
+        left, looked = seconds, time.monotonic()
         while not condition():
             if self._told_to_stop():
                 raise MavlinkError("told to stop before it flew")
-            if time.monotonic() > deadline:
+            if left < 0.0:
                 return False
             self._exchange(time.monotonic())
             time.sleep(POLL)
+            now = time.monotonic()
+            left, looked = left - min(now - looked, 10.0 * POLL), now
         return True
 
     def _stop(self) -> None:
