@@ -5,8 +5,6 @@ import subprocess
 import sys
 import threading
 
-import pytest
-
 from messaging.signals import heeded
 
 WAITS = """
@@ -55,8 +53,6 @@ def test_what_was_there_before_is_there_again() -> None:
         signal.raise_signal(signal.SIGINT)
         assert stop.wait(10.0)
     assert [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)] == before
-    with pytest.raises(KeyboardInterrupt):
-        signal.raise_signal(signal.SIGINT)
 
 
 def test_not_in_the_main_thread_nothing_is_changed() -> None:

@@ -53,7 +53,7 @@ def elsewhere(tmp_path, monkeypatch):
     monkeypatch.setenv("BRAKELINE_DATA", str(tmp_path / "data"))
     recordings = []
     original = recording.collect.record
-    monkeypatch.setattr(recording, "recorded", partial(recording.recorded, trajectories=20))
+    monkeypatch.setattr(recording, "recorded", partial(recording.recorded, trajectories=12))
     monkeypatch.setattr(recording.collect, "record", lambda *a: (recordings.append(a), original(*a))[1])
     return recordings
 
@@ -123,7 +123,7 @@ def test_an_interrupted_recording_is_gone_on_from(elsewhere, monkeypatch, capsys
     drive = recording.collect.record
 
     def interrupted(*given):
-        yield from itertools.islice(drive(*given), 7)
+        yield from itertools.islice(drive(*given), 5)
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
@@ -131,9 +131,9 @@ def test_an_interrupted_recording_is_gone_on_from(elsewhere, monkeypatch, capsys
         with pytest.raises(KeyboardInterrupt):
             recording.recorded(GROUND)
     assert not paths.record_path(GROUND).exists()
-    assert "recording ground once" in (told := capsys.readouterr().err) and "kept 7 of 20" in told
+    assert "recording ground once" in (told := capsys.readouterr().err) and "kept 5 of 12" in told
     whole = recording.recorded(GROUND)
-    assert elsewhere[-1][-1] == 7, "only what was missing is driven"
+    assert elsewhere[-1][-1] == 5, "only what was missing is driven"
     assert [path.name for path in paths.record_path(GROUND).parent.iterdir()] == ["record.safetensors"]
     fresh = recording.recorded(GROUND, paths.record_path(GROUND).with_name("fresh.safetensors"))
     assert whole.digest() == fresh.digest(), "the same data as in one go"
