@@ -39,8 +39,8 @@ def live(request: pytest.FixtureRequest) -> Iterator[Live]:
     channel = server.Truth("127.0.0.1", truth_port)
     thread = threading.Thread(target=server.serve, args=([autopilot], link, WallClock(), stop.is_set, channel))
     thread.start()
+    there = open_link(f"udpout:127.0.0.1:{link.port}")  # type: ignore[union-attr]
     try:
-        there = open_link(f"udpout:127.0.0.1:{link.port}")  # type: ignore[union-attr]
         vehicle = LiveVehicle(there, QUADROTOR, height=2.0, truth=Truth(truth_port, 1), tap=frames.append)
         try:
             yield vehicle, autopilot, frames
@@ -49,8 +49,8 @@ def live(request: pytest.FixtureRequest) -> Iterator[Live]:
     finally:
         stop.set()
         thread.join()
-        link.close()
-        channel.close()
+        for end in (there, link, channel):
+            end.close()
 
 
 def setpoints(frames: list[Frame]) -> list[tuple[float, float, float]]:
