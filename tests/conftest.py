@@ -16,7 +16,7 @@ from deploy.data import recording, store
 from safety.model_set import Recipe
 from tests.robots import GROUND, QUADROTOR
 
-FLIGHTS = 80  # trajectories of the quadrotor, recorded in half a minute
+FLIGHTS = 60  # trajectories of the quadrotor, recorded in half a minute
 TRAJECTORIES = 50  # enough for every check of the certificates, recorded in ten seconds
 
 

@@ -26,7 +26,7 @@ def taken(obstacles, pose, rng, error=0.01, turn=0.02, speed=0.0):
     return Scan(ranges, FAN, seen, far=FAR, least_width=WIDTH, speed=speed, **known)
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=8, deadline=None)
 @given(st.integers(0, 100_000))
 def test_what_is_remembered_is_free(seed):
     rng = np.random.default_rng(seed)

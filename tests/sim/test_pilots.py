@@ -46,14 +46,14 @@ def share(flights: list[dict[str, Any]], key: str) -> float:
 
 @pytest.mark.parametrize(("arena", "least"), [("default", 0.40), ("dense", 0.65)])
 def test_greed_collides_often_enough(arena: str, least: float) -> None:
-    flights = fly("greedy", arena, 100)
+    flights = fly("greedy", arena, 60)
     assert least <= share(flights, "collision") <= 0.9
     assert share(flights, "collision") + share(flights, "at_goal") == 1.0
     assert sum(flight["outside"] for flight in flights) == 0
 
 
 def test_knowing_the_map_reaches_every_goal_fast_and_keeps_away() -> None:
-    flights = fly("astar", "default", 40)
+    flights = fly("astar", "default", 20)
     assert share(flights, "at_goal") == 1.0
     speeds = np.concatenate([flight["speeds"] for flight in flights])
     assert speeds.mean() > 4.0

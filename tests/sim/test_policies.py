@@ -43,19 +43,19 @@ def share(results: list[dict[str, float]], key: str) -> float:
     return sum(result[key] for result in results) / len(results)
 
 
-@pytest.mark.parametrize(("arena", "least"), [("default", 0.40), ("dense", 0.65)])
+@pytest.mark.parametrize(("arena", "least"), [("default", 0.35), ("dense", 0.6)])
 def test_greed_collides_often_enough(arena: str, least: float) -> None:
-    results = play("greedy", arena, 150)
+    results = play("greedy", arena, 70)
     assert least <= share(results, "collision") <= 0.9
     assert share(results, "outside") == 0.0
 
 
 def test_knowing_the_map_reaches_every_goal_and_keeps_away() -> None:
-    results = play("astar", "default", 50)
+    results = play("astar", "default", 25)
     assert share(results, "at_goal") == 1.0
     assert share(results, "collision") == 0.0
     assert share(results, "outside") == 0.0
-    assert sorted(result["least"] for result in results)[2] > 0.08
+    assert sorted(result["least"] for result in results)[1] > 0.08
     assert sum(result["near"] for result in results) <= 0.01 * sum(result["steps"] for result in results)
 
 
