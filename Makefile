@@ -24,9 +24,9 @@ check: setup
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
-# Real time in one process, whole runs in another, the rest beside them in a third (tests/conftest.py); what was skipped, and why.
+# Real time in one process, whole runs in another, then the rest in both (tests/conftest.py); what was skipped, and why.
 unit: setup
-	$(BIN)/python -m pytest -m "not long" -n 3 --dist loadscope --no-loadscope-reorder -rs
+	$(BIN)/python -m pytest -m "not long" -n 2 --dist loadscope --no-loadscope-reorder -rs
 
 # For every save: no whole runs, no flights, no trainings.
 test-fast: setup
