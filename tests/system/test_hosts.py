@@ -12,7 +12,7 @@ from learner.config import LearnerConfig
 from logs.reader import read
 from tests.system.runs import until
 
-STEPS, WINDOW = 500, LearnerConfig().window
+STEPS, WINDOW = 900, LearnerConfig().window
 CLOCKS = {2: -7.0, 3: 5.0}
 ACTOR = "actor-ground-0"
 
