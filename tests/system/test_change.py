@@ -7,7 +7,7 @@ from logs.reader import open_log
 from messaging import brakeline_pb2 as pb
 from tests.system.runs import Run, brakeline, until
 
-BEFORE, DURING, AFTER = 600, 3500, 500  # steps of both actors
+BEFORE, DURING, AFTER = 800, 8000, 1000  # steps of both actors
 ENDLESS = 100_000  # the run is ended when it has shown what is wanted, however long the new model set takes to make
 
 
@@ -40,8 +40,8 @@ def test_a_payload_is_noticed_and_a_new_model_set_takes_over_in_mid_run(data_fol
     recorded = [step for _, step in taken if step.index < BEFORE // 2]
     loaded = [step for i, step in taken if step.index > BEFORE // 2 and i < last]
     anew = [step for i, step in taken if i > last + 20]  # those on their way were decided on by the old one
-    assert len(anew) > 300
+    assert len(anew) > 500
     assert share(recorded) <= 0.01
     assert share(loaded) > 0.05, "the old model set does not know the payload"
     assert share(anew) <= max(2.0 * published["bound_step"], 0.02)
-    assert published["bound_step"] < 0.12
+    assert published["bound_step"] < 0.05
