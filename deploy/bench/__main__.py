@@ -22,6 +22,7 @@ from deploy.bench import (
     askers,
     chaos,
     costs,
+    crowd,
     decide,
     environment,
     fuzz,
@@ -50,8 +51,12 @@ class Bench:
     """Of chaos and fuzz."""
     kills: int = 100
     """Of chaos."""
+    delay: float = 0.0
+    """Of chaos: s each way between actors and routers."""
     messages: int = 1_000_000
     """Of fuzz."""
+    rate: int = crowd.JUNK
+    """Of crowd: junk messages /s of each sender."""
 
 
 @dataclass(frozen=True)
@@ -76,8 +81,9 @@ BENCHMARKS = {
     "logs-2gb": Benchmark(logs, lambda _: logs.run_large(), asked=True),
     "fuzz": Benchmark(fuzz, lambda given: fuzz.fuzz(given.messages, given.seed), asked=True),
     "manners": Benchmark(manners, lambda _: manners.run(), asked=True),
+    "crowd": Benchmark(crowd, lambda given: crowd.run(given.rate), asked=True),
     "costs": Benchmark(costs, lambda _: costs.run(), asked=True),
-    "chaos": Benchmark(chaos, lambda given: chaos.chaos(given.kills, given.seed), asked=True),
+    "chaos": Benchmark(chaos, lambda given: chaos.chaos(given.kills, given.seed, given.delay), asked=True),
 }
 
 

@@ -115,7 +115,7 @@ def _crowd(settings: BusSettings, questions: list[bytes], askers: int, out: Conn
 
 
 @contextmanager
-def _cells(replicas: int, keys: Path) -> Iterator[tuple[list[str], list[int], list[int]]]:
+def cells(replicas: int, keys: Path) -> Iterator[tuple[list[str], list[int], list[int]]]:
     """Routers, each linked to the first, with a service each: endpoints, and process ids of services and routers."""
     spawn = spawning()
     stop, endpoints = spawn.Event(), [free_endpoint("tls") for _ in range(replicas)]
@@ -197,7 +197,7 @@ def run() -> Figures:
             question.voucher = notary.voucher(question, robot_named(question.robot))
         questions = [question.SerializeToString() for question in asked]
         for replicas in REPLICAS:
-            endpoints, services, routers = stack.enter_context(_cells(replicas, keys))
+            endpoints, services, routers = stack.enter_context(cells(replicas, keys))
             for askers in ASKERS:
                 row = _row(askers, endpoints, services, routers, keys, questions)
                 figures[f"{askers} askers, {replicas} replicas"] = row

@@ -1,6 +1,6 @@
 """A run over five hosts in which everything dies: processes and routers by `kill -9`, cables by being pulled.
 
-python -m deploy.bench chaos [--kills 100] [--seed 0]
+python -m deploy.bench chaos [--kills 100] [--seed 0] [--delay 0.01]
 
 One fault at a time, drawn at random; the next once everybody is back and both robots go on. Who died is started again,
 as an engine does; learners change their host each time. At the end the learners are told how far to go, and finish.
@@ -154,15 +154,16 @@ class Judged:
         seen[name].add(header.sequence)
 
 
-def chaos(kills: int, seed: int) -> Figures:
-    """
+def chaos(kills: int, seed: int, delay: float = 0.0) -> Figures:
+    """delay: s each way between actors and routers.
+
     Raises:
         NoHosts: namespaces can't be made here; Stuck: the run did not survive.
     """
     with tempfile.TemporaryDirectory(prefix="chaos") as name, Hosts(5, CLOCKS) as hosts:
         folder = Path(name)
         hosts.join(1, 2)
-        with Fleet(folder, hosts, ROBOTS, seed=seed) as fleet:
+        with Fleet(folder, hosts, ROBOTS, seed=seed, delay=delay) as fleet:
             fleet.start()
             run = Chaos(fleet, Random(seed))
             run.settle()

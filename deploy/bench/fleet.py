@@ -5,7 +5,7 @@ host 2   router-1  safety-1  recorder-1         host 5   learners
 host 3   actors of the first robot
 
 Everybody knows both routers and goes to the other when its own is gone; the routers have a cable between them besides
-the switch. The clocks of three hosts are hours off.
+the switch. The clocks of three hosts are hours off. With a delay, the actors' cables to the routers are long ones.
 """
 
 from __future__ import annotations
@@ -71,6 +71,7 @@ class Fleet:
     steps: int = 100_000  # of each robot
     seed: int = 0
     recorders: int = 2
+    delay: float = 0.0  # s each way between actors and routers, and as much again at the most, at random
     learning: tuple[object, ...] = SMALL
     metrics: Metrics = field(default_factory=Metrics)
     spots: dict[str, Spot] = field(default_factory=dict)
@@ -93,7 +94,8 @@ class Fleet:
                 "--resume-if-any", "--steps", self.steps, "--seed", self.seed,
                 "--learner.checkpoint-every", 300, *self.learning, *self._to(1 + i),
             )  # fmt: skip
-            self._add(f"actor-{robot}-0", 3 + i, "actor", robot, "--seed", self.seed, *self._to(1 + i))
+            to = self._far(3 + i, 1 + i) if self.delay else self._to(1 + i)
+            self._add(f"actor-{robot}-0", 3 + i, "actor", robot, "--seed", self.seed, *to)
 
     def log(self, recorder: int) -> Path:
         """Where a recorder writes."""
@@ -101,6 +103,19 @@ class Fleet:
 
     def start(self) -> None:
         """Everything, and look on."""
+        for host in range(3, 3 + len(self.robots)) if self.delay else ():
+            ports = [f"0.0.0.0:{PORT + i}={self.hosts.address(1 + i)}:{PORT}" for i in (0, 1)]
+            words = [
+                *PYTHON,
+                "-m",
+                "deploy.bench.delay",
+                *ports,
+                "--delay",
+                str(self.delay),
+                "--jitter",
+                str(self.delay),
+            ]
+            self.hosts.start(host, words, self.folder / f"delay-{host}.out")
         for name in self.spots:
             self.launch(name)
         self._bus = Bus(BusSettings(connect=self._endpoints(1), keys=self.folder / "keys", patience=PATIENCE), "viewer")
@@ -175,7 +190,7 @@ class Fleet:
     def _prepare(self) -> None:
         keys = self.folder / "keys"
         authority = Authority(keys)
-        hosts = [self.hosts.address(i) for i in (1, 2)] + [self.hosts.joined(i) for i in (1, 2)]
+        hosts = [self.hosts.address(i) for i in (1, 2, 3, 4)] + [self.hosts.joined(i) for i in (1, 2)]
         names = [f"{role}-{i}" for role in ("router", "safety", "recorder") for i in (0, 1)]
         names += [name for robot in self.robots for name in (f"learner-{robot}", f"actor-{robot}-0")]
         for name in ("viewer", *names):
@@ -196,6 +211,10 @@ class Fleet:
     def _to(self, first: int) -> tuple[str, ...]:
         """Both routers, the one that is to be asked first in front."""
         return ("--connect", *self._endpoints(first))
+
+    def _far(self, host: int, first: int) -> tuple[str, ...]:
+        """The same, at the far end of a host's long cables."""
+        return ("--connect", *(f"tls/{self.hosts.address(host)}:{PORT + i - 1}" for i in (first, 3 - first)))
 
     def _endpoints(self, first: int) -> tuple[str, ...]:
         return tuple(f"tls/{self.hosts.address(i)}:{PORT}" for i in (first, 3 - first))

@@ -10,6 +10,7 @@ from collections.abc import Iterable
 from typing import Any
 
 from messaging.bus.identity import role_of
+from messaging.bus.keys import own_key
 from messaging.topics import HEALTH, TOPICS, Delivery, Topic
 
 ALIVE = "alive/{source}"  # key of the token of each process that lives
@@ -56,12 +57,14 @@ def grants(name: str, prefix: str) -> list[Grant]:
         everywhere = f"{prefix}/{topic.at()}"
         question = topic.delivery is Delivery.QUERY
         if role in topic.publishers and question:
-            found += [(INGRESS, ("query",), everywhere), (EGRESS, ("reply", "declare_queryable"), everywhere)]
+            for key in (everywhere, own_key(everywhere, "*")):
+                found += [(INGRESS, ("query",), key), (EGRESS, ("reply", "declare_queryable"), key)]
         elif role in topic.publishers:
             found += [(INGRESS, ("put",), key) for key in _published(topic, name, prefix)]
             found.append((EGRESS, ("declare_subscriber",), everywhere))
         if role in topic.listeners and question:
-            found += [(INGRESS, ("declare_queryable", "reply"), everywhere), (EGRESS, ("query",), everywhere)]
+            for key in (everywhere, own_key(everywhere, "*")):
+                found += [(INGRESS, ("declare_queryable", "reply"), key), (EGRESS, ("query",), key)]
         elif role in topic.listeners:
             found += [(INGRESS, ("declare_subscriber",), everywhere), (EGRESS, ("put",), everywhere)]
     found += [(INGRESS, ("liveliness_token",), f"{prefix}/{key}") for key in _own(ALIVE, name)]

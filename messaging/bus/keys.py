@@ -28,6 +28,11 @@ def exact_key(topic: Topic, names: dict[str, str]) -> str:
     return key
 
 
+def own_key(key: str, who: object) -> str:
+    """Where one of those that serve a question at `key` is asked by itself: its session's id comes last."""
+    return f"{key}/{who}"
+
+
 def names_of(topic: Topic, key: str) -> dict[str, str]:
     """The names in a key of the topic."""
     parts = zip(topic.key.split("/"), key.split("/"), strict=False)

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import zenoh
 
 from messaging import brakeline_pb2 as pb
 from messaging.bus.errors import Busy, Expired
-from messaging.bus.subscription import Subscription
+from messaging.bus.subscription import Receiving
 from messaging.bus.turns import Turns
 from messaging.tolerant import Tolerance
 
@@ -27,39 +28,38 @@ class Question:
     until: float
 
 
-class Service(Subscription):
-    """Two threads take questions in turn: one notes when they come in while the other answers, and whoever takes one in
-    when nobody answers does it itself, for to wake another costs a tenth of a millisecond.
+class Service(Receiving):
+    """Two threads take the questions of a receiver in turn: one notes when they come in while the other answers, and
+    whoever takes one in when nobody answers does it itself, for to wake another costs a tenth of a millisecond. Who
+    asks at another receiver waits for its turn like the others.
 
     How long an answer is of use stands in a question's attachment: seconds from when it was asked, as text; they count
     from its receipt, for the clocks of two machines agree on durations only.
     """
 
-    def __init__(self, name: str, receiver: Any, handler: Callable[[bytes], bytes], tolerance: Tolerance) -> None:
-        self._handler, self._turns = handler, Turns[Question]()
-        self._receiving, self._state = threading.Lock(), threading.Lock()
+    def __init__(
+        self, name: str, receivers: Sequence[Any], handler: Callable[[bytes], bytes], tolerance: Tolerance
+    ) -> None:
+        self._handler, self._tolerance, self._turns = handler, tolerance, Turns[Question]()
+        self._state = threading.Lock()
         self._answering = False
-        super().__init__(name, receiver, self._answer, tolerance)
-        self._other = threading.Thread(target=self._run, name=f"bus {name} too", daemon=True)
-        self._other.start()
+        runs = []
+        for receiver in receivers:
+            run = partial(self._take, receiver.handler, threading.Lock())
+            runs += [run, run]
+        super().__init__(name, receivers, runs)
 
-    def join(self, timeout: float) -> None:
-        super().join(timeout)
-        if self._other is not threading.current_thread():
-            self._other.join(timeout)
-
-    def _run(self) -> None:
-        questions = self._receiver.handler
+    def _take(self, questions: Any, receiving: threading.Lock) -> None:
         while True:
             try:
-                with self._receiving:
+                with receiving:
                     query = questions.recv()
             except zenoh.ZError:  # closed
                 return
             answering = self._admit(query)
             while answering and (question := self._next()) is not None:
                 with self._tolerance.over(self._name):
-                    self._work(question)
+                    self._answer(question)
 
     def _admit(self, query: zenoh.Query) -> bool:
         """Let a question wait for its turn; True: nobody answers now."""

@@ -17,14 +17,13 @@ from typing import Any, Self
 import zenoh
 from zenoh.handlers import FifoChannel, RingChannel
 
-from messaging import brakeline_pb2 as pb
 from messaging.bus.access import ALIVE
-from messaging.bus.errors import Late, NoReply, Refused, typed
-from messaging.bus.keys import exact_key, key_of
+from messaging.bus.asking import Asker
+from messaging.bus.keys import exact_key, key_of, own_key
 from messaging.bus.publisher import Publisher
 from messaging.bus.service import Service
 from messaging.bus.settings import BusSettings, open_session
-from messaging.bus.subscription import Listener, Sample, Subscription
+from messaging.bus.subscription import Listener, Receiving, Sample, Subscription
 from messaging.plausible import NAME
 from messaging.tolerant import Tolerance
 from messaging.topics import Delivery, Topic
@@ -56,11 +55,11 @@ class Bus:
         self.tolerance = Tolerance()
         self._lock = threading.Lock()
         self._publishers: dict[str, Publisher] = {}
-        self._queriers: dict[tuple[str, float], zenoh.Querier] = {}
-        self._subscriptions: list[Subscription] = []
+        self._subscriptions: list[Receiving] = []
         self._telemetry = open_session(settings, source)
         # A router is one session; the two links of each client end in it separately.
         self._queries = self._telemetry if settings.listen else open_session(settings, source)
+        self._asker = Asker(self._queries)
         self._token = self._telemetry.liveliness().declare_token(self._full(ALIVE.format(source=source)))
 
     def __enter__(self) -> Self:
@@ -125,16 +124,22 @@ class Bus:
         self._keep(listener)
         return listener
 
-    def serve(self, topic: Topic, handler: Callable[[bytes], bytes], **names: str) -> Subscription:
+    def serve(self, topic: Topic, handler: Callable[[bytes], bytes], **names: str) -> Service:
         """Answer the questions of `topic`, one at a time and every asker's in turn, in a thread of its own.
 
         What the handler raises goes back to who asked as `Refused` (with the exception's `field`, if it has one) and is
-        logged. A question whose asker waits no longer is dropped. Several processes may serve one topic: a question
-        goes to one of them, and to another if that one is gone.
+        logged. A question whose asker waits no longer is dropped. Several processes may serve one topic: an asker's
+        questions go to the one that answered first, and to another if that one is gone or late.
         """
         key = key_of(topic, names)
-        receiver = self._queries.declare_queryable(self._full(key), FifoChannel(FIFO), complete=True)
-        return self._keep(Service(key, receiver, handler, self.tolerance))
+        shared = self._full(key)
+        receivers = [
+            self._queries.declare_queryable(at, FifoChannel(FIFO), complete=True)
+            for at in (own_key(shared, self._queries.zid()), shared)
+        ]
+        service = Service(key, receivers, handler, self.tolerance)
+        self._keep(service)
+        return service
 
     def ask(self, topic: Topic, payload: bytes, timeout: float, **names: str) -> bytes:
         """The answer to a question, within `timeout` s.
@@ -145,25 +150,7 @@ class Bus:
             Refused: the service answered with an error.
             ValueError: a name is missing or unknown.
         """
-        key = exact_key(topic, names)
-        refusal: Refused | None = None
-        late = False
-        with typed(f"cannot ask {key}"):
-            querier = self._querier(key, timeout)
-            source = zenoh.SourceInfo(querier.id, 0)  # whose turn it is
-            for reply in querier.get(payload=payload, attachment=f"{timeout:.6g}", source_info=source):
-                if reply.ok is not None:
-                    return reply.ok.payload.to_bytes()
-                assert reply.err is not None
-                if reply.err.encoding == zenoh.Encoding.APPLICATION_PROTOBUF:
-                    refusal = Refused(pb.Error.FromString(reply.err.payload.to_bytes()))
-                else:  # Zenoh's own error reply: its timer ran out
-                    late = True
-        if refusal is not None:
-            raise refusal
-        if late:
-            raise Late(f"no answer to {key} within {timeout * 1e3:.0f} ms")
-        raise NoReply(f"nobody answers {key}: is the service running, and on the same bus?")
+        return self._asker.ask(self._full(exact_key(topic, names)), payload, timeout)
 
     def living(self, timeout: float = 1.0) -> frozenset[str]:
         """The sources that are alive now, this one included."""
@@ -181,29 +168,16 @@ class Bus:
         def take(sample: zenoh.Sample) -> None:
             handler(str(sample.key_expr).rsplit("/", 1)[1], sample.kind == zenoh.SampleKind.PUT)
 
-        return self._keep(Subscription("alive/*", receiver, take, self.tolerance))
+        watching = Subscription("alive/*", receiver, take, self.tolerance)
+        self._keep(watching)
+        return watching
 
     def _full(self, key: str) -> str:
         return f"{self.settings.prefix}/{key}"
 
-    def _keep(self, subscription: Subscription) -> Subscription:
+    def _keep(self, receiving: Receiving) -> None:
         with self._lock:
-            self._subscriptions.append(subscription)
-        return subscription
-
-    def _querier(self, key: str, timeout: float) -> zenoh.Querier:
-        with self._lock:
-            if (key, timeout) not in self._queriers:
-                self._queriers[key, timeout] = self._queries.declare_querier(
-                    self._full(key),
-                    target=zenoh.QueryTarget.BEST_MATCHING,
-                    consolidation=zenoh.ConsolidationMode.NONE,  # the first answer is the answer
-                    timeout=timeout,
-                    priority=zenoh.Priority.REAL_TIME,
-                    congestion_control=zenoh.CongestionControl.DROP,  # never stall past the deadline
-                    express=True,
-                )
-            return self._queriers[key, timeout]
+            self._subscriptions.append(receiving)
 
     def _close_sessions(self) -> None:
         closables: list[Any] = [self._queries, self._telemetry]  # Any: their stubs are untyped here

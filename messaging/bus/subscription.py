@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -55,26 +55,38 @@ def _said(message: Any, field: str) -> list[str]:
     return said if field == "robot" else [*said, str(message.header.source)]
 
 
-class Subscription:
-    """A thread that hands samples, or questions, to a handler, one by one, until `close`."""
+class Receiving:
+    """Threads that take from receivers until `close`."""
 
-    def __init__(self, name: str, receiver: Any, work: Callable[[Any], None], tolerance: Tolerance) -> None:
-        self._name, self._receiver, self._work, self._tolerance = name, receiver, work, tolerance
-        self._thread = threading.Thread(target=self._run, name=f"bus {name}", daemon=True)
-        self._thread.start()
+    def __init__(self, name: str, receivers: Sequence[Any], runs: Sequence[Callable[[], None]]) -> None:
+        """runs: what each thread does; it ends when its receiver is closed."""
+        self._name, self._receivers = name, receivers
+        self._threads = [threading.Thread(target=run, name=f"bus {name}", daemon=True) for run in runs]
+        for thread in self._threads:
+            thread.start()
 
     def close(self) -> None:
-        """Stop receiving, and wait for the sample in hand for a moment."""
+        """Stop receiving, and wait for what is in hand for a moment."""
         with typed(f"closing {self._name}"):
-            self._receiver.undeclare()
+            for receiver in self._receivers:
+                receiver.undeclare()
         self.join(1.0)
 
     def join(self, timeout: float) -> None:
-        if self._thread is not threading.current_thread():
-            self._thread.join(timeout)
+        for thread in self._threads:
+            if thread is not threading.current_thread():
+                thread.join(timeout)
+
+
+class Subscription(Receiving):
+    """A thread that hands samples to a handler, one by one, until `close`."""
+
+    def __init__(self, name: str, receiver: Any, work: Callable[[Any], None], tolerance: Tolerance) -> None:
+        self._samples, self._work, self._tolerance = receiver.handler, work, tolerance
+        super().__init__(name, [receiver], [self._run])
 
     def _run(self) -> None:
-        for item in self._receiver.handler:
+        for item in self._samples:
             with self._tolerance.over(self._name):
                 self._work(item)
 

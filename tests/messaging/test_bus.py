@@ -6,6 +6,7 @@ import subprocess
 import threading
 import time
 from collections.abc import Callable
+from contextlib import ExitStack
 
 import pytest
 
@@ -194,6 +195,46 @@ def test_another_replica_answers_when_one_is_killed(join: Join, spawn: Spawn, en
     replicas[first].kill()
     other = "ab".replace(first, "").encode()
     eventually(lambda: answers(actor) == other + b":?")
+
+
+def test_of_replicas_behind_linked_routers_one_works_and_another_when_it_is_slow_or_gone() -> None:
+    one, other = free_endpoint(), free_endpoint()
+    heard: dict[str, int] = {"a": 0, "b": 0}
+    slow: set[str] = set()
+
+    def answerer(name: str) -> Callable[[bytes], bytes]:
+        def answer(payload: bytes) -> bytes:
+            heard[name] += 1
+            if name in slow:
+                time.sleep(0.5)
+            return name.encode()
+
+        return answer
+
+    with ExitStack() as stack:
+        stack.enter_context(Bus(BusSettings(listen=(one,)), "router-0"))
+        stack.enter_context(Bus(BusSettings(listen=(other,), connect=(one,)), "router-1"))
+        there = {"a": one, "b": other}
+        services = {
+            name: stack.enter_context(Bus(BusSettings(connect=(at,)), f"safety-{name}")) for name, at in there.items()
+        }
+        for name, bus in services.items():
+            bus.serve(DECIDE, answerer(name))
+        asker = stack.enter_context(Bus(BusSettings(connect=(other,)), "actor-0"))
+        eventually(lambda: answers(asker) is not None and min(heard.values()) > 0, 20.0)
+        before = sum(heard.values())
+        said = {answers(asker) for _ in range(50)}
+        assert len(said) == 1 and sum(heard.values()) - before == 50, "each question is answered once"
+        first = (said.pop() or b"").decode()
+        second = "ab".replace(first, "")
+        slow.add(first)
+        with pytest.raises(Late):
+            asker.ask(DECIDE, b"?", timeout=0.1, robot="ground")
+        assert answers(asker) == second.encode(), "the next goes to all, and who is quick is asked from then on"
+        assert answers(asker) == second.encode()
+        services[second].close()
+        slow.clear()
+        assert asker.ask(DECIDE, b"?", timeout=1.0, robot="ground") == first.encode(), "of one that is gone it is known"
 
 
 def test_a_question_does_not_wait_behind_telemetry(join: Join) -> None:

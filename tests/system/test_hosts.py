@@ -1,5 +1,6 @@
-"""A run over five hosts whose clocks are hours apart: robots that are cut off brake, everybody finds another router and
-another replica, the learner moves, and every step counts once. The long form is `python -m deploy.bench chaos`."""
+"""A run over five hosts, robots far from the rest, whose clocks are hours apart: robots that are cut off brake,
+everybody finds another router and another replica, the learner moves, and every step counts once. The long form is
+`python -m deploy.bench chaos`."""
 
 from collections import Counter
 
@@ -12,6 +13,7 @@ from learner.config import LearnerConfig
 from logs.reader import read
 from tests.system.runs import until
 
+DELAY = 0.005  # s each way, and up to as much again, between the robot and the routers
 STEPS, WINDOW = 900, LearnerConfig().window
 CLOCKS = {2: -7.0, 3: 5.0}
 ACTOR = "actor-ground-0"
@@ -28,7 +30,7 @@ def hosts():
 
 
 def test_hosts_are_cut_off_killed_and_left_and_the_run_ends_with_every_step_counted_once(hosts, data_folder, tmp_path):
-    with Fleet(tmp_path, hosts, steps=STEPS) as fleet:
+    with Fleet(tmp_path, hosts, steps=STEPS, delay=DELAY) as fleet:
         fleet.start()
 
         def go_on(steps, what):

@@ -1,0 +1,208 @@
+"""A 50 Hz asker alone, and again while an authorised actor sends junk, sessions idle, and a listener has stopped.
+
+python -m deploy.bench crowd [--rate 5000]
+
+The junk is noise, and requests that lack nearly everything: as many steps a second at one session as questions at
+another, both with an actor's certificate. The listener may hear steps, and its process is stopped (SIGSTOP). The asker
+drives one robot from the questions of a trained policy, each with its deadline. All share this machine's cores with the
+router and the service, as they would not where it matters.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import tempfile
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from multiprocessing.connection import Connection
+from multiprocessing.synchronize import Event
+from pathlib import Path
+from random import Random
+from typing import Any
+
+import numpy as np
+import psutil
+import zenoh
+
+from deploy.bench import situations
+from deploy.bench.askers import cells
+from deploy.bench.timing import Figures
+from deploy.interpreter import spawning
+from messaging import brakeline_pb2 as pb
+from messaging.bus import Bus, BusError, BusSettings, Late
+from messaging.bus.authority import Authority
+from messaging.bus.settings import open_session
+from messaging.robots import robot_named
+from messaging.topics import DECIDE, STEP
+from safety.client import ask
+from safety.vouch import Notary, write_key
+
+RATE = 50.0  # Hz of the asker
+DEADLINE = 0.1  # s
+SECONDS = 20.0  # of asking, each time
+IDLE = 500  # sessions
+EACH = 125  # of them in one process
+JUNK = 5000  # messages /s of each sender
+LARGEST = 600  # bytes of junk
+BURST = 0.002  # s between two bursts of junk
+
+
+def _junk(settings: BusSettings, question: bool, rate: int, sent: Connection, stop: Event) -> None:
+    """Send noise until told to stop; says how many messages a second."""
+    random = Random(question)
+    noise = [random.randbytes(random.randrange(1, LARGEST)) for _ in range(256)]
+    noise += [
+        pb.RequestBatch(requests=[pb.Request(robot="ground", state=[0.0] * n)]).SerializeToString() for n in range(9)
+    ]
+    session: Any = open_session(settings, "actor-0")  # Any: parts of its stubs are untyped
+    with session:
+        step = f"{settings.prefix}/{STEP.at(robot='ground', source='actor-0')}"
+        publisher = session.declare_publisher(step, congestion_control=zenoh.CongestionControl.BLOCK)
+        querier = session.declare_querier(f"{settings.prefix}/{DECIDE.at(robot='ground')}", timeout=DEADLINE)
+
+        def send(payload: bytes) -> None:
+            if question:
+                querier.get(lambda reply: None, payload=payload)
+            else:
+                publisher.put(payload)
+
+        begun, count = time.monotonic(), 0
+        while not stop.is_set():
+            for _ in range(int((time.monotonic() - begun) * rate) - count):
+                send(noise[count % len(noise)])
+                count += 1
+            time.sleep(BURST)
+        sent.send(count / (time.monotonic() - begun))
+
+
+def _idle(settings: BusSettings, sessions: int, up: Connection, stop: Event) -> None:
+    """Sessions that say nothing."""
+    with ExitStack() as stack:
+        for _ in range(sessions):
+            stack.enter_context(open_session(settings, "actor-0"))
+        up.send(sessions)
+        stop.wait()
+
+
+def _listen(settings: BusSettings, up: Connection, stop: Event) -> None:
+    """Who hears steps, and will be stopped."""
+    with Bus(settings, "recorder") as bus:
+        bus.subscribe(STEP, lambda sample: None)
+        up.send(1)
+        stop.wait()
+
+
+@contextmanager
+def _crowd(settings: BusSettings, rate: int) -> Iterator[dict[str, float]]:
+    """All that would starve an asker; at the end what it came to."""
+    spawn, said = spawning(), {"junk steps /s": 0.0, "junk questions /s": 0.0, "idle sessions": 0.0}
+    stop, started = spawn.Event(), []
+
+    def begin(target: Any, *given: Any) -> Connection:
+        mine, theirs = spawn.Pipe(duplex=False)
+        started.append(spawn.Process(target=target, args=(settings, *given, theirs, stop), daemon=True))
+        started[-1].start()
+        return mine
+
+    try:
+        begin(_listen).recv()
+        stalled = started[-1].pid
+        assert stalled is not None
+        idle = [begin(_idle, EACH) for _ in range(IDLE // EACH)]
+        said["idle sessions"] = float(sum(pipe.recv() for pipe in idle))
+        os.kill(stalled, signal.SIGSTOP)
+        senders = {"junk steps /s": begin(_junk, False, rate), "junk questions /s": begin(_junk, True, rate)}
+        time.sleep(3.0)  # until they are at it
+        yield said
+        stop.set()
+        said |= {name: pipe.recv() for name, pipe in senders.items()}
+    finally:
+        stop.set()
+        for process in reversed(started):
+            if process.pid:
+                os.kill(process.pid, signal.SIGCONT)
+            process.join(10.0)
+            if process.is_alive():
+                process.kill()
+
+
+def _ask(settings: BusSettings, questions: list[pb.Request]) -> dict[str, float]:
+    """At 50 Hz, whatever comes."""
+    took: list[float] = []
+    late = unanswered = 0
+    with Bus(settings, "client") as bus:
+        begun = time.monotonic()
+        for number in range(int(SECONDS * RATE)):
+            time.sleep(max(0.0, begun + number / RATE - time.monotonic()))
+            before = time.perf_counter()
+            try:
+                ask(bus, [questions[number % len(questions)]], DEADLINE)
+            except Late:
+                late += 1
+            except BusError:
+                unanswered += 1
+            else:
+                took.append(time.perf_counter() - before)
+    p50, p99, most = np.percentile(took or [np.nan], (50, 99, 100)) * 1e3
+    return {
+        "asked": SECONDS * RATE,
+        "late": late,
+        "no answer": unanswered,
+        "p50 ms": p50,
+        "p99 ms": p99,
+        "longest ms": most,
+    }
+
+
+def run(rate: int = JUNK) -> Figures:
+    """Junk messages of each kind at `rate` [1/s]."""
+    with tempfile.TemporaryDirectory() as name:
+        keys = Path(name) / "keys"
+        authority = Authority(keys)
+        for one in ("router-0", "safety-0", "client", "actor-0", "recorder"):
+            authority.issue(one)
+        write_key(keys)
+        notary, questions = Notary.of(keys), situations.messages("trained")
+        for question in questions:
+            question.voucher = notary.voucher(question, robot_named(question.robot))
+        with cells(1, keys) as (endpoints, services, routers):
+            settings = BusSettings(connect=tuple(endpoints), keys=keys)
+            alone = _ask(settings, questions)
+            with _crowd(settings, rate) as said:
+                processes = {"service": psutil.Process(services[0]), "router": psutil.Process(routers[0])}
+                before = {which: _used(process) for which, process in processes.items()}
+                with _stalls() as worst:
+                    crowded = _ask(settings, questions)
+                crowded["the machine's longest stall ms"] = 1e3 * worst[0]
+                for which, process in processes.items():
+                    crowded[f"{which}, cores"] = (_used(process) - before[which]) / SECONDS
+    return {"alone": alone, "in the crowd": crowded | said}
+
+
+def _used(process: psutil.Process) -> float:
+    """s of processor time so far."""
+    times = process.cpu_times()
+    return float(times.user + times.system)
+
+
+@contextmanager
+def _stalls() -> Iterator[list[float]]:
+    """[s] that a thread which only sleeps was woken too late, at the most."""
+    stop, worst = threading.Event(), [0.0]
+
+    def watch() -> None:
+        while not stop.is_set():
+            before = time.monotonic()
+            time.sleep(0.001)
+            worst[0] = max(worst[0], time.monotonic() - before - 0.001)
+
+    thread = threading.Thread(target=watch, daemon=True)
+    thread.start()
+    try:
+        yield worst
+    finally:
+        stop.set()
+        thread.join()
