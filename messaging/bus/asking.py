@@ -13,15 +13,20 @@ from messaging.bus.errors import Late, NoReply, Refused, typed
 from messaging.bus.keys import own_key
 
 RENEWED = 30.0  # s after which all are asked again: there may be more of them by now, or one that is less busy
+HELD = 1.0  # s for which who was late is asked again: if all are late, to ask all each time makes them later
 AGAIN = 0.1  # of the deadline: all are asked when one is known to be gone before that
 
 
 @dataclass(frozen=True)
 class _Chosen:
-    """Who answered first, and until when (time.monotonic) it alone is asked."""
+    """Who answered first, and since when (time.monotonic) it alone is asked."""
 
     key: str
-    until: float
+    since: float
+
+    @property
+    def age(self) -> float:
+        return time.monotonic() - self.since
 
 
 class Asker:
@@ -37,7 +42,7 @@ class Asker:
         """The answer of one that serves `key`, within `timeout` s; errors as `Bus.ask` says."""
         begun = time.monotonic()
         chosen = self._chosen.get(key)
-        if chosen is not None and begun < chosen.until:
+        if chosen is not None and chosen.age < RENEWED:
             try:
                 return self._answer(key, chosen.key, payload, timeout)
             except NoReply:
@@ -62,8 +67,8 @@ class Asker:
                     refusal = Refused(pb.Error.FromString(reply.err.payload.to_bytes()))
                 else:  # Zenoh's own error reply: its timer ran out
                     late = True
-        self._forget(key)
-        if refusal is not None:
+        self._forget(key, HELD if late or refusal is not None else 0.0)
+        if refusal is not None:  # it may be busy
             raise refusal
         if late:
             raise Late(f"no answer to {key} within {timeout * 1e3:.0f} ms")
@@ -71,13 +76,20 @@ class Asker:
 
     def _choose(self, key: str, own: str) -> None:
         with self._lock:
-            self._chosen[key] = _Chosen(own, time.monotonic() + RENEWED)
+            if (before := self._chosen.get(key)) is not None and before.key != own:
+                self._leave(before)
+            self._chosen[key] = _Chosen(own, time.monotonic())
 
-    def _forget(self, key: str) -> None:
+    def _forget(self, key: str, held: float) -> None:
+        """Who was chosen, unless it was so within `held` s."""
         with self._lock:
-            if (chosen := self._chosen.pop(key, None)) is not None:
-                for known in [known for known in self._queriers if known[0] == chosen.key]:
-                    del self._queriers[known]
+            if (chosen := self._chosen.get(key)) is not None and chosen.age >= held:
+                del self._chosen[key]
+                self._leave(chosen)
+
+    def _leave(self, chosen: _Chosen) -> None:
+        for known in [known for known in self._queriers if known[0] == chosen.key]:
+            del self._queriers[known]
 
     def _querier(self, key: str, timeout: float) -> zenoh.Querier:
         with self._lock:

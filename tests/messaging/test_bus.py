@@ -12,6 +12,7 @@ import pytest
 
 from messaging import brakeline_pb2 as pb
 from messaging.bus import Bus, BusError, BusSettings, Late, Malformed, NoReply, Refused, Sample, Unreachable
+from messaging.bus.asking import HELD
 from messaging.ports import free_endpoint
 from messaging.topics import DECIDE, HEALTH, LOG, STEP, WEIGHTS
 
@@ -228,6 +229,7 @@ def test_of_replicas_behind_linked_routers_one_works_and_another_when_it_is_slow
         first = (said.pop() or b"").decode()
         second = "ab".replace(first, "")
         slow.add(first)
+        time.sleep(HELD)
         with pytest.raises(Late):
             asker.ask(DECIDE, b"?", timeout=0.1, robot="ground")
         assert answers(asker) == second.encode(), "the next goes to all, and who is quick is asked from then on"
