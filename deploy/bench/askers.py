@@ -3,8 +3,8 @@
 python -m deploy.bench askers
 
 The questions are recorded ones of the trained policy, with keys. A replica stands behind a router of its own, and
-askers are spread over the routers; each stays with the replica that answers it first. Askers, routers and services share
-this machine's cores, so what is answered in time is this machine's, all of it together; the processor
+askers are spread over the routers; each stays with the replica that answers it first. Askers, routers and services
+share this machine's cores, so what is answered in time is this machine's, all of it together; the processor
 time that a question costs a service and a router is what can be carried over to others.
 """
 
