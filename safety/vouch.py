@@ -14,13 +14,13 @@ from __future__ import annotations
 import hmac
 import logging
 import secrets
+import struct
+from collections.abc import Sequence
 from pathlib import Path
-
-import numpy as np
 
 from messaging import brakeline_pb2 as pb
 from messaging.files import write_secret
-from messaging.robots import FEEDBACK, Robot
+from messaging.robots import FEEDBACK, HOLD, Robot
 from safety.commitment import UNVERIFIED
 
 log = logging.getLogger("brakeline.safety")
@@ -64,19 +64,20 @@ class Notary:
         """For a decision on a request: the first for the next period, the last for all from there on, when the plan's
         tail no longer changes."""
         m, n = robot.action_dim, robot.horizon
-        plan = _numbers(decision.plan).reshape(n, m)
-        last = np.where(robot.stopping, 0.0, plan[-1])
-        changing = np.flatnonzero((plan != last).any(1))
-        periods = max(2, 2 + int(changing[-1]) if len(changing) else 2)
-        inputs = np.vstack([plan, np.tile(last, (n + 1, 1))])
-        tails, held = inputs.tobytes(), (inputs * _planned(robot)).tobytes()
+        plan = list(decision.plan)
+        last = [0.0 if robot.stop[j] != HOLD else plan[j - m] for j in range(m)]
+        at_end = n
+        while at_end > 0 and plan[(at_end - 1) * m : at_end * m] == last:
+            at_end -= 1
+        inputs = plan + last * (n + 1)
+        tails, held = _bytes(inputs), _bytes(_planned(inputs, robot))
         said, row = _words(robot.name, request.actor, decision.model), 8 * m
         predicted = _prediction(decision)
         return [
             self._mac(
                 said + held[(k - 1) * row : k * row] + tails[k * row : (k + n) * row] + (predicted if k == 1 else b"")
             )
-            for k in range(1, periods + 1)
+            for k in range(1, max(2, 1 + at_end) + 1)
         ]
 
     def vouches(self, request: pb.Request, robot: Robot) -> bool:
@@ -89,8 +90,8 @@ class Notary:
 
     def voucher(self, request: pb.Request, robot: Robot) -> bytes:
         """The one that a request needs."""
-        held = (_numbers(request.input_in_force) * _planned(robot)).tobytes()
-        said = _words(robot.name, request.actor, request.model) + held + _numbers(request.plan).tobytes()
+        held = _bytes(_planned(request.input_in_force, robot))
+        said = _words(robot.name, request.actor, request.model) + held + _bytes(request.plan)
         if request.predicted_center or request.predicted_half_width:
             said += _prediction(request)
         return self._mac(said)
@@ -103,15 +104,18 @@ def _words(robot: str, actor: str, model: str) -> bytes:
     return repr((robot, actor, model)).encode()
 
 
-def _planned(robot: Robot) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
-    """(m,) 1 for each input that is what was planned when it is in force; feedback makes the others of the state."""
-    return np.array([float(rule != FEEDBACK) for rule in robot.stop])
+def _planned(inputs: Sequence[float], robot: Robot) -> Sequence[float]:
+    """Rows of inputs, those at zero that feedback makes of the state: the others are what was planned when in force."""
+    if FEEDBACK not in robot.stop:
+        return inputs
+    m = robot.action_dim
+    return [0.0 if robot.stop[i % m] == FEEDBACK else value for i, value in enumerate(inputs)]
 
 
 def _prediction(message: pb.Request | pb.Decision) -> bytes:
-    return _numbers(message.predicted_center, message.predicted_half_width, [message.predicted_heading]).tobytes()
+    return _bytes([*message.predicted_center, *message.predicted_half_width, message.predicted_heading])
 
 
-def _numbers(*fields: object) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
-    """Fields one after the other; zero has one sign."""
-    return np.concatenate([np.fromiter(field, "<f8") for field in fields]) + 0.0  # type: ignore[call-overload]
+def _bytes(numbers: Sequence[float]) -> bytes:
+    """Doubles, little-endian; zero has one sign."""
+    return struct.pack(f"<{len(numbers)}d", *[number + 0.0 for number in numbers])
