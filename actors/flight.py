@@ -49,6 +49,10 @@ class Unfiltered(ValueError):
     """In real time nobody flies without the filter: its plan is what is flown when nothing else comes."""
 
 
+class NoRoom(ValueError):
+    """Not even hovering can be verified where the flight is to begin."""
+
+
 class Outbox:
     """Publishes in a thread of its own: a receiver that does not drain may block it, and not the flight."""
 
@@ -227,15 +231,29 @@ def prepared(propose: MakePolicy, stages: Sequence[Arena], seed: int) -> Any:
     return policy
 
 
-def answered(question: Ask, robot: Robot, start: Sequence[float], stop: Callable[[], bool]) -> bool:
-    """Wait until the safety service answers about a robot that hovers at the start; False: told to stop."""
-    state = np.zeros(robot.state_dim)
-    state[: robot.position_dim] = start
+def answered(question: Ask, robot: Robot, stage: Arena, filtered: bool, stop: Callable[[], bool]) -> bool:
+    """Wait until the safety service answers about a robot that hovers at the start; False: told to stop.
+
+    filtered: by our own filter, which knows whether it could.
+
+    Raises:
+        NoRoom: hovering there can't be verified, let alone a flight from there.
+    """
+    start = np.array(stage.start[: robot.position_dim])
+    state = np.concatenate([start, np.zeros(robot.state_dim - len(start))])
+    away = stage.shapes.distance(start)
+    seen = [obstacle for obstacle, far in zip(stage.obstacles, away, strict=True) if far <= robot.sight]
     said = ""
     while not stop():
-        request = request_message(Commitment(robot), state, np.zeros(robot.action_dim), [])
+        request = request_message(Commitment(robot), state, np.zeros(robot.action_dim), seen)
         outcome = consult(question, [request], robot)[0]
         if outcome.answer is not None:
+            if filtered and outcome.answer.kind not in ("allowed", "adjusted"):
+                raise NoRoom(
+                    f"not taking off: hovering at the start, {away.min():.2f} m from the nearest obstacle, can't be "
+                    f"verified ({outcome.answer.message.reason}). Where this vehicle drifts to is known too badly for "
+                    "that much room: collect more data, or fly where there is more"
+                )
             return True
         if outcome.failure != said:
             log.info("on the ground, waiting for the safety service: %s", outcome.failure)
@@ -249,7 +267,7 @@ def run(settings: ActorSettings, flight: FlightSettings, arena: Arena, propose: 
     or SIGINT or SIGTERM; then brake, and leave the vehicle to its autopilot.
 
     Raises:
-        Unfiltered, RefusedByLearner, Unreachable, BadLink: with what to do.
+        Unfiltered, NoRoom, RefusedByLearner, Unreachable, BadLink: with what to do.
         MavlinkError: no autopilot, it refuses something, or nobody flies it any more.
     """
     robot = robot_named(settings.robot)
@@ -268,7 +286,7 @@ def run(settings: ActorSettings, flight: FlightSettings, arena: Arena, propose: 
         process.refresh = lambda: process.figures.update(tally.figures(time.monotonic() - started) | rider.figures())
         process.announce()
         question = partial(ask, process.bus, deadline=settings.deadline)
-        if not (rider.join(stop) and answered(question, robot, stages[0].start, stop)):
+        if not (rider.join(stop) and answered(question, robot, stages[0], settings.method == "ddpc", stop)):
             return False
         link, tap = open_link(flight.url), rider.tape.take
         witness = Witness(lambda position: float(arena.shapes.distance(position).min()) - robot.footprint)
