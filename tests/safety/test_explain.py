@@ -12,7 +12,7 @@ from messaging.shapes import Obstacle
 from safety.explain import SIGHT
 from safety.filter import Filter
 from safety.request import ALLOWED
-from tests.safety.test_filter import cylinder, random_request, request
+from tests.safety.asked import cylinder, random_request, request
 
 
 def blocked(ready, requests):

@@ -1,103 +1,19 @@
-"""`decide`: what it lets through is clear of the obstacles, closest to the proposal, and never a dead end."""
+"""`decide`: what it lets through is clear of the obstacles and closest to the proposal, and what it refuses."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from messaging.robots import Disc
-from messaging.shapes import Obstacle, Shapes, rotate
+from messaging.shapes import Obstacle, Shapes
 from safety.certificates import KINDS, Certificate
-from safety.commitment import UNVERIFIED, Commitment, Prediction, correction_penalty
-from safety.filter import Filter, _Attempt
+from safety.commitment import Prediction, correction_penalty
+from safety.filter import Filter
 from safety.model_set import ModelSet, Recipe
-from safety.request import ADJUSTED, ALLOWED, FAILSAFE, BadRequest, Request
+from safety.request import ADJUSTED, ALLOWED, FAILSAFE, BadRequest
 from tests.robots import GROUND, QUADROTOR
+from tests.safety.asked import cylinder, fits, random_request, request, same
 from tests.safety.unicycle import FIX, Unicycle
-
-NONE = Shapes.of([], 2)
-STILL = np.zeros((3, 2))
-
-
-def cylinder(x, y, radius=0.1):
-    return Obstacle("cylinder", (x, y), (radius,))
-
-
-def request(state=(0, 0, 0, 0, 0), action=(0.25, 0.0), obstacles=(), **more):
-    """Standing still by default."""
-    state = np.array(state, float)
-    return Request(
-        state=state,
-        action=np.array(action, float),
-        input_in_force=more.pop("input_in_force", state[3:].copy()),
-        plan=more.pop("plan", STILL),
-        obstacles=obstacles if isinstance(obstacles, Shapes) else Shapes.of(list(obstacles), 2),
-        **more,
-    )
-
-
-def random_request(rng, count=4, nearest=0.27):
-    heading, v, w = rng.uniform(-3, 3), rng.uniform(0, 0.25), rng.uniform(-0.5, 0.5)
-    angles, ways = rng.uniform(-np.pi, np.pi, count), rng.uniform(nearest, 0.45, count)
-    around = [cylinder(1 + r * np.cos(a), 2 + r * np.sin(a)) for a, r in zip(angles, ways, strict=True)]
-    return request((1, 2, heading, v, w), rng.uniform([0, -0.5], [0.25, 0.5]), around)
-
-
-def same(one, other):
-    """Equal in every bit but the times."""
-    for name in ("plan", "tube_center", "tube_half_width"):
-        if getattr(one, name).tobytes() != getattr(other, name).tobytes():
-            return False
-    if one.predicted.center.tobytes() != other.predicted.center.tobytes():
-        return False
-    names = (
-        "kind",
-        "margin",
-        "at_least",
-        "model",
-        "reason",
-        "verified",
-        "contained",
-        "compared",
-        "solver",
-        "iterations",
-    )
-    return all(getattr(one, name) == getattr(other, name) for name in names)
-
-
-# --- an exact check of its own ------------------------------------------------------------------------------------
-
-
-def fits(model: ModelSet, ask: Request, free):
-    """Smallest distance of the tube under a free input to the obstacles less footprint and Z_v, written out slowly.
-
-    By sampling the boundary of each step's set and of the hull of two steps: no half-spaces.
-    """
-    z = np.concatenate([ask.state[3:], ask.input_in_force, free])
-    angles = np.linspace(0, 2 * np.pi, 24, endpoint=False)
-    circle = np.stack([np.cos(angles), np.sin(angles)], axis=1)
-    corners = [np.zeros((1, 2))]
-    for step in model.steps:
-        half = (np.abs(step.W @ z) @ step.M.T + np.abs(z) @ step.kappa.T + step.w)[:2]
-        corners.append(step.C[:2] @ z + half * np.array([[1, 1], [1, -1], [-1, -1], [-1, 1]]))
-    bulge = np.abs(z) @ model.bulges.kappa.T + model.bulges.w
-    latch = (np.abs(z) @ model.latch.kappa.T + model.latch.w)[0]
-    noise = np.array(GROUND.measurement_bound[:2]) * np.array([[1, 1], [1, -1], [-1, -1], [-1, 1]])
-    worst = np.inf
-    for k in range(len(model.steps)):
-        pairs = [(a, b) for a in corners[k] for b in corners[k + 1]]
-        share = np.linspace(0, 1, 9)[:, None]
-        chords = np.concatenate([a + share * (b - a) for a, b in pairs])
-        grown = (chords[:, None] + GROUND.footprint * circle + bulge[k] * circle).reshape(-1, 2)
-        world = ask.state[:2] + rotate(grown, ask.state[2])
-        world = (world[:, None] + noise).reshape(-1, 2)
-        worst = min(worst, float(ask.obstacles.distance(world).min()))
-    stopped = corners[-1][:, None] + (GROUND.footprint + latch) * circle
-    world = ask.state[:2] + rotate(stopped.reshape(-1, 2), ask.state[2])
-    return min(worst, float(ask.obstacles.distance((world[:, None] + noise).reshape(-1, 2)).min()))
-
-
-# --- kinds --------------------------------------------------------------------------------------------------------
 
 
 def test_far_from_everything_the_proposal_is_allowed(ready):
@@ -267,8 +183,6 @@ def test_the_prediction_holds_for_every_kind(ready, kind):
     raise AssertionError(f"only {found} decisions were {kind}")
 
 
-# --- requests that can't be decided on -----------------------------------------------------------------------------
-
 NAN, INF = float("nan"), float("inf")
 
 
@@ -327,112 +241,17 @@ def test_an_obstacle_whose_distance_is_no_number_is_never_overlooked(ready):
     assert not decision.action.any()
 
 
-# --- the committed plan -------------------------------------------------------------------------------------------
-
-
-def moving(tail=((0, 0), (0, 0), (0, 0)), x=0.215, **more):
-    """At full speed before an obstacle so near that only the committed plan is left."""
-    more = {"input_in_force": np.array([0.25, 0.0]), "plan": np.array(tail, float)} | more
-    return request((0, 0, 0, 0.25, 0.0), (0.25, 0.0), [cylinder(x, 0)], **more)
-
-
-def test_failsafe_is_the_committed_plans_next_input(ready):
-    tail = ((0.0, 0.1), (0, 0), (0, 0))
-    decision = ready.decide(moving(tail, model=ready.version))
-    assert decision.kind == FAILSAFE
-    assert decision.verified
-    assert np.array_equal(decision.plan, tail)
-    assert decision.margin < 0.0
-    assert "no verified input" in decision.reason
-
-
-def test_a_plan_that_nobody_vouches_for_is_not_called_verified(ready):
-    """No model's version although something moves; a plan marked as unverified; a prediction that did not hold."""
-    tail = ((0.2, 0.0), (0, 0), (0, 0))
-    wrong = Prediction(np.full(5, 3.0), np.full(5, 0.01), 0.0)
-    for more in (
-        {"model": ""},
-        {"model": UNVERIFIED},
-        {"model": "0123456789ab"},
-        {"model": ready.version, "predicted": wrong},
-        {"model": "", "plan": STILL},
-    ):
-        decision = ready.decide(moving(tail, **more) if "plan" not in more else moving(**more))
-        assert decision.kind == FAILSAFE
-        assert not decision.verified
-        assert not decision.plan.any(), "brake"
-        assert decision.contained == ("predicted" not in more)
-    assert not ready.decide(moving(model="", plan=STILL)).verified
-
-
-@pytest.mark.parametrize("version", ["0123456789ab", UNVERIFIED])
-def test_an_older_models_tail_is_verified_anew(ready, version):
-    """Where there is room for it; but a tube from outside the recorded domain verifies nothing."""
-    for x, in_domain, verified in ((0.6, True, True), (0.6, False, False), (0.215, True, False)):
-        ask = moving(((0.1, 0.2), (0, 0), (0, 0)), x, model=version)
-        z_0 = np.concatenate([ask.state[3:], ask.input_in_force])
-        found = ready._committed(ask, ready.around.scene(ask), z_0, _Attempt(0), in_domain)
-        assert found.verified == verified
-        assert np.array_equal(found.plan, ask.plan if verified else STILL)
-
-
-def test_outside_the_recorded_domain_nothing_new_is_verified(ready):
-    ask = request((0, 0, 0, 0.6, 0.0), (0.1, 0.0), input_in_force=np.array([0.25, 0.0]))
-    decision = ready.decide(replace(ask, model="0123456789ab"))
-    assert decision.kind == FAILSAFE
-    assert not decision.verified
-    assert "domain" in decision.reason
-    trusted = ready.decide(replace(ask, model=ready.version))
-    assert trusted.kind == FAILSAFE
-    assert trusted.verified, "the plan was verified when it was made"
-
-
-def test_after_a_violation_the_proposal_may_still_be_verified_from_the_new_measurement(ready):
-    wrong = Prediction(np.full(5, 3.0), np.full(5, 0.01), 0.0)
-    decision = ready.decide(request(predicted=wrong))
-    assert decision.kind == ALLOWED
-    assert decision.compared
-    assert not decision.contained
-
-
-def test_standing_still_needs_nobodys_word(ready):
-    decision = ready.decide(request(obstacles=[cylinder(0.2, 0)]))
-    assert decision.kind == FAILSAFE
-    assert decision.verified
-    assert not decision.plan.any()
-
-
-def test_what_was_not_verified_stays_so_until_the_robot_stands():
-    kept = Commitment(GROUND)
-    assert kept.model == ""
-    kept.accept(np.array([[0.2, 0.1], [0, 0], [0, 0]]), "v1", None, True)
-    assert kept.model == "v1"
-    assert np.array_equal(kept.input_in_force, [0.2, 0.1])
-    kept.fallback()
-    assert kept.model == "", "it stands on a verified plan"
-    kept.accept(np.array([[0.2, 0.1], [0, 0], [0, 0]]), "v1", None, True)
-    kept.accept(STILL, "v1", None, False)
-    assert kept.model == UNVERIFIED
-    kept.accept(STILL, "v1", None, False)
-    assert kept.model == UNVERIFIED
-    kept.fallback()
-    assert kept.model == "", "it has stood for a whole plan"
-    kept.accept(STILL, "v1", None, False)
-    kept.accept(np.array([[0.2, 0.1], [0, 0], [0, 0]]), "v2", None, True)
-    assert kept.model == "v2"
-    kept.reset()
-    assert (kept.model, kept.predicted) == ("", None)
-
-
-def test_predictions_are_boxes_in_their_own_frame():
-    box = Prediction(np.array([1.0, 2.0, 3.1, 0.1, 0.0]), np.array([0.2, 0.01, 0.1, 0.1, 0.1]), np.pi / 2)
-    assert box.contains(GROUND, np.array([1.0, 2.15, -3.1, 0.1, 0.0]))  # the heading wraps
-    assert not box.contains(GROUND, np.array([1.15, 2.0, 3.1, 0.1, 0.0]))
-    assert not box.contains(GROUND, np.array([1.0, 2.0, 3.1, 0.3, 0.0]))
-    assert not box.contains(GROUND, np.array([NAN, 2.0, 3.1, 0.1, 0.0]))
-
-
-# --- a pure function ----------------------------------------------------------------------------------------------
+def test_the_reach_covers_every_plan(ready):
+    """No obstacle beyond the reach can matter: the farthest point of any plan's tube, by brute force."""
+    rng = np.random.default_rng(17)
+    farthest = 0.0
+    for _ in range(2000):
+        z = rng.uniform([*ready.domain[0], *GROUND.low()], [*ready.domain[1], *GROUND.high()])
+        sizes = ready.tube.magnitudes(z)
+        half = np.abs(ready.tube.directions) @ sizes[: ready.tube.generators]
+        way = np.linalg.norm(np.abs(ready.tube.centers(z)) + half, axis=1).max()
+        farthest = max(farthest, way + GROUND.footprint + FIX + sizes[ready.tube.generators :].max())
+    assert farthest < ready.reach <= GROUND.sight
 
 
 def test_the_same_request_has_the_same_answer_whatever_came_between(model):
@@ -459,171 +278,3 @@ def test_a_moved_and_turned_scene_has_the_same_answer(model):
         assert plans[0].kind == plans[1].kind
         assert np.allclose(plans[0].plan, plans[1].plan, atol=1e-5)
         assert plans[0].margin == pytest.approx(plans[1].margin, abs=1e-5)
-
-
-# --- closed loop --------------------------------------------------------------------------------------------------
-
-ROOM = [
-    Obstacle("wall", (-0.8, 0.0)),
-    Obstacle("wall", (0.8, 0.0), (), np.pi),
-    Obstacle("wall", (0.0, -0.8), (), np.pi / 2),
-    Obstacle("wall", (0.0, 0.8), (), -np.pi / 2),
-    cylinder(0.35, 0.35, 0.12),
-    Obstacle("box", (-0.4, 0.4), (0.2, 0.3), 0.4),
-]
-CORRIDOR = [
-    Obstacle("wall", (0.0, -0.2), (), np.pi / 2),
-    Obstacle("wall", (0.0, 0.2), (), -np.pi / 2),
-    Obstacle("wall", (0.7, 0.0), (), np.pi),
-    Obstacle("wall", (-0.7, 0.0)),
-]
-
-
-def clearance(obstacles, point):
-    """Distance of a true position to the solids, by their definitions."""
-    ways = []
-    for o in obstacles:
-        offset = np.asarray(point) - np.array(o.position)
-        local = rotate(offset, -o.yaw)
-        if o.kind == "wall":
-            ways.append(local[0])
-        elif o.kind == "cylinder":
-            ways.append(np.hypot(*offset) - o.size[0])
-        else:
-            ways.append(np.hypot(*np.maximum(np.abs(local) - 0.5 * np.array(o.size), 0.0)))
-    return min(ways)
-
-
-def drive(ready, obstacles, policy, steps, seed, start=(0, 0, 0)):
-    """Kinds, smallest clearance of the disc at any sub-step, violations, longest wait for a wanted turn."""
-    rng = np.random.default_rng(seed)
-    robot = Unicycle(start, rng)
-    kept, shapes = Commitment(GROUND), Shapes.of(obstacles, 2)
-    counts, least, violations, waiting, longest = dict.fromkeys((ALLOWED, ADJUSTED, FAILSAFE), 0), np.inf, 0, 0, 0
-    for k in range(steps):
-        state, action = robot.measure(), np.array(policy(k, rng, robot))
-        decision = ready.decide(
-            Request(state, action, kept.input_in_force, kept.plan, shapes, kept.model, kept.predicted)
-        )
-        counts[decision.kind] += 1
-        violations += not decision.contained
-        executed = kept.accept(decision.plan, decision.model, decision.predicted, decision.verified)
-        before = robot.state.copy()
-        path, turned = robot.step(executed)
-        wants = abs(action[1]) > 0.3
-        waiting = waiting + 1 if wants and abs(turned) < 0.01 else (0 if wants else waiting)
-        longest = max(longest, waiting)
-        points = before[:2] + rotate(path, before[2])
-        least = min(least, min(clearance(obstacles, p) for p in points) - GROUND.footprint)
-    return counts, least, violations, longest
-
-
-def wild(k, rng, robot):
-    return rng.uniform([-0.1, -0.7], [0.4, 0.7])
-
-
-def pushing(k, rng, robot):
-    """Full speed ahead for a while, then a turn in place: it must be possible again and again."""
-    return (0.25, 0.0) if k % 60 < 30 else (0.0, 0.5 if (k // 60) % 2 else -0.5)
-
-
-@pytest.mark.parametrize("policy", [wild, pushing])
-@pytest.mark.parametrize("obstacles", [ROOM, CORRIDOR], ids=["room", "corridor"])
-def test_the_robot_never_hits_anything_and_never_gets_stuck(ready, obstacles, policy):
-    counts, least, violations, longest = drive(ready, obstacles, policy, 2500, seed=11)
-    assert least > 0.0
-    assert violations <= 5
-    assert counts[ADJUSTED] > 20
-    assert counts[ALLOWED] > 500
-    assert longest < 100
-
-
-@pytest.mark.parametrize("kind", ["set-membership", "matrix-zonotope"])
-def test_the_other_certificates_hit_nothing_either(models, kind):
-    counts, least, violations, _ = drive(Filter(models[kind, "direct"]), ROOM, wild, 1200, seed=12)
-    assert least > 0.0
-    assert violations == 0
-    assert counts[ALLOWED] + counts[ADJUSTED] > 300
-
-
-def test_the_recursion_hits_nothing_either(models):
-    _, least, violations, _ = drive(Filter(models["residual", "recursion"]), ROOM, wild, 1200, seed=13)
-    assert least > 0.0
-    assert violations <= 3
-
-
-def test_a_robot_that_slips_more_than_recorded_is_noticed(ready):
-    rng = np.random.default_rng(14)
-    robot, kept, violations = Unicycle((0, 0, 0), rng, slip=0.3), Commitment(GROUND), 0
-    for _ in range(100):
-        decision = ready.decide(
-            Request(
-                robot.measure(), np.array([0.25, 0.1]), kept.input_in_force, kept.plan, NONE, kept.model, kept.predicted
-            )
-        )
-        violations += not decision.contained
-        robot.step(kept.accept(decision.plan, decision.model, decision.predicted, decision.verified))
-    assert violations > 50
-
-
-# --- mutations: what the tests above would notice -----------------------------------------------------------------
-
-
-def without_footprint(model):
-    return Filter(replace(model, robot=replace(GROUND, body=(Disc((0.0, 0.0), 0.05),))))
-
-
-def with_half_the_width(model):
-    thin = tuple(replace(s, kappa=0.1 * s.kappa, w=0.1 * s.w) for s in model.steps)
-    return Filter(replace(model, steps=thin))
-
-
-def without_measurement_error(model):
-    robot = replace(GROUND, measurement_bound=(0.0, 0.0, *GROUND.measurement_bound[2:]))
-    return Filter(replace(model, robot=robot))
-
-
-def without_bulge(model):
-    return Filter(replace(model, bulges=replace(model.bulges, w=model.bulges.w - EXTRA)))
-
-
-def without_latch(model):
-    return Filter(replace(model, latch=replace(model.latch, w=model.latch.w - EXTRA)))
-
-
-EXTRA = 0.02  # m; this robot hardly bulges and stops at once: let it be worse
-
-
-@pytest.mark.parametrize(
-    "mutant", [without_footprint, with_half_the_width, without_measurement_error, without_bulge, without_latch]
-)
-def test_what_is_left_out_is_noticed(model, mutant):
-    bulges, latch = replace(model.bulges, w=model.bulges.w + EXTRA), replace(model.latch, w=model.latch.w + EXTRA)
-    if mutant in (without_bulge, without_latch):
-        model = replace(model, bulges=bulges) if mutant is without_bulge else replace(model, latch=latch)
-    ready, honest = mutant(model), Filter(model)
-    noticed = 0
-    for x in np.linspace(0.11, 0.2, 150):  # a wall ahead: from right before it to well off
-        ask = request((0, 0, 0, 0.2, 0), (0.25, 0.0), [Obstacle("wall", (x, 0.0), (), np.pi)])
-        decision, right = ready.decide(ask), honest.decide(ask)
-        noticed += decision.kind != FAILSAFE and fits(model, ask, decision.action) <= 0.0
-        assert right.kind == FAILSAFE or fits(model, ask, right.action) > 0.0
-    assert noticed > 0
-
-
-def test_dropping_the_footprint_is_a_collision(model):
-    _, least, _, _ = drive(without_footprint(model), ROOM, pushing, 600, seed=16)
-    assert least < 0.0
-
-
-def test_the_reach_covers_every_plan(ready):
-    """No obstacle beyond the reach can matter: the farthest point of any plan's tube, by brute force."""
-    rng = np.random.default_rng(17)
-    farthest = 0.0
-    for _ in range(2000):
-        z = rng.uniform([*ready.domain[0], *GROUND.low()], [*ready.domain[1], *GROUND.high()])
-        sizes = ready.tube.magnitudes(z)
-        half = np.abs(ready.tube.directions) @ sizes[: ready.tube.generators]
-        way = np.linalg.norm(np.abs(ready.tube.centers(z)) + half, axis=1).max()
-        farthest = max(farthest, way + GROUND.footprint + FIX + sizes[ready.tube.generators :].max())
-    assert farthest < ready.reach <= GROUND.sight

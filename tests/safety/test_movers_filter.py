@@ -16,7 +16,7 @@ from safety.wire import obstacles_of
 from sim.movers import Crowd, MoverKind, Watch
 from sim.world import closing
 from tests.robots import GROUND
-from tests.safety.test_filter import request, same
+from tests.safety.asked import request, same
 from tests.safety.unicycle import Unicycle
 
 KIND = MoverKind(count=(6, 6), radius=0.2, speed=1.0, acceleration=1.0, keep=0.5)

@@ -10,7 +10,7 @@ from safety.commitment import Commitment
 from safety.recovery import least_violating, lower, slow_inputs
 from safety.request import RECOVERING
 from tests.robots import GROUND, QUADROTOR
-from tests.safety.test_filter import request
+from tests.safety.asked import request
 from tests.safety.unicycle import Unicycle
 
 BODY = GROUND.footprint

@@ -14,7 +14,7 @@ from safety.memory import Memory
 from safety.request import ALLOWED, FAILSAFE, BadRequest, check_for_filter
 from safety.wire import request_of, scan_of
 from tests.robots import GROUND, QUADROTOR
-from tests.safety.test_filter import request
+from tests.safety.asked import request
 from tests.safety.test_scan import FAN, FAR, WIDTH, cast
 from tests.safety.unicycle import FIX, Unicycle
 

@@ -1,0 +1,86 @@
+"""Requests to the ground robot's filter, and an exact check of its own."""
+
+import numpy as np
+
+from messaging.shapes import Obstacle, Shapes, rotate
+from safety.model_set import ModelSet
+from safety.request import Request
+from tests.robots import GROUND
+
+NONE = Shapes.of([], 2)
+STILL = np.zeros((3, 2))
+
+
+def cylinder(x, y, radius=0.1):
+    return Obstacle("cylinder", (x, y), (radius,))
+
+
+def request(state=(0, 0, 0, 0, 0), action=(0.25, 0.0), obstacles=(), **more):
+    """Standing still by default."""
+    state = np.array(state, float)
+    return Request(
+        state=state,
+        action=np.array(action, float),
+        input_in_force=more.pop("input_in_force", state[3:].copy()),
+        plan=more.pop("plan", STILL),
+        obstacles=obstacles if isinstance(obstacles, Shapes) else Shapes.of(list(obstacles), 2),
+        **more,
+    )
+
+
+def random_request(rng, count=4, nearest=0.27):
+    heading, v, w = rng.uniform(-3, 3), rng.uniform(0, 0.25), rng.uniform(-0.5, 0.5)
+    angles, ways = rng.uniform(-np.pi, np.pi, count), rng.uniform(nearest, 0.45, count)
+    around = [cylinder(1 + r * np.cos(a), 2 + r * np.sin(a)) for a, r in zip(angles, ways, strict=True)]
+    return request((1, 2, heading, v, w), rng.uniform([0, -0.5], [0.25, 0.5]), around)
+
+
+def same(one, other):
+    """Equal in every bit but the times."""
+    for name in ("plan", "tube_center", "tube_half_width"):
+        if getattr(one, name).tobytes() != getattr(other, name).tobytes():
+            return False
+    if one.predicted.center.tobytes() != other.predicted.center.tobytes():
+        return False
+    names = (
+        "kind",
+        "margin",
+        "at_least",
+        "model",
+        "reason",
+        "verified",
+        "contained",
+        "compared",
+        "solver",
+        "iterations",
+    )
+    return all(getattr(one, name) == getattr(other, name) for name in names)
+
+
+def fits(model: ModelSet, ask: Request, free):
+    """Smallest distance of the tube under a free input to the obstacles less footprint and Z_v, written out slowly.
+
+    By sampling the boundary of each step's set and of the hull of two steps: no half-spaces.
+    """
+    z = np.concatenate([ask.state[3:], ask.input_in_force, free])
+    angles = np.linspace(0, 2 * np.pi, 24, endpoint=False)
+    circle = np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    corners = [np.zeros((1, 2))]
+    for step in model.steps:
+        half = (np.abs(step.W @ z) @ step.M.T + np.abs(z) @ step.kappa.T + step.w)[:2]
+        corners.append(step.C[:2] @ z + half * np.array([[1, 1], [1, -1], [-1, -1], [-1, 1]]))
+    bulge = np.abs(z) @ model.bulges.kappa.T + model.bulges.w
+    latch = (np.abs(z) @ model.latch.kappa.T + model.latch.w)[0]
+    noise = np.array(GROUND.measurement_bound[:2]) * np.array([[1, 1], [1, -1], [-1, -1], [-1, 1]])
+    worst = np.inf
+    for k in range(len(model.steps)):
+        pairs = [(a, b) for a in corners[k] for b in corners[k + 1]]
+        share = np.linspace(0, 1, 9)[:, None]
+        chords = np.concatenate([a + share * (b - a) for a, b in pairs])
+        grown = (chords[:, None] + GROUND.footprint * circle + bulge[k] * circle).reshape(-1, 2)
+        world = ask.state[:2] + rotate(grown, ask.state[2])
+        world = (world[:, None] + noise).reshape(-1, 2)
+        worst = min(worst, float(ask.obstacles.distance(world).min()))
+    stopped = corners[-1][:, None] + (GROUND.footprint + latch) * circle
+    world = ask.state[:2] + rotate(stopped.reshape(-1, 2), ask.state[2])
+    return min(worst, float(ask.obstacles.distance((world[:, None] + noise).reshape(-1, 2)).min()))

@@ -1,0 +1,95 @@
+"""The wrapper around an environment: what is safe passes, what is not is replaced; episodes start standing."""
+
+from dataclasses import replace
+
+import gymnasium
+import numpy as np
+import pytest
+
+from messaging.shapes import Obstacle
+from safety.filter import Filter
+from safety.gym import SafetyWrapper
+from tests.messaging.conftest import endpoint, join  # noqa: F401 - fixtures
+from tests.robots import GROUND
+from tests.safety.unicycle import Unicycle
+
+NAN, INF = float("nan"), float("inf")
+AHEAD = Obstacle("cylinder", (0.34, 0.0), (0.1,))
+
+
+class Yard(gymnasium.Env):
+    """The kinematic robot before one obstacle; reward 1 a step."""
+
+    observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (5,), np.float32)
+    action_space = gymnasium.spaces.Box(np.array([0, -0.5], np.float32), np.array([0.25, 0.5], np.float32))
+
+    def __init__(self, obstacle=AHEAD):
+        self.obstacle = obstacle
+        self.executed = []
+
+    def _now(self):
+        state = self.robot.measure()
+        return state.astype(np.float32), {"state": state, "obstacles": [self.obstacle]}
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.robot, self.executed = Unicycle((0, 0, 0), np.random.default_rng(seed)), []
+        return self._now()
+
+    def step(self, action):
+        assert action.dtype == np.float32
+        self.executed.append(action)
+        self.robot.step(action)
+        observation, info = self._now()
+        return observation, 1.0, False, False, info
+
+
+def test_the_wrapper_lets_through_what_is_safe(ready):
+    env = SafetyWrapper(Yard(Obstacle("cylinder", (3.0, 0.0), (0.1,))), ready, penalty=2.0)
+    env.reset(seed=0)
+    _, reward, _, _, info = env.step(np.array([0.2, 0.25], np.float32))
+    assert np.array_equal(env.unwrapped.executed[0], np.array([0.2, 0.25], np.float32))
+    assert info["safety"].kind == "allowed"
+    assert (reward, info["penalty"]) == (1.0, 0.0)
+    assert np.array_equal(info["proposed"], np.array([0.2, 0.25], np.float32))
+    _, reward, *_ = env.step(np.array([9.0, 0.0]))
+    assert reward == 1.0, "clipping to bounds costs nothing"
+
+
+def test_the_wrapper_replaces_and_penalises_what_is_not(ready):
+    env = SafetyWrapper(Yard(), ready, penalty=2.0)
+    env.reset(seed=1)
+    kinds, costs = set(), []
+    for _ in range(60):
+        _, reward, _, _, info = env.step(np.array([0.25, 0.0]))
+        kinds.add(info["safety"].kind)
+        off = np.linalg.norm((info["safety"].action - [0.25, 0.0]) / [0.25, 1.0])
+        assert info["penalty"] == pytest.approx(2.0 * off)
+        assert reward == pytest.approx(1.0 - info["penalty"])
+        costs.append(info["penalty"])
+        assert np.hypot(*(env.unwrapped.robot.state[:2] - [0.34, 0.0])) > 0.1 + GROUND.footprint
+    assert "adjusted" in kinds
+    assert max(costs) > 1.0
+
+
+def test_a_proposal_that_is_no_number_is_standing_still(ready):
+    env = SafetyWrapper(Yard(), ready, penalty=1.0)
+    env.reset(seed=2)
+    _, reward, _, _, info = env.step(np.array([NAN, 0.1]))
+    assert not env.unwrapped.executed[0].any()
+    assert np.isfinite(reward)
+    assert info["safety"].verified
+
+
+def test_every_episode_starts_standing(ready):
+    env = SafetyWrapper(Yard(), ready)
+    env.reset(seed=3)
+    env.step(np.array([0.25, 0.1]))
+    assert env.commitment.input_in_force.any()
+    env.reset(seed=4)
+    assert not env.commitment.input_in_force.any()
+    assert env.commitment.predicted is None
+
+
+def test_a_filter_needs_no_more_than_the_model_set(model):
+    assert Filter(replace(model, about={})).version == model.version

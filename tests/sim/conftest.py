@@ -1,0 +1,17 @@
+"""The embedded autopilots, on the ground and in the air, by both rule sets."""
+
+import pytest
+
+from tests.sim.station import Station
+
+
+@pytest.fixture(params=["px4", "ardupilot"])
+def station(request: pytest.FixtureRequest) -> Station:
+    return Station(request.param)
+
+
+@pytest.fixture(params=["px4", "ardupilot"])
+def flying(request: pytest.FixtureRequest) -> Station:
+    station = Station(request.param)
+    station.into_the_air()
+    return station

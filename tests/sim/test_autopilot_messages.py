@@ -1,0 +1,142 @@
+"""What the simulated autopilots tell: at the rates asked for, in their units and frames, and their parameters."""
+
+from __future__ import annotations
+
+import math
+import struct
+
+import numpy as np
+import pytest
+
+from messaging.shapes import CYLINDER, Obstacle
+from messaging.tasks import task_of
+from sim.autopilot import frames
+from sim.autopilot.dialect import mavlink
+from sim.autopilot.endpoint import TICK, UnknownRules
+from sim.autopilot.parameters import BadParameter
+from sim.autopilot.pilot import Mode
+from sim.autopilot.telemetry import BINS, obstacle_bins
+from sim.lidar import Lidar
+from tests.robots import QUADROTOR
+from tests.sim.station import (
+    ACCEPTED,
+    FAILED,
+    Station,
+    field,
+)
+
+
+def test_messages_come_at_the_rates_asked_for(station: Station) -> None:
+    kind = mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED
+    assert station.command(511, kind, 40_000) == ACCEPTED
+    assert station.command(511, 77_777, 40_000) == FAILED
+    station.heard.clear()
+    station.wait(2.0)
+    stamps = [m.time_boot_ms for m in station.heard if m.get_type() == "LOCAL_POSITION_NED"]
+    assert stamps == list(range(40, 2001, 40))
+    assert station.command(510, kind) == ACCEPTED
+    assert station.last("MESSAGE_INTERVAL").interval_us == 40_000
+    assert station.command(511, kind, -1) == ACCEPTED
+    station.heard.clear()
+    station.wait(1.0)
+    assert not [m for m in station.heard if m.get_type() == "LOCAL_POSITION_NED"]
+    assert station.command(512, kind) == ACCEPTED
+    assert station.last("LOCAL_POSITION_NED")
+
+
+def test_every_message_can_be_asked_for() -> None:
+    lidar = Lidar(field(), task_of(QUADROTOR).rays)
+    station = Station("px4", airborne=True, lidar=lidar)
+    for name in (
+        "ATTITUDE", "ATTITUDE_QUATERNION", "LOCAL_POSITION_NED", "HIGHRES_IMU", "OBSTACLE_DISTANCE", "SYS_STATUS",
+        "EXTENDED_SYS_STATE", "GLOBAL_POSITION_INT", "SCALED_IMU", "GPS_RAW_INT", "HOME_POSITION", "BATTERY_STATUS",
+        "ODOMETRY", "VFR_HUD", "AUTOPILOT_VERSION",
+    ):  # fmt: skip
+        assert station.command(512, getattr(mavlink, f"MAVLINK_MSG_ID_{name}")) == ACCEPTED
+        assert station.last(name)
+
+
+def test_telemetry_is_in_ned(flying: Station) -> None:
+    flying.fly(1, 2, -0.5, seconds=3.0)
+    for name in ("LOCAL_POSITION_NED", "ATTITUDE", "HIGHRES_IMU", "GLOBAL_POSITION_INT"):
+        flying.command(512, getattr(mavlink, f"MAVLINK_MSG_ID_{name}"))
+        if name == "LOCAL_POSITION_NED":
+            m = flying.last(name)
+            assert (m.vx, m.vy, m.vz) == pytest.approx((1, 2, -0.5), abs=0.1)
+            x, y, z = flying.autopilot.vehicle.state()[:3]
+            assert (m.x, m.y, m.z) == pytest.approx((y, x, -z), abs=0.01)
+        elif name == "ATTITUDE":
+            assert flying.last(name).yaw == pytest.approx(0.5 * math.pi, abs=0.05)
+        elif name == "HIGHRES_IMU":
+            assert flying.last(name).zacc == pytest.approx(-9.81, abs=0.4)
+        else:
+            assert flying.last(name).vx == pytest.approx(100, abs=10)
+
+
+def test_frames_turn_back_and_forth() -> None:
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        w, x, y, z = (q := rng.standard_normal(4)) / np.linalg.norm(q)
+        q, v = (w, x, y, z), tuple(rng.standard_normal(3))
+        assert frames.world(frames.world(v)) == pytest.approx(v)
+        turned = frames.rotate(frames.attitude(q), frames.body(v))
+        assert turned == pytest.approx(frames.world(frames.rotate(q, v)))
+        assert frames.into_body(q, frames.rotate(q, v)) == pytest.approx(v)
+    assert frames.yaw(frames.yaw(0.3)) == pytest.approx(0.3)
+
+
+def test_obstacle_distance_is_the_least_of_each_sector() -> None:
+    pillar = Obstacle(CYLINDER, (0.0, -4.0, 10.0), (0.5, 20.0))  # to the south: to the right of who looks east
+    arena = field(pillar)
+    station = Station("px4", airborne=True, arena=arena, lidar=Lidar(arena, task_of(QUADROTOR).rays))
+    station.command(512, mavlink.MAVLINK_MSG_ID_OBSTACLE_DISTANCE)
+    distances = station.last("OBSTACLE_DISTANCE").distances
+    assert len(distances) == BINS
+    assert distances[BINS // 4] == pytest.approx(350, abs=2)
+    assert distances[0] == distances[BINS // 2] == 1201
+
+    directions = np.array([[1.0, 0.0, 0.0], [np.cos(0.5), 0.0, np.sin(0.5)]])
+    assert obstacle_bins(np.array([3.0, 2.0]), directions, 12.0)[0] == math.floor(200 * np.cos(0.5))
+
+
+def test_parameters_are_listed_read_and_set(station: Station) -> None:
+    station.listen()
+    station.heard.clear()
+    station.mav.param_request_list_send(1, 1)
+    table = station.autopilot.rules.parameters.table
+    assert [m.param_id for m in station.heard] == [parameter.name for parameter in table]
+    station.mav.param_request_read_send(1, 1, b"", 1)
+    assert station.last("PARAM_VALUE").param_id == table[1].name
+    name = table[2].name if not table[2].integer else table[3].name
+    station.mav.param_set_send(1, 1, name.encode(), 2.0, mavlink.MAV_PARAM_TYPE_REAL32)
+    assert station.last("PARAM_VALUE").param_value == 2.0
+    station.mav.param_set_send(1, 1, name.encode(), -5.0, mavlink.MAV_PARAM_TYPE_REAL32)
+    assert station.last("PARAM_VALUE").param_value == 2.0  # out of range: as it was
+    station.heard.clear()
+    station.mav.param_set_send(1, 1, b"NONSENSE", 1.0, mavlink.MAV_PARAM_TYPE_REAL32)
+    assert [m.get_type() for m in station.heard] == ["STATUSTEXT"]
+
+
+def test_integers_travel_as_bits_in_px4_and_as_values_in_ardupilot() -> None:
+    px4, ardupilot = Station("px4"), Station("ardupilot")
+    px4.mav.param_request_read_send(1, 1, b"SYS_AUTOSTART", -1)
+    assert struct.unpack("<i", struct.pack("<f", px4.last("PARAM_VALUE").param_value))[0] == 4001
+    (bits,) = struct.unpack("<f", struct.pack("<i", 4))
+    px4.mav.param_set_send(1, 1, b"COM_OBL_RC_ACT", bits, mavlink.MAV_PARAM_TYPE_INT32)
+    assert px4.pilot.limits.on_loss is Mode.LAND
+    ardupilot.mav.param_request_read_send(1, 1, b"FRAME_CLASS", -1)
+    assert ardupilot.last("PARAM_VALUE").param_value == 1.0
+
+
+def test_lockstep_time_is_the_ticks_time() -> None:
+    station = Station("px4", airborne=True)
+    station.wait(1.0)
+    assert station.pilot.time == pytest.approx(1.0)
+    assert round(1.0 / TICK) == 50
+
+
+def test_unknown_rules_and_parameters_are_refused() -> None:
+    with pytest.raises(UnknownRules, match="betaflight"):
+        Station("betaflight")
+    with pytest.raises(BadParameter):
+        Station("px4", parameters={"GUID_TIMEOUT": 1.0})
