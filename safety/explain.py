@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from messaging.movers import Movers
 from messaging.robots import Robot
 from messaging.shapes import Shapes
-from safety.freespace import half_spaces
 from safety.promise import Promises
 from safety.scan import Cells
 from safety.scan import half_spaces as unseen_half_spaces
@@ -52,13 +51,33 @@ class Around:
         return sum(len(part) for part in (self.near, self.moving, self.unseen) if part is not None)
 
 
-def worst(row: int, room: float, robot: Robot, around: Around, nominal: list[tuple[Array, Array]]) -> Stopped:
-    """What a row is about. nominal: of each disc where it is (d,) and will be (N, d), world, under the proposal."""
+@dataclass(frozen=True)
+class Planes:
+    """Half-spaces for one disc of the body: start (d,) and ends (N, d), world, of its centre's nominal way; normals
+    (n, N, d) and offsets (n, N) about `start`, in the order of `Around`, of obstacles that keep_off [m] and measured
+    (d,) have been taken from."""
+
+    start: Array
+    ends: Array
+    normals: Array
+    offsets: Array
+    keep_off: float
+    measured: Array
+
+    def itself(self, near: Shapes, which: int, period: int) -> tuple[Array, float]:
+        """The half-space (d,), () that an obstacle's surface is, whatever is to be kept to it."""
+        normal = self.normals[which, period]
+        kept = max(self.keep_off + float(near.margin[which]), 0.0) + float(np.abs(normal) @ self.measured)
+        return normal, float(self.offsets[which, period]) + kept
+
+
+def worst(row: int, room: float, robot: Robot, around: Around, planes: list[Planes]) -> Stopped:
+    """What a row is about; planes: of each disc, under the proposal."""
     N, T = robot.horizon, robot.period
     each = 2 * N + 1
     disc, rest = divmod(row, max(len(around) * each, 1))
-    if disc >= len(nominal) or not len(around):
-        number = row - len(nominal) * len(around) * each
+    if disc >= len(planes) or not len(around):
+        number = row - len(planes) * len(around) * each
         if around.promised is not None:
             each = (N + 1) << robot.position_dim  # of a robot
             if number < len(around.promised) * each:
@@ -70,23 +89,23 @@ def worst(row: int, room: float, robot: Robot, around: Around, nominal: list[tup
     which, end = divmod(rest, each)
     period = end if end < N else min(end - N, N - 1)
     when = end if end < N else min(end - N + 1, N)
-    start, ends = nominal[disc]
-    by, normals, offsets = _planes(which, robot, around, start, ends)
-    normal, level = normals[0, period], float(offsets[0, period])
+    start, ends = planes[disc].start, planes[disc].ends
+    if which < len(around.near):
+        by, (normal, level) = around.near.kind(which), planes[disc].itself(around.near, which, period)
+    else:
+        by, normals, offsets = _moving_or_unseen(which - len(around.near), robot, around, start, ends)
+        normal, level = normals[0, period], float(offsets[0, period])
     if not np.isfinite(level):
         return Stopped.nowhere(by, room, T * when)
     there = (ends[when - 1] if when else start) - start
     return Stopped(by, room, T * when, normal, start + there + normal * (level - normal @ there))
 
 
-def _planes(which: int, robot: Robot, around: Around, start: Array, ends: Array) -> tuple[str, Array, Array]:
-    """The name of that obstacle, and its half-spaces (1, N, d), (1, N) themselves, whatever is to be kept to them."""
+def _moving_or_unseen(which: int, robot: Robot, around: Around, start: Array, ends: Array) -> tuple[str, Array, Array]:
+    """The name of what does not stand still, and its half-spaces (1, N, d), (1, N) themselves."""
     one, exact = np.array([which]), np.zeros(len(start))
-    if which < len(around.near):
-        return around.near.kind(which), *half_spaces(around.near.take(one), start, ends, 0.0, exact)
-    one -= len(around.near)
     if around.moving is not None:
-        if one[0] < len(around.moving):
+        if which < len(around.moving):
             mover = around.moving.take(one)
             return f"moving {mover.shapes.kind(0)}", *swept_half_spaces(mover, start, ends, 0.0, exact, robot.period)
         one -= len(around.moving)

@@ -121,7 +121,8 @@ class Filter:
         z = self.inputs.regressors(z_0, proposal)
         if scene.empty and not self.around.far and self.around.limits is None:
             return _Found(ALLOWED, self.inputs.plan(z), z, self.reach, True)
-        rows = self.around.rows(scene, z)
+        planes = self.around.planes(scene, z)
+        rows = self.around.rows(scene, z, planes)
         slack = rows.bound - rows.support(self.tube, z)
         margin = self.around.least(slack, z)
         if self.around.least(slack - self.comfort * rows.keep, z, self.comfort) >= 0.0:
@@ -130,7 +131,7 @@ class Filter:
         if margin >= 0.0 and self.around.margin(kept, z) >= 0.0:
             return _Found(ALLOWED, self.inputs.plan(z), z, margin, True)
         attempt.reason = f"the proposal's tube comes within {margin:.3g} m of the free space's edge"
-        attempt.stopped = self.around.worst_of(scene, z, slack)
+        attempt.stopped = self.around.worst_of(scene, z, slack, planes)
         # Keeping the comfort margin, or at least not driving into it; else free space alone: from here even standing
         # still would not do.
         for choice in (kept, rows):

@@ -13,7 +13,7 @@ from messaging.robots import Robot
 from messaging.scans import Scan
 from messaging.shapes import Shapes
 from safety import scan as seen
-from safety.explain import SIGHT, Around, Stopped, worst
+from safety.explain import SIGHT, Around, Planes, Stopped, worst
 from safety.freespace import half_spaces
 from safety.limits import Limits, stacked
 from safety.model_set import needed
@@ -181,21 +181,30 @@ class Surroundings:
             margin = min(margin, most - self.extent(z))
         return max(margin, -self.reach) if margin == margin else -self.reach
 
-    def rows(self, scene: Scene, z: Array) -> Rows:
-        """Half-spaces about the rollout of regressors z, as rows of the tube (and of the QP's: its generators are the
-        same, only their magnitudes are not)."""
-        parts = []
+    def planes(self, scene: Scene, z: Array) -> list[Planes]:
+        """Half-spaces about the rollout of regressors z, of each disc of the body."""
+        found = []
         for disc in self.discs:
             start, measured = scene.start + scene.turn @ disc.at, self.measured + disc.swing
-            nominal = start + disc.position @ z @ scene.turn.T
-            normals, offsets = half_spaces(scene.near, start, nominal, disc.radius, measured)
+            ends = start + disc.position @ z @ scene.turn.T
+            normals, offsets = half_spaces(scene.near, start, ends, disc.radius, measured)
             if scene.moving is not None:
-                swept = swept_half_spaces(scene.moving, start, nominal, disc.radius, measured, self.robot.period)
+                swept = swept_half_spaces(scene.moving, start, ends, disc.radius, measured, self.robot.period)
                 normals, offsets = np.concatenate([normals, swept[0]]), np.concatenate([offsets, swept[1]])
             if scene.unseen is not None:
-                beside = seen.half_spaces(scene.unseen, start, nominal, disc.radius, measured, self.robot.period)
+                beside = seen.half_spaces(scene.unseen, start, ends, disc.radius, measured, self.robot.period)
                 normals, offsets = np.concatenate([normals, beside[0]]), np.concatenate([offsets, beside[1]])
-            parts.append(disc.layout.rows(normals @ scene.turn, offsets))
+            found.append(Planes(start, ends, normals, offsets, disc.radius, measured))
+        return found
+
+    def rows(self, scene: Scene, z: Array, planes: list[Planes] | None = None) -> Rows:
+        """Half-spaces about the rollout of regressors z, as rows of the tube (and of the QP's: its generators are the
+        same, only their magnitudes are not). planes: if they are known already."""
+        planes = planes or self.planes(scene, z)
+        parts = [
+            disc.layout.rows(plane.normals @ scene.turn, plane.offsets)
+            for disc, plane in zip(self.discs, planes, strict=True)
+        ]
         if scene.promised is not None:
             nominal = scene.start + self.tube.centers(z) @ scene.turn.T
             body = self.robot.footprint
@@ -205,18 +214,14 @@ class Surroundings:
             parts.append(self.limits.rows(scene.start, scene.heading, scene.turn))
         return stacked(parts)
 
-    def worst_of(self, scene: Scene, z: Array, slack: Array) -> Stopped:
+    def worst_of(self, scene: Scene, z: Array, slack: Array, planes: list[Planes]) -> Stopped:
         """What the proposal, regressors z, comes nearest to."""
         beyond = self.reach - self.extent(z) if self.far else np.inf
         if not len(slack) or beyond < slack.min():
             return Stopped.nowhere(SIGHT, beyond, self.robot.period * self.robot.horizon)
-        nominal = []
-        for disc in self.discs:
-            start = scene.start + scene.turn @ disc.at
-            nominal.append((start, start + disc.position @ z @ scene.turn.T))
         row = int(np.argmin(slack))
         around = Around(scene.near, scene.moving, scene.unseen, scene.promised)
-        return worst(row, max(float(slack[row]), -self.reach), self.robot, around, nominal)
+        return worst(row, max(float(slack[row]), -self.reach), self.robot, around, planes)
 
     def clear(self, request: Request, scene: Scene, z: Array, margin: float) -> tuple[float, bool]:
         """Smallest distance [m] of the tube to what is in sight, given that to what is within reach; True: it is only a
