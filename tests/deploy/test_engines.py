@@ -74,8 +74,9 @@ def test_kubernetes_manifests_are_of_its_schema(manifest):
 
 def test_kubernetes_manifests_hang_together():
     by = {(m["kind"], m["metadata"]["name"]): m for m in manifests() if m["kind"] != "Kustomization"}
-    target = by["HorizontalPodAutoscaler", "safety"]["spec"]["scaleTargetRef"]
-    assert (target["kind"], target["name"]) in by
+    for name in ("safety", "actor"):
+        target = by["HorizontalPodAutoscaler", name]["spec"]["scaleTargetRef"]
+        assert "replicas" not in by[target["kind"], target["name"]]["spec"], "else each `apply` undoes what it did"
     for manifest in by.values():
         for container in containers(manifest):
             probed = [probe for name, probe in container.items() if name.endswith("Probe")]
