@@ -57,7 +57,7 @@ from safety.request import BadRequest
 from safety.service import Counts, Models, answerer
 
 LOOK = 25_000  # messages between two looks at what the processes say and show
-SETTLED = 0.3  # of the messages: by then tables are nearly as full as they get
+SETTLED = 0.3  # of the messages: by then tables are as full as they get
 LATER = 0.67  # of the messages: what grows from here on is a leak
 
 

@@ -14,6 +14,7 @@ from messaging import brakeline_pb2 as pb
 from messaging.bus import Sample
 from messaging.topics import TOPICS, Topic
 
+ACTORS = 60  # so few that what is kept by name is soon as much as it gets; what too many do is tried elsewhere
 CORPUS = 200  # valid messages of each topic, that the mutated ones are made of
 NUMBERS = (0.0, 1.0, -1.0, 0.1, 1e-300, 1e300, -1e300, 1e9, math.inf, -math.inf, math.nan)
 INTEGERS = (0, 1, 2, 3, 7, 1000, 2**31 - 1, 2**31, 2**32 - 1, 2**53, 2**62, 2**63 - 1, 2**63, 2**64 - 1, -1, -(2**63))
@@ -35,7 +36,7 @@ class Mill:
         random = self.random
         key = topic.at(robot="ground", source="actor-0")
         if random.random() < 0.3:
-            key = topic.at(robot=self._text(), source=f"actor-{random.randrange(3000)}")
+            key = topic.at(robot=self._text(), source=f"actor-{random.randrange(ACTORS)}")
         return Sample(topic, key, self.payload(topic), time.time_ns())
 
     def payload(self, topic: Topic) -> bytes:
@@ -134,4 +135,4 @@ class Mill:
         random = self.random
         if random.random() < 0.1:
             return random.choice(STRANGE)
-        return random.choice(TEXTS) if random.random() < 0.7 else f"name-{random.randrange(3000)}"
+        return random.choice(TEXTS) if random.random() < 0.7 else f"name-{random.randrange(ACTORS)}"
