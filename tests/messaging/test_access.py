@@ -155,7 +155,8 @@ def test_a_second_queryable_answers_nobody(system: System) -> None:
             query.reply(query.key_expr, b"allowed")
 
     attacker, asker = system.attacker(), system.join("actor-0")
-    attacker.declare_queryable("brakeline/safety/*/decide", evil, complete=True)
+    for key in ("brakeline/safety/*/decide", "brakeline/safety/*/decide/*"):  # of all, and of each by itself
+        attacker.declare_queryable(key, evil, complete=True)
     time.sleep(JOINED)
     if system.keys is None:
         assert asker.ask(DECIDE, b"?", 2.0, robot="ground") == b"allowed"

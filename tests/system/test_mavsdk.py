@@ -16,7 +16,7 @@ from mavsdk.plugins.param import Param
 from mavsdk.plugins.telemetry import FlightMode, Telemetry
 
 from tests.system.flights import autopilot
-from tests.system.runs import until
+from tests.system.runs import PATIENCE, until
 
 os.environ.setdefault("MAVLINK20", "1")  # read when pymavlink is imported
 
@@ -123,7 +123,7 @@ def test_two_vehicles_on_one_port_by_system_id() -> None:
             flags: dict[int, bool] = {}
 
             def second_is_armed() -> bool:
-                message = station.recv_match(type="HEARTBEAT", blocking=True, timeout=5)
+                message = station.recv_match(type="HEARTBEAT", blocking=True, timeout=PATIENCE)
                 flags[message.get_srcSystem()] = bool(message.base_mode & 128)
                 return flags.get(2, False)
 
@@ -162,13 +162,13 @@ def stream(vehicle: Any, vx: float, vy: float, vz: float, seconds: float) -> Any
 
 
 def heartbeat(station: Any) -> int:
-    message = station.recv_match(type="HEARTBEAT", blocking=True, timeout=10)
+    message = station.recv_match(type="HEARTBEAT", blocking=True, timeout=PATIENCE)
     return int(message.get_srcSystem())
 
 
 def armed(vehicle: Any) -> bool:
-    return bool(vehicle.recv_match(type="HEARTBEAT", blocking=True, timeout=5).base_mode & 128)
+    return bool(vehicle.recv_match(type="HEARTBEAT", blocking=True, timeout=PATIENCE).base_mode & 128)
 
 
 def guided(vehicle: Any) -> bool:
-    return bool(vehicle.recv_match(type="HEARTBEAT", blocking=True, timeout=5).custom_mode == 4)
+    return bool(vehicle.recv_match(type="HEARTBEAT", blocking=True, timeout=PATIENCE).custom_mode == 4)
