@@ -268,7 +268,9 @@ def test_who_looks_on_knows_who_lives(keys: Path) -> None:
     comes: list[tuple[str, bool]] = []
     viewer.watch(lambda name, alive: comes.append((name, alive)))
     eventually(lambda: {"launcher", "viewer.watch-1", "actor-0"} <= viewer.living())
-    assert actor.living() == {"actor-0"}, "and an actor need not"
+    known: list[frozenset[str]] = []  # a machine that stalls for a second lets the question run out
+    eventually(lambda: known.append(actor.living()) or len(known[-1]) > 0)
+    assert known[-1] == {"actor-0"}, "and an actor need not"
     actor.close()
     eventually(lambda: ("actor-0", False) in comes)
     system.close()
