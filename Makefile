@@ -26,7 +26,7 @@ check: setup
 
 # Real time in one process, whole runs in another, then the rest in both (tests/conftest.py); what was skipped, and why.
 unit: setup
-	$(BIN)/python -m pytest -m "not long" -n 2 --dist loadscope --no-loadscope-reorder -rs
+	$(BIN)/python -m pytest -m "not long" -n 3 --dist loadscope --no-loadscope-reorder -rs
 
 # For every save: no whole runs, no flights, no trainings.
 test-fast: setup

@@ -1,5 +1,5 @@
 """A small recording of the ground robot, made once a session, for the tests that need a model set; and who runs what
-where tests run side by side (`pytest -n 2`)."""
+where tests run side by side (`pytest -n 3`)."""
 
 import os
 import threading
@@ -27,6 +27,8 @@ LIVE = (
 )
 WHOLE_RUNS = ("tests/system/",)
 LANES = (LIVE, WHOLE_RUNS)
+BESIDE = 10  # by which the priority of a process is lower that begins with none of them
+PLACE = ["not known yet"]  # of this process, until its first test
 
 
 def lane(nodeid: str) -> int:
@@ -50,6 +52,14 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Rooms:
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """The lanes first: they take as long as all the rest."""
     items.sort(key=lambda item: lane(item.nodeid))  # stable
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    """A process that begins beside the lanes takes what they leave of the processor: what is live must not wait for it."""
+    if PLACE and "PYTEST_XDIST_WORKER" in os.environ:
+        os.nice(BESIDE if lane(item.nodeid) == len(LANES) else 0)
+    PLACE.clear()
 
 
 @pytest.fixture(scope="session")
