@@ -24,7 +24,8 @@ check: setup
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
-# Real time in one process, whole runs in another, then the rest in both (tests/conftest.py); what was skipped, and why.
+# Real time in one process, whole runs in another, the rest beside them at a lower priority (tests/conftest.py); what was
+# skipped, and why.
 unit: setup
 	$(BIN)/python -m pytest -m "not long" -n 3 --dist loadscope --no-loadscope-reorder -rs
 

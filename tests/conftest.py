@@ -27,8 +27,8 @@ LIVE = (
 )
 WHOLE_RUNS = ("tests/system/",)
 LANES = (LIVE, WHOLE_RUNS)
-BESIDE = 10  # by which the priority of a process is lower that begins with none of them
-PLACE = ["not known yet"]  # of this process, until its first test
+PLACE = pytest.StashKey[int]()  # of a process: the lane of its first test
+BESIDE = 10  # by which the priority of a process is lower that began with none
 
 
 def lane(nodeid: str) -> int:
@@ -56,10 +56,10 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_runtest_setup(item: pytest.Item) -> None:
-    """A process that begins beside the lanes takes what they leave of the processor: what is live must not wait for it."""
-    if PLACE and "PYTEST_XDIST_WORKER" in os.environ:
-        os.nice(BESIDE if lane(item.nodeid) == len(LANES) else 0)
-    PLACE.clear()
+    """A process whose first test is of no lane takes what the lanes leave of the processor; nothing live waits."""
+    if "PYTEST_XDIST_WORKER" in os.environ and PLACE not in item.config.stash:
+        item.config.stash[PLACE] = lane(item.nodeid)
+        os.nice(BESIDE if item.config.stash[PLACE] == len(LANES) else 0)
 
 
 @pytest.fixture(scope="session")
