@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from messaging.ports import free_endpoint
-from tests.system.runs import BRAKELINE
+from tests.system.runs import BRAKELINE, until
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "ask_from_python.py"
 
@@ -24,13 +24,14 @@ def service(data_folder):
 def test_it_stops_before_the_cylinder(service, capsys):
     from brakeline import BusError, SafetyClient
 
-    for _ in range(60):  # until the service answers
+    def answers():
         try:
             with SafetyClient.open(service, "ground", 1.0) as safety:
-                safety.decide([0.0] * 5, [0.1, 0.0], [])
-            break
+                return safety.decide([0.0] * 5, [0.1, 0.0], [])
         except BusError:
-            continue
+            return None
+
+    until(answers, "the service answers")
     runpy.run_path(str(EXAMPLE))["main"](service)
     printed = capsys.readouterr().out
     assert printed.count("allowed") >= 5 and "fallback" not in printed
