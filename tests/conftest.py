@@ -2,8 +2,6 @@
 where tests run side by side (`pytest -n 3`)."""
 
 import os
-import threading
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -12,6 +10,7 @@ import pytest
 from filelock import FileLock
 from xdist.scheduler import LoadScopeScheduling
 
+from deploy.bench.timing import stalls
 from deploy.data import recording, store
 from safety.model_set import Recipe
 from tests.robots import GROUND, QUADROTOR
@@ -99,16 +98,5 @@ def flight_folder(data_folder: Path) -> Path:
 @pytest.fixture
 def stalled() -> Iterator[Callable[[], float]]:
     """How long [s] this machine let a thread wait beyond the 10 ms it had asked for: nobody acts in time then."""
-    worst, done = [0.0], threading.Event()
-
-    def watch() -> None:
-        while not done.is_set():
-            before = time.monotonic()
-            time.sleep(0.01)
-            worst[0] = max(worst[0], time.monotonic() - before - 0.01)
-
-    thread = threading.Thread(target=watch)
-    thread.start()
-    yield lambda: worst[0]
-    done.set()
-    thread.join()
+    with stalls(0.01) as worst:
+        yield lambda: worst[0]

@@ -145,7 +145,7 @@ def cells(replicas: int, keys: Path) -> Iterator[tuple[list[str], list[int], lis
                 process.kill()
 
 
-def _used(pids: list[int]) -> float:
+def used(pids: list[int]) -> float:
     """s of processor time so far."""
     return sum(sum(psutil.Process(pid).cpu_times()[:2]) for pid in pids)
 
@@ -160,7 +160,7 @@ def _row(
         settings = BusSettings(connect=(endpoints[i % len(endpoints)],), keys=keys)
         started.append(spawn.Process(target=_crowd, args=(settings, questions, askers // crowds, theirs), daemon=True))
         pipes.append(mine)
-    before = _used(services), _used(routers)
+    before = used(services), used(routers)
     for process in started:
         process.start()
     heard: list[Heard] = [pipe.recv() for pipe in pipes]
@@ -177,8 +177,8 @@ def _row(
         "never asked %": 100.0 * sum(h.skipped for h in heard) / due,
         "p50 ms": 1e3 * float(np.percentile(took, 50)),
         "p99 ms": 1e3 * float(np.percentile(took, 99)),
-        "service CPU ms": 1e3 * (_used(services) - before[0]) / asked,
-        "router CPU ms": 1e3 * (_used(routers) - before[1]) / asked,
+        "service CPU ms": 1e3 * (used(services) - before[0]) / asked,
+        "router CPU ms": 1e3 * (used(routers) - before[1]) / asked,
     }
 
 

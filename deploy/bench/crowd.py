@@ -25,12 +25,11 @@ from random import Random
 from typing import Any
 
 import numpy as np
-import psutil
 import zenoh
 
 from deploy.bench import situations
-from deploy.bench.askers import cells
-from deploy.bench.timing import Figures
+from deploy.bench.askers import cells, used
+from deploy.bench.timing import Figures, stalls
 from deploy.interpreter import spawning
 from messaging import brakeline_pb2 as pb
 from messaging.bus import Bus, BusError, BusSettings, Late
@@ -173,37 +172,11 @@ def run(rate: int = JUNK) -> Figures:
             settings = BusSettings(connect=tuple(endpoints), keys=keys)
             alone = _ask(settings, questions)
             with _crowd(settings, rate) as said:
-                processes = {"service": psutil.Process(services[0]), "router": psutil.Process(routers[0])}
-                before = {which: _used(process) for which, process in processes.items()}
-                with _stalls() as worst:
+                processes = {"service": services, "router": routers}
+                before = {which: used(pids) for which, pids in processes.items()}
+                with stalls(0.001) as worst:
                     crowded = _ask(settings, questions)
                 crowded["the machine's longest stall ms"] = 1e3 * worst[0]
-                for which, process in processes.items():
-                    crowded[f"{which}, cores"] = (_used(process) - before[which]) / SECONDS
+                for which, pids in processes.items():
+                    crowded[f"{which}, cores"] = (used(pids) - before[which]) / SECONDS
     return {"alone": alone, "in the crowd": crowded | said}
-
-
-def _used(process: psutil.Process) -> float:
-    """s of processor time so far."""
-    times = process.cpu_times()
-    return float(times.user + times.system)
-
-
-@contextmanager
-def _stalls() -> Iterator[list[float]]:
-    """[s] that a thread which only sleeps was woken too late, at the most."""
-    stop, worst = threading.Event(), [0.0]
-
-    def watch() -> None:
-        while not stop.is_set():
-            before = time.monotonic()
-            time.sleep(0.001)
-            worst[0] = max(worst[0], time.monotonic() - before - 0.001)
-
-    thread = threading.Thread(target=watch, daemon=True)
-    thread.start()
-    try:
-        yield worst
-    finally:
-        stop.set()
-        thread.join()

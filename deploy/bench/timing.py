@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from time import perf_counter
 
 import numpy as np
@@ -39,3 +42,23 @@ def each(calls: list[Callable[[], object]]) -> dict[str, float]:
         call()
         seconds.append(perf_counter() - before)
     return milliseconds(seconds[min(WARM_UP, len(seconds) // 2) :])
+
+
+@contextmanager
+def stalls(pause: float) -> Iterator[list[float]]:
+    """How long [s] this machine let a thread wait beyond the `pause` it asked for, at most, in a list of one."""
+    worst, done = [0.0], threading.Event()
+
+    def watch() -> None:
+        while not done.is_set():
+            before = time.monotonic()
+            time.sleep(pause)
+            worst[0] = max(worst[0], time.monotonic() - before - pause)
+
+    thread = threading.Thread(target=watch, daemon=True)
+    thread.start()
+    try:
+        yield worst
+    finally:
+        done.set()
+        thread.join()
