@@ -9,10 +9,10 @@ import sys
 from brakeline import BusError, Obstacle, SafetyClient
 
 
-def main(endpoint: str) -> None:
+def main(endpoint: str, deadline: float = 0.1) -> None:
     state = [0.0, 0.0, 0.0, 0.0, 0.0]  # x, y, heading, speed, turn rate: as measured by your robot
     near = [Obstacle("cylinder", (0.6, 0.0), (0.1,))]  # what your robot sees within its sight
-    with SafetyClient.open(endpoint, "ground") as safety:
+    with SafetyClient.open(endpoint, "ground", deadline) as safety:
         for period in range(15):
             wanted = [0.25, 0.0]  # your policy: full speed ahead, at the cylinder
             try:
