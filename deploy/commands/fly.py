@@ -11,10 +11,10 @@ import tyro
 from actors.flight import FlightSettings
 from deploy.commands.common import Filtering, Flags, Flight, Meeting, Physics, console, errors, say_json
 from deploy.commands.train import STOPPED, stamped
+from deploy.quadrotors import flight_arena
 from deploy.run.configurations import Embedded, RunConfig
 from deploy.run.display import Display, summary
 from deploy.run.launcher import Launcher, prepare
-from deploy.vehicles import flight_arena
 from messaging.ports import free_udp_port
 from messaging.tasks import learnt
 

@@ -16,7 +16,7 @@ from deploy.data.paths import data_root, method_path
 from deploy.data.store import method_for
 from deploy.policies import policy_named
 from deploy.run.configurations import RunConfig
-from deploy.vehicles import environment, fleet_world, flight_arena
+from deploy.vehicles import environment, fleet_world
 from learner.config import LearnerConfig
 from logs.recorder import Rotation
 from messaging.tasks import learnt
@@ -99,7 +99,6 @@ class Actor:
     flight: Flags[Flight] = field(default_factory=Flight)
 
     def run(self) -> int:
-        from actors import flight
         from actors.loop import ActorSettings, run
 
         robot = learnt(self.robot)
@@ -123,6 +122,9 @@ class Actor:
         )
         propose = partial(policy_named, self.policy, robot) if self.policy else None
         if self.url:
+            from actors import flight
+            from deploy.quadrotors import flight_arena
+
             arena = flight_arena(self.arena, self.seed)
             flight.run(settings, self.flight.settings(self.url, arena), arena, propose)
         else:

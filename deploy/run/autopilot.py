@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from deploy.vehicles import flight_arena
+from deploy.quadrotors import flight_arena
 from messaging.clock import WallClock
 from messaging.links import open_link
 from messaging.signals import heeded

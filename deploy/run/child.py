@@ -60,10 +60,9 @@ def _learner(place: Place, folder: Path, config: RunConfig, bus: BusSettings) ->
 
 
 def _actor(place: Place, folder: Path, config: RunConfig, bus: BusSettings) -> bool:
-    from actors import flight
     from actors.loop import ActorSettings, run
     from deploy.policies import policy_named
-    from deploy.vehicles import environment, fleet_world, flight_arena
+    from deploy.vehicles import environment, fleet_world
 
     settings = ActorSettings(
         bus=bus,
@@ -85,9 +84,11 @@ def _actor(place: Place, folder: Path, config: RunConfig, bus: BusSettings) -> b
     )
     propose = partial(policy_named, config.policy, robot_named(place.robot)) if config.policy else None
     if config.flight is not None:
-        return flight.run(
-            settings, config.flight, flight_arena(config.arena, config.seed, robot_named(place.robot)), propose
-        )
+        from actors import flight
+        from deploy.quadrotors import flight_arena
+
+        arena = flight_arena(config.arena, config.seed, robot_named(place.robot))
+        return flight.run(settings, config.flight, arena, propose)
     worlds = partial(fleet_world, conditions=config.conditions)
     return run(settings, partial(environment, conditions=config.conditions), propose, worlds)
 

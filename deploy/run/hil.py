@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
+from deploy.quadrotors import flight_arena
 from deploy.run.autopilot import PAD, open_field
-from deploy.vehicles import flight_arena
 from messaging.clock import Clock, WallClock
 from messaging.signals import heeded
 from sim.autopilot.hil import AutopilotGone, Hil

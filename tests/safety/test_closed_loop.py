@@ -30,19 +30,19 @@ CORRIDOR = [
 ]
 
 
-def clearance(obstacles, point):
-    """Distance of a true position to the solids, by their definitions."""
+def clearance(obstacles, points):
+    """Least distance of true positions (n, 2) to the solids, by their definitions."""
     ways = []
     for o in obstacles:
-        offset = np.asarray(point) - np.array(o.position)
+        offset = points - np.array(o.position)
         local = rotate(offset, -o.yaw)
         if o.kind == "wall":
-            ways.append(local[0])
+            ways.append(local[:, 0])
         elif o.kind == "cylinder":
-            ways.append(np.hypot(*offset) - o.size[0])
+            ways.append(np.hypot(*offset.T) - o.size[0])
         else:
-            ways.append(np.hypot(*np.maximum(np.abs(local) - 0.5 * np.array(o.size), 0.0)))
-    return min(ways)
+            ways.append(np.hypot(*np.maximum(np.abs(local) - 0.5 * np.array(o.size), 0.0).T))
+    return np.min(ways)
 
 
 def drive(ready, obstacles, policy, steps, seed, start=(0, 0, 0)):
@@ -65,7 +65,7 @@ def drive(ready, obstacles, policy, steps, seed, start=(0, 0, 0)):
         waiting = waiting + 1 if wants and abs(turned) < 0.01 else (0 if wants else waiting)
         longest = max(longest, waiting)
         points = before[:2] + rotate(path, before[2])
-        least = min(least, min(clearance(obstacles, p) for p in points) - GROUND.footprint)
+        least = min(least, clearance(obstacles, points) - GROUND.footprint)
     return counts, least, violations, longest
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import gymnasium
 import numpy as np
 
@@ -85,31 +87,33 @@ class Toy(gymnasium.Env):
     def step(self, action):
         assert action.dtype == np.float32, "cast to the environment's type"
         u = self.low + 0.5 * self.width * (np.clip(action.astype(float), -1.0, 1.0) + 1.0)
-        h, least = self.robot.period / SUBSTEPS, np.inf
+        h = self.robot.period / SUBSTEPS
+        between = []
         for _ in range(SUBSTEPS):
-            x, y, a, b = self.state
+            x, y, a, b = self.state.tolist()
             if self.robot.heading is not None:
-                b += (u[0] - b) * (1.0 - np.exp(-h / 0.05))
-                self.state = np.array([x + h * b * np.cos(a), y + h * b * np.sin(a), a + h * b * u[1], b])
+                b += (u[0] - b) * (1.0 - math.exp(-h / 0.05))
+                self.state = np.array([x + h * b * math.cos(a), y + h * b * math.sin(a), a + h * b * u[1], b])
             else:
                 vx, vy = a + h * (u[0] - a), b + h * (u[1] - b)
                 self.state = np.array([x + h * vx, y + h * vy, vx, vy])
-            self.trace.append(self.state)
-            least = min(least, self.clearance())
+            between.append(self.state)
+        self.trace += between
+        least = self.clearance(np.array(between))
         self.count, self.worst = self.count + 1, min(self.worst, least)
         return self.state.copy(), 0.0, bool(least < 0.0), self.count >= self.steps, {}
 
-    def clearance(self):
-        """m between body and the nearest disc, signed."""
-        first, last, radius = self.capsule
-        heading = self.state[2] if self.robot.heading is not None else 0.0
-        turn = np.array([[np.cos(heading), -np.sin(heading)], [np.sin(heading), np.cos(heading)]])
-        a, b = (self.state[:2] + turn @ np.array(end) for end in (first, last))
-        gaps = [np.inf]
+    def clearance(self, states):
+        """m between the body in states (n, 4) and the nearest disc, signed."""
+        *ends, radius = self.capsule
+        heading = states[:, 2] if self.robot.heading is not None else 0.0
+        cos, sin = np.cos(heading), np.sin(heading)
+        a, b = (states[:, :2] + np.stack((cos * x - sin * y, sin * x + cos * y), axis=-1) for x, y in ends)
+        axis, gaps = b - a, [np.inf]
         for disc in self.obstacles:
             away = np.array(disc.position) - a
-            along = np.clip(away @ (b - a) / max((b - a) @ (b - a), 1e-12), 0.0, 1.0)
-            gaps.append(np.linalg.norm(away - along * (b - a)) - radius - disc.size[0])
+            along = np.clip((away * axis).sum(axis=1) / np.maximum((axis * axis).sum(axis=1), 1e-12), 0.0, 1.0)
+            gaps.append((np.linalg.norm(away - along[:, None] * axis, axis=1) - radius - disc.size[0]).min())
         return min(gaps)
 
 

@@ -1,9 +1,12 @@
 """The planner's grid against the distances of the shapes, and its routes against staged rooms."""
 
+import math
 from collections.abc import Callable
+from itertools import product
 
 import numpy as np
 import pytest
+from scipy.ndimage import label
 
 from messaging.robots import Robot
 from messaging.shapes import BOX, CYLINDER, SPHERE, Obstacle
@@ -49,6 +52,20 @@ def test_routes_go_round_and_keep_away() -> None:
     assert walled.shapes.distance(way).min() > GROUND.footprint + 0.15
     assert not walled.clearance_map.connected((-1.0, 0.0), (1.0, 0.0), 0.51)
     assert walled.clearance_map.connected((-1.0, 0.0), (1.0, 0.0), 0.4)
+
+
+@pytest.mark.parametrize(("robot", "name"), [(GROUND, "dense"), (QUADROTOR, "default")])
+def test_what_hangs_together_is_what_scipy_labels_alike(robot: Robot, name: str) -> None:
+    together = []
+    for seed, clearance in product(range(3), (0.1, 0.2, 0.35, 0.8, 1.2, 1.6)):
+        arena = draw_arena(name, np.random.default_rng(seed), robot)
+        grid, start = arena.clearance_map, arena.start[: arena.dim]
+        least = math.hypot(clearance, 0.5 * grid.cell * math.sqrt(grid.dim))
+        regions, _ = label(grid.clearance >= least, structure=np.ones((3,) * grid.dim))
+        first, last = regions.ravel()[grid.number(np.array([start, arena.goal]))]
+        together.append(grid.connected(start, arena.goal, clearance))
+        assert together[-1] == (first == last and first > 0)
+    assert {True, False} == set(together)
 
 
 def test_routes_go_over_what_stands_on_the_floor() -> None:
