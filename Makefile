@@ -26,10 +26,13 @@ check: setup
 
 # Real time in one process, whole runs in another, the rest beside them at a lower priority (tests/conftest.py); what was
 # skipped, and why.
+# What the processes of a few hundred runs import is compiled once, whatever the shell says.
+unit: export PYTHONDONTWRITEBYTECODE =
 unit: setup
 	$(BIN)/python -m pytest -m "not long" -n 3 --dist loadscope --no-loadscope-reorder -rs
 
 # For every save: no whole runs, no flights, no trainings.
+test-fast: export PYTHONDONTWRITEBYTECODE =
 test-fast: setup
 	$(BIN)/ruff check .
 	$(BIN)/python -m pytest -m "not long" tests/messaging/test_descriptions.py tests/messaging/test_robots.py \

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import math
 
-from scipy.special import betaincinv
-
 Interval = tuple[float, float]
 
 CONFIDENCE = 0.95
@@ -19,6 +17,8 @@ def clopper_pearson(count: int, of: int) -> Interval | None:
     """
     if of <= 0:
         return None
+    from scipy.special import betaincinv  # a third of a second: a launcher needs it at its end
+
     tail = (1.0 - CONFIDENCE) / 2.0
     low = 0.0 if count == 0 else float(betaincinv(count, of - count + 1, tail))
     high = 1.0 if count == of else float(betaincinv(count + 1, of - count, 1.0 - tail))
