@@ -19,10 +19,14 @@ FAN = np.linspace(-math.pi, math.pi, 360, endpoint=False)
 def cast(obstacles, at, angles, far=FAR):
     """Ranges by marching: the step is the distance to the nearest obstacle."""
     shapes = Shapes.of(obstacles, 2)
-    ranges = np.zeros(len(angles))
+    ranges, going = np.zeros(len(angles)), np.arange(len(angles))
     directions = np.stack([np.cos(angles), np.sin(angles)], axis=1)
     for _ in range(400):
-        ranges = np.minimum(ranges + shapes.distance(at + ranges[:, None] * directions).min(axis=0), far)
+        steps = shapes.distance(at + ranges[going, None] * directions[going]).min(axis=0)
+        ranges[going] = np.minimum(ranges[going] + steps, far)
+        going = going[(steps > 1e-13) & (ranges[going] < far)]
+        if not len(going):
+            break
     return ranges
 
 
