@@ -74,12 +74,16 @@ class ClearanceMap:
         first, last = np.ravel_multi_index(tuple((self.index(np.array([start, goal])) + 1).T), free.shape)
         beside = np.array(list(product((-1, 0, 1), repeat=self.dim))) @ free.strides
         to_reach, front = free.ravel(), np.array([first])
+        place = np.zeros(free.size, np.intp)
         if not (to_reach[first] and to_reach[last]):
             return False
         while to_reach[last] and len(front):  # a cell farther each time
             front = (front[:, None] + beside).ravel()
-            front = np.unique(front[to_reach[front]])
+            front = front[to_reach[front]]
             to_reach[front] = False
+            places = np.arange(len(front))
+            place[front] = places
+            front = front[place[front] == places]  # each once
         return not to_reach[last]
 
 
