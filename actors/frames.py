@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-os.environ.setdefault("MAVLINK20", "1")  # read when pymavlink is imported
-
-from pymavlink.dialects.v20 import ardupilotmega as mavlink
+from actors.dialect import mavlink
 
 
 @dataclass(frozen=True)

@@ -7,9 +7,10 @@ import json
 import numpy as np
 import pytest
 
+from actors.dialect import mavlink
 from actors.flying import MavlinkVehicle
 from actors.frames import Frame
-from actors.mavlink import Client, CommandRefused, NoAutopilot, mavlink
+from actors.mavlink import Client, CommandRefused, NoAutopilot
 from messaging.shapes import CYLINDER, Obstacle
 from sim.autopilot.endpoint import Autopilot
 from sim.autopilot.pilot import Mode

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from actors.ceilings import CEILINGS, demand, too_low
-from actors.mavlink import Client, NotTold, mavlink, message_id
+from actors.dialect import mavlink
+from actors.mavlink import Client, NotTold, message_id
 from actors.telemetry import (
     ATTITUDE,
     ESTIMATED,

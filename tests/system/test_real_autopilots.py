@@ -11,9 +11,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from actors.dialect import mavlink
 from actors.frames import Frame
+from actors.heard import OFFBOARD
 from actors.live import LiveVehicle
-from actors.mavlink import OFFBOARD, mavlink, message_id
+from actors.mavlink import message_id
 from messaging.links import open_link
 from tests.real import KINDS, autopilot
 from tests.robots import QUADROTOR

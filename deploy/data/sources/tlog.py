@@ -6,18 +6,15 @@ to the recorder's clock by the messages that came soonest, for a link is late by
 
 from __future__ import annotations
 
-import os
 import struct
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-os.environ.setdefault("MAVLINK20", "1")
-
 import numpy as np
-from pymavlink.dialects.v20 import ardupilotmega as dialect
 
+from actors.dialect import mavlink as dialect
 from deploy.data.sources.acceleration import GRAVITY, with_accelerations
 from deploy.data.sources.angles import yaw_from_ned
 from deploy.data.sources.rows import Kept, Kinds, Row, vector
