@@ -1,4 +1,4 @@
-"""pymavlink's `ardupilotmega` dialect, as MAVLink 2: `common`, and what ArduPilot adds; the one place that imports it."""
+"""pymavlink's `ardupilotmega` dialect (`common`, and what ArduPilot adds) as MAVLink 2; nothing else imports it."""
 
 from __future__ import annotations
 
