@@ -37,10 +37,19 @@ def gaps(scan: Scan) -> tuple[Array, Array, Array]:
     if not len(angles):
         return np.array([-math.pi]), np.array([2.0 * math.pi]), np.zeros(1)
     width = np.diff(angles, append=angles[0] + 2.0 * math.pi)
-    least = np.minimum(ranges, np.roll(ranges, -1))
-    for k in range(1, min(scan.doubt, len(ranges)) + 1):
-        least = np.minimum(least, np.minimum(np.roll(ranges, k), np.roll(ranges, -1 - k)))
+    doubt = min(scan.doubt, len(ranges))
+    least = _least(ranges, range(-doubt, doubt + 2))
     return angles, width, _free(least, width, scan.least_width)
+
+
+def _least(ranges: Array, places: range) -> Array:
+    """The least of each beam's neighbours that are so many places on, all round."""
+    before, count = max(0, -places[0]), len(ranges)
+    turned = np.take(ranges, np.arange(-before, count + max(0, places[-1])), mode="wrap")
+    least = turned[before + places[0] :][:count].copy()
+    for k in places[1:]:
+        np.minimum(least, turned[before + k :][:count], out=least)
+    return least
 
 
 def _free(least: Array, width: Array, least_width: float) -> Array:
@@ -54,8 +63,8 @@ def _free(least: Array, width: Array, least_width: float) -> Array:
 
 def _lone(angles: Array, ranges: Array, scan: Scan) -> NDArray[np.bool_]:
     """Beams that return from where, by their neighbours and the least width, nothing can be: ghosts."""
-    width = (np.roll(angles, -1) - np.roll(angles, 1)) % (2.0 * math.pi)
-    beside = np.minimum(np.roll(ranges, 1), np.roll(ranges, -1))
-    for k in range(2, scan.doubt + 2):
-        beside = np.minimum(beside, np.minimum(np.roll(ranges, k), np.roll(ranges, -k)))
+    turned = np.take(angles, np.arange(-1, len(angles) + 1), mode="wrap")
+    width = (turned[2:] - turned[:-2]) % (2.0 * math.pi)
+    far = scan.doubt + 1
+    beside = np.minimum(_least(ranges, range(-far, 0)), _least(ranges, range(1, far + 1)))
     return np.asarray(ranges + 2.0 * scan.range_error < _free(beside, width, scan.least_width))

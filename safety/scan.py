@@ -58,16 +58,17 @@ def cells(scan: Scan, within: float) -> Cells:
     run = np.cumsum(begins) - 1
     along = angles - angles[begins][run]
     angles, width, free = angles[near], width[near], free[near]
-    _, cell = np.unique(np.stack([run[near], along[near] // SPAN]), axis=1, return_inverse=True)
-    cell = cell.ravel()
-    start = np.searchsorted(cell, np.arange(int(cell.max()) + 1))
+    run, span = run[near], along[near] // SPAN  # neither falls within the other
+    first = np.append(True, (run[1:] != run[:-1]) | (span[1:] != span[:-1]))
+    cell, start = np.cumsum(first) - 1, np.flatnonzero(first)
     slot = np.arange(len(cell)) - start[cell]
     at, heading = scan.sensor()
     # near ends at both sides of the gap, far ones so that the chord between them is beyond `within`
     far = np.maximum(free, within) / np.cos(0.5 * width)
-    sides = heading + np.stack([angles, angles + width, angles, angles + width], axis=1)
+    sides = heading + np.stack([angles, angles + width], axis=1)
+    towards = np.stack([np.cos(sides), np.sin(sides)], axis=-1)
     reach = np.stack([free, free, far, far], axis=1)
-    points = at + reach[..., None] * np.stack([np.cos(sides), np.sin(sides)], axis=-1)  # (gaps, 4, 2)
+    points = at + reach[..., None] * np.concatenate([towards, towards], axis=1)  # (gaps, 4, 2)
     error = scan.position_error + scan.heading_error * (reach + math.hypot(*scan.mount))
     filled = (
         np.zeros((len(start), int(slot.max()) + 1), dtype=int) + start[:, None]
@@ -86,10 +87,9 @@ def half_spaces(
     places[::2] = ends
     places[1::2] = 0.5 * (ends[1:] + ends[:-1])
     corners = near.corners - start
-    away = corners[:, None] - places[:, None]  # (n, q, V, 2)
-    distance = np.einsum("nqvd,nqvd->nqv", away, away)
-    closest = distance.argmin(axis=2)
-    towards = np.take_along_axis(away, closest[:, :, None, None], axis=2)[:, :, 0]
+    square = np.einsum("nvd,nvd->nv", corners, corners)  # of a corner's distance to a place, less that of the place
+    closest = (square[..., None] - 2.0 * (corners @ places.T)).argmin(axis=1)
+    towards = corners[np.arange(len(corners))[:, None], closest] - places  # (n, q, 2)
     gap = np.sqrt(np.einsum("nqd,nqd->nq", towards, towards))
     unit = towards / np.maximum(gap, TOUCHING)[..., None]
     level = (unit @ corners.transpose(0, 2, 1) - near.error[:, None]).min(axis=2)
