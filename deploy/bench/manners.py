@@ -155,7 +155,8 @@ def in_the_air(station: Station, kind: str) -> Manners:
     found |= braked(station, "silence", SILENCE)
     found["mode after silence"] = station.mode
     station.velocity = STILL
-    station.listen(0.5)
+    station.listen(3.0)
+    found["mode when setpoints come again"] = station.mode
     found["guided (offboard) again"] = to_offboard(station, kind)
     # Not NaN: it ends ArduCopter's simulator by a floating point exception.
     for what, frame, mask in (

@@ -79,6 +79,7 @@ class Pilot:
         self.last_setpoint: float | None = None  # s, when one was heard
         self.news: list[str] = []  # for the ground station
         self._height = 0.0  # m, of a takeoff
+        self._interrupted = False  # it lost its setpoints, and was told nothing else since
         self._since = 0.0  # s, when it armed or landed; in the air: when it last did not press on the floor
 
     @property
@@ -115,7 +116,7 @@ class Pilot:
             self.setpoint = Setpoint(STILL)
             if self.landed in (Landed.LANDING, Landed.TAKING_OFF):
                 self.landed = Landed.IN_AIR
-        self.mode = mode
+        self.mode, self._interrupted = mode, False
         if mode is Mode.LAND and self.landed is Landed.IN_AIR:
             self.landed = Landed.LANDING
 
@@ -126,8 +127,11 @@ class Pilot:
             self._leave_floor(Landed.TAKING_OFF)
 
     def hear(self, setpoint: Setpoint) -> None:
-        """A setpoint came, to be flown if the mode is offboard."""
+        """A setpoint came, to be flown if the mode is offboard, or was until there were none."""
         self.last_setpoint = self.time
+        if self._interrupted:
+            self.news.append("Setpoints again")
+            self.change(Mode.OFFBOARD)
         if self.mode is not Mode.OFFBOARD:
             return
         self.setpoint = setpoint
@@ -184,6 +188,7 @@ class Pilot:
         self.setpoint = Setpoint(STILL)
         if not stays:
             self.change(self.limits.on_loss)
+            self._interrupted = self.limits.on_loss is Mode.HOLD
 
     def _leave_floor(self, landed: Landed) -> None:
         self.vehicle.launch()

@@ -59,7 +59,7 @@ class Rules(Protocol):
 
 
 class Px4:
-    """Hold, takeoff, land and offboard; setpoints must stream before offboard, and a stream that stops ends it."""
+    """Hold, takeoff, land and offboard; setpoints must stream before offboard, and it holds while the stream stops."""
 
     name, autopilot = "px4", mavlink.MAV_AUTOPILOT_PX4
     refusal = mavlink.MAV_RESULT_TEMPORARILY_REJECTED

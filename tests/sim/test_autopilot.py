@@ -219,3 +219,15 @@ def test_a_stream_that_stops_ends_in_a_hold(flying: Station, timeout: float | No
     assert flying.autopilot.vehicle.state()[:3] == pytest.approx(where, abs=0.05)
     assert flying.pilot.mode is (Mode.HOLD if rules.name == "px4" else Mode.OFFBOARD)
     assert "Setpoints lost" in flying.texts()
+
+
+def test_setpoints_that_come_again_are_flown_unless_somebody_chose_another_mode(flying: Station) -> None:
+    """As a PX4 of late 2024 does (`python -m deploy.bench manners`): a stall of who sends them is not the end of the flight."""
+    flying.fly(0, 3, 0)
+    flying.wait(4.0)
+    flying.wait(0.1)
+    assert flying.pilot.setpoint.velocity == (0.0, 0.0, 0.0)
+    assert flying.fly(0, 3, 0)[1] == pytest.approx(3.0, abs=0.1) and flying.pilot.mode is Mode.OFFBOARD
+    flying.wait(4.0)
+    flying.pilot.change(Mode.HOLD)
+    assert flying.fly(0, 3, 0) == pytest.approx(np.zeros(3), abs=0.1) and flying.pilot.mode is Mode.HOLD
