@@ -222,7 +222,7 @@ def test_a_stream_that_stops_ends_in_a_hold(flying: Station, timeout: float | No
 
 
 def test_setpoints_that_come_again_are_flown_unless_somebody_chose_another_mode(flying: Station) -> None:
-    """As a PX4 of late 2024 does (`python -m deploy.bench manners`): a stall of who sends them is not the end of the flight."""
+    """As a real PX4 does (`python -m deploy.bench manners`): a stall of who sends them is not the end of the flight."""
     flying.fly(0, 3, 0)
     flying.wait(4.0)
     flying.wait(0.1)
