@@ -16,6 +16,7 @@ from safety.model_set import Recipe
 from safety.service import Counts, Models, answerer
 from tests.actors.teacher import Teacher
 from tests.robots import GROUND
+from tests.waiting import until
 
 STEPS = 60  # that each robot may take
 
@@ -73,13 +74,6 @@ def scene(buses, data_folder):
     service = Service(learner, data_folder)
     yield service, steps, exchanges, start
     end()
-
-
-def until(condition, seconds=60.0):
-    deadline = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < deadline, "it did not come about"
-        time.sleep(0.01)
 
 
 def test_the_robots_of_a_process_share_a_question(scene):

@@ -12,17 +12,11 @@ from messaging.bus import Bus
 from messaging.tasks import layout
 from tests.actors.teacher import Teacher
 from tests.robots import GROUND
+from tests.waiting import until
 
 
 def never() -> bool:
     return False
-
-
-def eventually(condition: Callable[[], bool], seconds: float = 10.0) -> None:
-    deadline = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < deadline, "it did not come about"
-        time.sleep(0.01)
 
 
 def joined(buses: tuple[Bus, Bus], lockstep: bool = False) -> tuple[Teacher, Student]:
@@ -72,7 +66,7 @@ def test_it_goes_as_far_as_it_may(buses: tuple[Bus, Bus]) -> None:
     time.sleep(0.3)
     assert not result
     teacher.say(5)
-    eventually(lambda: result == [True])
+    until(lambda: result == [True])
     assert student.wait(3, 7, never), "what was allowed stays so"
 
 
@@ -81,17 +75,17 @@ def test_the_end_of_the_run_and_a_stop_end_the_wait(buses: tuple[Bus, Bus]) -> N
     stop = threading.Event()
     result = waiting(student, 5, stop.is_set)
     stop.set()
-    eventually(lambda: result == [False])
+    until(lambda: result == [False])
     result = waiting(student, 5)
     teacher.say(0, done=True)
-    eventually(lambda: result == [False])
+    until(lambda: result == [False])
     assert student.done
 
 
 def test_a_new_incarnation_is_joined_and_its_weights_taken_older_or_not(buses: tuple[Bus, Bus]) -> None:
     teacher, student = joined(buses)
     teacher.publish(9)
-    eventually(lambda: student.policy is not None and student.policy.version == 9)
+    until(lambda: student.policy is not None and student.policy.version == 9)
     teacher.version = 4  # restarted from a checkpoint
     teacher.say(20, incarnation=2)
     assert student.wait(11, 7, never)
@@ -103,10 +97,10 @@ def test_without_permission_it_joins_again(buses: tuple[Bus, Bus], monkeypatch: 
     monkeypatch.setattr("actors.student.REJOIN_AFTER", 0.2)
     teacher, student = joined(buses)
     result = waiting(student, 5)
-    eventually(lambda: len(teacher.joins) >= 4)
+    until(lambda: len(teacher.joins) >= 4)
     assert not result
     teacher.say(5)
-    eventually(lambda: result == [True])
+    until(lambda: result == [True])
 
 
 def test_lockstep_waits_for_the_very_version(buses: tuple[Bus, Bus]) -> None:
@@ -116,7 +110,7 @@ def test_lockstep_waits_for_the_very_version(buses: tuple[Bus, Bus]) -> None:
     time.sleep(0.3)
     assert not result
     teacher.publish(2)
-    eventually(lambda: result == [True])
+    until(lambda: result == [True])
     teacher.say(2, weights_version=3)
     teacher.publish(4)
     result = waiting(student, 2)
@@ -128,7 +122,7 @@ def test_damaged_or_older_weights_are_not_taken(buses: tuple[Bus, Bus], caplog: 
     teacher, student = joined(buses)
     teacher._weights.put(pb.Weights(robot="ground", version=5, file=b"nonsense"))
     teacher.publish(6)
-    eventually(lambda: student.policy is not None and student.policy.version == 6)
+    until(lambda: student.policy is not None and student.policy.version == 6)
     teacher.publish(2)
     time.sleep(0.2)
     assert student.policy is not None and student.policy.version == 6
@@ -138,27 +132,27 @@ def test_damaged_or_older_weights_are_not_taken(buses: tuple[Bus, Bus], caplog: 
 def test_weights_that_do_not_go_on_from_ours_are_not_taken_and_the_learner_is_asked(buses: tuple[Bus, Bus]) -> None:
     teacher, student = joined(buses)
     teacher.publish(2**32 - 1)
-    eventually(lambda: buses[1].tolerance.count == 1)
+    until(lambda: buses[1].tolerance.count == 1)
     assert student.policy is not None and student.policy.version == 1
     teacher.version = 7
     result = waiting(student, 5)
-    eventually(lambda: len(teacher.joins) == 2)
+    until(lambda: len(teacher.joins) == 2)
     teacher.say(5)
-    eventually(lambda: result == [True])
+    until(lambda: result == [True])
     assert student.policy.version == 7
     teacher.publish(8)
-    eventually(lambda: student.policy is not None and student.policy.version == 8)
+    until(lambda: student.policy is not None and student.policy.version == 8)
 
 
 def test_a_permission_that_no_learner_gives_is_passed_over(buses: tuple[Bus, Bus]) -> None:
     teacher, student = joined(buses)
     teacher.say(10**9)
-    eventually(lambda: buses[1].tolerance.count == 1)
+    until(lambda: buses[1].tolerance.count == 1)
     result = waiting(student, 5)
     time.sleep(0.3)
     assert not result
     teacher.say(5)
-    eventually(lambda: result == [True])
+    until(lambda: result == [True])
 
 
 def test_nothing_is_taken_before_a_learner_has_taken_it_in(buses: tuple[Bus, Bus]) -> None:

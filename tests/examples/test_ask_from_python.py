@@ -8,7 +8,8 @@ from pathlib import Path
 import pytest
 
 from messaging.ports import free_endpoint
-from tests.system.runs import BRAKELINE, until
+from tests.system.runs import BRAKELINE
+from tests.waiting import until
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "ask_from_python.py"
 

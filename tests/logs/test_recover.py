@@ -26,6 +26,7 @@ from messaging.bus import Bus, BusSettings, Sample
 from messaging.ports import free_endpoint
 from messaging.topics import HEALTH, STEP
 from tests.logs.mixed import ABOUT, Writer
+from tests.waiting import until
 
 Say = Callable[..., Sample]
 KILLS = 10
@@ -184,7 +185,7 @@ def test_killed_at_ten_random_moments_nothing_older_than_a_second_is_missing(rou
         ready.clear()
         child = subprocess.Popen([sys.executable, "-c", RECORDER, router.settings.listen[0], str(folder / "run.mcap")])
         try:
-            _until(lambda place=f"/{number}/": any(place in file for file in ready))
+            until(lambda place=f"/{number}/": any(place in file for file in ready))
             first, dated = publisher.count + 1, []
             end = time.monotonic() + chance.uniform(0.2, 2.2)
             while time.monotonic() < end:
@@ -202,13 +203,6 @@ def test_killed_at_ten_random_moments_nothing_older_than_a_second_is_missing(rou
         assert found == list(range(first, first + len(found))), "none is missing in between, or twice"
         old = sum(at < killed - 1.0 for at in dated)
         assert len(found) >= old, f"kill {number}: {old - len(found)} older than a second are missing"
-
-
-def _until(condition: Callable[..., bool], seconds: float = 30.0) -> None:
-    deadline = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < deadline
-        time.sleep(0.02)
 
 
 def test_entries_keep_what_cannot_be_decoded() -> None:

@@ -14,7 +14,7 @@ from messaging.exposition import FIGURES, Exposition, State
 from messaging.ports import free_endpoint
 from messaging.process import Process
 from messaging.topics import LOG
-from tests.system.runs import until
+from tests.waiting import until
 
 DEPLOY = Path(__file__).parents[2] / "deploy"
 

@@ -38,7 +38,7 @@ from messaging.ros2.messages import (
     yaw_of,
 )
 from messaging.ros2.names import NODE, PUBLISHER, SUBSCRIPTION, full_name, ros_type, topic_key
-from tests.system.runs import until
+from tests.waiting import until
 
 KINDS = (Clock, DiagnosticArray, LaserScan, MarkerArray, Odometry, TFMessage, Twist, TwistStamped)
 HASH = "RIHS01_9c45bf16fe0983d80e3cfe750d6835843d265a9a6c46bd2e609fcddde6fb8d2a"

@@ -10,7 +10,8 @@ from messaging.bus import BusError
 from messaging.bus import turns as module
 from messaging.bus.turns import EACH, Turns
 from messaging.topics import DECIDE
-from tests.messaging.test_bus import Join, eventually
+from tests.messaging.test_bus import Join
+from tests.waiting import until
 
 
 def test_each_askers_questions_are_answered_in_turn() -> None:
@@ -42,7 +43,7 @@ def test_an_asker_is_not_delayed_by_the_many_questions_of_another(join: Join) ->
         return payload
 
     router.serve(DECIDE, work)
-    eventually(lambda: patient.ask(DECIDE, b"ready", timeout=2.0, robot="ground") == b"ready")
+    until(lambda: patient.ask(DECIDE, b"ready", timeout=10.0, robot="ground") == b"ready")
 
     def ask(number: int) -> None:
         with contextlib.suppress(BusError):
@@ -51,8 +52,8 @@ def test_an_asker_is_not_delayed_by_the_many_questions_of_another(join: Join) ->
     threads = [threading.Thread(target=ask, args=(number,)) for number in range(EACH)]
     for thread in threads:
         thread.start()
-    eventually(lambda: b"flood" in order)
-    assert patient.ask(DECIDE, b"patient", timeout=5.0, robot="ground") == b"patient"
+    until(lambda: b"flood" in order)
+    assert patient.ask(DECIDE, b"patient", timeout=10.0, robot="ground") == b"patient"
     ahead = order[order.index(b"flood") : order.index(b"patient")]
     assert len(ahead) <= 3, "the one in hand, and one whose turn had come"
     for thread in threads:
@@ -72,7 +73,7 @@ def test_a_question_for_which_nobody_waits_is_dropped(join: Join) -> None:
         return payload
 
     router.serve(DECIDE, work)
-    eventually(lambda: actor.ask(DECIDE, b"ready", timeout=2.0, robot="ground") == b"ready")
+    until(lambda: actor.ask(DECIDE, b"ready", timeout=10.0, robot="ground") == b"ready")
     slow = threading.Thread(target=lambda: actor.ask(DECIDE, b"slow", timeout=6.0, robot="ground"))
     slow.start()
     assert held.wait(5.0)
@@ -80,6 +81,6 @@ def test_a_question_for_which_nobody_waits_is_dropped(join: Join) -> None:
         actor.ask(DECIDE, b"dead", timeout=0.1, robot="ground")
     release.set()
     slow.join()
-    eventually(lambda: actor.ask(DECIDE, b"after", timeout=2.0, robot="ground") == b"after")
+    until(lambda: actor.ask(DECIDE, b"after", timeout=10.0, robot="ground") == b"after")
     assert b"dead" not in answered and {b"slow", b"after"} <= {*answered}
     assert router.tolerance.count == 1

@@ -4,7 +4,6 @@ import json
 import subprocess
 import sys
 import time
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -22,6 +21,7 @@ from safety.model_set import BadModel, ModelSet
 from safety.service import SafetySettings, archive_path, main
 from safety.sign import CONTEXT, Signed, Signer, Trust, Untrusted, recorded_domain, seal_of, write_signer
 from tests.messaging.keyring import keyring
+from tests.waiting import until
 
 
 @pytest.fixture
@@ -115,13 +115,6 @@ def test_a_restart_goes_on_with_the_newest_that_somebody_signed(model: ModelSet,
     assert newest_model(tmp_path, "ground", trust) == good
 
 
-def eventually(condition: Callable[[], bool], seconds: float = 60.0) -> None:
-    deadline = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < deadline, "it did not come about"
-        time.sleep(0.02)
-
-
 SERVICE = """
 import sys
 from pathlib import Path
@@ -147,7 +140,7 @@ def test_a_service_takes_over_the_bus_only_what_is_signed(
         words = [sys.executable, "-c", SERVICE, endpoint, keys, path, archive]
         service = subprocess.Popen([str(word) for word in words], stderr=subprocess.DEVNULL)
         try:
-            eventually(lambda: notes.get("model ground") == model.version)
+            until(lambda: notes.get("model ground") == model.version)
             with Bus(settings, "certify") as certify:
                 publisher = certify.publisher(MODEL, robot="ground")
                 rest = {"robot": "ground", "version": evil.version}
@@ -157,7 +150,7 @@ def test_a_service_takes_over_the_bus_only_what_is_signed(
                 signed = Signer.load(keys).sign(newer)
                 said = {"claim": signed.claim, "signature": signed.signature}
                 publisher.put(pb.Model(robot="ground", version=newer.version, file=signed.file, **said))
-                eventually(lambda: notes.get("model ground") == newer.version)
+                until(lambda: notes.get("model ground") == newer.version)
         finally:
             service.terminate()
             service.wait(20.0)

@@ -6,8 +6,6 @@ import json
 import os
 import signal
 import subprocess
-import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Self
 
@@ -18,19 +16,10 @@ from deploy.run.places import client_of, launcher_of
 from logs.metrics import Metrics
 from messaging.bus import Bus, BusSettings, Sample
 from messaging.topics import RECORDED
+from tests.waiting import PATIENCE, until
 
 BRAKELINE = (*PYTHON, "-m", "deploy.cli")
-PATIENCE = 120.0  # s: two cores that others use too
 STRIDE = 200  # steps of a run that take no longer
-
-
-def until(condition: Callable[[], Any], what: str, seconds: float = PATIENCE) -> Any:
-    """Wait for the condition; returns what it gave."""
-    deadline = time.monotonic() + seconds
-    while not (result := condition()):
-        assert time.monotonic() < deadline, f"not within {seconds:.0f} s: {what}"
-        time.sleep(0.05)
-    return result
 
 
 def brakeline(*arguments: object, timeout: float = PATIENCE) -> subprocess.CompletedProcess[str]:

@@ -10,7 +10,8 @@ from messaging.bus import Bus, BusSettings
 from messaging.ports import free_endpoint
 from messaging.shapes import Obstacle
 from safety.client import SafetyClient
-from tests.system.runs import BRAKELINE, brakeline, until
+from tests.system.runs import BRAKELINE, brakeline
+from tests.waiting import until
 
 LEARNING = ("--learner.td3.hidden", 16, "--learner.td3.batch", 16, "--learner.td3.warmup", 100)
 

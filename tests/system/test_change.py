@@ -5,7 +5,8 @@ import signal
 
 from logs.reader import open_log
 from messaging import brakeline_pb2 as pb
-from tests.system.runs import Run, brakeline, until
+from tests.system.runs import Run, brakeline
+from tests.waiting import until
 
 BEFORE, DURING, AFTER = 800, 6000, 1000  # steps of both actors
 ENDLESS = 100_000  # the run is ended when it has shown what is wanted, however long the new model set takes to make

@@ -18,7 +18,8 @@ from learner.checkpoint import exists
 from logs.reader import open_log, read
 from logs.report import analyse
 from tests.robots import GROUND
-from tests.system.runs import PATIENCE, Run, alive, brakeline, until
+from tests.system.runs import Run, alive, brakeline
+from tests.waiting import PATIENCE, until
 
 
 def test_each_process_is_killed_in_turn_and_the_run_goes_on_to_its_end(data_folder, tmp_path):

@@ -4,7 +4,8 @@ import shlex
 import subprocess
 from pathlib import Path
 
-from tests.system.runs import BRAKELINE, PATIENCE
+from tests.system.runs import BRAKELINE
+from tests.waiting import PATIENCE
 
 ROOT = Path(__file__).parent.parent.parent
 

@@ -15,7 +15,8 @@ from safety.filter import Filter
 from safety.model_set import ModelSet, Recipe
 from safety.request import Request
 from tests.deploy.data.porter import FILE, Porter, drive, porter, write_csv
-from tests.system.runs import BRAKELINE, brakeline, until
+from tests.system.runs import BRAKELINE, brakeline
+from tests.waiting import until
 
 STEPS = 60  # of an episode
 EPISODES = 12  # in `make test`; 200 behind `long`

@@ -25,7 +25,8 @@ from sim.autopilot.hil import Hil
 from sim.autopilot.px4 import Px4
 from sim.autopilot.sensors import SensorNoise, Sensors
 from sim.quadrotor import Quadrotor
-from tests.system.runs import BRAKELINE, until
+from tests.system.runs import BRAKELINE
+from tests.waiting import until
 
 PX4 = Path(os.environ.get("BRAKELINE_PX4", Path(__file__).parents[3] / "shared" / "px4"))
 EVERY = 10  # physics steps between two setpoints: 20 Hz

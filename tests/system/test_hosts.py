@@ -12,7 +12,7 @@ from deploy.bench.hosts import Hosts, NoHosts
 from learner.checkpoint import exists
 from learner.config import LearnerConfig
 from logs.reader import read
-from tests.system.runs import until
+from tests.waiting import until
 
 DELAY = 0.005  # s each way, and up to as much again, between the robot and the routers
 TELL = 1.5  # s, within which a process has said how it is

@@ -7,8 +7,9 @@ from messaging.bus import Bus, BusSettings
 from messaging.ports import free_endpoint
 from safety.model_set import Recipe
 from tests.robots import GROUND
-from tests.system.runs import brakeline, until
+from tests.system.runs import brakeline
 from tests.system.test_alone import start  # noqa: F401 - a fixture
+from tests.waiting import until
 
 
 def test_a_service_with_the_keys_that_were_handed_out_to_it(start, data_folder, tmp_path, monkeypatch):  # noqa: F811

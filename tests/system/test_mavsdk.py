@@ -16,7 +16,7 @@ from mavsdk.plugins.param import Param
 from mavsdk.plugins.telemetry import FlightMode, Telemetry
 
 from tests.system.flights import autopilot
-from tests.system.runs import PATIENCE, until
+from tests.waiting import PATIENCE, until
 
 os.environ.setdefault("MAVLINK20", "1")  # read when pymavlink is imported
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import math
-import time
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +18,7 @@ from actors.mavlink import message_id
 from messaging.links import open_link
 from tests.real import KINDS, autopilot
 from tests.robots import QUADROTOR
+from tests.waiting import until
 
 DEGREE = 111_319.5  # m, of latitude
 TRUTH = {"ardupilot": "SIMSTATE", "px4": "HIL_STATE_QUATERNION"}  # what its own simulator knows
@@ -73,19 +73,12 @@ def test_it_is_found_out_flown_and_given_back(kind: str, tmp_path: Path, caplog:
                 sub,
                 *[0] * 4,
             )
-            _until(lambda: "LAND" in vehicle.turn.lost)
+            until(lambda: "LAND" in vehicle.turn.lost)
             vehicle.wait(vehicle.turn.number + 10)
             assert client.custom_mode != OFFBOARD[kind][1], "who took it keeps it"
             assert any("braking" in record.message and "LAND" in record.message for record in caplog.records)
-            _until(lambda: "disarmed" in vehicle.turn.lost, 40.0)
+            until(lambda: "disarmed" in vehicle.turn.lost)
         finally:
             vehicle.close()
     waited = any("waiting for the position estimate" in record.message for record in caplog.records)
     assert waited or kind == "px4", "its estimator needs longer than a line takes"
-
-
-def _until(condition: Any, seconds: float = 10.0) -> None:
-    deadline = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < deadline
-        time.sleep(0.1)

@@ -27,7 +27,8 @@ from deploy.data import store
 from messaging.ports import free_endpoint
 from safety.model_set import Recipe
 from tests.robots import GROUND
-from tests.system.runs import BRAKELINE, PATIENCE, until
+from tests.system.runs import BRAKELINE
+from tests.waiting import PATIENCE, until
 
 DRIVER = Path(__file__).with_name("ros2_driver.py")
 SIMULATED = ("--sim-time", "--lockstep", "--factor", 6)

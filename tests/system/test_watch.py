@@ -12,7 +12,8 @@ import pytest
 from websockets.sync.client import connect
 
 from tests.browser import CHROMIUM, Page
-from tests.system.runs import BRAKELINE, Run, until
+from tests.system.runs import BRAKELINE, Run
+from tests.waiting import until
 
 needs_chromium = pytest.mark.skipif(CHROMIUM is None, reason="the live page in a browser: needs chromium")
 

@@ -27,7 +27,7 @@ from messaging.ros2.messages import (
 from tests.actors.ros2.test_gate import allow
 from tests.actors.ros2.test_laser import BEAMS, scan_of
 from tests.actors.ros2.test_senses import odometry, transform
-from tests.system.runs import until
+from tests.waiting import until
 
 # Wide, for a busy machine: what stops is told by its absence alone.
 FRESH = Freshness(odometry=1.0, scan=1.5, command=1.0)

@@ -12,7 +12,7 @@ import psutil
 import pytest
 
 from deploy.study.jobs import OtherConfiguration, complete, read, write
-from tests.system.runs import until
+from tests.waiting import until
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,18 @@
+"""Waiting for what comes about in its own time."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+PATIENCE = 120.0  # s: two cores that others use too
+
+
+def until(condition: Callable[[], Any], what: str = "it comes about", seconds: float = PATIENCE) -> Any:
+    """Wait for the condition; returns what it gave."""
+    deadline = time.monotonic() + seconds
+    while not (result := condition()):
+        assert time.monotonic() < deadline, f"not within {seconds:.0f} s: {what}"
+        time.sleep(0.02)
+    return result
