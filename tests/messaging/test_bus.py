@@ -142,13 +142,15 @@ def test_a_question_is_answered_by_another_process(join: Join, spawn: Spawn, end
     assert join("actor-0").ask(DECIDE, b"?", timeout=10.0, robot="ground") == b"a:?"
 
 
-def test_failures_of_a_question_are_typed(join: Join, caplog: pytest.LogCaptureFixture) -> None:
+def test_failures_of_a_question_are_typed(
+    join: Join, caplog: pytest.LogCaptureFixture, stalled: Callable[[], float]
+) -> None:
     join("launcher", listen=True)
     actor, safety = join("actor-0"), join("safety")
     start = time.perf_counter()
     with pytest.raises(NoReply, match="is the service running"):
         actor.ask(DECIDE, b"?", timeout=5.0, robot="ground")
-    assert time.perf_counter() - start < 1.0, "that nobody answers is known at once"
+    assert time.perf_counter() - start < 1.0 + stalled(), "that nobody answers is known at once"
 
     class BadRequest(ValueError):
         field = "state"
@@ -171,7 +173,7 @@ def test_failures_of_a_question_are_typed(join: Join, caplog: pytest.LogCaptureF
     start = time.perf_counter()
     with pytest.raises(Late, match="within 100 ms"):
         actor.ask(DECIDE, b"slow", timeout=0.1, robot="ground")
-    assert 0.09 < time.perf_counter() - start < 1.0
+    assert 0.09 < time.perf_counter() - start < 1.0 + stalled()
     release.set()
     noise = bytes(range(256)) * 40_000  # 10 MB
     assert actor.ask(DECIDE, noise, timeout=5.0, robot="ground") == noise
@@ -235,7 +237,7 @@ def test_of_replicas_behind_linked_routers_one_works_and_another_when_it_is_slow
         )
 
 
-def test_a_question_does_not_wait_behind_telemetry(join: Join) -> None:
+def test_a_question_does_not_wait_behind_telemetry(join: Join, stalled: Callable[[], float]) -> None:
     router, actor, safety = join("launcher", listen=True), join("actor-0"), join("safety")
     release = threading.Event()
     safety.serve(DECIDE, lambda payload: payload)
@@ -247,10 +249,10 @@ def test_a_question_does_not_wait_behind_telemetry(join: Join) -> None:
     for _ in range(300):
         publisher.put(pb.Step(observation=[0.0] * 100))
         start = time.perf_counter()
-        actor.ask(DECIDE, b"?", timeout=1.0, robot="ground")
+        actor.ask(DECIDE, b"?", timeout=10.0, robot="ground")
         worst = max(worst, time.perf_counter() - start)
     release.set()
-    assert worst < 0.25
+    assert worst < 0.25 + stalled()
 
 
 def test_who_lives_is_known_and_who_is_killed_is_missed(join: Join, spawn: Spawn, endpoint: str) -> None:
@@ -314,11 +316,13 @@ def test_everything_comes_back_after_the_router_was_killed(join: Join, spawn: Sp
     assert got[0] > 1, "what was put while the router was away is a gap"
 
 
-def test_without_a_router_a_client_says_so_after_its_patience(join: Join, endpoint: str) -> None:
+def test_without_a_router_a_client_says_so_after_its_patience(
+    join: Join, endpoint: str, stalled: Callable[[], float]
+) -> None:
     start = time.monotonic()
     with pytest.raises(Unreachable, match="start one there"):
         join("actor-0", patience=0.5)
-    assert 0.4 < time.monotonic() - start < 3.0
+    assert 0.4 < time.monotonic() - start < 3.0 + stalled()
 
 
 def test_a_client_waits_for_its_router(join: Join) -> None:

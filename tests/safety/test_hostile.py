@@ -2,7 +2,7 @@
 
 from fractions import Fraction
 from math import isqrt, pi
-from time import perf_counter
+from time import thread_time
 
 import numpy as np
 import pytest
@@ -76,11 +76,11 @@ def test_what_is_beyond_all_bounds_is_no_obstacle(far: float, field: str) -> Non
 
 
 def refused(payload: bytes) -> tuple[str, float]:
-    """The field that is wrong, and the seconds that saying so took."""
-    start = perf_counter()
+    """The field that is wrong, and the seconds of work that saying so took."""
+    start = thread_time()
     with pytest.raises(BadRequest) as error:
         batch_of(payload)
-    return error.value.field, perf_counter() - start
+    return error.value.field, thread_time() - start
 
 
 EMPTY = b"\x0a\x00"  # a request
