@@ -8,12 +8,17 @@ from typing import Any
 
 import pytest
 from filelock import FileLock
+from hypothesis import HealthCheck, settings
 from xdist.scheduler import LoadScopeScheduling
 
 from deploy.bench.timing import stalls
 from deploy.data import recording, store
 from safety.model_set import Recipe
 from tests.robots import GROUND, QUADROTOR
+
+# A machine that stalls is no failure of what is tested.
+settings.register_profile("patient", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.load_profile("patient")
 
 FLIGHTS = 60  # trajectories of the quadrotor, recorded in half a minute
 TRAJECTORIES = 50  # enough for every check of the certificates, recorded in ten seconds
