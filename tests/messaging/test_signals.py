@@ -8,8 +8,10 @@ import threading
 from messaging.signals import heeded
 
 WAITS = """
+import signal
 import threading
 from messaging.signals import heeded
+signal.signal(signal.SIGTERM, signal.SIG_IGN)  # the rest of a volley comes when it is through
 print("born", flush=True)
 with heeded(threading.Event()) as stop:
     print("ready", flush=True)
