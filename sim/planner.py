@@ -72,7 +72,7 @@ class ClearanceMap:
         least = float(np.hypot(clearance, 0.5 * self.cell * np.sqrt(self.dim)))
         free = np.pad(self.clearance >= least, 1)  # what is outside is solid
         first, last = np.ravel_multi_index(tuple((self.index(np.array([start, goal])) + 1).T), free.shape)
-        beside = np.array(list(product((-1, 0, 1), repeat=self.dim))) @ free.strides
+        beside = np.array(list(product((-1, 0, 1), repeat=self.dim))) @ free.strides  # a cell is a byte
         to_reach, front = free.ravel(), np.array([first])
         place = np.zeros(free.size, np.intp)
         if not (to_reach[first] and to_reach[last]):
@@ -84,7 +84,7 @@ class ClearanceMap:
             places = np.arange(len(front))
             place[front] = places
             front = front[place[front] == places]  # each once
-        return not to_reach[last]
+        return bool(not to_reach[last])
 
 
 def _nearest(shapes: Shapes, plan: Array, heights: Array | None = None) -> Array:

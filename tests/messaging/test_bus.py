@@ -98,7 +98,7 @@ def test_a_handler_that_raises_is_logged_and_goes_on(join: Join, caplog: pytest.
     assert "step/*/*: ZeroDivisionError" in caplog.text
 
 
-def test_a_publisher_that_falls_silent_is_stale_after_three_periods(join: Join) -> None:
+def test_a_publisher_that_falls_silent_is_stale_after_three_periods(join: Join, stalled: Callable[[], float]) -> None:
     bus = join("launcher", listen=True)
     often = bus.subscribe(dataclasses.replace(HEALTH, rate=10.0), lambda _: None)
     occasional = bus.subscribe(LOG, lambda _: None)
@@ -107,7 +107,7 @@ def test_a_publisher_that_falls_silent_is_stale_after_three_periods(join: Join) 
     bus.publisher(LOG).put(pb.LogLine())
     assert often.stale() == frozenset()
     until(lambda: often.stale() == {"health/launcher"})
-    assert time.monotonic() - start >= 0.3
+    assert 0.3 <= time.monotonic() - start < 1.0 + stalled()
     assert occasional.stale() == frozenset()
 
 
@@ -255,7 +255,9 @@ def test_a_question_does_not_wait_behind_telemetry(join: Join, stalled: Callable
     assert worst < 0.25 + stalled()
 
 
-def test_who_lives_is_known_and_who_is_killed_is_missed(join: Join, spawn: Spawn, endpoint: str) -> None:
+def test_who_lives_is_known_and_who_is_killed_is_missed(
+    join: Join, spawn: Spawn, endpoint: str, stalled: Callable[[], float]
+) -> None:
     router = join("launcher", listen=True)
     seen: list[tuple[str, bool]] = []
     router.watch(lambda source, alive: seen.append((source, alive)))
@@ -263,7 +265,9 @@ def test_who_lives_is_known_and_who_is_killed_is_missed(join: Join, spawn: Spawn
     until(lambda: ("safety-a", True) in seen)
     assert router.living() == {"launcher", "safety-a"}
     child.kill()
+    start = time.monotonic()
     until(lambda: ("safety-a", False) in seen)
+    assert time.monotonic() - start < 3.0 + stalled()
     assert router.living() == {"launcher"}
 
 
