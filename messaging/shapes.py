@@ -150,6 +150,23 @@ class Shapes:
         rest -= rounded * (self.rho[:, None] / np.maximum(norm, np.maximum(self.rho, 1e-300)[:, None]))[..., None]
         return np.asarray(-(rest @ self.axes.transpose(0, 2, 1))).reshape(len(self), *points.shape)
 
+    def out_of(self, point: Array) -> Array:
+        """Vectors (n, d) from a point (d,) inside of obstacles to the closest points of their surfaces; zero outside,
+        and in the middle of what is round, from where every way is as long."""
+        local = np.einsum("nji,nj->ni", self.axes, point - self.center)
+        beside = local * self.round
+        norm = np.sqrt(np.einsum("ni,ni->n", beside, beside))
+        rounded = beside * ((self.rho - norm) / np.maximum(norm, 1e-300))[:, None]
+        room = np.where(self.half > 0.0, self.half - np.abs(local), np.inf)  # to the flat faces
+        face = room.argmin(axis=1)
+        each = np.arange(len(self))
+        flat = np.zeros_like(local)
+        flat[each, face] = np.copysign(room[each, face], local[each, face])
+        depth_flat, depth_round = room[each, face], np.where(self.rho > 0.0, self.rho - norm, np.inf)
+        out = np.where((depth_flat < depth_round)[:, None], flat, rounded)
+        inside = (np.minimum(depth_flat, depth_round) >= 0.0)[:, None]
+        return np.einsum("nij,nj->ni", self.axes, np.where(inside, out, 0.0))
+
     def distance(self, points: Array) -> Array:
         """Distances from points (..., d) to the n obstacles: (n, ...); 0 inside."""
         vector = self.towards(points)

@@ -18,7 +18,7 @@ from safety.inputs import Inputs
 from safety.model_set import ModelSet
 from safety.program import SHARPEN, Builder, Rows
 from safety.promise import Promise
-from safety.recovery import SLOW, least_violating, slow_inputs, turn_towards
+from safety.recovery import SLOW, least_violating, slow_inputs, turn_towards, way_from
 from safety.request import ADJUSTED, ALLOWED, FAILSAFE, RECOVERING, Decision, Request, check_for_filter
 from safety.solver import INFEASIBLE, solve
 from safety.surroundings import Scene, Surroundings
@@ -221,8 +221,8 @@ class Filter:
         seeming = 0.0 if on_a_way else 2.0 * float(np.linalg.norm(self.around.measured)) + self.comfort
         if self.around.margin(self.around.rows(parked, stand), stand) >= -seeming:
             return None
-        rows = self.around.rows(scene, stand)
-        if not np.isfinite(rows.bound).all():  # of one that is touched, or is no number, no side is known
+        rows = self.around.rows(scene, stand, self.around.planes(scene, stand, leaving=True))
+        if not np.isfinite(rows.bound).all():  # of one that is just touched, or is no number, no side is known
             return None
         standing = rows.support(self.tube, stand) - rows.bound
         inputs = np.array([self.inputs.limited(wanted, before) for wanted in slow_inputs(robot)])
@@ -237,8 +237,7 @@ class Filter:
         if best is not None:
             z = plans[best]
         elif robot.heading is not None and len(scene.near):
-            ways = scene.near.towards(scene.start)
-            away = -ways[np.argmin(np.einsum("nd,nd->n", ways, ways))]
+            away = way_from(scene.near, scene.start)
             z = self.inputs.regressors(z_0, self.inputs.limited(turn_towards(robot, scene.heading, away), before))
         else:
             return None

@@ -51,6 +51,23 @@ def half_spaces(near: Shapes, start: Array, nominal: Array, keep_off: float, mea
     return normal, level[each, choice] - np.maximum(keep_off + near.margin, 0.0)[:, None] - np.abs(normal) @ measured
 
 
+def leading_out(
+    near: Shapes, start: Array, keep_off: float, measured: Array, planes: tuple[Array, Array]
+) -> tuple[Array, Array]:
+    """The same half-spaces, but of an obstacle that the start is inside of, the one behind which it is left soonest:
+    nothing that is verified, but a way out (method §11)."""
+    out = near.out_of(start)
+    depth = np.sqrt(np.einsum("nd,nd->n", out, out))
+    inside = depth > TOUCHING
+    if not inside.any():
+        return planes
+    normals, offsets = planes[0].copy(), planes[1].copy()
+    normals[inside] = (-out[inside] / depth[inside, None])[:, None]
+    kept = np.maximum(keep_off + near.margin[inside], 0.0) + np.abs(normals[inside, 0]) @ measured
+    offsets[inside] = -(depth[inside] + kept)[:, None]
+    return normals, offsets
+
+
 def roomiest(unit: Array, level: Array, ends: Array) -> NDArray[np.intp]:
     """Which of the planes (n, 2N+1) serves which period, the ends (N+1, d) of which are nominal: (n, N).
 

@@ -2,7 +2,8 @@
 
 Of slow inputs, each followed by braking, the one whose worst violated half-space is violated least at the plan's end,
 then the next worst, and so on; none may violate any half-space more than standing does, but for its tube's own width. A
-robot that has to turn first turns on the spot towards where it can get away. Never verified: only the least bad.
+robot that has to turn first turns on the spot towards where it can get away. Of an obstacle that it is inside of (a
+margin below zero lets the body overlap) the nearest side counts. Never verified: only the least bad.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from messaging.robots import Robot
+from messaging.shapes import Shapes
 
 Array = NDArray[np.float64]
 
@@ -55,6 +57,16 @@ def lower(one: Array, other: Array) -> bool:
         if abs(a - b) > BETTER:
             return bool(a < b)
     return False
+
+
+def way_from(near: Shapes, start: Array) -> Array:
+    """A direction (d,) that leads off the nearest of obstacles, out of the one that the start is deepest inside."""
+    out = near.out_of(start)
+    depth = np.einsum("nd,nd->n", out, out)
+    if depth.any():
+        return np.asarray(out[np.argmax(depth)])
+    ways = near.towards(start)
+    return np.asarray(-ways[np.argmin(np.einsum("nd,nd->n", ways, ways))])
 
 
 def turn_towards(robot: Robot, heading: float, away: Array) -> Array:

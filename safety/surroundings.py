@@ -14,7 +14,7 @@ from messaging.scans import Scan
 from messaging.shapes import Shapes
 from safety import scan as seen
 from safety.explain import SIGHT, Around, Planes, Stopped, worst
-from safety.freespace import half_spaces
+from safety.freespace import half_spaces, leading_out
 from safety.limits import Limits, stacked
 from safety.model_set import needed
 from safety.program import Layout, Rows
@@ -181,13 +181,16 @@ class Surroundings:
             margin = min(margin, most - self.extent(z))
         return max(margin, -self.reach) if margin == margin else -self.reach
 
-    def planes(self, scene: Scene, z: Array) -> list[Planes]:
-        """Half-spaces about the rollout of regressors z, of each disc of the body."""
+    def planes(self, scene: Scene, z: Array, leaving: bool = False) -> list[Planes]:
+        """Half-spaces about the rollout of regressors z, of each disc of the body; leaving: where it is inside of an
+        obstacle, those that lead out of it."""
         found = []
         for disc in self.discs:
             start, measured = scene.start + scene.turn @ disc.at, self.measured + disc.swing
             ends = start + disc.position @ z @ scene.turn.T
             normals, offsets = half_spaces(scene.near, start, ends, disc.radius, measured)
+            if leaving:
+                normals, offsets = leading_out(scene.near, start, disc.radius, measured, (normals, offsets))
             if scene.moving is not None:
                 swept = swept_half_spaces(scene.moving, start, ends, disc.radius, measured, self.robot.period)
                 normals, offsets = np.concatenate([normals, swept[0]]), np.concatenate([offsets, swept[1]])

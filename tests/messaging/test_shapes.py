@@ -74,6 +74,23 @@ def test_the_closest_point_is_in_the_shape_and_no_point_of_it_is_closer(obstacle
         assert ((drawn - point - vector) @ vector >= -1e-7).all()
 
 
+@settings(max_examples=150)
+@given(obstacles(), st.integers(0, 10_000))
+def test_the_way_out_ends_on_the_surface_and_none_is_shorter(obstacle, seed):
+    rng = np.random.default_rng(seed)
+    shapes = Shapes.of([obstacle], len(obstacle.position))
+    for point in [*sample(obstacle, rng, 10), *rng.uniform(-5, 5, (10, shapes.center.shape[1]))]:
+        out = shapes.out_of(point)[0]
+        depth = np.linalg.norm(out)
+        if not holds(obstacle, point, -1e-7):  # outside, or as good as on the surface
+            assert depth <= 1e-6
+            continue
+        assert holds(obstacle, point + out, 1e-9) and not holds(obstacle, point + out * (1 + 1e-6 / depth), 0.0)
+        around = rng.normal(size=(50, len(point)))
+        around *= depth / np.linalg.norm(around, axis=1, keepdims=True)
+        assert all(holds(obstacle, point + step, 1e-9) for step in around)
+
+
 def test_distances_by_hand():
     shapes = Shapes.of(
         [

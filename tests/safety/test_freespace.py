@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from messaging.shapes import Obstacle, Shapes
-from safety.freespace import half_spaces
+from safety.freespace import half_spaces, leading_out
 from tests.messaging.test_shapes import obstacles, sample
 
 BODY = 0.1
@@ -59,6 +59,23 @@ def test_nothing_is_free_for_a_start_that_touches(start):
     _, offsets = half_spaces(near, np.array(start), np.zeros((2, 2)), BODY, np.zeros(2))
     assert (offsets[0] == -np.inf).all()
     assert np.isfinite(offsets[1]).all()
+
+
+@given(obstacles(), st.integers(0, 10_000))
+def test_what_leads_out_has_all_of_the_obstacle_behind_it_and_is_the_same_outside(obstacle, seed):
+    rng = np.random.default_rng(seed)
+    d = len(obstacle.position)
+    near, measured, drawn = Shapes.of([obstacle], d), rng.uniform(0, 0.05, d), sample(obstacle, rng)
+    for start in (drawn[0], rng.uniform(-5, 5, d)):
+        nominal = start + rng.uniform(-1, 1, (3, d))
+        planes = half_spaces(near, start, nominal, BODY, measured)
+        normals, offsets = leading_out(near, start, BODY, measured, planes)
+        if near.distance(start)[0] > 0.0:
+            assert (normals == planes[0]).all() and (offsets == planes[1]).all()
+        elif np.isfinite(offsets).all():  # but in the middle, where no way is known
+            assert (offsets < 0.0).all()  # it is not free yet
+            kept = BODY + np.abs(normals[0, 0]) @ measured
+            assert ((drawn - start) @ normals[0, 0] >= offsets[0, 0] + kept - 1e-7).all()
 
 
 def test_no_number_is_never_free():

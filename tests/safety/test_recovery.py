@@ -58,6 +58,34 @@ def test_who_was_put_too_close_gets_away_and_drives_on(ready, angle):
     assert kinds[-1] != RECOVERING and "allowed" in kinds
 
 
+@pytest.mark.parametrize(
+    "obstacle",
+    [
+        Obstacle("cylinder", (0.15, 0.0), (0.2,), margin=-BODY),
+        Obstacle("cylinder", (-0.11, 0.08), (0.2,), margin=-BODY),
+        Obstacle("box", (0.0, 0.4), (1.0, 0.95), 0.3, margin=-BODY),
+        Obstacle("wall", (-0.06, 0.0), (), math.pi, margin=-BODY),
+    ],
+    ids=["ahead", "beside", "box", "wall"],
+)
+def test_who_came_to_stand_inside_of_what_only_its_middle_must_not_be_in_is_led_out(ready, obstacle):
+    """A hazard counts the body's middle, so the margin takes the body off; a policy that wants straight ahead."""
+    obstacles = Shapes.of([obstacle], 2)
+    robot, kept = Unicycle((0.0, 0.0, 0.0), np.random.default_rng(0)), Commitment(GROUND)
+    kinds, depths = [], []
+    for _ in range(300):
+        ask = request(robot.measure(), (0.25, 0.0), obstacles, input_in_force=kept.input_in_force, plan=kept.plan)
+        decision = ready.decide(type(ask)(**vars(ask) | {"model": kept.model, "predicted": kept.predicted}))
+        kinds.append(decision.kind)
+        depths.append(float(np.linalg.norm(obstacles.out_of(robot.state[:2]))))
+        assert decision.verified or decision.kind in (RECOVERING, "failsafe")
+        assert not (decision.verified and depths[-1] > 0.0) or decision.kind == "failsafe"
+        robot.step(kept.accept(decision.plan, decision.model, decision.predicted, decision.verified))
+    assert kinds[0] == RECOVERING and depths[0] > 0.0
+    assert max(depths) <= depths[0] + 0.003 and depths[-1] == 0.0
+    assert kinds[-1] in ("allowed", "adjusted")
+
+
 def test_who_only_seems_too_close_stands(ready):
     """By less than two measurements' errors: the plan that was verified counts, as ever."""
     near = 0.1 + BODY - 0.01
