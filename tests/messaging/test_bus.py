@@ -12,7 +12,7 @@ import pytest
 
 from messaging import brakeline_pb2 as pb
 from messaging.bus import Bus, BusError, BusSettings, Late, Malformed, NoReply, Refused, Sample, Unreachable
-from messaging.bus.asking import HELD
+from messaging.bus.asking import HELD, Asker
 from messaging.ports import free_endpoint
 from messaging.topics import DECIDE, HEALTH, LOG, STEP, WEIGHTS
 from tests.waiting import until
@@ -181,6 +181,30 @@ def test_failures_of_a_question_are_typed(
     service.close()
     with pytest.raises(NoReply):
         actor.ask(DECIDE, b"?", timeout=2.0, robot="ground")
+
+
+class _Silent:
+    """A Zenoh session whose questions end without any reply, after so many seconds."""
+
+    id = None
+
+    def __init__(self, after):
+        self._after = after
+
+    def declare_querier(self, *_, **__):
+        return self
+
+    def get(self, **_):
+        time.sleep(self._after)
+        return iter(())
+
+
+def test_a_question_that_ends_without_a_word_is_late_after_its_deadline_and_unheard_before(monkeypatch):
+    monkeypatch.setattr("zenoh.SourceInfo", lambda *_: None)
+    with pytest.raises(Late, match="within 20 ms"):
+        Asker(_Silent(0.03)).ask("a/key", b"", 0.02)
+    with pytest.raises(NoReply):
+        Asker(_Silent(0.0)).ask("a/key", b"", 5.0)
 
 
 def test_another_replica_answers_when_one_is_killed(join: Join, spawn: Spawn, endpoint: str) -> None:
