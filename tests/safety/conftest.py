@@ -2,11 +2,10 @@
 
 import pytest
 
-from safety.certificates import KINDS
 from safety.dataset import Dataset
 from safety.filter import Filter
 from safety.fitting import make
-from safety.model_set import MODES, ModelSet, Recipe
+from safety.model_set import ModelSet, Recipe
 from tests.safety.unicycle import record
 
 
@@ -20,13 +19,24 @@ def held_out() -> Dataset:
     return record(trajectories=30, periods=300, seed=1)
 
 
-@pytest.fixture(scope="session")
-def models(data: Dataset) -> dict[tuple[str, str], ModelSet]:
-    return {(kind, mode): make(data, Recipe(kind, mode)) for kind in KINDS for mode in MODES}
+class Made(dict[tuple[str, str], ModelSet]):
+    """Model sets by certificate and mode, each made when it is first asked for."""
+
+    def __init__(self, data: Dataset) -> None:
+        self._data = data
+
+    def __missing__(self, recipe: tuple[str, str]) -> ModelSet:
+        self[recipe] = make(self._data, Recipe(*recipe))
+        return self[recipe]
 
 
 @pytest.fixture(scope="session")
-def model(models: dict[tuple[str, str], ModelSet]) -> ModelSet:
+def models(data: Dataset) -> Made:
+    return Made(data)
+
+
+@pytest.fixture(scope="session")
+def model(models: Made) -> ModelSet:
     """The default certificate and mode."""
     return models["residual", "direct"]
 

@@ -25,13 +25,12 @@ def uninterrupted(data_folder, tmp_path_factory) -> bytes:
         return weights(run)
 
 
-def test_two_runs_with_one_seed_give_the_same_weights_and_another_seed_others(uninterrupted, tmp_path):
-    with Run(tmp_path / "same", *SHORT, "--seed", 3) as same, Run(tmp_path / "other", *SHORT, "--seed", 4) as other:
-        assert weights(same) == uninterrupted
+def test_another_seed_gives_other_weights(uninterrupted, tmp_path):
+    with Run(tmp_path / "other", *SHORT, "--seed", 4) as other:
         assert weights(other) != uninterrupted
 
 
-def test_interrupted_and_resumed_it_gives_the_weights_of_the_uninterrupted_run(uninterrupted, tmp_path):
+def test_a_second_run_with_the_seed_gives_the_same_weights_though_interrupted_and_resumed(uninterrupted, tmp_path):
     with Run(tmp_path / "run", *SHORT, "--seed", 3) as run:
         run.watch()
         until(lambda: exists(run.folder / "learner" / "checkpoint"), "a checkpoint")
