@@ -165,7 +165,7 @@ class Shapes:
         depth_flat, depth_round = room[each, face], np.where(self.rho > 0.0, self.rho - norm, np.inf)
         out = np.where((depth_flat < depth_round)[:, None], flat, rounded)
         inside = (np.minimum(depth_flat, depth_round) >= 0.0)[:, None]
-        return np.einsum("nij,nj->ni", self.axes, np.where(inside, out, 0.0))
+        return np.asarray(np.einsum("nij,nj->ni", self.axes, np.where(inside, out, 0.0)))
 
     def distance(self, points: Array) -> Array:
         """Distances from points (..., d) to the n obstacles: (n, ...); 0 inside."""
