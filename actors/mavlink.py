@@ -20,6 +20,7 @@ ANSWER = 0.5  # s for a COMMAND_ACK, then it is sent again
 TRIES = 5
 ARMINGS = 120  # times that arming may be refused at first
 FIRST, WATCHED = 1.0, 0.5  # s until a message that was granted comes, and for how long its rate is then watched
+LOOKS = 3  # at a rate that is poor: this side may have stalled
 PROMPT, SLOWEST = 0.6, 10.0  # share of the rate asked for that is good, and Hz without which nobody can fly
 RESULTS = {
     value: entry.name.removeprefix("MAV_RESULT_").lower() for value, entry in mavlink.enums["MAV_RESULT"].items()
@@ -65,7 +66,7 @@ class Client(Heard):
             except CommandRefused:
                 tried.append(f"{name} is refused")
                 continue
-            rates[name] = self._rate(what, wait)
+            rates[name] = self._rate(what, wait, interval)
             if rates[name] * interval >= PROMPT:
                 break
             tried.append(f"{name} comes at {rates[name]:.0f} Hz" if rates[name] else f"{name} is granted, never comes")
@@ -192,14 +193,19 @@ class Client(Heard):
         """Raises CommandRefused."""
         self.command(mavlink.MAV_CMD_NAV_LAND, wait=wait)
 
-    def _rate(self, what: str, wait: Wait) -> float:
+    def _rate(self, what: str, wait: Wait, interval: float) -> float:
         """Hz at which the message chosen for it comes, once it does; 0: it does not."""
-        began = self.heard[what]
+        began, best = self.heard[what], 0.0
         if not wait(lambda: self.heard[what] > began, FIRST):
-            return 0.0
-        began = self.heard[what]
-        wait(lambda: False, WATCHED)
-        return (self.heard[what] - began) / WATCHED
+            return best
+        time = max(WATCHED, 4.0 * interval)
+        for _ in range(LOOKS):
+            began = self.heard[what]
+            wait(lambda: False, time)
+            best = max(best, (self.heard[what] - began) / time)
+            if best * interval >= PROMPT:
+                break
+        return best
 
 
 def message_id(name: str) -> int:
