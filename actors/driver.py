@@ -14,7 +14,7 @@ from messaging.robots import Robot
 from messaging.tasks import task_of
 from safety.client import obstacle_messages, request_message
 from safety.commitment import Array, Commitment, Prediction, correction_penalty
-from safety.memory import Memory
+from safety.image_memory import filled, memory_of
 
 Result = tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]  # of a step
 EPISODE_STRIDE = 4096  # episodes of different robots of a run never share a seed: seed = episode · stride + number
@@ -69,7 +69,7 @@ class Driver:
         self.robot, self.env, self.identity, self.penalty, self.filtered = robot, env, identity, penalty, filtered
         self.cuts, self._goes_on = cuts, goes_on
         self.commitment = Commitment(robot)
-        self._memory = Memory(robot.footprint)
+        self._memory = memory_of(robot)
         self.index = 0  # steps so far
         self.running = False
         self.size = 0  # robots in its world; 0: it is alone
@@ -118,8 +118,7 @@ class Driver:
 
     def _remember(self) -> None:
         """Fill in the scan, if there is one, with what was seen free before."""
-        scan = self.info.get("scan")
-        self._scan = None if scan is None else self._memory.fill(scan, self.robot.period)
+        self._scan = filled(self._memory, self.info.get("scan"), self.robot.period)
 
     def may_wait(self, outcome: Outcome) -> bool:
         """No answer, and nothing moves: better to ask again than to let the episode pass."""

@@ -211,7 +211,7 @@ def _told(entity: SceneEntity, about: Surroundings, promises: Iterable[np.ndarra
         free.points.extend(map(_point, about.free))
         free.color.CopyFrom(FREE)
         hits = LinePrimitive(type=LinePrimitive.LINE_LIST, pose=_pose(()), thickness=4.0, scale_invariant=True)
-        hits.points.extend(_point((*at, z)) for at in about.hits for z in (0.0, FLAT))
+        hits.points.extend(_point((*at[:2], z + at[2:].sum())) for at in about.hits for z in (0.0, FLAT))
         hits.color.CopyFrom(HIT)
         entity.lines.extend([free, hits])
     swept = about.swept.reshape(-1, about.swept.shape[-1])

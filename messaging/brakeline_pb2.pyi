@@ -310,6 +310,89 @@ class Scan(_message.Message):
 Global___Scan: _TypeAlias = Scan  # noqa: Y015
 
 @_typing.final
+class RangeImage(_message.Message):
+    """One turn of a ranging sensor with beams all about (messaging/range_images.py): free space in the air."""
+
+    DESCRIPTOR: _descriptor.Descriptor
+
+    RANGES_FIELD_NUMBER: _builtins.int
+    RINGS_FIELD_NUMBER: _builtins.int
+    LOW_FIELD_NUMBER: _builtins.int
+    HIGH_FIELD_NUMBER: _builtins.int
+    AT_FIELD_NUMBER: _builtins.int
+    ATTITUDE_FIELD_NUMBER: _builtins.int
+    MOUNT_FIELD_NUMBER: _builtins.int
+    FAR_FIELD_NUMBER: _builtins.int
+    RANGE_ERROR_FIELD_NUMBER: _builtins.int
+    POSITION_ERROR_FIELD_NUMBER: _builtins.int
+    ANGLE_ERROR_FIELD_NUMBER: _builtins.int
+    LEAST_WIDTH_FIELD_NUMBER: _builtins.int
+    DOUBT_FIELD_NUMBER: _builtins.int
+    SPEED_FIELD_NUMBER: _builtins.int
+    AGE_FIELD_NUMBER: _builtins.int
+    ranges: _builtins.bytes
+    """unsigned 16 bit, little endian, mm, ring by ring from the lowest; 0: not known"""
+    rings: _builtins.int
+    low: _builtins.float
+    """rad, elevation of the lowest ring"""
+    high: _builtins.float
+    """rad, of the highest"""
+    far: _builtins.float
+    """m; a range of as much or more: nothing was hit"""
+    range_error: _builtins.float
+    """m"""
+    position_error: _builtins.float
+    """m"""
+    angle_error: _builtins.float
+    """rad, of a beam's direction in the world"""
+    least_width: _builtins.float
+    """m: nothing that it may meet is narrower"""
+    doubt: _builtins.int
+    """of any four neighbouring beams that may see through what is there"""
+    speed: _builtins.float
+    """m/s: whatever was hit may move as fast"""
+    age: _builtins.float
+    """s since it was taken"""
+    @_builtins.property
+    def at(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]:
+        """the robot's measured position when it was taken, m"""
+
+    @_builtins.property
+    def attitude(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]:
+        """w, x, y, z: the world from the sensor's frame"""
+
+    @_builtins.property
+    def mount(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]:
+        """m, the sensor's place in its own frame"""
+
+    def __init__(
+        self,
+        *,
+        ranges: _builtins.bytes = ...,
+        rings: _builtins.int = ...,
+        low: _builtins.float = ...,
+        high: _builtins.float = ...,
+        at: _abc.Iterable[_builtins.float] | None = ...,
+        attitude: _abc.Iterable[_builtins.float] | None = ...,
+        mount: _abc.Iterable[_builtins.float] | None = ...,
+        far: _builtins.float = ...,
+        range_error: _builtins.float = ...,
+        position_error: _builtins.float = ...,
+        angle_error: _builtins.float = ...,
+        least_width: _builtins.float = ...,
+        doubt: _builtins.int = ...,
+        speed: _builtins.float = ...,
+        age: _builtins.float = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["age", b"age", "angle_error", b"angle_error", "at", b"at", "attitude", b"attitude", "doubt", b"doubt", "far", b"far", "high", b"high", "least_width", b"least_width", "low", b"low", "mount", b"mount", "position_error", b"position_error", "range_error", b"range_error", "ranges", b"ranges", "rings", b"rings", "speed", b"speed"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    def WhichOneof(self, oneof_group: _Never) -> None: ...
+
+Global___RangeImage: _TypeAlias = RangeImage  # noqa: Y015
+
+@_typing.final
 class Request(_message.Message):
     """--- the safety service -------------------------------------------------------------------------------------------
 
@@ -337,6 +420,7 @@ class Request(_message.Message):
     FLEET_FIELD_NUMBER: _builtins.int
     PROMISE_FIELD_NUMBER: _builtins.int
     SCAN_FIELD_NUMBER: _builtins.int
+    IMAGE_FIELD_NUMBER: _builtins.int
     robot: _builtins.str
     actor: _builtins.str
     episode: _builtins.int
@@ -389,6 +473,10 @@ class Request(_message.Message):
     def scan(self) -> Global___Scan:
         """in the place of obstacles, or beside them: what is not seen free in it is occupied"""
 
+    @_builtins.property
+    def image(self) -> Global___RangeImage:
+        """the same of a robot in space"""
+
     def __init__(
         self,
         *,
@@ -411,10 +499,11 @@ class Request(_message.Message):
         fleet: _abc.Iterable[_builtins.str] | None = ...,
         promise: Global___Promise | None = ...,
         scan: Global___Scan | None = ...,
+        image: Global___RangeImage | None = ...,
     ) -> None: ...
-    _HasFieldArgType: _TypeAlias = _typing.Literal["promise", b"promise", "scan", b"scan"]  # noqa: Y015
+    _HasFieldArgType: _TypeAlias = _typing.Literal["image", b"image", "promise", b"promise", "scan", b"scan"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["action", b"action", "actor", b"actor", "episode", b"episode", "fleet", b"fleet", "input_in_force", b"input_in_force", "model", b"model", "observation", b"observation", "obstacles", b"obstacles", "plan", b"plan", "predicted_center", b"predicted_center", "predicted_half_width", b"predicted_half_width", "predicted_heading", b"predicted_heading", "promise", b"promise", "robot", b"robot", "scan", b"scan", "state", b"state", "step", b"step", "time", b"time", "voucher", b"voucher"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["action", b"action", "actor", b"actor", "episode", b"episode", "fleet", b"fleet", "image", b"image", "input_in_force", b"input_in_force", "model", b"model", "observation", b"observation", "obstacles", b"obstacles", "plan", b"plan", "predicted_center", b"predicted_center", "predicted_half_width", b"predicted_half_width", "predicted_heading", b"predicted_heading", "promise", b"promise", "robot", b"robot", "scan", b"scan", "state", b"state", "step", b"step", "time", b"time", "voucher", b"voucher"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 
@@ -841,7 +930,7 @@ class Step(_message.Message):
     speed: _builtins.float
     """m/s, true"""
     clearance: _builtins.float
-    """m from the footprint to the nearest obstacle, true"""
+    """m from the body's discs (spheres) to the nearest obstacle, true"""
     outside: _builtins.bool
     """the true state was outside the stated bound of the measurement"""
     compared: _builtins.bool

@@ -13,22 +13,27 @@ from messaging import brakeline_pb2 as pb
 from messaging.gaps import gaps
 from messaging.motion import Motion, Sighting
 from messaging.movers import Movers
+from messaging.patches import seen_free
+from messaging.range_images import RangeImage, directions
 from messaging.robots import Robot
-from messaging.scans import BadScan, Scan
+from messaging.scans import Scan
+from messaging.sensed import sensed_of
 from messaging.shapes import Obstacle
 
 Array = NDArray[np.float64]
 
 OUTLINE = 120  # corners of what is drawn of free space, about
+SLICE = 0.5  # m above and below the sensor: what was hit within is drawn from above
 
 
 @dataclass(frozen=True)
 class Surroundings:
     """Of one question, in the world's frame, m.
 
-    hits (k, 2): where beams ended; free (c, 2): the outline of what they showed to be free, as the filter takes it;
-    both empty without a scan. movers (n, d+1): of each that moves its place as measured and the radius of a disc (ball)
-    that holds it; swept (n, N, d+1): one for the end of every period of a plan, which holds wherever it may be then.
+    hits (k, d): where beams ended; free (c, d): the outline of what they showed to be free, as the filter takes it (in
+    space: at the sensor's height); both empty without a scan. movers (n, d+1): of each that moves its place as measured
+    and the radius of a disc (ball) that holds it; swept (n, N, d+1): one for the end of every period of a plan, which
+    holds wherever it may be then.
     """
 
     hits: Array
@@ -38,10 +43,13 @@ class Surroundings:
 
     def flat(self, hits: int = OUTLINE) -> dict[str, list[Any]]:
         """From above, as JSON can hold it: points x, y and discs x, y, radius, in mm; so many hits at the most."""
-        some = self.hits[:: max(1, -(-len(self.hits) // hits))]
+        level = self.hits
+        if level.shape[1] == 3 and len(self.free):
+            level = level[np.abs(level[:, 2] - self.free[0, 2]) <= SLICE]
+        some = level[:: max(1, -(-len(level) // hits)), :2]
         return {
             "hits": some.round(3).tolist(),
-            "free": self.free.round(3).tolist(),
+            "free": self.free[:, :2].round(3).tolist(),
             "movers": self.movers[..., [0, 1, -1]].round(3).tolist(),
             "swept": self.swept[..., [0, 1, -1]].round(3).tolist(),
         }
@@ -52,10 +60,12 @@ def surroundings(robot: Robot, request: pb.Request, corners: int = OUTLINE) -> S
 
     Raises BadShape, BadScan: the request tells of none that are.
     """
-    hits = free = np.zeros((0, 2))
-    if request.HasField("scan"):
-        scan = scan_of(request.scan)
-        hits, free = _hits(scan), outline(scan, corners)
+    hits = free = np.zeros((0, robot.position_dim))
+    sensed = sensed_of(request)
+    if isinstance(sensed, Scan):
+        hits, free = _hits(sensed), outline(sensed, corners)
+    elif sensed is not None:
+        hits, free = _image_hits(sensed), level_outline(sensed, corners)
     moving = Movers.of([_obstacle(o) for o in request.obstacles if o.HasField("motion")], robot.position_dim)
     shapes, ends = moving.shapes, robot.period * np.arange(1.0, robot.horizon + 1.0)
     across: Array = shapes.rho + np.sqrt((shapes.half**2).sum(axis=1))
@@ -83,27 +93,6 @@ def motion_of(m: pb.Motion) -> Motion:
     )
 
 
-def scan_of(m: pb.Scan) -> Scan:
-    """Raises BadScan: it is none."""
-    if len(m.pose) != 3 or len(m.mount) != 2:
-        raise BadScan("a scan's pose has 3 coordinates, its mount 2")
-    x, y, heading = m.pose
-    return Scan(
-        np.fromiter(m.ranges, np.float64, len(m.ranges)),  # `np.array` takes five times as long
-        np.fromiter(m.angles, np.float64, len(m.angles)),
-        (x, y, heading),
-        (m.mount[0], m.mount[1]),
-        far=m.far,
-        range_error=m.range_error,
-        position_error=m.position_error,
-        heading_error=m.heading_error,
-        least_width=m.least_width,
-        doubt=m.doubt,
-        speed=m.speed,
-        age=m.age,
-    )
-
-
 def _hits(scan: Scan) -> Array:
     """(k, 2)"""
     at, heading = scan.sensor()
@@ -122,6 +111,27 @@ def outline(scan: Scan, most: int = OUTLINE) -> Array:
     ends = np.append(angles[first[1:]], angles[-1] + width[-1])
     sides = heading + np.column_stack([angles[first], ends]).ravel()
     return np.asarray(at + np.repeat(reach, 2)[:, None] * np.column_stack([np.cos(sides), np.sin(sides)]))
+
+
+def _image_hits(image: RangeImage) -> Array:
+    """(k, 3)"""
+    elevations = image.low + image.step[0] * np.arange(len(image.ranges))
+    hit = image.known & (image.ranges < image.far)
+    ways = directions(elevations, image.ranges.shape[1])[hit]
+    return np.asarray(image.sensor() + image.ranges[hit, None] * ways @ image.turn.T)
+
+
+def level_outline(image: RangeImage, most: int = OUTLINE) -> Array:
+    """Corners (c, 3) of a part of what the image shows to be free at the sensor's height: the least F of each group of
+    columns, in the ring nearest to level."""
+    elevations, free = seen_free(image)
+    ring = int(np.abs(elevations).argmin())
+    columns = free.shape[1]
+    first = np.arange(0, columns, max(1, 2 * columns // most))
+    reach = np.repeat(np.minimum.reduceat(free[ring], first), 2)
+    sides = np.column_stack([first, np.append(first[1:], columns)]).ravel() - 0.5
+    ways = directions(np.zeros(1), columns, sides)[0]
+    return np.asarray(image.sensor() + reach[:, None] * ways @ image.turn.T)
 
 
 def promised(robot: Robot, exchange: pb.Exchange) -> Array:

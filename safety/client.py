@@ -22,7 +22,7 @@ from numpy.typing import ArrayLike, NDArray
 from messaging import brakeline_pb2 as pb
 from messaging.bus import Bus, BusError, BusSettings
 from messaging.robots import FEEDBACK, Robot, robot_named
-from messaging.scans import Scan
+from messaging.sensed import Sensed, add_sensed
 from messaging.shapes import Obstacle
 from messaging.topics import DECIDE
 from safety.commitment import Commitment, Prediction
@@ -81,29 +81,12 @@ def _motion(obstacle: Obstacle) -> pb.Motion | None:
     return message
 
 
-def scan_message(scan: Scan) -> pb.Scan:
-    return pb.Scan(
-        ranges=scan.ranges.astype(np.float32).tolist(),
-        angles=scan.angles.astype(np.float32).tolist(),
-        pose=scan.pose,
-        mount=scan.mount,
-        far=scan.far,
-        range_error=scan.range_error,
-        position_error=scan.position_error,
-        heading_error=scan.heading_error,
-        least_width=scan.least_width,
-        doubt=scan.doubt,
-        speed=scan.speed,
-        age=scan.age,
-    )
-
-
 def request_message(
     commitment: Commitment,
     state: ArrayLike,
     action: ArrayLike,
     obstacles: Iterable[Obstacle],
-    scan: Scan | None = None,
+    scan: Sensed | None = None,
     **more: Any,
 ) -> pb.Request:
     """A request; `more`: actor, episode, step, time, observation, fleet."""
@@ -117,9 +100,9 @@ def request_message(
         model=commitment.model,
         voucher=commitment.voucher,
         obstacles=obstacle_messages(obstacles),
-        scan=None if scan is None else scan_message(scan),
         **more,
     )
+    add_sensed(message, scan)
     if commitment.predicted is not None:
         message.predicted_center.extend(commitment.predicted.center.tolist())
         message.predicted_half_width.extend(commitment.predicted.half_width.tolist())

@@ -13,6 +13,7 @@ from messaging.shapes import Shapes
 from safety.promise import Promises
 from safety.scan import Cells
 from safety.scan import half_spaces as unseen_half_spaces
+from safety.shadows import Shadows
 from safety.sweep import swept_half_spaces
 
 Array = NDArray[np.float64]
@@ -44,7 +45,7 @@ class Around:
 
     near: Shapes
     moving: Movers | None
-    unseen: Cells | None
+    unseen: Cells | Shadows | None
     promised: Promises | None = None  # these come last, once for the whole body
 
     def __len__(self) -> int:
@@ -64,10 +65,10 @@ class Planes:
     keep_off: float
     measured: Array
 
-    def itself(self, near: Shapes, which: int, period: int) -> tuple[Array, float]:
-        """The half-space (d,), () that an obstacle's surface is, whatever is to be kept to it."""
+    def itself(self, which: int, period: int, margin: float = 0.0) -> tuple[Array, float]:
+        """The half-space (d,), () that the surface is of an obstacle of that margin, whatever is to be kept to it."""
         normal = self.normals[which, period]
-        kept = max(self.keep_off + float(near.margin[which]), 0.0) + float(np.abs(normal) @ self.measured)
+        kept = max(self.keep_off + margin, 0.0) + float(np.abs(normal) @ self.measured)
         return normal, float(self.offsets[which, period]) + kept
 
 
@@ -90,8 +91,13 @@ def worst(row: int, room: float, robot: Robot, around: Around, planes: list[Plan
     period = end if end < N else min(end - N, N - 1)
     when = end if end < N else min(end - N + 1, N)
     start, ends = planes[disc].start, planes[disc].ends
-    if which < len(around.near):
-        by, (normal, level) = around.near.kind(which), planes[disc].itself(around.near, which, period)
+    if isinstance(around.unseen, Shadows) and which >= len(around) - len(around.unseen):
+        by, (normal, level) = UNSEEN, planes[disc].itself(which, period)
+    elif which < len(around.near):
+        by, (normal, level) = (
+            around.near.kind(which),
+            planes[disc].itself(which, period, float(around.near.margin[which])),
+        )
     else:
         by, normals, offsets = _moving_or_unseen(which - len(around.near), robot, around, start, ends)
         normal, level = normals[0, period], float(offsets[0, period])
@@ -109,5 +115,5 @@ def _moving_or_unseen(which: int, robot: Robot, around: Around, start: Array, en
             mover = around.moving.take(one)
             return f"moving {mover.shapes.kind(0)}", *swept_half_spaces(mover, start, ends, 0.0, exact, robot.period)
         one -= len(around.moving)
-    assert around.unseen is not None
+    assert isinstance(around.unseen, Cells)
     return UNSEEN, *unseen_half_spaces(around.unseen.take(one), start, ends, 0.0, exact, robot.period)

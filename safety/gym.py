@@ -18,11 +18,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from messaging.bus import BusError
-from messaging.scans import Scan
+from messaging.sensed import Sensed
 from safety.client import Answer, SafetyClient
 from safety.commitment import correction_penalty
+from safety.image_memory import filled, memory_of
 from safety.inprocess import InProcess
-from safety.memory import Memory
 from safety.request import Decision
 from safety.spaces import Actions, actions_of, cast
 from safety.views import OBSTACLES, STATE, View
@@ -38,8 +38,8 @@ UNANSWERED = "unanswered"  # in place of a decision's kind: the service was not 
 class SafetyWrapper(gymnasium.Wrapper[Any, Any, Any, Any]):
     """Replaces each action by the filter's decision on it.
 
-    `info` may hold `scan`, a `messaging.scans.Scan` that takes the obstacles' place. The wrapper adds to it, after
-    `step`: `safety` (the `Decision`; of a service the `Answer`, None if there was none), `proposed` (the action given),
+    `info` may hold `scan` (`Scan`, in space `RangeImage`) in the obstacles' place. The wrapper adds, after `step`:
+    `safety` (the `Decision`; of a service the `Answer`, None if there was none), `proposed` (the action given),
     `penalty`, and `diagnostics`, a dict of plain values: kind, verified, contained, margin [m], time_ms, model, reason,
     and proposed and executed as inputs of the robot. The penalty is subtracted from the reward.
     """
@@ -72,8 +72,8 @@ class SafetyWrapper(gymnasium.Wrapper[Any, Any, Any, Any]):
         self._state, self._obstacles = state, obstacles
         self._actions = actions_of(env.action_space, self.asker.robot, actions)
         self._now: tuple[Any, dict[str, Any]] | None = None
-        self._memory = Memory(self.asker.robot.footprint)
-        self._scan: Scan | None = None
+        self._memory = memory_of(self.asker.robot)
+        self._scan: Sensed | None = None
 
     @classmethod
     def load(cls, env: gymnasium.Env[Any, Any], model: Path | str, penalty: float = 0.0, **how: Any) -> Self:
@@ -126,8 +126,7 @@ class SafetyWrapper(gymnasium.Wrapper[Any, Any, Any, Any]):
     def _remember(self) -> None:
         """The scan, if there is one, with what was seen free before."""
         assert self._now is not None
-        scan = self._now[1].get("scan")
-        self._scan = None if scan is None else self._memory.fill(scan, self.asker.robot.period)
+        self._scan = filled(self._memory, self._now[1].get("scan"), self.asker.robot.period)
 
 
 def diagnostics(answer: Decision | Answer | None, reason: str = "") -> dict[str, Any]:

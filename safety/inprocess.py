@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from messaging.movers import parted
 from messaging.robots import Robot
-from messaging.scans import Scan
+from messaging.sensed import Sensed
 from messaging.shapes import Obstacle
 from messaging.tasks import UnknownTask, task_of
 from safety.commitment import Commitment
@@ -44,7 +44,7 @@ class InProcess:
         action: ArrayLike,
         obstacles: Iterable[Obstacle],
         observation: object = None,
-        scan: Scan | None = None,
+        scan: Sensed | None = None,
     ) -> Decision:
         """The decision on an action; its plan is committed to, so execute `commitment.due`.
 
@@ -64,7 +64,7 @@ class InProcess:
         actions: Sequence[ArrayLike],
         obstacles: Sequence[Iterable[Obstacle]],
         observations: Sequence[object],
-        scans: Sequence[Scan | None],
+        scans: Sequence[Sensed | None],
     ) -> list[Decision]:
         """The same of several robots of the kind, each with a commitment of its own. Raises as `decide` does, before
         any plan is committed to."""
@@ -89,7 +89,7 @@ class InProcess:
         action: ArrayLike,
         obstacles: Iterable[Obstacle],
         observation: object,
-        scan: Scan | None,
+        scan: Sensed | None,
     ) -> Request:
         kept.seen = np.asarray(state, dtype=float)
         wanted = np.asarray(action, dtype=float)

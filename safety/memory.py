@@ -8,23 +8,87 @@ blind sector, for it would touch it already.
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from collections import deque
 from dataclasses import dataclass, replace
+from typing import Generic, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from messaging.range_images import RangeImage
 from messaging.scans import Scan
 from safety.scan import gaps
 
 Array = NDArray[np.float64]
 
-START = 0.1  # m beside the body, where it is put down
 KEPT = 12  # scans
 APART = 0.04  # m or, by a quarter of it, rad, between two that are kept
 LOOK = 1.0  # m along a beam that memory is asked about
 STEP = 0.01  # m between the places at which it is
 CELLS = 360  # of a turn
+
+
+S = TypeVar("S", Scan, RangeImage)
+
+
+class Memory(ABC, Generic[S]):
+    """Of one robot in one world that is not put back. Positions are the measured ones, with their errors."""
+
+    START = 0.1  # m beside the body, where it is put down
+
+    def __init__(self, footprint: float) -> None:
+        """footprint: radius of the body's disc or ball, m."""
+        self._room = footprint + self.START
+        self.reset()
+
+    def reset(self) -> None:
+        """It is put down somewhere else."""
+        self._put: S | None = None
+        self._age = 0.0  # s since it was put down
+        self._before: list[float] = []  # s since each that is kept was taken
+
+    def fill(self, scan: S, elapsed: float) -> S:
+        """The scan, with what is remembered in the place of beams that say nothing; elapsed: s since the last one."""
+        if self._put is None:
+            self._put = scan
+        else:
+            self._age += elapsed
+            self._before = [age + elapsed for age in self._before]
+        unknown = self._wanted(scan)
+        filled = scan
+        if unknown.any():
+            ranges = np.array(scan.ranges)
+            # What is remembered has its errors off already; whoever reads a scan takes them off every beam.
+            known = self._along(scan, unknown)
+            ranges[unknown] = np.where(known > 0.0, np.minimum(known + scan.range_error, scan.far), 0.0)
+            filled = replace(scan, ranges=ranges)
+        self._keep(scan)
+        return filled
+
+    @abstractmethod
+    def _wanted(self, scan: S) -> NDArray[np.bool_]:
+        """The beams to be filled in, as `ranges`."""
+
+    @abstractmethod
+    def _along(self, scan: S, beams: NDArray[np.bool_]) -> Array:
+        """How far these beams (B,) are known to be free, m; 0: not at all."""
+
+    @abstractmethod
+    def _keep(self, scan: S) -> None:
+        """Remember it, if it was taken from somewhere else than the last one that is kept."""
+
+    def _at_start(self, points: Array, scan: S, step: Array | float) -> NDArray[np.bool_]:
+        """In the room that it was put down in? step [m]: from each of the points (..., d) to the next."""
+        assert self._put is not None
+        moved = scan is not self._put
+        drift = 2.0 * scan.position_error * moved + scan.speed * self._age + step
+        return np.asarray(np.linalg.norm(points - _place(self._put), axis=-1) <= self._room - drift)
+
+
+def _place(scan: Scan | RangeImage) -> Array:
+    """(d,): the robot's measured position when it was taken."""
+    return np.asarray(scan.pose[:2] if isinstance(scan, Scan) else scan.at)
 
 
 @dataclass(frozen=True)
@@ -37,36 +101,15 @@ class _Seen:
     least: list[Array]
 
 
-class Memory:
-    """Of one robot in one world that is not put back. Positions are the measured ones, with their errors."""
-
-    def __init__(self, footprint: float) -> None:
-        """footprint: radius of the body's disc, m."""
-        self._room = footprint + START
-        self.reset()
+class FanMemory(Memory[Scan]):
+    """Of a fan in the plane."""
 
     def reset(self) -> None:
-        """It is put down somewhere else."""
+        super().reset()
         self._seen: deque[_Seen] = deque(maxlen=KEPT)
-        self._put: tuple[float, float, float] | None = None
-        self._age = 0.0  # s since it was put down
-        self._before: list[float] = []  # s since each scan was taken
 
-    def fill(self, scan: Scan, elapsed: float) -> Scan:
-        """The scan, with what is remembered in the place of beams that say nothing; elapsed: s since the last one."""
-        if self._put is None:
-            self._put = scan.pose
-        else:
-            self._age += elapsed
-            self._before = [age + elapsed for age in self._before]
-        unknown = ~scan.known
-        filled = scan
-        if unknown.any():
-            ranges = np.array(scan.ranges)
-            ranges[unknown] = self._along(scan, scan.angles[unknown])
-            filled = replace(scan, ranges=ranges)
-        self._keep(scan)
-        return filled
+    def _wanted(self, scan: Scan) -> NDArray[np.bool_]:
+        return ~scan.known
 
     def _keep(self, scan: Scan) -> None:
         if self._seen:
@@ -80,25 +123,15 @@ class Memory:
         self._seen.append(_Seen(scan, at, heading, _levels(_least(scan))))
         self._before.append(scan.age)
 
-    def _along(self, scan: Scan, angles: Array) -> Array:
-        """How far these beams (B,) are known to be free, m; 0: not at all."""
+    def _along(self, scan: Scan, beams: NDArray[np.bool_]) -> Array:
         at, heading = scan.sensor()
         away = STEP * np.arange(1, round(LOOK / STEP) + 1)
-        turned = heading + angles
+        turned = heading + scan.angles[beams]
         points = at + away[:, None, None] * np.stack([np.cos(turned), np.sin(turned)], axis=1)  # (S, B, 2)
-        free = self._at_start(points, scan)
+        free = self._at_start(points, scan, STEP)
         for seen, age in zip(self._seen, self._before, strict=True):
             free |= self._in(seen, age, points, scan)
-        steps = np.where(free.all(axis=0), len(away), free.argmin(axis=0))
-        known = STEP * steps
-        # `gaps` takes the range's error off every beam: what is remembered has its errors off already
-        return np.where(steps > 0, np.minimum(known + scan.range_error, scan.far), 0.0)
-
-    def _at_start(self, points: Array, scan: Scan) -> NDArray[np.bool_]:
-        """In the room that it was put down in?"""
-        assert self._put is not None
-        drift = 2.0 * scan.position_error * (scan.pose != self._put) + scan.speed * self._age + STEP
-        return np.asarray(np.linalg.norm(points - np.array(self._put[:2]), axis=-1) <= self._room - drift)
+        return STEP * np.where(free.all(axis=0), len(away), free.argmin(axis=0))
 
     def _in(self, seen: _Seen, age: float, points: Array, scan: Scan) -> NDArray[np.bool_]:
         """Was it seen free, with all that is within the errors since?"""

@@ -117,7 +117,7 @@ class Builder:
         bound = rows.bound - rows.gradient[:, : self.known] @ z_0 - rows.spread @ constant - SHARPEN
         steer, stretch = rows.gradient[:, self.known :], rows.spread @ self.M_t
         offset = self.W_t[:, : self.known] @ z_0
-        center, radius = self._box(z_0[-m:])
+        center, radius = self.reachable(z_0[-m:])
         atom = offset + self.W_t[:, self.known :] @ center
         give = np.abs(self.W_t[:, self.known :]) @ radius
         middle, swing = steer @ center, np.abs(steer) @ radius
@@ -135,7 +135,7 @@ class Builder:
         A, b = np.vstack([A / length[:, None], self.fixed]), np.concatenate([bound[matter] / length, fixed])
         return Program(self.h, g, A, b)
 
-    def _box(self, before: Array) -> tuple[Array, Array]:
+    def reachable(self, before: Array) -> tuple[Array, Array]:
         """Center and half-widths (F·m,) of what bounds and slew leave to the free inputs after `before` (m,)."""
         steps = self.free // len(before)
         way = np.arange(1, steps + 1)[:, None] * np.asarray(self.robot.action_slew)

@@ -10,8 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from messaging.movers import Movers
+from messaging.range_images import RangeImage
 from messaging.robots import Robot
 from messaging.scans import Scan
+from messaging.sensed import Sensed
 from messaging.shapes import FARTHEST, Shapes
 from messaging.tasks import UnknownTask, task_of
 from safety.commitment import Prediction
@@ -53,7 +55,7 @@ class Request:
     model: str = ""
     predicted: Prediction | None = None
     movers: Movers | None = None
-    scan: Scan | None = None
+    scan: Sensed | None = None
     promise: Promise | None = None
     promised: Promises | None = None
     observation: NDArray[np.float32] = field(default_factory=lambda: np.zeros(0, np.float32))
@@ -114,8 +116,10 @@ def check_for_filter(robot: Robot, request: Request) -> None:
         raise BadRequest("obstacles", f"a {robot.name} robot's obstacles have {robot.position_dim} coordinates")
     if request.movers is not None and request.movers.drift.shape[1] != robot.position_dim:
         raise BadRequest("obstacles", f"a {robot.name} robot's movers have {robot.position_dim} coordinates")
-    if request.scan is not None and (robot.position_dim != 2 or robot.heading is None):
-        raise BadRequest("scan", f"a {robot.name} robot has no fan in the plane: give obstacles")
+    if isinstance(request.scan, Scan) and (robot.position_dim != 2 or robot.heading is None):
+        raise BadRequest("scan", f"a {robot.name} robot has no fan in the plane: give obstacles, or a range image")
+    if isinstance(request.scan, RangeImage) and robot.position_dim != 3:
+        raise BadRequest("image", f"a {robot.name} robot has no range image in space: give obstacles, or a scan")
     if request.observation.size:
         _finite(robot, "observation", request.observation, (_observed(robot, request),))
     if request.predicted is not None:

@@ -9,10 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from messaging.movers import Movers
+from messaging.range_images import RangeImage
 from messaging.robots import Robot
 from messaging.scans import Scan
 from messaging.shapes import Shapes
 from safety import scan as seen
+from safety import shadows as shades
 from safety.explain import SIGHT, Around, Planes, Stopped, worst
 from safety.freespace import half_spaces, leading_out
 from safety.limits import Limits, stacked
@@ -24,6 +26,8 @@ from safety.sweep import swept_half_spaces
 from safety.tube import Tube
 
 Array = NDArray[np.float64]
+
+ASIDE = 0.5  # m beyond all plans: what a range image is looked at for, and so the largest margin that it tells
 
 
 @dataclass(frozen=True)
@@ -62,7 +66,7 @@ class Scene:
     near: Shapes
     beyond: float
     moving: Movers | None = None  # that may meet the tube
-    unseen: seen.Cells | None = None  # what a scan does not show to be free
+    unseen: seen.Cells | shades.Shadows | None = None  # what a scan does not show to be free
     promised: Promises | None = None  # to other robots
 
     @property
@@ -129,7 +133,8 @@ class Surroundings:
 
     # --- one scene ---------------------------------------------------------------------------------------------
 
-    def scene(self, request: Request) -> Scene:
+    def scene(self, request: Request, z_0: Array, inputs: tuple[Array, Array]) -> Scene:
+        """inputs: center and half-widths of what a plan's free inputs may be, after z_0."""
         d, robot = self.robot.position_dim, self.robot
         start, near = request.state[:d], request.obstacles
         heading = float(request.state[robot.heading]) if robot.heading is not None else 0.0
@@ -146,7 +151,11 @@ class Surroundings:
         if promised is not None:
             beyond, counts = self._parted(promised.nearest(start), beyond)
             promised = promised.take(counts) if counts.any() else None
-        unseen = None if request.scan is None else self._unseen(request.scan, start)
+        unseen: seen.Cells | shades.Shadows | None = None
+        if isinstance(request.scan, RangeImage):
+            unseen = shades.shadows(request.scan, self._room(z_0, inputs, start, turn), self.body)
+        elif request.scan is not None:
+            unseen = self._unseen(request.scan, start)
         return Scene(start, heading, turn, near, beyond, moving, unseen, promised)
 
     def _parted(self, away: Array, beyond: float) -> tuple[float, NDArray[np.bool_]]:
@@ -161,6 +170,20 @@ class Surroundings:
         cos, sin = math.cos(heading), math.sin(heading)
         turn[0, 0], turn[0, 1], turn[1, 0], turn[1, 1] = cos, -sin, sin, cos
         return turn
+
+    def _room(self, z_0: Array, inputs: tuple[Array, Array], start: Array, turn: Array) -> shades.Room:
+        """A box, world, in which every plan's discs stay with their middles after z_0; and some more."""
+        center, radius = inputs
+        free = len(radius)
+        z = np.concatenate([z_0, center])
+        sizes = self.tube.M @ (np.abs(self.tube.W @ z) + np.abs(self.tube.W[:, -free:]) @ radius) + self.tube.m_0
+        L = self.tube.generators
+        half = np.abs(self.tube.position[:, :, -free:]) @ radius + np.abs(self.tube.directions) @ sizes[:L]
+        half += sizes[L:].max() + self.measured + self.comfort + ASIDE
+        ways, half = np.vstack([np.zeros(len(start)), self.tube.centers(z) @ turn.T]), half @ np.abs(turn).T
+        half = np.vstack([half[:1], half]) + max((float(np.linalg.norm(disc.at)) for disc in self.discs), default=0.0)
+        last = self.robot.horizon * self.robot.period
+        return shades.Room(start + (ways - half).min(axis=0), start + (ways + half).max(axis=0), last)
 
     def _unseen(self, scan: Scan, start: Array) -> seen.Cells | None:
         """What is not known to be free within reach, or may come there before a plan ends."""
@@ -195,7 +218,8 @@ class Surroundings:
                 swept = swept_half_spaces(scene.moving, start, ends, disc.radius, measured, self.robot.period)
                 normals, offsets = np.concatenate([normals, swept[0]]), np.concatenate([offsets, swept[1]])
             if scene.unseen is not None:
-                beside = seen.half_spaces(scene.unseen, start, ends, disc.radius, measured, self.robot.period)
+                of = shades if isinstance(scene.unseen, shades.Shadows) else seen
+                beside = of.half_spaces(scene.unseen, start, ends, disc.radius, measured, self.robot.period)
                 normals, offsets = np.concatenate([normals, beside[0]]), np.concatenate([offsets, beside[1]])
             found.append(Planes(start, ends, normals, offsets, disc.radius, measured))
         return found
@@ -233,6 +257,8 @@ class Surroundings:
         What is beyond the reach decides nothing, but it may be what is nearest to the tube. Of it the bound is told:
         how far it is, less how far the tube goes.
         """
+        if isinstance(scene.unseen, shades.Shadows) and margin >= ASIDE:
+            return margin, True
         if not self.far and margin + self.widest <= self.reach:
             return margin, False
         extent = self.extent(z)

@@ -13,7 +13,8 @@ from messaging import brakeline_pb2 as pb
 from messaging import surroundings
 from messaging.movers import parted
 from messaging.robots import Robot
-from messaging.scans import BadScan, Scan
+from messaging.scans import BadScan
+from messaging.sensed import Sensed, sensed_of
 from messaging.shapes import FARTHEST, BadShape, Obstacle
 from safety.commitment import Prediction
 from safety.promise import Promise, Promises
@@ -96,7 +97,7 @@ def request_of(
         plan=plan.reshape(robot.horizon, robot.action_dim),
         obstacles=obstacles,
         movers=movers,
-        scan=scan_of(message.scan) if message.HasField("scan") else None,
+        scan=seen(message),
         model=message.model,
         predicted=predicted,
         promise=promise,
@@ -124,10 +125,10 @@ def obstacles_of(messages: Sequence[pb.Obstacle], dim: int) -> list[Obstacle]:
     return obstacles
 
 
-def scan_of(m: pb.Scan) -> Scan:
+def seen(message: pb.Request) -> Sensed | None:
     """Raises BadRequest: it is none."""
     try:
-        return surroundings.scan_of(m)
+        return sensed_of(message)
     except BadScan as error:
         raise BadRequest("scan", str(error)) from error
 

@@ -19,7 +19,7 @@ from sim.arenas import draw_arena
 from sim.conditions import Conditions
 from sim.estimator import wrap
 from sim.movers import Crowd, Watch
-from sim.scanner import Perception, Scanner
+from sim.scanner import Perception, scanner_of
 from sim.senses import LIDAR_NOISE, Senses
 from sim.vehicle import MakeVehicle, Period, Vehicle
 from sim.world import Arena
@@ -53,7 +53,7 @@ class NavigationEnv(gymnasium.Env[Observation, Any]):
     obstacles          list[Obstacle]: those with their surface within `robot.sight` of the measured position; those
                        that move, as measured, with their motion, if they may come as near within a plan;
                        none where free space comes from scans
-    scan               Scan | None: the newest there is, where free space comes from scans
+    scan               Scan | RangeImage | None: the newest there is, where free space comes from scans
     arena              Arena: the whole map
     goal               (d,) m
     time               s since the episode's start
@@ -127,7 +127,7 @@ class NavigationEnv(gymnasium.Env[Observation, Any]):
         self._senses: Senses = self._make_senses(self.robot, self._arena, rng, self._lidar_noise)
         self._scanner = None
         if self._perception.kind == "scan":
-            self._scanner = Scanner(self.robot, self._arena, rng, self._lidar_noise, self._perception.faults)
+            self._scanner = scanner_of(self.robot, self._arena, rng, self._lidar_noise, self._perception.faults)
         crowd = self._arena.crowd
         self._watch = Watch(crowd, rng) if isinstance(crowd, Crowd) else None  # other robots promise where they will be
         self._steps = 0

@@ -39,12 +39,16 @@ class Lidar:
             self._moving.place(time)
             mujoco.mj_kinematics(self._model, self._data)
 
-    def cast(self, origin: Array, heading: float = 0.0) -> Array:
+    def cast(self, origin: Array, turn: float | Array = 0.0) -> Array:
         """True ranges (R,) in m from a point (d,) of free space; `max_range` where nothing is hit within it.
+        turn: of the robot's frame in the world, a heading [rad] or (3, 3).
 
         A point inside an obstacle has no true range: a beam then ends where it leaves the obstacle.
         """
-        beams = rotate(self._beams, heading) if heading else self._beams
+        if isinstance(turn, np.ndarray):
+            beams = self._beams @ turn.T
+        else:
+            beams = rotate(self._beams, turn) if turn else self._beams
         point = origin if self._height is None else np.array([*origin, self._height])
         mujoco.mj_multiRay(
             self._model,
@@ -62,9 +66,9 @@ class Lidar:
         )
         return np.where((self._hit >= 0) & (self._ranges < self.max_range), self._ranges, self.max_range)
 
-    def ranges(self, origin: Array, heading: float = 0.0) -> Array:
+    def ranges(self, origin: Array, turn: float | Array = 0.0) -> Array:
         """What the lidar reports there, (R,) m in [0, max_range]; a beam that hits nothing reports `max_range`."""
-        true = self.cast(origin, heading)
+        true = self.cast(origin, turn)
         if self._rng is None:
             return true
         noisy = true + cut_normal(self._rng, self._noise, true.shape)

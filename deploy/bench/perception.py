@@ -1,5 +1,5 @@
-"""What free space costs by where it comes from: size on the wire and time, for a map, a scan, things that move, and
-fleets. A period's question of a fleet is one message with a request for each of its robots.
+"""What free space costs by where it comes from: size on the wire and time, for a map, a scan, things that move,
+fleets, and in the air. A period's question of a fleet is one message with a request for each of its robots.
 
 Times by kind are those in `decide`, by the clock; `answer` is a request's share of its question's processor time,
 decoding and encoding included, which other work on the machine changes less.
@@ -19,21 +19,24 @@ from deploy.bench.timing import WARM_UP, Figures
 from deploy.study.evaluate import Evaluation, episode, prepared, prepared_fleet, round_of
 from logs.tally import KINDS
 from messaging import brakeline_pb2 as pb
-from messaging.robots import robot_named
+from messaging.robots import Robot, robot_named
 from sim.conditions import Conditions, Perception
 
 STEPS = 600  # periods of each
 SCANS = Conditions(perception=Perception("scan"))
 SITUATIONS = {
-    "map": Evaluation(),
-    "map, dense": Evaluation(arena="dense"),
-    "scan": Evaluation(conditions=SCANS),
-    "scan, dense": Evaluation(arena="dense", conditions=SCANS),
-    "map, walkers": Evaluation(arena="walkers"),
-    "map, many-walkers": Evaluation(arena="many-walkers"),
-    "fleet of 2": Evaluation(arena="crossing", fleet=2),
-    "fleet of 4": Evaluation(arena="crossing", fleet=4),
-    "fleet of 8": Evaluation(arena="crossing", fleet=8),
+    "map": ("ground", Evaluation()),
+    "map, dense": ("ground", Evaluation(arena="dense")),
+    "scan": ("ground", Evaluation(conditions=SCANS)),
+    "scan, dense": ("ground", Evaluation(arena="dense", conditions=SCANS)),
+    "map, walkers": ("ground", Evaluation(arena="walkers")),
+    "map, many-walkers": ("ground", Evaluation(arena="many-walkers")),
+    "fleet of 2": ("ground", Evaluation(arena="crossing", fleet=2)),
+    "fleet of 4": ("ground", Evaluation(arena="crossing", fleet=4)),
+    "fleet of 8": ("ground", Evaluation(arena="crossing", fleet=8)),
+    "air, map": ("quadrotor", Evaluation()),
+    "air, scan": ("quadrotor", Evaluation(conditions=SCANS)),
+    "air, scan, dense": ("quadrotor", Evaluation(arena="dense", conditions=SCANS)),
 }
 POLICIES = ("trained", "random")  # most of the one's inputs are allowed, half of the other's are not
 
@@ -58,11 +61,10 @@ class Weighed:
 
 
 def run(steps: int = STEPS) -> Figures:
-    return {name: _weighed(what, steps) for name, what in SITUATIONS.items()}
+    return {name: _weighed(robot_named(robot), what, steps) for name, (robot, what) in SITUATIONS.items()}
 
 
-def _weighed(what: Evaluation, steps: int) -> dict[str, float]:
-    robot = robot_named("ground")
+def _weighed(robot: Robot, what: Evaluation, steps: int) -> dict[str, float]:
     sizes: dict[str, list[int]] = defaultdict(list)
     times: dict[str, list[float]] = defaultdict(list)
     for policy in POLICIES:

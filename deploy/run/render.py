@@ -37,6 +37,7 @@ COLOURS = {"no filter": "#444444", "allowed": "#0072b2", "adjusted": "#e69f00", 
 COLOURS["recovering"] = "#8e44ad"
 ARROWS = {"proposed": "#c77d00", "executed": "#1f5fbf"}
 EDGE = "#c02030"  # of what the proposal would have crossed
+HITS = 400  # of a scan that are drawn
 FREE, HIT, MOVER = "#148c78", "#5a288c", "#aa5a28"  # what the filter was told: a scan, and what moves
 FORMATS = (".png", ".gif", ".mp4")
 SPEED = 3.0  # times as fast as the robot
@@ -235,9 +236,12 @@ class _Stage:
             return []
         drawn: list[Any] = []
         if len(about.free):
-            outline = Polygon(about.free, closed=True, facecolor=FREE, edgecolor=FREE, alpha=0.12 * alpha, zorder=1)
+            outline = Polygon(
+                about.free[:, :2], closed=True, facecolor=FREE, edgecolor=FREE, alpha=0.12 * alpha, zorder=1
+            )
             drawn.append(self.axes.add_patch(outline))
-            drawn += self.axes.plot(*about.hits.T, ".", color=HIT, markersize=2, alpha=alpha, zorder=5)
+            hits = np.reshape(about.flat(HITS)["hits"], (-1, 2))
+            drawn += self.axes.plot(*hits.T, ".", color=HIT, markersize=2, alpha=alpha, zorder=5)
         for discs, faint in ((about.swept.reshape(-1, about.swept.shape[-1]), 0.12), (about.movers, 0.8)):
             for disc in discs:
                 circle = Circle(disc[:2], disc[-1], color=MOVER, alpha=faint * alpha, linewidth=0, zorder=3)

@@ -1,6 +1,15 @@
-"""The benchmark of what free space costs: every situation has its figures, and a scan weighs more than a map."""
+"""What free space costs by where it comes from; and driving by what a sensor in the air sees."""
+
+from collections import Counter
+from itertools import islice
+
+import pytest
 
 from deploy.bench import perception
+from deploy.study.evaluate import Evaluation, episode, prepared
+from logs.tally import KINDS
+from sim.conditions import Conditions, Faults, Perception
+from tests.robots import QUADROTOR
 
 
 def test_a_scan_weighs_kilobytes_and_a_map_hundreds_of_bytes(data_folder, monkeypatch):
@@ -12,3 +21,21 @@ def test_a_scan_weighs_kilobytes_and_a_map_hundreds_of_bytes(data_folder, monkey
     alone, scan, fleet = (figures[name]["request p50 B"] for name in names)
     assert 300 < alone < fleet < 1000 < 3000 < scan < 5000
     assert all(row["answer p50 ms"] > 0.0 and row["reply p50 B"] > 200 for row in figures.values())
+
+
+FAULTS = {"whole": Faults(), "ailing": Faults(dropped=0.1, ghosts=0.01, late=1), "blind": Faults(blind=1.0)}
+
+
+@pytest.mark.parametrize("faults", FAULTS)
+@pytest.mark.parametrize("policy", ["adversary", "greedy"])
+def test_who_flies_by_range_images_alone_hits_nothing(flight_folder, policy, faults):
+    what = Evaluation(policy, conditions=Conditions(perception=Perception("scan", FAULTS[faults])))
+    driver, choose, question = prepared(QUADROTOR, what)
+    weighed = perception.Weighed(question)
+    steps = list(islice(episode(driver, choose, weighed, 0), 40))
+    assert len(steps) > 10 and not any(step.collision for step in steps)
+    kinds = Counter(KINDS[step.decision] for step in steps)
+    assert kinds["adjusted"] > 0, "it was not let at them"
+    assert min(weighed.sizes["request"]) > 2 * driver.info["scan"].ranges.size
+    if faults == "whole":
+        assert kinds["allowed"] + kinds["adjusted"] > 0.5 * len(steps)

@@ -16,9 +16,10 @@ from logs.watch.server import Server
 from messaging import brakeline_pb2 as pb
 from messaging.motion import Motion
 from messaging.scans import Scan
+from messaging.sensed import scan_message
 from messaging.shapes import CYLINDER, Obstacle
 from messaging.surroundings import surroundings
-from safety.client import obstacle_messages, scan_message
+from safety.client import obstacle_messages
 from tests.browser import CHROMIUM, Page
 from tests.logs.mixed import Writer
 from tests.logs.test_foxglove import Say, Studio, episode, step

@@ -7,10 +7,11 @@ import pytest
 
 from messaging import brakeline_pb2 as pb
 from messaging.motion import Motion
+from messaging.sensed import scan_message
 from messaging.shapes import BOX, CYLINDER, Obstacle
 from messaging.surroundings import promised, surroundings
-from safety.client import obstacle_messages, scan_message
-from sim.scanner import Scanner
+from safety.client import obstacle_messages
+from sim.scanner import FanScanner
 from sim.world import staged_arena
 from tests.robots import GROUND, QUADROTOR
 
@@ -25,7 +26,7 @@ def scanned(seed: int) -> tuple[pb.Request, object]:
     obstacles = [Obstacle(CYLINDER, place, (0.15,)) for place in places[:2]]
     obstacles += [Obstacle(BOX, place, (0.3, 0.2), yaw=float(rng.uniform(0.0, 3.0))) for place in places[2:]]
     arena, state = staged_arena(*obstacles, half_width=3.0), np.array([0.0, 0.0, 0.7, 0.0, 0.0])
-    scan = Scanner(GROUND, arena, rng, 0.0).scan(state, state, 0.0)
+    scan = FanScanner(GROUND, arena, rng, 0.0).scan(state, state, 0.0)
     return pb.Request(state=state, scan=scan_message(scan)), arena
 
 

@@ -53,7 +53,9 @@ def test_an_older_models_tail_is_verified_anew(ready, version):
     for x, in_domain, verified in ((0.6, True, True), (0.6, False, False), (0.215, True, False)):
         ask = moving(((0.1, 0.2), (0, 0), (0, 0)), x, model=version)
         z_0 = np.concatenate([ask.state[3:], ask.input_in_force])
-        found = ready._committed(ask, ready.around.scene(ask), z_0, _Attempt(0), in_domain)
+        found = ready._committed(
+            ask, ready.around.scene(ask, z_0, ready.builder.reachable(z_0[-2:])), z_0, _Attempt(0), in_domain
+        )
         assert found.verified == verified
         assert np.array_equal(found.plan, ask.plan if verified else STILL)
 

@@ -40,11 +40,12 @@ def test_the_edge_touches_the_obstacle_that_is_in_the_way_and_holds_all_of_it(re
 def test_the_room_is_that_of_the_proposals_tube(ready):
     rng = np.random.default_rng(1)
     for question, decision in blocked(ready, (random_request(rng) for _ in range(60))):
+        z_0 = np.concatenate([question.state[ready.regressor], question.input_in_force])
         z = ready.inputs.regressors(
-            np.concatenate([question.state[ready.regressor], question.input_in_force]),
+            z_0,
             ready.inputs.limited(question.action, question.input_in_force),
         )
-        scene = ready.around.scene(question)
+        scene = ready.around.scene(question, z_0, ready.builder.reachable(question.input_in_force))
         assert decision.stopped.room == pytest.approx(ready.around.margin(ready.around.rows(scene, z), z))
 
 

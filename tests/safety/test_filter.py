@@ -99,7 +99,7 @@ def test_adjusted_is_the_closest_input_that_can_be_verified(ready):
             continue
         adjusted += 1
         z_0 = np.concatenate([ask.state[3:], ask.input_in_force])
-        scene = ready.around.scene(ask)
+        scene = ready.around.scene(ask, z_0, ready.builder.reachable(ask.input_in_force))
         rows = ready.around.rows(scene, np.concatenate([z_0, ready.inputs.limited(ask.action, ask.input_in_force)]))
         kept = ready._comfortable(rows, z_0, ready.inputs.limited(ask.action, ask.input_in_force))
         taken = np.linalg.norm((decision.action - ask.action) / width)

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from messaging.scans import Scan
 from messaging.shapes import Shapes
-from safety.memory import Memory
+from safety.memory import FanMemory
 from safety.scan import gaps
 from tests.safety.test_scan import FAN, FAR, WIDTH, cast, scene
 
@@ -32,7 +32,7 @@ def test_what_is_remembered_is_free(seed):
     rng = np.random.default_rng(seed)
     obstacles = scene(rng, 8)
     shapes = Shapes.of(obstacles, 2)
-    memory, pose, remembered = Memory(BODY), np.array([0.0, 0.0, rng.uniform(-3, 3)]), 0
+    memory, pose, remembered = FanMemory(BODY), np.array([0.0, 0.0, rng.uniform(-3, 3)]), 0
     for _ in range(12):
         scan = taken(obstacles, pose, rng)
         filled = memory.fill(scan, 0.2)
@@ -50,7 +50,7 @@ def test_what_is_remembered_is_free(seed):
 
 def test_who_drives_ahead_knows_what_is_behind():
     rng = np.random.default_rng(0)
-    memory = Memory(0.105)
+    memory = FanMemory(0.105)
     for k in range(20):
         filled = memory.fill(_open(0.05 * k, rng), 0.2)
     behind = gaps(filled)[2][np.abs(gaps(filled)[0]) > math.pi - 0.3]
@@ -59,14 +59,14 @@ def test_who_drives_ahead_knows_what_is_behind():
 
 def test_a_world_that_moves_takes_it_back():
     rng = np.random.default_rng(0)
-    memory = Memory(0.105)
+    memory = FanMemory(0.105)
     for k in range(20):
         filled = memory.fill(_open(0.05 * k, rng, speed=1.6), 0.2)
     assert not filled.known[np.abs(FAN) > math.pi - BLIND].any()
 
 
 def test_at_the_start_there_is_room_about_the_body_and_no_more():
-    filled = Memory(0.105).fill(_open(0.0, np.random.default_rng(0)), 0.0)
+    filled = FanMemory(0.105).fill(_open(0.0, np.random.default_rng(0)), 0.0)
     behind = filled.ranges[np.abs(FAN) > math.pi - BLIND] - filled.range_error
     assert (behind > 0.17).all() and (behind <= 0.205).all()
 

@@ -6,13 +6,15 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 
+from messaging.range_images import RangeImage
 from messaging.scans import Scan
+from messaging.sensed import scan_message, scan_of
 from messaging.shapes import Obstacle, Shapes
-from safety.client import request_message, scan_message
+from safety.client import request_message
 from safety.commitment import Commitment
-from safety.memory import Memory
+from safety.memory import FanMemory
 from safety.request import ALLOWED, FAILSAFE, BadRequest, check_for_filter
-from safety.wire import request_of, scan_of
+from safety.wire import request_of
 from tests.robots import GROUND, QUADROTOR
 from tests.safety.asked import request
 from tests.safety.test_scan import FAN, FAR, WIDTH, cast
@@ -49,7 +51,7 @@ def test_obstacles_count_beside_a_scan(ready):
 @pytest.mark.parametrize("blind", [0.0, math.radians(30.0)])
 def test_a_hostile_driver_touches_nothing_and_is_not_held_for_good(ready, blind):
     rng = np.random.default_rng(1)
-    robot, kept, memory = Unicycle((0.0, 0.0, 0.5), rng), Commitment(GROUND), Memory(GROUND.footprint)
+    robot, kept, memory = Unicycle((0.0, 0.0, 0.5), rng), Commitment(GROUND), FanMemory(GROUND.footprint)
     shapes, closest, turned = Shapes.of(ROOM, 2), math.inf, 0.0
     for k in range(100):
         state = robot.measure()
@@ -98,3 +100,16 @@ def test_scans_that_are_none_are_refused(ready):
     with pytest.raises(BadRequest) as error:
         check_for_filter(QUADROTOR, request_of(message, QUADROTOR))
     assert error.value.field == "scan"
+
+
+def test_an_image_is_for_robots_in_space(ready):
+    image = RangeImage(np.ones((45, 90)), (0.0, 0.0, 0.0))
+    message = request_message(Commitment(GROUND), np.zeros(5), np.zeros(2), [], image)
+    with pytest.raises(BadRequest) as error:
+        check_for_filter(GROUND, request_of(message, GROUND))
+    assert error.value.field == "image"
+    message = request_message(Commitment(QUADROTOR), np.zeros(9), np.zeros(3), [], image)
+    check_for_filter(QUADROTOR, request_of(message, QUADROTOR))
+    message.scan.CopyFrom(scan_message(Scan(np.ones(360), FAN, (0.0,) * 3)))
+    with pytest.raises(BadRequest, match="not both"):
+        request_of(message, QUADROTOR)

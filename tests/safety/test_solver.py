@@ -95,7 +95,7 @@ def test_the_answer_depends_on_the_program_alone(model):
 def test_rows_that_are_left_out_change_no_answer(models, kind, monkeypatch):
     """Against the same programs with every row in them."""
     pruned = [program for _, program in programs(models[kind, "direct"], 150)]
-    monkeypatch.setattr(Builder, "_box", lambda self, before: (np.zeros(self.free), np.full(self.free, 1e3)))
+    monkeypatch.setattr(Builder, "reachable", lambda self, before: (np.zeros(self.free), np.full(self.free, 1e3)))
     full = [program for _, program in programs(models[kind, "direct"], 150)]
     assert sum(len(program.b) for program in pruned) < 0.7 * sum(len(program.b) for program in full)
     left_out = 0

@@ -43,9 +43,14 @@ def follows_the_plan(records: list[Record]) -> int:
     exchanges = [record.message for record in records if record.topic == "exchange" and not record.message.failure]
     decided = {(e.header.run, e.request.episode, e.request.step): e.reply.decision.plan for e in exchanges}
     rest, run, fallbacks = np.zeros((0, m)), 0, 0  # the inputs from the next period on
+    episode, number = -1, 0  # of the step to come
     for step in (record.message for record in records if record.topic == "step"):
         if step.header.run != run:
             rest, run = np.zeros((0, m)), step.header.run  # another actor: it begins at rest
+        if step.episode != episode:
+            episode, number = step.episode, 0
+        rest = rest[step.step - number :]  # periods that this machine let pass unseen are a gap in the numbers
+        number = step.step + 1
         plan = decided.get((run, step.episode, step.step))
         assert step.fallback == (plan is None)
         rest = rest if plan is None else np.reshape(plan, (-1, m))[1:]

@@ -1,0 +1,218 @@
+"""Range images, and what of space they show to be free: no point of anything in random scenes is in it."""
+
+import math
+from dataclasses import fields, replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from messaging import brakeline_pb2 as pb
+from messaging.patches import Cover, half_diagonal, seen_free
+from messaging.range_images import RangeImage, directions
+from messaging.scans import BadScan, Scan
+from messaging.sensed import add_sensed, image_of, sensed_of
+from messaging.shapes import Obstacle, Shapes
+from messaging.surroundings import surroundings
+from tests.messaging.test_shapes import sample
+from tests.robots import QUADROTOR
+
+RINGS, COLUMNS, FAR, WIDTH = 45, 90, 8.0, 0.6  # every 4°
+EDGE = 0.5 * math.pi * (1.0 - 1.0 / RINGS)
+GRID = directions(np.linspace(-EDGE, EDGE, RINGS), COLUMNS)
+
+
+def cast(obstacles, at, ways, far=FAR):
+    """Ranges along unit vectors (..., 3) by marching: the step is the distance to the nearest obstacle."""
+    shapes, flat = Shapes.of(obstacles, 3), ways.reshape(-1, 3)
+    ranges, going = np.zeros(len(flat)), np.arange(len(flat))
+    for _ in range(300):
+        steps = shapes.distance(at + ranges[going, None] * flat[going]).min(axis=0)
+        ranges[going] = np.minimum(ranges[going] + steps, far)
+        going = going[(steps > 1e-9) & (ranges[going] < far)]
+        if not len(going):
+            break
+    return ranges.reshape(ways.shape[:-1])
+
+
+def hall(rng, count=5):
+    """A floor, and boxes, upright cylinders and balls that are no narrower than `WIDTH`, none of them at the sensor."""
+    found = [Obstacle("box", (0.0, 0.0, -2.0), (40.0, 40.0, 1.0))]
+    while len(found) < count:
+        at, kind = tuple(rng.uniform(-4.0, 4.0, 3)), rng.integers(3)
+        if kind == 0:
+            candidate = Obstacle("box", at, tuple(rng.uniform(WIDTH, 2.0, 3)), rng.uniform(-3.0, 3.0))
+        elif kind == 1:
+            candidate = Obstacle("cylinder", at, (rng.uniform(WIDTH / math.sqrt(2.0), 1.0), rng.uniform(WIDTH, 3.0)))
+        else:
+            candidate = Obstacle("sphere", at, (rng.uniform(0.87 * WIDTH, 1.0),))
+        if Shapes.of([candidate], 3).distance(np.zeros(3))[0] > 0.3:
+            found.append(candidate)
+    return found
+
+
+def taken(rng, obstacles, noise=0.0, at=(0.0, 0.0, 0.0), **more):
+    """An image of these, by a sensor that is not turned."""
+    ranges = cast(obstacles, np.array(at), GRID)
+    noisy = np.where(ranges < FAR, np.clip(ranges + rng.uniform(-noise, noise, ranges.shape), 1e-3, FAR), FAR)
+    more = {"far": FAR, "range_error": noise, "least_width": WIDTH} | more
+    return RangeImage(noisy, at, low=-EDGE, high=EDGE, **more)
+
+
+def solid(obstacles, rng, within=FAR):
+    points = np.concatenate([sample(obstacle, rng, 3000) for obstacle in obstacles])
+    return points[np.linalg.norm(points, axis=1) < within]
+
+
+def free_towards(image, points):
+    """F of the patches that points (n, 3) about the sensor lie in, and how far they are."""
+    elevations, free = seen_free(image)
+    far = np.linalg.norm(points, axis=1)
+    rings = np.abs(np.arcsin(points[:, 2] / far)[:, None] - elevations).argmin(axis=1)
+    columns = np.rint(np.arctan2(points[:, 1], points[:, 0]) * (COLUMNS / math.tau)).astype(int) % COLUMNS
+    return free[rings, columns], far
+
+
+@settings(max_examples=12)
+@given(st.integers(0, 100_000), st.sampled_from([0.0, 0.1, 0.3]), st.sampled_from([0.0, 0.03]))
+def test_nothing_is_where_it_is_said_to_be_free(seed, dropped, noise):
+    rng = np.random.default_rng(seed)
+    obstacles = hall(rng)
+    image = taken(rng, obstacles, noise)
+    image.ranges[rng.random(image.ranges.shape) < dropped] = 0.0
+    free, far = free_towards(image, solid(obstacles, rng))
+    assert (far >= free - 1e-9).all()
+    assert dropped > 0.2 or np.median(seen_free(image)[1]) > 1.0, "and that is not nothing"
+
+
+@settings(max_examples=8)
+@given(st.integers(0, 100_000))
+def test_neither_ghosts_nor_beams_that_see_through_free_what_is_not(seed):
+    rng = np.random.default_rng(seed)
+    obstacles = hall(rng)
+    image = taken(rng, obstacles, doubt=1)
+    lone = np.zeros(image.ranges.shape, dtype=bool)
+    lone[1::3, ::3] = rng.random((RINGS // 3, COLUMNS // 3)) < 0.3  # never two of a mesh
+    image.ranges[lone] = FAR
+    free, far = free_towards(image, solid(obstacles, rng))
+    assert (far >= free - 1e-9).all()
+    ghostly = taken(rng, obstacles)
+    ghostly.ranges[lone] *= rng.random(int(lone.sum()))
+    free, far = free_towards(ghostly, solid(obstacles, rng))
+    assert (far >= free - 1e-9).all()
+
+
+def test_a_lone_ghost_is_none_and_a_thing_as_narrow_as_things_may_be_is_no_ghost():
+    clear = RangeImage(
+        np.full((RINGS, COLUMNS), FAR), (0.0, 0.0, 0.0), low=-EDGE, high=EDGE, far=FAR, least_width=WIDTH
+    )
+    haunted = replace(clear, ranges=clear.ranges.copy())
+    haunted.ranges[20, 30] = haunted.ranges[22, 40] = 1.0
+    assert seen_free(haunted)[1].min() > 1.9
+    rng = np.random.default_rng(0)
+    for turn in np.linspace(0.0, math.radians(4.0), 5):  # wherever the beams fall on it
+        post = [Obstacle("box", (3.0 * math.cos(turn), 3.0 * math.sin(turn), 0.0), (WIDTH,) * 3, turn + 0.25 * math.pi)]
+        assert seen_free(taken(rng, post))[1][RINGS // 2, :2].max() < 3.0
+
+
+def test_what_is_not_seen_is_not_free():
+    ranges = np.full((RINGS, COLUMNS), FAR)
+    blind = RangeImage(0.0 * ranges, (0.0, 0.0, 0.0), low=-EDGE, high=EDGE)
+    assert (seen_free(blind)[1] == 0.0).all()
+    belt = RangeImage(ranges[:15], (0.0, 0.0, 0.0), low=-0.5, high=0.5, far=FAR)
+    elevations, free = seen_free(belt)
+    assert (free[np.abs(elevations) > 0.5] == 0.0).all() and free[len(elevations) // 2].min() > 1.0
+    assert abs(elevations[0]) <= 0.5 * math.pi and elevations[0] < -0.5 * math.pi + belt.step[0]
+
+
+def test_the_closer_beams_are_the_more_they_show():
+    wide, close = (Cover.of(half, half) for half in (0.05, 0.025))
+    assert close.within < wide.within and close.free(np.array(5.0), 1.0) > wide.free(np.array(5.0), 1.0)
+    image = RangeImage(np.full((RINGS, COLUMNS), FAR), (0.0, 0.0, 0.0), low=-EDGE, high=EDGE)
+    assert half_diagonal(image) == pytest.approx(0.5 * math.hypot(math.radians(4.0), math.radians(4.0)))
+
+
+def test_no_direction_is_farther_from_a_beam_than_half_a_meshes_diagonal():
+    rng = np.random.default_rng(0)
+    ways = rng.normal(size=(3000, 3))
+    ways /= np.linalg.norm(ways, axis=1, keepdims=True)
+    image = RangeImage(np.ones((RINGS, COLUMNS)), (0.0, 0.0, 0.0), low=-EDGE, high=EDGE)
+    nearest = np.arccos(np.clip((ways @ GRID.reshape(-1, 3).T).max(axis=1), -1.0, 1.0))
+    assert nearest.max() <= half_diagonal(image) + 1e-6
+
+
+def test_an_image_crosses_the_wire_and_its_ranges_never_grow():
+    rng = np.random.default_rng(0)
+    ranges = np.where(rng.random((RINGS, COLUMNS)) < 0.1, 0.0, rng.uniform(0.2, FAR, (RINGS, COLUMNS)))
+    half = math.sqrt(0.5)
+    sent = RangeImage(
+        *(ranges, (1.0, 2.0, 3.0), (half, 0.0, 0.0, half), -1.0, 1.2, (0.1, 0.0, 0.2), FAR, 0.03, 0.01, 0.02, 0.7),
+        **{"doubt": 1, "speed": 1.6, "age": 0.2},
+    )
+    message = pb.Request()
+    add_sensed(message, sent)
+    got = sensed_of(pb.Request.FromString(message.SerializeToString()))
+    assert isinstance(got, RangeImage) and message.ByteSize() < 2 * ranges.size + 200
+    assert (got.ranges <= sent.ranges + 1e-6).all() and np.abs(got.ranges - sent.ranges).max() <= 0.001
+    assert np.array_equal(got.known, sent.known)
+    names = [field.name for field in fields(RangeImage) if field.name != "ranges"]
+    assert [getattr(got, name) for name in names] == [getattr(sent, name) for name in names]
+    assert np.allclose(got.turn @ [1.0, 0.0, 0.0], [0.0, 1.0, 0.0])
+    assert np.allclose(got.sensor(), [1.0, 2.1, 3.2])
+
+
+def test_two_at_once_and_half_a_beam_are_refused():
+    message = pb.Request()
+    add_sensed(message, Scan(np.ones(4), np.arange(4.0), (0.0, 0.0, 0.0)))
+    assert isinstance(sensed_of(message), Scan) and sensed_of(pb.Request()) is None
+    add_sensed(message, RangeImage(np.ones((RINGS, COLUMNS)), (0.0, 0.0, 0.0)))
+    with pytest.raises(BadScan, match="not both"):
+        sensed_of(message)
+    message.image.ranges += b"0"
+    with pytest.raises(BadScan, match="two bytes"):
+        image_of(message.image)
+    message.image.ClearField("attitude")
+    with pytest.raises(BadScan, match="attitude"):
+        image_of(message.image)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [
+        ({"ranges": np.ones(90)}, "rings and columns"),
+        ({"ranges": np.ones((1, 90))}, "at most 12°"),
+        ({"ranges": np.ones((45, 12))}, "at most 12°"),
+        ({"ranges": np.ones((300, 300))}, "beams at most"),
+        ({"ranges": np.full((45, 90), np.nan)}, "finite"),
+        ({"ranges": np.full((45, 90), -1.0)}, "0 or more"),
+        ({"at": (0.0, 0.0)}, "3 coordinates"),
+        ({"at": (0.0, 0.0, math.nan)}, "finite"),
+        ({"attitude": (1.0, 1.0, 0.0, 0.0)}, "unit quaternion"),
+        ({"low": 0.5, "high": -0.5}, "from one elevation up"),
+        ({"high": 2.0}, "from one elevation up"),
+        ({"range_error": -0.1}, "not negative"),
+        ({"far": math.inf}, "finite"),
+        ({"least_width": 0.0}, "positive"),
+        ({"doubt": 2}, "doubted"),
+    ],
+)
+def test_what_is_no_image_is_refused(wrong, said):
+    right = {"ranges": np.ones((45, 90)), "at": (0.0, 0.0, 0.0)}
+    with pytest.raises(BadScan, match=said):
+        RangeImage(**right | wrong)
+
+
+def test_what_is_drawn_as_free_is_free_and_hits_lie_on_surfaces():
+    rng = np.random.default_rng(3)
+    obstacles = hall(rng, 7)
+    message = pb.Request()
+    add_sensed(message, taken(rng, obstacles))
+    about, shapes = surroundings(QUADROTOR, message, corners=60), Shapes.of(obstacles, 3)
+    assert len(about.hits) > 500 and np.abs(shapes.distance(about.hits).min(axis=0)).max() < 0.01
+    corners = about.free
+    k, share = rng.integers(len(corners), size=2000), np.sqrt(rng.random((2000, 1)))
+    edge = corners[k] + rng.random((2000, 1)) * (np.roll(corners, -1, axis=0)[k] - corners[k])
+    assert shapes.distance(share * edge).min() > 0.0
+    flat = about.flat(50)
+    assert len(flat["hits"]) <= 50 and all(len(point) == 2 for point in (*flat["hits"], *flat["free"]))

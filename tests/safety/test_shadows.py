@@ -1,0 +1,166 @@
+"""Half-spaces from range images: nothing solid is in the free space, whatever the errors of the pose."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from messaging.range_images import RangeImage
+from messaging.shapes import Obstacle
+from safety.image_memory import ImageMemory
+from safety.shadows import FACES, PLANES, Room, half_spaces, shadows
+from tests.messaging.test_range_images import (
+    COLUMNS,
+    EDGE,
+    FAR,
+    GRID,
+    RINGS,
+    WIDTH,
+    cast,
+    free_towards,
+    hall,
+    solid,
+    taken,
+)
+
+BODY, NOTHING = 0.2, np.zeros(3)
+
+
+def room(size=2.0, last=2.4):
+    return Room(np.full(3, -size), np.full(3, size), last)
+
+
+def clear(**more):
+    more = {"ranges": np.full((RINGS, COLUMNS), FAR), "far": FAR} | more
+    return RangeImage(at=(0.0, 0.0, 0.0), low=-EDGE, high=EDGE, **more)
+
+
+@settings(max_examples=12)
+@given(st.integers(0, 100_000), st.sampled_from([0.0, 0.1]))
+def test_every_point_within_reach_is_beyond_some_half_space(seed, dropped):
+    """In the world, for errors of the pose as large as they may be, and a body that reaches out of the room."""
+    rng = np.random.default_rng(seed)
+    obstacles = hall(rng)
+    image = taken(rng, obstacles, 0.02, position_error=0.03, angle_error=0.01)
+    image.ranges[rng.random(image.ranges.shape) < dropped] = 0.0
+    off = rng.normal(size=3)
+    points = solid(obstacles, rng) + 0.03 * off / np.linalg.norm(off)
+    turn = rng.uniform(-0.01, 0.01)
+    points = points @ np.array(
+        [[math.cos(turn), math.sin(turn), 0.0], [-math.sin(turn), math.cos(turn), 0.0], [0, 0, 1]]
+    )
+    near = points[(np.abs(points) < 2.0 + BODY / math.sqrt(3.0)).all(axis=1)]
+    nominal = np.cumsum(rng.uniform(-0.3, 0.3, (6, 3)), axis=0)
+    normals, offsets = half_spaces(shadows(image, room(), BODY), NOTHING, nominal, 0.0, NOTHING, 0.2)
+    assert normals.shape == (PLANES + len(FACES), 6, 3)
+    if np.isneginf(offsets).all():  # so much is not seen that even the start may be occupied
+        assert dropped
+        return
+    for k in range(6):
+        kept = normals[:, k].any(axis=1)
+        beyond = near @ normals[kept, k].T >= offsets[kept, k] - 1e-6
+        outside = beyond[:, : -len(FACES)].any(axis=1) | (np.abs(near) >= 2.0).any(axis=1)
+        assert outside.all()
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_whatever_is_not_shown_to_be_free_is_beyond_some_half_space(seed, monkeypatch):
+    """Not what is solid alone: all of every patch, behind what its beams say; with nothing given up besides."""
+    monkeypatch.setattr("safety.shadows.GIVE", 0.0)
+    monkeypatch.setattr("safety.shadows.PLANES", 1500)
+    rng = np.random.default_rng(seed)
+    image = clear(ranges=np.repeat(np.repeat(rng.uniform(1.5, 6.0, (RINGS // 5, COLUMNS // 5)), 5, 0), 5, 1))
+    nominal = np.cumsum(rng.uniform(-0.1, 0.1, (3, 3)), axis=0)
+    normals, offsets = half_spaces(shadows(image, room(), BODY), NOTHING, nominal, 0.0, NOTHING, 0.2)
+    points = rng.uniform(-2.0, 2.0, (20_000, 3))
+    free, far = free_towards(image, points)
+    hidden = points[far >= free]
+    assert len(hidden) > 100
+    for k in range(3):
+        assert (hidden @ normals[:-6, k].T >= offsets[:-6, k] - 1e-6).any(axis=1).all()
+
+
+def test_the_body_is_kept_off_and_what_may_move_takes_room_with_time():
+    wall = [Obstacle("box", (2.0, 0.0, 0.0), (2.0, 20.0, 20.0))]
+    rng = np.random.default_rng(0)
+    nominal = np.zeros((3, 3))
+    still, moving = (shadows(taken(rng, wall, speed=s, age=0.1), room(), BODY) for s in (0.0, 0.5))
+    ahead = half_spaces(still, NOTHING, nominal, 0.0, NOTHING, 0.2)[1][0]
+    assert 0.8 < ahead[0] <= 1.0
+    kept = half_spaces(still, NOTHING, nominal, BODY, np.full(3, 0.01), 0.2)[1][0]
+    assert (ahead - kept >= BODY + 0.01 - 0.02).all()
+    lost = ahead - half_spaces(moving, NOTHING, nominal, 0.0, NOTHING, 0.2)[1][0]
+    assert np.allclose(lost, 0.5 * (0.1 + 0.2 * np.arange(1, 4)), atol=0.02)
+
+
+def test_where_nothing_is_there_is_only_the_rooms_box():
+    normals, offsets = half_spaces(shadows(clear(), room(), BODY), NOTHING, np.zeros((2, 3)), BODY, NOTHING, 0.2)
+    assert not normals[:PLANES].any() and (offsets[:PLANES] > 1e3).all()
+    assert np.array_equal(normals[PLANES:, 0], FACES) and (offsets[PLANES:] == 2.0).all()
+
+
+@pytest.mark.parametrize("image", [clear(ranges=np.zeros((RINGS, COLUMNS))), clear(range_error=FAR)])
+def test_nothing_seen_is_nothing_free(image):
+    _, offsets = half_spaces(shadows(image, room(), BODY), NOTHING, np.full((2, 3), 0.1), BODY, NOTHING, 0.2)
+    assert (offsets.min(axis=0) < 0.0).all()
+
+
+def test_a_way_through_a_shadow_keeps_the_half_spaces_from_before_it():
+    wall = [Obstacle("box", (2.0, 0.0, 0.0), (2.0, 20.0, 20.0))]
+    seen = shadows(taken(np.random.default_rng(0), wall), room(4.0), BODY)
+    nominal = np.array([[0.5, 0.0, 0.0], [1.5, 0.0, 0.0], [2.5, 0.0, 0.0]])
+    normals, offsets = half_spaces(seen, NOTHING, nominal, 0.0, NOTHING, 0.2)
+    assert (normals[:, 1:] == normals[:, :1]).all() and (offsets[:, 1:] == offsets[:, :1]).all()
+    assert (nominal[1] @ normals[:, 1].T > offsets[:, 1]).any()
+
+
+# --- what is remembered ----------------------------------------------------------------------------------------------
+
+
+def behind():
+    return np.abs(np.arctan2(GRID[..., 1], GRID[..., 0])) > math.radians(150.0)
+
+
+@settings(max_examples=5)
+@given(st.integers(0, 100_000))
+def test_what_is_remembered_is_free(seed):
+    rng = np.random.default_rng(seed)
+    obstacles = hall(rng)
+    memory, at, remembered = ImageMemory(0.3 - ImageMemory.START), np.zeros(3), 0
+    for _ in range(6):
+        off = rng.normal(size=3)
+        seen = tuple(at + 0.02 * off / np.linalg.norm(off))
+        ranges = np.where(behind(), 0.0, cast(obstacles, at, GRID))
+        known = {"far": FAR, "range_error": 0.005, "position_error": 0.02, "angle_error": 0.01, "least_width": WIDTH}
+        image = RangeImage(ranges, seen, low=-EDGE, high=EDGE, **known)
+        filled = memory.fill(image, 0.2)
+        new = ~image.known & filled.known
+        remembered += int(new.sum())
+        if new.any():
+            assert (filled.ranges[new] - image.range_error <= cast(obstacles, at, GRID[new]) + 1e-6).all()
+        assert np.array_equal(filled.ranges[image.known], image.ranges[image.known])
+        step = np.array([0.55, 0.0, 0.0])
+        at = at + step if cast(obstacles, at, np.array([1.0, 0.0, 0.0])) > 0.8 else at - 0.3 * step
+    assert remembered > 0
+
+
+def test_who_flies_ahead_knows_what_is_behind_and_at_the_start_only_the_room_about_the_body():
+    memory, reached = ImageMemory(0.3), []
+    for k in range(8):
+        image = clear(ranges=np.where(behind(), 0.0, FAR), position_error=0.02, angle_error=0.01)
+        at = (0.6 * k, 0.0, 0.0)
+        filled = memory.fill(replace(image, at=at), 0.2)
+        reached.append(float(filled.ranges[RINGS // 2, COLUMNS // 2]))
+    assert 0.6 < reached[0] <= 1.0 + image.range_error
+    assert reached[-1] > 1.5
+
+
+def test_a_world_that_moves_takes_it_back():
+    memory = ImageMemory(0.3)
+    for k in range(8):
+        image = clear(ranges=np.where(behind(), 0.0, FAR), speed=3.0)
+        filled = memory.fill(replace(image, at=(0.6 * k, 0.0, 0.0)), 0.2)
+    assert not filled.known[behind()].any()
