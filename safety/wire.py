@@ -22,7 +22,7 @@ from safety.request import ADJUSTED, ALLOWED, FAILSAFE, RECOVERING, BadRequest, 
 
 KINDS = {ALLOWED: pb.ALLOWED, ADJUSTED: pb.ADJUSTED, FAILSAFE: pb.FAILSAFE, RECOVERING: pb.RECOVERING}
 # What a batch may cost, known before it is worked on: its bytes to decode, its requests and obstacles to decide on.
-LARGEST = 2**18  # bytes of a request batch
+LARGEST = 2**20  # bytes of a request batch: some thirty with a range image each
 MOST_REQUESTS = 64
 FIXED_64, LENGTH, FIXED_32 = 1, 2, 5  # how protobuf writes a field; else as one number
 MOST_OBSTACLES = 1000  # of all its requests

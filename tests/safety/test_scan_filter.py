@@ -6,6 +6,7 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 
+from messaging import brakeline_pb2 as pb
 from messaging.range_images import RangeImage
 from messaging.scans import Scan
 from messaging.sensed import scan_message, scan_of
@@ -14,7 +15,7 @@ from safety.client import request_message
 from safety.commitment import Commitment
 from safety.memory import FanMemory
 from safety.request import ALLOWED, FAILSAFE, BadRequest, check_for_filter
-from safety.wire import request_of
+from safety.wire import batch_of, request_of
 from tests.robots import GROUND, QUADROTOR
 from tests.safety.asked import request
 from tests.safety.test_scan import FAN, FAR, WIDTH, cast
@@ -113,3 +114,11 @@ def test_an_image_is_for_robots_in_space(ready):
     message.scan.CopyFrom(scan_message(Scan(np.ones(360), FAN, (0.0,) * 3)))
     with pytest.raises(BadRequest, match="not both"):
         request_of(message, QUADROTOR)
+
+
+def test_an_actors_batch_of_many_images_is_none_too_large():
+    image = RangeImage(np.ones((90, 180)), (0.0, 0.0, 0.0))
+    message = request_message(Commitment(QUADROTOR), np.zeros(9), np.zeros(3), [], image)
+    assert len(batch_of(pb.RequestBatch(requests=[message] * 24).SerializeToString()).requests) == 24
+    with pytest.raises(BadRequest, match="a request batch has at most"):
+        batch_of(pb.RequestBatch(requests=[message] * 48).SerializeToString())
