@@ -6,6 +6,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from time import perf_counter
 
 import numpy as np
@@ -44,21 +45,37 @@ def each(calls: list[Callable[[], object]]) -> dict[str, float]:
     return milliseconds(seconds[min(WARM_UP, len(seconds) // 2) :])
 
 
+@dataclass
+class Stalls:
+    """What this machine let a thread wait beyond the pauses that it asked for: at most, and in all, with these, s."""
+
+    worst: float = 0.0
+    beyond: float = 0.0
+    passed: float = 1e-9
+
+    @property
+    def share(self) -> float:
+        """Of the time that passed."""
+        return self.beyond / self.passed
+
+
 @contextmanager
-def stalls(pause: float) -> Iterator[list[float]]:
-    """How long [s] this machine let a thread wait beyond the `pause` it asked for, at most, in a list of one."""
-    worst, done = [0.0], threading.Event()
+def stalls(pause: float) -> Iterator[Stalls]:
+    """Of a thread that asks for such pauses [s]."""
+    found, done = Stalls(), threading.Event()
 
     def watch() -> None:
         while not done.is_set():
             before = time.monotonic()
             time.sleep(pause)
-            worst[0] = max(worst[0], time.monotonic() - before - pause)
+            passed = time.monotonic() - before
+            found.worst = max(found.worst, passed - pause)
+            found.beyond, found.passed = found.beyond + passed - pause, found.passed + passed
 
     thread = threading.Thread(target=watch, daemon=True)
     thread.start()
     try:
-        yield worst
+        yield found
     finally:
         done.set()
         thread.join()

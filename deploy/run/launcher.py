@@ -213,11 +213,11 @@ class Launcher:
                     self.lines.append(f"{message.process}: {headline(message.text)}")
 
     def _end(self) -> None:
-        """Everything but the recorder first, so that their last words are in the log."""
+        """Actors first, so that none is left without answers; the recorder last, so that all last words are logged."""
         recorders = [child for child in self.children if child.place.kind == "recorder"]
-        flying = [child for child in self.children if child.place.kind == "actor" and self.config.flight is not None]
-        others = [child for child in self.children if child not in (*recorders, *flying)]
-        for group in filter(None, (flying, others, recorders)):
+        actors = [child for child in self.children if child.place.kind == "actor"]
+        others = [child for child in self.children if child not in (*recorders, *actors)]
+        for group in filter(None, (actors, others, recorders)):
             for child in group:
                 child.terminate()
             deadline = time.monotonic() + END_PATIENCE

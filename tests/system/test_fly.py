@@ -5,7 +5,7 @@ How many answers come in time depends on the machine, which others use too: READ
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +15,7 @@ from pymavlink import mavutil
 
 from actors.frames import decoded
 from deploy import cli
+from deploy.bench.timing import stalls
 from logs.reader import Record, read
 from messaging import brakeline_pb2 as pb
 from tests.robots import QUADROTOR
@@ -23,7 +24,7 @@ from tests.system.runs import Run
 pytestmark = pytest.mark.usefixtures("flight_folder")
 
 PERIODS = 70  # of a flight
-IN_TIME = 0.85  # of the answers, on two cores that other tests keep busy
+IN_TIME = 0.9  # of the answers, less the share of the time for which this machine lets nobody act
 TIMEOUT = 1.0  # s without a setpoint until the autopilot brakes and holds, for good: a stall is shorter
 OFTEN = 0.06  # s between two setpoints, as a rule
 PX4_HOLD = 4 << 16 | 3 << 24  # custom mode
@@ -70,16 +71,15 @@ def sent(records: list[Record]) -> Iterator[tuple[float, Any]]:
 
 
 @pytest.mark.parametrize("policy", ["adversary", "astar"])
-def test_it_flies_in_time_and_hits_nothing(
-    policy: str, stalled: Callable[[], float], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    with Flight(tmp_path / "run", "--minutes", PERIODS * QUADROTOR.period / 60.0, "--policy", policy) as run:
+def test_it_flies_in_time_and_hits_nothing(policy: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    length = PERIODS * QUADROTOR.period / 60.0
+    with stalls(0.01) as lost, Flight(tmp_path / "run", "--minutes", length, "--policy", policy) as run:
         figures = run.end()
         assert figures["finished"], run.errors.read_text()
     flight, records = figures["flight"], list(read(run.folder))
     assert figures["collisions"] == 0 and figures["steps"] == PERIODS
-    assert flight["answers in time share"] >= IN_TIME, flight
-    assert flight["worst setpoint gap ms"] <= 1e3 * (TIMEOUT + stalled()) and flight["periods slipped"] == 0, flight
+    assert flight["answers in time share"] >= IN_TIME - lost.share, (flight, lost)
+    assert flight["worst setpoint gap ms"] <= 1e3 * (TIMEOUT + lost.worst) and flight["periods slipped"] == 0, flight
     assert follows_the_plan(records) == figures["fallbacks"]
     if policy == "astar":
         assert figures["goals"] >= 1
