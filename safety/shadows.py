@@ -93,7 +93,7 @@ def _meets(at: Array, along: Array, first: Array, last: float, low: Array, high:
 @lru_cache(maxsize=16)
 def _patches(elevations: tuple[float, ...], columns: int) -> tuple[NDArray[np.intp], Array]:
     """Where patches begin in a flat grid, and their middles (n, 3): near the poles several columns are one."""
-    half = 0.5 * (elevations[1] - elevations[0])
+    half = 0.5 * float(np.diff(elevations).max())  # the outermost rings may have been moved to the poles
     first, middles = [], []
     for ring, elevation in enumerate(elevations):
         together = int(1.0 / np.cos(max(abs(elevation) - half, 0.0)))

@@ -8,10 +8,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from messaging.patches import half_diagonal, seen_free
 from messaging.range_images import RangeImage
 from messaging.shapes import Obstacle
 from safety.image_memory import ImageMemory
-from safety.shadows import FACES, PLANES, Room, half_spaces, shadows
+from safety.shadows import FACES, PLANES, Room, _patches, half_spaces, shadows
 from tests.messaging.test_range_images import (
     COLUMNS,
     EDGE,
@@ -94,6 +95,17 @@ def test_the_body_is_kept_off_and_what_may_move_takes_room_with_time():
     assert (ahead - kept >= BODY + 0.01 - 0.02).all()
     lost = ahead - half_spaces(moving, NOTHING, nominal, 0.0, NOTHING, 0.2)[1][0]
     assert np.allclose(lost, 0.5 * (0.1 + 0.2 * np.arange(1, 4)), atol=0.02)
+
+
+@pytest.mark.parametrize("low", [-EDGE, -0.5 * math.pi, -0.9])
+def test_no_direction_is_farther_from_its_patch_than_half_a_meshes_diagonal(low):
+    image = RangeImage(np.ones((RINGS, COLUMNS)), (0.0, 0.0, 0.0), low=low, high=-low)
+    elevations, _ = seen_free(image)
+    _, middles = _patches(tuple(elevations), COLUMNS)
+    ways = np.random.default_rng(0).normal(size=(3000, 3))
+    ways /= np.linalg.norm(ways, axis=1, keepdims=True)
+    nearest = np.arccos(np.clip((ways @ middles.T).max(axis=1), -1.0, 1.0))
+    assert nearest.max() <= half_diagonal(image) + 1e-6
 
 
 def test_where_nothing_is_there_is_only_the_rooms_box():
