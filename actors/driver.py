@@ -83,7 +83,7 @@ class Driver:
             self.commitment.reset()
             self._memory.reset()
         self._remember()
-        self.episode, self.step, self.running = episode, 0, True
+        self.episode, self.step, self._number, self.running = episode, 0, 0, True
         self.rng = self.identity.noise(episode)
         arena = self.info["arena"]
         message = pb.Episode(
@@ -131,6 +131,7 @@ class Driver:
 
     def command(self, proposal: Array, outcome: Outcome | None) -> Array:
         """The input of the coming period; the committed plan moves on."""
+        self._number = self.step
         if outcome is None:
             return np.asarray(np.clip(proposal, self.robot.low(), self.robot.high()))
         return next_input(self.commitment, outcome)
@@ -170,7 +171,7 @@ class Driver:
             robot=self.robot.name,
             actor=self.identity.actor,
             episode=self.episode,
-            step=self.step,
+            step=self._number,  # periods that pass unseen meanwhile count on
             index=self.index,
             observation=before.tolist(),
             proposed=proposal.tolist(),

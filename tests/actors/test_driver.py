@@ -91,3 +91,19 @@ def test_no_two_robots_of_a_run_ever_see_the_same_episode():
     assert one.rng.random() == same.rng.random()
     same.begin(4)
     assert one.rng.random() != same.rng.random()
+
+
+def test_a_step_has_the_number_of_its_question_though_periods_pass_unseen_meanwhile(ask, monkeypatch):
+    robot = driver()
+    robot.begin(0)
+    drive = robot.env.step
+
+    def slow(action):  # as `actors.flight` counts them
+        robot.commitment.fallback()
+        robot.step += 1
+        return drive(action)
+
+    for number in (0, 1, 3):
+        asked = robot.request(FAST)
+        monkeypatch.setattr(robot.env, "step", slow if number == 1 else drive)
+        assert robot.execute(FAST, consult(ask, [asked], GROUND)[0]).step == asked.step == number
