@@ -22,6 +22,7 @@ import safetensors.numpy
 from learner.state import State
 
 FORMAT = 1
+CHECKPOINT = "checkpoint"  # the folder of a run's checkpoints
 LATEST = "latest"
 MANIFEST = "manifest.json"
 PARTIAL = ".partial"
@@ -97,7 +98,7 @@ def load(root: Path, names: tuple[str, ...]) -> tuple[dict[str, State], dict[str
     Raises:
         NoCheckpoint, MissingPart, DamagedPart: as they say.
     """
-    place = _latest(root)
+    place = latest(root)
     manifest = _manifest(place)
     parts = {}
     for name in names:
@@ -109,12 +110,18 @@ def load(root: Path, names: tuple[str, ...]) -> tuple[dict[str, State], dict[str
 
 def _serial(root: Path) -> int:
     try:
-        return int(_latest(root).name)
+        return int(latest(root).name)
     except NoCheckpoint:
         return 0
 
 
-def _latest(root: Path) -> Path:
+def latest(root: Path) -> Path:
+    """The folder of the latest checkpoint.
+
+    Raises:
+        NoCheckpoint: there is none.
+        MissingPart: what the pointer names is not there.
+    """
     try:
         name = (root / LATEST).read_text().strip()
     except FileNotFoundError:

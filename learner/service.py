@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from threading import Event
 
-from learner.checkpoint import CheckpointError, exists
+from learner.checkpoint import CHECKPOINT, CheckpointError, exists
 from learner.config import LearnerConfig
 from learner.core import Learner
 from learner.intake import BadStep
@@ -28,7 +28,6 @@ from messaging.topics import FLOW, JOIN, LEARNER, LOGGED, STEP, WEIGHTS
 
 log = logging.getLogger("brakeline.learner")
 
-CHECKPOINT = "checkpoint"  # under the run's folder
 POLICY = "policy.safetensors"
 UPDATES_A_TURN = 4  # about 20 ms: how long a joining actor or a lockstep step may wait
 FLOW_SPACING = 0.02  # s between two flows, except in lockstep, where every change goes out

@@ -58,8 +58,8 @@ class LearnerProcess:
     learner: LearnerConfig = field(default_factory=lambda: RunConfig().learner)
 
     def run(self) -> int:
-        from learner.checkpoint import exists
-        from learner.service import CHECKPOINT, LearnerSettings, main
+        from learner.checkpoint import CHECKPOINT, exists
+        from learner.service import LearnerSettings, main
 
         resume = self.resume or (self.resume_if_any and exists(self.out / CHECKPOINT))
         config = replace(self.learner, seed=self.seed, steps=self.steps)

@@ -52,11 +52,14 @@ def _safety(place: Place, folder: Path, config: RunConfig, bus: BusSettings) -> 
 
 
 def _learner(place: Place, folder: Path, config: RunConfig, bus: BusSettings) -> bool:
-    from learner.checkpoint import exists
-    from learner.service import CHECKPOINT, LearnerSettings, main
+    from learner.checkpoint import CHECKPOINT, exists, latest
 
     out = folder / place.name
-    return main(LearnerSettings(bus, place.robot, out, exists(out / CHECKPOINT), place.name, config.learning()))
+    if resume := exists(out / CHECKPOINT):
+        latest(out / CHECKPOINT)  # what is not there is said before torch is loaded, which takes seconds
+    from learner.service import LearnerSettings, main
+
+    return main(LearnerSettings(bus, place.robot, out, resume, place.name, config.learning()))
 
 
 def _actor(place: Place, folder: Path, config: RunConfig, bus: BusSettings) -> bool:

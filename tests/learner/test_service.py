@@ -12,7 +12,7 @@ import pytest
 from learner import checkpoint
 from learner.config import LearnerConfig, TD3Config
 from learner.core import Learner
-from learner.service import CHECKPOINT, POLICY, LearnerLoop, LearnerSettings, main
+from learner.service import POLICY, LearnerLoop, LearnerSettings, main
 from messaging import brakeline_pb2 as pb
 from messaging.bus import Bus, BusSettings, Refused
 from messaging.ports import free_endpoint
@@ -123,7 +123,7 @@ def test_a_run_from_the_first_step_to_the_last(bus, tmp_path):
     last = actor.metrics[-1]
     assert last.done and (last.steps, last.updates, last.missing, last.duplicates) == (300, 250, 0, 0)
     assert MLP.load(tmp_path / POLICY).version == last.weights_version
-    assert checkpoint.exists(tmp_path / CHECKPOINT)
+    assert checkpoint.exists(tmp_path / checkpoint.CHECKPOINT)
 
 
 @pytest.fixture
@@ -176,7 +176,7 @@ def test_resuming_from_nothing_is_an_error(bus, tmp_path):
 
 
 def test_a_fresh_start_over_a_checkpoint_is_an_error(bus, tmp_path):
-    Learner(GROUND, CONFIG).save(tmp_path / CHECKPOINT)
+    Learner(GROUND, CONFIG).save(tmp_path / checkpoint.CHECKPOINT)
     with pytest.raises(checkpoint.CheckpointError, match="resume"):
         main(LearnerSettings(BusSettings(connect=bus.settings.listen), out=tmp_path, learner=CONFIG))
 
@@ -187,7 +187,7 @@ def test_unknown_robot(tmp_path):
 
 
 def test_unwritable_checkpoints_do_not_end_the_run(bus, tmp_path):
-    (tmp_path / CHECKPOINT).write_text("a file where a folder belongs")
+    (tmp_path / checkpoint.CHECKPOINT).write_text("a file where a folder belongs")
     thread, actor = start(bus, tmp_path), Actor(bus)
     actor.join()
     actor.drive(10**6)

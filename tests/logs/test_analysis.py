@@ -191,10 +191,10 @@ def test_it_is_shown_whole(log: Path) -> None:
 
 
 def test_memory_does_not_grow_with_the_log(tmp_path: Path) -> None:
-    """Six times the messages need hardly more: bins of histograms that were empty before. (How much for gigabytes, with
-    all that is not Python's: `python -m deploy.bench logs-2gb`.)"""
+    """Five times the messages need hardly more: bins of histograms that were empty before. (How much for gigabytes,
+    with all that is not Python's: `python -m deploy.bench logs-2gb`.)"""
     held = []
-    for name, rounds in (("short", 60), ("long", 360)):
+    for name, rounds in (("short", 50), ("long", 250)):
         writer = Writer(3, losses=0.0)
         for number in range(rounds):
             writer.episode("actor-0", number)

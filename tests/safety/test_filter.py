@@ -119,7 +119,7 @@ def test_every_plan_that_leaves_is_clear_and_ends_in_a_stop(models, kind):
     ready = Filter(model)
     rng = np.random.default_rng(1)
     kinds = set()
-    for _ in range(400):
+    for _ in range(250):
         ask = random_request(rng)
         decision = ready.decide(ask)
         kinds.add(decision.kind)

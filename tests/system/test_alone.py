@@ -41,7 +41,7 @@ def test_safety_learner_actor_and_recorder_alone(start, data_folder, tmp_path):
     actor = start("actor", "ground", *there, "--name", "actor-7", "--number", 7, "--robots", 2)
     recorder = start("recorder", tmp_path / "run.mcap", *there)
     until((tmp_path / "run.mcap").exists, "the recorder records")
-    learner = start("learner", "ground", *there, "--out", tmp_path / "learner", "--steps", 400, *LEARNING)
+    learner = start("learner", "ground", *there, "--out", tmp_path / "learner", "--steps", 250, *LEARNING)
 
     with Bus(BusSettings(connect=(endpoint,), patience=60.0), "test") as bus:
         until(lambda: {"safety", "actor-7", "recorder", "learner"} <= bus.living(), "all live")
@@ -61,7 +61,7 @@ def test_safety_learner_actor_and_recorder_alone(start, data_folder, tmp_path):
     assert safety.wait(30.0) == 0
     figures = analyse(tmp_path / "run.mcap")
     assert sorted(figures["actors"]) == ["actor-7.0", "actor-7.1"]
-    assert figures["steps"] >= 400 and figures["collisions"] == 0 and figures["cuts"] == []
+    assert figures["steps"] >= 250 and figures["collisions"] == 0 and figures["cuts"] == []
     assert figures["topics"]["step/ground/actor-7.0"]["missing"] == 0
 
     again = brakeline("learner", "ground", "--listen", endpoint, "--out", tmp_path / "learner", *LEARNING)

@@ -8,7 +8,7 @@ from messaging import brakeline_pb2 as pb
 from tests.system.runs import Run, brakeline
 from tests.waiting import until
 
-BEFORE, DURING, AFTER = 800, 6000, 1000  # steps of both actors
+BEFORE, DURING, AFTER = 800, 4000, 800  # steps of both actors
 ENDLESS = 100_000  # the run is ended when it has shown what is wanted, however long the new model set takes to make
 
 
@@ -44,5 +44,4 @@ def test_a_payload_is_noticed_and_a_new_model_set_takes_over_in_mid_run(data_fol
     assert len(anew) > 500
     assert share(recorded) <= 0.01
     assert share(loaded) > 0.05, "the old model set does not know the payload"
-    assert share(anew) <= max(2.0 * published["bound_step"], 0.02)
-    assert published["bound_step"] < 0.05
+    assert share(anew) <= published["bound_step"] < share(loaded), "the new one does, and states how well"

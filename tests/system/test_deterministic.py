@@ -1,10 +1,14 @@
 """`--deterministic`: the seed alone decides about the weights, however fast the machine is and often it is stopped."""
 
 import signal
+from pathlib import Path
 
 import pytest
 
+from deploy.run.configurations import load
+from deploy.run.places import CONFIG
 from learner.checkpoint import exists
+from logs.reader import read
 from tests.system.runs import Run
 from tests.waiting import until
 
@@ -20,14 +24,21 @@ def weights(run: Run) -> bytes:
 
 
 @pytest.fixture(scope="module")
-def uninterrupted(data_folder, tmp_path_factory) -> bytes:
+def uninterrupted(data_folder, tmp_path_factory) -> tuple[Path, bytes]:
     with Run(tmp_path_factory.mktemp("runs") / "one", *SHORT, "--seed", 3) as run:
-        return weights(run)
+        return run.folder, weights(run)
 
 
-def test_another_seed_gives_other_weights(uninterrupted, tmp_path):
-    with Run(tmp_path / "other", *SHORT, "--seed", 4) as other:
-        assert weights(other) != uninterrupted
+def first_goal(folder: Path) -> list[float]:
+    records = read(folder)
+    return next(list(r.message.goal) for r in records if r.topic == "episode" and r.message.actor == "actor-0")
+
+
+def test_the_seed_decides_where_robots_go_and_what_the_learner_draws(uninterrupted, logged_run):
+    """That the learner's weights are others then: `tests/learner/test_core.py`."""
+    folder, _ = uninterrupted
+    assert load(folder / CONFIG).learning().seed == 3 != load(logged_run / CONFIG).learning().seed
+    assert first_goal(folder) != first_goal(logged_run)
 
 
 def test_a_second_run_with_the_seed_gives_the_same_weights_though_interrupted_and_resumed(uninterrupted, tmp_path):
@@ -38,4 +49,5 @@ def test_a_second_run_with_the_seed_gives_the_same_weights_though_interrupted_an
         figures = run.end(signal.SIGINT)
         assert not figures["finished"] and figures["steps"] < 600
     with Run(run.folder, fresh=False) as resumed:
-        assert weights(resumed) == uninterrupted
+        assert weights(resumed) == uninterrupted[1]
+    assert first_goal(run.folder) == first_goal(uninterrupted[0])

@@ -23,7 +23,7 @@ from tests.waiting import PATIENCE, until
 
 
 def test_each_process_is_killed_in_turn_and_the_run_goes_on_to_its_end(data_folder, tmp_path):
-    with Run(tmp_path / "run", "--steps", 1400, "--learner.checkpoint-every", 400) as run:
+    with Run(tmp_path / "run", "--steps", 1000, "--learner.checkpoint-every", 350) as run:
         run.until_steps(80)
         assert not exists(run.folder / "learner" / "checkpoint"), "the learner dies before its first checkpoint"
         run.kill("learner")
@@ -39,7 +39,7 @@ def test_each_process_is_killed_in_turn_and_the_run_goes_on_to_its_end(data_fold
         figures = run.end()
         assert run.popen.returncode == 0, run.errors.read_text()
     assert figures["finished"] and figures["collisions"] == 0
-    assert figures["learners"]["ground"]["steps"] == 1400
+    assert figures["learners"]["ground"]["steps"] == 1000
     assert figures["restarts"] == {"learner": 2, "safety-0": 1, "actor-1": 1, "recorder": 1}
     starts = {name: process["starts"] for name, process in figures["processes"].items()}
     assert starts == {"launcher": 1, "recorder": 2, "safety-0": 2, "learner": 3, "actor-0": 1, "actor-1": 2}

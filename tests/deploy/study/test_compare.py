@@ -25,7 +25,7 @@ DEAR = ("decision_ms", "milliseconds")
 
 # --- studies -------------------------------------------------------------------------------------------------------
 
-TINY = Study("ground", "none", 3, steps=400, episodes=1, arenas=("default",), untrained=1)
+TINY = Study("ground", "none", 3, steps=320, episodes=1, arenas=("default",), untrained=1)
 TINY = replace(TINY, td3=replace(TINY.td3, hidden=(16, 16), batch=16, warmup=60))
 
 
@@ -90,7 +90,7 @@ def test_methods_share_the_episodes_that_they_are_evaluated_on(cells):
 
 def test_another_task_in_another_arena_has_its_contacts_in_the_table(rivals, tmp_path):
     """Of its own observation, in `many-walkers`; results from before there were walkers have no such rows."""
-    study = replace(TINY, robot="ground+tracks", method="ddpc", arenas=("many-walkers",), steps=400)
+    study = replace(TINY, robot="ground+tracks", method="ddpc", arenas=("many-walkers",))
     try:
         cell = run(study, tmp_path)
         assert MLP.load(tmp_path / "policy.safetensors", GROUND).sizes == (50, 16, 16, 2)
