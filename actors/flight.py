@@ -35,6 +35,7 @@ from messaging.robots import Robot, robot_named
 from safety.client import ask, request_message
 from safety.commitment import Array, Commitment
 from sim.arenas import tour
+from sim.conditions import Conditions
 from sim.envs import NavigationEnv
 from sim.vehicle import Period
 from sim.world import Arena
@@ -149,8 +150,9 @@ class FlightRider(Rider):
         stages: Sequence[Arena],
         propose: MakePolicy | None,
         outbox: Outbox,
+        conditions: Conditions,
     ) -> None:
-        super().__init__(process, settings, 0, self._environment(stages), propose, goes_on=True)
+        super().__init__(process, settings, 0, self._environment(stages, conditions), propose, goes_on=True)
         self._flight: Flight | None = None
         self.answers: Counter[str] = Counter()  # in time | late | none | lost
         self.steps, self.episodes, self.exchanges = map(outbox.at, (self.steps, self.episodes, self.exchanges))
@@ -208,7 +210,11 @@ class FlightRider(Rider):
             **self._flight.vehicle.judged(),
         }
 
-    def _environment(self, stages: Sequence[Arena]) -> Make:
+    def _environment(self, stages: Sequence[Arena], conditions: Conditions) -> Make:
+        """Obstacles are virtual: what a scan shows is cast from the estimated pose."""
+        seeing = conditions.perception.kind == "scan"
+        noise = conditions.lidar_noise(flies=True) if seeing else 0.0
+
         def draw(name: str, rng: np.random.Generator, robot: Robot) -> Arena:
             self._stage += 1
             return stages[self._stage % len(stages)]
@@ -217,7 +223,7 @@ class FlightRider(Rider):
 
         def make(robot: Robot, arena: str, seed: int, *, tap: Tap | None = None) -> NavigationEnv:
             vehicle = lambda arena, rng: self.flight  # noqa: E731
-            return NavigationEnv(robot, arena, vehicle, lidar_noise=0.0, seed_key=seed, draw=draw)
+            return NavigationEnv(robot, arena, vehicle, noise, seed, draw=draw, perception=conditions.perception)
 
         return make
 
@@ -262,9 +268,15 @@ def answered(question: Ask, robot: Robot, stage: Arena, filtered: bool, stop: Ca
     return False
 
 
-def run(settings: ActorSettings, flight: FlightSettings, arena: Arena, propose: MakePolicy | None = None) -> bool:
+def run(
+    settings: ActorSettings,
+    flight: FlightSettings,
+    arena: Arena,
+    propose: MakePolicy | None = None,
+    conditions: Conditions | None = None,
+) -> bool:
     """Fly from goal to goal on the arena's map until the learner's run is done or the policy's steps are taken (True),
-    or SIGINT or SIGTERM; then brake, and leave the vehicle to its autopilot.
+    or SIGINT or SIGTERM; then brake, and leave the vehicle to its autopilot. Of the conditions, perception counts.
 
     Raises:
         Unfiltered, NoRoom, RefusedByLearner, Unreachable, BadLink: with what to do.
@@ -282,7 +294,7 @@ def run(settings: ActorSettings, flight: FlightSettings, arena: Arena, propose: 
         tolerance = process.bus.tolerance
         truth = Truth(flight.truth, flight.system, tolerance) if flight.truth else None
         stop, started = process.stop.is_set, time.monotonic()
-        rider = FlightRider(process, settings, stages, propose, outbox)
+        rider = FlightRider(process, settings, stages, propose, outbox, conditions or Conditions())
         process.refresh = lambda: process.figures.update(tally.figures(time.monotonic() - started) | rider.figures())
         process.announce()
         question = partial(ask, process.bus, deadline=settings.deadline)

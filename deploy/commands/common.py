@@ -65,7 +65,7 @@ class Physics:
     gust: float = 0.0
     """m/s, standard deviation of the wind on each axis."""
     perception: Literal["map", "scan"] = "map"
-    """Where free space comes from: the arena's map, or what a sensor of 360 beams shows (ground robot)."""
+    """Where free space comes from: the arena's map, or what a sensor shows (360 beams; in the air 90 rings of 180)."""
     dropped: float = 0.0
     """Share of the scan's beams that say nothing."""
     false_far: float = 0.0

@@ -121,14 +121,14 @@ class Actor:
             steps=self.steps,
         )
         propose = partial(policy_named, self.policy, robot) if self.policy else None
+        about = self.physics.conditions()
         if self.url:
             from actors import flight
             from deploy.quadrotors import flight_arena
 
             arena = flight_arena(self.arena, self.seed)
-            flight.run(settings, self.flight.settings(self.url, arena), arena, propose)
+            flight.run(settings, self.flight.settings(self.url, arena), arena, propose, about)
         else:
-            about = self.physics.conditions()
             worlds = partial(fleet_world, conditions=about)
             run(settings, partial(environment, conditions=about), propose, worlds)
         return 0

@@ -91,7 +91,7 @@ def _actor(place: Place, folder: Path, config: RunConfig, bus: BusSettings) -> b
         from deploy.quadrotors import flight_arena
 
         arena = flight_arena(config.arena, config.seed, robot_named(place.robot))
-        return flight.run(settings, config.flight, arena, propose)
+        return flight.run(settings, config.flight, arena, propose, config.conditions)
     worlds = partial(fleet_world, conditions=config.conditions)
     return run(settings, partial(environment, conditions=config.conditions), propose, worlds)
 

@@ -70,10 +70,12 @@ def sent(records: list[Record]) -> Iterator[tuple[float, Any]]:
                     yield frame.wall_time * 1e-9, found.message
 
 
-@pytest.mark.parametrize("policy", ["adversary", "astar"])
-def test_it_flies_in_time_and_hits_nothing(policy: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    length = PERIODS * QUADROTOR.period / 60.0
-    with stalls(0.01) as lost, Flight(tmp_path / "run", "--minutes", length, "--policy", policy) as run:
+@pytest.mark.parametrize(("policy", "perception"), [("adversary", "scan"), ("astar", "map")])
+def test_it_flies_in_time_and_hits_nothing(
+    policy: str, perception: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    how = ("--minutes", PERIODS * QUADROTOR.period / 60.0, "--policy", policy, "--perception", perception)
+    with stalls(0.01) as lost, Flight(tmp_path / "run", *how) as run:
         figures = run.end()
         assert figures["finished"], run.errors.read_text()
     flight, records = figures["flight"], list(read(run.folder))
@@ -83,6 +85,8 @@ def test_it_flies_in_time_and_hits_nothing(policy: str, tmp_path: Path, capsys: 
     assert follows_the_plan(records) == figures["fallbacks"]
     if policy == "astar":
         assert figures["goals"] >= 1
+    seen = {record.message.request.HasField("image") for record in records if record.topic == "exchange"}
+    assert seen == {perception == "scan"}, "what the filter was told"
 
     times = [at for at, message in sent(records) if message.get_type() == "SET_POSITION_TARGET_LOCAL_NED"]
     assert np.median(np.diff(times)) <= OFTEN and len(times) > 3 * PERIODS
