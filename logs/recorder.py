@@ -31,6 +31,7 @@ PATIENCE = 3.0  # s that it waits for this at most
 INBOX = 64 * 2**20  # bytes
 AROUND = 100  # bytes of a sample besides its payload
 PORTION = 2**20  # bytes saved at once: what fits on a nearly full disk is saved
+HURRY = 2.0  # s of one flush after which the messages that are left are saved as they came, without pictures
 
 Open = Callable[[Path, Metadata], Segment]
 Derive = Callable[[Sample], Iterable[Entry]]  # what is stored of a sample besides itself: Foxglove's pictures
@@ -104,10 +105,13 @@ class Recording:
         self._begun_at = 0.0
         self._retry_at = 0.0
         self._complained_of = 0
+        self.left_out = 0  # messages of which nothing was derived: it would have taken too long
+        self._flush_began = 0.0
 
     def save(self) -> None:
         """Bring what is in the inbox now to the operating system; what can't be written stays there."""
         self._complain_of_drops()
+        self._flush_began = time.monotonic()
         if time.monotonic() < self._retry_at:
             return
         try:
@@ -136,12 +140,20 @@ class Recording:
             log.error("%d bytes of messages could not be recorded: %s", self._inbox.bytes, self.failure)
 
     def _entries(self, sample: Sample) -> list[Entry]:
-        """The sample, whatever it holds, and what is made of it."""
+        """The sample, whatever it holds, and what is made of it, if there is time."""
         try:
+            if time.monotonic() - self._flush_began > HURRY:
+                self._leave_out()
+                return [entry(sample)]
             return [entry(sample), *self._derive(sample)]
         except Exception as error:  # its bytes are kept all the same
             self._tolerance.note(sample.key, error)
             return [as_it_came(sample)]
+
+    def _leave_out(self) -> None:
+        if not self.left_out:
+            log.warning("messages come faster than they can be drawn: some are recorded without pictures")
+        self.left_out += 1
 
     def _begun(self) -> Segment:
         """The file to write to, a new one if there is none. Raises OSError."""
@@ -205,8 +217,8 @@ def record(
 ) -> Recording:
     """Record until `process.stop` is set and nothing more comes. Its Health has the note `file` once it listens.
 
-    Health figures: `recorded` and `dropped` messages, `waiting` bytes, and `recorded <key>` per channel; the note
-    `failure` says why nothing can be written.
+    Health figures: `recorded`, `dropped` and `undrawn` messages, `waiting` bytes, and `recorded <key>` per channel; the
+    note `failure` says why nothing can be written.
     """
     inbox = Inbox()
     opened = partial(open_segment, attachments=attachments)
@@ -217,6 +229,7 @@ def record(
             {f"recorded {key}": float(count) for key, count in recording.recorded.copy().items()},
             recorded=float(recording.recorded.total()),
             dropped=float(inbox.dropped.total()),
+            undrawn=float(recording.left_out),
             waiting=float(inbox.bytes),
         )
         process.notes.update(file=str(recording.path or ""), failure=recording.failure)

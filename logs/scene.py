@@ -39,6 +39,7 @@ from messaging.surroundings import Surroundings, surroundings
 
 WORLD = "world"
 HEIGHT = 0.4  # m, of what is drawn of a plane's obstacles
+MARKED = 400  # hits of a scan that are drawn at the most: the request in the log has all
 FLAT = 0.02  # m, of what is drawn on a plane's floor, and half of it the thickness of walls
 LEVELS = {"DEBUG": Log.DEBUG, "INFO": Log.INFO, "WARNING": Log.WARNING, "ERROR": Log.ERROR}
 
@@ -211,7 +212,7 @@ def _told(entity: SceneEntity, about: Surroundings, promises: Iterable[np.ndarra
         free.points.extend(map(_point, about.free))
         free.color.CopyFrom(FREE)
         hits = LinePrimitive(type=LinePrimitive.LINE_LIST, pose=_pose(()), thickness=4.0, scale_invariant=True)
-        hits.points.extend(_point((*at[:2], z + at[2:].sum())) for at in about.hits for z in (0.0, FLAT))
+        hits.points.extend(map(_point, _marks(about.hits)))
         hits.color.CopyFrom(HIT)
         entity.lines.extend([free, hits])
     swept = about.swept.reshape(-1, about.swept.shape[-1])
@@ -230,6 +231,15 @@ def _told(entity: SceneEntity, about: Surroundings, promises: Iterable[np.ndarra
             d = len(box) // 2
             edges = [2.0 * (half + box[-1]) for half in box[d:-1]] + [FLAT] * (3 - d)
             entity.cubes.append(CubePrimitive(pose=_pose(box[:d]), size=_vector(*edges), color=PROMISE))
+
+
+def _marks(hits: np.ndarray) -> list[list[float]]:
+    """Ends of a short upright line at some of the points (k, d)."""
+    some = hits[:: max(1, -(-len(hits) // MARKED))]
+    ends = np.zeros((len(some), 2, 3))
+    ends[..., : some.shape[1]] = some[:, None]
+    ends[:, 1, 2] += FLAT
+    return list(ends.reshape(-1, 3).tolist())
 
 
 def _along(at: Iterable[float], way: Sequence[float] | np.ndarray) -> Pose:

@@ -12,11 +12,13 @@ from pathlib import Path
 from typing import IO, Any, cast
 
 import pytest
+from mcap.reader import make_reader
 
+from logs import recorder
 from logs.metrics import Metrics
 from logs.reader import open_log, read
 from logs.recorder import Inbox, Recording, as_it_came
-from logs.segment import Metadata, Segment, name_of, open_segment
+from logs.segment import Entry, Metadata, Segment, name_of, open_segment
 from messaging import brakeline_pb2 as pb
 from messaging.bus import Bus, BusSettings, Sample
 from messaging.ports import free_endpoint
@@ -216,6 +218,33 @@ def test_a_disk_that_stays_full_is_said_at_the_end(tmp_path: Path, say: Say, cap
     assert "could not be recorded" in caplog.text
     assert list(tmp_path.glob("*.mcap")) == []
     assert "No space left" in recording.failure
+
+
+def test_pictures_that_take_too_long_cost_no_message(
+    tmp_path: Path, say: Say, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It fell behind for its pictures, and when the run ended, it was killed with all that waited."""
+    monkeypatch.setattr(recorder, "HURRY", 0.1)
+
+    def drawn(sample: Sample) -> list[Entry]:
+        time.sleep(0.03)
+        return [Entry(f"picture/{sample.key}", pb.LogLine, sample.payload, sample.received, sample.received, 0)]
+
+    inbox = Inbox()
+    recording = Recording(tmp_path / "run.mcap", {}, inbox, derive=drawn)
+    for number in range(100):
+        inbox.put(say("log/a", pb.LogLine(text=f"{number}")))
+    began = time.monotonic()
+    recording.finish()
+    assert time.monotonic() - began < 1.5, "3 s of pictures"
+    topics = Counter(key.partition("/")[0] for key in _keys(tmp_path / "run.mcap"))
+    assert topics["log"] == 100 and topics["picture"] == 100 - recording.left_out > 0
+    assert recording.left_out > 80 and caplog.text.count("without pictures") == 1
+
+
+def _keys(path: Path) -> list[str]:
+    with path.open("rb") as file:
+        return [channel.topic for _, channel, _ in make_reader(file).iter_messages()]
 
 
 def test_a_folder_that_cannot_be_written_is_a_failure_too(tmp_path: Path, say: Say) -> None:

@@ -15,15 +15,16 @@ from logs.watch.board import Board
 from logs.watch.server import Server
 from messaging import brakeline_pb2 as pb
 from messaging.motion import Motion
+from messaging.range_images import RangeImage
 from messaging.scans import Scan
-from messaging.sensed import scan_message
+from messaging.sensed import add_sensed, scan_message
 from messaging.shapes import CYLINDER, Obstacle
 from messaging.surroundings import surroundings
 from safety.client import obstacle_messages
 from tests.browser import CHROMIUM, Page
 from tests.logs.mixed import Writer
 from tests.logs.test_foxglove import Say, Studio, episode, step
-from tests.robots import GROUND
+from tests.robots import GROUND, QUADROTOR
 
 FAN = np.linspace(-np.pi, np.pi, 360, endpoint=False)
 WALKER = Obstacle(CYLINDER, (1.0, 0.5), (0.2,), motion=Motion((0.5, 0.0), 0.03, 0.05, acceleration=1.0))
@@ -64,6 +65,20 @@ def test_foxgloves_scene_has_it(say: Say) -> None:
     ]
     assert boxes == [(0.0, 0.5, 0.7)] * 3, "the other's alone"
     assert shown.texts[0].color.r == pytest.approx(142 / 255), "recovering is violet"
+
+
+def test_of_a_range_image_so_few_hits_are_drawn_that_a_recorder_keeps_up(say: Say) -> None:
+    """A picture of all 16,200 took half a second: the recorder fell behind, and a flight's log ended in its middle."""
+    ranges = np.full((90, 180), 5.0)
+    edge = 0.5 * np.pi * (1.0 - 1.0 / 90)
+    exchange = pb.Exchange(request=pb.Request(robot="quadrotor", actor="q", state=[0.0] * 9, action=[0.0] * 3))
+    add_sensed(exchange.request, RangeImage(ranges, (1.0, 0.0, 2.0), low=-edge, high=edge))
+    exchange.reply.decision.kind = pb.ADJUSTED
+    drawn = scene.decision(QUADROTOR, pb.Step(actor="q", state=[0.0] * 9, decision=pb.ADJUSTED), exchange, 0)
+    (hits,) = (line for line in drawn.entities[0].lines if line.type == line.LINE_LIST)
+    assert scene.MARKED <= len(hits.points) <= 2 * scene.MARKED and drawn.ByteSize() < 2**16
+    away = [np.linalg.norm([p.x - 1.0, p.y, p.z - 2.0]) for p in hits.points[::2]]
+    assert np.allclose(away, 5.0)
 
 
 def test_a_scan_that_is_none_costs_its_picture_only(say: Say) -> None:
