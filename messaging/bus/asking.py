@@ -15,6 +15,9 @@ from messaging.bus.keys import own_key
 RENEWED = 30.0  # s after which all are asked again: there may be more of them by now, or one that is less busy
 HELD = 1.0  # s for which who was late is asked again: if all are late, to ask all each time makes them later
 AGAIN = 0.1  # of the deadline: all are asked when one is known to be gone before that
+PATIENT = (
+    1.0  # s: who waits as long would rather wait for a link that is busy than have the question, or its answer, lost
+)
 
 
 @dataclass(frozen=True)
@@ -100,7 +103,10 @@ class Asker:
                     consolidation=zenoh.ConsolidationMode.NONE,  # the first answer is the answer
                     timeout=timeout,
                     priority=zenoh.Priority.REAL_TIME,
-                    congestion_control=zenoh.CongestionControl.DROP,  # never stall past the deadline
+                    # Of the answer, too. Dropped: never stalled past the deadline.
+                    congestion_control=zenoh.CongestionControl.BLOCK
+                    if timeout >= PATIENT
+                    else zenoh.CongestionControl.DROP,
                     express=True,
                 )
             return self._queriers[key, timeout]

@@ -344,6 +344,19 @@ def test_everything_comes_back_after_the_router_was_killed(join: Join, spawn: Sp
     assert got[0] > 1, "what was put while the router was away is a gap"
 
 
+def test_who_has_the_patience_gets_an_answer_though_the_link_stalls(join: Join, spawn: Spawn, endpoint: str) -> None:
+    """Zenoh drops what a busy link does not take in time: once an answer, and a run in lockstep braked for nothing."""
+    router = spawn(ROUTER.format(endpoint=endpoint))
+    actor, safety = join("actor-0"), join("safety")
+    safety.serve(DECIDE, lambda payload: payload[:10], robot="ground")
+    assert actor.ask(DECIDE, b"x", 30.0, robot="ground") == b"x"
+    router.send_signal(signal.SIGSTOP)
+    wake = threading.Timer(0.3, router.send_signal, [signal.SIGCONT])
+    wake.start()
+    assert actor.ask(DECIDE, bytes(2**24), 30.0, robot="ground") == bytes(10)
+    wake.join()
+
+
 def test_without_a_router_a_client_says_so_after_its_patience(
     join: Join, endpoint: str, stalled: Callable[[], float]
 ) -> None:
