@@ -217,7 +217,7 @@ class Filter:
             return None
         before = z_0[-m:]
         stand = self.inputs.regressors(z_0, self.inputs.stop(request.state, before))
-        parked = replace(scene, moving=None)  # what moves may stand by: that is its affair
+        parked = scene.parked
         seeming = 0.0 if on_a_way else 2.0 * float(np.linalg.norm(self.around.measured)) + self.comfort
         if self.around.margin(self.around.rows(parked, stand), stand) >= -seeming:
             return None

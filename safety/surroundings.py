@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -68,6 +68,12 @@ class Scene:
     moving: Movers | None = None  # that may meet the tube
     unseen: seen.Cells | shades.Shadows | None = None  # what a scan does not show to be free
     promised: Promises | None = None  # to other robots
+
+    @property
+    def parked(self) -> Scene:
+        """The same for one that stands: what moves, or may, may stand by, that is its own affair."""
+        unseen = None if self.unseen is not None and self.unseen.speed > 0.0 else self.unseen
+        return replace(self, moving=None, unseen=unseen)
 
     @property
     def empty(self) -> bool:

@@ -49,6 +49,16 @@ def test_obstacles_count_beside_a_scan(ready):
     assert ready.decide(request(scan=clear, obstacles=ahead)).kind != ALLOWED
 
 
+def test_who_stands_where_something_comes_near_stays_where_it_is(ready):
+    """It turned about before a walker, `recovering`, and was touched in motion: only what stands is a corner."""
+    for away in (0.25, 0.4, 0.7, -0.25, -0.4, -0.7):
+        comes = [Obstacle("cylinder", (away + math.copysign(0.2, away), 0.0), (0.2,))]
+        ranges = cast(comes, np.zeros(2), FAN)
+        seen = Scan(ranges, FAN, (0.0, 0.0, 0.0), far=FAR, range_error=0.02, least_width=WIDTH, speed=1.2)
+        decision = ready.decide(request(action=(0.0, 0.5), scan=seen))
+        assert decision.kind == FAILSAFE and not decision.plan.any()
+
+
 @pytest.mark.parametrize("blind", [0.0, math.radians(30.0)])
 def test_a_hostile_driver_touches_nothing_and_is_not_held_for_good(ready, blind):
     rng = np.random.default_rng(1)
