@@ -109,6 +109,11 @@ def test_a_plan_that_comes_late_does_not_count_and_a_newer_one_does(live: Live) 
         vehicle.commit(np.full((2, 3), np.nan), number + 4)
 
 
+def heard_again(vehicle: LiveVehicle) -> bool:
+    """Within some periods, on a machine that may stall."""
+    return any(not vehicle.wait(vehicle.turn.number + 1).lost for _ in range(25))
+
+
 def test_without_telemetry_it_says_so_and_goes_on(live: Live) -> None:
     vehicle, autopilot, _ = live
     assert vehicle.commit(np.full((9, 3), 0.4), vehicle.turn.number + 2)
@@ -117,8 +122,7 @@ def test_without_telemetry_it_says_so_and_goes_on(live: Live) -> None:
     assert "no telemetry" in turn.lost
     assert turn.input == pytest.approx([0.4, 0.4, 0.4])
     autopilot.take = real  # type: ignore[method-assign]
-    time.sleep(0.3)
-    assert not vehicle.wait(vehicle.turn.number + 2).lost
+    assert heard_again(vehicle)
 
 
 def test_what_stops_coming_alone_is_lost_telemetry_too(live: Live) -> None:
@@ -127,7 +131,7 @@ def test_what_stops_coming_alone_is_lost_telemetry_too(live: Live) -> None:
     vehicle._client.chosen[ATTITUDE] = "AHRS2"  # which does not come; the position goes on coming
     assert "no telemetry of attitude" in vehicle.wait(vehicle.turn.number + 3).lost
     vehicle._client.chosen[ATTITUDE] = chosen
-    assert not vehicle.wait(vehicle.turn.number + 2).lost
+    assert heard_again(vehicle)
     assert vehicle.timing.figures()["periods without telemetry"] >= 1
 
 
