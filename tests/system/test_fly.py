@@ -24,7 +24,9 @@ from tests.system.runs import Run
 pytestmark = pytest.mark.usefixtures("flight_folder")
 
 PERIODS = 70  # of a flight
-IN_TIME = 0.9  # of the answers, less the share of the time for which this machine lets nobody act
+# Of the answers, less the share of the time for which this machine lets nobody act; by a range image a decision takes ten
+# times as long.
+IN_TIME = {"map": 0.9, "scan": 0.5}
 TIMEOUT = 1.0  # s without a setpoint until the autopilot brakes and holds, for good: a stall is shorter
 OFTEN = 0.06  # s between two setpoints, as a rule
 PX4_HOLD = 4 << 16 | 3 << 24  # custom mode
@@ -80,7 +82,7 @@ def test_it_flies_in_time_and_hits_nothing(
         assert figures["finished"], run.errors.read_text()
     flight, records = figures["flight"], list(read(run.folder))
     assert figures["collisions"] == 0 and figures["steps"] == PERIODS
-    assert flight["answers in time share"] >= IN_TIME - lost.share, (flight, lost)
+    assert flight["answers in time share"] >= IN_TIME[perception] - lost.share, (flight, lost)
     assert flight["worst setpoint gap ms"] <= 1e3 * (TIMEOUT + lost.worst) and flight["periods slipped"] == 0, flight
     assert follows_the_plan(records) == figures["fallbacks"]
     if policy == "astar":
