@@ -24,8 +24,8 @@ from tests.system.runs import Run
 pytestmark = pytest.mark.usefixtures("flight_folder")
 
 PERIODS = 70  # of a flight
-# Of the answers, less the share of the time for which this machine lets nobody act; by a range image a decision takes ten
-# times as long.
+# Of the answers, less the share of the time for which this machine lets nobody act. By a range image a decision takes
+# ten times as long.
 IN_TIME = {"map": 0.9, "scan": 0.5}
 TIMEOUT = 1.0  # s without a setpoint until the autopilot brakes and holds, for good: a stall is shorter
 OFTEN = 0.06  # s between two setpoints, as a rule
