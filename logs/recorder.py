@@ -105,7 +105,7 @@ class Recording:
         self._begun_at = 0.0
         self._retry_at = 0.0
         self._complained_of = 0
-        self.left_out = 0  # messages of which nothing was derived: it would have taken too long
+        self.undrawn = 0  # messages of which nothing was derived: it would have taken too long
         self._flush_began = 0.0
 
     def save(self) -> None:
@@ -151,9 +151,9 @@ class Recording:
             return [as_it_came(sample)]
 
     def _leave_out(self) -> None:
-        if not self.left_out:
+        if not self.undrawn:
             log.warning("messages come faster than they can be drawn: some are recorded without pictures")
-        self.left_out += 1
+        self.undrawn += 1
 
     def _begun(self) -> Segment:
         """The file to write to, a new one if there is none. Raises OSError."""
@@ -229,7 +229,7 @@ def record(
             {f"recorded {key}": float(count) for key, count in recording.recorded.copy().items()},
             recorded=float(recording.recorded.total()),
             dropped=float(inbox.dropped.total()),
-            undrawn=float(recording.left_out),
+            undrawn=float(recording.undrawn),
             waiting=float(inbox.bytes),
         )
         process.notes.update(file=str(recording.path or ""), failure=recording.failure)

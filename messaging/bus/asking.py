@@ -15,9 +15,7 @@ from messaging.bus.keys import own_key
 RENEWED = 30.0  # s after which all are asked again: there may be more of them by now, or one that is less busy
 HELD = 1.0  # s for which who was late is asked again: if all are late, to ask all each time makes them later
 AGAIN = 0.1  # of the deadline: all are asked when one is known to be gone before that
-PATIENT = (
-    1.0  # s: who waits as long would rather wait for a link that is busy than have the question, or its answer, lost
-)
+PATIENT = 1.0  # s of a deadline from which on a busy link is waited for: before that, question or answer is dropped
 
 
 @dataclass(frozen=True)
@@ -103,10 +101,12 @@ class Asker:
                     consolidation=zenoh.ConsolidationMode.NONE,  # the first answer is the answer
                     timeout=timeout,
                     priority=zenoh.Priority.REAL_TIME,
-                    # Of the answer, too. Dropped: never stalled past the deadline.
-                    congestion_control=zenoh.CongestionControl.BLOCK
-                    if timeout >= PATIENT
-                    else zenoh.CongestionControl.DROP,
+                    congestion_control=_congestion(timeout),  # of the answer, too
                     express=True,
                 )
             return self._queriers[key, timeout]
+
+
+def _congestion(timeout: float) -> zenoh.CongestionControl:
+    """Who asks is never stalled past a short deadline, and loses nothing before a long one."""
+    return zenoh.CongestionControl.BLOCK if timeout >= PATIENT else zenoh.CongestionControl.DROP

@@ -236,8 +236,8 @@ def test_pictures_that_take_too_long_cost_no_message(
         inbox.put(say("log/a", pb.LogLine(text=f"{number}")))
     recording.finish()
     topics = Counter(key.partition("/")[0] for key in _keys(tmp_path / "run.mcap"))
-    assert topics["log"] == 100 and topics["picture"] == 100 - recording.left_out > 0
-    assert recording.left_out > 80 and caplog.text.count("without pictures") == 1
+    assert topics["log"] == 100 and topics["picture"] == 100 - recording.undrawn > 0
+    assert recording.undrawn > 80 and caplog.text.count("without pictures") == 1
 
 
 def _keys(path: Path) -> list[str]:
