@@ -30,8 +30,8 @@ class Tolerance:
         except Exception as error:
             self.note(what, error)
 
-    def note(self, what: str, error: Exception) -> None:
-        """`what` could not be handled, for this reason."""
+    def note(self, what: str, error: Exception, level: int = logging.ERROR) -> None:
+        """`what` could not be handled, for this reason; below an error's level it is named without its place."""
         with self._lock:
             self.count += 1
             due = self._clock() - self._said_at >= SPACING
@@ -39,9 +39,9 @@ class Tolerance:
                 self._said_at = self._clock()
         if due:
             why = headline(f"{what}: {type(error).__name__}: {error}")
-            # A ValueError says what is wrong with the message; anything else, where we did not expect it.
-            trace = None if isinstance(error, ValueError) else error
-            log.error("passed over (%d so far): %s", self.count, why, exc_info=trace)
+            # A ValueError says what is wrong with the message; any other error, where we did not expect it.
+            expected = level < logging.ERROR or isinstance(error, ValueError)
+            log.log(level, "passed over (%d so far): %s", self.count, why, exc_info=None if expected else error)
 
 
 def headline(text: str, longest: int = LONGEST) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import threading
 import time
 from collections.abc import Callable, Sequence
@@ -69,8 +70,7 @@ class Service(Receiving):
             idle, self._answering = not self._answering, True
         if left_out is not None:
             with left_out.query as one:
-                _refuse(one, Busy("too many questions wait"))
-            self._tolerance.note(self._name, Busy("too many questions wait"))
+                self._pass_over(one, Busy("too many questions wait"))
         return idle
 
     def _next(self) -> Question | None:
@@ -82,14 +82,20 @@ class Service(Receiving):
     def _answer(self, question: Question) -> None:
         """Answer one query; without an answer of some kind the service would look dead."""
         with question.query as query:
+            if time.monotonic() > question.until:
+                self._pass_over(query, Expired("nobody waits for this answer any more"))
+                return
             try:
-                if time.monotonic() > question.until:
-                    raise Expired("nobody waits for this answer any more")
                 answer = self._handler(query.payload.to_bytes() if query.payload else b"")
                 query.reply(query.key_expr, answer, express=True)
             except Exception as error:
                 _refuse(query, error)
                 raise
+
+    def _pass_over(self, query: zenoh.Query, reason: Busy | Expired) -> None:
+        """That the machine does not keep up is nobody's mistake."""
+        _refuse(query, reason)
+        self._tolerance.note(self._name, reason, logging.WARNING)
 
 
 def _refuse(query: zenoh.Query, error: Exception) -> None:

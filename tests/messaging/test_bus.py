@@ -2,40 +2,18 @@
 
 import dataclasses
 import signal
-import subprocess
 import threading
 import time
 from collections.abc import Callable
-from contextlib import ExitStack
 
 import pytest
 
 from messaging import brakeline_pb2 as pb
-from messaging.bus import Bus, BusError, BusSettings, Late, Malformed, NoReply, Refused, Sample, Unreachable
-from messaging.bus.asking import HELD, Asker
+from messaging.bus import Bus, BusError, BusSettings, Late, Malformed, NoReply, Sample, Unreachable
 from messaging.ports import free_endpoint
 from messaging.topics import DECIDE, HEALTH, LOG, STEP, WEIGHTS
+from tests.messaging.programs import ROUTER, SERVICE, Join, Spawn, answers
 from tests.waiting import until
-
-Join = Callable[..., Bus]
-Spawn = Callable[[str], "subprocess.Popen[str]"]
-
-SERVICE = """
-import os, sys, time
-from messaging.bus import Bus, BusSettings
-from messaging.topics import DECIDE
-bus = Bus(BusSettings({place}=("{endpoint}",)), "safety-{name}")
-bus.serve(DECIDE, lambda payload: b"{name}:" + payload)
-print("ready", flush=True)
-time.sleep(60)
-"""
-
-
-def answers(bus: Bus, payload: bytes = b"?") -> bytes | None:
-    try:
-        return bus.ask(DECIDE, payload, timeout=0.5, robot="ground")
-    except BusError:
-        return None
 
 
 def test_messages_arrive_numbered_and_as_the_bytes_that_were_sent(join: Join) -> None:
@@ -136,149 +114,6 @@ def test_only_the_topics_type_and_whole_keys_are_published(join: Join) -> None:
         Bus(BusSettings(), "nowhere")
 
 
-def test_a_question_is_answered_by_another_process(join: Join, spawn: Spawn, endpoint: str) -> None:
-    join("launcher", listen=True)
-    spawn(SERVICE.format(place="connect", endpoint=endpoint, name="a"))
-    assert join("actor-0").ask(DECIDE, b"?", timeout=10.0, robot="ground") == b"a:?"
-
-
-def test_failures_of_a_question_are_typed(
-    join: Join, caplog: pytest.LogCaptureFixture, stalled: Callable[[], float]
-) -> None:
-    join("launcher", listen=True)
-    actor, safety = join("actor-0"), join("safety")
-    start = time.perf_counter()
-    with pytest.raises(NoReply, match="is the service running"):
-        actor.ask(DECIDE, b"?", timeout=5.0, robot="ground")
-    assert time.perf_counter() - start < 1.0 + stalled(), "that nobody answers is known at once"
-
-    class BadRequest(ValueError):
-        field = "state"
-
-    release = threading.Event()
-
-    def handler(payload: bytes) -> bytes:
-        if payload == b"wrong":
-            raise BadRequest("not finite")
-        if payload == b"slow":
-            release.wait(5.0)
-        return payload
-
-    service = safety.serve(DECIDE, handler)
-    until(lambda: answers(actor) == b"?")
-    with pytest.raises(Refused, match="BadRequest: not finite") as refused:
-        actor.ask(DECIDE, b"wrong", timeout=10.0, robot="ground")
-    assert (refused.value.type, refused.value.field, refused.value.text) == ("BadRequest", "state", "not finite")
-    until(lambda: "not finite" in caplog.text)
-    start = time.perf_counter()
-    with pytest.raises(Late, match="within 100 ms"):
-        actor.ask(DECIDE, b"slow", timeout=0.1, robot="ground")
-    assert 0.09 < time.perf_counter() - start < 1.0 + stalled()
-    release.set()
-    noise = bytes(range(256)) * 40_000  # 10 MB
-    assert actor.ask(DECIDE, noise, timeout=5.0, robot="ground") == noise
-    assert actor.ask(DECIDE, b"", timeout=10.0, robot="ground") == b""
-    service.close()
-    with pytest.raises(NoReply):
-        actor.ask(DECIDE, b"?", timeout=2.0, robot="ground")
-
-
-class _Silent:
-    """A Zenoh session whose questions end without any reply, after so many seconds."""
-
-    id = None
-
-    def __init__(self, after):
-        self._after = after
-
-    def declare_querier(self, *_, **__):
-        return self
-
-    def get(self, **_):
-        time.sleep(self._after)
-        return iter(())
-
-
-def test_a_question_that_ends_without_a_word_is_late_after_its_deadline_and_unheard_before(monkeypatch):
-    monkeypatch.setattr("zenoh.SourceInfo", lambda *_: None)
-    with pytest.raises(Late, match="within 20 ms"):
-        Asker(_Silent(0.03)).ask("a/key", b"", 0.02)
-    with pytest.raises(NoReply):
-        Asker(_Silent(0.0)).ask("a/key", b"", 5.0)
-
-
-def test_another_replica_answers_when_one_is_killed(join: Join, spawn: Spawn, endpoint: str) -> None:
-    join("launcher", listen=True)
-    replicas = {name: spawn(SERVICE.format(place="connect", endpoint=endpoint, name=name)) for name in "ab"}
-    actor = join("actor-0")
-    until(lambda: answers(actor) is not None)
-    first = (answers(actor) or b"").decode()[0]
-    replicas[first].kill()
-    other = "ab".replace(first, "").encode()
-    until(lambda: answers(actor) == other + b":?")
-
-
-def test_of_replicas_behind_linked_routers_one_works_and_another_when_it_is_slow_or_gone() -> None:
-    one, other = free_endpoint(), free_endpoint()
-    heard: dict[str, int] = {"a": 0, "b": 0}
-    slow: set[str] = set()
-
-    def answerer(name: str) -> Callable[[bytes], bytes]:
-        def answer(payload: bytes) -> bytes:
-            heard[name] += 1
-            if name in slow:
-                time.sleep(0.5)
-            return name.encode()
-
-        return answer
-
-    with ExitStack() as stack:
-        stack.enter_context(Bus(BusSettings(listen=(one,)), "router-0"))
-        stack.enter_context(Bus(BusSettings(listen=(other,), connect=(one,)), "router-1"))
-        there = {"a": one, "b": other}
-        services = {
-            name: stack.enter_context(Bus(BusSettings(connect=(at,)), f"safety-{name}")) for name, at in there.items()
-        }
-        for name, bus in services.items():
-            bus.serve(DECIDE, answerer(name))
-        asker = stack.enter_context(Bus(BusSettings(connect=(other,)), "actor-0"))
-        until(lambda: answers(asker) is not None and min(heard.values()) > 0)
-        before = sum(heard.values())
-        said = {asker.ask(DECIDE, b"?", timeout=10.0, robot="ground") for _ in range(50)}
-        assert len(said) == 1 and sum(heard.values()) - before == 50, "each question is answered once"
-        first = said.pop().decode()
-        second = "ab".replace(first, "")
-        slow.add(first)
-        time.sleep(HELD)
-        with pytest.raises(Late):
-            asker.ask(DECIDE, b"?", timeout=0.1, robot="ground")
-        assert answers(asker) == second.encode(), "the next goes to all, and who is quick is asked from then on"
-        assert answers(asker) == second.encode()
-        services[second].close()
-        slow.clear()
-        assert asker.ask(DECIDE, b"?", timeout=10.0, robot="ground") == first.encode(), (
-            "of one that is gone it is known"
-        )
-
-
-def test_a_question_does_not_wait_behind_telemetry(join: Join, stalled: Callable[[], float]) -> None:
-    router, actor, safety = join("launcher", listen=True), join("actor-0"), join("safety")
-    release = threading.Event()
-    safety.serve(DECIDE, lambda payload: payload)
-    router.subscribe(STEP, lambda _: release.wait(10.0) and None)
-    safety.subscribe(STEP, lambda _: release.wait(10.0) and None)
-    until(lambda: answers(actor) == b"?")
-    publisher = actor.publisher(STEP, robot="ground")
-    worst = 0.0
-    for _ in range(300):
-        publisher.put(pb.Step(observation=[0.0] * 100))
-        start = time.perf_counter()
-        actor.ask(DECIDE, b"?", timeout=10.0, robot="ground")
-        worst = max(worst, time.perf_counter() - start)
-    release.set()
-    assert worst < 0.25 + stalled()
-
-
 def test_who_lives_is_known_and_who_is_killed_is_missed(
     join: Join, spawn: Spawn, endpoint: str, stalled: Callable[[], float]
 ) -> None:
@@ -309,15 +144,6 @@ def test_a_stopped_process_is_missed_within_two_seconds(
     until(lambda: "safety-a" in router.living())
 
 
-ROUTER = """
-import sys, time
-from messaging.bus import Bus, BusSettings
-bus = Bus(BusSettings(listen=("{endpoint}",)), "router")
-print("ready", flush=True)
-time.sleep(60)
-"""
-
-
 def test_everything_comes_back_after_the_router_was_killed(join: Join, spawn: Spawn, endpoint: str) -> None:
     router = spawn(ROUTER.format(endpoint=endpoint))
     actor, safety = join("actor-0"), join("safety")
@@ -342,19 +168,6 @@ def test_everything_comes_back_after_the_router_was_killed(join: Join, spawn: Sp
 
     until(arrives)
     assert got[0] > 1, "what was put while the router was away is a gap"
-
-
-def test_who_has_the_patience_gets_an_answer_though_the_link_stalls(join: Join, spawn: Spawn, endpoint: str) -> None:
-    """Zenoh drops what a busy link does not take in time: once an answer, and a run in lockstep braked for nothing."""
-    router = spawn(ROUTER.format(endpoint=endpoint))
-    actor, safety = join("actor-0"), join("safety")
-    safety.serve(DECIDE, lambda payload: payload[:10], robot="ground")
-    assert actor.ask(DECIDE, b"x", 30.0, robot="ground") == b"x"
-    router.send_signal(signal.SIGSTOP)
-    wake = threading.Timer(0.3, router.send_signal, [signal.SIGCONT])
-    wake.start()
-    assert actor.ask(DECIDE, bytes(2**24), 30.0, robot="ground") == bytes(10)
-    wake.join()
 
 
 def test_without_a_router_a_client_says_so_after_its_patience(

@@ -1,0 +1,35 @@
+"""What runs in other processes, and who asks them."""
+
+import subprocess
+from collections.abc import Callable
+
+from messaging.bus import Bus, BusError
+from messaging.topics import DECIDE
+
+Join = Callable[..., Bus]
+Spawn = Callable[[str], "subprocess.Popen[str]"]
+
+SERVICE = """
+import os, sys, time
+from messaging.bus import Bus, BusSettings
+from messaging.topics import DECIDE
+bus = Bus(BusSettings({place}=("{endpoint}",)), "safety-{name}")
+bus.serve(DECIDE, lambda payload: b"{name}:" + payload)
+print("ready", flush=True)
+time.sleep(60)
+"""
+
+ROUTER = """
+import sys, time
+from messaging.bus import Bus, BusSettings
+bus = Bus(BusSettings(listen=("{endpoint}",)), "router")
+print("ready", flush=True)
+time.sleep(60)
+"""
+
+
+def answers(bus: Bus, payload: bytes = b"?") -> bytes | None:
+    try:
+        return bus.ask(DECIDE, payload, timeout=0.5, robot="ground")
+    except BusError:
+        return None
