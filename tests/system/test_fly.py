@@ -83,7 +83,8 @@ def test_it_flies_in_time_and_hits_nothing(
     flight, records = figures["flight"], list(read(run.folder))
     assert figures["collisions"] == 0 and figures["steps"] == PERIODS
     assert flight["answers in time share"] >= IN_TIME[perception] - lost.share, (flight, lost)
-    assert flight["worst setpoint gap ms"] <= 1e3 * (TIMEOUT + lost.worst) and flight["periods slipped"] == 0, flight
+    assert flight["worst setpoint gap ms"] <= 1e3 * (TIMEOUT + lost.worst), (flight, lost)
+    assert flight["periods slipped"] <= lost.beyond / QUADROTOR.period, (flight, lost)
     assert follows_the_plan(records) == figures["fallbacks"]
     if policy == "astar":
         assert figures["goals"] >= 1
