@@ -116,6 +116,12 @@ class Driver:
             fleet=self.fleet,
         )
 
+    def skip(self) -> None:
+        """A period went by unseen: the plan went on, and the steps' numbers show a gap."""
+        self.commitment.fallback()
+        self._memory.later(self.robot.period)
+        self.step += 1
+
     def _remember(self) -> None:
         """Fill in the scan, if there is one, with what was seen free before."""
         self._scan = filled(self._memory, self.info.get("scan"), self.robot.period)

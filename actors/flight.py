@@ -166,7 +166,7 @@ class FlightRider(Rider):
 
     def take(self, vehicle: LiveVehicle) -> None:
         """From here on it flies this one, which hovers. What is slow the first time is done once before."""
-        self._flight = Flight(vehicle, self._skip)
+        self._flight = Flight(vehicle, self.driver.skip)
         observation, info = self.driver.env.reset(options={"episode_seed": 0})
         self.proposer.begin(np.random.default_rng(0))
         self.proposer.propose(observation, info)
@@ -186,11 +186,6 @@ class FlightRider(Rider):
             what, outcome = "late", replace(outcome, answer=None, failure="Late: its period had begun")
         self.answers[what] += 1
         return super().settle(outcome)
-
-    def _skip(self) -> None:
-        """A period went by unseen: the plan went on, and the steps' numbers show a gap."""
-        self.driver.commitment.fallback()
-        self.driver.step += 1
 
     def stop(self) -> None:
         """Along the committed plan to hovering."""

@@ -11,8 +11,8 @@ from actors.frames import Tap
 from actors.mavlink import Client, message_id
 from actors.telemetry import Array
 from messaging.robots import Robot
-from sim.quadrotor import SAMPLES, Quadrotor, slewed
-from sim.vehicle import Period
+from sim.quadrotor import SAMPLES, Quadrotor
+from sim.vehicle import Period, executed
 
 
 class Endpoint(Protocol):
@@ -37,7 +37,7 @@ class MavlinkVehicle:
     def __init__(self, endpoint: Endpoint, robot: Robot, tap: Tap | None = None) -> None:
         """tap: is called with every MAVLink frame. Raises MavlinkError when the autopilot refuses something."""
         self._endpoint, self._client = endpoint, Client(endpoint.receive, tap=tap)
-        self._period = period = robot.period
+        self._robot, period = robot, robot.period
         self.input = np.zeros(robot.action_dim)
         wait = self._wait
         wanted = {"LOCAL_POSITION_NED": period / SAMPLES, "ATTITUDE_QUATERNION": period, "HIGHRES_IMU": period}
@@ -53,12 +53,12 @@ class MavlinkVehicle:
         Raises:
             BadInput: when the input is not three finite numbers.
         """
-        self.input = slewed(input, self.input)
+        self.input = executed(self._robot, input, self.input)
         client, endpoint, start = self._client, self._endpoint, self.measured[:3]
         client.path.clear()
         client.setpoint(self.input)
         endpoint.vehicle.watch()
-        endpoint.advance(self._period)
+        endpoint.advance(self._robot.period)
         client.feed(endpoint.take())
         self.measured = self._measured()
         path = np.array([position for _, position in client.path]) - start

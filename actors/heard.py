@@ -126,7 +126,7 @@ class Heard:
         chosen = self.chosen.get(what)
         if (chosen or source.message) != source.message or (not chosen and place > self._best.get(what, place)):
             return
-        told = source.read(message)
+        told = telemetry.told(source, message)
         if told is None:
             return
         self._best[what] = place

@@ -21,8 +21,8 @@ from actors.witness import Witness
 from messaging.links import Link
 from messaging.robots import Robot
 from messaging.tolerant import Tolerance
-from sim.quadrotor import SAMPLES, slewed
-from sim.vehicle import Period
+from sim.quadrotor import SAMPLES
+from sim.vehicle import Period, executed
 
 log = logging.getLogger("brakeline.flight")
 
@@ -122,7 +122,7 @@ class LiveVehicle:
         Raises:
             BadInput: when one is not three finite numbers.
         """
-        rows = [slewed(row, row) for row in np.asarray(plan, float)]
+        rows = [executed(self._robot, row, row) for row in np.asarray(plan, float)]
         with self._turned:
             in_time = self.turn.number < number
             if in_time:
@@ -209,7 +209,7 @@ class LiveVehicle:
     def _begin(self, now: float) -> None:
         """A period begins: send its input first, then see what the one before has come to."""
         following = self._plan.pop(0) if self._plan else np.zeros(self._robot.action_dim)
-        self._velocity = slewed(following, self.turn.input)
+        self._velocity = executed(self._robot, following, self.turn.input)
         self._send_setpoint(now)
         self._keep_time(now - self._due)
         start, state = self.turn.report.measured[:3], self._state(now)

@@ -22,8 +22,8 @@ from sim.autopilot.hil import AutopilotGone, Hil
 from sim.autopilot.px4 import Px4
 from sim.autopilot.sensors import SensorNoise, Sensors
 from sim.flight_estimator import QuadrotorNoise
-from sim.quadrotor import SAMPLES, Quadrotor, slewed
-from sim.vehicle import Period
+from sim.quadrotor import SAMPLES, Quadrotor
+from sim.vehicle import Period, executed
 from sim.world import Arena, closing, room_bounds
 
 Array = NDArray[np.float64]
@@ -198,7 +198,7 @@ class Px4Vehicle:
 
     def __init__(self, flight: Px4Flight, vehicle: Quadrotor, robot: Robot) -> None:
         """Raises what `Px4Flight.enter` does."""
-        self._flight, self._vehicle, self._period = flight, vehicle, robot.period
+        self._flight, self._vehicle, self._robot = flight, vehicle, robot
         self.input = np.zeros(robot.action_dim)
         flight.enter(vehicle)
         flight.tell(self.input)
@@ -214,17 +214,17 @@ class Px4Vehicle:
         Raises:
             BadInput: when the input is not three finite numbers; AutopilotGone.
         """
-        self.input = slewed(input, self.input)
+        self.input = executed(self._robot, input, self.input)
         flight, client, start, begin = self._flight, self._flight.client, self.measured[:3], self._flight.hil.time
         client.path.clear()
         self._vehicle.watch()
         flight.tell(self.input)
-        flight.advance(self._period)
+        flight.advance(self._robot.period)
         flight.settle()
         self.measured = self._estimate()
         times = [begin, *(at for at, _ in client.path), flight.hil.time]
         places = np.array([start, *(where + self._offset for _, where in client.path), self.measured[:3]])
-        samples = begin + self._period * np.arange(1, SAMPLES + 1) / SAMPLES
+        samples = begin + self._robot.period * np.arange(1, SAMPLES + 1) / SAMPLES
         path = np.column_stack([np.interp(samples, times, places[:, axis]) for axis in range(3)])
         period = self._vehicle.watched(self.measured, path - start)
         self.true = period.true

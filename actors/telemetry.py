@@ -66,6 +66,19 @@ class Source:
     kinds: tuple[str, ...] = ("px4", "ardupilot")  # whose it is to be understood so
 
 
+def told(source: Source, message: Message) -> Any:
+    """What a message says; None: nothing, for what is no number is not told."""
+    try:
+        said = source.read(message)
+    except (ValueError, OverflowError):  # of an infinite angle there is no sine
+        return None
+    if isinstance(said, Motion):
+        numbers = math.isfinite(said.time) and bool(np.isfinite([said.position, said.velocity]).all())
+    else:
+        numbers = not isinstance(said, tuple) or all(map(math.isfinite, said))
+    return said if numbers else None
+
+
 def turned(q: Quaternion, vector: Triple) -> Triple:
     """A vector in the frame that the attitude turns into."""
     w, x, y, z = q

@@ -7,6 +7,7 @@ Between two neighbouring beams Δ < 45° apart, free up to ρ from the sensor, e
 is free: from a point at d two edges of length W at right angles start, one of them at 45° or less to the beams' normal.
 The gap there is at most d sin Δ wide; if that edge is long enough to leave it, it meets a beam at most at
 d (cos Δ + sin Δ tan(45° + Δ)) from the sensor, where that is free if d < F.
+Where that many beams in a row may be false, the edge must reach the next one: Δ is as much wider.
 So a dropped beam costs little near by (2 m for W = 0.1 m), and a blind sector everything. A beam that returns from
 where, by its neighbours, nothing can be is a ghost, and says nothing.
 """
@@ -39,7 +40,16 @@ def gaps(scan: Scan) -> tuple[Array, Array, Array]:
     width = np.diff(angles, append=angles[0] + 2.0 * math.pi)
     doubt = min(scan.doubt, len(ranges))
     least = _least(ranges, range(-doubt, doubt + 2))
-    return angles, width, _free(least, width, scan.least_width)
+    return angles, width, _free(least, np.maximum(*_spans(width, doubt)), scan.least_width)
+
+
+def _spans(width: Array, doubt: int) -> tuple[Array, Array]:
+    """Of each gap [rad], with so many more before it, and after it, all round."""
+    before, after = width.copy(), width.copy()
+    for k in range(1, doubt + 1):
+        before += np.roll(width, k)
+        after += np.roll(width, -k)
+    return before, after
 
 
 def _least(ranges: Array, places: range) -> Array:
@@ -63,8 +73,9 @@ def _free(least: Array, width: Array, least_width: float) -> Array:
 
 def _lone(angles: Array, ranges: Array, scan: Scan) -> NDArray[np.bool_]:
     """Beams that return from where, by their neighbours and the least width, nothing can be: ghosts."""
-    turned = np.take(angles, np.arange(-1, len(angles) + 1), mode="wrap")
-    width = (turned[2:] - turned[:-2]) % (2.0 * math.pi)
+    gap = np.diff(angles, append=angles[0] + 2.0 * math.pi)
+    before, after = _spans(gap, scan.doubt)
+    width = np.maximum(np.roll(gap, 1) + after, np.roll(before, 1) + gap)
     far = scan.doubt + 1
     beside = np.minimum(_least(ranges, range(-far, 0)), _least(ranges, range(1, far + 1)))
     return np.asarray(ranges + 2.0 * scan.range_error < _free(beside, width, scan.least_width))

@@ -142,13 +142,17 @@ class Shapes:
 
     def towards(self, points: Array) -> Array:
         """Vectors from points (..., d) to the closest points of the n obstacles: (n, ..., d); zero inside."""
-        local = (points.reshape(-1, points.shape[-1]) - self.center[:, None]) @ self.axes  # (n, points, d)
+        return self.each_towards(points.reshape(1, -1, points.shape[-1])).reshape(len(self), *points.shape)
+
+    def each_towards(self, points: Array) -> Array:
+        """The same of each from points of its own (n, points, d)."""
+        local = (points - self.center[:, None]) @ self.axes
         half = self.half[:, None]
         rest = local - np.minimum(np.maximum(local, -half), half)
         rounded = rest * self.round[:, None]
         norm = np.sqrt(np.einsum("npi,npi->np", rounded, rounded))
         rest -= rounded * (self.rho[:, None] / np.maximum(norm, np.maximum(self.rho, 1e-300)[:, None]))[..., None]
-        return np.asarray(-(rest @ self.axes.transpose(0, 2, 1))).reshape(len(self), *points.shape)
+        return np.asarray(-(rest @ self.axes.transpose(0, 2, 1)))
 
     def out_of(self, point: Array) -> Array:
         """Vectors (n, d) from a point (d,) inside of obstacles to the closest points of their surfaces; zero outside,

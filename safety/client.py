@@ -90,7 +90,7 @@ def request_message(
     **more: Any,
 ) -> pb.Request:
     """A request; `more`: actor, episode, step, time, observation, fleet."""
-    commitment.seen = np.asarray(state, float)
+    commitment.measured(np.asarray(state, float))
     message = pb.Request(
         robot=commitment.robot.name,
         state=np.asarray(state, float).tolist(),

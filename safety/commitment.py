@@ -63,6 +63,7 @@ class Commitment:
         self.predicted: Prediction | None = None
         self.promise: Promise | None = None
         self.seen: Array = np.zeros(self.robot.state_dim)  # the last measured state: of feedback, a stop is made of it
+        self._compare = False  # was it measured where the prediction speaks of it?
         self._still = self.robot.horizon  # periods of a stop's inputs
         self._vouchers: tuple[bytes, ...] = ()  # of this period and those to come; the last stays
 
@@ -75,6 +76,11 @@ class Commitment:
     def voucher(self) -> bytes:
         """For the next request; empty: the service gave none."""
         return self._vouchers[0] if self._vouchers else b""
+
+    def measured(self, state: Array) -> None:
+        """At a period's beginning, before a question about it; one that is no state (n,) counts as none."""
+        if state.shape == self.seen.shape and np.isfinite(state).all():
+            self.seen, self._compare = state, True
 
     def accept(
         self,
@@ -93,7 +99,10 @@ class Commitment:
         return self._advance()
 
     def fallback(self) -> Array:
-        """No decision came: the committed plan's next input."""
+        """No decision came: the committed plan's next input. Nobody else saw whether the state that was measured is in
+        its predicted set; where it is not, what was verified of the plan does not hold any more."""
+        if self._compare and self.predicted is not None and not self.predicted.contains(self.robot, self.seen):
+            self.model, self._vouchers = UNVERIFIED, ()
         self.predicted = None
         if self.robot.feedback:
             self.plan[0] = self.robot.braked(self.plan[0], self.seen, self.input_in_force)
@@ -101,6 +110,7 @@ class Commitment:
 
     def _advance(self) -> Array:
         robot = self.robot
+        self._compare = False
         now: Array = self.plan[0].copy()
         self._vouchers = self._vouchers[1:] or self._vouchers
         self.promise = None if self.promise is None else self.promise.later()

@@ -22,7 +22,7 @@ from messaging.sensed import Sensed
 from safety.client import Answer, SafetyClient
 from safety.commitment import correction_penalty
 from safety.image_memory import filled, memory_of
-from safety.inprocess import InProcess
+from safety.inprocess import InProcess, own
 from safety.request import Decision
 from safety.spaces import Actions, actions_of, cast
 from safety.views import OBSTACLES, STATE, View
@@ -96,7 +96,7 @@ class SafetyWrapper(gymnasium.Wrapper[Any, Any, Any, Any]):
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         if self._now is None:
             raise gymnasium.error.ResetNeeded("reset the environment before anything else")
-        before = self.commitment.input_in_force
+        before = self.commitment.due
         wanted = np.asarray(self._actions.action_to_control(action), dtype=float)
         answer, reason = self._decide(wanted)
         executed = self.commitment.due
@@ -118,7 +118,8 @@ class SafetyWrapper(gymnasium.Wrapper[Any, Any, Any, Any]):
             return self.asker.decide(state, wanted, near, seen[0], self._scan), ""
         wanted = wanted if np.isfinite(wanted).all() else np.zeros(wanted.shape)
         try:
-            return self.asker.decide(state, wanted, near, scan=self._scan), ""
+            observed = own(seen[0], self.asker.robot).tolist()
+            return self.asker.decide(state, wanted, near, scan=self._scan, observation=observed), ""
         except BusError as error:
             self.asker.fallback()
             return None, str(error)

@@ -97,9 +97,9 @@ def memory_of(robot: Robot) -> FanMemory | ImageMemory:
 
 
 def filled(memory: FanMemory | ImageMemory, scan: Scan | RangeImage | None, elapsed: float) -> Scan | RangeImage | None:
-    """The scan with what is remembered; one that the memory is not of, as it is."""
-    if isinstance(memory, FanMemory) and isinstance(scan, Scan):
+    """The scan with what is remembered, None: the last one; one that the memory is not of, as it is."""
+    if isinstance(memory, FanMemory) and not isinstance(scan, RangeImage):
         return memory.fill(scan, elapsed)
-    if isinstance(memory, ImageMemory) and isinstance(scan, RangeImage):
+    if isinstance(memory, ImageMemory) and not isinstance(scan, Scan):
         return memory.fill(scan, elapsed)
     return scan

@@ -91,11 +91,12 @@ class InProcess:
         observation: object,
         scan: Sensed | None,
     ) -> Request:
-        kept.seen = np.asarray(state, dtype=float)
+        measured = np.asarray(state, dtype=float)
+        kept.measured(measured)
         wanted = np.asarray(action, dtype=float)
         standing, moving = parted(list(obstacles), self.robot.position_dim)
         return Request(
-            state=kept.seen,
+            state=measured,
             action=wanted if np.isfinite(wanted).all() else np.zeros(wanted.shape),
             input_in_force=kept.input_in_force,
             plan=kept.plan,
@@ -104,14 +105,15 @@ class InProcess:
             scan=scan,
             model=kept.model,
             predicted=kept.predicted,
-            observation=self._own(observation),
+            observation=own(observation, self.robot),
         )
 
-    def _own(self, observation: object) -> NDArray[np.float32]:
-        """The observation, if it is the robot's own: another environment has none that a method could read."""
-        try:
-            wanted = task_of(self.robot).observation_dim
-        except UnknownTask:  # then no method reads it
-            wanted = 0
-        fits = isinstance(observation, np.ndarray) and observation.shape == (wanted,)
-        return np.asarray(observation if fits else np.zeros(0), np.float32)
+
+def own(observation: object, robot: Robot) -> NDArray[np.float32]:
+    """The observation, if it is the robot's own: another environment has none that a method could read."""
+    try:
+        wanted = task_of(robot).observation_dim
+    except UnknownTask:  # then no method reads it
+        wanted = 0
+    fits = isinstance(observation, np.ndarray) and observation.shape == (wanted,)
+    return np.asarray(observation if fits else np.zeros(0), np.float32)

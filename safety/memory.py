@@ -45,16 +45,27 @@ class Memory(ABC, Generic[S]):
     def reset(self) -> None:
         """It is put down somewhere else."""
         self._put: S | None = None
+        self._last: S | None = None  # as it was given out
+        self._waited = 0.0  # s since then
         self._age = 0.0  # s since it was put down
         self._before: list[float] = []  # s since each that is kept was taken
 
-    def fill(self, scan: S, elapsed: float) -> S:
-        """The scan, with what is remembered in the place of beams that say nothing; elapsed: s since the last one."""
+    def later(self, elapsed: float) -> None:
+        """So many s go by."""
+        self._waited += elapsed
+        self._age += elapsed
+        self._before = [age + elapsed for age in self._before]
+
+    def fill(self, scan: S | None, elapsed: float) -> S | None:
+        """The scan, with what is remembered in the place of beams that say nothing; elapsed: s since the last one.
+
+        None: none came. Then the last one goes on to be what is known, so much older; None before the first.
+        """
+        self.later(elapsed)
+        if scan is None:
+            return None if self._last is None else replace(self._last, age=self._last.age + self._waited)
         if self._put is None:
-            self._put = scan
-        else:
-            self._age += elapsed
-            self._before = [age + elapsed for age in self._before]
+            self._put, self._age = scan, 0.0
         unknown = self._wanted(scan)
         filled = scan
         if unknown.any():
@@ -64,6 +75,7 @@ class Memory(ABC, Generic[S]):
             ranges[unknown] = np.where(known > 0.0, np.minimum(known + scan.range_error, scan.far), 0.0)
             filled = replace(scan, ranges=ranges)
         self._keep(scan)
+        self._last, self._waited = filled, 0.0
         return filled
 
     @abstractmethod

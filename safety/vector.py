@@ -10,8 +10,10 @@ import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv, VectorWrapper
 from numpy.typing import NDArray
 
+from messaging.sensed import Sensed
 from safety.commitment import Commitment, correction_penalty
 from safety.gym import diagnostics
+from safety.image_memory import filled, memory_of
 from safety.inprocess import InProcess
 from safety.spaces import Actions, actions_of
 from safety.views import OBSTACLES, STATE, View
@@ -26,8 +28,8 @@ class VectorSafetyWrapper(VectorWrapper):
     """`SafetyWrapper` of a `gymnasium.vector` environment, whatever its autoreset mode.
 
     `state(env, observations, infos)` gives (k, n), `obstacles` k lists, `actions` maps (k, m); all of them unless given
-    as `SafetyWrapper` has them. `infos` gains `safety` (k decisions; None where an environment is being reset),
-    `penalty` (k,) and `diagnostics` (a dict of k values each).
+    as `SafetyWrapper` has them, and scans in `infos` likewise. `infos` gains `safety` (k decisions; None where an
+    environment is being reset), `penalty` (k,) and `diagnostics` (a dict of k values each).
     """
 
     def __init__(
@@ -52,10 +54,13 @@ class VectorSafetyWrapper(VectorWrapper):
         self._mode = AutoresetMode(env.metadata.get("autoreset_mode", AutoresetMode.NEXT_STEP))
         self._ended = np.zeros(env.num_envs, dtype=bool)
         self._now: tuple[Any, dict[str, Any]] | None = None
+        self._memories = [memory_of(filter.robot) for _ in range(env.num_envs)]
+        self._scans: list[Sensed | None] = [None] * env.num_envs
 
     def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         self._now = self.env.reset(seed=seed, options=options)
         self._begin((options or {}).get("reset_mask", np.ones(self.num_envs, dtype=bool)))
+        self._remember(self._now[1])
         return self._now
 
     def step(self, actions: Any) -> tuple[Any, Array, NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]:
@@ -66,7 +71,7 @@ class VectorSafetyWrapper(VectorWrapper):
         # In the mode NEXT_STEP an environment that has ended takes no action, it is reset.
         resets = self._ended if self._mode == AutoresetMode.NEXT_STEP else np.zeros(self.num_envs, dtype=bool)
         deciding = np.flatnonzero(~resets)
-        before = np.array([kept.input_in_force for kept in self.commitments])
+        before = np.array([kept.due for kept in self.commitments])
         states, near = self._state(self.env, *seen), self._obstacles(self.env, *seen)
         answers = self.asker.decide_all(
             [self.commitments[i] for i in deciding],
@@ -74,7 +79,7 @@ class VectorSafetyWrapper(VectorWrapper):
             [wanted[i] for i in deciding],
             [near[i] for i in deciding],
             [seen[0][i] for i in deciding] if isinstance(seen[0], np.ndarray) else [None] * len(deciding),
-            [None] * len(deciding),
+            [self._scans[i] for i in deciding],
         )
         executed = np.array([kept.due for kept in self.commitments])
         executed[resets] = robot.at_zero()
@@ -87,6 +92,7 @@ class VectorSafetyWrapper(VectorWrapper):
             penalty[i] = correction_penalty(robot, wanted[i], before[i], executed[i], self.penalty)
         self._ended = np.asarray(terminated | truncated)
         self._begin(self._ended if self._mode == AutoresetMode.SAME_STEP else resets)
+        self._remember(infos)
         safety = np.array([decided.get(i) for i in range(self.num_envs)], dtype=object)
         told = [diagnostics(one, "" if one is not None else "reset") for one in safety]
         infos = infos | {
@@ -101,7 +107,14 @@ class VectorSafetyWrapper(VectorWrapper):
         """These environments stand at an episode's start."""
         for i in np.flatnonzero(which):
             self.commitments[i].reset()
+            self._memories[i].reset()
             self._ended[i] = False
+
+    def _remember(self, infos: dict[str, Any]) -> None:
+        """The scans, if there are any, with what was seen free before."""
+        scans = infos.get("scan", [None] * self.num_envs)
+        period = self.asker.robot.period
+        self._scans = [filled(memory, scan, period) for memory, scan in zip(self._memories, scans, strict=True)]
 
 
 def each(view: Callable[[Any, Any, dict[str, Any]], Any]) -> View:

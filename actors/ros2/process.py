@@ -151,8 +151,9 @@ class Steering:
             log.warning("the clock was set by %.2f s", jump)
             self.senses.forget()
             self._why = "the clock was set"
-        if jump or clock.now() > due + period:
+        if jump or clock.now() > due + period:  # what was decided was for another moment
             gate.tally.slips += not jump
+            in_time = False
             due = math.floor(clock.now() / period) * period
         number = gate.tally.periods
         self._begin(in_time, self._why)

@@ -65,7 +65,7 @@ class Senses:
         self.frame = sensing.odometry_frame  # in which the state is
         self._errors = Errors.of(robot, sensing.range_error)
         self._lock = threading.Lock()
-        self._track, self._frames = Track(), Frames()
+        self._track, self._frames = Track(fresh.odometry), Frames()
         self._base = sensing.base_frame
         self._scan: tuple[Beams, str] | None = None
         self._bad_scan = ""
@@ -122,7 +122,7 @@ class Senses:
     def forget(self) -> None:
         """The clock was set: nothing that came before counts."""
         with self._lock:
-            self._track, self._scan, self._command = Track(), None, None
+            self._track, self._scan, self._command = Track(self.fresh.odometry), None, None
 
     def state(self, at: float, now: float) -> Array:
         """(5,) as measured at that time. Raises Blind."""

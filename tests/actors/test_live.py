@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -93,6 +94,15 @@ def test_a_plan_is_carried_out_input_by_input_and_then_it_hovers(live: Live) -> 
     assert [turn.number - number for turn in turns] == [0, 1, 2, 3, 4, 5], "nobody was late to look"
     assert np.array([turn.input for turn in turns]) == pytest.approx(np.vstack([plan, np.zeros((2, 3))]))
     assert setpoints(frames) == [(0.0, 0.0, 0.0), *(tuple(row) for row in plan)]
+
+
+def test_what_is_carried_out_keeps_to_the_robots_own_slew(live: Live) -> None:
+    vehicle, _, _ = live
+    vehicle._robot = replace(QUADROTOR, action_slew=(0.2, 0.2, 0.2))
+    number = vehicle.turn.number + 2
+    assert vehicle.commit(np.tile([1.0, 0.0, 0.0], (3, 1)), number)
+    inputs = [vehicle.wait(number + k).input[0] for k in range(5)]
+    assert inputs == pytest.approx([0.2, 0.4, 0.6, 0.4, 0.2])
 
 
 def test_a_plan_that_comes_late_does_not_count_and_a_newer_one_does(live: Live) -> None:

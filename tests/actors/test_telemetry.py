@@ -159,6 +159,23 @@ class Pretender:
                     self._mav.send(SAID[name])
 
 
+@pytest.mark.parametrize(
+    "said",
+    [
+        mavlink.MAVLink_local_position_ned_message(1000, math.nan, 0, 0, 0, 0, 0),
+        mavlink.MAVLink_attitude_message(1000, math.inf, 0, 0, 0, 0, 0),
+        mavlink.MAVLink_highres_imu_message(0, math.nan, 0, 0, *[0] * 10, 0),
+    ],
+)
+def test_what_is_no_number_was_not_told(said: Any) -> None:
+    """It counted as fresh, and a flight by scan ended in an exception."""
+    client, mav = Client(lambda _: None), mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
+    client.feed(mavlink.MAVLink_heartbeat_message(2, KINDS["px4"], 128, 0, 4, 3).pack(mav))
+    before = dict(client.heard)
+    client.feed(said.pack(mav))
+    assert dict(client.heard) == before
+
+
 def test_what_is_granted_and_never_comes_is_not_relied_on() -> None:
     """PX4 before its heading is known, as it was met."""
     there = Pretender("px4", {"ATTITUDE_QUATERNION": 0.0, "ODOMETRY": 50.0, "HIGHRES_IMU": 50.0})

@@ -114,3 +114,27 @@ def test_predictions_are_boxes_in_their_own_frame():
     assert not box.contains(GROUND, np.array([1.15, 2.0, 3.1, 0.1, 0.0]))
     assert not box.contains(GROUND, np.array([1.0, 2.0, 3.1, 0.3, 0.0]))
     assert not box.contains(GROUND, np.array([np.nan, 2.0, 3.1, 0.1, 0.0]))
+
+
+def test_a_prediction_that_did_not_hold_is_not_forgotten_because_nobody_answered(ready):
+    """A robot that slid out of its set while the service was away has no verified plan any more."""
+    driven = Prediction(np.array([0.05, 0.0, 0.0, 0.25, 0.0]), np.full(5, 0.01), 0.0)
+    tail = np.array(((0.2, 0.0), (0, 0), (0, 0)), float)
+    for x, model in ((0.05, ready.version), (0.2, UNVERIFIED)):
+        kept = Commitment(GROUND)
+        kept.accept(np.vstack([[0.25, 0.0], tail[:-1]]), ready.version, driven, True, (b"word",) * 3)
+        kept.measured(np.array([x, 0.0, 0.0, 0.25, 0.0]))
+        kept.fallback()
+        assert kept.model == model and bool(kept.voucher) == (model == ready.version)
+    kept = Commitment(GROUND)
+    kept.accept(np.vstack([[0.25, 0.0], tail[:-1]]), ready.version, driven, True)
+    kept.fallback()  # nothing was measured where the prediction speaks of it
+    assert kept.model == ready.version
+
+
+@pytest.mark.parametrize("bad", [np.full(5, np.nan), np.zeros(4), np.array([0.0, 0.0, np.inf, 0.0, 0.0])])
+def test_what_is_no_state_is_not_kept(bad):
+    kept = Commitment(GROUND)
+    kept.measured(np.arange(5.0))
+    kept.measured(bad)
+    assert np.array_equal(kept.seen, np.arange(5.0))

@@ -7,6 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from deploy.data.episodes import collect
+from messaging.scans import Scan
 from messaging.shapes import Obstacle
 from safety.client import SafetyClient
 from safety.commitment import Commitment
@@ -159,6 +160,49 @@ def test_a_vector_decides_as_its_environments_do_alone(ready, mode):
             alone[i].reset()
         fresh = ended
     assert infos["diagnostics"]["kind"].shape == (count,)
+
+
+class Walled(Toy):
+    """With a scan in the place of obstacles: something at arm's length all round."""
+
+    FAN = np.linspace(-np.pi, np.pi, 360, endpoint=False)
+    blind = False  # from now on no scan comes
+
+    def _with_scan(self, info):
+        scan = Scan(np.full(360, 0.5), self.FAN, (*info["state"][:2], info["state"][2]))
+        return info | {"obstacles": [], "scan": None if self.blind else scan}
+
+    def reset(self, **how):
+        observation, info = super().reset(**how)
+        return observation, self._with_scan(info | {"state": observation})
+
+    def step(self, action):
+        observation, *ended, info = super().step(action)
+        return observation, *ended, self._with_scan(info | {"state": observation})
+
+
+def test_a_vector_decides_by_scans_too(ready):
+    vector = VectorSafetyWrapper(
+        gymnasium.vector.SyncVectorEnv([lambda: Walled(CAR)] * 2), ready, state=seen, actions=normalised(CAR)
+    )
+    vector.reset(seed=0)
+    *_, infos = vector.step(np.ones((2, 2), np.float32))
+    alone = SafetyWrapper(Walled(CAR), ready, state=seen, actions=normalised(CAR))
+    alone.reset(seed=0)
+    *_, info = alone.step(np.ones(2, np.float32))
+    assert info["diagnostics"]["margin"] < 0.3, "it is near"
+    assert infos["diagnostics"]["margin"][0] == info["diagnostics"]["margin"]
+
+
+def test_a_scan_that_does_not_come_is_not_a_world_without_obstacles(ready):
+    env = SafetyWrapper(Walled(CAR), ready, state=seen, actions=normalised(CAR))
+    env.reset(seed=0)
+    *_, before = env.step(np.array([-1.0, 0.0]))
+    env.unwrapped.blind = True
+    for _ in range(3):
+        *_, after = env.step(np.array([-1.0, 0.0]))
+    assert after["scan"] is None
+    assert after["diagnostics"]["margin"] == pytest.approx(before["diagnostics"]["margin"], abs=0.02)
 
 
 def test_collecting_leaves_out_what_ended_in_a_collision(data):

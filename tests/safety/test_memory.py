@@ -1,8 +1,10 @@
 """What is remembered as free is free: in random scenes, with the errors of every pose."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -69,6 +71,20 @@ def test_at_the_start_there_is_room_about_the_body_and_no_more():
     filled = FanMemory(0.105).fill(_open(0.0, np.random.default_rng(0)), 0.0)
     behind = filled.ranges[np.abs(FAN) > math.pi - BLIND] - filled.range_error
     assert (behind > 0.17).all() and (behind <= 0.205).all()
+
+
+def test_where_no_scan_comes_the_last_one_goes_on_so_much_older():
+    memory, rng = FanMemory(0.105), np.random.default_rng(0)
+    assert memory.fill(None, 0.2) is None
+    seen = memory.fill(_open(0.0, rng, speed=1.2), 0.2)
+    memory.later(0.2)  # a period that nobody saw
+    again = memory.fill(None, 0.2)
+    assert np.array_equal(again.ranges, seen.ranges) and again.age == pytest.approx(seen.age + 0.4)
+    assert memory.fill(None, 0.2).age == pytest.approx(seen.age + 0.6)
+    for _ in range(10):
+        memory.fill(None, 0.2)
+    blind = replace(_open(0.0, rng, speed=1.2), ranges=np.zeros(len(FAN)))
+    assert not memory.fill(blind, 0.2).known.any(), "what may walk took it all back meanwhile"
 
 
 def _open(x, rng, speed=0.0):

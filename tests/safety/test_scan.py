@@ -127,6 +127,30 @@ def test_lone_false_ranges_do_no_harm_where_they_are_doubted():
         assert gaps(Scan(broken, FAN, (0.0, 0.0, 0.0)))[2][170:190].max() > 2.0
 
 
+@pytest.mark.parametrize("beams", [90, 180, 360])
+def test_one_false_range_hides_nothing_as_wide_as_things_are(beams):
+    """A box's corner between two beams, of which one sees through it: the edge must reach the next."""
+    rng, fan = np.random.default_rng(beams), np.linspace(-math.pi, math.pi, beams, endpoint=False)
+    grid = (np.stack(np.meshgrid(*[np.linspace(-0.5, 0.5, 25)] * 2), axis=-1).reshape(-1, 2)) * WIDTH
+    looked = 0
+    for _ in range(80):
+        away, turn, yaw = rng.uniform(0.3, 2.5), rng.uniform(-0.2, 0.2), rng.uniform(-3.0, 3.0)
+        at = away * np.array([math.cos(turn), math.sin(turn)])
+        ranges = cast([Obstacle("box", tuple(at), (WIDTH, WIDTH), yaw)], np.zeros(2), fan)
+        cos, sin = math.cos(yaw), math.sin(yaw)
+        solid = grid @ np.array([[cos, sin], [-sin, cos]]) + at
+        towards, far = np.arctan2(solid[:, 1], solid[:, 0]), np.linalg.norm(solid, axis=1)
+        for k in np.flatnonzero(ranges < FAR):
+            broken = ranges.copy()
+            broken[k] = FAR
+            scan = Scan(broken, fan, (0.0, 0.0, 0.0), range_error=0.0, least_width=WIDTH, doubt=1)
+            angles, _, free = gaps(scan)
+            gap = (np.searchsorted(angles, towards, side="right") - 1) % len(angles)
+            assert (free[gap] <= far + 1e-6).all()
+            looked += 1
+    assert looked > 50
+
+
 def test_a_lone_ghost_is_none_and_a_thing_as_narrow_as_things_may_be_is_no_ghost():
     ranges = np.full(360, FAR)
     ranges[[50, 100, 102]] = 0.4

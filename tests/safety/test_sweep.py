@@ -1,5 +1,7 @@
 """Half-spaces beside what moves: whatever keeps its bounds is on their far side, for the whole of every period."""
 
+import tracemalloc
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -110,6 +112,25 @@ def test_a_walker_that_comes_is_given_way_to():
     assert np.allclose(normals[0], [1.0, 0.0])
     t = 0.2 * np.arange(1, 4)
     assert np.allclose(offsets[0], 0.8 - t - (0.03 + 0.05 * t + 0.5 * t * t) - 0.1)
+
+
+def test_many_movers_take_room_for_each_not_for_each_pair():
+    """A thousand in one request kept the service for three seconds: every robot braked."""
+    rng, count = np.random.default_rng(0), 1000
+    near = [
+        moving(Obstacle("cylinder", tuple(at), (0.05,)), Motion((0.1, 0.0), 0.01, 0.01, speed=0.5))
+        for at in rng.uniform(-2.0, 2.0, (count, 2))
+    ]
+    nominal = np.array([[0.05, 0.0], [0.1, 0.0], [0.1, 0.0]])
+    _, movers = parted(near, 2)
+    tracemalloc.start()
+    normals, offsets = swept_half_spaces(movers, np.zeros(2), nominal, BODY, np.zeros(2), PERIOD)
+    most = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert most < 100 * normals.nbytes
+    for i in rng.integers(0, count, 5):
+        alone = swept_half_spaces(movers.take(np.array([i])), np.zeros(2), nominal, BODY, np.zeros(2), PERIOD)
+        assert np.array_equal(alone[0][0], normals[i]) and np.array_equal(alone[1][0], offsets[i])
 
 
 def test_no_number_is_never_free():

@@ -6,9 +6,13 @@ import gymnasium
 import numpy as np
 import pytest
 
+from messaging.bus import NoReply
 from messaging.shapes import Obstacle
+from safety.client import SafetyClient
+from safety.commitment import Commitment
 from safety.filter import Filter
 from safety.gym import SafetyWrapper
+from sim.envs import NavigationEnv
 from tests.messaging.conftest import endpoint, join  # noqa: F401 - fixtures
 from tests.robots import GROUND
 from tests.safety.unicycle import Unicycle
@@ -93,3 +97,23 @@ def test_every_episode_starts_standing(ready):
 
 def test_a_filter_needs_no_more_than_the_model_set(model):
     assert Filter(replace(model, about={})).version == model.version
+
+
+class Hearing(SafetyClient):
+    """A client of a service that answers nothing."""
+
+    def __init__(self) -> None:
+        self.robot, self.commitment, self.asked = GROUND, Commitment(GROUND), {}
+
+    def decide(self, *asked, **more):
+        self.asked = more
+        raise NoReply("nobody serves")
+
+
+def test_a_service_hears_the_observation_too():
+    """Those of the rivals refused every question without it."""
+    client = Hearing()
+    env = SafetyWrapper(NavigationEnv(GROUND), client)
+    observation, _ = env.reset(seed=0)
+    env.step(np.zeros(2, np.float32))
+    assert client.asked["observation"] == observation.tolist()

@@ -22,7 +22,7 @@ def allow(requests):
     replies = []
     for request in requests:
         action = np.clip(request.action, ROBOT.low(), ROBOT.high())
-        plan = [*request.input_in_force, *action]
+        plan = [*request.plan[: ROBOT.action_dim], *action]
         for k in range(ROBOT.horizon - 2):
             plan += list(action * max(0.0, 1.0 - (k + 1) / ROBOT.brake_steps))
         decision = pb.Decision(kind=pb.ALLOWED, plan=plan, model="m", verified=True, contained=True)

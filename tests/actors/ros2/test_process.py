@@ -8,8 +8,9 @@ from contextlib import contextmanager
 import numpy as np
 import pytest
 
+from actors.ros2.gate import LATE
 from actors.ros2.process import Ros2Settings, Steering
-from actors.ros2.senses import Freshness, Sensing
+from actors.ros2.senses import Command, Freshness, Sensing
 from messaging.ports import free_endpoint
 from messaging.ros2 import LATCHED, SENSOR, Node, RosSettings
 from messaging.ros2.messages import (
@@ -142,6 +143,43 @@ def test_a_clock_that_stands_still_or_goes_back_stops_the_robot():
         robot._told = 3.0
         until(lambda: any("the clock was set" in said for said in robot.reasons), "the clock was set", 30.0)
         robot.drives()
+
+
+class Stalling:
+    """A clock that waits exactly, and once so many s longer."""
+
+    def __init__(self):
+        self.time, self.stall = 100.0, 0.0
+
+    def now(self):
+        return self.time
+
+    def wait(self, moment, stop, patience):
+        self.time, self.stall = max(self.time, moment) + self.stall, 0.0
+        return True
+
+    def jumped(self):
+        return 0.0
+
+
+def test_an_answer_for_a_moment_long_gone_does_not_count():
+    stop = threading.Event()
+    steering = Steering(Ros2Settings(ros=RosSettings(listen=(free_endpoint(),))), allow, stop)
+    try:
+        gate, clock = steering.gate, Stalling()
+        full = lambda number: Command(np.array([0.25, 0.0]), clock.time, number)  # noqa: E731
+        steering.clock = clock
+        steering._decide = lambda began, number: gate.decide(np.zeros(5), (), full(number), began, number)
+        due = 100.0
+        for _ in range(3):
+            due = steering._period(due, stop)
+        assert gate.kind == "allowed" and gate.input[0] == 0.25
+        clock.stall = 1.5
+        due = steering._period(due, stop)
+        assert gate.kind == LATE and gate.tally.slips == 1 and due > clock.now()
+        assert gate.input[0] < 0.25, "it brakes"
+    finally:
+        steering.close()
 
 
 def test_clocks_that_differ_stop_the_robot():

@@ -81,6 +81,20 @@ def test_speeds_come_from_poses_where_there_are_none():
     assert track.state(0.9)[3:] == pytest.approx([0.2, 0.4], abs=1e-3)
 
 
+def test_of_what_was_between_two_odometries_far_apart_nothing_is_known():
+    track = Track(gap=0.15)
+    for at in (0.0, 0.1, 1.1, 1.2):
+        track.add(at, 0.2 * at, 0.0, 0.0, 0.2, 0.0)
+    assert track.state(0.05) is not None and track.state(1.15) is not None
+    assert track.state(0.6) is None and track.at(np.array([0.05, 0.6])) is None
+    poses = Track(gap=0.15)
+    for at in (0.0, 0.05, 0.1, 0.15, 1.15, 1.2, 1.25, 1.3):
+        poses.add_pose(at, 0.2 * at, 0.0, 0.0)
+    assert poses.state(0.05) is None, "of one pose no speed is known"
+    assert poses.state(0.12)[3] == pytest.approx(0.2) if poses.state(0.12) is not None else True
+    assert poses.state(1.17) is None and poses.state(1.28)[3] == pytest.approx(0.2)
+
+
 def test_frames_are_followed_up_and_down():
     frames = Frames()
     frames.add(transform("base_footprint", "base_link", 0.0, 0.1, quaternion(0.5 * math.pi)))
