@@ -104,7 +104,7 @@ COMMANDS: dict[str, Command] = {
     "certify": Command(
         "data:Certify",
         "what held-out data say about each certificate; make and publish model sets",
-        "brakeline certify data/ground/record.safetensors",
+        "brakeline certify --robot ground",
     ),
     "evaluate": Command(
         "evaluation:Evaluate",

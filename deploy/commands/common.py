@@ -42,7 +42,7 @@ class Filtering:
     method: Method = "ddpc"
     """ddpc: ours; secas, sailr: the rivals; none: no filter."""
     certificate: Certificate = "residual"
-    """What the model set trusts in the data (README)."""
+    """What the model set trusts in the data (docs/certificates.md)."""
     mode: Mode = "direct"
     """A predictor for each step of the plan, or the paper's recursion."""
 
