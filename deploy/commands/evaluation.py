@@ -23,8 +23,8 @@ class Evaluate:
     filtering: Flags[Filtering] = field(default_factory=Filtering)
     physics: Flags[Physics] = field(default_factory=Physics)
     arena: str = "default"
-    """On the ground default | open | dense | few-walkers | walkers | many-walkers | crossing, in the air default | dense
-    | tall | traffic; else those of the robot's task."""
+    """On the ground default | open | dense | few-walkers | walkers | many-walkers | crossing, in the air default |
+    dense | tall | traffic; else those of the robot's task."""
     episodes: int = 100
     """Of a fleet: of all its robots, in whole worlds."""
     fleet: int = 0

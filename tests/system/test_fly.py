@@ -1,6 +1,7 @@
 """`brakeline fly`: a quadrotor in real time over UDP, while its processes are killed, too.
 
-How many answers come in time depends on the machine, which others use too: docs/flying.md has the figure of a calmer one.
+How many answers come in time depends on the machine, which others use too; docs/flying.md has the figure of a calmer
+one.
 """
 
 from __future__ import annotations
