@@ -119,7 +119,9 @@ def test_each_period_has_its_voucher_until_the_robot_stands(robot: Robot) -> Non
         reply = pb.Reply(robot=robot.name, decision=wire)
         accept(commitment, Answer("allowed", plan[0], plan, reply.decision))
         for _ in range(robot.horizon + 2):
-            asked = request_message(commitment, np.zeros(robot.state_dim), plan[0], [], actor="a")
+            predicted = commitment.predicted
+            state = np.zeros(robot.state_dim) if predicted is None else predicted.center
+            asked = request_message(commitment, state, plan[0], [], actor="a")
             asked = pb.Request.FromString(asked.SerializeToString())
             assert notary.vouches(asked, robot)
             moving = bool(np.any(commitment.plan) or np.any(commitment.input_in_force))
