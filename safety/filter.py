@@ -67,7 +67,7 @@ class Filter:
         self.builder = Builder(robot, outer)
         spread = OUTSIDE_DOMAIN * (model.domain[1] - model.domain[0])
         self.domain = np.stack([model.domain[0] - spread, model.domain[1] + spread])
-        self.around = Surroundings(robot, self.tube, outer, self.domain, comfort)
+        self.around = Surroundings(model, self.tube, outer, self.domain, comfort)
         self.inputs = Inputs(robot)
         self.same = SAME_INPUT * (self.inputs.high - self.inputs.low)
         self.standing = np.array([not moves for moves in robot.translates])

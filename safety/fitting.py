@@ -22,7 +22,7 @@ from safety.certificates import (
 )
 from safety.dataset import BadData, Dataset
 from safety.model_set import DIRECT, RECURSION, ModelSet, Recipe
-from safety.windows import FREE, PLAN, Windows, outputs, quality, standing_at_the_end, stops_of, windows
+from safety.windows import FREE, PLAN, Windows, outputs, quality, standing_at_the_end, stands_from, stops_of, windows
 
 Array = NDArray[np.float64]
 
@@ -63,7 +63,15 @@ def make(data: Dataset, recipe: Recipe) -> ModelSet:
     domain = np.stack([known.min(0), known.max(0)])
     about = data.about | {"data": data.digest(), "periods": str(data.periods)}
     return ModelSet(
-        robot, recipe, tuple(steps), _scalar(bulges, nz), _scalar([latch], nz), domain, whitening(whole.z), about
+        robot,
+        recipe,
+        tuple(steps),
+        _scalar(bulges, nz),
+        _scalar([latch], nz),
+        domain,
+        whitening(whole.z),
+        about,
+        stands=stands_from(whole, data, kind),
     )
 
 

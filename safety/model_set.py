@@ -48,6 +48,12 @@ class ModelSet:
     basis: Array  # (nz, nz): coordinates in which the recorded z are white
     about: dict[str, str]
     layout: str = ""  # of the robot when it was made, if that was before robots were files
+    stands: int = 0  # so many periods after a plan began the robot stands; 0: no sooner than at its end
+
+    @property
+    def moving(self) -> int:
+        """So many of a plan's periods the robot may move in."""
+        return self.stands or self.robot.horizon
 
     @property
     def first(self) -> Certificate:
@@ -114,6 +120,7 @@ class ModelSet:
         """Hash of the content and of what it means, so that one name can't mean two models."""
         layout = self.layout or self.robot.layout()
         meaning = f"{layout} {self.recipe.certificate} {self.recipe.mode} "
+        meaning += f"stands {self.stands} " if self.moving < self.robot.horizon else ""
         return hashlib.sha256(meaning.encode() + content(self._tensors())).hexdigest()[:12]
 
     def _tensors(self) -> dict[str, Array]:
@@ -128,6 +135,7 @@ class ModelSet:
             "layout": self.layout or self.robot.layout(),
             "recipe": asdict(self.recipe),
             "about": self.about,
+            "stands": self.stands,
             "version": self.version,
         }
         if not self.layout:
@@ -149,6 +157,7 @@ class ModelSet:
                 for name in ("bulges", "latch", *(f"step{k}" for k in range(robot.horizon)))
             }
             more = tensors["domain"], tensors["basis"], dict(about["about"])
+            stands = int(about.get("stands", 0))
         except (KeyError, TypeError, ValueError, UnknownRobot) as error:
             raise BadModel(f"no model set: {error!r}") from error
         if not robot.understands(about.get("layout")):
@@ -159,7 +168,9 @@ class ModelSet:
         if any((c.M < 0).any() or (c.kappa < 0).any() or (c.w < 0).any() for c in certificates.values()):
             raise BadModel("the model set has a negative width")
         steps = tuple(certificates[f"step{k}"] for k in range(robot.horizon))
-        model = ModelSet(robot, recipe, steps, certificates["bulges"], certificates["latch"], *more, layout)
+        if not 0 <= stands <= robot.horizon:
+            raise BadModel(f"a plan of {robot.horizon} periods can't have come to a stand after {stands}")
+        model = ModelSet(robot, recipe, steps, certificates["bulges"], certificates["latch"], *more, layout, stands)
         model._check_sizes()
         if model.version != about.get("version"):
             raise BadModel("the model set's content is not what its version says")

@@ -12,13 +12,13 @@ from messaging.movers import Movers
 from messaging.range_images import RangeImage
 from messaging.robots import Robot
 from messaging.scans import Scan
-from messaging.shapes import Shapes
+from messaging.shapes import FARTHEST, Shapes
 from safety import scan as seen
 from safety import shadows as shades
 from safety.explain import SIGHT, Around, Planes, Stopped, worst
 from safety.freespace import half_spaces, leading_out
 from safety.limits import Limits, stacked
-from safety.model_set import needed
+from safety.model_set import ModelSet, needed
 from safety.program import Layout, Rows
 from safety.promise import Boxes, Promises, promised_half_spaces
 from safety.request import Request
@@ -83,10 +83,11 @@ class Scene:
 class Surroundings:
     """A robot's tube, ready to be held against scenes."""
 
-    def __init__(self, robot: Robot, tube: Tube, outer: Tube, domain: Array, comfort: float | None) -> None:
-        """`outer`: the tube over-approximated with fewer atoms; domain (2, r): of the recorded regressors; `comfort`
-        [m]: what is kept to obstacles beyond the tube; as wide as it needs be, unless given."""
-        self.robot, self.tube = robot, tube
+    def __init__(self, model: ModelSet, tube: Tube, outer: Tube, domain: Array, comfort: float | None) -> None:
+        """tube: the model's; `outer`: the same over-approximated with fewer atoms; domain (2, r): of the recorded
+        regressors; `comfort` [m]: what is kept to obstacles beyond the tube; as wide as it needs be, unless given."""
+        robot = model.robot
+        self.robot, self.tube, self.stands = robot, tube, model.moving
         self.discs = _discs(robot, tube)
         self.boxes = Boxes(tube.position, tube.directions)
         self.limits = Limits(robot, tube) if robot.limits else None
@@ -222,13 +223,22 @@ class Surroundings:
                 normals, offsets = leading_out(scene.near, start, disc.radius, measured, (normals, offsets))
             if scene.moving is not None:
                 swept = swept_half_spaces(scene.moving, start, ends, disc.radius, measured, self.robot.period)
+                self._let_pass(swept[1])
                 normals, offsets = np.concatenate([normals, swept[0]]), np.concatenate([offsets, swept[1]])
             if scene.unseen is not None:
                 of = shades if isinstance(scene.unseen, shades.Shadows) else seen
                 beside = of.half_spaces(scene.unseen, start, ends, disc.radius, measured, self.robot.period)
+                if isinstance(scene.unseen, seen.Cells) and scene.unseen.speed > 0.0:
+                    self._let_pass(beside[1])
                 normals, offsets = np.concatenate([normals, beside[0]]), np.concatenate([offsets, beside[1]])
             found.append(Planes(start, ends, normals, offsets, disc.radius, measured))
         return found
+
+    def _let_pass(self, levels: Array) -> None:
+        """Nothing is asked of half-spaces (n, N) beside what moves from when on the robot stands: what is promised is
+        that it stands when it is touched. A level that is no number goes on to be none."""
+        late = levels[:, self.stands :]
+        late[late == late] = FARTHEST  # not of NaN
 
     def rows(self, scene: Scene, z: Array, planes: list[Planes] | None = None) -> Rows:
         """Half-spaces about the rollout of regressors z, as rows of the tube (and of the QP's: its generators are the

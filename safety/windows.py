@@ -192,6 +192,24 @@ def standing_at_the_end(robot: Robot) -> int:
     return max(robot.horizon - robot.free_steps - int(moving[-1]), 1)
 
 
+def stands_from(whole: Windows, data: Dataset, kind: str) -> int:
+    """So many periods after a plan began the robot stood, whatever the plan was, and went on standing: no measured
+    speed was more than its error can make of none. As many as a plan has where that was not so, or no plans were
+    recorded.
+
+    whole: the windows of all of a plan's periods.
+    """
+    robot = data.robot
+    speeds, none = list(robot.regressor), np.asarray(robot.measurement_bound)[list(robot.regressor)]
+    if kind != PLAN:
+        return robot.horizon
+    for k in range(robot.horizon, 0, -1):
+        after = np.array([data.trajectories[number].states[start + k, speeds] for number, start in whole.start])
+        if not (np.abs(after) <= none).all():
+            return min(k + 1, robot.horizon)
+    return 1
+
+
 def stops_of(robot: Robot, t: Trajectory, rested: int) -> Array:
     """The ways [m] still travelled from wherever the inputs had been those of a stop for `rested` periods."""
     still = resting(robot, t)

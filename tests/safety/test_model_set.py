@@ -11,7 +11,8 @@ from safety.filter import Filter
 from safety.fitting import make
 from safety.model_set import ENTRY, MODES, BadModel, ModelSet, Recipe
 from safety.tensors import pack, unpack
-from safety.windows import windows
+from safety.windows import stands_from, windows
+from tests.robots import GROUND
 from tests.safety.unicycle import record
 
 ALL = [(kind, mode) for kind in KINDS for mode in MODES]
@@ -39,6 +40,26 @@ def test_the_version_is_the_content(models, model, data):
     assert wider.version != model.version
     assert replace(model, about={"note": "another"}).version == model.version
     assert replace(model, recipe=replace(model.recipe, mode="recursion")).version != model.version
+
+
+def test_from_when_on_a_robot_stands_is_what_was_recorded(model, data):
+    """A plan of the toy has one input and then none: it stands after two of three periods, and not where one plan's
+    third period began with more speed than an error of measurement."""
+    assert model.moving == model.stands == 2
+    whole = windows(data, GROUND.horizon)
+    number, start = whole.start[len(whole) // 2]
+    coasting = data.trajectories[number]
+    states = coasting.states.copy()
+    states[start + 2, 3] = 0.03
+    some = list(data.trajectories)
+    some[number] = replace(coasting, states=states)
+    assert stands_from(whole, replace(data, trajectories=some), "plan") == 3
+    assert stands_from(whole, data, "plan") == 2 and stands_from(whole, data, "free") == 3
+    assert ModelSet.decode(model.encode()).stands == 2
+    assert replace(model, stands=3).version != model.version
+    assert replace(model, stands=3).version == replace(model, stands=0).version  # both say: no sooner than at its end
+    with pytest.raises(BadModel, match="can't have come to a stand after 4"):
+        ModelSet.decode(edited(model, {"stands": 4}))
 
 
 def test_garbage_is_refused(model, tmp_path):

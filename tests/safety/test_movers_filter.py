@@ -42,6 +42,16 @@ def test_one_that_comes_is_stopped_for_and_one_that_leaves_is_followed(ready):
     assert ready.decide(request(obstacles=[Obstacle("cylinder", (0.9, 0.0), (0.2,))])).kind == ALLOWED
 
 
+def test_who_can_only_come_once_it_stands_is_let_come(ready, model):
+    """After two of three periods it stands: who may be there in the third stops no plan."""
+    never = Filter(replace(model, stands=0))
+    at = [walker(0.9 + far, velocity=(-1.0, 0.0)) for far in np.arange(0.0, 0.6, 0.02)]
+    soon, late = ([f.decide(ask([one])).kind == ALLOWED for one in at] for f in (ready, never))
+    assert 0.15 < 0.02 * (sum(soon) - sum(late)) < 0.4  # m: what a walker goes in a period, and its errors
+    still = Obstacle("cylinder", (0.3, 0.0), (0.15,))
+    assert ready.decide(ask([still, at[-1]])).kind != ALLOWED  # what stands is kept off to the end
+
+
 def test_no_obstacle_that_stands_does_not_mean_that_nothing_is_near(ready):
     decision = ready.decide(ask([walker(0.35)]))
     assert decision.kind in (ADJUSTED, FAILSAFE) and decision.verified
@@ -155,6 +165,11 @@ def contacts(ready, policy, seed, sees=True, steps=300):
                 moving, standing = moving + (not still_stood), standing + still_stood
             touching = now
     return moving, standing
+
+
+def test_a_filter_that_takes_a_robot_for_standing_too_soon_touches_them(model):
+    early = Filter(replace(model, stands=1))
+    assert sum(contacts(early, policy, seed)[0] for policy in (wild, pushing) for seed in range(2)) > 0
 
 
 @pytest.mark.parametrize("policy", [wild, pushing])

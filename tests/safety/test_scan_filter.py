@@ -51,7 +51,7 @@ def test_obstacles_count_beside_a_scan(ready):
 
 def test_who_stands_where_something_comes_near_stays_where_it_is(ready):
     """It turned about before a walker, `recovering`, and was touched in motion: only what stands is a corner."""
-    for away in (0.25, 0.4, 0.7, -0.25, -0.4, -0.7):
+    for away in (0.25, 0.4, 0.55, -0.25, -0.4, -0.55):
         comes = [Obstacle("cylinder", (away + math.copysign(0.2, away), 0.0), (0.2,))]
         ranges = cast(comes, np.zeros(2), FAN)
         seen = Scan(ranges, FAN, (0.0, 0.0, 0.0), far=FAR, range_error=0.02, least_width=WIDTH, speed=1.2)
