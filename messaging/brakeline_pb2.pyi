@@ -253,6 +253,10 @@ class Scan(_message.Message):
     DOUBT_FIELD_NUMBER: _builtins.int
     SPEED_FIELD_NUMBER: _builtins.int
     AGE_FIELD_NUMBER: _builtins.int
+    ACCELERATION_FIELD_NUMBER: _builtins.int
+    LEAST_RADIUS_FIELD_NUMBER: _builtins.int
+    WHICH_FIELD_NUMBER: _builtins.int
+    WAYS_FIELD_NUMBER: _builtins.int
     far: _builtins.float
     """m"""
     range_error: _builtins.float
@@ -269,6 +273,12 @@ class Scan(_message.Message):
     """m/s: whatever was hit may move as fast"""
     age: _builtins.float
     """s since it was taken"""
+    acceleration: _builtins.float
+    """m/s²: no more than that whatever moves speeds up or slows down; 0: not known"""
+    least_radius: _builtins.float
+    """m: whatever moves is at least as large"""
+    which: _builtins.bytes
+    """of each beam: the row of `ways` that what it hit keeps to; 0: none; empty: of none"""
     @_builtins.property
     def ranges(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]:
         """m; `far`: nothing was hit; 0: not known"""
@@ -285,6 +295,10 @@ class Scan(_message.Message):
     def mount(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]:
         """m, the sensor's place in the robot"""
 
+    @_builtins.property
+    def ways(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]:
+        """4 a row: velocity [m/s, world], how wrong that may be [m/s], acceleration [m/s²]"""
+
     def __init__(
         self,
         *,
@@ -300,10 +314,14 @@ class Scan(_message.Message):
         doubt: _builtins.int = ...,
         speed: _builtins.float = ...,
         age: _builtins.float = ...,
+        acceleration: _builtins.float = ...,
+        least_radius: _builtins.float = ...,
+        which: _builtins.bytes = ...,
+        ways: _abc.Iterable[_builtins.float] | None = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["age", b"age", "angles", b"angles", "doubt", b"doubt", "far", b"far", "heading_error", b"heading_error", "least_width", b"least_width", "mount", b"mount", "pose", b"pose", "position_error", b"position_error", "range_error", b"range_error", "ranges", b"ranges", "speed", b"speed"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["acceleration", b"acceleration", "age", b"age", "angles", b"angles", "doubt", b"doubt", "far", b"far", "heading_error", b"heading_error", "least_radius", b"least_radius", "least_width", b"least_width", "mount", b"mount", "pose", b"pose", "position_error", b"position_error", "range_error", b"range_error", "ranges", b"ranges", "speed", b"speed", "ways", b"ways", "which", b"which"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 

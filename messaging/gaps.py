@@ -23,24 +23,49 @@ from messaging.scans import Scan
 
 Array = NDArray[np.float64]
 
+WIDE = math.radians(3.0)  # of a gap in which nothing is taken for what is on both sides of it
+NEARER = 0.15  # m between what two beams hit, if it is not one surface
 STEEPEST = math.radians(89.0)  # 45° and a gap: beyond it an edge may lie along the beams
 
 
 def gaps(scan: Scan) -> tuple[Array, Array, Array]:
     """Of each gap between two beams that say something: its first angle, its width [rad], and F [m] of the measured
     ranges, less their error. In the sensor's frame; all round."""
-    known = scan.known
-    angles = scan.angles[known]
-    ranges = np.maximum(np.minimum(scan.ranges[known], scan.far) - scan.range_error, 0.0)
+    return gaps_and_ways(scan)[:3]
+
+
+def gaps_and_ways(scan: Scan) -> tuple[Array, Array, Array, NDArray[np.uint8]]:
+    """The same, and which of the ways that a scan was followed by bounds what is behind F there; 0: none."""
+    beams = np.flatnonzero(scan.known)
+    angles = scan.angles[beams]
+    ranges = np.maximum(np.minimum(scan.ranges[beams], scan.far) - scan.range_error, 0.0)
     if len(angles) > 2 * scan.doubt + 2:
-        lone = _lone(angles, ranges, scan)
-        angles, ranges = angles[~lone], ranges[~lone]
+        single = ~_lone(angles, ranges, scan)
+        beams, angles, ranges = beams[single], angles[single], ranges[single]
     if not len(angles):
-        return np.array([-math.pi]), np.array([2.0 * math.pi]), np.zeros(1)
+        return np.array([-math.pi]), np.array([2.0 * math.pi]), np.zeros(1), np.zeros(1, np.uint8)
     width = np.diff(angles, append=angles[0] + 2.0 * math.pi)
     doubt = min(scan.doubt, len(ranges))
     least = _least(ranges, range(-doubt, doubt + 2))
-    return angles, width, _free(least, np.maximum(*_spans(width, doubt)), scan.least_width)
+    free = _free(least, np.maximum(*_spans(width, doubt)), scan.least_width)
+    if scan.followed is None:
+        return angles, width, free, np.zeros(len(free), np.uint8)
+    return angles, width, free, _ways(scan.followed.which[beams], ranges, width, doubt)
+
+
+def _ways(which: NDArray[np.uint8], ranges: Array, width: Array, doubt: int) -> NDArray[np.uint8]:
+    """Of each gap the way of the beams about it, if they have the same; where one of two hit something nearer, that
+    one's. A wide gap has none: there may be something else in it."""
+    same = np.ones(len(which), dtype=bool)
+    for k in range(-doubt, doubt + 2):
+        same &= np.roll(which, -k) == which
+    after = np.roll(ranges, -1)
+    if not doubt:
+        nearer = np.where(ranges < after, which, np.roll(which, -1))
+        which = np.where(np.abs(after - ranges) > NEARER, nearer, np.where(same, which, 0))
+    else:
+        which = np.where(same, which, 0)
+    return np.where(width > WIDE, 0, which).astype(np.uint8)
 
 
 def _spans(width: Array, doubt: int) -> tuple[Array, Array]:

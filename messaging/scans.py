@@ -24,6 +24,29 @@ class BadScan(ValueError):
 
 
 @dataclass(frozen=True, eq=False)
+class Followed:
+    """What earlier scans say of where whatever was hit goes (`safety/tracks.py`).
+
+    which (R,): of each beam, the row of `ways` that what it hit keeps to, from 1 on; 0: none, it may go anywhere at the
+    scan's speed. ways (K, 4): velocity x, y [m/s, world], how wrong it may be [m/s], largest acceleration [m/s²]: t
+    seconds after the scan it has gone by the velocity times t, give or take error·t + acceleration·t²/2.
+    """
+
+    which: NDArray[np.uint8]
+    ways: Array
+
+    def wrong(self, beams: int) -> str:
+        """What is wrong with it, of a scan of so many beams; empty: nothing."""
+        if self.which.shape != (beams,) or self.which.dtype != np.uint8:
+            return "of each beam one byte says what it hit"
+        if self.ways.ndim != 2 or self.ways.shape[1] != 4 or int(self.which.max(initial=0)) > len(self.ways):
+            return "what is followed keeps to ways of four numbers, and to no other"
+        if not np.isfinite(self.ways).all() or (self.ways[:, 2:] < 0.0).any():
+            return "ways must be finite, their errors and accelerations not negative"
+        return ""
+
+
+@dataclass(frozen=True, eq=False)
 class Scan:
     """A fan in the plane.
 
@@ -46,6 +69,9 @@ class Scan:
     doubt: int = 0  # this many beams on either side must agree that something is free: lone false ranges do no harm
     speed: float = 0.0  # m/s: whatever was hit may move as fast; 0: the world stands
     age: float = 0.0  # s since it was taken
+    acceleration: float = 0.0  # m/s²: no more than that whatever moves speeds up or slows down; 0: not known
+    least_radius: float = 0.0  # m: whatever moves is at least as large
+    followed: Followed | None = None
 
     def __post_init__(self) -> None:
         n = len(self.ranges)
@@ -60,13 +86,16 @@ class Scan:
         if len(self.pose) != 3 or len(self.mount) != 2:
             raise BadScan("a scan's pose has 3 coordinates, its mount 2")
         values = (*self.pose, *self.mount)
-        bounds = (self.far, self.range_error, self.position_error, self.heading_error, self.speed, self.age, self.doubt)
+        bounds = [self.far, self.range_error, self.position_error, self.heading_error, self.speed, self.age, self.doubt]
+        bounds += [self.acceleration, self.least_radius]
         if not all(math.isfinite(value) for value in values):
             raise BadScan("a scan's pose and mount must be finite")
         if not all(math.isfinite(value) and value >= 0.0 for value in bounds):
             raise BadScan("a scan's errors, speed and age must be finite and not negative")
         if not (math.isfinite(self.least_width) and self.least_width > 0.0):
             raise BadScan("a scan's least width must be positive")
+        if self.followed is not None and (wrong := self.followed.wrong(n)):
+            raise BadScan(wrong)
 
     @property
     def known(self) -> NDArray[np.bool_]:

@@ -6,7 +6,7 @@ import numpy as np
 
 from messaging import brakeline_pb2 as pb
 from messaging.range_images import RangeImage
-from messaging.scans import BadScan, Scan
+from messaging.scans import BadScan, Followed, Scan
 
 Sensed = Scan | RangeImage
 
@@ -46,6 +46,10 @@ def scan_message(scan: Scan) -> pb.Scan:
         doubt=scan.doubt,
         speed=scan.speed,
         age=scan.age,
+        acceleration=scan.acceleration,
+        least_radius=scan.least_radius,
+        which=b"" if scan.followed is None else scan.followed.which.tobytes(),
+        ways=[] if scan.followed is None else scan.followed.ways.ravel().tolist(),
     )
 
 
@@ -53,6 +57,11 @@ def scan_of(m: pb.Scan) -> Scan:
     """Raises BadScan: it is none."""
     if len(m.pose) != 3 or len(m.mount) != 2:
         raise BadScan("a scan's pose has 3 coordinates, its mount 2")
+    if len(m.ways) % 4:
+        raise BadScan("a scan's ways have four numbers each")
+    followed = None
+    if m.which:
+        followed = Followed(np.frombuffer(m.which, np.uint8), np.array(m.ways, dtype=float).reshape(-1, 4))
     x, y, heading = m.pose
     return Scan(
         np.fromiter(m.ranges, np.float64, len(m.ranges)),  # `np.array` takes five times as long
@@ -67,6 +76,9 @@ def scan_of(m: pb.Scan) -> Scan:
         doubt=m.doubt,
         speed=m.speed,
         age=m.age,
+        acceleration=m.acceleration,
+        least_radius=m.least_radius,
+        followed=followed,
     )
 
 

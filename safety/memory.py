@@ -18,7 +18,9 @@ from numpy.typing import NDArray
 
 from messaging.range_images import RangeImage
 from messaging.scans import Scan
+from safety.hidden import least_of
 from safety.scan import gaps
+from safety.tracks import Follower
 
 Array = NDArray[np.float64]
 
@@ -119,6 +121,21 @@ class FanMemory(Memory[Scan]):
     def reset(self) -> None:
         super().reset()
         self._seen: deque[_Seen] = deque(maxlen=KEPT)
+        self._follower = Follower()
+
+    def later(self, elapsed: float) -> None:
+        super().later(elapsed)
+        self._follower.later(elapsed)
+
+    def fill(self, scan: Scan | None, elapsed: float) -> Scan | None:
+        """The same; where it is known how things speed up, what earlier scans say of where they go comes with it."""
+        filled = super().fill(scan, elapsed)
+        if scan is None or filled is None:
+            return filled
+        followed = self._follower.follow(scan).followed
+        if followed is not None:
+            self._last = filled = replace(filled, followed=followed)
+        return filled
 
     def _wanted(self, scan: Scan) -> NDArray[np.bool_]:
         return ~scan.known
@@ -165,14 +182,7 @@ class FanMemory(Memory[Scan]):
 
 def _least(scan: Scan) -> Array:
     """The least free range (CELLS,) of the gaps that meet each of so many equal parts of a turn, from heading 0 on."""
-    angles, width, free = gaps(scan)
-    least = np.full(CELLS, np.inf)
-    first = np.floor(angles * (CELLS / math.tau) - 1e-9).astype(int)
-    last = np.floor((angles + width) * (CELLS / math.tau) + 1e-9).astype(int)
-    for step in range(int((last - first).max()) + 1):
-        within = first + step <= last
-        np.minimum.at(least, (first[within] + step) % CELLS, free[within])
-    return least
+    return least_of(*gaps(scan), CELLS)
 
 
 def _levels(least: Array) -> list[Array]:

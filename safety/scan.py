@@ -14,7 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from messaging.gaps import gaps as gaps
+from messaging.gaps import gaps_and_ways
 from messaging.scans import Scan
+from safety import hidden
 from safety.freespace import TOUCHING, roomiest
 
 Array = NDArray[np.float64]
@@ -27,10 +29,11 @@ WIDEST = math.radians(15.0)  # a wider gap is cut into several of the same F, so
 @dataclass(frozen=True)
 class Cells:
     """n convex cells: corners (n, V, 2), world [m], repeated where there are fewer; error (n, V) m, how far each may be
-    off; speed [m/s]: whatever they hold may move as fast since `age` s ago."""
+    off; ways (n, 4): where what they hold has gone since, `age` s ago, as `Followed` says; speed [m/s]: the fastest."""
 
     corners: Array
     error: Array
+    ways: Array
     speed: float = 0.0
     age: float = 0.0
 
@@ -39,25 +42,40 @@ class Cells:
 
     def take(self, index: NDArray[np.intp]) -> Cells:
         """The chosen ones."""
-        return Cells(self.corners[index], self.error[index], self.speed, self.age)
+        return Cells(self.corners[index], self.error[index], self.ways[index], self.speed, self.age)
+
+    def beside(self, others: Cells) -> Cells:
+        """These and those, of one scan."""
+        widest = max(self.corners.shape[1], others.corners.shape[1])
+        parts = []
+        for cells in (self, others):
+            slots = np.minimum(np.arange(widest), max(cells.corners.shape[1] - 1, 0))  # the last one repeated
+            parts.append((cells.corners[:, slots], cells.error[:, slots], cells.ways))
+        joined = [np.concatenate(pair) for pair in zip(*parts, strict=True)]
+        return Cells(joined[0], joined[1], joined[2], self.speed, self.age)
 
 
 def cells(scan: Scan, within: float) -> Cells:
-    """All that is not known to be free within so many m of the sensor."""
-    angles, width, free = gaps(scan)
+    """All that is not known to be free within so many m of the sensor, and where somebody may come out of it."""
+    found = gaps_and_ways(scan)
+    known = _cells(scan, within, *found)
+    return known if scan.followed is None else known.beside(_edges(scan, within, *found))
+
+
+def _cells(scan: Scan, within: float, angles: Array, width: Array, free: Array, way: NDArray[np.uint8]) -> Cells:
     parts = np.maximum(np.ceil(width / WIDEST).astype(int), 1)
     if (parts > 1).any():
         each = np.repeat(np.arange(len(angles)), parts)
         number = np.arange(len(each)) - np.repeat(np.cumsum(parts) - parts, parts)
         width = width[each] / parts[each]
-        angles, free = angles[each] + number * width, free[each]
+        angles, free, way = angles[each] + number * width, free[each], way[each]
     near = free < within
     if not near.any():
-        return Cells(np.zeros((0, 1, 2)), np.zeros((0, 1)), scan.speed, scan.age)
-    begins = np.append(True, ~near[:-1] | (np.abs(np.diff(free)) > JUMP))
+        return Cells(np.zeros((0, 1, 2)), np.zeros((0, 1)), np.zeros((0, 4)), scan.speed, scan.age)
+    begins = np.append(True, ~near[:-1] | (np.abs(np.diff(free)) > JUMP) | (way[1:] != way[:-1]))
     run = np.cumsum(begins) - 1
     along = angles - angles[begins][run]
-    angles, width, free = angles[near], width[near], free[near]
+    angles, width, free, way = angles[near], width[near], free[near], way[near]
     run, span = run[near], along[near] // SPAN  # neither falls within the other
     first = np.append(True, (run[1:] != run[:-1]) | (span[1:] != span[:-1]))
     cell, start = np.cumsum(first) - 1, np.flatnonzero(first)
@@ -74,7 +92,26 @@ def cells(scan: Scan, within: float) -> Cells:
         np.zeros((len(start), int(slot.max()) + 1), dtype=int) + start[:, None]
     )  # an empty slot repeats the cell's first gap
     filled[cell, slot] = np.arange(len(cell))
-    return Cells(points[filled].reshape(len(start), -1, 2), error[filled].reshape(len(start), -1), scan.speed, scan.age)
+    corners, error = points[filled].reshape(len(start), -1, 2), error[filled].reshape(len(start), -1)
+    return Cells(corners, error, ways_of(scan)[way[start]], scan.speed, scan.age)
+
+
+def ways_of(scan: Scan) -> Array:
+    """(K+1, 4): the ways of what was hit, the first of them that of whatever may go anywhere."""
+    anywhere = np.array([[0.0, 0.0, scan.speed, 0.0]])
+    return anywhere if scan.followed is None else np.concatenate([anywhere, scan.followed.ways])
+
+
+def _edges(scan: Scan, within: float, angles: Array, width: Array, free: Array, way: NDArray[np.uint8]) -> Cells:
+    """Where what is hidden behind something followed may come out: beside it, as fast as anything may (`hidden.py`)."""
+    outlets = hidden.outlets(angles, width, free, scan.least_radius)
+    chosen = (way[outlets.before] > 0) & (outlets.near < within)
+    at, heading = scan.sensor()
+    side = heading + outlets.angle[chosen]
+    reach = np.column_stack([outlets.near, outlets.far])[chosen]
+    corners = at + reach[..., None] * np.column_stack([np.cos(side), np.sin(side)])[:, None]
+    error = scan.position_error + scan.heading_error * (reach + math.hypot(*scan.mount))
+    return Cells(corners, error, np.tile(ways_of(scan)[0], (len(reach), 1)), scan.speed, scan.age)
 
 
 def half_spaces(
@@ -97,6 +134,9 @@ def half_spaces(
     choice = roomiest(unit, level, ends)
     each = np.arange(len(choice))[:, None]
     normal = unit[each, choice]
-    grown = near.speed * (near.age + period * np.arange(1, len(ends)))
-    offset = level[each, choice] - grown - keep_off - np.abs(normal) @ measured
+    t = near.age + period * np.arange(len(ends))
+    goes = np.einsum("nkd,nd->nk", normal, near.ways[:, :2])
+    offset = level[each, choice] + np.minimum(goes * t[:-1], goes * t[1:])
+    offset -= near.ways[:, 2:3] * t[1:] + 0.5 * near.ways[:, 3:] * t[1:] ** 2
+    offset -= keep_off + np.abs(normal) @ measured
     return normal, np.where(np.isnan(offset), -np.inf, offset)

@@ -82,10 +82,13 @@ class Perception:
 
     kind: str = "map"
     faults: Faults = Faults()
+    tracks: bool = False  # among things that move: how fast they may speed up is known, and so they are followed
 
     def __post_init__(self) -> None:
         if self.kind not in ("map", "scan"):
             raise ValueError(f"free space comes from a map or from scans, not from {self.kind!r}")
+        if self.tracks and self.kind != "scan":
+            raise ValueError("what moves is followed from scan to scan: with a map there are none (perception scan)")
 
 
 @dataclass(frozen=True)
@@ -108,7 +111,7 @@ class Conditions:
         if self.perception.kind == "map":
             return said
         faults = {f"scan_{name}": f"{value:g}" for name, value in asdict(self.perception.faults).items()}
-        return said | {"perception": self.perception.kind} | faults
+        return said | {"perception": self.perception.kind, "tracks": str(self.perception.tracks)} | faults
 
     def lidar_noise(self, flies: bool) -> float:
         """Sigma of a range, m."""

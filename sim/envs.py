@@ -127,7 +127,7 @@ class NavigationEnv(gymnasium.Env[Observation, Any]):
         self._senses: Senses = self._make_senses(self.robot, self._arena, rng, self._lidar_noise)
         self._scanner = None
         if self._perception.kind == "scan":
-            self._scanner = scanner_of(self.robot, self._arena, rng, self._lidar_noise, self._perception.faults)
+            self._scanner = scanner_of(self.robot, self._arena, rng, self._lidar_noise, self._perception)
         crowd = self._arena.crowd
         self._watch = Watch(crowd, rng) if isinstance(crowd, Crowd) else None  # other robots promise where they will be
         self._steps = 0

@@ -38,15 +38,18 @@ class Scanner(ABC, Generic[S]):
         near: float,
         rng: np.random.Generator,
         noise: float,
-        faults: Faults | None = None,
+        perception: Perception,
     ) -> None:
         """near [m]: what is nearer is not measured; noise: m, sigma of a range."""
-        self._faults, self._rng, self._noise, self._near = faults or Faults(), rng, noise, near
+        faults = perception.faults
+        self._faults, self._rng, self._noise, self._near = faults, rng, noise, near
         self._lidar = Lidar(arena, rays, noise, rng)
         self._azimuths = np.arctan2(rays.directions[:, 1], rays.directions[:, 0])
         self._position_error = math.hypot(*robot.measurement_bound[: robot.position_dim])
         self._period = robot.period
-        self._speed = arena.crowd.kind.speed if isinstance(arena.crowd, Crowd) else 0.0
+        movers = arena.crowd.kind if isinstance(arena.crowd, Crowd) else None
+        self._speed = movers.speed if movers else 0.0
+        self._movers = movers if perception.tracks else None  # and so it is known how they may speed up
         self._waiting: list[S] = []
 
     def scan(self, true: Array, measured: Array, time: float) -> S:
@@ -84,14 +87,14 @@ class FanScanner(Scanner[Scan]):
     LEAST_WIDTH = 0.1  # m: of everything in the arenas
 
     def __init__(
-        self, robot: Robot, arena: Arena, rng: np.random.Generator, noise: float, faults: Faults | None = None
+        self, robot: Robot, arena: Arena, rng: np.random.Generator, noise: float, perception: Perception
     ) -> None:
         """Raises ValueError: the robot has no heading."""
         if robot.heading is None:
             raise ValueError(f"{robot.name} has no heading for a fan of beams: its free space comes from the map")
         self._angles = np.linspace(-math.pi, math.pi, self.BEAMS, endpoint=False)
         rays = Rays(np.stack([np.cos(self._angles), np.sin(self._angles)], axis=1), self.FAR)
-        super().__init__(robot, arena, rays, self.NEAR, rng, noise, faults)
+        super().__init__(robot, arena, rays, self.NEAR, rng, noise, perception)
         self._heading, self._heading_error = robot.heading, robot.measurement_bound[robot.heading]
 
     def _taken(self, true: Array, measured: Array) -> Scan:
@@ -110,6 +113,8 @@ class FanScanner(Scanner[Scan]):
             least_width=self.LEAST_WIDTH,
             doubt=int(self._faults.far > 0.0),
             speed=self._speed,
+            acceleration=self._movers.acceleration if self._movers else 0.0,
+            least_radius=self._movers.radius if self._movers else 0.0,
         )
 
 
@@ -122,10 +127,12 @@ class DomeScanner(Scanner[RangeImage]):
     TILT = 0.01  # rad: largest error of the attitude
 
     def __init__(
-        self, robot: Robot, arena: Arena, rng: np.random.Generator, noise: float, faults: Faults | None = None
+        self, robot: Robot, arena: Arena, rng: np.random.Generator, noise: float, perception: Perception
     ) -> None:
         beams = directions(np.linspace(self.LOW, -self.LOW, self.RINGS), self.COLUMNS)
-        super().__init__(robot, arena, Rays(beams.reshape(-1, 3), self.FAR), self.NEAR, rng, noise, faults)
+        if perception.tracks:
+            raise ValueError("in space nothing is followed from scan to scan yet: leave tracks out")
+        super().__init__(robot, arena, Rays(beams.reshape(-1, 3), self.FAR), self.NEAR, rng, noise, perception)
 
     def _taken(self, true: Array, measured: Array) -> RangeImage:
         ranges = self._ailing(self._lidar.ranges(true[:3], _tilt(self._rng, self.TILT)))
@@ -154,7 +161,7 @@ def _tilt(rng: np.random.Generator, most: float) -> Array:
 
 
 def scanner_of(
-    robot: Robot, arena: Arena, rng: np.random.Generator, noise: float, faults: Faults | None = None
+    robot: Robot, arena: Arena, rng: np.random.Generator, noise: float, perception: Perception
 ) -> FanScanner | DomeScanner:
     """The sensor of a robot in the plane, or in space. Raises ValueError: it can have none."""
-    return (FanScanner if robot.position_dim == 2 else DomeScanner)(robot, arena, rng, noise, faults)
+    return (FanScanner if robot.position_dim == 2 else DomeScanner)(robot, arena, rng, noise, perception)

@@ -76,6 +76,8 @@ class Physics:
     """Degrees about straight behind that the sensor does not see."""
     late: int = 0
     """Periods until a scan is there."""
+    tracks: bool = False
+    """By scans, among things that move: follow what is seen from scan to scan, to know how fast it may go on."""
 
     def conditions(self) -> Conditions:
         return Conditions(
@@ -87,6 +89,7 @@ class Physics:
             Perception(
                 self.perception,
                 Faults(self.dropped, self.false_far, self.ghosts, math.radians(self.blind), self.late),
+                self.tracks,
             ),
         )
 

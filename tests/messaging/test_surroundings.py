@@ -11,6 +11,7 @@ from messaging.sensed import scan_message
 from messaging.shapes import BOX, CYLINDER, Obstacle
 from messaging.surroundings import promised, surroundings
 from safety.client import obstacle_messages
+from sim.conditions import Perception
 from sim.scanner import FanScanner
 from sim.world import staged_arena
 from tests.robots import GROUND, QUADROTOR
@@ -26,7 +27,7 @@ def scanned(seed: int) -> tuple[pb.Request, object]:
     obstacles = [Obstacle(CYLINDER, place, (0.15,)) for place in places[:2]]
     obstacles += [Obstacle(BOX, place, (0.3, 0.2), yaw=float(rng.uniform(0.0, 3.0))) for place in places[2:]]
     arena, state = staged_arena(*obstacles, half_width=3.0), np.array([0.0, 0.0, 0.7, 0.0, 0.0])
-    scan = FanScanner(GROUND, arena, rng, 0.0).scan(state, state, 0.0)
+    scan = FanScanner(GROUND, arena, rng, 0.0, Perception("scan")).scan(state, state, 0.0)
     return pb.Request(state=state, scan=scan_message(scan)), arena
 
 

@@ -1,0 +1,169 @@
+"""What is followed from scan to scan: whoever keeps to the bounds is where he may be, whatever he does and hid behind."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial import ConvexHull
+
+from messaging.gaps import gaps_and_ways
+from messaging.scans import BadScan, Followed, Scan
+from messaging.sensed import scan_message, scan_of
+from messaging.shapes import Obstacle, Shapes
+from safety import hidden, tracks
+from safety import scan as seen
+from safety.memory import FanMemory
+from safety.request import ADJUSTED, ALLOWED
+from safety.scan import Cells, cells
+from tests.robots import GROUND
+from tests.safety.asked import request
+from tests.safety.test_scan import FAN, FAR, WIDTH, cast
+
+SPEED, PUSH, SIZE = 1.2, 1.0, 0.2  # m/s, m/s², m
+DT = GROUND.period
+AHEAD = (0.1, 0.2, 0.4, 0.6)  # s
+ROOM = [Obstacle("wall", (-3.0 * math.cos(a), -3.0 * math.sin(a)), yaw=a) for a in np.arange(4) * math.pi / 2]
+
+
+def taken(obstacles, at, rng, **more):
+    """By a sensor at a true place, with the errors that it states."""
+    ranges = cast(obstacles, at, FAN)
+    noise = np.clip(rng.normal(0.0, 0.01, len(FAN)), -0.02, 0.02)
+    ranges = np.where(ranges < FAR, np.clip(ranges + noise, 1e-3, FAR), FAR)
+    pose = (*(at + rng.uniform(-0.01, 0.01, 2)).tolist(), float(rng.uniform(-0.02, 0.02)))
+    known = {"position_error": 0.0142, "heading_error": 0.02, "range_error": 0.02, "least_width": WIDTH, "far": FAR}
+    return Scan(ranges, FAN, pose, speed=SPEED, acceleration=PUSH, least_radius=SIZE, **known, **more)
+
+
+def disc(place):
+    return Obstacle("cylinder", (float(place[0]), float(place[1])), (SIZE,))
+
+
+# --- what may come is where it may be -------------------------------------------------------------------------------
+
+
+def starts(rng, sensor, still):
+    """Stands for a while, then comes as fast as it can."""
+    way = rng.uniform(0.0, math.tau)
+    begin = sensor + rng.uniform(0.5, 1.1) * np.array([math.cos(way), math.sin(way)])
+    wait = rng.uniform(0.3, 1.4)
+
+    def at(t):
+        t = max(0.0, t - wait)
+        gone = 0.5 * PUSH * min(t, SPEED / PUSH) ** 2 + SPEED * max(0.0, t - SPEED / PUSH)
+        return begin + gone * (sensor - begin) / np.linalg.norm(sensor - begin)
+
+    return at
+
+
+def turns(rng, sensor, still):
+    """Goes by, and then turns to the sensor as soon as it can."""
+    way, side = rng.uniform(0.0, math.tau), rng.choice([-1.0, 1.0])
+    begin = sensor + rng.uniform(0.6, 1.3) * np.array([math.cos(way), math.sin(way)])
+    velocity = side * rng.uniform(0.3, SPEED) * np.array([-math.sin(way), math.cos(way)])
+    begin, wait, step = begin - velocity * 0.9, rng.uniform(0.6, 1.4), 0.01
+    places = [begin]
+    for k in range(400):
+        if k * step >= wait:
+            wanted = SPEED * (sensor - places[-1]) / max(np.linalg.norm(sensor - places[-1]), 1e-9)
+            change = wanted - velocity
+            velocity = velocity + change * min(1.0, PUSH * step / max(np.linalg.norm(change), 1e-9))
+        places.append(places[-1] + step * velocity)
+    return lambda t: places[round(t / step)]
+
+
+def comes_out(rng, sensor, still):
+    """Goes straight at full speed past something that hides it, through nothing."""
+    hiding = still[int(rng.integers(len(still)))]
+    off = np.array(hiding.position) - sensor
+    out = off / np.linalg.norm(off)
+    across = rng.choice([-1.0, 1.0]) * np.array([-out[1], out[0]])
+    behind = np.array(hiding.position) + (hiding.size[0] + SIZE + rng.uniform(0.02, 0.8)) * out
+    aim = np.array(hiding.position) + (hiding.size[0] + SIZE + 0.02) * across - rng.uniform(0.0, 0.5) * out
+    way = (aim - behind) / np.linalg.norm(aim - behind)
+    begin = behind - way * SPEED * rng.uniform(0.0, 0.9)
+    return lambda t: begin + SPEED * t * way
+
+
+def outside(rng, kind, scans=9, count=24):
+    """(points looked at, m by which the worst was where it could not be): the sensor drives, somebody moves."""
+    sensor, drives = rng.uniform(-0.5, 0.5, 2), rng.uniform(-0.2, 0.2, 2)
+    still = []
+    while kind is comes_out and len(still) < 2:  # else nobody hides: what follows from what was seen is enough
+        one = Obstacle("cylinder", tuple((sensor + rng.uniform(-1.3, 1.3, 2)).tolist()), (rng.uniform(0.1, 0.35),))
+        if Shapes.of([*still, one], 2).distance(sensor).min() > 0.3:
+            still.append(one)
+    at = kind(rng, sensor, still)
+    walls = Shapes.of([*ROOM, *still], 2)
+    memory, looked, worst = FanMemory(GROUND.footprint), 0, -math.inf
+    ring = np.linspace(0.0, math.tau, count, endpoint=False)
+    around = SIZE * np.column_stack([np.cos(ring), np.sin(ring)])
+    for k in range(scans):
+        now, place = k * DT, sensor + drives * k * DT
+        scan = memory.fill(taken([*ROOM, *still, disc(at(now))], place, rng), DT)
+        way = np.array([at(now + t) for t in np.arange(0.0, AHEAD[-1] + 0.01, 0.05)])
+        if (walls.distance(way).min(axis=0) < SIZE).any() or np.linalg.norm(way - place, axis=1).min() < SIZE + 0.1:
+            continue  # it would go through something
+        near = cells(scan, 2.0) if kind is comes_out else seen._cells(scan, 2.0, *gaps_and_ways(scan))
+        for t in AHEAD:
+            points = at(now + t) + around
+            points = points[np.linalg.norm(points - place, axis=1) < 1.2]
+            looked += len(points)
+            worst = max(worst, away(points, near, t).max(initial=-math.inf))
+    return looked, worst
+
+
+def away(points, near: Cells, t):
+    """How far [m] each point is from all that may be occupied t s after the scan."""
+    least = np.full(len(points), math.inf)
+    for corners, error, (cx, cy, v, a) in zip(near.corners, near.error, near.ways, strict=True):
+        least = np.minimum(least, off(points - t * np.array([cx, cy]), corners) - error.max() - v * t - 0.5 * a * t * t)
+    return least
+
+
+def off(points, corners):
+    """Distances to the convex hull of corners, by another library's hull."""
+    corners = np.unique(corners.round(9), axis=0)
+    flat = len(corners) < 3 or np.linalg.matrix_rank(corners - corners[0], tol=1e-6) < 2
+    if not flat:
+        corners = corners[ConvexHull(corners).vertices]  # counter-clockwise
+    inside, least = np.full(len(points), not flat), np.full(len(points), math.inf)
+    for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True):
+        side, along = b - a, points - a
+        share = np.clip(along @ side / max(side @ side, 1e-18), 0.0, 1.0)
+        least = np.minimum(least, np.linalg.norm(along - share[:, None] * side, axis=1))
+        inside &= side[0] * along[:, 1] - side[1] * along[:, 0] >= 0.0
+    return np.where(inside, 0.0, least)
+
+
+@settings(max_examples=25)
+@given(st.integers(0, 100_000), st.sampled_from([starts, turns, comes_out]))
+def test_who_keeps_the_bounds_is_where_he_may_be(seed, kind):
+    _, worst = outside(np.random.default_rng(seed), kind)
+    assert worst <= 1e-6
+
+
+def standing(scan, ways=seen.ways_of):
+    """The mutant: what stood goes on standing."""
+    return np.where((ways(scan)[:, :2] == 0.0).all(axis=1)[:, None] & (ways(scan)[:, 3:] > 0.0), 0.0, ways(scan))
+
+
+def exact(scan, ways=seen.ways_of):
+    """The mutant: velocities are as they were measured, for good."""
+    return np.where(ways(scan)[:, 3:] > 0.0, ways(scan) * [1.0, 1.0, 0.0, 0.0], ways(scan))
+
+
+def none(scan, *rest, edges=seen._edges):
+    """The mutant: nothing comes out."""
+    return edges(scan, *rest).take(np.zeros(0, dtype=int))
+
+
+@pytest.mark.parametrize(
+    ("kind", "name", "mutant"), [(starts, "ways_of", standing), (turns, "ways_of", exact), (comes_out, "_edges", none)]
+)
+def test_a_mutant_does_not(monkeypatch, kind, name, mutant):
+    monkeypatch.setattr(seen, name, mutant)
+    assert max(outside(np.random.default_rng(seed), kind)[1] for seed in range(25)) > 0.02
