@@ -66,11 +66,34 @@ def surroundings(robot: Robot, request: pb.Request, corners: int = OUTLINE) -> S
         hits, free = _hits(sensed), outline(sensed, corners)
     elif sensed is not None:
         hits, free = _image_hits(sensed), level_outline(sensed, corners)
+    followed = _followed(robot, sensed) if isinstance(sensed, Scan) and sensed.followed is not None else None
     moving = Movers.of([_obstacle(o) for o in request.obstacles if o.HasField("motion")], robot.position_dim)
     shapes, ends = moving.shapes, robot.period * np.arange(1.0, robot.horizon + 1.0)
     across: Array = shapes.rho + np.sqrt((shapes.half**2).sum(axis=1))
     swept = shapes.center[:, None] + moving.moved(ends), (across[:, None] + moving.radius(ends))[..., None]
-    return Surroundings(hits, free, np.column_stack([shapes.center, across]), np.concatenate(swept, axis=2))
+    movers, sweeps = np.column_stack([shapes.center, across]), np.concatenate(swept, axis=2)
+    if followed is not None:
+        movers, sweeps = np.concatenate([movers, followed[0]]), np.concatenate([sweeps, followed[1]])
+    return Surroundings(hits, free, movers, sweeps)
+
+
+def _followed(robot: Robot, scan: Scan) -> tuple[Array, Array]:
+    """Of what a scan was followed to move: the discs about what was hit of it (k, 3), and those swept (k, N, 3)."""
+    assert scan.followed is not None
+    points = np.zeros((len(scan.ranges), 2))
+    points[scan.known & (scan.ranges < scan.far)] = _hits(scan)
+    t = scan.age + robot.period * np.arange(1.0, robot.horizon + 1.0)
+    discs, swept = [np.zeros((0, 3))], [np.zeros((0, len(t), 3))]
+    for row, (cx, cy, error, acceleration) in enumerate(scan.followed.ways, start=1):
+        hit = points[scan.followed.which == row]
+        if not len(hit) or not (cx or cy):
+            continue
+        middle = hit.mean(axis=0)
+        about = float(np.linalg.norm(hit - middle, axis=1).max())
+        discs.append(np.array([[*middle, about]]))
+        grown = about + error * t + 0.5 * acceleration * t * t
+        swept.append(np.column_stack([middle + t[:, None] * (cx, cy), grown])[None])
+    return np.concatenate(discs), np.concatenate(swept)
 
 
 def _obstacle(o: pb.Obstacle) -> Obstacle:

@@ -20,8 +20,9 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-PARTS = 180  # of a turn
+PARTS = 360  # of a turn
 PART = 2.0 * math.pi / PARTS  # rad
+BESIDE = 30  # parts to either side of a disc's middle that it is looked for in
 SLIT = 0.1  # m: nobody gets through what is narrower, and hardly into it
 
 
@@ -57,8 +58,8 @@ def outlets(angles: Array, width: Array, free: Array, radius: float) -> Outlets:
 def _hiding(angles: Array, width: Array, free: Array, radius: float) -> Array:
     """How far [m] from the sensor the middle of a disc of which nothing is seen is at least, in each part of a turn."""
     least = least_of(angles, width, free, PARTS)
-    away = np.arange(-(PARTS // 4), PARTS // 4 + 1)
-    off = (np.abs(away) + 1.0) * PART  # the middle may be anywhere in its part: less far than from this angle
+    away = np.arange(-BESIDE, BESIDE + 1)
+    off = (np.abs(away) + 0.5) * PART  # at most, from the middle to the beam in the middle of that part
     beside = least[(np.arange(PARTS)[:, None] + away) % PARTS]
     across = beside * np.sin(off)
     within = np.sqrt(np.maximum(radius * radius - across * across, 0.0))

@@ -144,3 +144,9 @@ class MapDriver:
         """The input that turns to a bearing (rad) as fast as is smooth, and drives when roughly aligned."""
         speed = self._robot.high()[0] * max(0.0, 1.0 - abs(angle) / self.ALIGNED)
         return bounded(self._robot, speed, self.GAIN * angle)
+
+
+class CarefulDriver(MapDriver):
+    """The same, that keeps a wide berth: where whatever is seen may move, what is near lets nobody pass."""
+
+    COMFORT = 0.6

@@ -1,13 +1,15 @@
 """What is drawn of a robot's surroundings: never more free space than there is, and no mover outside of its discs."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from messaging import brakeline_pb2 as pb
 from messaging.motion import Motion
-from messaging.sensed import scan_message
+from messaging.scans import Followed
+from messaging.sensed import scan_message, scan_of
 from messaging.shapes import BOX, CYLINDER, Obstacle
 from messaging.surroundings import promised, surroundings
 from safety.client import obstacle_messages
@@ -83,3 +85,21 @@ def test_a_promise_is_the_new_one_or_what_is_left_of_the_old() -> None:
     assert promised(GROUND, asked)[0, 0] == 2.0
     asked.reply.decision.promise.radius.append(1.0)
     assert len(promised(GROUND, asked)) == 0, "that is none"
+
+
+def test_what_a_scan_was_followed_to_move_is_drawn_where_it_may_go() -> None:
+    request, _ = scanned(0)
+    plain = surroundings(GROUND, request)
+    scan = scan_of(request.scan)
+    near = int(np.argmin(scan.ranges))
+    which = np.zeros(len(scan.ranges), np.uint8)
+    which[near - 2 : near + 3] = 1
+    which[:20] = 2  # stands
+    ways = np.array([[0.5, 0.0, 0.3, 1.0], [0.0, 0.0, 0.4, 1.0]])
+    request.scan.CopyFrom(scan_message(replace(scan, followed=Followed(which, ways))))
+    about = surroundings(GROUND, request)
+    assert len(plain.movers) == 0 and about.movers.shape == (1, 3) and about.swept.shape == (1, GROUND.horizon, 3)
+    assert np.linalg.norm(plain.hits - about.movers[0, :2], axis=1).min() < 0.05
+    ends = about.swept[0]
+    assert np.allclose(np.diff(ends[:, 0]), 0.5 * GROUND.period)
+    assert ends[0, 2] - about.movers[0, 2] == pytest.approx(0.3 * 0.2 + 0.5 * 0.2**2)

@@ -1,4 +1,4 @@
-"""What is followed from scan to scan: whoever keeps to the bounds is where he may be, whatever he does and hid behind."""
+"""What is followed from scan to scan: whoever keeps to the bounds is where he may be, wherever he was hidden."""
 
 import math
 from dataclasses import replace
@@ -16,7 +16,7 @@ from messaging.shapes import Obstacle, Shapes
 from safety import hidden, tracks
 from safety import scan as seen
 from safety.memory import FanMemory
-from safety.request import ADJUSTED, ALLOWED
+from safety.request import ALLOWED
 from safety.scan import Cells, cells
 from tests.robots import GROUND
 from tests.safety.asked import request
@@ -167,3 +167,110 @@ def none(scan, *rest, edges=seen._edges):
 def test_a_mutant_does_not(monkeypatch, kind, name, mutant):
     monkeypatch.setattr(seen, name, mutant)
     assert max(outside(np.random.default_rng(seed), kind)[1] for seed in range(25)) > 0.02
+
+
+# --- what is said of what was seen ----------------------------------------------------------------------------------
+
+
+def followed(world, scans=4, seed=0):
+    """What is known after so many scans of what is there at each time, from where the sensor stands."""
+    memory, rng = FanMemory(GROUND.footprint), np.random.default_rng(seed)
+    for k in range(scans):
+        scan = memory.fill(taken(world(k * DT), np.zeros(2), rng), DT)
+    return scan
+
+
+def test_what_stood_is_told_from_what_moved_and_how_fast():
+    pillar = Obstacle("cylinder", (0.8, 0.0), (0.15,))
+    velocity = np.array([0.5, -0.3])
+    scan = followed(lambda t: [*ROOM, pillar, disc(np.array([-1.0, 0.6]) + t * velocity)])
+    which, ways = scan.followed.which, scan.followed.ways
+    hit = np.abs(scan.ranges * np.cos(FAN) - 0.8) < 0.16
+    hit &= np.abs(scan.ranges * np.sin(FAN)) < 0.1
+    (stood,) = set(which[hit])
+    assert stood and not ways[stood - 1, :2].any() and 0.2 < ways[stood - 1, 2] < 0.5 and ways[stood - 1, 3] == PUSH
+    there = np.array([-1.0, 0.6]) + 3 * DT * velocity
+    at = np.column_stack([np.cos(FAN), np.sin(FAN)]) * scan.ranges[:, None]
+    (moved,) = set(which[np.linalg.norm(at - there, axis=1) < SIZE + 0.05]) - {0, stood}
+    assert np.linalg.norm(ways[moved - 1, :2] - velocity) < 0.15 and ways[moved - 1, 2] < 0.5
+
+
+def test_who_may_have_been_one_of_two_is_not_followed():
+    """The one ahead may have been either of them; the one behind was too far from where the other was."""
+    velocity, legs = np.array([0.5, 0.0]), [np.array([-0.5, 0.8]), np.array([-0.25, 0.8])]
+    world = [lambda t, leg=leg: Obstacle("cylinder", tuple(leg + t * velocity), (0.06,)) for leg in legs]
+    for some, count in ((world, 1), (world[:1], 1), (world[1:], 1)):
+        scan = followed(lambda t, some=some: [*ROOM, *(one(t) for one in some)])
+        assert np.count_nonzero(scan.followed.ways[:, 0]) == count
+
+
+def test_what_is_new_may_go_anywhere_and_what_nothing_bounds_is_not_followed():
+    new = followed(lambda t: [*ROOM, *([disc((0.8, 0.0))] if t > 2.5 * DT else [])])
+    assert not new.followed.which[np.abs(FAN) < 0.1].any() and new.followed.which[np.abs(FAN) > 0.5].any()
+    scan = taken(ROOM, np.zeros(2), np.random.default_rng(0))
+    for unknown in (replace(scan, acceleration=0.0), replace(scan, speed=0.0)):
+        assert tracks.Follower().follow(unknown) is unknown
+
+
+def test_where_a_scan_does_not_come_what_was_followed_is_older():
+    memory, rng = FanMemory(GROUND.footprint), np.random.default_rng(0)
+    for _ in range(4):
+        last = memory.fill(taken(ROOM, np.zeros(2), rng), DT)
+    missed = memory.fill(None, DT)
+    assert missed.age == pytest.approx(DT) and missed.followed is last.followed
+    memory.reset()
+    assert not memory.fill(taken(ROOM, np.zeros(2), rng), DT).followed.which.any()
+
+
+def test_who_hides_needs_room():
+    """Behind a pillar as wide as he is, somebody is as far off as the shadow takes to be as wide; behind a thin one
+    farther; of any size, he may stand right behind it."""
+    angles, free = np.radians(np.arange(-180.0, 180.0)), np.full(360, FAR)
+    width = np.full(360, math.radians(1.0))
+    for half, least, most in ((0.2, 1.0, 1.1), (0.1, 1.3, 1.8)):  # the smallest disc is 1.0 and 2.0 m off
+        shadow = np.where(np.abs(angles + 0.5 * width) < math.asin(half), 1.0, free)
+        near = hidden.outlets(angles, width, shadow, SIZE).near
+        assert len(near) == 2 and (least < near).all() and (near < most).all()
+        assert (hidden.outlets(angles, width, shadow, 0.0).near == 1.0).all()
+    narrow = np.where(np.abs(angles + 0.5 * width) < math.asin(0.05), 1.0, free)
+    assert hidden.outlets(angles, width, narrow, SIZE).near.min() > 2.0  # only beyond sight is room: 4 m off
+
+
+def test_by_what_stood_it_drives_and_where_somebody_may_come_out_it_does_not(ready, monkeypatch):
+    wall = Obstacle("wall", (0.0, -0.55), yaw=math.pi / 2)
+    scan = followed(lambda t: [*ROOM, wall])
+    assert ready.decide(request(scan=scan)).kind == ALLOWED
+    assert ready.decide(request(scan=replace(scan, followed=None))).kind != ALLOWED
+    scan = followed(lambda t: [*ROOM, disc((0.45, 0.6))])
+    assert ready.decide(request(scan=scan)).kind != ALLOWED
+    monkeypatch.setattr(seen, "_edges", none)
+    assert ready.decide(request(scan=scan)).kind == ALLOWED
+
+
+def test_what_was_followed_crosses_the_wire():
+    scan = followed(lambda t: [*ROOM, disc((-1.0 + 0.5 * t, 0.6))])
+    got = scan_of(scan_message(scan))
+    assert np.array_equal(got.followed.which, scan.followed.which)
+    assert np.array_equal(got.followed.ways, scan.followed.ways)
+    assert (got.acceleration, got.least_radius) == (PUSH, SIZE)
+
+
+@pytest.mark.parametrize(
+    ("which", "ways"),
+    [
+        (np.zeros(3, np.uint8), np.zeros((0, 4))),
+        (np.ones(360, np.uint8), np.zeros((0, 4))),
+        (np.zeros(360, np.int64), np.zeros((0, 4))),
+        (np.ones(360, np.uint8), np.zeros((1, 3))),
+        (np.ones(360, np.uint8), np.array([[0.0, 0.0, -0.1, 1.0]])),
+        (np.ones(360, np.uint8), np.array([[np.nan, 0.0, 0.1, 1.0]])),
+    ],
+)
+def test_what_nobody_can_have_followed_is_refused(which, ways):
+    with pytest.raises(BadScan):
+        Scan(np.ones(360), FAN, (0.0, 0.0, 0.0), followed=Followed(which, ways))
+    message = scan_message(Scan(np.ones(360), FAN, (0.0, 0.0, 0.0)))
+    message.which, message.ways[:] = which.astype(np.uint8).tobytes(), ways.ravel().tolist()
+    if which.dtype == np.uint8:
+        with pytest.raises(BadScan):
+            scan_of(message)
