@@ -88,7 +88,7 @@ class Perception:
         if self.kind not in ("map", "scan"):
             raise ValueError(f"free space comes from a map or from scans, not from {self.kind!r}")
         if self.tracks and self.kind != "scan":
-            raise ValueError("what moves is followed from scan to scan: with a map there are none (perception scan)")
+            raise ValueError("tracks are made of scans: ask for these, too (--perception scan)")
 
 
 @dataclass(frozen=True)

@@ -131,7 +131,7 @@ class DomeScanner(Scanner[RangeImage]):
     ) -> None:
         beams = directions(np.linspace(self.LOW, -self.LOW, self.RINGS), self.COLUMNS)
         if perception.tracks:
-            raise ValueError("in space nothing is followed from scan to scan yet: leave tracks out")
+            raise ValueError("in space nothing is followed from scan to scan: leave out --tracks")
         super().__init__(robot, arena, Rays(beams.reshape(-1, 3), self.FAR), self.NEAR, rng, noise, perception)
 
     def _taken(self, true: Array, measured: Array) -> RangeImage:
