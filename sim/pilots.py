@@ -103,6 +103,9 @@ class MapPilot:
     COMFORT = 2.0  # m; more clearance than this is worth no detour
     MARGIN = 0.6  # m beside the footprint: what a tube about the stop takes, and comfort
     CARE = 0.1  # s
+    BERTH = 0.0  # m beside the footprint that it would rather keep
+    UNEASE = 0.0  # s, as `CARE`
+    PRICE = 0.5  # m of the way that a metre missing to those is worth, at each point of a stop
     PACE = 1.0  # m/s; a second earlier at a place is worth this many metres of the way
     SHARES = (-1.0, -0.5, 0.0, 0.5, 1.0)  # of the slew, on each axis
 
@@ -128,7 +131,9 @@ class MapPilot:
         to_go = self._routes.to_go(places)
         at_goal = np.linalg.norm(places - info["goal"], axis=-1) < info["arena"].goal_radius
         value = (np.where(at_goal, 0.0, to_go) + self.PACE * self._stops.times).min(axis=1)
-        lack = self._lack(places, position)
+        speed, clearance = self._speed(places, position), self._clearance(places)
+        value += self.PRICE * _missing(self.BERTH + self.UNEASE * speed, clearance)
+        lack = _missing(self.MARGIN + self.CARE * speed, clearance)
         free = lack == 0.0
         best = np.argmin(np.where(free, value, np.inf) if free.any() else lack)
         return np.asarray(setpoints[best])
@@ -140,9 +145,24 @@ class MapPilot:
     def _plan(self, arena: Arena) -> Routes:
         return Routes(arena.clearance_map, arena.goal, self._robot.footprint, self.COMFORT)
 
-    def _lack(self, places: Array, position: Array) -> Array:
-        """What each stop (C, K, 3) from a position (3,) misses to the clearance asked for, summed over it, m: (C,)."""
+    def _speed(self, places: Array, position: Array) -> Array:
+        """How fast each stop (C, K, 3) from a position (3,) gets to its points, m/s: (C, K)."""
         before = np.concatenate((np.broadcast_to(position, (len(places), 1, 3)), places[:, :-1]), axis=1)
-        speed = np.linalg.norm(places - before, axis=-1) / self._stops.times[0]
-        clearance = self._grid.between(self._grid.clearance, places) - self._robot.footprint
-        return np.asarray(np.maximum(self.MARGIN + self.CARE * speed - clearance, 0.0).sum(axis=1))
+        return np.asarray(np.linalg.norm(places - before, axis=-1) / self._stops.times[0])
+
+    def _clearance(self, places: Array) -> Array:
+        """Of the footprint about points (C, K, 3), m: (C, K)."""
+        return np.asarray(self._grid.between(self._grid.clearance, places) - self._robot.footprint)
+
+
+class CarefulPilot(MapPilot):
+    """The same, that keeps a wide berth: by scans, obstacles seem larger, and nobody knows what a corner hides."""
+
+    COMFORT = 3.0
+    BERTH = 1.0
+    UNEASE = 0.4
+
+
+def _missing(wanted: Array, clearance: Array) -> Array:
+    """What stops (C, K) miss to the clearance asked for, summed over each, m: (C,)."""
+    return np.asarray(np.maximum(wanted - clearance, 0.0).sum(axis=1))

@@ -19,7 +19,7 @@ class Evaluate:
     robot: Robot = "ground"
     policy: str = "astar"
     """A policy file, inputs (.csv, as `excite` prints them), or trained (the one in policies/) | untrained | random |
-    greedy | adversary | astar | careful (astar by wider ways; on the ground)."""
+    greedy | adversary | astar | careful (astar with a wide berth)."""
     filtering: Flags[Filtering] = field(default_factory=Filtering)
     physics: Flags[Physics] = field(default_factory=Physics)
     arena: str = "default"

@@ -28,7 +28,7 @@ class Fly:
     robot: Annotated[str, tyro.conf.Positional] = "quadrotor"
     minutes: float = 10.0
     policy: str = "astar"
-    """A file, or trained | untrained | random | greedy | adversary | astar; learn: from what it flies."""
+    """A file, or trained | untrained | random | greedy | adversary | astar | careful; learn: from what it flies."""
     url: str = ""
     """An autopilot that runs elsewhere: udpin:HOST:PORT, udpout:HOST:PORT or tcp:HOST:PORT. Without one: our own."""
     flight: Flags[Flight] = field(default_factory=Flight)

@@ -7,7 +7,7 @@ import pytest
 
 from messaging.shapes import BOX, CYLINDER, Obstacle
 from sim.envs import NavigationEnv
-from sim.pilots import MapPilot, StopModel, full_speed
+from sim.pilots import CarefulPilot, MapPilot, StopModel, full_speed
 from sim.policies import scripted
 from sim.quadrotor import Quadrotor
 from sim.world import Arena, staged_arena
@@ -126,3 +126,27 @@ def test_it_gets_out_of_a_place_without_room() -> None:
     arena = staged_arena(pillar, start=(-1.4, 0.0, 5.0), goal=(8.0, 0.0, 5.0), half_width=10.0, height=10.0)
     first = MapPilot(QUADROTOR, np.random.default_rng(0))(BLIND, staged_info(arena, (-1.4, 0.0, 5.0), (0.0, 0.0, 0.0)))
     assert first[0] < 0.0
+
+
+def nearest_to(pillar: Obstacle, pilot: type[MapPilot]) -> float:
+    """How near to it the pilot gets on its way past, m."""
+    arena = staged_arena(pillar, start=(-10.0, 0.0, 5.0), goal=(10.0, 0.0, 5.0), half_width=15.0, height=10.0)
+    vehicle, fly, least = PointMass(arena, np.random.default_rng(0)), pilot(QUADROTOR, np.random.default_rng(0)), np.inf
+    for k in range(60):
+        info = {"arena": arena, "goal": arena.goal, "state": vehicle.measured, "input_in_force": vehicle.input}
+        vehicle.step(fly(BLIND, info | {"time": 0.2 * k}))
+        least = min(least, float(np.hypot(*(vehicle.true[:2] - pillar.position[:2]))) - pillar.size[0])
+        if np.linalg.norm(vehicle.true[:3] - arena.goal) < 1.0:
+            return least
+    raise AssertionError("it does not arrive")
+
+
+def test_with_care_it_keeps_a_wide_berth() -> None:
+    pillar = Obstacle(CYLINDER, (0.0, 0.5, 5.0), (1.0, 10.0))
+    assert nearest_to(pillar, CarefulPilot) > nearest_to(pillar, MapPilot) + 0.5
+
+
+def test_with_care_it_arrives_among_many_obstacles_too() -> None:
+    flights = fly("careful", "dense", 15)
+    assert share(flights, "at_goal") == 1.0
+    assert np.concatenate([flight["speeds"] for flight in flights]).mean() > 3.5
