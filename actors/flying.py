@@ -8,8 +8,8 @@ from typing import Protocol
 import numpy as np
 
 from actors.frames import Tap
-from actors.mavlink import Client, message_id
-from actors.telemetry import Array
+from actors.mavlink import Client, CommandRefused, message_id
+from actors.telemetry import ATTITUDE, FORCE, MOTION, SOURCES, Array
 from messaging.robots import Robot
 from sim.quadrotor import SAMPLES, Quadrotor
 from sim.vehicle import Period, executed
@@ -40,10 +40,8 @@ class MavlinkVehicle:
         self._robot, period = robot, robot.period
         self.input = np.zeros(robot.action_dim)
         wait = self._wait
-        wanted = {"LOCAL_POSITION_NED": period / SAMPLES, "ATTITUDE_QUATERNION": period, "HIGHRES_IMU": period}
-        for message, interval in wanted.items():
-            self._client.stream(message_id(message), interval, wait)
-            self._client.request(message_id(message), wait)
+        for what, interval in ((MOTION, period / SAMPLES), (ATTITUDE, period), (FORCE, period)):
+            self._listen(what, interval)
         self._client.follow_setpoints(wait)
         self.true, self.measured = endpoint.vehicle.state(), self._measured()
 
@@ -80,6 +78,18 @@ class MavlinkVehicle:
         client = self._client
         assert client.position is not None
         return np.concatenate((client.position, client.velocity, client.acceleration))
+
+    def _listen(self, what: str, interval: float) -> None:
+        """Have the best message that it grants sent every `interval` s, and once now. Raises CommandRefused."""
+        names = [source.message for source in SOURCES[what]]
+        for name in names:
+            try:
+                self._client.stream(message_id(name), interval, self._wait)
+                self._client.request(message_id(name), self._wait)
+                return
+            except CommandRefused:
+                if name == names[-1]:
+                    raise
 
     def _wait(self, condition: Callable[[], bool], _: float) -> bool:
         """Answers come at once or not at all."""

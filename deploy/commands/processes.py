@@ -87,8 +87,8 @@ class Actor:
     deadline: float = RunConfig.deadline
     """s, for an answer of the safety service; then the robot brakes along its plan."""
     policy: str = ""
-    """A file (weights, or inputs that `excite` printed), or trained | untrained | random | greedy | adversary | astar;
-    without one: a learner's weights."""
+    """A file (weights, or inputs that `excite` printed), or trained | untrained | random | greedy | adversary | astar |
+    careful; without one: a learner's weights."""
     steps: int = 0
     """With a policy: until it ends; 0: on ^C."""
     mavlink: bool = False

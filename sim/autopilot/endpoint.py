@@ -115,6 +115,10 @@ class Autopilot:
                 elif (message := self.reports.build(kind)) is not None:
                     send(message)
 
+    def knows(self, kind: int) -> bool:
+        """It can send that message."""
+        return kind == HEARTBEAT or (kind in BUILDERS and kind not in self.rules.lacks)
+
     def say(self, text: str, severity: int = mavlink.MAV_SEVERITY_WARNING) -> None:
         """STATUSTEXT, cut to its 50 bytes."""
         self.mav.statustext_send(severity, text.encode()[:50])
@@ -263,7 +267,8 @@ def _set_mode(autopilot: Autopilot, command: Command) -> int:
 def _set_interval(autopilot: Autopilot, command: Command) -> int:
     """param1: message id; param2: µs; 0: the default rate; -1: none."""
     kind, microseconds = round(command.params[0]), command.params[1]
-    if kind not in BUILDERS and kind != HEARTBEAT:
+    if not autopilot.knows(kind):
+        autopilot.say(f"message {kind} is not known")
         return FAILED
     interval = 1e-6 * microseconds
     if microseconds == 0.0:
@@ -276,7 +281,7 @@ def _set_interval(autopilot: Autopilot, command: Command) -> int:
 
 def _get_interval(autopilot: Autopilot, command: Command) -> int:
     kind = round(command.params[0])
-    if kind not in BUILDERS and kind != HEARTBEAT:
+    if not autopilot.knows(kind):
         return DENIED
     interval = autopilot.schedule.interval(kind)
     autopilot.mav.message_interval_send(kind, round(1e6 * interval) if interval else -1)
@@ -285,7 +290,7 @@ def _get_interval(autopilot: Autopilot, command: Command) -> int:
 
 def _request_message(autopilot: Autopilot, command: Command) -> int:
     kind = round(command.params[0])
-    message = autopilot.reports.build(kind) if kind in BUILDERS else None
+    message = autopilot.reports.build(kind) if kind in BUILDERS and autopilot.knows(kind) else None
     if message is None:
         return int(mavlink.MAV_RESULT_UNSUPPORTED)
     autopilot.mav.send(message)

@@ -35,7 +35,7 @@ class Rules(Protocol):
     boots_in: Mode
     parameters: Parameters
     rates: dict[int, float]  # Hz of messages that are sent without being asked for
-
+    lacks: frozenset[int]  # messages that it does not know
     groups: dict[int, tuple[int, ...]]  # messages of each group of REQUEST_DATA_STREAM
 
     def limits(self) -> Limits:
@@ -83,6 +83,7 @@ class Px4:
             mavlink.MAVLINK_MSG_ID_HOME_POSITION: 0.5,
             mavlink.MAVLINK_MSG_ID_OBSTACLE_DISTANCE: 5.0,
         }
+        self.lacks: frozenset[int] = frozenset()
         self.groups: dict[int, tuple[int, ...]] = {}  # it takes no REQUEST_DATA_STREAM
 
     def limits(self) -> Limits:
@@ -160,8 +161,11 @@ class ArduCopter:
         self.parameters = Parameters(ARDUPILOT, bitwise=False)
         self.rates: dict[int, float] = {}
         m = mavlink
+        self.lacks = frozenset(
+            (m.MAVLINK_MSG_ID_ATTITUDE_QUATERNION, m.MAVLINK_MSG_ID_HIGHRES_IMU, m.MAVLINK_MSG_ID_ODOMETRY)
+        )  # as 4.0
         self.groups: dict[int, tuple[int, ...]] = {
-            m.MAV_DATA_STREAM_RAW_SENSORS: (m.MAVLINK_MSG_ID_SCALED_IMU, m.MAVLINK_MSG_ID_HIGHRES_IMU),
+            m.MAV_DATA_STREAM_RAW_SENSORS: (m.MAVLINK_MSG_ID_SCALED_IMU,),
             m.MAV_DATA_STREAM_EXTENDED_STATUS: (m.MAVLINK_MSG_ID_SYS_STATUS, m.MAVLINK_MSG_ID_GPS_RAW_INT),
             m.MAV_DATA_STREAM_POSITION: (m.MAVLINK_MSG_ID_LOCAL_POSITION_NED, m.MAVLINK_MSG_ID_GLOBAL_POSITION_INT),
             m.MAV_DATA_STREAM_EXTRA1: (m.MAVLINK_MSG_ID_ATTITUDE,),

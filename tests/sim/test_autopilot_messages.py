@@ -21,6 +21,7 @@ from tests.robots import QUADROTOR
 from tests.sim.station import (
     ACCEPTED,
     FAILED,
+    UNSUPPORTED,
     Station,
     field,
 )
@@ -56,9 +57,25 @@ def test_every_message_can_be_asked_for() -> None:
         assert station.last(name)
 
 
+def test_what_arducopter_does_not_know_is_refused() -> None:
+    """So 4.0 answers; `deploy.bench manners` asks a real one."""
+    station = Station("ardupilot", airborne=True)
+    for name in ("ATTITUDE_QUATERNION", "HIGHRES_IMU", "ODOMETRY"):
+        kind = getattr(mavlink, f"MAVLINK_MSG_ID_{name}")
+        assert station.command(511, kind, 40_000) == FAILED
+        assert station.command(512, kind) == UNSUPPORTED
+        assert station.command(510, kind) != ACCEPTED
+    station.heard.clear()
+    station.mav.request_data_stream_send(1, 1, mavlink.MAV_DATA_STREAM_ALL, 10, 1)
+    station.wait(1.0)
+    names = {message.get_type() for message in station.heard}
+    assert {"SCALED_IMU", "ATTITUDE"} < names and not names & {"ATTITUDE_QUATERNION", "HIGHRES_IMU", "ODOMETRY"}
+
+
 def test_telemetry_is_in_ned(flying: Station) -> None:
     flying.fly(1, 2, -0.5, seconds=3.0)
-    for name in ("LOCAL_POSITION_NED", "ATTITUDE", "HIGHRES_IMU", "GLOBAL_POSITION_INT"):
+    force, unit = {"px4": ("HIGHRES_IMU", 1.0), "ardupilot": ("SCALED_IMU", 9.80665e-3)}[flying.autopilot.rules.name]
+    for name in ("LOCAL_POSITION_NED", "ATTITUDE", force, "GLOBAL_POSITION_INT"):
         flying.command(512, getattr(mavlink, f"MAVLINK_MSG_ID_{name}"))
         if name == "LOCAL_POSITION_NED":
             m = flying.last(name)
@@ -67,8 +84,8 @@ def test_telemetry_is_in_ned(flying: Station) -> None:
             assert (m.x, m.y, m.z) == pytest.approx((y, x, -z), abs=0.01)
         elif name == "ATTITUDE":
             assert flying.last(name).yaw == pytest.approx(0.5 * math.pi, abs=0.05)
-        elif name == "HIGHRES_IMU":
-            assert flying.last(name).zacc == pytest.approx(-9.81, abs=0.4)
+        elif name == force:
+            assert unit * flying.last(name).zacc == pytest.approx(-9.81, abs=0.4)
         else:
             assert flying.last(name).vx == pytest.approx(100, abs=10)
 
