@@ -16,7 +16,6 @@ from typing import Annotated
 
 import tyro
 from rich.console import Console
-from rich.table import Table
 
 from deploy.bench import (
     askers,
@@ -37,6 +36,7 @@ from deploy.bench import (
     solvers,
 )
 from deploy.bench.timing import Figures, Words
+from logs.tables import Stacking
 
 
 @dataclass(frozen=True)
@@ -102,7 +102,7 @@ def _cell(value: float | str) -> str:
 
 
 def show(console: Console, name: str, figures: Figures | Words) -> None:
-    table = Table(title=name)
+    table = Stacking(title=name)
     table.add_column("what")
     columns = sorted({key for row in figures.values() for key in row}, key=str)
     for column in columns:

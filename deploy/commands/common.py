@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
 import tyro
 from rich.console import Console
-from rich.table import Table
 
 from actors.settings import FlightSettings
 from logs.tables import PLAIN, Stacking
@@ -210,7 +209,7 @@ errors = Console(stderr=True, highlight=False, soft_wrap=True)
 Robot = Annotated[str, tyro.conf.Positional]
 
 
-def conditions(about: dict[str, str]) -> Table:
+def conditions(about: dict[str, str]) -> Stacking:
     """How data were recorded, a line each."""
     shown = Stacking(show_header=False, **PLAIN)
     for name, value in about.items():

@@ -9,7 +9,6 @@ from typing import Annotated, Any, Literal
 
 import tyro
 from rich.markup import escape
-from rich.table import Table
 
 from deploy.commands.common import (
     Endpoints,
@@ -221,7 +220,7 @@ class Certify:
         errors.print(f"published {model.recipe.certificate} {model.version} for {model.robot.name}")
 
 
-def table(rows: list[tuple[Statement, str]]) -> Table:
+def table(rows: list[tuple[Statement, str]]) -> Stacking:
     shown = Stacking(title="what held-out plans say (bounds at 99 % confidence)")
     for column in (
         *("certificate", "mode", "driving", "samples", "rank", "condition", "plans", "violations"),

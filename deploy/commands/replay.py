@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import tyro
-from rich.table import Table
 
 from deploy.commands.common import LATEST, Certificate, Mode, console, say_json
 from deploy.data.certified import certified
@@ -19,6 +18,7 @@ from deploy.data.store import model_for
 from deploy.progress import under_way
 from deploy.run.replay import Instead, replay
 from logs.extent import count
+from logs.tables import PLAIN, Stacking
 from messaging.tasks import learnt
 from messaging.topics import EXCHANGE
 from safety.dataset import Dataset
@@ -109,15 +109,15 @@ def show(figures: dict[str, Any]) -> None:
     if not figures["different"]:
         return
     console.print(f"the robot is told the same in {figures['same_input']} ({figures['same_input'] / compared:.2%})")
-    kinds = Table("decided", "now", "requests", box=None, padding=(0, 2, 0, 0))
+    kinds = Stacking("decided", "now", "requests", **PLAIN)
     for logged, row in figures["kinds"].items():
         for now, number in row.items():
             kinds.add_row(logged, now, str(number))
-    fields = Table("field", "differs in", "by at most", box=None, padding=(0, 2, 0, 0))
+    fields = Stacking("field", "differs in", "by at most", **PLAIN)
     for name, about in figures["fields"].items():
         fields.add_row(name, str(about["count"]), size(about["largest"]))
     columns = ("largest differences", "decided", "now", "input", "margin")
-    examples = Table(*columns, box=None, padding=(0, 2, 0, 0))
+    examples = Stacking(*columns, **PLAIN)
     for one in figures["examples"]:
         place = f"{one['actor']} episode {one['episode']} step {one['step']}"
         found = (size(one["differences"].get(name, 0.0)) for name in ("input", "margin"))

@@ -8,10 +8,10 @@ from typing import Annotated, Literal
 
 import tyro
 from rich.markup import escape
-from rich.table import Table
 
 from deploy.commands.common import console, errors, say_json
 from deploy.data.portrait import picture, summary
+from logs.tables import PLAIN, Stacking
 from messaging.descriptions import NAME, BadDescription
 from messaging.robots import FOLDER, Robot, robot_named
 from messaging.tasks import UnknownTask, learnt, task_of
@@ -80,7 +80,7 @@ class RobotCommand:
         if self.json:
             say_json(found)
             return 0
-        table = Table(box=None, show_header=False, padding=(0, 2, 0, 0))
+        table = Stacking(show_header=False, **PLAIN)
         for label, one in found.pop("inputs").items():
             table.add_row(escape(f"input {label}"), f"{one['low']:g} to {one['high']:g}, stop: {one['stop']}")
         for name, value in found.items():

@@ -7,9 +7,9 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from rich.markup import escape
-from rich.table import Table
 
 from deploy.commands.common import Endpoints, Flags, Robot, console, say_json
+from logs.tables import PLAIN, Stacking
 from messaging.bus import Bus, Sample
 from messaging.shapes import KINDS, Obstacle
 from messaging.tasks import learnt
@@ -71,7 +71,7 @@ class Query:
             say_json(figures)
             return 0
         console.print(f"[bold]{figures['decision']}[/] {message.reason}")
-        shown = Table(box=None, padding=(0, 2, 0, 0))
+        shown = Stacking(**PLAIN)
         for column in ("period", *robot.action, "center [m]", "± [m]"):
             shown.add_column(column)
         for k, (u, c, h) in enumerate(
@@ -120,7 +120,7 @@ class Status:
         if self.json:
             say_json({"alive": alive, "processes": processes, "learners": learners})
             return 0
-        table = Table(box=None, padding=(0, 2, 0, 0))
+        table = Stacking(**PLAIN)
         for column in ("process", "state", "what it says"):
             table.add_column(column)
         for name in sorted({*alive, *processes}):

@@ -8,7 +8,6 @@ from typing import Annotated
 
 import tyro
 from rich.markup import escape
-from rich.table import Table
 
 from deploy.commands.common import Robot, console, errors, say_json
 from deploy.data import bring, planned
@@ -18,6 +17,7 @@ from deploy.data.picture import draw
 from deploy.data.resample import HOLD
 from deploy.data.sources.quantities import columns_of
 from deploy.progress import under_way
+from logs.tables import PLAIN, Stacking
 from messaging.robots import Robot as RobotKind
 from messaging.tasks import learnt
 
@@ -66,8 +66,8 @@ class Import:
         return 0
 
 
-def covered(told: Coverage) -> Table:
-    shown = Table(box=None, padding=(0, 2, 0, 0))
+def covered(told: Coverage) -> Stacking:
+    shown = Stacking(**PLAIN)
     for column in ("", "least", "most", "bounds", "covered"):
         shown.add_column(column, justify="left" if not column else "right")
     for one in told.seen:
