@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 MOST_BEAMS = 1000
+FASTEST = 1e4  # m/s, m/s²: nothing that is followed goes or speeds up faster
 
 
 class BadScan(ValueError):
@@ -41,8 +42,8 @@ class Followed:
             return "of each beam one byte says what it hit"
         if self.ways.ndim != 2 or self.ways.shape[1] != 4 or int(self.which.max(initial=0)) > len(self.ways):
             return "what is followed keeps to ways of four numbers, and to no other"
-        if not np.isfinite(self.ways).all() or (self.ways[:, 2:] < 0.0).any():
-            return "ways must be finite, their errors and accelerations not negative"
+        if not (np.abs(self.ways) <= FASTEST).all() or (self.ways[:, 2:] < 0.0).any():  # NaN fails too
+            return f"ways are numbers up to {FASTEST:g}, their errors and accelerations not negative"
         return ""
 
 

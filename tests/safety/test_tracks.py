@@ -264,6 +264,7 @@ def test_what_was_followed_crosses_the_wire():
         (np.ones(360, np.uint8), np.zeros((1, 3))),
         (np.ones(360, np.uint8), np.array([[0.0, 0.0, -0.1, 1.0]])),
         (np.ones(360, np.uint8), np.array([[np.nan, 0.0, 0.1, 1.0]])),
+        (np.ones(360, np.uint8), np.array([[-1e300, 0.0, 0.1, 1.0]])),
     ],
 )
 def test_what_nobody_can_have_followed_is_refused(which, ways):
