@@ -22,6 +22,7 @@ STATION, COMPONENT = 245, int(mavlink.MAV_COMP_ID_ONBOARD_COMPUTER)  # who we ar
 AUTOPILOT = int(mavlink.MAV_COMP_ID_AUTOPILOT1)
 FULL = 100.0  # %
 KINDS = {int(mavlink.MAV_AUTOPILOT_PX4): "px4", int(mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA): "ardupilot"}
+SIDES = {1: "least altitude", 2: "greatest altitude", 3: "boundary"}  # FENCE_BREACH
 OFFBOARD = {"px4": (6, 6 << 16), "ardupilot": (4, 4)}  # DO_SET_MODE's param2, and HEARTBEAT's custom mode
 
 
@@ -59,6 +60,7 @@ class Heard:
         self.texts: list[str] = []
         self.estimator: int | None = None  # flags, see telemetry.ESTIMATED
         self.battery: float | None = None  # %, if it tells
+        self.outside = ""  # of its geofence: over which side; empty: it has not said that it is
         self.answers: list[tuple[int, int]] = []  # ns, of TIMESYNC: what we sent, and the autopilot's clock then
         self.chosen: dict[str, str] = {}  # message by key of SOURCES
         self.received = self.missed = 0
@@ -175,6 +177,10 @@ class Heard:
         if 0 <= message.battery_remaining <= FULL:
             self.battery = float(message.battery_remaining)
 
+    def _on_fence(self, message: Any) -> None:
+        side = SIDES.get(message.breach_type, "") or "geofence"
+        self.outside = side if message.breach_status else ""
+
     def _on_parameter(self, message: Any) -> None:
         value = message.param_value
         if self.kind == "px4" and message.param_type == mavlink.MAV_PARAM_TYPE_INT32:  # its bits, not its value
@@ -194,6 +200,7 @@ HANDLERS: dict[int, Callable[[Heard, Any], None]] = {
     mavlink.MAVLINK_MSG_ID_EKF_STATUS_REPORT: Heard._on_estimator,
     mavlink.MAVLINK_MSG_ID_ESTIMATOR_STATUS: Heard._on_estimator,
     mavlink.MAVLINK_MSG_ID_SYS_STATUS: Heard._on_status,
+    mavlink.MAVLINK_MSG_ID_FENCE_STATUS: Heard._on_fence,
     mavlink.MAVLINK_MSG_ID_PARAM_VALUE: Heard._on_parameter,
     mavlink.MAVLINK_MSG_ID_TIMESYNC: Heard._on_time,
 }

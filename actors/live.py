@@ -240,6 +240,8 @@ class LiveVehicle:
         if not (client.offboard and client.armed):
             state = client.mode if client.armed else "it is disarmed"
             return f"the autopilot does not follow our setpoints ({state})"
+        if client.outside:
+            return f"the autopilot says that it is outside of its geofence ({client.outside})"
         return "the autopilot says that it is in an emergency" if client.emergency else ""
 
     def _say_lost(self, why: str) -> None:

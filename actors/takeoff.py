@@ -19,6 +19,7 @@ log = logging.getLogger("brakeline.flight")
 
 TELEMETRY = 0.02  # s from one message to the next, as it is asked for
 READINGS = 10  # of the accelerometer, at most, the mean of which counts: those of one period
+STATUS = {"px4": {"SYS_STATUS": 2.0}, "ardupilot": {"SYS_STATUS": 2.0, "FENCE_STATUS": 0.5}}  # s; PX4 has no FENCE_STATUS
 ESTIMATING = 300.0  # s that an estimator may take to know where it is
 PROGRESS = 5.0  # s between two lines about that
 SPEECHLESS = 30.0  # s after which one that grants to tell and does not is no longer waited for
@@ -55,8 +56,9 @@ class Takeoff:
         if not wait(lambda: client.position is not None and client.airborne is not None, 3.0):
             raise NotTold("it does not tell its position, or whether it flies")
         self._smooth()
-        with contextlib.suppress(MavlinkError):
-            client.stream(message_id("SYS_STATUS"), 2.0, wait)
+        for message, interval in STATUS[kind].items():
+            with contextlib.suppress(MavlinkError):
+                client.stream(message_id(message), interval, wait)
         self._compare_limits(kind)
         self._hold(np.zeros(3))
         client.follow_setpoints(wait)

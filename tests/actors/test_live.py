@@ -145,6 +145,14 @@ def test_what_stops_coming_alone_is_lost_telemetry_too(live: Live) -> None:
     assert vehicle.timing.figures()["periods without telemetry"] >= 1
 
 
+def test_outside_of_the_autopilots_geofence_it_brakes(live: Live) -> None:
+    vehicle, _, _ = live
+    vehicle._client.outside = "boundary"
+    assert "outside of its geofence (boundary)" in vehicle.wait(vehicle.turn.number + 2).lost
+    vehicle._client.outside = ""
+    assert heard_again(vehicle)
+
+
 def test_a_pilot_may_take_over(live: Live) -> None:
     vehicle, autopilot, _ = live
     autopilot.pilot.change(Mode.HOLD)

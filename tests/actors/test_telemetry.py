@@ -159,6 +159,14 @@ class Pretender:
                     self._mav.send(SAID[name])
 
 
+def test_it_tells_when_it_is_outside_of_its_geofence() -> None:
+    client, mav = Client(lambda _: None), mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
+    for breach, side in ((1, 2), (1, 3), (1, 0), (0, 3)):
+        client.feed(mavlink.MAVLink_fence_status_message(breach, 1, side, 1000).pack(mav))
+        expected = {2: "greatest altitude", 3: "boundary", 0: "geofence"}[side] if breach else ""
+        assert client.outside == expected
+
+
 @pytest.mark.parametrize(
     "said",
     [
