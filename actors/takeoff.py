@@ -19,7 +19,7 @@ log = logging.getLogger("brakeline.flight")
 
 TELEMETRY = 0.02  # s from one message to the next, as it is asked for
 READINGS = 10  # of the accelerometer, at most, the mean of which counts: those of one period
-STATUS = {"px4": {"SYS_STATUS": 2.0}, "ardupilot": {"SYS_STATUS": 2.0, "FENCE_STATUS": 0.5}}  # s; PX4 has no FENCE_STATUS
+STATUS = {"px4": {"SYS_STATUS": 2.0}, "ardupilot": {"SYS_STATUS": 2.0, "FENCE_STATUS": 0.5}}  # s
 ESTIMATING = 300.0  # s that an estimator may take to know where it is
 PROGRESS = 5.0  # s between two lines about that
 SPEECHLESS = 30.0  # s after which one that grants to tell and does not is no longer waited for
