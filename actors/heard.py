@@ -71,6 +71,7 @@ class Heard:
         self._forces: deque[telemetry.Triple] = deque([(0.0, 0.0, -GRAVITY)], 1)
         self._acks: dict[int, int] = {}
         self._parameters: dict[str, float] = {}
+        self._types: dict[str, int] = {}  # MAV_PARAM_TYPE of each of them
         self._tap, self._say = tap, say
         self._mav = mavlink.MAVLink(_Pipe(send), srcSystem=STATION, srcComponent=COMPONENT)
         self._mav.robust_parsing = True
@@ -185,7 +186,7 @@ class Heard:
         value = message.param_value
         if self.kind == "px4" and message.param_type == mavlink.MAV_PARAM_TYPE_INT32:  # its bits, not its value
             value = struct.unpack("<i", struct.pack("<f", value))[0]
-        self._parameters[message.param_id] = float(value)
+        self._parameters[message.param_id], self._types[message.param_id] = float(value), message.param_type
 
     def _on_time(self, message: Any) -> None:
         if message.tc1 == 0:

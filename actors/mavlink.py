@@ -7,6 +7,7 @@ for something brings a way of waiting.
 from __future__ import annotations
 
 import contextlib
+import struct
 from collections.abc import Callable
 
 import numpy as np
@@ -100,10 +101,15 @@ class Client(Heard):
         return None
 
     def set_parameter(self, name: str, value: float, wait: Wait) -> bool:
-        """Whether it then has that value."""
+        """Whether it then has that value. One that it has not is not set."""
+        if self.parameter(name, wait) is None:
+            return False
+        type, sent = self._types[name], value
+        if self.kind == "px4" and type == mavlink.MAV_PARAM_TYPE_INT32:  # its bits, and of no other type
+            sent = struct.unpack("<f", struct.pack("<i", round(value)))[0]
         for _ in range(3):
             self._parameters.pop(name, None)
-            self._mav.param_set_send(self.system, AUTOPILOT, name.encode(), value, mavlink.MAV_PARAM_TYPE_REAL32)
+            self._mav.param_set_send(self.system, AUTOPILOT, name.encode(), sent, type)
             if wait(lambda: name in self._parameters, ANSWER) and abs(self._parameters[name] - value) < 0.01:
                 return True
         return False

@@ -11,6 +11,7 @@ import json
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 from types import ModuleType
 from typing import Annotated
 
@@ -24,6 +25,7 @@ from deploy.bench import (
     crowd,
     decide,
     environment,
+    flights,
     fuzz,
     learning,
     linkloss,
@@ -57,6 +59,10 @@ class Bench:
     """Of fuzz."""
     rate: int = crowd.JUNK
     """Of crowd: junk messages /s of each sender."""
+    minutes: float = 10.0
+    """Of flights: of each policy in each arena."""
+    folder: Path = Path("runs/flights")
+    """Of flights: where data, logs and figures are kept; what is there already is not flown again."""
 
 
 @dataclass(frozen=True)
@@ -81,6 +87,7 @@ BENCHMARKS = {
     "logs-2gb": Benchmark(logs, lambda _: logs.run_large(), asked=True),
     "fuzz": Benchmark(fuzz, lambda given: fuzz.fuzz(given.messages, given.seed), asked=True),
     "manners": Benchmark(manners, lambda _: manners.run(), asked=True),
+    "flights": Benchmark(flights, lambda given: flights.run(given.minutes, given.folder), asked=True),
     "crowd": Benchmark(crowd, lambda given: crowd.run(given.rate), asked=True),
     "costs": Benchmark(costs, lambda _: costs.run(), asked=True),
     "chaos": Benchmark(chaos, lambda given: chaos.chaos(given.kills, given.seed, given.delay), asked=True),

@@ -7,13 +7,17 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
+
+from actors.mavlink import Client
+from messaging.links import open_link
 
 KINDS = ("ardupilot", "px4")
 INSTANCES = range(1, 10)  # PX4 has no more ports
 STARTS_IN = 30.0  # s
+SAVED_IN = 4.0  # s until parameters that were set are in a file
 LISTENS = "0A"  # a socket's state in /proc/net/tcp
 # ArduCopter ends with its parent, and takes one of another user for gone: this one waits for it.
 KEEPER = "import subprocess, sys; sys.exit(subprocess.call(sys.argv[1:]))"
@@ -37,12 +41,46 @@ def program(kind: str, default: Path | None = None) -> Path:
 
 
 @contextmanager
-def flying(kind: str, start: Path, folder: Path) -> Iterator[tuple[str, int]]:
+def flying(
+    kind: str, start: Path, folder: Path, parameters: Mapping[str, float] | None = None
+) -> Iterator[tuple[str, int]]:
     """One that runs in a folder: (the URL for us, its system id).
 
+    parameters: set before, in a first start, for some count from a start on only.
+
     Raises:
-        NoAutopilot: with what it said.
+        NoAutopilot: with what it said, or the parameter that it does not take.
     """
+    if parameters:
+        with _running(kind, start, folder) as (url, system):
+            _configure(url, system, parameters)
+    with _running(kind, start, folder) as reached:
+        yield reached
+
+
+def _configure(url: str, system: int, parameters: Mapping[str, float]) -> None:
+    link = open_link(url)
+    client = Client(link.send, system)
+
+    def wait(condition: Callable[[], bool], seconds: float) -> bool:
+        end = time.monotonic() + seconds
+        while not condition() and time.monotonic() < end:
+            client.feed(link.receive())
+            time.sleep(0.01)
+        return condition()
+
+    try:
+        client.identify(lambda condition, seconds: wait(condition, max(seconds, STARTS_IN)))
+        for name, value in parameters.items():
+            if not client.set_parameter(name, value, wait):
+                raise NoAutopilot(f"it does not take {name} = {value:g}: {'; '.join(client.texts[-2:])}")
+        wait(lambda: False, SAVED_IN)
+    finally:
+        link.close()
+
+
+@contextmanager
+def _running(kind: str, start: Path, folder: Path) -> Iterator[tuple[str, int]]:
     instance = next(i for i in reversed(INSTANCES) if not _taken(kind, i))
     said = folder / "sitl.log"
     with said.open("wb") as output:

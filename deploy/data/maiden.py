@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -35,6 +35,7 @@ AHEAD = 5  # periods
 # m, and s times the level's speed: what 95 % of predictions that far ahead may be off by, to go faster, besides what
 # the vehicle's own estimate wanders by
 OFF = (0.2, 0.1)
+WANDERS = 0.4  # m, of its own estimate in `AHEAD` periods, from which that is what makes the sets wide
 PIECE = 60  # periods of a trajectory: whole ones are held out
 REACTION, BRAKING = 1.0, 1.5  # s and m/s²: a worse vehicle than any
 HOMEWARD = 0.5  # of a level, towards the middle, when the box ends
@@ -162,6 +163,12 @@ class Maiden:
         self._flown.cut()
         data = self._flown.dataset(self._robot.in_lockstep(), about)
         model, statement = self._model(data, missing)
+        wander = _wander(data.trajectories, self._robot.period)
+        if wander > WANDERS:
+            missing.append(
+                f"its own estimate is {wander:.2f} m off its own velocity after a second (95 %), and no set can be "
+                "narrower: tell its estimator how noisy and how late its sensors are, and fly again"
+            )
         if reached < 1.0:
             missing.append(f"nothing is known beyond {reached:.0%} of its speed")
         missing += [] if statement is None else more_to_drive(statement, data)
@@ -251,7 +258,7 @@ class Maiden:
         return model, statement
 
 
-def _wander(trajectories: list[Trajectory], period: float) -> float:
+def _wander(trajectories: Sequence[Trajectory], period: float) -> float:
     """m, what 95 % of the ways of `AHEAD` periods are off the way by its own velocity: no model can be better."""
     off = [np.zeros((1, 3))]
     for t in trajectories:

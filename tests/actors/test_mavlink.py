@@ -45,6 +45,16 @@ def test_in_lockstep_it_takes_control_before_time_begins(rules: str) -> None:
     assert vehicle.standing().clearance > 9.0
 
 
+@pytest.mark.parametrize("rules, name, value", [("px4", "COM_OBL_RC_ACT", 4), ("ardupilot", "LAND_SPEED", 50)])
+def test_a_whole_number_is_set_as_each_autopilot_wants_it(rules: str, name: str, value: int) -> None:
+    autopilot = embedded(rules)
+    vehicle = MavlinkVehicle(autopilot, QUADROTOR)
+    assert vehicle._client.set_parameter(name, value, vehicle._wait)
+    assert autopilot.rules.parameters[name] == value
+    assert not vehicle._client.set_parameter(name, 1e6, vehicle._wait), "out of its range"
+    assert not vehicle._client.set_parameter("NONSENSE", 1.0, vehicle._wait)
+
+
 @pytest.mark.parametrize("rules", RULES)
 def test_over_bytes_it_is_the_vehicle_that_it_is_without_them(rules: str) -> None:
     """Same seed, same inputs: the same flight, but for the rounding of float32, and of ArduPilot's milligravities."""

@@ -66,6 +66,7 @@ def test_an_obedient_vehicle_is_flown_at_every_level_and_stays_inside(tmp_path: 
     assert found.statement is not None and found.statement.violations <= 0.25 * found.statement.windows
     assert found.model.recipe.windows == PLAN and 11.0 * 60.0 <= found.seconds < 13.0 * 60.0
     assert any("more minutes like these" in line for line in found.missing)
+    assert not any("its own estimate" in line for line in found.missing)
     found.data.save(tmp_path / "flown.safetensors")
     assert Dataset.load(tmp_path / "flown.safetensors").digest() == found.data.digest()
     assert len(windows(found.data, QUADROTOR.horizon, PLAN)) > 20, "it brakes as the filter plans to"
@@ -83,6 +84,11 @@ def test_a_vehicle_that_nothing_predicts_is_not_flown_faster() -> None:
     found = Maiden(vehicle, LATE, BOX, 0).fly(2.0, {})
     assert found.level == 0.0 and vehicle.fastest < 1.5
     assert any("not flown faster" in line for line in found.missing)
+
+
+def test_an_estimate_that_wanders_is_named_as_what_makes_the_sets_wide() -> None:
+    found = Maiden(Sluggish(drift=0.3), LATE, BOX, 0).fly(2.0, {})
+    assert any("its own estimate is 0." in line for line in found.missing)
 
 
 def test_a_vehicle_that_leaves_its_box_ends_the_flight() -> None:
