@@ -23,6 +23,7 @@ from deploy.bench import (
     chaos,
     costs,
     crowd,
+    cuts,
     decide,
     environment,
     flights,
@@ -36,6 +37,7 @@ from deploy.bench import (
     recording,
     roundtrip,
     solvers,
+    upsets,
 )
 from deploy.bench.timing import Figures, Words
 from logs.tables import Stacking
@@ -50,9 +52,11 @@ class Bench:
     json: bool = False
     """One JSON object on stdout."""
     seed: int = 0
-    """Of chaos and fuzz."""
+    """Of chaos, cuts and fuzz."""
     kills: int = 100
     """Of chaos."""
+    faults: int = 60
+    """Of cuts."""
     delay: float = 0.0
     """Of chaos: s each way between actors and routers."""
     messages: int = 1_000_000
@@ -62,7 +66,7 @@ class Bench:
     minutes: float = 10.0
     """Of flights: of each policy in each arena."""
     folder: Path = Path("runs/flights")
-    """Of flights: where data, logs and figures are kept; what is there already is not flown again."""
+    """Of flights, upsets and cuts: where data, logs and figures are kept; what is there already is not flown again."""
 
 
 @dataclass(frozen=True)
@@ -88,6 +92,8 @@ BENCHMARKS = {
     "fuzz": Benchmark(fuzz, lambda given: fuzz.fuzz(given.messages, given.seed), asked=True),
     "manners": Benchmark(manners, lambda _: manners.run(), asked=True),
     "flights": Benchmark(flights, lambda given: flights.run(given.minutes, given.folder), asked=True),
+    "upsets": Benchmark(upsets, lambda given: upsets.run(given.folder), asked=True),
+    "cuts": Benchmark(cuts, lambda given: cuts.run(given.faults, given.seed, given.folder), asked=True),
     "crowd": Benchmark(crowd, lambda given: crowd.run(given.rate), asked=True),
     "costs": Benchmark(costs, lambda _: costs.run(), asked=True),
     "chaos": Benchmark(chaos, lambda given: chaos.chaos(given.kills, given.seed, given.delay), asked=True),

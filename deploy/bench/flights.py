@@ -12,6 +12,10 @@ import os
 import subprocess
 import sys
 import tempfile
+import threading
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -59,8 +63,18 @@ def run(minutes: float, folder: Path) -> Words:
             continue
         for arena in ARENAS:
             for policy in POLICIES:
-                rows[f"{kind}: {policy}, {arena}"] = _flown(flights.fly(policy, arena, minutes))
+                rows[f"{kind}: {policy}, {arena}"] = flown(flights.fly(policy, arena, minutes))
     return rows
+
+
+@dataclass(frozen=True)
+class Upset:
+    """Other parameters than `SET`; or from a moment of the command on, s, and others again from another one on."""
+
+    parameters: Mapping[str, float] = field(default_factory=dict)
+    begins: float = 0.0
+    ends: float = 0.0
+    afterwards: Mapping[str, float] = field(default_factory=dict)
 
 
 class Flights:
@@ -68,52 +82,92 @@ class Flights:
 
     def __init__(self, kind: str, start: Path, folder: Path) -> None:
         self._kind, self._start, self._folder = kind, start, folder.absolute()
+        self.data = self._folder / "data"
+
+    @classmethod
+    def beside(cls, other: Flights, name: str) -> Flights:
+        """Of the same autopilot, with data and flights of their own in a folder of the other's."""
+        return cls(other._kind, other._start, other._folder / f"{name}-own")
 
     def first(self) -> dict[str, Any]:
         return self._figures("first", FIRST, "collect", "quadrotor", "--minutes", str(FIRST))
 
     def fly(self, policy: str, arena: str, minutes: float) -> dict[str, Any]:
-        name = f"{policy}-{arena}"
-        words = ("fly", "--policy", policy, "--arena", arena, "--minutes", str(minutes), "--at-start")
-        return self._figures(name, minutes, *words, "--pictures", "0", "--out", str(self._folder / name))
+        return self.upset(f"{policy}-{arena}", minutes, Upset(), "--policy", policy, "--arena", arena)
 
-    def _figures(self, name: str, minutes: float, *words: str) -> dict[str, Any]:
+    def upset(self, name: str, minutes: float, upset: Upset, *words: str) -> dict[str, Any]:
+        out = ("--at-start", "--pictures", "0", "--out", str(self.run(name)))
+        return self._figures(name, minutes, "fly", "--minutes", str(minutes), *words, *out, upset=upset)
+
+    def run(self, name: str) -> Path:
+        """The folder of a flight."""
+        return self._folder / name
+
+    def _figures(self, name: str, minutes: float, *words: str, upset: Upset = Upset()) -> dict[str, Any]:
         """Of a command, or of the time when it was run. Raises Failed, NoAutopilot."""
         kept = self._folder / f"{name}.json"
         if not kept.exists():
             print(f"{self._kind}: {name}, {minutes:g} minutes", file=sys.stderr)
             kept.parent.mkdir(parents=True, exist_ok=True)
-            kept.write_text(self._flown(minutes, *words))
+            kept.write_text(self._flown(minutes, words, upset))
         figures: dict[str, Any] = json.loads(kept.read_text())
         return figures
 
-    def _flown(self, minutes: float, *words: str) -> str:
+    def _flown(self, minutes: float, words: tuple[str, ...], upset: Upset) -> str:
+        lasting = SET[self._kind] | ({} if upset.ends else dict(upset.parameters))
         with (
             tempfile.TemporaryDirectory() as folder,
-            sitl.flying(self._kind, self._start, Path(folder), SET[self._kind]) as (url, system),
+            sitl.flying(self._kind, self._start, Path(folder), lasting) as (url, system),
+            self._in_between(upset, sitl.beside(self._kind, system, url), system),
         ):
-            command = [*PYTHON, "-m", "deploy.cli", *words, "--url", url, "--system", str(system), "--raise-limits"]
-            done = subprocess.run(
-                [*command, "--json"],
-                check=False,
-                stdout=subprocess.PIPE,
-                text=True,
-                env=os.environ | {"BRAKELINE_DATA": str(self._folder / "data")},
-                timeout=60.0 * minutes + BEYOND,
-            )
-        lines = done.stdout.splitlines()
-        if not lines:
-            raise Failed(f"{' '.join(words)}: no figures, status {done.returncode}")
-        return lines[-1]
+            command = [*words, "--url", url, "--system", str(system), "--raise-limits", "--json"]
+            return told(command, self.data, 60.0 * minutes + BEYOND)
+
+    @contextmanager
+    def _in_between(self, upset: Upset, url: str, system: int) -> Iterator[None]:
+        over = threading.Event()
+
+        def change() -> None:
+            if not over.wait(upset.begins):
+                sitl.configure(url, system, upset.parameters)
+            if not over.wait(upset.ends - upset.begins):
+                sitl.configure(url, system, upset.afterwards)
+
+        thread = threading.Thread(target=change, daemon=True)
+        if upset.ends:
+            thread.start()
+        try:
+            yield
+        finally:
+            over.set()
+            if upset.ends:
+                thread.join()
+
+
+def told(words: list[str], data: Path, seconds: float) -> str:
+    """The last line of a command of ours, which works in that folder of data sets. Raises Failed."""
+    environment = os.environ | {"BRAKELINE_DATA": str(data)}
+    done = subprocess.run(
+        [*PYTHON, "-m", "deploy.cli", *words],
+        check=False,
+        stdout=subprocess.PIPE,
+        text=True,
+        env=environment,
+        timeout=seconds,
+    )
+    if not (lines := done.stdout.splitlines()):
+        raise Failed(f"{' '.join(words)}: no figures, status {done.returncode}")
+    return lines[-1]
 
 
 def _learned(first: dict[str, Any]) -> dict[str, float | str]:
-    wanted = ("minutes", "periods", "level", "windows", "violations", "bound_plan")
+    wanted = ["minutes", "periods", "level", "windows", "violations", "bound_plan", "bound_step"]
+    wanted += ["half_width_rest", "half_width_full"]
     found: dict[str, float | str] = {name: first[name] for name in wanted if name in first}
     return found | {"missing": "; ".join(first["missing"])}
 
 
-def _flown(figures: dict[str, Any]) -> dict[str, float | str]:
+def flown(figures: dict[str, Any]) -> dict[str, float | str]:
     flight, contained = figures["flight"], figures["containment"]
     row: dict[str, float | str] = {name: figures[name] for name in ("steps", "episodes", "goals")}
     row |= {"mean speed m/s": figures["mean_speed"] or 0.0}

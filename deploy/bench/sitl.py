@@ -53,20 +53,30 @@ def flying(
     """
     if parameters:
         with _running(kind, start, folder) as (url, system):
-            _configure(url, system, parameters)
+            configure(url, system, parameters)
     with _running(kind, start, folder) as reached:
         yield reached
 
 
-def _configure(url: str, system: int, parameters: Mapping[str, float]) -> None:
+def beside(kind: str, system: int, url: str) -> str:
+    """Where a second one can talk to it while somebody flies it."""
+    if kind == "px4":
+        return f"udpout:127.0.0.1:{18570 + system - 1}"
+    address, _, port = url.rpartition(":")
+    return f"{address}:{int(port) + 2}"
+
+
+def configure(url: str, system: int, parameters: Mapping[str, float]) -> None:
+    """Set them, and wait until they are in a file. Raises NoAutopilot: it does not take one of them."""
     link = open_link(url)
     client = Client(link.send, system)
 
     def wait(condition: Callable[[], bool], seconds: float) -> bool:
         end = time.monotonic() + seconds
         while not condition() and time.monotonic() < end:
+            client.heartbeat()  # PX4 speaks to who spoke first
             client.feed(link.receive())
-            time.sleep(0.01)
+            time.sleep(0.05)
         return condition()
 
     try:

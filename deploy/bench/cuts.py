@@ -1,0 +1,241 @@
+"""Real autopilots whose companion fails in flight: its link is cut, its safety service or its actor killed.
+
+After `flights`, whose model sets it flies behind. The adversary flies, for it is near something all the time; one fault
+after the other, at moments drawn at random, with the timeouts that the autopilots have. A judge of its own hears the
+simulator's truth on another port, also while no actor lives. In real time: twelve seconds for each fault.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from random import Random
+from typing import TypeVar
+
+import psutil
+
+from actors.mavlink import Client, MavlinkError
+from actors.telemetry import MOTION, TRUTH
+from actors.witness import Witness
+from deploy.bench import sitl
+from deploy.bench.flights import SET
+from deploy.bench.timing import Words
+from deploy.interpreter import PYTHON
+from deploy.quadrotors import flight_arena
+from messaging.links import Link, TcpServer, open_link
+from messaging.robots import robot_named
+
+T = TypeVar("T")
+
+ARENA, POLICY = "default", "adversary"
+FAULTS = ("link", "safety-0", "actor-0")  # children of a run, and what is between them and the autopilot
+BETWEEN = (8.0, 14.0)  # s from one fault to the next
+CUT = (0.3, 5.0)  # s that a link is cut
+PUMP = 0.002  # s
+FLIES_WITHIN = 180.0  # s
+OFTEN = 0.02  # s between two words of truth
+
+
+def run(faults: int, seed: int, folder: Path) -> Words:
+    """Rows: what failed; columns: how often, and what was touched from then until the next fault."""
+    rows: Words = {}
+    for kind in sitl.KINDS:
+        try:
+            start = sitl.program(kind)
+        except sitl.NoAutopilot as none:
+            print(none, file=sys.stderr)
+            continue
+        with tempfile.TemporaryDirectory() as place:
+            home = Path(place)
+            with sitl.flying(kind, start, home, SET[kind]) as (url, system):
+                rows |= _failing(kind, url, system, faults, Random(seed), folder / kind, home)
+    return rows
+
+
+@dataclass
+class Outcomes:
+    """Of one kind of fault."""
+
+    count: int = 0
+    collisions: int = 0
+    nearest: float = float("inf")  # m
+
+    def row(self) -> dict[str, float | str]:
+        return {"faults": self.count, "collisions": self.collisions, "nearest m": round(self.nearest, 2)}
+
+
+def _failing(
+    kind: str, url: str, system: int, faults: int, random: Random, folder: Path, home: Path
+) -> dict[str, dict[str, float | str]]:
+    outcomes = {name: Outcomes() for name in FAULTS}
+    calm = Outcomes()
+    with relayed(url) as relay, judged(sitl.beside(kind, system, url), system) as judge:
+        words = ["--url", relay.url, "--system", str(system), "--policy", POLICY, "--arena", ARENA, "--at-start"]
+        words += ["--minutes", "600", "--pictures", "0", "--raise-limits", "--json", "--out", str(home / "run")]
+        fly = subprocess.Popen(
+            [*PYTHON, "-m", "deploy.cli", "fly", *words],
+            stdout=subprocess.DEVNULL,
+            env=os.environ | {"BRAKELINE_DATA": str(folder.absolute() / "data")},
+        )
+        try:
+            _until(lambda: judge.airborne, fly)
+            time.sleep(random.uniform(*BETWEEN) + 10.0)
+            judge.take(calm)
+            for number in range(faults):
+                name = FAULTS[number % len(FAULTS)]
+                print(f"{kind}: fault {number + 1} of {faults}: {name}", file=sys.stderr)
+                if name == "link":
+                    relay.cut(random.uniform(*CUT))
+                else:
+                    _until(partial(child_of, home, name), fly).kill()
+                outcomes[name].count += 1
+                time.sleep(random.uniform(*BETWEEN))
+                judge.take(outcomes[name])
+        finally:
+            fly.terminate()
+            fly.wait()
+    rows = {f"{kind}: {name}": one.row() for name, one in outcomes.items()}
+    return {f"{kind}: before the first": calm.row()} | rows
+
+
+def _until(condition: Callable[[], T | None], fly: subprocess.Popen[bytes]) -> T:
+    """What it gives once that is something. Raises MavlinkError: the flight has ended, or it takes too long."""
+    deadline = time.monotonic() + FLIES_WITHIN
+    while not (found := condition()):
+        if fly.poll() is not None or time.monotonic() > deadline:
+            raise MavlinkError(f"it does not fly (any more); status {fly.poll()}")
+        time.sleep(0.2)
+    return found
+
+
+def child_of(home: Path, name: str) -> psutil.Process | None:
+    """The living process of that name in the run in that folder."""
+    for process in psutil.process_iter(["cmdline"]):
+        words = process.info["cmdline"] or []
+        if words[-2:] == [str(home / "run"), name]:
+            return process
+    return None
+
+
+class Relay:
+    """Carries bytes between an autopilot and whoever connects, until it is cut."""
+
+    def __init__(self, upstream: Link) -> None:
+        self._upstream, self._server = upstream, TcpServer("127.0.0.1", 0)
+        self.url = f"tcp:127.0.0.1:{self._server.port}"
+        self._dead_until = 0.0
+
+    def cut(self, seconds: float) -> None:
+        """What is sent meanwhile is lost."""
+        self._dead_until = time.monotonic() + seconds
+
+    def pump(self) -> None:
+        up, down = self._upstream.receive(), self._server.receive()
+        if time.monotonic() < self._dead_until:
+            return
+        if up:
+            self._server.send(up)
+        if down:
+            self._upstream.send(down)
+
+    def close(self) -> None:
+        self._server.close()
+        self._upstream.close()
+
+
+@contextmanager
+def relayed(url: str) -> Iterator[Relay]:
+    relay = Relay(open_link(url))
+    with repeated(relay.pump, PUMP):
+        yield relay
+    relay.close()
+
+
+@dataclass
+class Judge:
+    """Hears truth and estimate beside whoever flies, and compares with the map: all since it was last asked."""
+
+    client: Client
+    link: Link
+    witness: Witness
+    airborne: bool = False
+    _seen: int = 0
+    _beaten: float = 0.0
+    _nearest: float = field(default=float("inf"))
+
+    def listen(self) -> None:
+        client, witness = self.client, self.witness
+        if time.monotonic() - self._beaten > 1.0:
+            self._beaten = time.monotonic()
+            client.heartbeat()
+        client.feed(self.link.receive())
+        if client.truth is None or client.position is None:
+            return
+        witness.take(client.truth, client.position + ORIGIN, client.velocity)
+        client.truth = None
+        self.airborne |= witness.state is not None and witness.state[2] > 2.0
+        if self.airborne:
+            self._nearest = min(self._nearest, witness.clearance)
+
+    def take(self, outcomes: Outcomes) -> None:
+        """What happened since the last time goes there."""
+        outcomes.collisions += self.witness.collisions - self._seen
+        outcomes.nearest = min(outcomes.nearest, self._nearest)
+        self._seen, self._nearest = self.witness.collisions, float("inf")
+
+
+MAP = flight_arena(ARENA, 0)
+ORIGIN = (MAP.start[0], MAP.start[1], 0.0)  # of the autopilot's local frame, on the floor below the start
+
+
+@contextmanager
+def judged(url: str, system: int) -> Iterator[Judge]:
+    robot = robot_named("quadrotor-late")
+    link = open_link(url)
+    client = Client(link.send, system)
+    judge = Judge(client, link, Witness(lambda at: float(MAP.shapes.distance(at).min()) - robot.footprint))
+
+    def wait(condition: Callable[[], bool], seconds: float) -> bool:
+        end = time.monotonic() + seconds
+        while not condition() and time.monotonic() < end:
+            client.heartbeat()
+            client.feed(link.receive())
+            time.sleep(0.05)
+        return condition()
+
+    try:
+        client.identify(lambda condition, seconds: wait(condition, max(seconds, sitl.STARTS_IN)))
+        wait(lambda: False, 60.0)  # before, its estimator knows nothing
+        for what in (MOTION, TRUTH):
+            client.choose(what, OFTEN, wait)
+        with repeated(judge.listen, 0.01):
+            yield judge
+    finally:
+        link.close()
+
+
+@contextmanager
+def repeated(call: Callable[[], None], seconds: float) -> Iterator[None]:
+    """In a thread, until the end of the block."""
+    over = threading.Event()
+
+    def loop() -> None:
+        while not over.wait(seconds):
+            call()
+
+    thread = threading.Thread(target=loop, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        over.set()
+        thread.join()

@@ -1,0 +1,74 @@
+"""Real autopilots that are no longer what they were: wind, weak motors, a load, noise; a GPS that jumps, or is gone.
+
+After `flights`, whose folder it works in: A* flies among obstacles behind the model set of the first flight, the model
+set is made again of that flight's log, and A* flies behind the new one. In real time: eight minutes for each.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+import sys
+from pathlib import Path
+from typing import Any
+
+from deploy.bench import sitl
+from deploy.bench.flights import Failed, Flights, Upset, flown, told
+from deploy.bench.timing import Words
+
+BEFORE, AFTER = 5.0, 3.0  # minutes
+PRACTICE = "0.15"  # share of steps at which it brakes as planned: what a model set is made of
+JUMP = 4e-5  # degrees, 4.4 m
+
+LASTING: dict[str, dict[str, Upset]] = {
+    "ardupilot": {
+        "wind of 5 m/s, turbulent": Upset({"SIM_WIND_SPD": 5.0, "SIM_WIND_TURB": 1.0}),
+        "a motor at 80 %": Upset({"SIM_ENGINE_MUL": 0.8}),
+        "GPS noise of 0.5 m": Upset({"SIM_GPS_NOISE": 0.5}),
+    },
+    "px4": {
+        "20 % heavier": Upset({"SIH_MASS": 1.2}),
+        "motors at 80 %": Upset({"SIH_T_MAX": 4.0}),
+    },
+}
+PASSING: dict[str, dict[str, Upset]] = {
+    "ardupilot": {
+        "GPS off by 4.4 m for 10 s": Upset({"SIM_GPS_GLITCH_X": JUMP}, 150.0, 160.0, {"SIM_GPS_GLITCH_X": 0.0})
+    },
+    "px4": {"no GPS for 10 s": Upset({"SIM_GPS_USED": 3}, 150.0, 160.0, {"SIM_GPS_USED": 10})},
+}
+
+
+def run(folder: Path) -> Words:
+    """Rows: what was changed, before the model set was made again, how that went, and after it."""
+    rows: Words = {}
+    for kind in sitl.KINDS:
+        try:
+            flights = Flights(kind, sitl.program(kind), folder / kind)
+        except sitl.NoAutopilot as none:
+            print(none, file=sys.stderr)
+            continue
+        for what, upset in (LASTING[kind] | PASSING[kind]).items():
+            name = what.replace(" ", "-").replace("/", "").replace("%", "").replace(",", "")
+            before = flights.upset(name, BEFORE, upset, "--practice", PRACTICE)
+            rows[f"{kind}: {what}"] = flown(before)
+            if what in LASTING[kind]:
+                rows |= _again(flights, kind, what, name, upset)
+    return rows
+
+
+def _again(flights: Flights, kind: str, what: str, name: str, upset: Upset) -> Words:
+    """The model set of the flight's log, and a flight behind it."""
+    renewed = Flights.beside(flights, name)
+    shutil.copytree(flights.data, renewed.data, dirs_exist_ok=True)
+    words = ["certify", str(flights.run(name)), "--robot", "quadrotor-late", "--certificates", "residual"]
+    try:
+        said = told([*words, "--mode", "direct", "--use", "--json"], renewed.data, 600.0)
+    except Failed as error:
+        return {f"{kind}: {what}, certified again": {"refused": str(error)}}
+    found: dict[str, Any] = json.loads(said).get("residual", {})
+    wanted = ("windows", "violations", "bound_plan", "windows_of", "refused")
+    rows: Words = {f"{kind}: {what}, certified again": {key: found[key] for key in wanted if key in found}}
+    if "refused" not in found:
+        rows[f"{kind}: {what}, behind that"] = flown(renewed.upset(f"{name}-again", AFTER, upset))
+    return rows
