@@ -14,7 +14,7 @@ from actors.guard import Ask
 from actors.ros2.frames import Place
 from actors.ros2.process import Ros2Settings, Topics, driven, run
 from actors.ros2.senses import Freshness, Sensing
-from deploy.commands.common import Filtering, Flags, Physics, Robot, errors, say_json
+from deploy.commands.common import Filtering, Flags, Physics, Robot, default_keys, errors, say_json
 from deploy.data.store import model_for
 from deploy.run.bridge import Bridge, BridgeSettings
 from deploy.study.evaluate import in_process
@@ -65,6 +65,10 @@ class Ros2:
     filtering: Flags[Filtering] = field(default_factory=Filtering)
     connect: tuple[str, ...] = ()
     """Ask the safety service on the bus there; without: the filter runs inside."""
+    keys: Path | None = None
+    """With --connect: folder with the keys of --client; default: $BRAKELINE_KEYS, else none."""
+    client: str = "client"
+    """Its name on a bus with keys (`brakeline keys`)."""
     bag: Path | None = None
     """Record everything heard and sent as a ROS 2 bag: a folder that is not there yet."""
     seconds: float = 0.0
@@ -110,7 +114,8 @@ class Ros2:
         def question(requests: Sequence[pb.Request]) -> list[pb.Reply]:
             return ask(bus, requests, deadline)
 
-        with Bus(BusSettings(connect=self.connect), self.name) as bus:
+        keys = self.keys or default_keys()
+        with Bus(BusSettings(connect=self.connect, keys=keys), self.client if keys else self.name) as bus:
             yield question
 
     @contextlib.contextmanager

@@ -2,7 +2,10 @@
 
 import os
 
+from actors.ros2.process import Ros2Settings
+from deploy.commands.ros2 import Ros2
 from deploy.data.paths import method_path
+from messaging import brakeline_pb2 as pb
 from messaging.bus import Bus, BusSettings
 from messaging.ports import free_endpoint
 from safety.model_set import Recipe
@@ -35,5 +38,9 @@ def test_a_service_with_the_keys_that_were_handed_out_to_it(start, data_folder, 
         assert answer.returncode == 0 and '"decision": "allowed"' in answer.stdout, answer.stderr
         stranger = brakeline("query", "ground", "--connect", endpoint, "--keys", parts / "actor-0")
         assert stranger.returncode == 1 and "no keys of client" in stranger.stderr
+        node = Ros2(connect=(endpoint,), keys=parts / "client")
+        with node._question(Ros2Settings("ground", lead=30.0)) as question:
+            (reply,) = question([pb.Request(robot="ground")])
+        assert reply.error.field == "plan", "a ROS robot's questions are heard, and this one was empty"
     finally:
         model.with_suffix(".seal").unlink()
