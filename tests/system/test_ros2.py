@@ -192,6 +192,7 @@ def test_in_real_time_it_hits_nothing_and_says_what_delay_it_adds(late_folder: P
 
 
 @pytest.mark.long
+@pytest.mark.timeout(3600)
 def test_an_hour_of_ramming_hits_nothing(late_folder: Path, tmp_path: Path) -> None:
     """60 arenas, half of them dense, a simulated minute in each."""
     total: Counter[str] = Counter()
