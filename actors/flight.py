@@ -22,7 +22,7 @@ from google.protobuf.message import Message
 from actors.frames import Tap
 from actors.guard import Ask, Outcome, consult
 from actors.live import LiveVehicle, Turn
-from actors.loop import ActorSettings, Make, Rider, Tally, cycle
+from actors.loop import PRACTISED, ActorSettings, Make, Rider, Tally, cycle
 from actors.proposers import MakePolicy
 from actors.settings import FlightSettings as FlightSettings
 from actors.tape import Puts
@@ -178,6 +178,8 @@ class FlightRider(Rider):
         turn, answer = self.flight.turn, outcome.answer
         if turn.lost:
             what, outcome = "lost", replace(outcome, answer=None, failure=f"Lost: {turn.lost}")
+        elif outcome.failure == PRACTISED:
+            what = "not needed"
         elif answer is None:
             what = "none"
         elif self.flight.vehicle.commit(answer.plan[self.driver.robot.given :], turn.number + 1):
@@ -196,7 +198,7 @@ class FlightRider(Rider):
         """For Health."""
         if self._flight is None:
             return {}
-        asked = max(self.answers.total(), 1)
+        asked = max(self.answers.total() - self.answers["not needed"], 1)
         return {
             **{f"answers {what}": self.answers[what] for what in ("in time", "late", "none", "lost")},
             "answers in time share": self.answers["in time"] / asked,

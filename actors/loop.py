@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import TYPE_CHECKING, Protocol
 
@@ -25,6 +25,7 @@ from messaging.robots import Robot, robot_named
 from messaging.topics import EPISODE, EXCHANGE, FRAMES, STEP
 from safety.client import ask
 from safety.commitment import Array
+from safety.request import ALLOWED
 
 if TYPE_CHECKING:
     from actors.frames import Tap
@@ -62,6 +63,7 @@ class Make(Protocol):
 
 MakeWorld = Callable[[Robot, str, int, int], World]  # of robots of a kind in an arena, so many, from a seed
 
+PRACTISED = "Practised: the stop goes on as it was verified"  # instead of an answer
 STANDING = 2  # periods that a practised stop lasts beyond its plan
 
 
@@ -71,15 +73,25 @@ class Practice:
 
     def __init__(self, share: float) -> None:
         self.share, self._left = share, 0
+        self.running = False  # is the last proposal part of a stop?
 
     def instead(self, driver: Driver, proposal: Array) -> Array:
         """The committed plan's next input while a stop is practised, else the proposal."""
         if self._left == 0 and self.share > 0.0 and driver.rng.random() < self.share:
             self._left = driver.robot.horizon - 1 + STANDING
-        elif self._left == 0:
+        self.running = self._left > 0
+        if not self.running:
             return proposal
         self._left -= 1
         return np.asarray(driver.commitment.plan[driver.robot.given])
+
+    def kept(self, driver: Driver, outcome: Outcome) -> Outcome:
+        """A stop that was begun goes on as it was verified, also where the filter would do something else by now: it
+        keeps more distance than is needed. Not where what was verified does not hold any more."""
+        answer = outcome.answer
+        if not self.running or answer is None or answer.kind == ALLOWED or not driver.commitment.holds:
+            return outcome
+        return replace(outcome, answer=None, failure=PRACTISED)
 
 
 class Rider:
@@ -155,13 +167,13 @@ class Rider:
         """The last word on an outcome, when it is to be put into action."""
         if (outcome.answer is None) != self.braking:
             self.braking = outcome.answer is None
-            if self.braking:
+            if self.braking and not self.practice.running:
                 log.warning("no decision, braking along the committed plan: %s", outcome.failure)
         return outcome
 
     def act(self, proposal: Array, outcome: Outcome | None) -> pb.Step:
         if outcome is not None:
-            outcome = self.settle(outcome)
+            outcome = self.settle(self.practice.kept(self.driver, outcome))
             self.exchanges.put(outcome.exchange(self.driver.info["time"]))
         step = self.driver.execute(proposal, outcome, self.proposer.version)
         self.steps.put(step)

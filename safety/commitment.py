@@ -98,10 +98,16 @@ class Commitment:
         self.predicted = predicted if predicted is not None and len(predicted.center) else None
         return self._advance()
 
+    @property
+    def holds(self) -> bool:
+        """Does what was verified of the plan still hold, by the state that was measured?"""
+        outside = self._compare and self.predicted is not None and not self.predicted.contains(self.robot, self.seen)
+        return self.model != UNVERIFIED and not outside
+
     def fallback(self) -> Array:
         """No decision came: the committed plan's next input. Nobody else saw whether the state that was measured is in
         its predicted set; where it is not, what was verified of the plan does not hold any more."""
-        if self._compare and self.predicted is not None and not self.predicted.contains(self.robot, self.seen):
+        if not self.holds:
             self.model, self._vouchers = UNVERIFIED, ()
         self.predicted = None
         if self.robot.feedback:

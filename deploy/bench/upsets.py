@@ -61,9 +61,9 @@ def _again(flights: Flights, kind: str, what: str, name: str, upset: Upset) -> W
     """The model set of the flight's log, and a flight behind it."""
     renewed = Flights.beside(flights, name)
     shutil.copytree(flights.data, renewed.data, dirs_exist_ok=True)
-    words = ["certify", str(flights.run(name)), "--robot", "quadrotor-late", "--certificates", "residual"]
+    words = ["certify", str(flights.run(name)), "--robot", "quadrotor-late", "--few"]
     try:
-        said = told([*words, "--mode", "direct", "--use", "--json"], renewed.data, 600.0)
+        said = told([*words, "--certificates", "residual", "--mode", "direct", "--use", "--json"], renewed.data, 600.0)
     except Failed as error:
         return {f"{kind}: {what}, certified again": {"refused": str(error)}}
     found: dict[str, Any] = json.loads(said).get("residual", {})

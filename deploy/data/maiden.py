@@ -41,7 +41,6 @@ REACTION, BRAKING = 1.0, 1.5  # s and m/s²: a worse vehicle than any
 HOMEWARD = 0.5  # of a level, towards the middle, when the box ends
 NEAR = 0.3  # of the way to the wall from which the next stretch leads back
 OUTSIDE = 10.0  # m beyond the box at which the flight is over
-INFLATION, FEWEST = 1.5, 60  # of every envelope, and windows of a length: minutes of data bound less than hours
 ORIGIN = "maiden flight"
 
 
@@ -250,8 +249,7 @@ class Maiden:
     def _model(self, data: Dataset, missing: list[str]) -> tuple[ModelSet, Statement] | tuple[None, None]:
         """While the vehicle hovers."""
         try:
-            recipe = Recipe(inflation=INFLATION, fewest=FEWEST)
-            model, statement, _ = supported(replace(data, robot=self._robot), recipe)
+            model, statement, _ = supported(replace(data, robot=self._robot), Recipe().of_minutes())
         except (BadData, Unsupported) as error:
             missing.append(f"there is no model set: {error}")
             return None, None

@@ -3,15 +3,18 @@
 import threading
 import time
 from functools import partial
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from actors.loop import ActorSettings, run
+from actors.guard import Outcome
+from actors.loop import PRACTISED, ActorSettings, Practice, run
 from deploy.vehicles import environment, fleet_world
 from messaging import brakeline_pb2 as pb
 from messaging.bus import Bus, BusSettings
 from messaging.topics import DECIDE, EXCHANGE, STEP
+from safety.commitment import Commitment
 from safety.model_set import Recipe
 from safety.service import Counts, Models, answerer
 from tests.actors.teacher import Teacher
@@ -74,6 +77,22 @@ def scene(buses, data_folder):
     service = Service(learner, data_folder)
     yield service, steps, exchanges, start
     end()
+
+
+def test_a_practised_stop_goes_on_as_it_was_verified_unless_that_does_not_hold():
+    """Beside something the filter may prefer another input by now: then no stop would ever be recorded whole."""
+    driver = SimpleNamespace(robot=GROUND, commitment=Commitment(GROUND), rng=np.random.default_rng(0))
+    driver.commitment.accept(np.full((GROUND.horizon, 2), 0.2), "a model", None, True)
+    answers = {kind: SimpleNamespace(kind=kind) for kind in ("allowed", "adjusted", "failsafe", "recovering")}
+    asked = {kind: Outcome(pb.Request(), pb.Reply(), answer, "", 1.0) for kind, answer in answers.items()}
+    practice, never = Practice(1.0), Practice(0.0)
+    for one in (practice, never):
+        one.instead(driver, np.zeros(2))
+    assert [kind for kind, outcome in asked.items() if practice.kept(driver, outcome).answer] == ["allowed"]
+    assert practice.kept(driver, asked["adjusted"]).failure == PRACTISED
+    assert all(never.kept(driver, outcome) is outcome for outcome in asked.values())
+    driver.commitment.accept(np.full((GROUND.horizon, 2), 0.2), "a model", None, False)
+    assert all(practice.kept(driver, outcome) is outcome for outcome in asked.values())
 
 
 def test_the_robots_of_a_process_share_a_question(scene):
