@@ -1,7 +1,7 @@
 """Real autopilots whose companion fails in flight: its link is cut, its safety service or its actor killed.
 
-After `flights`, whose model sets it flies behind. The adversary flies, for it is near something all the time; one fault
-after the other, at moments drawn at random, with the timeouts that the autopilots have. A judge of its own hears the
+After `flights`, whose model sets it flies behind. A* flies, for it is the fastest; one fault after the other, at moments
+drawn at random, with the timeouts that the autopilots have. A judge of its own hears the
 simulator's truth on another port, also while no actor lives. In real time: twelve seconds for each fault.
 """
 
@@ -36,7 +36,7 @@ from messaging.robots import robot_named
 
 T = TypeVar("T")
 
-ARENA, POLICY = "default", "adversary"
+ARENA, POLICY = "default", "astar"
 FAULTS = ("link", "safety-0", "actor-0")  # children of a run, and what is between them and the autopilot
 BETWEEN = (8.0, 14.0)  # s from one fault to the next
 CUT = (0.3, 5.0)  # s that a link is cut
@@ -183,7 +183,9 @@ class Judge:
         witness.take(client.truth, client.position + ORIGIN, client.velocity)
         client.truth = None
         self.airborne |= witness.state is not None and witness.state[2] > 2.0
-        if self.airborne:
+        if not self.airborne:
+            self._seen = witness.collisions  # it touches what it stands on
+        else:
             self._nearest = min(self._nearest, witness.clearance)
 
     def take(self, outcomes: Outcomes) -> None:
