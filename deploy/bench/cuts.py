@@ -1,8 +1,8 @@
 """Real autopilots whose companion fails in flight: its link is cut, its safety service or its actor killed.
 
-After `flights`, whose model sets it flies behind. A* flies, for it is the fastest; one fault after the other, at moments
-drawn at random, with the timeouts that the autopilots have. A judge of its own hears the
-simulator's truth on another port, also while no actor lives. In real time: twelve seconds for each fault.
+After `flights`, whose model sets it flies behind. A* flies, for it is the fastest; one fault after the other, at
+moments drawn at random, with the timeouts that the autopilots have. A judge of its own hears the simulator's truth on
+another port, also while no actor lives. In real time: twelve seconds for each fault.
 """
 
 from __future__ import annotations
