@@ -24,6 +24,7 @@ ESTIMATING = 300.0  # s that an estimator may take to know where it is
 PROGRESS = 5.0  # s between two lines about that
 SPEECHLESS = 30.0  # s after which one that grants to tell and does not is no longer waited for
 REST = 0.1  # m/s: slower is hovering
+STOPPING = 20.0  # s until it hovers: it may have flown when we came, at full speed
 CLIMB = np.array([0.0, 0.0, 1.0])  # m/s
 
 Wait = Callable[[Callable[[], bool], float], bool]  # until it holds, or so many s have gone by: does it hold?
@@ -67,7 +68,7 @@ class Takeoff:
         if not client.airborne:
             self._climb(kind, height)
         self._hold(np.zeros(3))
-        if not wait(lambda: float(np.linalg.norm(client.velocity)) < REST, 8.0):  # it may have flown when we came
+        if not wait(lambda: float(np.linalg.norm(client.velocity)) < REST, STOPPING):
             raise MavlinkError("it does not come to rest")
         if not wait(lambda: client.offboard and client.armed, 3.0):
             raise MavlinkError("it says that it follows setpoints, and its heartbeat that it does not")
