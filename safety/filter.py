@@ -208,7 +208,8 @@ class Filter:
 
     def _recovered(self, request: Request, scene: Scene, z_0: Array) -> _Found | None:
         """A slow way out, if it stands (or is on such a way) where not even standing can be verified: by more than
-        the errors of two measurements could make it seem so."""
+        the errors of two measurements could make it seem so; of who stays where it stands, and than that its stop was
+        verified to end nearer."""
         robot, m = self.robot, self.robot.action_dim
         slow = np.where(robot.translates, SLOW + 0.05, 1.0) * np.maximum(self.inputs.high, -self.inputs.low)
         going = request.input_in_force
@@ -218,7 +219,9 @@ class Filter:
         before = z_0[-m:]
         stand = self.inputs.regressors(z_0, self.inputs.stop(request.state, before))
         parked = scene.parked
-        seeming = 0.0 if on_a_way else 2.0 * float(np.linalg.norm(self.around.measured)) + self.comfort
+        seeming = 0.0
+        if not on_a_way:  # who does not stay where it stands will be as near as it seems, before long
+            seeming = 2.0 * float(np.linalg.norm(self.around.measured)) + (self.comfort if self.around.stays else 0.0)
         if self.around.margin(self.around.rows(parked, stand), stand) >= -seeming:
             return None
         rows = self.around.rows(scene, stand, self.around.planes(scene, stand, leaving=True))

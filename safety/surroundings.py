@@ -94,6 +94,7 @@ class Surroundings:
         self.measured = np.asarray(robot.measurement_bound[: robot.position_dim])
         self.body = robot.footprint + float(np.linalg.norm(self.measured))  # m about where the center was measured
         self.comfort = self._comfort() if comfort is None else comfort
+        self.stays = self._stays()
         self.widest = self._widest(outer, domain)
         wanted = self.widest + self.comfort
         self.reach = min(wanted, robot.sight)  # m from the measured position: an obstacle beyond it decides nothing
@@ -117,6 +118,16 @@ class Surroundings:
         width = np.abs(directions[:, None, None, :] @ self.tube.directions)[:, :, 0] @ sizes[:L]
         drift = np.abs((directions[:, None, None, :] @ self.tube.position)[:, :, 0] @ z)
         return float((width + drift).max() + sizes[L:].max())
+
+    def _stays(self) -> bool:
+        """Is it, once it stands, where it stands? Who hovers by an estimate may go on drifting: then standing for a
+        plan's length adds more to where it may be than a measurement's error."""
+        nothing = self.robot.at_zero()
+        state = self.robot.driving(nothing)[list(self.robot.regressor)]
+        z = np.concatenate([state, np.tile(nothing, 1 + self.robot.free_steps)])
+        half = np.abs(self.tube.directions) @ self.tube.magnitudes(z)[: self.tube.generators]
+        size = np.linalg.norm(half, axis=1)
+        return bool(size[-1] - size[0] <= np.linalg.norm(self.measured))
 
     def _widest(self, tube: Tube, domain: Array) -> float:
         """[m] from the robot's measured position: no plan's tube, with the body about it, goes beyond.

@@ -1,16 +1,24 @@
 """Out of where not even standing can be verified: slowly, never nearer, and called what it is."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from deploy.data.episodes import collect
+from messaging.descriptions import robot_of
 from messaging.shapes import Obstacle, Shapes
 from safety.commitment import Commitment
+from safety.filter import Filter
+from safety.fitting import make
+from safety.model_set import Recipe
 from safety.recovery import least_violating, lower, slow_inputs
 from safety.request import RECOVERING
+from safety.spaces import normalised
 from tests.robots import GROUND, QUADROTOR
 from tests.safety.asked import request
+from tests.safety.toys import SUBSTEPS, Toy, seen
 from tests.safety.unicycle import Unicycle
 
 BODY = GROUND.footprint
@@ -91,3 +99,69 @@ def test_who_only_seems_too_close_stands(ready):
     near = 0.1 + BODY - 0.01
     decision = ready.decide(request(action=(0.25, 0.0), obstacles=[Obstacle("cylinder", (near, 0.0), (0.1,))]))
     assert decision.kind == "failsafe" and decision.verified
+
+
+HOVERER = robot_of(
+    {
+        "name": "toy-hoverer",
+        "period": 0.2,
+        "sight": 6.0,
+        "state": {
+            "x": {"unit": "m", "role": "position", "error": 0.01},
+            "y": {"unit": "m", "role": "position", "error": 0.01},
+            "vx": {"unit": "m/s", "error": 0.01, "follows": "vx setpoint"},
+            "vy": {"unit": "m/s", "error": 0.01, "follows": "vy setpoint"},
+        },
+        "input": {
+            "vx setpoint": {"unit": "m/s", "low": -1.0, "high": 1.0, "slew": 0.5},
+            "vy setpoint": {"unit": "m/s", "low": -1.0, "high": 1.0, "slew": 0.5},
+        },
+        "plan": {"horizon": 8, "free": 1, "brake": 2},
+        "body": [{"at": [0.0, 0.0], "radius": 0.3}],
+    }
+)
+
+
+class Hoverer(Toy):
+    """It comes to the velocity that it is given, but for a wind that it does not know of."""
+
+    def reset(self, *, seed=None, options=None):
+        observation, info = super().reset(seed=seed)
+        self.given, self.wind = np.zeros(2), self.np_random.normal(0.0, 0.1, 2)
+        return observation, info
+
+    def step(self, action):
+        wanted = self.low + 0.5 * self.width * (np.clip(np.asarray(action, float), -1.0, 1.0) + 1.0)
+        slew = np.array(self.robot.action_slew)
+        self.given = self.given + np.clip(wanted - self.given, -slew, slew)
+        between = []
+        for _ in range(SUBSTEPS):
+            h = self.robot.period / SUBSTEPS
+            self.wind += -h / 3.0 * self.wind + 0.1 * math.sqrt(2.0 * h / 3.0) * self.np_random.normal(size=2)
+            velocity = self.state[2:] + h / 0.2 * (self.given + self.wind - self.state[2:])
+            self.state = np.concatenate([self.state[:2] + h * velocity, velocity])
+            between.append(self.state)
+        self.worst = min(self.worst, self.clearance(np.array(between)))
+        self.count += 1
+        return self.state.copy(), 0.0, False, self.count >= self.steps, {}
+
+
+def test_who_drifts_where_it_hovers_moves_away_before_it_touches():
+    """A stop that was verified may end beside a wall; whoever does not stay there must not be taken to stand."""
+    env = Hoverer(HOVERER, capsule=((0.0, 0.0), (0.0, 0.0), 0.3), steps=100_000)
+    filter = Filter(make(collect(env, HOVERER, 6000, held=6, state=seen, actions=normalised(HOVERER)), Recipe()))
+    assert not filter.around.stays
+    touched = {True: 0, False: 0}
+    for episode in range(12):
+        for stays in (False, True):  # True: as it was before
+            filter.around.stays = stays
+            env.reset(seed=episode)
+            env.obstacles, env.worst, kept = [Obstacle("cylinder", (1.42, 0.0), (1.0,))], np.inf, Commitment(HOVERER)
+            for _ in range(150):
+                shapes = Shapes.of(env.obstacles, 2)
+                ask = request(env.state, (1.0, 0.0), shapes, input_in_force=kept.input_in_force, plan=kept.plan)
+                decision = filter.decide(replace(ask, model=kept.model, predicted=kept.predicted))
+                action = kept.accept(decision.plan, decision.model, decision.predicted, decision.verified)
+                env.step(action)
+            touched[stays] += env.worst < 0.0
+    assert touched[False] == 0 and touched[True] > 0, touched
