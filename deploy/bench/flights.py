@@ -1,7 +1,7 @@
-"""Real autopilots among obstacles: their first flight, then policies behind the filter that came of it.
+"""Real autopilots among obstacles: their first flight, one behind the filter that came of it, and then policies.
 
 Needs `$BRAKELINE_ARDUPILOT`, `$BRAKELINE_PX4`: folders whose `sitl FOLDER INSTANCE` runs one; what is not there is left
-out. In real time: a quarter of an hour, and `--minutes` for each policy in each arena. What `--folder` has already is
+out. In real time: twenty minutes, and `--minutes` for each policy in each arena. What `--folder` has already is
 not flown again. Collisions and clearances are the autopilot's own simulator's, not the estimate's.
 """
 
@@ -24,7 +24,8 @@ from deploy.bench.timing import Words
 from deploy.interpreter import PYTHON
 
 POLICIES, ARENAS = ("astar", "trained", "adversary"), ("default", "dense")
-FIRST = 15.0  # minutes
+FIRST, SECOND = 15.0, 5.0  # minutes
+PRACTICE = "0.15"  # share of steps at which it brakes as planned: what a model set is made of
 BEYOND = 240.0  # s that a command may take beyond its flight: the estimator, the landing, the model set
 TRUE = ("true collisions", "true clearance least m", "estimate off truth at most m")
 
@@ -61,6 +62,8 @@ def run(minutes: float, folder: Path) -> Words:
         rows[f"{kind}: first flight"] = _learned(first)
         if "model" not in first:
             continue
+        rows[f"{kind}: second flight"] = flown(flights.second())
+        rows[f"{kind}: certified by it"] = certified(flights.certify("second", flights.data))
         for arena in ARENAS:
             for policy in POLICIES:
                 rows[f"{kind}: {policy}, {arena}"] = flown(flights.fly(policy, arena, minutes))
@@ -91,6 +94,19 @@ class Flights:
 
     def first(self) -> dict[str, Any]:
         return self._figures("first", FIRST, "collect", "quadrotor", "--minutes", str(FIRST))
+
+    def second(self) -> dict[str, Any]:
+        """Behind the model set of the first, which a new one is to be made of."""
+        return self.upset("second", SECOND, Upset(), "--practice", PRACTICE)
+
+    def certify(self, name: str, data: Path) -> dict[str, Any]:
+        """The model set of a flight's log, from then on in use in that folder; {"refused": …}: there is none."""
+        kept = self._folder / f"{name}-certified.json"
+        if not kept.exists():
+            words = ["certify", str(self.run(name)), "--robot", "quadrotor-late", "--few", "--use", "--json"]
+            kept.write_text(told([*words, "--certificates", "residual", "--mode", "direct"], data, BEYOND))
+        figures: dict[str, Any] = json.loads(kept.read_text())["residual"]["direct"]
+        return figures
 
     def fly(self, policy: str, arena: str, minutes: float) -> dict[str, Any]:
         return self.upset(f"{policy}-{arena}", minutes, Upset(), "--policy", policy, "--arena", arena)
@@ -161,10 +177,14 @@ def told(words: list[str], data: Path, seconds: float) -> str:
 
 
 def _learned(first: dict[str, Any]) -> dict[str, float | str]:
-    wanted = ["minutes", "periods", "level", "windows", "violations", "bound_plan", "bound_step"]
-    wanted += ["half_width_rest", "half_width_full"]
-    found: dict[str, float | str] = {name: first[name] for name in wanted if name in first}
-    return found | {"missing": "; ".join(first["missing"])}
+    row: dict[str, float | str] = {name: first[name] for name in ("minutes", "periods", "level")}
+    return row | certified(first) | {"missing": "; ".join(first["missing"])}
+
+
+def certified(figures: dict[str, Any]) -> dict[str, float | str]:
+    """What a statement says."""
+    wanted = ["windows", "violations", "bound_plan", "bound_step", "half_width_rest", "half_width_full", "refused"]
+    return {name: figures[name] for name in wanted if name in figures}
 
 
 def flown(figures: dict[str, Any]) -> dict[str, float | str]:

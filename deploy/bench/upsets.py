@@ -1,23 +1,20 @@
 """Real autopilots that are no longer what they were: wind, weak motors, a load, noise; a GPS that jumps, or is gone.
 
-After `flights`, whose folder it works in: A* flies among obstacles behind the model set of the first flight, the model
+After `flights`, whose folder it works in: A* flies among obstacles behind the model set that was made there, the model
 set is made again of that flight's log, and A* flies behind the new one. In real time: eight minutes for each.
 """
 
 from __future__ import annotations
 
-import json
 import shutil
 import sys
 from pathlib import Path
-from typing import Any
 
 from deploy.bench import sitl
-from deploy.bench.flights import Failed, Flights, Upset, flown, told
+from deploy.bench.flights import PRACTICE, Flights, Upset, certified, flown
 from deploy.bench.timing import Words
 
 BEFORE, AFTER = 5.0, 3.0  # minutes
-PRACTICE = "0.15"  # share of steps at which it brakes as planned: what a model set is made of
 JUMP = 4e-5  # degrees, 4.4 m
 
 LASTING: dict[str, dict[str, Upset]] = {
@@ -61,14 +58,8 @@ def _again(flights: Flights, kind: str, what: str, name: str, upset: Upset) -> W
     """The model set of the flight's log, and a flight behind it."""
     renewed = Flights.beside(flights, name)
     shutil.copytree(flights.data, renewed.data, dirs_exist_ok=True)
-    words = ["certify", str(flights.run(name)), "--robot", "quadrotor-late", "--few"]
-    try:
-        said = told([*words, "--certificates", "residual", "--mode", "direct", "--use", "--json"], renewed.data, 600.0)
-    except Failed as error:
-        return {f"{kind}: {what}, certified again": {"refused": str(error)}}
-    found: dict[str, Any] = json.loads(said).get("residual", {})
-    wanted = ("windows", "violations", "bound_plan", "windows_of", "refused")
-    rows: Words = {f"{kind}: {what}, certified again": {key: found[key] for key in wanted if key in found}}
+    found = flights.certify(name, renewed.data)
+    rows: Words = {f"{kind}: {what}, certified again": certified(found)}
     if "refused" not in found:
         rows[f"{kind}: {what}, behind that"] = flown(renewed.upset(f"{name}-again", AFTER, upset))
     return rows
