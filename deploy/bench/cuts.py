@@ -2,18 +2,19 @@
 
 After `flights`, whose model sets it flies behind. A* flies, for it is the fastest; one fault after the other, at
 moments drawn at random, with the timeouts that the autopilots have. A judge of its own hears the simulator's truth on
-another port, also while no actor lives. In real time: twelve seconds for each fault.
+another port, also while no actor lives. The next fault comes when it flies again. In real time: half a minute for each.
 """
 
 from __future__ import annotations
 
 import os
+import re
 import subprocess
 import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import partial
@@ -38,10 +39,12 @@ T = TypeVar("T")
 
 ARENA, POLICY = "default", "astar"
 FAULTS = ("link", "safety-0", "actor-0")  # children of a run, and what is between them and the autopilot
-BETWEEN = (8.0, 14.0)  # s from one fault to the next
+BETWEEN = (3.0, 12.0)  # s from when it flies again to the next fault
+AGAIN = 15  # steps by which it does
 CUT = (0.3, 5.0)  # s that a link is cut
 PUMP = 0.002  # s
 FLIES_WITHIN = 180.0  # s
+LINE = re.compile(r"steps (\d+) ")
 OFTEN = 0.02  # s between two words of truth
 
 
@@ -84,11 +87,15 @@ def _failing(
         fly = subprocess.Popen(
             [*PYTHON, "-m", "deploy.cli", "fly", *words],
             stdout=subprocess.DEVNULL,
+            stderr=subprocess.PIPE,
+            text=True,
             env=os.environ | {"BRAKELINE_DATA": str(folder.absolute() / "data")},
         )
+        steps = Steps(fly)
         try:
             _until(lambda: judge.airborne, fly)
-            time.sleep(random.uniform(*BETWEEN) + 10.0)
+            _until(partial(steps.beyond, AGAIN), fly)
+            time.sleep(random.uniform(*BETWEEN))
             judge.take(calm)
             for number in range(faults):
                 name = FAULTS[number % len(FAULTS)]
@@ -98,6 +105,7 @@ def _failing(
                 else:
                     _until(partial(child_of, home, name), fly).kill()
                 outcomes[name].count += 1
+                _until(partial(steps.beyond, steps.taken + AGAIN), fly)
                 time.sleep(random.uniform(*BETWEEN))
                 judge.take(outcomes[name])
         finally:
@@ -107,7 +115,25 @@ def _failing(
     return {f"{kind}: before the first": calm.row()} | rows
 
 
-def _until(condition: Callable[[], T | None], fly: subprocess.Popen[bytes]) -> T:
+class Steps:
+    """How many a flight has taken, by the lines that it prints now and then."""
+
+    def __init__(self, fly: subprocess.Popen[str]) -> None:
+        self.taken = 0
+        threading.Thread(target=self._read, args=(fly.stderr,), daemon=True).start()
+
+    def beyond(self, number: int) -> bool:
+        return self.taken > number
+
+    def _read(self, lines: Iterable[str]) -> None:
+        for line in lines:
+            if said := LINE.match(line):
+                self.taken = int(said.group(1))
+            else:
+                print(line, end="", file=sys.stderr)
+
+
+def _until(condition: Callable[[], T | None], fly: subprocess.Popen[str]) -> T:
     """What it gives once that is something. Raises MavlinkError: the flight has ended, or it takes too long."""
     deadline = time.monotonic() + FLIES_WITHIN
     while not (found := condition()):
