@@ -23,7 +23,7 @@ STATUS = {"px4": {"SYS_STATUS": 2.0}, "ardupilot": {"SYS_STATUS": 2.0, "FENCE_ST
 ESTIMATING = 300.0  # s that an estimator may take to know where it is
 PROGRESS = 5.0  # s between two lines about that
 SPEECHLESS = 30.0  # s after which one that grants to tell and does not is no longer waited for
-REST = 0.1  # m/s: slower is hovering
+REST = 0.2  # m/s: slower is hovering; what is estimated may be off by half of that, for good
 STOPPING = 20.0  # s until it hovers: it may have flown when we came, at full speed
 CLIMB = np.array([0.0, 0.0, 1.0])  # m/s
 
