@@ -121,13 +121,13 @@ class Surroundings:
 
     def _stays(self) -> bool:
         """Is it, once it stands, where it stands? Who hovers by an estimate may go on drifting: then standing for a
-        plan's length adds more to where it may be than a measurement's error."""
+        plan's length adds more to where it may be than a measurement's error, and than a tenth of its body."""
         nothing = self.robot.at_zero()
         state = self.robot.driving(nothing)[list(self.robot.regressor)]
         z = np.concatenate([state, np.tile(nothing, 1 + self.robot.free_steps)])
         half = np.abs(self.tube.directions) @ self.tube.magnitudes(z)[: self.tube.generators]
         size = np.linalg.norm(half, axis=1)
-        return bool(size[-1] - size[0] <= np.linalg.norm(self.measured))
+        return bool(size[-1] - size[0] <= max(np.linalg.norm(self.measured), 0.1 * self.robot.footprint))
 
     def _widest(self, tube: Tube, domain: Array) -> float:
         """[m] from the robot's measured position: no plan's tube, with the body about it, goes beyond.
