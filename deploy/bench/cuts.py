@@ -92,7 +92,8 @@ def _failing(
             text=True,
             env=os.environ | {"BRAKELINE_DATA": str(folder.absolute() / "data")},
         )
-        steps = Steps(fly)
+        assert fly.stderr is not None
+        steps = Steps(fly.stderr)
         try:
             _until(lambda: judge.airborne, fly)
             _until(partial(steps.beyond, AGAIN), fly)
@@ -120,9 +121,9 @@ def _failing(
 class Steps:
     """How many a flight has taken, by the lines that it prints now and then."""
 
-    def __init__(self, fly: subprocess.Popen[str]) -> None:
+    def __init__(self, lines: Iterable[str]) -> None:
         self.taken = 0
-        threading.Thread(target=self._read, args=(fly.stderr,), daemon=True).start()
+        threading.Thread(target=self._read, args=(lines,), daemon=True).start()
 
     def beyond(self, number: int) -> bool:
         return self.taken > number
@@ -166,9 +167,13 @@ class Relay:
         """What is sent meanwhile is lost."""
         self._dead_until = time.monotonic() + seconds
 
+    @property
+    def dead(self) -> bool:
+        return time.monotonic() < self._dead_until
+
     def pump(self) -> None:
         up, down = self._upstream.receive(), self._server.receive()
-        if time.monotonic() < self._dead_until:
+        if self.dead:
             return
         if up:
             self._server.send(up)

@@ -1,0 +1,59 @@
+"""What `deploy.bench cuts` cuts with, and what `flights` makes of a flight that never was."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import pytest
+
+from deploy.bench.cuts import Relay, Steps
+from deploy.bench.flights import Failed, flown
+from messaging.links import Tcp, Udp, open_link
+from messaging.ports import free_udp_port
+from tests.waiting import until
+
+
+@pytest.fixture
+def ends() -> Iterator[tuple[Relay, Udp, Tcp]]:
+    """A relay, the autopilot behind it, and who flies it."""
+    port = free_udp_port()
+    relay = Relay(open_link(f"udpin:127.0.0.1:{port}"))
+    autopilot, companion = open_link(f"udpout:127.0.0.1:{port}"), open_link(relay.url)
+    assert isinstance(autopilot, Udp) and isinstance(companion, Tcp)
+    yield relay, autopilot, companion
+    for end in (relay, autopilot, companion):
+        end.close()
+
+
+def heard(relay: Relay, end: Udp | Tcp) -> bytes:
+    relay.pump()
+    return end.receive()
+
+
+def test_a_relay_carries_bytes_both_ways_until_it_is_cut(ends: tuple[Relay, Udp, Tcp]) -> None:
+    relay, autopilot, companion = ends
+    relay.pump()  # lets the companion in
+    autopilot.send(b"telemetry")
+    until(lambda: heard(relay, companion) == b"telemetry")
+    companion.send(b"setpoint")
+    until(lambda: heard(relay, autopilot) == b"setpoint")
+    relay.cut(0.3)
+    for _ in range(20):
+        autopilot.send(b"lost")
+        assert heard(relay, companion) == b""
+    until(lambda: relay.pump() is None and not relay.dead)
+    autopilot.send(b"again")
+    until(lambda: heard(relay, companion).endswith(b"again"))
+
+
+def test_steps_are_read_from_what_a_flight_prints() -> None:
+    steps = Steps(iter(["driving\n", "steps 55  episodes 1  goals 1\n", "it says: steps 3\n"]))
+    until(lambda: steps.taken == 55)
+    assert steps.beyond(54) and not steps.beyond(55)
+
+
+def test_a_flight_that_did_not_take_off_is_a_row() -> None:
+    def fly() -> dict[str, object]:
+        raise Failed("fly: no figures, status 1")
+
+    assert flown(fly) == {"failed": "fly: no figures, status 1"}
