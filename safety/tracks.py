@@ -33,7 +33,7 @@ LINK = 0.15  # m between two beams' hits on one surface; something apart is as f
 LARGEST = 0.8  # m from end to end of what may be somebody
 LEAST_BEAMS = 4  # on it
 MIDDLE = 0.03  # m, how wrong the middle of somebody may be
-SPAN = 0.3  # s, at least, between two places that a velocity is made of
+SPAN = 0.3  # s, at least, between two places that a velocity is made of; and at most since the last scan
 
 
 @dataclass(frozen=True)
@@ -86,8 +86,9 @@ class Follower:
     def _moving(
         self, scan: Scan, seen: _Seen, before: list[tuple[float, _Seen]]
     ) -> list[tuple[NDArray[np.intp], tuple[float, ...]]]:
-        """What stands apart and was followed from place to place, and its ways."""
-        if len(before) < FEWEST or before[-2][0] < SPAN:
+        """What stands apart and was followed from place to place, and its ways. Nobody is where a scan is missing, or
+        beams may see through: somebody else's place may then seem to be his."""
+        if len(before) < FEWEST or before[-2][0] < SPAN or before[-1][0] > SPAN or scan.doubt > 0:
             return []
         (short, last), (long, first) = before[-1], before[-2]
         error = _speed(2.0 * MIDDLE, long, scan)
