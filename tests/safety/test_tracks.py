@@ -18,6 +18,7 @@ from safety import scan as seen
 from safety.memory import FanMemory
 from safety.request import ALLOWED
 from safety.scan import Cells, cells
+from safety.tracks import Follower
 from tests.robots import GROUND
 from tests.safety.asked import request
 from tests.safety.test_scan import FAN, FAR, WIDTH, cast
@@ -170,6 +171,19 @@ def test_a_mutant_does_not(monkeypatch, kind, name, mutant):
 
 
 # --- what is said of what was seen ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("missing", "doubt", "followed"), [(0, 0, True), (1, 0, False), (0, 1, False)])
+def test_nobody_is_followed_across_a_missing_scan_or_by_doubtful_beams(missing, doubt, followed):
+    """Then the only place near by may be somebody else's."""
+    rng, follower, now = np.random.default_rng(0), Follower(), 0.0
+    for k in range(5):
+        scan = taken([*ROOM, disc(np.array([1.0, -0.5 + 0.8 * now]))], np.zeros(2), rng, doubt=doubt)
+        said = follower.follow(scan).followed
+        passed = DT * (1 + missing * (k == 3))
+        now += passed
+        follower.later(passed)
+    assert bool((np.abs(said.ways[:, :2]).max(axis=1) > 0.4).any()) is followed
 
 
 def followed(world, scans=4, seed=0):
