@@ -55,6 +55,7 @@ class MoverKind:
     keep: float  # m from the robot's start to its surface, at the start
     position_error: float = 0.03  # m, of what is measured of them
     velocity_error: float = 0.05  # m/s
+    steps_over: bool = False  # whoever it runs into while that stands, and which then goes on; else that is its end
 
 
 @dataclass(frozen=True)

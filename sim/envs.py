@@ -129,6 +129,7 @@ class NavigationEnv(gymnasium.Env[Observation, Any]):
         if self._perception.kind == "scan":
             self._scanner = scanner_of(self.robot, self._arena, rng, self._lidar_noise, self._perception)
         crowd = self._arena.crowd
+        self._pushed = crowd is not None and crowd.pushes  # by whoever runs into it
         self._watch = Watch(crowd, rng) if isinstance(crowd, Crowd) else None  # other robots promise where they will be
         self._steps = 0
         self._distance = self._goal_distance(self._vehicle.true)
@@ -146,7 +147,7 @@ class NavigationEnv(gymnasium.Env[Observation, Any]):
         hit = period.collision or period.contact_moving or period.contact_robot
         reward += self.reward.goal * at_goal + self.reward.collision * hit
         reward += self.reward.run_into * period.contact_standing
-        terminated = at_goal or hit or period.contact_standing
+        terminated = at_goal or hit or (period.contact_standing and self._pushed)
         truncated = not terminated and self._steps >= self._arena.step_limit
         return self._observe(), float(reward), terminated, truncated, self._info(period)
 

@@ -144,8 +144,6 @@ class GroundRobot(Turtle):
         self._bare_inertia = self._model.body_inertia[base].copy()
         self._moving = Moving(self._model, self._data, arena.crowd)
         self._time = -GROUND.period  # s; the episode's first is 0
-        self._meeting = False  # something that moves is touched now
-        self._contacts = [False, False]  # in this period one began while moving, while standing
         self._wheel_geoms = [self._model.geom(name).id for name in ("left wheel", "right wheel")]
         self._physics_steps = round(GROUND.period / SAMPLES / self._model.opt.timestep)
         self.set_payload(payload_kg)
@@ -183,24 +181,18 @@ class GroundRobot(Turtle):
             BadInput: when the input is not two finite numbers.
         """
         self.take(input)
-        return self.report(self._run(self.input), *self._contacts)
+        return self.report(self._run(self.input), *self._moving.contacts)
 
     def _run(self, input: Array) -> bool:
         """One period of physics; any collision."""
         self.begin(input)
-        collision, self._contacts = False, [False, False]
+        self._moving.begin()
+        collision = False
         driven = bool(input.any())
         for i in range(SAMPLES):
             collision |= self._run_sample(driven)
             self.sample(i)
         return collision
-
-    def _meet(self, moving: bool) -> None:
-        """Note when something that moves begins to be touched, and whether this robot was moving until then."""
-        touched = bool(self._moving.touched().any())
-        if touched and not self._meeting and not any(self._contacts):  # the push that follows is that contact's
-            self._contacts[0 if moving else 1] = True
-        self._meeting = touched
 
     def _run_sample(self, driven: bool) -> bool:
         """Physics up to the next sample; any collision. driven: the input is not zero."""
@@ -213,21 +205,19 @@ class GroundRobot(Turtle):
             # step2 before step1: contacts are then those of the position just reached
             mujoco.mj_step2(model, data)
             mujoco.mj_step1(model, data)
-            collision = collision or (self._touching() and not any(self._contacts))
-            if self._moving:
-                self._meet(moving)
+            collision = self._touching(moving) or collision
         return collision
 
-    def _touching(self) -> bool:
-        """Whether any contact now is with an obstacle that stands. Else, but for what moves, it touches only the floor,
-        which is geom 0.
+    def _touching(self, moving: bool) -> bool:
+        """Whether any contact now is with an obstacle that stands; what moves is noted apart. Else it touches only the
+        floor, which is geom 0.
 
         A plane is the lowest type of geom, and a contact names the geom of lower type first.
         """
         first = self._data.contact.geom[:, 0]
         if self._moving:
-            return bool((first * ~self._moving.touched()).any())
-        return bool(np.count_nonzero(first))
+            first = first * ~self._moving.meet(moving)
+        return bool(np.count_nonzero(first)) and not self._moving.pushed
 
 
 def simulated(conditions: Conditions, tap: object = None) -> MakeVehicle:

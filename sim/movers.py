@@ -44,6 +44,11 @@ class Crowd:
     def dim(self) -> int:
         return int(self._next[0].shape[1])
 
+    @property
+    def pushes(self) -> bool:
+        """Whoever it runs into, or does it step over it?"""
+        return not self.kind.steps_over
+
     def at(self, time: float) -> tuple[Array, Array]:
         """Positions and velocities (n, d) at a time [s] ≥ 0."""
         tick = int(time / TICK + 1e-9)
@@ -95,6 +100,8 @@ class Crowd:
 
 class Others:
     """The other robots of a world, where a lidar sees them: as discs about where they are now."""
+
+    pushes = True
 
     def __init__(self, now: Callable[[], Array], radius: float, told: Callable[[], tuple[Array, Array]]) -> None:
         """now: their true positions (n, 2), none for n = 0; radius [m]; told: positions and velocities (n, 2) as they

@@ -40,8 +40,6 @@ class PlanarRobot:
         self.data = mujoco.MjData(self.model)
         self._moving = Moving(self.model, self.data, arena.crowd)
         self._time = -robot.period  # s; the episode's first is 0
-        self._meeting = False  # something that moves is touched now
-        self._contacts = [False, False]  # in this period one began while moving, while standing
         self._steps = round(robot.period / SAMPLES / self.model.opt.timestep)
         self._bound = np.asarray(robot.measurement_bound)
         self._discs = np.array([disc.at[:2] for disc in robot.body])  # in the robot's frame
@@ -89,7 +87,7 @@ class PlanarRobot:
             float(distances[-1]),
             path,
             turned,
-            *self._contacts,
+            *self._moving.contacts,
         )
 
     def standing(self) -> Period:
@@ -115,7 +113,8 @@ class PlanarRobot:
         """One period of physics: poses (S, 3) at the samples; any collision."""
         model, data = self.model, self.data
         poses = np.empty((SAMPLES, 3))
-        collision, self._contacts = False, [False, False]
+        self._moving.begin()
+        collision = False
         rests = bool(self.robot.rests(self.input))
         for i in range(SAMPLES):
             for _ in range(self._steps):
@@ -137,13 +136,9 @@ class PlanarRobot:
         A plane is the lowest type of geom, and a contact names the geom of lower type first.
         """
         first = self.data.contact.geom[:, 0]
-        if not self._moving:
-            return bool(np.count_nonzero(first))
-        movers = self._moving.touched()
-        if movers.any() and not self._meeting:
-            self._contacts[0 if moving else 1] = True
-        self._meeting = bool(movers.any())
-        return bool((first * ~movers).any())
+        if self._moving:
+            first = first * ~self._moving.meet(moving)
+        return bool(np.count_nonzero(first)) and not self._moving.pushed
 
     def _state(self) -> Array:
         return np.array([*self.data.qpos[:2], self.heading(), *self.speeds()])

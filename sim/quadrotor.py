@@ -60,8 +60,6 @@ class Quadrotor:
         self._air = None if self._wind.calm else Air(self._wind, rng, self.timestep)
         self._moving = Moving(self._model, self._data, arena.crowd)
         self._time = 0.0  # s
-        self._meeting = False  # something that moves is touched now
-        self._contacts = [False, False]  # since `watch` one began while moving, while standing
         self._floor_geom = -1 if floor is None else self._model.geom("floor").id
         self.flying = floor is None  # the controller has the rotors; else they stand or idle
         self.collided = False  # an obstacle was touched since it was last set to False
@@ -73,7 +71,8 @@ class Quadrotor:
         mujoco.mj_forward(self._model, self._data)
         if self.flying:
             self._hover()
-        self._time, self._contacts = 0.0, [False, False]
+        self._time = 0.0
+        self._moving.begin()
         self.true, self.measured = self.state(), self.estimated_state(self.estimate())
 
     def step(self, input: Array) -> Period:
@@ -95,7 +94,8 @@ class Quadrotor:
 
     def watch(self) -> None:
         """A period begins: note from now on what is touched, and where it has been."""
-        self.collided, self._contacts = False, [False, False]
+        self.collided = False
+        self._moving.begin()
         self._track.clear()
 
     def watched(self, measured: Array, path: Array) -> Period:
@@ -103,7 +103,7 @@ class Quadrotor:
         self.true = self.state()
         distances = self.clearance(np.array(self._track))
         closest, clearance = float(distances.min()), float(distances[-1])
-        return Period(measured, self.true, self.collided, closest, clearance, path, 0.0, *self._contacts)
+        return Period(measured, self.true, self.collided, closest, clearance, path, 0.0, *self._moving.contacts)
 
     def standing(self) -> Period:
         """The present state as a period in which nothing happened: what there is to say before the first step."""
@@ -156,7 +156,8 @@ class Quadrotor:
             if data.ncon:
                 self._touch()
             else:
-                self.on_floor = self._meeting = False
+                self.on_floor = False
+                self._moving.part()
         vx, vy, vz = qvel[:3].tolist()
         dt = self.timestep
         self._track.append(qpos[:3].tolist())
@@ -250,13 +251,11 @@ class Quadrotor:
         first = self._data.contact.geom[:, 0]
         floor = self._floor_geom
         if self._moving:
-            movers = self._moving.touched()
-            if movers.any() and not self._meeting and not any(self._contacts):
-                speed = math.hypot(*self._data.qvel[:3].tolist())
-                self._contacts[0 if speed > STANDING or any(self.controller.setpoint) else 1] = True
-            self._meeting, first = bool(movers.any()), first[~movers]
+            speed = math.hypot(*self._data.qvel[:3].tolist())
+            movers = self._moving.meet(speed > STANDING or any(self.controller.setpoint))
+            first = first[~movers]
         self.on_floor = bool((first == floor).any())
-        if not any(self._contacts):  # what is touched after a push is that contact's
+        if not self._moving.pushed:
             self.collided = self.collided or bool((first != floor).any())
 
 

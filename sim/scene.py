@@ -15,6 +15,7 @@ from sim.world import Arena
 HEIGHT = 0.4  # m, of every obstacle of an arena in the plane: taller than the robot
 THICKNESS = 0.2  # m, of walls
 OBSTACLE_BIT = 2  # the contact bit that the robots' geoms answer to
+DEEP = 10.0  # m: so far in would a mover have to be that steps over whoever stands, to push him
 
 Geom = tuple[mujoco.mjtGeom, tuple[float, float, float], tuple[float, float, float]]
 
@@ -64,14 +65,23 @@ def add_movers(spec: mujoco.MjSpec, crowd: Crowd | Others | None) -> None:
             size=(radius, 0.5 * HEIGHT, 0.0) if flat else (radius, 0.0, 0.0),
             contype=OBSTACLE_BIT,
             conaffinity=0,
+            margin=0.0 if crowd is None or crowd.pushes else -DEEP,
+            gap=0.0 if crowd is None or crowd.pushes else DEEP,
         )
 
 
 class Moving:
-    """The movers of a compiled model."""
+    """The movers of a compiled model, and how a robot met them.
+
+    contacts: since `begin` one began while the robot moved, while it stood. Under somebody who steps over it, it must
+    not begin to move either.
+    """
 
     def __init__(self, model: mujoco.MjModel, data: mujoco.MjData, crowd: Crowd | Others | None) -> None:
         self._data, self._crowd = data, crowd
+        self._pushes = crowd is None or crowd.pushes
+        self._meeting = False  # one is touched now
+        self.contacts = [False, False]
         names = [f"mover {i}" for i in range(0 if crowd is None else len(crowd))]
         self._bodies = [int(model.body_mocapid[model.body(name).id]) for name in names]
         self._geoms = np.array([model.geom(name).id for name in names], dtype=int)
@@ -85,9 +95,29 @@ class Moving:
             positions, _ = self._crowd.at(max(time, 0.0))
             self._data.mocap_pos[self._bodies, : positions.shape[1]] = positions
 
-    def touched(self) -> NDArray[np.bool_]:
-        """Of each contact now: is one of them in it?"""
-        return np.asarray(np.isin(self._data.contact.geom, self._geoms).any(axis=1))
+    def begin(self) -> None:
+        """A period begins."""
+        self.contacts = [False, False]
+
+    def meet(self, moving: bool) -> NDArray[np.bool_]:
+        """Note what is touched now by a robot that moves or stands. Of each contact: is one of them in it?"""
+        touched = np.asarray(np.isin(self._data.contact.geom, self._geoms).any(axis=1))
+        now = bool(touched.any())
+        if now and not self._meeting and not any(self.contacts):
+            self.contacts[0 if moving else 1] = True
+        elif now and moving and not self._pushes:
+            self.contacts[0] = True
+        self._meeting = now
+        return touched
+
+    def part(self) -> None:
+        """Nothing is touched now."""
+        self._meeting = False
+
+    @property
+    def pushed(self) -> bool:
+        """Was the robot, in this period? What it then touches is of that contact."""
+        return self._pushes and any(self.contacts)
 
 
 def _geom(obstacle: Obstacle, arena: Arena) -> Geom:

@@ -75,12 +75,13 @@ def test_what_is_told_of_them_holds():
 class Straight(Crowd):
     """One that walks along x at a constant velocity."""
 
+    kind = KIND
+
     def __init__(self, start, pace, dim=2):
         self._start, self._pace = np.zeros((1, dim)), np.zeros((1, dim))
         self._start[0, 0], self._pace[0, 0] = start, pace
         if dim == 3:
             self._start[0, 2] = 2.0
-        self.kind = KIND
         self._next = (self._start, self._pace)
 
     def at(self, time):
@@ -130,6 +131,30 @@ def test_an_episode_ends_with_a_contact_and_tells_of_what_may_come():
     while not ended:
         _, reward, ended, _, info = env.step(np.zeros(2, np.float32))
     assert info["contact_standing"] and not info["contact_moving"] and not info["collision"] and reward < -40.0
+
+
+class Stepping(Straight):
+    """It steps over a robot that stands."""
+
+    kind = replace(KIND, steps_over=True)
+
+
+def test_who_is_stepped_over_stays_where_it_is_and_goes_on():
+    env = NavigationEnv(GROUND, draw=lambda *_: replace(staged_arena(), crowd=Stepping(1.0, -0.5)))
+    env.reset(seed=0)
+    ends, contacts = [], []
+    for _ in range(25):
+        _, _, ended, _, info = env.step(np.zeros(2, np.float32))
+        ends.append(ended)
+        contacts.append((info["contact_moving"], info["contact_standing"]))
+    assert not any(ends) and contacts.count((False, True)) == 1 and not any(moving for moving, _ in contacts)
+    assert np.abs(env.vehicle.true[:2]).max() < 1e-3
+
+
+def test_nobody_may_drive_off_under_who_steps_over_him():
+    robot = on_the_ground(Stepping(1.0, -0.5))
+    assert met(robot, (0.0, 0.0), 8) == (False, True, False)
+    assert met(robot, (0.25, 0.0), 1) == (True, False, False)
 
 
 def test_the_crowd_of_an_arena_is_drawn_with_it_and_the_others_stay_as_they_were():
