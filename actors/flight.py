@@ -1,7 +1,8 @@
 """PROCESS: flies one quadrotor in real time behind a MAVLink link; the loop is that of every actor.
 
 Period k: its input goes out; then it is observed, proposed and asked, and what the answer says is for period k + 1. An
-answer that comes too late is discarded for the committed plan's next input, which the vehicle's thread sends by itself.
+answer that comes too late is discarded for the committed plan's next input, which the vehicle's keeper sends by itself:
+a process of its own, which brakes along that plan should this one die (`actors.keeper`).
 """
 
 from __future__ import annotations
@@ -21,15 +22,13 @@ from google.protobuf.message import Message
 
 from actors.frames import Tap
 from actors.guard import Ask, Outcome, consult
-from actors.live import LiveVehicle, Turn
+from actors.kept import Charge, KeptVehicle
+from actors.live import Turn
 from actors.loop import PRACTISED, ActorSettings, Make, Rider, Tally, cycle
 from actors.proposers import MakePolicy
 from actors.settings import FlightSettings as FlightSettings
 from actors.tape import Puts
-from actors.truth import Truth
-from actors.witness import Witness
 from messaging.bus import BusError
-from messaging.links import open_link
 from messaging.process import Process
 from messaging.robots import Robot, robot_named
 from safety.client import ask, request_message
@@ -98,7 +97,7 @@ class Flight:
     What is true is not known here: the estimate stands for it, also where rays are cast.
     """
 
-    def __init__(self, vehicle: LiveVehicle, skip: Callable[[], object]) -> None:
+    def __init__(self, vehicle: KeptVehicle, skip: Callable[[], object]) -> None:
         """skip: is called for each period that went by unseen."""
         self.vehicle, self._skip = vehicle, skip
         self.turn: Turn = vehicle.turn
@@ -164,7 +163,7 @@ class FlightRider(Rider):
         assert self._flight is not None, "begin the flight first"
         return self._flight
 
-    def take(self, vehicle: LiveVehicle) -> None:
+    def take(self, vehicle: KeptVehicle) -> None:
         """From here on it flies this one, which hovers. What is slow the first time is done once before."""
         self._flight = Flight(vehicle, self.driver.skip)
         observation, info = self.driver.env.reset(options={"episode_seed": 0})
@@ -203,8 +202,7 @@ class FlightRider(Rider):
             **{f"answers {what}": self.answers[what] for what in ("in time", "late", "none", "lost")},
             "answers in time share": self.answers["in time"] / asked,
             "periods skipped": self._flight.skipped,
-            **self._flight.vehicle.timing.figures(),
-            **self._flight.vehicle.judged(),
+            **self._flight.vehicle.figures(),
         }
 
     def _environment(self, stages: Sequence[Arena], conditions: Conditions) -> Make:
@@ -288,8 +286,6 @@ def run(
         propose = lambda _: policy  # noqa: E731
     tally, outbox = Tally(), Outbox()
     with Process(settings.bus, settings.name) as process:
-        tolerance = process.bus.tolerance
-        truth = Truth(flight.truth, flight.system, tolerance) if flight.truth else None
         stop, started = process.stop.is_set, time.monotonic()
         rider = FlightRider(process, settings, stages, propose, outbox, conditions or Conditions())
         process.refresh = lambda: process.figures.update(tally.figures(time.monotonic() - started) | rider.figures())
@@ -297,21 +293,7 @@ def run(
         question = partial(ask, process.bus, deadline=settings.deadline)
         if not (rider.join(stop) and answered(question, robot, stages[0], settings.method == "ddpc", stop)):
             return False
-        link, tap = open_link(flight.url), rider.tape.take
-        witness = Witness(lambda position: float(arena.shapes.distance(position).min()) - robot.footprint)
-        vehicle = LiveVehicle(
-            link,
-            robot,
-            flight.system,
-            flight.height,
-            flight.origin,
-            truth,
-            tap,
-            tolerance,
-            stop,
-            flight.raise_limits,
-            witness,
-        )
+        vehicle = KeptVehicle(Charge(flight, robot.name, arena), rider.tape.keep, process.bus.tolerance, stop)
         try:
             rider.take(vehicle)
             while not stop() and cycle([rider], question, tally, stop):

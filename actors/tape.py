@@ -30,7 +30,12 @@ class Tape:
 
     def take(self, frame: Frame) -> None:
         """A frame that was sent or received now."""
-        self._frames.append(pb.MavlinkFrame(wall_time=time.time_ns(), outgoing=frame.outgoing, raw=frame.raw))
+        self.keep((time.time_ns(), frame.outgoing, frame.raw))
+
+    def keep(self, frame: tuple[int, bool, bytes]) -> None:
+        """A frame: when [ns] it was sent or received, whether it is outgoing, its bytes."""
+        wall_time, outgoing, raw = frame
+        self._frames.append(pb.MavlinkFrame(wall_time=wall_time, outgoing=outgoing, raw=raw))
 
     def publish(self) -> None:
         """Those since the last call, if there are any."""

@@ -107,6 +107,7 @@ def _failing(
                 else:
                     _until(partial(child_of, home, name), fly).kill()
                 outcomes[name].count += 1
+                _until(steps.told_anew(), fly)  # what was said last may be some seconds old
                 _until(partial(steps.beyond, steps.taken + AGAIN), fly)
                 _until(lambda: judge.witness.clearance > ROOM, fly)
                 judge.take(outcomes[name])
@@ -122,16 +123,22 @@ class Steps:
     """How many a flight has taken, by the lines that it prints now and then."""
 
     def __init__(self, lines: Iterable[str]) -> None:
-        self.taken = 0
+        self.taken = self._lines = 0
         threading.Thread(target=self._read, args=(lines,), daemon=True).start()
 
     def beyond(self, number: int) -> bool:
         return self.taken > number
 
+    def told_anew(self) -> Callable[[], bool]:
+        """Has another line come since this was called?"""
+        before = self._lines
+        return lambda: self._lines > before
+
     def _read(self, lines: Iterable[str]) -> None:
         for line in lines:
             if said := LINE.match(line):
                 self.taken = int(said.group(1))
+                self._lines += 1
             else:
                 print(line, end="", file=sys.stderr)
 

@@ -20,7 +20,7 @@ from deploy.bench.timing import stalls
 from logs.reader import Record, read
 from messaging import brakeline_pb2 as pb
 from tests.robots import QUADROTOR
-from tests.system.runs import Run
+from tests.system.runs import Run, until
 
 pytestmark = pytest.mark.usefixtures("flight_folder")
 
@@ -30,7 +30,7 @@ PERIODS = 70  # of a flight
 IN_TIME = {"map": 0.9, "scan": 0.5}
 TIMEOUT = 1.0  # s without a setpoint until the autopilot brakes and holds, for good: a stall is shorter
 OFTEN = 0.06  # s between two setpoints, as a rule
-PX4_HOLD = 4 << 16 | 3 << 24  # custom mode
+PX4_HOLD, PX4_OFFBOARD = 4 << 16 | 3 << 24, 6 << 16  # custom modes
 
 
 class Flight(Run):
@@ -120,23 +120,41 @@ def test_what_is_killed_in_flight_hurts_nobody(tmp_path: Path) -> None:
         run.until_steps(25)
         run.kill("actor-0")
         run.until_steps(25)
+        actor = run.children()["actor-0"]
+        (keeper,) = actor.children()
+        keeper.kill()
+        until(lambda: not actor.is_running(), "its actor ends")
+        run.until_steps(25)
         figures = run.end()
         assert figures["finished"], run.errors.read_text()
     assert figures["collisions"] == 0
-    assert figures["restarts"] == {"safety-0": 1, "actor-0": 1}
+    assert figures["restarts"] == {"safety-0": 1, "actor-0": 2}
     records = list(read(run.folder))
     steps = [record.message for record in records if record.topic == "step"]
     first_lives = [step for step in steps if step.header.run == steps[0].header.run]
     assert follows_the_plan(records) >= 1, "it braked along the plan"
     speeds = [float(np.linalg.norm(step.state[3:6])) for step in first_lives if step.fallback]
     assert min(speeds) < 0.3, "it came to a stop without the service"
-    assert _mode_at_takeover(records) == PX4_HOLD, "the autopilot braked by itself, and held"
+    second, third = _takeovers(records)
+    assert second["HEARTBEAT"].custom_mode == PX4_OFFBOARD, "its keeper flew it until it hovered"
+    assert _speed(second["LOCAL_POSITION_NED"]) < 0.3
+    assert third["HEARTBEAT"].custom_mode == PX4_HOLD, "without a keeper the autopilot braked by itself, and held"
     assert "0 collisions" in (run.folder / "logs" / "autopilot.log").read_text()
+    said = (run.folder / "logs" / "actor-0.log").read_text()
+    assert "braking along the committed plan" in said and "it hovers at" in said
 
 
-def _mode_at_takeover(records: list[Record]) -> int:
-    """What the autopilot's first heartbeat said to the second actor."""
+def _takeovers(records: list[Record]) -> list[dict[str, Any]]:
+    """What the autopilot said first to each actor but the first, by its type."""
     batches = [record.message for record in records if record.topic == "frames"]
-    second = next(batch for batch in batches if batch.header.run != batches[0].header.run)
-    messages = [found.message for f in second.frames if (found := decoded(f.raw, f.outgoing)) and not f.outgoing]
-    return int(next(message.custom_mode for message in messages if message.get_type() == "HEARTBEAT"))
+    lives = dict.fromkeys(batch.header.run for batch in batches)
+    found: dict[int, dict[str, Any]] = {life: {} for life in lives}
+    for batch in batches:
+        for frame in batch.frames:
+            if not frame.outgoing and (known := decoded(frame.raw, frame.outgoing)) is not None:
+                found[batch.header.run].setdefault(known.message.get_type(), known.message)
+    return list(found.values())[1:]
+
+
+def _speed(message: Any) -> float:
+    return float(np.linalg.norm([message.vx, message.vy, message.vz]))
