@@ -36,6 +36,7 @@ TRUE = ("true collisions", "true clearance least m", "estimate off truth at most
 SET: dict[str, dict[str, float]] = {
     "ardupilot": {"PSC_POSXY_P": 0.5, "PSC_VELXY_I": 0.02, "PSC_POSZ_P": 0.5},
     "px4": {
+        "COM_OF_LOSS_T": 0.5,
         "EKF2_GPS_DELAY": 0.0,
         "EKF2_ACC_NOISE": 1.0,
         "EKF2_GYR_NOISE": 0.1,

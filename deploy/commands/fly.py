@@ -1,8 +1,8 @@
-"""`brakeline fly`: one quadrotor in real time, with all that it needs on this machine."""
+"""`brakeline fly`: quadrotors in real time, with all that they need on this machine."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -19,7 +19,6 @@ from messaging.ports import free_udp_port
 from messaging.tasks import learnt
 
 LEARN = "learn"
-ACTOR = "actor-0"
 TOLD = ("periods ", "lateness", "worst", "link", "true", "estimate")  # beginnings of figures' names
 
 
@@ -29,8 +28,13 @@ class Fly:
     minutes: float = 10.0
     policy: str = "astar"
     """A file, or trained | untrained | random | greedy | adversary | astar | careful; learn: from what it flies."""
-    url: str = ""
-    """An autopilot that runs elsewhere: udpin:HOST:PORT, udpout:HOST:PORT or tcp:HOST:PORT. Without one: our own."""
+    url: tuple[str, ...] = ()
+    """An autopilot that runs elsewhere: udpin:HOST:PORT, udpout:HOST:PORT or tcp:HOST:PORT. Without one: our own. Of
+    several each flies alone on its own map, and all ask one safety service."""
+    systems: tuple[int, ...] = ()
+    """MAVLink system ids of several, where they are not all --system."""
+    vehicles: int = 1
+    """So many of our own."""
     flight: Flags[Flight] = field(default_factory=Flight)
     rules: Literal["px4", "ardupilot"] = "px4"
     """Of our own autopilot."""
@@ -55,15 +59,21 @@ class Fly:
     def run(self) -> int:
         config, folder, shown = self.config(), self.out or stamped(), errors if self.json else console
         prepare(config, folder, resume=False)
-        with Display(shown, config.steps) as display:
+        with Display(shown, config.steps * len(config.flights)) as display:
             figures = Launcher(config, folder, self.meeting.settings(config, folder)).run(display)
-        figures["flight"] = flown(figures)
+        actors = [f"actor-{i}" for i in range(len(config.flights))]
+        figures["flight"] = flown(figures, actors[0])
+        if len(actors) > 1:
+            figures["flights"] = {actor: timing(figures, actor) for actor in actors}
         if self.json:
             say_json(figures)
         else:
             summary(console, figures)
             for name, value in figures["flight"].items():
                 console.print(f"{name}: {value}", markup=False)
+            for actor, values in figures.get("flights", {}).items():
+                for name, value in values.items():
+                    console.print(f"{actor}: {name}: {value}", markup=False)
         return 0 if figures["finished"] else STOPPED
 
     def config(self) -> RunConfig:
@@ -72,12 +82,13 @@ class Fly:
         if robot.position_dim != 3:
             raise ValueError(f"a {robot.kind} robot does not fly")
         robot = robot if robot.late else robot.in_real_time()
+        flights = self._flights()
         return RunConfig(
             robots=(robot.name,),
             method=self.filtering.method,
             recipe=self.filtering.recipe(),
             arena=self.arena,
-            actors=1,
+            actors=len(flights),
             steps=max(1, round(60.0 * self.minutes / robot.period)),
             seed=self.seed,
             deadline=self.deadline,
@@ -85,24 +96,37 @@ class Fly:
             pictures=self.pictures,
             conditions=self.physics.conditions(),
             policy="" if self.policy == LEARN else self.policy,
-            flight=self._flight(),
+            flights=flights,
             autopilot=None if self.url else Embedded(self.rules, self.setpoint_timeout),
         )
 
-    def _flight(self) -> FlightSettings:
-        if self.url:
-            return self.flight.settings(self.url, flight_arena(self.arena, self.seed))
-        return FlightSettings(f"udpin:127.0.0.1:{free_udp_port()}", truth=free_udp_port())
+    def _flights(self) -> tuple[FlightSettings, ...]:
+        """Raises ValueError: not as many system ids as URLs, or our own vehicles beside others'."""
+        if not self.url:
+            ports = [(free_udp_port(), free_udp_port()) for _ in range(self.vehicles)]
+            return tuple(FlightSettings(f"udpin:127.0.0.1:{port}", truth=truth) for port, truth in ports)
+        if self.vehicles != 1:
+            raise ValueError("--vehicles are our own: name others by --url, one after the other")
+        systems = self.systems or (self.flight.system,) * len(self.url)
+        if len(systems) != len(self.url):
+            raise ValueError(f"{len(self.url)} URLs and {len(systems)} system ids: name one for each")
+        arena = flight_arena(self.arena, self.seed)
+        named = zip(self.url, systems, strict=True)
+        return tuple(replace(self.flight.settings(url, arena), system=system) for url, system in named)
 
 
-def flown(figures: dict[str, Any]) -> dict[str, Any]:
-    """How real time was kept, and what it came to, of a finished run's figures."""
-    actor = figures["processes"].get(ACTOR, {}).get("figures", {})
+def timing(figures: dict[str, Any], actor: str) -> dict[str, Any]:
+    """How an actor kept real time, and what a judge of its flight saw, of a finished run's figures."""
+    told = figures["processes"].get(actor, {}).get("figures", {})
     names = ("periods", "answers in time", "answers in time share", "answers late", "answers none", "answers lost")
-    timing = {name: value for name, value in actor.items() if name.startswith(TOLD)}
+    more = {name: value for name, value in told.items() if name.startswith(TOLD)}
+    return {name: told.get(name) for name in names} | more
+
+
+def flown(figures: dict[str, Any], actor: str) -> dict[str, Any]:
+    """How real time was kept by that actor, and what the whole run came to."""
     return {
-        **{name: actor.get(name) for name in names},
-        **timing,
+        **timing(figures, actor),
         "collisions": figures["collisions"],
         "goals": figures["goals"],
         "decision_ms": _pair(figures["decision_ms"]),

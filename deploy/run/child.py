@@ -86,12 +86,12 @@ def _actor(place: Place, folder: Path, config: RunConfig, bus: BusSettings) -> b
         steps=config.steps,
     )
     propose = partial(policy_named, config.policy, robot_named(place.robot)) if config.policy else None
-    if config.flight is not None:
+    if config.flights:
         from actors import flight
         from deploy.quadrotors import flight_arena
 
         arena = flight_arena(config.arena, config.seed, robot_named(place.robot))
-        return flight.run(settings, config.flight, arena, propose, config.conditions)
+        return flight.run(settings, config.flights[place.number], arena, propose, config.conditions)
     worlds = partial(fleet_world, conditions=config.conditions)
     return run(settings, partial(environment, conditions=config.conditions), propose, worlds)
 
@@ -99,17 +99,18 @@ def _actor(place: Place, folder: Path, config: RunConfig, bus: BusSettings) -> b
 def _autopilot(place: Place, folder: Path, config: RunConfig, bus: BusSettings) -> bool:
     from deploy.run.autopilot import AutopilotSettings, fly
 
-    assert config.autopilot is not None and config.flight is not None
+    assert config.autopilot is not None
+    flight = config.flights[place.number]
     tally = fly(
         AutopilotSettings(
-            url=config.flight.url.replace("udpin:0.0.0.0", "udpout:127.0.0.1").replace("udpin", "udpout"),
+            url=flight.url.replace("udpin:0.0.0.0", "udpout:127.0.0.1").replace("udpin", "udpout"),
             rules=config.autopilot.rules,
             arena=config.arena,
             seed=config.seed,
             airborne=True,
             setpoint_timeout=config.autopilot.setpoint_timeout,
             wind=config.conditions.wind,
-            truth=f"127.0.0.1:{config.flight.truth}",
+            truth=f"127.0.0.1:{flight.truth}",
         )
     )
     print(tally, file=sys.stderr)  # into its log

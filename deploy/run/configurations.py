@@ -53,8 +53,10 @@ class RunConfig:
     change: Change = field(default_factory=Change)  # of the robots, in mid-run
     conditions: Conditions = field(default_factory=Conditions)
     policy: str = ""  # a file or a name, as `evaluate` takes it; empty: one is learned
-    flight: FlightSettings | None = None  # in real time, behind a link; None: simulated as fast as it goes
-    autopilot: Embedded | None = None  # that the run starts itself, at the other end of the link
+    flights: tuple[
+        FlightSettings, ...
+    ] = ()  # in real time behind links, an actor each; none: simulated as fast as it goes
+    autopilot: Embedded | None = None  # that the run starts itself, at the other end of each link
     mavlink: bool = False  # every frame of quadrotors in memory into the log; those of a flight always are
     learner: LearnerConfig = field(default_factory=lambda: LearnerConfig(checkpoint_every=2500))
 
@@ -73,8 +75,8 @@ class RunConfig:
             raise ValueError("a deterministic run learns from its own actor, not from logs")
         if self.deterministic and (self.actors != 1 or self.robots_per_actor != 1 or len(self.robots) != 1):
             raise ValueError("a deterministic run has one actor with one robot: --actors 1")
-        if self.flight is not None and (self.actors != 1 or self.robots_per_actor != 1 or len(self.robots) != 1):
-            raise ValueError("a flight in real time has one robot")
+        if self.flights and (self.actors != len(self.flights) or self.robots_per_actor != 1 or len(self.robots) != 1):
+            raise ValueError("flights in real time have one actor each, with one robot of one kind")
 
     @property
     def filtered(self) -> bool:
@@ -149,7 +151,8 @@ def _value(hint: Any, value: Any) -> Any:
     if dataclasses.is_dataclass(hint):
         return decode(typing.cast(type[Any], hint), value)
     if typing.get_origin(hint) is tuple:
-        return tuple(value)
+        (part, *_) = typing.get_args(hint)
+        return tuple(decode(part, each) if isinstance(each, dict) else each for each in value)
     return Path(value) if hint is Path else value
 
 

@@ -29,11 +29,13 @@ class Place:
 
 def places(config: RunConfig) -> list[Place]:
     """THE table of a run's processes, in the order in which they start."""
-    table = [Place("recorder", "recorder", nice=5 if config.flight is not None else 0)] if config.record else []
+    table = [Place("recorder", "recorder", nice=5 if config.flights else 0)] if config.record else []
     if config.filtered:
         table += [Place(f"safety-{i}", "safety") for i in range(config.replicas)]
     if config.autopilot is not None:
-        table.append(Place("autopilot", "autopilot"))
+        several = len(config.flights) > 1
+        names = [f"autopilot-{i}" if several else "autopilot" for i in range(len(config.flights))]
+        table += [Place(name, "autopilot", number=i) for i, name in enumerate(names)]
     one = len(config.robots) == 1
     for kind in (robot_named(robot).name for robot in config.robots):
         if not config.policy:
@@ -42,7 +44,7 @@ def places(config: RunConfig) -> list[Place]:
             table.append(Place("feeder" if one else f"feeder-{kind}", "feeder", kind, nice=2))
         for i in range(config.actors):
             name = f"actor-{i}" if one else f"actor-{kind}-{i}"
-            nice = 0 if config.flight is not None else 2
+            nice = 0 if config.flights else 2
             table.append(Place(name, "actor", kind, i * config.robots_per_actor, nice))
     return table
 

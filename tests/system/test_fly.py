@@ -102,6 +102,24 @@ def test_it_flies_in_time_and_hits_nothing(
     _read_by_mavutil(tlog, frames)
 
 
+def test_two_at_once_ask_one_service(tmp_path: Path) -> None:
+    periods = 30
+    how = ("--vehicles", 2, "--minutes", periods * QUADROTOR.period / 60.0, "--policy", "adversary")
+    with stalls(0.01) as lost, Flight(tmp_path / "run", *how) as run:
+        run.until_steps(5)
+        assert set(run.children()) == {"recorder", "safety-0", "autopilot-0", "autopilot-1", "actor-0", "actor-1"}
+        figures = run.end()
+        assert figures["finished"], run.errors.read_text()
+    assert figures["collisions"] == 0 and figures["steps"] == 2 * periods
+    assert set(figures["flights"]) == {"actor-0", "actor-1"}
+    for flight in figures["flights"].values():
+        assert flight["answers in time share"] >= IN_TIME["map"] - lost.share, (flight, lost)
+    records = list(read(run.folder))
+    for name in ("step", "frames"):
+        assert {record.message.actor for record in records if record.topic == name} == {"actor-0", "actor-1"}, name
+    assert len(list((run.folder / "logs").glob("autopilot-*.log"))) == 2
+
+
 def _read_by_mavutil(tlog: Path, frames: list[pb.MavlinkFrame]) -> None:
     """pymavlink reads the frames that were logged, each at its time."""
     connection = mavutil.mavlink_connection(str(tlog))
