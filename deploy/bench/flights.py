@@ -14,7 +14,7 @@ import sys
 import tempfile
 import threading
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -69,6 +69,7 @@ def run(minutes: float, folder: Path) -> Words:
         for arena in ARENAS:
             for policy in POLICIES:
                 rows[f"{kind}: {policy}, {arena}"] = flown(partial(flights.fly, policy, arena, minutes))
+        rows |= {f"{kind}: {name}": row for name, row in two(partial(flights.pair, minutes)).items()}
     return rows
 
 
@@ -113,6 +114,10 @@ class Flights:
     def fly(self, policy: str, arena: str, minutes: float) -> dict[str, Any]:
         return self.upset(f"{policy}-{arena}", minutes, Upset(), "--policy", policy, "--arena", arena)
 
+    def pair(self, minutes: float) -> dict[str, Any]:
+        """Two of them in one run, which ask one service."""
+        return self._kept("pair", minutes, partial(self._both, minutes))
+
     def upset(self, name: str, minutes: float, upset: Upset, *words: str) -> dict[str, Any]:
         out = ("--at-start", "--pictures", "0", "--out", str(self.run(name)))
         return self._figures(name, minutes, "fly", "--minutes", str(minutes), *words, *out, upset=upset)
@@ -123,11 +128,14 @@ class Flights:
 
     def _figures(self, name: str, minutes: float, *words: str, upset: Upset = Upset()) -> dict[str, Any]:
         """Of a command, or of the time when it was run. Raises Failed, NoAutopilot."""
+        return self._kept(name, minutes, partial(self._flown, minutes, words, upset))
+
+    def _kept(self, name: str, minutes: float, fly: Callable[[], str]) -> dict[str, Any]:
         kept = self._folder / f"{name}.json"
         if not kept.exists():
             print(f"{self._kind}: {name}, {minutes:g} minutes", file=sys.stderr)
             kept.parent.mkdir(parents=True, exist_ok=True)
-            kept.write_text(self._flown(minutes, words, upset))
+            kept.write_text(fly())
         figures: dict[str, Any] = json.loads(kept.read_text())
         return figures
 
@@ -139,6 +147,17 @@ class Flights:
             self._in_between(upset, sitl.beside(self._kind, system, url), system),
         ):
             command = [*words, "--url", url, "--system", str(system), "--raise-limits", "--json"]
+            return told(command, self.data, 60.0 * minutes + BEYOND)
+
+    def _both(self, minutes: float) -> str:
+        with ExitStack() as stack:
+            reached = []
+            for _ in range(2):
+                folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
+                reached.append(stack.enter_context(sitl.flying(self._kind, self._start, folder, SET[self._kind])))
+            urls, systems = zip(*reached, strict=True)
+            command = ["fly", "--minutes", str(minutes), "--url", *urls, "--systems", *map(str, systems)]
+            command += ["--at-start", "--pictures", "0", "--out", str(self.run("pair")), "--raise-limits", "--json"]
             return told(command, self.data, 60.0 * minutes + BEYOND)
 
     @contextmanager
@@ -202,3 +221,15 @@ def flown(fly: Callable[[], dict[str, Any]]) -> dict[str, float | str]:
     row |= {"outside": f"{contained['violations']} of {contained['steps']}"}
     row |= {name: flight[name] for name in TRUE if name in flight}
     return row | {"in time": f"{flight['answers in time share'] or 0.0:.1%}"}
+
+
+def two(fly: Callable[[], dict[str, Any]]) -> Words:
+    """A row for both, and one for what is each one's own."""
+    whole = flown(fly)
+    if "failed" in whole:
+        return {"two at once": whole}
+    rows: Words = {"two at once": {name: value for name, value in whole.items() if name not in (*TRUE, "in time")}}
+    for actor, flight in fly()["flights"].items():
+        row: dict[str, float | str] = {name: flight[name] for name in TRUE if name in flight}
+        rows[f"two at once, {actor}"] = row | {"in time": f"{flight['answers in time share'] or 0.0:.1%}"}
+    return rows

@@ -1,6 +1,6 @@
-"""A quadrotor whose actor dies in flight: how far the autopilot's own braking leads out of the verified set.
+"""A quadrotor whose link is cut, or whose keeper dies: how far the autopilot's braking leads out of the verified set.
 
-The actor's last setpoint stays in force until the autopilot's timeout; the worst is when it dies just before the next
+The last setpoint stays in force until the autopilot's timeout; the worst is when that happens just before the next
 one, having sent the last one again. The plan that it was committed to brakes meanwhile.
 """
 
@@ -33,7 +33,7 @@ ROBOT, RULES = robot_named("quadrotor-late"), "px4"
 TIMEOUTS = (0.2, 0.3, 0.5, 1.0)  # s; the last is PX4's default
 POLICIES = ("astar", "greedy", "adversary")
 FLIGHTS = 20  # of each policy and timeout
-LONGEST = 40  # periods before the actor dies
+LONGEST = 40  # periods before the cut
 BETWEEN = 21  # boxes from one period's end to the next, for what is swept
 AFTER = 4.0  # s that the autopilot is watched for
 

@@ -99,15 +99,15 @@ def _running(kind: str, start: Path, folder: Path) -> Iterator[tuple[str, int]]:
             command, stdin=subprocess.DEVNULL, stdout=output, stderr=output, start_new_session=True
         )
         try:
-            if kind == "px4":
-                yield f"udpin:127.0.0.1:{14540 + instance}", instance + 1
-                return
             deadline = time.monotonic() + STARTS_IN
             while not _taken(kind, instance):  # looked at, not tried: its first connection is its only one
                 if time.monotonic() > deadline:
                     raise NoAutopilot(f"{kind} does not listen: {said.read_text(errors='replace')[-500:]}")
                 time.sleep(0.1)
-            yield f"tcp:127.0.0.1:{5760 + 10 * instance}", 1
+            if kind == "px4":
+                yield f"udpin:127.0.0.1:{14540 + instance}", instance + 1
+            else:
+                yield f"tcp:127.0.0.1:{5760 + 10 * instance}", 1
         finally:
             os.killpg(process.pid, signal.SIGKILL)
             process.wait()
