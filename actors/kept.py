@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import os
+import socket
+import struct
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from multiprocessing import Pipe
+from multiprocessing.connection import Connection
 from queue import Empty, SimpleQueue
 
 import numpy as np
@@ -23,7 +27,9 @@ from messaging.tolerant import Tolerance
 from sim.world import Arena
 
 ANSWERS_IN = 1.0  # s, for a process that does nothing else
+STARTS_IN = 30.0  # s
 ENDS_IN = 5.0  # s
+PREDECESSOR = 45.0  # s in which a keeper whose actor died has brought the vehicle to rest
 LOOK = 0.1  # s between two looks at whether to go on waiting
 ENDED = "the process that keeps the vehicle has ended"
 
@@ -32,11 +38,16 @@ Raw = tuple[int, bool, bytes]  # a MAVLink frame: when [ns], is it outgoing, its
 
 @dataclass(frozen=True)
 class Charge:
-    """What to fly: the first word to a keeper."""
+    """What to fly: an actor's first word."""
 
     flight: FlightSettings
     robot: str
     arena: Arena  # for the judge of simulated flights
+
+    def differs(self, other: Charge) -> bool:
+        """Would it be another flight?"""
+        mine, theirs = ((c.flight, c.robot, c.arena.obstacles) for c in (self, other))
+        return mine != theirs
 
 
 @dataclass(frozen=True)
@@ -51,8 +62,9 @@ class News:
 
 @dataclass(frozen=True)
 class Answer:
-    """To what the actor asked."""
+    """To the question of that number."""
 
+    number: int
     value: object
 
 
@@ -63,29 +75,43 @@ class Failure:
     error: Exception
 
 
+def address(url: str, system: int) -> str:
+    """Where a vehicle's keeper is met: a name that is gone with its process, however that ends, and not a file."""
+    return f"\0brakeline/{os.getuid()}/{url[-80:]}/{system}"
+
+
+def ours(peer: socket.socket) -> bool:
+    """Is it a process of this user? What it says is unpickled."""
+    size = struct.calcsize("3i")
+    _, user, _ = struct.unpack("3i", peer.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, size))
+    return bool(user == os.getuid())
+
+
 class KeptVehicle:
     """To its actor what a `LiveVehicle` is, see there; but it goes on to the end of its plan when the actor dies."""
 
     def __init__(
         self, charge: Charge, tap: Callable[[Raw], None], tolerance: Tolerance, stop: Callable[[], bool]
     ) -> None:
-        """Start its keeper and wait until it flies. tap: is called with every frame; stop: told to, it does not wait.
+        """Take over from a keeper whose actor died, or start one, and wait until it flies.
+
+        tap: is called with every frame; stop: told to, it does not wait.
 
         Raises:
-            MavlinkError, BadLink, OSError: what the keeper failed with.
+            MavlinkError, BadLink, OSError: what the keeper failed with; MavlinkError: another actor flies it, or told
+            to stop.
         """
         self._tap, self._tolerance, self._passed_over = tap, tolerance, 0
         self._period = robot_named(charge.robot).period
         self._turned = threading.Condition()
         self._turn: Turn | None = None
+        self._heard = False
         self._failure: Exception | None = None
         self._figures: dict[str, float] = {}
-        self._answers: SimpleQueue[object] = SimpleQueue()
-        self._pipe, theirs = Pipe()
-        words = [sys.executable, "-P", "-m", "actors.keeper", str(theirs.fileno())]
-        # Not of our session: ^C is for the actor, which then brakes and says when it is over.
-        self._process = subprocess.Popen(words, pass_fds=[theirs.fileno()], start_new_session=True)
-        theirs.close()
+        self._answers: SimpleQueue[Answer] = SimpleQueue()
+        self._asked = 0
+        self._process: subprocess.Popen[bytes] | None = None
+        self._pipe = self._reach(charge.flight)
         self._pipe.send(charge)
         self._listener = threading.Thread(target=self._listen, name="keeper", daemon=True)
         self._listener.start()
@@ -125,21 +151,36 @@ class KeptVehicle:
     def close(self) -> None:
         """Let go of the vehicle: its keeper ends."""
         with contextlib.suppress(MavlinkError):
-            self._ask("close", patience=ENDS_IN)
-        try:
-            self._process.wait(ENDS_IN)
-        except subprocess.TimeoutExpired:
-            self._process.kill()
+            self._ask("close", patience=0.0)
+        self._listener.join(ENDS_IN)  # to the keeper's last word
+        if self._process is not None:
+            if self._listener.is_alive():
+                self._process.kill()
             self._process.wait()
-        self._listener.join(ENDS_IN)
         self._pipe.close()
 
+    def _reach(self, flight: FlightSettings) -> Connection:
+        """Raises MavlinkError: no keeper is there, and none starts."""
+        deadline = time.monotonic() + STARTS_IN
+        while (pipe := _knock(flight)) is None:
+            if self._process is None:
+                words = [sys.executable, "-P", "-m", "actors.keeper", flight.url, str(flight.system)]
+                # Not of our session: ^C is for the actor, which then brakes and says when it is over.
+                self._process = subprocess.Popen(words, start_new_session=True)
+            if self._process.poll() is not None or time.monotonic() > deadline:
+                raise MavlinkError(f"the process that keeps the vehicle does not start ({self._process.poll()})")
+            time.sleep(0.2 * LOOK)
+        return pipe
+
     def _await_flight(self, stop: Callable[[], bool]) -> None:
+        deadline = time.monotonic() + PREDECESSOR
         with self._turned:
             while self._turn is None:
                 self._check()
                 if stop():
                     raise MavlinkError("told to stop before it flew")
+                if not self._heard and time.monotonic() > deadline:
+                    raise MavlinkError("another process here flies it")
                 self._turned.wait(LOOK)
 
     def _check(self) -> None:
@@ -147,32 +188,36 @@ class KeptVehicle:
             raise self._failure
 
     def _ask(self, *words: object, patience: float = ANSWERS_IN) -> object:
-        """Raises MavlinkError: it does not answer."""
+        """The answer; without patience none is waited for. Raises MavlinkError: it does not answer."""
+        self._asked += 1
         try:
-            self._pipe.send(words)
-            answer = self._answers.get(timeout=patience)
+            self._pipe.send((self._asked, *words))
+            while patience:
+                answer = self._answers.get(timeout=patience)
+                if answer.number == self._asked:  # not that of a question that nobody waited for
+                    return answer.value
+                self._check()
         except (OSError, Empty) as error:
-            raise self._failure or MavlinkError(ENDED) from error
-        if answer is ENDED:
-            raise self._failure or MavlinkError(ENDED)
-        return answer
+            raise self._failure or MavlinkError("the process that keeps the vehicle does not answer") from error
+        return None
 
     def _listen(self) -> None:
         """In a thread, to the keeper's last word."""
         try:
             while True:
                 said = self._pipe.recv()
+                self._heard = True
                 if isinstance(said, News):
                     self._take(said)
                 elif isinstance(said, Answer):
-                    self._answers.put(said.value)
+                    self._answers.put(said)
                 elif isinstance(said, Failure):
                     self._fail(said.error)
                 else:
                     logging.getLogger(said.name).handle(said)
         except (EOFError, OSError):
             self._fail(MavlinkError(ENDED))
-        except Exception as error:  # whatever it is: who is not heard any more does not fly for us
+        except Exception as error:  # whatever it is: who is not understood any more does not fly for us
             self._fail(error)
 
     def _take(self, news: News) -> None:
@@ -189,4 +234,18 @@ class KeptVehicle:
         with self._turned:
             self._failure = self._failure or error
             self._turned.notify_all()
-        self._answers.put(ENDED)
+        self._answers.put(Answer(-1, None))  # who waits for one looks up
+
+
+def _knock(flight: FlightSettings) -> Connection | None:
+    """A connection to the vehicle's keeper, if there is one. Raises MavlinkError: it is not this user's."""
+    knocking = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+    try:
+        knocking.connect(address(flight.url, flight.system))
+    except OSError:
+        knocking.close()
+        return None
+    if not ours(knocking):
+        knocking.close()
+        raise MavlinkError("somebody else keeps this vehicle")
+    return Connection(knocking.detach())

@@ -54,8 +54,9 @@ class LiveVehicle:
     Periods follow each other by the clock, whoever decides. `commit` hands over a plan: one input for each period from
     one on that has not begun. Its thread sends each at its time, again every `RESEND` seconds, and reads telemetry. So
     a plan that nobody replaces is carried out to its end, and then zero: hover. If the process dies, the autopilot's
-    own timeout brakes. A vehicle that leaves offboard or guided mode, for a pilot, a failsafe, its battery or its
-    fence, is not fought for: the periods until it comes back by itself are `lost`.
+    own timeout brakes; an actor has another process do this, which does not die with it (`actors.kept`). A vehicle that
+    leaves offboard or guided mode, for a pilot, a failsafe, its battery or its fence, is not fought for: the periods
+    until it comes back by itself are `lost`.
 
     Collisions and clearance are what the simulator's truth channel says, where there is one.
     """
@@ -161,6 +162,11 @@ class LiveVehicle:
     def armed(self) -> bool:
         """By its last heartbeat."""
         return self._client.armed
+
+    @property
+    def silence(self) -> float:
+        """s since anything was heard of it."""
+        return time.monotonic() - max(self._heard_at.values(), default=-math.inf)
 
     def judged(self) -> dict[str, float]:
         """For Health, once a witness told something."""

@@ -11,12 +11,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import psutil
 import pytest
 from pymavlink import mavutil
 
 from actors.frames import decoded
 from deploy import cli
 from deploy.bench.timing import stalls
+from deploy.run.configurations import load
+from deploy.run.places import CONFIG
 from logs.reader import Record, read
 from messaging import brakeline_pb2 as pb
 from tests.robots import QUADROTOR
@@ -139,8 +142,7 @@ def test_what_is_killed_in_flight_hurts_nobody(tmp_path: Path) -> None:
         run.kill("actor-0")
         run.until_steps(25)
         actor = run.children()["actor-0"]
-        (keeper,) = actor.children()
-        keeper.kill()
+        keeper(run).kill()
         until(lambda: not actor.is_running(), "its actor ends")
         run.until_steps(25)
         figures = run.end()
@@ -160,6 +162,13 @@ def test_what_is_killed_in_flight_hurts_nobody(tmp_path: Path) -> None:
     assert "0 collisions" in (run.folder / "logs" / "autopilot.log").read_text()
     said = (run.folder / "logs" / "actor-0.log").read_text()
     assert "braking along the committed plan" in said and "it hovers at" in said
+
+
+def keeper(run: Run) -> psutil.Process:
+    """The process that keeps the vehicle of a run."""
+    url = load(run.folder / CONFIG).flights[0].url
+    (found,) = (p for p in psutil.process_iter(["cmdline"]) if "actors.keeper" in p.cmdline() and url in p.cmdline())
+    return found
 
 
 def _takeovers(records: list[Record]) -> list[dict[str, Any]]:
