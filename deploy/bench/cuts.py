@@ -72,9 +72,11 @@ class Outcomes:
     count: int = 0
     collisions: int = 0
     nearest: float = float("inf")  # m
+    stuck: int = 0  # times that it did not come out of what it had been run into
 
     def row(self) -> dict[str, float | str]:
-        return {"faults": self.count, "collisions": self.collisions, "nearest m": round(self.nearest, 2)}
+        row: dict[str, float | str] = {"faults": self.count, "collisions": self.collisions, "stuck": self.stuck}
+        return row | {"nearest m": round(self.nearest, 2)}
 
 
 def _failing(
@@ -109,7 +111,7 @@ def _failing(
                 outcomes[name].count += 1
                 _until(steps.told_anew(), fly)  # what was said last may be some seconds old
                 _until(partial(steps.beyond, steps.taken + AGAIN), fly)
-                _until(lambda: judge.witness.clearance > ROOM, fly)
+                outcomes[name].stuck += not _comes_out(judge, fly)
                 judge.take(outcomes[name])
                 time.sleep(random.uniform(*BETWEEN))
         finally:
@@ -151,6 +153,16 @@ def _until(condition: Callable[[], T | None], fly: subprocess.Popen[str]) -> T:
             raise MavlinkError(f"it does not fly (any more); status {fly.poll()}")
         time.sleep(0.2)
     return found
+
+
+def _comes_out(judge: Judge, fly: subprocess.Popen[str]) -> bool:
+    """Of where it was run into. Raises MavlinkError: the flight has ended."""
+    try:
+        return _until(lambda: judge.witness.clearance > ROOM, fly)
+    except MavlinkError:
+        if fly.poll() is not None:
+            raise
+        return False
 
 
 def child_of(home: Path, name: str) -> psutil.Process | None:
