@@ -150,14 +150,23 @@ class KeptVehicle:
 
     def close(self) -> None:
         """Let go of the vehicle: its keeper ends."""
-        with contextlib.suppress(MavlinkError):
-            self._ask("close", patience=0.0)
-        self._listener.join(ENDS_IN)  # to the keeper's last word
+        if self._heard:
+            with contextlib.suppress(MavlinkError):
+                self._ask("close", patience=0.0)
+            self._listener.join(ENDS_IN)  # to the keeper's last word
+        else:  # it may fly for another actor, which is not to be disturbed
+            self.hang_up()
         if self._process is not None:
             if self._listener.is_alive():
                 self._process.kill()
             self._process.wait()
         self._pipe.close()
+
+    def hang_up(self) -> None:
+        """As if this process had died."""
+        with socket.socket(fileno=os.dup(self._pipe.fileno())) as connection, contextlib.suppress(OSError):
+            connection.shutdown(socket.SHUT_RDWR)
+        self._listener.join(ENDS_IN)
 
     def _reach(self, flight: FlightSettings) -> Connection:
         """Raises MavlinkError: no keeper is there, and none starts."""
