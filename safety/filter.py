@@ -212,7 +212,7 @@ class Filter:
         verified to end nearer."""
         robot, m = self.robot, self.robot.action_dim
         slow = np.where(robot.translates, SLOW + 0.05, 1.0) * np.maximum(self.inputs.high, -self.inputs.low)
-        going = request.input_in_force
+        going = np.vstack([request.input_in_force, request.plan[: robot.given]])
         on_a_way = request.model == UNVERIFIED and bool(going.any() and (np.abs(going) <= slow).all())
         if not (request.still(robot) or on_a_way):
             return None

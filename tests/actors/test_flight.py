@@ -1,12 +1,18 @@
-"""Before a flight: a vehicle stays on the ground where not even hovering can be verified."""
+"""Where not even hovering can be verified: a vehicle stays on the ground, and gets out of there in the air."""
 
+import numpy as np
 import pytest
 
+from actors.driver import Driver, Identity
 from actors.flight import NoRoom, answered
+from actors.guard import consult
 from deploy.data.store import model_for
 from deploy.study.evaluate import in_process
 from messaging.shapes import Obstacle
 from safety.recipe import Recipe
+from sim.envs import NavigationEnv
+from sim.late import late
+from sim.quadrotor import Quadrotor
 from sim.world import Arena, staged_arena
 from tests.robots import QUADROTOR
 
@@ -16,7 +22,11 @@ def stage(gap: float) -> Arena:
     radius = 0.4
     away = QUADROTOR.footprint + gap + radius
     return staged_arena(
-        Obstacle("sphere", (away, 0.0, 3.0), (radius,)), start=(0.0, 0.0, 3.0), half_width=6.0, height=6.0
+        Obstacle("sphere", (away, 0.0, 3.0), (radius,)),
+        start=(0.0, 0.0, 3.0),
+        goal=(-4.0, -4.0, 3.0),
+        half_width=6.0,
+        height=6.0,
     )
 
 
@@ -28,3 +38,27 @@ def test_it_does_not_take_off_where_it_could_not_hover() -> None:
     with pytest.raises(NoRoom, match=r"0\.\d+ m from the nearest obstacle.*collect more data"):
         answered(question, robot, stage(0.02), True, lambda: False)
     assert answered(question, robot, stage(0.02), False, lambda: False), "a rival says nothing of hovering"
+
+
+@pytest.mark.usefixtures("flight_folder")
+def test_in_real_time_a_way_out_is_gone_on_with_period_after_period() -> None:
+    """Not every other one: a real vehicle does not answer to velocities that last for a period."""
+    robot = QUADROTOR.in_real_time()
+    question = in_process(model_for(robot, Recipe()))
+    make = late(Quadrotor, robot)
+    env = NavigationEnv(
+        robot, "default", make, draw=lambda *_: staged_arena(start=(0.0, 0.0, 3.0), goal=(-4.0, -4.0, 3.0), height=6.0)
+    )
+    driver = Driver(robot, env, Identity("actor", 0, 0))
+    driver.begin(0)
+    kinds = []
+    for _ in range(25):
+        driver.info["obstacles"] = (
+            Obstacle("sphere", (0.5, 0.0, 3.0), (0.6,)),
+        )  # a virtual one, which it is inside of
+        outcome = consult(question, [driver.request(np.zeros(3))], robot)[0]
+        assert outcome.answer is not None
+        kinds.append(outcome.answer.kind)
+        driver.execute(np.zeros(3), outcome)
+    on_the_way = kinds[: len(kinds) - kinds[::-1].index("recovering")]
+    assert set(on_the_way) == {"recovering"} and len(on_the_way) >= 2 and kinds[-1] == "allowed", kinds
