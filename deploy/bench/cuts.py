@@ -58,10 +58,14 @@ def run(faults: int, seed: int, folder: Path) -> Words:
         except sitl.NoAutopilot as none:
             print(none, file=sys.stderr)
             continue
-        with tempfile.TemporaryDirectory() as place:
-            home = Path(place)
-            with sitl.flying(kind, start, home, SET[kind]) as (url, system):
-                rows |= _failing(kind, url, system, faults, Random(seed), folder / kind, home)
+        record = Record(kind, faults)
+        while record.left:
+            before = record.done
+            with tempfile.TemporaryDirectory() as place:
+                _flight(record, start, Path(place), folder / kind, Random(seed + before))
+            if record.done == before:
+                raise MavlinkError("it does not come to fly")
+        rows |= record.rows()
     return rows
 
 
@@ -73,52 +77,82 @@ class Outcomes:
     collisions: int = 0
     nearest: float = float("inf")  # m
     stuck: int = 0  # times that it did not come out of what it had been run into
+    crashed: int = 0  # times that the autopilot took itself for crashed, on the floor as a rule
 
     def row(self) -> dict[str, float | str]:
-        row: dict[str, float | str] = {"faults": self.count, "collisions": self.collisions, "stuck": self.stuck}
-        return row | {"nearest m": round(self.nearest, 2)}
+        row: dict[str, float | str] = {"faults": self.count, "collisions": self.collisions}
+        return row | {"stuck": self.stuck, "crashed": self.crashed, "nearest m": round(self.nearest, 2)}
 
 
-def _failing(
-    kind: str, url: str, system: int, faults: int, random: Random, folder: Path, home: Path
-) -> dict[str, dict[str, float | str]]:
-    outcomes = {name: Outcomes() for name in FAULTS}
-    calm = Outcomes()
-    with relayed(url) as relay, judged(sitl.beside(kind, system, url), system) as judge:
-        words = ["--url", relay.url, "--system", str(system), "--policy", POLICY, "--arena", ARENA, "--at-start"]
-        words += ["--minutes", "600", "--pictures", "0", "--raise-limits", "--json", "--out", str(home / "run")]
-        fly = subprocess.Popen(
-            [*PYTHON, "-m", "deploy.cli", "fly", *words],
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.PIPE,
-            text=True,
-            env=os.environ | {"BRAKELINE_DATA": str(folder.absolute() / "data")},
-        )
-        assert fly.stderr is not None
-        steps = Steps(fly.stderr)
-        try:
-            _until(lambda: judge.airborne, fly)
-            _until(partial(steps.beyond, AGAIN), fly)
+class Record:
+    """Of one kind of autopilot: what all its failures led to."""
+
+    def __init__(self, kind: str, faults: int) -> None:
+        self.kind, self._faults, self.done = kind, faults, 0
+        self.of = {name: Outcomes() for name in FAULTS}
+        self.calm = Outcomes()
+
+    @property
+    def left(self) -> int:
+        return self._faults - self.done
+
+    def next(self) -> str:
+        """What is to fail."""
+        name = FAULTS[self.done % len(FAULTS)]
+        self.done += 1
+        self.of[name].count += 1
+        print(f"{self.kind}: fault {self.done} of {self._faults}: {name}", file=sys.stderr)
+        return name
+
+    def rows(self) -> Words:
+        return {f"{self.kind}: {name}": one.row() for name, one in {"in between": self.calm, **self.of}.items()}
+
+
+def _flight(record: Record, start: Path, home: Path, folder: Path, random: Random) -> None:
+    """From switching on to the last fault, or to a crash."""
+    with (
+        sitl.flying(record.kind, start, home, SET[record.kind]) as (url, system),
+        relayed(url) as relay,
+        judged(sitl.beside(record.kind, system, url), system) as judge,
+        _flown(["--url", relay.url, "--system", str(system)], home, folder) as (fly, steps),
+    ):
+        _until(lambda: judge.airborne, fly)
+        _until(partial(steps.beyond, AGAIN), fly)
+        time.sleep(random.uniform(*BETWEEN))
+        while record.left:
+            judge.take(record.calm)
+            name = record.next()
+            if name == "link":
+                relay.cut(random.uniform(*CUT))
+            else:
+                _until(partial(child_of, home, name), fly).kill()
+            _until(steps.told_anew(), fly)  # what was said last may be some seconds old
+            _until(partial(steps.beyond, steps.taken + AGAIN), fly)
+            outcomes = record.of[name]
+            outcomes.stuck += not _comes_out(judge, fly)
+            judge.take(outcomes)
+            if not judge.client.armed:
+                outcomes.crashed += 1
+                return
             time.sleep(random.uniform(*BETWEEN))
-            for number in range(faults):
-                name = FAULTS[number % len(FAULTS)]
-                judge.take(calm)
-                print(f"{kind}: fault {number + 1} of {faults}: {name}", file=sys.stderr)
-                if name == "link":
-                    relay.cut(random.uniform(*CUT))
-                else:
-                    _until(partial(child_of, home, name), fly).kill()
-                outcomes[name].count += 1
-                _until(steps.told_anew(), fly)  # what was said last may be some seconds old
-                _until(partial(steps.beyond, steps.taken + AGAIN), fly)
-                outcomes[name].stuck += not _comes_out(judge, fly)
-                judge.take(outcomes[name])
-                time.sleep(random.uniform(*BETWEEN))
-        finally:
-            fly.terminate()
-            fly.wait()
-    rows = {f"{kind}: {name}": one.row() for name, one in outcomes.items()}
-    return {f"{kind}: in between": calm.row()} | rows
+
+
+@contextmanager
+def _flown(where: list[str], home: Path, folder: Path) -> Iterator[tuple[subprocess.Popen[str], Steps]]:
+    words = [*where, "--policy", POLICY, "--arena", ARENA, "--at-start", "--minutes", "600", "--pictures", "0"]
+    fly = subprocess.Popen(
+        [*PYTHON, "-m", "deploy.cli", "fly", *words, "--raise-limits", "--json", "--out", str(home / "run")],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=os.environ | {"BRAKELINE_DATA": str(folder.absolute() / "data")},
+    )
+    assert fly.stderr is not None
+    try:
+        yield fly, Steps(fly.stderr)
+    finally:
+        fly.terminate()
+        fly.wait()
 
 
 class Steps:
@@ -158,7 +192,7 @@ def _until(condition: Callable[[], T | None], fly: subprocess.Popen[str]) -> T:
 def _comes_out(judge: Judge, fly: subprocess.Popen[str]) -> bool:
     """Of where it was run into. Raises MavlinkError: the flight has ended."""
     try:
-        return _until(lambda: judge.witness.clearance > ROOM, fly)
+        return _until(lambda: judge.witness.clearance > ROOM or not judge.client.armed, fly)
     except MavlinkError:
         if fly.poll() is not None:
             raise
