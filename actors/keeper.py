@@ -209,9 +209,7 @@ def _keep(server: socket.socket, outbox: Outbox, stop: threading.Event) -> int:
     keeper: Keeper | None = None
     try:
         while (actor := next_actor(server, stop, keeper)) is not None:
-            try:
-                charge: Charge = actor.recv()
-            except (EOFError, OSError):
+            if (charge := _charge(actor)) is None:
                 continue
             outbox.actor = actor
             if keeper is None:
@@ -228,6 +226,15 @@ def _keep(server: socket.socket, outbox: Outbox, stop: threading.Event) -> int:
     finally:
         if keeper is not None:
             keeper.close()
+
+
+def _charge(actor: Connection) -> Charge | None:
+    """An actor's first word; None: it is gone, or has nothing to say."""
+    try:
+        said = actor.recv() if actor.poll(LAST_WORDS) else None
+    except (EOFError, OSError):
+        return None
+    return said if isinstance(said, Charge) else None
 
 
 def _portable(error: Exception) -> Exception:
