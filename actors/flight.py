@@ -293,15 +293,19 @@ def run(
         question = partial(ask, process.bus, deadline=settings.deadline)
         if not (rider.join(stop) and answered(question, robot, stages[0], settings.method == "ddpc", stop)):
             return False
-        vehicle = KeptVehicle(Charge(flight, robot.name, arena), rider.tape.keep, process.bus.tolerance, stop)
+        charge = Charge(flight, robot.name, arena.obstacles)
+        vehicle = KeptVehicle(charge, rider.tape.keep, process.bus.tolerance, stop)
         try:
             rider.take(vehicle)
             while not stop() and cycle([rider], question, tally, stop):
                 pass
             done = not stop()
             rider.stop()
-        finally:
             vehicle.close()
+        except BaseException:
+            vehicle.leave()
+            raise
+        finally:
             rider.tape.publish()
             outbox.close()
         log.info("%s: %d periods, %d without an answer in time", settings.name, tally.steps, tally.fallbacks)

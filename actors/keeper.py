@@ -1,7 +1,7 @@
 """PROCESS: keeps one vehicle flying for its actor, and outlives it.
 
 It has the link and the clock, and carries out what the actor commits: a process with nothing else to do, which no
-policy, no bus and no garbage collector holds up. An actor that dies leaves a plan that was verified to its end: it is
+policy and no bus holds up. An actor that dies leaves a plan that was verified to its end: it is
 flown to its end, and then the vehicle hovers until the next actor comes and goes on. If none does, it is let go of.
 
 The actor's side is `actors.kept`. They meet at a socket that only processes of this user on this machine reach.
@@ -9,7 +9,7 @@ The actor's side is `actors.kept`. They meet at a socket that only processes of 
 
 from __future__ import annotations
 
-import copy
+import contextlib
 import logging
 import select
 import socket
@@ -21,19 +21,21 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from logging.handlers import QueueHandler
 from multiprocessing.connection import Connection
+from multiprocessing.reduction import ForkingPickler
 from queue import SimpleQueue
 
 import numpy as np
 
 from actors.frames import Frame
-from actors.kept import Answer, Charge, Failure, News, Raw, address, ours
-from actors.live import LiveVehicle
+from actors.kept import Answer, Charge, Failure, LetGo, News, Raw, address, ours
+from actors.live import LiveVehicle, Turn
 from actors.mavlink import MavlinkError
 from actors.takeoff import REST, STOPPING
 from actors.truth import Truth
 from actors.witness import Witness
 from messaging.links import open_link
 from messaging.robots import robot_named
+from messaging.shapes import Shapes
 from messaging.signals import heeded
 from messaging.tolerant import Tolerance
 
@@ -42,6 +44,7 @@ log = logging.getLogger("brakeline.flight")
 LOOK = 0.1  # s between two looks at whether to end
 FIGURES = 5  # periods from one telling of figures to the next: percentiles of all that was late take a while
 LAST_WORDS = 1.0  # s for an actor to take them
+CLOSES = 15.0  # s for an actor to brake and close, once this process is told to end
 SUCCESSOR = 30.0  # s that one may take to come
 GONE = 3.0  # s without a word of the vehicle after which nobody waits for a successor any more
 MOST_FRAMES = 100_000  # kept for an actor that does not take them: some minutes'
@@ -53,6 +56,7 @@ class Outbox:
 
     def __init__(self) -> None:
         self.actor: Connection | None = None
+        self.lost: deque[Raw] = deque(maxlen=MOST_FRAMES)  # frames that it could not be told any more
         self._queue: SimpleQueue[tuple[Connection | None, object] | None] = SimpleQueue()
         self._thread = threading.Thread(target=self._run, name="outbox", daemon=True)
         self._thread.start()
@@ -62,6 +66,10 @@ class Outbox:
         self._queue.put((self.actor, said))
 
     put_nowait = put  # what a QueueHandler calls
+
+    def tell(self, actor: Connection, said: object) -> None:
+        """To one that is not the actor of the moment."""
+        self._queue.put((actor, said))
 
     @property
     def full(self) -> bool:
@@ -78,21 +86,28 @@ class Outbox:
                 if actor is None:
                     raise BrokenPipeError
                 actor.send(said)
-            except OSError:
-                if isinstance(said, logging.LogRecord):
-                    print(said.getMessage(), file=sys.stderr, flush=True)
+            except Exception:  # whatever it is: the next actor must be told again
+                self._keep(said)
+
+    def _keep(self, said: object) -> None:
+        if isinstance(said, News):
+            self.lost.extend(said.frames)
+        elif isinstance(said, logging.LogRecord):
+            with contextlib.suppress(OSError, ValueError):  # a terminal that is gone
+                print(said.getMessage(), file=sys.stderr, flush=True)
 
 
 class Keeper:
     """Of one vehicle, which flies once this is made."""
 
-    def __init__(self, charge: Charge, actor: Connection, outbox: Outbox) -> None:
+    def __init__(self, charge: Charge, actor: Connection, outbox: Outbox, stop: threading.Event) -> None:
         """Raises MavlinkError, BadLink, OSError; MavlinkError also when told to stop, or left alone, before it flew."""
-        self.charge, self._outbox = charge, outbox
+        self.charge, self._outbox, self._stop = charge, outbox, stop
         self._robot, flight = robot_named(charge.robot), charge.flight
         self._frames: deque[Raw] = deque(maxlen=MOST_FRAMES)
+        self._telling = threading.Lock()
         self._tolerance = Tolerance()
-        footprint, shapes = self._robot.footprint, charge.arena.shapes
+        footprint, shapes = self._robot.footprint, Shapes.of(charge.obstacles, self._robot.position_dim)
         self._vehicle = LiveVehicle(
             open_link(flight.url),
             self._robot,
@@ -102,15 +117,24 @@ class Keeper:
             Truth(flight.truth, flight.system, self._tolerance) if flight.truth else None,
             self._keep,
             self._tolerance,
-            actor.poll,  # whatever is said before it flies is: stop
+            lambda: stop.is_set() or actor.poll(),  # whatever is said before it flies is: stop
             flight.raise_limits,
             Witness(lambda position: float(shapes.distance(position).min()) - footprint),
         )
         threading.Thread(target=self._tell, name="news", daemon=True).start()
 
-    def serve(self, actor: Connection, stop: threading.Event) -> bool:
-        """Do as the actor says until it says `close` (True), or it is gone, or `stop` is set."""
-        while not stop.is_set():
+    def serve(self, actor: Connection) -> bool:
+        """Do as the actor says until it says `close` (True) or is gone (False).
+
+        Told to stop, the process waits for that word, but not for ever. Raises MavlinkError: nobody flies it any more,
+        or nobody said the word.
+        """
+        told_at: float | None = None
+        while not self._vehicle.failed:
+            if told_at is None and self._stop.is_set():
+                told_at = time.monotonic()
+            if told_at is not None and time.monotonic() - told_at > CLOSES:
+                raise MavlinkError("the process that keeps the vehicle was told to end")
             try:
                 if not actor.poll(LOOK):
                     continue
@@ -123,25 +147,37 @@ class Keeper:
                 self._outbox.put(Answer(number, self._vehicle.commit(*words)))
             except ValueError as error:
                 self._outbox.put(Answer(number, error))
-        return False
+        raise MavlinkError("nobody flies it any more")
 
     def brake(self) -> None:
         """Along the committed plan to its end, and then until it hovers. Raises MavlinkError: nobody flies it."""
         log.warning("without an actor: braking along the committed plan")
         vehicle, end = self._vehicle, time.monotonic() + STOPPING
         turn = vehicle.wait(vehicle.turn.number + self._robot.horizon)
-        while np.linalg.norm(turn.report.measured[3:6]) > REST and time.monotonic() < end and not self.gone:
+        while _speed(turn) > REST and time.monotonic() < end and not self.gone:
             turn = vehicle.wait(turn.number + 1)
-        log.warning("it hovers at (%.2f, %.2f, %.2f) m", *turn.report.measured[:3])
+        what = "it hovers" if _speed(turn) <= REST else "it does not come to rest"
+        log.warning("%s at (%.2f, %.2f, %.2f) m", what, *turn.report.measured[:3])
 
     @property
     def gone(self) -> bool:
-        """Has nothing been heard of the vehicle for a while?"""
-        return self._vehicle.silence > GONE
+        """Does nobody fly it any more, or was nothing heard of it for a while?"""
+        return self._vehicle.failed or self._vehicle.silence > GONE
+
+    def parted(self, charge: Charge) -> str:
+        """Why another actor can't go on with it, but has to take control anew; empty: it can."""
+        if charge != self.charge:
+            return "it was flown with other settings until now"
+        return self._vehicle.turn.lost
 
     def close(self) -> None:
-        """Let go of the vehicle."""
-        self._vehicle.close()
+        """Let go of the vehicle, which is first braked unless it hovers; what it said last goes to the actor."""
+        try:
+            if not (self._vehicle.idle or self.gone):
+                self.brake()
+        finally:
+            self._vehicle.close()
+            self._outbox.put(self._news(self._vehicle.turn, self._vehicle.timing.figures() | self._vehicle.judged()))
 
     def _keep(self, frame: Frame) -> None:
         self._frames.append((time.time_ns(), frame.outgoing, frame.raw))
@@ -149,25 +185,35 @@ class Keeper:
     def _tell(self) -> None:
         """Each period as it begins; what comes while there is no actor is for the next one."""
         vehicle, turn = self._vehicle, self._vehicle.turn
-        while True:
+        while not vehicle.failed:
             if self._outbox.actor is not None and not self._outbox.full:
-                frames = [self._frames.popleft() for _ in range(len(self._frames))]
-                figures = None
-                if turn.number % FIGURES == 0:
-                    figures = vehicle.timing.figures() | vehicle.judged()
-                self._outbox.put(News(turn, frames, self._tolerance.count, figures))
+                told = turn.number % FIGURES == 0
+                self._outbox.put(self._news(turn, vehicle.timing.figures() | vehicle.judged() if told else None))
             try:
                 turn = vehicle.wait(turn.number + 1)
-            except MavlinkError as error:
-                self._outbox.put(Failure(error))
-                return
+            except MavlinkError:  # it failed, or this machine stood still for seconds
+                turn = vehicle.turn
+
+    def _news(self, turn: Turn, figures: dict[str, float] | None) -> News:
+        frames: list[Raw] = []
+        with self._telling:
+            for kept in (self._outbox.lost, self._frames):
+                frames += [kept.popleft() for _ in range(len(kept))]
+        return News(turn, frames, self._tolerance.count, figures)
+
+
+def _speed(turn: Turn) -> float:
+    return float(np.linalg.norm(turn.report.measured[3:6]))
 
 
 @contextmanager
 def listening(url: str, system: int) -> Iterator[socket.socket]:
-    """A socket at which actors of that vehicle knock. Raises OSError: somebody else keeps it."""
+    """A socket at which actors of that vehicle knock. Raises MavlinkError: somebody else keeps it."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as server:
-        server.bind(address(url, system))
+        try:
+            server.bind(address(url, system))
+        except OSError as error:
+            raise MavlinkError(f"another process here flies vehicle {system} at {url}") from error
         server.listen()
         yield server
 
@@ -193,7 +239,7 @@ def main() -> int:
     root.setLevel(logging.INFO)
     root.addHandler(QueueHandler(outbox))  # type: ignore[arg-type]
     try:
-        with heeded(stop), listening(url, system) as server:
+        with heeded(stop, patient=True), listening(url, system) as server:
             return _keep(server, outbox, stop)
     except Exception as error:
         if outbox.actor is None:
@@ -211,14 +257,15 @@ def _keep(server: socket.socket, outbox: Outbox, stop: threading.Event) -> int:
         while (actor := next_actor(server, stop, keeper)) is not None:
             if (charge := _charge(actor)) is None:
                 continue
+            if keeper is not None and (why := keeper.parted(charge)):
+                outbox.tell(actor, Failure(LetGo(why)))
+                return 2
             outbox.actor = actor
             if keeper is None:
-                keeper = Keeper(charge, actor, outbox)
-            elif charge.differs(keeper.charge):
-                raise MavlinkError("it was flown with other settings until now, and is let go of: try again")
+                keeper = Keeper(charge, actor, outbox, stop)
             else:
                 log.info("it hovers, and goes on")
-            if keeper.serve(actor, stop):
+            if keeper.serve(actor):
                 return 0
             outbox.actor = None
             keeper.brake()
@@ -240,7 +287,7 @@ def _charge(actor: Connection) -> Charge | None:
 def _portable(error: Exception) -> Exception:
     """An exception that can be read at the other end."""
     try:
-        copy.copy(error)  # made anew of its arguments, as there
+        ForkingPickler.loads(ForkingPickler.dumps(error))
     except Exception:
         return MavlinkError(f"{type(error).__name__}: {error}")
     return error

@@ -23,12 +23,13 @@ from actors.mavlink import MavlinkError
 from actors.settings import FlightSettings
 from actors.telemetry import Array
 from messaging.robots import robot_named
+from messaging.shapes import Obstacle
 from messaging.tolerant import Tolerance
-from sim.world import Arena
 
 ANSWERS_IN = 1.0  # s, for a process that does nothing else
 STARTS_IN = 30.0  # s
-ENDS_IN = 5.0  # s
+ENDS_IN = 30.0  # s, braking included
+ATTEMPTS = 3  # at taking over, or taking off
 PREDECESSOR = 45.0  # s in which a keeper whose actor died has brought the vehicle to rest
 LOOK = 0.1  # s between two looks at whether to go on waiting
 ENDED = "the process that keeps the vehicle has ended"
@@ -42,12 +43,11 @@ class Charge:
 
     flight: FlightSettings
     robot: str
-    arena: Arena  # for the judge of simulated flights
+    obstacles: tuple[Obstacle, ...]  # for the judge of simulated flights
 
-    def differs(self, other: Charge) -> bool:
-        """Would it be another flight?"""
-        mine, theirs = ((c.flight, c.robot, c.arena.obstacles) for c in (self, other))
-        return mine != theirs
+
+class LetGo(MavlinkError):
+    """It was kept until now, but can't be handed over: somebody has to take control of it anew."""
 
 
 @dataclass(frozen=True)
@@ -77,7 +77,8 @@ class Failure:
 
 def address(url: str, system: int) -> str:
     """Where a vehicle's keeper is met: a name that is gone with its process, however that ends, and not a file."""
-    return f"\0brakeline/{os.getuid()}/{url[-80:]}/{system}"
+    place = url.replace("//", "").replace("localhost", "127.0.0.1")
+    return f"\0brakeline/{os.getuid()}/{place[-80:]}/{system}"
 
 
 def ours(peer: socket.socket) -> bool:
@@ -104,22 +105,20 @@ class KeptVehicle:
         self._tap, self._tolerance, self._passed_over = tap, tolerance, 0
         self._period = robot_named(charge.robot).period
         self._turned = threading.Condition()
-        self._turn: Turn | None = None
-        self._heard = False
-        self._failure: Exception | None = None
-        self._figures: dict[str, float] = {}
-        self._answers: SimpleQueue[Answer] = SimpleQueue()
-        self._asked = 0
+        self._lines: SimpleQueue[logging.LogRecord] = SimpleQueue()
+        threading.Thread(target=self._log, name="keeper's log", daemon=True).start()
         self._process: subprocess.Popen[bytes] | None = None
-        self._pipe = self._reach(charge.flight)
-        self._pipe.send(charge)
-        self._listener = threading.Thread(target=self._listen, name="keeper", daemon=True)
-        self._listener.start()
-        try:
-            self._await_flight(stop)
-        except BaseException:
-            self.close()
-            raise
+        self._asked = 0
+        for attempts_left in reversed(range(ATTEMPTS)):
+            self._meet(charge, stop)
+            try:
+                self._await_flight(stop)
+                return
+            except BaseException as error:
+                self.leave()
+                if not (attempts_left and isinstance(error, LetGo)):
+                    raise
+                logging.getLogger("brakeline.flight").info("taking control of it anew: %s", error)
 
     @property
     def turn(self) -> Turn:
@@ -149,47 +148,55 @@ class KeptVehicle:
         return self._figures
 
     def close(self) -> None:
-        """Let go of the vehicle: its keeper ends."""
-        if self._heard:
-            with contextlib.suppress(MavlinkError):
-                self._ask("close", patience=0.0)
-            self._listener.join(ENDS_IN)  # to the keeper's last word
-        else:  # it may fly for another actor, which is not to be disturbed
-            self.hang_up()
-        if self._process is not None:
-            if self._listener.is_alive():
-                self._process.kill()
-            self._process.wait()
-        self._pipe.close()
+        """Let go of the vehicle: its keeper brakes it, if it does not hover yet, and ends."""
+        with contextlib.suppress(Exception):
+            self._ask("close", patience=0.0)
+        self._listener.join(ENDS_IN)  # to the keeper's last word
+        self.leave()
 
-    def hang_up(self) -> None:
-        """As if this process had died."""
-        with socket.socket(fileno=os.dup(self._pipe.fileno())) as connection, contextlib.suppress(OSError):
+    def leave(self) -> None:
+        """As if this process had died: the keeper brakes it, and waits for another actor."""
+        with contextlib.suppress(OSError), socket.socket(fileno=os.dup(self._pipe.fileno())) as connection:
             connection.shutdown(socket.SHUT_RDWR)
         self._listener.join(ENDS_IN)
+        self._pipe.close()
+        if self._process is not None and self._process.poll() is not None:
+            self._process = None
 
-    def _reach(self, flight: FlightSettings) -> Connection:
-        """Raises MavlinkError: no keeper is there, and none starts."""
-        deadline = time.monotonic() + STARTS_IN
+    def _meet(self, charge: Charge, stop: Callable[[], bool]) -> None:
+        """Knock at its keeper's, and start one if there is none."""
+        self._turn: Turn | None = None
+        self._failure: Exception | None = None
+        self._figures: dict[str, float] = {}
+        self._answers: SimpleQueue[Answer] = SimpleQueue()
+        self._heard, self._heard_at = False, time.monotonic()
+        self._pipe = self._reach(charge.flight, stop)
+        with contextlib.suppress(OSError):  # it has ended meanwhile, as the listener finds
+            self._pipe.send(charge)
+        self._listener = threading.Thread(target=self._listen, name="keeper", daemon=True)
+        self._listener.start()
+
+    def _reach(self, flight: FlightSettings, stop: Callable[[], bool]) -> Connection:
+        """Raises MavlinkError: no keeper is there, and none starts; or told to stop."""
+        deadline, process = time.monotonic() + STARTS_IN, None
         while (pipe := _knock(flight)) is None:
-            if self._process is None:
+            if process is None:
                 words = [sys.executable, "-P", "-m", "actors.keeper", flight.url, str(flight.system)]
                 # Not of our session: ^C is for the actor, which then brakes and says when it is over.
-                self._process = subprocess.Popen(words, start_new_session=True)
-            if self._process.poll() is not None or time.monotonic() > deadline:
-                raise MavlinkError(f"the process that keeps the vehicle does not start ({self._process.poll()})")
+                process = self._process = subprocess.Popen(words, start_new_session=True)
+            if process.poll() is not None or time.monotonic() > deadline or stop():
+                raise MavlinkError(f"the process that keeps the vehicle does not start ({process.poll()})")
             time.sleep(0.2 * LOOK)
         return pipe
 
     def _await_flight(self, stop: Callable[[], bool]) -> None:
-        deadline = time.monotonic() + PREDECESSOR
         with self._turned:
             while self._turn is None:
                 self._check()
                 if stop():
                     raise MavlinkError("told to stop before it flew")
-                if not self._heard and time.monotonic() > deadline:
-                    raise MavlinkError("another process here flies it")
+                if time.monotonic() - self._heard_at > PREDECESSOR:
+                    raise MavlinkError("its keeper fell silent" if self._heard else "another process here flies it")
                 self._turned.wait(LOOK)
 
     def _check(self) -> None:
@@ -197,17 +204,19 @@ class KeptVehicle:
             raise self._failure
 
     def _ask(self, *words: object, patience: float = ANSWERS_IN) -> object:
-        """The answer; without patience none is waited for. Raises MavlinkError: it does not answer."""
+        """The answer; None: it comes late, or (without patience) is not waited for. Raises MavlinkError: it is gone."""
         self._asked += 1
         try:
             self._pipe.send((self._asked, *words))
             while patience:
                 answer = self._answers.get(timeout=patience)
+                self._check()
                 if answer.number == self._asked:  # not that of a question that nobody waited for
                     return answer.value
-                self._check()
-        except (OSError, Empty) as error:
-            raise self._failure or MavlinkError("the process that keeps the vehicle does not answer") from error
+        except OSError as error:
+            raise self._failure or MavlinkError(ENDED) from error
+        except Empty:
+            pass  # too late for what it was asked; whether it still flies is `wait`'s question
         return None
 
     def _listen(self) -> None:
@@ -215,7 +224,7 @@ class KeptVehicle:
         try:
             while True:
                 said = self._pipe.recv()
-                self._heard = True
+                self._heard, self._heard_at = True, time.monotonic()
                 if isinstance(said, News):
                     self._take(said)
                 elif isinstance(said, Answer):
@@ -223,11 +232,17 @@ class KeptVehicle:
                 elif isinstance(said, Failure):
                     self._fail(said.error)
                 else:
-                    logging.getLogger(said.name).handle(said)
+                    self._lines.put(said)
         except (EOFError, OSError):
-            self._fail(MavlinkError(ENDED))
+            self._fail(MavlinkError(ENDED) if self._heard else LetGo(ENDED))
         except Exception as error:  # whatever it is: who is not understood any more does not fly for us
             self._fail(error)
+
+    def _log(self) -> None:
+        """In a thread of its own, for a line goes over the bus too, which may wait."""
+        while True:
+            record = self._lines.get()
+            logging.getLogger(record.name).handle(record)
 
     def _take(self, news: News) -> None:
         for frame in news.frames:

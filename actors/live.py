@@ -164,6 +164,16 @@ class LiveVehicle:
         return self._client.armed
 
     @property
+    def idle(self) -> bool:
+        """Does it hover, as far as it was told to, with no input to come?"""
+        return not self._plan and not self.turn.input.any()
+
+    @property
+    def failed(self) -> bool:
+        """Has its thread died?"""
+        return bool(self._failure)
+
+    @property
     def silence(self) -> float:
         """s since anything was heard of it."""
         return time.monotonic() - max(self._heard_at.values(), default=-math.inf)

@@ -14,6 +14,9 @@ if TYPE_CHECKING:
     from actors.frames import Frame
 
 
+PART = 1000  # frames in a message, at most
+
+
 class Puts(Protocol):
     """A publisher, or what stands before one."""
 
@@ -38,7 +41,7 @@ class Tape:
         self._frames.append(pb.MavlinkFrame(wall_time=wall_time, outgoing=outgoing, raw=raw))
 
     def publish(self) -> None:
-        """Those since the last call, if there are any."""
-        frames = [self._frames.popleft() for _ in range(len(self._frames))]
-        if frames:
+        """Those since the last call, if there are any; in parts, for a message has a largest size."""
+        while self._frames:
+            frames = [self._frames.popleft() for _ in range(min(PART, len(self._frames)))]
             self.publisher.put(pb.MavlinkFrames(robot=self._robot, actor=self._actor, frames=frames))

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from actors.keeper import listening
 from actors.live import LiveVehicle
 from deploy.data.maiden import Box, Found, Maiden
 from messaging.links import open_link
@@ -36,7 +37,10 @@ def fly(robot: Robot, settings: MaidenSettings) -> Found:
         BadLink, MavlinkError: with what to do; BadData: nothing was flown.
     """
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s", datefmt="%H:%M:%S")
-    with heeded(threading.Event(), patient=True) as stop:  # a second one must not leave it in the air
+    with (
+        heeded(threading.Event(), patient=True) as stop,  # a second one must not leave it in the air
+        listening(settings.url, settings.system),  # so that no actor of this machine takes it
+    ):
         return _flown(robot, settings, stop)
 
 

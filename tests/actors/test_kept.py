@@ -51,7 +51,7 @@ def flown() -> Iterator[tuple[str, Autopilot]]:
 
 @contextmanager
 def actor(url: str, frames: list[Raw] | None = None, height: float = 2.0) -> Iterator[KeptVehicle]:
-    charge = Charge(FlightSettings(url, height=height), QUADROTOR.name, ARENA)
+    charge = Charge(FlightSettings(url, height=height), QUADROTOR.name, ARENA.obstacles)
     tap: Callable[[Raw], None] = (frames if frames is not None else []).append
     vehicle = KeptVehicle(charge, tap, Tolerance(), lambda: False)
     try:
@@ -74,7 +74,7 @@ def test_what_an_actor_that_dies_committed_is_flown_to_its_end_and_the_next_one_
         plan = np.array([[0.8, 0.0, 0.0], [1.5, 0.0, 0.0], [1.5, 0.0, 0.0], [0.8, 0.0, 0.0]])
         assert vehicle.commit(plan, number) and not vehicle.commit(plan, number - 2), "that one has begun"
         assert vehicle.wait(number + 1).input == pytest.approx(plan[1])
-        vehicle.hang_up()
+        vehicle.leave()
         with pytest.raises(MavlinkError, match="ended"):
             vehicle.wait(number + 5)
 
@@ -101,12 +101,36 @@ def test_one_vehicle_has_one_actor_and_a_keeper_that_ends_with_it(
             pass
         monkeypatch.undo()
         vehicle.wait(vehicle.turn.number + 2)
-        vehicle.hang_up()
-        with pytest.raises(MavlinkError, match="other settings"), actor(url, height=3.0):
-            pass
+        vehicle.leave()
+        with actor(url, height=3.0) as other:
+            assert other.turn.number < vehicle.turn.number, "of other settings: it was let go of, and taken anew"
     with socket.socket(socket.AF_UNIX) as knocking, pytest.raises(ConnectionRefusedError):
         knocking.connect(address(url, 1))
     until(lambda: autopilot.pilot.mode is not Mode.OFFBOARD, "the autopilot goes by its own timeout")
+
+
+def test_an_actor_that_closes_in_full_flight_leaves_it_braked(flown: tuple[str, Autopilot]) -> None:
+    url, autopilot = flown
+    frames: list[Raw] = []
+    with actor(url, frames) as vehicle:
+        number = vehicle.turn.number + 2
+        vehicle.commit(np.array([[0.8, 0.0, 0.0], [1.5, 0.0, 0.0], [1.5, 0.0, 0.0], [0.7, 0.0, 0.0]]), number)
+        vehicle.wait(number + 2)
+        assert np.linalg.norm(vehicle.turn.report.measured[3:6]) > 0.5
+    assert np.linalg.norm(autopilot.vehicle.state()[3:6]) < 0.3
+    sent = [found.message for _, out, raw in frames if out and (found := decoded(raw, out)) is not None]
+    assert [m for m in sent if m.get_type() == "SET_POSITION_TARGET_LOCAL_NED"][-1].vy == 0.0, "told to its end"
+
+
+def test_who_is_taken_by_somebody_else_meanwhile_is_taken_control_of_anew(flown: tuple[str, Autopilot]) -> None:
+    url, autopilot = flown
+    with actor(url) as vehicle:
+        vehicle.leave()
+        autopilot.pilot.mode = Mode.HOLD
+        time.sleep(0.5)
+        with actor(url) as heir:
+            heir.wait(heir.turn.number + 5)
+            assert not heir.turn.lost and autopilot.pilot.mode is Mode.OFFBOARD
 
 
 def test_nobody_elses_processes_are_listened_to(monkeypatch: pytest.MonkeyPatch) -> None:
