@@ -228,7 +228,9 @@ class Filter:
         if not np.isfinite(rows.bound).all():  # of one that is just touched, or is no number, no side is known
             return None
         standing = rows.support(self.tube, stand) - rows.bound
-        inputs = np.array([self.inputs.limited(wanted, before) for wanted in slow_inputs(robot)])
+        # What is carried out late is taken back late: no faster then than it gets within a period.
+        most = np.asarray(robot.action_slew) if robot.given else np.full(m, np.inf)
+        inputs = np.array([self.inputs.limited(np.clip(u, -most, most), before) for u in slow_inputs(robot)])
         plans = [self.inputs.regressors(z_0, action) for action in inputs]
         violated = np.array([rows.support(self.tube, z) - rows.bound for z in plans])
         ends = np.zeros(len(rows.bound), dtype=bool)
