@@ -232,13 +232,15 @@ class Filter:
         most = np.asarray(robot.action_slew) if robot.given else np.full(m, np.inf)
         inputs = np.array([self.inputs.limited(np.clip(u, -most, most), before) for u in slow_inputs(robot)])
         plans = [self.inputs.regressors(z_0, action) for action in inputs]
-        violated = np.array([rows.support(self.tube, z) - rows.bound for z in plans])
+        # Each as sure of where it goes as standing is: who knows little of its own motion would else be led to where
+        # that is known best, which is not out.
+        violated = standing + (np.array(plans) - stand) @ rows.gradient.T
         ends = np.zeros(len(rows.bound), dtype=bool)
         obstacles = len(scene.near) + (len(scene.moving) if scene.moving is not None else 0)
         obstacles += len(scene.unseen) if scene.unseen is not None else 0
         each = 2 * robot.horizon + 1
         ends[each - 1 : len(self.around.discs) * obstacles * each : each] = True
-        best = least_violating(violated, standing, ends, self.comfort)
+        best = least_violating(violated, standing, ends)
         if best is not None:
             z = plans[best]
         elif robot.heading is not None and len(scene.near):

@@ -1,8 +1,8 @@
 """Out of where nothing can be verified, not even standing (method §11).
 
 Of slow inputs, each followed by braking, the one whose worst violated half-space is violated least at the plan's end,
-then the next worst, and so on; none may violate any half-space more than standing does, but for its tube's own width. A
-robot that has to turn first turns on the spot towards where it can get away. Of an obstacle that it is inside of (a
+then the next worst, and so on; none may violate any half-space more than standing does. What is compared is where they
+lead, with the width of standing's tube. A robot that has to turn first turns on the spot towards where it can get away. Of an obstacle that it is inside of (a
 margin below zero lets the body overlap) the nearest side counts. Never verified: only the least bad.
 """
 
@@ -34,14 +34,14 @@ def slow_inputs(robot: Robot) -> Array:
     return np.array(list(product(*levels)))
 
 
-def least_violating(violated: Array, standing: Array, ends: NDArray[np.bool_], give: float) -> int | None:
+def least_violating(violated: Array, standing: Array, ends: NDArray[np.bool_]) -> int | None:
     """The candidate that gets out best, None if none does.
 
     violated (C, R): m, by which each candidate's tube is beyond each half-space; standing (R,): the same of standing;
-    ends (R,): those at the plan's end; give [m]: what a candidate may be worse by on the way, for its tube is wider.
+    ends (R,): those at the plan's end.
     """
     now = np.sort(np.maximum(standing[ends], 0.0))[::-1][:COMPARED]
-    harmless = (violated <= np.maximum(standing, 0.0) + give + 1e-9).all(axis=1)
+    harmless = (violated <= np.maximum(standing, 0.0) + 1e-9).all(axis=1)
     worst = -np.sort(-np.maximum(violated[:, ends], 0.0), axis=1)[:, :COMPARED]
     best: int | None = None
     for c in np.flatnonzero(harmless):

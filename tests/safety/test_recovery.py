@@ -35,9 +35,8 @@ def test_slow_inputs_are_slow_and_within_bounds():
 def test_the_worst_comes_first_and_nothing_gets_worse():
     standing, ends = np.array([0.05, 0.02, -0.1]), np.ones(3, dtype=bool)
     better = np.array([[0.04, 0.02, -0.1], [0.03, 0.025, -0.1], [0.03, 0.0, -0.1], [0.05, 0.02, -0.1]])
-    assert least_violating(better, standing, ends, 0.0) == 2
-    assert least_violating(better[[1, 3]], standing, ends, 0.0) is None  # the one harms, the other helps nothing
-    assert least_violating(better[[1]], standing, ends, 0.01) == 0
+    assert least_violating(better, standing, ends) == 2
+    assert least_violating(better[[1, 3]], standing, ends) is None  # the one harms, the other helps nothing
     assert lower(np.array([1.0, 0.0]), np.array([1.0, 1.0])) and not lower(np.array([1.0, 1.0]), np.array([1.0, 1.0]))
 
 
