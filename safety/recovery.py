@@ -2,8 +2,9 @@
 
 Of slow inputs, each followed by braking, the one whose worst violated half-space is violated least at the plan's end,
 then the next worst, and so on; none may violate any half-space more than standing does. What is compared is where they
-lead, with the width of standing's tube. A robot that has to turn first turns on the spot towards where it can get away. Of an obstacle that it is inside of (a
-margin below zero lets the body overlap) the nearest side counts. Never verified: only the least bad.
+lead, with the width of standing's tube. A robot that has to turn first turns on the spot towards where it can get away.
+Of an obstacle that it is inside of (a margin below zero lets the body overlap) the nearest side counts. Never verified:
+only the least bad.
 """
 
 from __future__ import annotations
