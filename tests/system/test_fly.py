@@ -167,7 +167,8 @@ def test_what_is_killed_in_flight_hurts_nobody(tmp_path: Path) -> None:
 def keeper(run: Run) -> psutil.Process:
     """The process that keeps the vehicle of a run."""
     url = load(run.folder / CONFIG).flights[0].url
-    (found,) = (p for p in psutil.process_iter(["cmdline"]) if "actors.keeper" in p.cmdline() and url in p.cmdline())
+    words = {process: process.info["cmdline"] or [] for process in psutil.process_iter(["cmdline"])}  # none: a zombie's
+    (found,) = (process for process, own in words.items() if "actors.keeper" in own and url in own)
     return found
 
 

@@ -1,5 +1,5 @@
 """ArduCopter and PX4 as they are, where there are any (tests/real.py): from switching on to flying and to landing, and
-a minute behind the filter, in which the actor dies."""
+half a minute behind the filter, in which the actor dies."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ DEGREE = 111_319.5  # m, of latitude
 TRUTH = {"ardupilot": "SIMSTATE", "px4": "HIL_STATE_QUATERNION"}  # what its own simulator knows
 LAND = {"ardupilot": (9, 0), "px4": (4, 6)}  # DO_SET_MODE
 USED = {"ardupilot": {"ATTITUDE", "SCALED_IMU", "LOCAL_POSITION_NED", "EXTENDED_SYS_STATE"}}
-BEFORE, AFTER = 100, 200  # periods until its actor dies, and from then on: a minute
+BEFORE, AFTER = 50, 100  # periods until its actor dies, and from then on: half a minute
 OFF = 1.5  # m that an estimate may be off after a few metres: it is made of a simulated GPS
 
 
@@ -90,7 +90,7 @@ def test_it_is_found_out_flown_and_given_back(kind: str, tmp_path: Path, caplog:
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.usefixtures("flight_folder")
-def test_it_flies_a_minute_behind_the_filter_and_hovers_when_its_actor_dies(kind: str, tmp_path: Path) -> None:
+def test_it_flies_half_a_minute_behind_the_filter_and_hovers_when_its_actor_dies(kind: str, tmp_path: Path) -> None:
     """By the embedded vehicle's model set, which is not this one's: nothing is said of how it gets on."""
     with autopilot(kind, tmp_path) as (url, system):
         how = ["--url", url, "--system", system, "--minutes", AFTER * QUADROTOR.period / 60.0, "--policy", "astar"]
