@@ -17,7 +17,24 @@ ROOT = Path(__file__).parents[1]
 def autopilot(kind: str, folder: Path) -> AbstractContextManager[tuple[str, int]]:
     """One that runs: (the URL for us, its system id)."""
     try:
-        start = sitl.program(kind, ROOT.parent / "shared" / kind)
+        start = _program(kind)
     except sitl.NoAutopilot as none:
         pytest.skip(str(none))
     return sitl.flying(kind, start, folder)
+
+
+def autopilots(folder: Path) -> list[AbstractContextManager[tuple[str, int]]]:
+    """One of each kind that there is."""
+    found, missing = [], []
+    for kind in KINDS:
+        try:
+            found.append(sitl.flying(kind, _program(kind), folder))
+        except sitl.NoAutopilot as none:
+            missing.append(str(none))
+    if not found:
+        pytest.skip("; ".join(missing))
+    return found
+
+
+def _program(kind: str) -> Path:
+    return sitl.program(kind, ROOT.parent / "shared" / kind)

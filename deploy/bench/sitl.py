@@ -92,7 +92,7 @@ def configure(url: str, system: int, parameters: Mapping[str, float]) -> None:
 @contextmanager
 def _running(kind: str, start: Path, folder: Path) -> Iterator[tuple[str, int]]:
     instance = next(i for i in reversed(INSTANCES) if not _taken(kind, i))
-    said = folder / "sitl.log"
+    said = folder / f"{kind}.log"
     with said.open("wb") as output:
         command = [sys.executable, "-c", KEEPER, str(start), str(folder / kind), str(instance)]
         process = subprocess.Popen(
