@@ -24,8 +24,8 @@ FLIGHTS = 60  # trajectories of the quadrotor, recorded in half a minute
 TRAJECTORIES = 50  # enough for every check of the certificates, recorded in ten seconds
 
 
-# What flies or drives in real time mostly waits; whole runs keep both cores busy. One of each at a time. Real autopilots
-# wait, too, but go with the whole runs: each lane takes about as long.
+# What flies or drives in real time mostly waits; whole runs keep both cores busy. One of each at a time. Real
+# autopilots wait, too, but go with the whole runs: each lane takes about as long.
 LIVE = (
     *("tests/actors/test_live.py", "tests/actors/ros2/", "tests/system/test_fly.py", "tests/system/test_mavsdk.py"),
     *("tests/system/test_hil.py", "tests/system/test_ros2.py"),
