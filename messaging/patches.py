@@ -100,34 +100,17 @@ def _rings(rings: int, low: float, high: float) -> tuple[Array, int, int]:
 
 def least_within(values: Array, elevations: Array, step: float, within: float) -> Array:
     """The least (E, A) of all that are within so many rad of each on the sphere: of a box about that cap."""
-    rings, columns = values.shape
-    rows = min(math.ceil(within / step - 1e-9), rings - 1)
-    padded = np.pad(values, ((rows, rows), (0, 0)), constant_values=np.inf)
-    upright = padded[:rings].copy()
-    for k in range(1, 2 * rows + 1):
-        np.minimum(upright, padded[k : k + rings], out=upright)
-    table = [upright]  # the least of 2^k columns from each on
-    while 1 << len(table) <= columns:
-        table.append(np.minimum(table[-1], np.roll(table[-1], -(1 << (len(table) - 1)), axis=1)))
-    first, last = _spans(columns, tuple(elevations), within)
-    flat = np.concatenate(table, axis=None)
-    return np.asarray(np.minimum(flat[first], flat[last]))
+    from messaging.nearby import least_of  # compiled
+
+    rows = math.ceil(within / step - 1e-9)
+    return least_of(np.ascontiguousarray(values), rows, _beside(values.shape[1], tuple(elevations), within))
 
 
 @lru_cache(maxsize=64)
-def _spans(columns: int, elevations: tuple[float, ...], within: float) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Where `least_within`'s table has two halves (E, A), which may overlap, of what is within so many rad of each."""
-    rings = len(elevations)
-    first, last = np.empty((rings, columns), np.intp), np.empty((rings, columns), np.intp)
+def _beside(columns: int, elevations: tuple[float, ...], within: float) -> NDArray[np.int64]:
+    """(E,): how many columns beside a beam of each ring `least_within` looks at."""
+    half = np.full(len(elevations), math.pi)  # a cap with a pole in it is all about
     for i, elevation in enumerate(elevations):
-        half = math.pi
         if abs(elevation) + within < 0.5 * math.pi:
-            half = math.asin(math.sin(within) / math.cos(elevation))
-        beside = math.ceil(half * columns / math.tau - 1e-9)
-        count = min(2 * beside + 1, columns)
-        level = count.bit_length() - 1
-        begin = np.arange(columns) - beside
-        end = begin + count - (1 << level)
-        row = (level * rings + i) * columns
-        first[i], last[i] = row + begin % columns, row + end % columns
-    return first, last
+            half[i] = math.asin(math.sin(within) / math.cos(elevation))
+    return np.minimum(np.ceil(half * columns / math.tau - 1e-9), columns).astype(np.int64)

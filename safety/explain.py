@@ -48,8 +48,10 @@ class Around:
     unseen: Cells | Shadows | None
     promised: Promises | None = None  # these come last, once for the whole body
 
-    def __len__(self) -> int:
-        return sum(len(part) for part in (self.near, self.moving, self.unseen) if part is not None)
+    @property
+    def told(self) -> int:
+        """How many half-spaces a period are about obstacles that were told of."""
+        return len(self.near) + (len(self.moving) if self.moving is not None else 0)
 
 
 @dataclass(frozen=True)
@@ -75,28 +77,35 @@ class Planes:
 def worst(row: int, room: float, robot: Robot, around: Around, planes: list[Planes]) -> Stopped:
     """What a row is about; planes: of each disc, under the proposal."""
     N, T = robot.horizon, robot.period
-    each = 2 * N + 1
-    disc, rest = divmod(row, max(len(around) * each, 1))
-    if disc >= len(planes) or not len(around):
-        number = row - len(planes) * len(around) * each
-        if around.promised is not None:
-            each = (N + 1) << robot.position_dim  # of a robot
-            if number < len(around.promised) * each:
-                period = (number % each) >> robot.position_dim
-                return Stopped.nowhere(ROBOT, room, T * min(period + 1, N))
-            number -= len(around.promised) * each
-        period, limit = divmod(number, len(robot.limits))
-        return Stopped.nowhere(robot.limits[limit].name, room, T * min(period + 1, N))
-    which, end = divmod(rest, each)
+    number = row
+    for disc in planes:
+        rows = (2 * N + 1) * len(disc.normals)
+        if number < rows:
+            return _about_an_obstacle(number, room, robot, around, disc)
+        number -= rows
+    if around.promised is not None:
+        each = (N + 1) << robot.position_dim  # of a robot
+        if number < len(around.promised) * each:
+            period = (number % each) >> robot.position_dim
+            return Stopped.nowhere(ROBOT, room, T * min(period + 1, N))
+        number -= len(around.promised) * each
+    period, limit = divmod(number, len(robot.limits))
+    return Stopped.nowhere(robot.limits[limit].name, room, T * min(period + 1, N))
+
+
+def _about_an_obstacle(row: int, room: float, robot: Robot, around: Around, planes: Planes) -> Stopped:
+    """The same of a disc's row."""
+    N, T = robot.horizon, robot.period
+    which, end = divmod(row, 2 * N + 1)
     period = end if end < N else min(end - N, N - 1)
     when = end if end < N else min(end - N + 1, N)
-    start, ends = planes[disc].start, planes[disc].ends
-    if isinstance(around.unseen, Shadows) and which >= len(around) - len(around.unseen):
-        by, (normal, level) = UNSEEN, planes[disc].itself(which, period)
+    start, ends = planes.start, planes.ends
+    if isinstance(around.unseen, Shadows) and which >= around.told:
+        by, (normal, level) = UNSEEN, planes.itself(which, period)
     elif which < len(around.near):
         by, (normal, level) = (
             around.near.kind(which),
-            planes[disc].itself(which, period, float(around.near.margin[which])),
+            planes.itself(which, period, float(around.near.margin[which])),
         )
     else:
         by, normals, offsets = _moving_or_unseen(which - len(around.near), robot, around, start, ends)

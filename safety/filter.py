@@ -224,7 +224,8 @@ class Filter:
             seeming = 2.0 * float(np.linalg.norm(self.around.measured)) + (self.comfort if self.around.stays else 0.0)
         if self.around.margin(self.around.rows(parked, stand), stand) >= -seeming:
             return None
-        rows = self.around.rows(scene, stand, self.around.planes(scene, stand, leaving=True))
+        planes = self.around.planes(scene, stand, leaving=True)
+        rows = self.around.rows(scene, stand, planes)
         if not np.isfinite(rows.bound).all():  # of one that is just touched, or is no number, no side is known
             return None
         standing = rows.support(self.tube, stand) - rows.bound
@@ -236,10 +237,8 @@ class Filter:
         # that is known best, which is not out.
         violated = standing + (np.array(plans) - stand) @ rows.gradient.T
         ends = np.zeros(len(rows.bound), dtype=bool)
-        obstacles = len(scene.near) + (len(scene.moving) if scene.moving is not None else 0)
-        obstacles += len(scene.unseen) if scene.unseen is not None else 0
         each = 2 * robot.horizon + 1
-        ends[each - 1 : len(self.around.discs) * obstacles * each : each] = True
+        ends[each - 1 : sum(len(of.normals) for of in planes) * each : each] = True
         best = least_violating(violated, standing, ends)
         if best is not None:
             z = plans[best]

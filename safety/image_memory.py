@@ -45,6 +45,11 @@ class ImageMemory(Memory[RangeImage]):
 
     START = 0.7  # what flies needs more to get going
 
+    def __init__(self, footprint: float) -> None:
+        import messaging.nearby  # noqa: F401  # compiled now, and not when the first image is to be answered in time
+
+        super().__init__(footprint)
+
     def reset(self) -> None:
         super().reset()
         self._seen: deque[_Seen] = deque(maxlen=KEPT)

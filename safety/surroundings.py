@@ -87,6 +87,8 @@ class Surroundings:
         """tube: the model's; `outer`: the same over-approximated with fewer atoms; domain (2, r): of the recorded
         regressors; `comfort` [m]: what is kept to obstacles beyond the tube; as wide as it needs be, unless given."""
         robot = model.robot
+        if robot.position_dim == 3:
+            shades.prepare()
         self.robot, self.tube, self.stands = robot, tube, model.moving
         self.discs = _discs(robot, tube)
         self.boxes = Boxes(tube.position, tube.directions)

@@ -61,7 +61,7 @@ def bounded(seed, dropped):
 @given(st.integers(0, 100_000), st.sampled_from([0.0, 0.1]))
 def test_every_point_within_reach_is_beyond_some_half_space(seed, dropped):
     normals, offsets, near = bounded(seed, dropped)
-    assert normals.shape == (PLANES + len(FACES), 6, 3)
+    assert len(FACES) <= len(normals) <= PLANES + len(FACES) and normals.shape[1:] == (6, 3)
     if np.isneginf(offsets).all():  # so much is not seen that even the start may be occupied
         return
     for k in range(6):
@@ -118,8 +118,7 @@ def test_no_direction_is_farther_from_its_patch_than_half_a_meshes_diagonal(low)
 
 def test_where_nothing_is_there_is_only_the_rooms_box():
     normals, offsets = half_spaces(shadows(clear(), room(), BODY), NOTHING, np.zeros((2, 3)), BODY, NOTHING, 0.2)
-    assert not normals[:PLANES].any() and (offsets[:PLANES] > 1e3).all()
-    assert np.array_equal(normals[PLANES:, 0], FACES) and (offsets[PLANES:] == 2.0).all()
+    assert np.array_equal(normals[:, 0], FACES) and (offsets == 2.0).all()
 
 
 @pytest.mark.parametrize("image", [clear(ranges=np.zeros((RINGS, COLUMNS))), clear(range_error=FAR)])
