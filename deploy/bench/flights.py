@@ -20,7 +20,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from deploy.bench import sitl
+from deploy.bench import mocap, sitl
 from deploy.bench.timing import Words
 from deploy.interpreter import PYTHON
 
@@ -44,6 +44,8 @@ SET: dict[str, dict[str, float]] = {
         "EKF2_BARO_NOISE": 0.3,
     },
 }
+INDOORS = "px4 with motion capture"
+SETUPS = {**{kind: kind for kind in sitl.KINDS}, INDOORS: "px4"}  # by name: the autopilot
 
 
 class Failed(RuntimeError):
@@ -53,24 +55,27 @@ class Failed(RuntimeError):
 def run(minutes: float, folder: Path) -> Words:
     """Rows: flights; columns: what they came to."""
     rows: Words = {}
-    for kind in sitl.KINDS:
+    for setup, kind in SETUPS.items():
         try:
             start = sitl.program(kind)
         except sitl.NoAutopilot as none:
             print(none, file=sys.stderr)
             continue
-        flights = Flights(kind, start, folder / kind)
-        first = flights.first()
-        rows[f"{kind}: first flight"] = _learned(first)
-        if "model" not in first:
-            continue
-        rows[f"{kind}: second flight"] = flown(flights.second)
-        rows[f"{kind}: certified by it"] = certified(flights.certify("second", flights.data))
-        for arena in ARENAS:
-            for policy in POLICIES:
-                rows[f"{kind}: {policy}, {arena}"] = flown(partial(flights.fly, policy, arena, minutes))
-        rows |= {f"{kind}: {name}": row for name, row in two(partial(flights.pair, minutes)).items()}
+        rows |= {f"{setup}: {name}": row for name, row in _flown(Flights(setup, start, folder / setup), minutes)}
     return rows
+
+
+def _flown(flights: Flights, minutes: float) -> Iterator[tuple[str, dict[str, float | str]]]:
+    first = flights.first()
+    yield "first flight", _learned(first)
+    if "model" not in first:
+        return
+    yield "second flight", flown(flights.second)
+    yield "certified by it", certified(flights.certify("second", flights.data))
+    for arena in ARENAS:
+        for policy in POLICIES:
+            yield f"{policy}, {arena}", flown(partial(flights.fly, policy, arena, minutes))
+    yield from two(partial(flights.pair, minutes)).items()
 
 
 @dataclass(frozen=True)
@@ -84,16 +89,16 @@ class Upset:
 
 
 class Flights:
-    """Of one kind of autopilot, each from switching on; its data, logs and figures are kept in a folder."""
+    """In one setup, each from switching on; its data, logs and figures are kept in a folder."""
 
-    def __init__(self, kind: str, start: Path, folder: Path) -> None:
-        self._kind, self._start, self._folder = kind, start, folder.absolute()
+    def __init__(self, setup: str, start: Path, folder: Path) -> None:
+        self._setup, self._kind, self._start, self._folder = setup, SETUPS[setup], start, folder.absolute()
         self.data = self._folder / "data"
 
     @classmethod
     def beside(cls, other: Flights, name: str) -> Flights:
         """Of the same autopilot, with data and flights of their own in a folder of the other's."""
-        return cls(other._kind, other._start, other._folder / f"{name}-own")
+        return cls(other._setup, other._start, other._folder / f"{name}-own")
 
     def first(self) -> dict[str, Any]:
         return self._figures("first", FIRST, "collect", "quadrotor", "--minutes", str(FIRST))
@@ -133,32 +138,35 @@ class Flights:
     def _kept(self, name: str, minutes: float, fly: Callable[[], str]) -> dict[str, Any]:
         kept = self._folder / f"{name}.json"
         if not kept.exists():
-            print(f"{self._kind}: {name}, {minutes:g} minutes", file=sys.stderr)
+            print(f"{self._setup}: {name}, {minutes:g} minutes", file=sys.stderr)
             kept.parent.mkdir(parents=True, exist_ok=True)
             kept.write_text(fly())
         figures: dict[str, Any] = json.loads(kept.read_text())
         return figures
 
     def _flown(self, minutes: float, words: tuple[str, ...], upset: Upset) -> str:
-        lasting = SET[self._kind] | ({} if upset.ends else dict(upset.parameters))
-        with (
-            tempfile.TemporaryDirectory() as folder,
-            sitl.flying(self._kind, self._start, Path(folder), lasting) as (url, system),
-            self._in_between(upset, sitl.beside(self._kind, system, url), system),
-        ):
+        with ExitStack() as stack:
+            url, system = self._switched_on(stack, {} if upset.ends else upset.parameters)
+            stack.enter_context(self._in_between(upset, sitl.beside(self._kind, system, url), system))
             command = [*words, "--url", url, "--system", str(system), "--raise-limits", "--json"]
             return told(command, self.data, 60.0 * minutes + BEYOND)
 
     def _both(self, minutes: float) -> str:
         with ExitStack() as stack:
-            reached = []
-            for _ in range(2):
-                folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
-                reached.append(stack.enter_context(sitl.flying(self._kind, self._start, folder, SET[self._kind])))
-            urls, systems = zip(*reached, strict=True)
+            urls, systems = zip(*(self._switched_on(stack, {}) for _ in range(2)), strict=True)
             command = ["fly", "--minutes", str(minutes), "--url", *urls, "--systems", *map(str, systems)]
             command += ["--at-start", "--pictures", "0", "--out", str(self.run("pair")), "--raise-limits", "--json"]
             return told(command, self.data, 60.0 * minutes + BEYOND)
+
+    def _switched_on(self, stack: ExitStack, parameters: Mapping[str, float]) -> tuple[str, int]:
+        """One more of them until the stack ends: (the URL for us, its system id)."""
+        folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
+        indoors = self._setup == INDOORS
+        lasting = {**SET[self._kind], **(mocap.PARAMETERS if indoors else {}), **parameters}
+        url, system = stack.enter_context(sitl.flying(self._kind, self._start, folder, lasting))
+        if indoors:
+            stack.enter_context(mocap.captured(sitl.beside(self._kind, system, url), system))
+        return url, system
 
     @contextmanager
     def _in_between(self, upset: Upset, url: str, system: int) -> Iterator[None]:

@@ -1,0 +1,101 @@
+"""A motion capture system: tells a PX4 with its own simulator where it is, as cameras about a hall would."""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+
+from messaging.links import Link, open_link
+from sim.autopilot.dialect import mavlink
+
+OURSELVES = 250  # system id
+EVERY = 0.02  # s between two pictures
+LOOKS = 0.002  # s between two looks at what has come
+ERROR = 0.01  # m, σ of a picture's position, an axis; what the simulator tells is rounded to 1.1 cm besides
+DEGREE = math.radians(1.0) * 6_371_000.0  # m of latitude, as that simulator has it
+
+# What its estimator is to make of it: position from here, none from GPS.
+PARAMETERS = {
+    "EKF2_EV_CTRL": 3,
+    "EKF2_EVP_NOISE": 0.02,
+    "EKF2_EV_DELAY": 10.0,
+    "EKF2_GPS_CTRL": 0,
+    "EKF2_HGT_REF": 3,
+}
+
+
+@contextmanager
+def captured(url: str, system: int, seed: int = 0) -> Iterator[None]:
+    """Meanwhile it is told, at an address that nobody else talks to it at."""
+    over = threading.Event()
+    thread = threading.Thread(target=_capture, args=(url, system, seed, over), daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        over.set()
+        thread.join()
+
+
+def _capture(url: str, system: int, seed: int, over: threading.Event) -> None:
+    link = open_link(url)
+    mav = mavlink.MAVLink(_Wire(link), srcSystem=OURSELVES, srcComponent=mavlink.MAV_COMP_ID_VISUAL_INERTIAL_ODOMETRY)
+    mav.robust_parsing = True
+    rng, home, flies, beaten = np.random.default_rng(seed), None, False, -math.inf
+    try:
+        while not over.wait(LOOKS):
+            if time.monotonic() - beaten > 1.0:
+                beaten = time.monotonic()
+                mav.heartbeat_send(mavlink.MAV_TYPE_ONBOARD_CONTROLLER, mavlink.MAV_AUTOPILOT_INVALID, 0, 0, 0)
+                _introduce(mav, system, None if flies else home)
+            for message in mav.parse_buffer(link.receive()) or ():
+                if message.get_srcSystem() != system:
+                    continue
+                if message.get_type() == "HEARTBEAT":
+                    flies = bool(message.base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED)
+                elif message.get_type() == "HIL_STATE_QUATERNION":
+                    home = message if home is None else home
+                    seen = _place(message, home) + ERROR * rng.normal(size=3)
+                    mav.vision_position_estimate_send(message.time_usec, *map(float, seen), *_angles(message))
+    finally:
+        link.close()
+
+
+def _introduce(mav: Any, system: int, home: Any) -> None:
+    """Ask for what is needed, and say where on Earth the hall is."""
+    if home is None:
+        what = mavlink.MAVLINK_MSG_ID_HIL_STATE_QUATERNION
+        mav.command_long_send(system, 1, mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, 0, what, 1e6 * EVERY, *[0.0] * 5)
+    else:
+        mav.set_gps_global_origin_send(system, home.lat, home.lon, home.alt)
+
+
+class _Wire:
+    """For pymavlink."""
+
+    def __init__(self, link: Link) -> None:
+        self._link = link
+
+    def write(self, data: bytes) -> None:
+        self._link.send(bytes(data))
+
+
+def _place(message: Any, home: Any) -> np.ndarray[Any, np.dtype[np.float64]]:
+    """North, east, down from there, m."""
+    narrow = math.cos(math.radians(1e-7 * home.lat))
+    north, east = 1e-7 * DEGREE * (message.lat - home.lat), 1e-7 * DEGREE * narrow * (message.lon - home.lon)
+    return np.array([north, east, -1e-3 * (message.alt - home.alt)])
+
+
+def _angles(message: Any) -> tuple[float, float, float]:
+    """Roll, pitch, yaw [rad]."""
+    w, x, y, z = message.attitude_quaternion
+    roll = math.atan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y))
+    pitch = math.asin(max(-1.0, min(1.0, 2.0 * (w * y - z * x))))
+    return roll, pitch, math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
