@@ -1,4 +1,4 @@
-"""A motion capture system: tells a PX4 with its own simulator where it is, as cameras about a hall would."""
+"""A motion capture system: tells a PX4 with its own simulator where it is and how fast, as cameras about a hall would."""
 
 from __future__ import annotations
 
@@ -17,13 +17,15 @@ from sim.autopilot.dialect import mavlink
 OURSELVES = 250  # system id
 EVERY = 0.02  # s between two pictures
 LOOKS = 0.002  # s between two looks at what has come
-ERROR = 0.01  # m, σ of a picture's position, an axis; what the simulator tells is rounded to 1.1 cm besides
+ERROR, SPEED_ERROR = 0.01, 0.02  # m, m/s: σ an axis; what the simulator tells is rounded to 1 cm, cm/s besides
+UNKNOWN = [math.nan, *[0.0] * 20]  # a covariance
 DEGREE = math.radians(1.0) * 6_371_000.0  # m of latitude, as that simulator has it
 
-# What its estimator is to make of it: position from here, none from GPS.
+# What its estimator is to make of it: position and velocity from here, none from GPS.
 PARAMETERS = {
-    "EKF2_EV_CTRL": 3,
+    "EKF2_EV_CTRL": 7,
     "EKF2_EVP_NOISE": 0.02,
+    "EKF2_EVV_NOISE": 0.05,
     "EKF2_EV_DELAY": 10.0,
     "EKF2_GPS_CTRL": 0,
     "EKF2_HGT_REF": 3,
@@ -61,8 +63,7 @@ def _capture(url: str, system: int, seed: int, over: threading.Event) -> None:
                     flies = bool(message.base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED)
                 elif message.get_type() == "HIL_STATE_QUATERNION":
                     home = message if home is None else home
-                    seen = _place(message, home) + ERROR * rng.normal(size=3)
-                    mav.vision_position_estimate_send(message.time_usec, *map(float, seen), *_angles(message))
+                    _tell(mav, message, home, rng)
     finally:
         link.close()
 
@@ -74,6 +75,15 @@ def _introduce(mav: Any, system: int, home: Any) -> None:
         mav.command_long_send(system, 1, mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, 0, what, 1e6 * EVERY, *[0.0] * 5)
     else:
         mav.set_gps_global_origin_send(system, home.lat, home.lon, home.alt)
+
+
+def _tell(mav: Any, message: Any, home: Any, rng: np.random.Generator) -> None:
+    place = _place(message, home) + ERROR * rng.normal(size=3)
+    velocity = 0.01 * np.array([message.vx, message.vy, message.vz]) + SPEED_ERROR * rng.normal(size=3)
+    ned, whose = mavlink.MAV_FRAME_LOCAL_NED, mavlink.MAV_ESTIMATOR_TYPE_VISION  # as MOCAP it would be logged alone
+    turn = list(message.attitude_quaternion)
+    rates = message.rollspeed, message.pitchspeed, message.yawspeed
+    mav.odometry_send(message.time_usec, ned, ned, *place, turn, *velocity, *rates, UNKNOWN, UNKNOWN, 0, whose, 100)
 
 
 class _Wire:
@@ -91,11 +101,3 @@ def _place(message: Any, home: Any) -> np.ndarray[Any, np.dtype[np.float64]]:
     narrow = math.cos(math.radians(1e-7 * home.lat))
     north, east = 1e-7 * DEGREE * (message.lat - home.lat), 1e-7 * DEGREE * narrow * (message.lon - home.lon)
     return np.array([north, east, -1e-3 * (message.alt - home.alt)])
-
-
-def _angles(message: Any) -> tuple[float, float, float]:
-    """Roll, pitch, yaw [rad]."""
-    w, x, y, z = message.attitude_quaternion
-    roll = math.atan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y))
-    pitch = math.asin(max(-1.0, min(1.0, 2.0 * (w * y - z * x))))
-    return roll, pitch, math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
