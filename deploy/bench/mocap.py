@@ -1,4 +1,4 @@
-"""A motion capture system: tells a PX4 with its own simulator where it is and how fast, as cameras about a hall would."""
+"""A motion capture system: tells a PX4 with its own simulator where it is, and how fast, as cameras would."""
 
 from __future__ import annotations
 
