@@ -49,6 +49,7 @@ class Shadows:
 
 def prepare() -> None:
     """Compile what reads range images, or load it: before the first one is to be answered in time."""
+    import messaging.nearby  # noqa: F401
     import safety.shading  # noqa: F401
 
 

@@ -29,6 +29,7 @@ from actors.telemetry import MOTION, TRUTH
 from actors.witness import Witness
 from deploy.bench import sitl
 from deploy.bench.flights import SET
+from deploy.bench.repeated import repeated
 from deploy.bench.timing import Words
 from deploy.interpreter import PYTHON
 from deploy.quadrotors import flight_arena
@@ -309,21 +310,3 @@ def judged(url: str, system: int) -> Iterator[Judge]:
             yield judge
     finally:
         link.close()
-
-
-@contextmanager
-def repeated(call: Callable[[], None], seconds: float) -> Iterator[None]:
-    """In a thread, until the end of the block."""
-    over = threading.Event()
-
-    def loop() -> None:
-        while not over.wait(seconds):
-            call()
-
-    thread = threading.Thread(target=loop, daemon=True)
-    thread.start()
-    try:
-        yield
-    finally:
-        over.set()
-        thread.join()

@@ -61,11 +61,11 @@ def run(minutes: float, folder: Path) -> Words:
         except sitl.NoAutopilot as none:
             print(none, file=sys.stderr)
             continue
-        rows |= {f"{setup}: {name}": row for name, row in _flown(Flights(setup, start, folder / setup), minutes)}
+        rows |= {f"{setup}: {name}": row for name, row in _rows(Flights(setup, start, folder / setup), minutes)}
     return rows
 
 
-def _flown(flights: Flights, minutes: float) -> Iterator[tuple[str, dict[str, float | str]]]:
+def _rows(flights: Flights, minutes: float) -> Iterator[tuple[str, dict[str, float | str]]]:
     first = flights.first()
     yield "first flight", _learned(first)
     if "model" not in first:

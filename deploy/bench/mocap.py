@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -11,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from deploy.bench.repeated import repeated
 from messaging.links import Link, open_link
 from sim.autopilot.dialect import mavlink
 
@@ -35,37 +35,42 @@ PARAMETERS = {
 @contextmanager
 def captured(url: str, system: int, seed: int = 0) -> Iterator[None]:
     """Meanwhile it is told, at an address that nobody else talks to it at."""
-    over = threading.Event()
-    thread = threading.Thread(target=_capture, args=(url, system, seed, over), daemon=True)
-    thread.start()
-    try:
-        yield
-    finally:
-        over.set()
-        thread.join()
-
-
-def _capture(url: str, system: int, seed: int, over: threading.Event) -> None:
     link = open_link(url)
-    mav = mavlink.MAVLink(_Wire(link), srcSystem=OURSELVES, srcComponent=mavlink.MAV_COMP_ID_VISUAL_INERTIAL_ODOMETRY)
-    mav.robust_parsing = True
-    rng, home, flies, beaten = np.random.default_rng(seed), None, False, -math.inf
     try:
-        while not over.wait(LOOKS):
-            if time.monotonic() - beaten > 1.0:
-                beaten = time.monotonic()
-                mav.heartbeat_send(mavlink.MAV_TYPE_ONBOARD_CONTROLLER, mavlink.MAV_AUTOPILOT_INVALID, 0, 0, 0)
-                _introduce(mav, system, None if flies else home)
-            for message in mav.parse_buffer(link.receive()) or ():
-                if message.get_srcSystem() != system:
-                    continue
-                if message.get_type() == "HEARTBEAT":
-                    flies = bool(message.base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED)
-                elif message.get_type() == "HIL_STATE_QUATERNION":
-                    home = message if home is None else home
-                    _tell(mav, message, home, rng)
+        with repeated(_Cameras(link, system, seed).look, LOOKS):
+            yield
     finally:
         link.close()
+
+
+class _Cameras:
+    def __init__(self, link: Link, system: int, seed: int) -> None:
+        self._link, self._system, self._rng = link, system, np.random.default_rng(seed)
+        self._mav = mavlink.MAVLink(
+            self, srcSystem=OURSELVES, srcComponent=mavlink.MAV_COMP_ID_VISUAL_INERTIAL_ODOMETRY
+        )
+        self._mav.robust_parsing = True
+        self._home: Any = None  # the first place that it told
+        self._flies, self._beaten = False, -math.inf
+
+    def write(self, data: bytes) -> None:
+        """For pymavlink."""
+        self._link.send(bytes(data))
+
+    def look(self) -> None:
+        """Answer every place that it tells with what is seen of it."""
+        if time.monotonic() - self._beaten > 1.0:
+            self._beaten = time.monotonic()
+            self._mav.heartbeat_send(mavlink.MAV_TYPE_ONBOARD_CONTROLLER, mavlink.MAV_AUTOPILOT_INVALID, 0, 0, 0)
+            _introduce(self._mav, self._system, None if self._flies else self._home)
+        for message in self._mav.parse_buffer(self._link.receive()) or ():
+            if message.get_srcSystem() != self._system:
+                continue
+            if message.get_type() == "HEARTBEAT":
+                self._flies = bool(message.base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED)
+            elif message.get_type() == "HIL_STATE_QUATERNION":
+                self._home = message if self._home is None else self._home
+                _tell(self._mav, message, self._home, self._rng)
 
 
 def _introduce(mav: Any, system: int, home: Any) -> None:
@@ -84,16 +89,6 @@ def _tell(mav: Any, message: Any, home: Any, rng: np.random.Generator) -> None:
     turn = list(message.attitude_quaternion)
     rates = message.rollspeed, message.pitchspeed, message.yawspeed
     mav.odometry_send(message.time_usec, ned, ned, *place, turn, *velocity, *rates, UNKNOWN, UNKNOWN, 0, whose, 100)
-
-
-class _Wire:
-    """For pymavlink."""
-
-    def __init__(self, link: Link) -> None:
-        self._link = link
-
-    def write(self, data: bytes) -> None:
-        self._link.send(bytes(data))
 
 
 def _place(message: Any, home: Any) -> np.ndarray[Any, np.dtype[np.float64]]:

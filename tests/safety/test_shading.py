@@ -1,6 +1,8 @@
 """What the compiled loops over shadows say, line by line: a shadow holds its patch, and is beyond some half-space."""
 
 import math
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -89,3 +91,12 @@ def test_a_way_that_is_no_number_frees_nothing_from_there_on(period):
     nominal[period:] = np.nan
     _, offsets = half_spaces(near, np.zeros(3), 0.1 * nominal, 0.0, np.zeros(3), 0.2)
     assert np.isneginf(offsets).all() if period == 0 else np.isfinite(offsets[:, :period]).all()
+
+
+def test_all_that_reads_an_image_is_ready_before_the_first_one():
+    """In an interpreter of its own: here others have imported it."""
+    code = (
+        "import sys; from safety.shadows import prepare; prepare(); assert {'messaging.nearby', 'safety.shading'}"
+        " <= set(sys.modules)"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
