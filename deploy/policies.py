@@ -21,8 +21,8 @@ POLICY_FOLDER = Path(__file__).parents[1] / "policies"
 
 
 def policy_named(name: str, robot: Robot, seed: int) -> Policy:
-    """A scripted policy, the trained one (in policies/, or beside the robot's own task), an untrained one, or a file's:
-    weights, or inputs as `brakeline excite` prints them (.csv).
+    """A scripted policy, a stored one (`trained` and others in policies/, or beside the robot's own task), an untrained
+    one, or a file's: weights, or inputs as `brakeline excite` prints them (.csv).
 
     Raises:
         ValueError: neither a name nor a file; BadWeights: a file that is no policy of this robot.
@@ -34,20 +34,22 @@ def policy_named(name: str, robot: Robot, seed: int) -> Policy:
         return driving(MLP.untrained(robot, seed))
     if name.endswith(".csv"):
         return replayed(Path(name), robot)
-    path = _trained(robot) if name == TRAINED else Path(name)
+    stored = _stored(robot)
+    path = stored.get(name, Path(name))
     if not path.is_file():
-        names = ", ".join([TRAINED, UNTRAINED, *policies])
+        names = ", ".join([*sorted(stored), UNTRAINED, *policies])
         raise ValueError(f"no policy is called {name!r} and no such file exists; there are: {names}, or a file's path")
     if robot.late and MLP.load(path).robot.kind == robot.kind:
         return driving(MLP.load(path))  # it may have been trained in lockstep: it proposes in real time too
     return driving(MLP.load(path, robot))
 
 
-def _trained(robot: Robot) -> Path:
-    """Beside the task's file, as robots of other people have it, or in the folder of this repository."""
+def _stored(robot: Robot) -> dict[str, Path]:
+    """By name: beside the task's file, as robots of other people have it, or in the folder of this repository."""
     task = task_of(robot)
-    beside = task.folder / "trained.safetensors"
-    return beside if beside.is_file() else POLICY_FOLDER / (task.name or robot.kind) / "trained.safetensors"
+    beside = task.folder / f"{TRAINED}.safetensors"
+    folder = POLICY_FOLDER / (task.name or robot.kind)
+    return {path.stem: path for path in folder.glob("*.safetensors")} | ({TRAINED: beside} if beside.is_file() else {})
 
 
 def driving(mlp: MLP) -> Policy:

@@ -18,8 +18,8 @@ from messaging.tasks import learnt
 class Evaluate:
     robot: Robot = "ground"
     policy: str = "astar"
-    """A policy file, inputs (.csv, as `excite` prints them), or trained (the one in policies/) | untrained | random |
-    greedy | adversary | astar | careful (astar with a wide berth)."""
+    """A policy file, inputs (.csv, as `excite` prints them), or trained | trained-by-scan (those in policies/) |
+    untrained | random | greedy | adversary | astar | careful (astar with a wide berth)."""
     filtering: Flags[Filtering] = field(default_factory=Filtering)
     physics: Flags[Physics] = field(default_factory=Physics)
     arena: str = "default"

@@ -105,7 +105,10 @@ def test_a_typing_error_is_answered_with_a_suggestion(command):
         ("train ground --experiment sleep", "there are: default, demo, debug"),
         ("evaluate submarine", "there are: ground"),
         ("evaluate ground --arena ballroom", "there are: crossing, default, dense"),
-        ("evaluate ground --policy [bold]", "no policy is called '[bold]' and no such file exists"),
+        (
+            "evaluate ground --policy [bold]",
+            "no policy is called '[bold]' and no such file exists; there are: trained, trained-by-scan, untrained,",
+        ),
         ("analyse {folder}/none", "no log at"),
         ("certify {folder}/none.mcap", "no log at"),
         ("query ground --connect tcp/127.0.0.1:1 --obstacle ball", "an obstacle is: cylinder X Y RADIUS"),
