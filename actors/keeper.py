@@ -120,6 +120,7 @@ class Keeper:
             lambda: stop.is_set() or actor.poll(),  # whatever is said before it flies is: stop
             flight.raise_limits,
             Witness(lambda position: float(shapes.distance(position).min()) - footprint),
+            flight.lead,
         )
         threading.Thread(target=self._tell, name="news", daemon=True).start()
 

@@ -74,12 +74,14 @@ class LiveVehicle:
         stop: Callable[[], bool] = lambda: False,
         raise_limits: bool = False,
         witness: Witness | None = None,
+        lead: bool = False,
     ) -> None:
         """Take control, climb to that height [m] above the ground unless it flies already, and begin the first period.
 
         origin: where the autopilot's local frame begins, in ours, m; stop: told to, it waits for nothing any more;
         raise_limits: set those parameters that hold it below what the robot's description asks for; witness: the judge
-        of the flight, if there is no truth channel and the autopilot has a simulator inside that tells.
+        of the flight, if there is no truth channel and the autopilot has a simulator inside that tells; lead: tell it
+        places to go to in place of velocities (`actors.leading`).
 
         Raises:
             MavlinkError: nobody there, or it refuses, or told to stop.
@@ -95,7 +97,7 @@ class LiveVehicle:
         self._counted: dict[str, int] = {}  # messages, by what they tell
         self._heard_at: dict[str, float] = {}  # s, when the latest of them came
         self._said_lost, self._said_low = "", False
-        self._takeoff = Takeoff(self._client, robot, self._wait, self._hold, raise_limits)
+        self._takeoff = Takeoff(self._client, robot, self._wait, self._hold, raise_limits, lead)
         self.notes = self._takeoff.notes
         self._velocity: Array | None = None  # the setpoint to be repeated
         self._offsets = Offset()

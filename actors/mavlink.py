@@ -14,6 +14,7 @@ import numpy as np
 
 from actors.dialect import mavlink
 from actors.heard import AUTOPILOT, OFFBOARD, Heard
+from actors.leading import MASK, PARAMETERS, Leading
 from actors.telemetry import ESTIMATORS, SOURCES, Array
 
 VELOCITY_ONLY = 0x0DC7  # type mask: position, acceleration, yaw and yaw rate are to be ignored
@@ -48,6 +49,8 @@ class NotTold(MavlinkError):
 
 class Client(Heard):
     """Commands to an autopilot, and what it tells: see `Heard`."""
+
+    leading: Leading | None = None  # it is told places in place of velocities
 
     def choose(self, what: str, interval: float, wait: Wait) -> str:
         """Find out which message tells something, and have it sent every so many seconds: a line about it for people.
@@ -126,11 +129,31 @@ class Client(Heard):
 
     def setpoint(self, velocity: Array) -> None:
         """Ask for a velocity (3,) [m/s], ENU."""
-        east, north, up = velocity.tolist()
+        if self.leading is not None and self.position is not None:
+            x, y, z = self.leading.target(self.position, self.velocity, velocity).tolist()
+            mask, told = MASK, (y, x, -z, 0.0, 0.0, 0.0)
+        else:
+            east, north, up = velocity.tolist()
+            mask, told = VELOCITY_ONLY, (0.0, 0.0, 0.0, north, east, -up)
         self._mav.set_position_target_local_ned_send(
-            round(1e3 * self.time), self.system, AUTOPILOT, mavlink.MAV_FRAME_LOCAL_NED, VELOCITY_ONLY,
-            0.0, 0.0, 0.0, north, east, -up, 0.0, 0.0, 0.0, 0.0, 0.0,
+            round(1e3 * self.time), self.system, AUTOPILOT, mavlink.MAV_FRAME_LOCAL_NED, mask,
+            *told, 0.0, 0.0, 0.0, 0.0, 0.0,
         )  # fmt: skip
+
+    def lead(self, wait: Wait) -> None:
+        """From now on tell it places. Raises MavlinkError: no ArduPilot, or it does not say what it makes of them."""
+        if self.identify(wait) != "ardupilot":
+            raise MavlinkError("only an ArduPilot can be led to places; without --lead it is told velocities")
+        told = {name: self.parameter(name, wait) for name in PARAMETERS}
+        values = {name: value for name, value in told.items() if value is not None}
+        if missing := told.keys() - values.keys():
+            raise MavlinkError(
+                f"it has no {', '.join(sorted(missing))}: it can only be told velocities, without --lead"
+            )
+        try:
+            self.leading = Leading.of(values)
+        except ValueError as error:
+            raise MavlinkError(f"it cannot be led to places: {error}") from error
 
     def command(self, number: int, *params: float, wait: Wait) -> None:
         """Send COMMAND_LONG until it is accepted.

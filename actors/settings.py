@@ -34,3 +34,4 @@ class FlightSettings:
     height: float = 3.0  # m above the ground that it climbs to, unless it flies already
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0)  # m: where the autopilot's local frame begins
     raise_limits: bool = False  # set the parameters that hold the vehicle below what the filter may ask for
+    lead: bool = False  # tell it places to go to in place of velocities

@@ -34,12 +34,18 @@ class Takeoff:
     """One takeoff, from the first heartbeat on. notes: which messages are used, which parameters are too low."""
 
     def __init__(
-        self, client: Client, robot: Robot, wait: Wait, hold: Callable[[Array | None], None], raise_limits: bool
+        self,
+        client: Client,
+        robot: Robot,
+        wait: Wait,
+        hold: Callable[[Array | None], None],
+        raise_limits: bool,
+        lead: bool = False,
     ) -> None:
         """hold: have a setpoint (3,) [m/s] repeated from now on, None: none; raise_limits: set those parameters that
-        hold it below what the robot's description asks for."""
+        hold it below what the robot's description asks for; lead: tell it places (`actors.leading`)."""
         self._client, self._robot, self._wait, self._hold = client, robot, wait, hold
-        self._raise_limits = raise_limits
+        self._raise_limits, self._lead = raise_limits, lead
         self.notes: list[str] = []
 
     def fly(self, height: float) -> None:
@@ -61,6 +67,9 @@ class Takeoff:
             with contextlib.suppress(MavlinkError):
                 client.stream(message_id(message), interval, wait)
         self._compare_limits(kind)
+        if self._lead:
+            client.lead(wait)
+            self.note("it is told places to go to: when setpoints stop it stays at the last one")
         self._hold(np.zeros(3))
         client.follow_setpoints(wait)
         if not client.armed:
@@ -123,6 +132,8 @@ class Takeoff:
                 self.note(f"{short}: raise it (--raise-limits), or it cannot do what is asked of it")
         name = TIMEOUTS[kind]
         timeout = client.parameter(name, wait)
+        if self._lead:
+            return
         if timeout is None and kind in FIXED_TIMEOUT:
             self.note(f"no {name} here: it flies on for {FIXED_TIMEOUT[kind]:g} s when setpoints stop")
         elif timeout is not None and timeout > SHORTEST[kind]:

@@ -28,7 +28,7 @@ from actors.mavlink import Client, MavlinkError
 from actors.telemetry import MOTION, TRUTH
 from actors.witness import Witness
 from deploy.bench import sitl
-from deploy.bench.flights import SET
+from deploy.bench.flights import SETUPS
 from deploy.bench.repeated import repeated
 from deploy.bench.timing import Words
 from deploy.interpreter import PYTHON
@@ -53,17 +53,19 @@ OFTEN = 0.02  # s between two words of truth
 def run(faults: int, seed: int, folder: Path) -> Words:
     """Rows: what failed; columns: how often, and what was touched from then until the next fault."""
     rows: Words = {}
-    for kind in sitl.KINDS:
+    for name, setup in SETUPS.items():
+        if setup.cameras:
+            continue
         try:
-            start = sitl.program(kind)
+            start = sitl.program(setup.kind)
         except sitl.NoAutopilot as none:
             print(none, file=sys.stderr)
             continue
-        record = Record(kind, faults)
+        record = Record(name, faults)
         while record.left:
             before = record.done
             with tempfile.TemporaryDirectory() as place:
-                _flight(record, start, Path(place), folder / kind, Random(seed + before))
+                _flight(record, start, Path(place), folder / name, Random(seed + before))
             if record.done == before:
                 raise MavlinkError("it does not come to fly")
         rows |= record.rows()
@@ -86,10 +88,10 @@ class Outcomes:
 
 
 class Record:
-    """Of one kind of autopilot: what all its failures led to."""
+    """Of an autopilot in one setup: what all its failures led to."""
 
-    def __init__(self, kind: str, faults: int) -> None:
-        self.kind, self._faults, self.done = kind, faults, 0
+    def __init__(self, name: str, faults: int) -> None:
+        self.name, self.setup, self._faults, self.done = name, SETUPS[name], faults, 0
         self.of = {name: Outcomes() for name in FAULTS}
         self.calm = Outcomes()
 
@@ -102,20 +104,20 @@ class Record:
         name = FAULTS[self.done % len(FAULTS)]
         self.done += 1
         self.of[name].count += 1
-        print(f"{self.kind}: fault {self.done} of {self._faults}: {name}", file=sys.stderr)
+        print(f"{self.name}: fault {self.done} of {self._faults}: {name}", file=sys.stderr)
         return name
 
     def rows(self) -> Words:
-        return {f"{self.kind}: {name}": one.row() for name, one in {"in between": self.calm, **self.of}.items()}
+        return {f"{self.name}: {name}": one.row() for name, one in {"in between": self.calm, **self.of}.items()}
 
 
 def _flight(record: Record, start: Path, home: Path, folder: Path, random: Random) -> None:
     """From switching on to the last fault, or to a crash."""
     with (
-        sitl.flying(record.kind, start, home, SET[record.kind]) as (url, system),
+        sitl.flying(record.setup.kind, start, home, record.setup.parameters) as (url, system),
         relayed(url) as relay,
-        judged(sitl.beside(record.kind, system, url), system) as judge,
-        _flown(["--url", relay.url, "--system", str(system)], home, folder) as (fly, steps),
+        judged(sitl.beside(record.setup.kind, system, url), system) as judge,
+        _flown([*record.setup.words, "--url", relay.url, "--system", str(system)], home, folder) as (fly, steps),
     ):
         _until(lambda: judge.airborne, fly)
         _until(partial(steps.beyond, AGAIN), fly)

@@ -30,22 +30,39 @@ PRACTICE = "0.15"  # share of steps at which it brakes as planned: what a model 
 BEYOND = 240.0  # s that a command may take beyond its flight: the estimator, the landing, the model set
 TRUE = ("true collisions", "true clearance least m", "estimate off truth at most m")
 
-# What their owner would set. ArduCopter 4.0 leads a position along with the velocity that it was given, and catches up
-# with it by flying faster than asked. PX4's SIH has an accelerometer, a gyro and a barometer of other noise than its
-# estimator takes them for, and a GPS without delay.
-SET: dict[str, dict[str, float]] = {
-    "ardupilot": {"PSC_POSXY_P": 0.5, "PSC_VELXY_I": 0.02, "PSC_POSZ_P": 0.5},
-    "px4": {
-        "COM_OF_LOSS_T": 0.5,
-        "EKF2_GPS_DELAY": 0.0,
-        "EKF2_ACC_NOISE": 1.0,
-        "EKF2_GYR_NOISE": 0.1,
-        "EKF2_HGT_REF": 0,
-        "EKF2_BARO_NOISE": 0.3,
-    },
+
+@dataclass(frozen=True)
+class Setup:
+    """kind: of autopilot; parameters: what their owner would set; words: for `collect` and `fly`; cameras: it flies under
+    motion capture."""
+
+    kind: str
+    parameters: Mapping[str, float]
+    words: tuple[str, ...] = ()
+    cameras: bool = False
+
+
+# ArduCopter 4.0 leads a position along with the velocity that it was given, and catches up with it by flying faster than
+# asked; led to places, it has nothing to catch up with, and may be as stiff as it can.
+CALM = {"PSC_POSXY_P": 0.5, "PSC_VELXY_I": 0.02, "PSC_POSZ_P": 0.5}
+STIFF = {"PSC_POSXY_P": 2.0, "PSC_POSZ_P": 1.0}
+# PX4's SIH has an accelerometer, a gyro and a barometer of other noise than its estimator takes them for, and a GPS
+# without delay.
+HEARD = {
+    "COM_OF_LOSS_T": 0.5,
+    "EKF2_GPS_DELAY": 0.0,
+    "EKF2_ACC_NOISE": 1.0,
+    "EKF2_GYR_NOISE": 0.1,
+    "EKF2_HGT_REF": 0,
+    "EKF2_BARO_NOISE": 0.3,
 }
-INDOORS = "px4 with motion capture"
-SETUPS = {**{kind: kind for kind in sitl.KINDS}, INDOORS: "px4"}  # by name: the autopilot
+LED, INDOORS = "ardupilot, led to places", "px4 with motion capture"
+SETUPS = {
+    "ardupilot": Setup("ardupilot", CALM),
+    "px4": Setup("px4", HEARD),
+    LED: Setup("ardupilot", STIFF, ("--lead",)),
+    INDOORS: Setup("px4", {**HEARD, **mocap.PARAMETERS}, cameras=True),
+}
 
 
 class Failed(RuntimeError):
@@ -55,13 +72,13 @@ class Failed(RuntimeError):
 def run(minutes: float, folder: Path) -> Words:
     """Rows: flights; columns: what they came to."""
     rows: Words = {}
-    for setup, kind in SETUPS.items():
+    for name, setup in SETUPS.items():
         try:
-            start = sitl.program(kind)
+            start = sitl.program(setup.kind)
         except sitl.NoAutopilot as none:
             print(none, file=sys.stderr)
             continue
-        rows |= {f"{setup}: {name}": row for name, row in _rows(Flights(setup, start, folder / setup), minutes)}
+        rows |= {f"{name}: {what}": row for what, row in _rows(Flights(name, start, folder / name), minutes)}
     return rows
 
 
@@ -80,7 +97,7 @@ def _rows(flights: Flights, minutes: float) -> Iterator[tuple[str, dict[str, flo
 
 @dataclass(frozen=True)
 class Upset:
-    """Other parameters than `SET`; or from a moment of the command on, s, and others again from another one on."""
+    """Other parameters than its setup's; or from a moment of the command on, s, and others again from another one on."""
 
     parameters: Mapping[str, float] = field(default_factory=dict)
     begins: float = 0.0
@@ -92,13 +109,13 @@ class Flights:
     """In one setup, each from switching on; its data, logs and figures are kept in a folder."""
 
     def __init__(self, setup: str, start: Path, folder: Path) -> None:
-        self._setup, self._kind, self._start, self._folder = setup, SETUPS[setup], start, folder.absolute()
+        self._name, self._setup, self._start, self._folder = setup, SETUPS[setup], start, folder.absolute()
         self.data = self._folder / "data"
 
     @classmethod
     def beside(cls, other: Flights, name: str) -> Flights:
         """Of the same autopilot, with data and flights of their own in a folder of the other's."""
-        return cls(other._setup, other._start, other._folder / f"{name}-own")
+        return cls(other._name, other._start, other._folder / f"{name}-own")
 
     def first(self) -> dict[str, Any]:
         return self._figures("first", FIRST, "collect", "quadrotor", "--minutes", str(FIRST))
@@ -138,7 +155,7 @@ class Flights:
     def _kept(self, name: str, minutes: float, fly: Callable[[], str]) -> dict[str, Any]:
         kept = self._folder / f"{name}.json"
         if not kept.exists():
-            print(f"{self._setup}: {name}, {minutes:g} minutes", file=sys.stderr)
+            print(f"{self._name}: {name}, {minutes:g} minutes", file=sys.stderr)
             kept.parent.mkdir(parents=True, exist_ok=True)
             kept.write_text(fly())
         figures: dict[str, Any] = json.loads(kept.read_text())
@@ -147,25 +164,33 @@ class Flights:
     def _flown(self, minutes: float, words: tuple[str, ...], upset: Upset) -> str:
         with ExitStack() as stack:
             url, system = self._switched_on(stack, {} if upset.ends else upset.parameters)
-            stack.enter_context(self._in_between(upset, sitl.beside(self._kind, system, url), system))
-            command = [*words, "--url", url, "--system", str(system), "--raise-limits", "--json"]
+            stack.enter_context(self._in_between(upset, sitl.beside(self._setup.kind, system, url), system))
+            command = [*words, *self._setup.words, "--url", url, "--system", str(system), "--raise-limits", "--json"]
             return told(command, self.data, 60.0 * minutes + BEYOND)
 
     def _both(self, minutes: float) -> str:
         with ExitStack() as stack:
             urls, systems = zip(*(self._switched_on(stack, {}) for _ in range(2)), strict=True)
             command = ["fly", "--minutes", str(minutes), "--url", *urls, "--systems", *map(str, systems)]
-            command += ["--at-start", "--pictures", "0", "--out", str(self.run("pair")), "--raise-limits", "--json"]
+            command += [
+                *self._setup.words,
+                "--at-start",
+                "--pictures",
+                "0",
+                "--out",
+                str(self.run("pair")),
+                "--raise-limits",
+                "--json",
+            ]
             return told(command, self.data, 60.0 * minutes + BEYOND)
 
     def _switched_on(self, stack: ExitStack, parameters: Mapping[str, float]) -> tuple[str, int]:
         """One more of them until the stack ends: (the URL for us, its system id)."""
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
-        indoors = self._setup == INDOORS
-        lasting = {**SET[self._kind], **(mocap.PARAMETERS if indoors else {}), **parameters}
-        url, system = stack.enter_context(sitl.flying(self._kind, self._start, folder, lasting))
-        if indoors:
-            stack.enter_context(mocap.captured(sitl.beside(self._kind, system, url), system))
+        kind, lasting = self._setup.kind, {**self._setup.parameters, **parameters}
+        url, system = stack.enter_context(sitl.flying(kind, self._start, folder, lasting))
+        if self._setup.cameras:
+            stack.enter_context(mocap.captured(sitl.beside(kind, system, url), system))
         return url, system
 
     @contextmanager

@@ -109,12 +109,15 @@ class Flight:
     """Its local frame begins on the floor below the arena's start: a simulator on its home position."""
     raise_limits: bool = False
     """Set those of its parameters that hold it below what the filter may ask for: speeds, accelerations, tilt."""
+    lead: bool = False
+    """Tell it places to go to in place of velocities (ArduPilot): when setpoints stop it stays at the last one, where an
+    ArduCopter without GUID_TIMEOUT flies on for 3 s. It flies otherwise then: both `collect` and `fly` with it, or none."""
 
     def settings(self, url: str, arena: Arena) -> FlightSettings:
         """For the flight in an arena."""
         x, y, *_ = arena.start
         origin = (x, y, 0.0) if self.at_start else self.origin
-        return FlightSettings(url, self.system, self.truth, self.height, origin, self.raise_limits)
+        return FlightSettings(url, self.system, self.truth, self.height, origin, self.raise_limits, self.lead)
 
 
 @dataclass(frozen=True)

@@ -56,6 +56,9 @@ class First:
     """MAVLink system id of the vehicle."""
     raise_limits: bool = False
     """Set those of its parameters that hold it below what its description says: speeds, accelerations, tilt."""
+    lead: bool = False
+    """Tell it places to go to in place of velocities (ArduPilot): when setpoints stop it stays at the last one, where an
+    ArduCopter without GUID_TIMEOUT flies on for 3 s. It flies otherwise then: both `collect` and `fly` with it, or none."""
 
 
 @dataclass(frozen=True)
@@ -99,7 +102,14 @@ class Collect:
         found = fly(
             robot.in_lockstep().in_real_time(),
             MaidenSettings(
-                self.url, first.system, first.minutes, first.height, first.room, self.seed, first.raise_limits
+                self.url,
+                first.system,
+                first.minutes,
+                first.height,
+                first.room,
+                self.seed,
+                first.raise_limits,
+                first.lead,
             ),
         )
         found.data.save(path)

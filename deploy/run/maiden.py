@@ -28,6 +28,7 @@ class MaidenSettings:
     room: float = 80.0  # m, the side of the square
     seed: int = 0
     raise_limits: bool = False
+    lead: bool = False
 
 
 def fly(robot: Robot, settings: MaidenSettings) -> Found:
@@ -52,6 +53,7 @@ def _flown(robot: Robot, settings: MaidenSettings, stop: threading.Event) -> Fou
         settings.height,
         stop=stop.is_set,
         raise_limits=settings.raise_limits,
+        lead=settings.lead,
     )
     try:
         middle = vehicle.turn.report.measured[:3]

@@ -1,0 +1,56 @@
+"""Velocities flown as places ahead, for an autopilot that flies on for seconds when setpoints stop: at a place it stays.
+
+ArduPilot's position controller asks for a velocity by how far its target is: in proportion to it near by, by its square
+root beyond, so that it never has to brake harder than an acceleration. Told with every setpoint a target just as far
+ahead as asks for the velocity that is wanted, it flies that velocity; told nothing more, it stops there.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from actors.telemetry import Array
+
+AGE = 0.05  # s, about: from where it says that it is to when it hears the target made of it
+PARAMETERS = ("PSC_POSXY_P", "PSC_POSZ_P", "WPNAV_ACCEL", "WPNAV_ACCEL_Z")  # 1/s, 1/s, cm/s², cm/s²
+MASK = 0x0DC0  # position and velocity count: acceleration, yaw and yaw rate are to be ignored
+
+
+@dataclass(frozen=True)
+class Lead:
+    """gain [1/s] and acceleration [m/s²] of a controller along some axes."""
+
+    gain: float
+    acceleration: float
+
+    def distance(self, speed: float) -> float:
+        """m, at which it asks for so many m/s."""
+        proportional = self.acceleration / self.gain
+        if speed <= proportional:
+            return speed / self.gain
+        return 0.5 * (speed**2 / self.acceleration + proportional / self.gain)
+
+
+@dataclass(frozen=True)
+class Leading:
+    across: Lead
+    upright: Lead
+
+    @staticmethod
+    def of(values: dict[str, float]) -> Leading:
+        """By its `PARAMETERS`, as it tells them. Raises ValueError: one is no such number."""
+        if not all(math.isfinite(values[name]) and values[name] > 0.0 for name in PARAMETERS):
+            raise ValueError(", ".join(f"{name} is {values[name]:g}" for name in PARAMETERS))
+        across, upright, level, vertical = (values[name] for name in PARAMETERS)
+        return Leading(Lead(across, 0.01 * level), Lead(upright, 0.01 * vertical))
+
+    def target(self, position: Array, velocity: Array, wanted: Array) -> Array:
+        """The place (3,) [m] to be told, for who is there, flies so [m/s], and is to fly `wanted` [m/s]."""
+        level, climb = math.hypot(wanted[0], wanted[1]), float(wanted[2])
+        ahead = np.empty(3)
+        ahead[:2] = wanted[:2] * (self.across.distance(level) / level if level else 0.0)
+        ahead[2] = math.copysign(self.upright.distance(abs(climb)), climb)
+        return np.asarray(position + AGE * velocity + ahead)
