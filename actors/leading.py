@@ -1,4 +1,4 @@
-"""Velocities flown as places ahead, for an autopilot that flies on for seconds when setpoints stop: at a place it stays.
+"""Velocities flown as places ahead, for who flies on for seconds when setpoints stop; at a place it stays.
 
 ArduPilot's position controller asks for a velocity by how far its target is: in proportion to it near by, by its square
 root beyond, so that it never has to brake harder than an acceleration. Told with every setpoint a target just as far

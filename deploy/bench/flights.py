@@ -33,8 +33,8 @@ TRUE = ("true collisions", "true clearance least m", "estimate off truth at most
 
 @dataclass(frozen=True)
 class Setup:
-    """kind: of autopilot; parameters: what their owner would set; words: for `collect` and `fly`; cameras: it flies under
-    motion capture."""
+    """kind: of autopilot; parameters: what their owner would set; words: for `collect` and `fly`; cameras: it flies
+    under motion capture."""
 
     kind: str
     parameters: Mapping[str, float]
@@ -42,8 +42,8 @@ class Setup:
     cameras: bool = False
 
 
-# ArduCopter 4.0 leads a position along with the velocity that it was given, and catches up with it by flying faster than
-# asked; led to places, it has nothing to catch up with, and may be as stiff as it can.
+# ArduCopter 4.0 leads a position along with the velocity that it was given, and catches up with it by flying faster
+# than asked; led to places, it has nothing to catch up with, and may be as stiff as it can.
 CALM = {"PSC_POSXY_P": 0.5, "PSC_VELXY_I": 0.02, "PSC_POSZ_P": 0.5}
 STIFF = {"PSC_POSXY_P": 2.0, "PSC_POSZ_P": 1.0}
 # PX4's SIH has an accelerometer, a gyro and a barometer of other noise than its estimator takes them for, and a GPS
@@ -97,7 +97,7 @@ def _rows(flights: Flights, minutes: float) -> Iterator[tuple[str, dict[str, flo
 
 @dataclass(frozen=True)
 class Upset:
-    """Other parameters than its setup's; or from a moment of the command on, s, and others again from another one on."""
+    """Other parameters than its setup's; or from a moment of the command on, s, and others from another one on."""
 
     parameters: Mapping[str, float] = field(default_factory=dict)
     begins: float = 0.0

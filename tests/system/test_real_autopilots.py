@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import logging
 import math
+import time
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -88,6 +89,26 @@ def test_it_is_found_out_flown_and_given_back(kind: str, tmp_path: Path, caplog:
             vehicle.close()
     waited = any("waiting for the position estimate" in record.message for record in caplog.records)
     assert waited or kind == "px4", "its estimator needs longer than a line takes"
+
+
+def test_an_ardupilot_that_is_led_stays_where_it_was_led_to_when_nothing_more_comes(tmp_path: Path) -> None:
+    """Told velocities, a version without GUID_TIMEOUT flies on for 3 s: 12 m."""
+    with autopilot("ardupilot", tmp_path) as (url, system):
+        vehicle = LiveVehicle(open_link(url), QUADROTOR, system, height=5.0, raise_limits=True, lead=True)
+        try:
+            flown = [vehicle.step(np.array([3.0, 0.0, 0.0])) for _ in range(20)][-1].measured
+            assert flown[3:6] == pytest.approx([3.0, 0.0, 0.0], abs=0.6)
+            vehicle._stop()  # nothing more is sent
+            client, link = vehicle._client, vehicle._link
+            end = time.monotonic() + 6.0
+            while time.monotonic() < end:
+                client.feed(link.receive())
+                time.sleep(0.01)
+            assert client.position is not None
+            assert float(np.linalg.norm(client.position - flown[:3])) < 5.0
+            assert np.linalg.norm(client.velocity) < 0.4 and client.armed and client.offboard
+        finally:
+            vehicle.close()
 
 
 @pytest.mark.usefixtures("flight_folder")
