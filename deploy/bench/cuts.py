@@ -28,7 +28,7 @@ from actors.mavlink import Client, MavlinkError
 from actors.telemetry import MOTION, TRUTH
 from actors.witness import Witness
 from deploy.bench import sitl
-from deploy.bench.flights import SETUPS
+from deploy.bench.flights import SETUPS, switched_on
 from deploy.bench.repeated import repeated
 from deploy.bench.timing import Words
 from deploy.interpreter import PYTHON
@@ -54,8 +54,6 @@ def run(faults: int, seed: int, folder: Path) -> Words:
     """Rows: what failed; columns: how often, and what was touched from then until the next fault."""
     rows: Words = {}
     for name, setup in SETUPS.items():
-        if setup.cameras:
-            continue
         try:
             start = sitl.program(setup.kind)
         except sitl.NoAutopilot as none:
@@ -114,7 +112,7 @@ class Record:
 def _flight(record: Record, start: Path, home: Path, folder: Path, random: Random) -> None:
     """From switching on to the last fault, or to a crash."""
     with (
-        sitl.flying(record.setup.kind, start, home, record.setup.parameters) as (url, system),
+        switched_on(record.setup, start, home) as (url, system),
         relayed(url) as relay,
         judged(sitl.beside(record.setup.kind, system, url), system) as judge,
         _flown([*record.setup.words, "--url", relay.url, "--system", str(system)], home, folder) as (fly, steps),

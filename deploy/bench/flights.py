@@ -18,6 +18,7 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 from deploy.bench import mocap, sitl
@@ -56,10 +57,11 @@ HEARD = {
     "EKF2_HGT_REF": 0,
     "EKF2_BARO_NOISE": 0.3,
 }
+OUTDOORS, HEARING = "ardupilot", "px4"
 LED, INDOORS = "ardupilot, led to places", "px4 with motion capture"
 SETUPS = {
-    "ardupilot": Setup("ardupilot", CALM),
-    "px4": Setup("px4", HEARD),
+    OUTDOORS: Setup("ardupilot", CALM),
+    HEARING: Setup("px4", HEARD),
     LED: Setup("ardupilot", STIFF, ("--lead",)),
     INDOORS: Setup("px4", {**HEARD, **mocap.PARAMETERS}, cameras=True),
 }
@@ -190,11 +192,7 @@ class Flights:
     def _switched_on(self, stack: ExitStack, parameters: Mapping[str, float]) -> tuple[str, int]:
         """One more of them until the stack ends: (the URL for us, its system id)."""
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
-        kind, lasting = self._setup.kind, {**self._setup.parameters, **parameters}
-        url, system = stack.enter_context(sitl.flying(kind, self._start, folder, lasting))
-        if self._setup.cameras:
-            stack.enter_context(mocap.captured(sitl.beside(kind, system, url), system))
-        return url, system
+        return stack.enter_context(switched_on(self._setup, self._start, folder, parameters))
 
     @contextmanager
     def _in_between(self, upset: Upset, url: str, system: int) -> Iterator[None]:
@@ -215,6 +213,19 @@ class Flights:
             over.set()
             if upset.ends:
                 thread.join()
+
+
+@contextmanager
+def switched_on(
+    setup: Setup, start: Path, folder: Path, parameters: Mapping[str, float] = MappingProxyType({})
+) -> Iterator[tuple[str, int]]:
+    """One of that setup with other parameters besides, which runs in a folder: (the URL for us, its system id)."""
+    with ExitStack() as stack:
+        lasting = {**setup.parameters, **parameters}
+        url, system = stack.enter_context(sitl.flying(setup.kind, start, folder, lasting))
+        if setup.cameras:
+            stack.enter_context(mocap.captured(sitl.hall(system), system))
+        yield url, system
 
 
 def told(words: list[str], data: Path, seconds: float) -> str:

@@ -66,6 +66,11 @@ def beside(kind: str, system: int, url: str) -> str:
     return f"{address}:{int(port) + 2}"
 
 
+def hall(system: int) -> str:
+    """Where cameras can talk to a PX4 while somebody flies it and a second one listens: its simulator's port."""
+    return f"udpout:127.0.0.1:{19450 + system - 1}"
+
+
 def configure(url: str, system: int, parameters: Mapping[str, float]) -> None:
     """Set them, and wait until they are in a file. Raises NoAutopilot: it does not take one of them."""
     link = open_link(url)
@@ -117,7 +122,7 @@ def _taken(kind: str, instance: int) -> bool:
     """Does one of that number run, or somebody who expects it?"""
     table, ports = "tcp", [5760 + 10 * instance]
     if kind == "px4":
-        table, ports = "udp", [14540 + instance, 14580 + instance, 18570 + instance]
+        table, ports = "udp", [14540 + instance, 14580 + instance, 18570 + instance, 19450 + instance]
     rows = [line.split() for line in Path(f"/proc/net/{table}").read_text().splitlines()[1:]]
     used = {int(row[1].split(":")[1], 16) for row in rows if table == "udp" or row[3] == LISTENS}
     return bool(used.intersection(ports))
