@@ -1,4 +1,4 @@
-"""The least of all beams nearby, compiled (`patches.least_within`)."""
+"""What `patches.py` makes of all beams of an image, compiled: in single precision, a pass over all at a time."""
 
 from __future__ import annotations
 
@@ -8,33 +8,123 @@ from numpy.typing import NDArray
 from messaging.compiled import compiled
 
 Array = NDArray[np.float64]
+Single = NDArray[np.float32]
+
+SINGLE = 1e-6  # of a range: more than a few operations in single precision are off by
 
 
-@compiled("f8[:,::1](f8[:,::1], i8, i8[::1])")
-def least_of(values: Array, rows: int, beside: NDArray[np.int64]) -> Array:
+@compiled("void(f4[::1], f4[::1], f4[::1])")
+def _lesser(one: Single, other: Single, found: Single) -> None:
+    """Of each two numbers. (So written it becomes one instruction for many of them, and `min` does not.)"""
+    for j in range(len(found)):
+        a, b = one[j], other[j]
+        found[j] = a if a < b else b
+
+
+@compiled("void(f4[::1], f4[::1], f4[::1], i8, i8)")
+def _least_ahead(values: Single, spare: Single, found: Single, count: int, stride: int) -> None:
+    """Of each number and those after it, so many in all, so far apart each; overwrites values and spare."""
+    n, width = len(values), 1  # so many each entry is the least of
+    while 2 * width <= count:
+        n -= width * stride
+        _lesser(values[:n], values[width * stride : width * stride + n], spare[:n])
+        values, spare = spare, values
+        width *= 2
+    ahead = (count - width) * stride
+    _lesser(values[: len(found)], values[ahead : ahead + len(found)], found)
+
+
+@compiled("f4[:,::1](f4[:,::1], i8, i8[::1])")
+def least_of(values: Single, rows: int, beside: NDArray[np.int64]) -> Single:
     """Of a grid (E, A), round in its columns: the least (E, A) of so many rows above and below each, and so many
     columns (E,) beside it."""
     rings, columns = values.shape
-    found, upright, wrapped = np.empty((rings, columns)), np.empty(columns), np.empty(2 * columns)
+    size, edge = rings * columns, rows * columns
+    tall, spare = np.full(size + 2 * edge, np.inf, np.float32), np.empty(size + 2 * edge, np.float32)
+    tall[edge : edge + size] = values.ravel()
+    upright, found = np.empty(size, np.float32), np.empty((rings, columns), np.float32)
+    _least_ahead(tall, spare, upright, 2 * rows + 1, columns)
     for i in range(rings):
-        upright[:] = values[max(i - rows, 0)]
-        for k in range(max(i - rows, 0) + 1, min(i + rows, rings - 1) + 1):
-            for j in range(columns):
-                upright[j] = min(upright[j], values[k, j])
-        count = 2 * beside[i] + 1
+        ring, at, count = upright[i * columns : (i + 1) * columns], beside[i], 2 * beside[i] + 1
         if count >= columns:
-            found[i] = upright.min()
+            found[i] = ring.min()
             continue
-        length = columns + count - 1
-        wrapped[: beside[i]] = upright[columns - beside[i] :]
-        wrapped[beside[i] : beside[i] + columns] = upright
-        wrapped[beside[i] + columns : length] = upright[: beside[i]]
-        width = 1  # of what each entry is the least
-        while 2 * width <= count:
-            length -= width
-            for j in range(length):
-                wrapped[j] = min(wrapped[j], wrapped[j + width])
-            width *= 2
-        for j in range(columns):
-            found[i, j] = min(wrapped[j], wrapped[j + count - width])
+        wrapped = tall[: columns + count - 1]
+        wrapped[:at] = ring[columns - at :]
+        wrapped[at : at + columns] = ring
+        wrapped[at + columns :] = ring[:at]
+        _least_ahead(wrapped, spare[: len(wrapped)], found[i], count, 1)
     return found
+
+
+@compiled("f4[:,::1](f8[:,::1], i8, i8, f8, f8)")
+def heard(ranges: Array, below: int, above: int, far: float, error: float) -> Single:
+    """The returns at the least (below + E + above, A) of a grid's ranges [m], so many rings added; < 0: not known."""
+    rings, columns = ranges.shape
+    found = np.full((below + rings + above, columns), -1.0, np.float32)
+    for i in range(rings):
+        ring, out = ranges[i], found[below + i]
+        for j in range(columns):
+            range_ = ring[j]
+            least = (range_ if range_ < far else far) - error
+            least = least if least > 0.0 else 0.0
+            out[j] = least if range_ > 0.0 else -1.0
+    return found
+
+
+@compiled("f4[:,::1](f4[:,::1])")
+def farthest_of_meshes(returns: Single) -> Single:
+    """Of each beam and its neighbours to the left, above and above to the left (E, A); of the last ring, of two. 0:
+    none is known."""
+    rings, columns = returns.shape
+    beside, found = np.empty((rings, columns), np.float32), np.empty((rings, columns), np.float32)
+    for i in range(rings):
+        ring, out = returns[i], beside[i]
+        for j in range(columns - 1):
+            a, b = ring[j], ring[j + 1]
+            out[j] = a if a > b else b
+        out[columns - 1] = max(ring[columns - 1], ring[0])
+    for i in range(rings):
+        one, other, out = beside[i], beside[min(i + 1, rings - 1)], found[i]
+        for j in range(columns):
+            a, b = one[j], other[j]
+            a = a if a > b else b
+            out[j] = a if a > 0.0 else 0.0
+    return found
+
+
+@compiled("b1(f4[:,::1], i8, i8, f4, i8, i8)")
+def _farther(meshes: Single, ring: int, column: int, than: float, rows: int, beside: int) -> bool:
+    """Do all meshes about a beam return from farther?"""
+    rings, columns = meshes.shape
+    aside = min(beside, columns // 2)
+    for i in range(max(ring - rows, 0), min(ring + rows, rings - 1) + 1):
+        for j in range(column - aside, column + aside + 1):
+            if meshes[i, j % columns] <= than:
+                return False
+    return True
+
+
+@compiled("i8(f4[:,::1], f4[:,::1], f4, f4, i8, i8[::1])")
+def forget_ghosts(
+    returns: Single, meshes: Single, share: float, error: float, rows: int, beside: NDArray[np.int64]
+) -> int:
+    """Make unknown what returns from nearer than so much of the least of all meshes about it, less an error [m]. So
+    many are left that are known."""
+    rings, columns = returns.shape
+    left = 0
+    for i in range(rings):
+        ring, own = returns[i], meshes[i]
+        doubtful = 0
+        for j in range(columns):  # its own mesh returns from farther: so may all
+            left += ring[j] >= 0.0
+            doubtful += (ring[j] >= 0.0) & (ring[j] < share * (own[j] - error))
+        if not doubtful:
+            continue
+        for j in range(columns):
+            if 0.0 <= ring[j] < share * (own[j] - error):
+                than = (ring[j] / share + error) * (1.0 + SINGLE)
+                if _farther(meshes, i, j, than, rows, beside[i]):
+                    ring[j] = -1.0
+                    left -= 1
+    return left

@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 from messaging.range_images import RangeImage
 
 Array = NDArray[np.float64]
+Single = NDArray[np.float32]
 
 CORNER = math.sqrt(0.75)  # of a cube's edge: from its corner to its middle
 
@@ -45,13 +46,17 @@ class Cover:
         kappa = 2.0 * sine / (1.0 - math.sqrt(3.0) * sine)
         return Cover(kappa, patch + math.asin(min(CORNER * kappa, 1.0)) + farthest)
 
-    def farthest(self, returns: Array, error: float) -> Array:
-        """m, from where a point can be hit at the nearest if what covers it returns from so far."""
-        return np.asarray((returns - error) / (1.0 + CORNER * self.kappa))
+    @property
+    def share(self) -> float:
+        """Of the range that what covers a point returns from: from where it can be hit at the nearest."""
+        return 1.0 / (1.0 + CORNER * self.kappa)
 
-    def free(self, least: Array, least_width: float) -> Array:
+    def free(self, least: Single, least_width: float) -> Single:
         """F [m] by the least ranges [m]."""
-        return np.minimum(least / (1.0 + CORNER * self.kappa), least_width / self.kappa)
+        from messaging.nearby import SINGLE  # compiled
+
+        share, most = (1.0 - SINGLE) * self.share, (1.0 - SINGLE) * least_width / self.kappa
+        return np.asarray(np.minimum(least * np.float32(share), np.float32(most)))
 
 
 def half_diagonal(image: RangeImage) -> float:
@@ -59,27 +64,25 @@ def half_diagonal(image: RangeImage) -> float:
     return 0.5 * math.hypot(*image.step)
 
 
-def seen_free(image: RangeImage) -> tuple[Array, Array]:
+def seen_free(image: RangeImage) -> tuple[Array, Single]:
     """The rings' elevations (E',), from pole to pole, and F (E', A) [m] of each beam's patch."""
-    elevations, above, below = _rings(len(image.ranges), image.low, image.high)
-    step, patch = image.step[0], half_diagonal(image)
-    single, double = Cover.of(patch, patch), Cover.of(max(2.0 * patch, 1.5 * step), patch)  # the latter at a pole
-    ranges = np.maximum(np.minimum(image.ranges, image.far) - image.range_error, 0.0)
-    known = image.ranges > 0.0
-    if below or above:
-        ranges, known = (np.pad(part, ((below, above), (0, 0))) for part in (ranges, known))
-    returns = meshes(np.maximum, np.where(known, ranges, 0.0))  # the farthest return of each mesh
-    possible = double.farthest(least_within(returns, elevations, step, double.within), 2.0 * image.range_error)
-    known &= ranges >= possible
-    if known.all() and not image.doubt:
-        return elevations, single.free(least_within(ranges, elevations, step, single.within), image.least_width)
+    from messaging.nearby import farthest_of_meshes, forget_ghosts, heard  # compiled
+
+    grid, width = _Grid.of(*image.ranges.shape, image.low, image.high), image.least_width
+    returns = heard(np.ascontiguousarray(image.ranges), grid.below, grid.above, image.far, image.range_error)
+    meshed, ghostly = farthest_of_meshes(returns), 2.0 * image.range_error
+    left = forget_ghosts(returns, meshed, grid.double.share, ghostly, grid.balls.rows, grid.balls.beside)
+    if left == returns.size and not image.doubt:
+        return grid.elevations, grid.single.free(grid.beams.least(returns), width)
+    known, nothing = returns >= 0.0, np.float32(0.0)
     enough = meshes(np.add, known.astype(np.int8)) > image.doubt
-    heard = np.where(known, ranges, np.inf)  # what says nothing does not say that something is near, either
-    free = double.free(least_within(np.where(enough, heard, 0.0), elevations, step, double.within), image.least_width)
+    silent = np.where(
+        known, returns, np.float32(np.inf)
+    )  # what says nothing does not say that something is near, either
+    free = grid.double.free(grid.balls.least(np.where(enough, silent, nothing)), width)
     if not image.doubt:
-        whole = least_within(np.where(known, ranges, 0.0), elevations, step, single.within)
-        free = np.maximum(free, single.free(whole, image.least_width))
-    return elevations, np.asarray(free)
+        free = np.maximum(free, grid.single.free(grid.beams.least(np.maximum(returns, nothing)), width))
+    return grid.elevations, free
 
 
 def meshes(of: np.ufunc, values: NDArray[Any]) -> NDArray[Any]:
@@ -89,28 +92,49 @@ def meshes(of: np.ufunc, values: NDArray[Any]) -> NDArray[Any]:
     return np.asarray(found)
 
 
-@lru_cache(maxsize=64)
-def _rings(rings: int, low: float, high: float) -> tuple[Array, int, int]:
-    """Elevations from pole to pole, and how many rings above and below are not seen."""
-    step = (high - low) / (rings - 1)
-    above, below = (max(math.ceil((0.5 * math.pi - end) / step - 0.5 - 1e-9), 0) for end in (high, -low))
-    elevations = low + step * np.arange(-below, rings + above)
-    return np.clip(elevations, -0.5 * math.pi, 0.5 * math.pi), above, below
+@dataclass(frozen=True)
+class Window:
+    """So many rings above and below a beam, and so many columns (E,) beside it by its ring."""
+
+    rows: int
+    beside: NDArray[np.int64]
+
+    @staticmethod
+    def of(columns: int, elevations: Array, step: float, within: float) -> Window:
+        """A box about all beams within so many rad of each on the sphere."""
+        half = np.full(len(elevations), math.pi)  # a cap with a pole in it is all about
+        level = np.abs(elevations) + within < 0.5 * math.pi
+        half[level] = np.arcsin(np.minimum(math.sin(within) / np.cos(elevations[level]), 1.0))
+        beside = np.minimum(np.ceil(half * columns / math.tau - 1e-9), columns).astype(np.int64)
+        return Window(math.ceil(within / step - 1e-9), beside)
+
+    def least(self, values: Single) -> Single:
+        """The least (E, A) of each beam's window in a grid (E, A)."""
+        from messaging.nearby import least_of  # compiled
+
+        return least_of(np.ascontiguousarray(values, np.float32), self.rows, self.beside)
 
 
-def least_within(values: Array, elevations: Array, step: float, within: float) -> Array:
-    """The least (E, A) of all that are within so many rad of each on the sphere: of a box about that cap."""
-    from messaging.nearby import least_of  # compiled
+@dataclass(frozen=True)
+class _Grid:
+    """What is known of a grid before any range: elevations (E',) from pole to pole, of which so many rings below and
+    above are not seen; what single beams say and where they are, and balls twice as wide."""
 
-    rows = math.ceil(within / step - 1e-9)
-    return least_of(np.ascontiguousarray(values), rows, _beside(values.shape[1], tuple(elevations), within))
+    elevations: Array
+    below: int
+    above: int
+    single: Cover
+    beams: Window
+    double: Cover
+    balls: Window
 
-
-@lru_cache(maxsize=64)
-def _beside(columns: int, elevations: tuple[float, ...], within: float) -> NDArray[np.int64]:
-    """(E,): how many columns beside a beam of each ring `least_within` looks at."""
-    half = np.full(len(elevations), math.pi)  # a cap with a pole in it is all about
-    for i, elevation in enumerate(elevations):
-        if abs(elevation) + within < 0.5 * math.pi:
-            half[i] = math.asin(math.sin(within) / math.cos(elevation))
-    return np.minimum(np.ceil(half * columns / math.tau - 1e-9), columns).astype(np.int64)
+    @staticmethod
+    @lru_cache(maxsize=64)
+    def of(rings: int, columns: int, low: float, high: float) -> _Grid:
+        step = (high - low) / (rings - 1)
+        above, below = (max(math.ceil((0.5 * math.pi - end) / step - 0.5 - 1e-9), 0) for end in (high, -low))
+        elevations = np.clip(low + step * np.arange(-below, rings + above), -0.5 * math.pi, 0.5 * math.pi)
+        patch = 0.5 * math.hypot(step, math.tau / columns)
+        single, double = Cover.of(patch, patch), Cover.of(max(2.0 * patch, 1.5 * step), patch)  # the latter at a pole
+        beams, balls = (Window.of(columns, elevations, step, cover.within) for cover in (single, double))
+        return _Grid(elevations, below, above, single, beams, double, balls)

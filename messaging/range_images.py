@@ -19,7 +19,9 @@ from messaging.scans import BadScan
 Array = NDArray[np.float64]
 
 MOST_BEAMS = 40_000
+MOST_AROUND = 400_000  # if its rings went on from pole to pole
 COARSEST = math.radians(12.0)  # between rings or columns
+MOST_TURNED = 0.3  # rad: who knows its attitude no better has no picture of what is about it
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,7 +46,7 @@ class RangeImage:
     far: float = 20.0  # m
     range_error: float = 0.05  # m, largest error of a range
     position_error: float = 0.0  # m, of `at`
-    angle_error: float = 0.0  # rad, of a beam's direction in the world
+    angle_error: float = 0.0  # rad, of the attitude: by which all beams are turned, the same way
     least_width: float = 0.5  # m
     doubt: int = 0  # so many of any four neighbouring beams, 0 or 1, may see through what is there
     speed: float = 0.0  # m/s: whatever was hit may move as fast; 0: the world stands
@@ -53,6 +55,8 @@ class RangeImage:
     def __post_init__(self) -> None:
         if self.ranges.ndim != 2 or not all(self.ranges.shape) or self.ranges.size > MOST_BEAMS:
             raise BadScan(f"a range image has rings and columns, of {MOST_BEAMS} beams at most")
+        if self.ranges.dtype != np.float64:
+            raise BadScan("a range image's ranges are in double precision")
         if not np.isfinite(self.ranges).all() or (self.ranges < 0.0).any():
             raise BadScan("a range image's ranges are 0 or more, and finite")
         if (len(self.at), len(self.attitude), len(self.mount)) != (3, 4, 3):
@@ -64,6 +68,8 @@ class RangeImage:
         bounds = (self.far, self.range_error, self.position_error, self.angle_error, self.speed, self.age)
         if not all(math.isfinite(value) and value >= 0.0 for value in bounds):
             raise BadScan("a range image's errors, speed and age must be finite and not negative")
+        if self.angle_error > MOST_TURNED:
+            raise BadScan(f"a range image's angle error is {MOST_TURNED:g} rad at most")
         if not (math.isfinite(self.least_width) and self.least_width > 0.0):
             raise BadScan("a range image's least width must be positive")
         if self.doubt not in (0, 1):
@@ -72,6 +78,8 @@ class RangeImage:
             raise BadScan("a range image's rings go from one elevation up to another, between -90° and 90°")
         if len(self.ranges) < 2 or max(self.step) > COARSEST:
             raise BadScan(f"a range image has rings and columns at most {math.degrees(COARSEST):.0f}° apart")
+        if math.pi / self.step[0] * self.ranges.shape[1] > MOST_AROUND:
+            raise BadScan(f"a range image's rings are so close that all about there were over {MOST_AROUND} beams")
 
     @cached_property
     def step(self) -> tuple[float, float]:
@@ -95,6 +103,11 @@ class RangeImage:
     def known(self) -> NDArray[np.bool_]:
         """Which beams say something."""
         return np.asarray(self.ranges > 0.0)
+
+    @property
+    def sensor_error(self) -> float:
+        """m, largest error of where the sensor was: a wrong attitude swings it about the robot."""
+        return self.position_error + self.angle_error * math.hypot(*self.mount)
 
     def sensor(self) -> Array:
         """(3,): where the sensor was, by the measured place, m."""

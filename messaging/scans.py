@@ -103,6 +103,11 @@ class Scan:
         """Which beams say something."""
         return np.asarray(self.ranges > 0.0)
 
+    @property
+    def sensor_error(self) -> float:
+        """m, largest error of where the sensor was: a wrong heading swings it about the robot."""
+        return self.position_error + self.heading_error * math.hypot(*self.mount)
+
     def sensor(self) -> tuple[Array, float]:
         """Where the sensor was, by the measured pose: place (2,) and heading."""
         x, y, heading = self.pose

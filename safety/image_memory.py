@@ -10,7 +10,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from messaging.patches import half_diagonal, least_within, meshes, seen_free
+from messaging.patches import Single, Window, half_diagonal, meshes, seen_free
 from messaging.range_images import RangeImage, directions
 from messaging.robots import Robot
 from messaging.scans import Scan
@@ -31,12 +31,13 @@ class _Seen:
     image: RangeImage
 
     @cached_property
-    def free(self) -> tuple[float, Array]:
+    def free(self) -> tuple[float, Single]:
         """The lowest ring's elevation [rad], and the free ranges (len(ASIDE), E, A) of all directions within so much of
         each patch."""
         elevations, free = seen_free(self.image)
         about = 2.0 * half_diagonal(self.image)
-        levels = [least_within(free, elevations, self.image.step[0], aside + about) for aside in ASIDE]
+        columns, step = free.shape[1], self.image.step[0]
+        levels = [Window.of(columns, elevations, step, aside + about).least(free) for aside in ASIDE]
         return float(elevations[0]), np.stack(levels)
 
 
@@ -83,8 +84,9 @@ class ImageMemory(Memory[RangeImage]):
         """Was it seen free, with all that is within the errors since?"""
         away = (points - seen.image.sensor()) @ seen.image.turn
         far = np.sqrt(np.einsum("sbd,sbd->sb", away, away))
-        drift = seen.image.position_error + scan.position_error + scan.speed * age + STEPS[:, None]
-        drift = drift + (seen.image.angle_error + scan.angle_error) * far
+        drift = seen.image.sensor_error + scan.position_error + scan.speed * age + STEPS[:, None]
+        reach = np.linalg.norm(points - np.asarray(scan.at), axis=-1)
+        drift = drift + seen.image.angle_error * far + scan.angle_error * reach
         aside = np.arcsin(np.minimum(drift / np.maximum(far, 1e-9), 1.0))
         level = np.searchsorted(np.array(ASIDE), aside)
         lowest, free = seen.free

@@ -166,8 +166,9 @@ class FanMemory(Memory[Scan]):
         """Was it seen free, with all that is within the errors since?"""
         away = points - seen.at
         far = np.sqrt(np.einsum("sbd,sbd->sb", away, away))
-        drift = seen.scan.position_error + scan.position_error + scan.speed * age + STEP
-        drift = drift + (seen.scan.heading_error + scan.heading_error) * far
+        drift = seen.scan.sensor_error + scan.position_error + scan.speed * age + STEP
+        reach = np.linalg.norm(points - _place(scan), axis=-1)
+        drift = drift + seen.scan.heading_error * far + scan.heading_error * reach
         aside = np.arcsin(np.minimum(drift / np.maximum(far, 1e-9), 1.0))
         angle = np.arctan2(away[..., 1], away[..., 0]) - seen.heading
         first = np.floor((angle - aside) * (CELLS / math.tau)).astype(int)

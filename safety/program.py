@@ -102,6 +102,8 @@ class Builder:
         self.length = np.linalg.norm(fixed, axis=1)
         self.fixed = fixed / self.length[:, None]
         self.limited = limited
+        self.low, self.high = robot.low(), robot.high()
+        self.way = np.arange(1, steps + 1)[:, None] * np.asarray(robot.action_slew)  # of the input, until each free one
         self.slew = np.tile(robot.action_slew, steps)[limited]
         self.box = np.concatenate([np.tile(robot.high(), steps), -np.tile(robot.low(), steps)])
 
@@ -137,10 +139,8 @@ class Builder:
 
     def reachable(self, before: Array) -> tuple[Array, Array]:
         """Center and half-widths (F·m,) of what bounds and slew leave to the free inputs after `before` (m,)."""
-        steps = self.free // len(before)
-        way = np.arange(1, steps + 1)[:, None] * np.asarray(self.robot.action_slew)
-        low = np.maximum(self.robot.low(), before - way).ravel()
-        high = np.minimum(self.robot.high(), before + way).ravel()
+        low = np.maximum(self.low, before - self.way).ravel()
+        high = np.minimum(self.high, before + self.way).ravel()
         return 0.5 * (low + high), 0.5 * (high - low)
 
     def inputs(self, x: Array) -> Array:

@@ -19,10 +19,12 @@ from messaging.shapes import FARTHEST
 from safety.freespace import TOUCHING
 
 Array = NDArray[np.float64]
+Single = NDArray[np.float32]
 
 PLANES = 32  # of a period at most: what needs more has no free space there
 GIVE = 0.05  # of the room to a shadow, that is given up for fewer half-spaces; twice as much after every eight
 SHARED = 0.6  # m of the nominal way, about, along which periods share half-spaces
+ASIDE = 1e-6  # rad: more than a direction in single precision is beside its patch's middle
 FACES = np.vstack([np.eye(3), -np.eye(3)])  # of the room
 
 
@@ -58,29 +60,29 @@ def shadows(image: RangeImage, room: Room, body: float) -> Shadows:
     from safety.shading import behind  # compiled
 
     elevations, free = seen_free(image)
-    first, ways = _patches(tuple(elevations), free.shape[1])
+    together, ways = _patches(tuple(elevations), free.shape[1])
     at, beside = image.sensor(), body + image.speed * (image.age + room.last)
     corners = np.maximum(np.abs(room.low - at), np.abs(room.high - at)) + beside
-    about = half_diagonal(image) + image.angle_error
-    within = (float(np.linalg.norm(corners)) + image.position_error) / (1.0 - about)
-    beside += within * about + image.position_error
+    about = half_diagonal(image) + image.angle_error + ASIDE
+    within = (float(np.linalg.norm(corners)) + image.sensor_error) / (1.0 - about)
+    beside += within * about + image.sensor_error
     low, high = room.low - beside, room.high + beside
-    lines = behind(free, first, ways, image.turn, at, within, low, high, about, image.position_error)
+    lines = behind(free, together, ways, image.turn, at, within, low, high, about, image.sensor_error)
     return Shadows(lines, room, image.speed, image.age)
 
 
 @lru_cache(maxsize=16)
-def _patches(elevations: tuple[float, ...], columns: int) -> tuple[NDArray[np.intp], Array]:
-    """Where patches begin in a flat grid, and their middles (n, 3): near the poles several columns are one."""
+def _patches(elevations: tuple[float, ...], columns: int) -> tuple[NDArray[np.int64], Single]:
+    """How many columns make a patch in each ring (E,), more than one near the poles, and their middles (3, n), as
+    exactly as `ASIDE`."""
     half = 0.5 * float(np.diff(elevations).max())  # the outermost rings may have been moved to the poles
-    first, middles = [], []
-    for ring, elevation in enumerate(elevations):
-        together = int(1.0 / np.cos(max(abs(elevation) - half, 0.0)))
-        begin = np.arange(0, columns, together)
-        middle = 0.5 * (begin + np.minimum(begin + together, columns) - 1)
-        first.append(ring * columns + begin)
+    together = (1.0 / np.cos(np.maximum(np.abs(elevations) - half, 0.0))).astype(np.int64)
+    middles = []
+    for elevation, each in zip(elevations, together, strict=True):
+        begin = np.arange(0, columns, each)
+        middle = 0.5 * (begin + np.minimum(begin + each, columns) - 1)
         middles.append(directions(np.array([elevation]), columns, middle)[0])
-    return np.concatenate(first), np.concatenate(middles)
+    return together, np.ascontiguousarray(np.concatenate(middles).T, np.float32)
 
 
 def half_spaces(
@@ -88,33 +90,19 @@ def half_spaces(
 ) -> tuple[Array, Array]:
     """As `freespace.half_spaces`: as many as any period needs, up to `PLANES`, and the room's faces. Those that a
     period does not need hold everywhere."""
-    from safety.shading import rooms, supporting  # compiled
+    from safety.shading import about_periods, free_groups, rooms, supporting, together  # compiled
 
-    N = len(nominal)
-    normals = np.broadcast_to(FACES[:, None], (len(FACES), N, 3))
-    offsets = np.broadcast_to(np.concatenate([near.room.high - start, start - near.room.low])[:, None], (len(FACES), N))
-    if not near.lines.size:
-        return normals, offsets
-    ends = np.concatenate([np.zeros((1, 3)), nominal - start])
-    first = _together(ends)
-    finite = np.isfinite(ends).all(axis=1)
-    room = rooms(near.lines, start, ends, first)
-    free = (room.min(axis=1) > TOUCHING) & np.logical_and.reduceat(finite[1:] & finite[:-1], first)
-    free = np.logical_and.accumulate(free)
-    if not free[0]:
-        return normals, np.full((len(FACES), N), -np.inf)
-    last = int(free.sum())
-    chords = np.stack([ends[first], ends[np.append(first[1:], N)]], axis=1)
-    a, b = supporting(near.lines, start, chords[:last], room[:last], keep_off, PLANES, GIVE, FARTHEST)
-    group = np.minimum(np.searchsorted(first, np.arange(N), side="right") - 1, last - 1)
-    a, b = a[:, group], b[:, group]
-    grown = near.speed * (near.age + period * np.arange(1, N + 1))
-    b -= (grown + keep_off) * a.any(axis=2) + np.abs(a) @ measured
-    return np.concatenate([a, normals]), np.concatenate([b, offsets])
-
-
-def _together(ends: Array) -> NDArray[np.intp]:
-    """The first periods of those that share half-spaces, for the nominal way hardly leads on in them."""
-    way = np.cumsum(np.linalg.norm(ends[1:] - ends[:-1], axis=1))
-    part = np.floor(way / SHARED)
-    return np.flatnonzero(np.append(True, part[1:] != part[:-1]))
+    low, high = near.room.low - start, near.room.high - start
+    grown: Array = near.speed * (near.age + period * np.arange(1.0, len(nominal) + 1.0))
+    normals, levels = np.zeros((1, 0, 3)), np.zeros((1, 0))
+    first = np.zeros(1, np.int64)
+    if near.lines.size:
+        ends = np.concatenate([np.zeros((1, 3)), nominal - start])
+        first = together(ends, SHARED)
+        room = rooms(near.lines, start, ends, first)
+        free = free_groups(ends, first, room, TOUCHING)
+        chords = np.stack([ends[first], ends[np.append(first[1:], len(nominal))]], axis=1)[:free]
+        if free == 0:
+            return np.tile(FACES[:, None], (1, len(nominal), 1)), np.full((len(FACES), len(nominal)), -np.inf)
+        normals, levels = supporting(near.lines, start, chords, room[:free], keep_off, PLANES, GIVE, FARTHEST)
+    return about_periods(normals, levels, first, low, high, grown, keep_off, measured)

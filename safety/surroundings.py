@@ -91,6 +91,8 @@ class Surroundings:
             shades.prepare()
         self.robot, self.tube, self.stands = robot, tube, model.moving
         self.discs = _discs(robot, tube)
+        free = len(robot.action_slew) * (robot.free_steps - robot.given)
+        self._sizes = np.abs(tube.W[:, -free:]), np.abs(tube.position[:, :, -free:]), np.abs(tube.directions)
         self.boxes = Boxes(tube.position, tube.directions)
         self.limits = Limits(robot, tube) if robot.limits else None
         self.measured = np.asarray(robot.measurement_bound[: robot.position_dim])
@@ -194,11 +196,11 @@ class Surroundings:
     def _room(self, z_0: Array, inputs: tuple[Array, Array], start: Array, turn: Array) -> shades.Room:
         """A box, world, in which every plan's discs stay with their middles after z_0; and some more."""
         center, radius = inputs
-        free = len(radius)
         z = np.concatenate([z_0, center])
-        sizes = self.tube.M @ (np.abs(self.tube.W @ z) + np.abs(self.tube.W[:, -free:]) @ radius) + self.tube.m_0
+        W_f, moved, spread = self._sizes
+        sizes = self.tube.M @ (np.abs(self.tube.W @ z) + W_f @ radius) + self.tube.m_0
         L = self.tube.generators
-        half = np.abs(self.tube.position[:, :, -free:]) @ radius + np.abs(self.tube.directions) @ sizes[:L]
+        half = moved @ radius + spread @ sizes[:L]
         half += sizes[L:].max() + self.measured + self.comfort + ASIDE
         ways, half = np.vstack([np.zeros(len(start)), self.tube.centers(z) @ turn.T]), half @ np.abs(turn).T
         half = np.vstack([half[:1], half]) + max((float(np.linalg.norm(disc.at)) for disc in self.discs), default=0.0)
@@ -208,7 +210,7 @@ class Surroundings:
     def _unseen(self, scan: Scan, start: Array) -> seen.Cells | None:
         """What is not known to be free within reach, or may come there before a plan ends."""
         within = self.reach + scan.speed * (scan.age + self.robot.horizon * self.robot.period)
-        within += float(np.linalg.norm(scan.sensor()[0] - start)) + scan.position_error
+        within += float(np.linalg.norm(scan.sensor()[0] - start)) + scan.sensor_error
         cells = seen.cells(scan, within + scan.heading_error * within)
         return cells if len(cells) else None
 
@@ -231,19 +233,20 @@ class Surroundings:
         for disc in self.discs:
             start, measured = scene.start + scene.turn @ disc.at, self.measured + disc.swing
             ends = start + disc.position @ z @ scene.turn.T
-            normals, offsets = half_spaces(scene.near, start, ends, disc.radius, measured)
-            if leaving:
-                normals, offsets = leading_out(scene.near, start, disc.radius, measured, (normals, offsets))
+            beside = []
+            if len(scene.near) or scene.unseen is None:
+                beside.append(half_spaces(scene.near, start, ends, disc.radius, measured))
+                if leaving:
+                    beside[0] = leading_out(scene.near, start, disc.radius, measured, beside[0])
             if scene.moving is not None:
-                swept = swept_half_spaces(scene.moving, start, ends, disc.radius, measured, self.robot.period)
-                self._let_pass(swept[1])
-                normals, offsets = np.concatenate([normals, swept[0]]), np.concatenate([offsets, swept[1]])
+                beside.append(swept_half_spaces(scene.moving, start, ends, disc.radius, measured, self.robot.period))
+                self._let_pass(beside[-1][1])
             if scene.unseen is not None:
                 of = shades if isinstance(scene.unseen, shades.Shadows) else seen
-                beside = of.half_spaces(scene.unseen, start, ends, disc.radius, measured, self.robot.period)
+                beside.append(of.half_spaces(scene.unseen, start, ends, disc.radius, measured, self.robot.period))
                 if isinstance(scene.unseen, seen.Cells) and scene.unseen.speed > 0.0:
-                    self._let_pass(beside[1])
-                normals, offsets = np.concatenate([normals, beside[0]]), np.concatenate([offsets, beside[1]])
+                    self._let_pass(beside[-1][1])
+            normals, offsets = beside[0] if len(beside) == 1 else map(np.concatenate, zip(*beside, strict=True))
             found.append(Planes(start, ends, normals, offsets, disc.radius, measured))
         return found
 

@@ -57,13 +57,15 @@ HEARD = {
     "EKF2_HGT_REF": 0,
     "EKF2_BARO_NOISE": 0.3,
 }
+# Who flies as fast as that must be quick to hold its place when setpoints stop.
+ALERT = {"COM_OF_LOSS_T": 0.2, "COM_OBL_RC_ACT": 5, "MPC_ACC_HOR": 8.0, "MPC_JERK_AUTO": 40.0}
 OUTDOORS, HEARING = "ardupilot", "px4"
 LED, INDOORS = "ardupilot, led to places", "px4 with motion capture"
 SETUPS = {
     OUTDOORS: Setup("ardupilot", CALM),
     HEARING: Setup("px4", HEARD),
     LED: Setup("ardupilot", STIFF, ("--lead",)),
-    INDOORS: Setup("px4", {**HEARD, **mocap.PARAMETERS}, cameras=True),
+    INDOORS: Setup("px4", {**HEARD, **mocap.PARAMETERS, **ALERT}, cameras=True),
 }
 
 

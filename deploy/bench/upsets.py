@@ -1,4 +1,4 @@
-"""Real autopilots that are no longer what they were: wind, weak motors, a load, noise; a GPS that jumps, or cameras gone.
+"""Real autopilots that are not what they were: wind, weak motors, a load, noise; a GPS that jumps, cameras that go out.
 
 After `flights`, whose folder it works in: A* flies among obstacles behind the model set that was made there, the model
 set is made again of that flight's log, and A* flies behind the new one. In real time: eight minutes for each.

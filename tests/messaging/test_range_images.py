@@ -206,6 +206,9 @@ def test_two_at_once_and_half_a_beam_are_refused():
         ({"far": math.inf}, "finite"),
         ({"least_width": 0.0}, "positive"),
         ({"doubt": 2}, "doubted"),
+        ({"angle_error": 1.0}, "angle error"),  # degrees, say: so wide is every shadow that none would be left
+        ({"low": 0.5, "high": 0.5 + 1e-6}, "so close"),
+        ({"ranges": np.ones((45, 90), np.float32)}, "double precision"),
     ],
 )
 def test_what_is_no_image_is_refused(wrong, said):

@@ -33,8 +33,11 @@ def test_a_shadow_holds_all_of_its_patch_that_comes_into_the_room_whatever_the_e
     rng, image = np.random.default_rng(seed), scattered(seed)
     lines = shadows(image, Room(np.full(3, -2.0), np.full(3, 2.0), 1.0), 0.2).lines
     elevations, free = seen_free(image)
-    first, middles = _patches(tuple(elevations), COLUMNS)
-    free = np.minimum.reduceat(free.ravel(), first)
+    together, middles = _patches(tuple(elevations), COLUMNS)
+    middles = middles.T
+    free = np.concatenate(
+        [np.minimum.reduceat(ring, np.arange(0, COLUMNS, each)) for ring, each in zip(free, together, strict=True)]
+    )
     which = rng.integers(len(middles), size=4000)
     aside = rng.normal(size=(4000, 3))
     aside -= np.einsum("nd,nd->n", aside, middles[which])[:, None] * middles[which]
@@ -47,7 +50,7 @@ def test_a_shadow_holds_all_of_its_patch_that_comes_into_the_room_whatever_the_e
     inside = (np.abs(points) < 2.0).all(axis=1)
     assert inside.sum() > 50
     for point, patch in zip(points[inside][:100], which[inside][:100], strict=True):
-        (line,) = np.flatnonzero(lines[3:6].T @ (image.turn @ middles[patch]) > 1.0 - 1e-9)
+        (line,) = np.flatnonzero(lines[3:6].T @ (image.turn @ middles[patch]) > 1.0 - 1e-7)
         near, along, (length, about_near, about_far) = lines[:3, line], lines[3:6, line], lines[6:, line]
         share = np.linspace(0.0, 1.0, 400)
         there = near + (share * length)[:, None] * along
@@ -64,20 +67,20 @@ def test_every_shadow_is_beyond_some_half_space_of_every_chord(seed, n, give):
     along /= np.linalg.norm(along, axis=0)
     lines = np.vstack([near, along, rng.uniform(0.0, 3.0, n), rng.uniform(0.0, 0.1, n), rng.uniform(0.1, 0.3, n)])
     start = rng.uniform(-0.2, 0.2, 3)
-    chords, room = rng.uniform(-0.3, 0.3, (3, 2, 3)), rng.uniform(0.0, 1.0, (3, n))
+    chords, room = rng.uniform(-0.3, 0.3, (3, 2, 3)), rng.random((3, n), np.float32)
     normals, levels = supporting(lines, start, chords, room, 0.2, n, give, FARTHEST)
     ends = near - start[:, None], near - start[:, None] + lines[6] * along
     for group in range(3):
-        used = levels[:, group] < FARTHEST
-        least = [normals[used, group] @ end - about for end, about in zip(ends, lines[7:], strict=True)]
-        assert (np.minimum(*least) >= levels[used, group, None] - 1e-9).any(axis=0).all()
-        assert np.allclose(np.linalg.norm(normals[used, group], axis=1), 1.0)
+        used = levels[group] < FARTHEST
+        least = [normals[group, used] @ end - about for end, about in zip(ends, lines[7:], strict=True)]
+        assert (np.minimum(*least) >= levels[group, used, None] - 1e-9).any(axis=0).all()
+        assert np.allclose(np.linalg.norm(normals[group, used], axis=1), 1.0)
 
 
 def test_where_half_spaces_do_not_suffice_nothing_is_free():
     lines = np.zeros((9, 2))
     lines[0], lines[3], lines[6] = [-1.0, 1.0], [-1.0, 1.0], 1.0  # one on either side
-    chords, room = np.zeros((1, 2, 3)), np.ones((1, 2))
+    chords, room = np.zeros((1, 2, 3)), np.ones((1, 2), np.float32)
     assert np.isfinite(supporting(lines, np.zeros(3), chords, room, 0.0, 2, 0.0, FARTHEST)[1]).all()
     assert np.isneginf(supporting(lines, np.zeros(3), chords, room, 0.0, 1, 0.0, FARTHEST)[1]).all()
 

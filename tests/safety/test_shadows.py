@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from messaging.patches import half_diagonal, seen_free
-from messaging.range_images import RangeImage
+from messaging.range_images import RangeImage, directions
 from messaging.shapes import Obstacle
 from safety.image_memory import ImageMemory
 from safety.shadows import FACES, PLANES, Room, _patches, half_spaces, shadows
@@ -105,11 +105,33 @@ def test_the_body_is_kept_off_and_what_may_move_takes_room_with_time():
     assert np.allclose(lost, 0.5 * (0.1 + 0.2 * np.arange(1, 4)), atol=0.02)
 
 
+def test_a_sensor_on_a_mast_swings_aside_when_its_attitude_is_wrong():
+    """A wall 0.5 m ahead of the robot, which in truth is tilted by all that its attitude may be wrong by."""
+    error, ahead, rings, columns = 0.05, 0.5, 90, 180
+    edge = 0.5 * math.pi * (1.0 - 1.0 / rings)
+    tilt = np.array([[math.cos(error), 0, math.sin(error)], [0, 1, 0], [-math.sin(error), 0, math.cos(error)]])
+    mount = (0.0, 0.0, -2.0)
+    ways = directions(np.linspace(-edge, edge, rings), columns) @ tilt.T
+    at = tilt @ mount
+    towards = np.maximum(ways[..., 0], 1e-9)
+    ranges = np.minimum((ahead - at[0]) / towards, FAR)
+    known = {"far": FAR, "range_error": 0.0, "angle_error": error, "least_width": 50.0}
+    image = RangeImage(ranges, (0.0, 0.0, 0.0), low=-edge, high=edge, mount=mount, **known)
+    nominal = np.linspace(0.0, 1.0, 9)[1:, None] * np.asarray(mount)
+    seen = shadows(image, Room(np.full(3, -4.0), np.full(3, 4.0), 1.0), 0.0)
+    normals, offsets = half_spaces(seen, NOTHING, nominal, 0.0, NOTHING, 0.2)
+    assert np.isfinite(offsets).all()
+    across = np.linspace(-0.3, 0.3, 31)
+    wall = np.array([[ahead, y, mount[2] + z] for y in across for z in across])
+    beyond = wall @ normals[: -len(FACES), -1].T >= offsets[: -len(FACES), -1]
+    assert beyond.any(axis=1).all()
+
+
 @pytest.mark.parametrize("low", [-EDGE, -0.5 * math.pi, -0.9])
 def test_no_direction_is_farther_from_its_patch_than_half_a_meshes_diagonal(low):
     image = RangeImage(np.ones((RINGS, COLUMNS)), (0.0, 0.0, 0.0), low=low, high=-low)
     elevations, _ = seen_free(image)
-    _, middles = _patches(tuple(elevations), COLUMNS)
+    middles = _patches(tuple(elevations), COLUMNS)[1].T
     ways = np.random.default_rng(0).normal(size=(3000, 3))
     ways /= np.linalg.norm(ways, axis=1, keepdims=True)
     nearest = np.arccos(np.clip((ways @ middles.T).max(axis=1), -1.0, 1.0))
