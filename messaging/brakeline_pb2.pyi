@@ -362,7 +362,7 @@ class RangeImage(_message.Message):
     position_error: _builtins.float
     """m"""
     angle_error: _builtins.float
-    """rad, of a beam's direction in the world"""
+    """rad, of the attitude, the same for all beams; 0.3 at most"""
     least_width: _builtins.float
     """m: nothing that it may meet is narrower"""
     doubt: _builtins.int
