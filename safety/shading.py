@@ -103,40 +103,19 @@ def behind(
     return lines
 
 
-ROOM = ", ".join(["f4"] * 3 + ["f4[::1]"] * 12)
-
-
-@compiled(f"void({ROOM})")
-def _room(
-    a: np.float32,
-    b: np.float32,
-    c: np.float32,
-    x: Single,
-    y: Single,
-    z: Single,
-    u: Single,
-    v: Single,
-    w: Single,
-    length: Single,
-    about: Single,
-    widening: Single,
-    outward: Single,
-    square: Single,
-    found: Single,
-) -> None:
-    """How near each shadow is to a place; where that is nearer than it was found to be before."""
-    zero, own = np.float32(0.0), a * a + b * b + c * c
+@compiled("void(f4[::1], f4[:,::1], f4[::1])")
+def _room(place: Single, told: Single, found: Single) -> None:
+    """How near each shadow, as `rooms` tells them, is to a place, where that is nearer than was found before."""
+    a, b, c, zero = place[0], place[1], place[2], np.float32(0.0)
+    x, y, z, u, v, w = told[0], told[1], told[2], told[3], told[4], told[5]
+    length, about, widening, outward, square = told[6], told[7], told[8], told[9], told[10]
+    own = a * a + b * b + c * c
     for s in range(len(found)):
         away = a * u[s] + b * v[s] + c * w[s] - outward[s]
         t = away if away > zero else zero
         t = t if t < length[s] else length[s]
-        gap = (
-            square[s]
-            - (a * x[s] + b * y[s] + c * z[s])
-            - (a * x[s] + b * y[s] + c * z[s])
-            + own
-            + t * (t - away - away)
-        )
+        aside = a * x[s] + b * y[s] + c * z[s]
+        gap = square[s] - aside - aside + own + t * (t - away - away)
         gap = gap if gap > zero else zero
         room = np.sqrt(gap) - about[s] - t * widening[s]
         found[s] = room if room < found[s] else found[s]
@@ -146,18 +125,17 @@ def _room(
 def rooms(lines: Array, start: Array, ends: Array, first: NDArray[np.int64]) -> Single:
     """About how near [m] each shadow is to any of the ends (N+1, 3), from the start, of the periods of each group,
     which begins with so many a period (G,): (G, n)."""
-    periods, found = len(ends) - 1, np.full((len(first), lines.shape[1]), np.inf, np.float32)
-    x, y, z, along_x, along_y, along_z, length, about, about_far = [
-        (lines[i] - (start[i] if i < 3 else 0.0)).astype(np.float32) for i in range(9)
-    ]
-    outward = x * along_x + y * along_y + z * along_z
-    square = x * x + y * y + z * z
-    widening = (about_far - about) / np.maximum(length, np.float32(TOUCHING))
+    n, periods = lines.shape[1], len(ends) - 1
+    told, found = np.empty((11, n), np.float32), np.full((len(first), n), np.inf, np.float32)
+    for i in range(8):
+        told[i] = lines[i] - (start[i] if i < 3 else 0.0)
+    told[8] = (lines[8] - lines[7]) / np.maximum(lines[6], TOUCHING)
+    told[9] = told[0] * told[3] + told[1] * told[4] + told[2] * told[5]
+    told[10] = told[0] * told[0] + told[1] * told[1] + told[2] * told[2]
     for group in range(len(first)):
         until = first[group + 1] if group + 1 < len(first) else periods
         for end in range(first[group], until + 1):
-            a, b, c = np.float32(ends[end, 0]), np.float32(ends[end, 1]), np.float32(ends[end, 2])
-            _room(a, b, c, x, y, z, along_x, along_y, along_z, length, about, widening, outward, square, found[group])
+            _room(ends[end].astype(np.float32), told, found[group])
     return found
 
 
