@@ -68,7 +68,8 @@ def seen_free(image: RangeImage) -> tuple[Array, Single]:
     """The rings' elevations (E',), from pole to pole, and F (E', A) [m] of each beam's patch."""
     from messaging.nearby import farthest_of_meshes, forget_ghosts, heard  # compiled
 
-    grid, width = _Grid.of(*image.ranges.shape, image.low, image.high), image.least_width
+    width, (rings, columns) = image.least_width, image.ranges.shape
+    grid = _Grid.of(rings, columns, image.low, image.high, image.step[0], half_diagonal(image))
     returns = heard(np.ascontiguousarray(image.ranges), grid.below, grid.above, image.far, image.range_error)
     meshed, ghostly = farthest_of_meshes(returns), 2.0 * image.range_error
     left = forget_ghosts(returns, meshed, grid.double.share, ghostly, grid.balls.rows, grid.balls.beside)
@@ -130,11 +131,9 @@ class _Grid:
 
     @staticmethod
     @lru_cache(maxsize=64)
-    def of(rings: int, columns: int, low: float, high: float) -> _Grid:
-        step = (high - low) / (rings - 1)
+    def of(rings: int, columns: int, low: float, high: float, step: float, patch: float) -> _Grid:
         above, below = (max(math.ceil((0.5 * math.pi - end) / step - 0.5 - 1e-9), 0) for end in (high, -low))
         elevations = np.clip(low + step * np.arange(-below, rings + above), -0.5 * math.pi, 0.5 * math.pi)
-        patch = 0.5 * math.hypot(step, math.tau / columns)
         single, double = Cover.of(patch, patch), Cover.of(max(2.0 * patch, 1.5 * step), patch)  # the latter at a pole
         beams, balls = (Window.of(columns, elevations, step, cover.within) for cover in (single, double))
         return _Grid(elevations, below, above, single, beams, double, balls)
