@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from messaging.patches import half_diagonal, seen_free
 from messaging.range_images import RangeImage, directions
 from messaging.shapes import Obstacle
-from safety.image_memory import ImageMemory
+from safety.image_memory import AWAY, ImageMemory, _Seen
 from safety.shadows import FACES, PLANES, Room, _patches, half_spaces, shadows
 from tests.messaging.test_range_images import (
     COLUMNS,
@@ -205,3 +205,12 @@ def test_a_world_that_moves_takes_it_back():
         image = clear(ranges=np.where(behind(), 0.0, FAR), speed=3.0)
         filled = memory.fill(replace(image, at=(0.6 * k, 0.0, 0.0)), 0.2)
     assert not filled.known[behind()].any()
+
+
+@pytest.mark.parametrize(("error", "free"), [(0.0, True), (0.03, False)])
+def test_a_wrong_attitude_displaces_what_is_far_from_the_sensor_now_however_near_it_was_before(error, free):
+    """A point 0.4 m from where an image was taken that shows 0.6 m to be free, 3.6 m from where the sensor is now."""
+    before = _Seen(clear(ranges=np.full((RINGS, COLUMNS), 0.6)))
+    now = replace(clear(angle_error=error), at=(4.0, 0.0, 0.0))
+    points = np.full((len(AWAY), 1, 3), [0.4, 0.0, 0.0])
+    assert ImageMemory(BODY)._in(before, 0.0, points, now)[0, 0] == free
