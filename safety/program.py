@@ -44,25 +44,35 @@ class Layout:
 
     def __init__(self, position: Array, directions: Array) -> None:
         """position (N, d, nz), directions (N, d, L): of a point of the body."""
+        import safety.holding  # noqa: F401  # compiled: before the first request is to be answered in time
+
         N, d, nz = position.shape
         L = directions.shape[2]
         at_start, at_end = np.arange(N), np.arange(1, N + 1)
         ends = np.concatenate([at_start, at_end, [N]])
-        self.period = np.concatenate([at_start, at_start, [N - 1]])
-        position = np.concatenate([np.zeros((1, d, nz)), position])[ends]
         directions = np.concatenate([np.zeros((1, d, L)), directions])[ends]
-        self.maps = np.concatenate([position, directions], axis=2)  # (2N+1, d, nz + L)
-        self.extra = np.concatenate([np.eye(N + 1)[at_start], np.eye(N + 1)[at_start], np.eye(N + 1)[[N]]])
-        self.nz = nz
+        used = np.abs(directions).max(axis=1, initial=0.0) > 0.0  # a generator may be a period's own
+        most = int(used.sum(axis=1).max(initial=0))
+        period, bulge = np.concatenate([at_start, at_start, [N - 1]]), L + np.concatenate([at_start, at_start, [N]])
+        ways = np.ascontiguousarray(np.concatenate([np.zeros((1, d, nz)), position])[ends])
+        columns = np.ascontiguousarray(np.argsort(~used, axis=1, kind="stable")[:, :most])
+        spans = np.ascontiguousarray(np.take_along_axis(directions, columns[:, None, :], axis=2))
+        self.parts = period, ways, spans, columns, bulge
+        self.sizes = L + N + 1
 
     def rows(self, normals: Array, offsets: Array) -> Rows:
         """Rows for half-spaces `a·p <= b` in the frame of now, a (n, N, d), b (n, N)."""
-        n = len(normals)
-        spread = normals[:, self.period, None, :] @ self.maps  # (n, 2N+1, 1, nz + L)
-        spread = spread.reshape(n * len(self.period), self.maps.shape[2])
-        extra = np.broadcast_to(self.extra, (n, *self.extra.shape)).reshape(len(spread), self.extra.shape[1])
-        both = np.hstack([np.abs(spread[:, self.nz :]), extra])
-        return Rows(spread[:, : self.nz], both, offsets[:, self.period].ravel(), np.ones(len(spread)))
+        from safety.holding import rows
+
+        gradient, spread, bound = rows(normals, offsets, *self.parts, self.sizes)
+        return Rows(gradient, spread, bound, np.ones(len(bound)))
+
+    def slack(self, normals: Array, offsets: Array, sizes: Array, z: Array) -> Array:
+        """What these rows leave, `bound - support`, of the tube with magnitudes `sizes` (L+N+1,) under regressors z,
+        without the rows themselves: there are hundreds, as wide as the tube has generators."""
+        from safety.holding import slack
+
+        return slack(normals, offsets, *self.parts, sizes, z)
 
 
 class Builder:

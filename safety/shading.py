@@ -179,12 +179,13 @@ def _beyond(lines: Array, count: int, normal: tuple[float, float, float], level:
         found[s] = near if near < far else far
 
 
-@compiled("i8(f8[:,::1], i8, i8, f8[::1], f8[:,::1], f4[::1])")
-def _left_over(lines: Array, count: int, but: np.intp, beyond: Array, kept: Array, room: Single) -> int:
-    """Of the first shadows those that are not beyond, but one, and the room to them: moved to the front of `kept`."""
+@compiled("i8(f8[:,::1], i8, i8, f8[::1], f8[:,::1], f4[::1], f8)")
+def _left_over(lines: Array, count: int, but: np.intp, beyond: Array, kept: Array, room: Single, reach: float) -> int:
+    """Of the first shadows those within reach that are not beyond, but one, and the room to them: moved to the front
+    of `kept`."""
     left = 0
     for s in range(count):
-        if s != but and not beyond[s] >= 0.0:
+        if s != but and not beyond[s] >= 0.0 and not room[s] > reach:
             for i in range(9):
                 kept[i, left] = lines[i, s]
             room[left] = room[s]
@@ -192,12 +193,13 @@ def _left_over(lines: Array, count: int, but: np.intp, beyond: Array, kept: Arra
     return left
 
 
-@compiled("i8(f8[:,::1], f8[::1], f8[:,::1], f4[::1], f8, f8, f8[:,::1], f8[::1], f8[:,::1], f8[::1])")
+@compiled("i8(f8[:,::1], f8[::1], f8[:,::1], f4[::1], f8, f8, f8, f8[:,::1], f8[::1], f8[:,::1], f8[::1])")
 def _until_beyond(
     lines: Array,
     start: Array,
     chord: Array,
     room: Single,
+    reach: float,
     keep_off: float,
     give: float,
     normals: Array,
@@ -210,12 +212,14 @@ def _until_beyond(
     count, k, most, rest = lines.shape[1], 0, len(levels), lines
     while count > 0 and k < most:
         chosen = room[:count].argmin()
+        if room[chosen] > reach:
+            return k
         normal, level = _support(rest, chosen, start, chord)
         level -= give * 2.0 ** (k // 8) * max(room[chosen] - keep_off, 0.0)
         normals[k, 0], normals[k, 1], normals[k, 2], levels[k] = normal[0], normal[1], normal[2], level
         world = level + normal[0] * start[0] + normal[1] * start[1] + normal[2] * start[2]
         _beyond(rest, count, normal, world, beyond)
-        count = _left_over(rest, count, chosen, beyond, kept, room)
+        count = _left_over(rest, count, chosen, beyond, kept, room, reach)
         rest = kept
         k += 1
     if count > 0:
@@ -223,19 +227,29 @@ def _until_beyond(
     return k
 
 
-@compiled("Tuple((f8[:,:,::1], f8[:,::1]))(f8[:,::1], f8[::1], f8[:,:,::1], f4[:,::1], f8, i8, f8, f8)")
+@compiled("Tuple((f8[:,:,::1], f8[:,::1]))(f8[:,::1], f8[::1], f8[:,:,::1], f4[:,::1], f8[::1], f8, i8, f8, f8)")
 def supporting(
-    lines: Array, start: Array, chords: Array, room: Single, keep_off: float, most: int, give: float, farthest: float
+    lines: Array,
+    start: Array,
+    chords: Array,
+    room: Single,
+    reach: Array,
+    keep_off: float,
+    most: int,
+    give: float,
+    farthest: float,
 ) -> tuple[Array, Array]:
-    """Half-spaces until every shadow is beyond one of them, about each of the chords (G, 2, 3), from the start: normals
-    (G, k, 3) and levels (G, k), also from the start, for as many as any chord needs; those that one does not need are
-    at `farthest`, and where `most` are not enough the last is at -inf. room (G, n) [m]: from the chords to the shadows;
-    give: as `shadows.GIVE`."""
+    """Half-spaces until every shadow within reach (G,) is beyond one of them, about each of the chords (G, 2, 3), from
+    the start: normals (G, k, 3) and levels (G, k), also from the start, for as many as any chord needs; those that one
+    does not need are at `farthest`, and where `most` are not enough the last is at -inf. room (G, n) [m]: from the
+    chords to the shadows; give: as `shadows.GIVE`."""
     normals, levels, needed = np.zeros((len(chords), most, 3)), np.full((len(chords), most), farthest), 0
     room, kept, beyond = room.copy(), np.empty_like(lines), np.empty(lines.shape[1])
     for group in range(len(chords)):
         a, b = normals[group], levels[group]
-        count = _until_beyond(lines, start, chords[group], room[group], keep_off, give, a, b, kept, beyond)
+        count = _until_beyond(
+            lines, start, chords[group], room[group], reach[group], keep_off, give, a, b, kept, beyond
+        )
         needed = max(needed, count)
     return normals[:, :needed].copy(), levels[:, :needed].copy()
 
@@ -264,20 +278,19 @@ def free_groups(ends: Array, first: NDArray[np.int64], room: Single, touching: f
     return len(first)
 
 
-@compiled("Tuple((f8[:,:,::1], f8[:,::1]))(f8[:,:,::1], f8[:,::1], i8[::1], f8[::1], f8[::1], f8[::1], f8, f8[::1])")
+@compiled("Tuple((f8[:,:,::1], f8[:,::1]))(f8[:,:,::1], f8[:,::1], i8[::1], f8[:,:,::1], f8[::1], f8, f8[::1])")
 def about_periods(
     normals: Array,
     levels: Array,
     first: NDArray[np.int64],
-    low: Array,
-    high: Array,
+    boxes: Array,
     grown: Array,
     keep_off: float,
     measured: Array,
 ) -> tuple[Array, Array]:
     """Of half-spaces (G, k) of groups those of every period, (k+6, N, 3) and (k+6, N), for a body that keeps off what
-    is there, and may have grown (N,), by where it is measured; and a box's faces (3,), (3,) from the start, as they
-    are. Periods after the last group have the last one's."""
+    is there, and may have grown (N,), by where it is measured; and the faces about both of its ends' boxes
+    (2, N+1, 3) from the start, as they are. Periods after the last group have the last one's."""
     count, periods = levels.shape[1], len(grown)
     a, b = np.zeros((count + 6, periods, 3)), np.empty((count + 6, periods))
     group = 0
@@ -292,6 +305,78 @@ def about_periods(
                 kept += abs(normal[axis]) * measured[axis]
             b[i, k] = levels[group, i] - kept
         for axis in range(3):
-            a[count + axis, k, axis], b[count + axis, k] = 1.0, high[axis]
-            a[count + 3 + axis, k, axis], b[count + 3 + axis, k] = -1.0, -low[axis]
+            a[count + axis, k, axis], b[count + axis, k] = 1.0, max(boxes[1, k, axis], boxes[1, k + 1, axis])
+            a[count + 3 + axis, k, axis] = -1.0
+            b[count + 3 + axis, k] = -min(boxes[0, k, axis], boxes[0, k + 1, axis])
     return a, b
+
+
+@compiled("f8[::1](f8[:,::1], i8[::1], f8[:,:,::1], f8[::1], f8)")
+def reaches(ends: Array, first: NDArray[np.int64], boxes: Array, grown: Array, body: float) -> Array:
+    """How far [m] from the ends of the periods of each group (G,) what may touch a body in the boxes is at the most.
+
+    Between two ends it is nowhere farther from the nearer one than at an end, and half the way between them.
+    """
+    found, periods = np.zeros(len(first)), len(ends) - 1
+    for group in range(len(first)):
+        until = first[group + 1] if group + 1 < len(first) else periods
+        most, step = 0.0, 0.0
+        for end in range(first[group], until + 1):
+            corner, way = 0.0, 0.0
+            for axis in range(3):
+                corner += max(boxes[1, end, axis] - ends[end, axis], ends[end, axis] - boxes[0, end, axis]) ** 2
+                way += (ends[end, axis] - ends[max(end - 1, first[group]), axis]) ** 2
+            most, step = max(most, corner), max(step, way)
+        found[group] = math.sqrt(most) + 0.5 * math.sqrt(step) + body + grown[until - 1] + ROUNDING
+    return found
+
+
+@compiled(
+    "Tuple((f8[:,:,::1], f8[:,::1]))"
+    "(f8[:,::1], f8[::1], f8[:,::1], f8[:,:,::1], UniTuple(f8, 2), f8, f8[::1], i8, UniTuple(f8, 4))"
+)
+def about_way(
+    lines: Array,
+    start: Array,
+    nominal: Array,
+    boxes: Array,
+    moved: tuple[float, float],
+    keep_off: float,
+    measured: Array,
+    most: int,
+    limits: tuple[float, float, float, float],
+) -> tuple[Array, Array]:
+    """The half-spaces of all periods about a nominal way (N, 3), world, in boxes (2, N+1, 3), world, as `about_periods`
+    has them. moved [m]: how far what is seen may have moved until now, and moves in a period; limits: `shadows.SHARED`,
+    `TOUCHING`, `GIVE`, `FARTHEST`."""
+    shared, touching, give, farthest = limits
+    periods = len(nominal)
+    ends, grown, within = np.zeros((periods + 1, 3)), np.empty(periods), np.empty_like(boxes)
+    for k in range(periods + 1):
+        for axis in range(3):
+            within[0, k, axis], within[1, k, axis] = boxes[0, k, axis] - start[axis], boxes[1, k, axis] - start[axis]
+            if k > 0:
+                ends[k, axis] = nominal[k - 1, axis] - start[axis]
+        if k > 0:
+            grown[k - 1] = moved[0] + moved[1] * k
+    first = np.zeros(1, np.int64)
+    faces, levels = about_periods(np.zeros((1, 0, 3)), np.zeros((1, 0)), first, within, grown, keep_off, measured)
+    nowhere = np.full_like(levels, -np.inf)
+    if not np.isfinite(within).all():  # of two numbers, one of which is none, the larger may be the other
+        return faces, nowhere
+    if lines.shape[1] == 0:
+        return faces, levels
+    first = together(ends, shared)
+    room = rooms(lines, start, ends, first)
+    free = free_groups(ends, first, room, touching)
+    if free == 0:
+        return faces, nowhere
+    chords, body = np.empty((free, 2, 3)), keep_off
+    for group in range(free):
+        until = first[group + 1] if group + 1 < len(first) else periods
+        chords[group, 0], chords[group, 1] = ends[first[group]], ends[until]
+    for axis in range(3):
+        body += measured[axis]
+    reach = reaches(ends, first, within, grown, body)
+    normals, levels = supporting(lines, start, chords, room[:free], reach, keep_off, most, give, farthest)
+    return about_periods(normals, levels, first, within, grown, keep_off, measured)

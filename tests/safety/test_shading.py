@@ -33,7 +33,7 @@ def test_a_shadow_holds_all_of_its_patch_that_comes_into_the_room_whatever_the_e
     rng, image = np.random.default_rng(seed), scattered(seed)
     lines = shadows(image, Room(np.full(3, -2.0), np.full(3, 2.0), 1.0), 0.2).lines
     elevations, free = seen_free(image)
-    together, middles = _patches(tuple(elevations), COLUMNS)
+    together, middles = _patches(elevations.tobytes(), COLUMNS)
     middles = middles.T
     free = np.concatenate(
         [np.minimum.reduceat(ring, np.arange(0, COLUMNS, each)) for ring, each in zip(free, together, strict=True)]
@@ -68,7 +68,7 @@ def test_every_shadow_is_beyond_some_half_space_of_every_chord(seed, n, give):
     lines = np.vstack([near, along, rng.uniform(0.0, 3.0, n), rng.uniform(0.0, 0.1, n), rng.uniform(0.1, 0.3, n)])
     start = rng.uniform(-0.2, 0.2, 3)
     chords, room = rng.uniform(-0.3, 0.3, (3, 2, 3)), rng.random((3, n), np.float32)
-    normals, levels = supporting(lines, start, chords, room, 0.2, n, give, FARTHEST)
+    normals, levels = supporting(lines, start, chords, room, np.full(3, np.inf), 0.2, n, give, FARTHEST)
     ends = near - start[:, None], near - start[:, None] + lines[6] * along
     for group in range(3):
         used = levels[group] < FARTHEST
@@ -81,8 +81,10 @@ def test_where_half_spaces_do_not_suffice_nothing_is_free():
     lines = np.zeros((9, 2))
     lines[0], lines[3], lines[6] = [-1.0, 1.0], [-1.0, 1.0], 1.0  # one on either side
     chords, room = np.zeros((1, 2, 3)), np.ones((1, 2), np.float32)
-    assert np.isfinite(supporting(lines, np.zeros(3), chords, room, 0.0, 2, 0.0, FARTHEST)[1]).all()
-    assert np.isneginf(supporting(lines, np.zeros(3), chords, room, 0.0, 1, 0.0, FARTHEST)[1]).all()
+    everywhere = np.full(1, np.inf)
+    assert np.isfinite(supporting(lines, np.zeros(3), chords, room, everywhere, 0.0, 2, 0.0, FARTHEST)[1]).all()
+    assert np.isneginf(supporting(lines, np.zeros(3), chords, room, everywhere, 0.0, 1, 0.0, FARTHEST)[1]).all()
+    assert supporting(lines, np.zeros(3), chords, room, np.full(1, 0.9), 0.0, 1, 0.0, FARTHEST)[1].size == 0
 
 
 @pytest.mark.parametrize("period", [0, 2])
