@@ -1,4 +1,5 @@
-"""Half-spaces held against the ends of a tube, compiled: as rows, and what is left of them (`program.Layout`).
+"""Half-spaces held against the ends of a tube, compiled: as rows, what is left of them, and which of them matter to
+a QP (`program.py`).
 
 Of E ends each has the half-spaces of one period (E,); the ways (E, d, nz) that regressors lead there; K generators,
 their directions (E, d, K) and which of all they are (E, K); and one magnitude (E,) that adds to it on all sides.
@@ -74,3 +75,59 @@ def slack(
         for i in range(n):
             left[i, e] = offsets[i, period[e]] - reached[i]
     return left.ravel()
+
+
+@compiled(
+    "Tuple((i8, f8[:,::1], f8[::1]))"
+    "(f8[:,::1], f8[:,::1], f8[::1], f8[::1], f8[::1], f8[:,::1], f8[::1], f8[::1], f8[:,::1], f8[::1], f8)"
+)
+def that_matter(
+    gradient: Array,
+    spread: Array,
+    bound: Array,
+    z_0: Array,
+    constant: Array,
+    M: Array,
+    center: Array,
+    radius: Array,
+    atoms: Array,
+    scale: Array,
+    sharpen: float,
+) -> tuple[int, Array, Array]:
+    """Rows `gradient z + spread (constant + M t) <= bound - sharpen`, of which the first regressors z_0 are known, as
+    those of the rest f and of t, times their scale and of unit length: (count, A, b), of which the first so many matter
+    to an f within `radius` of the center and a t within `atoms` (2, q). -1: one of them can't be met."""
+    known, free, q = len(z_0), len(center), M.shape[1]
+    A, b, count = np.empty((len(bound), free + q)), np.empty(len(bound)), 0
+    for r in range(len(bound)):
+        row, left = A[count], bound[r] - sharpen
+        for j in range(known):
+            left -= gradient[r, j] * z_0[j]
+        least, most = 0.0, 0.0
+        for j in range(free):
+            row[j] = gradient[r, known + j]
+            least += row[j] * center[j] - abs(row[j]) * radius[j]
+            most += row[j] * center[j] + abs(row[j]) * radius[j]
+        row[free:] = 0.0
+        for k in range(len(constant)):
+            share = spread[r, k]
+            if share != 0.0:  # most generators are other periods'
+                left -= share * constant[k]
+                for j in range(q):
+                    row[free + j] += share * M[k, j]
+        for j in range(q):
+            least += row[free + j] * atoms[0, j]
+            most += row[free + j] * atoms[1, j]
+        if least > left:
+            return -1, A, b
+        if most > left:
+            square = 0.0
+            for j in range(free + q):
+                row[j] *= scale[j]
+                square += row[j] * row[j]
+            length = max(np.sqrt(square), sharpen)
+            for j in range(free + q):
+                row[j] /= length
+            b[count] = left / length
+            count += 1
+    return count, A, b

@@ -94,7 +94,7 @@ class Builder:
         self.known = tube.position.shape[2] - free  # length of z_0
         self.free = free
         moving = np.abs(tube.W[:, self.known :]).max(1, initial=0.0) > ROUNDING
-        self.W_t, self.M_t = tube.W[moving], tube.M[:, moving]
+        self.W_t, self.M_t = tube.W[moving], np.ascontiguousarray(tube.M[:, moving])
         self.W_c, self.M_c = tube.W[~moving][:, : self.known], tube.M[:, ~moving]
         atoms = len(self.W_t)
         width = np.tile(robot.high() - robot.low(), steps)
@@ -125,27 +125,26 @@ class Builder:
         obstacles that is nearly all of them.
         """
         m = self.robot.action_dim
+        from safety.holding import that_matter
+
         constant = self.M_c @ np.abs(self.W_c @ z_0) + self.tube.m_0
-        bound = rows.bound - rows.gradient[:, : self.known] @ z_0 - rows.spread @ constant - SHARPEN
-        steer, stretch = rows.gradient[:, self.known :], rows.spread @ self.M_t
         offset = self.W_t[:, : self.known] @ z_0
         center, radius = self.reachable(z_0[-m:])
         atom = offset + self.W_t[:, self.known :] @ center
         give = np.abs(self.W_t[:, self.known :]) @ radius
-        middle, swing = steer @ center, np.abs(steer) @ radius
-        if (middle - swing + stretch @ np.maximum(np.abs(atom) - give, 0.0) > bound).any():
+        atoms = np.stack([np.maximum(np.abs(atom) - give, 0.0), np.abs(atom) + give])
+        count, A, b = that_matter(
+            rows.gradient, rows.spread, rows.bound, z_0, constant, self.M_t, center, radius, atoms, self.scale, SHARPEN
+        )
+        if count < 0:
             return None
-        matter = middle + swing + stretch @ (np.abs(atom) + give) > bound
-        A = np.hstack([steer[matter], stretch[matter]]) * self.scale
-        length = np.maximum(np.sqrt(np.einsum("ri,ri->r", A, A)), SHARPEN)
         first = np.zeros(self.free)
         first[:m] = z_0[-m:]
         first = first[self.limited]
         g = np.zeros(len(self.h))
         g[:m] = -proposal / self.scale[:m]
         fixed = np.concatenate([-offset, offset, self.box, self.slew + first, self.slew - first]) / self.length
-        A, b = np.vstack([A / length[:, None], self.fixed]), np.concatenate([bound[matter] / length, fixed])
-        return Program(self.h, g, A, b)
+        return Program(self.h, g, np.vstack([A[:count], self.fixed]), np.concatenate([b[:count], fixed]))
 
     def reachable(self, before: Array) -> tuple[Array, Array]:
         """Center and half-widths (F·m,) of what bounds and slew leave to the free inputs after `before` (m,)."""

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from messaging.patches import half_diagonal, seen_free
 from messaging.range_images import RangeImage
 from messaging.shapes import FARTHEST
-from safety.shading import supporting
+from safety.shading import supporting, told_from
 from safety.shadows import Room, _patches, half_spaces, shadows
 from tests.messaging.test_range_images import COLUMNS, EDGE, RINGS
 
@@ -68,7 +68,7 @@ def test_every_shadow_is_beyond_some_half_space_of_every_chord(seed, n, give):
     lines = np.vstack([near, along, rng.uniform(0.0, 3.0, n), rng.uniform(0.0, 0.1, n), rng.uniform(0.1, 0.3, n)])
     start = rng.uniform(-0.2, 0.2, 3)
     chords, room = rng.uniform(-0.3, 0.3, (3, 2, 3)), rng.random((3, n), np.float32)
-    normals, levels = supporting(lines, start, chords, room, np.full(3, np.inf), 0.2, n, give, FARTHEST)
+    normals, levels = supporting(told_from(lines, start), chords, room, np.full(3, np.inf), 0.2, n, give, FARTHEST)
     ends = near - start[:, None], near - start[:, None] + lines[6] * along
     for group in range(3):
         used = levels[group] < FARTHEST
@@ -81,10 +81,10 @@ def test_where_half_spaces_do_not_suffice_nothing_is_free():
     lines = np.zeros((9, 2))
     lines[0], lines[3], lines[6] = [-1.0, 1.0], [-1.0, 1.0], 1.0  # one on either side
     chords, room = np.zeros((1, 2, 3)), np.ones((1, 2), np.float32)
-    everywhere = np.full(1, np.inf)
-    assert np.isfinite(supporting(lines, np.zeros(3), chords, room, everywhere, 0.0, 2, 0.0, FARTHEST)[1]).all()
-    assert np.isneginf(supporting(lines, np.zeros(3), chords, room, everywhere, 0.0, 1, 0.0, FARTHEST)[1]).all()
-    assert supporting(lines, np.zeros(3), chords, room, np.full(1, 0.9), 0.0, 1, 0.0, FARTHEST)[1].size == 0
+    told, everywhere = told_from(lines, np.zeros(3)), np.full(1, np.inf)
+    assert np.isfinite(supporting(told, chords, room, everywhere, 0.0, 2, 0.0, FARTHEST)[1]).all()
+    assert np.isneginf(supporting(told, chords, room, everywhere, 0.0, 1, 0.0, FARTHEST)[1]).all()
+    assert supporting(told, chords, room, np.full(1, 0.9), 0.0, 1, 0.0, FARTHEST)[1].size == 0
 
 
 @pytest.mark.parametrize("period", [0, 2])
