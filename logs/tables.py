@@ -24,6 +24,7 @@ class Stacking(Table):
         needed = self.__rich_measure__(console, wide).maximum
         bounded = console.is_terminal or "COLUMNS" in os.environ
         if needed <= options.max_width or not bounded:
+            console.width = max(console.width, needed)  # beyond it a console cuts what it is given
             yield from super().__rich_console__(console, options.update(width=needed))
         else:
             yield from self._stacked()

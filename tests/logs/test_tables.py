@@ -1,0 +1,36 @@
+"""Tables into files and terminals: no cell is cut."""
+
+import io
+
+import pytest
+from rich.console import Console
+
+from logs.tables import Stacking
+
+CELLS = [f"the cell of column {i}, which is not short" for i in range(6)]
+
+
+def printed(**console):
+    table = Stacking(*(f"column {i}" for i in range(6)), title="a title")
+    table.add_row(*CELLS)
+    file = io.StringIO()
+    Console(file=file, **console).print(table)
+    return file.getvalue()
+
+
+def test_into_a_file_a_table_goes_as_wide_as_it_is(monkeypatch):
+    monkeypatch.delenv("COLUMNS", raising=False)
+    (row,) = (line for line in printed().splitlines() if CELLS[0] in line)
+    assert all(cell in row for cell in CELLS)
+
+
+@pytest.mark.parametrize("width", [40, 80])
+def test_in_a_terminal_what_does_not_fit_is_put_below_each_other(width):
+    text = printed(force_terminal=True, width=width, no_color=True)
+    assert "column 5:" in text
+    assert max(map(len, text.splitlines())) < width + 40  # and colours
+
+
+def test_columns_says_how_wide_who_reads_a_file_is(monkeypatch):
+    monkeypatch.setenv("COLUMNS", "80")
+    assert "column 5:" in printed() and "not short" in printed().replace("\n", " ")
