@@ -124,9 +124,9 @@ class Builder:
         whose least is beyond its bound can't be met, one whose largest is within it need not be looked at. With many
         obstacles that is nearly all of them.
         """
-        m = self.robot.action_dim
         from safety.holding import that_matter
 
+        m = self.robot.action_dim
         constant = self.M_c @ np.abs(self.W_c @ z_0) + self.tube.m_0
         offset = self.W_t[:, : self.known] @ z_0
         center, radius = self.reachable(z_0[-m:])

@@ -383,6 +383,18 @@ def reaches(ends: Array, first: NDArray[np.int64], boxes: Array, grown: Array, b
     return found
 
 
+@compiled("Tuple((f8[:,::1], f8[:,:,::1]))(f8[::1], f8[:,::1], f8[:,:,::1])")
+def _from(start: Array, nominal: Array, boxes: Array) -> tuple[Array, Array]:
+    """The ends of all periods (N+1, 3) and the boxes, as they are from the start."""
+    ends, within = np.zeros((len(nominal) + 1, 3)), np.empty_like(boxes)
+    for k in range(len(ends)):
+        for axis in range(3):
+            within[0, k, axis], within[1, k, axis] = boxes[0, k, axis] - start[axis], boxes[1, k, axis] - start[axis]
+            if k > 0:
+                ends[k, axis] = nominal[k - 1, axis] - start[axis]
+    return ends, within
+
+
 @compiled(
     "Tuple((f8[:,:,::1], f8[:,::1]))"
     "(f8[:,::1], f8[::1], f8[:,::1], f8[:,:,::1], UniTuple(f8, 2), f8, f8[::1], i8, UniTuple(f8, 4))"
@@ -402,16 +414,8 @@ def about_way(
     has them. moved [m]: how far what is seen may have moved until now, and moves in a period; limits: `shadows.SHARED`,
     `TOUCHING`, `GIVE`, `FARTHEST`."""
     shared, touching, give, farthest = limits
-    periods = len(nominal)
-    ends, grown, within = np.zeros((periods + 1, 3)), np.empty(periods), np.empty_like(boxes)
-    for k in range(periods + 1):
-        for axis in range(3):
-            within[0, k, axis], within[1, k, axis] = boxes[0, k, axis] - start[axis], boxes[1, k, axis] - start[axis]
-            if k > 0:
-                ends[k, axis] = nominal[k - 1, axis] - start[axis]
-        if k > 0:
-            grown[k - 1] = moved[0] + moved[1] * k
-    first = np.zeros(1, np.int64)
+    ends, within = _from(start, nominal, boxes)
+    grown, first = moved[0] + moved[1] * np.arange(1.0, len(ends)), np.zeros(1, np.int64)
     faces, levels = about_periods(np.zeros((1, 0, 3)), np.zeros((1, 0)), first, within, grown, keep_off, measured)
     nowhere = np.full_like(levels, -np.inf)
     if not np.isfinite(within).all():  # of two numbers, one of which is none, the larger may be the other
@@ -424,12 +428,10 @@ def about_way(
     free = free_groups(ends, first, room, touching)
     if free == 0:
         return faces, nowhere
-    chords, body = np.empty((free, 2, 3)), keep_off
+    chords = np.empty((free, 2, 3))
     for group in range(free):
-        until = first[group + 1] if group + 1 < len(first) else periods
+        until = first[group + 1] if group + 1 < len(first) else len(nominal)
         chords[group, 0], chords[group, 1] = ends[first[group]], ends[until]
-    for axis in range(3):
-        body += measured[axis]
-    reach = reaches(ends, first, within, grown, body)
+    reach = reaches(ends, first, within, grown, keep_off + measured.sum())
     normals, levels = supporting(told, chords, room[:free], reach, keep_off, most, give, farthest)
     return about_periods(normals, levels, first, within, grown, keep_off, measured)
