@@ -131,3 +131,58 @@ def that_matter(
             b[count] = left / length
             count += 1
     return count, A, b
+
+
+@compiled(
+    "f8[:,:,::1](f8[:,::1], f8[:,::1], f8[:,::1], f8[::1], f8[:,:,::1], f8[:,:,::1], f8[:,:,::1], f8[::1], f8[::1],"
+    " f8[::1], f8[::1], f8[:,::1])"
+)
+def filled_by_plans(
+    W: Array,
+    W_free: Array,
+    M: Array,
+    m_0: Array,
+    position: Array,
+    moved: Array,
+    spans: Array,
+    z: Array,
+    radius: Array,
+    beside: Array,
+    start: Array,
+    turn: Array,
+) -> Array:
+    """The corners (2, N+1, d), world, of boxes about all that may be reached at the ends of the periods, and now, of a
+    tube (W, M, m_0, position, and its directions' and W's free columns' absolute values) by inputs within so much of
+    those in z, and beside (d,) of it."""
+    (N, d, L), q = spans.shape, len(W)
+    atoms, sizes = np.empty(q), m_0.copy()
+    for i in range(q):
+        center, give = 0.0, 0.0
+        for j in range(len(z)):
+            center += W[i, j] * z[j]
+        for j in range(len(radius)):
+            give += W_free[i, j] * radius[j]
+        atoms[i] = abs(center) + give
+    for k in range(len(sizes)):
+        for i in range(q):
+            sizes[k] += M[k, i] * atoms[i]
+    bulge = sizes[L:].max()
+    way, half, boxes = np.empty(d), np.empty(d), np.zeros((2, N + 1, d))
+    for k in range(N):
+        for axis in range(d):
+            way[axis], half[axis] = 0.0, beside[axis] + bulge
+            for j in range(len(z)):
+                way[axis] += position[k, axis, j] * z[j]
+            for j in range(len(radius)):
+                half[axis] += moved[k, axis, j] * radius[j]
+            for j in range(L):
+                half[axis] += spans[k, axis, j] * sizes[j]
+        for axis in range(d):
+            middle, aside = start[axis], 0.0
+            for other in range(d):
+                middle += turn[axis, other] * way[other]
+                aside += abs(turn[axis, other]) * half[other]
+            boxes[0, k + 1, axis], boxes[1, k + 1, axis] = middle - aside, middle + aside
+            if k == 0:
+                boxes[0, 0, axis], boxes[1, 0, axis] = start[axis] - aside, start[axis] + aside
+    return boxes

@@ -73,22 +73,29 @@ def _that_meet(
     return found[:count]
 
 
-@compiled("f8[:,::1](f4[:,::1], i8[::1], f4[:,::1], f8[:,::1], f8[::1], f8, f8[::1], f8[::1], f8, f8)")
+@compiled("f8[:,::1](f4[:,::1], i8[::1], f4[:,::1], f8[:,::1], f8[::1], f8[:,:,::1], f8, f8, f8)")
 def behind(
     free: Single,
     together: NDArray[np.int64],
     ways: Single,
     turn: Array,
-    at: Array,
-    last: float,
-    low: Array,
-    high: Array,
+    place: Array,
+    boxes: Array,
+    body: float,
     widening: float,
     wide: float,
 ) -> Array:
     """The lines of what is behind patches, as many beams together as each ring (E,) of the grid has it, in directions
-    (3, n) from a point, turned by (3, 3): of those that come into a box between where they are free to and `last` m.
-    Wide are they by so much, and so much more a metre."""
+    (3, n), turned by (3, 3), from a sensor that is mounted aside of a place (6,): of those that a body may touch which
+    is so large, anywhere in the boxes (2, K, 3). Wide are they by so much, and so much more a metre."""
+    at, low, high, square = np.empty(3), np.empty(3), np.empty(3), 0.0
+    for axis in range(3):
+        at[axis] = place[axis] + turn[axis, 0] * place[3] + turn[axis, 1] * place[4] + turn[axis, 2] * place[5]
+        low[axis], high[axis] = boxes[0, :, axis].min(), boxes[1, :, axis].max()
+        square += (max(at[axis] - low[axis], high[axis] - at[axis]) + body) ** 2
+    last = (math.sqrt(square) + wide) / (1.0 - widening)  # no line of any width reaches into the boxes from beyond
+    low -= body + last * widening + wide
+    high += body + last * widening + wide
     near = nearest_of_patches(free, together, ways.shape[1])
     index = _that_meet(ways, turn, at, last, low, high, near)
     lines = np.empty((9, len(index)))
@@ -385,11 +392,12 @@ def reaches(ends: Array, first: NDArray[np.int64], boxes: Array, grown: Array, b
 
 @compiled("Tuple((f8[:,::1], f8[:,:,::1]))(f8[::1], f8[:,::1], f8[:,:,::1])")
 def _from(start: Array, nominal: Array, boxes: Array) -> tuple[Array, Array]:
-    """The ends of all periods (N+1, 3) and the boxes, as they are from the start."""
-    ends, within = np.zeros((len(nominal) + 1, 3)), np.empty_like(boxes)
+    """The ends of all periods (N+1, 3) and their boxes (2, N+1, 3), as they are from the start."""
+    ends, within, last = np.zeros((len(nominal) + 1, 3)), np.empty((2, len(nominal) + 1, 3)), boxes.shape[1] - 1
     for k in range(len(ends)):
         for axis in range(3):
-            within[0, k, axis], within[1, k, axis] = boxes[0, k, axis] - start[axis], boxes[1, k, axis] - start[axis]
+            for side in range(2):
+                within[side, k, axis] = boxes[side, min(k, last), axis] - start[axis]
             if k > 0:
                 ends[k, axis] = nominal[k - 1, axis] - start[axis]
     return ends, within
@@ -410,7 +418,7 @@ def about_way(
     most: int,
     limits: tuple[float, float, float, float],
 ) -> tuple[Array, Array]:
-    """The half-spaces of all periods about a nominal way (N, 3), world, in boxes (2, N+1, 3), world, as `about_periods`
+    """The half-spaces of all periods about a nominal way (N, 3), world, in boxes (2, N+1 or 1, 3), as `about_periods`
     has them. moved [m]: how far what is seen may have moved until now, and moves in a period; limits: `shadows.SHARED`,
     `TOUCHING`, `GIVE`, `FARTHEST`."""
     shared, touching, give, farthest = limits

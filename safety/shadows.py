@@ -7,7 +7,6 @@ supports the nearest of these, until none is left.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -31,11 +30,10 @@ FACES = np.vstack([np.eye(3), -np.eye(3)])  # of the room
 
 @dataclass(frozen=True)
 class Room:
-    """Boxes, world, that no plan is outside of at the periods' ends, now the first of them, (N+1, 3), (N+1, 3), or one
-    for all (3,), (3,), until so many s from now."""
+    """Boxes, world, that no plan is outside of at the periods' ends, now the first of them, until so many s from now:
+    their lowest and highest corners (2, N+1, 3), or of one for all (2, 1, 3)."""
 
-    low: Array
-    high: Array
+    boxes: Array
     last: float
 
 
@@ -63,14 +61,10 @@ def shadows(image: RangeImage, room: Room, body: float) -> Shadows:
 
     elevations, free = seen_free(image)
     together, ways = _patches(elevations.tobytes(), free.shape[1])
-    low, high = room.low.reshape(-1, 3).min(axis=0), room.high.reshape(-1, 3).max(axis=0)
-    at, beside = image.sensor(), body + image.speed * (image.age + room.last)
-    corners = np.maximum(at - low, high - at) + beside
+    beside = body + image.speed * (image.age + room.last)
     about = half_diagonal(image) + image.angle_error + ASIDE
-    within = (math.hypot(*corners.tolist()) + image.sensor_error) / (1.0 - about)
-    beside += within * about + image.sensor_error
-    error = image.sensor_error
-    lines = behind(free, together, ways, image.turn, at, within, low - beside, high + beside, about, error)
+    place = np.array([*image.at, *image.mount])
+    lines = behind(free, together, ways, image.turn, place, room.boxes, beside, about, image.sensor_error)
     return Shadows(lines, room, image.speed, image.age)
 
 
@@ -96,8 +90,6 @@ def half_spaces(
     period does not need hold everywhere."""
     from safety.shading import about_way  # compiled
 
-    boxes = np.empty((2, len(nominal) + 1, 3))
-    boxes[0], boxes[1] = near.room.low, near.room.high
-    moved = near.speed * near.age, near.speed * period  # m: until now, and in a period
+    boxes, moved = near.room.boxes, (near.speed * near.age, near.speed * period)  # m: until now, and in a period
     least = SHARED, TOUCHING, GIVE, FARTHEST
     return about_way(near.lines, start, np.ascontiguousarray(nominal), boxes, moved, keep_off, measured, PLANES, least)

@@ -93,7 +93,9 @@ class Surroundings:
         self.discs = _discs(robot, tube)
         free = len(robot.action_slew) * (robot.free_steps - robot.given)
         self._spans = np.abs(tube.directions)
-        self._sizes = np.abs(tube.W[:, -free:]), np.abs(tube.position[:, :, -free:])
+        W, M, position = (np.ascontiguousarray(part) for part in (tube.W, tube.M, tube.position))
+        moves = np.abs(W[:, -free:]), np.abs(position[..., -free:])  # the free inputs'
+        self._filled = W, moves[0], M, tube.m_0, position, moves[1], self._spans
         self.boxes = Boxes(tube.position, tube.directions)
         self.limits = Limits(robot, tube) if robot.limits else None
         self.measured = np.asarray(robot.measurement_bound[: robot.position_dim])
@@ -198,18 +200,13 @@ class Surroundings:
 
     def _room(self, z_0: Array, inputs: tuple[Array, Array], start: Array, turn: Array) -> shades.Room:
         """Boxes, world, in which every plan's discs stay with their middles after z_0; and some more."""
-        (center, radius), L = inputs, self.tube.generators
-        z = np.concatenate([z_0, center])
-        W_f, moved = self._sizes
-        sizes = self.tube.M @ (np.abs(self.tube.W @ z) + W_f @ radius) + self.tube.m_0
-        ways, half = np.zeros((self.robot.horizon + 1, len(start))), np.empty((self.robot.horizon + 1, len(start)))
-        ways[1:] = self.tube.position @ z
-        half[1:] = moved @ radius + self._spans @ sizes[:L] + (self._beside + sizes[L:].max())
-        half[0] = half[1]
-        if self.robot.heading is not None:
-            ways, half = ways @ turn.T, half @ np.abs(turn).T
-        ways += start
-        return shades.Room(ways - half, ways + half, self.robot.horizon * self.robot.period)
+        from safety.holding import filled_by_plans
+
+        z = np.concatenate([z_0, inputs[0]])
+        return shades.Room(
+            filled_by_plans(*self._filled, z, inputs[1], self._beside, np.ascontiguousarray(start), turn),
+            self.robot.horizon * self.robot.period,
+        )
 
     def _unseen(self, scan: Scan, start: Array) -> seen.Cells | None:
         """What is not known to be free within reach, or may come there before a plan ends."""

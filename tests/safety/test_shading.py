@@ -13,8 +13,9 @@ from messaging.patches import half_diagonal, seen_free
 from messaging.range_images import RangeImage
 from messaging.shapes import FARTHEST
 from safety.shading import supporting, told_from
-from safety.shadows import Room, _patches, half_spaces, shadows
+from safety.shadows import _patches, half_spaces, shadows
 from tests.messaging.test_range_images import COLUMNS, EDGE, RINGS
+from tests.safety.test_shadows import room
 
 TURN = (math.cos(0.4), 0.3 * math.sin(0.4), 0.0, math.sqrt(1.0 - 0.09) * math.sin(0.4))  # a quaternion
 
@@ -31,7 +32,7 @@ def scattered(seed):
 @given(st.integers(0, 100_000))
 def test_a_shadow_holds_all_of_its_patch_that_comes_into_the_room_whatever_the_errors(seed):
     rng, image = np.random.default_rng(seed), scattered(seed)
-    lines = shadows(image, Room(np.full(3, -2.0), np.full(3, 2.0), 1.0), 0.2).lines
+    lines = shadows(image, room(2.0, 1.0), 0.2).lines
     elevations, free = seen_free(image)
     together, middles = _patches(elevations.tobytes(), COLUMNS)
     middles = middles.T
@@ -89,7 +90,7 @@ def test_where_half_spaces_do_not_suffice_nothing_is_free():
 
 @pytest.mark.parametrize("period", [0, 2])
 def test_a_way_that_is_no_number_frees_nothing_from_there_on(period):
-    near = shadows(scattered(0), Room(np.full(3, -2.0), np.full(3, 2.0), 1.0), 0.0)
+    near = shadows(scattered(0), room(2.0, 1.0), 0.0)
     nominal = np.tile(np.arange(1.0, 5.0)[:, None] * 0.7, 3)
     sound = half_spaces(near, np.zeros(3), 0.1 * nominal, 0.0, np.zeros(3), 0.2)[1]
     assert np.isfinite(sound).all()
