@@ -93,9 +93,9 @@ class Surroundings:
         self.discs = _discs(robot, tube)
         free = len(robot.action_slew) * (robot.free_steps - robot.given)
         self._spans = np.abs(tube.directions)
-        W, M, position = (np.ascontiguousarray(part) for part in (tube.W, tube.M, tube.position))
-        moves = np.abs(W[:, -free:]), np.abs(position[..., -free:])  # the free inputs'
-        self._filled = W, moves[0], M, tube.m_0, position, moves[1], self._spans
+        moves = np.abs(tube.W[:, -free:]), np.abs(tube.position[..., -free:])  # the free inputs'
+        parts = tube.W, moves[0], tube.M, tube.m_0, tube.position, moves[1], self._spans
+        self._filled = [np.ascontiguousarray(part) for part in parts]
         self.boxes = Boxes(tube.position, tube.directions)
         self.limits = Limits(robot, tube) if robot.limits else None
         self.measured = np.asarray(robot.measurement_bound[: robot.position_dim])
