@@ -93,9 +93,10 @@ class Surroundings:
         self.discs = _discs(robot, tube)
         free = len(robot.action_slew) * (robot.free_steps - robot.given)
         self._spans = np.abs(tube.directions)
-        moves = np.abs(tube.W[:, -free:]), np.abs(tube.position[..., -free:])  # the free inputs'
-        parts = tube.W, moves[0], tube.M, tube.m_0, tube.position, moves[1], self._spans
-        self._filled = [np.ascontiguousarray(part) for part in parts]
+        whole = np.ascontiguousarray
+        W_free, moved = whole(np.abs(tube.W[:, -free:])), whole(np.abs(tube.position[..., -free:]))
+        parts = whole(tube.W), W_free, whole(tube.M), tube.m_0, whole(tube.position), moved, whole(self._spans)
+        self._filled = parts  # what `filled_by_plans` is told of the tube
         self.boxes = Boxes(tube.position, tube.directions)
         self.limits = Limits(robot, tube) if robot.limits else None
         self.measured = np.asarray(robot.measurement_bound[: robot.position_dim])

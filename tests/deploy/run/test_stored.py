@@ -2,8 +2,8 @@
 
 Since then distances to far walls are worked out with less rounding, and the margin that is told is the true one: inputs
 may differ in their last digits, the margin as it likes. And programs are solved by the rows that decide, more exactly:
-that is left out in the first test; in the second inputs differ by less than 1e-5, and some answers, which had been beyond
-the edge by less than a micrometre, are verified.
+that is left out in the first test; in the second inputs differ by less than 1e-5, and some answers, which had been
+beyond the edge by less than a micrometre, are verified.
 """
 
 from pathlib import Path
