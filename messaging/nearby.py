@@ -21,6 +21,15 @@ def _lesser(one: Single, other: Single, found: Single) -> None:
         found[j] = a if a < b else b
 
 
+@compiled("void(f4[:,::1], f4, f4)")
+def scale_to(values: Single, share: np.float32, most: np.float32) -> None:
+    """Each becomes so much of what it was, and that at the most."""
+    flat = values.ravel()
+    for k in range(len(flat)):
+        value = flat[k] * share
+        flat[k] = value if value < most else most
+
+
 @compiled("void(f4[::1], f4[::1], f4[::1], i8, i8)")
 def _least_ahead(values: Single, spare: Single, found: Single, count: int, stride: int) -> None:
     """Of each number and those after it, so many in all, so far apart each; overwrites values and spare."""

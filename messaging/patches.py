@@ -52,11 +52,12 @@ class Cover:
         return 1.0 / (1.0 + CORNER * self.kappa)
 
     def free(self, least: Single, least_width: float) -> Single:
-        """F [m] by the least ranges [m]."""
-        from messaging.nearby import SINGLE  # compiled
+        """F [m] by the least ranges [m], which it overwrites."""
+        from messaging.nearby import SINGLE, scale_to  # compiled
 
         share, most = (1.0 - SINGLE) * self.share, (1.0 - SINGLE) * least_width / self.kappa
-        return np.asarray(np.minimum(least * np.float32(share), np.float32(most)))
+        scale_to(least, np.float32(share), np.float32(most))
+        return least
 
 
 def half_diagonal(image: RangeImage) -> float:

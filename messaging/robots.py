@@ -19,6 +19,8 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
+ROUNDING = 1e-9  # of an input
+
 LATE = "-late"  # ends the name of a robot in real time
 WITH = "+"  # stands between a robot's name and that of another task than its usual one (`messaging.tasks`)
 RAMP, HOLD, FEEDBACK = "ramp", "hold", "feedback"
@@ -156,6 +158,11 @@ class Robot:
 
     def high(self) -> Array:
         return np.asarray(self.action_high)
+
+    @cached_property
+    def bounds(self) -> tuple[Array, Array]:
+        """(m,), (m,): what no input may be beyond, rounding allowed."""
+        return self.low() - ROUNDING, self.high() + ROUNDING
 
     @cached_property
     def stopping(self) -> NDArray[np.bool_]:

@@ -122,11 +122,11 @@ class Filter:
         if scene.empty and not self.around.far and self.around.limits is None:
             return _Found(ALLOWED, self.inputs.plan(z), z, self.reach, True)
         planes = self.around.planes(scene, z)
-        rows = self.around.rows(scene, z, planes)
-        slack = rows.bound - rows.support(self.tube, z)
+        slack, keep = self.around.slack(scene, z, planes)
         margin = self.around.least(slack, z)
-        if self.around.least(slack - self.comfort * rows.keep, z, self.comfort) >= 0.0:
+        if self.around.least(slack - self.comfort * keep, z, self.comfort) >= 0.0:
             return _Found(ALLOWED, self.inputs.plan(z), z, margin, True)
+        rows = self.around.rows(scene, z, planes)
         kept = self._comfortable(rows, z_0, proposal)
         if margin >= 0.0 and self.around.margin(kept, z) >= 0.0:
             return _Found(ALLOWED, self.inputs.plan(z), z, margin, True)
@@ -196,12 +196,12 @@ class Filter:
         chosen = tail[self.robot.given : self.robot.free_steps].ravel()
         as_committed = np.concatenate([z_0, chosen])
         if attempt.contained and vouched:
-            margin = self.around.margin(self.around.rows(scene, as_committed), as_committed)
+            margin = self.around.margin_in(scene, as_committed)
             return _Found(FAILSAFE, tail, as_committed, margin, True, kept=True)
         brake = self.inputs.regressors(z_0, self.inputs.stop(request.state, before))
         as_committed[len(z_0) :] = self.inputs.within(chosen, before)
         for z in (as_committed, brake):
-            margin = self.around.margin(self.around.rows(scene, z), z)
+            margin = self.around.margin_in(scene, z)
             if in_domain and margin >= 0.0:
                 return _Found(FAILSAFE, self.inputs.plan(z), z, margin, True)
         return _Found(FAILSAFE, self.inputs.plan(brake), brake, margin, False)
@@ -222,7 +222,7 @@ class Filter:
         seeming = 0.0
         if not on_a_way:  # who does not stay where it stands will be as near as it seems, before long
             seeming = 2.0 * float(np.linalg.norm(self.around.measured)) + (self.comfort if self.around.stays else 0.0)
-        if self.around.margin(self.around.rows(parked, stand), stand) >= -seeming:
+        if self.around.margin_in(parked, stand) >= -seeming:
             return None
         planes = self.around.planes(scene, stand, leaving=True)
         rows = self.around.rows(scene, stand, planes)
@@ -251,9 +251,7 @@ class Filter:
 
     def _decision(self, request: Request, scene: Scene, found: _Found, attempt: _Attempt) -> Decision:
         z = found.z
-        centers = scene.start + self.tube.centers(z) @ scene.turn.T
-        sizes = self.tube.magnitudes(z)[: self.tube.generators]
-        half = np.abs(scene.turn @ self.tube.directions) @ sizes + self.around.measured
+        centers, half = self.around.sets(scene.start, scene.turn, z)
         promise = request.promise
         if promise is not None and not found.kept:
             promise = self._promise(scene.start, centers, half, z)
@@ -287,10 +285,8 @@ class Filter:
         """What a robot promises that stands, and goes on standing, in a measured state (n,)."""
         z = np.concatenate([state[self.regressor], np.tile(self.inputs.nothing, 1 + self.robot.free_steps)])
         heading = float(state[self.robot.heading]) if self.robot.heading is not None else 0.0
-        turn, start = self.around.turn(heading), state[: self.robot.position_dim]
-        sizes = self.tube.magnitudes(z)[: self.tube.generators]
-        half = np.abs(turn @ self.tube.directions) @ sizes + self.around.measured
-        return self._promise(start, start + self.tube.centers(z) @ turn.T, half, z)
+        start = state[: self.robot.position_dim]
+        return self._promise(start, *self.around.sets(start, self.around.turn(heading), z), z)
 
     def _promise(self, start: Array, centers: Array, half: Array, z: Array) -> Promise:
         """Of a tube with these sets (N, d), world, and regressors z."""

@@ -44,25 +44,35 @@ class Layout:
 
     def __init__(self, position: Array, directions: Array) -> None:
         """position (N, d, nz), directions (N, d, L): of a point of the body."""
+        import safety.holding  # noqa: F401  # compiled: before the first request is to be answered in time
+
         N, d, nz = position.shape
         L = directions.shape[2]
         at_start, at_end = np.arange(N), np.arange(1, N + 1)
         ends = np.concatenate([at_start, at_end, [N]])
-        self.period = np.concatenate([at_start, at_start, [N - 1]])
-        position = np.concatenate([np.zeros((1, d, nz)), position])[ends]
         directions = np.concatenate([np.zeros((1, d, L)), directions])[ends]
-        self.maps = np.concatenate([position, directions], axis=2)  # (2N+1, d, nz + L)
-        self.extra = np.concatenate([np.eye(N + 1)[at_start], np.eye(N + 1)[at_start], np.eye(N + 1)[[N]]])
-        self.nz = nz
+        used = np.abs(directions).max(axis=1, initial=0.0) > 0.0  # a generator may be a period's own
+        most = int(used.sum(axis=1).max(initial=0))
+        period, bulge = np.concatenate([at_start, at_start, [N - 1]]), L + np.concatenate([at_start, at_start, [N]])
+        ways = np.ascontiguousarray(np.concatenate([np.zeros((1, d, nz)), position])[ends])
+        columns = np.ascontiguousarray(np.argsort(~used, axis=1, kind="stable")[:, :most])
+        spans = np.ascontiguousarray(np.take_along_axis(directions, columns[:, None, :], axis=2))
+        self.parts = period, ways, spans, columns, bulge
+        self.sizes = L + N + 1
 
     def rows(self, normals: Array, offsets: Array) -> Rows:
         """Rows for half-spaces `a·p <= b` in the frame of now, a (n, N, d), b (n, N)."""
-        n = len(normals)
-        spread = normals[:, self.period, None, :] @ self.maps  # (n, 2N+1, 1, nz + L)
-        spread = spread.reshape(n * len(self.period), self.maps.shape[2])
-        extra = np.broadcast_to(self.extra, (n, *self.extra.shape)).reshape(len(spread), self.extra.shape[1])
-        both = np.hstack([np.abs(spread[:, self.nz :]), extra])
-        return Rows(spread[:, : self.nz], both, offsets[:, self.period].ravel(), np.ones(len(spread)))
+        from safety.holding import rows
+
+        gradient, spread, bound = rows(normals, offsets, *self.parts, self.sizes)
+        return Rows(gradient, spread, bound, np.ones(len(bound)))
+
+    def slack(self, normals: Array, offsets: Array, sizes: Array, z: Array) -> Array:
+        """What these rows leave, `bound - support`, of the tube with magnitudes `sizes` (L+N+1,) under regressors z,
+        without the rows themselves: there are hundreds, as wide as the tube has generators."""
+        from safety.holding import slack
+
+        return slack(normals, offsets, *self.parts, sizes, z)
 
 
 class Builder:
@@ -84,7 +94,7 @@ class Builder:
         self.known = tube.position.shape[2] - free  # length of z_0
         self.free = free
         moving = np.abs(tube.W[:, self.known :]).max(1, initial=0.0) > ROUNDING
-        self.W_t, self.M_t = tube.W[moving], tube.M[:, moving]
+        self.W_t, self.M_t = tube.W[moving], np.ascontiguousarray(tube.M[:, moving])
         self.W_c, self.M_c = tube.W[~moving][:, : self.known], tube.M[:, ~moving]
         atoms = len(self.W_t)
         width = np.tile(robot.high() - robot.low(), steps)
@@ -114,28 +124,27 @@ class Builder:
         whose least is beyond its bound can't be met, one whose largest is within it need not be looked at. With many
         obstacles that is nearly all of them.
         """
+        from safety.holding import that_matter
+
         m = self.robot.action_dim
         constant = self.M_c @ np.abs(self.W_c @ z_0) + self.tube.m_0
-        bound = rows.bound - rows.gradient[:, : self.known] @ z_0 - rows.spread @ constant - SHARPEN
-        steer, stretch = rows.gradient[:, self.known :], rows.spread @ self.M_t
         offset = self.W_t[:, : self.known] @ z_0
         center, radius = self.reachable(z_0[-m:])
         atom = offset + self.W_t[:, self.known :] @ center
         give = np.abs(self.W_t[:, self.known :]) @ radius
-        middle, swing = steer @ center, np.abs(steer) @ radius
-        if (middle - swing + stretch @ np.maximum(np.abs(atom) - give, 0.0) > bound).any():
+        atoms = np.stack([np.maximum(np.abs(atom) - give, 0.0), np.abs(atom) + give])
+        count, A, b = that_matter(
+            rows.gradient, rows.spread, rows.bound, z_0, constant, self.M_t, center, radius, atoms, self.scale, SHARPEN
+        )
+        if count < 0:
             return None
-        matter = middle + swing + stretch @ (np.abs(atom) + give) > bound
-        A = np.hstack([steer[matter], stretch[matter]]) * self.scale
-        length = np.maximum(np.sqrt(np.einsum("ri,ri->r", A, A)), SHARPEN)
         first = np.zeros(self.free)
         first[:m] = z_0[-m:]
         first = first[self.limited]
         g = np.zeros(len(self.h))
         g[:m] = -proposal / self.scale[:m]
         fixed = np.concatenate([-offset, offset, self.box, self.slew + first, self.slew - first]) / self.length
-        A, b = np.vstack([A / length[:, None], self.fixed]), np.concatenate([bound[matter] / length, fixed])
-        return Program(self.h, g, A, b)
+        return Program(self.h, g, np.vstack([A[:count], self.fixed]), np.concatenate([b[:count], fixed]), len(fixed))
 
     def reachable(self, before: Array) -> tuple[Array, Array]:
         """Center and half-widths (F·m,) of what bounds and slew leave to the free inputs after `before` (m,)."""

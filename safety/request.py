@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +24,8 @@ Array = NDArray[np.float64]
 
 ALLOWED, ADJUSTED, FAILSAFE, RECOVERING = "allowed", "adjusted", "failsafe", "recovering"
 MOST_OBSERVED = 4096  # numbers in an observation
+
+Named: TypeAlias = dict[str, tuple[NDArray[np.floating[Any]], tuple[int, ...]]]  # arrays, and the shapes they must have
 
 
 class BadRequest(ValueError):
@@ -107,8 +109,14 @@ def check_for_filter(robot: Robot, request: Request) -> None:
     Raises:
         BadRequest: a value is missing, not finite or of the wrong size, with the field's name.
     """
-    _check_motion(robot, request)
-    _finite(robot, "plan", request.plan, (robot.horizon, robot.action_dim))
+    predicted = request.predicted
+    further: Named = {"plan": (request.plan, (robot.horizon, robot.action_dim))}
+    if request.observation.size:
+        further["observation"] = request.observation, (_observed(robot, request),)
+    if predicted is not None:
+        further["predicted_center"] = predicted.center, (robot.state_dim,)
+        further["predicted_half_width"] = predicted.half_width, (robot.state_dim,)
+    _check_motion(robot, request, further)
     _within_bounds(robot, "plan", request.plan)
     if not robot.rests(request.plan[-1]):
         raise BadRequest("plan", "the committed plan does not end in a stop")
@@ -120,10 +128,11 @@ def check_for_filter(robot: Robot, request: Request) -> None:
         raise BadRequest("scan", f"a {robot.name} robot has no fan in the plane: give obstacles, or a range image")
     if isinstance(request.scan, RangeImage) and robot.position_dim != 3:
         raise BadRequest("image", f"a {robot.name} robot has no range image in space: give obstacles, or a scan")
-    if request.observation.size:
-        _finite(robot, "observation", request.observation, (_observed(robot, request),))
-    if request.predicted is not None:
-        _check_prediction(robot, request.predicted)
+    if predicted is not None:
+        if (predicted.half_width < 0.0).any():
+            raise BadRequest("predicted_half_width", "a predicted set has a negative half-width")
+        if not math.isfinite(predicted.heading):
+            raise BadRequest("predicted_heading", "predicted_heading is NaN or infinite")
 
 
 def check_for_rival(robot: Robot, request: Request) -> None:
@@ -132,8 +141,7 @@ def check_for_rival(robot: Robot, request: Request) -> None:
     Raises:
         BadRequest: a value is missing, not finite or of the wrong size, with the field's name.
     """
-    _check_motion(robot, request)
-    _finite(robot, "observation", request.observation, (task_of(robot).observation_dim,))
+    _check_motion(robot, request, {"observation": (request.observation, (task_of(robot).observation_dim,))})
 
 
 def _observed(robot: Robot, request: Request) -> int:
@@ -150,32 +158,31 @@ def _observed(robot: Robot, request: Request) -> int:
         return request.observation.size
 
 
-def _check_motion(robot: Robot, request: Request) -> None:
-    """Where the robot is, and its inputs."""
-    _finite(robot, "state", request.state, (robot.state_dim,))
-    _finite(robot, "action", request.action, (robot.action_dim,))
-    _finite(robot, "input_in_force", request.input_in_force, (robot.action_dim,))
+def _check_motion(robot: Robot, request: Request, further: Named) -> None:
+    """Where the robot is, and its inputs; and that what else is named is of its size, and finite."""
+    inputs = (robot.action_dim,)
+    named: Named = {
+        "state": (request.state, (robot.state_dim,)),
+        "action": (request.action, inputs),
+        "input_in_force": (request.input_in_force, inputs),
+    }
+    _finite(robot, named | further)
     if np.abs(request.state).max() > FARTHEST:  # in any unit
         raise BadRequest("state", f"a state beyond ±{FARTHEST:g} is not plausible")
     _within_bounds(robot, "input_in_force", request.input_in_force)
 
 
-def _check_prediction(robot: Robot, predicted: Prediction) -> None:
-    _finite(robot, "predicted_center", predicted.center, (robot.state_dim,))
-    _finite(robot, "predicted_half_width", predicted.half_width, (robot.state_dim,))
-    if (predicted.half_width < 0.0).any():
-        raise BadRequest("predicted_half_width", "a predicted set has a negative half-width")
-    if not math.isfinite(predicted.heading):
-        raise BadRequest("predicted_heading", "predicted_heading is NaN or infinite")
-
-
 def _within_bounds(robot: Robot, name: str, inputs: Array) -> None:
-    if (inputs < robot.low() - 1e-9).any() or (inputs > robot.high() + 1e-9).any():
+    low, high = robot.bounds
+    if not ((inputs >= low) & (inputs <= high)).all():
         raise BadRequest(name, f"{name}: an input is out of the robot's bounds")
 
 
-def _finite(robot: Robot, name: str, value: NDArray[np.floating[Any]], shape: tuple[int, ...]) -> None:
-    if value.shape != shape:
-        raise BadRequest(name, f"{name} has shape {value.shape}, a {robot.name} robot's has {shape}")
-    if not np.isfinite(value).all():
-        raise BadRequest(name, f"{name} holds NaN or infinity")
+def _finite(robot: Robot, named: Named) -> None:
+    for name, (value, shape) in named.items():
+        if value.shape != shape:
+            raise BadRequest(name, f"{name} has shape {value.shape}, a {robot.name} robot's has {shape}")
+    if np.isfinite(np.concatenate([value.ravel() for value, _ in named.values()])).all():
+        return
+    name = next(name for name, (value, _) in named.items() if not np.isfinite(value).all())
+    raise BadRequest(name, f"{name} holds NaN or infinity")

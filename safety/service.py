@@ -206,6 +206,8 @@ def main(settings: SafetySettings) -> None:
     Raises:
         BadModel: a file is no model, or with keys none that is signed: a service without one would only refuse.
     """
+    import safety.holding  # noqa: F401  # compiled, which takes seconds the first time: before it is seen to live
+
     keys = settings.bus.keys
     models, counts = Models(settings.archive), Counts()
     with Process(settings.bus, settings.name) as process:

@@ -7,6 +7,7 @@ length, and how wide they are about their near ends and their far ones, m.
 from __future__ import annotations
 
 import math
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +17,8 @@ from safety.freespace import TOUCHING
 
 Array = NDArray[np.float64]
 Single = NDArray[np.float32]
+
+Normal: TypeAlias = tuple[np.float32, np.float32, np.float32]
 
 ROUNDING = 1e-4  # m: more than directions in single precision lead aside within sight
 ALTERNATIONS = 3  # between two segments, until their nearest points are known well enough
@@ -70,22 +73,29 @@ def _that_meet(
     return found[:count]
 
 
-@compiled("f8[:,::1](f4[:,::1], i8[::1], f4[:,::1], f8[:,::1], f8[::1], f8, f8[::1], f8[::1], f8, f8)")
+@compiled("f8[:,::1](f4[:,::1], i8[::1], f4[:,::1], f8[:,::1], f8[::1], f8[:,:,::1], f8, f8, f8)")
 def behind(
     free: Single,
     together: NDArray[np.int64],
     ways: Single,
     turn: Array,
-    at: Array,
-    last: float,
-    low: Array,
-    high: Array,
+    place: Array,
+    boxes: Array,
+    body: float,
     widening: float,
     wide: float,
 ) -> Array:
     """The lines of what is behind patches, as many beams together as each ring (E,) of the grid has it, in directions
-    (3, n) from a point, turned by (3, 3): of those that come into a box between where they are free to and `last` m.
-    Wide are they by so much, and so much more a metre."""
+    (3, n), turned by (3, 3), from a sensor that is mounted aside of a place (6,): of those that a body may touch which
+    is so large, anywhere in the boxes (2, K, 3). Wide are they by so much, and so much more a metre."""
+    at, low, high, square = np.empty(3), np.empty(3), np.empty(3), 0.0
+    for axis in range(3):
+        at[axis] = place[axis] + turn[axis, 0] * place[3] + turn[axis, 1] * place[4] + turn[axis, 2] * place[5]
+        low[axis], high[axis] = boxes[0, :, axis].min(), boxes[1, :, axis].max()
+        square += (max(at[axis] - low[axis], high[axis] - at[axis]) + body) ** 2
+    last = (math.sqrt(square) + wide) / (1.0 - widening)  # no line of any width reaches into the boxes from beyond
+    low -= body + last * widening + wide
+    high += body + last * widening + wide
     near = nearest_of_patches(free, together, ways.shape[1])
     index = _that_meet(ways, turn, at, last, low, high, near)
     lines = np.empty((9, len(index)))
@@ -103,12 +113,32 @@ def behind(
     return lines
 
 
+@compiled("f4[:,::1](f8[:,::1], f8[::1])")
+def told_from(lines: Array, start: Array) -> Single:
+    """The same lines as seen from the start (9, n), and three rows more of what `_room` needs of each: how much it
+    widens a metre, and the products of its near end with its direction and itself."""
+    n = lines.shape[1]
+    told = np.empty((12, n), np.float32)
+    for i in range(9):
+        line, out, off = lines[i], told[i], start[i] if i < 3 else 0.0
+        for s in range(n):
+            out[s] = line[s] - off
+    x, y, z, u, v, w = told[0], told[1], told[2], told[3], told[4], told[5]
+    length, near, far, widening, outward, square = told[6], told[7], told[8], told[9], told[10], told[11]
+    least = np.float32(TOUCHING)
+    for s in range(n):
+        widening[s] = (far[s] - near[s]) / (length[s] if length[s] > least else least)
+        outward[s] = x[s] * u[s] + y[s] * v[s] + z[s] * w[s]
+        square[s] = x[s] * x[s] + y[s] * y[s] + z[s] * z[s]
+    return told
+
+
 @compiled("void(f4[::1], f4[:,::1], f4[::1])")
 def _room(place: Single, told: Single, found: Single) -> None:
-    """How near each shadow, as `rooms` tells them, is to a place, where that is nearer than was found before."""
+    """How near each shadow, as `told_from` has them, is to a place, where that is nearer than was found before."""
     a, b, c, zero = place[0], place[1], place[2], np.float32(0.0)
     x, y, z, u, v, w = told[0], told[1], told[2], told[3], told[4], told[5]
-    length, about, widening, outward, square = told[6], told[7], told[8], told[9], told[10]
+    length, about, widening, outward, square = told[6], told[7], told[9], told[10], told[11]
     own = a * a + b * b + c * c
     for s in range(len(found)):
         away = a * u[s] + b * v[s] + c * w[s] - outward[s]
@@ -121,17 +151,12 @@ def _room(place: Single, told: Single, found: Single) -> None:
         found[s] = room if room < found[s] else found[s]
 
 
-@compiled("f4[:,::1](f8[:,::1], f8[::1], f8[:,::1], i8[::1])")
-def rooms(lines: Array, start: Array, ends: Array, first: NDArray[np.int64]) -> Single:
+@compiled("f4[:,::1](f4[:,::1], f8[:,::1], i8[::1])")
+def rooms(told: Single, ends: Array, first: NDArray[np.int64]) -> Single:
     """About how near [m] each shadow is to any of the ends (N+1, 3), from the start, of the periods of each group,
     which begins with so many a period (G,): (G, n)."""
-    n, periods = lines.shape[1], len(ends) - 1
-    told, found = np.empty((11, n), np.float32), np.full((len(first), n), np.inf, np.float32)
-    for i in range(8):
-        told[i] = lines[i] - (start[i] if i < 3 else 0.0)
-    told[8] = (lines[8] - lines[7]) / np.maximum(lines[6], TOUCHING)
-    told[9] = told[0] * told[3] + told[1] * told[4] + told[2] * told[5]
-    told[10] = told[0] * told[0] + told[1] * told[1] + told[2] * told[2]
+    n, periods = told.shape[1], len(ends) - 1
+    found = np.full((len(first), n), np.inf, np.float32)
     for group in range(len(first)):
         until = first[group + 1] if group + 1 < len(first) else periods
         for end in range(first[group], until + 1):
@@ -139,15 +164,31 @@ def rooms(lines: Array, start: Array, ends: Array, first: NDArray[np.int64]) -> 
     return found
 
 
-@compiled("Tuple((UniTuple(f8, 3), f8))(f8[:,::1], i8, f8[::1], f8[:,::1])")
-def _support(lines: Array, shadow: np.intp, start: Array, chord: Array) -> tuple[tuple[float, float, float], float]:
+@compiled("f4(f4[::1], f4[::1])")
+def _least(values: Single, spare: Single) -> np.float32:
+    """The least of n >= 1 numbers; the last half with the first, and again. Overwrites spare (n,)."""
+    n = len(values)
+    spare[0] = values[0]
+    while n > 1:
+        half = (n + 1) // 2
+        for k in range(n - half):
+            a, b = values[k], values[half + k]
+            spare[k] = b if b < a else a
+        if 2 * half > n:
+            spare[half - 1] = values[half - 1]
+        values, n = spare, half
+    return np.float32(spare[0])
+
+
+@compiled("Tuple((UniTuple(f8, 3), f8))(f4[:,::1], i8, f8[:,::1])")
+def _support(told: Single, shadow: int, chord: Array) -> tuple[tuple[float, float, float], float]:
     """The unit normal from a chord (2, 3), from the start, towards a shadow, and the level that it lies beyond."""
     near, along = np.empty(3), np.empty(3)
     square = 0.0
     for i in range(3):
-        near[i], along[i] = lines[i, shadow] - start[i], lines[3 + i, shadow]
+        near[i], along[i] = told[i, shadow], told[3 + i, shadow]
         square += (chord[1, i] - chord[0, i]) ** 2
-    length, share, square = lines[6, shadow], 0.5, max(square, TOUCHING**2)
+    length, share, square = float(told[6, shadow]), 0.5, max(square, TOUCHING**2)
     towards = np.zeros(3)
     for _ in range(ALTERNATIONS):
         t = 0.0
@@ -163,15 +204,15 @@ def _support(lines: Array, shadow: np.intp, start: Array, chord: Array) -> tuple
     x, y, z = towards[0] / norm, towards[1] / norm, towards[2] / norm
     at_near = x * near[0] + y * near[1] + z * near[2]
     at_far = at_near + length * (x * along[0] + y * along[1] + z * along[2])
-    return (x, y, z), min(at_near - lines[7, shadow], at_far - lines[8, shadow])
+    return (x, y, z), min(at_near - told[7, shadow], at_far - told[8, shadow]) - ROUNDING
 
 
-@compiled("void(f8[:,::1], i8, UniTuple(f8, 3), f8, f8[::1])")
-def _beyond(lines: Array, count: int, normal: tuple[float, float, float], level: float, found: Array) -> None:
+@compiled("void(f4[:,::1], i8, UniTuple(f4, 3), f4, f4[::1])")
+def _beyond(told: Single, count: int, normal: Normal, level: np.float32, found: Single) -> None:
     """How far [m] each of the first shadows is beyond a half-space."""
     a, b, c = normal
-    x, y, z, u, v, w = lines[0], lines[1], lines[2], lines[3], lines[4], lines[5]
-    length, about_near, about_far = lines[6], lines[7], lines[8]
+    x, y, z, u, v, w = told[0], told[1], told[2], told[3], told[4], told[5]
+    length, about_near, about_far = told[6], told[7], told[8]
     for s in range(count):
         near = a * x[s] + b * y[s] + c * z[s] - level
         far = near + length[s] * (a * u[s] + b * v[s] + c * w[s]) - about_far[s]
@@ -179,43 +220,61 @@ def _beyond(lines: Array, count: int, normal: tuple[float, float, float], level:
         found[s] = near if near < far else far
 
 
-@compiled("i8(f8[:,::1], i8, i8, f8[::1], f8[:,::1], f4[::1])")
-def _left_over(lines: Array, count: int, but: np.intp, beyond: Array, kept: Array, room: Single) -> int:
-    """Of the first shadows those that are not beyond, but one, and the room to them: moved to the front of `kept`."""
-    left = 0
+@compiled("i8(f4[:,::1], i8, i8, f4[::1], f4[:,::1], f4[::1], f8, i8[::1])")
+def _left_over(
+    told: Single,
+    count: int,
+    but: int,
+    beyond: Single,
+    kept: Single,
+    room: Single,
+    reach: float,
+    index: NDArray[np.int64],
+) -> int:
+    """Of the first shadows those within reach that are not beyond, but one, and the room to them: moved to the front
+    of `kept`."""
+    left, surely = 0, np.float32(ROUNDING)
     for s in range(count):
-        if s != but and not beyond[s] >= 0.0:
-            for i in range(9):
-                kept[i, left] = lines[i, s]
-            room[left] = room[s]
-            left += 1
+        index[left] = s
+        left += 0 if beyond[s] >= surely or room[s] > reach or s == but else 1
+    for i in range(9):
+        row, out = told[i], kept[i]
+        for k in range(left):
+            out[k] = row[index[k]]
+    for k in range(left):
+        room[k] = room[index[k]]
     return left
 
 
-@compiled("i8(f8[:,::1], f8[::1], f8[:,::1], f4[::1], f8, f8, f8[:,::1], f8[::1], f8[:,::1], f8[::1])")
+@compiled("i8(f4[:,::1], f8[:,::1], f4[::1], f8, f8, f8, f8[:,::1], f8[::1], f4[:,::1], f4[::1], i8[::1])")
 def _until_beyond(
-    lines: Array,
-    start: Array,
+    told: Single,
     chord: Array,
     room: Single,
+    reach: float,
     keep_off: float,
     give: float,
     normals: Array,
     levels: Array,
-    kept: Array,
-    beyond: Array,
+    kept: Single,
+    beyond: Single,
+    index: NDArray[np.int64],
 ) -> int:
     """Half-spaces about one chord, into normals (k, 3) and levels (k,): so many. Overwrites what it is given to work
-    with: room (n,), kept (9, n), beyond (n,)."""
-    count, k, most, rest = lines.shape[1], 0, len(levels), lines
+    with: room (n,), kept (9, n), beyond (n,), index (n,)."""
+    count, k, most, rest = told.shape[1], 0, len(levels), told
     while count > 0 and k < most:
-        chosen = room[:count].argmin()
-        normal, level = _support(rest, chosen, start, chord)
+        nearest, chosen = _least(room[:count], beyond), 0
+        while room[chosen] > nearest:
+            chosen += 1
+        if nearest > reach:
+            return k
+        normal, level = _support(rest, chosen, chord)
         level -= give * 2.0 ** (k // 8) * max(room[chosen] - keep_off, 0.0)
         normals[k, 0], normals[k, 1], normals[k, 2], levels[k] = normal[0], normal[1], normal[2], level
-        world = level + normal[0] * start[0] + normal[1] * start[1] + normal[2] * start[2]
-        _beyond(rest, count, normal, world, beyond)
-        count = _left_over(rest, count, chosen, beyond, kept, room)
+        single = np.float32(normal[0]), np.float32(normal[1]), np.float32(normal[2])
+        _beyond(rest, count, single, np.float32(level), beyond)
+        count = _left_over(rest, count, chosen, beyond, kept, room, reach, index)
         rest = kept
         k += 1
     if count > 0:
@@ -223,19 +282,32 @@ def _until_beyond(
     return k
 
 
-@compiled("Tuple((f8[:,:,::1], f8[:,::1]))(f8[:,::1], f8[::1], f8[:,:,::1], f4[:,::1], f8, i8, f8, f8)")
+@compiled("Tuple((f8[:,:,::1], f8[:,::1]))(f4[:,::1], f8[:,:,::1], f4[:,::1], f8[::1], f8, i8, f8, f8)")
 def supporting(
-    lines: Array, start: Array, chords: Array, room: Single, keep_off: float, most: int, give: float, farthest: float
+    told: Single,
+    chords: Array,
+    room: Single,
+    reach: Array,
+    keep_off: float,
+    most: int,
+    give: float,
+    farthest: float,
 ) -> tuple[Array, Array]:
-    """Half-spaces until every shadow is beyond one of them, about each of the chords (G, 2, 3), from the start: normals
-    (G, k, 3) and levels (G, k), also from the start, for as many as any chord needs; those that one does not need are
-    at `farthest`, and where `most` are not enough the last is at -inf. room (G, n) [m]: from the chords to the shadows;
-    give: as `shadows.GIVE`."""
+    """Half-spaces until every shadow, as `told_from` has them, that is within reach (G,) is beyond one of them, about
+    each of the chords (G, 2, 3), from the start: normals (G, k, 3) and levels (G, k), also from the start, for as many
+    as any chord needs; those that one does not need are at `farthest`, and where `most` are not enough the last is at
+    -inf. room (G, n) [m]: from the chords to the shadows, and numbers; give: as `shadows.GIVE`."""
     normals, levels, needed = np.zeros((len(chords), most, 3)), np.full((len(chords), most), farthest), 0
-    room, kept, beyond = room.copy(), np.empty_like(lines), np.empty(lines.shape[1])
+    n = told.shape[1]
+    room, kept, beyond, index = (
+        room.copy(),
+        np.empty((9, n), np.float32),
+        np.empty(n, np.float32),
+        np.empty(n, np.int64),
+    )
     for group in range(len(chords)):
-        a, b = normals[group], levels[group]
-        count = _until_beyond(lines, start, chords[group], room[group], keep_off, give, a, b, kept, beyond)
+        a, b, near, within = normals[group], levels[group], room[group], reach[group]
+        count = _until_beyond(told, chords[group], near, within, keep_off, give, a, b, kept, beyond, index)
         needed = max(needed, count)
     return normals[:, :needed].copy(), levels[:, :needed].copy()
 
@@ -257,27 +329,27 @@ def together(ends: Array, shared: float) -> NDArray[np.int64]:
 @compiled("i8(f8[:,::1], i8[::1], f4[:,::1], f8)")
 def free_groups(ends: Array, first: NDArray[np.int64], room: Single, touching: float) -> int:
     """Of how many groups, from the first on, the way is free, and a number."""
+    spare = np.empty(room.shape[1], np.float32)
     for group in range(len(first)):
         until = first[group + 1] if group + 1 < len(first) else len(ends) - 1
-        if not (room[group].min() > touching and np.isfinite(ends[first[group] : until + 1]).all()):
+        if not (_least(room[group], spare) > touching and np.isfinite(ends[first[group] : until + 1]).all()):
             return group
     return len(first)
 
 
-@compiled("Tuple((f8[:,:,::1], f8[:,::1]))(f8[:,:,::1], f8[:,::1], i8[::1], f8[::1], f8[::1], f8[::1], f8, f8[::1])")
+@compiled("Tuple((f8[:,:,::1], f8[:,::1]))(f8[:,:,::1], f8[:,::1], i8[::1], f8[:,:,::1], f8[::1], f8, f8[::1])")
 def about_periods(
     normals: Array,
     levels: Array,
     first: NDArray[np.int64],
-    low: Array,
-    high: Array,
+    boxes: Array,
     grown: Array,
     keep_off: float,
     measured: Array,
 ) -> tuple[Array, Array]:
     """Of half-spaces (G, k) of groups those of every period, (k+6, N, 3) and (k+6, N), for a body that keeps off what
-    is there, and may have grown (N,), by where it is measured; and a box's faces (3,), (3,) from the start, as they
-    are. Periods after the last group have the last one's."""
+    is there, and may have grown (N,), by where it is measured; and the faces about both of its ends' boxes
+    (2, N+1, 3) from the start, as they are. Periods after the last group have the last one's."""
     count, periods = levels.shape[1], len(grown)
     a, b = np.zeros((count + 6, periods, 3)), np.empty((count + 6, periods))
     group = 0
@@ -292,6 +364,82 @@ def about_periods(
                 kept += abs(normal[axis]) * measured[axis]
             b[i, k] = levels[group, i] - kept
         for axis in range(3):
-            a[count + axis, k, axis], b[count + axis, k] = 1.0, high[axis]
-            a[count + 3 + axis, k, axis], b[count + 3 + axis, k] = -1.0, -low[axis]
+            a[count + axis, k, axis], b[count + axis, k] = 1.0, max(boxes[1, k, axis], boxes[1, k + 1, axis])
+            a[count + 3 + axis, k, axis] = -1.0
+            b[count + 3 + axis, k] = -min(boxes[0, k, axis], boxes[0, k + 1, axis])
     return a, b
+
+
+@compiled("f8[::1](f8[:,::1], i8[::1], f8[:,:,::1], f8[::1], f8)")
+def reaches(ends: Array, first: NDArray[np.int64], boxes: Array, grown: Array, body: float) -> Array:
+    """How far [m] from the ends of the periods of each group (G,) what may touch a body in the boxes is at the most.
+
+    Between two ends it is nowhere farther from the nearer one than at an end, and half the way between them.
+    """
+    found, periods = np.zeros(len(first)), len(ends) - 1
+    for group in range(len(first)):
+        until = first[group + 1] if group + 1 < len(first) else periods
+        most, step = 0.0, 0.0
+        for end in range(first[group], until + 1):
+            corner, way = 0.0, 0.0
+            for axis in range(3):
+                corner += max(boxes[1, end, axis] - ends[end, axis], ends[end, axis] - boxes[0, end, axis]) ** 2
+                way += (ends[end, axis] - ends[max(end - 1, first[group]), axis]) ** 2
+            most, step = max(most, corner), max(step, way)
+        found[group] = math.sqrt(most) + 0.5 * math.sqrt(step) + body + grown[until - 1] + ROUNDING
+    return found
+
+
+@compiled("Tuple((f8[:,::1], f8[:,:,::1]))(f8[::1], f8[:,::1], f8[:,:,::1])")
+def _from(start: Array, nominal: Array, boxes: Array) -> tuple[Array, Array]:
+    """The ends of all periods (N+1, 3) and their boxes (2, N+1, 3), as they are from the start."""
+    ends, within, last = np.zeros((len(nominal) + 1, 3)), np.empty((2, len(nominal) + 1, 3)), boxes.shape[1] - 1
+    for k in range(len(ends)):
+        for axis in range(3):
+            for side in range(2):
+                within[side, k, axis] = boxes[side, min(k, last), axis] - start[axis]
+            if k > 0:
+                ends[k, axis] = nominal[k - 1, axis] - start[axis]
+    return ends, within
+
+
+@compiled(
+    "Tuple((f8[:,:,::1], f8[:,::1]))"
+    "(f8[:,::1], f8[::1], f8[:,::1], f8[:,:,::1], UniTuple(f8, 2), f8, f8[::1], i8, UniTuple(f8, 4))"
+)
+def about_way(
+    lines: Array,
+    start: Array,
+    nominal: Array,
+    boxes: Array,
+    moved: tuple[float, float],
+    keep_off: float,
+    measured: Array,
+    most: int,
+    limits: tuple[float, float, float, float],
+) -> tuple[Array, Array]:
+    """The half-spaces of all periods about a nominal way (N, 3), world, in boxes (2, N+1 or 1, 3), as `about_periods`
+    has them. moved [m]: how far what is seen may have moved until now, and moves in a period; limits: `shadows.SHARED`,
+    `TOUCHING`, `GIVE`, `FARTHEST`."""
+    shared, touching, give, farthest = limits
+    ends, within = _from(start, nominal, boxes)
+    grown, first = moved[0] + moved[1] * np.arange(1.0, len(ends)), np.zeros(1, np.int64)
+    faces, levels = about_periods(np.zeros((1, 0, 3)), np.zeros((1, 0)), first, within, grown, keep_off, measured)
+    nowhere = np.full_like(levels, -np.inf)
+    if not np.isfinite(within).all():  # of two numbers, one of which is none, the larger may be the other
+        return faces, nowhere
+    if lines.shape[1] == 0:
+        return faces, levels
+    first = together(ends, shared)
+    told = told_from(lines, start)
+    room = rooms(told, ends, first)
+    free = free_groups(ends, first, room, touching)
+    if free == 0:
+        return faces, nowhere
+    chords = np.empty((free, 2, 3))
+    for group in range(free):
+        until = first[group + 1] if group + 1 < len(first) else len(nominal)
+        chords[group, 0], chords[group, 1] = ends[first[group]], ends[until]
+    reach = reaches(ends, first, within, grown, keep_off + measured.sum())
+    normals, levels = supporting(told, chords, room[:free], reach, keep_off, most, give, farthest)
+    return about_periods(normals, levels, first, within, grown, keep_off, measured)

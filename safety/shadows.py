@@ -30,10 +30,10 @@ FACES = np.vstack([np.eye(3), -np.eye(3)])  # of the room
 
 @dataclass(frozen=True)
 class Room:
-    """A box (3,), (3,), world, that no plan leaves until so many s from now."""
+    """Boxes, world, that no plan is outside of at the periods' ends, now the first of them, until so many s from now:
+    their lowest and highest corners (2, N+1, 3), or of one for all (2, 1, 3)."""
 
-    low: Array
-    high: Array
+    boxes: Array
     last: float
 
 
@@ -60,21 +60,19 @@ def shadows(image: RangeImage, room: Room, body: float) -> Shadows:
     from safety.shading import behind  # compiled
 
     elevations, free = seen_free(image)
-    together, ways = _patches(tuple(elevations), free.shape[1])
-    at, beside = image.sensor(), body + image.speed * (image.age + room.last)
-    corners = np.maximum(np.abs(room.low - at), np.abs(room.high - at)) + beside
+    together, ways = _patches(elevations.tobytes(), free.shape[1])
+    beside = body + image.speed * (image.age + room.last)
     about = half_diagonal(image) + image.angle_error + ASIDE
-    within = (float(np.linalg.norm(corners)) + image.sensor_error) / (1.0 - about)
-    beside += within * about + image.sensor_error
-    low, high = room.low - beside, room.high + beside
-    lines = behind(free, together, ways, image.turn, at, within, low, high, about, image.sensor_error)
+    place = np.array([*image.at, *image.mount])
+    lines = behind(free, together, ways, image.turn, place, room.boxes, beside, about, image.sensor_error)
     return Shadows(lines, room, image.speed, image.age)
 
 
 @lru_cache(maxsize=16)
-def _patches(elevations: tuple[float, ...], columns: int) -> tuple[NDArray[np.int64], Single]:
+def _patches(rings: bytes, columns: int) -> tuple[NDArray[np.int64], Single]:
     """How many columns make a patch in each ring (E,), more than one near the poles, and their middles (3, n), as
-    exactly as `ASIDE`."""
+    exactly as `ASIDE`; rings: their elevations."""
+    elevations = np.frombuffer(rings)
     half = 0.5 * float(np.diff(elevations).max())  # the outermost rings may have been moved to the poles
     together = (1.0 / np.cos(np.maximum(np.abs(elevations) - half, 0.0))).astype(np.int64)
     middles = []
@@ -90,19 +88,8 @@ def half_spaces(
 ) -> tuple[Array, Array]:
     """As `freespace.half_spaces`: as many as any period needs, up to `PLANES`, and the room's faces. Those that a
     period does not need hold everywhere."""
-    from safety.shading import about_periods, free_groups, rooms, supporting, together  # compiled
+    from safety.shading import about_way  # compiled
 
-    low, high = near.room.low - start, near.room.high - start
-    grown: Array = near.speed * (near.age + period * np.arange(1.0, len(nominal) + 1.0))
-    normals, levels = np.zeros((1, 0, 3)), np.zeros((1, 0))
-    first = np.zeros(1, np.int64)
-    if near.lines.size:
-        ends = np.concatenate([np.zeros((1, 3)), nominal - start])
-        first = together(ends, SHARED)
-        room = rooms(near.lines, start, ends, first)
-        free = free_groups(ends, first, room, TOUCHING)
-        chords = np.stack([ends[first], ends[np.append(first[1:], len(nominal))]], axis=1)[:free]
-        if free == 0:
-            return np.tile(FACES[:, None], (1, len(nominal), 1)), np.full((len(FACES), len(nominal)), -np.inf)
-        normals, levels = supporting(near.lines, start, chords, room[:free], keep_off, PLANES, GIVE, FARTHEST)
-    return about_periods(normals, levels, first, low, high, grown, keep_off, measured)
+    boxes, moved = near.room.boxes, (near.speed * near.age, near.speed * period)  # m: until now, and in a period
+    least = SHARED, TOUCHING, GIVE, FARTHEST
+    return about_way(near.lines, start, np.ascontiguousarray(nominal), boxes, moved, keep_off, measured, PLANES, least)

@@ -92,12 +92,18 @@ class Surroundings:
         self.robot, self.tube, self.stands = robot, tube, model.moving
         self.discs = _discs(robot, tube)
         free = len(robot.action_slew) * (robot.free_steps - robot.given)
-        self._sizes = np.abs(tube.W[:, -free:]), np.abs(tube.position[:, :, -free:]), np.abs(tube.directions)
+        self._spans = np.abs(tube.directions)
+        whole = np.ascontiguousarray
+        W_free, moved = whole(np.abs(tube.W[:, -free:])), whole(np.abs(tube.position[..., -free:]))
+        parts = whole(tube.W), W_free, whole(tube.M), tube.m_0, whole(tube.position), moved, whole(self._spans)
+        self._filled = parts  # what `filled_by_plans` is told of the tube
         self.boxes = Boxes(tube.position, tube.directions)
         self.limits = Limits(robot, tube) if robot.limits else None
         self.measured = np.asarray(robot.measurement_bound[: robot.position_dim])
         self.body = robot.footprint + float(np.linalg.norm(self.measured))  # m about where the center was measured
         self.comfort = self._comfort() if comfort is None else comfort
+        farthest = max((float(np.linalg.norm(disc.at)) for disc in self.discs), default=0.0)
+        self._beside = self.measured + self.comfort + ASIDE + farthest  # of a plan's sets, which is looked at
         self.stays = self._stays()
         self.widest = self._widest(outer, domain)
         wanted = self.widest + self.comfort
@@ -194,18 +200,14 @@ class Surroundings:
         return turn
 
     def _room(self, z_0: Array, inputs: tuple[Array, Array], start: Array, turn: Array) -> shades.Room:
-        """A box, world, in which every plan's discs stay with their middles after z_0; and some more."""
-        center, radius = inputs
-        z = np.concatenate([z_0, center])
-        W_f, moved, spread = self._sizes
-        sizes = self.tube.M @ (np.abs(self.tube.W @ z) + W_f @ radius) + self.tube.m_0
-        L = self.tube.generators
-        half = moved @ radius + spread @ sizes[:L]
-        half += sizes[L:].max() + self.measured + self.comfort + ASIDE
-        ways, half = np.vstack([np.zeros(len(start)), self.tube.centers(z) @ turn.T]), half @ np.abs(turn).T
-        half = np.vstack([half[:1], half]) + max((float(np.linalg.norm(disc.at)) for disc in self.discs), default=0.0)
-        last = self.robot.horizon * self.robot.period
-        return shades.Room(start + (ways - half).min(axis=0), start + (ways + half).max(axis=0), last)
+        """Boxes, world, in which every plan's discs stay with their middles after z_0; and some more."""
+        from safety.holding import filled_by_plans
+
+        z = np.concatenate([z_0, inputs[0]])
+        return shades.Room(
+            filled_by_plans(*self._filled, z, inputs[1], self._beside, np.ascontiguousarray(start), turn),
+            self.robot.horizon * self.robot.period,
+        )
 
     def _unseen(self, scan: Scan, start: Array) -> seen.Cells | None:
         """What is not known to be free within reach, or may come there before a plan ends."""
@@ -214,9 +216,20 @@ class Surroundings:
         cells = seen.cells(scan, within + scan.heading_error * within)
         return cells if len(cells) else None
 
+    def sets(self, start: Array, turn: Array, z: Array) -> tuple[Array, Array]:
+        """Where the true positions at the periods' ends lie, world: centers and half-widths (N, d)."""
+        sizes, ways = self.tube.magnitudes(z)[: self.tube.generators], self.tube.centers(z)
+        if self.robot.heading is None:
+            return start + ways, self._spans @ sizes + self.measured
+        return start + ways @ turn.T, np.abs(turn @ self.tube.directions) @ sizes + self.measured
+
     def margin(self, rows: Rows, z: Array) -> float:
         """Smallest distance [m] of the exact tube to a half-space (of a limit: in its own units)."""
         return self.least(rows.bound - rows.support(self.tube, z), z)
+
+    def margin_in(self, scene: Scene, z: Array) -> float:
+        """The same, to those about the rollout of regressors z."""
+        return self.least(self.slack(scene, z)[0], z)
 
     def least(self, slack: Array, z: Array, comfort: float = 0.0) -> float:
         """The smallest slack, within ± the reach (less the comfort); NaN never counts as inside."""
@@ -260,10 +273,30 @@ class Surroundings:
         """Half-spaces about the rollout of regressors z, as rows of the tube (and of the QP's: its generators are the
         same, only their magnitudes are not). planes: if they are known already."""
         planes = planes or self.planes(scene, z)
-        parts = [
-            disc.layout.rows(plane.normals @ scene.turn, plane.offsets)
-            for disc, plane in zip(self.discs, planes, strict=True)
+        discs = zip(self.discs, planes, strict=True)
+        parts = [disc.layout.rows(self._turned(plane.normals, scene), plane.offsets) for disc, plane in discs]
+        return stacked(parts + self._further(scene, z))
+
+    def slack(self, scene: Scene, z: Array, planes: list[Planes] | None = None) -> tuple[Array, Array]:
+        """What the same rows leave, `bound - support`, and what of the comfort margin each keeps: (rows,), (rows,)."""
+        sizes = self.tube.magnitudes(z)
+        found = [
+            disc.layout.slack(self._turned(plane.normals, scene), plane.offsets, sizes, z)
+            for disc, plane in zip(self.discs, planes or self.planes(scene, z), strict=True)
         ]
+        kept = [np.ones(len(slack)) for slack in found]
+        for rows in self._further(scene, z):
+            found.append(rows.bound - rows.support(self.tube, z))
+            kept.append(rows.keep)
+        return np.concatenate(found), np.concatenate(kept)
+
+    def _turned(self, normals: Array, scene: Scene) -> Array:
+        """Into the frame of now."""
+        return normals if self.robot.heading is None else normals @ scene.turn
+
+    def _further(self, scene: Scene, z: Array) -> list[Rows]:
+        """The rows that are not a disc's own."""
+        parts = []
         if scene.promised is not None:
             nominal = scene.start + self.tube.centers(z) @ scene.turn.T
             body = self.robot.footprint
@@ -271,7 +304,7 @@ class Surroundings:
             parts.append(self.boxes.rows(*kept, scene.turn))
         if self.limits is not None:
             parts.append(self.limits.rows(scene.start, scene.heading, scene.turn))
-        return stacked(parts)
+        return parts
 
     def worst_of(self, scene: Scene, z: Array, slack: Array, planes: list[Planes]) -> Stopped:
         """What the proposal, regressors z, comes nearest to."""

@@ -139,7 +139,8 @@ def test_what_is_not_seen_is_not_free():
 
 def test_the_closer_beams_are_the_more_they_show():
     wide, close = (Cover.of(half, half) for half in (0.05, 0.025))
-    assert close.within < wide.within and close.free(np.array(5.0), 1.0) > wide.free(np.array(5.0), 1.0)
+    far = [cover.free(np.full((1, 1), 5.0, np.float32), 1.0) for cover in (close, wide)]
+    assert close.within < wide.within and far[0] > far[1]
     image = RangeImage(np.full((RINGS, COLUMNS), FAR), (0.0, 0.0, 0.0), low=-EDGE, high=EDGE)
     assert half_diagonal(image) == pytest.approx(0.5 * math.hypot(math.radians(4.0), math.radians(4.0)))
 

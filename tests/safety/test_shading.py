@@ -12,9 +12,10 @@ from hypothesis import strategies as st
 from messaging.patches import half_diagonal, seen_free
 from messaging.range_images import RangeImage
 from messaging.shapes import FARTHEST
-from safety.shading import supporting
-from safety.shadows import Room, _patches, half_spaces, shadows
+from safety.shading import supporting, told_from
+from safety.shadows import _patches, half_spaces, shadows
 from tests.messaging.test_range_images import COLUMNS, EDGE, RINGS
+from tests.safety.test_shadows import room
 
 TURN = (math.cos(0.4), 0.3 * math.sin(0.4), 0.0, math.sqrt(1.0 - 0.09) * math.sin(0.4))  # a quaternion
 
@@ -31,9 +32,9 @@ def scattered(seed):
 @given(st.integers(0, 100_000))
 def test_a_shadow_holds_all_of_its_patch_that_comes_into_the_room_whatever_the_errors(seed):
     rng, image = np.random.default_rng(seed), scattered(seed)
-    lines = shadows(image, Room(np.full(3, -2.0), np.full(3, 2.0), 1.0), 0.2).lines
+    lines = shadows(image, room(2.0, 1.0), 0.2).lines
     elevations, free = seen_free(image)
-    together, middles = _patches(tuple(elevations), COLUMNS)
+    together, middles = _patches(elevations.tobytes(), COLUMNS)
     middles = middles.T
     free = np.concatenate(
         [np.minimum.reduceat(ring, np.arange(0, COLUMNS, each)) for ring, each in zip(free, together, strict=True)]
@@ -68,7 +69,7 @@ def test_every_shadow_is_beyond_some_half_space_of_every_chord(seed, n, give):
     lines = np.vstack([near, along, rng.uniform(0.0, 3.0, n), rng.uniform(0.0, 0.1, n), rng.uniform(0.1, 0.3, n)])
     start = rng.uniform(-0.2, 0.2, 3)
     chords, room = rng.uniform(-0.3, 0.3, (3, 2, 3)), rng.random((3, n), np.float32)
-    normals, levels = supporting(lines, start, chords, room, 0.2, n, give, FARTHEST)
+    normals, levels = supporting(told_from(lines, start), chords, room, np.full(3, np.inf), 0.2, n, give, FARTHEST)
     ends = near - start[:, None], near - start[:, None] + lines[6] * along
     for group in range(3):
         used = levels[group] < FARTHEST
@@ -81,13 +82,15 @@ def test_where_half_spaces_do_not_suffice_nothing_is_free():
     lines = np.zeros((9, 2))
     lines[0], lines[3], lines[6] = [-1.0, 1.0], [-1.0, 1.0], 1.0  # one on either side
     chords, room = np.zeros((1, 2, 3)), np.ones((1, 2), np.float32)
-    assert np.isfinite(supporting(lines, np.zeros(3), chords, room, 0.0, 2, 0.0, FARTHEST)[1]).all()
-    assert np.isneginf(supporting(lines, np.zeros(3), chords, room, 0.0, 1, 0.0, FARTHEST)[1]).all()
+    told, everywhere = told_from(lines, np.zeros(3)), np.full(1, np.inf)
+    assert np.isfinite(supporting(told, chords, room, everywhere, 0.0, 2, 0.0, FARTHEST)[1]).all()
+    assert np.isneginf(supporting(told, chords, room, everywhere, 0.0, 1, 0.0, FARTHEST)[1]).all()
+    assert supporting(told, chords, room, np.full(1, 0.9), 0.0, 1, 0.0, FARTHEST)[1].size == 0
 
 
 @pytest.mark.parametrize("period", [0, 2])
 def test_a_way_that_is_no_number_frees_nothing_from_there_on(period):
-    near = shadows(scattered(0), Room(np.full(3, -2.0), np.full(3, 2.0), 1.0), 0.0)
+    near = shadows(scattered(0), room(2.0, 1.0), 0.0)
     nominal = np.tile(np.arange(1.0, 5.0)[:, None] * 0.7, 3)
     sound = half_spaces(near, np.zeros(3), 0.1 * nominal, 0.0, np.zeros(3), 0.2)[1]
     assert np.isfinite(sound).all()

@@ -31,7 +31,7 @@ BODY, NOTHING = 0.2, np.zeros(3)
 
 
 def room(size=2.0, last=2.4):
-    return Room(np.full(3, -size), np.full(3, size), last)
+    return Room(np.array([-size, size])[:, None, None].repeat(3, axis=2), last)
 
 
 def clear(**more):
@@ -69,6 +69,34 @@ def test_every_point_within_reach_is_beyond_some_half_space(seed, dropped):
         beyond = near @ normals[kept, k].T >= offsets[kept, k] - 1e-6
         outside = beyond[:, : -len(FACES)].any(axis=1) | (np.abs(near) >= 2.0).any(axis=1)
         assert outside.all()
+
+
+@settings(max_examples=12)
+@given(st.integers(0, 100_000))
+def test_of_every_period_all_that_may_be_touched_in_its_boxes_is_beyond_some_half_space(seed):
+    """Boxes as plans' ends fill them, which grow with time: what is out of reach of a period's own is left out."""
+    rng = np.random.default_rng(seed)
+    obstacles = hall(rng)
+    image, points = taken(rng, obstacles, 0.02), solid(obstacles, rng)
+    nominal = np.cumsum(rng.uniform(-0.3, 0.3, (6, 3)), axis=0)
+    size = np.linspace(0.05, 1.0, 7)[:, None]
+    ways = np.vstack([NOTHING, nominal]) + rng.uniform(-0.5, 0.5, (7, 3)) * size
+    boxes = np.stack([ways - size, ways + size])
+    normals, offsets = half_spaces(shadows(image, Room(boxes, 2.4), BODY), NOTHING, nominal, BODY, NOTHING, 0.2)
+    if np.isneginf(offsets).all():
+        return
+    for k in range(6):
+        at = rng.uniform(boxes[0, k : k + 2].min(axis=0), boxes[1, k : k + 2].max(axis=0), (300, 3))
+        free = (at @ normals[:, k].T <= offsets[:, k]).all(axis=1)
+        assert np.linalg.norm(at[free][:, None] - points, axis=2).min(initial=np.inf) >= BODY - 1e-6
+
+
+@pytest.mark.parametrize("end", [0, 2])
+def test_a_box_that_is_no_number_leaves_nothing_free(end):
+    boxes = room().boxes.repeat(3, axis=1)
+    boxes[1, end, 1] = np.nan
+    seen = replace(shadows(clear(), room(), BODY), room=Room(boxes, 2.4))
+    assert np.isneginf(half_spaces(seen, NOTHING, np.zeros((2, 3)), BODY, NOTHING, 0.2)[1]).all()
 
 
 def test_from_a_whole_sensor_the_start_is_rarely_said_to_be_occupied():
@@ -118,7 +146,7 @@ def test_a_sensor_on_a_mast_swings_aside_when_its_attitude_is_wrong():
     known = {"far": FAR, "range_error": 0.0, "angle_error": error, "least_width": 50.0}
     image = RangeImage(ranges, (0.0, 0.0, 0.0), low=-edge, high=edge, mount=mount, **known)
     nominal = np.linspace(0.0, 1.0, 9)[1:, None] * np.asarray(mount)
-    seen = shadows(image, Room(np.full(3, -4.0), np.full(3, 4.0), 1.0), 0.0)
+    seen = shadows(image, room(4.0, 1.0), 0.0)
     normals, offsets = half_spaces(seen, NOTHING, nominal, 0.0, NOTHING, 0.2)
     assert np.isfinite(offsets).all()
     across = np.linspace(-0.3, 0.3, 31)
@@ -131,7 +159,7 @@ def test_a_sensor_on_a_mast_swings_aside_when_its_attitude_is_wrong():
 def test_no_direction_is_farther_from_its_patch_than_half_a_meshes_diagonal(low):
     image = RangeImage(np.ones((RINGS, COLUMNS)), (0.0, 0.0, 0.0), low=low, high=-low)
     elevations, _ = seen_free(image)
-    middles = _patches(tuple(elevations), COLUMNS)[1].T
+    middles = _patches(elevations.tobytes(), COLUMNS)[1].T
     ways = np.random.default_rng(0).normal(size=(3000, 3))
     ways /= np.linalg.norm(ways, axis=1, keepdims=True)
     nearest = np.arccos(np.clip((ways @ middles.T).max(axis=1), -1.0, 1.0))

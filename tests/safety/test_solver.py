@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from messaging.shapes import Obstacle, Shapes
+from safety import solver
 from safety.freespace import half_spaces
 from safety.model_set import ModelSet
 from safety.program import Builder, Layout
@@ -50,6 +51,35 @@ def by_daqp(program):
 
 def value(program, x):
     return 0.5 * x @ (program.h * x) + program.g @ x
+
+
+def crowded(rng, rows=160, n=6):
+    """A projection onto a body that many faces bound, some of them nearly the same; at times there is no such body."""
+    A = rng.normal(size=(rows, n))
+    A[: rows // 2] = A[0] + 0.05 * A[: rows // 2]
+    A = np.vstack([A / np.linalg.norm(A, axis=1, keepdims=True), np.eye(n), -np.eye(n)])
+    b = A @ rng.uniform(-0.8, 0.8, n) + rng.uniform(-rng.uniform(0.0, 0.4), 0.8, len(A))
+    b[-2 * n :] = 1.0
+    return Program(np.array([1.0] * 3 + [1e-4] * 3), np.array([*rng.uniform(-2.0, 2.0, 3), 0, 0, 0]), A, b, 2 * n)
+
+
+def test_of_many_rows_those_that_decide_give_the_answer_to_all(monkeypatch):
+    programs = [crowded(np.random.default_rng(seed)) for seed in range(200)]
+    parts = []
+    monkeypatch.setattr(
+        solver, "_solved", lambda part, *to, of=solver._solved: parts.append(len(part.b)) or of(part, *to)
+    )
+    impossible = 0
+    for program in programs:
+        ours, (theirs, flag) = solve(program), by_daqp(program)
+        assert (ours.status == "solved") == (flag >= 1)
+        impossible += flag < 1
+        if flag >= 1:
+            assert ours.residual <= ACCURACY and (program.A @ ours.x - program.b).max() <= ACCURACY
+            assert np.abs(ours.x - theirs)[:3].max() < 1e-3
+            assert value(program, ours.x) == pytest.approx(value(program, theirs), abs=1e-4)
+        assert (solve(program).x == ours.x).all(), "always the same"
+    assert 20 < impossible < 180 and np.median(parts) < 30, "by few of 172"
 
 
 @pytest.mark.parametrize("kind", ["residual", "set-membership", "matrix-zonotope"])
