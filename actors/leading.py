@@ -1,8 +1,9 @@
 """Velocities flown as places ahead, for who flies on for seconds when setpoints stop; at a place it stays.
 
-ArduPilot's position controller asks for a velocity by how far its target is: in proportion to it near by, by its square
-root beyond, so that it never has to brake harder than an acceleration. Told with every setpoint a target just as far
-ahead as asks for the velocity that is wanted, it flies that velocity; told nothing more, it stops there.
+A position controller asks for a velocity by how far its target is: PX4's in proportion to it; ArduPilot's in proportion
+near by, by the square root beyond, so that it never has to brake harder than an acceleration. Told with every setpoint
+a target just as far ahead as asks for the velocity that is wanted, it flies that velocity; told nothing more, it stops
+there.
 """
 
 from __future__ import annotations
@@ -15,13 +16,16 @@ import numpy as np
 from actors.telemetry import Array
 
 AGE = 0.05  # s, about: from where it says that it is to when it hears the target made of it
-PARAMETERS = ("PSC_POSXY_P", "PSC_POSZ_P", "WPNAV_ACCEL", "WPNAV_ACCEL_Z")  # 1/s, 1/s, cm/s², cm/s²
+PARAMETERS = {  # 1/s, 1/s; and of ArduPilot cm/s², cm/s²
+    "ardupilot": ("PSC_POSXY_P", "PSC_POSZ_P", "WPNAV_ACCEL", "WPNAV_ACCEL_Z"),
+    "px4": ("MPC_XY_P", "MPC_Z_P"),
+}
 MASK = 0x0DC0  # position and velocity count: acceleration, yaw and yaw rate are to be ignored
 
 
 @dataclass(frozen=True)
 class Lead:
-    """gain [1/s] and acceleration [m/s²] of a controller along some axes."""
+    """gain [1/s] and acceleration [m/s²] (inf: it does not look at how hard it will have to brake) along some axes."""
 
     gain: float
     acceleration: float
@@ -40,12 +44,13 @@ class Leading:
     upright: Lead
 
     @staticmethod
-    def of(values: dict[str, float]) -> Leading:
+    def of(kind: str, values: dict[str, float]) -> Leading:
         """By its `PARAMETERS`, as it tells them. Raises ValueError: one is no such number."""
-        if not all(math.isfinite(values[name]) and values[name] > 0.0 for name in PARAMETERS):
-            raise ValueError(", ".join(f"{name} is {values[name]:g}" for name in PARAMETERS))
-        across, upright, level, vertical = (values[name] for name in PARAMETERS)
-        return Leading(Lead(across, 0.01 * level), Lead(upright, 0.01 * vertical))
+        told = [values[name] for name in PARAMETERS[kind]]
+        if not all(math.isfinite(value) and value > 0.0 for value in told):
+            raise ValueError(", ".join(f"{name} is {values[name]:g}" for name in PARAMETERS[kind]))
+        level, vertical = (0.01 * value for value in told[2:]) if kind == "ardupilot" else (math.inf, math.inf)
+        return Leading(Lead(told[0], level), Lead(told[1], vertical))
 
     def target(self, position: Array, velocity: Array, wanted: Array) -> Array:
         """The place (3,) [m] to be told, for who is there, flies so [m/s], and is to fly `wanted` [m/s]."""

@@ -141,17 +141,16 @@ class Client(Heard):
         )  # fmt: skip
 
     def lead(self, wait: Wait) -> None:
-        """From now on tell it places. Raises MavlinkError: no ArduPilot, or it does not say what it makes of them."""
-        if self.identify(wait) != "ardupilot":
-            raise MavlinkError("only an ArduPilot can be led to places; without --lead it is told velocities")
-        told = {name: self.parameter(name, wait) for name in PARAMETERS}
+        """From now on tell it places. Raises MavlinkError: it does not say what it makes of them."""
+        kind = self.identify(wait)
+        told = {name: self.parameter(name, wait) for name in PARAMETERS[kind]}
         values = {name: value for name, value in told.items() if value is not None}
         if missing := told.keys() - values.keys():
             raise MavlinkError(
                 f"it has no {', '.join(sorted(missing))}: it can only be told velocities, without --lead"
             )
         try:
-            self.leading = Leading.of(values)
+            self.leading = Leading.of(kind, values)
         except ValueError as error:
             raise MavlinkError(f"it cannot be led to places: {error}") from error
 

@@ -61,11 +61,15 @@ HEARD = {
 ALERT = {"COM_OF_LOSS_T": 0.2, "COM_OBL_RC_ACT": 5, "MPC_ACC_HOR": 8.0, "MPC_JERK_AUTO": 40.0}
 OUTDOORS, HEARING = "ardupilot", "px4"
 LED, INDOORS = "ardupilot, led to places", "px4 with motion capture"
+INDOORS_LED = "px4 with motion capture, led to places"
 SETUPS = {
     OUTDOORS: Setup("ardupilot", CALM),
     HEARING: Setup("px4", HEARD),
     LED: Setup("ardupilot", STIFF, ("--lead",)),
     INDOORS: Setup("px4", {**HEARD, **mocap.PARAMETERS, **ALERT}, cameras=True),
+    INDOORS_LED: Setup(
+        "px4", {**HEARD, **mocap.PARAMETERS, **ALERT, "MPC_XY_P": 2.0, "MPC_Z_P": 1.5}, ("--lead",), cameras=True
+    ),
 }
 
 

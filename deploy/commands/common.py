@@ -110,8 +110,8 @@ class Flight:
     raise_limits: bool = False
     """Set those of its parameters that hold it below what the filter may ask for: speeds, accelerations, tilt."""
     lead: bool = False
-    """Tell it places to go to in place of velocities (ArduPilot): when setpoints stop it stays at the last one, where
-    an ArduCopter without GUID_TIMEOUT flies on for 3 s. It flies otherwise then: `collect` and `fly` both with it."""
+    """Tell it places to go to in place of velocities: when setpoints stop it stays at the last one, where an ArduCopter
+    without GUID_TIMEOUT flies on for 3 s. It flies otherwise then: `collect` and `fly` both with it."""
 
     def settings(self, url: str, arena: Arena) -> FlightSettings:
         """For the flight in an arena."""

@@ -1,4 +1,4 @@
-"""Places in place of velocities: what ArduPilot's position controller makes of them is the velocity that was wanted."""
+"""Places in place of velocities: what a position controller makes of them is the velocity that was wanted."""
 
 import math
 
@@ -12,7 +12,10 @@ from actors.leading import AGE, PARAMETERS, Lead, Leading
 from actors.mavlink import Client, MavlinkError
 from actors.telemetry import MOTION
 
-VALUES = dict(zip(PARAMETERS, (2.0, 1.0, 500.0, 300.0), strict=True))
+VALUES = {
+    "ardupilot": dict(zip(PARAMETERS["ardupilot"], (2.0, 1.0, 500.0, 300.0), strict=True)),
+    "px4": {"MPC_XY_P": 2.0, "MPC_Z_P": 1.0},
+}
 
 
 def asked_for(error: float, gain: float, acceleration: float) -> float:
@@ -28,22 +31,25 @@ def test_a_place_so_far_ahead_asks_for_that_speed(speed: float, gain: float, acc
     assert asked_for(Lead(gain, acceleration).distance(speed), gain, acceleration) == pytest.approx(speed, abs=1e-9)
 
 
-@given(st.tuples(*[st.floats(-5.0, 5.0)] * 3))
-def test_the_place_lies_where_the_velocity_points(wanted: tuple[float, float, float]) -> None:
-    leading, at, flies = Leading.of(VALUES), np.array([3.0, -2.0, 7.0]), np.array([1.0, 2.0, -0.5])
+@pytest.mark.parametrize(("kind", "brakes"), [("ardupilot", (5.0, 3.0)), ("px4", (math.inf, math.inf))])
+@given(wanted=st.tuples(*[st.floats(-5.0, 5.0)] * 3))
+def test_the_place_lies_where_the_velocity_points(
+    kind: str, brakes: tuple[float, float], wanted: tuple[float, float, float]
+) -> None:
+    leading, at, flies = Leading.of(kind, VALUES[kind]), np.array([3.0, -2.0, 7.0]), np.array([1.0, 2.0, -0.5])
     ahead = leading.target(at, flies, np.array(wanted)) - at - AGE * flies
     level = math.hypot(*wanted[:2])
-    asked = asked_for(math.hypot(*ahead[:2]), 2.0, 5.0)
+    asked = asked_for(math.hypot(*ahead[:2]), 2.0, brakes[0])
     assert asked == pytest.approx(level, abs=1e-6)
     assert ahead[:2] * level == pytest.approx(np.array(wanted[:2]) * math.hypot(*ahead[:2]), abs=1e-6)
-    assert asked_for(ahead[2], 1.0, 3.0) == pytest.approx(wanted[2], abs=1e-6)
+    assert asked_for(ahead[2], 1.0, brakes[1]) == pytest.approx(wanted[2], abs=1e-6)
 
 
-@pytest.mark.parametrize("name", PARAMETERS)
+@pytest.mark.parametrize(("kind", "name"), [(kind, name) for kind, names in PARAMETERS.items() for name in names])
 @pytest.mark.parametrize("value", [0.0, -1.0, math.nan, math.inf])
-def test_a_parameter_that_makes_no_sense_is_named(name: str, value: float) -> None:
+def test_a_parameter_that_makes_no_sense_is_named(kind: str, name: str, value: float) -> None:
     with pytest.raises(ValueError, match=f"{name} is {value:g}"):
-        Leading.of(VALUES | {name: value})
+        Leading.of(kind, VALUES[kind] | {name: value})
 
 
 class Vehicle:
@@ -62,7 +68,7 @@ class Vehicle:
 def test_who_does_not_know_where_it_is_is_told_velocities_and_then_places() -> None:
     vehicle = Vehicle()
     client = Client(vehicle)
-    client.leading = Leading.of(VALUES)
+    client.leading = Leading.of("ardupilot", VALUES["ardupilot"])
     client.setpoint(np.array([1.0, 0.0, 0.0]))
     client.heard[MOTION] += 1
     client.position, client.velocity = np.array([10.0, 20.0, 30.0]), np.zeros(3)
@@ -75,13 +81,11 @@ def test_who_does_not_know_where_it_is_is_told_velocities_and_then_places() -> N
     assert place.type_mask & ignored["yaw"] and place.type_mask & ignored["yaw_rate"]
 
 
-def test_only_an_ardupilot_that_tells_its_controller_is_led() -> None:
+@pytest.mark.parametrize("kind", PARAMETERS)
+def test_only_who_tells_its_controller_is_led(kind: str) -> None:
     client = Client(lambda data: None)
     wait = lambda condition, seconds: condition()  # noqa: E731
-    client.kind = "px4"
-    with pytest.raises(MavlinkError, match="only an ArduPilot can be led"):
-        client.lead(wait)
-    client.kind = "ardupilot"
-    with pytest.raises(MavlinkError, match="it has no PSC_POSXY_P, PSC_POSZ_P, WPNAV_ACCEL, WPNAV_ACCEL_Z"):
+    client.kind = kind
+    with pytest.raises(MavlinkError, match=f"it has no {', '.join(PARAMETERS[kind])}: it can only be told velocities"):
         client.lead(wait)
     assert client.leading is None
