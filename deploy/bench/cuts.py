@@ -22,10 +22,11 @@ from pathlib import Path
 from random import Random
 from typing import TypeVar
 
+import numpy as np
 import psutil
 
 from actors.mavlink import Client, MavlinkError
-from actors.telemetry import MOTION, TRUTH
+from actors.telemetry import MOTION, TRUTH, Array
 from actors.witness import Witness
 from deploy.bench import sitl
 from deploy.bench.flights import SETUPS, switched_on
@@ -79,10 +80,17 @@ class Outcomes:
     nearest: float = float("inf")  # m
     stuck: int = 0  # times that it did not come out of what it had been run into
     crashed: int = 0  # times that the autopilot took itself for crashed, on the floor as a rule
+    way: float = 0.0  # m, the longest while a link was cut
+    speed: float = 0.0  # m/s at which that one began
+
+    def take_way(self, way: float, speed: float) -> None:
+        if way > self.way:
+            self.way, self.speed = way, speed
 
     def row(self) -> dict[str, float | str]:
         row: dict[str, float | str] = {"faults": self.count, "collisions": self.collisions}
-        return row | {"stuck": self.stuck, "crashed": self.crashed, "nearest m": round(self.nearest, 2)}
+        row |= {"stuck": self.stuck, "crashed": self.crashed, "nearest m": round(self.nearest, 2)}
+        return row | ({"way most m": round(self.way, 1), "from m/s": round(self.speed, 1)} if self.way else {})
 
 
 class Record:
@@ -124,7 +132,10 @@ def _flight(record: Record, start: Path, home: Path, folder: Path, random: Rando
             judge.take(record.calm)
             name = record.next()
             if name == "link":
+                at, speed = judge.motion()
                 relay.cut(random.uniform(*CUT))
+                _until(lambda: not relay.dead, fly)
+                record.of[name].take_way(float(np.linalg.norm(judge.motion()[0] - at)), speed)
             else:
                 _until(partial(child_of, home, name), fly).kill()
             _until(steps.told_anew(), fly)  # what was said last may be some seconds old
@@ -274,6 +285,11 @@ class Judge:
             self._seen = witness.collisions  # it touches what it stands on
         else:
             self._nearest = min(self._nearest, witness.clearance)
+
+    def motion(self) -> tuple[Array, float]:
+        """Where it says that it is (3,) [m], and how fast [m/s]."""
+        assert self.client.position is not None
+        return self.client.position.copy(), float(np.linalg.norm(self.client.velocity))
 
     def take(self, outcomes: Outcomes) -> None:
         """What happened since the last time goes there."""

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from deploy.bench.cuts import Relay, Steps
+from deploy.bench.cuts import Outcomes, Relay, Steps
 from deploy.bench.flights import Failed, flown
 from messaging.links import Tcp, Udp, open_link
 from messaging.ports import free_udp_port
@@ -50,6 +50,14 @@ def test_steps_are_read_from_what_a_flight_prints() -> None:
     steps = Steps(iter(["driving\n", "steps 55  episodes 1  goals 1\n", "it says: steps 3\n"]))
     until(lambda: steps.taken == 55)
     assert steps.beyond(54) and not steps.beyond(55)
+
+
+def test_of_cut_links_the_longest_way_is_told() -> None:
+    outcomes = Outcomes(count=3, nearest=0.5)
+    assert "way most m" not in outcomes.row(), "what was killed has none"
+    for way, speed in ((2.0, 4.0), (3.04, 3.0), (0.1, 0.0)):
+        outcomes.take_way(way, speed)
+    assert outcomes.row() | {"way most m": 3.0, "from m/s": 3.0} == outcomes.row()
 
 
 def test_a_flight_that_did_not_take_off_is_a_row() -> None:
