@@ -26,8 +26,8 @@ EXACT = 1e-7
 
 @dataclass(frozen=True)
 class Program:
-    """`min ½ xᵀ diag(h) x + gᵀ x  s.t.  A x <= b`: h, g (n,), A (rows, n), b (rows,), the last `always` of them such
-    as decide in every program."""
+    """`min ½ xᵀ diag(h) x + gᵀ x  s.t.  A x <= b`: h, g (n,), A (rows, n), b (rows,). The last `always` of them
+    (bounds and the like) are looked at from the beginning, whichever others decide."""
 
     h: Array
     g: Array
