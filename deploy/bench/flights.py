@@ -60,6 +60,8 @@ HEARD = {
 # Who flies as fast as that must be quick to hold its place when setpoints stop.
 ALERT = {"COM_OF_LOSS_T": 0.2, "COM_OBL_RC_ACT": 5, "MPC_ACC_HOR": 8.0, "MPC_JERK_AUTO": 40.0}
 OUTDOORS, HEARING = "ardupilot", "px4"
+# Who is led is at rest at the last place before it does anything else.
+PATIENT = {**ALERT, "COM_OF_LOSS_T": 5.0, "MPC_XY_P": 2.0, "MPC_Z_P": 1.5}
 LED, INDOORS = "ardupilot, led to places", "px4 with motion capture"
 INDOORS_LED = "px4 with motion capture, led to places"
 SETUPS = {
@@ -67,9 +69,7 @@ SETUPS = {
     HEARING: Setup("px4", HEARD),
     LED: Setup("ardupilot", STIFF, ("--lead",)),
     INDOORS: Setup("px4", {**HEARD, **mocap.PARAMETERS, **ALERT}, cameras=True),
-    INDOORS_LED: Setup(
-        "px4", {**HEARD, **mocap.PARAMETERS, **ALERT, "MPC_XY_P": 2.0, "MPC_Z_P": 1.5}, ("--lead",), cameras=True
-    ),
+    INDOORS_LED: Setup("px4", {**HEARD, **mocap.PARAMETERS, **PATIENT}, ("--lead",), cameras=True),
 }
 
 
