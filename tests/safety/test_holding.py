@@ -73,17 +73,20 @@ def test_rows_that_are_left_out_do_not_matter(seed: int) -> None:
     rows, known, free, L, q = 12, 3, 3, 5, 3
     gradient, spread = rng.normal(size=(rows, known + free)), np.abs(rng.normal(size=(rows, L)))
     spread *= rng.random(spread.shape) < 0.5
-    bound, z_0, constant = rng.uniform(-2.0, 12.0, rows), rng.normal(size=known), np.abs(rng.normal(size=L))
+    z_0, constant = rng.normal(size=known), np.abs(rng.normal(size=L))
     M, center, radius = np.abs(rng.normal(size=(L, q))), rng.normal(size=free), rng.uniform(0.0, 1.0, free)
     W, offset, scale = rng.normal(size=(q, free)), rng.normal(size=q), rng.uniform(0.5, 2.0, free + q)
-    atom, give = W @ center + offset, np.abs(W) @ radius
-    within = np.stack([np.maximum(np.abs(atom) - give, 0.0), np.abs(atom) + give])
-    count, A, b = that_matter(gradient, spread, bound, z_0, constant, M, center, radius, within, scale, 1e-6)
     f = center + radius * rng.uniform(-1.0, 1.0, (400, free))
     f[:8] = center + radius * np.array(np.meshgrid(*[[-1.0, 1.0]] * free)).reshape(free, -1).T
     t = np.abs(f @ W.T + offset)
     z = np.hstack([np.tile(z_0, (len(f), 1)), f])
-    left = bound - 1e-6 - z @ gradient.T - (constant + t @ M.T) @ spread.T  # (plans, rows)
+    reached = z @ gradient.T + (constant + t @ M.T) @ spread.T  # (plans, rows)
+    bound = rng.uniform(reached.min(axis=0) - 0.1, reached.max(axis=0) + 1.0)
+    bound[::2] = reached.max(axis=0)[::2] - rng.uniform(0.0, 0.2, rows // 2)  # a corner or so is just beyond
+    atom, give = W @ center + offset, np.abs(W) @ radius
+    within = np.stack([np.maximum(np.abs(atom) - give, 0.0), np.abs(atom) + give])
+    count, A, b = that_matter(gradient, spread, bound, z_0, constant, M, center, radius, within, scale, 1e-6)
+    left = bound - 1e-6 - reached
     if count < 0:
         assert (left.min(axis=1) < 1e-9).all(), "it can't be met, and no plan meets it"
         return
