@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from messaging.scans import BadScan
+from messaging.shapes import FARTHEST
 
 Array = NDArray[np.float64]
 
@@ -61,13 +62,13 @@ class RangeImage:
             raise BadScan("a range image's ranges are 0 or more, and finite")
         if (len(self.at), len(self.attitude), len(self.mount)) != (3, 4, 3):
             raise BadScan("a range image's place and mount have 3 coordinates, its attitude 4")
-        if not all(math.isfinite(value) for value in (*self.at, *self.attitude, *self.mount)):
-            raise BadScan("a range image's place, attitude and mount must be finite")
+        if not all(abs(value) <= FARTHEST for value in (*self.at, *self.attitude, *self.mount)):  # NaN fails too
+            raise BadScan(f"a range image's place, attitude and mount must be finite, and within {FARTHEST:g}")
         if abs(math.hypot(*self.attitude) - 1.0) > 1e-3:
             raise BadScan("a range image's attitude is a unit quaternion")
         bounds = (self.far, self.range_error, self.position_error, self.angle_error, self.speed, self.age)
-        if not all(math.isfinite(value) and value >= 0.0 for value in bounds):
-            raise BadScan("a range image's errors, speed and age must be finite and not negative")
+        if not all(0.0 <= value <= FARTHEST for value in bounds):
+            raise BadScan(f"a range image's errors, speed and age are finite, not negative, and {FARTHEST:g} at most")
         if self.angle_error > MOST_TURNED:
             raise BadScan(f"a range image's angle error is {MOST_TURNED:g} rad at most")
         if not (math.isfinite(self.least_width) and self.least_width > 0.0):

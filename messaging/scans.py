@@ -12,6 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from messaging.shapes import FARTHEST
+
 Array = NDArray[np.float64]
 
 MOST_BEAMS = 1000
@@ -89,10 +91,10 @@ class Scan:
         values = (*self.pose, *self.mount)
         bounds = [self.far, self.range_error, self.position_error, self.heading_error, self.speed, self.age, self.doubt]
         bounds += [self.acceleration, self.least_radius]
-        if not all(math.isfinite(value) for value in values):
-            raise BadScan("a scan's pose and mount must be finite")
-        if not all(math.isfinite(value) and value >= 0.0 for value in bounds):
-            raise BadScan("a scan's errors, speed and age must be finite and not negative")
+        if not all(abs(value) <= FARTHEST for value in values):  # NaN fails too
+            raise BadScan(f"a scan's pose and mount must be finite, and within {FARTHEST:g}")
+        if not all(0.0 <= value <= FARTHEST for value in bounds):
+            raise BadScan(f"a scan's errors, speed and age must be finite, not negative, and {FARTHEST:g} at most")
         if not (math.isfinite(self.least_width) and self.least_width > 0.0):
             raise BadScan("a scan's least width must be positive")
         if self.followed is not None and (wrong := self.followed.wrong(n)):

@@ -20,8 +20,14 @@ Single = NDArray[np.float32]
 
 Normal: TypeAlias = tuple[np.float32, np.float32, np.float32]
 
-ROUNDING = 1e-4  # m: more than directions in single precision lead aside within sight
+ROUNDING, WITHIN = 1e-4, 100.0  # m: by how much single precision may be off, of whatever is so near
 ALTERNATIONS = 3  # between two segments, until their nearest points are known well enough
+
+
+@compiled("f8(f8)")
+def rounding(extent: float) -> float:
+    """How far [m] places may be off that are computed in single precision, from coordinates up to so many metres."""
+    return ROUNDING * max(1.0, extent / WITHIN)
 
 
 @compiled("f4[::1](f4[:,::1], i8[::1], i8)")
@@ -61,10 +67,10 @@ def _between_faces(ways: Single, axis: Single, low: np.float32, high: np.float32
 def _that_meet(
     ways: Single, turn: Array, at: Array, last: float, low: Array, high: Array, near: Single
 ) -> NDArray[np.int64]:
-    """Which rays come into a box, or are as near to it as `ROUNDING`, between `near` (n,) and last."""
-    begins, ends = near.copy(), np.full(len(near), last, np.float32)
+    """Which rays come into a box, or as near to it as rounding leads them aside, between `near` (n,) and last."""
+    begins, ends, aside = near.copy(), np.full(len(near), last, np.float32), rounding(last)
     for axis in range(3):
-        lower, upper = np.float32(low[axis] - at[axis] - ROUNDING), np.float32(high[axis] - at[axis] + ROUNDING)
+        lower, upper = np.float32(low[axis] - at[axis] - aside), np.float32(high[axis] - at[axis] + aside)
         _between_faces(ways, turn[axis].astype(np.float32), lower, upper, begins, ends)
     found, count = np.empty(len(near), np.int64), 0
     for k in range(len(near)):
@@ -115,21 +121,21 @@ def behind(
 
 @compiled("f4[:,::1](f8[:,::1], f8[::1])")
 def told_from(lines: Array, start: Array) -> Single:
-    """The same lines as seen from the start (9, n), and three rows more of what `_room` needs of each: how much it
-    widens a metre, and the products of its near end with its direction and itself."""
+    """The same lines as seen from the start (9, n), and two rows more: how much each widens a metre, and how far [m]
+    from the start it is at the most, which is no number where one of them is none."""
     n = lines.shape[1]
-    told = np.empty((12, n), np.float32)
+    told = np.empty((11, n), np.float32)
     for i in range(9):
         line, out, off = lines[i], told[i], start[i] if i < 3 else 0.0
         for s in range(n):
             out[s] = line[s] - off
     x, y, z, u, v, w = told[0], told[1], told[2], told[3], told[4], told[5]
-    length, near, far, widening, outward, square = told[6], told[7], told[8], told[9], told[10], told[11]
+    length, near, far, widening, extent = told[6], told[7], told[8], told[9], told[10]
     least = np.float32(TOUCHING)
     for s in range(n):
         widening[s] = (far[s] - near[s]) / (length[s] if length[s] > least else least)
-        outward[s] = x[s] * u[s] + y[s] * v[s] + z[s] * w[s]
-        square[s] = x[s] * x[s] + y[s] * y[s] + z[s] * z[s]
+        extent[s] = abs(x[s]) + abs(y[s]) + abs(z[s]) + near[s] + far[s]
+        extent[s] += length[s] * (abs(u[s]) + abs(v[s]) + abs(w[s]))
     return told
 
 
@@ -138,17 +144,15 @@ def _room(place: Single, told: Single, found: Single) -> None:
     """How near each shadow, as `told_from` has them, is to a place, where that is nearer than was found before."""
     a, b, c, zero = place[0], place[1], place[2], np.float32(0.0)
     x, y, z, u, v, w = told[0], told[1], told[2], told[3], told[4], told[5]
-    length, about, widening, outward, square = told[6], told[7], told[9], told[10], told[11]
-    own = a * a + b * b + c * c
+    length, about, widening = told[6], told[7], told[9]
     for s in range(len(found)):
-        away = a * u[s] + b * v[s] + c * w[s] - outward[s]
-        t = away if away > zero else zero
+        p, q, r = a - x[s], b - y[s], c - z[s]  # first: far away, the squares' difference would be all rounding
+        t = p * u[s] + q * v[s] + r * w[s]
+        t = t if t > zero else zero
         t = t if t < length[s] else length[s]
-        aside = a * x[s] + b * y[s] + c * z[s]
-        gap = square[s] - aside - aside + own + t * (t - away - away)
-        gap = gap if gap > zero else zero
-        room = np.sqrt(gap) - about[s] - t * widening[s]
-        found[s] = room if room < found[s] else found[s]
+        p, q, r = p - t * u[s], q - t * v[s], r - t * w[s]
+        room = np.sqrt(p * p + q * q + r * r) - about[s] - t * widening[s]
+        found[s] = found[s] if room >= found[s] else room
 
 
 @compiled("f4[:,::1](f4[:,::1], f8[:,::1], i8[::1])")
@@ -166,22 +170,23 @@ def rooms(told: Single, ends: Array, first: NDArray[np.int64]) -> Single:
 
 @compiled("f4(f4[::1], f4[::1])")
 def _least(values: Single, spare: Single) -> np.float32:
-    """The least of n >= 1 numbers; the last half with the first, and again. Overwrites spare (n,)."""
+    """The least of n >= 1 numbers, none if one of them is none; the last half with the first, and again. Overwrites
+    spare (n,), which may be what is asked of."""
     n = len(values)
     spare[0] = values[0]
     while n > 1:
         half = (n + 1) // 2
         for k in range(n - half):
             a, b = values[k], values[half + k]
-            spare[k] = b if b < a else a
+            spare[k] = a if a < b or a != a else b
         if 2 * half > n:
             spare[half - 1] = values[half - 1]
         values, n = spare, half
     return np.float32(spare[0])
 
 
-@compiled("Tuple((UniTuple(f8, 3), f8))(f4[:,::1], i8, f8[:,::1])")
-def _support(told: Single, shadow: int, chord: Array) -> tuple[tuple[float, float, float], float]:
+@compiled("Tuple((UniTuple(f8, 3), f8))(f4[:,::1], i8, f8[:,::1], f8)")
+def _support(told: Single, shadow: int, chord: Array, rounded: float) -> tuple[tuple[float, float, float], float]:
     """The unit normal from a chord (2, 3), from the start, towards a shadow, and the level that it lies beyond."""
     near, along = np.empty(3), np.empty(3)
     square = 0.0
@@ -204,7 +209,7 @@ def _support(told: Single, shadow: int, chord: Array) -> tuple[tuple[float, floa
     x, y, z = towards[0] / norm, towards[1] / norm, towards[2] / norm
     at_near = x * near[0] + y * near[1] + z * near[2]
     at_far = at_near + length * (x * along[0] + y * along[1] + z * along[2])
-    return (x, y, z), min(at_near - told[7, shadow], at_far - told[8, shadow]) - ROUNDING
+    return (x, y, z), min(at_near - told[7, shadow], at_far - told[8, shadow]) - rounded
 
 
 @compiled("void(f4[:,::1], i8, UniTuple(f4, 3), f4, f4[::1])")
@@ -220,7 +225,7 @@ def _beyond(told: Single, count: int, normal: Normal, level: np.float32, found: 
         found[s] = near if near < far else far
 
 
-@compiled("i8(f4[:,::1], i8, i8, f4[::1], f4[:,::1], f4[::1], f8, i8[::1])")
+@compiled("i8(f4[:,::1], i8, i8, f4[::1], f4[:,::1], f4[::1], f8, f8, i8[::1])")
 def _left_over(
     told: Single,
     count: int,
@@ -229,11 +234,12 @@ def _left_over(
     kept: Single,
     room: Single,
     reach: float,
+    rounded: float,
     index: NDArray[np.int64],
 ) -> int:
     """Of the first shadows those within reach that are not beyond, but one, and the room to them: moved to the front
     of `kept`."""
-    left, surely = 0, np.float32(ROUNDING)
+    left, surely = 0, np.float32(rounded)
     for s in range(count):
         index[left] = s
         left += 0 if beyond[s] >= surely or room[s] > reach or s == but else 1
@@ -246,7 +252,7 @@ def _left_over(
     return left
 
 
-@compiled("i8(f4[:,::1], f8[:,::1], f4[::1], f8, f8, f8, f8[:,::1], f8[::1], f4[:,::1], f4[::1], i8[::1])")
+@compiled("i8(f4[:,::1], f8[:,::1], f4[::1], f8, f8, f8, f8, f8[:,::1], f8[::1], f4[:,::1], f4[::1], i8[::1])")
 def _until_beyond(
     told: Single,
     chord: Array,
@@ -254,6 +260,7 @@ def _until_beyond(
     reach: float,
     keep_off: float,
     give: float,
+    rounded: float,
     normals: Array,
     levels: Array,
     kept: Single,
@@ -269,12 +276,12 @@ def _until_beyond(
             chosen += 1
         if nearest > reach:
             return k
-        normal, level = _support(rest, chosen, chord)
+        normal, level = _support(rest, chosen, chord, rounded)
         level -= give * 2.0 ** (k // 8) * max(room[chosen] - keep_off, 0.0)
         normals[k, 0], normals[k, 1], normals[k, 2], levels[k] = normal[0], normal[1], normal[2], level
         single = np.float32(normal[0]), np.float32(normal[1]), np.float32(normal[2])
         _beyond(rest, count, single, np.float32(level), beyond)
-        count = _left_over(rest, count, chosen, beyond, kept, room, reach, index)
+        count = _left_over(rest, count, chosen, beyond, kept, room, reach, rounded, index)
         rest = kept
         k += 1
     if count > 0:
@@ -282,7 +289,7 @@ def _until_beyond(
     return k
 
 
-@compiled("Tuple((f8[:,:,::1], f8[:,::1]))(f4[:,::1], f8[:,:,::1], f4[:,::1], f8[::1], f8, i8, f8, f8)")
+@compiled("Tuple((f8[:,:,::1], f8[:,::1]))(f4[:,::1], f8[:,:,::1], f4[:,::1], f8[::1], f8, i8, f8, f8, f8)")
 def supporting(
     told: Single,
     chords: Array,
@@ -292,11 +299,13 @@ def supporting(
     most: int,
     give: float,
     farthest: float,
+    rounded: float,
 ) -> tuple[Array, Array]:
     """Half-spaces until every shadow, as `told_from` has them, that is within reach (G,) is beyond one of them, about
     each of the chords (G, 2, 3), from the start: normals (G, k, 3) and levels (G, k), also from the start, for as many
     as any chord needs; those that one does not need are at `farthest`, and where `most` are not enough the last is at
-    -inf. room (G, n) [m]: from the chords to the shadows, and numbers; give: as `shadows.GIVE`."""
+    -inf. room (G, n) [m]: from the chords to the shadows, and numbers; give: as `shadows.GIVE`; rounded [m]: by
+    how much single precision may be off."""
     normals, levels, needed = np.zeros((len(chords), most, 3)), np.full((len(chords), most), farthest), 0
     n = told.shape[1]
     room, kept, beyond, index = (
@@ -307,7 +316,7 @@ def supporting(
     )
     for group in range(len(chords)):
         a, b, near, within = normals[group], levels[group], room[group], reach[group]
-        count = _until_beyond(told, chords[group], near, within, keep_off, give, a, b, kept, beyond, index)
+        count = _until_beyond(told, chords[group], near, within, keep_off, give, rounded, a, b, kept, beyond, index)
         needed = max(needed, count)
     return normals[:, :needed].copy(), levels[:, :needed].copy()
 
@@ -370,23 +379,39 @@ def about_periods(
     return a, b
 
 
-@compiled("f8[::1](f8[:,::1], i8[::1], f8[:,:,::1], f8[::1], f8)")
-def reaches(ends: Array, first: NDArray[np.int64], boxes: Array, grown: Array, body: float) -> Array:
-    """How far [m] from the ends of the periods of each group (G,) what may touch a body in the boxes is at the most.
+@compiled("f8(f8[::1], f8[:,:,::1], i8)")
+def _farthest_corner(place: Array, boxes: Array, end: int) -> float:
+    """How far [m] from a place any point of an end's box is at the most."""
+    square = 0.0
+    for axis in range(3):
+        square += max(boxes[1, end, axis] - place[axis], place[axis] - boxes[0, end, axis]) ** 2
+    return math.sqrt(square)
 
-    Between two ends it is nowhere farther from the nearer one than at an end, and half the way between them.
+
+@compiled("f8[::1](f8[:,::1], i8[::1], i8, f8[:,:,::1], f8[::1], f8)")
+def reaches(ends: Array, first: NDArray[np.int64], free: int, boxes: Array, grown: Array, body: float) -> Array:
+    """How far [m] from the ends of the periods of each of the first groups (free,) what may touch a body in the boxes
+    is at the most.
+
+    Between two ends it is nowhere farther from the nearer one than at an end, and half the way between them. The last
+    free group is also that of all periods after it (`about_periods`), and what they may touch is as near to its last
+    end as their boxes' corners are.
     """
-    found, periods = np.zeros(len(first)), len(ends) - 1
-    for group in range(len(first)):
+    found, periods = np.zeros(free), len(ends) - 1
+    for group in range(free):
         until = first[group + 1] if group + 1 < len(first) else periods
         most, step = 0.0, 0.0
         for end in range(first[group], until + 1):
-            corner, way = 0.0, 0.0
+            square = 0.0
             for axis in range(3):
-                corner += max(boxes[1, end, axis] - ends[end, axis], ends[end, axis] - boxes[0, end, axis]) ** 2
-                way += (ends[end, axis] - ends[max(end - 1, first[group]), axis]) ** 2
-            most, step = max(most, corner), max(step, way)
-        found[group] = math.sqrt(most) + 0.5 * math.sqrt(step) + body + grown[until - 1] + ROUNDING
+                square += (ends[end, axis] - ends[max(end - 1, first[group]), axis]) ** 2
+            most, step = max(most, _farthest_corner(ends[end], boxes, end)), max(step, square)
+        most, last = most + 0.5 * math.sqrt(step), until
+        if group == free - 1:
+            last = periods
+            for end in range(until, periods + 1):
+                most = max(most, _farthest_corner(ends[until], boxes, end))
+        found[group] = most + body + grown[last - 1]
     return found
 
 
@@ -426,12 +451,16 @@ def about_way(
     grown, first = moved[0] + moved[1] * np.arange(1.0, len(ends)), np.zeros(1, np.int64)
     faces, levels = about_periods(np.zeros((1, 0, 3)), np.zeros((1, 0)), first, within, grown, keep_off, measured)
     nowhere = np.full_like(levels, -np.inf)
-    if not np.isfinite(within).all():  # of two numbers, one of which is none, the larger may be the other
+    if not (np.abs(within) <= farthest).all():  # of two numbers, one of which is none, the larger may be the other
         return faces, nowhere
     if lines.shape[1] == 0:
         return faces, levels
     first = together(ends, shared)
     told = told_from(lines, start)
+    extent = -_least(-told[10], np.empty_like(told[10]))
+    if not extent <= farthest:
+        return faces, nowhere
+    rounded = rounding(extent + np.abs(within).max())
     room = rooms(told, ends, first)
     free = free_groups(ends, first, room, touching)
     if free == 0:
@@ -440,6 +469,6 @@ def about_way(
     for group in range(free):
         until = first[group + 1] if group + 1 < len(first) else len(nominal)
         chords[group, 0], chords[group, 1] = ends[first[group]], ends[until]
-    reach = reaches(ends, first, within, grown, keep_off + measured.sum())
-    normals, levels = supporting(told, chords, room[:free], reach, keep_off, most, give, farthest)
+    reach = reaches(ends, first, free, within, grown, keep_off + measured.sum() + rounded)
+    normals, levels = supporting(told, chords, room[:free], reach, keep_off, most, give, farthest, rounded)
     return about_periods(normals, levels, first, within, grown, keep_off, measured)

@@ -13,13 +13,13 @@ Array = NDArray[np.float64]
 ACCURACY = 1e-6  # of unit rows in scaled variables: about 1e-7 m
 # With the default tolerance feasible problems were called infeasible; see the solver's own `eps_primal_inf`.
 NOT_INFEASIBLE = 1e-12
-SOLVED, IMPOSSIBLE = "solved", "primal_infeasible"
+SOLVED = "solved"
 MOST_ITERATIONS = 100
 MOST_INNER_ITERATIONS = 50
 # Of many rows few decide: those that the unhindered answer violates most are solved alone, then with what that answer
-# violates, and so on. An answer that is within all rows is the answer to all of them, and where few can't be met, all
-# can't. So few are solved exactly, for there are no others to hold the answer off the edge; where that does not come
-# soon, all are solved as usual.
+# violates, and so on. An answer that is within all rows is the answer to all of them. So few are solved exactly, for
+# there are no others to hold the answer off the edge; where that does not come soon, or few are said to be impossible
+# (which the solver is quicker to say of few rows: 13 of 9,727 that could be met), all are solved as usual.
 MANY, FEW, ROUNDS, SOON = 40, 5, 4, 15  # SOON: iterations
 EXACT = 1e-7
 
@@ -72,10 +72,10 @@ def _by_few(program: Program) -> Solution | None:
         part = _solved(replace(program, A=program.A[inside], b=program.b[inside]), EXACT, SOON)
         x, iterations = part.x, iterations + part.iterations
         residual = float((program.A @ x - program.b).max())
-        if part.status == IMPOSSIBLE or (part.status == SOLVED and residual <= 2.0 * EXACT):
-            return Solution(x, part.status, iterations, residual)
         if part.status != SOLVED:
             return None
+        if residual <= 2.0 * EXACT:
+            return Solution(x, part.status, iterations, residual)
     return None
 
 

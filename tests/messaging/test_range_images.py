@@ -205,6 +205,8 @@ def test_two_at_once_and_half_a_beam_are_refused():
         ({"high": 2.0}, "from one elevation up"),
         ({"range_error": -0.1}, "not negative"),
         ({"far": math.inf}, "finite"),
+        ({"position_error": 1e39}, "10000 at most"),  # finite, but not in single precision
+        ({"at": (1e20, 0.0, 0.0)}, "within 10000"),
         ({"least_width": 0.0}, "positive"),
         ({"doubt": 2}, "doubted"),
         ({"angle_error": 1.0}, "angle error"),  # degrees, say: so wide is every shadow that none would be left

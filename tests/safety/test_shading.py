@@ -12,10 +12,10 @@ from hypothesis import strategies as st
 from messaging.patches import half_diagonal, seen_free
 from messaging.range_images import RangeImage
 from messaging.shapes import FARTHEST
-from safety.shading import supporting, told_from
-from safety.shadows import _patches, half_spaces, shadows
+from safety.shading import rooms, rounding, supporting, told_from
+from safety.shadows import Room, Shadows, _patches, half_spaces, shadows
 from tests.messaging.test_range_images import COLUMNS, EDGE, RINGS
-from tests.safety.test_shadows import room
+from tests.safety.test_shadows import NOTHING, room
 
 TURN = (math.cos(0.4), 0.3 * math.sin(0.4), 0.0, math.sqrt(1.0 - 0.09) * math.sin(0.4))  # a quaternion
 
@@ -69,7 +69,9 @@ def test_every_shadow_is_beyond_some_half_space_of_every_chord(seed, n, give):
     lines = np.vstack([near, along, rng.uniform(0.0, 3.0, n), rng.uniform(0.0, 0.1, n), rng.uniform(0.1, 0.3, n)])
     start = rng.uniform(-0.2, 0.2, 3)
     chords, room = rng.uniform(-0.3, 0.3, (3, 2, 3)), rng.random((3, n), np.float32)
-    normals, levels = supporting(told_from(lines, start), chords, room, np.full(3, np.inf), 0.2, n, give, FARTHEST)
+    normals, levels = supporting(
+        told_from(lines, start), chords, room, np.full(3, np.inf), 0.2, n, give, FARTHEST, 1e-4
+    )
     ends = near - start[:, None], near - start[:, None] + lines[6] * along
     for group in range(3):
         used = levels[group] < FARTHEST
@@ -83,9 +85,105 @@ def test_where_half_spaces_do_not_suffice_nothing_is_free():
     lines[0], lines[3], lines[6] = [-1.0, 1.0], [-1.0, 1.0], 1.0  # one on either side
     chords, room = np.zeros((1, 2, 3)), np.ones((1, 2), np.float32)
     told, everywhere = told_from(lines, np.zeros(3)), np.full(1, np.inf)
-    assert np.isfinite(supporting(told, chords, room, everywhere, 0.0, 2, 0.0, FARTHEST)[1]).all()
-    assert np.isneginf(supporting(told, chords, room, everywhere, 0.0, 1, 0.0, FARTHEST)[1]).all()
-    assert supporting(told, chords, room, np.full(1, 0.9), 0.0, 1, 0.0, FARTHEST)[1].size == 0
+    assert np.isfinite(supporting(told, chords, room, everywhere, 0.0, 2, 0.0, FARTHEST, 1e-4)[1]).all()
+    assert np.isneginf(supporting(told, chords, room, everywhere, 0.0, 1, 0.0, FARTHEST, 1e-4)[1]).all()
+    assert supporting(told, chords, room, np.full(1, 0.9), 0.0, 1, 0.0, FARTHEST, 1e-4)[1].size == 0
+
+
+def along_x(step, half):
+    """Ends (N+1, 3) so far apart, and boxes (2, N+1, 3) about them, so wide to either side (N+1,)."""
+    half = np.asarray(half)[:, None] * np.ones(3)
+    ends = np.zeros((len(half), 3))
+    ends[:, 0] = step * np.arange(len(half))
+    return ends, np.stack([ends - half, ends + half])
+
+
+def lines_of(*lines):
+    return np.ascontiguousarray(np.array(lines, dtype=float).T)
+
+
+def left(lines, ends, boxes, point):
+    """What the half-spaces that are not the room's faces leave to a body of 0.2 m at a point, in every period (N,)."""
+    seen = Shadows(lines, Room(boxes, 0.1 * len(ends)), 0.0, 0.0)
+    normals, offsets = half_spaces(seen, NOTHING, ends[1:].copy(), 0.2, NOTHING, 0.1)
+    return (offsets - normals @ point)[:-6].min(axis=0, initial=np.inf)
+
+
+def test_where_the_way_is_blocked_what_later_periods_may_touch_counts_too():
+    """A wall across the way ends it early; beside its beginning, out of reach there, a post that later boxes hold."""
+    ends, boxes = along_x(0.7, [0.6, 0.7, 0.9, 1.6, 2.4, 3.2, 4.0])
+    wall, post = (2.1, -1, 0, 0, 1, 0, 2, 0.02, 0.02), (0.9, 2.5, -1, 0, 0, 1, 2, 0.02, 0.02)
+    at_post = np.array([0.9, 2.5, 0.0])
+    assert left(lines_of(wall, post), ends, boxes, at_post)[3:].max() < -0.2
+
+
+@pytest.mark.parametrize("step", [3.0, 4.0])
+def test_a_fast_way_through_a_shadow_that_begins_out_of_the_first_boxes_reach(step):
+    ends, boxes = along_x(step, [0.6] * 5)
+    lines = lines_of((3.0 * step, 0, 0, 1, 0, 0, 5.0, 0.05, 0.05))
+    assert left(lines, ends, boxes, ends[3])[2:].max() < -0.2
+
+
+def far_off(rng, away, n):
+    """Shadows (9, n) that begin so far from the start [m] and pass it at arm's length, or hardly."""
+    along = rng.normal(size=(3, n))
+    along /= np.linalg.norm(along, axis=0)
+    aside = rng.normal(size=(3, n))
+    aside -= along * (along * aside).sum(axis=0)
+    aside *= rng.uniform(0.35, 2.0, n) / np.linalg.norm(aside, axis=0)
+    return np.vstack([aside - away * along, along, np.full(n, 2.0 * away), np.full((2, n), 0.01)])
+
+
+@pytest.mark.parametrize("away", [3.0, 300.0, 3000.0])
+@settings(max_examples=20)
+@given(seed=st.integers(0, 100_000))
+def test_how_near_a_shadow_is_does_not_depend_on_how_far_off_it_begins(away, seed):
+    rng = np.random.default_rng(seed)
+    lines, place = far_off(rng, away, 40), rng.uniform(-0.2, 0.2, (2, 3))
+    rooms_ = rooms(told_from(lines, NOTHING), place, np.zeros(1, np.int64))[0]
+    exact = np.full(40, np.inf)
+    for at in place:
+        off = at[:, None] - lines[:3]
+        off -= np.clip((off * lines[3:6]).sum(axis=0), 0.0, lines[6]) * lines[3:6]
+        exact = np.minimum(exact, np.linalg.norm(off, axis=0) - 0.01)
+    assert np.abs(rooms_ - exact).max() < rounding(4.0 * away)
+
+
+@pytest.mark.parametrize("row", range(9))
+@pytest.mark.parametrize("value", [np.nan, np.inf, 1e39, 1e20, 2e4])
+def test_shadows_that_single_precision_can_not_tell_leave_nothing_free(row, value):
+    ends, boxes = along_x(0.1, [0.5] * 4)
+    lines = lines_of((3.0, 0, 0, 1, 0, 0, 1, 0.1, 0.1), (-3.0, 0, 0, -1, 0, 0, 1, 0.1, 0.1))
+    lines[row, 1] = value
+    seen = Shadows(lines, Room(boxes, 0.4), 0.0, 0.0)
+    assert np.isneginf(half_spaces(seen, NOTHING, ends[1:].copy(), 0.2, NOTHING, 0.1)[1]).all()
+
+
+@settings(max_examples=60)
+@given(st.integers(0, 1_000_000))
+def test_no_body_in_a_periods_boxes_touches_a_shadow_whatever_the_way(seed):
+    """Ways that are blocked early, late or not, slow or fast, in boxes that grow; bodies that touch, at random."""
+    rng = np.random.default_rng(seed)
+    N, n, m = int(rng.integers(1, 13)), int(rng.integers(1, 60)), 4000
+    ends = np.vstack([NOTHING, np.cumsum(rng.normal(size=(N, 3)) * 0.3 + [rng.choice([0.0, 0.3, 3.0]), 0, 0], axis=0)])
+    half = 0.3 + np.cumsum(rng.uniform(0.0, 0.5, (N + 1, 3)), axis=0)
+    boxes, ways = np.stack([ends - half, ends + half]), rng.normal(size=(n, 3))
+    ways /= np.linalg.norm(ways, axis=1, keepdims=True)
+    last = np.abs(ends).max() + np.linalg.norm(half[-1]) + 2.0
+    near, wide = rng.uniform(0.3, last, n), rng.choice([0.0, 0.05])
+    parts = (near[:, None] * ways).T, ways.T, last - near, 0.02 * near + wide, np.full(n, 0.02 * last + wide)
+    lines = np.ascontiguousarray(np.vstack(parts))
+    moves, keep_off = (rng.choice([0.0, 0.5]), 0.1), 0.2
+    which, share, k = rng.integers(0, n, m), rng.random(m), rng.integers(0, N, m)
+    about = lines[7, which] * (1 - share) + lines[8, which] * share + keep_off + moves[0] * 0.1 * (k + 2)
+    off = rng.normal(size=(m, 3))
+    off *= (about * rng.random(m) ** 0.2 / np.linalg.norm(off, axis=1))[:, None]
+    bodies = lines[:3, which].T + (share * lines[6, which])[:, None] * ways[which] + off
+    in_either = [((bodies >= boxes[0, e]) & (bodies <= boxes[1, e])).all(axis=1) for e in (k, k + 1)]
+    seen = Shadows(lines, Room(boxes, 0.1 * N), *moves)
+    normals, offsets = half_spaces(seen, NOTHING, ends[1:].copy(), keep_off, NOTHING, 0.1)
+    slack = (offsets[:, k] - np.einsum("hmd,md->hm", normals[:, k], bodies)).min(axis=0)
+    assert slack[in_either[0] | in_either[1]].max(initial=-np.inf) <= 1e-6
 
 
 @pytest.mark.parametrize("period", [0, 2])

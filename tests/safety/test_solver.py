@@ -82,6 +82,18 @@ def test_of_many_rows_those_that_decide_give_the_answer_to_all(monkeypatch):
     assert 20 < impossible < 180 and np.median(parts) < 30, "by few of 172"
 
 
+def test_that_few_can_not_be_met_is_not_taken_for_granted(monkeypatch):
+    """The solver is quicker to say so of few rows, exactly, and is wrong at times."""
+    program = next(one for one in map(crowded, map(np.random.default_rng, range(200))) if by_daqp(one)[1] >= 1)
+    rows, whole = len(program.b), solver._solved
+
+    def hasty(part, *to):
+        return whole(part, *to) if len(part.b) == rows else Solution(np.zeros(6), "primal_infeasible", 1, 1.0)
+
+    monkeypatch.setattr(solver, "_solved", hasty)
+    assert solve(program).status == "solved"
+
+
 @pytest.mark.parametrize("kind", ["residual", "set-membership", "matrix-zonotope"])
 def test_another_solver_agrees(models, kind):
     feasible = 0
