@@ -21,6 +21,7 @@ Single = NDArray[np.float32]
 Normal: TypeAlias = tuple[np.float32, np.float32, np.float32]
 
 ROUNDING, WITHIN = 1e-4, 100.0  # m: by how much single precision may be off, of whatever is so near
+FEW = 6  # of so many that are looked at one is left: then they are moved together
 ALTERNATIONS = 3  # between two segments, until their nearest points are known well enough
 
 
@@ -212,37 +213,34 @@ def _support(told: Single, shadow: int, chord: Array, rounded: float) -> tuple[t
     return (x, y, z), min(at_near - told[7, shadow], at_far - told[8, shadow]) - rounded
 
 
-@compiled("void(f4[:,::1], i8, UniTuple(f4, 3), f4, f4[::1])")
-def _beyond(told: Single, count: int, normal: Normal, level: np.float32, found: Single) -> None:
-    """How far [m] each of the first shadows is beyond a half-space."""
+@compiled("void(f4[:,::1], UniTuple(f4, 3), f4, f4, f4[::1])")
+def _without_beyond(told: Single, normal: Normal, level: np.float32, surely: np.float32, room: Single) -> None:
+    """Of the first shadows, as many as there are rooms, those that are so far [m] beyond a half-space are done with:
+    the room to them is infinite."""
     a, b, c = normal
     x, y, z, u, v, w = told[0], told[1], told[2], told[3], told[4], told[5]
-    length, about_near, about_far = told[6], told[7], told[8]
-    for s in range(count):
+    length, about_near, about_far, done = told[6], told[7], told[8], np.float32(np.inf)
+    for s in range(len(room)):
         near = a * x[s] + b * y[s] + c * z[s] - level
         far = near + length[s] * (a * u[s] + b * v[s] + c * w[s]) - about_far[s]
         near -= about_near[s]
-        found[s] = near if near < far else far
+        beyond = near if near < far else far
+        room[s] = done if beyond >= surely else room[s]
 
 
-@compiled("i8(f4[:,::1], i8, i8, f4[::1], f4[:,::1], f4[::1], f8, f8, i8[::1])")
-def _left_over(
-    told: Single,
-    count: int,
-    but: int,
-    beyond: Single,
-    kept: Single,
-    room: Single,
-    reach: float,
-    rounded: float,
-    index: NDArray[np.int64],
-) -> int:
-    """Of the first shadows those within reach that are not beyond, but one, and the room to them: moved to the front
-    of `kept`."""
-    left, surely = 0, np.float32(rounded)
-    for s in range(count):
+@compiled("i8(f4[:,::1], f4[:,::1], f4[::1], i8[::1])")
+def _moved_up(told: Single, kept: Single, room: Single, index: NDArray[np.int64]) -> int:
+    """How many of the first shadows, as many as there are rooms, are left. Where they are few, they and their rooms are
+    moved to the front of `kept` and room; else all stay."""
+    n, left = len(room), 0
+    for s in range(n):
+        left += room[s] != np.inf
+    if FEW * left > n:
+        return n
+    left = 0
+    for s in range(n):
         index[left] = s
-        left += 0 if beyond[s] >= surely or room[s] > reach or s == but else 1
+        left += room[s] != np.inf
     for i in range(9):
         row, out = told[i], kept[i]
         for k in range(left):
@@ -264,29 +262,33 @@ def _until_beyond(
     normals: Array,
     levels: Array,
     kept: Single,
-    beyond: Single,
+    spare: Single,
     index: NDArray[np.int64],
 ) -> int:
     """Half-spaces about one chord, into normals (k, 3) and levels (k,): so many. Overwrites what it is given to work
-    with: room (n,), kept (9, n), beyond (n,), index (n,)."""
-    count, k, most, rest = told.shape[1], 0, len(levels), told
-    while count > 0 and k < most:
-        nearest, chosen = _least(room[:count], beyond), 0
+    with: room (n,), kept (9, n), spare (n,), index (n,)."""
+    within, surely, most, rest = np.float32(reach), np.float32(rounded), len(levels), told
+    for s in range(len(room)):
+        room[s] = np.float32(np.inf) if room[s] > within else room[s]
+    for k in range(most):
+        nearest, chosen = _least(room, spare), 0
+        if nearest == np.inf:
+            return k
         while room[chosen] > nearest:
             chosen += 1
-        if nearest > reach:
-            return k
         normal, level = _support(rest, chosen, chord, rounded)
         level -= give * 2.0 ** (k // 8) * max(room[chosen] - keep_off, 0.0)
         normals[k, 0], normals[k, 1], normals[k, 2], levels[k] = normal[0], normal[1], normal[2], level
         single = np.float32(normal[0]), np.float32(normal[1]), np.float32(normal[2])
-        _beyond(rest, count, single, np.float32(level), beyond)
-        count = _left_over(rest, count, chosen, beyond, kept, room, reach, rounded, index)
-        rest = kept
-        k += 1
-    if count > 0:
-        levels[most - 1] = -np.inf
-    return k
+        _without_beyond(rest, single, np.float32(level), surely, room)
+        room[chosen] = np.inf
+        left = _moved_up(rest, kept, room, index)
+        if left < len(room):
+            room, rest = room[:left], kept
+        if left == 0:
+            return k + 1
+    levels[most - 1] = -np.inf
+    return most
 
 
 @compiled("Tuple((f8[:,:,::1], f8[:,::1]))(f4[:,::1], f8[:,:,::1], f4[:,::1], f8[::1], f8, i8, f8, f8, f8)")
@@ -308,7 +310,7 @@ def supporting(
     how much single precision may be off."""
     normals, levels, needed = np.zeros((len(chords), most, 3)), np.full((len(chords), most), farthest), 0
     n = told.shape[1]
-    room, kept, beyond, index = (
+    room, kept, spare, index = (
         room.copy(),
         np.empty((9, n), np.float32),
         np.empty(n, np.float32),
@@ -316,7 +318,7 @@ def supporting(
     )
     for group in range(len(chords)):
         a, b, near, within = normals[group], levels[group], room[group], reach[group]
-        count = _until_beyond(told, chords[group], near, within, keep_off, give, rounded, a, b, kept, beyond, index)
+        count = _until_beyond(told, chords[group], near, within, keep_off, give, rounded, a, b, kept, spare, index)
         needed = max(needed, count)
     return normals[:, :needed].copy(), levels[:, :needed].copy()
 
