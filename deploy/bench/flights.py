@@ -1,8 +1,8 @@
 """Real autopilots among obstacles: their first flight, one behind the filter that came of it, and then policies.
 
 Needs `$BRAKELINE_ARDUPILOT`, `$BRAKELINE_PX4`: folders whose `sitl FOLDER INSTANCE` runs one; what is not there is left
-out. In real time: twenty minutes, and `--minutes` for each policy in each arena. What `--folder` has already is
-not flown again. Collisions and clearances are the autopilot's own simulator's, not the estimate's.
+out. In real time: twenty minutes or thirty, and `--minutes` for each policy in each arena. What `--folder` has already
+is not flown again. Collisions and clearances are the autopilot's own simulator's, not the estimate's.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from deploy.bench.timing import Words
 from deploy.interpreter import PYTHON
 
 POLICIES, ARENAS = ("astar", "trained", "adversary"), ("default", "dense")
-FIRST, SECOND = 15.0, 5.0  # minutes
+FIRST, SECOND, THIRD = 15.0, 5.0, 10.0  # minutes
 PRACTICE = "0.15"  # share of steps at which it brakes as planned: what a model set is made of
 BEYOND = 240.0  # s that a command may take beyond its flight: the estimator, the landing, the model set
 TRUE = ("true collisions", "true clearance least m", "estimate off truth at most m")
@@ -35,12 +35,13 @@ TRUE = ("true collisions", "true clearance least m", "estimate off truth at most
 @dataclass(frozen=True)
 class Setup:
     """kind: of autopilot; parameters: what their owner would set; words: for `collect` and `fly`; cameras: it flies
-    under motion capture."""
+    under motion capture; further: its last model set is of a third flight, long enough for envelopes as they are."""
 
     kind: str
     parameters: Mapping[str, float]
     words: tuple[str, ...] = ()
     cameras: bool = False
+    further: bool = False
 
 
 # ArduCopter 4.0 leads a position along with the velocity that it was given, and catches up with it by flying faster
@@ -65,7 +66,7 @@ PATIENT = {**ALERT, "COM_OF_LOSS_T": 5.0, "MPC_XY_P": 2.0, "MPC_Z_P": 1.5}
 LED, INDOORS = "ardupilot, led to places", "px4 with motion capture"
 INDOORS_LED = "px4 with motion capture, led to places"
 SETUPS = {
-    OUTDOORS: Setup("ardupilot", CALM),
+    OUTDOORS: Setup("ardupilot", CALM, further=True),
     HEARING: Setup("px4", HEARD),
     LED: Setup("ardupilot", STIFF, ("--lead",)),
     INDOORS: Setup("px4", {**HEARD, **mocap.PARAMETERS, **ALERT}, cameras=True),
@@ -96,14 +97,21 @@ def _rows(flights: Flights, minutes: float) -> Iterator[tuple[str, dict[str, flo
     if "model" not in first:
         return
     yield "second flight", flown(flights.second)
-    try:
-        yield "certified by it", certified(flights.certify("second", flights.data))
-    except Failed as error:  # too few windows: what follows is behind the model set of the first flight
-        yield "certified by it", {"failed": str(error)}
+    yield "certified by it", _certified(flights, "second", "--few")
+    if flights.further:
+        yield "third flight", flown(flights.third)
+        yield "certified by that", _certified(flights, "third")
     for arena in ARENAS:
         for policy in POLICIES:
             yield f"{policy}, {arena}", flown(partial(flights.fly, policy, arena, minutes))
     yield from two(partial(flights.pair, minutes)).items()
+
+
+def _certified(flights: Flights, name: str, *words: str) -> dict[str, float | str]:
+    try:
+        return certified(flights.certify(name, flights.data, *words))
+    except Failed as error:  # too few windows: what follows is behind the model set of before
+        return {"failed": str(error)}
 
 
 @dataclass(frozen=True)
@@ -121,7 +129,7 @@ class Flights:
 
     def __init__(self, setup: str, start: Path, folder: Path) -> None:
         self._name, self._setup, self._start, self._folder = setup, SETUPS[setup], start, folder.absolute()
-        self.data = self._folder / "data"
+        self.data, self.further = self._folder / "data", self._setup.further
 
     @classmethod
     def beside(cls, other: Flights, name: str) -> Flights:
@@ -135,12 +143,16 @@ class Flights:
         """Behind the model set of the first, which a new one is to be made of."""
         return self.upset("second", SECOND, Upset(), "--practice", PRACTICE)
 
-    def certify(self, name: str, data: Path) -> dict[str, Any]:
+    def third(self) -> dict[str, Any]:
+        """Behind the model set of the second, and as long as it takes to do without `--few`."""
+        return self.upset("third", THIRD, Upset(), "--practice", PRACTICE)
+
+    def certify(self, name: str, data: Path, *words: str) -> dict[str, Any]:
         """The model set of a flight's log, from then on in use in that folder; {"refused": …}: there is none."""
         kept = self._folder / f"{name}-certified.json"
         if not kept.exists():
-            words = ["certify", str(self.run(name)), "--robot", "quadrotor-late", "--few", "--use", "--json"]
-            kept.write_text(told([*words, "--certificates", "residual", "--mode", "direct"], data, BEYOND))
+            command = ["certify", str(self.run(name)), "--robot", "quadrotor-late", *words, "--use", "--json"]
+            kept.write_text(told([*command, "--certificates", "residual", "--mode", "direct"], data, BEYOND))
         figures: dict[str, Any] = json.loads(kept.read_text())["residual"]["direct"]
         return figures
 

@@ -66,7 +66,7 @@ def _again(flights: Flights, setup: str, what: str, name: str, upset: Upset) -> 
     """The model set of the flight's log, and a flight behind it."""
     renewed = Flights.beside(flights, name)
     shutil.copytree(flights.data, renewed.data, dirs_exist_ok=True)
-    found = flights.certify(name, renewed.data)
+    found = flights.certify(name, renewed.data, "--few")
     rows: Words = {f"{setup}: {what}, certified again": certified(found)}
     if "refused" not in found:
         rows[f"{setup}: {what}, behind that"] = flown(partial(renewed.upset, f"{name}-again", AFTER, upset))

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 
+from deploy.bench import flights
 from deploy.bench.cuts import Outcomes, Relay, Steps
-from deploy.bench.flights import Failed, flown
+from deploy.bench.flights import Failed, Flights, flown
 from messaging.links import Tcp, Udp, open_link
 from messaging.ports import free_udp_port
 from tests.waiting import until
@@ -65,3 +68,29 @@ def test_a_flight_that_did_not_take_off_is_a_row() -> None:
         raise Failed("fly: no figures, status 1")
 
     assert flown(fly) == {"failed": "fly: no figures, status 1"}
+
+
+@pytest.mark.parametrize(
+    ("setup", "certified"),
+    [(flights.OUTDOORS, [("second", True), ("third", False)]), (flights.LED, [("second", True)])],
+)
+def test_the_last_model_set_is_of_the_longest_flight(
+    setup: str, certified: list[tuple[str, bool]], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """Of minutes every envelope is half as wide again (`--few`); a setup that flies a third time does without."""
+    made: list[tuple[str, bool]] = []
+
+    def told(words: list[str], data: Path, seconds: float) -> str:
+        if words[0] == "certify":
+            made.append((Path(words[1]).name, "--few" in words))
+            raise Failed("no windows")
+        if words[0] == "collect":
+            return json.dumps({"minutes": 15, "periods": 4500, "level": 1, "missing": [], "model": "made"})
+        raise Failed("no room to hover")
+
+    monkeypatch.setattr(flights, "told", told)
+    monkeypatch.setattr(Flights, "_switched_on", lambda *_: ("tcp:127.0.0.1:1", 1))
+    rows = dict(flights._rows(Flights(setup, Path("sitl"), tmp_path), 1.0))
+    assert made == certified
+    assert rows["certified by it"] == {"failed": "no windows"} and ("third flight" in rows) == (len(certified) > 1)
+    assert rows["astar, dense"] == {"failed": "no room to hover"}
