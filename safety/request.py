@@ -24,6 +24,7 @@ Array = NDArray[np.float64]
 
 ALLOWED, ADJUSTED, FAILSAFE, RECOVERING = "allowed", "adjusted", "failsafe", "recovering"
 MOST_OBSERVED = 4096  # numbers in an observation
+FEW = 64  # numbers
 
 Named: TypeAlias = dict[str, tuple[NDArray[np.floating[Any]], tuple[int, ...]]]  # arrays, and the shapes they must have
 
@@ -129,7 +130,7 @@ def check_for_filter(robot: Robot, request: Request) -> None:
     if isinstance(request.scan, RangeImage) and robot.position_dim != 3:
         raise BadRequest("image", f"a {robot.name} robot has no range image in space: give obstacles, or a scan")
     if predicted is not None:
-        if (predicted.half_width < 0.0).any():
+        if min(predicted.half_width.tolist()) < 0.0:
             raise BadRequest("predicted_half_width", "a predicted set has a negative half-width")
         if not math.isfinite(predicted.heading):
             raise BadRequest("predicted_heading", "predicted_heading is NaN or infinite")
@@ -167,7 +168,7 @@ def _check_motion(robot: Robot, request: Request, further: Named) -> None:
         "input_in_force": (request.input_in_force, inputs),
     }
     _finite(robot, named | further)
-    if np.abs(request.state).max() > FARTHEST:  # in any unit
+    if max(map(abs, request.state.tolist())) > FARTHEST:  # in any unit
         raise BadRequest("state", f"a state beyond ±{FARTHEST:g} is not plausible")
     _within_bounds(robot, "input_in_force", request.input_in_force)
 
@@ -182,7 +183,6 @@ def _finite(robot: Robot, named: Named) -> None:
     for name, (value, shape) in named.items():
         if value.shape != shape:
             raise BadRequest(name, f"{name} has shape {value.shape}, a {robot.name} robot's has {shape}")
-    if np.isfinite(np.concatenate([value.ravel() for value, _ in named.values()])).all():
-        return
-    name = next(name for name, (value, _) in named.items() if not np.isfinite(value).all())
-    raise BadRequest(name, f"{name} holds NaN or infinity")
+        few = value.size <= FEW  # sooner looked at one by one
+        if not (all(map(math.isfinite, value.ravel().tolist())) if few else np.isfinite(value).all()):
+            raise BadRequest(name, f"{name} holds NaN or infinity")

@@ -43,40 +43,49 @@ def nearest_of_patches(free: Single, together: NDArray[np.int64], patches: int) 
             k += columns
             continue
         for j in range(0, columns, each):
-            found[k] = ring[j]
+            least = ring[j]
             for beam in range(j + 1, min(j + each, columns)):
-                found[k] = min(found[k], ring[beam])
+                least = least if least < ring[beam] else ring[beam]
+            found[k] = least
             k += 1
     return found
 
 
-@compiled("void(f4[:,::1], f4[::1], f4, f4, f4[::1], f4[::1])")
-def _between_faces(ways: Single, axis: Single, low: np.float32, high: np.float32, begins: Single, ends: Single) -> None:
-    """What is left of rays in directions (3, n), from `begins` to `ends`, between faces so far along an axis (3,)."""
-    a, b, c = axis[0], axis[1], axis[2]
-    x, y, z = ways[0], ways[1], ways[2]  # named one by one it becomes one instruction for many rays
-    aside = np.float32(1e-20)
-    for k in range(len(begins)):
-        way = a * x[k] + b * y[k] + c * z[k]
-        way = way if abs(way) > aside else aside  # beside the faces: for ever, or never
-        one, other, begin, end = low / way, high / way, begins[k], ends[k]
-        enters, leaves = one if one < other else other, one if one > other else other
-        begins[k], ends[k] = enters if enters > begin else begin, leaves if leaves < end else end
+@compiled("void(f4[:,::1], f4[::1], f4[:,::1], f4[:,::1], f4, f4[::1])")
+def _room_inside(ways: Single, near: Single, turn: Single, faces: Single, last: np.float32, room: Single) -> None:
+    """How far (n,) the near ends of rays in directions (3, n), turned by (3, 3), are from the faces (3, 2) of a box,
+    and from being too far away; < 0: outside. From the sensor, which is at zero."""
+    x, y, z = ways[0], ways[1], ways[2]  # all named one by one: so it becomes one instruction for many rays
+    a, b, c, d, e, f = turn[0, 0], turn[0, 1], turn[0, 2], turn[1, 0], turn[1, 1], turn[1, 2]
+    g, h, i = turn[2, 0], turn[2, 1], turn[2, 2]
+    west, east, south, north, low, high = faces[0, 0], faces[0, 1], faces[1, 0], faces[1, 1], faces[2, 0], faces[2, 1]
+    for k in range(len(room)):
+        p, q, r, t = x[k], y[k], z[k], near[k]
+        u, v, w, least = t * (a * p + b * q + c * r), t * (d * p + e * q + f * r), t * (g * p + h * q + i * r), last - t
+        least = least if least < u - west else u - west
+        least = least if least < east - u else east - u
+        least = least if least < v - south else v - south
+        least = least if least < north - v else north - v
+        least = least if least < w - low else w - low
+        room[k] = least if least < high - w else high - w
 
 
 @compiled("i8[::1](f4[:,::1], f8[:,::1], f8[::1], f8, f8[::1], f8[::1], f4[::1])")
 def _that_meet(
     ways: Single, turn: Array, at: Array, last: float, low: Array, high: Array, near: Single
 ) -> NDArray[np.int64]:
-    """Which rays come into a box, or as near to it as rounding leads them aside, between `near` (n,) and last."""
-    begins, ends, aside = near.copy(), np.full(len(near), last, np.float32), rounding(last)
+    """Which rays come into a box, or as near to it as rounding leads them aside, between `near` (n,) and last: those
+    that begin in it, for it is convex and the sensor is inside. Where that is not, all may."""
+    aside, faces, inside = rounding(last), np.empty((3, 2), np.float32), True
     for axis in range(3):
-        lower, upper = np.float32(low[axis] - at[axis] - aside), np.float32(high[axis] - at[axis] + aside)
-        _between_faces(ways, turn[axis].astype(np.float32), lower, upper, begins, ends)
-    found, count = np.empty(len(near), np.int64), 0
+        inside &= low[axis] <= at[axis] <= high[axis]
+        faces[axis, 0], faces[axis, 1] = low[axis] - at[axis] - aside, high[axis] - at[axis] + aside
+    found, room, count = np.empty(len(near), np.int64), np.float32(last) - near, 0
+    if inside:
+        _room_inside(ways, near, turn.astype(np.float32), faces, np.float32(last), room)
     for k in range(len(near)):
         found[count] = k
-        count += begins[k] <= ends[k]
+        count += room[k] >= 0.0
     return found[:count]
 
 

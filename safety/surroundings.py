@@ -100,6 +100,7 @@ class Surroundings:
         self.boxes = Boxes(tube.position, tube.directions)
         self.limits = Limits(robot, tube) if robot.limits else None
         self.measured = np.asarray(robot.measurement_bound[: robot.position_dim])
+        self._unturned = np.eye(robot.position_dim)
         self.body = robot.footprint + float(np.linalg.norm(self.measured))  # m about where the center was measured
         self.comfort = self._comfort() if comfort is None else comfort
         farthest = max((float(np.linalg.norm(disc.at)) for disc in self.discs), default=0.0)
@@ -194,7 +195,9 @@ class Surroundings:
 
     def turn(self, heading: float) -> Array:
         """(d, d), world from the frame of now."""
-        turn = np.eye(self.robot.position_dim)
+        if self.robot.heading is None:
+            return self._unturned
+        turn = self._unturned.copy()
         cos, sin = math.cos(heading), math.sin(heading)
         turn[0, 0], turn[0, 1], turn[1, 0], turn[1, 1] = cos, -sin, sin, cos
         return turn
@@ -245,7 +248,8 @@ class Surroundings:
         found = []
         for disc in self.discs:
             start, measured = scene.start + scene.turn @ disc.at, self.measured + disc.swing
-            ends = start + disc.position @ z @ scene.turn.T
+            way = disc.position @ z
+            ends = start + (way if self.robot.heading is None else way @ scene.turn.T)
             beside = []
             if len(scene.near) or scene.unseen is None:
                 beside.append(half_spaces(scene.near, start, ends, disc.radius, measured))
@@ -288,7 +292,7 @@ class Surroundings:
         for rows in self._further(scene, z):
             found.append(rows.bound - rows.support(self.tube, z))
             kept.append(rows.keep)
-        return np.concatenate(found), np.concatenate(kept)
+        return (found[0], kept[0]) if len(found) == 1 else (np.concatenate(found), np.concatenate(kept))
 
     def _turned(self, normals: Array, scene: Scene) -> Array:
         """Into the frame of now."""

@@ -1,4 +1,5 @@
-"""`decide`, by kind of decision, of the ground robot for every certificate and mode, and of the quadrotor.
+"""`decide`, by kind of decision, of the ground robot for every certificate and mode, of the quadrotor, and of both by
+what they see.
 
 The paper's figures are 80.4 and 80.9 ms a step.
 """
@@ -15,6 +16,9 @@ from messaging.robots import robot_named
 from safety.certificates import KINDS
 from safety.filter import Filter
 from safety.model_set import MODES
+from sim.conditions import Conditions, Perception
+
+SCANS = Conditions(perception=Perception("scan"))
 
 
 def run() -> Figures:
@@ -25,10 +29,15 @@ def run() -> Figures:
             ready = Filter(situations.model(certificate, mode))
             for kind, seconds in _by_kind(ready, asked).items():
                 figures[f"{certificate} {mode}: {kind}"] = milliseconds(seconds) | {"count": len(seconds)}
-    quadrotor = robot_named("quadrotor")
-    flights = situations.messages(robot=quadrotor)
-    for kind, seconds in _by_kind(Filter(situations.model(robot=quadrotor)), flights).items():
-        figures[f"quadrotor, residual direct: {kind}"] = milliseconds(seconds) | {"count": len(seconds)}
+    for name, robot, conditions in (
+        ("quadrotor, residual direct", "quadrotor", None),
+        ("ground by scan, residual direct", "ground", SCANS),
+        ("quadrotor by scan, residual direct", "quadrotor", SCANS),
+    ):
+        of = robot_named(robot)
+        asked = situations.messages(robot=of, conditions=conditions)
+        for kind, seconds in _by_kind(Filter(situations.model(robot=of)), asked).items():
+            figures[f"{name}: {kind}"] = milliseconds(seconds) | {"count": len(seconds)}
     figures["the paper, a step (its own machine)"] = {"mean ms": 80.41}
     return figures
 

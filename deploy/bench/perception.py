@@ -15,15 +15,14 @@ from time import process_time
 import numpy as np
 
 from actors.guard import Ask
+from deploy.bench.decide import SCANS
 from deploy.bench.timing import WARM_UP, Figures
 from deploy.study.evaluate import Evaluation, episode, prepared, prepared_fleet, round_of
 from logs.tally import KINDS
 from messaging import brakeline_pb2 as pb
 from messaging.robots import Robot, robot_named
-from sim.conditions import Conditions, Perception
 
 STEPS = 600  # periods of each
-SCANS = Conditions(perception=Perception("scan"))
 SITUATIONS = {
     "map": ("ground", Evaluation()),
     "map, dense": ("ground", Evaluation(arena="dense")),

@@ -16,6 +16,7 @@ from safety.filter import Filter
 from safety.model_set import ModelSet, Recipe
 from safety.request import Request
 from safety.wire import request_of
+from sim.conditions import Conditions
 
 STEPS = 1500
 
@@ -24,11 +25,13 @@ def model(certificate: str = "residual", mode: str = "direct", robot: Robot | No
     return model_for(robot or robot_named("ground"), Recipe(certificate, mode))
 
 
-def messages(policy: str = "random", seed: int = 5, robot: Robot | None = None) -> list[pb.Request]:
+def messages(
+    policy: str = "random", seed: int = 5, robot: Robot | None = None, conditions: Conditions | None = None
+) -> list[pb.Request]:
     """The questions of some episodes of a policy behind the default filter."""
     robot = robot or robot_named("ground")
     question = in_process(model(robot=robot))
-    driver = Driver(robot, environment(robot, "default", seed), Identity("bench", 0, seed))
+    driver = Driver(robot, environment(robot, "default", seed, conditions), Identity("bench", 0, seed))
     choose = policy_named(policy, robot, seed)
     asked: list[pb.Request] = []
     episode = 0
