@@ -39,7 +39,7 @@ class Room:
 
 @dataclass(frozen=True)
 class Shadows:
-    """n of them, as `lines` (9, n) from their near ends to their far ones, world: `shading.py` says what a line is, and
+    """n of them, as `lines` (9, n) from their near ends to their far ones, world: `casting.py` says what a line is, and
     the hull of balls about both ends holds the shadow. room: all that come into it. speed [m/s]: whatever they hold may
     move as fast since `age` s ago."""
 
@@ -52,12 +52,13 @@ class Shadows:
 def prepare() -> None:
     """Compile what reads range images, or load it: before the first one is to be answered in time."""
     import messaging.nearby  # noqa: F401
+    import safety.casting
     import safety.shading  # noqa: F401
 
 
 def shadows(image: RangeImage, room: Room, body: float) -> Shadows:
     """All that is not known to be free and that a body of that radius [m], with its middle in the room, may touch."""
-    from safety.shading import behind  # compiled
+    from safety.casting import behind  # compiled
 
     elevations, free = seen_free(image)
     together, ways = _patches(elevations.tobytes(), free.shape[1])

@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 from messaging.patches import half_diagonal, seen_free
 from messaging.range_images import RangeImage
 from messaging.shapes import FARTHEST
-from safety.shading import rooms, rounding, supporting, told_from
+from safety.casting import rounding
+from safety.shading import rooms, supporting, told_from
 from safety.shadows import Room, Shadows, _patches, half_spaces, shadows
 from tests.messaging.test_range_images import COLUMNS, EDGE, RINGS
 from tests.safety.test_shadows import NOTHING, room
@@ -202,7 +203,7 @@ def test_a_way_that_is_no_number_frees_nothing_from_there_on(period):
 def test_all_that_reads_an_image_is_ready_before_the_first_one():
     """In an interpreter of its own: here others have imported it."""
     code = (
-        "import sys; from safety.shadows import prepare; prepare(); assert {'messaging.nearby', 'safety.shading'}"
-        " <= set(sys.modules)"
+        "import sys; from safety.shadows import prepare; prepare();"
+        " assert {'messaging.nearby', 'safety.casting', 'safety.shading'} <= set(sys.modules)"
     )
     subprocess.run([sys.executable, "-c", code], check=True)
