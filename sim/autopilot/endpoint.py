@@ -104,7 +104,7 @@ class Autopilot:
         """Let time pass, in whole ticks of `TICK`."""
         pilot, send, schedule = self.pilot, self.mav.send, self.schedule
         for _ in range(round(seconds / TICK)):
-            pilot.steer()
+            pilot.steer(TICK)
             self.vehicle.fly(self._ticks)
             pilot.tick(TICK)
             if pilot.news:

@@ -48,9 +48,13 @@ ARDUPILOT: tuple[Parameter, ...] = (
     Parameter("FRAME_CLASS", 1, 0, 15, "1: quadrotor", integer=True),
     Parameter("GUID_TIMEOUT", 3.0, 0.1, 5.0, "s without a setpoint until it stops"),
     Parameter("LAND_SPEED", 70, 30, 200, "cm/s", integer=True),
-    Parameter("WPNAV_SPEED", 800.0, 10.0, 800.0, "cm/s, horizontal"),
-    Parameter("WPNAV_SPEED_DN", 500.0, 10.0, 500.0, "cm/s"),
-    Parameter("WPNAV_SPEED_UP", 500.0, 10.0, 500.0, "cm/s"),
+    Parameter(
+        "WPNAV_ACCEL", 100.0, 1.0, 1e6, "cm/s², horizontal, by which the velocity that it flies follows setpoints"
+    ),
+    Parameter("WPNAV_ACCEL_Z", 100.0, 1.0, 1e6, "cm/s², the same up and down"),
+    Parameter("WPNAV_SPEED", 500.0, 20.0, 2000.0, "cm/s, horizontal"),
+    Parameter("WPNAV_SPEED_DN", 150.0, 10.0, 500.0, "cm/s"),
+    Parameter("WPNAV_SPEED_UP", 250.0, 10.0, 1000.0, "cm/s"),
 )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from enum import Enum
 
@@ -53,6 +54,8 @@ class Limits:
     land_speed: float  # m/s
     disarm_landed: float  # s after a landing
     disarm_unused: float  # s from arming without taking off
+    across: float = math.inf  # m/s², horizontal, by which the velocity that it flies follows setpoints
+    upright: float = math.inf  # m/s², the same up and down
 
 
 @dataclass(frozen=True)
@@ -78,6 +81,7 @@ class Pilot:
         self.setpoint = Setpoint(STILL)
         self.last_setpoint: float | None = None  # s, when one was heard
         self.news: list[str] = []  # for the ground station
+        self._flown = STILL  # m/s, of a setpoint what it has come to
         self._height = 0.0  # m, of a takeoff
         self._interrupted = False  # it lost its setpoints, and was told nothing else since
         self._since = 0.0  # s, when it armed or landed; in the air: when it last did not press on the floor
@@ -153,16 +157,16 @@ class Pilot:
             self._land()
         self.steer()
 
-    def steer(self) -> None:
-        """Give the controller what the mode asks for now."""
+    def steer(self, seconds: float = 0.0) -> None:
+        """Give the controller what the mode asks for now, to be followed for so long."""
         controller, wanted = self.vehicle.controller, self.setpoint
         if self.mode is Mode.OFFBOARD and self.landed is not Landed.TAKING_OFF:
-            controller.setpoint = self._limited(wanted.velocity)
+            self._flown = controller.setpoint = self._following(self._limited(wanted.velocity), seconds)
             controller.yaw_rate = wanted.yaw_rate or 0.0
             if wanted.yaw is not None:
                 controller.yaw_goal = wanted.yaw
             return
-        controller.yaw_rate = 0.0
+        self._flown, controller.yaw_rate = self.vehicle.seen()[1], 0.0
         if self.landed is Landed.TAKING_OFF:
             left = self._height - self.vehicle.seen()[0][2]
             controller.setpoint = (0.0, 0.0, min(max(left, 0.3), CLIMB))
@@ -178,6 +182,16 @@ class Pilot:
         level = (x * x + y * y) ** 0.5
         share = min(1.0, self.limits.speed / level) if level > 0.0 else 1.0
         return (x * share, y * share, min(max(z, -self.limits.sink), self.limits.climb))
+
+    def _following(self, wanted: Vector, seconds: float) -> Vector:
+        """The velocity on the way to the wanted one that it may come to in that time."""
+        limits = self.limits
+        if math.isinf(limits.across):
+            return wanted
+        (x, y, z), (u, v, w) = self._flown, wanted
+        away, up = math.hypot(u - x, v - y), limits.upright * seconds
+        share = min(1.0, limits.across * seconds / away) if away > 0.0 else 1.0
+        return (x + share * (u - x), y + share * (v - y), z + min(max(w - z, -up), up))
 
     def _lose_setpoints(self) -> None:
         """Nobody asks for anything any more: brake, and do what the parameters say."""

@@ -182,6 +182,8 @@ class ArduCopter:
             speed=p["WPNAV_SPEED"] / 100.0,
             climb=p["WPNAV_SPEED_UP"] / 100.0,
             sink=p["WPNAV_SPEED_DN"] / 100.0,
+            across=p["WPNAV_ACCEL"] / 100.0,
+            upright=p["WPNAV_ACCEL_Z"] / 100.0,
             land_speed=p["LAND_SPEED"] / 100.0,
             disarm_landed=0.0,
             disarm_unused=p["DISARM_DELAY"] or math.inf,

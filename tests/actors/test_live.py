@@ -42,7 +42,9 @@ def live(request: pytest.FixtureRequest) -> Iterator[Live]:
     thread.start()
     there = open_link(f"udpout:127.0.0.1:{link.port}")  # type: ignore[union-attr]
     try:
-        vehicle = LiveVehicle(there, QUADROTOR, height=2.0, truth=Truth(truth_port, 1), tap=frames.append)
+        vehicle = LiveVehicle(
+            there, QUADROTOR, height=2.0, truth=Truth(truth_port, 1), tap=frames.append, raise_limits=True
+        )
         try:
             yield vehicle, autopilot, frames
         finally:

@@ -20,6 +20,7 @@ from sim.quadrotor import SAMPLES, Quadrotor
 from sim.vehicle import BadInput
 from sim.world import Arena, staged_arena
 from tests.robots import QUADROTOR
+from tests.sim.station import AT_ONCE
 
 RULES = ("px4", "ardupilot")
 
@@ -59,7 +60,7 @@ def test_a_whole_number_is_set_as_each_autopilot_wants_it(rules: str, name: str,
 def test_over_bytes_it_is_the_vehicle_that_it_is_without_them(rules: str) -> None:
     """Same seed, same inputs: the same flight, but for the rounding of float32, and of ArduPilot's milligravities."""
     rounding = np.array(6 * [2e-3] + 3 * [{"px4": 2e-3, "ardupilot": 0.02}[rules]])
-    bare, flown = quadrotor(scale=0.0), Autopilot(quadrotor(scale=0.0), rules, quiet=True)
+    bare, flown = quadrotor(scale=0.0), Autopilot(quadrotor(scale=0.0), rules, parameters=AT_ONCE[rules], quiet=True)
     vehicle = MavlinkVehicle(flown, QUADROTOR)
     rng = np.random.default_rng(1)
     for _ in range(40):

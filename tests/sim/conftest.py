@@ -2,7 +2,7 @@
 
 import pytest
 
-from tests.sim.station import Station
+from tests.sim.station import AT_ONCE, Station
 
 
 @pytest.fixture(params=["px4", "ardupilot"])
@@ -12,6 +12,7 @@ def station(request: pytest.FixtureRequest) -> Station:
 
 @pytest.fixture(params=["px4", "ardupilot"])
 def flying(request: pytest.FixtureRequest) -> Station:
-    station = Station(request.param)
+    """Set to follow setpoints at once."""
+    station = Station(request.param, parameters=AT_ONCE[request.param])
     station.into_the_air()
     return station

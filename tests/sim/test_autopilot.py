@@ -201,6 +201,26 @@ def test_setpoints_are_not_flown_in_another_mode() -> None:
     assert station.fly(2, 0, 0) == pytest.approx(np.zeros(3), abs=0.05)
 
 
+@pytest.mark.parametrize(("acceleration", "speed", "way"), [(None, 1.0, 4.5), (500.0, 2.9, 0.9)])
+def test_what_an_arducopter_flies_follows_setpoints_by_an_acceleration(
+    acceleration: float | None, speed: float, way: float
+) -> None:
+    """As the real one does (`python -m deploy.bench manners`): as delivered it takes seconds, and as long to stop."""
+    station = Station("ardupilot", parameters={} if acceleration is None else {"WPNAV_ACCEL": acceleration})
+    station.into_the_air()
+    for k in range(50):
+        station.setpoint(0, 3, 0)
+        station.wait(0.1)
+        if k == 9:
+            assert station.autopilot.vehicle.controller.setpoint[0] == pytest.approx(speed, abs=0.15)
+    began = station.autopilot.vehicle.state()[0]
+    for _ in range(60):
+        station.setpoint(0, 0, 0)
+        station.wait(0.1)
+    went = station.autopilot.vehicle.state()[0] - began
+    assert way < went < way + 1.2
+
+
 @pytest.mark.parametrize("timeout", [None, 0.2])
 def test_a_stream_that_stops_ends_in_a_hold(flying: Station, timeout: float | None) -> None:
     rules = flying.autopilot.rules
