@@ -33,7 +33,7 @@ class Parameter:
 PX4: tuple[Parameter, ...] = (
     Parameter("COM_DISARM_LAND", 2.0, -1.0, 20.0, "s after a landing until it disarms"),
     Parameter("COM_DISARM_PRFLT", 10.0, -1.0, 60.0, "s after arming until it disarms if it stays on the ground"),
-    Parameter("COM_OBL_RC_ACT", 5, 4, 5, "setpoints lost: 4 land, 5 hold", integer=True),
+    Parameter("COM_OBL_RC_ACT", 0, 0, 5, "setpoints lost: 0 to 3 position, 4 land, 5 hold", integer=True),
     Parameter("COM_OF_LOSS_T", 1.0, 0.1, 60.0, "s without a setpoint until it leaves offboard"),
     Parameter("MIS_TAKEOFF_ALT", 2.5, 0.5, 80.0, "m above home to take off to"),
     Parameter("MPC_LAND_SPEED", 0.7, 0.3, 2.0, "m/s"),

@@ -28,6 +28,7 @@ class Unknown(Refused):
 class Mode(Enum):
     MANUAL = "manual"  # sticks, of which there are none
     HOLD = "hold"
+    POSITION = "position"  # sticks move it; there are none, so it holds
     BRAKE = "brake"
     TAKEOFF = "takeoff"
     LAND = "land"
@@ -54,6 +55,7 @@ class Limits:
     land_speed: float  # m/s
     disarm_landed: float  # s after a landing
     disarm_unused: float  # s from arming without taking off
+    goes_back: bool  # once it has landed it is in the mode of before
     across: float = math.inf  # m/s², horizontal, by which the velocity that it flies follows setpoints
     upright: float = math.inf  # m/s², the same up and down
 
@@ -81,6 +83,7 @@ class Pilot:
         self.setpoint = Setpoint(STILL)
         self.last_setpoint: float | None = None  # s, when one was heard
         self.news: list[str] = []  # for the ground station
+        self._before_landing = mode
         self._flown = STILL  # m/s, of a setpoint what it has come to
         self._height = 0.0  # m, of a takeoff
         self._interrupted = False  # it lost its setpoints, and was told nothing else since
@@ -113,6 +116,8 @@ class Pilot:
             self.news.append("Disarmed")
         self.armed = False
         self.vehicle.cut_rotors()
+        if self.mode is Mode.LAND and self.limits.goes_back:
+            self.mode = self._before_landing
 
     def change(self, mode: Mode) -> None:
         """To a mode. What may precede which is the rules' business."""
@@ -120,6 +125,8 @@ class Pilot:
             self.setpoint = Setpoint(STILL)
             if self.landed in (Landed.LANDING, Landed.TAKING_OFF):
                 self.landed = Landed.IN_AIR
+        if mode is Mode.LAND and self.mode is not Mode.LAND:
+            self._before_landing = self.mode
         self.mode, self._interrupted = mode, False
         if mode is Mode.LAND and self.landed is Landed.IN_AIR:
             self.landed = Landed.LANDING
@@ -202,7 +209,7 @@ class Pilot:
         self.setpoint = Setpoint(STILL)
         if not stays:
             self.change(self.limits.on_loss)
-            self._interrupted = self.limits.on_loss is Mode.HOLD
+            self._interrupted = self.limits.on_loss is not Mode.LAND
 
     def _leave_floor(self, landed: Landed) -> None:
         self.vehicle.launch()

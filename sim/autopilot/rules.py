@@ -18,7 +18,11 @@ POSITION, VELOCITY, ACCELERATION = 0x007, 0x038, 0x1C0  # bits of a type mask: t
 FORCE, YAW, YAW_RATE = 0x200, 0x400, 0x800
 FASTEST = 1000.0  # m/s, a velocity beyond which is no velocity to ArduCopter
 
-PX4_MODES = {(4, 2): Mode.TAKEOFF, (4, 3): Mode.HOLD, (4, 6): Mode.LAND, (6, 0): Mode.OFFBOARD}  # main, sub
+PX4_MODES = {
+    **{(3, 0): Mode.POSITION, (6, 0): Mode.OFFBOARD},
+    **{(4, 2): Mode.TAKEOFF, (4, 3): Mode.HOLD, (4, 6): Mode.LAND},
+}  # main, sub
+PX4_ON_LOSS = {4: Mode.LAND, 5: Mode.HOLD}  # by COM_OBL_RC_ACT; else sticks would count
 COPTER_MODES = {0: Mode.MANUAL, 4: Mode.OFFBOARD, 5: Mode.HOLD, 9: Mode.LAND, 17: Mode.BRAKE}
 
 PX4_LAST, COPTER_LAST = 10, 27  # number of the last main mode, of the last mode
@@ -90,7 +94,7 @@ class Px4:
         p = self.parameters
         return Limits(
             setpoint_timeout=p["COM_OF_LOSS_T"],
-            on_loss=Mode.LAND if p["COM_OBL_RC_ACT"] == 4 else Mode.HOLD,
+            on_loss=PX4_ON_LOSS.get(round(p["COM_OBL_RC_ACT"]), Mode.POSITION),
             lifts=True,
             speed=p["MPC_XY_VEL_MAX"],
             climb=p["MPC_Z_VEL_MAX_UP"],
@@ -98,6 +102,7 @@ class Px4:
             land_speed=p["MPC_LAND_SPEED"],
             disarm_landed=_seconds(p["COM_DISARM_LAND"]),
             disarm_unused=_seconds(p["COM_DISARM_PRFLT"]),
+            goes_back=True,
         )
 
     def command_mode(self, main: int, sub: int) -> int:
@@ -112,7 +117,7 @@ class Px4:
         mode = PX4_MODES.get((main, sub if main == 4 else 0))
         if main > PX4_LAST:
             return  # accepted, and nothing happens
-        if mode is None:
+        if mode in (None, Mode.POSITION):
             raise Refused(f"mode {main}.{sub} is not available: no sticks, no mission")
         if mode is Mode.OFFBOARD and pilot.armed and not pilot.streaming:
             raise Refused("offboard: no offboard signal")
@@ -187,6 +192,7 @@ class ArduCopter:
             land_speed=p["LAND_SPEED"] / 100.0,
             disarm_landed=0.0,
             disarm_unused=p["DISARM_DELAY"] or math.inf,
+            goes_back=False,
         )
 
     def command_mode(self, main: int, sub: int) -> int:

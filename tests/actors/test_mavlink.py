@@ -93,7 +93,7 @@ def test_it_never_meets_its_own_timeout() -> None:
         vehicle.step(np.array([2.0, 0.0, 0.0]))
     assert autopilot.pilot.mode is Mode.OFFBOARD
     autopilot.advance(0.22)  # nobody steps any more
-    assert autopilot.pilot.mode is Mode.HOLD
+    assert autopilot.pilot.mode is Mode.POSITION
 
 
 def test_collisions_come_from_the_simulator() -> None:

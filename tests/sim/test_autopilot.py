@@ -187,7 +187,7 @@ def test_wrong_frames_and_masks_are_not_flown(
     assert reached == pytest.approx(np.zeros(3), abs=0.1)  # nothing was heard for long
     if flying.autopilot.rules.name == "px4":
         assert "SET_POSITION_TARGET_LOCAL_NED" in flying.texts()
-        assert flying.pilot.mode is Mode.HOLD
+        assert flying.pilot.mode is Mode.POSITION
 
 
 def test_only_ardupilot_knows_the_body_offset_frame(flying: Station) -> None:
@@ -237,8 +237,28 @@ def test_a_stream_that_stops_ends_in_a_hold(flying: Station, timeout: float | No
     where = flying.autopilot.vehicle.state()[:3]
     flying.wait(5.0)
     assert flying.autopilot.vehicle.state()[:3] == pytest.approx(where, abs=0.05)
-    assert flying.pilot.mode is (Mode.HOLD if rules.name == "px4" else Mode.OFFBOARD)
+    assert flying.pilot.mode is (Mode.POSITION if rules.name == "px4" else Mode.OFFBOARD)
     assert "Setpoints lost" in flying.texts()
+
+
+@pytest.mark.parametrize(("action", "mode"), [(0, Mode.POSITION), (4, Mode.LAND), (5, Mode.HOLD)])
+def test_what_follows_lost_setpoints_is_a_parameter_of_px4s(action: float, mode: Mode) -> None:
+    station = Station("px4", parameters={"COM_OBL_RC_ACT": action})
+    station.into_the_air()
+    station.fly(0, 1, 0)
+    station.wait(1.5)
+    assert station.pilot.mode is mode
+
+
+def test_a_px4_that_has_landed_is_in_the_mode_of_before(flying: Station) -> None:
+    """As the real ones (`python -m deploy.bench manners`): an ArduCopter stays in its landing mode."""
+    rules = flying.autopilot.rules.name
+    flying.fly(0, 0, 0, seconds=0.2)
+    assert flying.command(MODE, 1, *{"px4": (4, 6), "ardupilot": (COPTER_LAND,)}[rules]) == ACCEPTED
+    assert flying.pilot.mode is Mode.LAND
+    flying.wait(12.0)
+    assert not flying.pilot.armed
+    assert flying.pilot.mode is {"px4": Mode.OFFBOARD, "ardupilot": Mode.LAND}[rules]
 
 
 def test_setpoints_that_come_again_are_flown_unless_somebody_chose_another_mode(flying: Station) -> None:

@@ -33,7 +33,7 @@ PERIODS = 70  # of a flight
 IN_TIME = {"map": 0.9, "scan": 0.5}
 TIMEOUT = 1.0  # s without a setpoint until the autopilot brakes and holds, for good: a stall is shorter
 OFTEN = 0.06  # s between two setpoints, as a rule
-PX4_HOLD, PX4_OFFBOARD = 4 << 16 | 3 << 24, 6 << 16  # custom modes
+PX4_POSITION, PX4_OFFBOARD = 3 << 16, 6 << 16  # custom modes
 
 
 class Flight(Run):
@@ -158,7 +158,7 @@ def test_what_is_killed_in_flight_hurts_nobody(tmp_path: Path) -> None:
     second, third = _takeovers(records)
     assert second["HEARTBEAT"].custom_mode == PX4_OFFBOARD, "its keeper flew it until it hovered"
     assert _speed(second["LOCAL_POSITION_NED"]) < 0.3
-    assert third["HEARTBEAT"].custom_mode == PX4_HOLD, "without a keeper the autopilot braked by itself, and held"
+    assert third["HEARTBEAT"].custom_mode == PX4_POSITION, "without a keeper the autopilot braked by itself, and held"
     assert "0 collisions" in (run.folder / "logs" / "autopilot.log").read_text()
     said = (run.folder / "logs" / "actor-0.log").read_text()
     assert "braking along the committed plan" in said and "it hovers at" in said
