@@ -46,6 +46,7 @@ class Statement:
     half_width_rest: float  # m, of a full stop, largest axis, position noise of the estimate not included
     half_width_full: float
     comfort: float  # m, kept to obstacles while driving so that turning in place stays possible
+    excess: float  # the largest share of its set that any part of a held-out plan came to; above 1: it was outside
 
     def figures(self) -> dict[str, Any]:
         return asdict(self)
@@ -67,18 +68,18 @@ def state(model: ModelSet, fitted: Dataset, held_out: Dataset) -> Statement:
     whole = windows(held_out, robot.horizon, kind)
     plans = apart(whole.take(~np.isnan(whole.latch)) if kind == PLAN else whole, robot.horizon)
     ends = {tuple(start): row for row, start in enumerate(plans.start)}
-    outside = np.zeros(len(plans), dtype=bool)
-    first = np.zeros(len(plans), dtype=bool)
+    excess, first = np.zeros(len(plans)), np.zeros(len(plans))
     for k in range(1, robot.horizon + 1):
         seen = windows(held_out, k, kind)
         rows = [i for i, start in enumerate(seen.start) if tuple(start) in ends]
         part = seen.take(np.isin(np.arange(len(seen)), rows))
         if k == 1:
-            first = _first_outside(model, part)
-            outside |= first
-        outside |= _outside(model, tube, part, k)
+            first = _first_excess(model, part)
+            excess = np.maximum(excess, first)
+        excess = np.maximum(excess, _excess(model, tube, part, k))
     full = np.asarray(robot.high())
-    bound_step = upper_bound(int(first.sum()), len(plans))
+    outside, steps_outside = int((excess > 1.0).sum()), int((first > 1.0).sum())
+    bound_step = upper_bound(steps_outside, len(plans))
     return Statement(
         certificate=model.recipe.certificate,
         mode=model.recipe.mode,
@@ -88,22 +89,29 @@ def state(model: ModelSet, fitted: Dataset, held_out: Dataset) -> Statement:
         smallest_singular=figures.smallest,
         condition=figures.condition,
         windows=len(plans),
-        violations=int(outside.sum()),
-        step_violations=int(first.sum()),
+        violations=outside,
+        step_violations=steps_outside,
         bound_step=bound_step,
-        bound_plan=upper_bound(int(outside.sum()), len(plans)),
+        bound_plan=upper_bound(outside, len(plans)),
         bound_episode=1.0 - (1.0 - bound_step) ** 300,
         half_width_rest=ready.half_width(np.zeros(robot.action_dim)),
         half_width_full=ready.half_width(full),
         comfort=ready.comfort,
+        excess=float(excess.max(initial=0.0)),
     )
 
 
-def _first_outside(model: ModelSet, w: Windows) -> NDArray[np.bool_]:
-    """Is any coordinate of the state after one period outside its predicted set? (T,)"""
+def _share(off: Array, half: Array) -> Array:
+    """How much of half a set's width something is off its middle; of a set without a width nothing, or all."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.where(off > 0.0, off / half, 0.0)
+
+
+def _first_excess(model: ModelSet, w: Windows) -> Array:
+    """How much of its predicted set any coordinate of the state comes to after one period. (T,)"""
     z = w.z if model.recipe.mode == DIRECT else model.first_regressor(w.z)
     half = np.concatenate([model.first.half_widths(z[i : i + CHUNK]) for i in range(0, len(z), CHUNK)])
-    return np.asarray((np.abs(outputs_of(model, w) - z @ model.first.C.T) > half).any(1))
+    return np.asarray(_share(np.abs(outputs_of(model, w) - z @ model.first.C.T), half).max(1))
 
 
 def outputs_of(model: ModelSet, w: Windows) -> Array:
@@ -111,24 +119,26 @@ def outputs_of(model: ModelSet, w: Windows) -> Array:
     return outputs(model.robot, w.y) if model.recipe.mode == DIRECT else w.y
 
 
-def _outside(model: ModelSet, tube: Tube, w: Windows, k: int) -> NDArray[np.bool_]:
-    """Is the position after k periods outside the tube (or what else it speaks of), or the path off it between, or the
-    stop not one? (T,)"""
+def _excess(model: ModelSet, tube: Tube, w: Windows, k: int) -> Array:
+    """How much of the tube the position comes to after k periods (or what else it speaks of), of its bound the path off
+    it between, and of the latch the stop. (T,)"""
     d, more = model.robot.position_dim, list(needed(model.robot))
     normals = facet_normals(tube.directions[k - 1][:, np.abs(tube.directions[k - 1]).any(0)])
     spread = np.abs(normals @ tube.directions[k - 1])  # (facets, L)
     others = outputs_of(model, w)[:, more]
-    bad = np.zeros(len(w), dtype=bool)
+    found = np.zeros(len(w))
     for i in range(0, len(w), CHUNK):
         z = w.z[i : i + CHUNK]
         sizes = tube.magnitudes(z)
         made = sizes[:, : tube.generators]
         away = np.abs((w.y[i : i + CHUNK, :d] - z @ tube.position[k - 1].T) @ normals.T)
-        outside = (away > made @ spread.T).any(1)
         off = np.abs(others[i : i + CHUNK] - z @ tube.more[k - 1].T)
-        outside |= (off > made @ np.abs(tube.more_directions[k - 1]).T).any(1)
-        outside |= w.bulge[i : i + CHUNK] > sizes[:, tube.generators + k - 1]
+        parts = [
+            _share(away, made @ spread.T),
+            _share(off, made @ np.abs(tube.more_directions[k - 1]).T),
+            _share(w.bulge[i : i + CHUNK, None], sizes[:, tube.generators + k - 1, None]),
+        ]
         if k == tube.horizon:
-            outside |= w.latch[i : i + CHUNK] > sizes[:, -1]
-        bad[i : i + CHUNK] = outside
-    return bad
+            parts.append(_share(w.latch[i : i + CHUNK, None], sizes[:, -1, None]))
+        found[i : i + CHUNK] = np.concatenate(parts, axis=1).max(1)
+    return found

@@ -143,6 +143,8 @@ class Certify:
     few: bool = False
     """Of minutes of driving instead of hours: 60 windows of each length will do, and every envelope is half as wide
     again, as after `collect --url`."""
+    until_held: bool = False
+    """Widen every envelope until no held-out plan leaves its set, and by no more: what few plans support."""
     robot: str = "ground"
     """Whose data set in use; of a log: whose steps are taken."""
     last: int = 20_000
@@ -168,8 +170,8 @@ class Certify:
                 advance(0, f"certifying {kind}, {mode}")
                 recipe = Recipe(kind, mode)
                 try:
-                    made = supported(source.data, recipe.of_minutes() if self.few else recipe, self.windows)
-                    model, statement, not_of = made
+                    recipe = recipe.of_minutes() if self.few else recipe
+                    model, statement, not_of = supported(source.data, recipe, self.windows, self.until_held)
                 except Unsupported as error:
                     results.setdefault(kind, {})[mode] = {"refused": str(error)}
                     errors.print(f"[red]{kind}, {mode}: refused:[/] {escape(str(error))}")

@@ -23,8 +23,11 @@ class Unsupported(BadData):
         self.reasons = reasons
 
 
-def supported(data: Dataset, recipe: Recipe, windows: str = AUTO) -> tuple[ModelSet, Statement, dict[str, str]]:
+def supported(
+    data: Dataset, recipe: Recipe, windows: str = AUTO, until_held: bool = False
+) -> tuple[ModelSet, Statement, dict[str, str]]:
     """The model set of the first kind of windows that serves, its statement, and why the kinds before it did not.
+    until_held: see `certified`.
 
     Raises:
         Unsupported: none does.
@@ -32,7 +35,7 @@ def supported(data: Dataset, recipe: Recipe, windows: str = AUTO) -> tuple[Model
     reasons: dict[str, str] = {}
     for kind in (PLAN, FREE) if windows == AUTO else (windows,):
         try:
-            model, statement = certified(data, replace(recipe, windows=kind))
+            model, statement = certified(data, replace(recipe, windows=kind), until_held)
         except (BadData, CertificateError) as error:
             reasons[kind] = str(error) + (NO_PLANS if kind == PLAN else "")
         else:
