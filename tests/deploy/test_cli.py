@@ -218,7 +218,7 @@ def said(**figures):
     plain |= {"step_violations": 0, "bound_step": 0.01, "bound_plan": 0.02, "bound_episode": 0.9}
     sizes = {"half_width_rest": 0.0012, "half_width_full": 149810.138, "comfort": 1.5}
     about = {"certificate": "matrix-zonotope", "mode": "recursion", "version": "a"}
-    return Statement(**{**plain, **sizes, **about, **figures})
+    return Statement(**{**plain, **sizes, **about, "excess": 0.8, **figures})
 
 
 @pytest.mark.parametrize("columns", [60, 80, 160])
