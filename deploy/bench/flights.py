@@ -45,8 +45,9 @@ class Setup:
 
 
 # ArduCopter 4.0 leads a position along with the velocity that it was given, and catches up with it by flying faster
-# than asked; led to places, it has nothing to catch up with, and may be as stiff as it can.
-CALM = {"PSC_POSXY_P": 0.5, "PSC_VELXY_I": 0.02, "PSC_POSZ_P": 0.5}
+# than asked: with less than this of it, it creeps after a stop, with more it overshoots. Upright it is quicker. Led to
+# places, it has nothing to catch up with, and may be as stiff as it can.
+CALM = {"PSC_POSXY_P": 0.5, "PSC_VELXY_I": 0.02, "PSC_POSZ_P": 1.0, "PSC_VELZ_P": 8.0}
 STIFF = {"PSC_POSXY_P": 2.0, "PSC_POSZ_P": 1.0}
 # PX4's SIH has an accelerometer, a gyro and a barometer of other noise than its estimator takes them for, and a GPS
 # without delay.
