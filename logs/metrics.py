@@ -14,7 +14,9 @@ from typing import Any, TypeVar
 
 from google.protobuf.message import Message
 
+from logs import plans
 from logs.decisions import Decisions, joined
+from logs.plans import Plans
 from logs.sketch import Histogram, spread
 from logs.tally import KINDS, Figures, Tally, closed_loop
 from messaging import brakeline_pb2 as pb
@@ -77,6 +79,7 @@ class Metrics:
     def __init__(self, topics: Iterable[Topic] = RECORDED) -> None:
         self.actors: dict[str, Tally] = {}
         self.decisions: dict[str, Decisions] = {}  # by actor
+        self.plans: dict[str, Plans] = {}  # by actor
         self.streams: dict[tuple[str, int], Stream] = {}  # by key and start of the process
         self.learners: dict[str, pb.LearnerMetrics] = {}  # the latest, by robot
         self.processes: dict[str, ProcessFigures] = {}
@@ -190,6 +193,7 @@ class Metrics:
         name = exchange.request.actor
         decisions = self.decisions.get(name) or _entered(self.decisions, name, Decisions)
         decisions.exchange(exchange)
+        (self.plans.get(name) or _entered(self.plans, name, Plans)).exchange(exchange)
 
     def _learner(self, metrics: pb.LearnerMetrics) -> None:
         name = metrics.robot
@@ -251,6 +255,7 @@ def together(runs: Mapping[str, Metrics]) -> Figures:
         "actors": {name: closed_loop([actors[name]]) for name in names},
         "learners": {robot: learner(learners[robot]) for robot in sorted(learners)},
         **joined([decisions[name] for name in sorted(decisions)]).figures(),
+        "plans": plans.figures(part for run in runs.values() for part in run.plans.copy().values()),
         "topics": _summed([run.topics() for run in runs.values()]),
         "processes": {
             prefix + name: run.process(name) for prefix, run in runs.items() for name in sorted(run.processes)

@@ -130,6 +130,10 @@ def _add_safety(table: Table, figures: Figures) -> None:
         table.add_row(
             "solver", f"{solver['programs']} programs, {solver['failures']} failed ({statuses}); {iterations}"
         )
+    plans = figures.get("plans") or {}
+    if plans.get("flown"):
+        outside = _share(plans["outside"], plans["flown"], None)
+        table.add_row("verified plans that were gone on along", f"{plans['flown']}, outside of their tubes {outside}")
     if figures.get("unverified"):
         table.add_row("[red]unverified failsafes[/]", str(figures["unverified"]))
 

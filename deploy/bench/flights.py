@@ -285,6 +285,8 @@ def flown(fly: Callable[[], dict[str, Any]]) -> dict[str, float | str]:
     row |= {"mean speed m/s": figures["mean_speed"] or 0.0}
     row |= {"interventions": f"{figures['interventions'] / max(1, figures['steps']):.1%}"}
     row |= {"outside": f"{contained['violations']} of {contained['steps']}"}
+    if plans := figures.get("plans"):
+        row |= {"stops outside": f"{plans['outside']} of {plans['flown']}"}
     row |= {name: flight[name] for name in TRUE if name in flight}
     return row | {"in time": f"{flight['answers in time share'] or 0.0:.1%}"}
 

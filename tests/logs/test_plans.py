@@ -1,0 +1,124 @@
+"""Plans that robots went on along, beside the tubes that had been verified for them."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from logs.metrics import Metrics
+from logs.plans import Plans, figures
+from messaging import brakeline_pb2 as pb
+
+N = 4  # periods of a plan
+PLAN = [0.3, 0.2, 0.1, 0.0]  # of one input
+
+
+def asked(step, kind, x=0.0, given=0, own=0.0, verified=True, episode=0, run=1):
+    """An exchange at a place x, of a robot whose committed plan's tail begins with that input. A plan of its own leads
+    to x + 0.1 a period, ± 0.05."""
+    exchange = pb.Exchange(header=pb.Header(run=run))
+    exchange.request.CopyFrom(
+        pb.Request(robot="nobody", actor="a", episode=episode, step=step, state=[x], action=[0.0], plan=PLAN[given:])
+    )
+    decision = exchange.reply.decision
+    decision.kind, decision.verified = kind, verified
+    decision.plan[:] = PLAN
+    decision.tube_center[:] = [own + 0.1 * (k + 1) for k in range(N)]
+    decision.tube_half_width[:] = [0.05] * N
+    return exchange
+
+
+def of(*exchanges):
+    plans = Plans()
+    for exchange in exchanges:
+        plans.exchange(exchange)
+    return plans
+
+
+def test_a_stop_that_keeps_to_its_tube_is_counted_once():
+    plans = of(
+        asked(0, pb.ALLOWED),
+        *(asked(k, pb.FAILSAFE, 0.1 * min(k, N) + 0.02, min(k, 3)) for k in range(1, 6)),
+        asked(6, pb.ALLOWED, 0.42, 3),
+    )
+    assert (plans.flown, plans.outside) == (1, 0)
+    assert plans.excess == pytest.approx(0.4)
+
+
+@pytest.mark.parametrize("late", range(2, 5))
+def test_that_it_is_left_at_any_period_counts(late):
+    steps = [asked(0, pb.ALLOWED)]
+    for k in range(1, 5):
+        off = 0.06 if k == late else 0.0
+        steps.append(asked(k, pb.FAILSAFE, 0.1 * min(k, N) + off, min(k, 3)))
+    steps.append(asked(5, pb.ADJUSTED, 0.4, 3))
+    plans = of(*steps)
+    assert (plans.flown, plans.outside) == (1, 1) and plans.excess == pytest.approx(1.2)
+
+
+def test_that_it_is_left_counts_also_where_the_next_plan_begins():
+    plans = of(asked(0, pb.ALLOWED), asked(1, pb.FAILSAFE, 0.1, 1), asked(2, pb.ADJUSTED, 0.26, 2))
+    assert (plans.flown, plans.outside) == (1, 1)
+
+
+def test_a_plan_that_another_follows_at_once_was_not_gone_on_along():
+    plans = of(asked(0, pb.ALLOWED), asked(1, pb.ALLOWED, 9.0, 1), asked(2, pb.ADJUSTED, 9.0, 1), asked(3, pb.ALLOWED))
+    assert (plans.flown, plans.outside) == (0, 0)
+
+
+def test_without_an_answer_it_goes_on_along_its_plan():
+    silent = pb.Exchange(header=pb.Header(run=1), request=asked(1, pb.FAILSAFE, 0.3, 1).request, failure="timeout: 80")
+    assert of(asked(0, pb.ALLOWED), silent, asked(2, pb.ALLOWED, 0.2, 2)).outside == 1
+
+
+@pytest.mark.parametrize(
+    "change", [{"episode": 1}, {"run": 2}, {"step": 3}, {"given": 2}], ids=["episode", "process", "gap", "other plan"]
+)
+def test_what_was_not_flown_is_not_compared(change):
+    """Another episode, a process that began anew, a lost exchange, an answer that came too late to be taken."""
+    plans = of(asked(0, pb.ALLOWED), asked(**{"step": 1, "kind": pb.FAILSAFE, "x": 9.0, "given": 1} | change))
+    plans._end()
+    assert plans.flown == 0
+
+
+def test_a_plan_that_nothing_verified_has_no_tube():
+    plans = of(asked(0, pb.FAILSAFE, verified=False), asked(1, pb.FAILSAFE, 9.0, 1), asked(2, pb.ALLOWED, 9.0, 2))
+    assert plans.flown == 0
+
+
+def test_a_position_that_is_no_number_is_outside():
+    plans = of(asked(0, pb.ALLOWED), asked(1, pb.FAILSAFE, float("nan"), 1), asked(2, pb.ALLOWED, 0.2, 2))
+    assert plans.outside == 1 and np.isfinite(plans.excess)
+
+
+@settings(max_examples=60)
+@given(st.data())
+def test_whatever_somebody_sends_is_no_error(data):
+    numbers = st.lists(st.floats(width=32), max_size=6)
+    plans = Plans()
+    for step in range(4):
+        exchange = asked(step, data.draw(st.sampled_from([pb.ALLOWED, pb.FAILSAFE, pb.RECOVERING, pb.UNKNOWN])))
+        for field in (exchange.request.state, exchange.request.action, exchange.request.plan):
+            field[:] = data.draw(numbers)
+        for field in (exchange.reply.decision.plan, exchange.reply.decision.tube_center):
+            field[:] = data.draw(numbers)
+        plans.exchange(exchange)
+    assert plans.outside <= plans.flown
+
+
+def test_it_is_one_of_a_runs_figures():
+    metrics = Metrics()
+    for sequence, exchange in enumerate(
+        (asked(0, pb.ALLOWED), asked(1, pb.FAILSAFE, 0.9, 1), asked(2, pb.ALLOWED, 0.2, 2)), 1
+    ):
+        exchange.header.sequence = sequence
+        metrics.add("exchange/a", exchange)
+    assert (
+        metrics.figures()["plans"]
+        == figures(metrics.plans.values())
+        == {
+            "flown": 1,
+            "outside": 1,
+            "excess": pytest.approx(16.0),
+        }
+    )
