@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 
 from actors.driver import Driver, Identity
@@ -45,8 +47,9 @@ def messages(
     return asked
 
 
-def requests(ready: Filter, asked: list[pb.Request]) -> list[Request]:
-    """The same as the filter takes them; plans of another model count as standing still's."""
+def requests(ready: Filter, asked: list[pb.Request]) -> Iterator[Request]:
+    """The same as the filter takes them, each decoded when it is its turn, as a service does; plans of another model
+    count as standing still's."""
     for message in asked:
         message.model = message.model and ready.version
-    return [request_of(message, ready.robot) for message in asked]
+        yield request_of(message, ready.robot)

@@ -104,9 +104,7 @@ class Fly:
         """Raises ValueError: not as many system ids as URLs, or our own vehicles beside others'."""
         if not self.url:
             ports = [(free_udp_port(), free_udp_port()) for _ in range(self.vehicles)]
-            return tuple(
-                FlightSettings(f"udpin:127.0.0.1:{port}", truth=truth, raise_limits=True) for port, truth in ports
-            )
+            return tuple(FlightSettings(f"udpin:127.0.0.1:{port}", truth=truth) for port, truth in ports)
         if self.vehicles != 1:
             raise ValueError("--vehicles are our own: name others by --url, one after the other")
         systems = self.systems or (self.flight.system,) * len(self.url)

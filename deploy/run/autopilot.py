@@ -15,6 +15,7 @@ from messaging.links import open_link
 from messaging.signals import heeded
 from messaging.tasks import task_of
 from sim.autopilot.endpoint import Autopilot
+from sim.autopilot.parameters import AT_ONCE
 from sim.autopilot.rules import SETPOINT_TIMEOUT
 from sim.autopilot.server import Tally, Truth, serve
 from sim.flight_estimator import QuadrotorNoise
@@ -39,6 +40,7 @@ class AutopilotSettings:
     wind: Wind = field(default_factory=Wind)
     truth: str = "127.0.0.1:14600"  # where states and collisions go, as JSON in UDP datagrams; empty: nowhere
     seconds: float = 0.0  # until it ends; 0: on SIGINT or SIGTERM
+    at_once: bool = False  # it follows setpoints at once, as the vehicle that was recorded; else as it is delivered
 
 
 def fly(settings: AutopilotSettings, begun: Callable[[Arena], Any] = lambda arena: None) -> Tally:
@@ -66,7 +68,9 @@ def vehicle(settings: AutopilotSettings, arena: Arena, system: int) -> Autopilot
     quadrotor = Quadrotor(arena, rng, noise, settings.wind, floor=None if settings.airborne else PAD)
     lidar = Lidar(arena, task_of(QUADROTOR).rays, noise.scale * noise.lidar, rng)
     timeout = settings.setpoint_timeout
-    parameters = {} if timeout is None else {SETPOINT_TIMEOUT[settings.rules]: timeout}
+    parameters = dict(AT_ONCE[settings.rules]) if settings.at_once else {}
+    if timeout is not None:
+        parameters[SETPOINT_TIMEOUT[settings.rules]] = timeout
     return Autopilot(quadrotor, settings.rules, system, parameters, lidar)
 
 

@@ -108,6 +108,7 @@ def _autopilot(place: Place, folder: Path, config: RunConfig, bus: BusSettings) 
             arena=config.arena,
             seed=config.seed,
             airborne=True,
+            at_once=True,
             setpoint_timeout=config.autopilot.setpoint_timeout,
             wind=config.conditions.wind,
             truth=f"127.0.0.1:{flight.truth}",

@@ -57,6 +57,15 @@ ARDUPILOT: tuple[Parameter, ...] = (
     Parameter("WPNAV_SPEED_UP", 250.0, 10.0, 1000.0, "cm/s"),
 )
 
+# What makes a vehicle follow setpoints at once, within what the quadrotor's description may ask for: as it is recorded.
+AT_ONCE: dict[str, dict[str, float]] = {
+    "px4": {},
+    "ardupilot": {
+        **{"WPNAV_SPEED": 800.0, "WPNAV_SPEED_UP": 500.0, "WPNAV_SPEED_DN": 500.0},
+        **{"WPNAV_ACCEL": 1e6, "WPNAV_ACCEL_Z": 1e6},
+    },
+}
+
 
 class Parameters:
     """One vehicle's parameters, by name, in the table's order."""

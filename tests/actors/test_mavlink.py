@@ -13,6 +13,7 @@ from actors.frames import Frame
 from actors.mavlink import Client, CommandRefused, NoAutopilot
 from messaging.shapes import CYLINDER, Obstacle
 from sim.autopilot.endpoint import Autopilot
+from sim.autopilot.parameters import AT_ONCE
 from sim.autopilot.pilot import Mode
 from sim.autopilot.rules import SETPOINT_TIMEOUT as TIMEOUT
 from sim.flight_estimator import QuadrotorNoise
@@ -20,7 +21,6 @@ from sim.quadrotor import SAMPLES, Quadrotor
 from sim.vehicle import BadInput
 from sim.world import Arena, staged_arena
 from tests.robots import QUADROTOR
-from tests.sim.station import AT_ONCE
 
 RULES = ("px4", "ardupilot")
 

@@ -7,6 +7,7 @@ import pytest
 from deploy.bench import sitl
 from deploy.bench.manners import embedded, on_the_ground
 from deploy.bench.station import Station
+from deploy.run.autopilot import AutopilotSettings, open_field, vehicle
 from messaging.links import open_link
 
 
@@ -22,6 +23,15 @@ def test_an_embedded_one_answers_on_the_ground() -> None:
     assert found["interval of message 9999"] == "failed" and found["command USER_1"] == "unsupported"
     assert (found["mode 99"], found["mode after mode 99"]) == ("unsupported", 0)
     assert (found["take off, disarmed"], found["mode after that"]) == ("failed", 4)
+
+
+@pytest.mark.parametrize(("at_once", "acceleration"), [(False, 1.0), (True, 1e4)])
+def test_an_arducopter_of_ours_is_as_delivered_or_as_it_was_recorded(at_once: bool, acceleration: float) -> None:
+    """`fly` flies it behind a model set of one that follows setpoints at once: else states are outside of their sets."""
+    settings = AutopilotSettings("", "ardupilot", airborne=True, at_once=at_once, setpoint_timeout=0.2)
+    autopilot = vehicle(settings, open_field(), 1)
+    assert autopilot.pilot.limits.across == autopilot.pilot.limits.upright == acceleration
+    assert autopilot.pilot.limits.setpoint_timeout == 0.2
 
 
 def test_where_there_is_no_real_one_the_variable_is_named(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -2,7 +2,8 @@
 
 import pytest
 
-from tests.sim.station import AT_ONCE, Station
+from sim.autopilot.parameters import AT_ONCE
+from tests.sim.station import Station
 
 
 @pytest.fixture(params=["px4", "ardupilot"])

@@ -21,14 +21,6 @@ ARM, TAKEOFF, LAND, MODE = 400, 22, 21, 176
 ACCEPTED, REJECTED, DENIED, UNSUPPORTED, FAILED = range(5)
 GUIDED, COPTER_LAND, BRAKE, AUTO = 4, 9, 17, 3  # ArduCopter's modes
 OFFBOARD = 6  # PX4's main mode
-# What an ArduCopter flies follows setpoints with a limited acceleration, as it is delivered.
-AT_ONCE: dict[str, dict[str, float]] = {
-    "px4": {},
-    "ardupilot": {
-        **{"WPNAV_SPEED": 800.0, "WPNAV_SPEED_UP": 500.0, "WPNAV_SPEED_DN": 500.0},
-        **{"WPNAV_ACCEL": 1e6, "WPNAV_ACCEL_Z": 1e6},
-    },
-}
 
 
 def field(*obstacles: Obstacle) -> Arena:
