@@ -27,7 +27,7 @@ def test_an_embedded_one_answers_on_the_ground() -> None:
 
 @pytest.mark.parametrize(("at_once", "acceleration"), [(False, 1.0), (True, 1e4)])
 def test_an_arducopter_of_ours_is_as_delivered_or_as_it_was_recorded(at_once: bool, acceleration: float) -> None:
-    """`fly` flies it behind a model set of one that follows setpoints at once: else states are outside of their sets."""
+    """`fly` flies it behind a model set of one that follows setpoints at once: else states leave their sets."""
     settings = AutopilotSettings("", "ardupilot", airborne=True, at_once=at_once, setpoint_timeout=0.2)
     autopilot = vehicle(settings, open_field(), 1)
     assert autopilot.pilot.limits.across == autopilot.pilot.limits.upright == acceleration
