@@ -21,6 +21,13 @@ def _lesser(one: Single, other: Single, found: Single) -> None:
         found[j] = a if a < b else b
 
 
+@compiled("void(f4[::1], f4[::1])")
+def _copy(values: Single, found: Single) -> None:
+    """Each number. (`found[:] = values` looks whether they overlap, and takes one at a time.)"""
+    for j in range(len(found)):
+        found[j] = values[j]
+
+
 @compiled("void(f4[:,::1], f4, f4)")
 def scale_to(values: Single, share: np.float32, most: np.float32) -> None:
     """Each becomes so much of what it was, and that at the most."""
@@ -43,26 +50,44 @@ def _least_ahead(values: Single, spare: Single, found: Single, count: int, strid
     _lesser(values[: len(found)], values[ahead : ahead + len(found)], found)
 
 
+@compiled("void(f4[:,::1], i8, f4[:,::1])")
+def _least_beside(rings: Single, beside: int, found: Single) -> None:
+    """The least of so many columns beside each, on either side, in rings (R, A). All at once: what comes of windows
+    from one ring into the next is not looked at."""
+    columns, count = rings.shape[1], 2 * beside + 1
+    if count >= columns:
+        for i in range(len(rings)):
+            found[i] = rings[i].min()
+        return
+    each = columns + count - 1
+    wrapped, spare = np.empty((len(rings), each), np.float32), np.empty(len(rings) * each, np.float32)
+    for i in range(len(rings)):
+        ring, round_ = rings[i], wrapped[i]
+        _copy(ring[columns - beside :], round_[:beside])
+        _copy(ring, round_[beside : beside + columns])
+        _copy(ring[:beside], round_[beside + columns :])
+    least = np.empty((len(rings), each), np.float32)
+    _least_ahead(wrapped.ravel(), spare, least.ravel()[: len(rings) * each - count + 1], count, 1)
+    for i in range(len(rings)):
+        _copy(least[i, :columns], found[i])
+
+
 @compiled("f4[:,::1](f4[:,::1], i8, i8[::1])")
 def least_of(values: Single, rows: int, beside: NDArray[np.int64]) -> Single:
     """Of a grid (E, A), round in its columns: the least (E, A) of so many rows above and below each, and so many
     columns (E,) beside it."""
     rings, columns = values.shape
     size, edge = rings * columns, rows * columns
-    tall, spare = np.full(size + 2 * edge, np.inf, np.float32), np.empty(size + 2 * edge, np.float32)
-    tall[edge : edge + size] = values.ravel()
-    upright, found = np.empty(size, np.float32), np.empty((rings, columns), np.float32)
-    _least_ahead(tall, spare, upright, 2 * rows + 1, columns)
-    for i in range(rings):
-        ring, at, count = upright[i * columns : (i + 1) * columns], beside[i], 2 * beside[i] + 1
-        if count >= columns:
-            found[i] = ring.min()
-            continue
-        wrapped = tall[: columns + count - 1]
-        wrapped[:at] = ring[columns - at :]
-        wrapped[at : at + columns] = ring
-        wrapped[at + columns :] = ring[:at]
-        _least_ahead(wrapped, spare[: len(wrapped)], found[i], count, 1)
+    tall, spare = np.empty(size + 2 * edge, np.float32), np.empty(size + 2 * edge, np.float32)
+    tall[:edge] = tall[edge + size :] = np.float32(np.inf)
+    _copy(values.ravel(), tall[edge : edge + size])
+    upright, found = np.empty((rings, columns), np.float32), np.empty((rings, columns), np.float32)
+    _least_ahead(tall, spare, upright.ravel(), 2 * rows + 1, columns)
+    first = 0
+    for i in range(1, rings + 1):
+        if i == rings or beside[i] != beside[first]:
+            _least_beside(upright[first:i], beside[first], found[first:i])
+            first = i
     return found
 
 
@@ -121,17 +146,27 @@ def forget_ghosts(
     """Make unknown what returns from nearer than so much of the least of all meshes about it, less an error [m]. So
     many are left that are known."""
     rings, columns = returns.shape
-    left = 0
+    left, pair, spare = returns.size, np.empty(columns + 1, np.float32), np.empty(columns, np.float32)
+    signs, zero = spare.view(np.int32), np.float32(0.0)
     for i in range(rings):
-        ring, own = returns[i], meshes[i]
-        doubtful = 0
-        for j in range(columns):  # its own mesh returns from farther: so may all
-            left += ring[j] >= 0.0
-            doubtful += (ring[j] >= 0.0) & (ring[j] < share * (own[j] - error))
-        if not doubtful:
+        ring, own, under, any_ = returns[i], meshes[i], meshes[max(i - min(rows, 1), 0)], np.int32(0)
+        for j in range(columns):
+            pair[j + 1] = own[j] if own[j] < under[j] else under[j]
+        aside = min(beside[i], 1)
+        pair[0] = pair[columns]
+        before = pair[1 - aside : 1 - aside + columns]
+        for j in range(columns):  # one of the four that it is in returns from no farther: so do not all
+            one, other = pair[j + 1], before[j]
+            least = share * ((one if one < other else other) - error)
+            spare[j] = ring[j] - (least if least > zero else zero)
+        for j in range(columns):
+            any_ |= signs[j]
+        if any_ >= 0:  # all are known, and none is doubtful
             continue
         for j in range(columns):
-            if 0.0 <= ring[j] < share * (own[j] - error):
+            if ring[j] < zero:
+                left -= 1
+            elif spare[j] < zero:
                 than = (ring[j] / share + error) * (1.0 + SINGLE)
                 if _farther(meshes, i, j, than, rows, beside[i]):
                     ring[j] = -1.0
