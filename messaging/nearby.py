@@ -38,7 +38,7 @@ def scale_to(values: Single, share: np.float32, most: np.float32) -> None:
 
 
 @compiled("void(f4[::1], f4[::1], f4[::1], i8, i8)")
-def _least_ahead(values: Single, spare: Single, found: Single, count: int, stride: int) -> None:
+def least_ahead(values: Single, spare: Single, found: Single, count: int, stride: int) -> None:
     """Of each number and those after it, so many in all, so far apart each; overwrites values and spare."""
     n, width = len(values), 1  # so many each entry is the least of
     while 2 * width <= count:
@@ -67,7 +67,7 @@ def _least_beside(rings: Single, beside: int, found: Single) -> None:
         _copy(ring, round_[beside : beside + columns])
         _copy(ring[:beside], round_[beside + columns :])
     least = np.empty((len(rings), each), np.float32)
-    _least_ahead(wrapped.ravel(), spare, least.ravel()[: len(rings) * each - count + 1], count, 1)
+    least_ahead(wrapped.ravel(), spare, least.ravel()[: len(rings) * each - count + 1], count, 1)
     for i in range(len(rings)):
         _copy(least[i, :columns], found[i])
 
@@ -82,7 +82,7 @@ def least_of(values: Single, rows: int, beside: NDArray[np.int64]) -> Single:
     tall[:edge] = tall[edge + size :] = np.float32(np.inf)
     _copy(values.ravel(), tall[edge : edge + size])
     upright, found = np.empty((rings, columns), np.float32), np.empty((rings, columns), np.float32)
-    _least_ahead(tall, spare, upright.ravel(), 2 * rows + 1, columns)
+    least_ahead(tall, spare, upright.ravel(), 2 * rows + 1, columns)
     first = 0
     for i in range(1, rings + 1):
         if i == rings or beside[i] != beside[first]:

@@ -1,7 +1,8 @@
 """Which shadows the patches of a range image cast into where a robot may be, compiled (`shadows.py`).
 
-Shadows are told as `lines` (9, n), contiguous: their near ends x, y, z, the unit vectors along them x, y, z, their
-length, and how wide they are about their near ends and their far ones, m.
+Shadows are told as `lines` (11, n), contiguous, in single precision, from some place: their near ends x, y, z, the
+unit vectors along them x, y, z, their length, how wide they are about their near ends and their far ones, m; and what
+follows from these: how much each widens a metre, and how far [m] it is at the most, no number where one of them is none.
 """
 
 from __future__ import annotations
@@ -12,10 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from messaging.compiled import compiled
+from messaging.nearby import least_ahead
+from safety.freespace import TOUCHING
 
 Array = NDArray[np.float64]
 Single = NDArray[np.float32]
 
+BLOCK = 64  # rays
 ROUNDING, WITHIN = 1e-4, 100.0  # m: by how much single precision may be off, of whatever is so near
 
 
@@ -30,18 +34,22 @@ def nearest_of_patches(free: Single, together: NDArray[np.int64], patches: int) 
     """The least of each patch's beams: so many together in each ring (E,) of a grid (E, A)."""
     rings, columns = free.shape
     found, k = np.empty(patches, np.float32), 0
+    ahead, spare, least = np.empty(2 * columns, np.float32), np.empty(2 * columns, np.float32), free[0].copy()
     for i in range(rings):
-        ring, each = free[i], together[i]
+        each, ring = together[i], free[i]
+        count = (columns + each - 1) // each
+        out = found[k : k + count]
         if each == 1:
-            found[k : k + columns] = ring
-            k += columns
-            continue
-        for j in range(0, columns, each):
-            least = ring[j]
-            for beam in range(j + 1, min(j + each, columns)):
-                least = least if least < ring[beam] else ring[beam]
-            found[k] = least
-            k += 1
+            for j in range(count):
+                out[j] = ring[j]
+        else:
+            for j in range(columns):
+                ahead[j] = ring[j]
+            ahead[columns : columns + each] = np.float32(np.inf)  # the last patch of a ring may be narrower
+            least_ahead(ahead[: columns + each - 1], spare, least, each, 1)
+            for j in range(count):
+                out[j] = least[j * each]
+        k += count
     return found
 
 
@@ -77,13 +85,32 @@ def _that_meet(
     found, room, count = np.empty(len(near), np.int64), np.float32(last) - near, 0
     if inside:
         _room_inside(ways, near, turn.astype(np.float32), faces, np.float32(last), room)
-    for k in range(len(near)):
-        found[count] = k
-        count += room[k] >= 0.0
+    signs = room.view(np.int32)
+    for begin in range(0, len(near), BLOCK):
+        block, all_ = signs[begin : begin + BLOCK], np.int32(-1)
+        for k in range(len(block)):
+            all_ &= block[k]
+        if all_ < 0:  # of most blocks all begin outside
+            continue
+        for k in range(len(block)):
+            found[count] = begin + k
+            count += block[k] >= 0
     return found[:count]
 
 
-@compiled("f8[:,::1](f4[:,::1], i8[::1], f4[:,::1], f8[:,::1], f8[::1], f8[:,:,::1], f8, f8, f8)")
+@compiled("void(f4[:,::1])")
+def complete(lines: Single) -> None:
+    """Tells what follows from the lines' first nine rows."""
+    x, y, z, u, v, w = lines[0], lines[1], lines[2], lines[3], lines[4], lines[5]
+    length, near, far, widening, extent = lines[6], lines[7], lines[8], lines[9], lines[10]
+    least = np.float32(TOUCHING)
+    for s in range(lines.shape[1]):
+        widening[s] = (far[s] - near[s]) / (length[s] if length[s] > least else least)
+        extent[s] = abs(x[s]) + abs(y[s]) + abs(z[s]) + near[s] + far[s]
+        extent[s] += length[s] * (abs(u[s]) + abs(v[s]) + abs(w[s]))
+
+
+@compiled("f4[:,::1](f4[:,::1], i8[::1], f4[:,::1], f8[:,::1], f8[::1], f8[:,:,::1], f8, f8, f8, f8[::1])")
 def behind(
     free: Single,
     together: NDArray[np.int64],
@@ -94,10 +121,12 @@ def behind(
     body: float,
     widening: float,
     wide: float,
-) -> Array:
-    """The lines of what is behind patches, as many beams together as each ring (E,) of the grid has it, in directions
-    (3, n), turned by (3, 3), from a sensor that is mounted aside of a place (6,): of those that a body may touch which
-    is so large, anywhere in the boxes (2, K, 3). Wide are they by so much, and so much more a metre."""
+    origin: Array,
+) -> Single:
+    """The lines, from the origin (3,), of what is behind patches, as many beams together as each ring (E,) of the grid
+    has it, in directions (3, n), turned by (3, 3), from a sensor that is mounted aside of a place (6,): of those that a
+    body may touch which is so large, anywhere in the boxes (2, K, 3). Wide are they by so much, and so much more a
+    metre."""
     at, low, high, square = np.empty(3), np.empty(3), np.empty(3), 0.0
     for axis in range(3):
         at[axis] = place[axis] + turn[axis, 0] * place[3] + turn[axis, 1] * place[4] + turn[axis, 2] * place[5]
@@ -108,16 +137,21 @@ def behind(
     high += body + last * widening + wide
     near = nearest_of_patches(free, together, ways.shape[1])
     index = _that_meet(ways, turn, at, last, low, high, near)
-    lines = np.empty((9, len(index)))
+    lines = np.empty((11, len(index)), np.float32)
+    x, y, z = ways[0], ways[1], ways[2]
     for axis in range(3):
-        a, b, c = turn[axis, 0], turn[axis, 1], turn[axis, 2]
+        a, b, c = np.float32(turn[axis, 0]), np.float32(turn[axis, 1]), np.float32(turn[axis, 2])
+        off, begins, along = np.float32(at[axis] - origin[axis]), lines[axis], lines[3 + axis]
         for s in range(len(index)):
             k = index[s]
-            lines[3 + axis, s] = a * ways[0, k] + b * ways[1, k] + c * ways[2, k]
-            lines[axis, s] = at[axis] + near[k] * lines[3 + axis, s]
+            along[s] = a * x[k] + b * y[k] + c * z[k]
+            begins[s] = off + near[k] * along[s]
+    most, wider, least_wide = np.float32(last), np.float32(widening), np.float32(wide)
+    length, about_near, about_far = lines[6], lines[7], lines[8]
     for s in range(len(index)):
-        least = near[index[s]]
-        lines[6, s] = last - least
-        lines[7, s] = least * widening + wide
-        lines[8, s] = last * widening + wide
+        begin = near[index[s]]
+        length[s] = most - begin
+        about_near[s] = begin * wider + least_wide
+        about_far[s] = most * wider + least_wide
+    complete(lines)
     return lines

@@ -22,34 +22,15 @@ Normal: TypeAlias = tuple[np.float32, np.float32, np.float32]
 
 FEW = 6  # of so many that are looked at one is left: then they are moved together
 ALTERNATIONS = 3  # between two segments, until their nearest points are known well enough
-
-
-@compiled("f4[:,::1](f8[:,::1], f8[::1])")
-def told_from(lines: Array, start: Array) -> Single:
-    """The same lines as seen from the start (9, n), and two rows more: how much each widens a metre, and how far [m]
-    from the start it is at the most, which is no number where one of them is none."""
-    n = lines.shape[1]
-    told = np.empty((11, n), np.float32)
-    for i in range(9):
-        line, out, off = lines[i], told[i], start[i] if i < 3 else 0.0
-        for s in range(n):
-            out[s] = line[s] - off
-    x, y, z, u, v, w = told[0], told[1], told[2], told[3], told[4], told[5]
-    length, near, far, widening, extent = told[6], told[7], told[8], told[9], told[10]
-    least = np.float32(TOUCHING)
-    for s in range(n):
-        widening[s] = (far[s] - near[s]) / (length[s] if length[s] > least else least)
-        extent[s] = abs(x[s]) + abs(y[s]) + abs(z[s]) + near[s] + far[s]
-        extent[s] += length[s] * (abs(u[s]) + abs(v[s]) + abs(w[s]))
-    return told
+BLOCK = 128  # numbers that the least of is looked for at a time
 
 
 @compiled("void(f4[::1], f4[:,::1], f4[::1])")
-def _room(place: Single, told: Single, found: Single) -> None:
-    """How near each shadow, as `told_from` has them, is to a place, where that is nearer than was found before."""
+def _room(place: Single, lines: Single, found: Single) -> None:
+    """How near each shadow is to a place, where that is nearer than was found before."""
     a, b, c, zero = place[0], place[1], place[2], np.float32(0.0)
-    x, y, z, u, v, w = told[0], told[1], told[2], told[3], told[4], told[5]
-    length, about, widening = told[6], told[7], told[9]
+    x, y, z, u, v, w = lines[0], lines[1], lines[2], lines[3], lines[4], lines[5]
+    length, about, widening = lines[6], lines[7], lines[9]
     for s in range(len(found)):
         p, q, r = a - x[s], b - y[s], c - z[s]  # first: far away, the squares' difference would be all rounding
         t = p * u[s] + q * v[s] + r * w[s]
@@ -60,45 +41,79 @@ def _room(place: Single, told: Single, found: Single) -> None:
         found[s] = found[s] if room >= found[s] else room
 
 
+@compiled("f8[:,::1](f8[:,::1], f8)")
+def thinned(ends: Array, apart: float) -> Array:
+    """The ends (N+1, 3), each by the last one before it that it is within so much of [m], if there is one."""
+    places, last = ends.copy(), 0
+    for end in range(1, len(ends)):
+        square = 0.0
+        for axis in range(3):
+            square += (ends[end, axis] - ends[last, axis]) ** 2
+        if square <= apart**2:  # not of what is no number
+            places[end] = ends[last]
+        else:
+            last = end
+    return places
+
+
 @compiled("f4[:,::1](f4[:,::1], f8[:,::1], i8[::1])")
-def rooms(told: Single, ends: Array, first: NDArray[np.int64]) -> Single:
-    """About how near [m] each shadow is to any of the ends (N+1, 3), from the start, of the periods of each group,
-    which begins with so many a period (G,): (G, n)."""
-    n, periods = told.shape[1], len(ends) - 1
+def rooms(lines: Single, places: Array, first: NDArray[np.int64]) -> Single:
+    """About how near [m] each shadow is to any of the places (N+1, 3) at the ends of the periods of each group, which
+    begins with so many a period (G,): (G, n)."""
+    n, periods = lines.shape[1], len(places) - 1
     found = np.full((len(first), n), np.inf, np.float32)
     for group in range(len(first)):
         until = first[group + 1] if group + 1 < len(first) else periods
-        for end in range(first[group], until + 1):
-            _room(ends[end].astype(np.float32), told, found[group])
+        own = found[group]
+        _room(places[first[group]].astype(np.float32), lines, own)
+        if group > 0:  # where one group begins, the one before ends
+            before = found[group - 1]
+            for s in range(n):
+                before[s] = own[s] if own[s] < before[s] else before[s]
+        for end in range(first[group] + 1, until + (group + 1 == len(first))):
+            if (places[end] != places[end - 1]).any():
+                _room(places[end].astype(np.float32), lines, own)
     return found
 
 
-@compiled("f4(f4[::1], f4[::1])")
-def _least(values: Single, spare: Single) -> np.float32:
-    """The least of n >= 1 numbers, none if one of them is none; the last half with the first, and again. Overwrites
-    spare (n,), which may be what is asked of."""
-    n = len(values)
-    spare[0] = values[0]
-    while n > 1:
-        half = (n + 1) // 2
-        for k in range(n - half):
-            a, b = values[k], values[half + k]
-            spare[k] = a if a < b or a != a else b
-        if 2 * half > n:
-            spare[half - 1] = values[half - 1]
-        values, n = spare, half
-    return np.float32(spare[0])
+@compiled("i8(i4[::1])")
+def _least(values: NDArray[np.int32]) -> int:
+    """Which of n >= 1 is the least. Of numbers that are not negative their bits, as integers, are in the same order,
+    which many at a time can be compared in."""
+    best, at = values[0], 0
+    for begin in range(0, len(values), BLOCK):
+        block, least = values[begin : begin + BLOCK], best
+        for k in range(len(block)):
+            least = block[k] if block[k] < least else least
+        if least < best:
+            best, at = least, begin
+    while values[at] != best:
+        at += 1
+    return at
+
+
+@compiled("f4(f4[::1])")
+def _greatest(values: Single) -> np.float32:
+    """The greatest of n >= 1 numbers that are not negative, no number where one of them is none: its bits are greater
+    than infinity's."""
+    bits, most, unsigned = values.view(np.int32), np.int32(0), np.int32(0x7FFFFFFF)
+    for k in range(len(bits)):
+        own = bits[k] & unsigned
+        most = own if own > most else most
+    one = np.empty(1, np.int32)
+    one[0] = most
+    return np.float32(one.view(np.float32)[0])
 
 
 @compiled("Tuple((UniTuple(f8, 3), f8))(f4[:,::1], i8, f8[:,::1], f8)")
-def _support(told: Single, shadow: int, chord: Array, rounded: float) -> tuple[tuple[float, float, float], float]:
+def _support(lines: Single, shadow: int, chord: Array, rounded: float) -> tuple[tuple[float, float, float], float]:
     """The unit normal from a chord (2, 3), from the start, towards a shadow, and the level that it lies beyond."""
     near, along = np.empty(3), np.empty(3)
     square = 0.0
     for i in range(3):
-        near[i], along[i] = told[i, shadow], told[3 + i, shadow]
+        near[i], along[i] = lines[i, shadow], lines[3 + i, shadow]
         square += (chord[1, i] - chord[0, i]) ** 2
-    length, share, square = float(told[6, shadow]), 0.5, max(square, TOUCHING**2)
+    length, share, square = float(lines[6, shadow]), 0.5, max(square, TOUCHING**2)
     towards = np.zeros(3)
     for _ in range(ALTERNATIONS):
         t = 0.0
@@ -114,16 +129,16 @@ def _support(told: Single, shadow: int, chord: Array, rounded: float) -> tuple[t
     x, y, z = towards[0] / norm, towards[1] / norm, towards[2] / norm
     at_near = x * near[0] + y * near[1] + z * near[2]
     at_far = at_near + length * (x * along[0] + y * along[1] + z * along[2])
-    return (x, y, z), min(at_near - told[7, shadow], at_far - told[8, shadow]) - rounded
+    return (x, y, z), min(at_near - lines[7, shadow], at_far - lines[8, shadow]) - rounded
 
 
 @compiled("void(f4[:,::1], UniTuple(f4, 3), f4, f4, f4[::1])")
-def _without_beyond(told: Single, normal: Normal, level: np.float32, surely: np.float32, room: Single) -> None:
+def _without_beyond(lines: Single, normal: Normal, level: np.float32, surely: np.float32, room: Single) -> None:
     """Of the first shadows, as many as there are rooms, those that are so far [m] beyond a half-space are done with:
     the room to them is infinite."""
     a, b, c = normal
-    x, y, z, u, v, w = told[0], told[1], told[2], told[3], told[4], told[5]
-    length, about_near, about_far, done = told[6], told[7], told[8], np.float32(np.inf)
+    x, y, z, u, v, w = lines[0], lines[1], lines[2], lines[3], lines[4], lines[5]
+    length, about_near, about_far, done = lines[6], lines[7], lines[8], np.float32(np.inf)
     for s in range(len(room)):
         near = a * x[s] + b * y[s] + c * z[s] - level
         far = near + length[s] * (a * u[s] + b * v[s] + c * w[s]) - about_far[s]
@@ -133,7 +148,7 @@ def _without_beyond(told: Single, normal: Normal, level: np.float32, surely: np.
 
 
 @compiled("i8(f4[:,::1], f4[:,::1], f4[::1], i8[::1])")
-def _moved_up(told: Single, kept: Single, room: Single, index: NDArray[np.int64]) -> int:
+def _moved_up(lines: Single, kept: Single, room: Single, index: NDArray[np.int64]) -> int:
     """How many of the first shadows, as many as there are rooms, are left. Where they are few, they and their rooms are
     moved to the front of `kept` and room; else all stay."""
     n, left = len(room), 0
@@ -146,7 +161,7 @@ def _moved_up(told: Single, kept: Single, room: Single, index: NDArray[np.int64]
         index[left] = s
         left += room[s] != np.inf
     for i in range(9):
-        row, out = told[i], kept[i]
+        row, out = lines[i], kept[i]
         for k in range(left):
             out[k] = row[index[k]]
     for k in range(left):
@@ -154,9 +169,9 @@ def _moved_up(told: Single, kept: Single, room: Single, index: NDArray[np.int64]
     return left
 
 
-@compiled("i8(f4[:,::1], f8[:,::1], f4[::1], f8, f8, f8, f8, f8[:,::1], f8[::1], f4[:,::1], f4[::1], i8[::1])")
+@compiled("i8(f4[:,::1], f8[:,::1], f4[::1], f8, f8, f8, f8, f8[:,::1], f8[::1], f4[:,::1], i8[::1])")
 def _until_beyond(
-    told: Single,
+    lines: Single,
     chord: Array,
     room: Single,
     reach: float,
@@ -166,20 +181,17 @@ def _until_beyond(
     normals: Array,
     levels: Array,
     kept: Single,
-    spare: Single,
     index: NDArray[np.int64],
 ) -> int:
     """Half-spaces about one chord, into normals (k, 3) and levels (k,): so many. Overwrites what it is given to work
-    with: room (n,), kept (9, n), spare (n,), index (n,)."""
-    within, surely, most, rest = np.float32(reach), np.float32(rounded), len(levels), told
+    with: room (n,), not negative, kept (9, n), index (n,)."""
+    within, surely, most, rest = np.float32(reach), np.float32(rounded), len(levels), lines
     for s in range(len(room)):
         room[s] = np.float32(np.inf) if room[s] > within else room[s]
     for k in range(most):
-        nearest, chosen = _least(room, spare), 0
-        if nearest == np.inf:
+        chosen = _least(room.view(np.int32))
+        if room[chosen] == np.inf:
             return k
-        while room[chosen] > nearest:
-            chosen += 1
         normal, level = _support(rest, chosen, chord, rounded)
         level -= give * 2.0 ** (k // 8) * max(room[chosen] - keep_off, 0.0)
         normals[k, 0], normals[k, 1], normals[k, 2], levels[k] = normal[0], normal[1], normal[2], level
@@ -197,7 +209,7 @@ def _until_beyond(
 
 @compiled("Tuple((f8[:,:,::1], f8[:,::1]))(f4[:,::1], f8[:,:,::1], f4[:,::1], f8[::1], f8, i8, f8, f8, f8)")
 def supporting(
-    told: Single,
+    lines: Single,
     chords: Array,
     room: Single,
     reach: Array,
@@ -207,22 +219,16 @@ def supporting(
     farthest: float,
     rounded: float,
 ) -> tuple[Array, Array]:
-    """Half-spaces until every shadow, as `told_from` has them, that is within reach (G,) is beyond one of them, about
-    each of the chords (G, 2, 3), from the start: normals (G, k, 3) and levels (G, k), also from the start, for as many
-    as any chord needs; those that one does not need are at `farthest`, and where `most` are not enough the last is at
-    -inf. room (G, n) [m]: from the chords to the shadows, and numbers; give: as `shadows.GIVE`; rounded [m]: by
-    how much single precision may be off."""
+    """Half-spaces until every shadow that is within reach (G,) is beyond one of them, about each of the chords
+    (G, 2, 3): normals (G, k, 3) and levels (G, k) for as many as any chord needs; those that one does not need are at
+    `farthest`, and where `most` are not enough the last is at -inf. room (G, n) [m]: from the chords to the shadows,
+    not negative; give: as `shadows.GIVE`; rounded [m]: by how much single precision may be off."""
     normals, levels, needed = np.zeros((len(chords), most, 3)), np.full((len(chords), most), farthest), 0
-    n = told.shape[1]
-    room, kept, spare, index = (
-        room.copy(),
-        np.empty((9, n), np.float32),
-        np.empty(n, np.float32),
-        np.empty(n, np.int64),
-    )
+    n = lines.shape[1]
+    room, kept, index = room.copy(), np.empty((9, n), np.float32), np.empty(n, np.int64)
     for group in range(len(chords)):
         a, b, near, within = normals[group], levels[group], room[group], reach[group]
-        count = _until_beyond(told, chords[group], near, within, keep_off, give, rounded, a, b, kept, spare, index)
+        count = _until_beyond(lines, chords[group], near, within, keep_off, give, rounded, a, b, kept, index)
         needed = max(needed, count)
     return normals[:, :needed].copy(), levels[:, :needed].copy()
 
@@ -243,16 +249,17 @@ def together(ends: Array, shared: float) -> NDArray[np.int64]:
 
 @compiled("i8(f8[:,::1], i8[::1], f4[:,::1], f8)")
 def free_groups(ends: Array, first: NDArray[np.int64], room: Single, touching: float) -> int:
-    """Of how many groups, from the first on, the way is free, and a number."""
-    spare = np.empty(room.shape[1], np.float32)
+    """Of how many groups, from the first on, the way (N+1, 3) is free, and a number."""
     for group in range(len(first)):
         until = first[group + 1] if group + 1 < len(first) else len(ends) - 1
-        if not (_least(room[group], spare) > touching and np.isfinite(ends[first[group] : until + 1]).all()):
+        near = room[group]
+        least = near[_least(near.view(np.int32))]  # of a negative one, too, a negative one
+        if not (least > touching and np.isfinite(ends[first[group] : until + 1]).all()):
             return group
     return len(first)
 
 
-@compiled("Tuple((f8[:,:,::1], f8[:,::1]))(f8[:,:,::1], f8[:,::1], i8[::1], f8[:,:,::1], f8[::1], f8, f8[::1])")
+@compiled("Tuple((f8[:,:,::1], f8[:,::1]))(f8[:,:,::1], f8[:,::1], i8[::1], f8[:,:,::1], f8[::1], f8, f8[::1], f8[::1])")
 def about_periods(
     normals: Array,
     levels: Array,
@@ -261,10 +268,12 @@ def about_periods(
     grown: Array,
     keep_off: float,
     measured: Array,
+    aside: Array,
 ) -> tuple[Array, Array]:
     """Of half-spaces (G, k) of groups those of every period, (k+6, N, 3) and (k+6, N), for a body that keeps off what
     is there, and may have grown (N,), by where it is measured; and the faces about both of its ends' boxes
-    (2, N+1, 3) from the start, as they are. Periods after the last group have the last one's."""
+    (2, N+1, 3), as they are. From a place so far aside (3,) of where these are told from. Periods after the last group
+    have the last one's."""
     count, periods = levels.shape[1], len(grown)
     a, b = np.zeros((count + 6, periods, 3)), np.empty((count + 6, periods))
     group = 0
@@ -276,12 +285,12 @@ def about_periods(
                 kept = grown[k] + keep_off
             for axis in range(3):
                 a[i, k, axis] = normal[axis]
-                kept += abs(normal[axis]) * measured[axis]
+                kept += abs(normal[axis]) * measured[axis] + normal[axis] * aside[axis]
             b[i, k] = levels[group, i] - kept
         for axis in range(3):
-            a[count + axis, k, axis], b[count + axis, k] = 1.0, max(boxes[1, k, axis], boxes[1, k + 1, axis])
-            a[count + 3 + axis, k, axis] = -1.0
-            b[count + 3 + axis, k] = -min(boxes[0, k, axis], boxes[0, k + 1, axis])
+            a[count + axis, k, axis], a[count + 3 + axis, k, axis] = 1.0, -1.0
+            b[count + axis, k] = max(boxes[1, k, axis], boxes[1, k + 1, axis]) - aside[axis]
+            b[count + 3 + axis, k] = aside[axis] - min(boxes[0, k, axis], boxes[0, k + 1, axis])
     return a, b
 
 
@@ -295,51 +304,51 @@ def _farthest_corner(place: Array, boxes: Array, end: int) -> float:
 
 
 @compiled("f8[::1](f8[:,::1], i8[::1], i8, f8[:,:,::1], f8[::1], f8)")
-def reaches(ends: Array, first: NDArray[np.int64], free: int, boxes: Array, grown: Array, body: float) -> Array:
-    """How far [m] from the ends of the periods of each of the first groups (free,) what may touch a body in the boxes
-    is at the most.
+def reaches(places: Array, first: NDArray[np.int64], free: int, boxes: Array, grown: Array, body: float) -> Array:
+    """How far [m] from the places (N+1, 3) at the ends of the periods of each of the first groups (free,) what may
+    touch a body in the boxes is at the most.
 
-    Between two ends it is nowhere farther from the nearer one than at an end, and half the way between them. The last
+    Between two places it is nowhere farther from the nearer one than at an end, and half the way between them. The last
     free group is also that of all periods after it (`about_periods`), and what they may touch is as near to its last
-    end as their boxes' corners are.
+    place as their boxes' corners are.
     """
-    found, periods = np.zeros(free), len(ends) - 1
+    found, periods = np.zeros(free), len(places) - 1
     for group in range(free):
         until = first[group + 1] if group + 1 < len(first) else periods
         most, step = 0.0, 0.0
         for end in range(first[group], until + 1):
             square = 0.0
             for axis in range(3):
-                square += (ends[end, axis] - ends[max(end - 1, first[group]), axis]) ** 2
-            most, step = max(most, _farthest_corner(ends[end], boxes, end)), max(step, square)
+                square += (places[end, axis] - places[max(end - 1, first[group]), axis]) ** 2
+            most, step = max(most, _farthest_corner(places[end], boxes, end)), max(step, square)
         most, last = most + 0.5 * math.sqrt(step), until
         if group == free - 1:
             last = periods
             for end in range(until, periods + 1):
-                most = max(most, _farthest_corner(ends[until], boxes, end))
+                most = max(most, _farthest_corner(places[until], boxes, end))
         found[group] = most + body + grown[last - 1]
     return found
 
 
-@compiled("Tuple((f8[:,::1], f8[:,:,::1]))(f8[::1], f8[:,::1], f8[:,:,::1])")
-def _from(start: Array, nominal: Array, boxes: Array) -> tuple[Array, Array]:
-    """The ends of all periods (N+1, 3) and their boxes (2, N+1, 3), as they are from the start."""
-    ends, within, last = np.zeros((len(nominal) + 1, 3)), np.empty((2, len(nominal) + 1, 3)), boxes.shape[1] - 1
+@compiled("Tuple((f8[:,::1], f8[:,:,::1]))(f8[::1], f8[::1], f8[:,::1], f8[:,:,::1])")
+def _from(origin: Array, start: Array, nominal: Array, boxes: Array) -> tuple[Array, Array]:
+    """The start and the ends of all periods (N+1, 3) and their boxes (2, N+1, 3), as they are from the origin."""
+    ends, within, last = np.empty((len(nominal) + 1, 3)), np.empty((2, len(nominal) + 1, 3)), boxes.shape[1] - 1
     for k in range(len(ends)):
         for axis in range(3):
             for side in range(2):
-                within[side, k, axis] = boxes[side, min(k, last), axis] - start[axis]
-            if k > 0:
-                ends[k, axis] = nominal[k - 1, axis] - start[axis]
+                within[side, k, axis] = boxes[side, min(k, last), axis] - origin[axis]
+            ends[k, axis] = (nominal[k - 1, axis] if k > 0 else start[axis]) - origin[axis]
     return ends, within
 
 
 @compiled(
     "Tuple((f8[:,:,::1], f8[:,::1]))"
-    "(f8[:,::1], f8[::1], f8[:,::1], f8[:,:,::1], UniTuple(f8, 2), f8, f8[::1], i8, UniTuple(f8, 4))"
+    "(f4[:,::1], f8[::1], f8[::1], f8[:,::1], f8[:,:,::1], UniTuple(f8, 2), f8, f8[::1], i8, UniTuple(f8, 5))"
 )
 def about_way(
-    lines: Array,
+    lines: Single,
+    origin: Array,
     start: Array,
     nominal: Array,
     boxes: Array,
@@ -347,27 +356,26 @@ def about_way(
     keep_off: float,
     measured: Array,
     most: int,
-    limits: tuple[float, float, float, float],
+    limits: tuple[float, float, float, float, float],
 ) -> tuple[Array, Array]:
-    """The half-spaces of all periods about a nominal way (N, 3), world, in boxes (2, N+1 or 1, 3), as `about_periods`
-    has them. moved [m]: how far what is seen may have moved until now, and moves in a period; limits: `shadows.SHARED`,
-    `TOUCHING`, `GIVE`, `FARTHEST`."""
-    shared, touching, give, farthest = limits
-    ends, within = _from(start, nominal, boxes)
+    """The half-spaces of all periods about a nominal way (N, 3), world, from a start (3,), in boxes (2, N+1 or 1, 3),
+    as `about_periods` has them, of shadows from an origin (3,). moved [m]: how far what is seen may have moved until
+    now, and moves in a period; limits: `shadows.SHARED`, `APART`, `TOUCHING`, `GIVE`, `FARTHEST`."""
+    shared, apart, touching, give, farthest = limits
+    ends, within = _from(origin, start, nominal, boxes)
     grown, first = moved[0] + moved[1] * np.arange(1.0, len(ends)), np.zeros(1, np.int64)
-    faces, levels = about_periods(np.zeros((1, 0, 3)), np.zeros((1, 0)), first, within, grown, keep_off, measured)
+    aside, no, none = ends[0].copy(), np.zeros((1, 0, 3)), np.zeros((1, 0))
+    faces, levels = about_periods(no, none, first, within, grown, keep_off, measured, aside)
     nowhere = np.full_like(levels, -np.inf)
     if not (np.abs(within) <= farthest).all():  # of two numbers, one of which is none, the larger may be the other
         return faces, nowhere
     if lines.shape[1] == 0:
         return faces, levels
-    first = together(ends, shared)
-    told = told_from(lines, start)
-    extent = -_least(-told[10], np.empty_like(told[10]))
+    first, extent, places = together(ends, shared), _greatest(lines[10]), thinned(ends, apart)
     if not extent <= farthest:
         return faces, nowhere
     rounded = rounding(extent + np.abs(within).max())
-    room = rooms(told, ends, first)
+    room = rooms(lines, places, first)
     free = free_groups(ends, first, room, touching)
     if free == 0:
         return faces, nowhere
@@ -375,6 +383,6 @@ def about_way(
     for group in range(free):
         until = first[group + 1] if group + 1 < len(first) else len(nominal)
         chords[group, 0], chords[group, 1] = ends[first[group]], ends[until]
-    reach = reaches(ends, first, free, within, grown, keep_off + measured.sum() + rounded)
-    normals, levels = supporting(told, chords, room[:free], reach, keep_off, most, give, farthest, rounded)
-    return about_periods(normals, levels, first, within, grown, keep_off, measured)
+    reach = reaches(places, first, free, within, grown, keep_off + measured.sum() + rounded)
+    normals, levels = supporting(lines, chords, room[:free], reach, keep_off, most, give, farthest, rounded)
+    return about_periods(normals, levels, first, within, grown, keep_off, measured, aside)

@@ -24,6 +24,7 @@ Single = NDArray[np.float32]
 PLANES = 32  # of a period at most: what needs more has no free space there
 GIVE = 0.05  # of the room to a shadow, that is given up for fewer half-spaces; twice as much after every eight
 SHARED = 0.6  # m of the nominal way, about, along which periods share half-spaces
+APART = 0.1  # m; ends of periods that are no farther from one before are as near as that one to any shadow, about
 ASIDE = 1e-6  # rad: more than a direction in single precision is beside its patch's middle
 FACES = np.vstack([np.eye(3), -np.eye(3)])  # of the room
 
@@ -39,11 +40,12 @@ class Room:
 
 @dataclass(frozen=True)
 class Shadows:
-    """n of them, as `lines` (9, n) from their near ends to their far ones, world: `casting.py` says what a line is, and
-    the hull of balls about both ends holds the shadow. room: all that come into it. speed [m/s]: whatever they hold may
-    move as fast since `age` s ago."""
+    """n of them, as `lines` (11, n) from their near ends to their far ones, from an origin (3,), world: `casting.py`
+    says what a line is, and the hull of balls about both ends holds the shadow. room: all that come into it. speed
+    [m/s]: whatever they hold may move as fast since `age` s ago."""
 
-    lines: Array
+    lines: Single
+    origin: Array
     room: Room
     speed: float
     age: float
@@ -56,8 +58,9 @@ def prepare() -> None:
     import safety.shading  # noqa: F401
 
 
-def shadows(image: RangeImage, room: Room, body: float) -> Shadows:
-    """All that is not known to be free and that a body of that radius [m], with its middle in the room, may touch."""
+def shadows(image: RangeImage, room: Room, body: float, origin: Array) -> Shadows:
+    """All that is not known to be free and that a body of that radius [m], with its middle in the room, may touch; from
+    an origin (3,) in the room."""
     from safety.casting import behind  # compiled
 
     elevations, free = seen_free(image)
@@ -65,8 +68,8 @@ def shadows(image: RangeImage, room: Room, body: float) -> Shadows:
     beside = body + image.speed * (image.age + room.last)
     about = half_diagonal(image) + image.angle_error + ASIDE
     place = np.array([*image.at, *image.mount])
-    lines = behind(free, together, ways, image.turn, place, room.boxes, beside, about, image.sensor_error)
-    return Shadows(lines, room, image.speed, image.age)
+    lines = behind(free, together, ways, image.turn, place, room.boxes, beside, about, image.sensor_error, origin)
+    return Shadows(lines, origin, room, image.speed, image.age)
 
 
 @lru_cache(maxsize=16)
@@ -92,5 +95,5 @@ def half_spaces(
     from safety.shading import about_way  # compiled
 
     boxes, moved = near.room.boxes, (near.speed * near.age, near.speed * period)  # m: until now, and in a period
-    least = SHARED, TOUCHING, GIVE, FARTHEST
-    return about_way(near.lines, start, np.ascontiguousarray(nominal), boxes, moved, keep_off, measured, PLANES, least)
+    way, limits = np.ascontiguousarray(nominal), (SHARED, APART, TOUCHING, GIVE, FARTHEST)
+    return about_way(near.lines, near.origin, start, way, boxes, moved, keep_off, measured, PLANES, limits)

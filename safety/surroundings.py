@@ -182,7 +182,8 @@ class Surroundings:
             promised = promised.take(counts) if counts.any() else None
         unseen: seen.Cells | shades.Shadows | None = None
         if isinstance(request.scan, RangeImage):
-            unseen = shades.shadows(request.scan, self._room(z_0, inputs, start, turn), self.body)
+            start = np.ascontiguousarray(start)
+            unseen = shades.shadows(request.scan, self._room(z_0, inputs, start, turn), self.body, start)
         elif request.scan is not None:
             unseen = self._unseen(request.scan, start)
         return Scene(start, heading, turn, near, beyond, moving, unseen, promised)
@@ -208,7 +209,7 @@ class Surroundings:
 
         z = np.concatenate([z_0, inputs[0]])
         return shades.Room(
-            filled_by_plans(*self._filled, z, inputs[1], self._beside, np.ascontiguousarray(start), turn),
+            filled_by_plans(*self._filled, z, inputs[1], self._beside, start, turn),
             self.robot.horizon * self.robot.period,
         )
 

@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 from messaging.patches import half_diagonal, seen_free
 from messaging.range_images import RangeImage
 from messaging.shapes import FARTHEST
-from safety.casting import rounding
-from safety.shading import rooms, supporting, told_from
+from safety.casting import complete, rounding
+from safety.shading import rooms, supporting
 from safety.shadows import Room, Shadows, _patches, half_spaces, shadows
 from tests.messaging.test_range_images import COLUMNS, EDGE, RINGS
 from tests.safety.test_shadows import NOTHING, room
@@ -35,7 +35,9 @@ def scattered(seed, at=(0.2, -0.1, 0.3)):
 def test_a_shadow_holds_all_of_its_patch_that_comes_into_the_room_whatever_the_errors(at, seed):
     """Also by a sensor that is not where the robot may be: what an old image shows."""
     rng, image = np.random.default_rng(seed), scattered(seed, at)
-    lines = shadows(image, room(2.0, 1.0), 0.2).lines
+    origin = np.array([0.5, 0.3, -0.2])
+    lines = shadows(image, room(2.0, 1.0), 0.2, origin).lines.astype(float)
+    lines[:3] += origin[:, None]
     elevations, free = seen_free(image)
     together, middles = _patches(elevations.tobytes(), COLUMNS)
     middles = middles.T
@@ -54,8 +56,8 @@ def test_a_shadow_holds_all_of_its_patch_that_comes_into_the_room_whatever_the_e
     inside = (np.abs(points) < 2.0).all(axis=1)
     assert inside.sum() > 50
     for point, patch in zip(points[inside][:100], which[inside][:100], strict=True):
-        (line,) = np.flatnonzero(lines[3:6].T @ (image.turn @ middles[patch]) > 1.0 - 1e-7)
-        near, along, (length, about_near, about_far) = lines[:3, line], lines[3:6, line], lines[6:, line]
+        (line,) = np.flatnonzero(lines[3:6].T @ (image.turn @ middles[patch]) > 1.0 - 5e-7)
+        near, along, (length, about_near, about_far) = lines[:3, line], lines[3:6, line], lines[6:9, line]
         share = np.linspace(0.0, 1.0, 400)
         there = near + (share * length)[:, None] * along
         about = about_near + share * (about_far - about_near)
@@ -72,9 +74,8 @@ def test_every_shadow_is_beyond_some_half_space_of_every_chord(seed, n, give):
     lines = np.vstack([near, along, rng.uniform(0.0, 3.0, n), rng.uniform(0.0, 0.1, n), rng.uniform(0.1, 0.3, n)])
     start = rng.uniform(-0.2, 0.2, 3)
     chords, room = rng.uniform(-0.3, 0.3, (3, 2, 3)), rng.random((3, n), np.float32)
-    normals, levels = supporting(
-        told_from(lines, start), chords, room, np.full(3, np.inf), 0.2, n, give, FARTHEST, 1e-4
-    )
+    told = from_(lines, start)
+    normals, levels = supporting(told, chords, room, np.full(3, np.inf), 0.2, n, give, FARTHEST, 1e-4)
     ends = near - start[:, None], near - start[:, None] + lines[6] * along
     for group in range(3):
         used = levels[group] < FARTHEST
@@ -87,10 +88,19 @@ def test_where_half_spaces_do_not_suffice_nothing_is_free():
     lines = np.zeros((9, 2))
     lines[0], lines[3], lines[6] = [-1.0, 1.0], [-1.0, 1.0], 1.0  # one on either side
     chords, room = np.zeros((1, 2, 3)), np.ones((1, 2), np.float32)
-    told, everywhere = told_from(lines, np.zeros(3)), np.full(1, np.inf)
+    told, everywhere = from_(lines, NOTHING), np.full(1, np.inf)
     assert np.isfinite(supporting(told, chords, room, everywhere, 0.0, 2, 0.0, FARTHEST, 1e-4)[1]).all()
     assert np.isneginf(supporting(told, chords, room, everywhere, 0.0, 1, 0.0, FARTHEST, 1e-4)[1]).all()
     assert supporting(told, chords, room, np.full(1, 0.9), 0.0, 1, 0.0, FARTHEST, 1e-4)[1].size == 0
+
+
+def from_(lines, origin):
+    """Lines (9, n), world, as they are told from an origin (3,)."""
+    told = np.empty((11, lines.shape[1]), np.float32)
+    with np.errstate(over="ignore"):
+        told[:3], told[3:9] = lines[:3] - origin[:, None], lines[3:]
+    complete(told)
+    return told
 
 
 def along_x(step, half):
@@ -107,7 +117,7 @@ def lines_of(*lines):
 
 def left(lines, ends, boxes, point):
     """What the half-spaces that are not the room's faces leave to a body of 0.2 m at a point, in every period (N,)."""
-    seen = Shadows(lines, Room(boxes, 0.1 * len(ends)), 0.0, 0.0)
+    seen = Shadows(from_(lines, NOTHING), NOTHING, Room(boxes, 0.1 * len(ends)), 0.0, 0.0)
     normals, offsets = half_spaces(seen, NOTHING, ends[1:].copy(), 0.2, NOTHING, 0.1)
     return (offsets - normals @ point)[:-6].min(axis=0, initial=np.inf)
 
@@ -143,7 +153,7 @@ def far_off(rng, away, n):
 def test_how_near_a_shadow_is_does_not_depend_on_how_far_off_it_begins(away, seed):
     rng = np.random.default_rng(seed)
     lines, place = far_off(rng, away, 40), rng.uniform(-0.2, 0.2, (2, 3))
-    rooms_ = rooms(told_from(lines, NOTHING), place, np.zeros(1, np.int64))[0]
+    rooms_ = rooms(from_(lines, NOTHING), place, np.zeros(1, np.int64))[0]
     exact = np.full(40, np.inf)
     for at in place:
         off = at[:, None] - lines[:3]
@@ -158,7 +168,7 @@ def test_shadows_that_single_precision_can_not_tell_leave_nothing_free(row, valu
     ends, boxes = along_x(0.1, [0.5] * 4)
     lines = lines_of((3.0, 0, 0, 1, 0, 0, 1, 0.1, 0.1), (-3.0, 0, 0, -1, 0, 0, 1, 0.1, 0.1))
     lines[row, 1] = value
-    seen = Shadows(lines, Room(boxes, 0.4), 0.0, 0.0)
+    seen = Shadows(from_(lines, NOTHING), NOTHING, Room(boxes, 0.4), 0.0, 0.0)
     assert np.isneginf(half_spaces(seen, NOTHING, ends[1:].copy(), 0.2, NOTHING, 0.1)[1]).all()
 
 
@@ -183,7 +193,8 @@ def test_no_body_in_a_periods_boxes_touches_a_shadow_whatever_the_way(seed):
     off *= (about * rng.random(m) ** 0.2 / np.linalg.norm(off, axis=1))[:, None]
     bodies = lines[:3, which].T + (share * lines[6, which])[:, None] * ways[which] + off
     in_either = [((bodies >= boxes[0, e]) & (bodies <= boxes[1, e])).all(axis=1) for e in (k, k + 1)]
-    seen = Shadows(lines, Room(boxes, 0.1 * N), *moves)
+    origin = rng.normal(size=3)
+    seen = Shadows(from_(lines, origin), origin, Room(boxes, 0.1 * N), *moves)
     normals, offsets = half_spaces(seen, NOTHING, ends[1:].copy(), keep_off, NOTHING, 0.1)
     slack = (offsets[:, k] - np.einsum("hmd,md->hm", normals[:, k], bodies)).min(axis=0)
     assert slack[in_either[0] | in_either[1]].max(initial=-np.inf) <= 1e-6
@@ -191,7 +202,7 @@ def test_no_body_in_a_periods_boxes_touches_a_shadow_whatever_the_way(seed):
 
 @pytest.mark.parametrize("period", [0, 2])
 def test_a_way_that_is_no_number_frees_nothing_from_there_on(period):
-    near = shadows(scattered(0), room(2.0, 1.0), 0.0)
+    near = shadows(scattered(0), room(2.0, 1.0), 0.0, NOTHING)
     nominal = np.tile(np.arange(1.0, 5.0)[:, None] * 0.7, 3)
     sound = half_spaces(near, np.zeros(3), 0.1 * nominal, 0.0, np.zeros(3), 0.2)[1]
     assert np.isfinite(sound).all()
