@@ -41,38 +41,22 @@ def _room(place: Single, lines: Single, found: Single) -> None:
         found[s] = found[s] if room >= found[s] else room
 
 
-@compiled("f8[:,::1](f8[:,::1], f8)")
-def thinned(ends: Array, apart: float) -> Array:
-    """The ends (N+1, 3), each by the last one before it that it is within so much of [m], if there is one."""
-    places, last = ends.copy(), 0
-    for end in range(1, len(ends)):
-        square = 0.0
-        for axis in range(3):
-            square += (ends[end, axis] - ends[last, axis]) ** 2
-        if square <= apart**2:  # not of what is no number
-            places[end] = ends[last]
-        else:
-            last = end
-    return places
-
-
 @compiled("f4[:,::1](f4[:,::1], f8[:,::1], i8[::1])")
-def rooms(lines: Single, places: Array, first: NDArray[np.int64]) -> Single:
-    """About how near [m] each shadow is to any of the places (N+1, 3) at the ends of the periods of each group, which
-    begins with so many a period (G,): (G, n)."""
-    n, periods = lines.shape[1], len(places) - 1
+def rooms(lines: Single, ends: Array, first: NDArray[np.int64]) -> Single:
+    """About how near [m] each shadow is to any of the ends (N+1, 3) of the periods of each group, which begins with so
+    many a period (G,): (G, n)."""
+    n, periods = lines.shape[1], len(ends) - 1
     found = np.full((len(first), n), np.inf, np.float32)
     for group in range(len(first)):
         until = first[group + 1] if group + 1 < len(first) else periods
         own = found[group]
-        _room(places[first[group]].astype(np.float32), lines, own)
+        _room(ends[first[group]].astype(np.float32), lines, own)
         if group > 0:  # where one group begins, the one before ends
             before = found[group - 1]
             for s in range(n):
                 before[s] = own[s] if own[s] < before[s] else before[s]
         for end in range(first[group] + 1, until + (group + 1 == len(first))):
-            if (places[end] != places[end - 1]).any():
-                _room(places[end].astype(np.float32), lines, own)
+            _room(ends[end].astype(np.float32), lines, own)
     return found
 
 
@@ -304,28 +288,28 @@ def _farthest_corner(place: Array, boxes: Array, end: int) -> float:
 
 
 @compiled("f8[::1](f8[:,::1], i8[::1], i8, f8[:,:,::1], f8[::1], f8)")
-def reaches(places: Array, first: NDArray[np.int64], free: int, boxes: Array, grown: Array, body: float) -> Array:
-    """How far [m] from the places (N+1, 3) at the ends of the periods of each of the first groups (free,) what may
+def reaches(ends: Array, first: NDArray[np.int64], free: int, boxes: Array, grown: Array, body: float) -> Array:
+    """How far [m] from the ends (N+1, 3) of the periods of each of the first groups (free,) what may
     touch a body in the boxes is at the most.
 
-    Between two places it is nowhere farther from the nearer one than at an end, and half the way between them. The last
+    Between two ends it is nowhere farther from the nearer one than at an end, and half the way between them. The last
     free group is also that of all periods after it (`about_periods`), and what they may touch is as near to its last
-    place as their boxes' corners are.
+    end as their boxes' corners are.
     """
-    found, periods = np.zeros(free), len(places) - 1
+    found, periods = np.zeros(free), len(ends) - 1
     for group in range(free):
         until = first[group + 1] if group + 1 < len(first) else periods
         most, step = 0.0, 0.0
         for end in range(first[group], until + 1):
             square = 0.0
             for axis in range(3):
-                square += (places[end, axis] - places[max(end - 1, first[group]), axis]) ** 2
-            most, step = max(most, _farthest_corner(places[end], boxes, end)), max(step, square)
+                square += (ends[end, axis] - ends[max(end - 1, first[group]), axis]) ** 2
+            most, step = max(most, _farthest_corner(ends[end], boxes, end)), max(step, square)
         most, last = most + 0.5 * math.sqrt(step), until
         if group == free - 1:
             last = periods
             for end in range(until, periods + 1):
-                most = max(most, _farthest_corner(places[until], boxes, end))
+                most = max(most, _farthest_corner(ends[until], boxes, end))
         found[group] = most + body + grown[last - 1]
     return found
 
@@ -344,7 +328,7 @@ def _from(origin: Array, start: Array, nominal: Array, boxes: Array) -> tuple[Ar
 
 @compiled(
     "Tuple((f8[:,:,::1], f8[:,::1]))"
-    "(f4[:,::1], f8[::1], f8[::1], f8[:,::1], f8[:,:,::1], UniTuple(f8, 2), f8, f8[::1], i8, UniTuple(f8, 5))"
+    "(f4[:,::1], f8[::1], f8[::1], f8[:,::1], f8[:,:,::1], UniTuple(f8, 2), f8, f8[::1], i8, UniTuple(f8, 4))"
 )
 def about_way(
     lines: Single,
@@ -356,12 +340,12 @@ def about_way(
     keep_off: float,
     measured: Array,
     most: int,
-    limits: tuple[float, float, float, float, float],
+    limits: tuple[float, float, float, float],
 ) -> tuple[Array, Array]:
     """The half-spaces of all periods about a nominal way (N, 3), world, from a start (3,), in boxes (2, N+1 or 1, 3),
     as `about_periods` has them, of shadows from an origin (3,). moved [m]: how far what is seen may have moved until
-    now, and moves in a period; limits: `shadows.SHARED`, `APART`, `TOUCHING`, `GIVE`, `FARTHEST`."""
-    shared, apart, touching, give, farthest = limits
+    now, and moves in a period; limits: `shadows.SHARED`, `TOUCHING`, `GIVE`, `FARTHEST`."""
+    shared, touching, give, farthest = limits
     ends, within = _from(origin, start, nominal, boxes)
     grown, first = moved[0] + moved[1] * np.arange(1.0, len(ends)), np.zeros(1, np.int64)
     aside, no, none = ends[0].copy(), np.zeros((1, 0, 3)), np.zeros((1, 0))
@@ -371,11 +355,11 @@ def about_way(
         return faces, nowhere
     if lines.shape[1] == 0:
         return faces, levels
-    first, extent, places = together(ends, shared), _greatest(lines[10]), thinned(ends, apart)
+    first, extent = together(ends, shared), _greatest(lines[10])
     if not extent <= farthest:
         return faces, nowhere
     rounded = rounding(extent + np.abs(within).max())
-    room = rooms(lines, places, first)
+    room = rooms(lines, ends, first)
     free = free_groups(ends, first, room, touching)
     if free == 0:
         return faces, nowhere
@@ -383,6 +367,6 @@ def about_way(
     for group in range(free):
         until = first[group + 1] if group + 1 < len(first) else len(nominal)
         chords[group, 0], chords[group, 1] = ends[first[group]], ends[until]
-    reach = reaches(places, first, free, within, grown, keep_off + measured.sum() + rounded)
+    reach = reaches(ends, first, free, within, grown, keep_off + measured.sum() + rounded)
     normals, levels = supporting(lines, chords, room[:free], reach, keep_off, most, give, farthest, rounded)
     return about_periods(normals, levels, first, within, grown, keep_off, measured, aside)

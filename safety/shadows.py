@@ -24,7 +24,6 @@ Single = NDArray[np.float32]
 PLANES = 32  # of a period at most: what needs more has no free space there
 GIVE = 0.05  # of the room to a shadow, that is given up for fewer half-spaces; twice as much after every eight
 SHARED = 0.6  # m of the nominal way, about, along which periods share half-spaces
-APART = 0.1  # m; ends of periods that are no farther from one before are as near as that one to any shadow, about
 ASIDE = 1e-6  # rad: more than a direction in single precision is beside its patch's middle
 FACES = np.vstack([np.eye(3), -np.eye(3)])  # of the room
 
@@ -95,5 +94,5 @@ def half_spaces(
     from safety.shading import about_way  # compiled
 
     boxes, moved = near.room.boxes, (near.speed * near.age, near.speed * period)  # m: until now, and in a period
-    way, limits = np.ascontiguousarray(nominal), (SHARED, APART, TOUCHING, GIVE, FARTHEST)
+    way, limits = np.ascontiguousarray(nominal), (SHARED, TOUCHING, GIVE, FARTHEST)
     return about_way(near.lines, near.origin, start, way, boxes, moved, keep_off, measured, PLANES, limits)
