@@ -98,6 +98,13 @@ def _that_meet(
     return found[:count]
 
 
+@compiled("void(f4[::1], i8[::1], f4[::1])")
+def _take(values: Single, index: NDArray[np.int64], found: Single) -> None:
+    """The chosen ones."""
+    for s in range(len(index)):
+        found[s] = values[index[s]]
+
+
 @compiled("void(f4[:,::1])")
 def complete(lines: Single) -> None:
     """Tells what follows from the lines' first nine rows."""
@@ -137,21 +144,24 @@ def behind(
     high += body + last * widening + wide
     near = nearest_of_patches(free, together, ways.shape[1])
     index = _that_meet(ways, turn, at, last, low, high, near)
-    lines = np.empty((11, len(index)), np.float32)
-    x, y, z = ways[0], ways[1], ways[2]
+    n = len(index)
+    lines, chosen, begin = np.empty((11, n), np.float32), np.empty((3, n), np.float32), np.empty(n, np.float32)
+    for axis in range(3):
+        _take(ways[axis], index, chosen[axis])
+    _take(near, index, begin)
+    x, y, z = chosen[0], chosen[1], chosen[2]
     for axis in range(3):
         a, b, c = np.float32(turn[axis, 0]), np.float32(turn[axis, 1]), np.float32(turn[axis, 2])
         off, begins, along = np.float32(at[axis] - origin[axis]), lines[axis], lines[3 + axis]
-        for s in range(len(index)):
-            k = index[s]
-            along[s] = a * x[k] + b * y[k] + c * z[k]
-            begins[s] = off + near[k] * along[s]
+        for s in range(n):
+            way = a * x[s] + b * y[s] + c * z[s]
+            along[s] = way
+            begins[s] = off + begin[s] * way
     most, wider, least_wide = np.float32(last), np.float32(widening), np.float32(wide)
     length, about_near, about_far = lines[6], lines[7], lines[8]
-    for s in range(len(index)):
-        begin = near[index[s]]
-        length[s] = most - begin
-        about_near[s] = begin * wider + least_wide
+    for s in range(n):
+        length[s] = most - begin[s]
+        about_near[s] = begin[s] * wider + least_wide
         about_far[s] = most * wider + least_wide
     complete(lines)
     return lines
