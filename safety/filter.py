@@ -19,7 +19,17 @@ from safety.model_set import ModelSet
 from safety.program import SHARPEN, Builder, Rows
 from safety.promise import Promise
 from safety.recovery import SLOW, least_violating, slow_inputs, turn_towards, way_from
-from safety.request import ADJUSTED, ALLOWED, FAILSAFE, RECOVERING, Decision, Request, check_for_filter
+from safety.request import (
+    ADJUSTED,
+    ALLOWED,
+    FAILSAFE,
+    RECOVERING,
+    Decision,
+    Ordinary,
+    Request,
+    check_for_filter,
+    check_surroundings,
+)
 from safety.solver import INFEASIBLE, solve
 from safety.surroundings import Scene, Surroundings
 
@@ -69,6 +79,7 @@ class Filter:
         self.domain = np.stack([model.domain[0] - spread, model.domain[1] + spread])
         self.around = Surroundings(model, self.tube, outer, self.domain, comfort)
         self.inputs = Inputs(robot)
+        self.ordinary = Ordinary(robot)
         self.same = SAME_INPUT * (self.inputs.high - self.inputs.low)
         self.standing = np.array([not moves for moves in robot.translates])
         driven = np.tile(robot.translates, robot.free_steps)
@@ -91,7 +102,10 @@ class Filter:
             BadRequest: a value is missing, not finite or of the wrong size, with the field's name.
         """
         attempt = _Attempt(perf_counter_ns())
-        check_for_filter(self.robot, request)
+        if self.ordinary(request):
+            check_surroundings(self.robot, request)
+        else:
+            check_for_filter(self.robot, request)
         attempt.contained = request.predicted is None or request.predicted.contains(self.robot, request.state)
         attempt.broken = 0 if request.movers is None else int((~request.movers.kept).sum())
         given = request.plan[: self.robot.given].ravel()

@@ -25,6 +25,7 @@ Array = NDArray[np.float64]
 ALLOWED, ADJUSTED, FAILSAFE, RECOVERING = "allowed", "adjusted", "failsafe", "recovering"
 MOST_OBSERVED = 4096  # numbers in an observation
 FEW = 64  # numbers
+STOPPED = 0.9e-9  # of an input: surely one of a stop (`Robot.rests`)
 
 Named: TypeAlias = dict[str, tuple[NDArray[np.floating[Any]], tuple[int, ...]]]  # arrays, and the shapes they must have
 
@@ -121,6 +122,20 @@ def check_for_filter(robot: Robot, request: Request) -> None:
     _within_bounds(robot, "plan", request.plan)
     if not robot.rests(request.plan[-1]):
         raise BadRequest("plan", "the committed plan does not end in a stop")
+    check_surroundings(robot, request)
+    if predicted is not None:
+        if min(predicted.half_width.tolist()) < 0.0:
+            raise BadRequest("predicted_half_width", "a predicted set has a negative half-width")
+        if not math.isfinite(predicted.heading):
+            raise BadRequest("predicted_heading", "predicted_heading is NaN or infinite")
+
+
+def check_surroundings(robot: Robot, request: Request) -> None:
+    """Is what it tells of the surroundings of a kind that this robot meets?
+
+    Raises:
+        BadRequest: it is not, with the field's name.
+    """
     if request.obstacles.center.shape[1] != robot.position_dim:
         raise BadRequest("obstacles", f"a {robot.name} robot's obstacles have {robot.position_dim} coordinates")
     if request.movers is not None and request.movers.drift.shape[1] != robot.position_dim:
@@ -129,11 +144,43 @@ def check_for_filter(robot: Robot, request: Request) -> None:
         raise BadRequest("scan", f"a {robot.name} robot has no fan in the plane: give obstacles, or a range image")
     if isinstance(request.scan, RangeImage) and robot.position_dim != 3:
         raise BadRequest("image", f"a {robot.name} robot has no range image in space: give obstacles, or a scan")
-    if predicted is not None:
-        if min(predicted.half_width.tolist()) < 0.0:
-            raise BadRequest("predicted_half_width", "a predicted set has a negative half-width")
-        if not math.isfinite(predicted.heading):
-            raise BadRequest("predicted_heading", "predicted_heading is NaN or infinite")
+
+
+class Ordinary:
+    """All of a request's numbers at once: what nearly every one takes, in a third of the time."""
+
+    def __init__(self, robot: Robot) -> None:
+        n, m, most = robot.state_dim, robot.action_dim, np.finfo(float).max
+        self.sizes = n, m, (robot.horizon, m)
+        low, high = (np.tile(bound, (robot.horizon, 1)) for bound in robot.bounds)
+        low[-1, robot.stopping], high[-1, robot.stopping] = -STOPPED, STOPPED
+        fixed = [np.full(n, FARTHEST), np.full(m, most)]
+        self.low = np.concatenate([*(-part for part in fixed), robot.bounds[0], low.ravel()])
+        self.high = np.concatenate([*fixed, robot.bounds[1], high.ravel()])
+        self.predicted_low = np.concatenate([self.low, [-most], np.full(n, -most), np.zeros(n)])
+        self.predicted_high = np.concatenate([self.high, np.full(2 * n + 1, most)])
+        self.observed = _observation_dim(robot)
+
+    def __call__(self, request: Request) -> bool:
+        """False: `check_for_filter` may find something in them, and says what."""
+        (n, m, planned), observed = self.sizes, request.observation
+        inputs = request.action, request.input_in_force, request.plan.ravel()
+        sized = request.state.shape == (n,) and inputs[0].shape == inputs[1].shape == (m,)
+        if not (sized and request.plan.shape == planned):
+            return False
+        # A product that is no number, or infinite, is of an observation in which one is, or which is very large.
+        if observed.size and not (observed.shape == (self.observed,) and math.isfinite(np.dot(observed, observed))):
+            return False
+        predicted = request.predicted
+        if predicted is None:
+            told, low, high = np.concatenate((request.state, *inputs)), self.low, self.high
+        else:
+            if not predicted.center.shape == predicted.half_width.shape == (n,):
+                return False
+            sets = (predicted.heading,), predicted.center, predicted.half_width
+            told = np.concatenate((request.state, *inputs, *sets))
+            low, high = self.predicted_low, self.predicted_high
+        return bool(((told >= low) & (told <= high)).all())
 
 
 def check_for_rival(robot: Robot, request: Request) -> None:
@@ -145,18 +192,24 @@ def check_for_rival(robot: Robot, request: Request) -> None:
     _check_motion(robot, request, {"observation": (request.observation, (task_of(robot).observation_dim,))})
 
 
+def _observation_dim(robot: Robot) -> int | None:
+    """So many numbers an observation has; None: no task is known here."""
+    try:
+        return task_of(robot).observation_dim
+    except UnknownTask:
+        return None
+
+
 def _observed(robot: Robot, request: Request) -> int:
     """So many numbers an observation has; where no task is known here, as many as there are, within reason.
 
     Raises:
         BadRequest: more than that.
     """
-    try:
-        return task_of(robot).observation_dim
-    except UnknownTask:
-        if request.observation.size > MOST_OBSERVED:
-            raise BadRequest("observation", f"an observation has at most {MOST_OBSERVED} numbers") from None
-        return request.observation.size
+    expected = _observation_dim(robot)
+    if expected is None and request.observation.size > MOST_OBSERVED:
+        raise BadRequest("observation", f"an observation has at most {MOST_OBSERVED} numbers")
+    return request.observation.size if expected is None else expected
 
 
 def _check_motion(robot: Robot, request: Request, further: Named) -> None:

@@ -1,0 +1,88 @@
+"""What makes a question one that can't be decided on: looked at all at once, it is the same as field by field."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from messaging.robots import robot_named
+from messaging.shapes import FARTHEST, Shapes
+from messaging.tasks import task_of
+from safety.commitment import Prediction
+from safety.request import BadRequest, Ordinary, Request, check_for_filter
+from tests.safety.toys import car
+
+FEW_INPUTS = car("cart")  # holds its steering, and no task of it is known
+ROBOTS = robot_named("ground"), robot_named("quadrotor"), FEW_INPUTS
+FIELDS = "state", "action", "input_in_force", "plan", "observation", "center", "half_width", "heading"
+ODD = np.nan, np.inf, -np.inf, -1.0, 1e-9, 0.99e-9, 0.5, 1e30, 2.0 * FARTHEST, 1e200
+
+
+def usual(robot, seed, predicted):
+    """One that all is well with."""
+    rng = np.random.default_rng(seed)
+    low, high = robot.low(), robot.high()
+    plan = rng.uniform(low, high, (robot.horizon, robot.action_dim))
+    plan[-1, robot.stopping] = 0.0
+    n = robot.state_dim
+    sets = Prediction(rng.normal(size=n), rng.random(n), 0.3) if predicted else None
+    observed = 7 if robot is FEW_INPUTS else task_of(robot).observation_dim
+    return Request(
+        state=rng.normal(size=n),
+        action=3.0 * rng.normal(size=robot.action_dim),
+        input_in_force=rng.uniform(low, high),
+        plan=plan,
+        obstacles=Shapes.of([], robot.position_dim),
+        predicted=sets,
+        observation=rng.normal(size=observed).astype(np.float32) if rng.random() < 0.5 else np.zeros(0, np.float32),
+    )
+
+
+def with_(request, field, change):
+    """The same with another value in a field."""
+    if field in ("center", "half_width", "heading"):
+        if request.predicted is None:
+            return request
+        return replace(request, predicted=replace(request.predicted, **{field: change(getattr(request.predicted, field))}))
+    return replace(request, **{field: change(getattr(request, field))})
+
+
+def lets_pass(robot, request):
+    try:
+        check_for_filter(robot, request)
+    except BadRequest:
+        return False
+    return True
+
+
+@pytest.mark.parametrize("robot", ROBOTS, ids=lambda robot: robot.name)
+@settings(max_examples=300)
+@given(st.integers(0, 1000), st.booleans(), st.sampled_from(FIELDS), st.sampled_from(ODD), st.integers(0, 50))
+def test_what_passes_at_once_passes_field_by_field(robot, seed, predicted, field, odd, at):
+    ordinary, sound = Ordinary(robot), usual(robot, seed, predicted)
+    assert lets_pass(robot, sound)
+    assert ordinary(sound) or (robot is FEW_INPUTS and sound.observation.size)
+
+    def put(values):
+        if field == "heading":
+            return odd
+        with np.errstate(over="ignore"):
+            changed = np.array(values)
+            if changed.size:
+                changed.ravel()[at % changed.size] = odd
+        return changed
+
+    asked = with_(sound, field, put)
+    assert lets_pass(robot, asked) or not ordinary(asked)
+
+
+@pytest.mark.parametrize("field", FIELDS[:-1])
+@pytest.mark.parametrize("change", [lambda v: v[:-1], lambda v: np.append(v, 0.0), lambda v: v[None]])
+def test_what_has_another_size_does_not_pass_at_once(field, change):
+    robot = robot_named("ground")
+    sound = usual(robot, 1, True)
+    sound = replace(sound, observation=np.zeros(task_of(robot).observation_dim, np.float32))
+    assert Ordinary(robot)(sound)
+    assert not Ordinary(robot)(with_(sound, field, change))
