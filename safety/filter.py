@@ -80,6 +80,9 @@ class Filter:
         self.around = Surroundings(model, self.tube, outer, self.domain, comfort)
         self.inputs = Inputs(robot)
         self.ordinary = Ordinary(robot)
+        first, n, whole = model.first, robot.state_dim, np.ascontiguousarray
+        parts = (first.C[:n], first.W.T, first.M.T, first.kappa.T, first.w, np.abs(first.generators[:n]))
+        self.first = tuple(whole(part) for part in parts)  # what `next_state` is told of it
         self.same = SAME_INPUT * (self.inputs.high - self.inputs.low)
         self.standing = np.array([not moves for moves in robot.translates])
         driven = np.tile(robot.translates, robot.free_steps)
@@ -311,10 +314,10 @@ class Filter:
 
     def _predict(self, scene: Scene, z: Array) -> Prediction:
         """The set of the next measured state, all coordinates."""
-        robot, first, d = self.robot, self.model.first, self.robot.position_dim
+        from safety.reaching import next_state  # compiled
+
         regressor = self.model.first_regressor(z)
-        center = (first.C @ regressor)[: robot.state_dim]
-        center[:d] = scene.start + scene.turn @ center[:d]
-        if robot.heading is not None:
-            center[robot.heading] += scene.heading
-        return Prediction(center, first.half_widths(regressor)[: robot.state_dim], scene.heading)
+        center, half = next_state(*self.first, regressor, np.ascontiguousarray(scene.start), scene.turn)
+        if self.robot.heading is not None:
+            center[self.robot.heading] += scene.heading
+        return Prediction(center, half, scene.heading)

@@ -97,6 +97,8 @@ class Surroundings:
         W_free, moved = whole(np.abs(tube.W[:, -free:])), whole(np.abs(tube.position[..., -free:]))
         parts = whole(tube.W), W_free, whole(tube.M), tube.m_0, whole(tube.position), moved, whole(self._spans)
         self._filled = parts  # what `filled_by_plans` is told of the tube
+        self._sized = whole(tube.W.T), whole(tube.M.T), tube.m_0  # and what its `magnitudes` are
+        self._reached = *self._sized, whole(tube.position), whole(tube.directions)
         self.boxes = Boxes(tube.position, tube.directions)
         self.limits = Limits(robot, tube) if robot.limits else None
         self.measured = np.asarray(robot.measurement_bound[: robot.position_dim])
@@ -155,10 +157,9 @@ class Surroundings:
 
     def extent(self, z: Array) -> float:
         """[m] from the measured position to the farthest point that the body may reach under regressors z."""
-        sizes = self.tube.magnitudes(z)
-        L = self.tube.generators
-        way = np.abs(self.tube.centers(z)) + np.abs(self.tube.directions) @ sizes[:L]
-        return math.sqrt(np.einsum("kd,kd->k", way, way).max()) + self.body + float(sizes[L:].max())
+        from safety.reaching import extent  # compiled
+
+        return extent(*self._reached, z, self.body)
 
     # --- one scene ---------------------------------------------------------------------------------------------
 
@@ -222,10 +223,9 @@ class Surroundings:
 
     def sets(self, start: Array, turn: Array, z: Array) -> tuple[Array, Array]:
         """Where the true positions at the periods' ends lie, world: centers and half-widths (N, d)."""
-        sizes, ways = self.tube.magnitudes(z)[: self.tube.generators], self.tube.centers(z)
-        if self.robot.heading is None:
-            return start + ways, self._spans @ sizes + self.measured
-        return start + ways @ turn.T, np.abs(turn @ self.tube.directions) @ sizes + self.measured
+        from safety.reaching import sets  # compiled
+
+        return sets(*self._reached, z, np.ascontiguousarray(start), turn, self.measured)
 
     def margin(self, rows: Rows, z: Array) -> float:
         """Smallest distance [m] of the exact tube to a half-space (of a limit: in its own units)."""
@@ -284,7 +284,9 @@ class Surroundings:
 
     def slack(self, scene: Scene, z: Array, planes: list[Planes] | None = None) -> tuple[Array, Array]:
         """What the same rows leave, `bound - support`, and what of the comfort margin each keeps: (rows,), (rows,)."""
-        sizes = self.tube.magnitudes(z)
+        from safety.reaching import magnitudes  # compiled
+
+        sizes = magnitudes(*self._sized, z)
         found = [
             disc.layout.slack(self._turned(plane.normals, scene), plane.offsets, sizes, z)
             for disc, plane in zip(self.discs, planes or self.planes(scene, z), strict=True)
