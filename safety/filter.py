@@ -87,7 +87,7 @@ class Filter:
         self.standing = np.array([not moves for moves in robot.translates])
         driven = np.tile(robot.translates, robot.free_steps)
         self.translating = np.concatenate([np.zeros(robot.regressor_dim), driven])
-        self.regressor = list(robot.regressor)
+        self.regressor = np.array(robot.regressor, dtype=np.intp)
         self.comfort, self.reach = self.around.comfort, self.around.reach  # m
 
     def half_width(self, speed: Array) -> float:
@@ -139,11 +139,13 @@ class Filter:
         if scene.empty and not self.around.far and self.around.limits is None:
             return _Found(ALLOWED, self.inputs.plan(z), z, self.reach, True)
         planes = self.around.planes(scene, z)
-        slack, keep = self.around.slack(scene, z, planes)
+        slack = self.around.slack(scene, z, planes)
         margin = self.around.least(slack, z)
-        if self.around.least(slack - self.comfort * keep, z, self.comfort) >= 0.0:
+        if margin >= self.comfort:
             return _Found(ALLOWED, self.inputs.plan(z), z, margin, True)
         rows = self.around.rows(scene, z, planes)
+        if self.around.least(slack - self.comfort * rows.keep, z, self.comfort) >= 0.0:
+            return _Found(ALLOWED, self.inputs.plan(z), z, margin, True)
         kept = self._comfortable(rows, z_0, proposal)
         if margin >= 0.0 and self.around.margin(kept, z) >= 0.0:
             return _Found(ALLOWED, self.inputs.plan(z), z, margin, True)

@@ -233,7 +233,7 @@ class Surroundings:
 
     def margin_in(self, scene: Scene, z: Array) -> float:
         """The same, to those about the rollout of regressors z."""
-        return self.least(self.slack(scene, z)[0], z)
+        return self.least(self.slack(scene, z), z)
 
     def least(self, slack: Array, z: Array, comfort: float = 0.0) -> float:
         """The smallest slack, within ± the reach (less the comfort); NaN never counts as inside."""
@@ -282,8 +282,8 @@ class Surroundings:
         parts = [disc.layout.rows(self._turned(plane.normals, scene), plane.offsets) for disc, plane in discs]
         return stacked(parts + self._further(scene, z))
 
-    def slack(self, scene: Scene, z: Array, planes: list[Planes] | None = None) -> tuple[Array, Array]:
-        """What the same rows leave, `bound - support`, and what of the comfort margin each keeps: (rows,), (rows,)."""
+    def slack(self, scene: Scene, z: Array, planes: list[Planes] | None = None) -> Array:
+        """What the same rows leave, `bound - support` (rows,)."""
         from safety.reaching import magnitudes  # compiled
 
         sizes = magnitudes(*self._sized, z)
@@ -291,11 +291,8 @@ class Surroundings:
             disc.layout.slack(self._turned(plane.normals, scene), plane.offsets, sizes, z)
             for disc, plane in zip(self.discs, planes or self.planes(scene, z), strict=True)
         ]
-        kept = [np.ones(len(slack)) for slack in found]
-        for rows in self._further(scene, z):
-            found.append(rows.bound - rows.support(self.tube, z))
-            kept.append(rows.keep)
-        return (found[0], kept[0]) if len(found) == 1 else (np.concatenate(found), np.concatenate(kept))
+        found += [rows.bound - rows.support(self.tube, z) for rows in self._further(scene, z)]
+        return found[0] if len(found) == 1 else np.concatenate(found)
 
     def _turned(self, normals: Array, scene: Scene) -> Array:
         """Into the frame of now."""
