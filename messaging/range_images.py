@@ -91,7 +91,8 @@ class RangeImage:
     @cached_property
     def turn(self) -> Array:
         """(3, 3): the world from the sensor's frame."""
-        w, x, y, z = (float(part) / math.hypot(*self.attitude) for part in self.attitude)
+        length = math.hypot(*self.attitude)
+        w, x, y, z = (float(part) / length for part in self.attitude)
         return np.array(
             [
                 [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,6 +41,16 @@ class _Disc:
     swing: float
     position: Array
     layout: Layout
+
+    @cached_property
+    def aside(self) -> bool:
+        """Is it not where the robot is?"""
+        return bool(self.at.any() or self.swing)
+
+    @cached_property
+    def flat(self) -> Array:
+        """(N·d, nz): where its centre goes."""
+        return np.ascontiguousarray(self.position.reshape(-1, self.position.shape[2]))
 
 
 def _discs(robot: Robot, tube: Tube) -> list[_Disc]:
@@ -248,8 +259,10 @@ class Surroundings:
         obstacle, those that lead out of it."""
         found = []
         for disc in self.discs:
-            start, measured = scene.start + scene.turn @ disc.at, self.measured + disc.swing
-            way = disc.position @ z
+            start, measured = scene.start, self.measured
+            if disc.aside:
+                start, measured = start + scene.turn @ disc.at, measured + disc.swing
+            way = (disc.flat @ z).reshape(-1, len(start))
             ends = start + (way if self.robot.heading is None else way @ scene.turn.T)
             beside = []
             if len(scene.near) or scene.unseen is None:
