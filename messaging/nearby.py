@@ -50,14 +50,14 @@ def least_ahead(values: Single, spare: Single, found: Single, count: int, stride
     _lesser(values[: len(found)], values[ahead : ahead + len(found)], found)
 
 
-@compiled("void(f4[:,::1], i8, f4[:,::1])")
-def _least_beside(rings: Single, beside: int, found: Single) -> None:
-    """The least of so many columns beside each, on either side, in rings (R, A). All at once: what comes of windows
-    from one ring into the next is not looked at."""
+@compiled("void(f4[:,::1], i8)")
+def _least_beside(rings: Single, beside: int) -> None:
+    """Of each number in rings (R, A) makes the least of so many columns beside it, on either side. All at once: what
+    comes of windows from one ring into the next is not looked at."""
     columns, count = rings.shape[1], 2 * beside + 1
     if count >= columns:
         for i in range(len(rings)):
-            found[i] = rings[i].min()
+            rings[i] = rings[i].min()
         return
     each = columns + count - 1
     wrapped, spare = np.empty((len(rings), each), np.float32), np.empty(len(rings) * each, np.float32)
@@ -69,7 +69,7 @@ def _least_beside(rings: Single, beside: int, found: Single) -> None:
     least = np.empty((len(rings), each), np.float32)
     least_ahead(wrapped.ravel(), spare, least.ravel()[: len(rings) * each - count + 1], count, 1)
     for i in range(len(rings)):
-        _copy(least[i, :columns], found[i])
+        _copy(least[i, :columns], rings[i])
 
 
 @compiled("f4[:,::1](f4[:,::1], i8, i8[::1])")
@@ -81,12 +81,12 @@ def least_of(values: Single, rows: int, beside: NDArray[np.int64]) -> Single:
     tall, spare = np.empty(size + 2 * edge, np.float32), np.empty(size + 2 * edge, np.float32)
     tall[:edge] = tall[edge + size :] = np.float32(np.inf)
     _copy(values.ravel(), tall[edge : edge + size])
-    upright, found = np.empty((rings, columns), np.float32), np.empty((rings, columns), np.float32)
-    least_ahead(tall, spare, upright.ravel(), 2 * rows + 1, columns)
+    found = np.empty((rings, columns), np.float32)
+    least_ahead(tall, spare, found.ravel(), 2 * rows + 1, columns)
     first = 0
     for i in range(1, rings + 1):
         if i == rings or beside[i] != beside[first]:
-            _least_beside(upright[first:i], beside[first], found[first:i])
+            _least_beside(found[first:i], beside[first])
             first = i
     return found
 
@@ -111,19 +111,16 @@ def farthest_of_meshes(returns: Single) -> Single:
     """Of each beam and its neighbours to the left, above and above to the left (E, A); of the last ring, of two. 0:
     none is known."""
     rings, columns = returns.shape
-    beside, found = np.empty((rings, columns), np.float32), np.empty((rings, columns), np.float32)
+    found, tall = np.empty((rings, columns), np.float32), np.empty(columns + 1, np.float32)
+    beside, zero = tall[1:], np.float32(0.0)
     for i in range(rings):
-        ring, out = returns[i], beside[i]
-        for j in range(columns - 1):
-            a, b = ring[j], ring[j + 1]
-            out[j] = a if a > b else b
-        out[columns - 1] = max(ring[columns - 1], ring[0])
-    for i in range(rings):
-        one, other, out = beside[i], beside[min(i + 1, rings - 1)], found[i]
+        ring, above, out = returns[i], returns[min(i + 1, rings - 1)], found[i]
         for j in range(columns):
-            a, b = one[j], other[j]
-            a = a if a > b else b
-            out[j] = a if a > 0.0 else 0.0
+            tall[j] = ring[j] if ring[j] > above[j] else above[j]
+        tall[columns] = tall[0]
+        for j in range(columns):
+            most = tall[j] if tall[j] > beside[j] else beside[j]
+            out[j] = most if most > zero else zero
     return found
 
 
@@ -172,3 +169,34 @@ def forget_ghosts(
                     ring[j] = -1.0
                     left -= 1
     return left
+
+
+@compiled(
+    "Tuple((f4[:,::1], f4[:,::1]))"
+    "(f8[:,::1], i8, i8, f8, f8, f4, i8, i8[::1], i8, i8[::1], f4, f4, b1)"
+)
+def free_of_single(
+    ranges: Array,
+    below: int,
+    above: int,
+    far: float,
+    error: float,
+    mesh_share: np.float32,
+    mesh_rows: int,
+    mesh_beside: NDArray[np.int64],
+    rows: int,
+    beside: NDArray[np.int64],
+    share: np.float32,
+    most: np.float32,
+    doubt: bool,
+) -> tuple[Single, Single]:
+    """The returns, without ghosts, and how far each patch is free by single beams; of no size where not all of them are
+    known, or they are doubted. Told are the windows of balls that cover a mesh, and of single beams."""
+    returns = heard(ranges, below, above, far, error)
+    meshed = farthest_of_meshes(returns)
+    left = forget_ghosts(returns, meshed, mesh_share, 2.0 * error, mesh_rows, mesh_beside)
+    if left < returns.size or doubt:
+        return returns, np.empty((0, 0), np.float32)
+    free = least_of(returns, rows, beside)
+    scale_to(free, share, most)
+    return returns, free

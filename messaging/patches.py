@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
@@ -28,6 +28,7 @@ from messaging.range_images import RangeImage
 Array = NDArray[np.float64]
 Single = NDArray[np.float32]
 
+SINGLE = 1e-6  # of a range: more than a few operations in single precision are off by
 CORNER = math.sqrt(0.75)  # of a cube's edge: from its corner to its middle
 
 
@@ -53,11 +54,14 @@ class Cover:
 
     def free(self, least: Single, least_width: float) -> Single:
         """F [m] by the least ranges [m], which it overwrites."""
-        from messaging.nearby import SINGLE, scale_to  # compiled
+        from messaging.nearby import scale_to  # compiled
 
-        share, most = (1.0 - SINGLE) * self.share, (1.0 - SINGLE) * least_width / self.kappa
-        scale_to(least, np.float32(share), np.float32(most))
+        scale_to(least, *self.scale(least_width))
         return least
+
+    def scale(self, least_width: float) -> tuple[float, float]:
+        """What F is of the least range, and how much [m] at the most."""
+        return (1.0 - SINGLE) * self.share, (1.0 - SINGLE) * least_width / self.kappa
 
 
 def half_diagonal(image: RangeImage) -> float:
@@ -67,15 +71,14 @@ def half_diagonal(image: RangeImage) -> float:
 
 def seen_free(image: RangeImage) -> tuple[Array, Single]:
     """The rings' elevations (E',), from pole to pole, and F (E', A) [m] of each beam's patch."""
-    from messaging.nearby import farthest_of_meshes, forget_ghosts, heard  # compiled
+    from messaging.nearby import free_of_single  # compiled
 
     width, (rings, columns) = image.least_width, image.ranges.shape
     grid = _Grid.of(rings, columns, image.low, image.high, image.step[0], half_diagonal(image))
-    returns = heard(np.ascontiguousarray(image.ranges), grid.below, grid.above, image.far, image.range_error)
-    meshed, ghostly = farthest_of_meshes(returns), 2.0 * image.range_error
-    left = forget_ghosts(returns, meshed, grid.double.share, ghostly, grid.balls.rows, grid.balls.beside)
-    if left == returns.size and not image.doubt:
-        return grid.elevations, grid.single.free(grid.beams.least(returns), width)
+    ranges, scale = np.ascontiguousarray(image.ranges), grid.single.scale(width)
+    returns, free = free_of_single(ranges, *grid.rings, image.far, image.range_error, *grid.windows, *scale, image.doubt)
+    if free.size:
+        return grid.elevations, free
     known, nothing = returns >= 0.0, np.float32(0.0)
     enough = meshes(np.add, known.astype(np.int8)) > image.doubt
     silent = np.where(
@@ -129,6 +132,16 @@ class _Grid:
     beams: Window
     double: Cover
     balls: Window
+
+    @cached_property
+    def rings(self) -> tuple[int, int]:
+        """That are not seen, below and above."""
+        return self.below, self.above
+
+    @cached_property
+    def windows(self) -> tuple[float, int, NDArray[np.int64], int, NDArray[np.int64]]:
+        """Of balls twice as wide: of a mesh's range the share that they return from; theirs and single beams'."""
+        return self.double.share, self.balls.rows, self.balls.beside, self.beams.rows, self.beams.beside
 
     @staticmethod
     @lru_cache(maxsize=64)
