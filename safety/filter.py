@@ -12,6 +12,7 @@ from time import perf_counter_ns
 import numpy as np
 from numpy.typing import NDArray
 
+from safety import reaching
 from safety.commitment import UNVERIFIED, Prediction
 from safety.explain import Stopped
 from safety.inputs import Inputs
@@ -316,10 +317,8 @@ class Filter:
 
     def _predict(self, scene: Scene, z: Array) -> Prediction:
         """The set of the next measured state, all coordinates."""
-        from safety.reaching import next_state  # compiled
-
         regressor = self.model.first_regressor(z)
-        center, half = next_state(*self.first, regressor, np.ascontiguousarray(scene.start), scene.turn)
+        center, half = reaching.next_state(*self.first, regressor, np.ascontiguousarray(scene.start), scene.turn)
         if self.robot.heading is not None:
             center[self.robot.heading] += scene.heading
         return Prediction(center, half, scene.heading)

@@ -133,6 +133,20 @@ def that_matter(
     return count, A, b
 
 
+@compiled("Tuple((f8[::1], f8[::1]))(f8[::1], f8[::1], f8[:,::1], f8[::1])")
+def reachable(low: Array, high: Array, way: Array, before: Array) -> tuple[Array, Array]:
+    """Center and half-widths (F·m,) of inputs between low and high (m,), no farther from the one before (m,) than so
+    much (F, m)."""
+    F, m = way.shape
+    center, radius = np.empty(F * m), np.empty(F * m)
+    for k in range(F):
+        for i in range(m):
+            least, most = before[i] - way[k, i], before[i] + way[k, i]
+            least, most = least if least > low[i] else low[i], most if most < high[i] else high[i]
+            center[k * m + i], radius[k * m + i] = 0.5 * (least + most), 0.5 * (most - least)
+    return center, radius
+
+
 @compiled(
     "f8[:,:,::1](f8[:,::1], f8[:,::1], f8[:,::1], f8[::1], f8[:,:,::1], f8[:,:,::1], f8[:,:,::1], f8[::1], f8[::1],"
     " f8[::1], f8[::1], f8[:,::1])"

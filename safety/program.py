@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from messaging.robots import Robot
+from safety import holding
 from safety.solver import Program
 from safety.tube import Tube
 
@@ -44,8 +45,6 @@ class Layout:
 
     def __init__(self, position: Array, directions: Array) -> None:
         """position (N, d, nz), directions (N, d, L): of a point of the body."""
-        import safety.holding  # noqa: F401  # compiled: before the first request is to be answered in time
-
         N, d, nz = position.shape
         L = directions.shape[2]
         at_start, at_end = np.arange(N), np.arange(1, N + 1)
@@ -62,17 +61,13 @@ class Layout:
 
     def rows(self, normals: Array, offsets: Array) -> Rows:
         """Rows for half-spaces `a·p <= b` in the frame of now, a (n, N, d), b (n, N)."""
-        from safety.holding import rows
-
-        gradient, spread, bound = rows(normals, offsets, *self.parts, self.sizes)
+        gradient, spread, bound = holding.rows(normals, offsets, *self.parts, self.sizes)
         return Rows(gradient, spread, bound, np.ones(len(bound)))
 
     def slack(self, normals: Array, offsets: Array, sizes: Array, z: Array) -> Array:
         """What these rows leave, `bound - support`, of the tube with magnitudes `sizes` (L+N+1,) under regressors z,
         without the rows themselves: there are hundreds, as wide as the tube has generators."""
-        from safety.holding import slack
-
-        return slack(normals, offsets, *self.parts, sizes, z)
+        return holding.slack(normals, offsets, *self.parts, sizes, z)
 
 
 class Builder:
@@ -124,8 +119,6 @@ class Builder:
         whose least is beyond its bound can't be met, one whose largest is within it need not be looked at. With many
         obstacles that is nearly all of them.
         """
-        from safety.holding import that_matter
-
         m = self.robot.action_dim
         constant = self.M_c @ np.abs(self.W_c @ z_0) + self.tube.m_0
         offset = self.W_t[:, : self.known] @ z_0
@@ -133,7 +126,7 @@ class Builder:
         atom = offset + self.W_t[:, self.known :] @ center
         give = np.abs(self.W_t[:, self.known :]) @ radius
         atoms = np.stack([np.maximum(np.abs(atom) - give, 0.0), np.abs(atom) + give])
-        count, A, b = that_matter(
+        count, A, b = holding.that_matter(
             rows.gradient, rows.spread, rows.bound, z_0, constant, self.M_t, center, radius, atoms, self.scale, SHARPEN
         )
         if count < 0:
@@ -148,9 +141,7 @@ class Builder:
 
     def reachable(self, before: Array) -> tuple[Array, Array]:
         """Center and half-widths (F·m,) of what bounds and slew leave to the free inputs after `before` (m,)."""
-        low = np.maximum(self.low, before - self.way).ravel()
-        high = np.minimum(self.high, before + self.way).ravel()
-        return 0.5 * (low + high), 0.5 * (high - low)
+        return holding.reachable(self.low, self.high, self.way, before)
 
     def inputs(self, x: Array) -> Array:
         """The free inputs (F·m,) in a solution."""

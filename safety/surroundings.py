@@ -14,6 +14,7 @@ from messaging.range_images import RangeImage
 from messaging.robots import Robot
 from messaging.scans import Scan
 from messaging.shapes import FARTHEST, Shapes
+from safety import holding, reaching
 from safety import scan as seen
 from safety import shadows as shades
 from safety.explain import SIGHT, Around, Planes, Stopped, worst
@@ -168,9 +169,7 @@ class Surroundings:
 
     def extent(self, z: Array) -> float:
         """[m] from the measured position to the farthest point that the body may reach under regressors z."""
-        from safety.reaching import extent  # compiled
-
-        return extent(*self._reached, z, self.body)
+        return reaching.extent(*self._reached, z, self.body)
 
     # --- one scene ---------------------------------------------------------------------------------------------
 
@@ -217,11 +216,9 @@ class Surroundings:
 
     def _room(self, z_0: Array, inputs: tuple[Array, Array], start: Array, turn: Array) -> shades.Room:
         """Boxes, world, in which every plan's discs stay with their middles after z_0; and some more."""
-        from safety.holding import filled_by_plans
-
         z = np.concatenate([z_0, inputs[0]])
         return shades.Room(
-            filled_by_plans(*self._filled, z, inputs[1], self._beside, start, turn),
+            holding.filled_by_plans(*self._filled, z, inputs[1], self._beside, start, turn),
             self.robot.horizon * self.robot.period,
         )
 
@@ -234,9 +231,7 @@ class Surroundings:
 
     def sets(self, start: Array, turn: Array, z: Array) -> tuple[Array, Array]:
         """Where the true positions at the periods' ends lie, world: centers and half-widths (N, d)."""
-        from safety.reaching import sets  # compiled
-
-        return sets(*self._reached, z, np.ascontiguousarray(start), turn, self.measured)
+        return reaching.sets(*self._reached, z, np.ascontiguousarray(start), turn, self.measured)
 
     def margin(self, rows: Rows, z: Array) -> float:
         """Smallest distance [m] of the exact tube to a half-space (of a limit: in its own units)."""
@@ -297,9 +292,7 @@ class Surroundings:
 
     def slack(self, scene: Scene, z: Array, planes: list[Planes] | None = None) -> Array:
         """What the same rows leave, `bound - support` (rows,)."""
-        from safety.reaching import magnitudes  # compiled
-
-        sizes = magnitudes(*self._sized, z)
+        sizes = reaching.magnitudes(*self._sized, z)
         found = [
             disc.layout.slack(self._turned(plane.normals, scene), plane.offsets, sizes, z)
             for disc, plane in zip(self.discs, planes or self.planes(scene, z), strict=True)
