@@ -171,10 +171,7 @@ def forget_ghosts(
     return left
 
 
-@compiled(
-    "Tuple((f4[:,::1], f4[:,::1]))"
-    "(f8[:,::1], i8, i8, f8, f8, f4, i8, i8[::1], i8, i8[::1], f4, f4, b1)"
-)
+@compiled("Tuple((f4[:,::1], f4[:,::1]))(f8[:,::1], i8, i8, f8, f8, f4, i8, i8[::1], i8, i8[::1], f4, f4, b1)")
 def free_of_single(
     ranges: Array,
     below: int,

@@ -64,30 +64,26 @@ class Cover:
         return (1.0 - SINGLE) * self.share, (1.0 - SINGLE) * least_width / self.kappa
 
 
-def half_diagonal(image: RangeImage) -> float:
-    """[rad]: no direction is farther from the grid's nearest beam."""
-    return 0.5 * math.hypot(*image.step)
-
-
-def seen_free(image: RangeImage) -> tuple[Array, Single]:
-    """The rings' elevations (E',), from pole to pole, and F (E', A) [m] of each beam's patch."""
+def seen_free(image: RangeImage) -> tuple[Grid, Single]:
+    """The grid, from pole to pole, and F (E', A) [m] of each beam's patch."""
     from messaging.nearby import free_of_single  # compiled
 
-    width, (rings, columns) = image.least_width, image.ranges.shape
-    grid = _Grid.of(rings, columns, image.low, image.high, image.step[0], half_diagonal(image))
+    width, grid = image.least_width, Grid.of(*image.ranges.shape, image.low, image.high)
     ranges, scale = np.ascontiguousarray(image.ranges), grid.single.scale(width)
-    returns, free = free_of_single(ranges, *grid.rings, image.far, image.range_error, *grid.windows, *scale, image.doubt)
+    returns, free = free_of_single(
+        ranges, *grid.rings, image.far, image.range_error, *grid.windows, *scale, image.doubt
+    )
     if free.size:
-        return grid.elevations, free
+        return grid, free
     known, nothing = returns >= 0.0, np.float32(0.0)
     enough = meshes(np.add, known.astype(np.int8)) > image.doubt
     silent = np.where(
         known, returns, np.float32(np.inf)
-    )  # what says nothing does not say that something is near, either
+    )  # who says nothing does not say that something is near, either
     free = grid.double.free(grid.balls.least(np.where(enough, silent, nothing)), width)
     if not image.doubt:
         free = np.maximum(free, grid.single.free(grid.beams.least(np.maximum(returns, nothing)), width))
-    return grid.elevations, free
+    return grid, free
 
 
 def meshes(of: np.ufunc, values: NDArray[Any]) -> NDArray[Any]:
@@ -120,12 +116,15 @@ class Window:
         return least_of(np.ascontiguousarray(values, np.float32), self.rows, self.beside)
 
 
-@dataclass(frozen=True)
-class _Grid:
-    """What is known of a grid before any range: elevations (E',) from pole to pole, of which so many rings below and
-    above are not seen; what single beams say and where they are, and balls twice as wide."""
+@dataclass(frozen=True, eq=False)
+class Grid:
+    """What is known of a grid before any range: elevations (E',) [rad] from pole to pole, of which so many rings below
+    and above are not seen, columns, and how far no direction is from the nearest beam [rad]; what single beams say and
+    where they are, and balls twice as wide."""
 
     elevations: Array
+    columns: int
+    half_diagonal: float
     below: int
     above: int
     single: Cover
@@ -145,9 +144,11 @@ class _Grid:
 
     @staticmethod
     @lru_cache(maxsize=64)
-    def of(rings: int, columns: int, low: float, high: float, step: float, patch: float) -> _Grid:
+    def of(rings: int, columns: int, low: float, high: float) -> Grid:
+        step = (high - low) / (rings - 1)
+        patch = 0.5 * math.hypot(step, math.tau / columns)
         above, below = (max(math.ceil((0.5 * math.pi - end) / step - 0.5 - 1e-9), 0) for end in (high, -low))
         elevations = np.clip(low + step * np.arange(-below, rings + above), -0.5 * math.pi, 0.5 * math.pi)
         single, double = Cover.of(patch, patch), Cover.of(max(2.0 * patch, 1.5 * step), patch)  # the latter at a pole
         beams, balls = (Window.of(columns, elevations, step, cover.within) for cover in (single, double))
-        return _Grid(elevations, below, above, single, beams, double, balls)
+        return Grid(elevations, columns, patch, below, above, single, beams, double, balls)

@@ -147,7 +147,8 @@ def _image_hits(image: RangeImage) -> Array:
 def level_outline(image: RangeImage, most: int = OUTLINE) -> Array:
     """Corners (c, 3) of a part of what the image shows to be free at the sensor's height: the least F of each group of
     columns, in the ring nearest to level."""
-    elevations, free = seen_free(image)
+    grid, free = seen_free(image)
+    elevations = grid.elevations
     ring = int(np.abs(elevations).argmin())
     columns = free.shape[1]
     first = np.arange(0, columns, max(1, 2 * columns // most))

@@ -117,13 +117,16 @@ def complete(lines: Single) -> None:
         extent[s] += length[s] * (abs(u[s]) + abs(v[s]) + abs(w[s]))
 
 
-@compiled("f4[:,::1](f4[:,::1], i8[::1], f4[:,::1], f8[:,::1], f8[::1], f8[:,:,::1], f8, f8, f8, f8[::1])")
+@compiled(
+    "f4[:,::1](f4[:,::1], i8[::1], f4[:,::1], f8[:,::1], UniTuple(f8, 3), UniTuple(f8, 3), f8[:,:,::1], f8, f8, f8, f8[::1])"
+)
 def behind(
     free: Single,
     together: NDArray[np.int64],
     ways: Single,
     turn: Array,
-    place: Array,
+    place: tuple[float, float, float],
+    mount: tuple[float, float, float],
     boxes: Array,
     body: float,
     widening: float,
@@ -131,12 +134,12 @@ def behind(
     origin: Array,
 ) -> Single:
     """The lines, from the origin (3,), of what is behind patches, as many beams together as each ring (E,) of the grid
-    has it, in directions (3, n), turned by (3, 3), from a sensor that is mounted aside of a place (6,): of those that a
+    has it, in directions (3, n), turned by (3, 3), from a sensor that is mounted so far aside of a place: of those that a
     body may touch which is so large, anywhere in the boxes (2, K, 3). Wide are they by so much, and so much more a
     metre."""
     at, low, high, square = np.empty(3), np.empty(3), np.empty(3), 0.0
     for axis in range(3):
-        at[axis] = place[axis] + turn[axis, 0] * place[3] + turn[axis, 1] * place[4] + turn[axis, 2] * place[5]
+        at[axis] = place[axis] + turn[axis, 0] * mount[0] + turn[axis, 1] * mount[1] + turn[axis, 2] * mount[2]
         low[axis], high[axis] = boxes[0, :, axis].min(), boxes[1, :, axis].max()
         square += (max(at[axis] - low[axis], high[axis] - at[axis]) + body) ** 2
     last = (math.sqrt(square) + wide) / (1.0 - widening)  # no line of any width reaches into the boxes from beyond

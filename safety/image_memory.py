@@ -10,7 +10,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from messaging.patches import Single, Window, half_diagonal, meshes, seen_free
+from messaging.patches import Single, Window, meshes, seen_free
 from messaging.range_images import RangeImage, directions
 from messaging.robots import Robot
 from messaging.scans import Scan
@@ -34,9 +34,9 @@ class _Seen:
     def free(self) -> tuple[float, Single]:
         """The lowest ring's elevation [rad], and the free ranges (len(ASIDE), E, A) of all directions within so much of
         each patch."""
-        elevations, free = seen_free(self.image)
-        about = 2.0 * half_diagonal(self.image)
-        columns, step = free.shape[1], self.image.step[0]
+        grid, free = seen_free(self.image)
+        about, elevations = 2.0 * grid.half_diagonal, grid.elevations
+        columns, step = grid.columns, self.image.step[0]
         levels = [Window.of(columns, elevations, step, aside + about).least(free) for aside in ASIDE]
         return float(elevations[0]), np.stack(levels)
 

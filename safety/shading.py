@@ -243,7 +243,9 @@ def free_groups(ends: Array, first: NDArray[np.int64], room: Single, touching: f
     return len(first)
 
 
-@compiled("Tuple((f8[:,:,::1], f8[:,::1]))(f8[:,:,::1], f8[:,::1], i8[::1], f8[:,:,::1], f8[::1], f8, f8[::1], f8[::1])")
+@compiled(
+    "Tuple((f8[:,:,::1], f8[:,::1]))(f8[:,:,::1], f8[:,::1], i8[::1], f8[:,:,::1], f8[::1], f8, f8[::1], f8[::1])"
+)
 def about_periods(
     normals: Array,
     levels: Array,

@@ -13,7 +13,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from messaging.patches import half_diagonal, seen_free
+from messaging.patches import Grid, seen_free
 from messaging.range_images import RangeImage, directions
 from messaging.shapes import FARTHEST
 from safety.freespace import TOUCHING
@@ -62,20 +62,19 @@ def shadows(image: RangeImage, room: Room, body: float, origin: Array) -> Shadow
     an origin (3,) in the room."""
     from safety.casting import behind  # compiled
 
-    elevations, free = seen_free(image)
-    together, ways = _patches(elevations.tobytes(), free.shape[1])
+    grid, free = seen_free(image)
     beside = body + image.speed * (image.age + room.last)
-    about = half_diagonal(image) + image.angle_error + ASIDE
-    place = np.array([*image.at, *image.mount])
-    lines = behind(free, together, ways, image.turn, place, room.boxes, beside, about, image.sensor_error, origin)
+    about = grid.half_diagonal + image.angle_error + ASIDE
+    pose = image.turn, image.at, image.mount
+    lines = behind(free, *_patches(grid), *pose, room.boxes, beside, about, image.sensor_error, origin)
     return Shadows(lines, origin, room, image.speed, image.age)
 
 
 @lru_cache(maxsize=16)
-def _patches(rings: bytes, columns: int) -> tuple[NDArray[np.int64], Single]:
+def _patches(grid: Grid) -> tuple[NDArray[np.int64], Single]:
     """How many columns make a patch in each ring (E,), more than one near the poles, and their middles (3, n), as
-    exactly as `ASIDE`; rings: their elevations."""
-    elevations = np.frombuffer(rings)
+    exactly as `ASIDE`."""
+    elevations, columns = grid.elevations, grid.columns
     half = 0.5 * float(np.diff(elevations).max())  # the outermost rings may have been moved to the poles
     together = (1.0 / np.cos(np.maximum(np.abs(elevations) - half, 0.0))).astype(np.int64)
     middles = []

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from messaging import brakeline_pb2 as pb
-from messaging.patches import Cover, half_diagonal, seen_free
+from messaging.patches import Cover, Grid, seen_free
 from messaging.range_images import RangeImage, directions
 from messaging.scans import BadScan, Scan
 from messaging.sensed import add_sensed, image_of, sensed_of
@@ -67,7 +67,8 @@ def solid(obstacles, rng, within=FAR):
 
 def free_towards(image, points):
     """F of the patches that points (n, 3) about the sensor lie in, and how far they are."""
-    elevations, free = seen_free(image)
+    grid, free = seen_free(image)
+    elevations = grid.elevations
     far = np.linalg.norm(points, axis=1)
     rings = np.abs(np.arcsin(points[:, 2] / far)[:, None] - elevations).argmin(axis=1)
     columns = np.rint(np.arctan2(points[:, 1], points[:, 0]) * (COLUMNS / math.tau)).astype(int) % COLUMNS
@@ -132,7 +133,8 @@ def test_what_is_not_seen_is_not_free():
     blind = RangeImage(0.0 * ranges, (0.0, 0.0, 0.0), low=-EDGE, high=EDGE)
     assert (seen_free(blind)[1] == 0.0).all()
     belt = RangeImage(ranges[:15], (0.0, 0.0, 0.0), low=-0.5, high=0.5, far=FAR)
-    elevations, free = seen_free(belt)
+    grid, free = seen_free(belt)
+    elevations = grid.elevations
     assert (free[np.abs(elevations) > 0.5] == 0.0).all() and free[len(elevations) // 2].min() > 1.0
     assert abs(elevations[0]) <= 0.5 * math.pi and elevations[0] < -0.5 * math.pi + belt.step[0]
 
@@ -141,17 +143,17 @@ def test_the_closer_beams_are_the_more_they_show():
     wide, close = (Cover.of(half, half) for half in (0.05, 0.025))
     far = [cover.free(np.full((1, 1), 5.0, np.float32), 1.0) for cover in (close, wide)]
     assert close.within < wide.within and far[0] > far[1]
-    image = RangeImage(np.full((RINGS, COLUMNS), FAR), (0.0, 0.0, 0.0), low=-EDGE, high=EDGE)
-    assert half_diagonal(image) == pytest.approx(0.5 * math.hypot(math.radians(4.0), math.radians(4.0)))
+    assert Grid.of(RINGS, COLUMNS, -EDGE, EDGE).half_diagonal == pytest.approx(
+        0.5 * math.hypot(math.radians(4.0), math.radians(4.0))
+    )
 
 
 def test_no_direction_is_farther_from_a_beam_than_half_a_meshes_diagonal():
     rng = np.random.default_rng(0)
     ways = rng.normal(size=(3000, 3))
     ways /= np.linalg.norm(ways, axis=1, keepdims=True)
-    image = RangeImage(np.ones((RINGS, COLUMNS)), (0.0, 0.0, 0.0), low=-EDGE, high=EDGE)
     nearest = np.arccos(np.clip((ways @ GRID.reshape(-1, 3).T).max(axis=1), -1.0, 1.0))
-    assert nearest.max() <= half_diagonal(image) + 1e-6
+    assert nearest.max() <= Grid.of(RINGS, COLUMNS, -EDGE, EDGE).half_diagonal + 1e-6
 
 
 def test_an_image_crosses_the_wire_and_its_ranges_never_grow():

@@ -45,7 +45,9 @@ def with_(request, field, change):
     if field in ("center", "half_width", "heading"):
         if request.predicted is None:
             return request
-        return replace(request, predicted=replace(request.predicted, **{field: change(getattr(request.predicted, field))}))
+        return replace(
+            request, predicted=replace(request.predicted, **{field: change(getattr(request.predicted, field))})
+        )
     return replace(request, **{field: change(getattr(request, field))})
 
 

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from messaging.patches import half_diagonal, seen_free
+from messaging.patches import seen_free
 from messaging.range_images import RangeImage
 from messaging.shapes import FARTHEST
 from safety.casting import complete, rounding
@@ -38,8 +38,8 @@ def test_a_shadow_holds_all_of_its_patch_that_comes_into_the_room_whatever_the_e
     origin = np.array([0.5, 0.3, -0.2])
     lines = shadows(image, room(2.0, 1.0), 0.2, origin).lines.astype(float)
     lines[:3] += origin[:, None]
-    elevations, free = seen_free(image)
-    together, middles = _patches(elevations.tobytes(), COLUMNS)
+    grid, free = seen_free(image)
+    together, middles = _patches(grid)
     middles = middles.T
     free = np.concatenate(
         [np.minimum.reduceat(ring, np.arange(0, COLUMNS, each)) for ring, each in zip(free, together, strict=True)]
@@ -47,7 +47,7 @@ def test_a_shadow_holds_all_of_its_patch_that_comes_into_the_room_whatever_the_e
     which = rng.integers(len(middles), size=4000)
     aside = rng.normal(size=(4000, 3))
     aside -= np.einsum("nd,nd->n", aside, middles[which])[:, None] * middles[which]
-    aside *= math.tan(half_diagonal(image) + image.angle_error) / np.linalg.norm(aside, axis=1, keepdims=True)
+    aside *= math.tan(grid.half_diagonal + image.angle_error) / np.linalg.norm(aside, axis=1, keepdims=True)
     ways = middles[which] + aside
     ways /= np.linalg.norm(ways, axis=1, keepdims=True)
     off = rng.normal(size=(4000, 3))

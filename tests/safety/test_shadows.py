@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from messaging.patches import half_diagonal, seen_free
+from messaging.patches import seen_free
 from messaging.range_images import RangeImage, directions
 from messaging.shapes import Obstacle
 from safety.image_memory import AWAY, ImageMemory, _Seen
@@ -82,7 +82,9 @@ def test_of_every_period_all_that_may_be_touched_in_its_boxes_is_beyond_some_hal
     size = np.linspace(0.05, 1.0, 7)[:, None]
     ways = np.vstack([NOTHING, nominal]) + rng.uniform(-0.5, 0.5, (7, 3)) * size
     boxes = np.stack([ways - size, ways + size])
-    normals, offsets = half_spaces(shadows(image, Room(boxes, 2.4), BODY, NOTHING), NOTHING, nominal, BODY, NOTHING, 0.2)
+    normals, offsets = half_spaces(
+        shadows(image, Room(boxes, 2.4), BODY, NOTHING), NOTHING, nominal, BODY, NOTHING, 0.2
+    )
     if np.isneginf(offsets).all():
         return
     for k in range(6):
@@ -158,16 +160,18 @@ def test_a_sensor_on_a_mast_swings_aside_when_its_attitude_is_wrong():
 @pytest.mark.parametrize("low", [-EDGE, -0.5 * math.pi, -0.9])
 def test_no_direction_is_farther_from_its_patch_than_half_a_meshes_diagonal(low):
     image = RangeImage(np.ones((RINGS, COLUMNS)), (0.0, 0.0, 0.0), low=low, high=-low)
-    elevations, _ = seen_free(image)
-    middles = _patches(elevations.tobytes(), COLUMNS)[1].T
+    grid, _ = seen_free(image)
+    middles = _patches(grid)[1].T
     ways = np.random.default_rng(0).normal(size=(3000, 3))
     ways /= np.linalg.norm(ways, axis=1, keepdims=True)
     nearest = np.arccos(np.clip((ways @ middles.T).max(axis=1), -1.0, 1.0))
-    assert nearest.max() <= half_diagonal(image) + 1e-6
+    assert nearest.max() <= grid.half_diagonal + 1e-6
 
 
 def test_where_nothing_is_there_is_only_the_rooms_box():
-    normals, offsets = half_spaces(shadows(clear(), room(), BODY, NOTHING), NOTHING, np.zeros((2, 3)), BODY, NOTHING, 0.2)
+    normals, offsets = half_spaces(
+        shadows(clear(), room(), BODY, NOTHING), NOTHING, np.zeros((2, 3)), BODY, NOTHING, 0.2
+    )
     assert np.array_equal(normals[:, 0], FACES) and (offsets == 2.0).all()
 
 
