@@ -6,7 +6,7 @@ log can be replayed.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from time import perf_counter_ns
 
 import numpy as np
@@ -189,7 +189,7 @@ class Filter:
         inside = rows.support(self.tube, stay) > rows.bound - comfort
         bound = np.where(inside, rows.bound, rows.bound - comfort)
         if not inside.any():
-            return replace(rows, bound=bound)
+            return Rows(rows.gradient, rows.spread, bound, rows.keep)
         closer = rows.gradient[inside] * self.translating
         return Rows(
             np.vstack([rows.gradient, closer]),

@@ -89,16 +89,18 @@ class Builder:
         self.known = tube.position.shape[2] - free  # length of z_0
         self.free = free
         moving = np.abs(tube.W[:, self.known :]).max(1, initial=0.0) > ROUNDING
-        self.W_t, self.M_t = tube.W[moving], np.ascontiguousarray(tube.M[:, moving])
-        self.W_c, self.M_c = tube.W[~moving][:, : self.known], tube.M[:, ~moving]
-        atoms = len(self.W_t)
+        whole = np.ascontiguousarray
+        W_t, self.M_t = tube.W[moving], whole(tube.M[:, moving])
+        self.W_c, self.M_c = whole(tube.W[~moving][:, : self.known]), whole(tube.M[:, ~moving])
+        self.W_known, self.W_f = whole(W_t[:, : self.known]), whole(W_t[:, self.known :])
+        self.give = np.abs(self.W_f)
+        atoms = len(W_t)
         width = np.tile(robot.high() - robot.low(), steps)
-        self.scale = np.concatenate([width, np.abs(self.W_t[:, self.known :]) @ width])
+        self.scale = np.concatenate([width, self.give @ width])
         self.h = np.full(free + atoms, REGULAR)
         self.h[:m] = 1.0
-        W_f = self.W_t[:, self.known :]
-        above = np.hstack([W_f, -np.eye(atoms)])
-        below = np.hstack([-W_f, -np.eye(atoms)])
+        above = np.hstack([self.W_f, -np.eye(atoms)])
+        below = np.hstack([-self.W_f, -np.eye(atoms)])
         inputs = np.hstack([np.eye(free), np.zeros((free, atoms))])
         difference = np.hstack([np.eye(free) - np.eye(free, k=-m), np.zeros((free, atoms))])
         limited = np.tile(np.isfinite(robot.action_slew), steps)
@@ -121,10 +123,9 @@ class Builder:
         """
         m = self.robot.action_dim
         constant = self.M_c @ np.abs(self.W_c @ z_0) + self.tube.m_0
-        offset = self.W_t[:, : self.known] @ z_0
+        offset = self.W_known @ z_0
         center, radius = self.reachable(z_0[-m:])
-        atom = offset + self.W_t[:, self.known :] @ center
-        give = np.abs(self.W_t[:, self.known :]) @ radius
+        atom, give = offset + self.W_f @ center, self.give @ radius
         atoms = np.stack([np.maximum(np.abs(atom) - give, 0.0), np.abs(atom) + give])
         count, A, b = holding.that_matter(
             rows.gradient, rows.spread, rows.bound, z_0, constant, self.M_t, center, radius, atoms, self.scale, SHARPEN
