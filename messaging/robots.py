@@ -154,10 +154,10 @@ class Robot:
         return state
 
     def low(self) -> Array:
-        return np.asarray(self.action_low)
+        return np.asarray(self.action_low, dtype=float)
 
     def high(self) -> Array:
-        return np.asarray(self.action_high)
+        return np.asarray(self.action_high, dtype=float)
 
     @cached_property
     def bounds(self) -> tuple[Array, Array]:

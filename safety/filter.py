@@ -116,8 +116,7 @@ class Filter:
         z_0 = np.concatenate([request.state[self.regressor], request.input_in_force, given])
         proposal = self.inputs.limited(request.action, z_0[-self.robot.action_dim :])
         scene = self.around.scene(request, z_0, self.builder.reachable(z_0[-self.robot.action_dim :]))
-        recorded = z_0[: self.robot.regressor_dim]
-        in_domain = bool(((recorded >= self.domain[0]) & (recorded <= self.domain[1])).all())
+        in_domain = reaching.within(z_0, self.domain)
         found = None
         if attempt.broken:
             attempt.reason = (

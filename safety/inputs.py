@@ -5,9 +5,34 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from messaging.compiled import compiled
 from messaging.robots import Robot
 
 Array = NDArray[np.float64]
+
+
+@compiled("f8[::1](f8[::1], f8[::1], f8[::1], f8[::1], f8[::1])")
+def _limited(wanted: Array, before: Array, low: Array, high: Array, slew: Array) -> Array:
+    """The input (m,) closest to the wanted one within bounds and slew; of what is no number, none."""
+    found = np.empty(len(wanted))
+    for i in range(len(wanted)):
+        least, most = max(low[i], before[i] - slew[i]), min(high[i], before[i] + slew[i])
+        value = least if wanted[i] < least else wanted[i]
+        found[i] = most if value > most else value
+    return found
+
+
+@compiled("f8[::1](f8[::1], f8[:,::1], f8[::1])")
+def _followed(z_0: Array, braking: Array, action: Array) -> Array:
+    """z_0, and what is left (F, m) of an action (m,) from then on."""
+    (F, m), known = braking.shape, len(z_0)
+    z = np.empty(known + F * m)
+    for j in range(known):
+        z[j] = z_0[j]
+    for k in range(F):
+        for i in range(m):
+            z[known + k * m + i] = braking[k, i] * action[i]
+    return z
 
 
 class Inputs:
@@ -16,15 +41,14 @@ class Inputs:
 
     def __init__(self, robot: Robot) -> None:
         self.robot = robot
-        self.low, self.high, self.slew = robot.low(), robot.high(), np.asarray(robot.action_slew)
+        self.low, self.high, self.slew = robot.low(), robot.high(), np.asarray(robot.action_slew, dtype=float)
         self.schedule = robot.schedule()
         self.nothing = robot.at_zero()
-        self.braking = robot.fractions()[: robot.free_steps - robot.given]
+        self.braking = np.ascontiguousarray(robot.fractions()[: robot.free_steps - robot.given])
 
     def limited(self, wanted: Array, before: Array) -> Array:
         """The input (m,) closest to the wanted one within bounds and slew."""
-        low, high = np.maximum(self.low, before - self.slew), np.minimum(self.high, before + self.slew)
-        return np.asarray(np.minimum(np.maximum(wanted, low), high))
+        return _limited(wanted, before, self.low, self.high, self.slew)
 
     def within(self, free: Array, before: Array) -> Array:
         """Free inputs (F·m,) brought within bounds and slew, one after the other."""
@@ -40,7 +64,7 @@ class Inputs:
 
     def regressors(self, z_0: Array, action: Array) -> Array:
         """z of an action followed by braking."""
-        return np.concatenate([z_0, (self.braking * action).ravel()])
+        return _followed(z_0, self.braking, action)
 
     def plan(self, z: Array) -> Array:
         """The inputs (N, m) that regressors z speak of."""

@@ -110,7 +110,9 @@ class Builder:
         self.fixed = fixed / self.length[:, None]
         self.limited = limited
         self.low, self.high = robot.low(), robot.high()
-        self.way = np.arange(1, steps + 1)[:, None] * np.asarray(robot.action_slew)  # of the input, until each free one
+        self.way = np.arange(1.0, steps + 1.0)[:, None] * np.asarray(
+            robot.action_slew
+        )  # of the input, until each free one
         self.slew = np.tile(robot.action_slew, steps)[limited]
         self.box = np.concatenate([np.tile(robot.high(), steps), -np.tile(robot.low(), steps)])
 

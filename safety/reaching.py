@@ -15,6 +15,15 @@ from messaging.compiled import compiled
 Array = NDArray[np.float64]
 
 
+@compiled("b1(f8[::1], f8[:,::1])")
+def within(values: Array, bounds: Array) -> bool:
+    """Are the first values, as many as there are bounds (2, k), within them? One that is no number is not."""
+    for i in range(bounds.shape[1]):
+        if not bounds[0, i] <= values[i] <= bounds[1, i]:
+            return False
+    return True
+
+
 @compiled("void(f8[:,::1], f8[::1], f8[::1])")
 def _add_product(A: Array, x: Array, found: Array) -> None:
     """A's transpose (n, k) times x (n,), added to what is found (k,)."""

@@ -64,6 +64,11 @@ class Request:
     promised: Promises | None = None
     observation: NDArray[np.float32] = field(default_factory=lambda: np.zeros(0, np.float32))
 
+    def __post_init__(self) -> None:
+        """Of one type and memory layout, which compiled code relies on, whatever arrays they come as."""
+        for name in ("state", "action", "input_in_force", "plan"):
+            object.__setattr__(self, name, np.ascontiguousarray(getattr(self, name), dtype=float))
+
     def still(self, robot: Robot) -> bool:
         """Is the robot said to stand, and to be committed to that? Needs no model's word."""
         committed = not self.model and bool(robot.rests(self.plan).all()) and robot.may_stand(self.input_in_force)

@@ -113,7 +113,7 @@ class Surroundings:
         self._reached = *self._sized, whole(tube.position), whole(tube.directions)
         self.boxes = Boxes(tube.position, tube.directions)
         self.limits = Limits(robot, tube) if robot.limits else None
-        self.measured = np.asarray(robot.measurement_bound[: robot.position_dim])
+        self.measured = np.asarray(robot.measurement_bound[: robot.position_dim], dtype=float)
         self._unturned = np.eye(robot.position_dim)
         self.body = robot.footprint + float(np.linalg.norm(self.measured))  # m about where the center was measured
         self.comfort = self._comfort() if comfort is None else comfort

@@ -12,6 +12,7 @@ from messaging.shapes import FARTHEST, Shapes
 from messaging.tasks import task_of
 from safety.commitment import Prediction
 from safety.request import BadRequest, Ordinary, Request, check_for_filter
+from tests.safety.asked import cylinder, request, same
 from tests.safety.toys import car
 
 FEW_INPUTS = car("cart")  # holds its steering, and no task of it is known
@@ -88,3 +89,12 @@ def test_what_has_another_size_does_not_pass_at_once(field, change):
     sound = replace(sound, observation=np.zeros(task_of(robot).observation_dim, np.float32))
     assert Ordinary(robot)(sound)
     assert not Ordinary(robot)(with_(sound, field, change))
+
+
+def test_arrays_of_any_type_and_layout_are_decided_on_as_usual(ready):
+    sound = request(action=(0.25, 0.5), obstacles=[cylinder(1.0, 0.0)])
+    expected = ready.decide(sound)
+    stridden = {name: np.repeat(getattr(sound, name), 2, axis=0)[::2] for name in ("state", "action", "input_in_force")}
+    for odd in (stridden, {name: value.astype(np.float32) for name, value in stridden.items()}):
+        assert same(ready.decide(replace(sound, **odd)), expected)
+    assert same(ready.decide(replace(sound, plan=sound.plan.astype(int))), expected)
