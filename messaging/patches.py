@@ -16,8 +16,9 @@ known. And a beam that returns from where no mesh about it returns as a whole, w
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cache, cached_property, lru_cache
 from typing import Any
 
 import numpy as np
@@ -64,22 +65,25 @@ class Cover:
         return (1.0 - SINGLE) * self.share, (1.0 - SINGLE) * least_width / self.kappa
 
 
-def seen_free(image: RangeImage) -> tuple[Grid, Single]:
-    """The grid, from pole to pole, and F (E', A) [m] of each beam's patch."""
+@cache
+def _free_of_single() -> Callable[..., tuple[Single, Single]]:
     from messaging.nearby import free_of_single  # compiled
 
+    return free_of_single
+
+
+def seen_free(image: RangeImage) -> tuple[Grid, Single]:
+    """The grid, from pole to pole, and F (E', A) [m] of each beam's patch."""
     width, grid = image.least_width, Grid.of(*image.ranges.shape, image.low, image.high)
     ranges, scale = np.ascontiguousarray(image.ranges), grid.single.scale(width)
-    returns, free = free_of_single(
-        ranges, *grid.rings, image.far, image.range_error, *grid.windows, *scale, image.doubt
-    )
+    errors = image.far, image.range_error
+    returns, free = _free_of_single()(ranges, *grid.rings, *errors, *grid.windows, *scale, image.doubt)
     if free.size:
         return grid, free
     known, nothing = returns >= 0.0, np.float32(0.0)
     enough = meshes(np.add, known.astype(np.int8)) > image.doubt
-    silent = np.where(
-        known, returns, np.float32(np.inf)
-    )  # who says nothing does not say that something is near, either
+    # Who says nothing does not say that something is near, either.
+    silent = np.where(known, returns, np.float32(np.inf))
     free = grid.double.free(grid.balls.least(np.where(enough, silent, nothing)), width)
     if not image.doubt:
         free = np.maximum(free, grid.single.free(grid.beams.least(np.maximum(returns, nothing)), width))

@@ -117,14 +117,28 @@ def complete(lines: Single) -> None:
         extent[s] += length[s] * (abs(u[s]) + abs(v[s]) + abs(w[s]))
 
 
+@compiled("f8[:,::1](UniTuple(f8, 4))")
+def _turned(attitude: tuple[float, float, float, float]) -> Array:
+    """As `RangeImage.turn`."""
+    a, b, c, d = attitude
+    length = math.sqrt(a * a + b * b + c * c + d * d)
+    w, x, y, z = a / length, b / length, c / length, d / length
+    turn = np.empty((3, 3))
+    turn[0, 0], turn[0, 1], turn[0, 2] = 1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)
+    turn[1, 0], turn[1, 1], turn[1, 2] = 2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)
+    turn[2, 0], turn[2, 1], turn[2, 2] = 2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)
+    return turn
+
+
 @compiled(
-    "f4[:,::1](f4[:,::1], i8[::1], f4[:,::1], f8[:,::1], UniTuple(f8, 3), UniTuple(f8, 3), f8[:,:,::1], f8, f8, f8, f8[::1])"
+    "f4[:,::1](f4[:,::1], i8[::1], f4[:,::1], UniTuple(f8, 4), UniTuple(f8, 3), UniTuple(f8, 3), f8[:,:,::1], f8, f8,"
+    " f8, f8[::1])"
 )
 def behind(
     free: Single,
     together: NDArray[np.int64],
     ways: Single,
-    turn: Array,
+    attitude: tuple[float, float, float, float],
     place: tuple[float, float, float],
     mount: tuple[float, float, float],
     boxes: Array,
@@ -134,10 +148,10 @@ def behind(
     origin: Array,
 ) -> Single:
     """The lines, from the origin (3,), of what is behind patches, as many beams together as each ring (E,) of the grid
-    has it, in directions (3, n), turned by (3, 3), from a sensor that is mounted so far aside of a place: of those that a
-    body may touch which is so large, anywhere in the boxes (2, K, 3). Wide are they by so much, and so much more a
-    metre."""
-    at, low, high, square = np.empty(3), np.empty(3), np.empty(3), 0.0
+    has it, in directions (3, n) in the frame of a sensor with that attitude, mounted so far aside of a place: of those
+    that a body may touch which is so large, anywhere in the boxes (2, K, 3). Wide are they by so much, and so much more
+    a metre."""
+    turn, at, low, high, square = _turned(attitude), np.empty(3), np.empty(3), np.empty(3), 0.0
     for axis in range(3):
         at[axis] = place[axis] + turn[axis, 0] * mount[0] + turn[axis, 1] * mount[1] + turn[axis, 2] * mount[2]
         low[axis], high[axis] = boxes[0, :, axis].min(), boxes[1, :, axis].max()

@@ -77,6 +77,16 @@ def slack(
     return left.ravel()
 
 
+@compiled("f8(f8[::1], f8)")
+def least(left: Array, most: float) -> float:
+    """The least of all (r,), so much at the most; no number where one of them is none."""
+    found, numbers = most, True
+    for row in range(len(left)):
+        found = left[row] if left[row] < found else found
+        numbers &= left[row] == left[row]
+    return found if numbers else np.nan
+
+
 @compiled(
     "Tuple((i8, f8[:,::1], f8[::1]))"
     "(f8[:,::1], f8[:,::1], f8[::1], f8[::1], f8[::1], f8[:,::1], f8[::1], f8[::1], f8[:,::1], f8[::1], f8)"

@@ -42,6 +42,23 @@ def magnitudes(W: Array, M: Array, m_0: Array, z: Array) -> Array:
     return sizes
 
 
+@compiled("f8[:,::1](f8[:,:,::1], f8[::1], f8[::1], f8[:,::1])")
+def places(position: Array, z: Array, start: Array, turn: Array) -> Array:
+    """Nominal ends of the periods (N, d), world, from a start (d,) turned by (d, d)."""
+    (N, d, nz), way = position.shape, np.empty(position.shape[1])
+    found = np.empty((N, d))
+    for k in range(N):
+        for axis in range(d):
+            way[axis] = 0.0
+            for j in range(nz):
+                way[axis] += position[k, axis, j] * z[j]
+        for axis in range(d):
+            found[k, axis] = start[axis]
+            for other in range(d):
+                found[k, axis] += turn[axis, other] * way[other]
+    return found
+
+
 @compiled(
     "Tuple((f8[:,::1], f8[:,::1]))"
     "(f8[:,::1], f8[:,::1], f8[::1], f8[:,:,::1], f8[:,:,::1], f8[::1], f8[::1], f8[:,::1], f8[::1])"
@@ -60,22 +77,17 @@ def sets(
     """Centers and half-widths (N, d), world, of boxes about a tube's positions at the periods' ends, from a start (d,)
     turned by (d, d), and whatever is measured (d,) beside it."""
     (N, d, L), sizes = directions.shape, magnitudes(W, M, m_0, z)
-    centers, half, way, along = np.empty((N, d)), np.empty((N, d)), np.empty(d), np.empty(L)
+    half, along = np.empty((N, d)), np.empty(L)
     for k in range(N):
         for axis in range(d):
-            way[axis] = 0.0
-            for j in range(len(z)):
-                way[axis] += position[k, axis, j] * z[j]
-        for axis in range(d):
-            centers[k, axis], half[k, axis], along[:] = start[axis], measured[axis], 0.0
+            half[k, axis], along[:] = measured[axis], 0.0
             for other in range(d):
                 part, span = turn[axis, other], directions[k, other]
-                centers[k, axis] += part * way[other]
                 for i in range(L):
                     along[i] += part * span[i]
             for i in range(L):
                 half[k, axis] += abs(along[i]) * sizes[i]
-    return centers, half
+    return places(position, z, start, turn), half
 
 
 @compiled("f8(f8[:,::1], f8[:,::1], f8[::1], f8[:,:,::1], f8[:,:,::1], f8[::1], f8)")

@@ -7,8 +7,9 @@ supports the nearest of these, until none is left.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cache, lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,19 +54,26 @@ class Shadows:
 def prepare() -> None:
     """Compile what reads range images, or load it: before the first one is to be answered in time."""
     import messaging.nearby  # noqa: F401
-    import safety.casting
-    import safety.shading  # noqa: F401
+
+    _compiled()
+
+
+@cache  # importing anew what there is takes a fiftieth of a decision
+def _compiled() -> tuple[Callable[..., Single], Callable[..., tuple[Array, Array]]]:
+    from safety.casting import behind
+    from safety.shading import about_way
+
+    return behind, about_way
 
 
 def shadows(image: RangeImage, room: Room, body: float, origin: Array) -> Shadows:
     """All that is not known to be free and that a body of that radius [m], with its middle in the room, may touch; from
     an origin (3,) in the room."""
-    from safety.casting import behind  # compiled
-
     grid, free = seen_free(image)
     beside = body + image.speed * (image.age + room.last)
     about = grid.half_diagonal + image.angle_error + ASIDE
-    pose = image.turn, image.at, image.mount
+    pose = image.attitude, image.at, image.mount
+    behind, _ = _compiled()
     lines = behind(free, *_patches(grid), *pose, room.boxes, beside, about, image.sensor_error, origin)
     return Shadows(lines, origin, room, image.speed, image.age)
 
@@ -90,8 +98,7 @@ def half_spaces(
 ) -> tuple[Array, Array]:
     """As `freespace.half_spaces`: as many as any period needs, up to `PLANES`, and the room's faces. Those that a
     period does not need hold everywhere."""
-    from safety.shading import about_way  # compiled
-
     boxes, moved = near.room.boxes, (near.speed * near.age, near.speed * period)  # m: until now, and in a period
     way, limits = np.ascontiguousarray(nominal), (SHARED, TOUCHING, GIVE, FARTHEST)
+    _, about_way = _compiled()
     return about_way(near.lines, near.origin, start, way, boxes, moved, keep_off, measured, PLANES, limits)

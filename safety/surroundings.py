@@ -48,11 +48,6 @@ class _Disc:
         """Is it not where the robot is?"""
         return bool(self.at.any() or self.swing)
 
-    @cached_property
-    def flat(self) -> Array:
-        """(N·d, nz): where its centre goes."""
-        return np.ascontiguousarray(self.position.reshape(-1, self.position.shape[2]))
-
 
 def _discs(robot: Robot, tube: Tube) -> list[_Disc]:
     d, found = robot.position_dim, []
@@ -63,7 +58,8 @@ def _discs(robot: Robot, tube: Tube) -> list[_Disc]:
             position, directions = tube.more[:, after : after + d], tube.more_directions[:, after : after + d]
             swing = disc.arm * robot.measurement_bound[robot.heading]
             after += d
-        found.append(_Disc(np.asarray(disc.at), disc.radius, swing, position, Layout(position, directions)))
+        whole = np.ascontiguousarray(position)
+        found.append(_Disc(np.asarray(disc.at), disc.radius, swing, whole, Layout(position, directions)))
     return found
 
 
@@ -176,7 +172,7 @@ class Surroundings:
     def scene(self, request: Request, z_0: Array, inputs: tuple[Array, Array]) -> Scene:
         """inputs: center and half-widths of what a plan's free inputs may be, after z_0."""
         d, robot = self.robot.position_dim, self.robot
-        start, near = request.state[:d], request.obstacles
+        start, near = np.ascontiguousarray(request.state[:d]), request.obstacles
         heading = float(request.state[robot.heading]) if robot.heading is not None else 0.0
         turn = self.turn(heading)
         beyond = robot.sight
@@ -193,7 +189,6 @@ class Surroundings:
             promised = promised.take(counts) if counts.any() else None
         unseen: seen.Cells | shades.Shadows | None = None
         if isinstance(request.scan, RangeImage):
-            start = np.ascontiguousarray(start)
             unseen = shades.shadows(request.scan, self._room(z_0, inputs, start, turn), self.body, start)
         elif request.scan is not None:
             unseen = self._unseen(request.scan, start)
@@ -244,7 +239,7 @@ class Surroundings:
     def least(self, slack: Array, z: Array, comfort: float = 0.0) -> float:
         """The smallest slack, within ± the reach (less the comfort); NaN never counts as inside."""
         most = self.reach - comfort
-        margin = float(slack.min(initial=most))
+        margin = holding.least(slack, most)
         if self.far:
             margin = min(margin, most - self.extent(z))
         return max(margin, -self.reach) if margin == margin else -self.reach
@@ -257,8 +252,7 @@ class Surroundings:
             start, measured = scene.start, self.measured
             if disc.aside:
                 start, measured = start + scene.turn @ disc.at, measured + disc.swing
-            way = (disc.flat @ z).reshape(-1, len(start))
-            ends = start + (way if self.robot.heading is None else way @ scene.turn.T)
+            ends = reaching.places(disc.position, z, start, scene.turn)
             beside = []
             if len(scene.near) or scene.unseen is None:
                 beside.append(half_spaces(scene.near, start, ends, disc.radius, measured))
