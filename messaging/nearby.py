@@ -29,7 +29,7 @@ def _copy(values: Single, found: Single) -> None:
 
 
 @compiled("void(f4[:,::1], f4, f4)")
-def scale_to(values: Single, share: np.float32, most: np.float32) -> None:
+def scale_to(values: Single, share: float, most: float) -> None:
     """Each becomes so much of what it was, and that at the most."""
     flat = values.ravel()
     for k in range(len(flat)):
@@ -178,13 +178,13 @@ def free_of_single(
     above: int,
     far: float,
     error: float,
-    mesh_share: np.float32,
+    mesh_share: float,
     mesh_rows: int,
     mesh_beside: NDArray[np.int64],
     rows: int,
     beside: NDArray[np.int64],
-    share: np.float32,
-    most: np.float32,
+    share: float,
+    most: float,
     doubt: bool,
 ) -> tuple[Single, Single]:
     """The returns, without ghosts, and how far each patch is free by single beams; of no size where not all of them are

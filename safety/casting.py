@@ -2,7 +2,7 @@
 
 Shadows are told as `lines` (11, n), contiguous, in single precision, from some place: their near ends x, y, z, the
 unit vectors along them x, y, z, their length, how wide they are about their near ends and their far ones, m; and what
-follows from these: how much each widens a metre, and how far [m] it is at the most, no number where one of them is none.
+follows from these: how much each widens a metre, and how far off [m] it ends, no number where one of them is none.
 """
 
 from __future__ import annotations

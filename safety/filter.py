@@ -82,8 +82,9 @@ class Filter:
         self.inputs = Inputs(robot)
         self.ordinary = Ordinary(robot)
         first, n, whole = model.first, robot.state_dim, np.ascontiguousarray
-        parts = (first.C[:n], first.W.T, first.M.T, first.kappa.T, first.w, np.abs(first.generators[:n]))
-        self.first = tuple(whole(part) for part in parts)  # what `next_state` is told of it
+        transposed = whole(first.W.T), whole(first.M.T), whole(first.kappa.T)
+        # What `next_state` is told of it.
+        self.first = whole(first.C[:n]), *transposed, first.w, whole(np.abs(first.generators[:n]))
         self.same = SAME_INPUT * (self.inputs.high - self.inputs.low)
         self.standing = np.array([not moves for moves in robot.translates])
         driven = np.tile(robot.translates, robot.free_steps)

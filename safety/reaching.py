@@ -1,4 +1,4 @@
-"""Where a tube and its first step lead under regressors z, compiled (`tube.py` and `certificates.py` say what they are).
+"""Where a tube and its first step lead under regressors z, compiled; what they are say `tube.py`, `certificates.py`.
 
 W (q, nz), M (K, q) and kappa (g, nz) are told transposed: so many sums are made at a time, each in its own order.
 """
@@ -18,10 +18,10 @@ Array = NDArray[np.float64]
 @compiled("b1(f8[::1], f8[:,::1])")
 def within(values: Array, bounds: Array) -> bool:
     """Are the first values, as many as there are bounds (2, k), within them? One that is no number is not."""
+    found = True
     for i in range(bounds.shape[1]):
-        if not bounds[0, i] <= values[i] <= bounds[1, i]:
-            return False
-    return True
+        found &= bounds[0, i] <= values[i] <= bounds[1, i]
+    return found
 
 
 @compiled("void(f8[:,::1], f8[::1], f8[::1])")
@@ -104,7 +104,7 @@ def extent(W: Array, M: Array, m_0: Array, position: Array, directions: Array, z
                 aside += abs(directions[k, axis, i]) * sizes[i]
             square += (abs(way) + aside) ** 2
         farthest = max(farthest, square)
-    return math.sqrt(farthest) + body + sizes[L:].max()
+    return math.sqrt(farthest) + body + float(sizes[L:].max())
 
 
 @compiled(
