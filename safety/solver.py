@@ -8,6 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 from proxsuite import proxqp
 
+from safety.deciding import come_by
+
 Array = NDArray[np.float64]
 
 ACCURACY = 1e-6  # of unit rows in scaled variables: about 1e-7 m
@@ -16,13 +18,13 @@ NOT_INFEASIBLE = 1e-12
 SOLVED = "solved"
 MOST_ITERATIONS = 100
 MOST_INNER_ITERATIONS = 50
-# Of many rows few decide: those that the unhindered answer violates most are solved alone, then with what that answer
-# violates, and so on. An answer that is within all rows is the answer to all of them. So few are solved exactly, for
-# there are no others to hold the answer off the edge; where that does not come soon, or few are said to be impossible
-# (which the solver is quicker to say of few rows: 13 of 9,727 that could be met), all are solved as usual.
+# Of all rows few decide: those that a quick ascent comes by (`deciding.py`) are solved alone, then with those that the
+# answer violates most, and so on. An answer within all rows is the answer to all of them. So few are solved exactly,
+# for there are no others to hold the answer off the edge; where that does not come soon, or few are said to be
+# impossible (which the solver is quicker to say of few rows: 13 of 9,727 that could be met), all are solved as usual.
 # Rows are of unit length already, so few need no preconditioner; and few are met the more exactly, the more it costs at
 # once not to meet one (`FIRMNESS`).
-MANY, FEW, ROUNDS, SOON = 40, 5, 4, 15  # SOON: iterations
+STEPS, FEW, ROUNDS, SOON = 20, 5, 8, 30  # STEPS: of the ascent; SOON: iterations
 EXACT, FIRMNESS = 1e-7, 1e-2
 
 
@@ -57,27 +59,22 @@ INFEASIBLE = Solution(np.array([np.nan]), "ruled out", 0, np.inf)  # of a progra
 
 def solve(program: Program) -> Solution:
     """Cold start: the answer depends on the program alone, so that a log can be replayed."""
-    if len(program.b) - program.always < MANY:
-        return _solved(program)
     return _by_few(program) or _solved(program)
 
 
 def _by_few(program: Program) -> Solution | None:
     """By as few rows as will do; None if that does not come soon."""
-    rows, iterations = len(program.b), 0
-    inside = np.zeros(rows, dtype=bool)
-    inside[rows - program.always :] = True
-    x = -program.g / program.h
+    inside, iterations = come_by(program.h, program.g, program.A, program.b, STEPS), 0
+    inside[len(program.b) - program.always :] = True
     for _ in range(ROUNDS):
-        left = np.where(inside, -np.inf, program.A @ x - program.b)
-        inside[np.argsort(-left, kind="stable")[:FEW]] = True
         part = _solved(replace(program, A=program.A[inside], b=program.b[inside]), few=True)
-        x, iterations = part.x, iterations + part.iterations
-        residual = float((program.A @ x - program.b).max())
+        iterations += part.iterations
         if part.status != SOLVED:
             return None
-        if residual <= 2.0 * EXACT:
-            return Solution(x, part.status, iterations, residual)
+        left = program.A @ part.x - program.b
+        if left.max() <= 2.0 * EXACT:
+            return Solution(part.x, part.status, iterations, float(left.max()))
+        inside[np.argsort(-np.where(inside, -np.inf, left), kind="stable")[:FEW]] = True
     return None
 
 

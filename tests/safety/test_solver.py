@@ -9,6 +9,7 @@ import pytest
 
 from messaging.shapes import Obstacle, Shapes
 from safety import solver
+from safety.deciding import come_by
 from safety.freespace import half_spaces
 from safety.model_set import ModelSet
 from safety.program import Builder, Layout
@@ -83,6 +84,26 @@ def test_of_many_rows_those_that_decide_give_the_answer_to_all(monkeypatch):
             assert value(program, ours.x) == pytest.approx(value(program, theirs), abs=1e-5)
         assert (solve(program).x == ours.x).all(), "always the same"
     assert 20 < impossible < 180 and np.median(parts) < 30, "by few of 172"
+
+
+def test_rows_that_are_come_by_save_rounds_and_change_no_answer(monkeypatch):
+    found = [one for one in map(crowded, map(np.random.default_rng, range(300))) if by_daqp(one)[1] >= 1]
+    parts, rounds = [], []
+    monkeypatch.setattr(
+        solver, "_solved", lambda part, of=solver._solved, **how: parts.append(len(part.b)) or of(part, **how)
+    )
+    for steps in (solver.STEPS, 0):
+        parts.clear()
+        monkeypatch.setattr(solver, "STEPS", steps)
+        for program in found:
+            assert value(program, solve(program).x) == pytest.approx(value(program, by_daqp(program)[0]), abs=1e-5)
+        rounds.append(len(parts))
+    assert rounds[0] < 0.9 * rounds[1]
+
+
+def test_a_row_that_is_no_number_is_not_come_by():
+    A, b = np.array([[1.0, 0.0], [np.nan, 1.0], [0.0, 1.0], [0.0, 0.0]]), np.array([-1.0, -5.0, np.nan, -1.0])
+    assert come_by(np.ones(2), np.zeros(2), A, b, 20).tolist() == [True, False, False, False]
 
 
 def test_that_few_can_not_be_met_is_not_taken_for_granted(monkeypatch):
