@@ -60,6 +60,8 @@ class RangeImage:
             raise BadScan("a range image's ranges are in double precision")
         if not np.isfinite(self.ranges).all() or (self.ranges < 0.0).any():
             raise BadScan("a range image's ranges are 0 or more, and finite")
+        for name in ("at", "attitude", "mount"):
+            object.__setattr__(self, name, tuple(map(float, getattr(self, name))))
         if (len(self.at), len(self.attitude), len(self.mount)) != (3, 4, 3):
             raise BadScan("a range image's place and mount have 3 coordinates, its attitude 4")
         if not all(abs(value) <= FARTHEST for value in (*self.at, *self.attitude, *self.mount)):  # NaN fails too

@@ -36,7 +36,7 @@ def nearest_of_patches(free: Single, together: NDArray[np.int64], patches: int) 
     found, k = np.empty(patches, np.float32), 0
     ahead, spare, least = np.empty(2 * columns, np.float32), np.empty(2 * columns, np.float32), free[0].copy()
     for i in range(rings):
-        each, ring = together[i], free[i]
+        each, ring = min(together[i], columns), free[i]
         count = (columns + each - 1) // each
         out = found[k : k + count]
         if each == 1:

@@ -235,3 +235,9 @@ def test_what_is_drawn_as_free_is_free_and_hits_lie_on_surfaces():
     assert shapes.distance(share * edge).min() > 0.0
     flat = about.flat(50)
     assert len(flat["hits"]) <= 50 and all(len(point) == 2 for point in (*flat["hits"], *flat["free"]))
+
+
+def test_a_place_and_an_attitude_may_come_as_any_numbers():
+    image = RangeImage(np.ones((RINGS, COLUMNS)), np.array([1, 2, 3]), [1, 0, 0, 0], low=-EDGE, high=EDGE)
+    assert (image.at, image.attitude) == ((1.0, 2.0, 3.0), (1.0, 0.0, 0.0, 0.0))
+    assert all(type(value) is float for value in (*image.at, *image.attitude, *image.mount))

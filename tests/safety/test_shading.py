@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from messaging.patches import seen_free
 from messaging.range_images import RangeImage
 from messaging.shapes import FARTHEST
-from safety.casting import complete, rounding
+from safety.casting import complete, nearest_of_patches, rounding
 from safety.shading import rooms, supporting
 from safety.shadows import Room, Shadows, _patches, half_spaces, shadows
 from tests.messaging.test_range_images import COLUMNS, EDGE, RINGS
@@ -62,6 +62,17 @@ def test_a_shadow_holds_all_of_its_patch_that_comes_into_the_room_whatever_the_e
         there = near + (share * length)[:, None] * along
         about = about_near + share * (about_far - about_near)
         assert (np.linalg.norm(point - there, axis=1) <= about + 1e-3).any(), "in the hull of the balls"
+
+
+@settings(max_examples=30)
+@given(st.integers(0, 100_000), st.integers(2, 40), st.integers(1, 30))
+def test_a_patch_is_as_near_as_the_nearest_of_its_beams(seed, rings, columns):
+    """Also where a patch near a pole would be wider than the ring is round."""
+    rng = np.random.default_rng(seed)
+    free, together = rng.random((rings, columns), np.float32), rng.integers(1, 3 * columns, rings)
+    rings_ = zip(free, together, strict=True)
+    expected = np.concatenate([np.minimum.reduceat(ring, np.arange(0, columns, each)) for ring, each in rings_])
+    assert np.array_equal(nearest_of_patches(free, together, len(expected)), expected)
 
 
 @settings(max_examples=30)
