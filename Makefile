@@ -18,10 +18,11 @@ $(STAMP): pyproject.toml constraints.txt
 
 test: check unit
 
+# Beside it loops are compiled (Numba), once: else by all processes that the first tests start, in their own time.
 check: setup
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
-	$(BIN)/mypy
+	$(BIN)/python -c 'import safety.filter, safety.shadows as s; s.prepare()' & $(BIN)/mypy; found=$$?; wait; exit $$found
 	$(BIN)/lint-imports
 
 # Real time in one process, whole runs in another, the rest beside them at a lower priority (tests/conftest.py); what was
