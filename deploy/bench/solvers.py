@@ -1,4 +1,5 @@
-"""The filter's QPs by ProxQP, as the filter calls it, and by DAQP."""
+"""The filter's QPs by ProxQP, as the filter calls it, and by DAQP: how long they take; of how many the two disagree
+whether they can be met, or on the input, by more than a thousandth of its range, and by how much at the most."""
 
 from __future__ import annotations
 
@@ -9,13 +10,25 @@ import daqp
 import numpy as np
 
 from deploy.bench import situations
+from deploy.bench.decide import SCANS
 from deploy.bench.timing import Figures, each
+from messaging.robots import Robot, robot_named
 from safety import filter as filtering
 from safety.filter import Filter
-from safety.solver import Program, Solution, solve
+from safety.solver import ACCURACY, SOLVED, Program, Solution, solve
+from sim.conditions import Conditions
+
+APART = 1e-3  # of an input's range
+QUESTIONS: tuple[tuple[str, str, str, Conditions | None], ...] = (
+    ("residual", "ground", "residual", None),
+    ("matrix zonotope", "ground", "matrix-zonotope", None),
+    ("ground by scan", "ground", "residual", SCANS),
+    ("quadrotor", "quadrotor", "residual", None),
+    ("quadrotor by scan", "quadrotor", "residual", SCANS),
+)
 
 
-def programs(certificate: str) -> list[Program]:
+def programs(certificate: str, robot: Robot, conditions: Conditions | None) -> list[Program]:
     """The QPs that come up."""
     seen: list[Program] = []
 
@@ -23,26 +36,42 @@ def programs(certificate: str) -> list[Program]:
         seen.append(program)
         return solve(program)
 
-    ready = Filter(situations.model(certificate))
+    ready = Filter(situations.model(certificate, robot=robot))
     with patch.object(filtering, "solve", note):
-        for request in situations.requests(ready, situations.messages()):
+        for request in situations.requests(ready, situations.messages(robot=robot, conditions=conditions)):
             ready.decide(request)
     return seen
 
 
-def by_daqp(program: Program) -> np.ndarray:
+def by_daqp(program: Program) -> np.ndarray | None:
+    """None: it can't be met."""
     n = len(program.h)
     low = np.full(len(program.b), -1e30)
     sense = np.zeros(len(program.b), dtype=np.int32)
-    x, *_ = daqp.solve(np.diag(program.h), program.g.copy(), program.A.copy(), program.b.copy(), low, sense)
-    return np.asarray(x[:n])
+    x, _, flag, _ = daqp.solve(np.diag(program.h), program.g.copy(), program.A.copy(), program.b.copy(), low, sense)
+    return np.asarray(x[:n]) if flag >= 1 else None
+
+
+def disagreements(seen: list[Program], inputs: int) -> dict[str, float]:
+    """How often the two do, and by how much at the most they do on the first so many unknowns."""
+    apart, other = [0.0], 0
+    for program in seen:
+        ours, theirs = solve(program), by_daqp(program)
+        met = ours.status == SOLVED and ours.residual <= 2.0 * ACCURACY
+        other += met != (theirs is not None)
+        if met and theirs is not None:
+            apart.append(float(np.abs(ours.x - theirs)[:inputs].max()))
+    return {"disagree": other, "apart": sum(value > APART for value in apart), "most apart": max(apart)}
 
 
 def run() -> Figures:
     figures: Figures = {}
-    for certificate in ("residual", "matrix-zonotope"):
-        seen = programs(certificate)
-        size = f"{len(seen[0].h)} variables"
-        figures[f"{certificate} ({size}): ProxQP"] = each([partial(solve, p) for p in seen]) | {"count": len(seen)}
-        figures[f"{certificate} ({size}): DAQP"] = each([partial(by_daqp, p) for p in seen]) | {"count": len(seen)}
+    for name, kind, certificate, conditions in QUESTIONS:
+        robot = robot_named(kind)
+        seen = programs(certificate, robot, conditions)
+        count = {"count": float(len(seen))}
+        size = f"{name} ({len(seen[0].h)} variables)"
+        beside = disagreements(seen, robot.action_dim)
+        figures[f"{size}: ProxQP"] = each([partial(solve, program) for program in seen]) | count | beside
+        figures[f"{size}: DAQP"] = each([partial(by_daqp, program) for program in seen]) | count
     return figures
