@@ -142,7 +142,7 @@ class Filter:
         planes = self.around.planes(scene, z)
         slack = self.around.slack(scene, z, planes)
         margin = self.around.least(slack, z)
-        if margin >= self.comfort:
+        if margin >= max(self.comfort, 0.0):
             return _Found(ALLOWED, self.inputs.plan(z), z, margin, True)
         rows = self.around.rows(scene, z, planes)
         if self.around.least(slack - self.comfort * rows.keep, z, self.comfort) >= 0.0:

@@ -164,7 +164,7 @@ class Ordinary:
         self.high = np.concatenate([*fixed, robot.bounds[1], high.ravel()])
         self.predicted_low = np.concatenate([self.low, [-most], np.full(n, -most), np.zeros(n)])
         self.predicted_high = np.concatenate([self.high, np.full(2 * n + 1, most)])
-        self.observed = _observation_dim(robot)
+        self.robot = robot
 
     def __call__(self, request: Request) -> bool:
         """False: `check_for_filter` may find something in them, and says what."""
@@ -173,9 +173,11 @@ class Ordinary:
         sized = request.state.shape == (n,) and inputs[0].shape == inputs[1].shape == (m,)
         if not (sized and request.plan.shape == planned):
             return False
-        # A product that is no number, or infinite, is of an observation in which one is, or which is very large.
-        if observed.size and not (observed.shape == (self.observed,) and math.isfinite(np.dot(observed, observed))):
-            return False
+        if observed.size:
+            # A product that is no number, or infinite, is of an observation in which one is, or which is very large.
+            as_expected = observed.shape == (_observation_dim(self.robot),)
+            if not (as_expected and math.isfinite(np.dot(observed, observed))):
+                return False
         predicted = request.predicted
         if predicted is None:
             told, low, high = np.concatenate((request.state, *inputs)), self.low, self.high

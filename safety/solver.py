@@ -72,8 +72,9 @@ def _by_few(program: Program) -> Solution | None:
         if part.status != SOLVED:
             return None
         left = program.A @ part.x - program.b
-        if left.max() <= 2.0 * EXACT:
-            return Solution(part.x, part.status, iterations, float(left.max()))
+        residual = float(left.max(initial=-np.inf))
+        if residual <= 2.0 * EXACT:
+            return Solution(part.x, part.status, iterations, residual)
         inside[np.argsort(-np.where(inside, -np.inf, left), kind="stable")[:FEW]] = True
     return None
 

@@ -226,7 +226,7 @@ class Surroundings:
 
     def sets(self, start: Array, turn: Array, z: Array) -> tuple[Array, Array]:
         """Where the true positions at the periods' ends lie, world: centers and half-widths (N, d)."""
-        return reaching.sets(*self._reached, z, np.ascontiguousarray(start), turn, self.measured)
+        return reaching.sets(*self._reached, z, np.ascontiguousarray(start, dtype=float), turn, self.measured)
 
     def margin(self, rows: Rows, z: Array) -> float:
         """Smallest distance [m] of the exact tube to a half-space (of a limit: in its own units)."""

@@ -5,10 +5,12 @@ import numpy as np
 import pytest
 
 from deploy.data.episodes import collect
+from messaging.shapes import Shapes
 from safety.filter import Filter
 from safety.fitting import make
 from safety.gym import SafetyWrapper
 from safety.model_set import Recipe
+from safety.request import ADJUSTED, ALLOWED, FAILSAFE, Request
 from safety.spaces import normalised
 from tests.safety.toys import Toy, car, discs, hostile, near, puck, seen
 
@@ -98,6 +100,19 @@ def test_limits_hold_between_periods_and_in_the_stop(name):
     assert (worst <= 0.0).all()
     assert worst[-1] > -0.15, "the limit of speed is used"
     assert farthest > 0.6, "so is the room"
+
+
+def test_a_limit_is_kept_whatever_the_comfort_margin():
+    """Less than none leaves it to obstacles what is kept to them, and says nothing of limits."""
+    ours = Filter(ready("boxed car").model, comfort=-0.05)
+    rng, plan, kinds = np.random.default_rng(0), np.zeros((ours.robot.horizon, 2)), set()
+    for _ in range(200):
+        state = np.array([rng.uniform(0.55, 0.8), 0.0, rng.uniform(-0.3, 0.3), 0.2])
+        driving = np.array([0.2, 0.0])
+        decision = ours.decide(Request(state, driving, driving, plan, Shapes.of([], 2)))
+        kinds.add(decision.kind)
+        assert decision.margin >= -1e-9 or decision.kind == FAILSAFE
+    assert {ALLOWED, ADJUSTED} <= kinds
 
 
 @pytest.mark.parametrize("margin", [0.2, -0.1])

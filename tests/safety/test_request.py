@@ -98,3 +98,5 @@ def test_arrays_of_any_type_and_layout_are_decided_on_as_usual(ready):
     for odd in (stridden, {name: value.astype(np.float32) for name, value in stridden.items()}):
         assert same(ready.decide(replace(sound, **odd)), expected)
     assert same(ready.decide(replace(sound, plan=sound.plan.astype(int))), expected)
+    rest, whole = ready.rest(np.zeros(5)), ready.rest(np.zeros(5, np.float32))
+    assert np.array_equal(rest.center, whole.center) and np.array_equal(rest.half_width, whole.half_width)

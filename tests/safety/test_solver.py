@@ -151,6 +151,11 @@ def test_an_infeasible_problem_comes_back_with_its_residual():
     assert solution.found  # a candidate: whoever uses it must check
 
 
+def test_without_rows_nothing_holds_the_answer_off():
+    solution = solve(Program(np.ones(2), np.array([-1.0, 2.0]), np.zeros((0, 2)), np.zeros(0)))
+    assert solution.status == "solved" and solution.x == pytest.approx([1.0, -2.0], abs=1e-6)
+
+
 def test_the_residual_is_recomputed_from_the_rows():
     program = Program(np.ones(2), np.array([-1.0, -1.0]), np.eye(2), np.array([0.5, 2.0]))
     solution = solve(program)
