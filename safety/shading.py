@@ -291,8 +291,8 @@ def _farthest_corner(place: Array, boxes: Array, end: int) -> float:
 
 @compiled("f8[::1](f8[:,::1], i8[::1], i8, f8[:,:,::1], f8[::1], f8)")
 def reaches(ends: Array, first: NDArray[np.int64], free: int, boxes: Array, grown: Array, body: float) -> Array:
-    """How far [m] from the ends (N+1, 3) of the periods of each of the first groups (free,) what may touch a body in the
-    boxes is at the most.
+    """How far [m] from the ends (N+1, 3) of the periods of each of the first groups (free,) what may touch a body in
+    the boxes is at the most.
 
     Between two ends it is nowhere farther from the nearer one than at an end, and half the way between them. The last
     free group is also that of all periods after it (`about_periods`), and what they may touch is as near to its last
