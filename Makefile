@@ -25,8 +25,8 @@ check: setup
 	$(BIN)/python -c 'import safety.filter, safety.shadows as s; s.prepare()' & $(BIN)/mypy; found=$$?; wait; exit $$found
 	$(BIN)/lint-imports
 
-# Real time in one process, whole runs in another, the rest beside them at a lower priority (tests/conftest.py); what was
-# skipped, and why.
+# Real time in one process, real autopilots in another, whole runs in a third, then the rest at a lower priority
+# (tests/conftest.py); what was skipped, and why.
 # What the processes of a few hundred runs import is compiled once, whatever the shell says.
 unit: export PYTHONDONTWRITEBYTECODE =
 unit: setup

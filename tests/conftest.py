@@ -24,16 +24,17 @@ FLIGHTS = 60  # trajectories of the quadrotor, recorded in half a minute
 TRAJECTORIES = 50  # enough for every check of the certificates, recorded in ten seconds
 
 
-# What flies or drives in real time mostly waits; whole runs keep both cores busy. One of each at a time. Real
-# autopilots wait, too, but go with the whole runs: each lane takes about as long.
+# What flies or drives in real time mostly waits, as do real autopilots; whole runs keep both cores busy. One of each at
+# a time, and what keeps a core busy by itself beside them only from when one of the lanes is through.
 LIVE = (
     *("tests/actors/test_live.py", "tests/actors/ros2/", "tests/system/test_fly.py", "tests/system/test_mavsdk.py"),
     *("tests/system/test_hil.py", "tests/system/test_ros2.py"),
 )
+REAL_AUTOPILOTS = ("tests/system/test_real_autopilots.py",)
 WHOLE_RUNS = ("tests/system/",)
-LANES = (LIVE, WHOLE_RUNS)
-PLACE = pytest.StashKey[int]()  # of a process: the lane of its first test
-BESIDE = 10  # by which the priority of a process is lower that began with none
+LANES = (LIVE, REAL_AUTOPILOTS, WHOLE_RUNS)
+ASIDE = pytest.StashKey[bool]()  # of a process: it has given way to the others
+BESIDE = 10  # by which the priority of a process is lower that is on no lane
 
 
 def lane(nodeid: str) -> int:
@@ -61,10 +62,11 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_runtest_setup(item: pytest.Item) -> None:
-    """A process whose first test is of no lane takes what the lanes leave of the processor; nothing live waits."""
-    if "PYTEST_XDIST_WORKER" in os.environ and PLACE not in item.config.stash:
-        item.config.stash[PLACE] = lane(item.nodeid)
-        os.nice(BESIDE if item.config.stash[PLACE] == len(LANES) else 0)
+    """A process on no lane takes what the lanes leave of the processor; nothing live waits."""
+    stash = item.config.stash
+    if "PYTEST_XDIST_WORKER" in os.environ and lane(item.nodeid) == len(LANES) and ASIDE not in stash:
+        stash[ASIDE] = True  # for good: none that was on a lane before goes back to it
+        os.nice(BESIDE)
 
 
 @pytest.fixture(scope="session")

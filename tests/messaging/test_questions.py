@@ -1,6 +1,5 @@
 """Questions and answers between real sessions, and real processes, on loopback."""
 
-import logging
 import signal
 import threading
 import time
@@ -173,40 +172,3 @@ def test_who_has_the_patience_gets_an_answer_though_the_link_stalls(join: Join, 
     wake.start()
     assert actor.ask(DECIDE, bytes(2**24), 30.0, robot="ground") == bytes(10)
     wake.join()
-
-
-def test_a_question_that_came_too_late_to_its_turn_is_a_warning(join: Join, caplog: pytest.LogCaptureFixture) -> None:
-    """A machine that stalls is no error of the service: it is said in a line, and counted."""
-    join("launcher", listen=True)
-    safety, first, second = join("safety"), join("actor-0"), join("actor-1")
-    release = threading.Event()
-    heard: list[bytes] = []
-
-    def handler(payload: bytes) -> bytes:
-        heard.append(payload)
-        if payload == b"slow":
-            release.wait(30.0)
-        return payload
-
-    def overtaken() -> bool:
-        """A question waits behind a slow one until its time is over; that counts from when it was taken in."""
-        release.clear()
-        waiting = threading.Thread(target=first.ask, args=(DECIDE, b"slow", 30.0), kwargs={"robot": "ground"})
-        waiting.start()
-        until(lambda: heard[-1] == b"slow")
-        with pytest.raises(Late):
-            second.ask(DECIDE, b"late", 0.05, robot="ground")
-        time.sleep(0.1)
-        release.set()
-        waiting.join()
-        until(lambda: heard[-1] == b"late" or safety.tolerance.count > before)  # the former: it was taken in just now
-        return safety.tolerance.count > before
-
-    safety.serve(DECIDE, handler)
-    until(lambda: answers(first) == answers(second) == b"?")
-    before = safety.tolerance.count
-    until(overtaken)
-    assert safety.tolerance.count == before + 1
-    said = caplog.records[-1]
-    assert "Expired" in said.getMessage() and said.levelno == logging.WARNING and said.exc_info is None
-    assert heard[-1] == b"slow", "nobody waited for an answer to the other"
