@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from filelock import FileLock
 from hypothesis import HealthCheck, settings
 from xdist.scheduler import LoadScopeScheduling
 
@@ -83,9 +82,8 @@ def data_folder(shared_folder: Path) -> Iterator[Path]:
     folder = shared_folder / "recorded"
     folder.mkdir(exist_ok=True)
     os.environ["BRAKELINE_DATA"] = str(folder)
-    with FileLock(folder / "ground.lock"):
-        recording.recorded(GROUND, trajectories=TRAJECTORIES)
-        store.model_for(GROUND, Recipe())
+    recording.recorded(GROUND, trajectories=TRAJECTORIES)
+    store.model_for(GROUND, Recipe())
     yield folder
     if before is None:
         del os.environ["BRAKELINE_DATA"]
@@ -96,10 +94,9 @@ def data_folder(shared_folder: Path) -> Iterator[Path]:
 @pytest.fixture(scope="session")
 def flight_folder(data_folder: Path) -> Path:
     """The same, with a data set of the quadrotor, and its models in lockstep and in real time."""
-    with FileLock(data_folder / "flight.lock"):
-        recording.recorded(QUADROTOR, trajectories=FLIGHTS)
-        for robot in (QUADROTOR, QUADROTOR.in_real_time()):
-            store.model_for(robot, Recipe())
+    recording.recorded(QUADROTOR, trajectories=FLIGHTS)
+    for robot in (QUADROTOR, QUADROTOR.in_real_time()):
+        store.model_for(robot, Recipe())
     return data_folder
 
 

@@ -10,6 +10,9 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
+from tempfile import gettempdir
+
+from filelock import FileLock, Timeout
 
 from actors.mavlink import Client
 from messaging.links import open_link
@@ -96,9 +99,8 @@ def configure(url: str, system: int, parameters: Mapping[str, float]) -> None:
 
 @contextmanager
 def _running(kind: str, start: Path, folder: Path) -> Iterator[tuple[str, int]]:
-    instance = next(i for i in reversed(INSTANCES) if not _taken(kind, i))
     said = folder / f"{kind}.log"
-    with said.open("wb") as output:
+    with _free(kind) as instance, said.open("wb") as output:
         command = [sys.executable, "-c", KEEPER, str(start), str(folder / kind), str(instance)]
         process = subprocess.Popen(
             command, stdin=subprocess.DEVNULL, stdout=output, stderr=output, start_new_session=True
@@ -116,6 +118,24 @@ def _running(kind: str, start: Path, folder: Path) -> Iterator[tuple[str, int]]:
         finally:
             os.killpg(process.pid, signal.SIGKILL)
             process.wait()
+
+
+@contextmanager
+def _free(kind: str) -> Iterator[int]:
+    """A number that nobody of this machine has, kept: of two that start at once each finds the other's ports free."""
+    for instance in reversed(INSTANCES):
+        lock = FileLock(Path(gettempdir(), f"{kind}-{instance}.brakeline"), blocking=False, mode=0o666)
+        try:
+            lock.acquire()
+        except Timeout:
+            continue
+        try:
+            if not _taken(kind, instance):
+                yield instance
+                return
+        finally:
+            lock.release()
+    raise NoAutopilot(f"{len(INSTANCES)} of {kind} run on this machine already: it has no ports for more")
 
 
 def _taken(kind: str, instance: int) -> bool:

@@ -10,6 +10,7 @@ from pathlib import Path
 from rich.console import Console
 
 from deploy.data import collect
+from deploy.data.making import alone
 from deploy.data.paths import record_path
 from deploy.progress import each
 from messaging.robots import Robot, known
@@ -45,7 +46,13 @@ def recorded(
         return Dataset.load(path)
     if path.exists():
         _spare(path, robot)
-    conditions, trajectories = conditions or Conditions(), trajectories or task_of(robot).trajectories
+    with alone(path.parent):
+        if path.exists() and not again:
+            return Dataset.load(path)
+        return _record(robot, path, trajectories or task_of(robot).trajectories, seed, conditions or Conditions())
+
+
+def _record(robot: Robot, path: Path, trajectories: int, seed: int, conditions: Conditions) -> Dataset:
     part = path.with_name(f"{path.stem}.part{path.suffix}")
     driven = _begun(part, robot, trajectories, seed, conditions)
     console.print(

@@ -6,10 +6,15 @@ launcher that find their model would else spend seconds, and hundreds of megabyt
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Callable
+from contextlib import suppress
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, TypeVar
 
 from rich.console import Console
 
+from deploy.data.making import alone
 from deploy.data.paths import method_path, model_path
 from deploy.progress import under_way
 from messaging.robots import Robot, known
@@ -21,21 +26,40 @@ from safety.rivals.pretrained import Pretrained
 if TYPE_CHECKING:
     from deploy.data.pretrain import Recipe as RivalRecipe
 
+M = TypeVar("M")
+
 console = Console(stderr=True, highlight=False, soft_wrap=True)
 
 
 def model_for(robot: Robot, recipe: Recipe) -> ModelSet:
     """The model set in use, made (and its data recorded) if it is not there or not of this layout."""
     path = model_path(robot, recipe)
-    if path.exists():
+    return _kept_or_made(path, partial(_kept, path, robot), partial(_made, path, robot, recipe), "making the model set")
+
+
+def _kept_or_made(path: Path, kept: Callable[[], M], made: Callable[[], M], making: str) -> M:
+    """What lies at the path, or what is made where `kept` finds nothing of use (BadModel), by one process only."""
+    with suppress(BadModel):
+        return kept()
+    with alone(path.parent):
         try:
-            model = ModelSet.load(path)
-            if model.robot == robot:
-                return model
-            known(robot)  # and not what the file says of it
-            console.print(f"[yellow]making the model set again:[/] the description of {robot.name} has changed")
+            return kept()
         except BadModel as error:
-            console.print(f"[yellow]making the model set again:[/] {error}")
+            if path.exists():
+                console.print(f"[yellow]{making} again:[/] {error}")
+        return made()
+
+
+def _kept(path: Path, robot: Robot) -> ModelSet:
+    """Raises BadModel: it is not there, or not of this layout or robot."""
+    model = ModelSet.load(path)
+    if model.robot != robot:
+        known(robot)  # and not what the file says of it
+        raise BadModel(f"the description of {robot.name} has changed")
+    return model
+
+
+def _made(path: Path, robot: Robot, recipe: Recipe) -> ModelSet:
     from deploy.data.certified import certified
     from deploy.data.recording import data_for, recorded
 
@@ -74,19 +98,32 @@ def method_for(robot: Robot, method: str, recipe: Recipe) -> Model:
 
 def pretrained(robot: Robot, method: str, recipe: RivalRecipe, again: bool = False) -> Pretrained:
     """A rival's model of this recipe, pre-trained if it is not there (or `again`)."""
-    from deploy.data import pretrain as rivals
-
     path = method_path(robot, method, Recipe())
-    if path.exists() and not again:
-        try:
-            kept = Pretrained.decode(path.read_bytes())
-            if rivals.made_by(kept, recipe):
-                return kept
-            console.print(f"[yellow]pre-training {method} again:[/] {path} is of another recipe")
-        except BadModel as error:
-            console.print(f"[yellow]pre-training {method} again:[/] {error}")
+    made = partial(_pretrained, path, robot, method, recipe)
+    if again:
+        with alone(path.parent):
+            return made()
+    return _kept_or_made(path, partial(_kept_rival, path, recipe), made, f"pre-training {method}")
+
+
+def _kept_rival(path: Path, recipe: RivalRecipe) -> Pretrained:
+    """Raises BadModel: it is not there, or not of this layout or recipe."""
+    from deploy.data.pretrain import made_by
+
+    try:
+        kept = Pretrained.decode(path.read_bytes())
+    except OSError as error:
+        raise BadModel(f"{path}: {error}") from error
+    if not made_by(kept, recipe):
+        raise BadModel(f"{path} is of another recipe")
+    return kept
+
+
+def _pretrained(path: Path, robot: Robot, method: str, recipe: RivalRecipe) -> Pretrained:
+    from deploy.data.pretrain import pretrain
+
     with under_way(f"pre-training {method} for {robot.name}", recipe.samples) as advance:
-        model = rivals.pretrain(robot, recipe, advance)
+        model = pretrain(robot, recipe, advance)
     model.save(path)
     about = model.about
     console.print(

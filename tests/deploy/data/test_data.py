@@ -1,6 +1,8 @@
 """Recording, storing, and data from a log."""
 
 import itertools
+import subprocess
+import sys
 from functools import partial
 
 import numpy as np
@@ -9,6 +11,7 @@ import pytest
 from deploy.data import paths, recording, store
 from deploy.data.excite import excitation
 from deploy.data.logged import from_log, trajectories_of
+from deploy.data.making import LOCK
 from logs.segment import Entry, open_segment
 from messaging import brakeline_pb2 as pb
 from safety.dataset import BadData, Dataset
@@ -16,6 +19,15 @@ from safety.model_set import ModelSet, Recipe
 from safety.windows import windows
 from tests.robots import GROUND
 from tests.safety.toys import car
+from tests.waiting import PATIENCE
+
+MAKE = """
+from deploy.data import recording, store
+from messaging.robots import robot_named
+from safety.recipe import Recipe
+recording.recorded(robot_named("ground"), trajectories=12)
+store.model_for(robot_named("ground"), Recipe())
+"""
 
 
 def test_excitation_stays_in_bounds_and_slew_and_holds_plans_of_the_schedule():
@@ -76,6 +88,16 @@ def test_the_store_makes_what_is_missing_and_only_that(elsewhere, capsys):
     assert len(elsewhere) == 2
 
 
+def test_of_two_that_find_nothing_one_records_and_the_other_waits_for_it(tmp_path, monkeypatch):
+    monkeypatch.setenv("BRAKELINE_DATA", str(tmp_path / "data"))
+    both = [subprocess.Popen([sys.executable, "-c", MAKE], stderr=subprocess.PIPE, text=True) for _ in range(2)]
+    said = [process.communicate(timeout=PATIENCE)[1] for process in both]
+    assert [process.returncode for process in both] == [0, 0], said
+    assert sorted(text.count("recording ground once") for text in said) == [0, 1], said
+    assert sorted(text.count("waiting for it") for text in said) == [0, 1], said
+    assert not list((tmp_path / "data").rglob("*.new"))
+
+
 def steps(actor: str, episode: int, numbers, run: int = 1) -> list[pb.Step]:
     """Steps of an actor's episode; the state tells which."""
     made = []
@@ -134,6 +156,6 @@ def test_an_interrupted_recording_is_gone_on_from(elsewhere, monkeypatch, capsys
     assert "recording ground once" in (told := capsys.readouterr().err) and "kept 5 of 12" in told
     whole = recording.recorded(GROUND)
     assert elsewhere[-1][-1] == 5, "only what was missing is driven"
-    assert [path.name for path in paths.record_path(GROUND).parent.iterdir()] == ["record.safetensors"]
+    assert {path.name for path in paths.record_path(GROUND).parent.iterdir()} == {"record.safetensors", LOCK}
     fresh = recording.recorded(GROUND, paths.record_path(GROUND).with_name("fresh.safetensors"))
     assert whole.digest() == fresh.digest(), "the same data as in one go"
