@@ -134,8 +134,8 @@ def test_of_replicas_behind_linked_routers_one_works_and_another_when_it_is_slow
         time.sleep(HELD)
         with pytest.raises(Late):
             asker.ask(DECIDE, b"?", timeout=0.1, robot="ground")
-        assert answers(asker) == second.encode(), "the next goes to all, and who is quick is asked from then on"
-        assert answers(asker) == second.encode()
+        for _ in range(2):  # the next goes to all, and who is quick is asked from then on
+            assert asker.ask(DECIDE, b"?", timeout=10.0, robot="ground") == second.encode()
         services[second].close()
         slow.clear()
         assert asker.ask(DECIDE, b"?", timeout=10.0, robot="ground") == first.encode(), (
