@@ -12,6 +12,7 @@ from time import perf_counter_ns
 import numpy as np
 from numpy.typing import NDArray
 
+from messaging.scans import Scan
 from safety import reaching
 from safety.commitment import UNVERIFIED, Prediction
 from safety.explain import Stopped
@@ -19,7 +20,7 @@ from safety.inputs import Inputs
 from safety.model_set import ModelSet
 from safety.program import SHARPEN, Builder, Rows
 from safety.promise import Promise
-from safety.recovery import SLOW, least_violating, slow_inputs, turn_towards, way_from
+from safety.recovery import SLOW, least_violating, slow_inputs, turn_towards
 from safety.request import (
     ADJUSTED,
     ALLOWED,
@@ -31,6 +32,7 @@ from safety.request import (
     check_for_filter,
     check_surroundings,
 )
+from safety.scan import shows
 from safety.solver import INFEASIBLE, solve
 from safety.surroundings import Scene, Surroundings
 
@@ -236,6 +238,8 @@ class Filter:
         on_a_way = request.model == UNVERIFIED and bool(going.any() and (np.abs(going) <= slow).all())
         if not (request.still(robot) or on_a_way):
             return None
+        if isinstance(request.scan, Scan) and not shows(request.scan, scene.start):  # no way out of there is known
+            return None
         before = z_0[-m:]
         stand = self.inputs.regressors(z_0, self.inputs.stop(request.state, before))
         parked = scene.parked
@@ -262,8 +266,7 @@ class Filter:
         best = least_violating(violated, standing, ends)
         if best is not None:
             z = plans[best]
-        elif robot.heading is not None and len(scene.near):
-            away = way_from(scene.near, scene.start)
+        elif robot.heading is not None and (away := scene.away) is not None:
             z = self.inputs.regressors(z_0, self.inputs.limited(turn_towards(robot, scene.heading, away), before))
         else:
             return None

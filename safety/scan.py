@@ -114,6 +114,15 @@ def _edges(scan: Scan, within: float, angles: Array, width: Array, free: Array, 
     return Cells(corners, error, np.tile(ways_of(scan)[0], (len(reach), 1)), scan.speed, scan.age)
 
 
+def shows(scan: Scan, place: Array) -> bool:
+    """Is a place (2,), world, among what the scan shows to be free, or on its edge?"""
+    at, heading = scan.sensor()
+    east, north = place - at
+    angles, width, free = gaps(scan)
+    here = (math.atan2(north, east) - heading - angles) % math.tau <= width
+    return bool(math.hypot(east, north) <= free[here].min(initial=math.inf))
+
+
 def half_spaces(
     near: Cells, start: Array, nominal: Array, keep_off: float, measured: Array, period: float
 ) -> tuple[Array, Array]:

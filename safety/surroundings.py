@@ -23,6 +23,7 @@ from safety.limits import Limits, stacked
 from safety.model_set import ModelSet, needed
 from safety.program import Layout, Rows
 from safety.promise import Boxes, Promises, promised_half_spaces
+from safety.recovery import way_from
 from safety.request import Request
 from safety.sweep import swept_half_spaces
 from safety.tube import Tube
@@ -82,6 +83,16 @@ class Scene:
         """The same for one that stands: what moves, or may, may stand by, that is its own affair."""
         unseen = None if self.unseen is not None and self.unseen.speed > 0.0 else self.unseen
         return replace(self, moving=None, unseen=unseen)
+
+    @property
+    def away(self) -> Array | None:
+        """A direction (d,), world, off what is nearest to the start; None: nothing is of which that can be told."""
+        if len(self.near):
+            return way_from(self.near, self.start)
+        if isinstance(self.unseen, seen.Cells):
+            ways = self.start - self.unseen.corners.reshape(-1, len(self.start))
+            return np.asarray(ways[np.argmin(np.einsum("nd,nd->n", ways, ways))])
+        return None
 
     @property
     def empty(self) -> bool:

@@ -8,6 +8,7 @@ import pytest
 
 from deploy.data.episodes import collect
 from messaging.descriptions import robot_of
+from messaging.scans import Scan
 from messaging.shapes import Obstacle, Shapes
 from safety.commitment import Commitment
 from safety.filter import Filter
@@ -98,6 +99,56 @@ def test_who_only_seems_too_close_stands(ready):
     near = 0.1 + BODY - 0.01
     decision = ready.decide(request(action=(0.25, 0.0), obstacles=[Obstacle("cylinder", (near, 0.0), (0.1,))]))
     assert decision.kind == "failsafe" and decision.verified
+
+
+TURN = np.radians(np.arange(360) - 180.0)
+
+
+def room(beams: float = 1.0) -> Scan:
+    """From the middle of a hall without walls within sight, of which so great a share of the beams says something."""
+    ranges = np.where(np.arange(360) < 360 * beams, 3.5, np.nan)
+    return Scan(ranges, TURN, pose=(0.0, 0.0, 0.0))
+
+
+@pytest.mark.parametrize("beams, least", [(0.0, 0.0), (1.0, 3.5)], ids=["nothing seen", "all seen"])
+def test_where_a_scan_shows_nothing_no_way_out_is_known(ready, beams, least):
+    """Wherever it is said to be: odometry that jumped, a sensor that says nothing. Once it drove off, at 0.075 m/s."""
+    scan = room(beams)
+    for way in (0.01, 0.3, 0.75, 1.25, 2.5, 3.0, 3.51, 5.0, 40.0):
+        for angle in np.radians(np.arange(0, 360, 20)):
+            for heading in np.radians(np.arange(0, 360, 30)):
+                at = (way * math.cos(angle), way * math.sin(angle), heading, 0.0, 0.0)
+                decision = ready.decide(request(at, (0.0, 0.0), scan=replace(scan, age=0.2)))
+                assert decision.kind != RECOVERING or way < least, (at, decision.plan)
+                if way > least:
+                    assert decision.kind == "failsafe" and not decision.plan.any()
+
+
+@pytest.mark.parametrize("angle", [0.0, 1.5, 3.1, -2.0])
+def test_by_a_scan_too_who_was_put_too_close_gets_away(ready, angle):
+    """A pillar into which the body's disc reaches, which every scan shows."""
+    pillar, radius = (0.1 + BODY - 0.045) * np.array([math.cos(angle), math.sin(angle)]), 0.1
+    robot, kept, kinds, gaps = Unicycle((0.0, 0.0, 0.0), np.random.default_rng(0)), Commitment(GROUND), [], []
+    for _ in range(120):
+        state = robot.measure()
+        scan = Scan(ranges_to(pillar, radius, robot.state[:3]), TURN, tuple(state[:3]), position_error=0.02)
+        ask = request(state, (0.25, 0.0), scan=scan, input_in_force=kept.input_in_force, plan=kept.plan)
+        decision = ready.decide(replace(ask, model=kept.model, predicted=kept.predicted))
+        kinds.append(decision.kind)
+        robot.step(kept.accept(decision.plan, decision.model, decision.predicted, decision.verified))
+        gaps.append(float(np.linalg.norm(robot.state[:2] - pillar)) - radius)
+    assert kinds[0] == RECOVERING
+    assert min(gaps) >= gaps[0] - 0.003 and gaps[-1] > BODY
+    assert kinds[-1] != RECOVERING and "allowed" in kinds
+
+
+def ranges_to(pillar, radius, pose):
+    """What 360 beams from a pose show of a pillar in an empty hall, m."""
+    x, y = pillar - pose[:2]
+    beams = TURN + pose[2]
+    along = x * np.cos(beams) + y * np.sin(beams)
+    half = radius**2 - (x * x + y * y - along**2)
+    return np.where((along > 0.0) & (half > 0.0), along - np.sqrt(np.maximum(half, 0.0)), 3.5)
 
 
 HOVERER = robot_of(
