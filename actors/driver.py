@@ -124,7 +124,7 @@ class Driver:
 
     def _remember(self) -> None:
         """Fill in the scan, if there is one, with what was seen free before."""
-        self._scan = filled(self._memory, self.info.get("scan"), self.robot.period)
+        self._scan = filled(self._memory, self.info, self.robot.period)
 
     def may_wait(self, outcome: Outcome) -> bool:
         """No answer, and nothing moves: better to ask again than to let the episode pass."""

@@ -17,6 +17,7 @@ from messaging.shapes import FARTHEST
 Array = NDArray[np.float64]
 
 MOST_BEAMS = 1000
+OLDEST = 2.0  # s: what a scan or range image showed to be free is not taken to be so any longer
 FASTEST = 1e4  # m/s, m/s²: nothing that is followed goes or speeds up faster
 
 

@@ -6,13 +6,13 @@ log can be replayed.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from time import perf_counter_ns
 
 import numpy as np
 from numpy.typing import NDArray
 
-from messaging.scans import Scan
+from messaging.scans import OLDEST, Scan
 from safety import reaching
 from safety.commitment import UNVERIFIED, Prediction
 from safety.explain import Stopped
@@ -40,6 +40,7 @@ Array = NDArray[np.float64]
 
 OUTSIDE_DOMAIN = 0.02  # of the recorded range: how far beyond it a regressor may lie (rounding, not extrapolation)
 SAME_INPUT = 1e-6  # of the input's range: an answer this close to the proposal is the proposal
+BROKEN = "an obstacle was seen outside of what its bounds allow: nothing is known of where it will be"
 
 
 @dataclass
@@ -115,23 +116,25 @@ class Filter:
             check_for_filter(self.robot, request)
         attempt.contained = request.predicted is None or request.predicted.contains(self.robot, request.state)
         attempt.broken = 0 if request.movers is None else int((~request.movers.kept).sum())
+        blind = "" if not attempt.broken else BROKEN
+        if request.scan is not None and request.scan.age > OLDEST:
+            blind = f"the scan is {request.scan.age:.3g} s old, over {OLDEST:g}: it shows nothing to be free any more"
+            request = replace(request, scan=replace(request.scan, ranges=np.zeros_like(request.scan.ranges)))
         given = request.plan[: self.robot.given].ravel()
         z_0 = np.concatenate([request.state[self.regressor], request.input_in_force, given])
         proposal = self.inputs.limited(request.action, z_0[-self.robot.action_dim :])
         scene = self.around.scene(request, z_0, self.builder.reachable(z_0[-self.robot.action_dim :]))
         in_domain = reaching.within(z_0, self.domain)
         found = None
-        if attempt.broken:
-            attempt.reason = (
-                "an obstacle was seen outside of what its bounds allow: nothing is known of where it will be"
-            )
+        if blind:
+            attempt.reason = blind
         elif in_domain:
             found = self._search(scene, z_0, proposal, attempt)
         else:
             attempt.reason = "the state is outside the domain that was recorded"
         if found is None:
             found = self._committed(request, scene, z_0, attempt, in_domain)
-            if in_domain and not attempt.broken and request.promise is None:  # others rely on a promise
+            if in_domain and not blind and request.promise is None:  # others rely on a promise
                 found = self._recovered(request, scene, z_0) or found
         return self._decision(request, scene, found, attempt)
 

@@ -127,7 +127,7 @@ class SafetyWrapper(gymnasium.Wrapper[Any, Any, Any, Any]):
     def _remember(self) -> None:
         """The scan, if there is one, with what was seen free before."""
         assert self._now is not None
-        self._scan = filled(self._memory, self._now[1].get("scan"), self.asker.robot.period)
+        self._scan = filled(self._memory, self._now[1], self.asker.robot.period)
 
 
 def diagnostics(answer: Decision | Answer | None, reason: str = "") -> dict[str, Any]:

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,6 +47,7 @@ class ImageMemory(Memory[RangeImage]):
     """Of an image all about."""
 
     START = 0.7  # what flies needs more to get going
+    nothing = RangeImage(np.zeros((16, 32)), (0.0, 0.0, 0.0))
 
     def __init__(self, footprint: float) -> None:
         import messaging.nearby  # noqa: F401  # compiled now, and not when the first image is to be answered in time
@@ -103,8 +106,14 @@ def memory_of(robot: Robot) -> FanMemory | ImageMemory:
     return FanMemory(robot.footprint) if robot.position_dim == 2 else ImageMemory(robot.footprint)
 
 
-def filled(memory: FanMemory | ImageMemory, scan: Scan | RangeImage | None, elapsed: float) -> Scan | RangeImage | None:
-    """The scan with what is remembered, None: the last one; one that the memory is not of, as it is."""
+def filled(memory: FanMemory | ImageMemory, info: Mapping[str, Any], elapsed: float) -> Scan | RangeImage | None:
+    """The scan in an environment's `info`, with what is remembered; one that the memory is not of, as it is.
+
+    A scan that is None did not come: the last one counts, so much older. None: the environment never had a `scan`.
+    """
+    if "scan" not in info and memory.unused:
+        return None
+    scan = info.get("scan")
     if isinstance(memory, FanMemory) and not isinstance(scan, RangeImage):
         return memory.fill(scan, elapsed)
     if isinstance(memory, ImageMemory) and not isinstance(scan, Scan):

@@ -38,6 +38,7 @@ class Memory(ABC, Generic[S]):
     """Of one robot in one world that is not put back. Positions are the measured ones, with their errors."""
 
     START = 0.1  # m beside the body, where it is put down
+    nothing: S  # a scan that shows nothing to be free
 
     def __init__(self, footprint: float) -> None:
         """footprint: radius of the body's disc or ball, m."""
@@ -58,14 +59,19 @@ class Memory(ABC, Generic[S]):
         self._age += elapsed
         self._before = [age + elapsed for age in self._before]
 
-    def fill(self, scan: S | None, elapsed: float) -> S | None:
+    @property
+    def unused(self) -> bool:
+        """Has no scan been given to it?"""
+        return self._last is None
+
+    def fill(self, scan: S | None, elapsed: float) -> S:
         """The scan, with what is remembered in the place of beams that say nothing; elapsed: s since the last one.
 
-        None: none came. Then the last one goes on to be what is known, so much older; None before the first.
+        None: none came. Then the last one goes on to be what is known, so much older; before the first nothing is.
         """
         self.later(elapsed)
         if scan is None:
-            return None if self._last is None else replace(self._last, age=self._last.age + self._waited)
+            return self.nothing if self._last is None else replace(self._last, age=self._last.age + self._waited)
         if self._put is None:
             self._put, self._age = scan, 0.0
         unknown = self._wanted(scan)
@@ -118,6 +124,8 @@ class _Seen:
 class FanMemory(Memory[Scan]):
     """Of a fan in the plane."""
 
+    nothing = Scan(np.zeros(0), np.zeros(0), (0.0, 0.0, 0.0))
+
     def reset(self) -> None:
         super().reset()
         self._seen: deque[_Seen] = deque(maxlen=KEPT)
@@ -127,10 +135,10 @@ class FanMemory(Memory[Scan]):
         super().later(elapsed)
         self._follower.later(elapsed)
 
-    def fill(self, scan: Scan | None, elapsed: float) -> Scan | None:
+    def fill(self, scan: Scan | None, elapsed: float) -> Scan:
         """The same; where it is known how things speed up, what earlier scans say of where they go comes with it."""
         filled = super().fill(scan, elapsed)
-        if scan is None or filled is None:
+        if scan is None:
             return filled
         followed = self._follower.follow(scan).followed
         if followed is not None:

@@ -73,6 +73,7 @@ class VectorSafetyWrapper(VectorWrapper):
         deciding = np.flatnonzero(~resets)
         before = np.array([kept.due for kept in self.commitments])
         states, near = self._state(self.env, *seen), self._obstacles(self.env, *seen)
+        near = near if len(near) else [[]] * self.num_envs  # there are scans instead
         answers = self.asker.decide_all(
             [self.commitments[i] for i in deciding],
             [states[i] for i in deciding],
@@ -112,9 +113,9 @@ class VectorSafetyWrapper(VectorWrapper):
 
     def _remember(self, infos: dict[str, Any]) -> None:
         """The scans, if there are any, with what was seen free before."""
-        scans = infos.get("scan", [None] * self.num_envs)
+        each = [{"scan": scan} for scan in infos["scan"]] if "scan" in infos else [{}] * self.num_envs
         period = self.asker.robot.period
-        self._scans = [filled(memory, scan, period) for memory, scan in zip(self._memories, scans, strict=True)]
+        self._scans = [filled(memory, info, period) for memory, info in zip(self._memories, each, strict=True)]
 
 
 def each(view: Callable[[Any, Any, dict[str, Any]], Any]) -> View:

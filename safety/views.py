@@ -12,7 +12,7 @@ View = Callable[[Any, Any, dict[str, Any]], Any]
 
 WANTED = {
     "state": "the measured state, as the robot's description names its coordinates",
-    "obstacles": "a list of messaging.shapes.Obstacle",
+    "obstacles": "a list of messaging.shapes.Obstacle; none are needed beside a `scan`",
 }
 
 
@@ -35,4 +35,9 @@ def in_info(name: str) -> View:
     return view
 
 
-STATE, OBSTACLES = in_info("state"), in_info("obstacles")
+def _obstacles(env: Any, observation: Any, info: dict[str, Any]) -> Any:
+    """`info["obstacles"]`; none beside a scan, if there are none."""
+    return [] if "scan" in info and "obstacles" not in info else in_info("obstacles")(env, observation, info)
+
+
+STATE, OBSTACLES = in_info("state"), _obstacles

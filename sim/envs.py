@@ -184,9 +184,9 @@ class NavigationEnv(gymnasium.Env[Observation, Any]):
 
     def _info(self, period: Period) -> Info:
         position, time = period.measured[: self.robot.position_dim], self._steps * self.robot.period
-        obstacles, scan = [], None
+        obstacles, sensed = [], {}
         if self._scanner is not None:
-            scan = self._scanner.scan(period.true, period.measured, time)
+            sensed["scan"] = self._scanner.scan(period.true, period.measured, time)
         else:
             near = self._arena.shapes.distance(position) <= self.robot.sight
             obstacles = [self._arena.obstacles[i] for i in np.flatnonzero(near)] + self._moving(position)
@@ -197,7 +197,7 @@ class NavigationEnv(gymnasium.Env[Observation, Any]):
             "outside": self._outside(period),
             "input_in_force": self.vehicle.input,
             "obstacles": obstacles,
-            "scan": scan,
+            **sensed,
             "arena": self._arena,
             "goal": self._arena.goal,
             "time": time,

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from deploy.data.episodes import collect
-from messaging.scans import Scan
+from messaging.scans import OLDEST, Scan
 from messaging.shapes import Obstacle
 from safety.client import SafetyClient
 from safety.commitment import Commitment
@@ -170,7 +170,7 @@ class Walled(Toy):
 
     def _with_scan(self, info):
         scan = Scan(np.full(360, 0.5), self.FAN, (*info["state"][:2], info["state"][2]))
-        return info | {"obstacles": [], "scan": None if self.blind else scan}
+        return info | {"scan": None if self.blind else scan}
 
     def reset(self, **how):
         observation, info = super().reset(**how)
@@ -203,6 +203,22 @@ def test_a_scan_that_does_not_come_is_not_a_world_without_obstacles(ready):
         *_, after = env.step(np.array([-1.0, 0.0]))
     assert after["scan"] is None
     assert after["diagnostics"]["margin"] == pytest.approx(before["diagnostics"]["margin"], abs=0.02)
+    for _ in range(round(OLDEST / CAR.period) + CAR.horizon):
+        *_, after = env.step(np.array([1.0, 0.0]))
+    told = after["diagnostics"]
+    assert told["kind"] == "failsafe" and "s old" in told["reason"] and CAR.rests(told["executed"]), "nor is an old one"
+
+
+@pytest.mark.parametrize("many", [False, True])
+def test_before_the_first_scan_nothing_is_free(ready, many):
+    env = Walled(CAR)
+    env.blind = True
+    if many:
+        env = gymnasium.vector.SyncVectorEnv([lambda: env])
+    env = (VectorSafetyWrapper if many else SafetyWrapper)(env, ready, state=seen, actions=normalised(CAR))
+    env.reset(seed=0)
+    *_, info = env.step(np.ones((1, 2) if many else 2, np.float32))
+    assert np.all(info["diagnostics"]["kind"] == "failsafe")
 
 
 def test_collecting_leaves_out_what_ended_in_a_collision(data):

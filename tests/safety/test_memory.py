@@ -75,7 +75,7 @@ def test_at_the_start_there_is_room_about_the_body_and_no_more():
 
 def test_where_no_scan_comes_the_last_one_goes_on_so_much_older():
     memory, rng = FanMemory(0.105), np.random.default_rng(0)
-    assert memory.fill(None, 0.2) is None
+    assert not len(memory.fill(None, 0.2).ranges), "before the first nothing is known to be free"
     seen = memory.fill(_open(0.0, rng, speed=1.2), 0.2)
     memory.later(0.2)  # a period that nobody saw
     again = memory.fill(None, 0.2)

@@ -32,7 +32,6 @@ INFO_KEYS = {
     "goal",
     "time",
     "collision",
-    "scan",
     "contact_moving",
     "contact_robot",
     "contact_standing",
