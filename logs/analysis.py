@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -20,7 +20,7 @@ from logs.training import Training
 from messaging.tolerant import Tolerance
 from messaging.topics import EPISODE, EXCHANGE, HEALTH, LEARNER, LOG, STEP
 
-SETUP = ("method", "certificate", "policy", "arena", "seed")
+SETUP = ("method", "certificate", "policy", "arena", "perception", "seed")
 
 
 @dataclass
@@ -141,6 +141,8 @@ class Analysis:
         metrics, log = self.metrics, self.log
         about = log.metadata.get("run", {})
         setup: Figures = {name: about.get(name) for name in SETUP}
+        if (conditions := log.metadata.get("conditions")) is not None:
+            setup["perception"] = perception_in(conditions)
         if setup["seed"] is not None and setup["seed"].lstrip("-").isdigit():
             setup["seed"] = int(setup["seed"])
         return {
@@ -154,6 +156,12 @@ class Analysis:
             "cuts": [str(cut) for cut in log.cuts],
             "metadata": _metadata(log),
         }
+
+
+def perception_in(conditions: Mapping[str, str]) -> str:
+    """What the conditions of a run say of where free space came from, in a word or two."""
+    kind = conditions.get("perception", "map")
+    return f"{kind} with tracks" if conditions.get("tracks") == "True" else kind
 
 
 class Analyses:

@@ -25,6 +25,18 @@ def clopper_pearson(count: int, of: int) -> Interval | None:
     return low, high
 
 
+def poisson(count: int, of: int) -> Interval | None:
+    """The exact interval (Garwood's) of how often something happens in a trial, that happened `count` times in `of`
+    trials, and may happen several times in one. None without a trial."""
+    if of <= 0:
+        return None
+    from scipy.special import gammaincinv
+
+    tail = (1.0 - CONFIDENCE) / 2.0
+    low = 0.0 if count == 0 else float(gammaincinv(count, tail))
+    return low / of, float(gammaincinv(count + 1, 1.0 - tail)) / of
+
+
 class Clustered:
     """The interval of a share of steps, when the steps of one episode resemble each other.
 

@@ -91,7 +91,7 @@ def _summary(figures: Figures) -> Table:
         table.add_row("set-up", ", ".join(setup))
     table.add_row("steps", f"{steps}" + _optional(", {:.1f}/s", figures.get("steps_per_s")))
     table.add_row("episodes", f"{episodes}" + _optional(", mean reward {:.2f}", figures["mean_reward"]))
-    touched = [name for name in CONTACTS if figures[name]]
+    touched = CONTACTS if figures["fleet"] else CONTACTS[:2]
     for name in ("goals", "collisions", *touched, "timeouts"):
         table.add_row(name.replace("_", " "), _share(figures[name], episodes, within.get(name)))
     interventions = _share(figures["interventions"], steps, within.get("interventions"))
@@ -100,7 +100,7 @@ def _summary(figures: Figures) -> Table:
         "speed",
         _optional("{:.3f} m/s", figures["mean_speed"]) + _optional(", at most {:.3f} m/s", figures["max_speed"]),
     )
-    table.add_row("closest approach", _optional("{:.3f} m", figures.get("closest_approach")))
+    table.add_row("closest approach", _optional("{:.3f} m, to what stands still", figures.get("closest_approach")))
     containment = figures["containment"]
     outside = _share(containment["violations"], containment["steps"], within.get("violations"), digits=3)
     table.add_row("outside the predicted set", outside)
@@ -146,10 +146,23 @@ LEARNER = (
 
 def _runs(runs: dict[str, Figures]) -> Table:
     """One row for each run, where there are several."""
-    columns = ("method", "certificate", "seed", "steps", "episodes", "goals", "collisions", "interventions", "reward")
+    columns = (
+        "method",
+        "certificate",
+        "perception",
+        "seed",
+        "steps",
+        "episodes",
+        "goals",
+        "collisions",
+        "interventions",
+        "reward",
+    )
     table = Stacking("run", *columns, **PLAIN)
     for label, run in runs.items():
-        setup = ["-" if run[name] is None else str(run[name]) for name in ("method", "certificate", "seed")]
+        setup = [
+            "-" if run[name] is None else str(run[name]) for name in ("method", "certificate", "perception", "seed")
+        ]
         episodes = run["episodes"]
         ends = [_share(run[name], episodes) for name in ("goals", "collisions")]
         stopped = _share(run["interventions"], run["steps"])

@@ -14,13 +14,15 @@ from typing import Any
 
 import numpy as np
 
-from logs.intervals import Clustered, clopper_pearson
+from logs.intervals import Clustered, clopper_pearson, poisson
 from logs.sketch import Histogram, spread, summary
 from messaging import brakeline_pb2 as pb
 
 Figures = dict[str, Any]  # what JSON can hold
 
 CONTACTS = ("contacts_moving", "contacts_standing", "contacts_robots")  # not with what stands still
+
+RUN_INTO = "contacts_standing"  # of which an episode may have several
 
 KINDS: dict[int, str] = {
     pb.ALLOWED: "allowed",
@@ -41,7 +43,7 @@ class Tally:
     goals: int = 0
     collisions: int = 0  # episodes with one
     contacts_moving: int = 0  # episodes in which it touched something that moves, itself moving when that began
-    contacts_standing: int = 0  # the same, but it had been standing: it was run into
+    contacts_standing: int = 0  # times that it was run into, standing: several in an episode where people step over it
     contacts_robots: int = 0  # episodes in which it touched another robot of its world
     fleet: int = 0  # robots in its world; 0: it is alone
     broken: int = 0  # times that an obstacle was seen outside of what its bounds allowed
@@ -174,9 +176,10 @@ def intervals(figures: Figures, tallies: Iterable[Tally]) -> dict[str, list[floa
     shares = Clustered()
     for tally in tallies:
         shares.join(tally.shares)
-    ends = {name: figures[name] for name in ("goals", "collisions", *CONTACTS, "timeouts")}
+    ends = {name: figures[name] for name in ("goals", "collisions", *CONTACTS, "timeouts") if name != RUN_INTO}
     found = {
         **{name: clopper_pearson(count, max(episodes, count)) for name, count in ends.items()},
+        RUN_INTO: poisson(figures[RUN_INTO], episodes),
         "interventions": shares.interval(),
         "violations": clopper_pearson(contained["violations"], contained["steps"]),
     }

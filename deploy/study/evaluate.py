@@ -14,6 +14,7 @@ from actors.guard import Ask, Outcome, consult
 from deploy.data.store import method_for
 from deploy.policies import policy_named
 from deploy.vehicles import environment, fleet_world
+from logs.analysis import perception_in
 from logs.metrics import Tally, closed_loop
 from messaging import brakeline_pb2 as pb
 from messaging.robots import Robot
@@ -155,6 +156,7 @@ def _about(what: Evaluation) -> dict[str, Any]:
         "mode": what.recipe.mode if what.method == DDPC else None,
         "policy": what.policy,
         "arena": what.arena,
+        "perception": perception_in(what.conditions.describe()),
         "seed": what.seed,
         "conditions": what.conditions.describe(),
     }

@@ -30,7 +30,10 @@ SCRIPTS = ("svg.js", "save.js", "learning.js", "charts.js", "arena.js", "episode
 
 RATES = (  # name, of what, in words
     ("goals", "episodes", "goals reached"),
-    ("collisions", "episodes", "collisions"),
+    ("collisions", "episodes", "collisions with what stands still"),
+    ("contacts_moving", "episodes", "contacts with what moves, in motion"),
+    ("contacts_standing", "episodes", "times that it was run into while it stood"),
+    ("contacts_robots", "episodes", "contacts with other robots of its world"),
     ("timeouts", "episodes", "timeouts"),
     ("interventions", "steps", "steps in which the filter stepped in"),
 )

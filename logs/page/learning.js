@@ -112,7 +112,7 @@ function chart(lines, what, view) {
 /** Curves with their controls; `runs` as the page's data has them. */
 function learning(target, controls, runs) {
   const robots = [...new Set(runs.flatMap((run) => Object.keys(run.training)))].sort();
-  const setups = runs.map((run) => ["method", "certificate", "policy", "arena"].map((name) => run.setup[name]).filter(Boolean).join(", ") || "run");
+  const setups = runs.map((run) => Object.entries(run.setup).filter(([name]) => name !== "seed").map(([, value]) => value).filter(Boolean).join(", ") || "run");
   runs.forEach((run, k) => { run.group = setups[k]; run.color = COLORS[(setups.length === new Set(setups).size ? k : [...new Set(setups)].indexOf(setups[k])) % COLORS.length]; });
   if (runs.length > 1 && new Set(setups).size < runs.length) runs.forEach((run, k) => { run.color = COLORS[k % COLORS.length]; });
   const view = { share: 0.02, raw: true, bands: false, shown: new Set(runs) };

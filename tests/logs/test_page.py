@@ -108,7 +108,7 @@ def test_everything_is_drawn(page: Page, report: tuple[Path, dict[str, Any]]) ->
         broken: [...document.querySelectorAll('svg, #picker, .card')].map(e => e.outerHTML).join()
             .match(/NaN|undefined|Infinity/g),
     })""")
-    assert drawn["rates"] == 5 and drawn["near"] == 16 and drawn["tubes"] > 20 and drawn["bars"] > 20
+    assert drawn["rates"] == 8 and drawn["near"] == 16 and drawn["tubes"] > 20 and drawn["bars"] > 20
     assert len(drawn["curves"]) == 10 and "goals reached" in drawn["curves"], "of both robot kinds"
     assert drawn["maps"] > 50 and set(figures["processes"]) <= set(drawn["lanes"])
     assert drawn["broken"] is None
@@ -222,7 +222,7 @@ def test_a_run_is_chosen_and_its_own_parts_are_shown(comparison: Page, compared:
     page.value(choose)
     assert page.value(visible) == ["c"]
     assert page.value("document.querySelectorAll('#run2-near .card svg').length") > 4
-    assert page.value("document.querySelectorAll('#run2-rates .whisker svg').length") == 5
+    assert page.value("document.querySelectorAll('#run2-rates .whisker svg').length") == 8
     page.value("location.hash = '#run=1&episode=3&step=1'")
     page.until("document.getElementById('run').value === '1'")
     facts = "[...document.querySelectorAll('#run1-episode-facts dd')].find(d => d.dataset.fact === 'step').textContent"

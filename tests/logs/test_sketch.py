@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from scipy.stats import binomtest
+from scipy.stats import binomtest, chi2
 
-from logs.intervals import Clustered, clopper_pearson
+from logs.intervals import Clustered, clopper_pearson, poisson
 from logs.sketch import BATCH, RESOLUTION, Histogram, merged, spread, summary
 
 VALUES = st.lists(st.floats(-1e6, 1e6).filter(lambda x: x == 0.0 or abs(x) > 1e-6), min_size=1, max_size=300)
@@ -86,8 +86,16 @@ def test_clopper_pearson_is_scipys_exact_interval(count: int, of: int) -> None:
     assert clopper_pearson(count, of) == pytest.approx((exact.low, exact.high), abs=1e-9)
 
 
+@given(st.integers(0, 400), st.integers(1, 400))
+def test_what_may_happen_several_times_in_a_trial_has_garwoods_interval(count: int, of: int) -> None:
+    low, high = poisson(count, of) or (0.0, 0.0)
+    assert low == pytest.approx(chi2.ppf(0.025, 2 * count) / 2.0 / of if count else 0.0, rel=1e-9)
+    assert high == pytest.approx(chi2.ppf(0.975, 2 * count + 2) / 2.0 / of, rel=1e-9)
+    assert low <= count / of <= high
+
+
 def test_no_trial_no_interval() -> None:
-    assert clopper_pearson(0, 0) is None and Clustered().interval() is None
+    assert clopper_pearson(0, 0) is None and poisson(0, 0) is None and Clustered().interval() is None
     alone = Clustered()
     alone.add(3, 10)
     assert alone.interval() is None
