@@ -59,7 +59,7 @@ class RangeImage:
         if self.ranges.dtype != np.float64:
             raise BadScan("a range image's ranges are in double precision")
         if not np.isfinite(self.ranges).all() or (self.ranges < 0.0).any():
-            raise BadScan("a range image's ranges are 0 or more, and finite")
+            raise BadScan("a range image's ranges are 0 (not known) or more, and finite: `far` where nothing was hit")
         for name in ("at", "attitude", "mount"):
             object.__setattr__(self, name, tuple(map(float, getattr(self, name))))
         if (len(self.at), len(self.attitude), len(self.mount)) != (3, 4, 3):

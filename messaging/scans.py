@@ -78,14 +78,18 @@ class Scan:
     followed: Followed | None = None
 
     def __post_init__(self) -> None:
-        n = len(self.ranges)
+        for name in ("ranges", "angles"):
+            object.__setattr__(self, name, np.asarray(getattr(self, name), dtype=float))
+        n = self.ranges.size
         if self.ranges.shape != (n,) or self.angles.shape != (n,) or n > MOST_BEAMS:
             raise BadScan(f"a scan has as many ranges as angles, {MOST_BEAMS} at most")
         if not np.isfinite(self.angles).all() or (np.diff(self.angles) <= 0.0).any():
             raise BadScan("a scan's angles must be finite and ascend")
         if n and self.angles[-1] - self.angles[0] >= 2.0 * math.pi:
-            raise BadScan("a scan's angles span less than a turn")
-        if (np.nan_to_num(self.ranges, nan=0.0) < 0.0).any() or np.isinf(self.ranges).any():
+            raise BadScan("a scan's angles [rad] span less than a turn: leave out a last beam that is the first again")
+        if np.isinf(self.ranges).any():
+            raise BadScan("a scan's ranges are finite: `far` where nothing was hit, 0 or NaN where nothing is known")
+        if (np.nan_to_num(self.ranges, nan=0.0) < 0.0).any():
             raise BadScan("a scan's ranges are 0 or more")
         if len(self.pose) != 3 or len(self.mount) != 2:
             raise BadScan("a scan's pose has 3 coordinates, its mount 2")

@@ -87,6 +87,10 @@ class Perception:
     def __post_init__(self) -> None:
         if self.kind not in ("map", "scan"):
             raise ValueError(f"free space comes from a map or from scans, not from {self.kind!r}")
+        if self.faults != Faults() and self.kind != "scan":
+            raise ValueError(
+                "dropped, false, ghost, blind and late beams are a scan's: ask for it, too (--perception scan)"
+            )
         if self.tracks and self.kind != "scan":
             raise ValueError("tracks are made of scans: ask for these, too (--perception scan)")
 

@@ -41,6 +41,10 @@ class Evaluate:
     json: bool = False
 
     def run(self) -> int:
+        if self.render is not None:
+            from deploy.run.render import check_ending
+
+            check_ending(self.render)
         if self.beside and self.render is None:
             raise ValueError("--beside draws: give --render FILE too")
         robot = learnt(self.robot)

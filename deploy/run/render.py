@@ -99,14 +99,19 @@ def record(driver: Driver, policy: Policy, question: Ask | None, number: int) ->
     return Film(driver.robot, driver.info["arena"], frames, np.asarray(step.true_state[:d]), end)
 
 
+def check_ending(path: Path) -> None:
+    """Raises ValueError: it is none of a picture's."""
+    if path.suffix not in FORMATS:
+        raise ValueError(f"{path}: a picture ends in {', '.join(FORMATS)}")
+
+
 def save(films: Sequence[Film], path: Path) -> None:
     """Draw the films side by side: one picture of all of each (.png), or a moving one (.gif, .mp4).
 
     Raises:
         ValueError: another ending.
     """
-    if path.suffix not in FORMATS:
-        raise ValueError(f"{path}: a picture ends in {', '.join(FORMATS)}")
+    check_ending(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     figure = Figure(figsize=(7.0 * len(films), 7.4), layout="constrained")
     stages = [_Stage(film, axes) for film, axes in zip(films, np.ravel(figure.subplots(1, len(films))), strict=True)]
