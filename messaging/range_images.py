@@ -54,12 +54,11 @@ class RangeImage:
     age: float = 0.0  # s since it was taken
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "ranges", np.ascontiguousarray(self.ranges, dtype=float))  # as loops are compiled for
         if self.ranges.ndim != 2 or not all(self.ranges.shape) or self.ranges.size > MOST_BEAMS:
             raise BadScan(f"a range image has rings and columns, of {MOST_BEAMS} beams at most")
-        if self.ranges.dtype != np.float64:
-            raise BadScan("a range image's ranges are in double precision")
         if not np.isfinite(self.ranges).all() or (self.ranges < 0.0).any():
-            raise BadScan("a range image's ranges are 0 (not known) or more, and finite: `far` where nothing was hit")
+            raise BadScan("a range image's ranges are finite, and 0 or more: `far` where nothing was hit, 0: not known")
         for name in ("at", "attitude", "mount"):
             object.__setattr__(self, name, tuple(map(float, getattr(self, name))))
         if (len(self.at), len(self.attitude), len(self.mount)) != (3, 4, 3):

@@ -213,7 +213,6 @@ def test_two_at_once_and_half_a_beam_are_refused():
         ({"doubt": 2}, "doubted"),
         ({"angle_error": 1.0}, "angle error"),  # degrees, say: so wide is every shadow that none would be left
         ({"low": 0.5, "high": 0.5 + 1e-6}, "so close"),
-        ({"ranges": np.ones((45, 90), np.float32)}, "double precision"),
     ],
 )
 def test_what_is_no_image_is_refused(wrong, said):
@@ -241,3 +240,10 @@ def test_a_place_and_an_attitude_may_come_as_any_numbers():
     image = RangeImage(np.ones((RINGS, COLUMNS)), np.array([1, 2, 3]), [1, 0, 0, 0], low=-EDGE, high=EDGE)
     assert (image.at, image.attitude) == ((1.0, 2.0, 3.0), (1.0, 0.0, 0.0, 0.0))
     assert all(type(value) is float for value in (*image.at, *image.attitude, *image.mount))
+
+
+@pytest.mark.parametrize("given", [lambda a: a.astype(np.float32), np.asfortranarray, np.ndarray.tolist])
+def test_ranges_come_as_any_numbers(given):
+    """As a driver or a log has them; the loops are compiled for one kind only, and compiling takes seconds."""
+    ranges = RangeImage(given(np.ones((RINGS, COLUMNS))), (0.0, 0.0, 0.0), low=-EDGE, high=EDGE).ranges
+    assert ranges.dtype == np.float64 and ranges.flags.c_contiguous and (ranges == 1.0).all()
