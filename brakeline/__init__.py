@@ -17,7 +17,10 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from messaging.bus import BusError, BusSettings, Late, NoReply, Refused, Unreachable
     from messaging.descriptions import BadDescription
+    from messaging.motion import Motion
+    from messaging.range_images import RangeImage
     from messaging.robots import Disc, Limit, Robot, UnknownRobot, robot_named
+    from messaging.scans import BadScan, Scan
     from messaging.shapes import BadShape, Obstacle, Shapes
     from messaging.tasks import Task, task_of
     from safety.certificates import CertificateError
@@ -26,7 +29,10 @@ if TYPE_CHECKING:
     from safety.dataset import BadData, Dataset, Trajectory
     from safety.filter import Filter
     from safety.fitting import make
+    from safety.fleet_client import FleetClient
     from safety.gym import SafetyWrapper
+    from safety.image_memory import filled, memory_of
+    from safety.inprocess import InProcess
     from safety.model_set import BadModel, ModelSet, Recipe
     from safety.request import BadRequest, Decision, Request
     from safety.statement import Statement, state
@@ -34,7 +40,10 @@ if TYPE_CHECKING:
 PLACES = {
     "messaging.bus": ("BusError", "BusSettings", "Late", "NoReply", "Refused", "Unreachable"),
     "messaging.descriptions": ("BadDescription",),
+    "messaging.motion": ("Motion",),
+    "messaging.range_images": ("RangeImage",),
     "messaging.robots": ("Disc", "Limit", "Robot", "UnknownRobot", "robot_named"),
+    "messaging.scans": ("BadScan", "Scan"),
     "messaging.shapes": ("BadShape", "Obstacle", "Shapes"),
     "messaging.tasks": ("Task", "task_of"),
     "safety.certificates": ("CertificateError",),
@@ -43,7 +52,10 @@ PLACES = {
     "safety.dataset": ("BadData", "Dataset", "Trajectory"),
     "safety.filter": ("Filter",),
     "safety.fitting": ("make",),
+    "safety.fleet_client": ("FleetClient",),
     "safety.gym": ("SafetyWrapper",),
+    "safety.image_memory": ("filled", "memory_of"),
+    "safety.inprocess": ("InProcess",),
     "safety.model_set": ("BadModel", "ModelSet", "Recipe"),
     "safety.request": ("BadRequest", "Decision", "Request"),
     "safety.statement": ("Statement", "state"),
@@ -56,6 +68,7 @@ __all__ = [
     "BadDescription",
     "BadModel",
     "BadRequest",
+    "BadScan",
     "BadShape",
     "BusError",
     "BusSettings",
@@ -65,12 +78,16 @@ __all__ = [
     "Decision",
     "Disc",
     "Filter",
+    "FleetClient",
+    "InProcess",
     "Late",
     "Limit",
     "ModelSet",
+    "Motion",
     "NoReply",
     "Obstacle",
     "Prediction",
+    "RangeImage",
     "Recipe",
     "Refused",
     "Request",
@@ -78,6 +95,7 @@ __all__ = [
     "SafetyClient",
     "SafetyError",
     "SafetyWrapper",
+    "Scan",
     "Shapes",
     "Statement",
     "Task",
@@ -85,7 +103,9 @@ __all__ = [
     "UnknownRobot",
     "Unreachable",
     "__version__",
+    "filled",
     "make",
+    "memory_of",
     "robot_named",
     "state",
     "task_of",

@@ -178,16 +178,44 @@ def accept(commitment: Commitment, answer: Answer) -> Array:
     return commitment.accept(answer.plan, message.model, predicted, message.verified, message.vouchers, promise)
 
 
-class SafetyClient:
+def bus_at(connect: str | Sequence[str], keys: Path | str | None, name: str) -> Bus:
+    """A bus of one's own at these endpoints; keys: the folder with the keys of `name`, if the bus has keys.
+
+    Raises:
+        Unreachable: no router at these endpoints; BadKeys: no keys of that name.
+    """
+    endpoints = (connect,) if isinstance(connect, str) else tuple(connect)
+    return Bus(BusSettings(connect=endpoints, keys=None if keys is None else Path(keys)), name)
+
+
+class Asker:
+    """A bus to ask about robots of one kind, closed with it if it is its own."""
+
+    def __init__(self, bus: Bus, robot: str, deadline: float) -> None:
+        self.bus, self.robot, self.deadline = bus, robot_named(robot), deadline
+        self._owned = False
+
+    def close(self) -> None:
+        if self._owned:
+            self.bus.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None) -> None:
+        self.close()
+
+
+class SafetyClient(Asker):
     """Asks the safety service about one robot, and keeps its committed plan.
 
-    Not for several threads at once; a program with several robots has a client (or a `Commitment`) for each.
+    Not for several threads at once; a program with several robots has a client (or a `Commitment`) for each, and a
+    `FleetClient` for those that share a world.
     """
 
     def __init__(self, bus: Bus, robot: str, deadline: float = DEADLINE) -> None:
-        self.bus, self.robot, self.deadline = bus, robot_named(robot), deadline
+        super().__init__(bus, robot, deadline)
         self.commitment = Commitment(self.robot)
-        self._owned = False
 
     @classmethod
     def open(
@@ -206,22 +234,29 @@ class SafetyClient:
         Raises:
             Unreachable: no router at these endpoints; BadKeys: no keys of that name.
         """
-        endpoints = (connect,) if isinstance(connect, str) else tuple(connect)
-        settings = BusSettings(connect=endpoints, keys=None if keys is None else Path(keys))
-        client = cls(Bus(settings, name), robot, deadline)
+        client = cls(bus_at(connect, keys, name), robot, deadline)
         client._owned = True
         return client
 
-    def decide(self, state: ArrayLike, action: ArrayLike, obstacles: Iterable[Obstacle], **more: Any) -> Answer:
+    def decide(
+        self,
+        state: ArrayLike,
+        action: ArrayLike,
+        obstacles: Iterable[Obstacle] = (),
+        scan: Sensed | None = None,
+        **more: Any,
+    ) -> Answer:
         """The decision on an action; its plan is committed to, so execute `answer.action`.
 
         Args:
-            state: measured; action: proposed; obstacles: at least those within reach (1 m is enough for `ground`).
+            state: measured; action: proposed; obstacles: at least those within reach (1 m is enough for `ground`),
+            not needed where there is a scan; scan: a `Scan` or a `RangeImage`, filled in by
+            `safety.image_memory.filled`. Without either all is free. more: actor, episode, step, time, observation.
 
         Raises:
             NoReply, Late, Refused, SafetyError: no decision; execute `fallback()` instead.
         """
-        request = request_message(self.commitment, state, action, obstacles, **more)
+        request = request_message(self.commitment, state, action, obstacles, scan, **more)
         answer = read(ask(self.bus, [request], self.deadline)[0], request, self.robot)
         accept(self.commitment, answer)
         return answer
@@ -229,16 +264,6 @@ class SafetyClient:
     def fallback(self) -> Array:
         """The committed plan's next input, for when there is no decision."""
         return self.commitment.fallback()
-
-    def close(self) -> None:
-        if self._owned:
-            self.bus.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None) -> None:
-        self.close()
 
 
 def ask(bus: Bus, requests: Sequence[pb.Request], deadline: float) -> list[pb.Reply]:

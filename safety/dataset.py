@@ -93,7 +93,7 @@ class Dataset:
             for i in range(len(shares))
         ]
 
-    def save(self, path: Path) -> None:
+    def save(self, path: Path | str) -> None:
         """Writes a safetensors file: trajectories one after the other, with their lengths."""
         names = ("states", "inputs", "paths", "turned")
         tensors = {n: np.concatenate([getattr(t, n) for t in self.trajectories]) for n in names}
@@ -104,17 +104,17 @@ class Dataset:
         about: dict[str, Any] = {"robot": robot.name, "layout": robot.layout(), "about": self.about}
         about["bulge"] = self.bulge
         about["description"] = json.dumps(robot.description)  # a text: the order of its names counts
-        write_whole(path, pack(tensors, ENTRY, about))
+        write_whole(Path(path), pack(tensors, ENTRY, about))
 
     @staticmethod
-    def load(path: Path) -> Dataset:
+    def load(path: Path | str) -> Dataset:
         """Reads and checks a data set.
 
         Raises:
             BadData: not such a file, of another robot layout, or a check fails.
         """
         try:
-            tensors, about = unpack(path.read_bytes(), ENTRY)
+            tensors, about = unpack(Path(path).read_bytes(), ENTRY)
             about_data = dict(about.get("about", {}))
         except (OSError, ValueError, TypeError) as error:
             raise BadData(f"{path} is no data set: {error}") from error

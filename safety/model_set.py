@@ -142,8 +142,8 @@ class ModelSet:
             about["description"] = json.dumps(self.robot.description)  # a text: the order of its names counts
         return pack(self._tensors(), ENTRY, about)
 
-    def save(self, path: Path) -> None:
-        write_whole(path, self.encode())
+    def save(self, path: Path | str) -> None:
+        write_whole(Path(path), self.encode())
 
     @staticmethod
     def decode(payload: bytes) -> ModelSet:
@@ -177,10 +177,10 @@ class ModelSet:
         return model
 
     @staticmethod
-    def load(path: Path) -> ModelSet:
+    def load(path: Path | str) -> ModelSet:
         """Raises BadModel, naming the file."""
         try:
-            model = ModelSet.decode(path.read_bytes())
+            model = ModelSet.decode(Path(path).read_bytes())
             known(model.robot)
             return model
         except OSError as error:

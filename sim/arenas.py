@@ -101,7 +101,7 @@ def draw_fleet(name: str, rng: np.random.Generator, robot: Robot, size: int) -> 
             alike(first, start=(*start, float(heading)), goal=goal)
             for start, goal, heading in zip(starts, goals, headings, strict=True)
         )
-    raise NoArena(f"no arena {name!r} with ways for {size} robots in {ATTEMPTS} draws")
+    raise NoArena(f"no arena {name!r} with ways for {size} robots in {ATTEMPTS} draws: ask for fewer")
 
 
 def _ends(

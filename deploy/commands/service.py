@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
+from pathlib import Path
 from typing import Any
 
 from rich.markup import escape
@@ -11,6 +13,9 @@ from rich.markup import escape
 from deploy.commands.common import Endpoints, Flags, Robot, console, say_json
 from logs.tables import PLAIN, Stacking
 from messaging.bus import Bus, Sample
+from messaging.range_images import RangeImage
+from messaging.scans import BadScan, Scan
+from messaging.sensed import Sensed
 from messaging.shapes import KINDS, Obstacle
 from messaging.tasks import learnt
 from messaging.topics import HEALTH, LEARNER
@@ -34,6 +39,23 @@ def obstacle_of(words: tuple[str, ...], dim: int) -> Obstacle:
     return Obstacle(kind, tuple(values[:dim]), tuple(values[dim : dim + sizes]), yaw)
 
 
+def sensed_in(path: Path, dim: int) -> Sensed:
+    """What a file says was seen: a JSON object with the fields of a `Scan`, in the air (dim 3) of a `RangeImage`.
+
+    Raises:
+        BadScan: it says something else; OSError: there is no such file.
+    """
+    kind = Scan if dim == 2 else RangeImage
+    names = [field.name for field in fields(kind) if field.name != "followed"]
+    try:
+        said = json.loads(path.read_text())
+        if not isinstance(said, dict) or not said.keys() <= set(names):
+            raise BadScan(f"{path}: not a {kind.__name__}, which is a JSON object of {', '.join(names)}")
+        return kind(**said)
+    except (TypeError, ValueError) as error:  # no JSON, a field missing, or no numbers in it
+        raise error if isinstance(error, BadScan) else BadScan(f"{path}: not a {kind.__name__}: {error}") from error
+
+
 @dataclass(frozen=True)
 class Query:
     robot: Robot = "ground"
@@ -44,6 +66,9 @@ class Query:
     """Proposed; default: the highest inputs."""
     obstacle: str = ""
     """What is near, separated by commas, e.g. "cylinder 0.4 0 0.1, wall 1 0 3.14"."""
+    scan: Path | None = None
+    """What was seen, beside it: JSON, {"ranges": [...], "angles": [...], "pose": [0, 0, 0], ...}, the fields of a Scan
+    (in the air of a RangeImage: docs/perception.md). What it does not show to be free is occupied."""
     timeout: float = 1.0
     json: bool = False
 
@@ -54,8 +79,9 @@ class Query:
         ]
         state = self.state or (0.0,) * robot.state_dim
         action = self.action or robot.action_high
+        scan = None if self.scan is None else sensed_in(self.scan, robot.position_dim)
         with Bus(self.endpoints.bus(), f"client.query-{time.time_ns() % 10**6}") as bus:
-            message = SafetyClient(bus, robot.name, self.timeout).decide(state, action, near).message
+            message = SafetyClient(bus, robot.name, self.timeout).decide(state, action, near, scan).message
         d = robot.position_dim
         figures: dict[str, Any] = {
             "decision": {1: "allowed", 2: "adjusted", 3: "failsafe", 4: "recovering"}[message.kind],

@@ -7,15 +7,18 @@ import shlex
 import subprocess
 import sys
 
+import numpy as np
 import pytest
 from rich.console import Console
 
 from deploy import progress
 from deploy.cli import COMMANDS, find, main
 from deploy.commands.data import table
-from deploy.commands.service import obstacle_of
+from deploy.commands.service import obstacle_of, sensed_in
 from logs.report import analyse
 from logs.segment import open_segment
+from messaging.range_images import RangeImage
+from messaging.scans import BadScan, Scan
 from messaging.shapes import Obstacle
 from safety import methods, recipe
 from safety.statement import Statement
@@ -112,6 +115,7 @@ def test_a_typing_error_is_answered_with_a_suggestion(command):
         ("analyse {folder}/none", "no log at"),
         ("certify {folder}/none.mcap", "no log at"),
         ("query ground --connect tcp/127.0.0.1:1 --obstacle ball", "an obstacle is: cylinder X Y RADIUS"),
+        ("query ground --connect tcp/127.0.0.1:1 --scan {folder}/none", "none"),
         ("status", "no run at runs/latest: give --connect tls/HOST:PORT"),
         ("query ground", "no run at runs/latest"),
         ("safety ground --listen tcp/0.0.0.0:7447", "is open to other machines: give --keys FOLDER"),
@@ -285,3 +289,26 @@ def test_the_version_is_told(command):
 
 def test_a_configuration_may_say_every_method_that_can_be_served():
     assert recipe.METHODS == methods.METHODS
+
+
+def test_a_scan_is_read_from_a_file(tmp_path):
+    def read(dim, text):
+        (tmp_path / "seen.json").write_text(text)
+        return sensed_in(tmp_path / "seen.json", dim)
+
+    scan = read(2, '{"ranges": [1, null, 0], "angles": [0, 0.1, 0.2], "pose": [1, 2, 0], "doubt": 1}')
+    assert isinstance(scan, Scan) and scan.known.tolist() == [True, False, False] and (scan.doubt, scan.far) == (1, 3.5)
+    image = read(3, json.dumps({"ranges": np.ones((45, 90)).tolist(), "at": [0, 0, 1]}))
+    assert isinstance(image, RangeImage) and image.ranges.shape == (45, 90)
+    for dim, text, said in (
+        (2, "{", "not a Scan: Expecting property name"),
+        (2, "[]", "a JSON object of ranges, angles, pose"),
+        (2, '{"ranges": [1], "angels": [0]}', "a JSON object of ranges, angles, pose"),
+        (2, '{"ranges": [1], "angles": [0]}', "missing 1 required positional argument: 'pose'"),
+        (2, '{"ranges": ["far"], "angles": [0], "pose": [0, 0, 0]}', "could not convert"),
+        (2, '{"ranges": [-1], "angles": [0], "pose": [0, 0, 0]}', "0 or more"),
+        (3, '{"ranges": [[1], [1, 2]], "at": [0, 0, 0]}', "inhomogeneous"),
+        (3, '{"ranges": [1], "angles": [0], "pose": [0, 0, 0]}', "a JSON object of ranges, at, attitude"),
+    ):
+        with pytest.raises(BadScan, match=said):
+            read(dim, text)

@@ -27,6 +27,8 @@ def test_what_is_encoded_is_decoded(models, which, tmp_path):
     assert again.about == model.about
     model.save(tmp_path / "deep" / "model.safetensors")
     assert ModelSet.load(tmp_path / "deep" / "model.safetensors").version == model.version
+    model.save(str(tmp_path / "again"))
+    assert ModelSet.load(str(tmp_path / "again")).version == model.version
     z = np.array([0.1, 0.2, 0.1, 0.2, 0.25, -0.5])
     for one, other in ((model.tube(), again.tube()), (model.outer_tube(), again.outer_tube())):
         assert np.array_equal(one.magnitudes(z), other.magnitudes(z))

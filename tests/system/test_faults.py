@@ -6,6 +6,7 @@ import signal
 import socket
 import subprocess
 import time
+from pathlib import Path
 
 import numpy as np
 import psutil
@@ -107,7 +108,7 @@ def test_interrupted_it_ends_in_order_and_is_resumed(data_folder, tmp_path):
 def test_two_replicas_and_then_no_launcher(data_folder, tmp_path):
     with Run(tmp_path / "run", "--steps", 100_000, "--replicas", 2) as run:
         run.until_steps(200)
-        _is_asked(run.there)
+        _is_asked(run.there, tmp_path)
         victims = run.children()
         assert {"safety-0", "safety-1", "recorder", "learner", "actor-0", "actor-1"} == victims.keys()
         _imports_what_it_needs(victims)
@@ -135,7 +136,7 @@ def _imports_what_it_needs(children: dict[str, psutil.Process]) -> None:
     assert not {name for name, paths in loaded.items() if "/scipy/" in paths and name.startswith("actor")}
 
 
-def _is_asked(there: tuple[object, ...]) -> None:
+def _is_asked(there: tuple[object, ...], folder: Path) -> None:
     """`status` and `query` of a run in progress, for people and as JSON."""
     status = brakeline("status", *there)
     assert status.returncode == 0 and "safety-1" in status.stdout and "learning ground" in status.stdout
@@ -148,6 +149,11 @@ def _is_asked(there: tuple[object, ...]) -> None:
     assert answer["decision"] in ("allowed", "adjusted", "failsafe") and answer["margin"] >= 0.0
     assert len(answer["plan"]) == len(answer["tube"]["center"]) == len(answer["tube"]["half_width"]) == GROUND.horizon
     assert answer["decision"] in brakeline(*near).stdout
+    for far, said in ((3.5, ("allowed",)), (0.0, ("adjusted", "failsafe"))):  # all free about it; nothing seen
+        scan = {"ranges": [far] * 360, "angles": np.radians(range(360)).tolist(), "pose": [0.0, 0.0, 0.0]}
+        (folder / "scan.json").write_text(json.dumps(scan))
+        seen = brakeline("query", "ground", *there, "--timeout", 10, "--scan", folder / "scan.json", "--json")
+        assert json.loads(seen.stdout)["decision"] in said
     wrong = brakeline("query", "ground", *there, "--state", 1, 2)
     assert wrong.returncode == 1 and "BadRequest" in wrong.stderr and "Traceback" not in wrong.stderr
 

@@ -1,0 +1,92 @@
+"""How any program asks the safety service about robots that share a world: all in one question, each with its promise.
+
+with FleetClient.open("tcp/127.0.0.1:7447", "ground", ["left", "right"]) as fleet:
+    answers = fleet.decide(states, actions, obstacles)   # one of each for each robot, in the order of their names
+    drive([answer.action for answer in answers])         # and next period again; if it raises: drive(fleet.fallback())
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Self
+
+from numpy.typing import ArrayLike
+
+from messaging.bus import Bus
+from messaging.shapes import Obstacle
+from safety.client import DEADLINE, Answer, Array, Asker, accept, ask, bus_at, read, request_message
+from safety.commitment import Commitment
+
+
+class FleetClient(Asker):
+    """Asks about all robots of a world, and keeps each one's committed plan and promise (docs/fleets.md).
+
+    Time passes for all of them or for none: each period is one `decide`, or one `fallback` where that raised. They
+    begin standing still. Not for several threads at once.
+    """
+
+    def __init__(self, bus: Bus, robot: str, names: Sequence[str], deadline: float = DEADLINE) -> None:
+        """robot: what all of them are; names: by which the service tells them apart.
+
+        Raises:
+            ValueError: fewer than two names, or one twice.
+        """
+        if len(names) < 2 or len(set(names)) < len(names):
+            raise ValueError(f"a fleet has two robots or more, each with a name of its own, not {list(names)}")
+        super().__init__(bus, robot, deadline)
+        self.names = tuple(names)
+        self.commitments = [Commitment(self.robot) for _ in self.names]
+        self._episode = self._step = 0
+
+    @classmethod
+    def open(
+        cls,
+        connect: str | Sequence[str],
+        robot: str,
+        names: Sequence[str],
+        deadline: float = DEADLINE,
+        keys: Path | str | None = None,
+        name: str = "client",
+    ) -> Self:
+        """A client with a bus of its own. Arguments and errors are those of `SafetyClient.open`."""
+        client = cls(bus_at(connect, keys, name), robot, names, deadline)
+        client._owned = True
+        return client
+
+    def decide(
+        self, states: Sequence[ArrayLike], actions: Sequence[ArrayLike], obstacles: Sequence[Iterable[Obstacle]]
+    ) -> list[Answer]:
+        """The decisions; their plans are committed to, so execute every `answer.action`.
+
+        Args:
+            states: measured, at one time; actions: proposed; obstacles: near each robot, what stands still. The others
+            are not among them: the service keeps each off what the others promise.
+
+        Raises:
+            ValueError: not one of each for each robot.
+            NoReply, Late, Refused, SafetyError: no decision about one robot, so none about any, for the others' new
+            plans may rest on that one's: execute `fallback()` instead, all of it.
+        """
+        asked = zip(self.commitments, states, actions, obstacles, self.names, strict=True)
+        requests = [
+            request_message(kept, *one, actor=name, episode=self._episode, step=self._step, fleet=self.names)
+            for kept, *one, name in asked
+        ]
+        replies = zip(ask(self.bus, requests, self.deadline), requests, strict=True)
+        answers = [read(reply, request, self.robot) for reply, request in replies]
+        for kept, answer in zip(self.commitments, answers, strict=True):
+            accept(kept, answer)
+        self._step += 1
+        return answers
+
+    def fallback(self) -> list[Array]:
+        """The committed plans' next inputs, for when there is no decision: all brake along what they promised."""
+        self._step += 1
+        return [kept.fallback() for kept in self.commitments]
+
+    def reset(self) -> None:
+        """They stand somewhere else, and have promised each other nothing."""
+        for kept in self.commitments:
+            kept.reset()
+        self._episode, self._step = self._episode + 1, 0

@@ -1,0 +1,96 @@
+"""Robots that share a world, asked about through the documented client: together, or not at all."""
+
+import numpy as np
+import pytest
+
+from messaging import brakeline_pb2 as pb
+from messaging.bus import NoReply
+from messaging.shapes import Obstacle
+from messaging.topics import DECIDE
+from safety.client import SafetyError
+from safety.fleet_client import FleetClient
+from tests.messaging.conftest import endpoint, join  # noqa: F401 - fixtures
+from tests.robots import GROUND
+from tests.safety.test_service import Service
+from tests.safety.unicycle import Unicycle
+
+POST = Obstacle("cylinder", (0.0, 0.8), (0.1,))
+NAMES = ("left", "right")
+
+
+def facing(rng):
+    """Two robots, half a metre from each other."""
+    return [Unicycle((-0.25, 0.0, 0.0), rng, noise=0.0), Unicycle((0.25, 0.0, np.pi), rng, noise=0.0)]
+
+
+def decided(fleet, robots, actions):
+    """An answer, however long the service takes to be known on this side."""
+    while True:
+        try:
+            return fleet.decide([r.measure() for r in robots], actions, [[POST], [POST]])
+        except NoReply:
+            continue
+
+
+def apart(robots):
+    return float(np.hypot(*(robots[0].state[:2] - robots[1].state[:2])))
+
+
+@pytest.fixture
+def fleet(join, endpoint, model):  # noqa: F811
+    join("safety", listen=True).serve(DECIDE, Service(model).answer)
+    with FleetClient.open(endpoint, "ground", NAMES, deadline=5.0) as client:
+        yield client
+
+
+def test_who_drives_at_each_other_does_not_meet(fleet):
+    robots, moved = facing(np.random.default_rng(0)), 0.0
+    for _ in range(15):
+        answers = decided(fleet, robots, [[0.25, 0.0], [0.25, 0.0]])
+        for robot, answer in zip(robots, answers, strict=True):
+            robot.step(answer.action)
+        moved = max(moved, robots[0].state[0] + 0.25)
+        one, other = (kept.promise for kept in fleet.commitments)
+        assert one.apart(other) > 0.0
+        assert apart(robots) > 2.0 * GROUND.footprint
+    assert moved > 0.02, "they stood all the time"
+    fleet.reset()
+    assert all(kept.promise is None and not kept.plan.any() for kept in fleet.commitments)
+
+
+def test_an_answer_that_misses_one_counts_for_none(fleet):
+    robots = facing(np.random.default_rng(1))
+    answers = decided(fleet, robots, [[0.1, 0.0], [0.1, 0.0]])
+    for robot, answer in zip(robots, answers, strict=True):
+        robot.step(answer.action)
+    before = [kept.plan.copy() for kept in fleet.commitments]
+    with pytest.raises(SafetyError) as caught:
+        decided(fleet, robots, [[0.1, 0.0], [float("nan"), 0.0]])
+    assert caught.value.field == "action"
+    assert all(np.array_equal(kept.plan, plan) for kept, plan in zip(fleet.commitments, before, strict=True))
+    inputs = fleet.fallback()
+    assert all(np.array_equal(given, plan[0]) for given, plan in zip(inputs, before, strict=True))
+    for robot, given in zip(robots, inputs, strict=True):
+        robot.step(given)
+    assert [a.message.verified for a in decided(fleet, robots, [[0.1, 0.0], [0.1, 0.0]])] == [True, True]
+
+
+def test_each_period_somebody_else_is_decided_first(fleet, monkeypatch):
+    asked = []
+    monkeypatch.setattr(fleet.bus, "ask", lambda key, payload, *_, **__: asked.append(payload) or b"")
+    for _ in range(3):
+        with pytest.raises(SafetyError):
+            fleet.decide([np.zeros(5), np.ones(5)], [[0.1, 0.0]] * 2, [[], []])
+        fleet.fallback()
+    requests = [pb.RequestBatch.FromString(payload).requests for payload in asked]
+    assert [[(r.step, r.actor, tuple(r.fleet)) for r in batch] for batch in requests] == [
+        [(i, name, NAMES) for name in NAMES] for i in range(3)
+    ]
+
+
+def test_what_is_no_fleet_is_refused(fleet):
+    for names in ((), ("alone",), ("same", "same")):
+        with pytest.raises(ValueError, match="two robots or more"):
+            FleetClient(fleet.bus, "ground", names)
+    with pytest.raises(ValueError, match="zip"):
+        fleet.decide([np.zeros(5)], [[0.1, 0.0]] * 2, [[], []])
