@@ -68,10 +68,11 @@ class FleetClient(Asker):
             NoReply, Late, Refused, SafetyError: no decision about one robot, so none about any, for the others' new
             plans may rest on that one's: execute `fallback()` instead, all of it.
         """
-        asked = zip(self.commitments, states, actions, obstacles, self.names, strict=True)
+        asked = zip(self.names, self.commitments, states, actions, obstacles, strict=True)
+        episode, step = self._episode, self._step
         requests = [
-            request_message(kept, *one, actor=name, episode=self._episode, step=self._step, fleet=self.names)
-            for kept, *one, name in asked
+            request_message(kept, state, action, near, actor=name, episode=episode, step=step, fleet=self.names)
+            for name, kept, state, action, near in asked
         ]
         replies = zip(ask(self.bus, requests, self.deadline), requests, strict=True)
         answers = [read(reply, request, self.robot) for reply, request in replies]

@@ -38,8 +38,8 @@ def test_what_is_saved_is_what_is_loaded(small, tmp_path):
     moving.save(tmp_path / "deep" / "set.safetensors")
     again = Dataset.load(tmp_path / "deep" / "set.safetensors")
     assert again.digest() == Dataset.load(tmp_path / "deep" / "set.safetensors").digest()
-    small.save(str(tmp_path / "named"))
-    assert Dataset.load(str(tmp_path / "named")).digest() == small.digest()
+    again.save(str(tmp_path / "named"))
+    assert Dataset.load(str(tmp_path / "named")).digest() == again.digest()
     assert again.about == small.about
     assert again.periods == 240
     for one, other in zip(moving.trajectories, again.trajectories, strict=True):
