@@ -63,13 +63,14 @@ def test_an_answer_that_misses_one_counts_for_none(fleet):
     answers = decided(fleet, robots, [[0.1, 0.0], [0.1, 0.0]])
     for robot, answer in zip(robots, answers, strict=True):
         robot.step(answer.action)
-    before = [kept.plan.copy() for kept in fleet.commitments]
+    before = [(kept.plan.copy(), kept.input_in_force, kept.promise) for kept in fleet.commitments]
     with pytest.raises(SafetyError) as caught:
-        decided(fleet, robots, [[0.1, 0.0], [float("nan"), 0.0]])
+        decided(fleet, robots, [[0.2, 0.3], [float("nan"), 0.0]])
     assert caught.value.field == "action"
-    assert all(np.array_equal(kept.plan, plan) for kept, plan in zip(fleet.commitments, before, strict=True))
+    for kept, (plan, held, promise) in zip(fleet.commitments, before, strict=True):
+        assert np.array_equal(kept.plan, plan) and kept.input_in_force is held and kept.promise is promise
     inputs = fleet.fallback()
-    assert all(np.array_equal(given, plan[0]) for given, plan in zip(inputs, before, strict=True))
+    assert all(np.array_equal(given, plan[0]) for given, (plan, *_) in zip(inputs, before, strict=True))
     for robot, given in zip(robots, inputs, strict=True):
         robot.step(given)
     assert [a.message.verified for a in decided(fleet, robots, [[0.1, 0.0], [0.1, 0.0]])] == [True, True]
