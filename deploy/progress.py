@@ -14,6 +14,7 @@ from rich.progress import TimeRemainingColumn as Remaining
 
 FIRST = 2.0  # s without a word: what is done by then needs none
 AGAIN = 10.0  # s between two lines
+UNDER_WAY: list[threading.Event] = []  # that say lines, each within the one before: the last one speaks
 T = TypeVar("T")
 
 console = Console(stderr=True, highlight=False, soft_wrap=True)
@@ -57,6 +58,7 @@ def _bar(what: str, total: int | None) -> Iterator[Advance]:
 @contextmanager
 def _lines(what: str, total: int | None) -> Iterator[Advance]:
     begun, ended = time.monotonic(), threading.Event()
+    UNDER_WAY.append(ended)
     said, done = what, 0
 
     def advance(by: int = 1, what: str | None = None) -> None:
@@ -66,7 +68,8 @@ def _lines(what: str, total: int | None) -> Iterator[Advance]:
     def talk() -> None:
         wait = FIRST
         while not ended.wait(wait):
-            console.print(line(said, done, total, time.monotonic() - begun), markup=False)
+            if UNDER_WAY[-1] is ended:
+                console.print(line(said, done, total, time.monotonic() - begun), markup=False)
             wait = AGAIN
 
     talker = threading.Thread(target=talk, name="progress", daemon=True)
@@ -76,6 +79,7 @@ def _lines(what: str, total: int | None) -> Iterator[Advance]:
     finally:
         ended.set()
         talker.join()
+        UNDER_WAY.remove(ended)
 
 
 def line(what: str, done: int, total: int | None, seconds: float) -> str:

@@ -6,6 +6,7 @@ import re
 import shlex
 import subprocess
 import sys
+import time
 
 import numpy as np
 import pytest
@@ -244,6 +245,21 @@ def test_certify_says_what_it_does_and_keeps_the_conditions_for_those_who_ask(co
     assert status == 0 and "{" not in out and "encoder" not in out
     assert "certifying residual, direct: 0 of 1" in err
     assert "encoder ticks" in command(*words, "--verbose")[1]
+
+
+def test_of_works_within_each_other_the_innermost_is_told(monkeypatch, capsys):
+    monkeypatch.setattr(progress, "FIRST", 0.01)
+    monkeypatch.setattr(progress, "AGAIN", 0.01)
+    monkeypatch.setattr(progress, "console", Console(stderr=True, force_terminal=False))
+    with progress.under_way("driving", 3), progress.under_way("recording"):
+        time.sleep(0.1)
+    told = capsys.readouterr().err
+    assert "recording" in told and "driving" not in told
+    with progress.under_way("driving", 3), progress.under_way("recording"):
+        pass
+    with progress.under_way("driving", 3):
+        time.sleep(0.1)
+    assert "driving: 0 of 3" in capsys.readouterr().err and not progress.UNDER_WAY
 
 
 HEAVY = ("torch", "mujoco", "zenoh", "scipy", "numpy", "pymavlink", "proxsuite", "google.protobuf", "pydantic")
