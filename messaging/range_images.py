@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from messaging.scans import BadScan
+from messaging.scans import BadScan, check_unit
 from messaging.shapes import FARTHEST
 
 Array = NDArray[np.float64]
@@ -54,6 +54,7 @@ class RangeImage:
     age: float = 0.0  # s since it was taken
 
     def __post_init__(self) -> None:
+        check_unit(self.ranges)
         object.__setattr__(self, "ranges", np.ascontiguousarray(self.ranges, dtype=float))  # as loops are compiled for
         if self.ranges.ndim != 2 or not all(self.ranges.shape) or self.ranges.size > MOST_BEAMS:
             raise BadScan(f"a range image has rings and columns, of {MOST_BEAMS} beams at most")
@@ -76,6 +77,7 @@ class RangeImage:
             raise BadScan("a range image's least width must be positive")
         if self.doubt not in (0, 1):
             raise BadScan("of a range image one beam of four is doubted, or none")
+        object.__setattr__(self, "doubt", int(self.doubt))
         if not -0.5 * math.pi <= self.low < self.high <= 0.5 * math.pi:
             raise BadScan("a range image's rings go from one elevation up to another, between -90° and 90°")
         if len(self.ranges) < 2 or max(self.step) > COARSEST:

@@ -27,6 +27,12 @@ class BadScan(ValueError):
     field = "scan"
 
 
+def check_unit(ranges: object) -> None:
+    """Raises BadScan for an array of whole numbers: a depth camera's millimetres, which in m were free space."""
+    if isinstance(ranges, np.ndarray) and ranges.dtype.kind in "iu":
+        raise BadScan(f"ranges are in m: an array of {ranges.dtype} may be in mm; divide, or give `.astype(float)`")
+
+
 @dataclass(frozen=True, eq=False)
 class Followed:
     """What earlier scans say of where whatever was hit goes (`safety/tracks.py`).
@@ -78,6 +84,7 @@ class Scan:
     followed: Followed | None = None
 
     def __post_init__(self) -> None:
+        check_unit(self.ranges)
         for name in ("ranges", "angles"):
             object.__setattr__(self, name, np.asarray(getattr(self, name), dtype=float))
         n = self.ranges.size
@@ -100,6 +107,9 @@ class Scan:
             raise BadScan(f"a scan's pose and mount must be finite, and within {FARTHEST:g}")
         if not all(0.0 <= value <= FARTHEST for value in bounds):
             raise BadScan(f"a scan's errors, speed and age must be finite, not negative, and {FARTHEST:g} at most")
+        if self.doubt != int(self.doubt):
+            raise BadScan("a scan's doubt is a whole number of beams")
+        object.__setattr__(self, "doubt", int(self.doubt))
         if not (math.isfinite(self.least_width) and self.least_width > 0.0):
             raise BadScan("a scan's least width must be positive")
         if self.followed is not None and (wrong := self.followed.wrong(n)):

@@ -242,16 +242,16 @@ class SafetyClient(Asker):
         self,
         state: ArrayLike,
         action: ArrayLike,
-        obstacles: Iterable[Obstacle] = (),
+        obstacles: Iterable[Obstacle],
         scan: Sensed | None = None,
         **more: Any,
     ) -> Answer:
         """The decision on an action; its plan is committed to, so execute `answer.action`.
 
         Args:
-            state: measured; action: proposed; obstacles: at least those within reach (1 m is enough for `ground`),
-            not needed where there is a scan; scan: a `Scan` or a `RangeImage`, filled in by
-            `safety.image_memory.filled`. Without either all is free. more: actor, episode, step, time, observation.
+            state: measured; action: proposed; obstacles: at least those within reach (1 m is enough for `ground`);
+            none beside a scan, if that is all that is known; scan: a `Scan` or a `RangeImage`, filled in by
+            `safety.image_memory.filled`. With neither all is free. more: actor, episode, step, time, observation.
 
         Raises:
             NoReply, Late, Refused, SafetyError: no decision; execute `fallback()` instead.

@@ -271,6 +271,12 @@ class Filter:
             z = plans[best]
         elif robot.heading is not None and (away := scene.away) is not None:
             z = self.inputs.regressors(z_0, self.inputs.limited(turn_towards(robot, scene.heading, away), before))
+            # Turning leaves a disc in the middle where it is, but swings one aside: never nearer to anything.
+            aside = np.repeat([disc.aside for disc in self.around.discs], [len(of.normals) * each for of in planes])
+            swung = np.flatnonzero(aside)
+            after = standing[swung] + rows.gradient[swung] @ (z - stand)
+            if (after > np.maximum(standing[swung], 0.0) + 1e-9).any():
+                return None
         else:
             return None
         return _Found(RECOVERING, self.inputs.plan(z), z, self.around.margin(rows, z), False)

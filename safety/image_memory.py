@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -57,6 +57,9 @@ class ImageMemory(Memory[RangeImage]):
     def reset(self) -> None:
         super().reset()
         self._seen: deque[_Seen] = deque(maxlen=KEPT)
+
+    def _own(self, scan: RangeImage) -> RangeImage:
+        return replace(scan, ranges=scan.ranges.copy())
 
     def _wanted(self, scan: RangeImage) -> NDArray[np.bool_]:
         """Those that none of a mesh speaks for: single ones cost little."""

@@ -47,6 +47,7 @@ class Memory(ABC, Generic[S]):
 
     def reset(self) -> None:
         """It is put down somewhere else."""
+        self._begun = False
         self._put: S | None = None
         self._last: S | None = None  # as it was given out
         self._waited = 0.0  # s since then
@@ -69,11 +70,14 @@ class Memory(ABC, Generic[S]):
 
         None: none came. Then the last one goes on to be what is known, so much older; before the first nothing is.
         """
-        self.later(elapsed)
+        if self._begun:
+            self.later(elapsed)
+        self._begun = True
         if scan is None:
             return self.nothing if self._last is None else replace(self._last, age=self._last.age + self._waited)
+        scan = self._own(scan)
         if self._put is None:
-            self._put, self._age = scan, 0.0
+            self._put = scan
         unknown = self._wanted(scan)
         filled = scan
         if unknown.any():
@@ -85,6 +89,10 @@ class Memory(ABC, Generic[S]):
         self._keep(scan)
         self._last, self._waited = filled, 0.0
         return filled
+
+    @abstractmethod
+    def _own(self, scan: S) -> S:
+        """With arrays of its own: whoever asks may fill his again."""
 
     @abstractmethod
     def _wanted(self, scan: S) -> NDArray[np.bool_]:
@@ -144,6 +152,9 @@ class FanMemory(Memory[Scan]):
         if followed is not None:
             self._last = filled = replace(filled, followed=followed)
         return filled
+
+    def _own(self, scan: Scan) -> Scan:
+        return replace(scan, ranges=scan.ranges.copy(), angles=scan.angles.copy())
 
     def _wanted(self, scan: Scan) -> NDArray[np.bool_]:
         return ~scan.known

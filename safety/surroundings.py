@@ -87,12 +87,10 @@ class Scene:
     @property
     def away(self) -> Array | None:
         """A direction (d,), world, off what is nearest to the start; None: nothing is of which that can be told."""
-        if len(self.near):
-            return way_from(self.near, self.start)
+        ways = [way_from(self.near, self.start)] if len(self.near) else []
         if isinstance(self.unseen, seen.Cells):
-            ways = self.start - self.unseen.corners.reshape(-1, len(self.start))
-            return np.asarray(ways[np.argmin(np.einsum("nd,nd->n", ways, ways))])
-        return None
+            ways.extend(self.start - self.unseen.corners.reshape(-1, len(self.start)))
+        return min(ways, key=np.linalg.norm, default=None)
 
     @property
     def empty(self) -> bool:

@@ -15,7 +15,7 @@ from safety.commitment import Commitment, correction_penalty
 from safety.gym import diagnostics
 from safety.image_memory import filled, memory_of
 from safety.inprocess import InProcess
-from safety.spaces import Actions, actions_of
+from safety.spaces import Actions, Mismatch, actions_of
 from safety.views import OBSTACLES, STATE, View
 
 if TYPE_CHECKING:
@@ -73,7 +73,10 @@ class VectorSafetyWrapper(VectorWrapper):
         deciding = np.flatnonzero(~resets)
         before = np.array([kept.due for kept in self.commitments])
         states, near = self._state(self.env, *seen), self._obstacles(self.env, *seen)
-        near = near if len(near) else [[]] * self.num_envs  # there are scans instead
+        if not len(near) and all(scan is not None for scan in self._scans):  # these say what is free
+            near = [[]] * self.num_envs
+        if len(near) != self.num_envs:
+            raise Mismatch(f"obstacles were told for {len(near)} of {self.num_envs} environments: give a list for each")
         answers = self.asker.decide_all(
             [self.commitments[i] for i in deciding],
             [states[i] for i in deciding],

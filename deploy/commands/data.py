@@ -24,6 +24,7 @@ from deploy.commands.common import (
 )
 from deploy.data.coverage import more_to_drive
 from deploy.data.logged import Recorded, from_log
+from deploy.data.making import alone
 from deploy.data.paths import model_path, record_path
 from deploy.data.recording import SEED, data_for, recorded
 from deploy.data.support import Unsupported, supported
@@ -112,7 +113,8 @@ class Collect:
                 first.lead,
             ),
         )
-        found.data.save(path)
+        with alone(path.parent):
+            found.data.save(path)
         figures: dict[str, Any] = {"path": str(path), "periods": found.data.periods, "minutes": found.seconds / 60.0}
         figures |= {"level": found.level, "missing": found.missing}
         if found.model is not None and found.statement is not None:

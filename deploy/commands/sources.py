@@ -12,6 +12,7 @@ from rich.markup import escape
 from deploy.commands.common import Robot, console, errors, say_json
 from deploy.data import bring, planned
 from deploy.data.coverage import Coverage, coverage
+from deploy.data.making import alone
 from deploy.data.paths import record_path
 from deploy.data.picture import draw
 from deploy.data.resample import HOLD
@@ -48,7 +49,8 @@ class Import:
         if self.picture is not None:
             draw(made.data, told, self.picture)
         if not told.refused:
-            made.data.save(path)
+            with alone(path.parent):
+                made.data.save(path)
         figures = {"path": None if told.refused else str(path), "digest": made.data.digest()}
         if self.json:
             say_json(figures | {"report": asdict(made.report), "coverage": asdict(told), "refused": told.refused})

@@ -44,11 +44,10 @@ def recorded(
     path = path or record_path(robot)
     if path.exists() and not again:
         return Dataset.load(path)
-    if path.exists():
-        _spare(path, robot)
     with alone(path.parent):
         if path.exists() and not again:
             return Dataset.load(path)
+        _spare(path, robot)
         return _record(robot, path, trajectories or task_of(robot).trajectories, seed, conditions or Conditions())
 
 
@@ -75,6 +74,7 @@ def _record(robot: Robot, path: Path, trajectories: int, seed: int, conditions: 
             console.print(f"[yellow]kept {len(driven)} of {trajectories} trajectories[/]: the same command goes on")
         raise
     data = collect.dataset(robot, driven, seed, conditions)
+    _spare(path, robot)  # what was imported meanwhile
     data.save(path)
     part.unlink(missing_ok=True)
     return data
