@@ -196,6 +196,8 @@ def test_two_at_once_and_half_a_beam_are_refused():
     [
         ({"ranges": np.ones(90)}, "rings and columns"),
         ({"ranges": np.ones((1, 90))}, "at most 12°"),
+        ({"ranges": np.full((45, 90), 1200, np.uint16)}, "may be in mm"),
+        ({"doubt": 0.5}, "doubted"),
         ({"ranges": np.ones((45, 12))}, "at most 12°"),
         ({"ranges": np.ones((300, 300))}, "beams at most"),
         ({"ranges": np.full((45, 90), np.nan)}, "finite"),

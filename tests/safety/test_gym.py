@@ -194,6 +194,14 @@ def test_a_vector_decides_by_scans_too(ready):
     assert infos["diagnostics"]["margin"][0] == info["diagnostics"]["margin"]
 
 
+def test_a_view_of_a_vector_that_tells_nothing_is_no_world_without_obstacles(ready):
+    vector = gymnasium.vector.SyncVectorEnv([lambda: Toy(CAR, discs())] * 2)
+    env = VectorSafetyWrapper(vector, ready, state=seen, obstacles=lambda *_: [], actions=normalised(CAR))
+    env.reset(seed=0)
+    with pytest.raises(Mismatch, match="0 of 2 environments: give a list for each"):
+        env.step(np.ones((2, 2), np.float32))
+
+
 def test_a_scan_that_does_not_come_is_not_a_world_without_obstacles(ready):
     env = SafetyWrapper(Walled(CAR), ready, state=seen, actions=normalised(CAR))
     env.reset(seed=0)

@@ -8,8 +8,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from messaging.range_images import RangeImage
 from messaging.scans import Scan
 from messaging.shapes import Shapes
+from safety.image_memory import ImageMemory
 from safety.memory import FanMemory
 from safety.scan import gaps
 from tests.safety.test_scan import FAN, FAR, WIDTH, cast, scene
@@ -85,6 +87,29 @@ def test_where_no_scan_comes_the_last_one_goes_on_so_much_older():
         memory.fill(None, 0.2)
     blind = replace(_open(0.0, rng, speed=1.2), ranges=np.zeros(len(FAN)))
     assert not memory.fill(blind, 0.2).known.any(), "what may walk took it all back meanwhile"
+
+
+def test_the_room_where_it_was_put_is_as_old_as_that():
+    """However late the first scan comes: somebody may have walked in meanwhile."""
+    blind = replace(_open(0.0, np.random.default_rng(0), speed=1.2), ranges=np.zeros(len(FAN)))
+    memory = FanMemory(0.105)
+    assert memory.fill(blind, 0.2).known.any(), "at once"
+    memory.reset()
+    for _ in range(3):
+        memory.fill(None, 0.2)
+    assert not memory.fill(blind, 0.2).known.any()
+
+
+@pytest.mark.parametrize("memory", [FanMemory(0.105), ImageMemory(0.3)])
+def test_who_fills_his_array_again_does_not_change_what_was_seen(memory):
+    beams = np.full(36, 0.5) if isinstance(memory, FanMemory) else np.full((30, 60), 0.5)
+    angles = np.linspace(-math.pi, math.pi, 36, endpoint=False)
+    memory.fill(Scan(beams, angles, (0.0, 0.0, 0.0)) if beams.ndim == 1 else RangeImage(beams, (0.0, 0.0, 0.0)), 0.2)
+    beams[:] = 3.0
+    angles += 1.0
+    last = memory.fill(None, 0.2)
+    assert (last.ranges == 0.5).all()
+    assert beams.ndim == 2 or last.angles[0] == -math.pi
 
 
 def _open(x, rng, speed=0.0):

@@ -8,11 +8,13 @@ import pytest
 
 from deploy.data.episodes import collect
 from messaging.descriptions import robot_of
+from messaging.robots import Disc
 from messaging.scans import Scan
 from messaging.shapes import Obstacle, Shapes
 from safety.commitment import Commitment
 from safety.filter import Filter
 from safety.fitting import make
+from safety.inprocess import InProcess
 from safety.model_set import Recipe
 from safety.recovery import least_violating, lower, slow_inputs
 from safety.request import RECOVERING
@@ -140,6 +142,43 @@ def test_by_a_scan_too_who_was_put_too_close_gets_away(ready, angle):
     assert kinds[0] == RECOVERING
     assert min(gaps) >= gaps[0] - 0.003 and gaps[-1] > BODY
     assert kinds[-1] != RECOVERING and "allowed" in kinds
+
+
+@pytest.fixture(scope="module")
+def long_filter(data):
+    """A body of five discs, half a metre long."""
+    body = tuple(Disc((x, 0.0), 0.08) for x in (-0.25, -0.12, 0.0, 0.12, 0.25))
+    return Filter(make(replace(data, robot=replace(data.robot, body=body)), Recipe("residual", "direct")))
+
+
+@pytest.mark.parametrize("wall", [0.09, 0.1, 0.12])
+@pytest.mark.parametrize("errors", [{}, {"position_error": 0.03, "heading_error": 0.05}])
+def test_a_long_body_beside_a_wall_does_not_swing_its_rear_into_it(long_filter, wall, errors):
+    robot, safety = Unicycle((0.0, 0.0, 0.0), np.random.default_rng(0), noise=0.0), InProcess(long_filter)
+    for _ in range(12):
+        state = robot.measure()
+        up = np.sin(TURN + state[2])
+        to = np.where(up > 1e-9, (wall - state[1]) / np.maximum(up, 1e-9), 3.5)
+        scan = Scan(np.clip(to, 0.02, 3.5), TURN, tuple(state[:3]), range_error=0.02, **errors)
+        safety.decide(state, [0.1, 0.0], [], scan=scan)
+        robot.step(safety.commitment.due)
+        nearest = robot.state[1] + 0.25 * abs(math.sin(robot.state[2])) + 0.08
+        assert nearest < wall - 0.002
+
+
+def test_away_is_from_the_nearest_of_map_and_scan(ready):
+    """A wall 6 cm to the left that the scan shows; farther off on the other side a post of the map."""
+    robot, safety = Unicycle((0.0, 0.0, 0.0), np.random.default_rng(0), noise=0.0), InProcess(ready)
+    wall, kinds = BODY + 0.06 - 0.075, []
+    for _ in range(60):
+        state = robot.measure()
+        up = np.sin(TURN + state[2])
+        to = np.where(up > 1e-9, (wall - state[1]) / np.maximum(up, 1e-9), 3.5)
+        scan = Scan(np.clip(to, 0.02, 3.5), TURN, tuple(state[:3]), range_error=0.02)
+        post = Obstacle("cylinder", (-0.3, -0.1), (0.08,))
+        kinds.append(safety.decide(state, [0.25, 0.0], [post], scan=scan).kind)
+        robot.step(safety.commitment.due)
+    assert kinds[0] == RECOVERING and kinds[-1] != RECOVERING
 
 
 def ranges_to(pillar, radius, pose):

@@ -3,12 +3,13 @@
 import itertools
 import subprocess
 import sys
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
 import pytest
 
-from deploy.data import paths, recording, store
+from deploy.data import collect, paths, recording, store
 from deploy.data.excite import excitation
 from deploy.data.logged import from_log, trajectories_of
 from deploy.data.making import LOCK
@@ -96,6 +97,25 @@ def test_of_two_that_find_nothing_one_records_and_the_other_waits_for_it(tmp_pat
     assert sorted(text.count("recording ground once") for text in said) == [0, 1], said
     assert sorted(text.count("waiting for it") for text in said) == [0, 1], said
     assert not list((tmp_path / "data").rglob("*.new"))
+
+
+def test_what_is_imported_meanwhile_is_not_recorded_over(elsewhere, monkeypatch):
+    data = recording.recorded(GROUND, trajectories=1)
+    driven = replace(data, about={"origin": "a log", "source": "drive.csv"})
+    path, record = paths.record_path(GROUND), collect.record
+
+    def interrupted(*how):
+        driven.save(path)
+        yield from record(*how)
+
+    monkeypatch.setattr(collect, "record", interrupted)
+    for again in (True, False):
+        path.unlink()
+        with pytest.raises(BadData, match="is kept"):
+            recording.recorded(GROUND, trajectories=1, again=again)
+        assert Dataset.about_of(path)["source"] == "drive.csv"
+    with pytest.raises(BadData, match="is kept"):
+        recording.recorded(GROUND, trajectories=1, again=True)
 
 
 def steps(actor: str, episode: int, numbers, run: int = 1) -> list[pb.Step]:
