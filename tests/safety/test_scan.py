@@ -180,6 +180,8 @@ def test_what_may_move_takes_room_with_time():
         {"least_width": 0.0},
         {"speed": -1.0},
         {"age": math.inf},
+        {"doubt": 1.5},
+        {"ranges": np.full(360, 1200, np.uint16)},
     ],
 )
 def test_a_scan_that_is_none_is_refused(wrong):
