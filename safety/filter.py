@@ -20,7 +20,7 @@ from safety.inputs import Inputs
 from safety.model_set import ModelSet
 from safety.program import SHARPEN, Builder, Rows
 from safety.promise import Promise
-from safety.recovery import SLOW, least_violating, slow_inputs, turn_towards
+from safety.recovery import SLOW, harmless, least_violating, slow_inputs, turn_towards
 from safety.request import (
     ADJUSTED,
     ALLOWED,
@@ -274,8 +274,8 @@ class Filter:
             # Turning leaves a disc in the middle where it is, but swings one aside: never nearer to anything.
             aside = np.repeat([disc.aside for disc in self.around.discs], [len(of.normals) * each for of in planes])
             swung = np.flatnonzero(aside)
-            after = standing[swung] + rows.gradient[swung] @ (z - stand)
-            if (after > np.maximum(standing[swung], 0.0) + 1e-9).any():
+            turned = standing[swung] + rows.gradient[swung] @ (z - stand)
+            if not harmless(turned[None], standing[swung])[0]:
                 return None
         else:
             return None

@@ -42,14 +42,18 @@ def least_violating(violated: Array, standing: Array, ends: NDArray[np.bool_]) -
     ends (R,): those at the plan's end.
     """
     now = np.sort(np.maximum(standing[ends], 0.0))[::-1][:COMPARED]
-    harmless = (violated <= np.maximum(standing, 0.0) + 1e-9).all(axis=1)
     worst = -np.sort(-np.maximum(violated[:, ends], 0.0), axis=1)[:, :COMPARED]
     best: int | None = None
-    for c in np.flatnonzero(harmless):
+    for c in np.flatnonzero(harmless(violated, standing)):
         than = now if best is None else worst[best]
         if lower(worst[c], than):
             best = int(c)
     return best
+
+
+def harmless(violated: Array, standing: Array) -> NDArray[np.bool_]:
+    """(C,): of which candidates is no half-space violated (C, R) by more than standing (R,) violates it?"""
+    return np.asarray((violated <= np.maximum(standing, 0.0) + 1e-9).all(axis=1))
 
 
 def lower(one: Array, other: Array) -> bool:

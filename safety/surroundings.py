@@ -87,10 +87,11 @@ class Scene:
     @property
     def away(self) -> Array | None:
         """A direction (d,), world, off what is nearest to the start; None: nothing is of which that can be told."""
-        ways = [way_from(self.near, self.start)] if len(self.near) else []
+        ways = [way_from(self.near, self.start)[None]] if len(self.near) else []
         if isinstance(self.unseen, seen.Cells):
-            ways.extend(self.start - self.unseen.corners.reshape(-1, len(self.start)))
-        return min(ways, key=np.linalg.norm, default=None)
+            ways.append(self.start - self.unseen.corners.reshape(-1, len(self.start)))
+        each = np.concatenate(ways or [np.zeros((0, len(self.start)))])
+        return each[np.argmin(np.einsum("nd,nd->n", each, each))] if len(each) else None
 
     @property
     def empty(self) -> bool:

@@ -74,7 +74,7 @@ def _record(robot: Robot, path: Path, trajectories: int, seed: int, conditions: 
             console.print(f"[yellow]kept {len(driven)} of {trajectories} trajectories[/]: the same command goes on")
         raise
     data = collect.dataset(robot, driven, seed, conditions)
-    _spare(path, robot)  # what was imported meanwhile
+    _spare(path, robot)  # what was put there meanwhile
     data.save(path)
     part.unlink(missing_ok=True)
     return data
