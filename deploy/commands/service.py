@@ -67,8 +67,8 @@ class Query:
     obstacle: str = ""
     """What is near, separated by commas, e.g. "cylinder 0.4 0 0.1, wall 1 0 3.14"."""
     scan: Path | None = None
-    """What was seen, beside it: JSON, {"ranges": [...], "angles": [...], "pose": [0, 0, 0], ...}, the fields of a Scan
-    (in the air of a RangeImage: docs/perception.md). What it does not show to be free is occupied."""
+    """What was seen, beside it: a JSON file, {"ranges": [...], "angles": [...], "pose": [0, 0, 0], ...}, with the
+    fields of a Scan, in the air of a RangeImage (docs/perception.md). What it does not show to be free is occupied."""
     timeout: float = 1.0
     json: bool = False
 
