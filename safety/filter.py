@@ -72,8 +72,9 @@ class _Found:
 class Filter:
     """A model set made ready for decisions."""
 
-    def __init__(self, model: ModelSet, comfort: float | None = None) -> None:
-        """`comfort` [m]: what is kept to obstacles beyond the tube; as wide as it needs be, unless given."""
+    def __init__(self, model: ModelSet, clearance_margin: float | None = None) -> None:
+        """clearance_margin [m]: the distance from the tube to obstacles that the QP keeps; by default as wide as
+        turning in place needs."""
         self.model = model
         self.version = model.version
         self.robot = robot = model.robot
@@ -81,7 +82,7 @@ class Filter:
         self.builder = Builder(robot, outer)
         spread = OUTSIDE_DOMAIN * (model.domain[1] - model.domain[0])
         self.domain = np.stack([model.domain[0] - spread, model.domain[1] + spread])
-        self.around = Surroundings(model, self.tube, outer, self.domain, comfort)
+        self.around = Surroundings(model, self.tube, outer, self.domain, clearance_margin)
         self.inputs = Inputs(robot)
         self.ordinary = Ordinary(robot)
         first, n, whole = model.first, robot.state_dim, np.ascontiguousarray
@@ -93,7 +94,7 @@ class Filter:
         driven = np.tile(robot.translates, robot.free_steps)
         self.translating = np.concatenate([np.zeros(robot.regressor_dim), driven])
         self.regressor = np.array(robot.regressor, dtype=np.intp)
-        self.comfort, self.reach = self.around.comfort, self.around.reach  # m
+        self.clearance_margin, self.reach = self.around.clearance_margin, self.around.reach  # m
 
     def half_width(self, speed: Array) -> float:
         """[m] of the full stop's set, largest axis, from driving at inputs `speed` (m,) with that input once more."""
@@ -147,17 +148,17 @@ class Filter:
         planes = self.around.planes(scene, z)
         slack = self.around.slack(scene, z, planes)
         margin = self.around.least(slack, z)
-        if margin >= max(self.comfort, 0.0):
+        if margin >= max(self.clearance_margin, 0.0):
             return _Found(ALLOWED, self.inputs.plan(z), z, margin, True)
         rows = self.around.rows(scene, z, planes)
-        if self.around.least(slack - self.comfort * rows.keep, z, self.comfort) >= 0.0:
+        if self.around.least(slack - self.clearance_margin * rows.keep, z, self.clearance_margin) >= 0.0:
             return _Found(ALLOWED, self.inputs.plan(z), z, margin, True)
-        kept = self._comfortable(rows, z_0, proposal)
+        kept = self._with_clearance_margin(rows, z_0, proposal)
         if margin >= 0.0 and self.around.margin(kept, z) >= 0.0:
             return _Found(ALLOWED, self.inputs.plan(z), z, margin, True)
         attempt.reason = f"the proposal's tube comes within {margin:.3g} m of the free space's edge"
         attempt.stopped = self.around.worst_of(scene, z, slack, planes)
-        # Keeping the comfort margin, or at least not driving into it; else free space alone: from here even standing
+        # Keeping the clearance margin, or at least not driving into it; else free space alone: from here even standing
         # still would not do.
         for choice in (kept, rows):
             if not np.isfinite(choice.bound).all():
@@ -184,15 +185,15 @@ class Filter:
         free = self.inputs.within(self.builder.inputs(solution.x), z_0[-self.robot.action_dim :])
         return np.concatenate([z_0, free])
 
-    def _comfortable(self, rows: Rows, z_0: Array, proposal: Array) -> Rows:
-        """Rows with the comfort margin. Where moving in place would not keep it, the tube may stay as near as the
+    def _with_clearance_margin(self, rows: Rows, z_0: Array, proposal: Array) -> Rows:
+        """Rows with the clearance margin. Where moving in place would not keep it, the tube may stay as near as the
         free space allows, but no input may translate the robot nearer (one that can't stop at once: not more than
         the strongest braking does): two rows instead of one."""
         in_place = self.inputs.limited(np.where(self.standing, proposal, self.inputs.nothing), z_0[-len(proposal) :])
         stay = self.inputs.regressors(z_0, in_place)
-        comfort = self.comfort * rows.keep
-        inside = rows.support(self.tube, stay) > rows.bound - comfort
-        bound = np.where(inside, rows.bound, rows.bound - comfort)
+        kept_off = self.clearance_margin * rows.keep
+        inside = rows.support(self.tube, stay) > rows.bound - kept_off
+        bound = np.where(inside, rows.bound, rows.bound - kept_off)
         if not inside.any():
             return Rows(rows.gradient, rows.spread, bound, rows.keep)
         closer = rows.gradient[inside] * self.translating
@@ -248,7 +249,9 @@ class Filter:
         parked = scene.parked
         seeming = 0.0
         if not on_a_way:  # who does not stay where it stands will be as near as it seems, before long
-            seeming = 2.0 * float(np.linalg.norm(self.around.measured)) + (self.comfort if self.around.stays else 0.0)
+            seeming = 2.0 * float(np.linalg.norm(self.around.measured)) + (
+                self.clearance_margin if self.around.stays else 0.0
+            )
         if self.around.margin_in(parked, stand) >= -seeming:
             return None
         planes = self.around.planes(scene, stand, leaving=True)

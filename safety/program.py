@@ -23,8 +23,8 @@ ROUNDING = 1e-12  # of a unit row of W: an atom that depends on the inputs no mo
 class Rows:
     """A half-space for every end of every period: support of the tube in its normal, `gradient z + spread m(z)`.
 
-    gradient (rows, nz); spread (rows, L+N+1) >= 0; bound (rows,). keep (rows,): what of the comfort margin a row keeps:
-    1 where it is about an obstacle, 0 where it is about a limit in other units.
+    gradient (rows, nz); spread (rows, L+N+1) >= 0; bound (rows,). keep (rows,): the factor of
+    the clearance margin in a row: 1 if the row is about an obstacle, 0 if it is about a limit in other units.
     """
 
     gradient: Array

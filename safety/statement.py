@@ -45,7 +45,7 @@ class Statement:
     bound_episode: float  # of any step in an episode of 300, from bound_step
     half_width_rest: float  # m, of a full stop, largest axis, position noise of the estimate not included
     half_width_full: float
-    comfort: float  # m, kept to obstacles while driving so that turning in place stays possible
+    clearance_margin: float  # m, kept to obstacles while driving so that turning in place stays possible
     excess: float  # the largest share of its set that any part of a held-out plan came to; above 1: it was outside
 
     def figures(self) -> dict[str, Any]:
@@ -96,7 +96,7 @@ def state(model: ModelSet, fitted: Dataset, held_out: Dataset) -> Statement:
         bound_episode=1.0 - (1.0 - bound_step) ** 300,
         half_width_rest=ready.half_width(np.zeros(robot.action_dim)),
         half_width_full=ready.half_width(full),
-        comfort=ready.comfort,
+        clearance_margin=ready.clearance_margin,
         excess=float(excess.max(initial=0.0)),
     )
 

@@ -101,9 +101,10 @@ class Scene:
 class Surroundings:
     """A robot's tube, ready to be held against scenes."""
 
-    def __init__(self, model: ModelSet, tube: Tube, outer: Tube, domain: Array, comfort: float | None) -> None:
+    def __init__(self, model: ModelSet, tube: Tube, outer: Tube, domain: Array, clearance_margin: float | None) -> None:
         """tube: the model's; `outer`: the same over-approximated with fewer atoms; domain (2, r): of the recorded
-        regressors; `comfort` [m]: what is kept to obstacles beyond the tube; as wide as it needs be, unless given."""
+        regressors; clearance_margin [m]: the distance from the tube to obstacles that the QP keeps; by default as
+        wide as turning in place needs."""
         robot = model.robot
         if robot.position_dim == 3:
             shades.prepare()
@@ -122,18 +123,18 @@ class Surroundings:
         self.measured = np.asarray(robot.measurement_bound[: robot.position_dim], dtype=float)
         self._unturned = np.eye(robot.position_dim)
         self.body = robot.footprint + float(np.linalg.norm(self.measured))  # m about where the center was measured
-        self.comfort = self._comfort() if comfort is None else comfort
+        self.clearance_margin = self._own_clearance_margin() if clearance_margin is None else clearance_margin
         farthest = max((float(np.linalg.norm(disc.at)) for disc in self.discs), default=0.0)
-        self._beside = self.measured + self.comfort + ASIDE + farthest  # of a plan's sets, which is looked at
+        self._beside = self.measured + self.clearance_margin + ASIDE + farthest  # of a plan's sets, which is looked at
         self.stays = self._stays()
         self.widest = self._widest(outer, domain)
-        wanted = self.widest + self.comfort
+        wanted = self.widest + self.clearance_margin
         self.reach = min(wanted, robot.sight)  # m from the measured position: an obstacle beyond it decides nothing
         self.far = wanted > robot.sight  # a tube may leave what can be seen: every candidate must be looked at
 
     # --- what is known before any request ---------------------------------------------------------------------
 
-    def _comfort(self) -> float:
+    def _own_clearance_margin(self) -> float:
         """[m]: as wide as the tube of moving in place ever gets, so that wherever the robot stopped it can still turn.
 
         Without it a robot may stop so close to an obstacle that no motion can be verified from there, for good.
@@ -246,9 +247,9 @@ class Surroundings:
         """The same, to those about the rollout of regressors z."""
         return self.least(self.slack(scene, z), z)
 
-    def least(self, slack: Array, z: Array, comfort: float = 0.0) -> float:
-        """The smallest slack, within ± the reach (less the comfort); NaN never counts as inside."""
-        most = self.reach - comfort
+    def least(self, slack: Array, z: Array, nearer: float = 0.0) -> float:
+        """The smallest slack, within ± the reach (less `nearer`); NaN never counts as inside."""
+        most = self.reach - nearer
         margin = holding.least(slack, most)
         if self.far:
             margin = min(margin, most - self.extent(z))

@@ -245,7 +245,7 @@ def table(rows: list[tuple[Statement, str]]) -> Stacking:
     shown = Stacking(title="what held-out plans say (bounds at 99 % confidence)")
     for column in (
         *("certificate", "mode", "driving", "samples", "rank", "condition", "plans", "violations"),
-        *("≤ per step", "≤ per plan", "stop from rest", "from full speed", "comfort"),
+        *("≤ per step", "≤ per plan", "stop from rest", "from full speed", "clearance margin"),
     ):
         shown.add_column(column, justify="left" if column in ("certificate", "mode", "driving") else "right")
     for s, windows in rows:
@@ -255,7 +255,7 @@ def table(rows: list[tuple[Statement, str]]) -> Stacking:
             windows,
             *(str(s.samples), str(s.rank), f"{s.condition:.0f}", str(s.windows), str(s.violations)),
             *(f"{s.bound_step:.3%}", f"{s.bound_plan:.3%}"),
-            *(width(value) for value in (s.half_width_rest, s.half_width_full, s.comfort)),
+            *(width(value) for value in (s.half_width_rest, s.half_width_full, s.clearance_margin)),
         )
     shown.caption = "* the default; half-widths: a full stop's set, largest axis"
     return shown

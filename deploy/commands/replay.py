@@ -51,7 +51,7 @@ class Replay:
     data: Path | None = None
     """What would have been decided with a model set from this data set (a file that `collect` wrote)?"""
     margin: float | None = None
-    """What would have been decided with this comfort margin, m, instead of the model set's own?"""
+    """What would have been decided with this clearance margin, m, instead of the model set's own?"""
     json: bool = False
 
     def run(self) -> int:

@@ -221,7 +221,7 @@ def said(**figures):
     """A statement with figures as a recursion that feeds on itself gives them."""
     plain = {"samples": 1000, "rank": 6, "smallest_singular": 1.0, "condition": 12.0, "windows": 300, "violations": 0}
     plain |= {"step_violations": 0, "bound_step": 0.01, "bound_plan": 0.02, "bound_episode": 0.9}
-    sizes = {"half_width_rest": 0.0012, "half_width_full": 149810.138, "comfort": 1.5}
+    sizes = {"half_width_rest": 0.0012, "half_width_full": 149810.138, "clearance_margin": 1.5}
     about = {"certificate": "matrix-zonotope", "mode": "recursion", "version": "a"}
     return Statement(**{**plain, **sizes, **about, "excess": 0.8, **figures})
 

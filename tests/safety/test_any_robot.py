@@ -102,9 +102,9 @@ def test_limits_hold_between_periods_and_in_the_stop(name):
     assert farthest > 0.6, "so is the room"
 
 
-def test_a_limit_is_kept_whatever_the_comfort_margin():
+def test_a_limit_is_kept_whatever_the_clearance_margin():
     """Less than none leaves it to obstacles what is kept to them, and says nothing of limits."""
-    ours = Filter(ready("boxed car").model, comfort=-0.05)
+    ours = Filter(ready("boxed car").model, clearance_margin=-0.05)
     rng, plan, kinds = np.random.default_rng(0), np.zeros((ours.robot.horizon, 2)), set()
     for _ in range(200):
         state = np.array([rng.uniform(0.55, 0.8), 0.0, rng.uniform(-0.3, 0.3), 0.2])

@@ -101,7 +101,7 @@ def test_adjusted_is_the_closest_input_that_can_be_verified(ready):
         z_0 = np.concatenate([ask.state[3:], ask.input_in_force])
         scene = ready.around.scene(ask, z_0, ready.builder.reachable(ask.input_in_force))
         rows = ready.around.rows(scene, np.concatenate([z_0, ready.inputs.limited(ask.action, ask.input_in_force)]))
-        kept = ready._comfortable(rows, z_0, ready.inputs.limited(ask.action, ask.input_in_force))
+        kept = ready._with_clearance_margin(rows, z_0, ready.inputs.limited(ask.action, ask.input_in_force))
         taken = np.linalg.norm((decision.action - ask.action) / width)
         best = np.inf
         for u in grid:
@@ -134,12 +134,12 @@ def test_every_plan_that_leaves_is_clear_and_ends_in_a_stop(models, kind):
     assert {ALLOWED, ADJUSTED} <= kinds
 
 
-def test_comfort_apart_a_proposal_is_only_changed_if_its_tube_does_not_fit(ready, model):
+def test_clearance_apart_a_proposal_is_only_changed_if_its_tube_does_not_fit(ready, model):
     """The price of half-spaces: with one obstacle there is none."""
     rng = np.random.default_rng(2)
     for _ in range(300):
         ask = random_request(rng, count=1)
-        roomy = fits(model, ask, ask.action) > ready.comfort + 0.02
+        roomy = fits(model, ask, ask.action) > ready.clearance_margin + 0.02
         if roomy:
             assert ready.decide(ask).kind == ALLOWED
 

@@ -58,7 +58,7 @@ def test_a_log_without_models_is_replayed_from_its_folder_or_not_at_all(
 def test_another_margin_decides_otherwise_and_it_is_told_by_how_much(
     log: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    margin = Filter(model_for(GROUND, Recipe())).comfort
+    margin = Filter(model_for(GROUND, Recipe())).clearance_margin
     status, figures = run(capsys, "replay", log, "--margin", margin + 0.05)
     assert status == 0, "it was asked for"
     assert figures["different"] > 0 and figures["instead"] == {"margin": margin + 0.05}
