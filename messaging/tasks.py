@@ -188,6 +188,18 @@ def task_of(robot: Robot) -> Task:
     return _tasks[robot.kind]
 
 
+def usual_task(robot: Robot) -> Task:
+    """Read the task that comes with the program for the robot of that name.
+
+    Raises:
+        UnknownTask: none comes with the program.
+    """
+    path = FOLDER / f"{robot.kind}.task.toml"
+    if not path.is_file():
+        raise UnknownTask(f"no task of {robot.kind} comes with the program (expected: {path})")
+    return read(path)
+
+
 def learnt(name: str) -> Robot:
     """`robot_named`, and from now on its task is the one that the name says: the file beside the description, if the
     name is a path; another than the usual one, if it has a `+`.

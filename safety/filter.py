@@ -72,6 +72,8 @@ class _Found:
 class Filter:
     """A model set made ready for decisions."""
 
+    observed = 0  # it reads no observation
+
     def __init__(self, model: ModelSet, clearance_margin: float | None = None) -> None:
         """clearance_margin [m]: the distance from the tube to obstacles that the QP keeps; by default as wide as
         turning in place needs."""

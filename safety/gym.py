@@ -22,7 +22,7 @@ from messaging.sensed import Sensed
 from safety.client import Answer, SafetyClient
 from safety.commitment import correction_penalty
 from safety.image_memory import filled, memory_of
-from safety.inprocess import InProcess, own
+from safety.inprocess import InProcess, sendable
 from safety.request import Decision
 from safety.spaces import Actions, actions_of, cast
 from safety.views import OBSTACLES, STATE, View
@@ -118,7 +118,7 @@ class SafetyWrapper(gymnasium.Wrapper[Any, Any, Any, Any]):
             return self.asker.decide(state, wanted, near, seen[0], self._scan), ""
         wanted = wanted if np.isfinite(wanted).all() else np.zeros(wanted.shape)
         try:
-            observed = own(seen[0], self.asker.robot).tolist()
+            observed = sendable(seen[0]).tolist()
             return self.asker.decide(state, wanted, near, scan=self._scan, observation=observed), ""
         except BusError as error:
             self.asker.fallback()

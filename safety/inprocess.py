@@ -17,9 +17,8 @@ from messaging.movers import parted
 from messaging.robots import Robot
 from messaging.sensed import Sensed
 from messaging.shapes import Obstacle
-from messaging.tasks import UnknownTask, task_of
 from safety.commitment import Commitment
-from safety.request import Decision, Request
+from safety.request import MOST_OBSERVED, Decision, Request
 
 if TYPE_CHECKING:
     from safety.methods import Method
@@ -94,6 +93,7 @@ class InProcess:
         measured = np.asarray(state, dtype=float)
         kept.measured(measured)
         wanted = np.asarray(action, dtype=float)
+        observed = sendable(observation)
         standing, moving = parted(list(obstacles), self.robot.position_dim)
         return Request(
             state=measured,
@@ -105,15 +105,18 @@ class InProcess:
             scan=scan,
             model=kept.model,
             predicted=kept.predicted,
-            observation=own(observation, self.robot),
+            observation=observed if observed.size == self.method.observed else np.zeros(0, np.float32),
         )
 
 
-def own(observation: object, robot: Robot) -> NDArray[np.float32]:
-    """The observation, if it is the robot's own: another environment has none that a method could read."""
-    try:
-        wanted = task_of(robot).observation_dim
-    except UnknownTask:  # then no method reads it
-        wanted = 0
-    fits = isinstance(observation, np.ndarray) and observation.shape == (wanted,)
-    return np.asarray(observation if fits else np.zeros(0), np.float32)
+def sendable(observation: object) -> NDArray[np.float32]:
+    """Return the observation as a request holds it: a list of finite numbers, or an empty one.
+
+    Only the rivals read observations. Another environment may observe an image or a dict: a request holds none of it.
+    """
+    empty = np.zeros(0, np.float32)
+    if not isinstance(observation, np.ndarray) or observation.ndim != 1 or observation.dtype.kind not in "fiu":
+        return empty
+    if observation.size > MOST_OBSERVED or not np.isfinite(observation).all():
+        return empty
+    return observation.astype(np.float32)

@@ -32,6 +32,10 @@ class Method(Protocol):
     def version(self) -> str:
         """Of the model: its hash."""
 
+    @property
+    def observed(self) -> int:
+        """The number of values in the observation that it reads; 0: it reads none."""
+
     def decide(self, request: Request) -> Decision:
         """Raises BadRequest."""
 

@@ -15,7 +15,6 @@ from messaging.robots import Robot
 from messaging.scans import Scan
 from messaging.sensed import Sensed
 from messaging.shapes import FARTHEST, Shapes
-from messaging.tasks import UnknownTask, task_of
 from safety.commitment import Prediction
 from safety.explain import Stopped
 from safety.promise import Promise, Promises
@@ -118,8 +117,9 @@ def check_for_filter(robot: Robot, request: Request) -> None:
     """
     predicted = request.predicted
     further: Named = {"plan": (request.plan, (robot.horizon, robot.action_dim))}
-    if request.observation.size:
-        further["observation"] = request.observation, (_observed(robot, request),)
+    if request.observation.size > MOST_OBSERVED:
+        raise BadRequest("observation", f"an observation has at most {MOST_OBSERVED} numbers")
+    further["observation"] = request.observation, (request.observation.size,)
     if predicted is not None:
         further["predicted_center"] = predicted.center, (robot.state_dim,)
         further["predicted_half_width"] = predicted.half_width, (robot.state_dim,)
@@ -164,7 +164,6 @@ class Ordinary:
         self.high = np.concatenate([*fixed, robot.bounds[1], high.ravel()])
         self.predicted_low = np.concatenate([self.low, [-most], np.full(n, -most), np.zeros(n)])
         self.predicted_high = np.concatenate([self.high, np.full(2 * n + 1, most)])
-        self.robot = robot
 
     def __call__(self, request: Request) -> bool:
         """False: `check_for_filter` may find something in them, and says what."""
@@ -173,10 +172,10 @@ class Ordinary:
         sized = request.state.shape == (n,) and inputs[0].shape == inputs[1].shape == (m,)
         if not (sized and request.plan.shape == planned):
             return False
-        if observed.size:
+        if observed.shape != (0,):
             # A product that is no number, or infinite, is of an observation in which one is, or which is very large.
-            as_expected = observed.shape == (_observation_dim(self.robot),)
-            if not (as_expected and math.isfinite(np.dot(observed, observed))):
+            bounded = observed.ndim == 1 and observed.size <= MOST_OBSERVED
+            if not (bounded and math.isfinite(np.dot(observed, observed))):
                 return False
         predicted = request.predicted
         if predicted is None:
@@ -190,33 +189,13 @@ class Ordinary:
         return bool(((told >= low) & (told <= high)).all())
 
 
-def check_for_rival(robot: Robot, request: Request) -> None:
-    """The fields that the rivals read.
+def check_for_rival(robot: Robot, request: Request, observed: int) -> None:
+    """Check the fields that the rivals read; `observed` is the number of values that the rival's networks observe.
 
     Raises:
         BadRequest: a value is missing, not finite or of the wrong size, with the field's name.
     """
-    _check_motion(robot, request, {"observation": (request.observation, (task_of(robot).observation_dim,))})
-
-
-def _observation_dim(robot: Robot) -> int | None:
-    """So many numbers an observation has; None: no task is known here."""
-    try:
-        return task_of(robot).observation_dim
-    except UnknownTask:
-        return None
-
-
-def _observed(robot: Robot, request: Request) -> int:
-    """So many numbers an observation has; where no task is known here, as many as there are, within reason.
-
-    Raises:
-        BadRequest: more than that.
-    """
-    expected = _observation_dim(robot)
-    if expected is None and request.observation.size > MOST_OBSERVED:
-        raise BadRequest("observation", f"an observation has at most {MOST_OBSERVED} numbers")
-    return request.observation.size if expected is None else expected
+    _check_motion(robot, request, {"observation": (request.observation, (observed,))})
 
 
 def _check_motion(robot: Robot, request: Request, further: Named) -> None:

@@ -81,7 +81,7 @@ def pretrain(robot: Robot, recipe: Recipe, each: Each = lambda: None) -> Pretrai
         "seed": str(recipe.seed),
         "seconds": f"{time.perf_counter() - started:.0f}",
     }
-    return Pretrained(robot, method, networks, settings, about)
+    return Pretrained(robot, method, networks, settings, about, task_of(robot).rays if method == SECAS else None)
 
 
 def _secas(robot: Robot, recipe: SecasRecipe, each: Each) -> Made:

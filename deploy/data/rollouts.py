@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from deploy.vehicles import environment
 from messaging.robots import Robot
+from messaging.tasks import task_of
 from safety.backup import brake
 from safety.rivals.sailr import normalised
 from safety.rivals.secas import Constraints
@@ -83,7 +84,7 @@ def transitions(
     """`samples` steps of random inputs, each held for some periods (Dalal et al. 2018, section 5.1)."""
     drive = _Drive(environment(robot, arena, APART + seed))
     policy = scripted("random", robot, np.random.default_rng((seed, 1)))
-    constraints = Constraints(robot)
+    constraints = Constraints(robot, task_of(robot).rays)
     rows: list[tuple[Any, Array, Array]] = []
     while len(rows) < samples:
         drive.ready()

@@ -17,22 +17,29 @@ import numpy as np
 
 from messaging.files import write_whole
 from messaging.perceptrons import BadPerceptrons, Perceptrons
+from messaging.rays import Rays
 from messaging.robots import Robot, UnknownRobot, robot_named
 from safety.model_set import BadModel
 from safety.tensors import pack, unpack
 
 ENTRY = "pretrained"
+RAYS = "rays"  # the name of the tensor with the directions
 
 
 @dataclass(frozen=True)
 class Pretrained:
-    """networks by name; settings: numbers that a decision depends on; about: where it comes from, in words."""
+    """What a rival needs for decisions.
+
+    networks: by name. settings: the numbers that a decision depends on. about: the origin, in words. rays: of the lidar
+    whose ranges come first in an observation, where the method reads them.
+    """
 
     robot: Robot
     method: str
     networks: Mapping[str, Perceptrons]
     settings: Mapping[str, float]
     about: dict[str, str] = field(default_factory=dict)
+    rays: Rays | None = None
 
     @property
     def version(self) -> str:
@@ -44,7 +51,8 @@ class Pretrained:
         return digest.hexdigest()[:12]
 
     def _tensors(self) -> dict[str, Any]:
-        return {key: t for name, network in self.networks.items() for key, t in network.tensors(name).items()}
+        tensors = {key: t for name, network in self.networks.items() for key, t in network.tensors(name).items()}
+        return tensors if self.rays is None else tensors | {RAYS: self.rays.directions}
 
     def encode(self) -> bytes:
         about = {
@@ -56,6 +64,8 @@ class Pretrained:
             "about": self.about,
             "version": self.version,
         }
+        if self.rays is not None:
+            about["range"] = self.rays.range
         return pack(self._tensors(), ENTRY, about)
 
     def save(self, path: Path) -> None:
@@ -72,7 +82,8 @@ class Pretrained:
             robot = robot_named(about["robot"])
             networks = {str(name): Perceptrons.of(tensors, name) for name in about["networks"]}
             settings = {str(name): float(value) for name, value in about["settings"].items()}
-            model = Pretrained(robot, str(about["method"]), networks, settings, dict(about["about"]))
+            rays = _rays(tensors, about)
+            model = Pretrained(robot, str(about["method"]), networks, settings, dict(about["about"]), rays)
         except (KeyError, TypeError, ValueError, UnknownRobot, BadPerceptrons) as error:
             raise BadModel(f"no pretrained model: {error!r}") from error
         if not robot.understands(about.get("layout")):
@@ -82,3 +93,14 @@ class Pretrained:
         if model.version != about.get("version"):
             raise BadModel("the model's content is not what its version says")
         return model
+
+
+def _rays(tensors: Mapping[str, Any], about: Mapping[str, Any]) -> Rays | None:
+    """Return the rays that the file holds, or None. Raises ValueError if they are not unit vectors with a range."""
+    if RAYS not in tensors:
+        return None
+    directions, reach = tensors[RAYS], float(about["range"])
+    unit = directions.ndim == 2 and directions.dtype == np.float64 and len(directions) > 0
+    if not unit or not np.allclose(np.linalg.norm(directions, axis=1), 1.0) or not 0.0 < reach < np.inf:
+        raise ValueError("the rays are not unit vectors with a finite range")
+    return Rays(directions, reach)

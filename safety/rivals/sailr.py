@@ -18,7 +18,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from messaging.robots import Robot
-from messaging.tasks import task_of
 from safety.backup import brake, braking_plan, within
 from safety.commitment import NO_PREDICTION
 from safety.model_set import BadModel
@@ -48,9 +47,9 @@ class Sailr:
             self.q, self.v, self.threshold = model.networks["q"], model.networks["v"], model.settings["threshold"]
         except KeyError as error:
             raise BadModel(f"no model of SAILR: {error} is missing") from error
-        seen = task_of(self.robot).observation_dim
+        self.observed = self.v.inputs  # the size of an observation
         found = (self.q.inputs, self.q.outputs, self.v.inputs, self.v.outputs)
-        if model.method != SAILR or found != (seen + self.robot.action_dim, 1, seen, 1):
+        if model.method != SAILR or found != (self.observed + self.robot.action_dim, 1, self.observed, 1):
             raise BadModel(f"no model of SAILR for {self.robot.name}: {model.method}, networks {found}")
 
     def advantage(self, observation: NDArray[np.float32], action: Array) -> float:
@@ -67,7 +66,7 @@ class Sailr:
         """
         started = perf_counter_ns()
         robot = self.robot
-        check_for_rival(robot, request)
+        check_for_rival(robot, request, self.observed)
         proposal = within(robot, request.action, request.input_in_force)
         advantage = self.advantage(request.observation, proposal)
         intervene = advantage > self.threshold

@@ -18,8 +18,9 @@ from time import perf_counter_ns
 import numpy as np
 from numpy.typing import NDArray
 
+from messaging.rays import Rays
 from messaging.robots import Robot
-from messaging.tasks import task_of
+from messaging.tasks import UnknownTask, usual_task
 from safety.backup import braking_plan, within
 from safety.commitment import NO_PREDICTION
 from safety.model_set import BadModel
@@ -49,8 +50,7 @@ class Constraints:
     nothing about the input, and would drown what is near in the fit.
     """
 
-    def __init__(self, robot: Robot) -> None:
-        rays = task_of(robot).rays
+    def __init__(self, robot: Robot, rays: Rays) -> None:
         self.robot, self.directions, self.range = robot, rays.directions, rays.range
         self.stopping = robot.period * (0.5 * robot.brake_steps + LAG)  # s
         fastest = float(np.linalg.norm(np.where(robot.translates, robot.high(), 0.0)))
@@ -119,14 +119,19 @@ class Secas:
             BadModel: not of this method, or its networks do not fit the robot.
         """
         self.model, self.robot, self.version = model, model.robot, model.version
-        self.constraints = Constraints(model.robot)
+        try:
+            rays = model.rays or usual_task(self.robot).rays  # older files do not hold the rays
+        except UnknownTask as error:
+            raise BadModel(f"no model of SECAS for {self.robot.name}: {error}") from error
+        self.constraints = Constraints(model.robot, rays)
         try:
             self.g, clearance = model.networks["g"], model.settings["clearance"]
         except KeyError as error:
             raise BadModel(f"no model of SECAS: {error} is missing") from error
-        found = (self.g.count, self.g.inputs, self.g.outputs)
-        wanted = (self.constraints.count, task_of(self.robot).observation_dim, self.robot.action_dim)
-        if model.method != SECAS or found != wanted:
+        self.observed = self.g.inputs  # the size of an observation
+        sized = (self.g.count, self.g.outputs) == (self.constraints.count, self.robot.action_dim)
+        if model.method != SECAS or not sized or self.observed < len(rays.directions):
+            found = self.g.count, self.g.inputs, self.g.outputs
             raise BadModel(f"no model of SECAS for {self.robot.name}: {model.method}, networks {found}")
         self.bound = -clearance
         self.scale = self.robot.high()
@@ -139,7 +144,7 @@ class Secas:
         """
         started = perf_counter_ns()
         robot = self.robot
-        check_for_rival(robot, request)
+        check_for_rival(robot, request, self.observed)
         proposal = within(robot, request.action, request.input_in_force)
         c = self.constraints(request.observation, request.state)
         G, d = np.asarray(self.g(request.observation), float), self.bound - c

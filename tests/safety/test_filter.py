@@ -10,7 +10,7 @@ from safety.certificates import KINDS, Certificate
 from safety.commitment import Prediction, correction_penalty
 from safety.filter import Filter
 from safety.model_set import ModelSet, Recipe
-from safety.request import ADJUSTED, ALLOWED, FAILSAFE, BadRequest
+from safety.request import ADJUSTED, ALLOWED, FAILSAFE, MOST_OBSERVED, BadRequest
 from tests.robots import GROUND, QUADROTOR
 from tests.safety.asked import cylinder, fits, random_request, request, same
 from tests.safety.unicycle import FIX, Unicycle
@@ -206,7 +206,7 @@ NAN, INF = float("nan"), float("inf")
         ("plan", np.array([[0.1, 0], [0.1, 0], [0.1, 0]])),
         ("obstacles", Shapes.of([Obstacle("sphere", (0, 0, 0), (1,))], 3)),
         ("observation", np.full(26, NAN, np.float32)),
-        ("observation", np.zeros(7, np.float32)),
+        ("observation", np.zeros(MOST_OBSERVED + 1, np.float32)),
     ],
 )
 def test_bad_requests_are_refused_by_the_field(ready, field, value):

@@ -9,14 +9,12 @@ from hypothesis import strategies as st
 
 from messaging.robots import robot_named
 from messaging.shapes import FARTHEST, Shapes
-from messaging.tasks import task_of
 from safety.commitment import Prediction
-from safety.request import BadRequest, Ordinary, Request, check_for_filter
+from safety.request import MOST_OBSERVED, BadRequest, Ordinary, Request, check_for_filter
 from tests.safety.asked import cylinder, request, same
 from tests.safety.toys import car
 
-FEW_INPUTS = car("cart")  # holds its steering, and no task of it is known
-ROBOTS = robot_named("ground"), robot_named("quadrotor"), FEW_INPUTS
+ROBOTS = robot_named("ground"), robot_named("quadrotor"), car("cart")  # the cart holds its steering
 FIELDS = "state", "action", "input_in_force", "plan", "observation", "center", "half_width", "heading"
 ODD = np.nan, np.inf, -np.inf, -1.0, 1e-9, 0.99e-9, 0.5, 1e30, 2.0 * FARTHEST, 1e200
 
@@ -29,7 +27,6 @@ def usual(robot, seed, predicted):
     plan[-1, robot.stopping] = 0.0
     n = robot.state_dim
     sets = Prediction(rng.normal(size=n), rng.random(n), 0.3) if predicted else None
-    observed = 7 if robot is FEW_INPUTS else task_of(robot).observation_dim
     return Request(
         state=rng.normal(size=n),
         action=3.0 * rng.normal(size=robot.action_dim),
@@ -37,7 +34,7 @@ def usual(robot, seed, predicted):
         plan=plan,
         obstacles=Shapes.of([], robot.position_dim),
         predicted=sets,
-        observation=rng.normal(size=observed).astype(np.float32) if rng.random() < 0.5 else np.zeros(0, np.float32),
+        observation=rng.normal(size=26).astype(np.float32) if rng.random() < 0.5 else np.zeros(0, np.float32),
     )
 
 
@@ -66,7 +63,7 @@ def lets_pass(robot, request):
 def test_what_passes_at_once_passes_field_by_field(robot, seed, predicted, field, odd, at):
     ordinary, sound = Ordinary(robot), usual(robot, seed, predicted)
     assert lets_pass(robot, sound)
-    assert ordinary(sound) or (robot is FEW_INPUTS and sound.observation.size)
+    assert ordinary(sound)
 
     def put(values):
         if field == "heading":
@@ -81,14 +78,24 @@ def test_what_passes_at_once_passes_field_by_field(robot, seed, predicted, field
     assert lets_pass(robot, asked) or not ordinary(asked)
 
 
-@pytest.mark.parametrize("field", FIELDS[:-1])
+@pytest.mark.parametrize("field", [field for field in FIELDS[:-1] if field != "observation"])
 @pytest.mark.parametrize("change", [lambda v: v[:-1], lambda v: np.append(v, 0.0), lambda v: v[None]])
 def test_what_has_another_size_does_not_pass_at_once(field, change):
     robot = robot_named("ground")
     sound = usual(robot, 1, True)
-    sound = replace(sound, observation=np.zeros(task_of(robot).observation_dim, np.float32))
     assert Ordinary(robot)(sound)
     assert not Ordinary(robot)(with_(sound, field, change))
+
+
+@pytest.mark.parametrize("observed", [np.zeros((1, 26)), np.zeros(MOST_OBSERVED + 1), np.float32(0.0)])
+def test_the_filter_refuses_an_observation_that_is_no_list_of_bounded_size(observed):
+    robot = robot_named("ground")
+    sound = usual(robot, 1, True)
+    for size in (0, 1, MOST_OBSERVED):
+        asked = replace(sound, observation=np.zeros(size, np.float32))
+        assert Ordinary(robot)(asked) and lets_pass(robot, asked)
+    asked = replace(sound, observation=observed)
+    assert not Ordinary(robot)(asked) and not lets_pass(robot, asked)
 
 
 def test_arrays_of_any_type_and_layout_are_decided_on_as_usual(ready):

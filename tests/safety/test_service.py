@@ -108,7 +108,7 @@ def with_obstacle(**changes):
         ("plan", bad(plan=[NAN] * 6)),
         ("plan", bad(plan=[9.0, 0, 0, 0, 0, 0])),
         ("plan", bad(plan=[0.1, 0, 0.1, 0, 0.1, 0])),
-        ("observation", bad(observation=[0.0] * 3)),
+        ("observation", bad(observation=[NAN] * 3)),
         ("predicted_center", bad(predicted_center=[0.0] * 2, predicted_half_width=[0.0] * 2)),
         ("predicted_half_width", bad(predicted_center=[0.0] * 5)),
         ("predicted_half_width", bad(predicted_center=[0.0] * 5, predicted_half_width=[NAN] * 5)),

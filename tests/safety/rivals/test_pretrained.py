@@ -27,6 +27,10 @@ def test_a_saved_model_is_read_back(pretrained, tmp_path):
     assert (found.version, found.about, found.settings) == (pretrained.version, {"samples": "7"}, pretrained.settings)
     assert type(ready(found)) is {"secas": Secas, "sailr": Sailr}[pretrained.method]
     assert ready(found).version == pretrained.version
+    assert (found.rays is None) == (pretrained.rays is None)
+    if pretrained.rays is not None:
+        assert np.array_equal(found.rays.directions, pretrained.rays.directions)
+        assert found.rays.range == pretrained.rays.range
 
 
 def test_the_version_is_of_all_that_decisions_depend_on(pretrained):

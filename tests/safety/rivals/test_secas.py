@@ -1,5 +1,7 @@
 """SECAS alone: the closed form against the QP, and what a decision makes of known constraints."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -7,6 +9,7 @@ from hypothesis import strategies as st
 
 from messaging import brakeline_pb2 as pb
 from messaging.perceptrons import Perceptrons
+from messaging.rays import fan
 from messaging.shapes import Shapes
 from messaging.tasks import task_of
 from safety.client import accept, read, request_message
@@ -83,9 +86,10 @@ REACT = np.array([0.06, 0.0])  # m that a sector comes nearer at full speed
 
 def known(g=REACT, robot=GROUND, **settings) -> Pretrained:
     """g_i is the same everywhere."""
-    count, m = Constraints(robot).count, robot.action_dim
+    count, m = Constraints(robot, task_of(robot).rays).count, robot.action_dim
     layers = [(np.zeros((count, m, task_of(robot).observation_dim), np.float32), np.tile(np.float32(g), (count, 1)))]
-    return Pretrained(robot, "secas", {"g": Perceptrons(layers)}, {"clearance": CLEARANCE} | settings)
+    settings = {"clearance": CLEARANCE} | settings
+    return Pretrained(robot, "secas", {"g": Perceptrons(layers)}, settings, rays=task_of(robot).rays)
 
 
 def seen(ahead: float, beside: float = 3.5) -> np.ndarray:
@@ -126,7 +130,7 @@ def test_the_speed_is_cut_to_what_the_linear_model_allows():
 
 
 def test_moving_towards_it_counts_as_nearer():
-    constraints = Constraints(GROUND)
+    constraints = Constraints(GROUND, task_of(GROUND).rays)
     still, moving = (constraints(seen(0.3), np.array([0, 0, 0, v, 0])) for v in (0.0, 0.25))
     assert still[2] == pytest.approx(-0.3, abs=1e-6)
     assert 0.04 < moving[2] - still[2] <= 0.25 * constraints.stopping
@@ -134,13 +138,13 @@ def test_moving_towards_it_counts_as_nearer():
 
 
 def test_what_is_far_away_is_all_the_same():
-    constraints, at_rest = Constraints(GROUND), np.zeros(5)
+    constraints, at_rest = Constraints(GROUND, task_of(GROUND).rays), np.zeros(5)
     assert np.array_equal(constraints(seen(3.5), at_rest), constraints(seen(2.0, beside=1.0), at_rest))
 
 
 @pytest.mark.parametrize("robot", [GROUND, QUADROTOR])
 def test_every_ray_is_in_one_sector(robot):
-    constraints = Constraints(robot)
+    constraints = Constraints(robot, task_of(robot).rays)
     assert sorted(np.concatenate(constraints.sectors)) == list(range(len(task_of(robot).rays.directions)))
     assert np.allclose(np.linalg.norm(constraints.directions, axis=1), 1.0)
 
@@ -179,13 +183,23 @@ def test_a_model_of_another_shape_or_method_is_refused():
     good = known()
     short = Perceptrons([(w[:3], b[:3]) for w, b in good.networks["g"].layers])
     for wrong in (
-        Pretrained(GROUND, "secas", {"g": short}, good.settings),
-        Pretrained(GROUND, "sailr", good.networks, good.settings),
-        Pretrained(GROUND, "secas", good.networks, {}),
-        Pretrained(GROUND, "secas", {}, good.settings),
+        replace(good, networks={"g": short}),
+        replace(good, method="sailr"),
+        replace(good, settings={}),
+        replace(good, networks={}),
+        replace(good, rays=fan(30, 180.0, 3.5)),
     ):
         with pytest.raises(BadModel):
             Secas(wrong)
+
+
+def test_a_model_without_rays_has_those_of_the_robots_usual_task():
+    """Older files do not hold the rays."""
+    asked = request(seen(0.25), (0.25, 0.3))
+    older = Secas(replace(known(), rays=None))
+    assert np.array_equal(older.decide(asked).plan, Secas(known()).decide(asked).plan)
+    with pytest.raises(BadModel, match="no task of cart"):
+        Secas(replace(known(), rays=None, robot=replace(GROUND, name="cart")))
 
 
 def test_the_service_answers_with_it_and_the_asker_brakes_when_it_falls_silent():
