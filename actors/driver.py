@@ -136,9 +136,11 @@ class Driver:
         return self.took(proposal, outcome, action, self.env.step(action), weights_version)
 
     def command(self, proposal: Array, outcome: Outcome | None) -> Array:
-        """The input of the coming period; the committed plan moves on."""
+        """The input of the coming period; the committed plan moves on. Without a filter a proposal with NaN or infinity
+        counts as standing still."""
         self._number = self.step
         if outcome is None:
+            proposal = proposal if np.isfinite(proposal).all() else self.robot.at_zero()
             return np.asarray(np.clip(proposal, self.robot.low(), self.robot.high()))
         return next_input(self.commitment, outcome)
 
@@ -180,7 +182,8 @@ class Driver:
             step=self._number,  # periods that pass unseen meanwhile count on
             index=self.index,
             observation=before.tolist(),
-            proposed=proposal.tolist(),
+            # A learner takes in finite numbers only. The exchange with the safety service has the proposal as it was.
+            proposed=(proposal if np.isfinite(proposal).all() else action).tolist(),
             action=action.tolist(),
             next_observation=self.observation.tolist(),
             reward=reward,

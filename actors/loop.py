@@ -14,7 +14,7 @@ import numpy as np
 from actors.driver import EPISODE_STRIDE, Driver, Environment, Identity
 from actors.fleet import Fleet, World, as_one
 from actors.guard import Ask, Outcome, consult
-from actors.proposers import Fixed, FlyingPupil, MakePolicy, Proposer, Pupil, finite
+from actors.proposers import Fixed, FlyingPupil, MakePolicy, Proposer, Pupil, check
 from actors.settings import Change as Change
 from actors.student import Student
 from actors.tape import Puts, Tape
@@ -153,14 +153,15 @@ class Rider:
         return True
 
     def propose(self) -> Array:
-        """The proposer's action, standing still if it is no number; now and then a practised stop's.
+        """The proposer's action; now and then a practised stop's.
 
         Who stands and waits goes on proposing the same: how often it has to ask must not move the random generator.
         """
         driver = self.driver
         if not self.waiting:
             proposal = self.proposer.propose(driver.observation, driver.info)
-            self.proposal = self.practice.instead(driver, finite(proposal, driver.robot, self.proposer.version))
+            check(proposal, self.proposer.version)
+            self.proposal = self.practice.instead(driver, proposal)
         return self.proposal
 
     def settle(self, outcome: Outcome) -> Outcome:

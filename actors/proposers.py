@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from actors.student import Student
-from messaging.robots import Robot
 from safety.commitment import Array
 from sim.policies import Policy, scripted
 
@@ -111,9 +110,7 @@ class Fixed:
         return np.asarray(self.policy(observation, info), dtype=float)
 
 
-def finite(proposal: Array, robot: Robot, version: int) -> Array:
-    """The proposal; standing still if it is no number."""
-    if np.isfinite(proposal).all():
-        return proposal
-    log.error("weights %d propose %s: standing still", version, proposal)
-    return np.zeros(robot.action_dim)
+def check(proposal: Array, version: int) -> None:
+    """Log a proposal that holds NaN or infinity: the filter answers it with a failsafe."""
+    if not np.isfinite(proposal).all():
+        log.error("weights %d propose %s", version, proposal)

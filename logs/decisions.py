@@ -49,6 +49,7 @@ class Decisions:
     half_width: Histogram = field(default_factory=Histogram)  # m: the largest in a tube
     margin: Histogram = field(default_factory=Histogram)  # m: of a tube to the free space's edge
     unverified: int = 0  # failsafes whose plan could not be verified
+    not_finite: int = 0  # decisions on proposals with NaN or infinity
     failures: Counter[str] = field(default_factory=Counter)  # exchanges without a decision, by reason
     waiting: array[float] = field(default_factory=lambda: array("d"))  # rows that are not in the histograms yet
 
@@ -64,6 +65,8 @@ class Decisions:
             count(self.statuses, solver)
         if not decision.verified:
             self.unverified += 1
+        if not all(map(math.isfinite, exchange.request.action)):
+            self.not_finite += 1
         if widths := decision.tube_half_width[:]:
             width, margin = max(widths), decision.margin
         times = exchange.round_trip_ms, decision.queue_ms, decision.time_ms, decision.verify_ms
@@ -106,6 +109,7 @@ class Decisions:
                 "iterations": summary(self.iterations),
             },
             "unverified": self.unverified,
+            "not_finite": self.not_finite,
             "tube_half_width": summary(self.half_width),
             "margin": summary(self.margin),
         }
@@ -127,6 +131,7 @@ def joined(parts: Iterable[Decisions]) -> Decisions:
         half_width=merged(part.half_width for part in parts),
         margin=merged(part.margin for part in parts),
         unverified=sum(part.unverified for part in parts),
+        not_finite=sum(part.not_finite for part in parts),
         failures=sum((part.failures for part in parts), Counter()),
     )
 

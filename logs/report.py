@@ -136,6 +136,8 @@ def _add_safety(table: Table, figures: Figures) -> None:
         table.add_row("verified plans that were gone on along", f"{plans['flown']}, outside of their tubes {outside}")
     if figures.get("unverified"):
         table.add_row("[red]unverified failsafes[/]", str(figures["unverified"]))
+    if figures.get("not_finite"):
+        table.add_row("[red]proposals with NaN or infinity[/]", str(figures["not_finite"]))
 
 
 LEARNER = (

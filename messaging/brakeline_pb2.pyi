@@ -981,7 +981,7 @@ class Step(_message.Message):
     def observation(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]: ...
     @_builtins.property
     def proposed(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]:
-        """by the policy"""
+        """by the policy; if that holds NaN or infinity, what was executed"""
 
     @_builtins.property
     def action(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]:

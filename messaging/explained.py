@@ -35,14 +35,14 @@ class Explanation:
 
 
 def explain(robot: Robot, request: pb.Request, decision: pb.Decision) -> Explanation:
-    """For whoever draws a decision."""
+    """For whoever draws a decision. A proposal with NaN or infinity has an arrow of length zero."""
     proposed, executed = np.array(request.action), np.array(decision.plan[: robot.action_dim])
     heading = 0.0 if robot.heading is None else request.state[robot.heading]
     names = [split(label) for label in robot.action]
     return Explanation(
         sentence(robot, request, decision),
         [(*name, float(p), float(e)) for name, p, e in zip(names, proposed, executed, strict=True)],
-        arrow(robot, heading, proposed),
+        arrow(robot, heading, proposed if np.isfinite(proposed).all() else np.zeros(robot.action_dim)),
         arrow(robot, heading, executed),
         np.array(decision.stopped.at),
         np.array(decision.stopped.normal),

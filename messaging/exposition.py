@@ -38,6 +38,7 @@ FIGURES: dict[str, Shown] = {
     "violations": Shown("brakeline_prediction_violations", "States outside of what was predicted", COUNT),
     "unverified": Shown("brakeline_unverified_decisions", "Decisions without a verified plan", COUNT),
     "unvouched": Shown("brakeline_unvouched_requests", "Requests whose plan nobody vouched for", COUNT),
+    "not_finite": Shown("brakeline_not_finite_proposals", "Proposed actions with NaN or infinity", COUNT),
     "decide_ms": Shown("brakeline_decide_seconds", "Mean time of a decision", factor=1e-3),
     "busy": Shown("brakeline_busy", "Share of the last second that a safety service was answering"),
     "steps": Shown("brakeline_steps", "Steps taken by an actor, or taken in by a learner", COUNT),

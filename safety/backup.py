@@ -11,6 +11,8 @@ from __future__ import annotations
 import numpy as np
 
 from messaging.robots import Array, Robot
+from safety.commitment import NO_PREDICTION
+from safety.request import FAILSAFE, Decision, Request
 
 
 def brake(robot: Robot, before: Array) -> Array:
@@ -33,3 +35,21 @@ def braking_plan(robot: Robot, first: Array) -> Array:
     for k in range(1, robot.horizon):
         plan[k] = brake(robot, plan[k - 1])
     return plan
+
+
+def braked(robot: Robot, request: Request, version: str, reason: str, total: float) -> Decision:
+    """The failsafe of a method that verifies nothing: μ from the input in force on. total [ms]: inside `decide`."""
+    before = request.input_in_force
+    return Decision(
+        kind=FAILSAFE,
+        plan=braking_plan(robot, within(robot, brake(robot, before), before)),
+        tube_center=np.zeros((0, robot.position_dim)),
+        tube_half_width=np.zeros((0, robot.position_dim)),
+        predicted=NO_PREDICTION,
+        margin=0.0,
+        model=version,
+        reason=reason,
+        verified=False,
+        time_ms=total,
+        verify_ms=total,
+    )

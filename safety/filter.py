@@ -25,6 +25,7 @@ from safety.request import (
     ADJUSTED,
     ALLOWED,
     FAILSAFE,
+    NOT_FINITE,
     RECOVERING,
     Decision,
     Ordinary,
@@ -123,6 +124,9 @@ class Filter:
         if request.scan is not None and request.scan.age > OLDEST:
             blind = f"the scan is {request.scan.age:.3g} s old, over {OLDEST:g}: it shows nothing to be free any more"
             request = replace(request, scan=replace(request.scan, ranges=np.zeros_like(request.scan.ranges)))
+        if not request.finite:
+            blind = NOT_FINITE
+            request = replace(request, action=request.input_in_force)  # it is not looked at
         given = request.plan[: self.robot.given].ravel()
         z_0 = np.concatenate([request.state[self.regressor], request.input_in_force, given])
         proposal = self.inputs.limited(request.action, z_0[-self.robot.action_dim :])

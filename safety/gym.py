@@ -116,7 +116,6 @@ class SafetyWrapper(gymnasium.Wrapper[Any, Any, Any, Any]):
         state, near = self._state(self.env, *seen), self._obstacles(self.env, *seen)
         if isinstance(self.asker, InProcess):
             return self.asker.decide(state, wanted, near, seen[0], self._scan), ""
-        wanted = wanted if np.isfinite(wanted).all() else np.zeros(wanted.shape)
         try:
             observed = sendable(seen[0]).tolist()
             return self.asker.decide(state, wanted, near, scan=self._scan, observation=observed), ""

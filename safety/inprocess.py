@@ -48,7 +48,7 @@ class InProcess:
         """The decision on an action; its plan is committed to, so execute `commitment.due`.
 
         Args:
-            state: measured; action: proposed, one that is no number becomes standing still; obstacles: at least those
+            state: measured; action: proposed, a failsafe if it holds NaN or infinity; obstacles: at least those
             within reach; observation: the robot's own, which the rivals read; scan: in the obstacles' place.
 
         Raises:
@@ -92,12 +92,11 @@ class InProcess:
     ) -> Request:
         measured = np.asarray(state, dtype=float)
         kept.measured(measured)
-        wanted = np.asarray(action, dtype=float)
         observed = sendable(observation)
         standing, moving = parted(list(obstacles), self.robot.position_dim)
         return Request(
             state=measured,
-            action=wanted if np.isfinite(wanted).all() else np.zeros(wanted.shape),
+            action=np.asarray(action, dtype=float),
             input_in_force=kept.input_in_force,
             plan=kept.plan,
             obstacles=standing,

@@ -24,6 +24,7 @@ Array = NDArray[np.float64]
 ALLOWED, ADJUSTED, FAILSAFE, RECOVERING = "allowed", "adjusted", "failsafe", "recovering"
 MOST_OBSERVED = 4096  # numbers in an observation
 FEW = 64  # numbers
+NOT_FINITE = "the proposed action holds NaN or infinity"  # the reason of a failsafe
 STOPPED = 0.9e-9  # of an input: surely one of a stop (`Robot.rests`)
 
 Named: TypeAlias = dict[str, tuple[NDArray[np.floating[Any]], tuple[int, ...]]]  # arrays, and the shapes they must have
@@ -67,6 +68,11 @@ class Request:
         """Of one type and memory layout, which compiled code relies on, whatever arrays they come as."""
         for name in ("state", "action", "input_in_force", "plan"):
             object.__setattr__(self, name, np.ascontiguousarray(getattr(self, name), dtype=float))
+
+    @property
+    def finite(self) -> bool:
+        """Is every number of the proposed action finite? If not, no method lets the proposal pass: the robot brakes."""
+        return all(map(math.isfinite, self.action.ravel().tolist()))
 
     def still(self, robot: Robot) -> bool:
         """Is the robot said to stand, and to be committed to that? Needs no model's word."""
@@ -113,7 +119,8 @@ def check_for_filter(robot: Robot, request: Request) -> None:
     """All fields, for our filter; the observation only if there is one.
 
     Raises:
-        BadRequest: a value is missing, not finite or of the wrong size, with the field's name.
+        BadRequest: a value is missing, not finite or of the wrong size, with the field's name. A proposed action with
+        NaN or infinity raises nothing: the decision on it is a failsafe.
     """
     predicted = request.predicted
     further: Named = {"plan": (request.plan, (robot.horizon, robot.action_dim))}
@@ -203,9 +210,9 @@ def _check_motion(robot: Robot, request: Request, further: Named) -> None:
     inputs = (robot.action_dim,)
     named: Named = {
         "state": (request.state, (robot.state_dim,)),
-        "action": (request.action, inputs),
         "input_in_force": (request.input_in_force, inputs),
     }
+    _sized(robot, "action", request.action, inputs)
     _finite(robot, named | further)
     if max(map(abs, request.state.tolist())) > FARTHEST:  # in any unit
         raise BadRequest("state", f"a state beyond ±{FARTHEST:g} is not plausible")
@@ -218,10 +225,14 @@ def _within_bounds(robot: Robot, name: str, inputs: Array) -> None:
         raise BadRequest(name, f"{name}: an input is out of the robot's bounds")
 
 
+def _sized(robot: Robot, name: str, value: NDArray[np.floating[Any]], shape: tuple[int, ...]) -> None:
+    if value.shape != shape:
+        raise BadRequest(name, f"{name} has shape {value.shape}, a {robot.name} robot's has {shape}")
+
+
 def _finite(robot: Robot, named: Named) -> None:
     for name, (value, shape) in named.items():
-        if value.shape != shape:
-            raise BadRequest(name, f"{name} has shape {value.shape}, a {robot.name} robot's has {shape}")
+        _sized(robot, name, value, shape)
         few = value.size <= FEW  # sooner looked at one by one
         if not (all(map(math.isfinite, value.ravel().tolist())) if few else np.isfinite(value).all()):
             raise BadRequest(name, f"{name} holds NaN or infinity")

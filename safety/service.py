@@ -94,6 +94,7 @@ class Counts:
     compared: int = 0
     unverified: int = 0
     unvouched: int = 0
+    not_finite: int = 0  # decisions on proposals with NaN or infinity
     decide_ms: float = 0.0
     answering: float = 0.0  # s
 
@@ -106,6 +107,7 @@ class Counts:
             "violations": self.violations,
             "unverified": self.unverified,
             "unvouched": self.unvouched,
+            "not_finite": self.not_finite,
             "decide_ms": mean,
         }
 
@@ -142,6 +144,7 @@ def answerer(models: Models, counts: Counts, notary: Notary | None = None) -> Ca
         counts.decide_ms += decision.time_ms
         counts.compared += decision.compared
         counts.unverified += not decision.verified
+        counts.not_finite += not request.finite
         if not decision.contained:
             counts.violations += 1
             log.warning("%s, step %d: outside the predicted set", message.actor or message.robot, message.step)

@@ -153,10 +153,10 @@ class Senses:
         return obstacles(beams, poses, mount, self.robot, self._errors, around)
 
     def command(self, now: float) -> Command | None:
-        """The last one; None: none lately, or it holds no numbers."""
+        """The last one; None: none lately."""
         with self._lock:
             command = self._command
-        if command is None or now - command.at > self.fresh.command or not np.isfinite(command.action).all():
+        if command is None or now - command.at > self.fresh.command:
             return None
         return command
 

@@ -18,11 +18,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from messaging.robots import Robot
-from safety.backup import brake, braking_plan, within
+from safety.backup import braked, braking_plan, within
 from safety.commitment import NO_PREDICTION
 from safety.model_set import BadModel
 from safety.recipe import SAILR as SAILR
-from safety.request import ALLOWED, FAILSAFE, Decision, Request, check_for_rival
+from safety.request import ALLOWED, NOT_FINITE, Decision, Request, check_for_rival
 from safety.rivals.pretrained import Pretrained
 
 Array = NDArray[np.float64]
@@ -67,20 +67,22 @@ class Sailr:
         started = perf_counter_ns()
         robot = self.robot
         check_for_rival(robot, request, self.observed)
+        if not request.finite:
+            return braked(robot, request, self.version, NOT_FINITE, (perf_counter_ns() - started) * 1e-6)
         proposal = within(robot, request.action, request.input_in_force)
         advantage = self.advantage(request.observation, proposal)
-        intervene = advantage > self.threshold
-        action = within(robot, brake(robot, request.input_in_force), request.input_in_force) if intervene else proposal
+        if advantage > self.threshold:
+            reason = f"its advantage over braking is {advantage:.3f}, above {self.threshold:g}"
+            return braked(robot, request, self.version, reason, (perf_counter_ns() - started) * 1e-6)
         total = (perf_counter_ns() - started) * 1e-6
         return Decision(
-            kind=FAILSAFE if intervene else ALLOWED,
-            plan=braking_plan(robot, action),
+            kind=ALLOWED,
+            plan=braking_plan(robot, proposal),
             tube_center=np.zeros((0, robot.position_dim)),
             tube_half_width=np.zeros((0, robot.position_dim)),
             predicted=NO_PREDICTION,
             margin=0.0,
             model=self.version,
-            reason=f"its advantage over braking is {advantage:.3f}, above {self.threshold:g}" if intervene else "",
             verified=False,
             time_ms=total,
             verify_ms=total,

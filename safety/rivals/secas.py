@@ -21,11 +21,11 @@ from numpy.typing import NDArray
 from messaging.rays import Rays
 from messaging.robots import Robot
 from messaging.tasks import UnknownTask, usual_task
-from safety.backup import braking_plan, within
+from safety.backup import braked, braking_plan, within
 from safety.commitment import NO_PREDICTION
 from safety.model_set import BadModel
 from safety.recipe import SECAS as SECAS
-from safety.request import ADJUSTED, ALLOWED, Decision, Request, check_for_rival
+from safety.request import ADJUSTED, ALLOWED, NOT_FINITE, Decision, Request, check_for_rival
 from safety.rivals.pretrained import Pretrained
 from safety.solver import Program, solve
 
@@ -145,6 +145,8 @@ class Secas:
         started = perf_counter_ns()
         robot = self.robot
         check_for_rival(robot, request, self.observed)
+        if not request.finite:
+            return braked(robot, request, self.version, NOT_FINITE, (perf_counter_ns() - started) * 1e-6)
         proposal = within(robot, request.action, request.input_in_force)
         c = self.constraints(request.observation, request.state)
         G, d = np.asarray(self.g(request.observation), float), self.bound - c

@@ -7,9 +7,11 @@ from actors.driver import Driver, Identity
 from actors.guard import consult
 from deploy.study.evaluate import in_process
 from deploy.vehicles import environment
+from learner.intake import Intake
 from messaging import brakeline_pb2 as pb
 from messaging.bus import NoReply
 from safety.model_set import Recipe
+from safety.request import NOT_FINITE
 from tests.robots import GROUND
 
 FAST = np.array([0.25, 0.1])
@@ -72,6 +74,25 @@ def test_without_a_filter_the_proposal_is_executed_within_bounds():
     step = robot.execute(np.array([9.0, -9.0]), None)
     assert np.allclose(step.action, [0.25, -0.5])
     assert (step.decision, step.penalty, step.compared) == (pb.UNKNOWN, 0.0, False)
+
+
+@pytest.mark.parametrize("wrong", [[np.nan, 0.1], [np.inf, 0.0]])
+def test_a_proposal_that_is_not_finite_is_a_failsafe_and_a_step_to_learn_from(ask, wrong):
+    robot = driver(penalty=2.0)
+    robot.begin(0)
+    robot.execute(FAST, consult(ask, [robot.request(FAST)], GROUND)[0])
+    outcome = consult(ask, [robot.request(np.array(wrong))], GROUND)[0]
+    assert np.array_equal(outcome.exchange(0.2).request.action, wrong, equal_nan=True)
+    assert (outcome.answer.kind, outcome.answer.message.reason) == ("failsafe", NOT_FINITE)
+    step = robot.execute(np.array(wrong), outcome)
+    assert step.decision == pb.FAILSAFE and step.proposed == step.action == [0.0, 0.0]
+    Intake(GROUND).move(step)
+
+
+def test_without_a_filter_a_proposal_that_is_not_finite_is_standing_still():
+    robot = driver(filtered=False)
+    robot.begin(0)
+    assert robot.execute(np.array([np.nan, 0.3]), None).action == [0.0, 0.0]
 
 
 def test_no_two_robots_of_a_run_ever_see_the_same_episode():

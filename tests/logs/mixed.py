@@ -236,6 +236,7 @@ def counted(messages: list[tuple[str, Any]]) -> dict[str, Any]:
             "iterations": percentiles([float(d.iterations) for d in solved]),
         },
         "unverified": sum(not e.reply.decision.verified for e in answered),
+        "not_finite": sum(not np.isfinite(e.request.action).all() for e in answered),
         "tube_half_width": percentiles([max(d.tube_half_width) for d in tubes]),
         "margin": percentiles([d.margin for d in tubes]),
         "topics": _topics(every, messages),

@@ -124,7 +124,7 @@ def test_processes_learners_and_round_trips(say: Say) -> None:
         say("metrics/ground", pb.LearnerMetrics(robot="ground", updates=5)),
         say("metrics/ground", pb.LearnerMetrics(robot="ground", updates=9, critic_loss=0.5, updates_per_s=100.0)),
         say("exchange/ground/a", pb.Exchange(round_trip_ms=1.0)),
-        say("exchange/ground/a", pb.Exchange(round_trip_ms=3.0)),
+        say("exchange/ground/a", pb.Exchange(request=pb.Request(action=[float("nan"), 0.0]), round_trip_ms=3.0)),
         say("exchange/ground/a", pb.Exchange(failure="Late: no answer within 60 ms")),
     ):
         put(metrics, sample)
@@ -136,6 +136,7 @@ def test_processes_learners_and_round_trips(say: Say) -> None:
     assert figures["round_trip_ms"]["p50"] == pytest.approx(1.0, rel=0.005)
     assert figures["round_trip_ms"]["mean"] == 2.0
     assert figures["no_decision"] == {"Late": 1}
+    assert figures["not_finite"] == 1
     assert figures["seconds"] == 6.0
 
 

@@ -142,3 +142,9 @@ def test_what_has_another_robots_sizes_fits_not():
     assert not fits(QUADROTOR, request, decision)
     decision.stopped.at.append(1.0)
     assert not fits(GROUND, request, decision)
+
+
+def test_a_proposal_that_is_not_finite_has_no_arrow():
+    question, answer = asked(GROUND, (float("nan"), 0.1)), answered(GROUND, pb.FAILSAFE, (0.0, 0.0), by="")
+    about = explain(GROUND, question, answer)
+    assert about.proposed.tolist() == [0.0, 0.0] and about.said.endswith("verified before: why not")

@@ -10,7 +10,7 @@ from safety.certificates import KINDS, Certificate
 from safety.commitment import Prediction, correction_penalty
 from safety.filter import Filter
 from safety.model_set import ModelSet, Recipe
-from safety.request import ADJUSTED, ALLOWED, FAILSAFE, MOST_OBSERVED, BadRequest
+from safety.request import ADJUSTED, ALLOWED, FAILSAFE, MOST_OBSERVED, NOT_FINITE, BadRequest
 from tests.robots import GROUND, QUADROTOR
 from tests.safety.asked import cylinder, fits, random_request, request, same
 from tests.safety.unicycle import FIX, Unicycle
@@ -193,8 +193,6 @@ NAN, INF = float("nan"), float("inf")
         ("state", np.array([0, 0, INF, 0, 0])),
         ("state", np.zeros(4)),
         ("state", np.array([1e9, 0, 0, 0, 0])),
-        ("action", np.array([NAN, 0])),
-        ("action", np.array([0, -INF])),
         ("action", np.zeros(3)),
         ("input_in_force", np.array([0, NAN])),
         ("input_in_force", np.array([0.9, 0])),
@@ -214,6 +212,18 @@ def test_bad_requests_are_refused_by_the_field(ready, field, value):
         ready.decide(replace(request(), **{field: value}))
     assert caught.value.field == field
     assert ready.decide(request()).kind == ALLOWED
+
+
+@pytest.mark.parametrize("action", [(NAN, 0.0), (0.2, -INF), (INF, NAN)])
+def test_a_proposal_that_is_not_finite_brakes_along_the_committed_plan(ready, action):
+    tail = np.array([[0.1, 0.2], [0.0, 0.0], [0.0, 0.0]])
+    moving = {"state": (0, 0, 0, 0.1, 0.2), "plan": tail, "model": ready.version}
+    decision = ready.decide(request(action=action, **moving))
+    assert (decision.kind, decision.reason, decision.verified) == (FAILSAFE, NOT_FINITE, True)
+    assert np.array_equal(decision.plan, tail)
+    standing = ready.decide(request(action=action))
+    assert (standing.kind, standing.reason) == (FAILSAFE, NOT_FINITE) and not standing.plan.any()
+    assert ready.decide(request(action=(0.2, 0.0))).kind == ALLOWED
 
 
 @pytest.mark.parametrize(

@@ -65,7 +65,7 @@ def test_an_answer_that_misses_one_counts_for_none(fleet):
         robot.step(answer.action)
     before = [(kept.plan.copy(), kept.input_in_force, kept.promise) for kept in fleet.commitments]
     with pytest.raises(SafetyError) as caught:
-        decided(fleet, robots, [[0.2, 0.3], [float("nan"), 0.0]])
+        decided(fleet, robots, [[0.2, 0.3], [0.0]])
     assert caught.value.field == "action"
     for kept, (plan, held, promise) in zip(fleet.commitments, before, strict=True):
         assert np.array_equal(kept.plan, plan) and kept.input_in_force is held and kept.promise is promise

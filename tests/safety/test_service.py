@@ -12,7 +12,7 @@ from messaging.topics import DECIDE
 from safety.client import SafetyClient, SafetyError, ask, read, request_message
 from safety.commitment import UNVERIFIED, Commitment
 from safety.model_set import ModelSet
-from safety.request import BadRequest
+from safety.request import NOT_FINITE, BadRequest
 from safety.service import Counts, Models, answerer
 from safety.wire import LARGEST, request_of
 from tests.messaging.conftest import endpoint, join  # noqa: F401 - fixtures
@@ -99,8 +99,8 @@ def with_obstacle(**changes):
         ("state", bad(state=[INF, 0, 0, 0, 0])),
         ("state", bad(state=[0.0] * 4)),
         ("state", bad(state=[])),
-        ("action", bad(action=[NAN, 0])),
         ("action", bad(action=[0.0] * 3)),
+        ("action", bad(action=[NAN])),
         ("input_in_force", bad(input_in_force=[INF, 0])),
         ("input_in_force", bad(input_in_force=[5.0, 0])),
         ("plan", bad(plan=[0.0] * 5)),
@@ -136,7 +136,7 @@ def test_bad_requests_get_an_error_that_names_the_field(service, field, message)
 
 
 def test_a_bad_request_spoils_no_other_of_its_batch(service):
-    replies = service.replies(good(), bad(action=[NAN, 0]), good())
+    replies = service.replies(good(), bad(action=[0.0]), good())
     assert [reply.WhichOneof("result") for reply in replies] == ["decision", "error", "decision"]
 
 
@@ -324,8 +324,11 @@ def test_a_client_over_the_bus(join, endpoint, service):  # noqa: F811
         assert np.hypot(*(robot.state[:2] - [0.34, 0.0])) > 0.1 + GROUND.footprint
         assert robot.state[0] > 0.02
         assert client.commitment.model in ("", answer.message.model)
+        refused = client.decide(robot.measure(), [NAN, 0.0], [AHEAD])
+        assert (refused.kind, refused.message.reason) == ("failsafe", NOT_FINITE)
+        assert service.counts.figures()["not_finite"] == 1
         with pytest.raises(SafetyError) as caught:
-            client.decide(robot.measure(), [NAN, 0.0], [AHEAD])
+            client.decide(robot.measure(), [0.0], [AHEAD])
         assert caught.value.field == "action"
         assert not client.fallback().any(), "the committed plan brakes"
         with pytest.raises(Refused):

@@ -12,6 +12,7 @@ from safety.client import SafetyClient
 from safety.commitment import Commitment
 from safety.filter import Filter
 from safety.gym import SafetyWrapper
+from safety.request import NOT_FINITE
 from sim.envs import NavigationEnv
 from tests.messaging.conftest import endpoint, join  # noqa: F401 - fixtures
 from tests.robots import GROUND
@@ -76,13 +77,15 @@ def test_the_wrapper_replaces_and_penalises_what_is_not(ready):
     assert max(costs) > 1.0
 
 
-def test_a_proposal_that_is_no_number_is_standing_still(ready):
+@pytest.mark.parametrize("wrong", [NAN, INF, -INF])
+def test_a_proposal_that_is_not_finite_is_a_failsafe(ready, wrong):
     env = SafetyWrapper(Yard(), ready, penalty=1.0)
     env.reset(seed=2)
-    _, reward, _, _, info = env.step(np.array([NAN, 0.1]))
+    _, reward, _, _, info = env.step(np.array([wrong, 0.1]))
     assert not env.unwrapped.executed[0].any()
     assert np.isfinite(reward)
-    assert info["safety"].verified
+    told = info["diagnostics"]
+    assert (told["kind"], told["verified"], told["reason"]) == ("failsafe", True, NOT_FINITE)
 
 
 def test_every_episode_starts_standing(ready):

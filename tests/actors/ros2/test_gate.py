@@ -11,6 +11,7 @@ from messaging import brakeline_pb2 as pb
 from messaging.bus import NoReply
 from messaging.ros2.messages import DiagnosticArray, DiagnosticStatus, MarkerArray, decode, encode
 from messaging.shapes import Obstacle, Shapes
+from safety.request import NOT_FINITE
 from tests.robots import GROUND
 
 ROBOT = GROUND.in_real_time()
@@ -18,7 +19,7 @@ STATE = np.zeros(ROBOT.state_dim)
 
 
 def allow(requests):
-    """Allows every command: in force, the command, half of it, stop."""
+    """Allows every command of finite numbers: in force, the command, half of it, stop."""
     replies = []
     for request in requests:
         action = np.clip(request.action, ROBOT.low(), ROBOT.high())
@@ -26,6 +27,8 @@ def allow(requests):
         for k in range(ROBOT.horizon - 2):
             plan += list(action * max(0.0, 1.0 - (k + 1) / ROBOT.brake_steps))
         decision = pb.Decision(kind=pb.ALLOWED, plan=plan, model="m", verified=True, contained=True)
+        if not np.isfinite(request.action).all():
+            decision.kind, decision.plan[:], decision.reason = pb.FAILSAFE, request.plan, NOT_FINITE
         decision.tube_center.extend([0.0] * 2 * ROBOT.horizon)
         decision.tube_half_width.extend([0.1] * 2 * ROBOT.horizon)
         replies.append(pb.Reply(decision=decision, robot=request.robot))
@@ -70,6 +73,14 @@ def test_an_answer_that_cannot_count_is_not_executed(in_time, why, kind, reason)
     gate.decide(STATE, (), command(0.25), 0.0, 0)
     assert gate.begin(0.2, in_time, why).tolist() == [0.0, 0.0]
     assert gate.kind == kind and reason in gate.reason and gate.tally.kinds[kind] == 1
+
+
+def test_a_command_that_is_not_finite_is_a_failsafe():
+    gate = Gate(ROBOT, allow)
+    gate.decide(STATE, (), command(0.2), 0.0, 0)
+    assert gate.begin(0.2).tolist() == [0.2, 0.0]
+    gate.decide(STATE, (), command(float("nan"), number=2), 0.2, 1)
+    assert gate.begin(0.4).tolist() == [0.0, 0.0] and (gate.kind, gate.reason) == ("failsafe", NOT_FINITE)
 
 
 def test_without_a_command_it_is_asked_to_stand():

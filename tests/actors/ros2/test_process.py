@@ -121,7 +121,7 @@ def steered(simulated=False, stamped=False, ask=allow):
         ("odometry", "odometry is"),
         ("scan", "the scan is"),
         ("command", "no command"),
-        ("numbers", "no command"),
+        ("numbers", "holds NaN"),
     ],
 )
 def test_what_falls_silent_stops_the_robot_until_it_speaks(what, because):

@@ -8,7 +8,7 @@ from messaging.shapes import Shapes
 from messaging.tasks import task_of
 from safety.backup import brake, braking_plan
 from safety.model_set import BadModel
-from safety.request import BadRequest, Request
+from safety.request import NOT_FINITE, BadRequest, Request
 from safety.rivals.pretrained import Pretrained
 from safety.rivals.sailr import Sailr
 from tests.robots import GROUND, QUADROTOR
@@ -98,6 +98,13 @@ def test_the_backup_brakes_as_fast_as_the_slew_allows(before):
 def test_every_braking_plan_ends_in_a_stop(robot):
     for corner in (robot.low(), robot.high()):
         assert not braking_plan(robot, corner)[-1].any()
+
+
+def test_a_proposal_that_is_not_finite_brakes():
+    before = np.array([2.0, 0.0, -1.0])
+    decision = Sailr(known(robot=QUADROTOR)).decide(request((0.0, np.nan, 0.0), before, QUADROTOR))
+    assert (decision.kind, decision.reason, decision.verified) == ("failsafe", NOT_FINITE, False)
+    assert np.allclose(decision.plan[0], brake(QUADROTOR, before)) and not decision.plan[-1].any()
 
 
 def test_without_the_observation_it_does_not_guess():

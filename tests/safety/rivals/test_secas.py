@@ -15,7 +15,7 @@ from messaging.tasks import task_of
 from safety.client import accept, read, request_message
 from safety.commitment import UNVERIFIED, Commitment
 from safety.model_set import BadModel
-from safety.request import BadRequest, Request
+from safety.request import NOT_FINITE, BadRequest, Request
 from safety.rivals.pretrained import Pretrained
 from safety.rivals.secas import Constraints, Secas, closed_form, quadratic
 from safety.service import Counts, Models, answerer
@@ -167,7 +167,7 @@ def test_a_robot_with_a_slew_is_corrected_within_it():
     [
         ("observation", {"observation": np.zeros(0)}),
         ("observation", {"observation": np.full(26, np.nan)}),
-        ("action", {"action": (np.nan, 0.0)}),
+        ("action", {"action": (np.nan,)}),
         ("state", {"state": (0.0, 0.0)}),
         ("input_in_force", {"before": (1.0, 0.0)}),
     ],
@@ -177,6 +177,12 @@ def test_a_request_that_cannot_be_decided_on_is_refused(field, wrong):
     with pytest.raises(BadRequest) as refused:
         Secas(known()).decide(request(**values))
     assert refused.value.field == field
+
+
+def test_a_proposal_that_is_not_finite_brakes():
+    decision = Secas(known()).decide(request(seen(3.0), (np.inf, np.nan), before=(0.2, 0.1)))
+    assert (decision.kind, decision.reason, decision.verified) == ("failsafe", NOT_FINITE, False)
+    assert not decision.plan.any(), "the ground robot stops at once"
 
 
 def test_a_model_of_another_shape_or_method_is_refused():
