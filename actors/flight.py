@@ -2,7 +2,7 @@
 
 Period k: its input goes out; then it is observed, proposed and asked, and what the answer says is for period k + 1. An
 answer that comes too late is discarded for the committed plan's next input, which the vehicle's keeper sends by itself:
-a process of its own, which brakes along that plan should this one die (`actors.keeper`).
+a process of its own, which brakes along that plan should this one die (`actors.vehicle_server`).
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ from google.protobuf.message import Message
 
 from actors.frames import Tap
 from actors.guard import Ask, Outcome, consult
-from actors.kept import Charge, KeptVehicle
-from actors.live import Turn
 from actors.loop import PRACTISED, ActorSettings, Make, Rider, Tally, cycle
+from actors.mavlink_vehicle import ControlPeriod
 from actors.proposers import MakePolicy
 from actors.settings import FlightSettings as FlightSettings
 from actors.tape import Puts
+from actors.vehicle_client import FlightRequest, VehicleClient
 from messaging.bus import BusError
 from messaging.process import Process
 from messaging.robots import Robot, robot_named
@@ -97,40 +97,40 @@ class Flight:
     What is true is not known here: the estimate stands for it, also where rays are cast.
     """
 
-    def __init__(self, vehicle: KeptVehicle, skip: Callable[[], object]) -> None:
+    def __init__(self, vehicle: VehicleClient, skip: Callable[[], object]) -> None:
         """skip: is called for each period that went by unseen."""
         self.vehicle, self._skip = vehicle, skip
-        self.turn: Turn = vehicle.turn
+        self.current_period: ControlPeriod = vehicle.current_period
         self.skipped = 0
 
     @property
     def true(self) -> Array:
         """(9,) as estimated."""
-        return self.turn.report.measured
+        return self.current_period.report.measured
 
     measured = true
 
     @property
     def input(self) -> Array:
         """(3,) m/s, in force."""
-        return self.turn.input
+        return self.current_period.input
 
     def catch_up(self) -> None:
         """Go on from the next period on, whatever the number of the last one."""
-        self.turn = self.vehicle.wait(self.vehicle.turn.number + 1)
+        self.current_period = self.vehicle.wait(self.vehicle.current_period.number + 1)
 
     def step(self, input: Array) -> Period:
         """The running period to its end. Raises MavlinkError."""
-        expected = self.turn.number + 1
-        self.turn = self.vehicle.wait(expected)
-        for _ in range(self.turn.number - expected):
+        expected = self.current_period.number + 1
+        self.current_period = self.vehicle.wait(expected)
+        for _ in range(self.current_period.number - expected):
             self.skipped += 1
             self._skip()
         return self.standing()
 
     def standing(self) -> Period:
         """The report about the period that ended last."""
-        return replace(self.turn.report, true=self.turn.report.measured)
+        return replace(self.current_period.report, true=self.current_period.report.measured)
 
     def alter(self, **changes: float) -> None:
         """Raises ValueError: nobody can, from here."""
@@ -163,7 +163,7 @@ class FlightRider(Rider):
         assert self._flight is not None, "begin the flight first"
         return self._flight
 
-    def take(self, vehicle: KeptVehicle) -> None:
+    def take(self, vehicle: VehicleClient) -> None:
         """From here on it flies this one, which hovers. What is slow the first time is done once before."""
         self._flight = Flight(vehicle, self.driver.skip)
         observation, info = self.driver.env.reset(options={"episode_seed": 0})
@@ -174,14 +174,14 @@ class FlightRider(Rider):
 
     def settle(self, outcome: Outcome) -> Outcome:
         """Hand the plan over, if it comes in time and what it was made from counts; else there is no answer."""
-        turn, answer = self.flight.turn, outcome.answer
-        if turn.lost:
-            what, outcome = "lost", replace(outcome, answer=None, failure=f"Lost: {turn.lost}")
+        period, answer = self.flight.current_period, outcome.answer
+        if period.lost:
+            what, outcome = "lost", replace(outcome, answer=None, failure=f"Lost: {period.lost}")
         elif outcome.failure == PRACTISED:
             what = "not needed"
         elif answer is None:
             what = "none"
-        elif self.flight.vehicle.commit(answer.plan[self.driver.robot.given :], turn.number + 1):
+        elif self.flight.vehicle.commit(answer.plan[self.driver.robot.given :], period.number + 1):
             what = "in time"
         else:
             what, outcome = "late", replace(outcome, answer=None, failure="Late: its period had begun")
@@ -190,8 +190,8 @@ class FlightRider(Rider):
 
     def stop(self) -> None:
         """Along the committed plan to hovering."""
-        turn = self.flight.turn
-        self.flight.vehicle.wait(turn.number + self.driver.robot.horizon)
+        period = self.flight.current_period
+        self.flight.vehicle.wait(period.number + self.driver.robot.horizon)
 
     def figures(self) -> dict[str, float]:
         """For Health."""
@@ -293,8 +293,8 @@ def run(
         question = partial(ask, process.bus, deadline=settings.deadline)
         if not (rider.join(stop) and answered(question, robot, stages[0], settings.method == "ddpc", stop)):
             return False
-        charge = Charge(flight, robot.name, arena.obstacles)
-        vehicle = KeptVehicle(charge, rider.tape.keep, process.bus.tolerance, stop)
+        request = FlightRequest(flight, robot.name, arena.obstacles)
+        vehicle = VehicleClient(request, rider.tape.keep, process.bus.tolerance, stop)
         try:
             rider.take(vehicle)
             while not stop() and cycle([rider], question, tally, stop):

@@ -13,8 +13,8 @@ from collections.abc import Callable
 import numpy as np
 
 from actors.dialect import mavlink
-from actors.heard import AUTOPILOT, OFFBOARD, Heard
-from actors.leading import MASK, PARAMETERS, Leading
+from actors.mavlink_decoder import AUTOPILOT, OFFBOARD, MavlinkDecoder
+from actors.position_lookahead import MASK, PARAMETERS, PositionLookahead
 from actors.telemetry import ESTIMATORS, SOURCES, Array
 
 VELOCITY_ONLY = 0x0DC7  # type mask: position, acceleration, yaw and yaw rate are to be ignored
@@ -47,10 +47,10 @@ class NotTold(MavlinkError):
     """Something that is needed comes by none of the messages that could tell it."""
 
 
-class Client(Heard):
-    """Commands to an autopilot, and what it tells: see `Heard`."""
+class Client(MavlinkDecoder):
+    """Commands to an autopilot, and what it tells: see `MavlinkDecoder`."""
 
-    leading: Leading | None = None  # it is told places in place of velocities
+    lookahead: PositionLookahead | None = None  # it is told places in place of velocities
 
     def choose(self, what: str, interval: float, wait: Wait) -> str:
         """Find out which message tells something, and have it sent every so many seconds: a line about it for people.
@@ -129,8 +129,8 @@ class Client(Heard):
 
     def setpoint(self, velocity: Array) -> None:
         """Ask for a velocity (3,) [m/s], ENU."""
-        if self.leading is not None and self.position is not None:
-            x, y, z = self.leading.target(self.position, self.velocity, velocity).tolist()
+        if self.lookahead is not None and self.position is not None:
+            x, y, z = self.lookahead.target(self.position, self.velocity, velocity).tolist()
             mask, told = MASK, (y, x, -z, 0.0, 0.0, 0.0)
         else:
             east, north, up = velocity.tolist()
@@ -150,7 +150,7 @@ class Client(Heard):
                 f"it has no {', '.join(sorted(missing))}: it can only be told velocities, without --lead"
             )
         try:
-            self.leading = Leading.of(kind, values)
+            self.lookahead = PositionLookahead.of(kind, values)
         except ValueError as error:
             raise MavlinkError(f"it cannot be led to places: {error}") from error
 
@@ -223,14 +223,14 @@ class Client(Heard):
 
     def _rate(self, what: str, wait: Wait, interval: float) -> float:
         """Hz at which the message chosen for it comes, once it does; 0: it does not."""
-        began, best = self.heard[what], 0.0
-        if not wait(lambda: self.heard[what] > began, FIRST):
+        began, best = self.message_counts[what], 0.0
+        if not wait(lambda: self.message_counts[what] > began, FIRST):
             return best
         time = max(WATCHED, 4.0 * interval)
         for _ in range(LOOKS):
-            began = self.heard[what]
+            began = self.message_counts[what]
             wait(lambda: False, time)
-            best = max(best, (self.heard[what] - began) / time)
+            best = max(best, (self.message_counts[what] - began) / time)
             if best * interval >= PROMPT:
                 break
         return best

@@ -10,7 +10,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from actors.ceilings import CEILINGS, FIXED_TIMEOUT, SHORTEST, TIMEOUTS, demand, too_low
+from actors.autopilot_limits import AUTOPILOT_LIMITS, FIXED_TIMEOUT, SHORTEST, TIMEOUTS, demand, limits_below_demand
 from actors.mavlink import Client, MavlinkError, NotTold, message_id
 from actors.telemetry import ATTITUDE, FORCE, LANDED, MOTION, Array, missing
 from messaging.robots import Robot
@@ -43,7 +43,8 @@ class Takeoff:
         lead: bool = False,
     ) -> None:
         """hold: have a setpoint (3,) [m/s] repeated from now on, None: none; raise_limits: set those parameters that
-        hold it below what the robot's description asks for; lead: tell it places (`actors.leading`)."""
+        hold it below what the robot's description asks for; lead: send
+        positions (`actors.position_lookahead`)."""
         self._client, self._robot, self._wait, self._hold = client, robot, wait, hold
         self._raise_limits, self._lead = raise_limits, lead
         self.notes: list[str] = []
@@ -103,12 +104,12 @@ class Takeoff:
         felt: list[Array] = []
 
         def another() -> bool:
-            if client.heard[FORCE] != len(felt) + heard:
+            if client.message_counts[FORCE] != len(felt) + heard:
                 felt.append(client.acceleration)
                 return len(felt) >= 2 * READINGS
             return False
 
-        heard = client.heard[FORCE]
+        heard = client.message_counts[FORCE]
         self._wait(another, 1.0)
         noise = 2.0 * float(np.std(felt, axis=0).max()) if felt else 0.0
         bound = float(np.min(np.asarray(self._robot.measurement_bound)[-self._robot.position_dim :]))
@@ -120,14 +121,14 @@ class Takeoff:
     def _compare_limits(self, kind: str) -> None:
         """What its parameters allow, beside what may be asked of it."""
         client, wait = self._client, self._wait
-        told = {c.parameter: client.parameter(c.parameter, wait) for c in CEILINGS[kind]}
+        told = {c.parameter: client.parameter(c.parameter, wait) for c in AUTOPILOT_LIMITS[kind]}
         values = {name: value for name, value in told.items() if value is not None}
-        for ceiling, value in too_low(kind, values, self._robot):
-            wanted = ceiling.value(demand(self._robot))
-            short = f"{ceiling.parameter} is {value:g} ({ceiling.what}), and up to {wanted:g} may be asked for"
+        for limit, value in limits_below_demand(kind, values, self._robot):
+            wanted = limit.value(demand(self._robot))
+            short = f"{limit.parameter} is {value:g} ({limit.what}), and up to {wanted:g} may be asked for"
             if self._raise_limits:
-                done = client.set_parameter(ceiling.parameter, wanted, wait)
-                self.note(f"{ceiling.parameter}: {value:g} -> {wanted:g}" + ("" if done else ", which it refuses"))
+                done = client.set_parameter(limit.parameter, wanted, wait)
+                self.note(f"{limit.parameter}: {value:g} -> {wanted:g}" + ("" if done else ", which it refuses"))
             else:
                 self.note(f"{short}: raise it (--raise-limits), or it cannot do what is asked of it")
         name = TIMEOUTS[kind]

@@ -25,9 +25,9 @@ from typing import TypeVar
 import numpy as np
 import psutil
 
+from actors.ground_truth import MavlinkGroundTruth
 from actors.mavlink import Client, MavlinkError
 from actors.telemetry import MOTION, TRUTH, Array
-from actors.witness import Witness
 from deploy.bench import sitl
 from deploy.bench.flights import SETUPS, switched_on
 from deploy.bench.repeated import repeated
@@ -204,7 +204,7 @@ def _until(condition: Callable[[], T | None], fly: subprocess.Popen[str]) -> T:
 def _comes_out(judge: Judge, fly: subprocess.Popen[str]) -> bool:
     """Of where it was run into. Raises MavlinkError: the flight has ended."""
     try:
-        return _until(lambda: judge.witness.clearance > ROOM or not judge.client.armed, fly)
+        return _until(lambda: judge.truth.clearance > ROOM or not judge.client.armed, fly)
     except MavlinkError:
         if fly.poll() is not None:
             raise
@@ -264,27 +264,27 @@ class Judge:
 
     client: Client
     link: Link
-    witness: Witness
+    truth: MavlinkGroundTruth
     airborne: bool = False
     _seen: int = 0
     _beaten: float = 0.0
     _nearest: float = field(default=float("inf"))
 
     def listen(self) -> None:
-        client, witness = self.client, self.witness
+        client, truth = self.client, self.truth
         if time.monotonic() - self._beaten > 1.0:
             self._beaten = time.monotonic()
             client.heartbeat()
         client.feed(self.link.receive())
         if client.truth is None or client.position is None:
             return
-        witness.take(client.truth, client.position + ORIGIN, client.velocity)
+        truth.take(client.truth, client.position + ORIGIN, client.velocity)
         client.truth = None
-        self.airborne |= witness.state is not None and witness.state[2] > 2.0
+        self.airborne |= truth.state is not None and truth.state[2] > 2.0
         if not self.airborne:
-            self._seen = witness.collisions  # it touches what it stands on
+            self._seen = truth.collisions  # it touches what it stands on
         else:
-            self._nearest = min(self._nearest, witness.clearance)
+            self._nearest = min(self._nearest, truth.clearance)
 
     def motion(self) -> tuple[Array, float]:
         """Where it says that it is (3,) [m], and how fast [m/s]."""
@@ -293,9 +293,9 @@ class Judge:
 
     def take(self, outcomes: Outcomes) -> None:
         """What happened since the last time goes there."""
-        outcomes.collisions += self.witness.collisions - self._seen
+        outcomes.collisions += self.truth.collisions - self._seen
         outcomes.nearest = min(outcomes.nearest, self._nearest)
-        self._seen, self._nearest = self.witness.collisions, float("inf")
+        self._seen, self._nearest = self.truth.collisions, float("inf")
 
 
 MAP = flight_arena(ARENA, 0)
@@ -307,7 +307,7 @@ def judged(url: str, system: int) -> Iterator[Judge]:
     robot = robot_named("quadrotor-late")
     link = open_link(url)
     client = Client(link.send, system)
-    judge = Judge(client, link, Witness(lambda at: float(MAP.shapes.distance(at).min()) - robot.footprint))
+    judge = Judge(client, link, MavlinkGroundTruth(lambda at: float(MAP.shapes.distance(at).min()) - robot.footprint))
 
     def wait(condition: Callable[[], bool], seconds: float) -> bool:
         end = time.monotonic() + seconds

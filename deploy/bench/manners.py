@@ -15,7 +15,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from actors.heard import OFFBOARD
+from actors.mavlink_decoder import OFFBOARD
 from deploy.bench import sitl
 from deploy.bench.station import VELOCITY_ONLY, Station
 from deploy.bench.timing import Words

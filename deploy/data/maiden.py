@@ -14,7 +14,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from actors.live import LiveVehicle
+from actors.mavlink_vehicle import MavlinkVehicle
 from deploy.data.coverage import more_to_drive
 from deploy.data.excite import random_target, towards
 from deploy.data.support import Unsupported, supported
@@ -134,7 +134,7 @@ class Maiden:
     """Flies one vehicle that hovers where the box's middle is to be."""
 
     def __init__(
-        self, vehicle: LiveVehicle, robot: Robot, box: Box, seed: int, stop: Callable[[], bool] = lambda: False
+        self, vehicle: MavlinkVehicle, robot: Robot, box: Box, seed: int, stop: Callable[[], bool] = lambda: False
     ) -> None:
         """robot: in real time."""
         self._vehicle, self._robot, self._box, self._stop = vehicle, robot, box, stop
@@ -178,7 +178,7 @@ class Maiden:
         vehicle, robot = self._vehicle, self._robot
         bounds = level * robot.high()
         log.info("%.0f %% of its speed: %.1f m/s an axis, for %.0f s", 100 * level, bounds.max(), seconds)
-        vehicle.wait(vehicle.turn.number + 1)
+        vehicle.wait(vehicle.current_period.number + 1)
         self._flown.cut()
         end = self._periods + round(seconds / robot.period)
         while self._periods < end:
@@ -186,39 +186,39 @@ class Maiden:
                 if self._period(wanted, bounds):
                     break
         self._flown.cut()
-        vehicle.wait(vehicle.turn.number + 5)
+        vehicle.wait(vehicle.current_period.number + 5)
 
     def _next(self, level: float) -> list[Array]:
-        turn = self._vehicle.turn
-        inputs = stretch(self._robot, level, turn.input, self._rng)
-        if not turn.input.any():
-            return homeward(inputs, turn.report.measured, self._box, self._robot.period, self._rng)
+        period = self._vehicle.current_period
+        inputs = stretch(self._robot, level, period.input, self._rng)
+        if not period.input.any():
+            return homeward(inputs, period.report.measured, self._box, self._robot.period, self._rng)
         return inputs
 
     def _period(self, wanted: Array, level: Array) -> bool:
         """Fly one; whether the box had its way, or the recording a gap: the stretch is over. Raises Ended."""
         vehicle, flown, box = self._vehicle, self._flown, self._box
-        before = vehicle.turn
+        before = vehicle.current_period
         kept = box.kept(before.report.measured, wanted, level)
         vehicle.commit(kept[None], before.number + 1)
-        turn = vehicle.wait(before.number + 1)
+        period = vehicle.wait(before.number + 1)
         self._periods += 1
-        if turn.number != before.number + 1 or turn.lost:
+        if period.number != before.number + 1 or period.lost:
             flown.cut()
-            if turn.lost:
+            if period.lost:
                 self._patiently()
             return True
         if not flown.states:
-            flown.states, flown.before = [turn.report.measured], before.input
+            flown.states, flown.before = [period.report.measured], before.input
         else:
-            flown.states.append(turn.report.measured)
-            flown.paths.append(turn.report.subsamples)
+            flown.states.append(period.report.measured)
+            flown.paths.append(period.report.subsamples)
             flown.inputs.append(before.input)
         if len(flown.inputs) >= PIECE:
             flown.cut()
-        if box.outside(turn.report.measured) > OUTSIDE:
+        if box.outside(period.report.measured) > OUTSIDE:
             raise Ended(
-                f"it left its box by {box.outside(turn.report.measured):.0f} m: it does not do what it is asked to"
+                f"it left its box by {box.outside(period.report.measured):.0f} m: it does not do what it is asked to"
             )
         if self._stop():
             raise Ended("told to stop")
@@ -227,9 +227,9 @@ class Maiden:
     def _patiently(self) -> None:
         """Lost telemetry, or a pilot who took over: hover until it is over, and give up after a while."""
         for _ in range(round(10.0 / self._robot.period)):
-            if not self._vehicle.wait(self._vehicle.turn.number + 1).lost:
+            if not self._vehicle.wait(self._vehicle.current_period.number + 1).lost:
                 return
-        raise Ended(f"it was lost for 10 s: {self._vehicle.turn.lost}")
+        raise Ended(f"it was lost for 10 s: {self._vehicle.current_period.lost}")
 
     def _off(self) -> float:
         """m, 95 % of held-out predictions `AHEAD` periods ahead are better: a linear fit of what was flown so far."""

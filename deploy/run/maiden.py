@@ -9,8 +9,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from actors.keeper import listening
-from actors.live import LiveVehicle
+from actors.mavlink_vehicle import MavlinkVehicle
+from actors.vehicle_server import listening
 from deploy.data.maiden import Box, Found, Maiden
 from messaging.links import open_link
 from messaging.robots import Robot
@@ -46,7 +46,7 @@ def fly(robot: Robot, settings: MaidenSettings) -> Found:
 
 
 def _flown(robot: Robot, settings: MaidenSettings, stop: threading.Event) -> Found:
-    vehicle = LiveVehicle(
+    vehicle = MavlinkVehicle(
         open_link(settings.url),
         robot,
         settings.system,
@@ -56,11 +56,11 @@ def _flown(robot: Robot, settings: MaidenSettings, stop: threading.Event) -> Fou
         lead=settings.lead,
     )
     try:
-        middle = vehicle.turn.report.measured[:3]
+        middle = vehicle.current_period.report.measured[:3]
         box = Box(middle, np.array([0.5 * settings.room, 0.5 * settings.room, settings.height * 2.0 / 3.0]))
         about = {"autopilot": "; ".join(vehicle.notes), "url": settings.url}
         found = Maiden(vehicle, robot, box, settings.seed, stop.is_set).fly(settings.minutes, about)
-        vehicle.wait(vehicle.turn.number + robot.horizon)
+        vehicle.wait(vehicle.current_period.number + robot.horizon)
         vehicle.land()
         _await_landing(vehicle)
     finally:
@@ -68,7 +68,7 @@ def _flown(robot: Robot, settings: MaidenSettings, stop: threading.Event) -> Fou
     return found
 
 
-def _await_landing(vehicle: LiveVehicle) -> None:
+def _await_landing(vehicle: MavlinkVehicle) -> None:
     deadline = time.monotonic() + LANDING
     while vehicle.armed and time.monotonic() < deadline:
         vehicle.listen(1.0)

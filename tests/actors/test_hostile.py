@@ -7,8 +7,8 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
+from actors.ground_truth import MOST_DATAGRAMS, UdpGroundTruth
 from actors.mavlink import Client
-from actors.truth import MOST_TOLD, Truth
 from messaging.ports import free_udp_port
 from messaging.tolerant import Tolerance
 
@@ -21,7 +21,7 @@ class Said:
 
     def __init__(self) -> None:
         self.tolerance, self.port = Tolerance(), free_udp_port()
-        self.truth = Truth(self.port, 1, self.tolerance)
+        self.truth = UdpGroundTruth(self.port, 1, self.tolerance)
         self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
 
     def __call__(self, data: object) -> None:
@@ -72,7 +72,7 @@ def test_who_sends_without_end_does_not_hold_up_the_flight(say: Said) -> None:
     before, say.truth._socket = say.truth._socket, Endless()  # type: ignore[assignment]
     say.truth.poll()
     say.truth._socket = before
-    assert len(read) == MOST_TOLD
+    assert len(read) == MOST_DATAGRAMS
 
 
 def test_noise_on_a_link_is_passed_over() -> None:

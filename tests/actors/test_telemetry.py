@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from actors.ceilings import CEILINGS, demand, too_low
+from actors.autopilot_limits import AUTOPILOT_LIMITS, demand, limits_below_demand
 from actors.dialect import mavlink
 from actors.mavlink import Client, NotTold, message_id
 from actors.telemetry import (
@@ -179,9 +179,9 @@ def test_what_is_no_number_was_not_told(said: Any) -> None:
     """It counted as fresh, and a flight by scan ended in an exception."""
     client, mav = Client(lambda _: None), mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
     client.feed(mavlink.MAVLink_heartbeat_message(2, KINDS["px4"], 128, 0, 4, 3).pack(mav))
-    before = dict(client.heard)
+    before = dict(client.message_counts)
     client.feed(said.pack(mav))
-    assert dict(client.heard) == before
+    assert dict(client.message_counts) == before
 
 
 def test_what_is_granted_and_never_comes_is_not_relied_on() -> None:
@@ -224,10 +224,10 @@ def test_the_faster_of_two_slow_ones_is_taken_and_one_too_slow_to_fly_is_none() 
 def test_once_chosen_another_message_says_nothing() -> None:
     there = Pretender("px4", {"ATTITUDE_QUATERNION": 0.0, "ATTITUDE": 50.0})
     there.client.choose(ATTITUDE, 0.02, there.wait)
-    heard = there.client.heard[ATTITUDE]
+    heard = there.client.message_counts[ATTITUDE]
     there._mav.send(SAID["ATTITUDE_QUATERNION"])
     there.wait(lambda: False, 0.0)
-    assert there.client.heard[ATTITUDE] == heard
+    assert there.client.message_counts[ATTITUDE] == heard
 
 
 def test_frames_that_are_missing_are_counted() -> None:
@@ -243,12 +243,12 @@ def test_frames_that_are_missing_are_counted() -> None:
 def test_parameters_that_hold_it_below_what_may_be_asked_for() -> None:
     there = Pretender("ardupilot", {}, {"WPNAV_ACCEL": 100.0, "WPNAV_SPEED": 800.0})
     there.client.identify(there.wait)
-    values = {c.parameter: there.client.parameter(c.parameter, there.wait) for c in CEILINGS["ardupilot"]}
+    values = {c.parameter: there.client.parameter(c.parameter, there.wait) for c in AUTOPILOT_LIMITS["ardupilot"]}
     known = {name: value for name, value in values.items() if value is not None}
     assert known == {"WPNAV_ACCEL": 100.0, "WPNAV_SPEED": 800.0}
-    assert [ceiling.parameter for ceiling, _ in too_low("ardupilot", known, QUADROTOR)] == ["WPNAV_ACCEL"]
+    assert [limit.parameter for limit, _ in limits_below_demand("ardupilot", known, QUADROTOR)] == ["WPNAV_ACCEL"]
     asked = demand(QUADROTOR)
-    assert (asked.speed, asked.climb, asked.across) == pytest.approx((50**0.5, 5.0, 32**0.5))
+    assert (asked.speed, asked.climb, asked.horizontal_acceleration) == pytest.approx((50**0.5, 5.0, 32**0.5))
 
 
 def test_what_the_estimator_lacks_has_a_name() -> None:

@@ -168,7 +168,7 @@ def keeper(run: Run) -> psutil.Process:
     """The process that keeps the vehicle of a run."""
     url = load(run.folder / CONFIG).flights[0].url
     words = {process: process.info["cmdline"] or [] for process in psutil.process_iter(["cmdline"])}  # none: a zombie's
-    (found,) = (process for process, own in words.items() if "actors.keeper" in own and url in own)
+    (found,) = (process for process, own in words.items() if "actors.vehicle_server" in own and url in own)
     return found
 
 

@@ -15,9 +15,9 @@ import pytest
 
 from actors.dialect import mavlink
 from actors.frames import Frame
-from actors.heard import OFFBOARD
-from actors.live import LiveVehicle
 from actors.mavlink import message_id
+from actors.mavlink_decoder import OFFBOARD
+from actors.mavlink_vehicle import MavlinkVehicle
 from deploy.bench.timing import stalls
 from messaging.links import open_link
 from tests.real import KINDS, autopilot, autopilots
@@ -45,7 +45,7 @@ def test_it_is_found_out_flown_and_given_back(kind: str, tmp_path: Path, caplog:
     caplog.set_level(logging.INFO)
     frames: list[Frame] = []
     with autopilot(kind, tmp_path) as (url, system):
-        vehicle = LiveVehicle(open_link(url), QUADROTOR, system, height=5.0, tap=frames.append, raise_limits=True)
+        vehicle = MavlinkVehicle(open_link(url), QUADROTOR, system, height=5.0, tap=frames.append, raise_limits=True)
         try:
             client = vehicle._client
             assert client.kind == kind and set(client.chosen.values()) >= USED.get(kind, set()), vehicle.notes
@@ -66,7 +66,7 @@ def test_it_is_found_out_flown_and_given_back(kind: str, tmp_path: Path, caplog:
             assert flown[0] - hovering[0] > 2.0 and flown[1] - hovering[1] < -0.8 and flown[5] > 0.0
             assert flown[3:5] == pytest.approx([2.0, -1.0], abs=0.6)
             braked = [vehicle.step(np.zeros(3)) for _ in range(15)][-1].measured
-            assert np.linalg.norm(braked[3:6]) < 0.7 and not vehicle.turn.lost
+            assert np.linalg.norm(braked[3:6]) < 0.7 and not vehicle.current_period.lost
             assert vehicle.timing.round_trip < 0.2 and client.missed < 0.1 * client.received
 
             main, sub = LAND[kind]  # somebody else takes it
@@ -80,11 +80,11 @@ def test_it_is_found_out_flown_and_given_back(kind: str, tmp_path: Path, caplog:
                 sub,
                 *[0] * 4,
             )
-            until(lambda: "LAND" in vehicle.turn.lost)
-            vehicle.wait(vehicle.turn.number + 10)
+            until(lambda: "LAND" in vehicle.current_period.lost)
+            vehicle.wait(vehicle.current_period.number + 10)
             assert client.custom_mode != OFFBOARD[kind][1], "who took it keeps it"
             assert any("braking" in record.message and "LAND" in record.message for record in caplog.records)
-            until(lambda: "disarmed" in vehicle.turn.lost)
+            until(lambda: "disarmed" in vehicle.current_period.lost)
         finally:
             vehicle.close()
     waited = any("waiting for the position estimate" in record.message for record in caplog.records)
@@ -94,7 +94,7 @@ def test_it_is_found_out_flown_and_given_back(kind: str, tmp_path: Path, caplog:
 def test_an_ardupilot_that_is_led_stays_where_it_was_led_to_when_nothing_more_comes(tmp_path: Path) -> None:
     """Told velocities, a version without GUID_TIMEOUT flies on for 3 s: 12 m."""
     with autopilot("ardupilot", tmp_path) as (url, system):
-        vehicle = LiveVehicle(open_link(url), QUADROTOR, system, height=5.0, raise_limits=True, lead=True)
+        vehicle = MavlinkVehicle(open_link(url), QUADROTOR, system, height=5.0, raise_limits=True, lead=True)
         try:
             flown = [vehicle.step(np.array([3.0, 0.0, 0.0])) for _ in range(20)][-1].measured
             assert flown[3:6] == pytest.approx([3.0, 0.0, 0.0], abs=0.6)

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from actors.live import Turn
+from actors.mavlink_vehicle import ControlPeriod
 from deploy.data.maiden import LEVELS, Box, Maiden, homeward, stretch
 from safety.dataset import Dataset
 from safety.windows import PLAN, windows
@@ -28,20 +28,20 @@ class Sluggish:
         self.position, self.velocity, self.acceleration = BOX.middle.copy(), np.zeros(3), np.zeros(3)
         self.plan: list[np.ndarray] = []
         self.farthest, self.fastest = -np.inf, 0.0
-        self.turn = Turn(0, np.zeros(3), self._report(np.zeros((SAMPLES, 3))))
+        self.current_period = ControlPeriod(0, np.zeros(3), self._report(np.zeros((SAMPLES, 3))))
 
     def commit(self, plan: np.ndarray, number: int) -> bool:
         self.plan = [slewed(row, row) for row in plan]
         return True
 
-    def wait(self, number: int) -> Turn:
-        while self.turn.number < number:
+    def wait(self, number: int) -> ControlPeriod:
+        while self.current_period.number < number:
             self._pass()
-        return self.turn
+        return self.current_period
 
     def _pass(self) -> None:
         path, start = [], self.position.copy()
-        told = self.turn.input * (self.rng.choice([-1.0, 1.0]) if self.fickle else 1.0)
+        told = self.current_period.input * (self.rng.choice([-1.0, 1.0]) if self.fickle else 1.0)
         for _ in range(SAMPLES):
             self.acceleration = (told - self.velocity) / self.constant
             self.velocity = self.velocity + self.acceleration * 0.2 / SAMPLES
@@ -50,7 +50,9 @@ class Sluggish:
         self.farthest = max(self.farthest, BOX.outside(self.position))
         self.fastest = max(self.fastest, float(np.abs(self.velocity).max()))
         following = self.plan.pop(0) if self.plan else np.zeros(3)
-        self.turn = Turn(self.turn.number + 1, slewed(following, self.turn.input), self._report(np.array(path)))
+        self.current_period = ControlPeriod(
+            self.current_period.number + 1, slewed(following, self.current_period.input), self._report(np.array(path))
+        )
 
     def _report(self, path: np.ndarray) -> Period:
         state = np.concatenate([self.position, self.velocity, self.acceleration])

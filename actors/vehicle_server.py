@@ -4,7 +4,7 @@ It has the link and the clock, and carries out what the actor commits: a process
 policy and no bus holds up. An actor that dies leaves a plan that was verified to its end: it is
 flown to its end, and then the vehicle hovers until the next actor comes and goes on. If none does, it is let go of.
 
-The actor's side is `actors.kept`. They meet at a socket that only processes of this user on this machine reach.
+The actor's side is `actors.vehicle_client`. They meet at a socket that only this user's processes reach.
 """
 
 from __future__ import annotations
@@ -27,12 +27,11 @@ from queue import SimpleQueue
 import numpy as np
 
 from actors.frames import Frame
-from actors.kept import Answer, Charge, Failure, LetGo, News, Raw, address, ours
-from actors.live import LiveVehicle, Turn
+from actors.ground_truth import MavlinkGroundTruth, UdpGroundTruth
 from actors.mavlink import MavlinkError
+from actors.mavlink_vehicle import ControlPeriod, MavlinkVehicle
 from actors.takeoff import REST, STOPPING
-from actors.truth import Truth
-from actors.witness import Witness
+from actors.vehicle_client import Answer, Failure, FlightRequest, HandoverRefused, Raw, VehicleUpdate, address, ours
 from messaging.links import open_link
 from messaging.robots import robot_named
 from messaging.shapes import Shapes
@@ -90,36 +89,36 @@ class Outbox:
                 self._keep(said)
 
     def _keep(self, said: object) -> None:
-        if isinstance(said, News):
+        if isinstance(said, VehicleUpdate):
             self.lost.extend(said.frames)
         elif isinstance(said, logging.LogRecord):
             with contextlib.suppress(OSError, ValueError):  # a terminal that is gone
                 print(said.getMessage(), file=sys.stderr, flush=True)
 
 
-class Keeper:
+class VehicleServer:
     """Of one vehicle, which flies once this is made."""
 
-    def __init__(self, charge: Charge, actor: Connection, outbox: Outbox, stop: threading.Event) -> None:
+    def __init__(self, request: FlightRequest, actor: Connection, outbox: Outbox, stop: threading.Event) -> None:
         """Raises MavlinkError, BadLink, OSError; MavlinkError also when told to stop, or left alone, before it flew."""
-        self.charge, self._outbox, self._stop = charge, outbox, stop
-        self._robot, flight = robot_named(charge.robot), charge.flight
+        self.request, self._outbox, self._stop = request, outbox, stop
+        self._robot, flight = robot_named(request.robot), request.flight
         self._frames: deque[Raw] = deque(maxlen=MOST_FRAMES)
         self._telling = threading.Lock()
         self._tolerance = Tolerance()
-        footprint, shapes = self._robot.footprint, Shapes.of(charge.obstacles, self._robot.position_dim)
-        self._vehicle = LiveVehicle(
+        footprint, shapes = self._robot.footprint, Shapes.of(request.obstacles, self._robot.position_dim)
+        self._vehicle = MavlinkVehicle(
             open_link(flight.url),
             self._robot,
             flight.system,
             flight.height,
             flight.origin,
-            Truth(flight.truth, flight.system, self._tolerance) if flight.truth else None,
+            UdpGroundTruth(flight.truth, flight.system, self._tolerance) if flight.truth else None,
             self._keep,
             self._tolerance,
             lambda: stop.is_set() or actor.poll(),  # whatever is said before it flies is: stop
             flight.raise_limits,
-            Witness(lambda position: float(shapes.distance(position).min()) - footprint),
+            MavlinkGroundTruth(lambda position: float(shapes.distance(position).min()) - footprint),
             flight.lead,
         )
         threading.Thread(target=self._tell, name="news", daemon=True).start()
@@ -154,22 +153,22 @@ class Keeper:
         """Along the committed plan to its end, and then until it hovers. Raises MavlinkError: nobody flies it."""
         log.warning("without an actor: braking along the committed plan")
         vehicle, end = self._vehicle, time.monotonic() + STOPPING
-        turn = vehicle.wait(vehicle.turn.number + self._robot.horizon)
-        while _speed(turn) > REST and time.monotonic() < end and not self.gone:
-            turn = vehicle.wait(turn.number + 1)
-        what = "it hovers" if _speed(turn) <= REST else "it does not come to rest"
-        log.warning("%s at (%.2f, %.2f, %.2f) m", what, *turn.report.measured[:3])
+        period = vehicle.wait(vehicle.current_period.number + self._robot.horizon)
+        while _speed(period) > REST and time.monotonic() < end and not self.gone:
+            period = vehicle.wait(period.number + 1)
+        what = "it hovers" if _speed(period) <= REST else "it does not come to rest"
+        log.warning("%s at (%.2f, %.2f, %.2f) m", what, *period.report.measured[:3])
 
     @property
     def gone(self) -> bool:
         """Does nobody fly it any more, or was nothing heard of it for a while?"""
         return self._vehicle.failed or self._vehicle.silence > GONE
 
-    def parted(self, charge: Charge) -> str:
+    def parted(self, request: FlightRequest) -> str:
         """Why another actor can't go on with it, but has to take control anew; empty: it can."""
-        if charge != self.charge:
+        if request != self.request:
             return "it was flown with other settings until now"
-        return self._vehicle.turn.lost
+        return self._vehicle.current_period.lost
 
     def close(self) -> None:
         """Let go of the vehicle, which is first braked unless it hovers; what it said last goes to the actor."""
@@ -178,33 +177,35 @@ class Keeper:
                 self.brake()
         finally:
             self._vehicle.close()
-            self._outbox.put(self._news(self._vehicle.turn, self._vehicle.timing.figures() | self._vehicle.judged()))
+            self._outbox.put(
+                self._news(self._vehicle.current_period, self._vehicle.timing.figures() | self._vehicle.judged())
+            )
 
     def _keep(self, frame: Frame) -> None:
         self._frames.append((time.time_ns(), frame.outgoing, frame.raw))
 
     def _tell(self) -> None:
         """Each period as it begins; what comes while there is no actor is for the next one."""
-        vehicle, turn = self._vehicle, self._vehicle.turn
+        vehicle, period = self._vehicle, self._vehicle.current_period
         while not vehicle.failed:
             if self._outbox.actor is not None and not self._outbox.full:
-                told = turn.number % FIGURES == 0
-                self._outbox.put(self._news(turn, vehicle.timing.figures() | vehicle.judged() if told else None))
+                told = period.number % FIGURES == 0
+                self._outbox.put(self._news(period, vehicle.timing.figures() | vehicle.judged() if told else None))
             try:
-                turn = vehicle.wait(turn.number + 1)
+                period = vehicle.wait(period.number + 1)
             except MavlinkError:  # it failed, or this machine stood still for seconds
-                turn = vehicle.turn
+                period = vehicle.current_period
 
-    def _news(self, turn: Turn, figures: dict[str, float] | None) -> News:
+    def _news(self, period: ControlPeriod, figures: dict[str, float] | None) -> VehicleUpdate:
         frames: list[Raw] = []
         with self._telling:
             for kept in (self._outbox.lost, self._frames):
                 frames += [kept.popleft() for _ in range(len(kept))]
-        return News(turn, frames, self._tolerance.count, figures)
+        return VehicleUpdate(period, frames, self._tolerance.count, figures)
 
 
-def _speed(turn: Turn) -> float:
-    return float(np.linalg.norm(turn.report.measured[3:6]))
+def _speed(period: ControlPeriod) -> float:
+    return float(np.linalg.norm(period.report.measured[3:6]))
 
 
 @contextmanager
@@ -219,7 +220,7 @@ def listening(url: str, system: int) -> Iterator[socket.socket]:
         yield server
 
 
-def next_actor(server: socket.socket, stop: threading.Event, keeper: Keeper | None) -> Connection | None:
+def next_actor(server: socket.socket, stop: threading.Event, keeper: VehicleServer | None) -> Connection | None:
     """The next one of this user that knocks; None: told to stop, or none comes."""
     deadline = time.monotonic() + SUCCESSOR
     while not stop.is_set() and time.monotonic() < deadline and not (keeper and keeper.gone):
@@ -253,17 +254,17 @@ def main() -> int:
 
 def _keep(server: socket.socket, outbox: Outbox, stop: threading.Event) -> int:
     """For one actor after the other. Raises what making a keeper does, and MavlinkError."""
-    keeper: Keeper | None = None
+    keeper: VehicleServer | None = None
     try:
         while (actor := next_actor(server, stop, keeper)) is not None:
-            if (charge := _charge(actor)) is None:
+            if (request := _charge(actor)) is None:
                 continue
-            if keeper is not None and (why := keeper.parted(charge)):
-                outbox.tell(actor, Failure(LetGo(why)))
+            if keeper is not None and (why := keeper.parted(request)):
+                outbox.tell(actor, Failure(HandoverRefused(why)))
                 return 2
             outbox.actor = actor
             if keeper is None:
-                keeper = Keeper(charge, actor, outbox, stop)
+                keeper = VehicleServer(request, actor, outbox, stop)
             else:
                 log.info("it hovers, and goes on")
             if keeper.serve(actor):
@@ -276,13 +277,13 @@ def _keep(server: socket.socket, outbox: Outbox, stop: threading.Event) -> int:
             keeper.close()
 
 
-def _charge(actor: Connection) -> Charge | None:
+def _charge(actor: Connection) -> FlightRequest | None:
     """An actor's first word; None: it is gone, or has nothing to say."""
     try:
         said = actor.recv() if actor.poll(LAST_WORDS) else None
     except (EOFError, OSError):
         return None
-    return said if isinstance(said, Charge) else None
+    return said if isinstance(said, FlightRequest) else None
 
 
 def _portable(error: Exception) -> Exception:

@@ -1,4 +1,4 @@
-"""A vehicle that a process of its own keeps flying (`actors.keeper`), as its actor sees it."""
+"""A vehicle that a process of its own keeps flying (`actors.vehicle_server`), as its actor sees it."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from queue import Empty, SimpleQueue
 
 import numpy as np
 
-from actors.live import Turn
 from actors.mavlink import MavlinkError
+from actors.mavlink_vehicle import ControlPeriod
 from actors.settings import FlightSettings
 from actors.telemetry import Array
 from messaging.robots import robot_named
@@ -38,7 +38,7 @@ Raw = tuple[int, bool, bytes]  # a MAVLink frame: when [ns], is it outgoing, its
 
 
 @dataclass(frozen=True)
-class Charge:
+class FlightRequest:
     """What to fly: an actor's first word."""
 
     flight: FlightSettings
@@ -46,15 +46,15 @@ class Charge:
     obstacles: tuple[Obstacle, ...]  # for the judge of simulated flights
 
 
-class LetGo(MavlinkError):
+class HandoverRefused(MavlinkError):
     """It was kept until now, but can't be handed over: somebody has to take control of it anew."""
 
 
 @dataclass(frozen=True)
-class News:
+class VehicleUpdate:
     """Of a period that begins, and what came since the one before."""
 
-    turn: Turn
+    period: ControlPeriod
     frames: list[Raw]
     passed_over: int  # messages, since the beginning
     figures: dict[str, float] | None
@@ -88,11 +88,11 @@ def ours(peer: socket.socket) -> bool:
     return bool(user == os.getuid())
 
 
-class KeptVehicle:
-    """To its actor what a `LiveVehicle` is, see there; but it goes on to the end of its plan when the actor dies."""
+class VehicleClient:
+    """To its actor what a `MavlinkVehicle` is, see there; but it goes on to the end of its plan when the actor dies."""
 
     def __init__(
-        self, charge: Charge, tap: Callable[[Raw], None], tolerance: Tolerance, stop: Callable[[], bool]
+        self, request: FlightRequest, tap: Callable[[Raw], None], tolerance: Tolerance, stop: Callable[[], bool]
     ) -> None:
         """Take over from a keeper whose actor died, or start one, and wait until it flies.
 
@@ -103,45 +103,45 @@ class KeptVehicle:
             to stop.
         """
         self._tap, self._tolerance, self._passed_over = tap, tolerance, 0
-        self._period = robot_named(charge.robot).period
-        self._turned = threading.Condition()
+        self._period = robot_named(request.robot).period
+        self._changed = threading.Condition()
         self._lines: SimpleQueue[logging.LogRecord] = SimpleQueue()
         threading.Thread(target=self._log, name="keeper's log", daemon=True).start()
         self._process: subprocess.Popen[bytes] | None = None
         self._asked = 0
         for attempts_left in reversed(range(ATTEMPTS)):
-            self._meet(charge, stop)
+            self._meet(request, stop)
             try:
                 self._await_flight(stop)
                 return
             except BaseException as error:
                 self.leave()
-                if not (attempts_left and isinstance(error, LetGo)):
+                if not (attempts_left and isinstance(error, HandoverRefused)):
                     raise
                 logging.getLogger("brakeline.flight").info("taking control of it anew: %s", error)
 
     @property
-    def turn(self) -> Turn:
+    def current_period(self) -> ControlPeriod:
         """The latest."""
-        assert self._turn is not None
-        return self._turn
+        assert self._current is not None
+        return self._current
 
     def commit(self, plan: Array, number: int) -> bool:
-        """See `LiveVehicle.commit`. Raises BadInput; MavlinkError: nobody flies any more."""
+        """See `MavlinkVehicle.commit`. Raises BadInput; MavlinkError: nobody flies any more."""
         answer = self._ask("commit", np.asarray(plan, float), number)
         if isinstance(answer, Exception):
             raise answer
         return bool(answer)
 
-    def wait(self, number: int) -> Turn:
-        """See `LiveVehicle.wait`. Raises MavlinkError."""
-        with self._turned:
-            patience = 2.0 + self._period * max(0, number - self.turn.number)
-            came = lambda: self.turn.number >= number or self._failure is not None  # noqa: E731
-            if not self._turned.wait_for(came, patience):
+    def wait(self, number: int) -> ControlPeriod:
+        """See `MavlinkVehicle.wait`. Raises MavlinkError."""
+        with self._changed:
+            patience = 2.0 + self._period * max(0, number - self.current_period.number)
+            came = lambda: self.current_period.number >= number or self._failure is not None  # noqa: E731
+            if not self._changed.wait_for(came, patience):
                 raise MavlinkError(f"period {number} does not begin")
             self._check()
-            return self.turn
+            return self.current_period
 
     def figures(self) -> dict[str, float]:
         """For Health: how time was kept, and what the judge of a simulated flight saw."""
@@ -163,16 +163,16 @@ class KeptVehicle:
         if self._process is not None and self._process.poll() is not None:
             self._process = None
 
-    def _meet(self, charge: Charge, stop: Callable[[], bool]) -> None:
+    def _meet(self, request: FlightRequest, stop: Callable[[], bool]) -> None:
         """Knock at its keeper's, and start one if there is none."""
-        self._turn: Turn | None = None
+        self._current: ControlPeriod | None = None
         self._failure: Exception | None = None
         self._figures: dict[str, float] = {}
         self._answers: SimpleQueue[Answer] = SimpleQueue()
         self._heard, self._heard_at = False, time.monotonic()
-        self._pipe = self._reach(charge.flight, stop)
+        self._pipe = self._reach(request.flight, stop)
         with contextlib.suppress(OSError):  # it has ended meanwhile, as the listener finds
-            self._pipe.send(charge)
+            self._pipe.send(request)
         self._listener = threading.Thread(target=self._listen, name="keeper", daemon=True)
         self._listener.start()
 
@@ -181,7 +181,7 @@ class KeptVehicle:
         deadline, process = time.monotonic() + STARTS_IN, None
         while (pipe := _knock(flight)) is None:
             if process is None:
-                words = [sys.executable, "-P", "-m", "actors.keeper", flight.url, str(flight.system)]
+                words = [sys.executable, "-P", "-m", "actors.vehicle_server", flight.url, str(flight.system)]
                 # Not of our session: ^C is for the actor, which then brakes and says when it is over.
                 process = self._process = subprocess.Popen(words, start_new_session=True)
             if process.poll() is not None or time.monotonic() > deadline or stop():
@@ -190,14 +190,14 @@ class KeptVehicle:
         return pipe
 
     def _await_flight(self, stop: Callable[[], bool]) -> None:
-        with self._turned:
-            while self._turn is None:
+        with self._changed:
+            while self._current is None:
                 self._check()
                 if stop():
                     raise MavlinkError("told to stop before it flew")
                 if time.monotonic() - self._heard_at > PREDECESSOR:
                     raise MavlinkError("its keeper fell silent" if self._heard else "another process here flies it")
-                self._turned.wait(LOOK)
+                self._changed.wait(LOOK)
 
     def _check(self) -> None:
         if self._failure is not None:
@@ -225,7 +225,7 @@ class KeptVehicle:
             while True:
                 said = self._pipe.recv()
                 self._heard, self._heard_at = True, time.monotonic()
-                if isinstance(said, News):
+                if isinstance(said, VehicleUpdate):
                     self._take(said)
                 elif isinstance(said, Answer):
                     self._answers.put(said)
@@ -234,7 +234,7 @@ class KeptVehicle:
                 else:
                     self._lines.put(said)
         except (EOFError, OSError):
-            self._fail(MavlinkError(ENDED) if self._heard else LetGo(ENDED))
+            self._fail(MavlinkError(ENDED) if self._heard else HandoverRefused(ENDED))
         except Exception as error:  # whatever it is: who is not understood any more does not fly for us
             self._fail(error)
 
@@ -244,20 +244,20 @@ class KeptVehicle:
             record = self._lines.get()
             logging.getLogger(record.name).handle(record)
 
-    def _take(self, news: News) -> None:
+    def _take(self, news: VehicleUpdate) -> None:
         for frame in news.frames:
             self._tap(frame)
         self._tolerance.count += news.passed_over - self._passed_over
         self._passed_over = news.passed_over
         self._figures = news.figures or self._figures
-        with self._turned:
-            self._turn = news.turn
-            self._turned.notify_all()
+        with self._changed:
+            self._current = news.period
+            self._changed.notify_all()
 
     def _fail(self, error: Exception) -> None:
-        with self._turned:
+        with self._changed:
             self._failure = self._failure or error
-            self._turned.notify_all()
+            self._changed.notify_all()
         self._answers.put(Answer(-1, None))  # who waits for one looks up
 
 

@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 
 from actors.frames import Frame
-from actors.live import LiveVehicle
+from actors.ground_truth import UdpGroundTruth
+from actors.mavlink_vehicle import MavlinkVehicle
 from actors.telemetry import ATTITUDE
 from actors.timing import Offset
-from actors.truth import Truth
 from messaging.clock import WallClock
 from messaging.links import open_link
 from messaging.ports import free_udp_port
@@ -28,7 +28,7 @@ from tests.robots import QUADROTOR
 
 GAP = 0.25  # s between two setpoints, at most
 
-Live = tuple[LiveVehicle, Autopilot, list[Frame]]
+Live = tuple[MavlinkVehicle, Autopilot, list[Frame]]
 
 
 @pytest.fixture(params=RULES)
@@ -42,8 +42,8 @@ def live(request: pytest.FixtureRequest) -> Iterator[Live]:
     thread.start()
     there = open_link(f"udpout:127.0.0.1:{link.port}")  # type: ignore[union-attr]
     try:
-        vehicle = LiveVehicle(
-            there, QUADROTOR, height=2.0, truth=Truth(truth_port, 1), tap=frames.append, raise_limits=True
+        vehicle = MavlinkVehicle(
+            there, QUADROTOR, height=2.0, truth=UdpGroundTruth(truth_port, 1), tap=frames.append, raise_limits=True
         )
         try:
             yield vehicle, autopilot, frames
@@ -72,10 +72,10 @@ def test_it_takes_off_flies_brakes_and_lands(stalled: Callable[[], float], live:
     late = 3.0 * stalled()  # m flown meanwhile: the truth's word is of a moment before, or of one before a stall
     assert period.measured[:3] == pytest.approx(period.true[:3], abs=0.3 + late)
     assert period.subsamples[-1] == pytest.approx([0.4, 0.2, 0.0], abs=0.15)
-    assert vehicle.timing.worst_gap < GAP + stalled() and not vehicle.turn.lost and not period.collision
-    assert vehicle.turn.number >= 12
+    assert vehicle.timing.worst_gap < GAP + stalled() and not vehicle.current_period.lost and not period.collision
+    assert vehicle.current_period.number >= 12
 
-    hovering = vehicle.wait(vehicle.turn.number + 10)  # nothing follows: it brakes within its slew
+    hovering = vehicle.wait(vehicle.current_period.number + 10)  # nothing follows: it brakes within its slew
     assert not hovering.input.any()
     assert np.linalg.norm(hovering.report.measured[3:6]) < 0.3
 
@@ -90,18 +90,18 @@ def test_a_plan_is_carried_out_input_by_input_and_then_it_hovers(live: Live) -> 
     vehicle, _, frames = live
     frames.clear()
     plan = np.array([[0.5, 0.0, 0.0], [1.0, 0.2, 0.0], [0.6, 0.1, 0.0], [0.0, 0.0, 0.0]])
-    number = vehicle.turn.number + 2
+    number = vehicle.current_period.number + 2
     assert vehicle.commit(plan, number)
-    turns = [vehicle.wait(number + k) for k in range(6)]
-    assert [turn.number - number for turn in turns] == [0, 1, 2, 3, 4, 5], "nobody was late to look"
-    assert np.array([turn.input for turn in turns]) == pytest.approx(np.vstack([plan, np.zeros((2, 3))]))
+    periods = [vehicle.wait(number + k) for k in range(6)]
+    assert [current.number - number for current in periods] == [0, 1, 2, 3, 4, 5], "nobody was late to look"
+    assert np.array([current.input for current in periods]) == pytest.approx(np.vstack([plan, np.zeros((2, 3))]))
     assert setpoints(frames) == [(0.0, 0.0, 0.0), *(tuple(row) for row in plan)]
 
 
 def test_what_is_carried_out_keeps_to_the_robots_own_slew(live: Live) -> None:
     vehicle, _, _ = live
     vehicle._robot = replace(QUADROTOR, action_slew=(0.2, 0.2, 0.2))
-    number = vehicle.turn.number + 2
+    number = vehicle.current_period.number + 2
     assert vehicle.commit(np.tile([1.0, 0.0, 0.0], (3, 1)), number)
     inputs = [vehicle.wait(number + k).input[0] for k in range(5)]
     assert inputs == pytest.approx([0.2, 0.4, 0.6, 0.4, 0.2])
@@ -110,29 +110,29 @@ def test_what_is_carried_out_keeps_to_the_robots_own_slew(live: Live) -> None:
 def test_a_plan_that_comes_late_does_not_count_and_a_newer_one_does(live: Live) -> None:
     vehicle, _, _ = live
     first, second = np.full((3, 3), 0.3), np.full((3, 3), 0.6)
-    number = vehicle.turn.number + 2
+    number = vehicle.current_period.number + 2
     assert vehicle.commit(first, number)
     vehicle.wait(number)
     assert not vehicle.commit(second, number), "the period has begun"
-    assert vehicle.turn.input == pytest.approx(first[0])
+    assert vehicle.current_period.input == pytest.approx(first[0])
     assert vehicle.commit(second, number + 1)
     assert vehicle.wait(number + 1).input == pytest.approx(second[0])
     with pytest.raises(BadInput):
         vehicle.commit(np.full((2, 3), np.nan), number + 4)
 
 
-def heard_again(vehicle: LiveVehicle) -> bool:
+def heard_again(vehicle: MavlinkVehicle) -> bool:
     """Within some periods, on a machine that may stall."""
-    return any(not vehicle.wait(vehicle.turn.number + 1).lost for _ in range(25))
+    return any(not vehicle.wait(vehicle.current_period.number + 1).lost for _ in range(25))
 
 
 def test_without_telemetry_it_says_so_and_goes_on(live: Live) -> None:
     vehicle, autopilot, _ = live
-    assert vehicle.commit(np.full((9, 3), 0.4), vehicle.turn.number + 2)
+    assert vehicle.commit(np.full((9, 3), 0.4), vehicle.current_period.number + 2)
     real, autopilot.take = autopilot.take, lambda: real() and b""  # type: ignore[method-assign, func-returns-value]
-    turn = vehicle.wait(vehicle.turn.number + 4)
-    assert "no telemetry" in turn.lost
-    assert turn.input == pytest.approx([0.4, 0.4, 0.4])
+    current = vehicle.wait(vehicle.current_period.number + 4)
+    assert "no telemetry" in current.lost
+    assert current.input == pytest.approx([0.4, 0.4, 0.4])
     autopilot.take = real  # type: ignore[method-assign]
     assert heard_again(vehicle)
 
@@ -141,7 +141,7 @@ def test_what_stops_coming_alone_is_lost_telemetry_too(live: Live) -> None:
     vehicle, _, _ = live
     chosen = vehicle._client.chosen[ATTITUDE]
     vehicle._client.chosen[ATTITUDE] = "AHRS2"  # which does not come; the position goes on coming
-    assert "no telemetry of attitude" in vehicle.wait(vehicle.turn.number + 3).lost
+    assert "no telemetry of attitude" in vehicle.wait(vehicle.current_period.number + 3).lost
     vehicle._client.chosen[ATTITUDE] = chosen
     assert heard_again(vehicle)
     assert vehicle.timing.figures()["periods without telemetry"] >= 1
@@ -150,7 +150,7 @@ def test_what_stops_coming_alone_is_lost_telemetry_too(live: Live) -> None:
 def test_outside_of_the_autopilots_geofence_it_brakes(live: Live) -> None:
     vehicle, _, _ = live
     vehicle._client.outside = "boundary"
-    assert "outside of its geofence (boundary)" in vehicle.wait(vehicle.turn.number + 2).lost
+    assert "outside of its geofence (boundary)" in vehicle.wait(vehicle.current_period.number + 2).lost
     vehicle._client.outside = ""
     assert heard_again(vehicle)
 
@@ -159,9 +159,12 @@ def test_a_pilot_may_take_over(live: Live) -> None:
     vehicle, autopilot, _ = live
     autopilot.pilot.change(Mode.HOLD)
     for _ in range(25):  # until a heartbeat comes, on a machine that may stall
-        if "does not follow" in (turn := vehicle.wait(vehicle.turn.number + 1)).lost:
+        if "does not follow" in (current := vehicle.wait(vehicle.current_period.number + 1)).lost:
             break
-    assert "does not follow" in turn.lost and {"px4": "HOLD", "ardupilot": "LOITER"}[vehicle._client.kind] in turn.lost
+    assert (
+        "does not follow" in current.lost
+        and {"px4": "HOLD", "ardupilot": "LOITER"}[vehicle._client.kind] in current.lost
+    )
     assert autopilot.pilot.mode is Mode.HOLD, "who took it keeps it"
 
 

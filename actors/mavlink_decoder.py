@@ -1,6 +1,7 @@
-"""What an autopilot tells: its MAVLink 2 messages, read.
+"""Decode the MAVLink 2 messages of one autopilot.
 
-NED and forward-right-down end here; what comes out is ENU, SI units. Bytes are fed in: no thread, no clock, no socket.
+The frames NED and forward-right-down end here: every value that comes out is in ENU and SI units. The caller feeds the
+bytes; the decoder has no thread, no clock and no socket.
 """
 
 from __future__ import annotations
@@ -26,15 +27,17 @@ SIDES = {1: "least altitude", 2: "greatest altitude", 3: "boundary"}  # FENCE_BR
 OFFBOARD = {"px4": (6, 6 << 16), "ardupilot": (4, 4)}  # DO_SET_MODE's param2, and HEARTBEAT's custom mode
 
 
-class Heard:
-    """What is known of one autopilot, from its messages.
+class MavlinkDecoder:
+    """The latest values from one autopilot's messages.
 
-    path: (time [s since its boot], position (3,)) of each position since it was last emptied; the rest is the latest.
-    `position`, `velocity` [m, m/s] are (3,) or None before the first; `acceleration` [m/s²] is the accelerometer's
-    reading turned into the world by the attitude, gravity taken out: few autopilots tell it themselves. Until `choose`
-    has found out what comes, everything is taken from the best message that did.
+    Until `choose` has selected a message for a quantity, the decoder uses the best one that arrives.
 
-    received, missed: frames of the autopilot, by their sequence numbers.
+    Attributes:
+        path: (time [s since its boot], position (3,)) of each position since the caller last emptied the list.
+        position, velocity: (3,) m and m/s; the position is None before the first message.
+        acceleration: (3,) m/s², the accelerometer's reading in the world frame without gravity: few autopilots send it.
+        message_counts: messages by the quantity that they carry (a key of `SOURCES`); heartbeats count as "mode".
+        received, missed: number of the autopilot's frames, by their sequence numbers.
     """
 
     def __init__(
@@ -44,29 +47,29 @@ class Heard:
         tap: Tap | None = None,
         say: Callable[[str], object] | None = None,
     ) -> None:
-        """system: the autopilot's; tap: is called with every frame from it and to it; say: with its texts."""
+        """system: the autopilot's id; tap: called with each frame from it or to it; say: called with its texts."""
         self.system = system
         self.kind: str | None = None
         self.armed = False
         self.custom_mode = 0
         self.emergency = False
-        self.airborne: bool | None = None  # None: it has not said
-        self.heard: Counter[str] = Counter()  # messages by what they told: a key of SOURCES; heartbeats: "mode"
+        self.airborne: bool | None = None  # None: unknown
+        self.message_counts: Counter[str] = Counter()
         self.time = 0.0  # s since its boot, of the latest position
         self.position: Array | None = None
         self.velocity = np.zeros(3)
         self.path: list[tuple[float, Array]] = []
-        self.truth: Place | None = None  # by a simulator inside it
+        self.truth: Place | None = None  # ground truth of the autopilot's simulator
         self.texts: list[str] = []
         self.estimator: int | None = None  # flags, see telemetry.ESTIMATED
-        self.battery: float | None = None  # %, if it tells
-        self.outside = ""  # of its geofence: over which side; empty: it has not said that it is
-        self.answers: list[tuple[int, int]] = []  # ns, of TIMESYNC: what we sent, and the autopilot's clock then
+        self.battery: float | None = None  # %; None: unknown
+        self.outside = ""  # the side of its geofence that it has crossed; empty: none
+        self.answers: list[tuple[int, int]] = []  # ns, from TIMESYNC: our clock when we asked, the autopilot's then
         self.chosen: dict[str, str] = {}  # message by key of SOURCES
         self.received = self.missed = 0
         self._sequence: int | None = None
         self._came: Counter[str] = Counter()  # messages by name
-        self._best: dict[str, int] = {}  # place in SOURCES of the best message that came, until one is chosen
+        self._best: dict[str, int] = {}  # index in SOURCES of the best message so far, until one is chosen
         self._attitude: telemetry.Quaternion = (1.0, 0.0, 0.0, 0.0)  # NED from forward-right-down
         self._forces: deque[telemetry.Triple] = deque([(0.0, 0.0, -GRAVITY)], 1)
         self._acks: dict[int, int] = {}
@@ -87,16 +90,16 @@ class Heard:
 
     @property
     def offboard(self) -> bool:
-        """It follows setpoints, by its last heartbeat."""
+        """Whether the autopilot follows setpoints, by its last heartbeat."""
         return self.kind is not None and self.custom_mode == OFFBOARD[self.kind][1]
 
     @property
     def mode(self) -> str:
-        """As people call it, by its last heartbeat."""
+        """The name of its mode, by its last heartbeat."""
         return "no mode yet" if self.kind is None else telemetry.mode_name(self.kind, self.custom_mode)
 
     def feed(self, data: bytes) -> None:
-        """Bytes from the link, in pieces of any size."""
+        """Decode bytes from the link, in pieces of any size."""
         for message in self._mav.parse_buffer(data) or ():
             if message.get_srcSystem() != self.system or message.get_srcComponent() != AUTOPILOT:
                 continue
@@ -112,7 +115,7 @@ class Heard:
                 handler(self, message)
 
     def smooth(self, readings: int) -> None:
-        """From now on the mean of so many readings of the accelerometer counts."""
+        """Average this many readings of the accelerometer from now on."""
         self._forces = deque(self._forces, readings)
 
     def _count(self, sequence: int) -> None:
@@ -122,19 +125,19 @@ class Heard:
         self.received += 1
 
     def _take(self, what: str, place: int, message: Any) -> None:
-        """What a message says of something, unless another is relied on for that."""
+        """Take the quantity `what` from a message, unless a better message provides it."""
         source = SOURCES[what][place]
         if self.kind is not None and self.kind not in source.kinds:
             return
         chosen = self.chosen.get(what)
         if (chosen or source.message) != source.message or (not chosen and place > self._best.get(what, place)):
             return
-        told = telemetry.told(source, message)
-        if told is None:
+        value = telemetry.told(source, message)
+        if value is None:
             return
         self._best[what] = place
-        self.heard[what] += 1
-        TAKERS[what](self, told)
+        self.message_counts[what] += 1
+        TAKERS[what](self, value)
 
     def _move(self, motion: Motion) -> None:
         self.time, self.position, self.velocity = motion.time, motion.position, motion.velocity
@@ -149,7 +152,7 @@ class Heard:
     def _lift(self, airborne: bool) -> None:
         self.airborne = airborne
 
-    def _witness(self, place: Place) -> None:
+    def _locate(self, place: Place) -> None:
         self.truth = place
 
     def _on_heartbeat(self, message: Any) -> None:
@@ -159,7 +162,7 @@ class Heard:
         self.armed = bool(message.base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED)
         self.emergency = message.system_status in (mavlink.MAV_STATE_CRITICAL, mavlink.MAV_STATE_EMERGENCY)
         self.custom_mode = message.custom_mode
-        self.heard["mode"] += 1
+        self.message_counts["mode"] += 1
 
     def _on_ack(self, message: Any) -> None:
         if message.result != mavlink.MAV_RESULT_IN_PROGRESS:
@@ -190,29 +193,29 @@ class Heard:
 
     def _on_time(self, message: Any) -> None:
         if message.tc1 == 0:
-            return  # it asks: its own estimate of our clock is of no use to what we send
+            return  # a request of the autopilot for our clock
         self.answers.append((message.ts1, message.tc1))
 
 
-HANDLERS: dict[int, Callable[[Heard, Any], None]] = {
-    mavlink.MAVLINK_MSG_ID_HEARTBEAT: Heard._on_heartbeat,
-    mavlink.MAVLINK_MSG_ID_COMMAND_ACK: Heard._on_ack,
-    mavlink.MAVLINK_MSG_ID_STATUSTEXT: Heard._on_text,
-    mavlink.MAVLINK_MSG_ID_EKF_STATUS_REPORT: Heard._on_estimator,
-    mavlink.MAVLINK_MSG_ID_ESTIMATOR_STATUS: Heard._on_estimator,
-    mavlink.MAVLINK_MSG_ID_SYS_STATUS: Heard._on_status,
-    mavlink.MAVLINK_MSG_ID_FENCE_STATUS: Heard._on_fence,
-    mavlink.MAVLINK_MSG_ID_PARAM_VALUE: Heard._on_parameter,
-    mavlink.MAVLINK_MSG_ID_TIMESYNC: Heard._on_time,
+HANDLERS: dict[int, Callable[[MavlinkDecoder, Any], None]] = {
+    mavlink.MAVLINK_MSG_ID_HEARTBEAT: MavlinkDecoder._on_heartbeat,
+    mavlink.MAVLINK_MSG_ID_COMMAND_ACK: MavlinkDecoder._on_ack,
+    mavlink.MAVLINK_MSG_ID_STATUSTEXT: MavlinkDecoder._on_text,
+    mavlink.MAVLINK_MSG_ID_EKF_STATUS_REPORT: MavlinkDecoder._on_estimator,
+    mavlink.MAVLINK_MSG_ID_ESTIMATOR_STATUS: MavlinkDecoder._on_estimator,
+    mavlink.MAVLINK_MSG_ID_SYS_STATUS: MavlinkDecoder._on_status,
+    mavlink.MAVLINK_MSG_ID_FENCE_STATUS: MavlinkDecoder._on_fence,
+    mavlink.MAVLINK_MSG_ID_PARAM_VALUE: MavlinkDecoder._on_parameter,
+    mavlink.MAVLINK_MSG_ID_TIMESYNC: MavlinkDecoder._on_time,
 }
-TAKERS: dict[str, Callable[[Heard, Any], None]] = {
-    MOTION: Heard._move,
-    ATTITUDE: Heard._turn,
-    FORCE: Heard._feel,
-    LANDED: Heard._lift,
-    TRUTH: Heard._witness,
+TAKERS: dict[str, Callable[[MavlinkDecoder, Any], None]] = {
+    MOTION: MavlinkDecoder._move,
+    ATTITUDE: MavlinkDecoder._turn,
+    FORCE: MavlinkDecoder._feel,
+    LANDED: MavlinkDecoder._lift,
+    TRUTH: MavlinkDecoder._locate,
 }
-SENDERS: dict[str, list[tuple[str, int]]] = {}  # by message: what it can tell, and its place there
+SENDERS: dict[str, list[tuple[str, int]]] = {}  # by message: the quantities in it, each with its index in SOURCES
 for _what, _sources in SOURCES.items():
     for _place, _source in enumerate(_sources):
         SENDERS.setdefault(_source.message, []).append((_what, _place))
@@ -220,6 +223,6 @@ for _what, _sources in SOURCES.items():
 
 @dataclass(frozen=True)
 class _Pipe:
-    """What pymavlink takes for a file."""
+    """The part of a file that pymavlink uses."""
 
     write: Callable[[bytes], object]

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from actors.ground_truth import MavlinkGroundTruth
 from actors.telemetry import Place
-from actors.witness import Witness
 
 METRES = 0.0111195  # of latitude, a ten millionth of a degree
 
@@ -17,18 +17,18 @@ def at(north: float, altitude: float | None = 10.0) -> Place:
 
 def test_a_touch_is_judged_by_the_truth_and_counted_once() -> None:
     """A wall at 5 m north; the estimate drifts, and says that there is room."""
-    witness = Witness(lambda position: 5.0 - position[1])
+    truth = MavlinkGroundTruth(lambda position: 5.0 - position[1])
     for north in (0.0, 3.0, 4.9, 5.2, 5.4, 4.0, 5.1):
         estimate = np.array([1.0, 0.5 * north, 3.0])
-        witness.take(at(north), estimate, np.zeros(3))
-    assert witness.collisions == 2 and witness.least == pytest.approx(-0.4, abs=0.01)
-    assert witness.clearance == pytest.approx(-0.1, abs=0.01)
-    assert witness.worst == pytest.approx(2.7, abs=0.01)
-    assert witness.state is not None and witness.state[:3] == pytest.approx([1.0, 5.1, 3.0], abs=0.02)
+        truth.take(at(north), estimate, np.zeros(3))
+    assert truth.collisions == 2 and truth.least == pytest.approx(-0.4, abs=0.01)
+    assert truth.clearance == pytest.approx(-0.1, abs=0.01)
+    assert truth.worst == pytest.approx(2.7, abs=0.01)
+    assert truth.state is not None and truth.state[:3] == pytest.approx([1.0, 5.1, 3.0], abs=0.02)
 
 
 def test_a_height_that_is_not_told_is_the_estimates() -> None:
-    witness = Witness(lambda position: float(position[2]))
+    truth = MavlinkGroundTruth(lambda position: float(position[2]))
     for height in (3.0, 2.0):
-        witness.take(at(0.0, None), np.array([0.0, 0.0, height]), np.zeros(3))
-    assert witness.clearance == pytest.approx(2.0)
+        truth.take(at(0.0, None), np.array([0.0, 0.0, height]), np.zeros(3))
+    assert truth.clearance == pytest.approx(2.0)

@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from actors.dialect import mavlink
-from actors.leading import AGE, PARAMETERS, Lead, Leading
 from actors.mavlink import Client, MavlinkError
+from actors.position_lookahead import LATENCY, PARAMETERS, AxisLookahead, PositionLookahead
 from actors.telemetry import MOTION
 
 VALUES = {
@@ -28,7 +28,9 @@ def asked_for(error: float, gain: float, acceleration: float) -> float:
 
 @given(st.floats(0.0, 20.0), st.floats(0.5, 3.0), st.floats(0.5, 9.0))
 def test_a_place_so_far_ahead_asks_for_that_speed(speed: float, gain: float, acceleration: float) -> None:
-    assert asked_for(Lead(gain, acceleration).distance(speed), gain, acceleration) == pytest.approx(speed, abs=1e-9)
+    assert asked_for(AxisLookahead(gain, acceleration).distance(speed), gain, acceleration) == pytest.approx(
+        speed, abs=1e-9
+    )
 
 
 @pytest.mark.parametrize(("kind", "brakes"), [("ardupilot", (5.0, 3.0)), ("px4", (math.inf, math.inf))])
@@ -36,8 +38,12 @@ def test_a_place_so_far_ahead_asks_for_that_speed(speed: float, gain: float, acc
 def test_the_place_lies_where_the_velocity_points(
     kind: str, brakes: tuple[float, float], wanted: tuple[float, float, float]
 ) -> None:
-    leading, at, flies = Leading.of(kind, VALUES[kind]), np.array([3.0, -2.0, 7.0]), np.array([1.0, 2.0, -0.5])
-    ahead = leading.target(at, flies, np.array(wanted)) - at - AGE * flies
+    lookahead, at, flies = (
+        PositionLookahead.of(kind, VALUES[kind]),
+        np.array([3.0, -2.0, 7.0]),
+        np.array([1.0, 2.0, -0.5]),
+    )
+    ahead = lookahead.target(at, flies, np.array(wanted)) - at - LATENCY * flies
     level = math.hypot(*wanted[:2])
     asked = asked_for(math.hypot(*ahead[:2]), 2.0, brakes[0])
     assert asked == pytest.approx(level, abs=1e-6)
@@ -49,7 +55,7 @@ def test_the_place_lies_where_the_velocity_points(
 @pytest.mark.parametrize("value", [0.0, -1.0, math.nan, math.inf])
 def test_a_parameter_that_makes_no_sense_is_named(kind: str, name: str, value: float) -> None:
     with pytest.raises(ValueError, match=f"{name} is {value:g}"):
-        Leading.of(kind, VALUES[kind] | {name: value})
+        PositionLookahead.of(kind, VALUES[kind] | {name: value})
 
 
 class Vehicle:
@@ -68,9 +74,9 @@ class Vehicle:
 def test_who_does_not_know_where_it_is_is_told_velocities_and_then_places() -> None:
     vehicle = Vehicle()
     client = Client(vehicle)
-    client.leading = Leading.of("ardupilot", VALUES["ardupilot"])
+    client.lookahead = PositionLookahead.of("ardupilot", VALUES["ardupilot"])
     client.setpoint(np.array([1.0, 0.0, 0.0]))
-    client.heard[MOTION] += 1
+    client.message_counts[MOTION] += 1
     client.position, client.velocity = np.array([10.0, 20.0, 30.0]), np.zeros(3)
     client.setpoint(np.array([1.0, 0.0, 2.0]))
     fast, place = vehicle.heard
@@ -88,4 +94,4 @@ def test_only_who_tells_its_controller_is_led(kind: str) -> None:
     client.kind = kind
     with pytest.raises(MavlinkError, match=f"it has no {', '.join(PARAMETERS[kind])}: it can only be told velocities"):
         client.lead(wait)
-    assert client.leading is None
+    assert client.lookahead is None

@@ -13,12 +13,12 @@ from contextlib import contextmanager
 import numpy as np
 import pytest
 
-from actors import kept
+from actors import vehicle_client
 from actors.frames import decoded
-from actors.keeper import listening, next_actor
-from actors.kept import Charge, KeptVehicle, Raw, address, ours
 from actors.mavlink import MavlinkError
 from actors.settings import FlightSettings
+from actors.vehicle_client import FlightRequest, Raw, VehicleClient, address, ours
+from actors.vehicle_server import listening, next_actor
 from messaging.clock import WallClock
 from messaging.links import open_link
 from messaging.tolerant import Tolerance
@@ -50,10 +50,10 @@ def flown() -> Iterator[tuple[str, Autopilot]]:
 
 
 @contextmanager
-def actor(url: str, frames: list[Raw] | None = None, height: float = 2.0) -> Iterator[KeptVehicle]:
-    charge = Charge(FlightSettings(url, height=height), QUADROTOR.name, ARENA.obstacles)
+def actor(url: str, frames: list[Raw] | None = None, height: float = 2.0) -> Iterator[VehicleClient]:
+    request = FlightRequest(FlightSettings(url, height=height), QUADROTOR.name, ARENA.obstacles)
     tap: Callable[[Raw], None] = (frames if frames is not None else []).append
-    vehicle = KeptVehicle(charge, tap, Tolerance(), lambda: False)
+    vehicle = VehicleClient(request, tap, Tolerance(), lambda: False)
     try:
         yield vehicle
     finally:
@@ -69,8 +69,8 @@ def test_what_an_actor_that_dies_committed_is_flown_to_its_end_and_the_next_one_
     with contextlib.ExitStack() as stack:
         vehicle = stack.enter_context(actor(url, first))
         with pytest.raises(BadInput):
-            vehicle.commit(np.full((2, 3), np.nan), vehicle.turn.number + 2)
-        number = vehicle.turn.number + 2
+            vehicle.commit(np.full((2, 3), np.nan), vehicle.current_period.number + 2)
+        number = vehicle.current_period.number + 2
         plan = np.array([[0.8, 0.0, 0.0], [1.5, 0.0, 0.0], [1.5, 0.0, 0.0], [0.8, 0.0, 0.0]])
         assert vehicle.commit(plan, number) and not vehicle.commit(plan, number - 2), "that one has begun"
         assert vehicle.wait(number + 1).input == pytest.approx(plan[1])
@@ -79,10 +79,11 @@ def test_what_an_actor_that_dies_committed_is_flown_to_its_end_and_the_next_one_
             vehicle.wait(number + 5)
 
         heir = stack.enter_context(actor(url, second))
-        assert heir.turn.number >= number + QUADROTOR.horizon, "the periods went on"
-        assert np.linalg.norm(heir.turn.report.measured[3:6]) < 0.3 and not heir.turn.lost, "it hovers"
-        assert heir.turn.report.measured[0] > 0.5 and autopilot.pilot.mode is Mode.OFFBOARD, "where the plan ended"
-        heir.wait(heir.turn.number + 6)
+        period = heir.current_period
+        assert period.number >= number + QUADROTOR.horizon, "the periods went on"
+        assert np.linalg.norm(period.report.measured[3:6]) < 0.3 and not period.lost, "it hovers"
+        assert period.report.measured[0] > 0.5 and autopilot.pilot.mode is Mode.OFFBOARD, "where the plan ended"
+        heir.wait(heir.current_period.number + 6)
         assert heir.figures()["periods"] >= number
     times = np.array([at for at, _, _ in first + second]) * 1e-9
     assert np.diff(times).max() < 0.3 + stalled(), "what it said in between was kept for the next actor"
@@ -96,14 +97,14 @@ def test_one_vehicle_has_one_actor_and_a_keeper_that_ends_with_it(
 ) -> None:
     url, autopilot = flown
     with actor(url) as vehicle:
-        monkeypatch.setattr(kept, "PREDECESSOR", 0.5)
+        monkeypatch.setattr(vehicle_client, "PREDECESSOR", 0.5)
         with pytest.raises(MavlinkError, match="another process here flies it"), actor(url):
             pass
         monkeypatch.undo()
-        vehicle.wait(vehicle.turn.number + 2)
+        vehicle.wait(vehicle.current_period.number + 2)
         vehicle.leave()
         with actor(url, height=3.0) as other:
-            assert other.turn.number < vehicle.turn.number, "of other settings: it was let go of, and taken anew"
+            assert other.current_period.number < vehicle.current_period.number, "other settings: taken anew"
     with socket.socket(socket.AF_UNIX) as knocking, pytest.raises(ConnectionRefusedError):
         knocking.connect(address(url, 1))
     until(lambda: autopilot.pilot.mode is not Mode.OFFBOARD, "the autopilot goes by its own timeout")
@@ -113,10 +114,10 @@ def test_an_actor_that_closes_in_full_flight_leaves_it_braked(flown: tuple[str, 
     url, autopilot = flown
     frames: list[Raw] = []
     with actor(url, frames) as vehicle:
-        number = vehicle.turn.number + 2
+        number = vehicle.current_period.number + 2
         vehicle.commit(np.array([[0.8, 0.0, 0.0], [1.5, 0.0, 0.0], [1.5, 0.0, 0.0], [0.7, 0.0, 0.0]]), number)
         vehicle.wait(number + 2)
-        assert np.linalg.norm(vehicle.turn.report.measured[3:6]) > 0.5
+        assert np.linalg.norm(vehicle.current_period.report.measured[3:6]) > 0.5
     assert np.linalg.norm(autopilot.vehicle.state()[3:6]) < 0.3
     sent = [found.message for _, out, raw in frames if out and (found := decoded(raw, out)) is not None]
     assert [m for m in sent if m.get_type() == "SET_POSITION_TARGET_LOCAL_NED"][-1].vy == 0.0, "told to its end"
@@ -129,8 +130,8 @@ def test_who_is_taken_by_somebody_else_meanwhile_is_taken_control_of_anew(flown:
         autopilot.pilot.mode = Mode.HOLD
         time.sleep(0.5)
         with actor(url) as heir:
-            heir.wait(heir.turn.number + 5)
-            assert not heir.turn.lost and autopilot.pilot.mode is Mode.OFFBOARD
+            heir.wait(heir.current_period.number + 5)
+            assert not heir.current_period.lost and autopilot.pilot.mode is Mode.OFFBOARD
 
 
 def test_nobody_elses_processes_are_listened_to(monkeypatch: pytest.MonkeyPatch) -> None:
