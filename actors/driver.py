@@ -208,6 +208,8 @@ class Driver:
         step.decision = outcome.answer.message.kind
         step.decide_ms = outcome.answer.message.time_ms
         step.broken = outcome.answer.message.broken
+        if outcome.answer.message.HasField("for_clearance"):
+            step.for_clearance = outcome.answer.message.for_clearance
         if self.cuts:
             self._cut(step)
         predicted: Prediction | None = self.commitment.predicted

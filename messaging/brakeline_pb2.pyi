@@ -580,6 +580,7 @@ class Decision(_message.Message):
     PROMISE_FIELD_NUMBER: _builtins.int
     BROKEN_FIELD_NUMBER: _builtins.int
     STOPPED_FIELD_NUMBER: _builtins.int
+    FOR_CLEARANCE_FIELD_NUMBER: _builtins.int
     kind: Global___Kind.ValueType
     predicted_heading: _builtins.float
     """rad, of the frame in which its position part is a box"""
@@ -610,6 +611,10 @@ class Decision(_message.Message):
     """it was not believed that the request's model verified its plan"""
     broken: _builtins.int
     """obstacles seen outside of what their bounds allowed since they were seen before"""
+    for_clearance: _builtins.bool
+    """Of an adjusted decision: was the proposal's own tube verified, and replaced only because it came nearer to an
+    obstacle than the clearance margin? Absent: another kind of decision, another method, or a log from before.
+    """
     @_builtins.property
     def plan(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]:
         """(horizon, inputs); its first row is to be executed now"""
@@ -668,12 +673,15 @@ class Decision(_message.Message):
         promise: Global___Promise | None = ...,
         broken: _builtins.int = ...,
         stopped: Global___Stopped | None = ...,
+        for_clearance: _builtins.bool | None = ...,
     ) -> None: ...
-    _HasFieldArgType: _TypeAlias = _typing.Literal["promise", b"promise", "stopped", b"stopped"]  # noqa: Y015
+    _HasFieldArgType: _TypeAlias = _typing.Literal["_for_clearance", b"_for_clearance", "for_clearance", b"for_clearance", "promise", b"promise", "stopped", b"stopped"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["at_least", b"at_least", "broken", b"broken", "compared", b"compared", "contained", b"contained", "iterations", b"iterations", "kind", b"kind", "margin", b"margin", "model", b"model", "plan", b"plan", "predicted_center", b"predicted_center", "predicted_half_width", b"predicted_half_width", "predicted_heading", b"predicted_heading", "promise", b"promise", "queue_ms", b"queue_ms", "reason", b"reason", "solve_ms", b"solve_ms", "solver", b"solver", "stopped", b"stopped", "time_ms", b"time_ms", "tube_center", b"tube_center", "tube_half_width", b"tube_half_width", "unvouched", b"unvouched", "verified", b"verified", "verify_ms", b"verify_ms", "vouchers", b"vouchers"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["_for_clearance", b"_for_clearance", "at_least", b"at_least", "broken", b"broken", "compared", b"compared", "contained", b"contained", "for_clearance", b"for_clearance", "iterations", b"iterations", "kind", b"kind", "margin", b"margin", "model", b"model", "plan", b"plan", "predicted_center", b"predicted_center", "predicted_half_width", b"predicted_half_width", "predicted_heading", b"predicted_heading", "promise", b"promise", "queue_ms", b"queue_ms", "reason", b"reason", "solve_ms", b"solve_ms", "solver", b"solver", "stopped", b"stopped", "time_ms", b"time_ms", "tube_center", b"tube_center", "tube_half_width", b"tube_half_width", "unvouched", b"unvouched", "verified", b"verified", "verify_ms", b"verify_ms", "vouchers", b"vouchers"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
-    def WhichOneof(self, oneof_group: _Never) -> None: ...
+    _WhichOneofReturnType__for_clearance: _TypeAlias = _typing.Literal["for_clearance"]  # noqa: Y015
+    _WhichOneofArgType__for_clearance: _TypeAlias = _typing.Literal["_for_clearance", b"_for_clearance"]  # noqa: Y015
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__for_clearance) -> _WhichOneofReturnType__for_clearance | None: ...
 
 Global___Decision: _TypeAlias = Decision  # noqa: Y015
 
@@ -924,6 +932,7 @@ class Step(_message.Message):
     CONTACT_ROBOT_FIELD_NUMBER: _builtins.int
     FLEET_FIELD_NUMBER: _builtins.int
     BROKEN_FIELD_NUMBER: _builtins.int
+    FOR_CLEARANCE_FIELD_NUMBER: _builtins.int
     robot: _builtins.str
     actor: _builtins.str
     episode: _builtins.int
@@ -975,6 +984,8 @@ class Step(_message.Message):
     """robots in its world; 0: it is alone"""
     broken: _builtins.int
     """obstacles seen outside of what their bounds allowed"""
+    for_clearance: _builtins.bool
+    """as the decision says"""
     @_builtins.property
     def header(self) -> Global___Header: ...
     @_builtins.property
@@ -1038,12 +1049,15 @@ class Step(_message.Message):
         contact_robot: _builtins.bool = ...,
         fleet: _builtins.int = ...,
         broken: _builtins.int = ...,
+        for_clearance: _builtins.bool | None = ...,
     ) -> None: ...
-    _HasFieldArgType: _TypeAlias = _typing.Literal["header", b"header"]  # noqa: Y015
+    _HasFieldArgType: _TypeAlias = _typing.Literal["_for_clearance", b"_for_clearance", "for_clearance", b"for_clearance", "header", b"header"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["action", b"action", "actor", b"actor", "broken", b"broken", "clearance", b"clearance", "collision", b"collision", "compared", b"compared", "contact_moving", b"contact_moving", "contact_robot", b"contact_robot", "contact_standing", b"contact_standing", "contained", b"contained", "cut", b"cut", "decide_ms", b"decide_ms", "decision", b"decision", "episode", b"episode", "fallback", b"fallback", "fleet", b"fleet", "goal", b"goal", "header", b"header", "index", b"index", "next_observation", b"next_observation", "observation", b"observation", "outside", b"outside", "path", b"path", "penalty", b"penalty", "propose_ms", b"propose_ms", "proposed", b"proposed", "reward", b"reward", "robot", b"robot", "speed", b"speed", "state", b"state", "step", b"step", "terminated", b"terminated", "true_state", b"true_state", "truncated", b"truncated", "turned", b"turned", "weights_version", b"weights_version"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["_for_clearance", b"_for_clearance", "action", b"action", "actor", b"actor", "broken", b"broken", "clearance", b"clearance", "collision", b"collision", "compared", b"compared", "contact_moving", b"contact_moving", "contact_robot", b"contact_robot", "contact_standing", b"contact_standing", "contained", b"contained", "cut", b"cut", "decide_ms", b"decide_ms", "decision", b"decision", "episode", b"episode", "fallback", b"fallback", "fleet", b"fleet", "for_clearance", b"for_clearance", "goal", b"goal", "header", b"header", "index", b"index", "next_observation", b"next_observation", "observation", b"observation", "outside", b"outside", "path", b"path", "penalty", b"penalty", "propose_ms", b"propose_ms", "proposed", b"proposed", "reward", b"reward", "robot", b"robot", "speed", b"speed", "state", b"state", "step", b"step", "terminated", b"terminated", "true_state", b"true_state", "truncated", b"truncated", "turned", b"turned", "weights_version", b"weights_version"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
-    def WhichOneof(self, oneof_group: _Never) -> None: ...
+    _WhichOneofReturnType__for_clearance: _TypeAlias = _typing.Literal["for_clearance"]  # noqa: Y015
+    _WhichOneofArgType__for_clearance: _TypeAlias = _typing.Literal["_for_clearance", b"_for_clearance"]  # noqa: Y015
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__for_clearance) -> _WhichOneofReturnType__for_clearance | None: ...
 
 Global___Step: _TypeAlias = Step  # noqa: Y015
 

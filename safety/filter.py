@@ -1,5 +1,10 @@
 """`decide`: a proposed action in, a verified plan out (paper, algorithm 1 lines 5-9 and algorithm 2; method §4).
 
+The filter allows a proposal whose tube keeps the clearance margin to every obstacle, or does not drive nearer to one.
+It replaces every other proposal by the closest input that does, even if the proposal's own tube is verified: a robot
+that stops nearer than the clearance margin may not be able to turn there. Such decisions are `for_clearance`. If no
+input keeps the clearance margin, the filter allows a verified proposal and adjusts others to free space alone.
+
 A pure function of the request and the model set: no state is kept about a robot, so that any replica can answer and a
 log can be replayed.
 """
@@ -40,7 +45,6 @@ from safety.surroundings import Scene, Surroundings
 Array = NDArray[np.float64]
 
 OUTSIDE_DOMAIN = 0.02  # of the recorded range: how far beyond it a regressor may lie (rounding, not extrapolation)
-SAME_INPUT = 1e-6  # of the input's range: an answer this close to the proposal is the proposal
 BROKEN = "an obstacle was seen outside of what its bounds allow: nothing is known of where it will be"
 
 
@@ -68,6 +72,7 @@ class _Found:
     margin: float
     verified: bool
     kept: bool = False  # the committed plan goes on as it was verified before
+    for_clearance: bool = False  # the proposal's tube is verified too, and is nearer than the clearance margin
 
 
 class Filter:
@@ -92,7 +97,6 @@ class Filter:
         transposed = whole(first.W.T), whole(first.M.T), whole(first.kappa.T)
         # What `next_state` is told of it.
         self.first = whole(first.C[:n]), *transposed, first.w, whole(np.abs(first.generators[:n]))
-        self.same = SAME_INPUT * (self.inputs.high - self.inputs.low)
         self.standing = np.array([not moves for moves in robot.translates])
         driven = np.tile(robot.translates, robot.free_steps)
         self.translating = np.concatenate([np.zeros(robot.regressor_dim), driven])
@@ -146,8 +150,8 @@ class Filter:
         return self._decision(request, scene, found, attempt)
 
     def _search(self, scene: Scene, z_0: Array, proposal: Array, attempt: _Attempt) -> _Found | None:
-        """The proposal if its tube is verified, else the QP's answer if that is, else nothing."""
-        known, m = len(z_0), len(proposal)
+        """The proposal if it is verified and keeps the clearance margin, else the QP's answer if that is verified, else
+        the proposal if it is verified, else nothing."""
         z = self.inputs.regressors(z_0, proposal)
         if scene.empty and not self.around.far and self.around.limits is None:
             return _Found(ALLOWED, self.inputs.plan(z), z, self.reach, True)
@@ -167,15 +171,15 @@ class Filter:
         # Keeping the clearance margin, or at least not driving into it; else free space alone: from here even standing
         # still would not do.
         for choice in (kept, rows):
+            if choice is rows and margin >= 0.0:
+                return _Found(ALLOWED, self.inputs.plan(z), z, margin, True)
             if not np.isfinite(choice.bound).all():
                 break
             candidate = self._closest(choice, z_0, proposal, attempt)
             if candidate is None or self.around.margin(choice, candidate) < 0.0:
                 continue
-            near_enough = np.abs(candidate[known : known + m] - proposal) <= self.same
-            if near_enough.all() and self.around.margin(choice, z) >= 0.0:
-                return _Found(ALLOWED, self.inputs.plan(z), z, margin, True)
-            return _Found(ADJUSTED, self.inputs.plan(candidate), candidate, self.around.margin(rows, candidate), True)
+            plan, room = self.inputs.plan(candidate), self.around.margin(rows, candidate)
+            return _Found(ADJUSTED, plan, candidate, room, True, for_clearance=margin >= 0.0)
         attempt.reason += "; no verified input was found"
         return None
 
@@ -319,6 +323,7 @@ class Filter:
             iterations=attempt.iterations,
             broken=attempt.broken,
             stopped=None if found.kind == ALLOWED else attempt.stopped,
+            for_clearance=found.for_clearance if found.kind == ADJUSTED else None,
             promise=promise,
         )
 

@@ -109,6 +109,7 @@ class Decision:
     broken: int = 0  # movers that were seen outside of what their bounds allowed
     stopped: Stopped | None = None  # of a proposal that was not allowed: what it would have come too near to
     promise: Promise | None = None  # to the other robots of its world
+    for_clearance: bool | None = None  # adjusted though the proposal's tube was verified; None: not said
 
     @property
     def action(self) -> Array:

@@ -169,6 +169,8 @@ def message_of(decision: Decision, queue_ms: float) -> pb.Reply:
         iterations=decision.iterations,
         broken=decision.broken,
     )
+    if decision.for_clearance is not None:
+        message.for_clearance = decision.for_clearance
     if (stopped := decision.stopped) is not None:
         message.stopped.by, message.stopped.room, message.stopped.after = stopped.by, stopped.room, stopped.after
         message.stopped.normal.extend(stopped.normal.tolist())

@@ -133,6 +133,8 @@ def differences(
     for descriptor in pb.Decision.DESCRIPTOR.fields:
         name = descriptor.name
         one, other = getattr(before, name), getattr(after, name)
+        if descriptor.has_presence and not descriptor.message_type and not before.HasField(name):
+            continue  # a log from before there was such a field
         if name not in ignored and one != other:
             found[name] = math.inf if descriptor.enum_type is not None else _size(one, other)
     if before.plan[:inputs] != after.plan[:inputs]:

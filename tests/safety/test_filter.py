@@ -6,11 +6,14 @@ import numpy as np
 import pytest
 
 from messaging.shapes import Obstacle, Shapes
+from safety import filter as filter_module
 from safety.certificates import KINDS, Certificate
 from safety.commitment import Prediction, correction_penalty
 from safety.filter import Filter
 from safety.model_set import ModelSet, Recipe
 from safety.request import ADJUSTED, ALLOWED, FAILSAFE, MOST_OBSERVED, NOT_FINITE, BadRequest
+from safety.solver import INFEASIBLE
+from safety.wire import message_of
 from tests.robots import GROUND, QUADROTOR
 from tests.safety.asked import cylinder, fits, random_request, request, same
 from tests.safety.unicycle import FIX, Unicycle
@@ -111,6 +114,35 @@ def test_adjusted_is_the_closest_input_that_can_be_verified(ready):
         if adjusted == 12:
             break
     assert adjusted == 12
+
+
+def test_a_verified_proposal_is_allowed_or_replaced_for_clearance_and_the_decision_says_which(ready, model):
+    """With a clearance margin of zero, the filter allows exactly the proposals whose own tubes it verifies."""
+    without = Filter(model, clearance_margin=0.0)
+    rng, counts = np.random.default_rng(5), {}
+    for _ in range(500):
+        ask = random_request(rng, nearest=0.235)
+        decision, verified = ready.decide(ask), without.decide(ask).kind == ALLOWED
+        key = decision.kind, bool(decision.for_clearance), verified
+        counts[key] = counts.get(key, 0) + 1
+        if decision.for_clearance:
+            assert decision.stopped.room >= 0.0
+            assert message_of(decision, 0.0).decision.for_clearance
+    assert counts[ADJUSTED, True, True] > 10 < counts[ADJUSTED, False, False], counts
+    assert {key for key in counts if key[2]} <= {(ALLOWED, False, True), (ADJUSTED, True, True)}, counts
+    assert {key for key in counts if not key[2]} <= {(ADJUSTED, False, False), (FAILSAFE, False, False)}, counts
+
+
+def test_a_verified_proposal_is_allowed_where_no_input_keeps_the_clearance_margin(ready, monkeypatch):
+    """Before, the solver's failure to find a better input braked the robot, though its proposal was verified."""
+    rng = np.random.default_rng(5)
+    replaced = [ask for ask in (random_request(rng) for _ in range(200)) if ready.decide(ask).for_clearance]
+    assert len(replaced) > 5
+    monkeypatch.setattr(filter_module, "solve", lambda program: INFEASIBLE)
+    for ask in replaced:
+        decision = ready.decide(ask)
+        assert (decision.kind, decision.for_clearance, decision.verified) == (ALLOWED, None, True)
+        assert decision.action == pytest.approx(ask.action)
 
 
 @pytest.mark.parametrize("kind", KINDS)
