@@ -15,6 +15,7 @@ from messaging.tasks import task_of
 from safety.client import obstacle_messages, request_message
 from safety.commitment import Array, Commitment, Prediction, correction_penalty
 from safety.image_memory import filled, memory_of
+from safety.wire import KINDS
 
 Result = tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]  # of a step
 EPISODE_STRIDE = 4096  # episodes of different robots of a run never share a seed: seed = episode · stride + number
@@ -205,11 +206,10 @@ class Driver:
             step.fallback = True
             step.decision = pb.FAILSAFE
             return
-        step.decision = outcome.answer.message.kind
-        step.decide_ms = outcome.answer.message.time_ms
-        step.broken = outcome.answer.message.broken
-        if outcome.answer.message.HasField("for_clearance"):
-            step.for_clearance = outcome.answer.message.for_clearance
+        answer = outcome.answer
+        step.decision, step.decide_ms, step.broken = KINDS[answer.kind], answer.time_ms, answer.broken
+        if answer.for_clearance is not None:
+            step.for_clearance = answer.for_clearance
         if self.cuts:
             self._cut(step)
         predicted: Prediction | None = self.commitment.predicted

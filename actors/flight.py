@@ -252,7 +252,7 @@ def answered(question: Ask, robot: Robot, stage: Arena, filtered: bool, stop: Ca
             if filtered and outcome.answer.kind not in ("allowed", "adjusted"):
                 raise NoRoom(
                     f"not taking off: hovering at the start, {away.min():.2f} m from the nearest obstacle, can't be "
-                    f"verified ({outcome.answer.message.reason}). Where this vehicle drifts to is known too badly for "
+                    f"verified ({outcome.answer.reason}). Where this vehicle drifts to is known too badly for "
                     "that much room: collect more data, or fly where there is more"
                 )
             return True

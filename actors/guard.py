@@ -9,7 +9,8 @@ from time import perf_counter_ns
 from messaging import brakeline_pb2 as pb
 from messaging.bus import BusError
 from messaging.robots import Robot
-from safety.client import Answer, SafetyError, accept, read
+from safety.asker import Answer, accept
+from safety.client import SafetyError, read
 from safety.commitment import Array, Commitment
 
 Ask = Callable[[Sequence[pb.Request]], list[pb.Reply]]  # raises BusError when there is no answer

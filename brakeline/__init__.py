@@ -23,8 +23,9 @@ if TYPE_CHECKING:
     from messaging.scans import BadScan, Scan
     from messaging.shapes import BadShape, Obstacle, Shapes
     from messaging.tasks import Task, task_of
+    from safety.asker import Answer
     from safety.certificates import CertificateError
-    from safety.client import Answer, SafetyClient, SafetyError
+    from safety.client import SafetyClient, SafetyError
     from safety.commitment import Commitment, Prediction
     from safety.dataset import BadData, Dataset, Trajectory
     from safety.filter import Filter
@@ -47,7 +48,8 @@ PLACES = {
     "messaging.shapes": ("BadShape", "Obstacle", "Shapes"),
     "messaging.tasks": ("Task", "task_of"),
     "safety.certificates": ("CertificateError",),
-    "safety.client": ("Answer", "SafetyClient", "SafetyError"),
+    "safety.asker": ("Answer",),
+    "safety.client": ("SafetyClient", "SafetyError"),
     "safety.commitment": ("Commitment", "Prediction"),
     "safety.dataset": ("BadData", "Dataset", "Trajectory"),
     "safety.filter": ("Filter",),

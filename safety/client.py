@@ -10,7 +10,6 @@ from __future__ import annotations
 import math
 import secrets
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -25,14 +24,14 @@ from messaging.robots import FEEDBACK, Robot, robot_named
 from messaging.sensed import Sensed, add_sensed
 from messaging.shapes import Obstacle
 from messaging.topics import DECIDE
-from safety.commitment import Commitment, Prediction
+from safety.asker import Answer, accept
+from safety.commitment import Commitment
 from safety.digest import digest
 from safety.request import BadRequest
-from safety.wire import promise_message, promise_of
+from safety.wire import decision_of, promise_message, promise_of
 
 Array = NDArray[np.float64]
 
-KINDS = {pb.ALLOWED: "allowed", pb.ADJUSTED: "adjusted", pb.FAILSAFE: "failsafe", pb.RECOVERING: "recovering"}
 DEADLINE = 0.1  # s
 NONCE = 16  # bytes
 SAME_INPUT = 1e-9  # rounding allowed where inputs are compared
@@ -44,16 +43,6 @@ class SafetyError(BusError):
     def __init__(self, error: pb.Error) -> None:
         super().__init__(f"{error.type}: {error.message}")
         self.type, self.field = error.type, error.field
-
-
-@dataclass(frozen=True)
-class Answer:
-    """A decision as the asker sees it; `message` has everything."""
-
-    kind: str
-    action: Array
-    plan: Array
-    message: pb.Decision
 
 
 def obstacle_messages(obstacles: Iterable[Obstacle]) -> list[pb.Obstacle]:
@@ -124,8 +113,6 @@ def read(reply: pb.Reply, request: pb.Request, robot: Robot) -> Answer:
     if reply.robot != robot.name:
         raise _bad_reply("robot", f"a decision about {reply.robot[:100]!r}")
     decision = reply.decision
-    if decision.kind not in KINDS:
-        raise _bad_reply("kind", f"kind {decision.kind}")
     plan = np.array(decision.plan)
     if plan.size != robot.horizon * robot.action_dim:
         raise _bad_reply("plan", f"a plan of {plan.size} numbers")
@@ -145,9 +132,11 @@ def read(reply: pb.Reply, request: pb.Request, robot: Robot) -> Answer:
     try:
         if request.fleet:
             promise_of(decision.promise, robot)
+        found = decision_of(decision, robot)
     except BadRequest as error:
-        raise _bad_reply("promise", str(error)) from error
-    return Answer(KINDS[decision.kind], plan[0], plan, decision)
+        raise _bad_reply(error.field, str(error)) from error
+    vouchers = tuple(decision.vouchers)
+    return Answer.of(found, robot, queue_ms=decision.queue_ms, unvouched=decision.unvouched, vouchers=vouchers)
 
 
 def _follows(plan: Array, request: pb.Request, robot: Robot) -> bool:
@@ -166,16 +155,6 @@ def _follows(plan: Array, request: pb.Request, robot: Robot) -> bool:
 
 def _bad_reply(field: str, message: str) -> SafetyError:
     return SafetyError(pb.Error(type="BadReply", field=field, message=message))
-
-
-def accept(commitment: Commitment, answer: Answer) -> Array:
-    """Commit to an answer's plan; returns the input to execute now."""
-    message = answer.message
-    predicted = Prediction(
-        np.array(message.predicted_center), np.array(message.predicted_half_width), message.predicted_heading
-    )
-    promise = promise_of(message.promise, commitment.robot) if message.HasField("promise") else None
-    return commitment.accept(answer.plan, message.model, predicted, message.verified, message.vouchers, promise)
 
 
 def bus_at(connect: str | Sequence[str], keys: Path | str | None, name: str) -> Bus:

@@ -15,7 +15,8 @@ from numpy.typing import ArrayLike
 
 from messaging.bus import Bus
 from messaging.shapes import Obstacle
-from safety.client import DEADLINE, Answer, Array, Asker, accept, ask, bus_at, read, request_message
+from safety.asker import Answer, accept
+from safety.client import DEADLINE, Array, Asker, ask, bus_at, read, request_message
 from safety.commitment import Commitment
 
 

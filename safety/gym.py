@@ -19,11 +19,11 @@ from numpy.typing import NDArray
 
 from messaging.bus import BusError
 from messaging.sensed import Sensed
-from safety.client import Answer, SafetyClient
+from safety.asker import Answer
+from safety.client import SafetyClient
 from safety.commitment import correction_penalty
 from safety.image_memory import filled, memory_of
 from safety.inprocess import InProcess, sendable
-from safety.request import Decision
 from safety.spaces import Actions, actions_of, cast
 from safety.views import OBSTACLES, STATE, View
 
@@ -39,7 +39,7 @@ class SafetyWrapper(gymnasium.Wrapper[Any, Any, Any, Any]):
     """Replaces each action by the filter's decision on it.
 
     `info` may hold `scan` (`Scan`, in space `RangeImage`) in the obstacles' place. The wrapper adds, after `step`:
-    `safety` (the `Decision`; of a service the `Answer`, None if there was none), `proposed` (the action given),
+    `safety` (the `Answer`, None if a service gave none), `proposed` (the action given),
     `penalty`, and `diagnostics`, a dict of plain values: kind, verified, contained, margin [m], time_ms, model, reason,
     and proposed and executed as inputs of the robot. The penalty is subtracted from the reward.
     """
@@ -109,7 +109,7 @@ class SafetyWrapper(gymnasium.Wrapper[Any, Any, Any, Any]):
         self._remember()
         return observation, float(reward) - cost, terminated, truncated, info
 
-    def _decide(self, wanted: Array) -> tuple[Decision | Answer | None, str]:
+    def _decide(self, wanted: Array) -> tuple[Answer | None, str]:
         """The decision, committed to, or None and why there is none: then the committed plan goes on."""
         assert self._now is not None
         seen = self._now[0], self._now[1]
@@ -129,14 +129,12 @@ class SafetyWrapper(gymnasium.Wrapper[Any, Any, Any, Any]):
         self._scan = filled(self._memory, self._now[1], self.asker.robot.period)
 
 
-def diagnostics(answer: Decision | Answer | None, reason: str = "") -> dict[str, Any]:
+def diagnostics(answer: Answer | None, reason: str = "") -> dict[str, Any]:
     """The figures of a decision as a dict."""
     if answer is None:
         return {"kind": UNANSWERED, "verified": False, "contained": False, "margin": np.nan, "time_ms": np.nan} | {
             "model": "",
             "reason": reason,
         }
-    said: Any = answer if isinstance(answer, Decision) else answer.message
-    return {"kind": answer.kind} | {
-        name: getattr(said, name) for name in ("verified", "contained", "margin", "time_ms", "model", "reason")
-    }
+    names = ("kind", "verified", "contained", "margin", "time_ms", "model", "reason")
+    return {name: getattr(answer, name) for name in names}

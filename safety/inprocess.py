@@ -1,8 +1,8 @@
 """The filter (or a rival) without a service and without an environment: what a program asks in its own process.
 
 safety = InProcess(Filter(ModelSet.load(path)))
-decision = safety.decide(state, action, obstacles)
-drive(safety.commitment.due)          # and next period again; `safety.reset()` where an episode begins, standing still
+answer = safety.decide(state, action, obstacles)
+drive(answer.action)                  # and next period again; `safety.reset()` where an episode begins, standing still
 """
 
 from __future__ import annotations
@@ -17,8 +17,9 @@ from messaging.movers import parted
 from messaging.robots import Robot
 from messaging.sensed import Sensed
 from messaging.shapes import Obstacle
+from safety.asker import Answer, accept
 from safety.commitment import Commitment
-from safety.request import MOST_OBSERVED, Decision, Request
+from safety.request import MOST_OBSERVED, Request
 
 if TYPE_CHECKING:
     from safety.methods import Method
@@ -44,8 +45,8 @@ class InProcess:
         obstacles: Iterable[Obstacle],
         observation: object = None,
         scan: Sensed | None = None,
-    ) -> Decision:
-        """The decision on an action; its plan is committed to, so execute `commitment.due`.
+    ) -> Answer:
+        """The decision on an action; its plan is committed to, so execute `answer.action`.
 
         Args:
             state: measured; action: proposed, a failsafe if it holds NaN or infinity; obstacles: at least those
@@ -64,14 +65,14 @@ class InProcess:
         obstacles: Sequence[Iterable[Obstacle]],
         observations: Sequence[object],
         scans: Sequence[Sensed | None],
-    ) -> list[Decision]:
+    ) -> list[Answer]:
         """The same of several robots of the kind, each with a commitment of its own. Raises as `decide` does, before
         any plan is committed to."""
         asked = zip(commitments, states, actions, obstacles, observations, scans, strict=True)
-        decisions = [self.method.decide(self._request(*one)) for one in asked]
-        for kept, decision in zip(commitments, decisions, strict=True):
-            kept.accept(decision.plan, decision.model, decision.predicted, decision.verified)
-        return decisions
+        answers = [Answer.of(self.method.decide(self._request(*one)), self.robot) for one in asked]
+        for kept, answer in zip(commitments, answers, strict=True):
+            accept(kept, answer)
+        return answers
 
     def fallback(self) -> Array:
         """The committed plan's next input, for when there is no decision."""

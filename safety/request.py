@@ -111,10 +111,6 @@ class Decision:
     promise: Promise | None = None  # to the other robots of its world
     for_clearance: bool | None = None  # adjusted though the proposal's tube was verified; None: not said
 
-    @property
-    def action(self) -> Array:
-        return np.asarray(self.plan[0])
-
 
 def check_for_filter(robot: Robot, request: Request) -> None:
     """All fields, for our filter; the observation only if there is one.

@@ -28,7 +28,7 @@ class VectorSafetyWrapper(VectorWrapper):
     """`SafetyWrapper` of a `gymnasium.vector` environment, whatever its autoreset mode.
 
     `state(env, observations, infos)` gives (k, n), `obstacles` k lists, `actions` maps (k, m); all of them unless given
-    as `SafetyWrapper` has them, and scans in `infos` likewise. `infos` gains `safety` (k decisions; None where an
+    as `SafetyWrapper` has them, and scans in `infos` likewise. `infos` gains `safety` (k answers; None where an
     environment is being reset), `penalty` (k,) and `diagnostics` (a dict of k values each).
     """
 

@@ -17,10 +17,12 @@ from messaging.scans import BadScan
 from messaging.sensed import Sensed, sensed_of
 from messaging.shapes import FARTHEST, BadShape, Obstacle
 from safety.commitment import Prediction
+from safety.explain import Stopped
 from safety.promise import Promise, Promises
 from safety.request import ADJUSTED, ALLOWED, FAILSAFE, RECOVERING, BadRequest, Decision, Request
 
 KINDS = {ALLOWED: pb.ALLOWED, ADJUSTED: pb.ADJUSTED, FAILSAFE: pb.FAILSAFE, RECOVERING: pb.RECOVERING}
+NAMES = {number: name for name, number in KINDS.items()}
 # What a batch may cost, known before it is worked on: its bytes to decode, its requests and obstacles to decide on.
 LARGEST = 2**20  # bytes of a request batch: some thirty with a range image each
 MOST_REQUESTS = 64
@@ -178,6 +180,49 @@ def message_of(decision: Decision, queue_ms: float) -> pb.Reply:
     if decision.promise is not None:
         message.promise.CopyFrom(promise_message(decision.promise))
     return pb.Reply(decision=message)
+
+
+def decision_of(m: pb.Decision, robot: Robot) -> Decision:
+    """The decision in a message, its plan's size having been checked.
+
+    Raises:
+        BadRequest: its kind, tube or promise is none of this robot's, with the field's name.
+    """
+    if m.kind not in NAMES:
+        raise BadRequest("kind", f"kind {m.kind}")
+    d = robot.position_dim
+    tube = numbers(m.tube_center), numbers(m.tube_half_width)
+    if {part.size for part in tube} not in ({0}, {robot.horizon * d}):  # the rivals have none
+        raise BadRequest("tube_center", "a tube of the wrong size")
+    if not all(np.isfinite(part).all() for part in tube):
+        raise BadRequest("tube_center", "a tube that holds NaN or infinity")
+    stopped = None
+    if m.HasField("stopped"):
+        where = numbers(m.stopped.normal), numbers(m.stopped.at)
+        stopped = Stopped(m.stopped.by, m.stopped.room, m.stopped.after, *where)
+    return Decision(
+        kind=NAMES[m.kind],
+        plan=numbers(m.plan).reshape(robot.horizon, robot.action_dim),
+        tube_center=tube[0].reshape(-1, d),
+        tube_half_width=tube[1].reshape(-1, d),
+        predicted=Prediction(numbers(m.predicted_center), numbers(m.predicted_half_width), m.predicted_heading),
+        margin=m.margin,
+        at_least=m.at_least,
+        model=m.model,
+        reason=m.reason,
+        verified=m.verified,
+        contained=m.contained,
+        compared=m.compared,
+        time_ms=m.time_ms,
+        solve_ms=m.solve_ms,
+        verify_ms=m.verify_ms,
+        solver=m.solver,
+        iterations=m.iterations,
+        broken=m.broken,
+        stopped=stopped,
+        promise=promise_of(m.promise, robot) if m.HasField("promise") else None,
+        for_clearance=m.for_clearance if m.HasField("for_clearance") else None,
+    )
 
 
 def promise_message(promise: Promise) -> pb.Promise:

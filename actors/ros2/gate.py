@@ -16,11 +16,12 @@ from numpy.typing import NDArray
 
 from actors.guard import Ask, Outcome, consult, next_input
 from actors.ros2.senses import Command
-from messaging import brakeline_pb2 as pb
 from messaging.robots import Robot
 from messaging.shapes import BOX, Obstacle, Shapes
-from safety.client import KINDS, request_message
+from safety.client import request_message
 from safety.commitment import Commitment
+from safety.request import ADJUSTED, ALLOWED
+from safety.wire import KINDS
 
 Array = NDArray[np.float64]
 
@@ -49,7 +50,7 @@ class Tally:
     decide_ms: deque[float] = field(default_factory=lambda: deque(maxlen=KEPT))
 
     def figures(self) -> dict[str, float]:
-        kinds = (*KINDS.values(), NO_ANSWER, LATE, BLIND)
+        kinds = (*KINDS, NO_ANSWER, LATE, BLIND)
         delays, decide = 1e3 * np.array([*self.delays] or [0.0]), np.array([*self.decide_ms] or [0.0])
         return {
             "periods": self.periods,
@@ -111,11 +112,11 @@ class Gate:
         self.outcome = self._command = None
         tally.periods += 1
         if outcome is not None and outcome.answer is not None and in_time:
-            message = outcome.answer.message
-            tally.compared += message.compared
-            tally.outside += message.compared and not message.contained
-            tally.decide_ms.append(message.time_ms)
-            self.kind, self.reason = outcome.answer.kind, message.reason
+            answer = outcome.answer
+            tally.compared += answer.compared
+            tally.outside += answer.compared and not answer.contained
+            tally.decide_ms.append(answer.time_ms)
+            self.kind, self.reason = answer.kind, answer.reason
             self.input = next_input(self.commitment, outcome)
             if command is None:
                 self.reason = self.reason or "no command"
@@ -134,13 +135,13 @@ class Gate:
 
     def _stuck(self, outcome: Outcome) -> bool:
         """Was there an answer, and was nothing verified?"""
-        return outcome.answer is not None and outcome.answer.message.kind not in (pb.ALLOWED, pb.ADJUSTED)
+        return outcome.answer is not None and outcome.answer.kind not in (ALLOWED, ADJUSTED)
 
     def _nearer(self, outcome: Outcome, state: Array, obstacles: Sequence[Obstacle]) -> bool:
         """Does the answer's plan end nearer to what stands around than the robot is now?"""
         assert outcome.answer is not None
         d = self.robot.position_dim
-        ends = np.stack([state[:d], np.array(outcome.answer.message.tube_center[-d:])])
+        ends = np.stack([state[:d], outcome.answer.tube_center[-1]])
         here, there = Shapes.of(obstacles, d).distance(ends).min(axis=0)
         return bool(there < here)
 

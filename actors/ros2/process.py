@@ -36,7 +36,7 @@ from messaging.ros2.messages import (
     twist,
 )
 from messaging.shapes import Obstacle
-from safety.client import KINDS
+from safety.wire import KINDS
 
 Array = NDArray[np.float64]
 
@@ -179,7 +179,7 @@ class Steering:
         self.gate.decide(state, around, self.senses.command(now), began, number)
         outcome = self.gate.outcome
         if outcome is not None and outcome.answer is not None:
-            self._markers.put(markers(began, self.senses.frame, outcome.answer.message, around))
+            self._markers.put(markers(began, self.senses.frame, outcome.answer, around))
 
     def _until(self, moment: float, stop: threading.Event) -> bool:
         """Wait, and meanwhile send the input in force again (not in a simulation: it may wait for the next one)."""
@@ -203,7 +203,7 @@ class Steering:
         gate, now = self.gate, self.clock.now()
         when, *said = self._told
         if gate.kind != said[0]:
-            lost = gate.kind not in KINDS.values()
+            lost = gate.kind not in KINDS
             log.log(logging.WARNING if lost else logging.INFO, "%s: %s", gate.kind, gate.reason)
         if [gate.kind, gate.reason] == said and now - when < TELL:
             return

@@ -8,7 +8,6 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from messaging import brakeline_pb2 as pb
 from messaging.ros2.messages import (
     ColorRGBA,
     CompressedImage,
@@ -27,7 +26,8 @@ from messaging.ros2.messages import (
     vector,
 )
 from messaging.shapes import BOX, CYLINDER, Obstacle
-from safety.client import KINDS
+from safety.request import ADJUSTED, ALLOWED, FAILSAFE, Decision
+from safety.wire import KINDS
 
 Array = NDArray[np.float64]
 
@@ -36,18 +36,17 @@ THIN = 0.01  # m, of lines and of the tube's boxes
 KEPT = Duration(sec=1, nanosec=0)  # s that a marker stays when nothing new comes
 OBSTACLE = ColorRGBA(r=0.47, g=0.5, b=0.55, a=0.6)
 COLORS = {
-    pb.ALLOWED: (0.2, 0.66, 0.39),
-    pb.ADJUSTED: (0.94, 0.59, 0.12),
-    pb.FAILSAFE: (0.84, 0.19, 0.24),
+    ALLOWED: (0.2, 0.66, 0.39),
+    ADJUSTED: (0.94, 0.59, 0.12),
+    FAILSAFE: (0.84, 0.19, 0.24),
 }
 OTHER = (0.5, 0.3, 0.7)
 CUBE, ROUND, LINE = Marker.CUBE, Marker.CYLINDER, Marker.LINE_STRIP
 
 
-def markers(time: float, frame: str, decision: pb.Decision, obstacles: Sequence[Obstacle]) -> MarkerArray:
+def markers(time: float, frame: str, decision: Decision, obstacles: Sequence[Obstacle]) -> MarkerArray:
     """The tube's boxes, the way through their middles, and what was taken to stand around."""
-    centers = np.reshape(decision.tube_center, (-1, 2))
-    halves = np.reshape(decision.tube_half_width, (-1, 2))
+    centers, halves = decision.tube_center, decision.tube_half_width
     red, green, blue = COLORS.get(decision.kind, OTHER)
     tube, plan = ColorRGBA(r=red, g=green, b=blue, a=0.35), ColorRGBA(r=red, g=green, b=blue, a=1.0)
     drawn = [
@@ -118,9 +117,9 @@ def diagnostics(
 ) -> DiagnosticArray:
     """OK: the command went through; WARN: another input or the committed plan did; ERROR: there was nothing to decide
     on, or nobody to do it, and the robot brakes."""
-    decided = DiagnosticStatus.OK if kind == KINDS[pb.ALLOWED] else DiagnosticStatus.WARN
+    decided = DiagnosticStatus.OK if kind == ALLOWED else DiagnosticStatus.WARN
     status = DiagnosticStatus(
-        level=decided if kind in KINDS.values() else DiagnosticStatus.ERROR,
+        level=decided if kind in KINDS else DiagnosticStatus.ERROR,
         name=f"{node}: safety filter",
         message=f"{kind}: {reason}" if reason else kind,
         hardware_id=robot,

@@ -65,8 +65,7 @@ class Loss:
             if not driver.running:
                 break
         assert outcome.answer is not None, "nobody kills the filter here"
-        message = outcome.answer.message
-        center, half = (np.reshape(a, (-1, 3)) for a in (message.tube_center, message.tube_half_width))
+        center, half = outcome.answer.tube_center, outcome.answer.tube_half_width
         positions = self._die(driver.commitment.plan[0])
         return float(excess(positions, center, half).max())
 

@@ -81,22 +81,21 @@ class Query:
         action = self.action or robot.action_high
         scan = None if self.scan is None else sensed_in(self.scan, robot.position_dim)
         with Bus(self.endpoints.bus(), f"client.query-{time.time_ns() % 10**6}") as bus:
-            message = SafetyClient(bus, robot.name, self.timeout).decide(state, action, near, scan).message
-        d = robot.position_dim
+            answer = SafetyClient(bus, robot.name, self.timeout).decide(state, action, near, scan)
         figures: dict[str, Any] = {
-            "decision": {1: "allowed", 2: "adjusted", 3: "failsafe", 4: "recovering"}[message.kind],
-            "plan": _rows(message.plan, robot.action_dim),
-            "tube": {"center": _rows(message.tube_center, d), "half_width": _rows(message.tube_half_width, d)},
-            "margin": message.margin,
-            "at_least": message.at_least,
-            "time_ms": message.time_ms,
-            "model": message.model,
-            "reason": message.reason,
+            "decision": answer.kind,
+            "plan": answer.plan.tolist(),
+            "tube": {"center": answer.tube_center.tolist(), "half_width": answer.tube_half_width.tolist()},
+            "margin": answer.margin,
+            "at_least": answer.at_least,
+            "time_ms": answer.time_ms,
+            "model": answer.model,
+            "reason": answer.reason,
         }
         if self.json:
             say_json(figures)
             return 0
-        console.print(f"[bold]{figures['decision']}[/] {message.reason}")
+        console.print(f"[bold]{figures['decision']}[/] {answer.reason}")
         shown = Stacking(**PLAIN)
         for column in ("period", *robot.action, "center [m]", "± [m]"):
             shown.add_column(column)
@@ -105,13 +104,9 @@ class Query:
         ):
             shown.add_row(str(k), *(f"{value:.4f}" for value in u), _numbers(c), _numbers(h))
         console.print(shown)
-        margin = f"{'> ' if message.at_least else ''}{message.margin:.4f} m"
-        console.print(f"margin {margin}, {message.time_ms:.2f} ms in decide, model {message.model}")
+        margin = f"{'> ' if answer.at_least else ''}{answer.margin:.4f} m"
+        console.print(f"margin {margin}, {answer.time_ms:.2f} ms in decide, model {answer.model}")
         return 0
-
-
-def _rows(values: Any, width: int) -> list[list[float]]:
-    return [list(values[i : i + width]) for i in range(0, len(values), width)]
 
 
 def _numbers(values: list[float]) -> str:

@@ -83,7 +83,8 @@ def record(driver: Driver, policy: Policy, question: Ask | None, number: int) ->
         proposal = np.asarray(policy(driver.observation, driver.info), dtype=float)
         asked = driver.request(proposal)
         outcome = consult(question, [asked], driver.robot)[0] if question is not None else None
-        decision = outcome.answer.message if outcome is not None and outcome.answer is not None else pb.Decision()
+        reply = None if outcome is None or outcome.answer is None else outcome.reply
+        decision = pb.Decision() if reply is None else reply.decision
         before = np.asarray(driver.info["true_state"])
         step = driver.execute(proposal, outcome)
         center = np.reshape(decision.tube_center, (-1, d))

@@ -12,6 +12,7 @@ from messaging import brakeline_pb2 as pb
 from messaging.bus import NoReply
 from safety.model_set import Recipe
 from safety.request import NOT_FINITE
+from safety.wire import KINDS
 from tests.robots import GROUND
 
 FAST = np.array([0.25, 0.1])
@@ -40,7 +41,7 @@ def test_the_steps_of_an_episode(ask):
         assert (step.episode, step.step, step.index, step.weights_version) == (5, number, number + 1, 3)
         assert np.array_equal(np.float32(step.observation), observation)
         assert np.array_equal(np.float32(step.next_observation), robot.observation)
-        assert step.decision == outcome.answer.message.kind and step.decide_ms > 0 and not step.fallback
+        assert step.decision == KINDS[outcome.answer.kind] and step.decide_ms > 0 and not step.fallback
         assert np.allclose(step.action, outcome.answer.action) and np.allclose(step.proposed, FAST)
         intervened = step.decision != pb.ALLOWED
         assert (step.penalty > 0) == intervened and step.penalty <= 2.0 * np.sqrt(2)
@@ -58,7 +59,7 @@ def test_containment_is_of_the_state_after_the_step_and_unknown_after_a_fallback
     for wrong in (False, True):
         outcome = consult(ask, [robot.request(FAST)], GROUND)[0]
         if wrong:  # a prediction that cannot come true
-            outcome.answer.message.predicted_center[0] += 1.0
+            outcome.answer.predicted.center[0] += 1.0
         step = robot.execute(FAST, outcome)
         assert step.compared and step.contained is not wrong
     missing = consult(lambda requests: (_ for _ in ()).throw(NoReply("gone")), [robot.request(FAST)], GROUND)[0]
@@ -83,7 +84,7 @@ def test_a_proposal_that_is_not_finite_is_a_failsafe_and_a_step_to_learn_from(as
     robot.execute(FAST, consult(ask, [robot.request(FAST)], GROUND)[0])
     outcome = consult(ask, [robot.request(np.array(wrong))], GROUND)[0]
     assert np.array_equal(outcome.exchange(0.2).request.action, wrong, equal_nan=True)
-    assert (outcome.answer.kind, outcome.answer.message.reason) == ("failsafe", NOT_FINITE)
+    assert (outcome.answer.kind, outcome.answer.reason) == ("failsafe", NOT_FINITE)
     step = robot.execute(np.array(wrong), outcome)
     assert step.decision == pb.FAILSAFE and step.proposed == step.action == [0.0, 0.0]
     Intake(GROUND).move(step)

@@ -154,7 +154,7 @@ def test_what_is_left_out_is_noticed(model, mutant):
     for x in np.linspace(0.11, 0.2, 150):  # a wall ahead: from right before it to well off
         ask = request((0, 0, 0, 0.2, 0), (0.25, 0.0), [Obstacle("wall", (x, 0.0), (), np.pi)])
         decision, right = ready.decide(ask), honest.decide(ask)
-        noticed += decision.kind != FAILSAFE and fits(model, ask, decision.action) <= 0.0
+        noticed += decision.kind != FAILSAFE and fits(model, ask, decision.plan[0]) <= 0.0
         assert right.kind == FAILSAFE or fits(model, ask, right.action) > 0.0
     assert noticed > 0
 

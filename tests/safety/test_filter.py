@@ -34,7 +34,7 @@ def test_the_margin_is_the_way_to_the_obstacle_however_far_it_is(model, ready, w
     """Obstacles beyond the reach of any plan decide nothing, but they are what is near."""
     ask = request(obstacles=[cylinder(way, 0.0)])
     decision = ready.decide(ask)
-    clear = fits(model, ask, decision.action)
+    clear = fits(model, ask, decision.plan[0])
     assert clear - 0.01 <= decision.margin <= clear + 1e-3
     assert decision.at_least == (way - 0.1 > ready.reach), "beyond the reach it is a lower bound, and said to be"
 
@@ -52,8 +52,8 @@ def test_where_nothing_is_near_the_margin_says_that_it_is_only_a_bound(ready):
 def test_allowed_is_the_proposal_clipped_to_the_bounds(ready):
     decision = ready.decide(request(action=(7.0, -3.0)))
     assert decision.kind == ALLOWED
-    assert np.array_equal(decision.action, [0.25, -0.5])
-    assert correction_penalty(GROUND, (7.0, -3.0), np.zeros(2), decision.action, 1.0) == 0.0
+    assert np.array_equal(decision.plan[0], [0.25, -0.5])
+    assert correction_penalty(GROUND, (7.0, -3.0), np.zeros(2), decision.plan[0], 1.0) == 0.0
 
 
 def test_the_penalty_counts_from_what_bounds_and_slew_let_pass():
@@ -105,7 +105,7 @@ def test_adjusted_is_the_closest_input_that_can_be_verified(ready):
         scene = ready.around.scene(ask, z_0, ready.builder.reachable(ask.input_in_force))
         rows = ready.around.rows(scene, np.concatenate([z_0, ready.inputs.limited(ask.action, ask.input_in_force)]))
         kept = ready._with_clearance_margin(rows, z_0, ready.inputs.limited(ask.action, ask.input_in_force))
-        taken = np.linalg.norm((decision.action - ask.action) / width)
+        taken = np.linalg.norm((decision.plan[0] - ask.action) / width)
         best = np.inf
         for u in grid:
             if ready.around.margin(kept, np.concatenate([z_0, u])) >= 0.0:
@@ -162,7 +162,7 @@ def test_every_plan_that_leaves_is_clear_and_ends_in_a_stop(models, kind):
             continue
         assert decision.verified
         assert decision.margin >= 0.0
-        assert fits(model, ask, decision.action) > 0.0
+        assert fits(model, ask, decision.plan[0]) > 0.0
     assert {ALLOWED, ADJUSTED} <= kinds
 
 
@@ -207,7 +207,7 @@ def test_the_prediction_holds_for_every_kind(ready, kind):
         decision = ready.decide(request(state, (0.25, 0.1), obstacles, input_in_force=before, model=ready.version))
         if decision.kind != kind:
             continue
-        robot.step(decision.action)
+        robot.step(decision.plan[0])
         assert decision.predicted.contains(GROUND, robot.measure())
         found += 1
         if found == 100:
@@ -280,7 +280,7 @@ def test_an_obstacle_whose_distance_is_no_number_is_never_overlooked(ready):
     broken = replace(near, center=near.center * NAN)
     decision = ready.decide(request(obstacles=broken))
     assert decision.kind == FAILSAFE
-    assert not decision.action.any()
+    assert not decision.plan[0].any()
 
 
 def test_the_reach_covers_every_plan(ready):

@@ -73,7 +73,7 @@ def test_an_answer_that_misses_one_counts_for_none(fleet):
     assert all(np.array_equal(given, plan[0]) for given, (plan, *_) in zip(inputs, before, strict=True))
     for robot, given in zip(robots, inputs, strict=True):
         robot.step(given)
-    assert [a.message.verified for a in decided(fleet, robots, [[0.1, 0.0], [0.1, 0.0]])] == [True, True]
+    assert [a.verified for a in decided(fleet, robots, [[0.1, 0.0], [0.1, 0.0]])] == [True, True]
 
 
 def test_each_period_somebody_else_is_decided_first(fleet, monkeypatch):

@@ -57,9 +57,9 @@ def test_a_batch_is_answered_in_its_order(service, model):
     for reply in replies:
         answer = read(reply, good(), GROUND)
         assert answer.kind in ("allowed", "adjusted")
-        assert answer.message.model == model.version
-        assert answer.message.verified
-        assert answer.message.time_ms > 0
+        assert answer.model == model.version
+        assert answer.verified
+        assert answer.time_ms > 0
     assert service.counts.figures()["decisions"] == 6
     assert service.counts.errors == 0
 
@@ -70,8 +70,8 @@ def test_the_wire_changes_no_decision(service, ready):
     answer = read(service.replies(message)[0], message, GROUND)
     assert np.array_equal(answer.plan, direct.plan)
     assert answer.kind == direct.kind
-    assert answer.message.margin == direct.margin
-    assert list(answer.message.predicted_half_width) == list(direct.predicted.half_width)
+    assert answer.margin == direct.margin
+    assert list(answer.predicted.half_width) == list(direct.predicted.half_width)
 
 
 def bad(**changes):
@@ -132,7 +132,7 @@ def test_bad_requests_get_an_error_that_names_the_field(service, field, message)
     assert error.type in ("BadRequest", "StaleModel", "UnknownRobot")
     assert error.message
     assert service.counts.errors == 1
-    assert read(service.replies(good())[0], good(), GROUND).message.verified
+    assert read(service.replies(good())[0], good(), GROUND).verified
 
 
 def test_a_bad_request_spoils_no_other_of_its_batch(service):
@@ -147,7 +147,7 @@ def test_what_is_no_batch_is_refused_and_the_service_goes_on(service):
         with pytest.raises(BadRequest) as caught:
             service.answer(payload)
         assert caught.value.field in ("payload", "requests")
-        assert read(service.replies(good())[0], good(), GROUND).message.verified
+        assert read(service.replies(good())[0], good(), GROUND).verified
 
 
 def test_random_damage_never_gets_an_unchecked_decision(service):
@@ -192,13 +192,13 @@ def test_a_model_is_replaced_while_the_service_runs(model, models, tmp_path):
     moving = good()
     moving.ClearField("obstacles")
     moving.model, moving.input_in_force[0], moving.plan[0] = model.version, 0.2, 0.1
-    assert read(service.replies(moving)[0], moving, GROUND).message.model == model.version
+    assert read(service.replies(moving)[0], moving, GROUND).model == model.version
     service.models.install(newer)
     answer = read(service.replies(moving)[0], moving, GROUND)
-    assert answer.message.model == newer.version
-    assert answer.message.verified
+    assert answer.model == newer.version
+    assert answer.verified
     moving.model = UNVERIFIED
-    assert read(service.replies(moving)[0], moving, GROUND).message.model == newer.version
+    assert read(service.replies(moving)[0], moving, GROUND).model == newer.version
     stale = good()
     stale.model = models["matrix-zonotope", "direct"].version
     assert service.error(stale).type == "StaleModel"
@@ -214,11 +214,11 @@ def test_violations_and_what_could_not_be_verified_are_counted(service, caplog):
     message.predicted_center.extend([9.0] * 5)
     message.predicted_half_width.extend([0.1] * 5)
     answer = read(service.replies(message)[0], message, GROUND)
-    assert answer.message.compared
-    assert not answer.message.contained
+    assert answer.compared
+    assert not answer.contained
     assert "outside the predicted set" in caplog.text
     message.obstacles.append(pb.Obstacle(kind="cylinder", position=[0.2, 0.0], size=[0.1]))
-    assert not read(service.replies(message)[0], message, GROUND).message.verified
+    assert not read(service.replies(message)[0], message, GROUND).verified
     figures = service.counts.figures()
     assert (figures["violations"], figures["compared"], figures["unverified"]) == (2, 2, 1)
 
@@ -273,7 +273,7 @@ def test_a_recorded_reply_is_no_answer_at_another_place(service):
             recorded.append(service.answer(payload))
             return recorded[-1]
 
-    assert read(ask(Recording(b""), [good()], 0.1)[0], good(), GROUND).message.verified
+    assert read(ask(Recording(b""), [good()], 0.1)[0], good(), GROUND).verified
     elsewhere = request_message(Commitment(GROUND), np.ones(5) * 0.1, [0.2, 0.1], [AHEAD])
     for question in (good(), elsewhere):
         with pytest.raises(SafetyError) as caught:
@@ -323,9 +323,9 @@ def test_a_client_over_the_bus(join, endpoint, service):  # noqa: F811
             done += 1
         assert np.hypot(*(robot.state[:2] - [0.34, 0.0])) > 0.1 + GROUND.footprint
         assert robot.state[0] > 0.02
-        assert client.commitment.model in ("", answer.message.model)
+        assert client.commitment.model in ("", answer.model)
         refused = client.decide(robot.measure(), [NAN, 0.0], [AHEAD])
-        assert (refused.kind, refused.message.reason) == ("failsafe", NOT_FINITE)
+        assert (refused.kind, refused.reason) == ("failsafe", NOT_FINITE)
         assert service.counts.figures()["not_finite"] == 1
         with pytest.raises(SafetyError) as caught:
             client.decide(robot.measure(), [0.0], [AHEAD])
@@ -333,4 +333,4 @@ def test_a_client_over_the_bus(join, endpoint, service):  # noqa: F811
         assert not client.fallback().any(), "the committed plan brakes"
         with pytest.raises(Refused):
             client.bus.ask(DECIDE, b"\xff" * 20, 5.0, robot="ground")
-        assert client.decide(robot.measure(), [0.0, 0.1], [AHEAD]).message.verified
+        assert client.decide(robot.measure(), [0.0, 0.1], [AHEAD]).verified

@@ -8,11 +8,13 @@ import pytest
 from messaging import brakeline_pb2 as pb
 from messaging.robots import Robot
 from messaging.shapes import Obstacle
-from safety.client import Answer, accept, read, request_message
+from safety.asker import Answer, accept
+from safety.client import read, request_message
 from safety.commitment import UNVERIFIED, Commitment
 from safety.model_set import ModelSet
 from safety.service import Counts, Models, answerer
 from safety.vouch import SIZE, BadKey, Notary, write_key
+from safety.wire import decision_of
 from tests.robots import GROUND, QUADROTOR
 
 KEY = bytes(range(32))
@@ -112,12 +114,12 @@ def test_each_period_has_its_voucher_until_the_robot_stands(robot: Robot) -> Non
         commitment, plan = Commitment(robot), plan_of(robot, rng)
         request = pb.Request(robot=robot.name, actor="a")
         decision = pb.Decision(plan=plan.ravel().tolist(), model="abc", verified=True, predicted_heading=-0.0)
+        decision.kind = pb.ALLOWED
         decision.predicted_center.extend(rng.normal(size=robot.state_dim).tolist())
         decision.predicted_half_width.extend(rng.random(robot.state_dim).tolist())
         decision.vouchers.extend(notary.vouchers(request, decision, robot))
         wire = pb.Decision.FromString(decision.SerializeToString())
-        reply = pb.Reply(robot=robot.name, decision=wire)
-        accept(commitment, Answer("allowed", plan[0], plan, reply.decision))
+        accept(commitment, Answer.of(decision_of(wire, robot), robot, vouchers=tuple(wire.vouchers)))
         for _ in range(robot.horizon + 2):
             predicted = commitment.predicted
             state = np.zeros(robot.state_dim) if predicted is None else predicted.center

@@ -12,6 +12,7 @@ from messaging.bus import NoReply
 from messaging.ros2.messages import DiagnosticArray, DiagnosticStatus, MarkerArray, decode, encode
 from messaging.shapes import Obstacle, Shapes
 from safety.request import NOT_FINITE
+from safety.wire import decision_of
 from tests.robots import GROUND
 
 ROBOT = GROUND.in_real_time()
@@ -98,9 +99,11 @@ def test_only_what_a_twist_can_drive_is_taken():
 
 
 def test_views_are_messages():
-    decision = allow([pb.Request(action=[0.2, 0.0], input_in_force=[0.0, 0.0])])[0].decision
+    decision = allow([pb.Request(action=[0.2, 0.0], input_in_force=[0.0, 0.0], plan=[0.0] * 2 * ROBOT.horizon)])[
+        0
+    ].decision
     things = (Obstacle("box", (1.0, 0.0), (0.1, 0.5), 0.3), Obstacle("cylinder", (0.0, 1.0), (0.1,)))
-    drawn = decode(MarkerArray, encode(markers(3.0, "odom", decision, things)))
+    drawn = decode(MarkerArray, encode(markers(3.0, "odom", decision_of(decision, ROBOT), things)))
     groups = [marker.ns for marker in drawn.markers]
     assert groups.count("tube") == ROBOT.horizon and groups.count("plan") == 1 and groups.count("obstacles") == 2
     assert {marker.header.frame_id for marker in drawn.markers} == {"odom"}

@@ -59,7 +59,7 @@ def test_it_intervenes_exactly_where_the_advantage_is_above_the_threshold(thresh
         decision = ready.decide(request((speed, 0.2), (0.2, 0.1)))
         intervened = decision.kind == "failsafe"
         assert intervened == (advantage > threshold) and ("above" in decision.reason) == intervened
-        assert np.allclose(decision.action, (0.0, 0.0) if intervened else (speed, 0.2))
+        assert np.allclose(decision.plan[0], (0.0, 0.0) if intervened else (speed, 0.2))
 
 
 def test_the_larger_q_and_the_smaller_v_count():
@@ -79,7 +79,7 @@ def test_only_the_advantage_counts_not_the_danger_itself():
 
 def test_it_looks_at_the_proposal_as_it_would_be_executed():
     decision = Sailr(known(threshold=0.95)).decide(request((99.0, -99.0)))
-    assert decision.kind == "allowed" and np.allclose(decision.action, (0.25, -0.5))
+    assert decision.kind == "allowed" and np.allclose(decision.plan[0], (0.25, -0.5))
 
 
 @pytest.mark.parametrize("before", [(0.0, 0.0, 0.0), (5.0, -5.0, 2.0), (0.3, 0.0, -0.9)])
@@ -88,8 +88,8 @@ def test_the_backup_brakes_as_fast_as_the_slew_allows(before):
     ready = Sailr(known(threshold=0.1, q=(9.0, 9.0), robot=robot))
     decision = ready.decide(request((5.0, 5.0, 5.0), before, robot))
     assert decision.kind == "failsafe"
-    assert np.allclose(decision.action, np.sign(before) * np.maximum(np.abs(before) - 0.8, 0.0))
-    assert np.allclose(decision.action, brake(robot, before))
+    assert np.allclose(decision.plan[0], np.sign(before) * np.maximum(np.abs(before) - 0.8, 0.0))
+    assert np.allclose(decision.plan[0], brake(robot, before))
     plan = np.vstack([before, decision.plan])
     assert (np.abs(np.diff(plan, axis=0)) <= 0.8 + 1e-9).all() and not decision.plan[-1].any()
 

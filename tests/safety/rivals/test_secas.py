@@ -12,7 +12,8 @@ from messaging.perceptrons import Perceptrons
 from messaging.rays import fan
 from messaging.shapes import Shapes
 from messaging.tasks import task_of
-from safety.client import accept, read, request_message
+from safety.asker import accept
+from safety.client import read, request_message
 from safety.commitment import UNVERIFIED, Commitment
 from safety.model_set import BadModel
 from safety.request import NOT_FINITE, BadRequest, Request
@@ -112,7 +113,7 @@ def request(observation, action, before=(0.0, 0.0), state=(0, 0, 0, 0, 0), robot
 
 def test_far_from_everything_the_proposal_passes():
     decision = Secas(known()).decide(request(seen(1.0), (0.25, 0.4)))
-    assert decision.kind == "allowed" and np.allclose(decision.action, (0.25, 0.4)) and decision.reason == ""
+    assert decision.kind == "allowed" and np.allclose(decision.plan[0], (0.25, 0.4)) and decision.reason == ""
     assert decision.margin > 0 and not decision.verified and decision.solver == ""
 
 
@@ -122,11 +123,11 @@ def test_the_speed_is_cut_to_what_the_linear_model_allows():
         decision = ready.decide(request(seen(ahead), (0.25, 0.4)))
         allowed = (ahead - CLEARANCE) / REACT[0]  # of full speed
         assert decision.kind == "adjusted" and "sector 2" in decision.reason
-        assert decision.action == pytest.approx((0.25 * allowed, 0.4), abs=1e-5)
+        assert decision.plan[0] == pytest.approx((0.25 * allowed, 0.4), abs=1e-5)
         assert decision.margin == pytest.approx(0.0, abs=1e-5)
         assert not decision.plan[-1].any() and len(decision.plan) == GROUND.horizon
     too_near = ready.decide(request(seen(0.15), (0.25, 0.4)))  # the correction would be to drive backwards
-    assert too_near.action == pytest.approx((0.0, 0.4), abs=1e-4) and too_near.margin < 0
+    assert too_near.plan[0] == pytest.approx((0.0, 0.4), abs=1e-4) and too_near.margin < 0
 
 
 def test_moving_towards_it_counts_as_nearer():
@@ -158,7 +159,7 @@ def test_a_robot_with_a_slew_is_corrected_within_it():
     observation = np.full(task_of(robot).observation_dim, 0.2)  # walls 2.4 m away all round: too near at that speed
     decision = ready.decide(request(observation, (5.0, 0.0, 0.0), before, state, robot))
     assert decision.kind == "adjusted"
-    assert decision.action == pytest.approx((2.2, 0.0, 0.0), abs=1e-3), "as much less as the slew allows"
+    assert decision.plan[0] == pytest.approx((2.2, 0.0, 0.0), abs=1e-3), "as much less as the slew allows"
     assert (np.abs(np.diff(decision.plan, axis=0)) <= 0.8 + 1e-9).all() and not decision.plan[-1].any()
 
 
