@@ -81,12 +81,12 @@ def test_a_slew_limit_is_kept():
     ready = Filter(ModelSet(robot, Recipe(), tuple(steps), *nothing, domain, np.eye(6), {}))
     found = ready.decide(request((0, 0, 0, 0.2, 0), (0.0, 0.5), [cylinder(2, 0)]))
     assert found.kind == ALLOWED
-    assert np.allclose(found.action, [0.15, 0.1])
+    assert np.allclose(found.plan[0], [0.15, 0.1])
     for x in np.linspace(0.24, 0.28, 9):
         found = ready.decide(request((0, 0, 0, 0.15, 0), (0.25, 0.5), [cylinder(x, 0.02)]))
         if found.kind != FAILSAFE:
-            assert 0.1 - 1e-12 <= found.action[0] <= 0.2 + 1e-12
-            assert abs(found.action[1]) <= 0.1 + 1e-12
+            assert 0.1 - 1e-12 <= found.plan[0][0] <= 0.2 + 1e-12
+            assert abs(found.plan[0][1]) <= 0.1 + 1e-12
 
 
 def test_adjusted_is_the_closest_input_that_can_be_verified(ready):
@@ -142,7 +142,7 @@ def test_a_verified_proposal_is_allowed_where_no_input_keeps_the_clearance_margi
     for ask in replaced:
         decision = ready.decide(ask)
         assert (decision.kind, decision.for_clearance, decision.verified) == (ALLOWED, None, True)
-        assert decision.action == pytest.approx(ask.action)
+        assert decision.plan[0] == pytest.approx(ask.action)
 
 
 @pytest.mark.parametrize("kind", KINDS)
