@@ -132,7 +132,7 @@ COMMANDS: dict[str, Command] = {
     ),
     "replay": Command(
         "replay:Replay",
-        "ask every logged question again: is the same decided, and what would be with another model set?",
+        "ask every logged question again: is the same decided, to within 1e-12? And what with another model set?",
         "brakeline replay runs/latest --certificate set-membership",
     ),
     "export": Command(

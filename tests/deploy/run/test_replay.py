@@ -1,4 +1,4 @@
-"""Replay: the same decisions to the last bit, and every difference there is."""
+"""Replay: the same decisions, and every difference there is."""
 
 import json
 import math
@@ -11,7 +11,7 @@ import pytest
 from deploy import cli
 from deploy.data.paths import record_path
 from deploy.data.store import model_for
-from deploy.run.replay import ReplayError, differences, replay
+from deploy.run.replay import APART, Difference, ReplayError, differences, replay
 from messaging import brakeline_pb2 as pb
 from safety.filter import Filter
 from safety.model_set import Recipe
@@ -26,10 +26,10 @@ def run(capsys: pytest.CaptureFixture[str], *words: object) -> tuple[int, dict[s
     return status, json.loads(capsys.readouterr().out)
 
 
-def test_the_same_version_decides_the_same_to_the_last_bit(log: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_same_version_decides_the_same(log: Path, capsys: pytest.CaptureFixture[str]) -> None:
     status, figures = run(capsys, "replay", log)
     assert status == 0
-    assert (figures["requests"], figures["identical"], figures["different"]) == (STEPS, STEPS, 0)
+    assert (figures["requests"], figures["identical"] + figures["equal"], figures["different"]) == (STEPS, STEPS, 0)
     assert set(figures["kinds"]) >= {"allowed", "adjusted"}, "the log has something to compare"
     assert figures["fields"] == {} and figures["examples"] == [] and figures["same_input"] == STEPS
 
@@ -40,7 +40,7 @@ def test_the_log_alone_is_enough(
     shutil.copy(log, tmp_path / "elsewhere.mcap")
     monkeypatch.setenv("BRAKELINE_DATA", str(tmp_path / "nothing"))
     status, figures = run(capsys, "replay", tmp_path / "elsewhere.mcap")
-    assert (status, figures["identical"]) == (0, STEPS)
+    assert (status, figures["identical"] + figures["equal"]) == (0, STEPS)
 
 
 def test_a_log_without_models_is_replayed_from_its_folder_or_not_at_all(
@@ -52,7 +52,8 @@ def test_a_log_without_models_is_replayed_from_its_folder_or_not_at_all(
     with pytest.raises(ReplayError, match=version):
         replay(tmp_path)
     model.save(tmp_path / "ground" / "models" / f"{version}.safetensors")
-    assert replay(tmp_path).identical == 20
+    again = replay(tmp_path)
+    assert (again.requests, again.unanswered, again.different) == (20, 0, 0)
 
 
 def test_another_margin_decides_otherwise_and_it_is_told_by_how_much(
@@ -66,7 +67,7 @@ def test_another_margin_decides_otherwise_and_it_is_told_by_how_much(
     assert figures["same_input"] == STEPS - figures["fields"]["input"]["count"] < STEPS
     changes = [example["differences"].get("input", 0.0) for example in figures["examples"]]
     assert changes == sorted(changes, reverse=True) and changes[0] == figures["fields"]["input"]["largest"]
-    assert run(capsys, "replay", log, "--margin", margin)[1]["identical"] == STEPS
+    assert run(capsys, "replay", log, "--margin", margin)[1]["different"] == 0
 
 
 def test_another_certificate_and_other_data_can_be_asked(log: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -81,8 +82,11 @@ def test_another_certificate_and_other_data_can_be_asked(log: Path, capsys: pyte
 def test_falsified_decisions_are_found(data_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     def falsify(exchange: pb.Exchange) -> None:
         decision = exchange.reply.decision
+        if exchange.request.step == 1:
+            decision.plan[0] += 1e-14
+            decision.iterations += 7
         if exchange.request.step == 3:
-            decision.plan[0] += 1e-12
+            decision.plan[0] += 1e-11
         if exchange.request.step == 5:
             decision.kind = pb.FAILSAFE
         if exchange.request.step == 7:
@@ -94,8 +98,10 @@ def test_falsified_decisions_are_found(data_folder: Path, tmp_path: Path, capsys
     drive(tmp_path / "run.mcap", 12, falsify)
     status, figures = run(capsys, "replay", tmp_path)
     assert status == 1
-    assert (figures["requests"], figures["unanswered"], figures["identical"]) == (12, 1, 8)
-    assert figures["fields"]["input"] == {"count": 1, "largest": pytest.approx(1e-12, rel=1e-3)}
+    assert (figures["requests"], figures["unanswered"], figures["different"]) == (12, 1, 3)
+    assert figures["identical"] + figures["equal"] == 8 and figures["equal"] >= 1
+    assert figures["rounding"] == pytest.approx(1e-14, rel=0.1, abs=0.0) and figures["same_input"] == 9
+    assert figures["fields"]["input"] == {"count": 1, "largest": pytest.approx(1e-11, rel=1e-3)}
     assert figures["fields"]["kind"]["count"] == 1 and figures["fields"]["result"]["count"] == 1
     assert {example["step"] for example in figures["examples"]} == {3, 5, 9}
     assert cli.main(["replay", str(tmp_path)]) == 1
@@ -118,10 +124,28 @@ def test_differences_of_replies() -> None:
     one = pb.Reply(decision=pb.Decision(plan=(1.0, 2.0, 0.0, 0.0), reason="a", time_ms=1.0))
     other = pb.Reply(decision=pb.Decision(plan=(1.0, 2.5, 0.0, 0.0), reason="b", time_ms=9.0))
     assert differences(one, one, 2) == {}
-    assert differences(one, other, 2) == {"plan": 0.5, "reason": math.inf, "input": 0.5}
+    half = Difference(0.5, rounding=False)
+    assert differences(one, other, 2) == {"plan": half, "reason": APART, "input": half}
     shorter = pb.Reply(decision=pb.Decision(plan=(1.0, 2.0), reason="a"))
-    assert differences(one, shorter, 2) == {"plan": math.inf}
+    assert differences(one, shorter, 2) == {"plan": APART}
     error = pb.Reply(error=pb.Error(type="StaleModel", message="x"))
-    assert differences(one, error, 2) == {"result": math.inf}
+    assert differences(one, error, 2) == {"result": APART}
     assert differences(error, pb.Reply(error=pb.Error(type="StaleModel", message="y")), 2) == {}
-    assert differences(error, pb.Reply(error=pb.Error(type="NoModel")), 2) == {"error": math.inf}
+    assert differences(error, pb.Reply(error=pb.Error(type="NoModel")), 2) == {"error": APART}
+
+
+def test_rounding_is_of_a_numbers_size_or_of_one() -> None:
+    def off(value: float, by: float) -> bool:
+        one, other = (pb.Reply(decision=pb.Decision(margin=m)) for m in (value, value + by))
+        return differences(one, other, 2)["margin"].rounding
+
+    assert off(0.1, 1e-13) and off(5000.0, 4e-9)
+    assert not off(0.1, 2e-12) and not off(5000.0, 6e-9) and not off(0.1, math.inf) and not off(0.1, math.nan)
+
+
+def test_a_log_from_before_a_field_was_there_is_no_different_for_it() -> None:
+    before, now = pb.Decision(kind=pb.ADJUSTED), pb.Decision(kind=pb.ADJUSTED, for_clearance=True)
+    assert differences(pb.Reply(decision=before), pb.Reply(decision=now), 2) == {}
+    now.for_clearance = before.for_clearance = False
+    before.for_clearance = True
+    assert differences(pb.Reply(decision=before), pb.Reply(decision=now), 2) == {"for_clearance": APART}
