@@ -27,7 +27,8 @@ from actors.mavlink_vehicle import ControlPeriod
 from actors.proposers import MakePolicy
 from actors.settings import FlightSettings as FlightSettings
 from actors.tape import Puts
-from actors.vehicle_client import FlightRequest, VehicleClient
+from actors.vehicle_client import VehicleClient
+from actors.vehicle_messages import FlightRequest
 from messaging.bus import BusError
 from messaging.process import Process
 from messaging.robots import Robot, robot_named
@@ -293,7 +294,7 @@ def run(
         question = partial(ask, process.bus, deadline=settings.deadline)
         if not (rider.join(stop) and answered(question, robot, stages[0], settings.method == "ddpc", stop)):
             return False
-        request = FlightRequest(flight, robot.name, arena.obstacles)
+        request = FlightRequest(flight, robot, arena.obstacles)
         vehicle = VehicleClient(request, rider.tape.keep, process.bus.tolerance, stop)
         try:
             rider.take(vehicle)

@@ -33,12 +33,11 @@ class Tape:
 
     def take(self, frame: Frame) -> None:
         """A frame that was sent or received now."""
-        self.keep((time.time_ns(), frame.outgoing, frame.raw))
+        self.keep(pb.MavlinkFrame(wall_time=time.time_ns(), outgoing=frame.outgoing, raw=frame.raw))
 
-    def keep(self, frame: tuple[int, bool, bytes]) -> None:
-        """A frame: when [ns] it was sent or received, whether it is outgoing, its bytes."""
-        wall_time, outgoing, raw = frame
-        self._frames.append(pb.MavlinkFrame(wall_time=wall_time, outgoing=outgoing, raw=raw))
+    def keep(self, frame: pb.MavlinkFrame) -> None:
+        """Take a frame that another process sent or received."""
+        self._frames.append(frame)
 
     def publish(self) -> None:
         """Those since the last call, if there are any; in parts, for a message has a largest size."""

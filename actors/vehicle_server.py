@@ -1,10 +1,12 @@
-"""PROCESS: keeps one vehicle flying for its actor, and outlives it.
+"""PROCESS: keeps one vehicle in flight for its actor, and outlives the actor.
 
-It has the link and the clock, and carries out what the actor commits: a process with nothing else to do, which no
-policy and no bus holds up. An actor that dies leaves a plan that was verified to its end: it is
-flown to its end, and then the vehicle hovers until the next actor comes and goes on. If none does, it is let go of.
+The process has the link and the clock, and carries out the plans that the actor commits. It does nothing else: no
+policy and no bus can hold it up. If the actor dies, the process flies the committed plan, which was verified, to its
+end. The vehicle then hovers until the next actor takes over. If none comes, the process lets go of the vehicle.
 
-The actor's side is `actors.vehicle_client`. They meet at a socket that only this user's processes reach.
+The actor's side is `actors.vehicle_client`; their socket is in `actors.vehicle_socket`, their messages are in
+`actors.vehicle_messages`. The process drops a message that is not valid, says so in the log, and flies on: without a
+valid plan the vehicle brakes.
 """
 
 from __future__ import annotations
@@ -17,11 +19,6 @@ import sys
 import threading
 import time
 from collections import deque
-from collections.abc import Iterator
-from contextlib import contextmanager
-from logging.handlers import QueueHandler
-from multiprocessing.connection import Connection
-from multiprocessing.reduction import ForkingPickler
 from queue import SimpleQueue
 
 import numpy as np
@@ -31,80 +28,123 @@ from actors.ground_truth import MavlinkGroundTruth, UdpGroundTruth
 from actors.mavlink import MavlinkError
 from actors.mavlink_vehicle import ControlPeriod, MavlinkVehicle
 from actors.takeoff import REST, STOPPING
-from actors.vehicle_client import Answer, Failure, FlightRequest, HandoverRefused, Raw, VehicleUpdate, address, ours
+from actors.vehicle_messages import (
+    FlightRequest,
+    HandoverRefused,
+    error_message,
+    log_message,
+    period_message,
+    plan_of,
+    request_of,
+)
+from actors.vehicle_socket import BadMessage, MessageSocket, listening, same_user
+from messaging import brakeline_pb2 as pb
 from messaging.links import open_link
-from messaging.robots import robot_named
 from messaging.shapes import Shapes
 from messaging.signals import heeded
 from messaging.tolerant import Tolerance
+from sim.vehicle import BadInput
 
 log = logging.getLogger("brakeline.flight")
 
-LOOK = 0.1  # s between two looks at whether to end
-FIGURES = 5  # periods from one telling of figures to the next: percentiles of all that was late take a while
-LAST_WORDS = 1.0  # s for an actor to take them
-CLOSES = 15.0  # s for an actor to brake and close, once this process is told to end
-SUCCESSOR = 30.0  # s that one may take to come
-GONE = 3.0  # s without a word of the vehicle after which nobody waits for a successor any more
-MOST_FRAMES = 100_000  # kept for an actor that does not take them: some minutes'
-UNSAID = 20  # words at which it is not told more for now
+POLL = 0.1  # s between two checks whether to end
+FIGURES_EVERY = 5  # periods: the percentiles in the figures take a while
+REQUEST_TIMEOUT = 1.0  # s from an actor's connection to its flight request
+DRAIN_TIMEOUT = 1.0  # s for the last messages to the actor
+CLOSE_TIMEOUT = 15.0  # s for the actor to brake and close once this process has to end
+HANDOVER_TIMEOUT = 30.0  # s for the next actor to connect
+SILENCE = 3.0  # s without a message of the vehicle, after which the process does not wait for the next actor
+MOST_FRAMES = 100_000  # stored while no actor takes them: some minutes
+FRAMES_PER_UPDATE = 300  # of up to 280 bytes: they fit into one message
+MOST_QUEUED = 20  # messages, from which on the actor gets no new updates
 
 
 class Outbox:
-    """Says things to the actor of the moment in a thread of its own: nobody waits for one that does not listen."""
+    """Sends messages to the current actor in its own thread, so that an actor that does not read holds up nobody.
+
+    Attributes:
+        actor: the current actor; None: there is none.
+        unsent: frames that could not be sent; the next update contains them.
+    """
 
     def __init__(self) -> None:
-        self.actor: Connection | None = None
-        self.lost: deque[Raw] = deque(maxlen=MOST_FRAMES)  # frames that it could not be told any more
-        self._queue: SimpleQueue[tuple[Connection | None, object] | None] = SimpleQueue()
+        self.actor: MessageSocket | None = None
+        self.unsent: deque[pb.MavlinkFrame] = deque(maxlen=MOST_FRAMES)
+        self._queue: SimpleQueue[tuple[MessageSocket | None, pb.VehicleMessage | None] | None] = SimpleQueue()
         self._thread = threading.Thread(target=self._run, name="outbox", daemon=True)
         self._thread.start()
 
-    def put(self, said: object) -> None:
-        """Never waits. Without an actor what is logged goes to stderr, and all else nowhere."""
-        self._queue.put((self.actor, said))
+    def put(self, message: pb.VehicleMessage) -> None:
+        """Queue a message to the current actor. Without an actor, a log line goes to stderr."""
+        self._queue.put((self.actor, message))
 
-    put_nowait = put  # what a QueueHandler calls
-
-    def tell(self, actor: Connection, said: object) -> None:
-        """To one that is not the actor of the moment."""
-        self._queue.put((actor, said))
+    def dismiss(self, actor: MessageSocket, error: Exception | None = None) -> None:
+        """Queue an error, if there is one, to this actor, and then the end of its connection."""
+        if error is not None:
+            self._queue.put((actor, pb.VehicleMessage(failure=error_message(error))))
+        self._queue.put((actor, None))
 
     @property
     def full(self) -> bool:
-        return self._queue.qsize() > UNSAID
+        """Whether the actor reads too slowly for another update."""
+        return self._queue.qsize() > MOST_QUEUED
 
     def close(self) -> None:
+        """Wait until all messages are sent, for `DRAIN_TIMEOUT` at most."""
         self._queue.put(None)
-        self._thread.join(LAST_WORDS)
+        self._thread.join(DRAIN_TIMEOUT)
 
     def _run(self) -> None:
         while (item := self._queue.get()) is not None:
-            actor, said = item
+            actor, message = item
+            if message is None:
+                if actor is not None:
+                    actor.close()
+                continue
             try:
                 if actor is None:
                     raise BrokenPipeError
-                actor.send(said)
-            except Exception:  # whatever it is: the next actor must be told again
-                self._keep(said)
+                actor.send(message)
+            except Exception:  # any error: the next actor must get the frames
+                self._store(message)
 
-    def _keep(self, said: object) -> None:
-        if isinstance(said, VehicleUpdate):
-            self.lost.extend(said.frames)
-        elif isinstance(said, logging.LogRecord):
-            with contextlib.suppress(OSError, ValueError):  # a terminal that is gone
-                print(said.getMessage(), file=sys.stderr, flush=True)
+    def _store(self, message: pb.VehicleMessage) -> None:
+        if message.HasField("update"):
+            self.unsent.extend(message.update.frames)
+        elif message.HasField("log"):
+            with contextlib.suppress(OSError, ValueError):  # the terminal is gone
+                print(message.log.text, file=sys.stderr, flush=True)
+
+
+class ActorLog(logging.Handler):
+    """Sends each line of the log to the actor, which publishes it."""
+
+    def __init__(self, outbox: Outbox) -> None:
+        super().__init__()
+        self._outbox = outbox
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Queue a record with its traceback, if it has one."""
+        try:
+            self._outbox.put(pb.VehicleMessage(log=log_message(record, self.format(record))))
+        except Exception:
+            self.handleError(record)
 
 
 class VehicleServer:
-    """Of one vehicle, which flies once this is made."""
+    """One vehicle, which flies once this object exists."""
 
-    def __init__(self, request: FlightRequest, actor: Connection, outbox: Outbox, stop: threading.Event) -> None:
-        """Raises MavlinkError, BadLink, OSError; MavlinkError also when told to stop, or left alone, before it flew."""
+    def __init__(self, request: FlightRequest, actor: MessageSocket, outbox: Outbox, stop: threading.Event) -> None:
+        """Take control of the vehicle and take off.
+
+        Raises:
+            MavlinkError, BadLink, OSError: the vehicle does not fly; MavlinkError also if `stop` is set before it
+                flies, or if the actor hangs up or sends anything.
+        """
         self.request, self._outbox, self._stop = request, outbox, stop
-        self._robot, flight = robot_named(request.robot), request.flight
-        self._frames: deque[Raw] = deque(maxlen=MOST_FRAMES)
-        self._telling = threading.Lock()
+        self._robot, flight = request.robot, request.flight
+        self._frames: deque[pb.MavlinkFrame] = deque(maxlen=MOST_FRAMES)
+        self._updating = threading.Lock()
         self._tolerance = Tolerance()
         footprint, shapes = self._robot.footprint, Shapes.of(request.obstacles, self._robot.position_dim)
         self._vehicle = MavlinkVehicle(
@@ -114,185 +154,208 @@ class VehicleServer:
             flight.height,
             flight.origin,
             UdpGroundTruth(flight.truth, flight.system, self._tolerance) if flight.truth else None,
-            self._keep,
+            self._store_frame,
             self._tolerance,
-            lambda: stop.is_set() or actor.poll(),  # whatever is said before it flies is: stop
+            lambda: stop.is_set() or actor.poll(),
             flight.raise_limits,
             MavlinkGroundTruth(lambda position: float(shapes.distance(position).min()) - footprint),
             flight.lead,
         )
-        threading.Thread(target=self._tell, name="news", daemon=True).start()
+        threading.Thread(target=self._send_updates, name="updates", daemon=True).start()
 
-    def serve(self, actor: Connection) -> bool:
-        """Do as the actor says until it says `close` (True) or is gone (False).
+    def serve(self, actor: MessageSocket) -> bool:
+        """Carry out the actor's commands until it closes the flight (True) or is gone (False).
 
-        Told to stop, the process waits for that word, but not for ever. Raises MavlinkError: nobody flies it any more,
-        or nobody said the word.
+        Once the process has to end, the actor has `CLOSE_TIMEOUT` to close the flight.
+
+        Raises:
+            MavlinkError: the vehicle's thread has died, or the actor did not close the flight in time.
         """
-        told_at: float | None = None
+        stopped_at: float | None = None
         while not self._vehicle.failed:
-            if told_at is None and self._stop.is_set():
-                told_at = time.monotonic()
-            if told_at is not None and time.monotonic() - told_at > CLOSES:
-                raise MavlinkError("the process that keeps the vehicle was told to end")
+            if stopped_at is None and self._stop.is_set():
+                stopped_at = time.monotonic()
+            if stopped_at is not None and time.monotonic() - stopped_at > CLOSE_TIMEOUT:
+                raise MavlinkError("the vehicle server had to end")
             try:
-                if not actor.poll(LOOK):
+                if not actor.poll(POLL):
                     continue
-                number, what, *words = actor.recv()
+                command = actor.receive(pb.VehicleCommand)
+            except BadMessage as error:
+                self._tolerance.note("vehicle command", error)
+                continue
             except (EOFError, OSError):
                 return False
-            if what == "close":
+            if command.WhichOneof("command") == "close":
                 return True
-            try:
-                self._outbox.put(Answer(number, self._vehicle.commit(*words)))
-            except ValueError as error:
-                self._outbox.put(Answer(number, error))
-        raise MavlinkError("nobody flies it any more")
+            self._outbox.put(pb.VehicleMessage(reply=self._reply(command)))
+        raise MavlinkError("the vehicle's thread has died")
 
     def brake(self) -> None:
-        """Along the committed plan to its end, and then until it hovers. Raises MavlinkError: nobody flies it."""
+        """Fly the committed plan to its end, and wait until the vehicle hovers.
+
+        Raises:
+            MavlinkError: the vehicle's thread has died.
+        """
         log.warning("without an actor: braking along the committed plan")
         vehicle, end = self._vehicle, time.monotonic() + STOPPING
         period = vehicle.wait(vehicle.current_period.number + self._robot.horizon)
         while _speed(period) > REST and time.monotonic() < end and not self.gone:
             period = vehicle.wait(period.number + 1)
-        what = "it hovers" if _speed(period) <= REST else "it does not come to rest"
-        log.warning("%s at (%.2f, %.2f, %.2f) m", what, *period.report.measured[:3])
+        outcome = "it hovers" if _speed(period) <= REST else "it does not come to rest"
+        log.warning("%s at (%.2f, %.2f, %.2f) m", outcome, *period.report.measured[:3])
 
     @property
     def gone(self) -> bool:
-        """Does nobody fly it any more, or was nothing heard of it for a while?"""
-        return self._vehicle.failed or self._vehicle.silence > GONE
+        """Whether the vehicle's thread has died, or the vehicle is silent."""
+        return self._vehicle.failed or self._vehicle.silence > SILENCE
 
-    def parted(self, request: FlightRequest) -> str:
-        """Why another actor can't go on with it, but has to take control anew; empty: it can."""
+    def refusal(self, request: FlightRequest) -> str:
+        """Return why the vehicle can't be handed over for this request; empty: it can."""
         if request != self.request:
             return "it was flown with other settings until now"
         return self._vehicle.current_period.lost
 
     def close(self) -> None:
-        """Let go of the vehicle, which is first braked unless it hovers; what it said last goes to the actor."""
+        """Brake unless the vehicle hovers, let go of it, and send the last update."""
+        vehicle = self._vehicle
         try:
-            if not (self._vehicle.idle or self.gone):
+            if not (vehicle.idle or self.gone):
                 self.brake()
         finally:
-            self._vehicle.close()
-            self._outbox.put(
-                self._news(self._vehicle.current_period, self._vehicle.timing.figures() | self._vehicle.judged())
-            )
+            vehicle.close()
+            self._send_update(vehicle.current_period, figures=True)
 
-    def _keep(self, frame: Frame) -> None:
-        self._frames.append((time.time_ns(), frame.outgoing, frame.raw))
+    def _reply(self, command: pb.VehicleCommand) -> pb.CommitReply:
+        """Commit a plan; a command that is not valid changes nothing."""
+        try:
+            if command.WhichOneof("command") != "commit":
+                raise BadMessage("in flight a command is `commit` or `close`")
+            plan = plan_of(command.commit, self._robot, self._vehicle.current_period.number)
+            in_time = self._vehicle.commit(plan, command.commit.period)
+        except (BadMessage, BadInput) as error:
+            self._tolerance.note("vehicle command", error)
+            return pb.CommitReply(number=command.number, error=error_message(error))
+        return pb.CommitReply(number=command.number, in_time=in_time)
 
-    def _tell(self) -> None:
-        """Each period as it begins; what comes while there is no actor is for the next one."""
+    def _store_frame(self, frame: Frame) -> None:
+        self._frames.append(pb.MavlinkFrame(wall_time=time.time_ns(), outgoing=frame.outgoing, raw=frame.raw))
+
+    def _send_updates(self) -> None:
+        """Send each period as it begins. What arrives while there is no actor goes to the next one."""
         vehicle, period = self._vehicle, self._vehicle.current_period
         while not vehicle.failed:
             if self._outbox.actor is not None and not self._outbox.full:
-                told = period.number % FIGURES == 0
-                self._outbox.put(self._news(period, vehicle.timing.figures() | vehicle.judged() if told else None))
+                self._send_update(period, figures=period.number % FIGURES_EVERY == 0)
             try:
                 period = vehicle.wait(period.number + 1)
-            except MavlinkError:  # it failed, or this machine stood still for seconds
+            except MavlinkError:  # the thread died, or this machine stood still for seconds
                 period = vehicle.current_period
 
-    def _news(self, period: ControlPeriod, figures: dict[str, float] | None) -> VehicleUpdate:
-        frames: list[Raw] = []
-        with self._telling:
-            for kept in (self._outbox.lost, self._frames):
-                frames += [kept.popleft() for _ in range(len(kept))]
-        return VehicleUpdate(period, frames, self._tolerance.count, figures)
+    def _send_update(self, period: ControlPeriod, figures: bool) -> None:
+        vehicle, frames = self._vehicle, list[pb.MavlinkFrame]()
+        with self._updating:
+            for source in (self._outbox.unsent, self._frames):
+                frames += [source.popleft() for _ in range(len(source))]
+        for start in range(0, max(len(frames), 1), FRAMES_PER_UPDATE):
+            update = pb.VehicleUpdate(
+                period=period_message(period),
+                frames=frames[start : start + FRAMES_PER_UPDATE],
+                passed_over=self._tolerance.count,
+                figures=vehicle.timing.figures() | vehicle.judged() if figures else {},
+            )
+            self._outbox.put(pb.VehicleMessage(update=update))
 
 
 def _speed(period: ControlPeriod) -> float:
     return float(np.linalg.norm(period.report.measured[3:6]))
 
 
-@contextmanager
-def listening(url: str, system: int) -> Iterator[socket.socket]:
-    """A socket at which actors of that vehicle knock. Raises MavlinkError: somebody else keeps it."""
-    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as server:
-        try:
-            server.bind(address(url, system))
-        except OSError as error:
-            raise MavlinkError(f"another process here flies vehicle {system} at {url}") from error
-        server.listen()
-        yield server
-
-
-def next_actor(server: socket.socket, stop: threading.Event, keeper: VehicleServer | None) -> Connection | None:
-    """The next one of this user that knocks; None: told to stop, or none comes."""
-    deadline = time.monotonic() + SUCCESSOR
-    while not stop.is_set() and time.monotonic() < deadline and not (keeper and keeper.gone):
-        if not select.select([server], [], [], LOOK)[0]:
+def next_actor(listener: socket.socket, stop: threading.Event, server: VehicleServer | None) -> MessageSocket | None:
+    """Wait for the next actor of this user; None: `stop` is set, none came, or the vehicle is gone."""
+    deadline = time.monotonic() + HANDOVER_TIMEOUT
+    while not stop.is_set() and time.monotonic() < deadline and not (server and server.gone):
+        if not select.select([listener], [], [], POLL)[0]:
             continue
-        knocking, _ = server.accept()
-        if ours(knocking):
-            return Connection(knocking.detach())
-        knocking.close()
+        connection, _ = listener.accept()
+        if same_user(connection):
+            return MessageSocket(connection)
+        connection.close()
     return None
 
 
+def receive_request(actor: MessageSocket, url: str, system: int) -> FlightRequest:
+    """Return the flight request, which is an actor's first message.
+
+    Raises:
+        BadMessage: there is none, it is not valid, or it is for another vehicle.
+        EOFError, OSError: the actor is gone.
+    """
+    if not actor.poll(REQUEST_TIMEOUT):
+        raise BadMessage(f"no flight request within {REQUEST_TIMEOUT:g} s")
+    command = actor.receive(pb.VehicleCommand)
+    if command.WhichOneof("command") != "fly":
+        raise BadMessage("an actor's first message is a flight request")
+    request = request_of(command.fly)
+    if (request.flight.url, request.flight.system) != (url, system):
+        raise BadMessage(f"the flight request is for vehicle {request.flight.system} at {request.flight.url}")
+    return request
+
+
 def main() -> int:
-    """Keep vehicle SYSTEM at URL: both on the command line. 0: told to end; 1: it failed; 2: left alone."""
+    """Fly the vehicle of the command line: URL SYSTEM.
+
+    Returns:
+        0: an actor closed the flight; 1: the flight failed; 2: no actor took over.
+    """
     url, system = sys.argv[1], int(sys.argv[2])
     outbox, stop = Outbox(), threading.Event()
     root = logging.getLogger()
     root.setLevel(logging.INFO)
-    root.addHandler(QueueHandler(outbox))  # type: ignore[arg-type]
+    root.addHandler(ActorLog(outbox))
     try:
-        with heeded(stop, patient=True), listening(url, system) as server:
-            return _keep(server, outbox, stop)
+        with heeded(stop, patient=True), listening(url, system) as listener:
+            return _serve_actors(listener, url, system, outbox, stop)
     except Exception as error:
         if outbox.actor is None:
-            log.error("the vehicle is let go of: %s", error)
-        outbox.put(Failure(_portable(error)))
+            log.error("the vehicle server lets go of the vehicle: %s", error)
+        outbox.put(pb.VehicleMessage(failure=error_message(error)))
         return 1
     finally:
         outbox.close()
 
 
-def _keep(server: socket.socket, outbox: Outbox, stop: threading.Event) -> int:
-    """For one actor after the other. Raises what making a keeper does, and MavlinkError."""
-    keeper: VehicleServer | None = None
+def _serve_actors(listener: socket.socket, url: str, system: int, outbox: Outbox, stop: threading.Event) -> int:
+    """Serve one actor after the other. Raises what `VehicleServer` raises."""
+    server: VehicleServer | None = None
     try:
-        while (actor := next_actor(server, stop, keeper)) is not None:
-            if (request := _charge(actor)) is None:
+        while (actor := next_actor(listener, stop, server)) is not None:
+            try:
+                request = receive_request(actor, url, system)
+            except BadMessage as error:
+                log.warning("an actor is refused: %s", error)
+                outbox.dismiss(actor, error)
                 continue
-            if keeper is not None and (why := keeper.parted(request)):
-                outbox.tell(actor, Failure(HandoverRefused(why)))
+            except (EOFError, OSError):  # it is gone
+                outbox.dismiss(actor)
+                continue
+            if server is not None and (why := server.refusal(request)):
+                outbox.dismiss(actor, HandoverRefused(why))
                 return 2
             outbox.actor = actor
-            if keeper is None:
-                keeper = VehicleServer(request, actor, outbox, stop)
+            if server is None:
+                server = VehicleServer(request, actor, outbox, stop)
             else:
                 log.info("it hovers, and goes on")
-            if keeper.serve(actor):
+            if server.serve(actor):
                 return 0
             outbox.actor = None
-            keeper.brake()
+            outbox.dismiss(actor)
+            server.brake()
         return 2
     finally:
-        if keeper is not None:
-            keeper.close()
-
-
-def _charge(actor: Connection) -> FlightRequest | None:
-    """An actor's first word; None: it is gone, or has nothing to say."""
-    try:
-        said = actor.recv() if actor.poll(LAST_WORDS) else None
-    except (EOFError, OSError):
-        return None
-    return said if isinstance(said, FlightRequest) else None
-
-
-def _portable(error: Exception) -> Exception:
-    """An exception that can be read at the other end."""
-    try:
-        ForkingPickler.loads(ForkingPickler.dumps(error))
-    except Exception:
-        return MavlinkError(f"{type(error).__name__}: {error}")
-    return error
+        if server is not None:
+            server.close()
 
 
 if __name__ == "__main__":

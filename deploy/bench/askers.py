@@ -11,12 +11,13 @@ time that a question costs a service and a router is what can be carried over to
 from __future__ import annotations
 
 import heapq
+import json
 import tempfile
 import threading
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from multiprocessing.connection import Connection
 from multiprocessing.synchronize import Event
 from pathlib import Path
@@ -49,8 +50,8 @@ THREADS = 24  # of each: questions that are on their way at once
 
 
 @dataclass(frozen=True)
-class Heard:
-    """What a crowd of askers saw; times in s."""
+class CrowdResult:
+    """Answers to the questions of some askers; times in s."""
 
     answered: list[float]
     late: int
@@ -111,7 +112,7 @@ def _crowd(settings: BusSettings, questions: list[bytes], askers: int, out: Conn
             thread.start()
         for thread in threads:
             thread.join()
-    out.send(Heard(answered, **counts))
+    out.send_bytes(json.dumps(asdict(CrowdResult(answered, **counts))).encode())
 
 
 @contextmanager
@@ -163,18 +164,18 @@ def _row(
     before = used(services), used(routers)
     for process in started:
         process.start()
-    heard: list[Heard] = [pipe.recv() for pipe in pipes]
+    results = [CrowdResult(**json.loads(pipe.recv_bytes())) for pipe in pipes]
     for process in started:
         process.join()
-    took = np.array([second for part in heard for second in part.answered] or [np.nan])
-    due = sum(len(h.answered) + h.late + h.unanswered + h.skipped for h in heard)
-    asked = max(1, due - sum(h.skipped for h in heard))
+    took = np.array([second for result in results for second in result.answered] or [np.nan])
+    due = sum(len(r.answered) + r.late + r.unanswered + r.skipped for r in results)
+    asked = max(1, due - sum(r.skipped for r in results))
     return {
         "due /s": due / SECONDS,
         "answered /s": len(took) / SECONDS,
         "in time %": 100.0 * len(took) / due,
-        "late or none %": 100.0 * sum(h.late + h.unanswered for h in heard) / due,
-        "never asked %": 100.0 * sum(h.skipped for h in heard) / due,
+        "late or none %": 100.0 * sum(r.late + r.unanswered for r in results) / due,
+        "never asked %": 100.0 * sum(r.skipped for r in results) / due,
         "p50 ms": 1e3 * float(np.percentile(took, 50)),
         "p99 ms": 1e3 * float(np.percentile(took, 99)),
         "service CPU ms": 1e3 * (used(services) - before[0]) / asked,

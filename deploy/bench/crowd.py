@@ -50,6 +50,16 @@ LARGEST = 600  # bytes of junk
 BURST = 0.002  # s between two bursts of junk
 
 
+def _report(pipe: Connection, figure: float) -> None:
+    """Send a number to the process that started this one."""
+    pipe.send_bytes(str(figure).encode())
+
+
+def _reported(pipe: Connection) -> float:
+    """Wait for the number that a process sends."""
+    return float(pipe.recv_bytes())
+
+
 def _junk(settings: BusSettings, question: bool, rate: int, sent: Connection, stop: Event) -> None:
     """Send noise until told to stop; says how many messages a second."""
     os.nice(10)
@@ -78,7 +88,7 @@ def _junk(settings: BusSettings, question: bool, rate: int, sent: Connection, st
                 send(noise[count % len(noise)])
                 count += 1
             time.sleep(BURST)
-        sent.send(count / (time.monotonic() - begun))
+        _report(sent, count / (time.monotonic() - begun))
 
 
 def _idle(settings: BusSettings, sessions: int, up: Connection, stop: Event) -> None:
@@ -86,7 +96,7 @@ def _idle(settings: BusSettings, sessions: int, up: Connection, stop: Event) -> 
     with ExitStack() as stack:
         for _ in range(sessions):
             stack.enter_context(open_session(settings, "actor-0"))
-        up.send(sessions)
+        _report(up, sessions)
         stop.wait()
 
 
@@ -94,7 +104,7 @@ def _listen(settings: BusSettings, up: Connection, _: Event) -> None:
     """Who hears steps, and will be stopped; one that is can't be waited for, so it never ends by itself."""
     with Bus(settings, "recorder") as bus:
         bus.subscribe(STEP, lambda sample: None)
-        up.send(1)
+        _report(up, 1)
         threading.Event().wait()
 
 
@@ -111,15 +121,15 @@ def _crowd(settings: BusSettings, rate: int) -> Iterator[dict[str, float]]:
         return mine
 
     try:
-        begin(_listen).recv()
+        _reported(begin(_listen))
         idle = [begin(_idle, EACH) for _ in range(IDLE // EACH)]
-        said["idle sessions"] = float(sum(pipe.recv() for pipe in idle))
+        said["idle sessions"] = sum(_reported(pipe) for pipe in idle)
         os.kill(started[0].pid or 0, signal.SIGSTOP)
         senders = {"junk steps /s": begin(_junk, False, rate), "junk questions /s": begin(_junk, True, rate)}
         time.sleep(3.0)  # until they are at it
         yield said
         stop.set()
-        said |= {name: pipe.recv() for name, pipe in senders.items()}
+        said |= {name: _reported(pipe) for name, pipe in senders.items()}
     finally:
         stop.set()
         started[0].kill()  # the listener

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from actors.mavlink_vehicle import MavlinkVehicle
-from actors.vehicle_server import listening
+from actors.vehicle_socket import listening
 from deploy.data.maiden import Box, Found, Maiden
 from messaging.links import open_link
 from messaging.robots import Robot

@@ -11,12 +11,14 @@ import signal
 import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
-from multiprocessing.managers import SyncManager
+from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any, Protocol
 
 from deploy.interpreter import spawning
 from messaging.files import write_whole
+
+LONGEST_LINE = 500  # characters of a job's progress
 
 
 class OtherConfiguration(ValueError):
@@ -95,15 +97,13 @@ def _side_by_side(
 ) -> None:
     """Each in a process of its own."""
     context = spawning()
-    manager = SyncManager(ctx=context)
-    manager.start(_begin_work)
-    with manager, ProcessPoolExecutor(workers, context, initializer=_begin_work) as pool:
-        told = manager.Queue()
-        under_way = {pool.submit(_found_out, job, results, runs, told): job for job in jobs}
+    reader, writer = context.Pipe(duplex=False)
+    with reader, writer, ProcessPoolExecutor(workers, context, initializer=_begin_work, initargs=(writer,)) as pool:
+        under_way = {pool.submit(_found_out, job, results, runs): job for job in jobs}
         while under_way:
             done, _ = wait(under_way, timeout=0.5, return_when=FIRST_COMPLETED)
-            while not told.empty():
-                say(*told.get())
+            while reader.poll():
+                say(*json.loads(reader.recv_bytes()))
             for future in done:
                 job = under_way.pop(future)
                 if future.exception() is not None:
@@ -113,9 +113,13 @@ def _side_by_side(
                 say(job.name, "done")
 
 
-def _begin_work() -> None:
-    """One thread each, for two processes with two threads each on two cores are slower; and no life after the parent,
-    however that one ends."""
+_to_parent: list[Connection] = []  # in a worker: the pipe on which it reports its progress
+
+
+def _begin_work(progress: Connection) -> None:
+    """Begin a worker. It has one thread for NumPy, for two processes with two threads each on two cores are slower. It
+    ends with its parent, however that one ends."""
+    _to_parent.append(progress)
     for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ[name] = "1"
     signal.signal(signal.SIGINT, signal.SIG_DFL)  # ^C is meant for them too, and needs no traceback
@@ -129,7 +133,12 @@ def _begin_work() -> None:
     threading.Thread(target=follow, name="follow the parent", daemon=True).start()
 
 
-def _found_out(job: Job, results: Path, runs: Path, told: Any) -> None:
-    """In a worker: the result is on the disk before anybody hears of it."""
-    result = job.run(runs / job.robot / job.name, lambda text: told.put((job.name, text)))
-    write(results, job, result)
+def _found_out(job: Job, results: Path, runs: Path) -> None:
+    """Run a job in a worker: its result is on the disk before the parent knows of it."""
+
+    def say(text: str) -> None:
+        # Not longer than a pipe takes at once (4096 bytes): the workers share it.
+        line = json.dumps([job.name, text[:LONGEST_LINE]], ensure_ascii=False)
+        _to_parent[0].send_bytes(line.encode(errors="replace"))
+
+    write(results, job, job.run(runs / job.robot / job.name, say))

@@ -1,14 +1,18 @@
-"""A vehicle that a process of its own keeps: what an actor sees of it, and what becomes of it when the actor dies."""
+"""A vehicle in a process of its own: an actor flies it, the actor dies, and the socket carries what is no message."""
 
 from __future__ import annotations
 
 import contextlib
 import os
 import socket
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,16 +20,21 @@ import pytest
 from actors import vehicle_client
 from actors.frames import decoded
 from actors.mavlink import MavlinkError
+from actors.mavlink_vehicle import ControlPeriod
 from actors.settings import FlightSettings
-from actors.vehicle_client import FlightRequest, Raw, VehicleClient, address, ours
-from actors.vehicle_server import listening, next_actor
+from actors.vehicle_client import VehicleClient
+from actors.vehicle_messages import FlightRequest, period_message
+from actors.vehicle_server import FRAMES_PER_UPDATE, MOST_QUEUED, Outbox, next_actor
+from actors.vehicle_socket import LARGEST, BadMessage, MessageSocket, address, connect, listening, same_user
+from messaging import brakeline_pb2 as pb
 from messaging.clock import WallClock
 from messaging.links import open_link
 from messaging.tolerant import Tolerance
 from sim.autopilot import server
 from sim.autopilot.endpoint import Autopilot
 from sim.autopilot.pilot import Mode
-from sim.vehicle import BadInput
+from sim.quadrotor import SAMPLES
+from sim.vehicle import BadInput, Period
 from sim.world import staged_arena
 from tests.actors.test_mavlink import quadrotor
 from tests.robots import QUADROTOR
@@ -50,9 +59,9 @@ def flown() -> Iterator[tuple[str, Autopilot]]:
 
 
 @contextmanager
-def actor(url: str, frames: list[Raw] | None = None, height: float = 2.0) -> Iterator[VehicleClient]:
-    request = FlightRequest(FlightSettings(url, height=height), QUADROTOR.name, ARENA.obstacles)
-    tap: Callable[[Raw], None] = (frames if frames is not None else []).append
+def actor(url: str, frames: list[pb.MavlinkFrame] | None = None, height: float = 2.0) -> Iterator[VehicleClient]:
+    request = FlightRequest(FlightSettings(url, height=height), QUADROTOR, ARENA.obstacles)
+    tap: Callable[[pb.MavlinkFrame], None] = (frames if frames is not None else []).append
     vehicle = VehicleClient(request, tap, Tolerance(), lambda: False)
     try:
         yield vehicle
@@ -60,12 +69,22 @@ def actor(url: str, frames: list[Raw] | None = None, height: float = 2.0) -> Ite
         vehicle.close()
 
 
+def standing() -> Period:
+    return Period(np.zeros(9), np.zeros(9), False, np.inf, np.inf, np.zeros((SAMPLES, 3)), 0.0)
+
+
+def setpoints(frames: list[pb.MavlinkFrame]) -> list[Any]:
+    """The setpoints among the frames, in their order."""
+    sent = [decoded(frame.raw, True) for frame in frames if frame.outgoing]
+    return [f.message for f in sent if f is not None and f.message.get_type() == "SET_POSITION_TARGET_LOCAL_NED"]
+
+
 def test_what_an_actor_that_dies_committed_is_flown_to_its_end_and_the_next_one_goes_on(
     stalled: Callable[[], float], flown: tuple[str, Autopilot]
 ) -> None:
     url, autopilot = flown
-    first: list[Raw] = []
-    second: list[Raw] = []
+    first: list[pb.MavlinkFrame] = []
+    second: list[pb.MavlinkFrame] = []
     with contextlib.ExitStack() as stack:
         vehicle = stack.enter_context(actor(url, first))
         with pytest.raises(BadInput):
@@ -85,19 +104,18 @@ def test_what_an_actor_that_dies_committed_is_flown_to_its_end_and_the_next_one_
         assert period.report.measured[0] > 0.5 and autopilot.pilot.mode is Mode.OFFBOARD, "where the plan ended"
         heir.wait(heir.current_period.number + 6)
         assert heir.figures()["periods"] >= number
-    times = np.array([at for at, _, _ in first + second]) * 1e-9
-    assert np.diff(times).max() < 0.3 + stalled(), "what it said in between was kept for the next actor"
-    sent = [found.message for _, out, raw in first + second if out and (found := decoded(raw, out)) is not None]
-    speeds = [m.vy for m in sent if m.get_type() == "SET_POSITION_TARGET_LOCAL_NED"]
-    assert set(np.round(speeds, 3)) == {0.0, 0.8, 1.5}, "nothing else was ever asked of it"
+    times = np.array([frame.wall_time for frame in first + second]) * 1e-9
+    assert np.diff(times).max() < 0.3 + stalled(), "the next actor gets the frames of the time between"
+    sent = setpoints(first + second)
+    assert set(np.round([m.vy for m in sent], 3)) == {0.0, 0.8, 1.5}, "nothing else was ever asked of it"
 
 
-def test_one_vehicle_has_one_actor_and_a_keeper_that_ends_with_it(
+def test_one_vehicle_has_one_actor_and_a_server_that_ends_with_it(
     monkeypatch: pytest.MonkeyPatch, flown: tuple[str, Autopilot]
 ) -> None:
     url, autopilot = flown
     with actor(url) as vehicle:
-        monkeypatch.setattr(vehicle_client, "PREDECESSOR", 0.5)
+        monkeypatch.setattr(vehicle_client, "HANDOVER_TIMEOUT", 0.5)
         with pytest.raises(MavlinkError, match="another process here flies it"), actor(url):
             pass
         monkeypatch.undo()
@@ -105,22 +123,22 @@ def test_one_vehicle_has_one_actor_and_a_keeper_that_ends_with_it(
         vehicle.leave()
         with actor(url, height=3.0) as other:
             assert other.current_period.number < vehicle.current_period.number, "other settings: taken anew"
-    with socket.socket(socket.AF_UNIX) as knocking, pytest.raises(ConnectionRefusedError):
+    with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as knocking, pytest.raises(ConnectionRefusedError):
         knocking.connect(address(url, 1))
     until(lambda: autopilot.pilot.mode is not Mode.OFFBOARD, "the autopilot goes by its own timeout")
 
 
 def test_an_actor_that_closes_in_full_flight_leaves_it_braked(flown: tuple[str, Autopilot]) -> None:
     url, autopilot = flown
-    frames: list[Raw] = []
+    frames: list[pb.MavlinkFrame] = []
     with actor(url, frames) as vehicle:
         number = vehicle.current_period.number + 2
         vehicle.commit(np.array([[0.8, 0.0, 0.0], [1.5, 0.0, 0.0], [1.5, 0.0, 0.0], [0.7, 0.0, 0.0]]), number)
         vehicle.wait(number + 2)
         assert np.linalg.norm(vehicle.current_period.report.measured[3:6]) > 0.5
     assert np.linalg.norm(autopilot.vehicle.state()[3:6]) < 0.3
-    sent = [found.message for _, out, raw in frames if out and (found := decoded(raw, out)) is not None]
-    assert [m for m in sent if m.get_type() == "SET_POSITION_TARGET_LOCAL_NED"][-1].vy == 0.0, "told to its end"
+    sent = setpoints(frames)
+    assert sent[-1].vy == 0.0, "told to its end"
 
 
 def test_who_is_taken_by_somebody_else_meanwhile_is_taken_control_of_anew(flown: tuple[str, Autopilot]) -> None:
@@ -135,9 +153,9 @@ def test_who_is_taken_by_somebody_else_meanwhile_is_taken_control_of_anew(flown:
 
 
 def test_nobody_elses_processes_are_listened_to(monkeypatch: pytest.MonkeyPatch) -> None:
-    with listening("udpin:test", os.getpid()) as door, socket.socket(socket.AF_UNIX) as knocking:
+    with listening("udpin:test", os.getpid()) as door, socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as knocking:
         knocking.connect(address("udpin:test", os.getpid()))
-        assert ours(knocking)
+        assert same_user(knocking)
         user = os.getuid()
         monkeypatch.setattr("os.getuid", lambda: user + 1)
         stop = threading.Event()
@@ -150,3 +168,131 @@ def test_nobody_elses_processes_are_listened_to(monkeypatch: pytest.MonkeyPatch)
 def test_what_is_said_of_a_link_that_is_none(flown: tuple[str, Autopilot]) -> None:
     with pytest.raises(ValueError, match="a link is"), actor("nonsense:1"):
         pass
+
+
+def test_a_robot_of_ones_own_file_is_flown(flown: tuple[str, Autopilot]) -> None:
+    """The server gets the description itself: it knows no name but those that come with the program."""
+    robot = replace(QUADROTOR, name="mine").in_real_time()
+    request = FlightRequest(FlightSettings(flown[0], height=2.0), robot, ())
+    vehicle = VehicleClient(request, lambda _: None, Tolerance(), lambda: False)
+    try:
+        assert vehicle.wait(vehicle.current_period.number + 2).report.measured.shape == (9,)
+    finally:
+        vehicle.close()
+
+
+def test_what_is_no_command_is_lost_and_the_flight_goes_on(
+    flown: tuple[str, Autopilot], caplog: pytest.LogCaptureFixture
+) -> None:
+    tolerance, horizon, url = Tolerance(), QUADROTOR.horizon, flown[0]
+    request = FlightRequest(FlightSettings(url, height=2.0), QUADROTOR, ARENA.obstacles)
+    vehicle = VehicleClient(request, lambda _: None, tolerance, lambda: False)
+    with contextlib.closing(vehicle), caplog.at_level("INFO", "brakeline"):
+        raw = vehicle._socket._socket
+        for junk in (b"\xff", b"\x80\x04\x95\x00.", b"x" * LARGEST, b"x" * (LARGEST + 1)):
+            raw.send(junk)
+        for command in (pb.VehicleCommand(number=7), pb.VehicleCommand(number=8, fly=pb.FlightRequest(url=url))):
+            vehicle._socket.send(command)
+        number = vehicle.current_period.number + 2
+        with pytest.raises(BadInput):
+            vehicle.commit(np.full((2, 3), np.nan), number)
+        with pytest.raises(BadInput, match="a plan is"):
+            vehicle.commit(np.zeros((3, 4)), number)
+        with pytest.raises(BadMessage, match="too far ahead"):
+            vehicle.commit(np.zeros((1, 3)), 2**63)
+        for plan in (np.zeros((0, 3)), np.zeros((horizon + 1, 3))):
+            with pytest.raises(BadMessage, match="a plan has"):
+                vehicle.commit(plan, number)
+        odd = pb.VehicleCommand(commit=pb.PlanCommit(period=number, plan=[0.0] * 4))
+        reply = vehicle._ask(odd)
+        assert reply is not None and reply.error.type == "BadMessage" and not reply.in_time
+        after = vehicle.wait(vehicle.current_period.number + 3)
+        assert not after.input.any() and not after.lost, "nothing of it was flown"
+        assert vehicle.commit(np.full((1, 3), 0.3), after.number + 2), "a plan that is valid still is"
+        until(lambda: tolerance.count >= 11, "the server's count")
+    lines = [record.message for record in caplog.records if "passed over" in record.message]
+    assert lines and "vehicle command" in lines[0], "the actor's log says so"
+
+
+def test_what_is_no_flight_request_is_answered_and_the_next_actor_is_served(flown: tuple[str, Autopilot]) -> None:
+    url, _ = flown
+    server = subprocess.Popen([sys.executable, "-P", "-m", "actors.vehicle_server", url, "1"])
+    try:
+        until(lambda: (probe := connect(url, 1)) is not None and (probe.close() or True), "the server listens")
+        for command, why in (
+            (pb.VehicleCommand(close=True), "first message"),
+            (pb.VehicleCommand(fly=pb.FlightRequest(url=url, system=1, robot="{")), "flight request"),
+            (pb.VehicleCommand(fly=pb.FlightRequest(url=url, system=1, robot="[" * 50_000)), "flight request"),
+        ):
+            client = connect(url, 1)
+            assert client is not None
+            client.send(command)
+            assert client.poll(10.0)
+            failure = client.receive(pb.VehicleMessage).failure
+            assert failure.type == "BadMessage" and why in failure.message
+            client.poll(10.0)
+            with pytest.raises(EOFError):
+                client.receive(pb.VehicleMessage)
+            client.close()
+        with actor(url) as vehicle:
+            vehicle.wait(vehicle.current_period.number + 2)
+        assert server.wait(30.0) == 0
+    finally:
+        server.kill()
+        server.wait()
+
+
+def test_an_update_that_is_not_valid_is_lost_and_the_next_one_counts() -> None:
+    """A server that sends nonsense, and then falls silent: the actor gets an error and does not hang."""
+    url, tolerance = f"udpout:127.0.0.1:{os.getpid()}", Tolerance()
+    good = period_message(ControlPeriod(3, np.zeros(3), standing()))
+    bad = [pb.ControlPeriod(), pb.ControlPeriod.FromString(good.SerializeToString())]
+    bad[1].measured[4] = np.nan
+
+    def serve(listener: socket.socket) -> None:
+        connection, _ = listener.accept()
+        there = MessageSocket(connection)
+        there.poll(10.0)
+        there.receive(pb.VehicleCommand)
+        connection.send(b"\xff")
+        connection.send(b"x" * (LARGEST + 1))
+        for period in bad:
+            there.send(pb.VehicleMessage(update=pb.VehicleUpdate(period=period)))
+        there.send(pb.VehicleMessage(update=pb.VehicleUpdate(period=good)))
+        silent.wait()
+        there.close()
+
+    silent = threading.Event()
+    with listening(url, 1) as listener:
+        thread = threading.Thread(target=serve, args=(listener,))
+        thread.start()
+        request = FlightRequest(FlightSettings(url), QUADROTOR, ())
+        vehicle = VehicleClient(request, lambda _: None, tolerance, lambda: False)
+        assert vehicle.current_period.number == 3 and tolerance.count == 4
+        assert not vehicle.commit(np.zeros((1, 3)), 5), "no reply: as if it came too late"
+        with pytest.raises(MavlinkError, match="period 4 does not begin"):
+            vehicle.wait(4)
+        silent.set()
+        with pytest.raises(MavlinkError, match="the vehicle server has ended"):
+            vehicle.wait(4)
+        vehicle.leave()
+        thread.join()
+
+
+def test_an_actor_that_does_not_read_holds_up_nobody() -> None:
+    """Its messages wait in the outbox; once it is gone, the next actor gets the frames."""
+    near, far = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    outbox, frames = Outbox(), [pb.MavlinkFrame(wall_time=n, raw=bytes(280)) for n in range(FRAMES_PER_UPDATE)]
+    message = pb.VehicleMessage(update=pb.VehicleUpdate(frames=frames))
+    assert message.ByteSize() < LARGEST
+    outbox.actor = MessageSocket(near)
+    began = time.monotonic()
+    for _ in range(MOST_QUEUED + 5):
+        outbox.put(message)
+    assert outbox.full and time.monotonic() - began < 0.5
+    far.close()
+    until(lambda: not outbox.full, "it gives up on that actor", 5.0)
+    until(lambda: len(outbox.unsent) >= MOST_QUEUED * FRAMES_PER_UPDATE, "the frames are stored", 5.0)
+    outbox.dismiss(outbox.actor)
+    outbox.close()
+    assert near.fileno() == -1
