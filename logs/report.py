@@ -96,6 +96,8 @@ def _summary(figures: Figures) -> Table:
         table.add_row(name.replace("_", " "), _share(figures[name], episodes, within.get(name)))
     interventions = _share(figures["interventions"], steps, within.get("interventions"))
     table.add_row("interventions", f"{interventions}, of these failsafe {figures['failsafes']}")
+    table.add_row("adjusted", _share(figures["adjusted"], steps))
+    table.add_row("adjusted for clearance", for_clearance(figures))
     table.add_row(
         "speed",
         _optional("{:.3f} m/s", figures["mean_speed"]) + _optional(", at most {:.3f} m/s", figures["max_speed"]),
@@ -113,6 +115,13 @@ def _summary(figures: Figures) -> Table:
     for robot, learner in figures.get("learners", {}).items():
         table.add_row(f"learner {robot}", LEARNER.format(**learner))
     return table
+
+
+def for_clearance(figures: Figures) -> str:
+    """How many proposals the filter replaced though it had verified them."""
+    if figures["for_clearance"] is None:
+        return "not recorded by this method or version"
+    return f"{figures['for_clearance']} of {figures['adjusted']} adjusted: the proposal itself was verified"
 
 
 def _add_safety(table: Table, figures: Figures) -> None:

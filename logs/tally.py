@@ -49,9 +49,12 @@ class Tally:
     broken: int = 0  # times that an obstacle was seen outside of what its bounds allowed
     timeouts: int = 0
     interventions: int = 0  # steps whose action was not the proposed one
-    failsafes: int = 0  # of these, steps along the committed plan
-    recovering: int = 0  # of these, steps out of where nothing could be verified
-    fallbacks: int = 0  # of these, because no decision came
+    adjusted: int = 0  # of these, steps by the closest input that could be verified
+    for_clearance: int = 0  # of the adjusted, steps whose proposals were verified but nearer than the clearance margin
+    unsaid: int = 0  # of the adjusted, steps of other methods or of earlier versions, which do not say
+    failsafes: int = 0  # of the interventions, steps along the committed plan
+    recovering: int = 0  # of the interventions, steps out of where nothing could be verified
+    fallbacks: int = 0  # of the failsafes, because no decision came
     outside: int = 0  # steps whose true state was outside the stated bound of the measurement
     compared: int = 0  # steps whose measured state was compared with the predicted set
     violations: int = 0  # of these, not contained
@@ -97,7 +100,12 @@ class Tally:
             self.failsafes += 1
             self.interventions += 1
         elif kind == _ADJUSTED:
+            self.adjusted += 1
             self.interventions += 1
+            if step.HasField("for_clearance"):
+                self.for_clearance += step.for_clearance
+            else:
+                self.unsaid += 1
         elif kind == _RECOVERING:
             self.recovering += 1
             self.interventions += 1
@@ -152,6 +160,8 @@ def closed_loop(tallies: Iterable[Tally]) -> Figures:
         "timeouts": total("timeouts"),
         "steps": steps,
         "interventions": total("interventions"),
+        "adjusted": total("adjusted"),
+        "for_clearance": None if total("unsaid") else total("for_clearance"),
         "failsafes": total("failsafes"),
         "recovering": total("recovering"),
         "fallbacks": total("fallbacks"),

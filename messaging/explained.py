@@ -17,6 +17,7 @@ LEAST = 0.02  # of an input's range: a smaller change is none to speak of
 AHEAD = math.radians(40.0)
 BEHIND = math.radians(140.0)
 UPRIGHT = 0.8  # of a unit vector: more than that is up or down
+NEARER = "verified, but nearer than the clearance margin"
 ARROW = 3  # periods: an input's arrow ends where it would take the robot in that time, followed at once
 
 
@@ -108,6 +109,8 @@ def _why(robot: Robot, request: pb.Request, decision: pb.Decision) -> str:
         return f"the limit {stopped.by} would have been passed by {-stopped.room:.2g} after {stopped.after:.1f} s"
     end = robot.horizon * robot.period
     what = "the stop" if stopped.after >= end - 1e-9 else f"it (after {stopped.after:.1f} s)"
+    if stopped.by == "sight" and decision.for_clearance:
+        return f"the stop could have come within {_length(stopped.room)} of the end of sight: {NEARER}"
     if stopped.by == "sight":
         return "the stop could have been beyond what is seen"
     thing = "what is not seen" if stopped.by == "unseen" else f"the {stopped.by}"
@@ -116,7 +119,10 @@ def _why(robot: Robot, request: pb.Request, decision: pb.Decision) -> str:
         return f"{place} is touched already"
     if stopped.room < 0.0:
         return f"{what} would have come {_length(-stopped.room)} too close to {place}"
-    return f"{what} would have come within {_length(stopped.room)} of {place}, too near to move from there"
+    within = f"{what} would have come within {_length(stopped.room)} of {place}"
+    if decision.for_clearance:
+        return f"{within}: {NEARER}"
+    return f"{within}, too near to move from there"
 
 
 def _length(metres: float) -> str:

@@ -1,9 +1,10 @@
 """`decide`: a proposed action in, a verified plan out (paper, algorithm 1 lines 5-9 and algorithm 2; method §4).
 
-The filter allows a proposal whose tube keeps the clearance margin to every obstacle, or does not drive nearer to one.
-It replaces every other proposal by the closest input that does, even if the proposal's own tube is verified: a robot
-that stops nearer than the clearance margin may not be able to turn there. Such decisions are `for_clearance`. If no
-input keeps the clearance margin, the filter allows a verified proposal and adjusts others to free space alone.
+The filter allows a proposal whose tube keeps the clearance margin to every obstacle. Where turning in place does not
+keep that margin, the proposal must not drive nearer. The filter replaces every other proposal by the closest input
+that keeps to this, even if the proposal's own tube is verified: a robot that stops nearer than the clearance margin
+may not be able to turn there. Such decisions are `for_clearance`. If no input keeps to it, the filter allows a
+verified proposal, and adjusts others to free space alone.
 
 A pure function of the request and the model set: no state is kept about a robot, so that any replica can answer and a
 log can be replayed.
@@ -167,7 +168,8 @@ class Filter:
         if margin >= 0.0 and self.around.margin(kept, z) >= 0.0:
             return _Found(ALLOWED, self.inputs.plan(z), z, margin, True)
         attempt.reason = f"the proposal's tube comes within {margin:.3g} m of the free space's edge"
-        attempt.stopped = self.around.worst_of(scene, z, slack, planes)
+        kept_off = self.clearance_margin * rows.keep if margin >= 0.0 else np.zeros(len(slack))
+        attempt.stopped = self.around.worst_of(scene, z, slack, planes, kept_off)
         # Keeping the clearance margin, or at least not driving into it; else free space alone: from here even standing
         # still would not do.
         for choice in (kept, rows):

@@ -321,12 +321,14 @@ class Surroundings:
             parts.append(self.limits.rows(scene.start, scene.heading, scene.turn))
         return parts
 
-    def worst_of(self, scene: Scene, z: Array, slack: Array, planes: list[Planes]) -> Stopped:
-        """What the proposal, regressors z, comes nearest to."""
+    def worst_of(self, scene: Scene, z: Array, slack: Array, planes: list[Planes], kept_off: Array) -> Stopped:
+        """What the proposal, regressors z, comes nearest to; kept_off (rows,): so much nearer than it is each counts,
+        and the end of sight as much as the most of them."""
         beyond = self.reach - self.extent(z) if self.far else np.inf
-        if not len(slack) or beyond < slack.min():
+        short = slack - kept_off
+        if not len(slack) or beyond - kept_off.max(initial=0.0) < short.min():
             return Stopped.nowhere(SIGHT, beyond, self.robot.period * self.robot.horizon)
-        row = int(np.argmin(slack))
+        row = int(np.argmin(short))
         around = Around(scene.near, scene.moving, scene.unseen, scene.promised)
         return worst(row, max(float(slack[row]), -self.reach), self.robot, around, planes)
 

@@ -84,6 +84,7 @@ class Query:
             answer = SafetyClient(bus, robot.name, self.timeout).decide(state, action, near, scan)
         figures: dict[str, Any] = {
             "decision": answer.kind,
+            "for_clearance": answer.for_clearance,
             "plan": answer.plan.tolist(),
             "tube": {"center": answer.tube_center.tolist(), "half_width": answer.tube_half_width.tolist()},
             "margin": answer.margin,
@@ -95,7 +96,8 @@ class Query:
         if self.json:
             say_json(figures)
             return 0
-        console.print(f"[bold]{figures['decision']}[/] {answer.reason}")
+        why = " for clearance: the proposal is verified too," if answer.for_clearance else ""
+        console.print(f"[bold]{answer.kind}[/]{why} {answer.reason}")
         shown = Stacking(**PLAIN)
         for column in ("period", *robot.action, "center [m]", "± [m]"):
             shown.add_column(column)

@@ -103,6 +103,8 @@ def _run(figures: dict[str, Any]) -> Table:
     table.add_row("episodes", str(episodes), "goals", share(figures["goals"], episodes))
     table.add_row("collisions", f"[{color}]{figures['collisions']}[/]", "mean reward", _mean(figures))
     table.add_row("interventions", share(figures["interventions"], steps), "failsafe", str(figures["failsafes"]))
+    clearance = "-" if figures["for_clearance"] is None else str(figures["for_clearance"])
+    table.add_row("adjusted", share(figures["adjusted"], steps), "for clearance", clearance)
     table.add_row(
         "left the set", share(contained["violations"], contained["steps"]), "no answer", str(figures["fallbacks"])
     )

@@ -72,6 +72,8 @@ class Writer:
         fallback = chance.random() < 0.02
         step = pb.Step(robot=robot, actor=actor, episode=number, step=k, fallback=fallback, weights_version=version)
         step.decision = pb.FAILSAFE if fallback else chance.choice([pb.ALLOWED] * 8 + [pb.ADJUSTED] * 3 + [pb.FAILSAFE])
+        if step.decision == pb.ADJUSTED:
+            step.for_clearance = number % 2 == 0
         step.reward, step.penalty = chance.gauss(0.0, 1.0), chance.random()
         step.speed, step.clearance = chance.random(), chance.expovariate(3.0) + 0.01
         step.decide_ms, step.propose_ms = (0.0 if fallback else chance.lognormvariate(-1.0, 0.5)), 0.1
@@ -214,6 +216,8 @@ def counted(messages: list[tuple[str, Any]]) -> dict[str, Any]:
         "contacts_standing": sum(s.contact_standing for s in steps),
         "contacts_robots": sum(s.contact_robot for s in steps),
         "fleet": max(s.fleet for s in steps),
+        "adjusted": sum(s.decision == 2 and not s.fallback for s in steps),
+        "for_clearance": sum(s.decision == 2 and s.for_clearance and not s.fallback for s in steps),
         "failsafes": len(failsafe),
         "fallbacks": sum(s.fallback for s in steps),
         "mean_speed": float(np.mean([s.speed for s in steps])),

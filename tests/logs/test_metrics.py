@@ -14,7 +14,7 @@ from logs.decisions import Decisions, joined
 from logs.figures import draw
 from logs.metrics import Metrics, Tally, closed_loop, spread
 from logs.recorder import entry
-from logs.report import analyse, show
+from logs.report import analyse, for_clearance, show
 from logs.segment import open_segment
 from logs.training import Training
 from messaging import brakeline_pb2 as pb
@@ -68,6 +68,24 @@ def test_steps_are_counted() -> None:
     assert (figures["closest_approach"], figures["clearance"]["count"]) == (0.0, 10)
     assert figures["intervals"]["goals"] == pytest.approx([0.0084, 0.9057], abs=1e-4)
     assert times["std"] == pytest.approx(np.std([*allowed, 2.0, 1.0, 2.0]))
+
+
+def test_steps_adjusted_for_clearance_are_counted_where_every_adjusted_step_says_it() -> None:
+    steps = episode(0, [pb.ADJUSTED, pb.ADJUSTED, pb.ADJUSTED, pb.ALLOWED], terminated=True)
+    for step, said in zip(steps, (True, True, False), strict=False):
+        step.for_clearance = said
+    new, old = Tally(), Tally()
+    for step in steps:
+        new.step(step)
+    figures = closed_loop([new])
+    assert (figures["interventions"], figures["adjusted"], figures["for_clearance"]) == (3, 3, 2)
+    assert for_clearance(figures) == "2 of 3 adjusted: the proposal itself was verified"
+    for step in some_steps():  # as logged by a version that did not say
+        old.step(step)
+    figures = closed_loop([old])
+    assert (figures["adjusted"], figures["for_clearance"]) == (1, None)
+    assert closed_loop([new, old])["for_clearance"] is None and closed_loop([])["for_clearance"] == 0
+    assert for_clearance(figures) == "not recorded by this method or version"
 
 
 def test_a_collision_counts_once_an_episode() -> None:

@@ -20,10 +20,10 @@ def asked(robot, action, heading=0.0):
     return pb.Request(state=state, action=action)
 
 
-def answered(robot, kind, action, by="cylinder", room=-0.03, after=None, normal=(), verified=True):
+def answered(robot, kind, action, by="cylinder", room=-0.03, after=None, normal=(), verified=True, **more):
     d, end = robot.position_dim, robot.horizon * robot.period
     rest = [0.0] * (robot.horizon - 1) * robot.action_dim
-    decision = pb.Decision(kind=kind, plan=[*action, *rest], verified=verified, reason="why not")
+    decision = pb.Decision(kind=kind, plan=[*action, *rest], verified=verified, reason="why not", **more)
     if by:
         at = [0.3 * value for value in normal]
         decision.stopped.CopyFrom(
@@ -109,6 +109,10 @@ def test_what_is_near_but_not_too_near_what_is_not_seen_and_what_is_unverified()
 
     assert "within 4 mm of the cylinder ahead, too near to move from there" in said(
         kind=pb.ADJUSTED, room=0.004, normal=(1, 0)
+    )
+    assert said(kind=pb.ADJUSTED, room=0.004, normal=(1, 0), for_clearance=True) == (
+        "stopped: going on, the stop would have come within 4 mm of the cylinder ahead: verified, but nearer than the "
+        "clearance margin"
     )
     assert "it (after 0.2 s) would have come 12 cm too close to what is not seen on the left" in said(
         kind=pb.ADJUSTED, by="unseen", room=-0.12, after=0.2, normal=(0, 1)

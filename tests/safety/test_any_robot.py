@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from deploy.data.episodes import collect
-from messaging.shapes import Shapes
+from messaging.shapes import Obstacle, Shapes
 from safety.filter import Filter
 from safety.fitting import make
 from safety.gym import SafetyWrapper
@@ -113,6 +113,22 @@ def test_a_limit_is_kept_whatever_the_clearance_margin():
         kinds.add(decision.kind)
         assert decision.margin >= -1e-9 or decision.kind == FAILSAFE
     assert {ALLOWED, ADJUSTED} <= kinds
+
+
+def test_what_is_replaced_for_clearance_is_not_laid_to_a_limit():
+    """A limit has no clearance margin, so a tube may come nearer to it than to the obstacle that is named."""
+    ours = Filter(ready("boxed car").model, clearance_margin=0.1)
+    limits = {limit.name for limit in ours.robot.limits}
+    rng, plan, near = np.random.default_rng(0), np.zeros((ours.robot.horizon, 2)), 0
+    for _ in range(300):
+        state = np.array([rng.uniform(0.55, 0.8), 0.0, rng.uniform(-0.3, 0.3), 0.2])
+        driving = np.array([0.2, 0.0])
+        about = Shapes.of([Obstacle("cylinder", (state[0] + 0.1, rng.uniform(0.2, 0.4)), (0.1,))], 2)
+        decision = ours.decide(Request(state, driving, driving, plan, about))
+        if decision.for_clearance:
+            assert decision.stopped.by not in limits
+            near += 1
+    assert near > 5
 
 
 @pytest.mark.parametrize("margin", [0.2, -0.1])
