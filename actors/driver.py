@@ -108,7 +108,8 @@ class Driver:
             self.info["state"],
             proposal,
             self.info["obstacles"],
-            self._scan,
+            scan=self._scan,
+            known_free=self._scan is None,  # by the map
             actor=self.identity.actor,
             episode=self.episode,
             step=self.step,

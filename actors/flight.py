@@ -247,7 +247,7 @@ def answered(question: Ask, robot: Robot, stage: Arena, filtered: bool, stop: Ca
     seen = [obstacle for obstacle, far in zip(stage.obstacles, away, strict=True) if far <= robot.sight]
     said = ""
     while not stop():
-        request = request_message(Commitment(robot), state, np.zeros(robot.action_dim), seen)
+        request = request_message(Commitment(robot), state, np.zeros(robot.action_dim), seen, known_free=True)
         outcome = consult(question, [request], robot)[0]
         if outcome.answer is not None:
             if filtered and outcome.answer.kind not in ("allowed", "adjusted"):

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from messaging.scans import BadScan, Scan
     from messaging.shapes import BadShape, Obstacle, Shapes
     from messaging.tasks import Task, task_of
-    from safety.asker import Answer
+    from safety.asker import Answer, Asker
     from safety.certificates import CertificateError
     from safety.client import SafetyClient, SafetyError
     from safety.commitment import Commitment, Prediction
@@ -48,7 +48,7 @@ PLACES = {
     "messaging.shapes": ("BadShape", "Obstacle", "Shapes"),
     "messaging.tasks": ("Task", "task_of"),
     "safety.certificates": ("CertificateError",),
-    "safety.asker": ("Answer",),
+    "safety.asker": ("Answer", "Asker"),
     "safety.client": ("SafetyClient", "SafetyError"),
     "safety.commitment": ("Commitment", "Prediction"),
     "safety.dataset": ("BadData", "Dataset", "Trajectory"),
@@ -66,6 +66,7 @@ _PLACE_OF = {name: module for module, names in PLACES.items() for name in names}
 
 __all__ = [
     "Answer",
+    "Asker",
     "BadData",
     "BadDescription",
     "BadModel",

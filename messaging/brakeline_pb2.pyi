@@ -440,6 +440,7 @@ class Request(_message.Message):
     PROMISE_FIELD_NUMBER: _builtins.int
     SCAN_FIELD_NUMBER: _builtins.int
     IMAGE_FIELD_NUMBER: _builtins.int
+    KNOWN_FREE_FIELD_NUMBER: _builtins.int
     robot: _builtins.str
     actor: _builtins.str
     episode: _builtins.int
@@ -452,6 +453,8 @@ class Request(_message.Message):
     """rad, of the frame in which that set's position part is a box"""
     voucher: _builtins.bytes
     """the service's word that `model` verified `plan` (safety/vouch.py)"""
+    known_free: _builtins.bool
+    """Nothing but `obstacles` is near: all other space within reach is free. Needed without obstacles, scan and image."""
     @_builtins.property
     def state(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]:
         """measured"""
@@ -519,10 +522,11 @@ class Request(_message.Message):
         promise: Global___Promise | None = ...,
         scan: Global___Scan | None = ...,
         image: Global___RangeImage | None = ...,
+        known_free: _builtins.bool = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _typing.Literal["image", b"image", "promise", b"promise", "scan", b"scan"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["action", b"action", "actor", b"actor", "episode", b"episode", "fleet", b"fleet", "image", b"image", "input_in_force", b"input_in_force", "model", b"model", "observation", b"observation", "obstacles", b"obstacles", "plan", b"plan", "predicted_center", b"predicted_center", "predicted_half_width", b"predicted_half_width", "predicted_heading", b"predicted_heading", "promise", b"promise", "robot", b"robot", "scan", b"scan", "state", b"state", "step", b"step", "time", b"time", "voucher", b"voucher"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["action", b"action", "actor", b"actor", "episode", b"episode", "fleet", b"fleet", "image", b"image", "input_in_force", b"input_in_force", "known_free", b"known_free", "model", b"model", "observation", b"observation", "obstacles", b"obstacles", "plan", b"plan", "predicted_center", b"predicted_center", "predicted_half_width", b"predicted_half_width", "predicted_heading", b"predicted_heading", "promise", b"promise", "robot", b"robot", "scan", b"scan", "state", b"state", "step", b"step", "time", b"time", "voucher", b"voucher"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 

@@ -12,7 +12,7 @@ import secrets
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
 from google.protobuf.message import DecodeError
@@ -24,7 +24,7 @@ from messaging.robots import FEEDBACK, Robot, robot_named
 from messaging.sensed import Sensed, add_sensed
 from messaging.shapes import Obstacle
 from messaging.topics import DECIDE
-from safety.asker import Answer, accept
+from safety.asker import Answer, accept, known_free_in, observation_in, obstacles_in, scan_in
 from safety.commitment import Commitment
 from safety.digest import digest
 from safety.request import BadRequest
@@ -74,11 +74,18 @@ def request_message(
     commitment: Commitment,
     state: ArrayLike,
     action: ArrayLike,
-    obstacles: Iterable[Obstacle],
+    obstacles: Iterable[Obstacle] | None = None,
+    *,
     scan: Sensed | None = None,
-    **more: Any,
+    observation: ArrayLike | None = None,
+    known_free: bool = False,
+    actor: str = "",
+    episode: int = 0,
+    step: int = 0,
+    time: float = 0.0,
+    fleet: Sequence[str] = (),
 ) -> pb.Request:
-    """A request; `more`: actor, episode, step, time, observation, fleet."""
+    """The question about an action. Raises BadRequest: a value is of another type."""
     commitment.measured(np.asarray(state, float))
     message = pb.Request(
         robot=commitment.robot.name,
@@ -88,10 +95,16 @@ def request_message(
         plan=commitment.plan.ravel().tolist(),
         model=commitment.model,
         voucher=commitment.voucher,
-        obstacles=obstacle_messages(obstacles),
-        **more,
+        obstacles=obstacle_messages(obstacles_in(obstacles)),
+        observation=observation_in(observation).tolist(),
+        known_free=known_free_in(known_free),
+        actor=actor,
+        episode=episode,
+        step=step,
+        time=time,
+        fleet=fleet,
     )
-    add_sensed(message, scan)
+    add_sensed(message, scan_in(scan))
     if commitment.predicted is not None:
         message.predicted_center.extend(commitment.predicted.center.tolist())
         message.predicted_half_width.extend(commitment.predicted.half_width.tolist())
@@ -167,7 +180,7 @@ def bus_at(connect: str | Sequence[str], keys: Path | str | None, name: str) -> 
     return Bus(BusSettings(connect=endpoints, keys=None if keys is None else Path(keys)), name)
 
 
-class Asker:
+class BusAsker:
     """A bus to ask about robots of one kind, closed with it if it is its own."""
 
     def __init__(self, bus: Bus, robot: str, deadline: float) -> None:
@@ -185,7 +198,7 @@ class Asker:
         self.close()
 
 
-class SafetyClient(Asker):
+class SafetyClient(BusAsker):
     """Asks the safety service about one robot, and keeps its committed plan.
 
     Not for several threads at once; a program with several robots has a client (or a `Commitment`) for each, and a
@@ -221,21 +234,38 @@ class SafetyClient(Asker):
         self,
         state: ArrayLike,
         action: ArrayLike,
-        obstacles: Iterable[Obstacle],
+        obstacles: Iterable[Obstacle] | None = None,
+        *,
         scan: Sensed | None = None,
-        **more: Any,
+        observation: ArrayLike | None = None,
+        known_free: bool = False,
+        actor: str = "",
+        episode: int = 0,
+        step: int = 0,
+        time: float = 0.0,
     ) -> Answer:
-        """The decision on an action; its plan is committed to, so execute `answer.action`.
+        """Ask for the decision on an action and commit to its plan, as `Asker` says: then execute `answer.action`.
 
         Args:
-            state: measured; action: proposed; obstacles: at least those within reach (1 m is enough for `ground`);
-            none beside a scan, if that is all that is known; scan: a `Scan` or a `RangeImage`, filled in by
-            `safety.image_memory.filled`. With neither all is free. more: actor, episode, step, time, observation.
+            actor: your name, the same in every question; episode, step, time [s]: for the service's log.
 
         Raises:
+            BadRequest: a value is of another type; `field` names it.
             NoReply, Late, Refused, SafetyError: no decision; execute `fallback()` instead.
         """
-        request = request_message(self.commitment, state, action, obstacles, scan, **more)
+        request = request_message(
+            self.commitment,
+            state,
+            action,
+            obstacles,
+            scan=scan,
+            observation=observation,
+            known_free=known_free,
+            actor=actor,
+            episode=episode,
+            step=step,
+            time=time,
+        )
         answer = read(ask(self.bus, [request], self.deadline)[0], request, self.robot)
         accept(self.commitment, answer)
         return answer
@@ -243,6 +273,10 @@ class SafetyClient(Asker):
     def fallback(self) -> Array:
         """The committed plan's next input, for when there is no decision."""
         return self.commitment.fallback()
+
+    def reset(self) -> None:
+        """An episode begins, standing still."""
+        self.commitment.reset()
 
 
 def ask(bus: Bus, requests: Sequence[pb.Request], deadline: float) -> list[pb.Reply]:

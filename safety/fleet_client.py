@@ -14,13 +14,14 @@ from typing import Self
 from numpy.typing import ArrayLike
 
 from messaging.bus import Bus
+from messaging.sensed import Sensed
 from messaging.shapes import Obstacle
 from safety.asker import Answer, accept
-from safety.client import DEADLINE, Array, Asker, ask, bus_at, read, request_message
+from safety.client import DEADLINE, Array, BusAsker, ask, bus_at, read, request_message
 from safety.commitment import Commitment
 
 
-class FleetClient(Asker):
+class FleetClient(BusAsker):
     """Asks about all robots of a world, and keeps each one's committed plan and promise (docs/fleets.md).
 
     Time passes for all of them or for none: each period is one `decide`, or one `fallback` where that raised. They
@@ -56,24 +57,45 @@ class FleetClient(Asker):
         return client
 
     def decide(
-        self, states: Sequence[ArrayLike], actions: Sequence[ArrayLike], obstacles: Sequence[Iterable[Obstacle]]
+        self,
+        states: Sequence[ArrayLike],
+        actions: Sequence[ArrayLike],
+        obstacles: Sequence[Iterable[Obstacle] | None] | None = None,
+        *,
+        scans: Sequence[Sensed | None] | None = None,
+        known_free: bool = False,
     ) -> list[Answer]:
         """The decisions; their plans are committed to, so execute every `answer.action`.
 
         Args:
             states: measured, at one time; actions: proposed; obstacles: near each robot, what stands still. The others
-            are not among them: the service keeps each off what the others promise.
+            are not among them: the service keeps each off what the others promise. scans: of each robot, in the
+            obstacles' place or beside them; known_free: nothing but the obstacles and the other robots is near any of
+            them, so all other space is free. Without it, a robot with neither obstacles nor a scan is an error.
 
         Raises:
+            BadRequest: a value is of another type; `field` names it.
             ValueError: not one of each for each robot.
             NoReply, Late, Refused, SafetyError: no decision about one robot, so none about any, for the others' new
             plans may rest on that one's: execute `fallback()` instead, all of it.
         """
-        asked = zip(self.names, self.commitments, states, actions, obstacles, strict=True)
-        episode, step = self._episode, self._step
+        nothing: list[None] = [None] * len(self.names)
+        surroundings = nothing if obstacles is None else obstacles, nothing if scans is None else scans
+        asked = zip(self.names, self.commitments, states, actions, *surroundings, strict=True)
         requests = [
-            request_message(kept, state, action, near, actor=name, episode=episode, step=step, fleet=self.names)
-            for name, kept, state, action, near in asked
+            request_message(
+                kept,
+                state,
+                action,
+                near,
+                scan=scan,
+                known_free=known_free,
+                actor=name,
+                episode=self._episode,
+                step=self._step,
+                fleet=self.names,
+            )
+            for name, kept, state, action, near, scan in asked
         ]
         replies = zip(ask(self.bus, requests, self.deadline), requests, strict=True)
         answers = [read(reply, request, self.robot) for reply, request in replies]

@@ -19,8 +19,7 @@ from numpy.typing import NDArray
 
 from messaging.bus import BusError
 from messaging.sensed import Sensed
-from safety.asker import Answer
-from safety.client import SafetyClient
+from safety.asker import Answer, Asker
 from safety.commitment import correction_penalty
 from safety.image_memory import filled, memory_of
 from safety.inprocess import InProcess, sendable
@@ -47,7 +46,7 @@ class SafetyWrapper(gymnasium.Wrapper[Any, Any, Any, Any]):
     def __init__(
         self,
         env: gymnasium.Env[Any, Any],
-        filter: Method | InProcess | SafetyClient,
+        filter: Method | Asker,
         penalty: float = 0.0,
         *,
         state: View = STATE,
@@ -56,18 +55,18 @@ class SafetyWrapper(gymnasium.Wrapper[Any, Any, Any, Any]):
     ) -> None:
         """
         Args:
-            filter: or one that asks: `SafetyClient` asks a service, and brakes along the committed plan without an
-                answer.
+            filter: or an asker: `SafetyClient` asks a service, and brakes along the committed plan without an answer.
             penalty: of leaning on the filter, in reward (`correction_penalty`).
             state: (env, observation, info) -> measured state (n,); unless given, `info["state"]`.
-            obstacles: likewise -> a list of `Obstacle` with at least those within `filter.reach`.
+            obstacles: likewise -> a list of `Obstacle` with at least those within `filter.reach`, as a map says: where
+                the list has nothing, space is free. None instead of a list: nothing is known, but by a scan.
             actions: between the environment's actions and the robot's inputs; unless given they are the same.
 
         Raises:
             Mismatch: the action space is not that of the robot's inputs, and `actions` is not given.
         """
         super().__init__(env)
-        self.asker = filter if isinstance(filter, InProcess | SafetyClient) else InProcess(filter)
+        self.asker = filter if isinstance(filter, Asker) else InProcess(filter)
         self.penalty, self.commitment = penalty, self.asker.commitment
         self._state, self._obstacles = state, obstacles
         self._actions = actions_of(env.action_space, self.asker.robot, actions)
@@ -114,11 +113,12 @@ class SafetyWrapper(gymnasium.Wrapper[Any, Any, Any, Any]):
         assert self._now is not None
         seen = self._now[0], self._now[1]
         state, near = self._state(self.env, *seen), self._obstacles(self.env, *seen)
-        if isinstance(self.asker, InProcess):
-            return self.asker.decide(state, wanted, near, seen[0], self._scan), ""
+        observation, known_free = sendable(seen[0]), near is not None
         try:
-            observed = sendable(seen[0]).tolist()
-            return self.asker.decide(state, wanted, near, scan=self._scan, observation=observed), ""
+            answer = self.asker.decide(
+                state, wanted, near, scan=self._scan, observation=observation, known_free=known_free
+            )
+            return answer, ""
         except BusError as error:
             self.asker.fallback()
             return None, str(error)

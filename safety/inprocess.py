@@ -17,7 +17,7 @@ from messaging.movers import parted
 from messaging.robots import Robot
 from messaging.sensed import Sensed
 from messaging.shapes import Obstacle
-from safety.asker import Answer, accept
+from safety.asker import Answer, accept, known_free_in, observation_in, obstacles_in, scan_in
 from safety.commitment import Commitment
 from safety.request import MOST_OBSERVED, Request
 
@@ -42,33 +42,41 @@ class InProcess:
         self,
         state: ArrayLike,
         action: ArrayLike,
-        obstacles: Iterable[Obstacle],
-        observation: object = None,
+        obstacles: Iterable[Obstacle] | None = None,
+        *,
         scan: Sensed | None = None,
+        observation: ArrayLike | None = None,
+        known_free: bool = False,
     ) -> Answer:
-        """The decision on an action; its plan is committed to, so execute `answer.action`.
-
-        Args:
-            state: measured; action: proposed, a failsafe if it holds NaN or infinity; obstacles: at least those
-            within reach; observation: the robot's own, which the rivals read; scan: in the obstacles' place.
+        """Decide on an action and commit to its plan, as `Asker` says: then execute `answer.action`.
 
         Raises:
-            BadRequest, BadShape: a value is missing, not finite or of the wrong size, with the field's name.
+            BadRequest, BadShape: a value is missing, not finite, of the wrong size or type; `field` names it.
         """
-        return self.decide_all([self.commitment], [state], [action], [obstacles], [observation], [scan])[0]
+        return self.decide_all(
+            [self.commitment],
+            [state],
+            [action],
+            [obstacles],
+            scans=[scan],
+            observations=[observation],
+            known_free=[known_free],
+        )[0]
 
     def decide_all(
         self,
         commitments: Sequence[Commitment],
         states: Sequence[ArrayLike],
         actions: Sequence[ArrayLike],
-        obstacles: Sequence[Iterable[Obstacle]],
-        observations: Sequence[object],
+        obstacles: Sequence[Iterable[Obstacle] | None],
+        *,
         scans: Sequence[Sensed | None],
+        observations: Sequence[ArrayLike | None],
+        known_free: Sequence[bool],
     ) -> list[Answer]:
         """The same of several robots of the kind, each with a commitment of its own. Raises as `decide` does, before
         any plan is committed to."""
-        asked = zip(commitments, states, actions, obstacles, observations, scans, strict=True)
+        asked = zip(commitments, states, actions, obstacles, scans, observations, known_free, strict=True)
         answers = [Answer.of(self.method.decide(self._request(*one)), self.robot) for one in asked]
         for kept, answer in zip(commitments, answers, strict=True):
             accept(kept, answer)
@@ -87,14 +95,14 @@ class InProcess:
         kept: Commitment,
         state: ArrayLike,
         action: ArrayLike,
-        obstacles: Iterable[Obstacle],
-        observation: object,
+        obstacles: Iterable[Obstacle] | None,
         scan: Sensed | None,
+        observation: ArrayLike | None,
+        known_free: bool,
     ) -> Request:
         measured = np.asarray(state, dtype=float)
         kept.measured(measured)
-        observed = sendable(observation)
-        standing, moving = parted(list(obstacles), self.robot.position_dim)
+        standing, moving = parted(obstacles_in(obstacles), self.robot.position_dim)
         return Request(
             state=measured,
             action=np.asarray(action, dtype=float),
@@ -102,10 +110,11 @@ class InProcess:
             plan=kept.plan,
             obstacles=standing,
             movers=moving,
-            scan=scan,
+            scan=scan_in(scan),
             model=kept.model,
             predicted=kept.predicted,
-            observation=observed if observed.size == self.method.observed else np.zeros(0, np.float32),
+            observation=observation_in(observation),
+            known_free=known_free_in(known_free),
         )
 
 

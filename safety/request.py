@@ -25,6 +25,10 @@ ALLOWED, ADJUSTED, FAILSAFE, RECOVERING = "allowed", "adjusted", "failsafe", "re
 MOST_OBSERVED = 4096  # numbers in an observation
 FEW = 64  # numbers
 NOT_FINITE = "the proposed action holds NaN or infinity"  # the reason of a failsafe
+NOTHING_KNOWN = (
+    "nothing is known of the space around the robot: give obstacles, or a scan, or say known_free if a map says that "
+    "all space within reach is free"
+)
 STOPPED = 0.9e-9  # of an input: surely one of a stop (`Robot.rests`)
 
 Named: TypeAlias = dict[str, tuple[NDArray[np.floating[Any]], tuple[int, ...]]]  # arrays, and the shapes they must have
@@ -49,7 +53,8 @@ class Request:
     standing still; `UNVERIFIED`: by none); obstacles: at least those within `Filter.reach`; predicted: what the last
     decision said of this state, if there was one; movers: obstacles that move, at least those that may come within
     reach before the plan ends; scan: in the place of obstacles, or beside them: what is not seen free in it counts as
-    occupied; promise: its own, if other robots share its world, and promised: theirs, to be kept off."""
+    occupied; promise: its own, if other robots share its world, and promised: theirs, to be kept off; known_free:
+    nothing but the obstacles is near, so all other space within reach is free; needed without obstacles and scan."""
 
     state: Array
     action: Array
@@ -63,6 +68,7 @@ class Request:
     promise: Promise | None = None
     promised: Promises | None = None
     observation: NDArray[np.float32] = field(default_factory=lambda: np.zeros(0, np.float32))
+    known_free: bool = False
 
     def __post_init__(self) -> None:
         """Of one type and memory layout, which compiled code relies on, whatever arrays they come as."""
@@ -140,11 +146,14 @@ def check_for_filter(robot: Robot, request: Request) -> None:
 
 
 def check_surroundings(robot: Robot, request: Request) -> None:
-    """Is what it tells of the surroundings of a kind that this robot meets?
+    """Check that a request says something about the space around the robot, of a kind that this robot meets.
 
     Raises:
-        BadRequest: it is not, with the field's name.
+        BadRequest: it does not, with the field's name.
     """
+    moving = request.movers is not None and len(request.movers)
+    if not (len(request.obstacles) or moving or request.scan is not None or request.known_free):
+        raise BadRequest("obstacles", NOTHING_KNOWN)
     if request.obstacles.center.shape[1] != robot.position_dim:
         raise BadRequest("obstacles", f"a {robot.name} robot's obstacles have {robot.position_dim} coordinates")
     if request.movers is not None and request.movers.drift.shape[1] != robot.position_dim:

@@ -14,7 +14,7 @@ from messaging.sensed import Sensed
 from safety.commitment import Commitment, correction_penalty
 from safety.gym import diagnostics
 from safety.image_memory import filled, memory_of
-from safety.inprocess import InProcess
+from safety.inprocess import InProcess, sendable
 from safety.spaces import Actions, Mismatch, actions_of
 from safety.views import OBSTACLES, STATE, View
 
@@ -73,8 +73,9 @@ class VectorSafetyWrapper(VectorWrapper):
         deciding = np.flatnonzero(~resets)
         before = np.array([kept.due for kept in self.commitments])
         states, near = self._state(self.env, *seen), self._obstacles(self.env, *seen)
-        if not len(near) and all(scan is not None for scan in self._scans):  # these say what is free
-            near = [[]] * self.num_envs
+        near = [] if near is None else near
+        if not len(near) and all(scan is not None for scan in self._scans):  # only these say what is free
+            near = [None] * self.num_envs
         if len(near) != self.num_envs:
             raise Mismatch(f"obstacles were told for {len(near)} of {self.num_envs} environments: give a list for each")
         answers = self.asker.decide_all(
@@ -82,8 +83,9 @@ class VectorSafetyWrapper(VectorWrapper):
             [states[i] for i in deciding],
             [wanted[i] for i in deciding],
             [near[i] for i in deciding],
-            [seen[0][i] for i in deciding] if isinstance(seen[0], np.ndarray) else [None] * len(deciding),
-            [self._scans[i] for i in deciding],
+            scans=[self._scans[i] for i in deciding],
+            observations=[sendable(seen[0][i] if isinstance(seen[0], np.ndarray) else None) for i in deciding],
+            known_free=[near[i] is not None for i in deciding],
         )
         executed = np.array([kept.due for kept in self.commitments])
         executed[resets] = robot.at_zero()

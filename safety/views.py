@@ -36,8 +36,8 @@ def in_info(name: str) -> View:
 
 
 def _obstacles(env: Any, observation: Any, info: dict[str, Any]) -> Any:
-    """`info["obstacles"]`; none beside a scan, if there are none."""
-    return [] if "scan" in info and "obstacles" not in info else in_info("obstacles")(env, observation, info)
+    """`info["obstacles"]`; None beside a scan, if there are none: only the scan says what is free."""
+    return None if "scan" in info and "obstacles" not in info else in_info("obstacles")(env, observation, info)
 
 
 STATE, OBSTACLES = in_info("state"), _obstacles

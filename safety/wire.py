@@ -105,6 +105,7 @@ def request_of(
         promise=promise,
         promised=promised,
         observation=np.fromiter(message.observation, np.float32, len(message.observation)),
+        known_free=message.known_free,
     )
 
 

@@ -84,7 +84,8 @@ class Gate:
     def decide(
         self, state: Array, obstacles: Sequence[Obstacle], command: Command | None, time: float, step: int
     ) -> None:
-        """Ask about a command (None: to stand) in the state of the period's beginning.
+        """Ask about a command (None: to stand) in the state of the period's beginning. obstacles: all that a scan
+        shows; space is known to be free where it shows nothing.
 
         First with `ROOM` around the obstacles: the next scan will show them somewhat nearer or farther, and who stopped
         where this one just allowed it could not even turn by the next. If nothing is verified there, then without; but
@@ -94,7 +95,14 @@ class Gate:
 
         def ask(action: Array, around: Sequence[Obstacle]) -> Outcome:
             request = request_message(
-                self.commitment, state, action, around, actor=self._name, step=step & 0xFFFFFFFF, time=time
+                self.commitment,
+                state,
+                action,
+                around,
+                known_free=True,
+                actor=self._name,
+                step=step & 0xFFFFFFFF,
+                time=time,
             )
             return consult(self._ask, [request], self.robot)[0]
 

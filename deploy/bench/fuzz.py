@@ -202,7 +202,7 @@ def safety() -> Party:
 
 def asker(robot: Robot, mill: Mill) -> Party:
     """Who asked, and gets an answer of whoever answers."""
-    request = request_message(Commitment(robot), [0.0] * robot.state_dim, [0.0] * robot.action_dim, [])
+    request = request_message(Commitment(robot), [0.0] * robot.state_dim, [0.0] * robot.action_dim, known_free=True)
 
     def take(sample: Sample) -> None:
         message = pb.Reply(robot=robot.name)

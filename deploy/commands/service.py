@@ -69,6 +69,8 @@ class Query:
     scan: Path | None = None
     """What was seen, beside it: a JSON file, {"ranges": [...], "angles": [...], "pose": [0, 0, 0], ...}, with the
     fields of a Scan, in the air of a RangeImage (docs/perception.md). What it does not show to be free is occupied."""
+    known_free: bool = False
+    """Say that nothing but the obstacles is near. Needed without --obstacle and --scan."""
     timeout: float = 1.0
     json: bool = False
 
@@ -81,7 +83,8 @@ class Query:
         action = self.action or robot.action_high
         scan = None if self.scan is None else sensed_in(self.scan, robot.position_dim)
         with Bus(self.endpoints.bus(), f"client.query-{time.time_ns() % 10**6}") as bus:
-            answer = SafetyClient(bus, robot.name, self.timeout).decide(state, action, near, scan)
+            asker = SafetyClient(bus, robot.name, self.timeout)
+            answer = asker.decide(state, action, near, scan=scan, known_free=self.known_free)
         figures: dict[str, Any] = {
             "decision": answer.kind,
             "for_clearance": answer.for_clearance,

@@ -212,6 +212,8 @@ def replay(paths: Paths, instead: Instead | None = None, each: Callable[[], Any]
         request, logged = record.message.request, record.message.reply
         if logged.decision.unvouched:  # by the log's own word; else what the request says is believed
             request.model = UNVERIFIED
+        if _from_before_known_free(request, logged):
+            request.known_free = True
         each()
         questions = _question(waiting, request, logged)
         if any(reply.WhichOneof("result") is None for _, reply in questions):
@@ -229,6 +231,13 @@ def replay(paths: Paths, instead: Instead | None = None, each: Callable[[], Any]
         for (request, logged), reply in zip(questions, replies, strict=True):
             result.add(request, logged, reply, () if instead is None else ("model",))
     return result
+
+
+def _from_before_known_free(request: pb.Request, logged: pb.Reply) -> bool:
+    """Does a request say nothing about the space around the robot, and was it not refused for that? Then it is from
+    before requests had to, when an empty list of obstacles meant that all space is free."""
+    said = request.known_free or request.obstacles or request.HasField("scan") or request.HasField("image")
+    return not said and logged.error.field != "obstacles"
 
 
 def _question(waiting: Waiting, request: pb.Request, logged: pb.Reply) -> list[tuple[pb.Request, pb.Reply]]:

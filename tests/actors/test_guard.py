@@ -99,7 +99,7 @@ def test_it_goes_on_when_the_service_is_back():
     assert commitment.model == "abc" and commitment.predicted is not None
     for _ in range(3):
         next_input(commitment, outcome_of(FAILURES["late"]))
-    request = request_message(commitment, np.zeros(5), np.zeros(2), [])
+    request = request_message(commitment, np.zeros(5), np.zeros(2), known_free=True)
     assert request.model == "" and not any(request.plan), "standing still needs nobody's word"
 
 

@@ -16,7 +16,7 @@ def cylinder(x, y, radius=0.1):
 
 
 def request(state=(0, 0, 0, 0, 0), action=(0.25, 0.0), obstacles=(), **more):
-    """Standing still by default."""
+    """Standing still by default, in space that is known to be free."""
     state = np.array(state, float)
     return Request(
         state=state,
@@ -24,6 +24,7 @@ def request(state=(0, 0, 0, 0, 0), action=(0.25, 0.0), obstacles=(), **more):
         input_in_force=more.pop("input_in_force", state[3:].copy()),
         plan=more.pop("plan", STILL),
         obstacles=obstacles if isinstance(obstacles, Shapes) else Shapes.of(list(obstacles), 2),
+        known_free=more.pop("known_free", True),
         **more,
     )
 

@@ -1,20 +1,25 @@
 """Every asker answers alike: in process and over the bus."""
 
-from dataclasses import fields
+from dataclasses import fields, replace
+from inspect import signature
 
 import numpy as np
 import pytest
 
 from messaging import brakeline_pb2 as pb
+from messaging.motion import Motion
+from messaging.movers import Movers
+from messaging.scans import Scan
 from messaging.shapes import Obstacle
-from safety.asker import Answer, accept
-from safety.client import SafetyError, read, request_message
-from safety.commitment import Commitment
+from safety.asker import Answer, Asker, accept
+from safety.client import SafetyClient, SafetyError, read, request_message
+from safety.commitment import Commitment, Prediction
 from safety.filter import Filter
 from safety.inprocess import InProcess
+from safety.request import BadRequest, check_for_filter
 from safety.service import Counts, Models, answerer
 from tests.robots import GROUND
-from tests.safety.asked import cylinder
+from tests.safety.asked import cylinder, request
 
 LATE = GROUND.in_real_time()
 AHEAD = cylinder(0.34, 0.0)
@@ -37,10 +42,10 @@ class Wire:
         models.install(model)
         self.ask, self.robot, self.commitment = answerer(models, Counts()), model.robot, Commitment(model.robot)
 
-    def decide(self, state, action, obstacles):
-        request = request_message(self.commitment, state, action, obstacles)
-        batch = pb.ReplyBatch.FromString(self.ask(pb.RequestBatch(requests=[request]).SerializeToString()))
-        answer = read(batch.replies[0], request, self.robot)
+    def decide(self, state, action, obstacles=None, **more):
+        asked = request_message(self.commitment, state, action, obstacles, **more)
+        batch = pb.ReplyBatch.FromString(self.ask(pb.RequestBatch(requests=[asked]).SerializeToString()))
+        answer = read(batch.replies[0], asked, self.robot)
         accept(self.commitment, answer)
         return answer
 
@@ -78,13 +83,105 @@ def test_the_action_of_a_late_robot_is_the_input_of_the_next_period(late, ask):
     assert np.array_equal(second.action, asker.commitment.due)
 
 
+FAN = np.linspace(-np.pi, np.pi, 360, endpoint=False)
+WALL = Scan(np.full(360, 0.13), FAN, (0.0, 0.0, 0.0))  # 13 cm away all round
+
+
+class Unsent(SafetyClient):
+    """A client of a bus that nobody is on: what it refuses it refuses before it asks."""
+
+    def __init__(self, model):
+        self.robot, self.commitment, self.deadline = model.robot, Commitment(model.robot), 0.1
+
+
+@pytest.fixture(params=[lambda model: InProcess(Filter(model)), Unsent], ids=["in process", "client"])
+def asker(request, model):
+    return request.param(model)
+
+
+def test_every_asker_is_one(asker, model):
+    assert isinstance(asker, Asker) and not isinstance(Filter(model), Asker)
+
+
+def test_both_sign_alike():
+    wanted = list(signature(Asker.decide).parameters.values())
+    for kind in (SafetyClient, InProcess):
+        own = list(signature(kind.decide).parameters.values())
+        assert [(p.name, p.kind, p.default) for p in own[: len(wanted)]] == [
+            (p.name, p.kind, p.default) for p in wanted
+        ]
+        assert all(p.kind is p.KEYWORD_ONLY for p in own[4:])
+
+
+def test_nothing_after_the_obstacles_is_taken_by_its_place(asker):
+    with pytest.raises(TypeError, match="positional"):
+        asker.decide(np.zeros(5), [0.25, 0.0], [], WALL)
+    with pytest.raises(TypeError, match="scna"):
+        asker.decide(np.zeros(5), [0.25, 0.0], [], scna=WALL)
+
+
+@pytest.mark.parametrize(
+    ("field", "more", "said"),
+    [
+        ("obstacles", {"obstacles": WALL}, "give it as scan="),
+        ("obstacles", {"obstacles": AHEAD}, "give a list of Obstacle"),
+        ("obstacles", {"obstacles": [AHEAD, (0.3, 0.0)]}, "holds a tuple"),
+        ("obstacles", {"obstacles": [WALL]}, "holds a Scan"),
+        ("obstacles", {"obstacles": 3.0}, "is a float"),
+        ("scan", {"scan": [AHEAD]}, "is a list: give a Scan"),
+        ("scan", {"scan": np.ones(360)}, "is a ndarray: give a Scan"),
+        ("observation", {"observation": WALL, "known_free": True}, "give it as scan="),
+        ("observation", {"observation": {"rays": 1}, "known_free": True}, "is a dict"),
+        ("observation", {"observation": np.zeros((3, 3)), "known_free": True}, "shape"),
+        ("known_free", {"known_free": "yes"}, "is a str"),
+        ("known_free", {"known_free": []}, "is a list"),
+    ],
+)
+def test_another_type_is_refused_by_the_field(asker, field, more, said):
+    with pytest.raises(BadRequest, match=said) as caught:
+        asker.decide(np.zeros(5), [0.25, 0.0], **more)
+    assert caught.value.field == field
+
+
+def test_where_nothing_is_known_nothing_is_decided(model):
+    """Before, an empty list said that all space is free, and so did a scan that was dropped."""
+    alone, asked = InProcess(Filter(model)), Wire(model)
+    blocked = [asker.decide(np.zeros(5), [0.25, 0.0], [], scan=WALL) for asker in (alone, asked)]
+    assert [answer.kind for answer in blocked] == ["failsafe", "failsafe"]
+    for nothing in ((), (None,), ([],)):
+        with pytest.raises(BadRequest, match="known_free") as caught:
+            alone.decide(np.zeros(5), [0.25, 0.0], *nothing)
+        assert caught.value.field == "obstacles"
+        with pytest.raises(SafetyError, match="known_free") as refused:
+            asked.decide(np.zeros(5), [0.25, 0.0], *nothing)
+        assert refused.value.field == "obstacles"
+    for asker in (alone, asked):
+        asker.commitment.reset()
+        assert asker.decide(np.zeros(5), [0.25, 0.0], known_free=True).kind == "allowed"
+        asker.commitment.reset()
+        assert asker.decide(np.zeros(5), [0.25, 0.0], scan=WALL, known_free=True).kind == "failsafe", "the scan counts"
+
+
+@pytest.mark.parametrize("prediction", [False, True])
+def test_the_quick_check_and_the_whole_one_both_ask_what_is_known(ready, prediction):
+    sets = Prediction(np.zeros(5), np.full(5, 0.1), 0.0) if prediction else None
+    silent = request(known_free=False, predicted=sets)
+    assert ready.ordinary(silent), "nothing else is wrong with it"
+    for check in (ready.decide, lambda asked: check_for_filter(GROUND, asked)):
+        with pytest.raises(BadRequest) as caught:
+            check(silent)
+        assert caught.value.field == "obstacles"
+    walker = Movers.of([Obstacle("cylinder", (0.9, 0.0), (0.2,), motion=Motion((0.0, 0.0), 0.05, speed=0.5))], 2)
+    assert ready.decide(replace(silent, movers=walker)).kind in ("allowed", "adjusted", "failsafe")
+
+
 def test_a_tube_that_is_none_of_this_robots_is_no_answer(model):
     asked = Wire(model)
-    request = request_message(asked.commitment, np.zeros(5), [0.1, 0.0], [AHEAD])
-    payload = pb.RequestBatch(requests=[request]).SerializeToString()
+    question = request_message(asked.commitment, np.zeros(5), [0.1, 0.0], [AHEAD])
+    payload = pb.RequestBatch(requests=[question]).SerializeToString()
     for change in (lambda d: d.tube_center.pop(), lambda d: d.tube_half_width.__setitem__(0, float("inf"))):
         (reply,) = pb.ReplyBatch.FromString(asked.ask(payload)).replies
         change(reply.decision)
         with pytest.raises(SafetyError, match="tube") as caught:
-            read(reply, request, GROUND)
+            read(reply, question, GROUND)
         assert caught.value.field == "tube_center"

@@ -54,7 +54,7 @@ def drive(ready, obstacles, policy, steps, seed, start=(0, 0, 0)):
     for k in range(steps):
         state, action = robot.measure(), np.array(policy(k, rng, robot))
         decision = ready.decide(
-            Request(state, action, kept.input_in_force, kept.plan, shapes, kept.model, kept.predicted)
+            Request(state, action, kept.input_in_force, kept.plan, shapes, kept.model, kept.predicted, known_free=True)
         )
         counts[decision.kind] += 1
         violations += not decision.contained
@@ -109,7 +109,14 @@ def test_a_robot_that_slips_more_than_recorded_is_noticed(ready):
     for _ in range(100):
         decision = ready.decide(
             Request(
-                robot.measure(), np.array([0.25, 0.1]), kept.input_in_force, kept.plan, NONE, kept.model, kept.predicted
+                robot.measure(),
+                np.array([0.25, 0.1]),
+                kept.input_in_force,
+                kept.plan,
+                NONE,
+                kept.model,
+                kept.predicted,
+                known_free=True,
             )
         )
         violations += not decision.contained
@@ -155,7 +162,7 @@ def test_what_is_left_out_is_noticed(model, mutant):
         ask = request((0, 0, 0, 0.2, 0), (0.25, 0.0), [Obstacle("wall", (x, 0.0), (), np.pi)])
         decision, right = ready.decide(ask), honest.decide(ask)
         noticed += decision.kind != FAILSAFE and fits(model, ask, decision.plan[0]) <= 0.0
-        assert right.kind == FAILSAFE or fits(model, ask, right.action) > 0.0
+        assert right.kind == FAILSAFE or fits(model, ask, right.plan[0]) > 0.0
     assert noticed > 0
 
 

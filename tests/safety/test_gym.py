@@ -17,6 +17,7 @@ from safety.fitting import make
 from safety.gym import UNANSWERED, SafetyWrapper
 from safety.inprocess import InProcess
 from safety.model_set import ModelSet, Recipe
+from safety.request import BadRequest
 from safety.spaces import Actions, Mismatch, actions_of, normalised
 from safety.vector import VectorSafetyWrapper, each
 from safety.views import STATE
@@ -200,6 +201,23 @@ def test_a_view_of_a_vector_that_tells_nothing_is_no_world_without_obstacles(rea
     env.reset(seed=0)
     with pytest.raises(Mismatch, match="0 of 2 environments: give a list for each"):
         env.step(np.ones((2, 2), np.float32))
+
+
+@pytest.mark.parametrize("many", [False, True])
+def test_an_empty_list_says_that_space_is_free_and_none_says_nothing(ready, many):
+    def stepped(near):
+        env = Toy(CAR)
+        if many:
+            env = gymnasium.vector.SyncVectorEnv([lambda: Toy(CAR)])
+        wrapper = VectorSafetyWrapper if many else SafetyWrapper
+        env = wrapper(env, ready, state=seen, obstacles=lambda *_: [near] if many else near, actions=normalised(CAR))
+        env.reset(seed=0)
+        *_, info = env.step(np.ones((1, 2) if many else 2, np.float32))
+        return info["diagnostics"]["kind"]
+
+    assert np.all(stepped([]) == "allowed")
+    with pytest.raises(BadRequest, match="known_free"):
+        stepped(None)
 
 
 def test_a_scan_that_does_not_come_is_not_a_world_without_obstacles(ready):

@@ -33,6 +33,7 @@ def usual(robot, seed, predicted):
         input_in_force=rng.uniform(low, high),
         plan=plan,
         obstacles=Shapes.of([], robot.position_dim),
+        known_free=True,
         predicted=sets,
         observation=rng.normal(size=26).astype(np.float32) if rng.random() < 0.5 else np.zeros(0, np.float32),
     )

@@ -96,17 +96,17 @@ def test_a_scan_crosses_the_wire():
     assert np.allclose(got.ranges, sent.ranges) and np.allclose(got.angles, sent.angles)
     names = [field.name for field in fields(Scan) if field.name not in ("ranges", "angles")]
     assert [getattr(got, name) for name in names] == [getattr(sent, name) for name in names]
-    message = request_message(Commitment(GROUND), np.zeros(5), np.zeros(2), [], sent)
+    message = request_message(Commitment(GROUND), np.zeros(5), np.zeros(2), scan=sent)
     assert request_of(message, GROUND).scan is not None and message.ByteSize() < 3500
 
 
 def test_scans_that_are_none_are_refused(ready):
-    message = request_message(Commitment(GROUND), np.zeros(5), np.zeros(2), [], Scan(np.ones(360), FAN, (0.0,) * 3))
+    message = request_message(Commitment(GROUND), np.zeros(5), np.zeros(2), scan=Scan(np.ones(360), FAN, (0.0,) * 3))
     message.scan.ranges[5] = -1.0
     with pytest.raises(BadRequest) as error:
         request_of(message, GROUND)
     assert error.value.field == "scan"
-    message = request_message(Commitment(QUADROTOR), np.zeros(9), np.zeros(3), [])
+    message = request_message(Commitment(QUADROTOR), np.zeros(9), np.zeros(3))
     message.scan.CopyFrom(scan_message(Scan(np.ones(360), FAN, (0.0,) * 3)))
     with pytest.raises(BadRequest) as error:
         check_for_filter(QUADROTOR, request_of(message, QUADROTOR))
@@ -115,11 +115,11 @@ def test_scans_that_are_none_are_refused(ready):
 
 def test_an_image_is_for_robots_in_space(ready):
     image = RangeImage(np.ones((45, 90)), (0.0, 0.0, 0.0))
-    message = request_message(Commitment(GROUND), np.zeros(5), np.zeros(2), [], image)
+    message = request_message(Commitment(GROUND), np.zeros(5), np.zeros(2), scan=image)
     with pytest.raises(BadRequest) as error:
         check_for_filter(GROUND, request_of(message, GROUND))
     assert error.value.field == "image"
-    message = request_message(Commitment(QUADROTOR), np.zeros(9), np.zeros(3), [], image)
+    message = request_message(Commitment(QUADROTOR), np.zeros(9), np.zeros(3), scan=image)
     check_for_filter(QUADROTOR, request_of(message, QUADROTOR))
     message.scan.CopyFrom(scan_message(Scan(np.ones(360), FAN, (0.0,) * 3)))
     with pytest.raises(BadRequest, match="not both"):
@@ -128,7 +128,7 @@ def test_an_image_is_for_robots_in_space(ready):
 
 def test_an_actors_batch_of_many_images_is_none_too_large():
     image = RangeImage(np.ones((90, 180)), (0.0, 0.0, 0.0))
-    message = request_message(Commitment(QUADROTOR), np.zeros(9), np.zeros(3), [], image)
+    message = request_message(Commitment(QUADROTOR), np.zeros(9), np.zeros(3), scan=image)
     assert len(batch_of(pb.RequestBatch(requests=[message] * 24).SerializeToString()).requests) == 24
     with pytest.raises(BadRequest, match="a request batch has at most"):
         batch_of(pb.RequestBatch(requests=[message] * 48).SerializeToString())

@@ -114,6 +114,7 @@ def with_obstacle(**changes):
         ("predicted_half_width", bad(predicted_center=[0.0] * 5, predicted_half_width=[NAN] * 5)),
         ("robot", bad(robot="submarine")),
         ("robot", bad(robot="")),
+        ("obstacles", bad(obstacles=[])),
         ("model", bad(model="ffffffffffff")),
         ("model", bad(model="../../etc/passwd")),
         ("obstacles[1].size", with_obstacle(size=[-0.1])),
@@ -191,6 +192,7 @@ def test_a_model_is_replaced_while_the_service_runs(model, models, tmp_path):
     service = Service(model, archive=tmp_path)
     moving = good()
     moving.ClearField("obstacles")
+    moving.known_free = True
     moving.model, moving.input_in_force[0], moving.plan[0] = model.version, 0.2, 0.1
     assert read(service.replies(moving)[0], moving, GROUND).model == model.version
     service.models.install(newer)
@@ -285,7 +287,7 @@ def test_a_plan_that_no_actuator_could_follow_is_not_believed():
     """Its first input must follow the one in force within the slew, every other the one before; and it is about this
     robot."""
     flying = Commitment(QUADROTOR)
-    question = request_message(flying, np.zeros(QUADROTOR.state_dim), [1.0, 0.0, 0.0], [])
+    question = request_message(flying, np.zeros(QUADROTOR.state_dim), [1.0, 0.0, 0.0], known_free=True)
     zero = np.zeros(QUADROTOR.state_dim)
 
     def reply(plan, robot="quadrotor"):

@@ -36,7 +36,7 @@ class Service:
 def driving(service: Service) -> tuple[Commitment, pb.Request]:
     """A robot that drives, and its next honest question, before a wall that has come up."""
     commitment = Commitment(GROUND)
-    request = request_message(commitment, np.zeros(5), [0.25, 0.1], [], actor="actor-0")
+    request = request_message(commitment, np.zeros(5), [0.25, 0.1], known_free=True, actor="actor-0")
     accept(commitment, read(service(request), request, GROUND))
     state = np.array(commitment.predicted.center)
     return commitment, request_message(commitment, state, [0.25, 0.0], [WALL], actor="actor-0")
@@ -123,7 +123,7 @@ def test_each_period_has_its_voucher_until_the_robot_stands(robot: Robot) -> Non
         for _ in range(robot.horizon + 2):
             predicted = commitment.predicted
             state = np.zeros(robot.state_dim) if predicted is None else predicted.center
-            asked = request_message(commitment, state, plan[0], [], actor="a")
+            asked = request_message(commitment, state, plan[0], known_free=True, actor="a")
             asked = pb.Request.FromString(asked.SerializeToString())
             assert notary.vouches(asked, robot)
             moving = bool(np.any(commitment.plan) or np.any(commitment.input_in_force))

@@ -119,4 +119,4 @@ def test_a_service_hears_the_observation_too():
     env = SafetyWrapper(NavigationEnv(GROUND), client)
     observation, _ = env.reset(seed=0)
     env.step(np.zeros(2, np.float32))
-    assert client.asked["observation"] == observation.tolist()
+    assert np.array_equal(client.asked["observation"], observation)

@@ -12,6 +12,7 @@ from deploy import cli
 from deploy.data.paths import record_path
 from deploy.data.store import model_for
 from deploy.run.replay import APART, Difference, ReplayError, differences, replay
+from deploy.study.evaluate import in_process
 from messaging import brakeline_pb2 as pb
 from safety.filter import Filter
 from safety.model_set import Recipe
@@ -77,6 +78,22 @@ def test_another_certificate_and_other_data_can_be_asked(log: Path, capsys: pyte
     assert sum(count for row in wider["kinds"].values() for count in row.values()) == STEPS
     _, same = run(capsys, *words, "--data", record_path(GROUND))
     assert same["kinds"] == wider["kinds"] and same["instead"]["data"] == str(record_path(GROUND))
+
+
+def test_questions_from_before_known_free_are_asked_as_they_were_meant(data_folder: Path, tmp_path: Path) -> None:
+    ask = in_process(model_for(GROUND, Recipe()))
+
+    def before(exchange: pb.Exchange) -> None:
+        request = exchange.request
+        del request.obstacles[:]
+        request.known_free = request.step < 8  # the later ones are refused for saying nothing
+        exchange.reply.CopyFrom(ask([request])[0])
+        request.known_free = False
+
+    drive(tmp_path / "run.mcap", 10, before)
+    found = replay(tmp_path)
+    assert (found.requests, found.identical) == (10, 10)
+    assert found.kinds["error", "error"] == 2 and found.kinds.total() == 10
 
 
 def test_falsified_decisions_are_found(data_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

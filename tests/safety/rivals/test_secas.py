@@ -214,7 +214,9 @@ def test_the_service_answers_with_it_and_the_asker_brakes_when_it_falls_silent()
     models.install(known())
     answer, commitment = answerer(models, Counts()), Commitment(GROUND)
     for _ in range(2):  # the second request carries a plan that nobody vouches for
-        message = request_message(commitment, np.zeros(5), [0.25, 0.3], [], observation=seen(0.25).tolist())
+        message = request_message(
+            commitment, np.zeros(5), [0.25, 0.3], known_free=True, observation=seen(0.25).tolist()
+        )
         payload = pb.RequestBatch(requests=[message]).SerializeToString()
         reply = read(pb.ReplyBatch.FromString(answer(payload)).replies[0], message, GROUND)
         executed = accept(commitment, reply)
