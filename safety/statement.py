@@ -22,6 +22,8 @@ from safety.zonotope import facet_normals
 Array = NDArray[np.float64]
 
 CONFIDENCE = 0.99
+EPISODE = 300  # steps
+HOUR = 3600.0  # s
 CHUNK = 256  # windows at once: an exact matrix zonotope has thousands of atoms
 
 
@@ -42,7 +44,9 @@ class Statement:
     step_violations: int  # windows of which the first step was outside, in any coordinate
     bound_step: float  # probability that a step's measured state is outside, at 99 % confidence
     bound_plan: float  # the same of any part of a plan
-    bound_episode: float  # of any step in an episode of 300, from bound_step
+    bound_episode: float  # of any step in an episode of `EPISODE`, from bound_step, if steps were independent
+    outside_episode: float  # steps outside in such an episode, on average, at most; from bound_step, independent or not
+    outside_hour: float  # the same in an hour of driving
     half_width_rest: float  # m, of a full stop, largest axis, position noise of the estimate not included
     half_width_full: float
     clearance_margin: float  # m, kept to obstacles while driving so that turning in place stays possible
@@ -93,7 +97,9 @@ def state(model: ModelSet, fitted: Dataset, held_out: Dataset) -> Statement:
         step_violations=steps_outside,
         bound_step=bound_step,
         bound_plan=upper_bound(outside, len(plans)),
-        bound_episode=1.0 - (1.0 - bound_step) ** 300,
+        bound_episode=1.0 - (1.0 - bound_step) ** EPISODE,
+        outside_episode=bound_step * EPISODE,
+        outside_hour=bound_step * HOUR / robot.period,
         half_width_rest=ready.half_width(np.zeros(robot.action_dim)),
         half_width_full=ready.half_width(full),
         clearance_margin=ready.clearance_margin,

@@ -38,7 +38,7 @@ from safety.certificates import KINDS, RESIDUAL
 from safety.dataset import Dataset
 from safety.model_set import MODES, ModelSet, Recipe
 from safety.sign import KEY, Signer, seal_of
-from safety.statement import Statement
+from safety.statement import CONFIDENCE, EPISODE, HOUR, Statement
 
 DIVERGES = 100.0  # m, of a stop's half-width: wider than any arena
 
@@ -127,6 +127,7 @@ class Collect:
         console.print(f"{path}: {found.data.periods} periods in {found.seconds / 60.0:.1f} min of flight", markup=False)
         if found.statement is not None and found.model is not None:
             console.print(table([(found.statement, found.model.recipe.windows)]))
+            console.print(in_words(found.statement, robot.period), markup=False)
             console.print(f"{figures['model']}: in use from now on", markup=False)
         for line in found.missing:
             console.print(f"missing: {line}", markup=False)
@@ -195,6 +196,8 @@ class Certify:
             say_json(flat | {"source": str(path), "periods": source.data.periods, "note": source.note})
         else:
             console.print(table(rows))
+            if rows:
+                console.print(in_words(rows[0][0], source.data.robot.period), markup=False)
             for text in dict.fromkeys(passed):
                 console.print(f"not supported: {text}", markup=False)
             for text in more_to_drive(rows[0][0], source.data) if rows else ():
@@ -245,7 +248,15 @@ def table(rows: list[tuple[Statement, str]]) -> Stacking:
     shown = Stacking(title="what held-out plans say (bounds at 99 % confidence)")
     for column in (
         *("certificate", "mode", "driving", "samples", "rank", "condition", "plans", "violations"),
-        *("≤ per step", "≤ per plan", "stop from rest", "from full speed", "clearance margin"),
+        *(
+            "≤ per step",
+            "≤ per plan",
+            "≤ per episode",
+            "outside an hour",
+            "stop from rest",
+            "from full speed",
+            "clearance margin",
+        ),
     ):
         shown.add_column(column, justify="left" if column in ("certificate", "mode", "driving") else "right")
     for s, windows in rows:
@@ -254,11 +265,27 @@ def table(rows: list[tuple[Statement, str]]) -> Stacking:
             s.mode + ("" if s.certificate != RESIDUAL or s.mode != "direct" else " *"),
             windows,
             *(str(s.samples), str(s.rank), f"{s.condition:.0f}", str(s.windows), str(s.violations)),
-            *(f"{s.bound_step:.3%}", f"{s.bound_plan:.3%}"),
+            *(f"{s.bound_step:.3%}", f"{s.bound_plan:.3%}", f"{s.bound_episode:.1%}", f"≤ {s.outside_hour:.0f} steps"),
             *(width(value) for value in (s.half_width_rest, s.half_width_full, s.clearance_margin)),
         )
     shown.caption = "* the default; half-widths: a full stop's set, largest axis"
     return shown
+
+
+def in_words(s: Statement, period: float) -> str:
+    """What a statement says of how far its model set can be trusted; period: s between two steps."""
+    episode, hour = f"{EPISODE} steps ({EPISODE * period:.0f} s)", f"{round(HOUR / period):,} steps"
+    lines = (
+        f"{s.certificate}, {s.mode}, in words, at {CONFIDENCE:.0%} confidence, from {s.windows} held-out plans:",
+        f"  a step: at most {s.bound_step:.2%} of steps leave their predicted set ({s.step_violations} did)",
+        f"  a plan, driven to its stop: at most {s.bound_plan:.2%} of plans leave their tube ({s.violations} did)",
+        f"  an episode of {episode}: at most {s.outside_episode:.2g} steps outside on average; at least one in up to "
+        f"{s.bound_episode:.0%} of episodes, if steps are independent",
+        f"  an hour of driving ({hour}): at most {s.outside_hour:.3g} steps outside on average",
+        "A step outside is no collision by itself, but nothing was verified about where the robot then is.",
+        "The bounds hold for driving like the recorded one; more held-out plans make them tighter.",
+    )
+    return "\n".join(lines)
 
 
 def width(metres: float) -> str:

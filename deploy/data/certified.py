@@ -35,5 +35,6 @@ def certified(data: Dataset, recipe: Recipe, until_held: bool = False) -> tuple[
         model = make(fitted, recipe)
         statement = state(model, fitted, held_out)
     about = model.about | {"bound_step": f"{statement.bound_step:.6g}", "bound_plan": f"{statement.bound_plan:.6g}"}
+    about |= {"bound_episode": f"{statement.bound_episode:.6g}", "outside_hour": f"{statement.outside_hour:.6g}"}
     about |= {"windows": str(statement.windows), "violations": str(statement.violations)}
     return replace(model, about=about), statement

@@ -73,7 +73,8 @@ def _made(path: Path, robot: Robot, recipe: Recipe) -> ModelSet:
         model, statement = certified(data, recipe)
     console.print(
         f"{robot.name}: {recipe.certificate} ({recipe.mode}) {model.version}: {statement.violations} violations in "
-        f"{statement.windows} held-out plans, at most {statement.bound_plan:.2%} of plans (99 % confidence)"
+        f"{statement.windows} held-out plans, at most {statement.bound_plan:.2%} of plans and "
+        f"{statement.bound_step:.2%} of steps leave their sets (99 % confidence)"
     )
     model.save(path)
     return model

@@ -161,11 +161,12 @@ def differences(
     if not now.HasField("decision"):
         return {} if logged.error.type == now.error.type else {"error": APART}
     before, after = logged.decision, now.decision
+    said = {descriptor.name for descriptor, _ in before.ListFields()}
     found: dict[str, Difference] = {}
     for descriptor in pb.Decision.DESCRIPTOR.fields:
         name = descriptor.name
         one, other = getattr(before, name), getattr(after, name)
-        if descriptor.has_presence and not descriptor.message_type and not before.HasField(name):
+        if descriptor.has_presence and not descriptor.message_type and name not in said:
             continue  # a log from before there was such a field
         if name not in ignored and one != other:
             found[name] = APART if descriptor.enum_type is not None else _difference(one, other)

@@ -220,7 +220,14 @@ def test_a_mistyped_data_set_is_not_recorded_anew(command, tmp_path, monkeypatch
 def said(**figures):
     """A statement with figures as a recursion that feeds on itself gives them."""
     plain = {"samples": 1000, "rank": 6, "smallest_singular": 1.0, "condition": 12.0, "windows": 300, "violations": 0}
-    plain |= {"step_violations": 0, "bound_step": 0.01, "bound_plan": 0.02, "bound_episode": 0.9}
+    plain |= {
+        "step_violations": 0,
+        "bound_step": 0.01,
+        "bound_plan": 0.02,
+        "bound_episode": 0.951,
+        "outside_episode": 3.0,
+    }
+    plain |= {"outside_hour": 180.0}
     sizes = {"half_width_rest": 0.0012, "half_width_full": 149810.138, "clearance_margin": 1.5}
     about = {"certificate": "matrix-zonotope", "mode": "recursion", "version": "a"}
     return Statement(**{**plain, **sizes, **about, "excess": 0.8, **figures})
@@ -233,9 +240,34 @@ def test_certificates_are_told_whole_at_any_width(columns):
     console.print(table([(said(), "plan"), (said(half_width_full=float("nan"), certificate="residual"), "free")]))
     shown = file.getvalue()
     assert "…" not in shown and max(map(len, shown.splitlines())) <= columns
-    for word in ("certificate", "matrix-zonotope", "≤ per plan", "2.000%", "1.2 mm", "1.5 m"):
+    for word in (
+        "certificate",
+        "matrix-zonotope",
+        "≤ per plan",
+        "2.000%",
+        "≤ per episode",
+        "95.1%",
+        "≤ 180 steps",
+        "1.2 mm",
+        "1.5 m",
+    ):
         assert word in shown, word
     assert shown.count("diverges") == 2 and "149810" not in shown
+
+
+def test_certify_says_on_its_page_how_sure_it_is_as_in_json(command, data_folder):
+    words = ("certify", data_folder / "ground" / "record.safetensors", "--certificates", "residual", "--mode", "direct")
+    s, page = json.loads(command(*words, "--json")[1])["residual"], command(*words)[1]
+    assert s["outside_hour"] == pytest.approx(18_000 * s["bound_step"])
+    for said in (
+        f"residual, direct, in words, at 99% confidence, from {s['windows']} held-out plans",
+        f"at most {s['bound_step']:.2%} of steps leave their predicted set ({s['step_violations']} did)",
+        f"at most {s['bound_plan']:.2%} of plans leave their tube ({s['violations']} did)",
+        f"an episode of 300 steps (60 s): at most {300 * s['bound_step']:.2g} steps outside on average",
+        f"at least one in up to {s['bound_episode']:.0%} of episodes, if steps are independent",
+        f"an hour of driving (18,000 steps): at most {s['outside_hour']:.3g} steps outside on average",
+    ):
+        assert said in page
 
 
 def test_certify_says_what_it_does_and_keeps_the_conditions_for_those_who_ask(command, data_folder, monkeypatch):

@@ -64,6 +64,26 @@ def test_the_tables_say_what_json_says_without_a_script(report: tuple[Path, dict
     assert sum(name.startswith("topics.") for name in cells.values) == 3 * len(figures["topics"])
 
 
+def test_it_says_in_words_how_sure_a_model_set_is(tmp_path: Path) -> None:
+    analysis = analysed(mixed(tmp_path / "run"), Look(pictures=True))
+    [(label, (figures, pictures))] = analysis.each().items()
+
+    def said(**more: str) -> str:
+        metadata = {"model ground": {"version": "abc", "bound_step": "0.003", **more}}
+        return " ".join(render(analysis.figures(), {label: (figures | {"metadata": metadata}, pictures)}).split())
+
+    thousands = number(figures["steps"]).replace("\u202f", " ")  # as `split` leaves them
+    steps = f"Over the {thousands} steps of this run that adds up to at most"
+    before = said()
+    assert "at 99 % confidence, that at most 0.3 % of the steps leave their predicted set. Over the" in before
+    assert f"{steps} {number(0.003 * figures['steps'])} steps outside on average." in before
+    whole = said(bound_plan="0.02", windows="300", bound_episode="0.594", outside_hour="54")
+    assert "from 300 held-out plans, that" in whole
+    assert "and at most 2.0 % of the plans their tube, driven to the stop." in whole
+    assert "over an hour of driving to 54, over an episode of 300 steps to at least one with a probability of" in whole
+    assert "up to 59.4 %, if steps are independent." in whole
+
+
 def test_it_needs_no_network_and_no_other_file(report: tuple[Path, dict[str, Any]]) -> None:
     text = report[0].read_text()
     assert "default-src 'none'" in text

@@ -34,6 +34,10 @@ def test_a_model_set_holds_on_data_it_has_not_seen(models, data, held_out, which
     assert found.step_violations <= found.violations
     assert found.bound_step <= found.bound_plan < 0.05
     assert found.bound_step <= found.bound_episode <= 1.0
+    assert (
+        found.outside_episode == pytest.approx(300 * found.bound_step) and found.outside_episode > found.bound_episode
+    )
+    assert found.outside_hour == pytest.approx(18_000 * found.bound_step), "of 0.2 s"
     assert 0 < found.half_width_rest < found.half_width_full
     assert found.samples == len(windows(data, 3))
     assert set(found.figures()) > {"samples", "rank", "condition", "bound_step", "bound_plan"}
