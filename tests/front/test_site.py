@@ -5,6 +5,7 @@ import os
 import subprocess
 import sys
 import threading
+from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 
@@ -33,17 +34,39 @@ def test_every_page_is_in_the_menu(site: Path) -> None:
     assert (site / "results" / "ground" / "curves.png").exists()
 
 
-def test_the_search_finds_and_nothing_is_asked_of_others(site: Path, tmp_path: Path) -> None:
-    if CHROMIUM is None:
-        pytest.skip("there is no Chromium: the site was not searched")
+@pytest.fixture
+def served(site: Path) -> Iterator[str]:
+    """The address of the site."""
     handler = partial(http.server.SimpleHTTPRequestHandler, directory=str(site))
     handler.log_message = lambda *_: None  # type: ignore[attr-defined]
-    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler) as server, Page(tmp_path) as page:
+    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
         threading.Thread(target=server.serve_forever, daemon=True).start()
-        address = f"http://127.0.0.1:{server.server_address[1]}/"
-        page.open(address + "index.html?q=committed+plan")
+        yield f"http://127.0.0.1:{server.server_address[1]}/"
+        server.shutdown()
+
+
+def _asked_elsewhere(page: Page, address: str) -> list[str]:
+    return [url for url in page.requests if not url.startswith((address, "data:", "blob:"))]
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="there is no Chromium: the site was not searched")
+def test_the_search_finds_and_nothing_is_asked_of_others(served: str, tmp_path: Path) -> None:
+    with Page(tmp_path) as page:
+        page.open(served + "index.html?q=committed+plan")
         page.until("document.querySelectorAll('.md-search-result__item').length > 0")
         found = page.value("document.querySelector('.md-search-result__list').textContent")
         assert "Glossary" in found
-        assert [url for url in page.requests if not url.startswith((address, "data:", "blob:"))] == []
-        server.shutdown()
+        assert _asked_elsewhere(page, served) == []
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="there is no Chromium: no formula was drawn")
+def test_formulas_and_figures_are_drawn_and_nothing_is_asked_of_others(served: str, tmp_path: Path) -> None:
+    with Page(tmp_path) as page:
+        page.open(served + "method.html")
+        formulas = page.value("document.querySelectorAll('.arithmatex').length")
+        assert formulas > 50
+        page.until(f"document.querySelectorAll('.arithmatex .katex').length == {formulas}")
+        assert page.value("document.querySelectorAll('.katex-error').length") == 0
+        assert page.value("[...document.querySelectorAll('article img')].filter(i => !i.naturalWidth).length") == 0
+        assert page.complaints == []
+        assert _asked_elsewhere(page, served) == []
