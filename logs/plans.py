@@ -1,7 +1,7 @@
 """Verified plans that robots went on along: did they stay in the tubes that had been verified for them?
 
 A measured state is compared with what was predicted a period before (`containment`). That says little about a stop of
-many periods, and a stop is what keeps a robot from hitting anything: the unit of a certificate is a plan (method §1).
+many periods, and a stop is what keeps a robot from hitting anything: the unit is a plan (docs/method.md §12).
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""How far a scan shows each gap between two beams to be free (method §10).
+"""How far a scan shows each gap between two beams to be free (docs/method.md §10).
 
 Between two neighbouring beams Δ < 45° apart, free up to ρ from the sensor, everything nearer than
 

@@ -1,10 +1,10 @@
-"""What recorded data say about the next step: one form, three certificates (method §1, paper lemmas 1 and 2).
+"""What recorded data say about the next step: one form, three certificates (docs/method.md §1, paper lemmas 1 and 2).
 
 Every certificate bounds one step from a regressor z = [x; u] (column vector of length nz) by
 
     y+ ∈ C z + Σ_j ( M_j·|W z| + κ_j·|z| + w_j ) g_j [-1, 1]
 
-which is method (1) with `H_j = diag(M_j) W` factored, because the H_j of one data set share their rows W.
+which is (1) of docs/method.md with `H_j = diag(M_j) W` factored, because the H_j of one data set share their rows W.
 """
 
 from __future__ import annotations
@@ -211,7 +211,7 @@ def _row_box(white: Array, y: Array, size: Array) -> tuple[Array, Array]:
 
 
 def measured_noise(z: Array, y: Array, w_half: Array, v_half: Array) -> Array:
-    """Half-widths of `w + v+ - A v` for a linear system with box noise, without knowing A (method §1).
+    """Half-widths of `w + v+ - A v` for a linear system with box noise, without knowing A (docs/method.md §1).
 
     `|A v| <= s = (|C_A| v̄ + β (w̄ + v̄)) / (1 - β)`, `β = Σ_i v̄_i ‖Z⁺_{:,i}‖₁`, where the state comes first in z.
 

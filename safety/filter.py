@@ -1,4 +1,4 @@
-"""`decide`: a proposed action in, a verified plan out (paper, algorithm 1 lines 5-9 and algorithm 2; method §4).
+"""`decide`: a proposed action in, a verified plan out (paper, algorithms 1 and 2; docs/method.md §4).
 
 The filter allows a proposal whose tube keeps the clearance margin to every obstacle. Where turning in place does not
 keep that margin, the proposal must not drive nearer. The filter replaces every other proposal by the closest input

@@ -1,4 +1,4 @@
-"""A model set from recorded data (method §1, §2): predictors, their bounds, bulges and the stop latch."""
+"""A model set from recorded data (docs/method.md §1, §2): predictors, their bounds, bulges and the stop latch."""
 
 from __future__ import annotations
 

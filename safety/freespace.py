@@ -1,4 +1,4 @@
-"""Free space about a nominal plan, as half-spaces `a·p <= b` (method §3).
+"""Free space about a nominal plan, as half-spaces `a·p <= b` (docs/method.md §3).
 
 A supporting half-space per near obstacle and period: the obstacle is convex, so the plane through its point closest
 to some nominal position, normal to the line between them, has all of it on the far side. The same half-space holds for
@@ -55,7 +55,7 @@ def leading_out(
     near: Shapes, start: Array, keep_off: float, measured: Array, planes: tuple[Array, Array]
 ) -> tuple[Array, Array]:
     """The same half-spaces, but of an obstacle that the start is inside of, the one behind which it is left soonest:
-    nothing that is verified, but a way out (method §11)."""
+    nothing that is verified, but a way out (docs/method.md §11)."""
     out = near.out_of(start)
     depth = np.sqrt(np.einsum("nd,nd->n", out, out))
     inside = depth > TOUCHING

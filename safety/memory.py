@@ -1,4 +1,4 @@
-"""What a robot's sensor saw free before: fills in the beams of a scan that say nothing (method §10).
+"""What a robot's sensor saw free before: fills in the beams of a scan that say nothing (docs/method.md §10).
 
 The asker keeps it: the service keeps nothing about a robot. A world that moves (`Scan.speed`) takes back with time what
 was seen. Where the robot was put there is room: `START` m about its body; without that it could never move away from a

@@ -1,4 +1,4 @@
-"""The QP of one decision: the closest input whose tube stays inside the half-spaces (paper, algorithm 2; method §2)."""
+"""The QP of one decision: the closest input whose tube stays inside the half-spaces (docs/method.md §4)."""
 
 from __future__ import annotations
 

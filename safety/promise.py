@@ -1,4 +1,4 @@
-"""What robots of one world promise each other: where each will be, period by period, and then for ever (method §9).
+"""What robots of one world promise each other: where each is in each period, and for ever after (docs/method.md §9).
 
 A tube with sets S_0 (where the robot is), S_1, ..., S_N at the ends of its periods keeps the body, in period k, within
 

@@ -1,4 +1,4 @@
-"""Out of where nothing can be verified, not even standing (method §11).
+"""Out of where nothing can be verified, not even standing (docs/method.md §11).
 
 Of slow inputs, each followed by braking, the one whose worst violated half-space is violated least at the plan's end,
 then the next worst, and so on; none may violate any half-space more than standing does. What is compared is where they

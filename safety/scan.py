@@ -1,4 +1,4 @@
-"""Free space from a scan, as convex cells that hold all that is not known to be free (method §10).
+"""Free space from a scan, as convex cells that hold all that is not known to be free (docs/method.md §10).
 
 Up to F from the sensor a gap between two beams is free (`messaging/gaps.py`). Beyond F, and behind every hit, nothing
 is known: occupied. Neighbouring gaps of about the same F make a cell, the convex hull of their near ends and their far

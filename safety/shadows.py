@@ -1,4 +1,4 @@
-"""Free space from a range image: what it does not show to be free lies in shadows, one for each patch (method §10).
+"""Free space from a range image: what it does not show to be free lies in shadows of patches (docs/method.md §10).
 
 The shadow of a patch is what is in it beyond F (`messaging/patches.py`). Thousands of them are kept off by a few
 half-spaces a period: the one that supports the nearest shadow, then, of all that are not beyond it, the one that

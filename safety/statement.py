@@ -1,4 +1,4 @@
-"""What held-out windows say about a model set: how often a tube would not have held, with 99 % confidence (method §1).
+"""How often tubes fail to hold held-out windows, bounded at 99 % confidence (docs/method.md §12).
 
 A statement about the distribution that was recorded, and about no other.
 """

@@ -1,4 +1,4 @@
-"""What is around a robot, as half-spaces that its tube is held against (method §3, §8-§10)."""
+"""What is around a robot, as half-spaces that its tube is held against (docs/method.md §3, §8-§10)."""
 
 from __future__ import annotations
 

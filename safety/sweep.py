@@ -1,4 +1,4 @@
-"""Free space beside what moves: a half-space per obstacle and period that holds for the whole sweep (method §8).
+"""Free space beside what moves: half-spaces that hold for the whole sweep of a period (docs/method.md §8).
 
 In period k = [t_k, t_{k+1}] an obstacle lies within O + c t ⊕ ball(r(t)). For a unit normal n that points from the
 robot to it, `n·p <= b` keeps the robot off all of it at all of these times if

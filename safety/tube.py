@@ -1,4 +1,4 @@
-"""The reachable tube of a plan, stacked over the horizon once, offline (method §2).
+"""The reachable tube of a plan, stacked over the horizon once, offline (docs/method.md §2).
 
 The tube is a function of `z = [x_0; input in force; free inputs]` alone. At step i = 1..N the measured position,
 relative to where it is now and in the frame of now, lies in

@@ -1,4 +1,4 @@
-"""From a laser scan to obstacles that hold all it may have seen (method §10).
+"""From a laser scan to obstacles that hold all it may have seen (docs/method.md §10).
 
 A beam that hits at range r becomes a disc of radius `increment r + range error + heading error r + position error`:
 the gap to the next beam, before which an edge may lie anywhere, and how wrong the hit's place may be. Neighbouring hits

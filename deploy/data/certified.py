@@ -19,8 +19,8 @@ def certified(data: Dataset, recipe: Recipe, until_held: bool = False) -> tuple[
     """A model set from 70 % of the trajectories, with its statement about the others.
 
     until_held: every envelope is widened by the largest factor that a held-out plan asks for, until none leaves its set
-    (split conformal prediction, method §12). That what comes is beyond the largest of n factors has a probability of at
-    most `1 - 0.01^(1/n)` at 99 % confidence, which is what the statement's bound of no violation in n plans is.
+    (split conformal prediction, docs/method.md §12). That what comes is beyond the largest of n factors has a
+    probability of at most `1 - 0.01^(1/n)` at 99 % confidence: the statement's bound for n plans without a violation.
 
     Raises:
         BadData, CertificateError: the data do not support it; the message says why.

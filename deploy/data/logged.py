@@ -1,6 +1,6 @@
 """A data set from a log: what robots did in a run says what they are like now.
 
-It makes a new version of the model set, never changes one in place (method §4).
+It makes a new version of the model set, never changes one in place (docs/method.md §4).
 """
 
 from __future__ import annotations

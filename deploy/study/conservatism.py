@@ -1,4 +1,4 @@
-"""How conservative each certificate is, in both modes (method §6): what its tubes are like, and what that costs.
+"""How conservative each certificate is in both modes: its tubes, and what they cost (docs/method.md §6).
 
 Half-widths of a full stop, what held-out plans say of the bound, and closed-loop goal rates of the map's oracle (A*)
 and of the stored policy, which was trained behind the default. Where a full stop's set is wider than the arena, no
