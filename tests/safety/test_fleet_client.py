@@ -5,6 +5,7 @@ import pytest
 
 from messaging import brakeline_pb2 as pb
 from messaging.bus import NoReply
+from messaging.scans import Scan
 from messaging.shapes import Obstacle
 from messaging.topics import DECIDE
 from safety.client import SafetyError
@@ -87,6 +88,21 @@ def test_each_period_somebody_else_is_decided_first(fleet, monkeypatch):
     assert [[(r.step, r.actor, tuple(r.fleet)) for r in batch] for batch in requests] == [
         [(i, name, NAMES) for name in NAMES] for i in range(3)
     ]
+
+
+def test_a_fleet_says_where_space_is_known_to_be_free(fleet):
+    robots = facing(np.random.default_rng(2))
+    decided(fleet, robots, [[0.0, 0.1]] * 2)
+    fleet.reset()
+    asked = [r.measure() for r in robots], [[0.0, 0.1]] * 2
+    with pytest.raises(SafetyError, match="known_free") as caught:
+        fleet.decide(*asked)
+    assert caught.value.field == "obstacles"
+    fleet.fallback()
+    assert [answer.kind for answer in fleet.decide(*asked, known_free=True)] == ["allowed", "allowed"]
+    fleet.reset()
+    blind = [Scan(np.full(360, 0.13), np.linspace(-np.pi, np.pi, 360, endpoint=False), tuple(s[:3])) for s in asked[0]]
+    assert {answer.kind for answer in fleet.decide(*asked, scans=blind)} == {"failsafe"}
 
 
 def test_what_is_no_fleet_is_refused(fleet):
