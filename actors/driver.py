@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 
 from actors.guard import Outcome, at_rest, next_input
 from messaging import brakeline_pb2 as pb
-from messaging.robots import Robot
-from messaging.tasks import task_of
+from messaging.tasks import RobotWithTask
 from safety.client import obstacle_messages, request_message
 from safety.commitment import Array, Commitment, Prediction, correction_penalty
 from safety.image_memory import filled, memory_of
@@ -55,7 +54,7 @@ class Driver:
 
     def __init__(
         self,
-        robot: Robot,
+        robot: RobotWithTask,
         env: Environment,
         identity: Identity,
         penalty: float = 0.0,
@@ -221,6 +220,6 @@ class Driver:
     def _cut(self, step: pb.Step) -> None:
         """No penalty, but the end of the episode if there was an intervention. A collision while braking stays one."""
         step.cut = step.decision == pb.FAILSAFE
-        step.penalty = max(step.reward - task_of(self.robot).reward.cut, 0.0) if step.cut else 0.0
+        step.penalty = max(step.reward - self.robot.task.reward.cut, 0.0) if step.cut else 0.0
         if step.cut and self.running:
             self.running, step.truncated = False, True

@@ -31,7 +31,8 @@ from actors.vehicle_client import VehicleClient
 from actors.vehicle_messages import FlightRequest
 from messaging.bus import BusError
 from messaging.process import Process
-from messaging.robots import Robot, robot_named
+from messaging.robots import Robot
+from messaging.tasks import RobotWithTask, robot_with_task
 from safety.client import ask, request_message
 from safety.commitment import Array, Commitment
 from sim.arenas import tour
@@ -211,13 +212,13 @@ class FlightRider(Rider):
         seeing = conditions.perception.kind == "scan"
         noise = conditions.lidar_noise(flies=True) if seeing else 0.0
 
-        def draw(name: str, rng: np.random.Generator, robot: Robot) -> Arena:
+        def draw(name: str, rng: np.random.Generator, robot: RobotWithTask) -> Arena:
             self._stage += 1
             return stages[self._stage % len(stages)]
 
         self._stage = -1
 
-        def make(robot: Robot, arena: str, seed: int, *, tap: Tap | None = None) -> NavigationEnv:
+        def make(robot: RobotWithTask, arena: str, seed: int, *, tap: Tap | None = None) -> NavigationEnv:
             vehicle = lambda arena, rng: self.flight  # noqa: E731
             return NavigationEnv(robot, arena, vehicle, noise, seed, draw=draw, perception=conditions.perception)
 
@@ -278,7 +279,7 @@ def run(
         Unfiltered, NoRoom, RefusedByLearner, Unreachable, BadLink: with what to do.
         MavlinkError: no autopilot, it refuses something, or nobody flies it any more.
     """
-    robot = robot_named(settings.robot)
+    robot = robot_with_task(settings.robot)
     if settings.method == "none" or not robot.late:
         raise Unfiltered("in real time a robot flies behind the filter, with plans that reckon with the delay")
     stages = tour(arena, GOALS, np.random.default_rng(settings.seed), robot)

@@ -21,7 +21,7 @@ from actors.tape import Puts, Tape
 from messaging import brakeline_pb2 as pb
 from messaging.bus import BusSettings, Publisher
 from messaging.process import Process
-from messaging.robots import Robot, robot_named
+from messaging.tasks import RobotWithTask, robot_with_task
 from messaging.topics import EPISODE, EXCHANGE, FRAMES, STEP
 from safety.client import ask
 from safety.commitment import Array
@@ -58,10 +58,10 @@ class ActorSettings:
 class Make(Protocol):
     """Makes a robot's environment; tap: is to be called with every MAVLink frame, if there are any."""
 
-    def __call__(self, robot: Robot, arena: str, seed: int, *, tap: Tap | None = None) -> Environment: ...
+    def __call__(self, robot: RobotWithTask, arena: str, seed: int, *, tap: Tap | None = None) -> Environment: ...
 
 
-MakeWorld = Callable[[Robot, str, int, int], World]  # of robots of a kind in an arena, so many, from a seed
+MakeWorld = Callable[[RobotWithTask, str, int, int], World]  # of robots of a kind in an arena, so many, from a seed
 
 PRACTISED = "Practised: the stop goes on as it was verified"  # instead of an answer
 STANDING = 2  # periods that a practised stop lasts beyond its plan
@@ -110,7 +110,7 @@ class Rider:
         env: Environment | None = None,
     ) -> None:
         """propose: instead of learning; goes_on: see Driver; env: its place in a world that others share."""
-        robot = robot_named(settings.robot)
+        robot = robot_with_task(settings.robot)
         actor = settings.name if settings.robots == 1 else f"{settings.name}.{offset}"
         identity = Identity(actor, settings.number + offset, settings.seed)
         publisher: Callable[..., Publisher] = process.bus.publisher
@@ -290,7 +290,7 @@ def run(
         world = None
         if settings.fleet and make_world is not None:
             number = settings.seed * EPISODE_STRIDE + settings.number
-            world = make_world(robot_named(settings.robot), settings.arena, settings.robots, number)
+            world = make_world(robot_with_task(settings.robot), settings.arena, settings.robots, number)
         places: Sequence[Environment | None] = [None] * settings.robots if world is None else world.members
         riders = [Rider(process, settings, i, make, propose, env=env) for i, env in enumerate(places)]
         one_period: Callable[[list[Rider], Ask | None, Tally, Callable[[], bool]], bool] = cycle

@@ -10,8 +10,7 @@ from collections.abc import Callable
 from messaging import brakeline_pb2 as pb
 from messaging.bus import Bus, BusError, Sample
 from messaging.plausible import Implausible
-from messaging.robots import Robot
-from messaging.tasks import layout
+from messaging.tasks import RobotWithTask
 from messaging.topics import FLOW, JOIN, WEIGHTS
 from messaging.weights import MLP, BadWeights, decode
 
@@ -31,7 +30,7 @@ class RefusedByLearner(RuntimeError):
 class Student:
     """The link of one actor name to the learner. `policy` is the newest, None before the first join."""
 
-    def __init__(self, bus: Bus, robot: Robot, actor: str, lockstep: bool = False) -> None:
+    def __init__(self, bus: Bus, robot: RobotWithTask, actor: str, lockstep: bool = False) -> None:
         self.bus, self.robot, self.actor, self.lockstep = bus, robot, actor, lockstep
         self.policy: MLP | None = None
         self.flow = pb.Flow()
@@ -65,7 +64,7 @@ class Student:
             RefusedByLearner: it says why.
         """
         message = pb.Join(
-            robot=self.robot.name, actor=self.actor, layout=layout(self.robot), index=index, episode=episode
+            robot=self.robot.name, actor=self.actor, layout=self.robot.learning_layout(), index=index, episode=episode
         )
         say_at = 0.0
         while not stop():

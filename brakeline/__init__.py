@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from messaging.robots import Disc, Limit, Robot, UnknownRobot, robot_named
     from messaging.scans import BadScan, Scan
     from messaging.shapes import BadShape, Obstacle, Shapes
-    from messaging.tasks import Task, task_of
+    from messaging.tasks import RobotWithTask, Task, robot_with_task
     from safety.asker import Answer, Asker
     from safety.certificates import CertificateError
     from safety.client import SafetyClient, SafetyError
@@ -46,7 +46,7 @@ PLACES = {
     "messaging.robots": ("Disc", "Limit", "Robot", "UnknownRobot", "robot_named"),
     "messaging.scans": ("BadScan", "Scan"),
     "messaging.shapes": ("BadShape", "Obstacle", "Shapes"),
-    "messaging.tasks": ("Task", "task_of"),
+    "messaging.tasks": ("RobotWithTask", "Task", "robot_with_task"),
     "safety.certificates": ("CertificateError",),
     "safety.asker": ("Answer", "Asker"),
     "safety.client": ("SafetyClient", "SafetyError"),
@@ -95,6 +95,7 @@ __all__ = [
     "Refused",
     "Request",
     "Robot",
+    "RobotWithTask",
     "SafetyClient",
     "SafetyError",
     "SafetyWrapper",
@@ -110,8 +111,8 @@ __all__ = [
     "make",
     "memory_of",
     "robot_named",
+    "robot_with_task",
     "state",
-    "task_of",
 ]
 
 

@@ -3,6 +3,7 @@ inputs that were written down."""
 
 from __future__ import annotations
 
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -11,23 +12,22 @@ from numpy.typing import NDArray
 
 from deploy.data.sources.quantities import columns_of
 from deploy.data.sources.table import NoSource
-from messaging.robots import Robot
-from messaging.tasks import task_of
-from messaging.weights import MLP
+from messaging.tasks import RobotWithTask
+from messaging.weights import MLP, BadWeights
 from sim.policies import Policy, scripted
 
 UNTRAINED, TRAINED = "untrained", "trained"
 POLICY_FOLDER = Path(__file__).parents[1] / "policies"
 
 
-def policy_named(name: str, robot: Robot, seed: int) -> Policy:
+def policy_named(name: str, robot: RobotWithTask, seed: int) -> Policy:
     """A scripted policy, a stored one (`trained` and others in policies/, or beside the robot's own task), an untrained
     one, or a file's: weights, or inputs as `brakeline excite` prints them (.csv).
 
     Raises:
         ValueError: neither a name nor a file; BadWeights: a file that is no policy of this robot.
     """
-    policies = task_of(robot).policies
+    policies = robot.task.policies
     if name in policies:
         return scripted(name, robot, np.random.default_rng(seed))
     if name == UNTRAINED:
@@ -39,14 +39,15 @@ def policy_named(name: str, robot: Robot, seed: int) -> Policy:
     if not path.is_file():
         names = ", ".join([*sorted(stored), UNTRAINED, *policies])
         raise ValueError(f"no policy is called {name!r} and no such file exists; there are: {names}, or a file's path")
-    if robot.late and MLP.load(path).robot.kind == robot.kind:
-        return driving(MLP.load(path))  # it may have been trained in lockstep: it proposes in real time too
+    if robot.late:
+        with suppress(BadWeights):  # it may have been trained in lockstep: it proposes in real time too
+            return driving(MLP.load(path, robot.in_lockstep()))
     return driving(MLP.load(path, robot))
 
 
-def _stored(robot: Robot) -> dict[str, Path]:
+def _stored(robot: RobotWithTask) -> dict[str, Path]:
     """By name: beside the task's file, as robots of other people have it, or in the folder of this repository."""
-    task = task_of(robot)
+    task = robot.task
     beside = task.folder / f"{TRAINED}.safetensors"
     folder = POLICY_FOLDER / (task.name or robot.kind)
     return {path.stem: path for path in folder.glob("*.safetensors")} | ({TRAINED: beside} if beside.is_file() else {})
@@ -57,7 +58,7 @@ def driving(mlp: MLP) -> Policy:
     return lambda observation, info: mlp(observation)
 
 
-def replayed(path: Path, robot: Robot) -> Policy:
+def replayed(path: Path, robot: RobotWithTask) -> Policy:
     """The inputs in a file of columns, one a period; an episode is a run of it, and after the last row it stands.
 
     Raises:

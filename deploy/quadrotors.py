@@ -11,7 +11,7 @@ import numpy as np
 from actors.flying import MavlinkVehicle
 from actors.frames import Tap
 from actors.px4 import QUIET, Px4Flight, Px4Vehicle
-from messaging.robots import Robot
+from messaging.tasks import RobotWithTask, robot_with_task
 from sim.arenas import draw_arena
 from sim.autopilot.endpoint import Autopilot
 from sim.autopilot.rules import SETPOINT_TIMEOUT
@@ -64,6 +64,6 @@ def behind_px4(conditions: Conditions, tap: Tap | None = None) -> MakeVehicle:
     return make
 
 
-def flight_arena(name: str, seed: int, robot: Robot = QUADROTOR) -> Arena:
+def flight_arena(name: str, seed: int, robot: RobotWithTask | None = None) -> Arena:
     """The one arena of a flight in real time: the autopilot's world, and the actor's map."""
-    return draw_arena(name, np.random.default_rng(seed), robot)
+    return draw_arena(name, np.random.default_rng(seed), robot or robot_with_task("quadrotor"))

@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from messaging.robots import Robot
-from messaging.tasks import task_of
+from messaging.tasks import RobotWithTask
 from sim.arenas import arena_kind
 from sim.conditions import Conditions
 from sim.envs import NavigationEnv
@@ -26,7 +25,7 @@ if TYPE_CHECKING:
 YARD = {2: 50.0, 3: 500.0}  # m to the walls of the place where data are recorded: farther than a trajectory can go
 
 
-def factory(robot: Robot, conditions: Conditions, tap: Tap | None = None) -> MakeVehicle:
+def factory(robot: RobotWithTask, conditions: Conditions, tap: Tap | None = None) -> MakeVehicle:
     """What makes a vehicle of that kind under these conditions; tap: see `environment`.
 
     Raises:
@@ -34,13 +33,13 @@ def factory(robot: Robot, conditions: Conditions, tap: Tap | None = None) -> Mak
     """
     if robot.late:
         return late(factory(robot.in_lockstep(), conditions, tap), robot)
-    task = task_of(robot)
+    task = robot.task
     make: MakeVehicle = task.code(task.simulator)(conditions, tap)
     return make
 
 
 def environment(
-    robot: Robot, arena: str, seed: int, conditions: Conditions | None = None, *, tap: Tap | None = None
+    robot: RobotWithTask, arena: str, seed: int, conditions: Conditions | None = None, *, tap: Tap | None = None
 ) -> NavigationEnv:
     """A Gymnasium environment; `seed` sets its episodes apart from those of another seed; tap: is called with every
     MAVLink frame of a robot that has any.
@@ -55,14 +54,16 @@ def environment(
     return NavigationEnv(robot, arena, make, noise, seed_key=seed, perception=c.perception)
 
 
-def fleet_world(robot: Robot, arena: str, size: int, seed: int, conditions: Conditions | None = None) -> FleetEnv:
+def fleet_world(
+    robot: RobotWithTask, arena: str, size: int, seed: int, conditions: Conditions | None = None
+) -> FleetEnv:
     """A world of several robots: see there."""
     from sim.fleet import FleetEnv
 
     return FleetEnv(robot, arena, size, seed, conditions)
 
 
-def vehicle_in_yard(robot: Robot, rng: np.random.Generator, conditions: Conditions) -> Vehicle:
+def vehicle_in_yard(robot: RobotWithTask, rng: np.random.Generator, conditions: Conditions) -> Vehicle:
     """The bare vehicle with nothing near it, heading at random."""
     yard = YARD[robot.position_dim]
     height = None if robot.position_dim == 2 else 2.0 * yard
@@ -73,6 +74,6 @@ def vehicle_in_yard(robot: Robot, rng: np.random.Generator, conditions: Conditio
 
 
 @lru_cache(maxsize=1)
-def _maker(robot: Robot, conditions: Conditions) -> MakeVehicle:
+def _maker(robot: RobotWithTask, conditions: Conditions) -> MakeVehicle:
     """The same for one trajectory after the other: what starts a real autopilot starts it once."""
     return factory(robot, conditions)

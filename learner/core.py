@@ -28,8 +28,7 @@ from learner.td3 import TD3
 from learner.windows import Windows
 from messaging import brakeline_pb2 as pb
 from messaging import weights as policy
-from messaging.robots import Robot
-from messaging.tasks import layout, task_of
+from messaging.tasks import RobotWithTask
 
 MOST_ACTORS = 2048
 AHEAD = 1000  # steps beyond its permission that an actor may be: it had it from the learner before
@@ -45,14 +44,14 @@ class Learner:
 
     def __init__(
         self,
-        robot: Robot,
+        robot: RobotWithTask,
         config: LearnerConfig,
         incarnation: int = 0,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         """`incarnation` tells actors of a restart: they join again when it changes."""
         self._intake = Intake(robot)
-        td3, dims = config.td3, (task_of(robot).observation_dim, robot.action_dim)
+        td3, dims = config.td3, (robot.task.observation_dim, robot.action_dim)
         self.robot, self.config, self.incarnation = robot, config, incarnation
         networks, draws = np.random.SeedSequence(config.seed).spawn(2)
         self._td3 = TD3(*dims, td3, seed=int(networks.generate_state(1)[0]))
@@ -120,8 +119,8 @@ class Learner:
     def _refusal(self, join: pb.Join) -> pb.Error | None:
         if join.robot != self.robot.name:
             field, why = "robot", f"{join.robot!r} where {self.robot.name!r} is learned"
-        elif join.layout != layout(self.robot):
-            field, why = "layout", f"{join.layout!r} where {self.robot.name} has {layout(self.robot)!r} here"
+        elif join.layout != self.robot.learning_layout():
+            field, why = "layout", f"{join.layout!r} where {self.robot.name} has {self.robot.learning_layout()!r} here"
         elif not join.actor:
             field, why = "actor", "empty"
         elif join.index >= LATEST or join.episode >= LATEST:
@@ -187,7 +186,9 @@ class Learner:
     def _encode(self) -> None:
         noise = self.config.td3.exploration_noise
         file = policy.encode(self.robot, self._td3.policy_layers(), self._version, noise)
-        self._weights = pb.Weights(robot=self.robot.name, version=self._version, layout=layout(self.robot), file=file)
+        self._weights = pb.Weights(
+            robot=self.robot.name, version=self._version, layout=self.robot.learning_layout(), file=file
+        )
 
     def weights(self) -> pb.Weights:
         """The version published last."""
@@ -293,7 +294,7 @@ class Learner:
         }
 
     def _about(self) -> dict[str, Any]:
-        about = {"robot": self.robot.name, "layout": layout(self.robot), "steps": self.steps}
+        about = {"robot": self.robot.name, "layout": self.robot.learning_layout(), "steps": self.steps}
         return about | {"config": self.config.lasting()}
 
     def _compare(self, root: Path, about: dict[str, Any]) -> None:

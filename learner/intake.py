@@ -10,8 +10,7 @@ import numpy as np
 from learner.replay import Vector
 from learner.windows import Move
 from messaging import brakeline_pb2 as pb
-from messaging.robots import Robot
-from messaging.tasks import task_of
+from messaging.tasks import RobotWithTask
 
 # What no task pays and no sensor says: far beyond any, and far below what would drown the networks.
 AT_ONCE = 10.0  # times all that a task pays, a metre's progress included: no step is paid as much
@@ -32,9 +31,9 @@ class BadStep(ValueError):
 class Intake:
     """Reads the steps of one kind of robot. The reward learned is `reward − penalty`."""
 
-    def __init__(self, robot: Robot) -> None:
+    def __init__(self, robot: RobotWithTask) -> None:
         self.robot = robot
-        self.most_reward = AT_ONCE * sum(map(abs, astuple(task_of(robot).reward)))
+        self.most_reward = AT_ONCE * sum(map(abs, astuple(robot.task.reward)))
         self._centre, self._half = (robot.high() + robot.low()) / 2.0, (robot.high() - robot.low()) / 2.0
 
     def move(self, step: pb.Step) -> Move:
@@ -68,7 +67,7 @@ class Intake:
         return clipped
 
     def _observed(self, name: str, values: Any) -> Vector:
-        vector = _vector(name, values, task_of(self.robot).observation_dim)
+        vector = _vector(name, values, self.robot.task.observation_dim)
         if np.abs(vector).max() > MOST_OBSERVED:
             raise BadStep(name, f"{float(np.abs(vector).max())} is not plausible")
         return vector

@@ -18,7 +18,7 @@ from learner.adam import Adam
 from learner.networks import Network
 from learner.symmetry import Images
 from messaging.perceptrons import Perceptrons
-from messaging.robots import Robot
+from messaging.tasks import RobotWithTask
 
 Array = NDArray[np.float64]
 
@@ -65,7 +65,7 @@ def fit_linear(observation: Array, action: Array, change: Array, how: Fit, seed:
     return networks, np.sqrt(np.stack([((predicted - rest) ** 2).mean(0), (rest**2).mean(0)]))
 
 
-def fit_cost(robot: Robot, x: Array, cost: Array, count: int, how: Fit, seed: int) -> tuple[Perceptrons, float]:
+def fit_cost(robot: RobotWithTask, x: Array, cost: Array, count: int, how: Fit, seed: int) -> tuple[Perceptrons, float]:
     """`count` networks whose sigmoid is the cost (N,) in [0, 1] of inputs x (N, i), observations or pairs of
     observation and action; they differ by their start. They learn from images too (`learner/symmetry.py`).
 

@@ -23,7 +23,7 @@ from messaging import brakeline_pb2 as pb
 from messaging.bus import BusSettings, Sample
 from messaging.files import write_whole
 from messaging.process import Process
-from messaging.robots import robot_named
+from messaging.tasks import robot_with_task
 from messaging.topics import FLOW, JOIN, LEARNER, LOGGED, STEP, WEIGHTS
 
 log = logging.getLogger("brakeline.learner")
@@ -55,7 +55,7 @@ def main(settings: LearnerSettings) -> bool:
         CheckpointError: `resume` was asked for and is impossible, or was not and there is a checkpoint in the folder.
         UnknownRobot, Unreachable: as they say.
     """
-    robot = robot_named(settings.robot)
+    robot = robot_with_task(settings.robot)
     with Process(settings.bus, settings.source) as process:
         root = settings.out / CHECKPOINT
         if exists(root) and not settings.resume:
@@ -86,7 +86,7 @@ class LearnerLoop:
         self._wake = Event()
         self._said: object = None  # the content of the last flow
         self._flow_at = self._metrics_at = self._retry_at = -1e9
-        bus, robot = process.bus, robot_named(settings.robot).name
+        bus, robot = process.bus, learner.robot.name
         self._weights, self._flow = bus.publisher(WEIGHTS, robot=robot), bus.publisher(FLOW, robot=robot)
         self._metrics = bus.publisher(LEARNER, robot=robot)
         self._weights.put(learner.weights())

@@ -17,8 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from learner.replay import Batch, Replay
-from messaging.robots import Robot
-from messaging.tasks import task_of
+from messaging.tasks import RobotWithTask
 
 Indices = NDArray[np.intp]
 Matrix = NDArray[np.float64]
@@ -26,30 +25,30 @@ Matrix = NDArray[np.float64]
 OBSERVATION, ACTION, NEXT_OBSERVATION = (Replay.NAMES.index(n) for n in ("observation", "action", "next_observation"))
 
 
-def turns_of(robot: Robot) -> list[Matrix]:
+def turns_of(robot: RobotWithTask) -> list[Matrix]:
     """The R (d, d) under which a robot and its world stay the same, the identity first."""
     d = robot.position_dim
-    if task_of(robot).symmetry == "none":
+    if robot.task.symmetry == "none":
         return [np.eye(d)]
     swap = np.eye(d)[[1, 0, 2]]
     flips = [np.diag([x, y, 1.0]) for x, y in product((1.0, -1.0), repeat=2)]
     return [flip @ axes for axes in (np.eye(d), swap) for flip in flips]
 
 
-def image_of(robot: Robot, turn: Matrix) -> tuple[Indices, Matrix, Indices, Matrix]:
+def image_of(robot: RobotWithTask, turn: Matrix) -> tuple[Indices, Matrix, Indices, Matrix]:
     """Where each coordinate of an observation's image comes from, with which sign; the same of an action's.
 
     Raises:
         ValueError: the rays do not come upon each other.
     """
-    directions, d = task_of(robot).rays.directions, len(turn)
+    directions, d = robot.task.rays.directions, len(turn)
     alike = directions @ turn @ directions.T  # [j, i]: e_j · R e_i
     rays = alike.argmax(axis=1)
     if (alike.max(axis=1) < 1.0 - 1e-9).any():
         raise ValueError(f"the rays of {robot.name} are not the same after {turn.tolist()}")
     axes = np.abs(turn).argmax(axis=1)
     signs = turn[np.arange(d), axes]
-    vectors, left = divmod(task_of(robot).observation_dim - len(rays), d)
+    vectors, left = divmod(robot.task.observation_dim - len(rays), d)
     if left or robot.action_dim != d:
         raise ValueError(f"{robot.name} observes and does more than vectors of {d} coordinates")
     after = len(rays) + (np.arange(vectors)[:, None] * d + axes).ravel()
@@ -63,7 +62,7 @@ class Images:
     Rows are drawn at random, so which image of a transition is seen is as random.
     """
 
-    def __init__(self, robot: Robot, batch: int) -> None:
+    def __init__(self, robot: RobotWithTask, batch: int) -> None:
         turns = turns_of(robot)
         if len(turns) == 1:
             self._sources: dict[int, tuple[Indices, NDArray[np.float32]]] = {}

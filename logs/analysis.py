@@ -39,7 +39,7 @@ class Analysis:
         """`prefix` goes before the names of actors in episodes: it tells runs apart."""
         self.label, self.log, self.prefix = label, log, prefix
         self.look = look or Look()
-        self.metrics = Metrics()
+        self.metrics = Metrics(robots=log.robots)
         self.training: dict[str, Training] = {}  # by robot kind
         self.places: dict[str, Places] = {}
         self.galleries: dict[str, Gallery] = {}
@@ -123,7 +123,7 @@ class Analysis:
     def _gallery(self, robot: str) -> Gallery:
         gallery = self.galleries.get(robot)
         if gallery is None:
-            gallery = self.galleries[robot] = Gallery(robot, self.look.episode, self.look.actor)
+            gallery = self.galleries[robot] = Gallery(self.log.robots.named(robot), self.look.episode, self.look.actor)
             gallery.label = self.prefix
         return gallery
 

@@ -15,25 +15,24 @@ from logs.reader import TYPES, Log, Paths, Record, open_log
 from logs.segment import Entry, Segment, open_segment
 from logs.trajectories import ExportError, nothing_of
 from messaging import brakeline_pb2 as pb
-from messaging.robots import Robot
-from messaging.tasks import task_of
+from messaging.tasks import RobotWithTask
 
 BATCH = 1000  # messages that are written at once
 
 
-def columns(robot: Robot) -> dict[str, tuple[str, ...]]:
+def columns(robot: RobotWithTask) -> dict[str, tuple[str, ...]]:
     """The names within each repeated field of a step, in their order. What is not here is not exported: `path`."""
     return {
-        "observation": task_of(robot).observed,
+        "observation": robot.task.observed,
         "proposed": robot.action,
         "action": robot.action,
-        "next_observation": task_of(robot).observed,
+        "next_observation": robot.task.observed,
         "state": robot.state,
         "true_state": robot.state,
     }
 
 
-def to_csv(paths: Paths, robot: Robot, file: TextIO) -> int:
+def to_csv(paths: Paths, robot: RobotWithTask, file: TextIO) -> int:
     """Write every step of a robot kind in the log as a line, in the order of receipt; returns how many, at least one.
 
     Columns: log_time [ns], header.time [s], header.source, header.run, header.sequence, the message's fields by their
@@ -82,7 +81,8 @@ def to_foxglove(paths: Paths, out: Path, rate: float = math.inf) -> int:
     """
     if out.exists():
         raise ExportError(f"{out} is there already")
-    log, pictures = open_log(paths), Pictures(rate)
+    log = open_log(paths)
+    pictures = Pictures(rate, log.robots)
     segment: Segment | None = None
     count = 0
     batch: list[Entry] = []

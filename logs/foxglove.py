@@ -19,12 +19,13 @@ from google.protobuf.message import Message
 
 from logs import scene
 from logs.reader import Record
+from logs.robots import Robots
 from logs.segment import Entry
 from messaging import brakeline_pb2 as pb
 from messaging.bus import Sample
-from messaging.robots import Robot, robot_named
+from messaging.robots import Robot, UnknownRobot
 from messaging.surroundings import promised
-from messaging.tasks import task_of
+from messaging.tasks import RobotWithTask
 from messaging.topics import EPISODE, EXCHANGE, LOG, STEP
 
 log = logging.getLogger("brakeline.foxglove")
@@ -70,8 +71,10 @@ class _Actor:
 class Pictures:
     """Turns messages into Foxglove's, one by one. Whatever is wrong with one, there is only no picture of it."""
 
-    def __init__(self, rate: float = RATE) -> None:
-        """`rate`: steps drawn per second and actor, by the time when they came; infinite: every one."""
+    def __init__(self, rate: float = RATE, robots: Robots | None = None) -> None:
+        """rate: steps drawn per second and actor, by the time when they came; infinite: every one. robots: those that
+        the messages name; the rays of a robot without a task are not drawn."""
+        self._robots = robots or Robots()
         self.failures = 0
         self._spacing = 1.0 / rate
         self._sites = Sites()
@@ -105,7 +108,9 @@ class Pictures:
 
     def _episode(self, key: str, decode: Decode, time: int) -> list[Entry]:
         episode = decode()
-        robot, name = robot_named(episode.robot), episode.actor
+        robot, name = self._robots.named(episode.robot), episode.actor
+        if robot is None:
+            raise UnknownRobot(f"no robot is called {episode.robot!r}")
         site = self._sites.of(robot.name, name, 2.0 * scene.half_width(episode))
         actor = self._actors.setdefault(_source(key), _Actor(robot, name, site))
         actor.waiting = None
@@ -148,11 +153,14 @@ class Pictures:
                 exchange = None
         actor.waiting, actor.drawn = None, time * 1e-9
         robot, name = actor.robot, actor.name
-        return [
+        pictures = [
             _entry(actor, "frames", scene.frames(robot, name, actor.site, step.state, time), time),
             _entry(actor, "decision", scene.decision(robot, step, exchange, time, self._promises(exchange)), time),
-            _entry(actor, "lidar", scene.lidar(task_of(robot).rays, name, step.next_observation, time), time),
         ]
+        if isinstance(robot, RobotWithTask):
+            rays = scene.lidar(robot.task.rays, name, step.next_observation, time)
+            pictures.append(_entry(actor, "lidar", rays, time))
+        return pictures
 
     def _promises(self, exchange: pb.Exchange | None) -> list[np.ndarray]:
         """What the other robots of its world promised last, as far as it was drawn."""

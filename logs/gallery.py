@@ -15,7 +15,7 @@ from dataclasses import dataclass, field, replace
 from logs.picture import picture, rows
 from logs.tally import Figures
 from messaging import brakeline_pb2 as pb
-from messaging.robots import LATE, robot_if_known
+from messaging.robots import Robot
 
 NEAREST = 8
 COLLISIONS = 8
@@ -94,8 +94,8 @@ class Gallery:
     `wanted` is the number of an episode that is kept whatever happens in it, of every actor (or of `actor` alone).
     """
 
-    def __init__(self, robot: str, wanted: int | None = None, actor: str | None = None) -> None:
-        self.robot = robot_if_known(robot.removesuffix(LATE))  # what is drawn is the same in real time
+    def __init__(self, robot: Robot | None, wanted: int | None = None, actor: str | None = None) -> None:
+        self.robot = robot
         self.label = ""
         self.wanted, self.actor = wanted, actor
         self.found: list[Figures] = []  # the wanted ones, with all their steps

@@ -10,6 +10,7 @@ import math
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any, TypeVar
 
 from google.protobuf.message import Message
@@ -17,6 +18,7 @@ from google.protobuf.message import Message
 from logs import plans
 from logs.decisions import Decisions, joined
 from logs.plans import Plans
+from logs.robots import Robots
 from logs.sketch import Histogram, spread
 from logs.tally import KINDS, Figures, Tally, closed_loop
 from messaging import brakeline_pb2 as pb
@@ -73,10 +75,11 @@ class Metrics:
     memory that is bounded whatever they say.
 
     `topics` are those of which it is given every message: of these, what a process says it published and what never
-    came is missing.
+    came is missing. robots: those that the messages name.
     """
 
-    def __init__(self, topics: Iterable[Topic] = RECORDED) -> None:
+    def __init__(self, topics: Iterable[Topic] = RECORDED, robots: Robots | None = None) -> None:
+        self._robots = robots or Robots()
         self.actors: dict[str, Tally] = {}
         self.decisions: dict[str, Decisions] = {}  # by actor
         self.plans: dict[str, Plans] = {}  # by actor
@@ -193,7 +196,7 @@ class Metrics:
         name = exchange.request.actor
         decisions = self.decisions.get(name) or _entered(self.decisions, name, Decisions)
         decisions.exchange(exchange)
-        (self.plans.get(name) or _entered(self.plans, name, Plans)).exchange(exchange)
+        (self.plans.get(name) or _entered(self.plans, name, partial(Plans, self._robots))).exchange(exchange)
 
     def _learner(self, metrics: pb.LearnerMetrics) -> None:
         name = metrics.robot

@@ -7,14 +7,14 @@ many periods, and a stop is what keeps a robot from hitting anything: the unit i
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
+from logs.robots import Robots
 from logs.tally import Figures
 from messaging import brakeline_pb2 as pb
-from messaging.robots import robot_if_known
 
 Array = NDArray[np.float64]
 
@@ -29,6 +29,7 @@ class Plans:
     verified; outside: of these, in which it was measured outside of the plan's tube, at any period's end; excess: the
     largest share of a tube's half-width that any position came to."""
 
+    robots: Robots = field(default_factory=Robots)
     flown: int = 0
     outside: int = 0
     excess: float = 0.0
@@ -72,7 +73,7 @@ class Plans:
         assert self._tube is not None
         centers, half = self._tube
         k, d = self._periods - 1, centers.shape[1]
-        robot = robot_if_known(request.robot)
+        robot = self.robots.named(request.robot)
         error = np.zeros(d) if robot is None else np.asarray(robot.measurement_bound[:d])
         if k >= len(centers) or len(request.state) < d:
             return

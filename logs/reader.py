@@ -6,8 +6,6 @@ for record in read("runs/demo"):
 
 from __future__ import annotations
 
-import json
-import logging
 import os
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
@@ -19,13 +17,10 @@ from google.protobuf.message import DecodeError, Message
 from mcap.records import Attachment, Metadata
 
 from logs.container import Damage, NotMcap, Row, Series, records
+from logs.robots import Robots
 from logs.segment import being_written, name_of, number_of
-from messaging.descriptions import robot_of
 from messaging.plausible import Implausible, check
-from messaging.robots import known
 from messaging.topics import TOPICS
-
-log = logging.getLogger("brakeline.logs")
 
 Paths = str | os.PathLike[str] | Iterable[str | os.PathLike[str]]
 
@@ -111,6 +106,7 @@ class Log:
     cuts: list[Cut | Absent] = field(default_factory=list)
     malformed: int = 0  # messages that are not of their type, or say what nobody can handle
     segments: list[Segment] = field(default_factory=list)
+    robots: Robots = field(default_factory=Robots)
 
     def __iter__(self) -> Iterator[Record]:
         for series, message, log_time, publish_time in self.decoded():
@@ -149,7 +145,7 @@ class Log:
                     elif isinstance(item, Metadata):
                         self.metadata[item.name] = dict(item.metadata)
                         if item.name == "robots":
-                            _meet(item.metadata)
+                            self.robots.describe(item.metadata)
                     elif isinstance(item, Attachment):
                         self.attachments[item.name] = item.data
         except NotMcap as error:
@@ -226,12 +222,3 @@ def open_log(paths: Paths) -> Log:
 def read(paths: Paths) -> Iterator[Record]:
     """The messages of the log at `paths`, in the order in which they were recorded; as `open_log` where it fails."""
     yield from open_log(paths)
-
-
-def _meet(descriptions: dict[str, str]) -> None:
-    """Make the robots of a log known by their names; one that can't be is said, and the log is read all the same."""
-    for name, text in descriptions.items():
-        try:
-            known(robot_of(json.loads(text), f"the log's {name}"))
-        except ValueError as error:
-            log.warning("%s", error)

@@ -13,8 +13,7 @@ import numpy as np
 
 from logs.reader import Paths, open_log
 from messaging import brakeline_pb2 as pb
-from messaging.robots import Robot
-from messaging.tasks import task_of
+from messaging.tasks import RobotWithTask
 
 BATCH = 100  # episodes that are written at once
 # Per step, besides what Minari knows; `infos` of a data set.
@@ -25,7 +24,7 @@ class ExportError(ValueError):
     """Nothing can be written; the message says why."""
 
 
-def nothing_of(robot: Robot, others: Collection[str]) -> str:
+def nothing_of(robot: RobotWithTask, others: Collection[str]) -> str:
     """What to say of a log without a step of this robot, and what to give instead."""
     if not others:
         return f"no step of {robot.name} in the log, nor of any other robot"
@@ -33,7 +32,7 @@ def nothing_of(robot: Robot, others: Collection[str]) -> str:
     return f"no step of {robot.name} in the log; it has those of {names}: give --robot NAME, or its description's path"
 
 
-def episodes(paths: Paths, robot: Robot) -> Iterator[list[pb.Step]]:
+def episodes(paths: Paths, robot: RobotWithTask) -> Iterator[list[pb.Step]]:
     """Consecutive steps of one episode of one actor, in the order in which they ended.
 
     An episode that is cut off, by the log's end or by a lost step, comes in parts whose last step does not end it.
@@ -69,7 +68,7 @@ class Written:
     steps: int
 
 
-def to_minari(paths: Paths, robot: Robot, name: str) -> Written:
+def to_minari(paths: Paths, robot: RobotWithTask, name: str) -> Written:
     """Write the episodes of a robot kind as the local Minari data set `name`, e.g. "brakeline/ground-v0".
 
     Actions are those executed, rewards without the penalty; the proposed actions, the penalty and what the filter did
@@ -87,13 +86,13 @@ def to_minari(paths: Paths, robot: Robot, name: str) -> Written:
     if path.exists():
         raise ExportError(f"{path} is there already: give another name, e.g. with the next -v<number>")
     about: dict[str, Any] = {
-        "observation_space": gymnasium.spaces.Box(-np.inf, np.inf, (task_of(robot).observation_dim,), np.float32),
+        "observation_space": gymnasium.spaces.Box(-np.inf, np.inf, (robot.task.observation_dim,), np.float32),
         "action_space": gymnasium.spaces.Box(robot.low().astype(np.float32), robot.high().astype(np.float32)),
         "algorithm_name": "logged by brakeline",
         "author": "brakeline",
         "author_email": "none",
         "code_permalink": "none",
-        "description": f"{robot.name}: observation {task_of(robot).observed}; action {robot.action}",
+        "description": f"{robot.name}: observation {robot.task.observed}; action {robot.action}",
     }
     every = episodes(paths, robot)
     dataset: Any = None

@@ -10,6 +10,7 @@ import math
 import re
 import tomllib
 from collections import Counter
+from functools import lru_cache
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -105,12 +106,19 @@ def read(path: Path) -> Robot:
         BadDescription: with every mistake; UnknownRobot: there is no such file, or it is no TOML.
     """
     try:
-        values = tomllib.loads(path.read_text())
+        text = path.read_text()
     except (OSError, UnicodeDecodeError) as error:
         raise UnknownRobot(f"{path}: {error}; a robot is a name or the path of a description (.toml)") from error
+    return _robot_in(text, str(path))
+
+
+@lru_cache(maxsize=64)
+def _robot_in(text: str, source: str) -> Robot:
+    """The robot in a file of this content: the file is read each time, and checked once."""
+    try:
+        return robot_of(tomllib.loads(text), source)
     except tomllib.TOMLDecodeError as error:
-        raise BadDescription(str(path), [("", f"not TOML: {error}")]) from error
-    return robot_of(values, str(path))
+        raise BadDescription(source, [("", f"not TOML: {error}")]) from error
 
 
 def robot_of(values: Any, source: str = "this") -> Robot:

@@ -12,7 +12,7 @@ import math
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -113,7 +113,7 @@ class Robot:
         """So many of a plan's free inputs are no longer free when the question is asked."""
         return int(self.late)
 
-    def in_real_time(self) -> Robot:
+    def in_real_time(self) -> Self:
         """The same robot where the world does not wait for an answer: it decides on the period after this one.
 
         Raises:
@@ -123,7 +123,7 @@ class Robot:
             raise UnknownRobot(f"{self.name} stops by feedback: it has no real-time mode")
         return replace(self, name=self.name + LATE, late=True, horizon=self.horizon + 1, free_steps=self.free_steps + 1)
 
-    def in_lockstep(self) -> Robot:
+    def in_lockstep(self) -> Self:
         """The same robot where the world waits."""
         if not self.late:
             return self
@@ -263,8 +263,6 @@ FORMER_LAYOUTS = {
     "quadrotor-late": "296e1f047a7fcc62",
 }
 
-_known: dict[str, Robot] = {}  # by name, those that were read
-
 
 def shipped() -> tuple[str, ...]:
     """The names of the robots that come with the program."""
@@ -272,10 +270,11 @@ def shipped() -> tuple[str, ...]:
 
 
 def robot_named(name: str) -> Robot:
-    """The robot of that name, or in the file at that path; with `LATE` at the end, the same in real time. Which of its
-    tasks is named too (`ground+tracks`) makes no other robot of it.
+    """Read the robot of a name or at a path.
 
-    A name is one that comes with the program, or one whose file, or model set, was read before.
+    Args:
+        name: of a robot that comes with the program, or the path of a description (.toml). `LATE` at its end: the same
+            robot in real time. A task's name after the robot's (`ground+tracks`) makes no other robot of it.
 
     Raises:
         UnknownRobot: with the names there are, or every mistake in the file.
@@ -283,44 +282,25 @@ def robot_named(name: str) -> Robot:
     from messaging.descriptions import read
 
     base = name.removesuffix(LATE)
-    if not base.endswith(".toml"):
+    if base.endswith(".toml"):
+        robot = unless_shipped(read(Path(base)))
+    else:
         base = base.partition(WITH)[0]
-    robot = _known.get(base)
-    if robot is None:
-        path = Path(base) if base.endswith(".toml") else FOLDER / f"{base}.toml"
-        if path.parent == FOLDER and path.stem not in shipped():
+        if base not in shipped():
             raise UnknownRobot(
                 f"no robot is called {name!r}; there are: {', '.join(shipped())}, or the path of a description (.toml)"
             )
-        robot = _known[base] = known(read(path))
+        robot = read(FOLDER / f"{base}.toml")
     return robot.in_real_time() if name.endswith(LATE) else robot
 
 
-def robot_if_known(name: str) -> Robot | None:
-    """`robot_named`, or None."""
-    try:
-        return robot_named(name)
-    except UnknownRobot:
-        return None
-
-
-def known(robot: Robot) -> Robot:
-    """The same robot, to be found by its name from now on.
+def unless_shipped(robot: Robot) -> Robot:
+    """Return the robot, unless it takes the name of a robot that comes with the program and differs from it.
 
     Raises:
-        UnknownRobot: another of that name comes with the program.
+        UnknownRobot: it does.
     """
-    base = robot.in_lockstep()
-    if base.name in shipped():
-        own = _known.get(base.name) or _read_shipped(base.name)
-        if own != base:
-            raise UnknownRobot(f"{base.name} is the name of a robot that comes with the program: choose another")
-        base = own
-    _known[base.name] = base
+    name = robot.in_lockstep().name
+    if name in shipped() and robot.description != robot_named(name).description:
+        raise UnknownRobot(f"{name} is the name of a robot that comes with the program: choose another")
     return robot
-
-
-def _read_shipped(name: str) -> Robot:
-    from messaging.descriptions import read
-
-    return read(FOLDER / f"{name}.toml")

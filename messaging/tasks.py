@@ -14,7 +14,7 @@ import importlib.util
 import json
 import sys
 import tomllib
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
@@ -170,79 +170,107 @@ def _module_in(path: Path) -> Any:
     return sys.modules[name]
 
 
-_tasks: dict[str, Task] = {}  # by the robot's kind
-_files: dict[str, Path] = {}  # by the robot's kind, where a task was said to lie
+@dataclass(frozen=True)
+class RobotWithTask(Robot):
+    """A robot together with what is learned with it: what an environment, a policy, and a learner need.
 
-
-def task_of(robot: Robot) -> Task:
-    """The task of a robot: of those that come with the program, or the one in the file beside the robot's.
-
-    Raises:
-        UnknownTask: there is none.
+    The filter needs a `Robot` alone: a request, a model set, and a data set know no task.
     """
-    if robot.kind not in _tasks:
-        path = _files.get(robot.kind, FOLDER / f"{robot.kind}.task.toml")
-        if not path.is_file():
-            raise UnknownTask(f"{robot.kind} has no task: what it observes, is paid, and drives in (expected: {path})")
-        _tasks[robot.kind] = read(path)
-    return _tasks[robot.kind]
+
+    task: Task = field(kw_only=True, hash=False)
+
+    def learning_layout(self) -> str:
+        """Hash of what an actor and a learner must share: the robot's vectors, and what is observed."""
+        words = json.dumps([self.layout(), *self.task.observed])
+        return hashlib.sha256(words.encode()).hexdigest()[:16]
+
+    def accepts_learning_layout(self, layout: object) -> bool:
+        """Is it this learning layout, or the one that the robot had before robots were files?"""
+        return layout == self.learning_layout() or layout == FORMER_LAYOUTS.get(self.name)
 
 
-def usual_task(robot: Robot) -> Task:
-    """Read the task that comes with the program for the robot of that name.
+def with_task(robot: Robot, task: Task) -> RobotWithTask:
+    """The robot together with a task."""
+    return RobotWithTask(**{part.name: getattr(robot, part.name) for part in fields(Robot)}, task=task)
+
+
+def robot_with_task(name: str) -> RobotWithTask:
+    """Read the robot of a name or at a path, and its task.
+
+    Args:
+        name: as `robot_named` takes it. The task of `my.toml` is `my.task.toml` beside it; `ground+tracks` is the robot
+            `ground` with another task than its usual one.
 
     Raises:
-        UnknownTask: none comes with the program.
+        UnknownRobot; UnknownTask: there is no such task.
     """
-    path = FOLDER / f"{robot.kind}.task.toml"
-    if not path.is_file():
-        raise UnknownTask(f"no task of {robot.kind} comes with the program (expected: {path})")
-    return read(path)
+    return with_task(robot_named(name), read(task_path(name)))
 
 
-def learnt(name: str) -> Robot:
-    """`robot_named`, and from now on its task is the one that the name says: the file beside the description, if the
-    name is a path; another than the usual one, if it has a `+`.
+def robot_maybe_with_task(name: str) -> Robot:
+    """Read the robot of a name or at a path, together with its task if it has one: somebody's own robot needs none.
 
     Raises:
-        UnknownRobot; UnknownTask: there is no such other task.
+        UnknownRobot; UnknownTask: the name says a task that there is not, or its file is none.
     """
     robot = robot_named(name)
-    if name.endswith(".toml"):
-        _choose(robot, Path(name).with_suffix(".task.toml"))
-    elif WITH in name:
-        path = FOLDER / f"{name.removesuffix(LATE)}.task.toml"
-        if not path.is_file():
-            there = sorted(p.name.removesuffix(".task.toml") for p in FOLDER.glob(f"{robot.kind}{WITH}*.task.toml"))
-            raise UnknownTask(f"there is no {name}; of {robot.kind} there are, besides itself: {', '.join(there)}")
-        _choose(robot, path)
-    elif WITH in _files.get(robot.kind, Path()).name:
-        _choose(robot, None)
+    if name.endswith(".toml") and not _task_beside(name).is_file():
+        return robot
+    return with_task(robot, read(task_path(name)))
+
+
+def needs_task(robot: Robot) -> RobotWithTask:
+    """Return the robot if it has a task.
+
+    Raises:
+        UnknownTask: it has none.
+    """
+    if not isinstance(robot, RobotWithTask):
+        raise UnknownTask(
+            f"{robot.name} has no task: what it observes, is paid, and drives in ({robot.kind}.task.toml)"
+        )
     return robot
 
 
-def _choose(robot: Robot, path: Path | None) -> None:
-    """The robot's task is that of this file; None: its usual one."""
-    if _files.get(robot.kind) == path:
-        return
-    _tasks.pop(robot.kind, None)
-    if path is None:
-        del _files[robot.kind]
+def task_path(name: str) -> Path:
+    """The file of the task that belongs to a robot's name or path.
+
+    Raises:
+        UnknownRobot; UnknownTask: there is no such file.
+    """
+    if name.removesuffix(LATE).endswith(".toml"):
+        path = _task_beside(name)
     else:
-        _files[robot.kind] = path
+        path = FOLDER / f"{name.removesuffix(LATE)}.task.toml"
+    if path.is_file():
+        return path
+    kind = robot_named(name).kind
+    if WITH in name and not name.removesuffix(LATE).endswith(".toml"):
+        there = sorted(p.name.removesuffix(".task.toml") for p in FOLDER.glob(f"{kind}{WITH}*.task.toml"))
+        raise UnknownTask(f"there is no {name}; of {kind} there are, besides itself: {', '.join(there)}")
+    raise UnknownTask(f"{kind} has no task: what it observes, is paid, and drives in (expected: {path})")
+
+
+def _task_beside(path: str) -> Path:
+    return Path(path.removesuffix(LATE)).with_suffix(".task.toml")
 
 
 def address(name: str) -> str:
-    """What another process finds the robot and its task by: the name, or the path made absolute."""
-    if name.endswith(".toml"):
-        return str(Path(name).resolve())
-    robot = learnt(name)
-    return name if WITH in name else robot.name
+    """What another process finds the robot and its task by: the name, or the path made absolute.
+
+    Raises:
+        UnknownRobot; UnknownTask: there is no such robot, or no such task of it.
+    """
+    base = name.removesuffix(LATE)
+    if base.endswith(".toml"):
+        return str(Path(base).resolve()) + name[len(base) :]
+    task_path(name)
+    return name
 
 
-def enlist(robot: Robot, task: Task) -> None:
-    """From now on this is the robot's task."""
-    _tasks[robot.kind] = task
+def address_in_real_time(name: str) -> str:
+    """The same of the robot in real time."""
+    return address(name.removesuffix(LATE)) + LATE
 
 
 def read(path: Path) -> Task:
@@ -277,14 +305,3 @@ def _alike(arenas: dict[str, Any], name: str) -> dict[str, Any]:
     own = dict(arenas[name])
     base = own.pop("like", None)
     return (_alike(arenas, base) if base is not None else {}) | own
-
-
-def layout(robot: Robot) -> str:
-    """Hash of what an actor and a learner must share: the robot's vectors and what is observed."""
-    words = json.dumps([robot.layout(), *task_of(robot).observed])
-    return hashlib.sha256(words.encode()).hexdigest()[:16]
-
-
-def understands(robot: Robot, said: object) -> bool:
-    """Is it that layout, or the one it had before robots were files?"""
-    return said == layout(robot) or said == FORMER_LAYOUTS.get(robot.name)

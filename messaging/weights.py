@@ -18,8 +18,8 @@ import safetensors
 import safetensors.numpy
 from numpy.typing import NDArray
 
-from messaging.robots import Array, Robot, UnknownRobot, robot_named
-from messaging.tasks import layout, task_of, understands
+from messaging.robots import LATE, Array, shipped
+from messaging.tasks import RobotWithTask, robot_with_task
 
 Matrix = NDArray[np.float32]
 Layers = Sequence[tuple[Matrix, Matrix]]  # weight (out, in), bias (out,)
@@ -35,7 +35,7 @@ class MLP:
     Working memory is allocated once, so one `MLP` belongs to one thread.
     """
 
-    def __init__(self, robot: Robot, layers: Layers, version: int = 0, noise: float = 0.0) -> None:
+    def __init__(self, robot: RobotWithTask, layers: Layers, version: int = 0, noise: float = 0.0) -> None:
         """`noise`: standard deviation of the exploration, as a fraction of half an action's range.
 
         Raises:
@@ -44,17 +44,17 @@ class MLP:
         _check(robot, layers)
         self.robot, self.version, self.noise = robot, version, noise
         self.layers = [(np.array(weight, np.float32), np.array(bias, np.float32)) for weight, bias in layers]
-        self._input = np.zeros(task_of(robot).observation_dim, np.float32)
+        self._input = np.zeros(robot.task.observation_dim, np.float32)
         self._outputs = [np.zeros_like(bias) for _, bias in self.layers]
         self._low, self._high = robot.low(), robot.high()
         self._centre, self._half = (self._high + self._low) / 2.0, (self._high - self._low) / 2.0
 
     @classmethod
-    def untrained(cls, robot: Robot, seed: int, hidden: tuple[int, ...] = (256, 256)) -> MLP:
+    def untrained(cls, robot: RobotWithTask, seed: int, hidden: tuple[int, ...] = (256, 256)) -> MLP:
         """Uniform in ±1/√(inputs of the layer), as the learner starts."""
         generator = np.random.default_rng(seed)
         layers = []
-        for inputs, outputs in pairwise((task_of(robot).observation_dim, *hidden, robot.action_dim)):
+        for inputs, outputs in pairwise((robot.task.observation_dim, *hidden, robot.action_dim)):
             bound = 1.0 / np.sqrt(inputs)
             draw = generator.uniform(-bound, bound, (outputs, inputs + 1)).astype(np.float32)
             layers.append((draw[:, :inputs], draw[:, inputs]))
@@ -62,7 +62,7 @@ class MLP:
 
     @property
     def sizes(self) -> tuple[int, ...]:
-        return (task_of(self.robot).observation_dim, *(len(bias) for _, bias in self.layers))
+        return (self.robot.task.observation_dim, *(len(bias) for _, bias in self.layers))
 
     def __call__(self, observation: NDArray[Any]) -> Array:
         """The action (action_dim,), in the robot's units."""
@@ -92,7 +92,7 @@ class MLP:
         path.write_bytes(self.encode())
 
     @classmethod
-    def load(cls, path: Path, robot: Robot | None = None) -> MLP:
+    def load(cls, path: Path, robot: RobotWithTask | None = None) -> MLP:
         """
         Raises:
             BadWeights: the file is not a policy (of that robot, if one is given).
@@ -101,18 +101,18 @@ class MLP:
         return decode(path.read_bytes(), robot)
 
 
-def encode(robot: Robot, layers: Layers, version: int, noise: float = 0.0) -> bytes:
+def encode(robot: RobotWithTask, layers: Layers, version: int, noise: float = 0.0) -> bytes:
     """The same arguments give the same bytes."""
     tensors = {}
     for number, (weight, bias) in enumerate(layers):
         tensors[f"layers.{number}.weight"] = np.ascontiguousarray(weight, np.float32)
         tensors[f"layers.{number}.bias"] = np.ascontiguousarray(bias, np.float32)
-    about = {"robot": robot.name, "layout": layout(robot), "version": version, "noise": noise}
+    about = {"robot": robot.name, "layout": robot.learning_layout(), "version": version, "noise": noise}
     # One entry: the order of several would change from call to call.
     return safetensors.numpy.save(tensors, {"policy": json.dumps(about, sort_keys=True)})
 
 
-def decode(data: bytes, robot: Robot | None = None) -> MLP:
+def decode(data: bytes, robot: RobotWithTask | None = None) -> MLP:
     """The policy in `data`; `robot` is the one it must be for, else the one that it names.
 
     Raises:
@@ -144,18 +144,17 @@ def decode(data: bytes, robot: Robot | None = None) -> MLP:
     return MLP(robot, layers, version, float(noise))
 
 
-def _robot(about: Any, robot: Robot | None) -> Robot:
+def _robot(about: Any, robot: RobotWithTask | None) -> RobotWithTask:
     if not isinstance(about, dict) or not isinstance(about.get("robot"), str):
         raise BadWeights("robot: missing")
     if robot is None:
-        try:
-            robot = robot_named(about["robot"])
-        except UnknownRobot as error:
-            raise BadWeights(f"robot: unknown, {about['robot']!r}") from error
+        if about["robot"].removesuffix(LATE) not in shipped():  # the name is from outside: no path is read
+            raise BadWeights(f"robot: unknown, {about['robot']!r}")
+        robot = robot_with_task(about["robot"])
     if about["robot"] != robot.name:
         raise BadWeights(f"robot: of {about['robot']!r} where {robot.name!r} is meant")
-    if not understands(robot, about.get("layout")):
-        raise BadWeights(f"layout: {about.get('layout')!r} where {robot.name} has {layout(robot)!r}")
+    if not robot.accepts_learning_layout(about.get("layout")):
+        raise BadWeights(f"layout: {about.get('layout')!r} where {robot.name} has {robot.learning_layout()!r}")
     return robot
 
 
@@ -167,10 +166,10 @@ def _array(entries: dict[str, Any], name: str) -> Matrix:
     return array
 
 
-def _check(robot: Robot, layers: Layers) -> None:
+def _check(robot: RobotWithTask, layers: Layers) -> None:
     if not layers:
         raise BadWeights("layers: there are none")
-    inputs = task_of(robot).observation_dim
+    inputs = robot.task.observation_dim
     for number, (weight, bias) in enumerate(layers):
         if weight.ndim != 2 or weight.shape[1] != inputs or bias.shape != weight.shape[:1] or not len(bias):
             raise BadWeights(f"layers.{number}: {weight.shape} and {bias.shape} behind {inputs} inputs")

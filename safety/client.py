@@ -183,8 +183,9 @@ def bus_at(connect: str | Sequence[str], keys: Path | str | None, name: str) -> 
 class BusAsker:
     """A bus to ask about robots of one kind, closed with it if it is its own."""
 
-    def __init__(self, bus: Bus, robot: str, deadline: float) -> None:
-        self.bus, self.robot, self.deadline = bus, robot_named(robot), deadline
+    def __init__(self, bus: Bus, robot: Robot | str, deadline: float) -> None:
+        self.bus, self.deadline = bus, deadline
+        self.robot = robot_named(robot) if isinstance(robot, str) else robot
         self._owned = False
 
     def close(self) -> None:
@@ -205,7 +206,7 @@ class SafetyClient(BusAsker):
     `FleetClient` for those that share a world.
     """
 
-    def __init__(self, bus: Bus, robot: str, deadline: float = DEADLINE) -> None:
+    def __init__(self, bus: Bus, robot: Robot | str, deadline: float = DEADLINE) -> None:
         super().__init__(bus, robot, deadline)
         self.commitment = Commitment(self.robot)
 
@@ -213,7 +214,7 @@ class SafetyClient(BusAsker):
     def open(
         cls,
         connect: str | Sequence[str],
-        robot: str,
+        robot: Robot | str,
         deadline: float = DEADLINE,
         keys: Path | str | None = None,
         name: str = "client",
@@ -221,6 +222,7 @@ class SafetyClient(BusAsker):
         """A client with a bus of its own.
 
         Args:
+            robot: the robot, its name, or the path of its description.
             keys: the folder with the keys of `name`, if the bus has keys; its endpoints are then tls/HOST:PORT.
 
         Raises:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from messaging.descriptions import robot_of
 from messaging.files import write_whole
-from messaging.robots import Robot, UnknownRobot, known, robot_named
+from messaging.robots import Robot, UnknownRobot, robot_named, unless_shipped
 from safety.tensors import pack, unpack
 
 Array = NDArray[np.float64]
@@ -124,7 +124,7 @@ class Dataset:
         try:
             name = str(about["robot"])
             described = about.get("description")
-            robot = robot_named(name) if described is None else known(robot_of(json.loads(described), name))
+            robot = robot_named(name) if described is None else unless_shipped(robot_of(json.loads(described), name))
         except (UnknownRobot, ValueError, TypeError) as error:
             raise BadData(f"{path}: {error}") from error
         if robot.name != name:

@@ -14,6 +14,7 @@ from typing import Self
 from numpy.typing import ArrayLike
 
 from messaging.bus import Bus
+from messaging.robots import Robot
 from messaging.sensed import Sensed
 from messaging.shapes import Obstacle
 from safety.asker import Answer, accept
@@ -28,7 +29,7 @@ class FleetClient(BusAsker):
     begin standing still. Not for several threads at once.
     """
 
-    def __init__(self, bus: Bus, robot: str, names: Sequence[str], deadline: float = DEADLINE) -> None:
+    def __init__(self, bus: Bus, robot: Robot | str, names: Sequence[str], deadline: float = DEADLINE) -> None:
         """robot: what all of them are; names: by which the service tells them apart.
 
         Raises:
@@ -45,7 +46,7 @@ class FleetClient(BusAsker):
     def open(
         cls,
         connect: str | Sequence[str],
-        robot: str,
+        robot: Robot | str,
         names: Sequence[str],
         deadline: float = DEADLINE,
         keys: Path | str | None = None,

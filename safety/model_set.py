@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from messaging.descriptions import robot_of
 from messaging.files import write_whole
-from messaging.robots import FORMER_LAYOUTS, LATE, Robot, UnknownRobot, known, robot_named
+from messaging.robots import FORMER_LAYOUTS, LATE, Robot, UnknownRobot, robot_named, unless_shipped
 from safety.certificates import Certificate
 from safety.recipe import DIRECT as DIRECT
 from safety.recipe import FREE, PLAN
@@ -150,7 +150,7 @@ class ModelSet:
         """Raises BadModel unless the bytes are a complete, finite model set of a robot that this program knows."""
         try:
             tensors, about = unpack(payload, ENTRY)
-            robot = _robot_in(about)
+            robot = robot_in(about)
             recipe = Recipe(**about["recipe"])
             certificates = {
                 name: Certificate(*(tensors[f"{name}.{t}"] for t in TENSORS))
@@ -181,7 +181,7 @@ class ModelSet:
         """Raises BadModel, naming the file."""
         try:
             model = ModelSet.decode(Path(path).read_bytes())
-            known(model.robot)
+            unless_shipped(model.robot)
             return model
         except OSError as error:
             raise BadModel(f"{path}: {error}") from error
@@ -189,7 +189,7 @@ class ModelSet:
             raise BadModel(f"{path}: {error}") from error
 
 
-def _robot_in(about: dict[str, Any]) -> Robot:
+def robot_in(about: dict[str, Any]) -> Robot:
     """The robot that a model set is of: it carries its description, unless it is older than those.
 
     Raises:

@@ -12,7 +12,7 @@ from time import perf_counter_ns
 from messaging import brakeline_pb2 as pb
 from messaging.bus import BusError, BusSettings, Sample
 from messaging.process import Process
-from messaging.robots import UnknownRobot, known, robot_named
+from messaging.robots import LATE, UnknownRobot, shipped, unless_shipped
 from messaging.topics import DECIDE, MODEL
 from safety.commitment import UNVERIFIED
 from safety.digest import digest
@@ -50,7 +50,7 @@ class Models:
         """
         method = ready(model)
         try:
-            known(model.robot)
+            unless_shipped(model.robot)
         except UnknownRobot as error:
             raise BadModel(str(error)) from error
         with self._lock:
@@ -62,13 +62,14 @@ class Models:
 
     def filter_for(self, request: pb.Request) -> Method:
         """Raises UnknownRobot, NoModel or StaleModel."""
-        robot = robot_named(request.robot)
-        method = self.filters.get(robot.name)
+        method = self.filters.get(request.robot)
         if method is None:
+            if request.robot.removesuffix(LATE) not in shipped():
+                raise UnknownRobot(f"no robot is called {request.robot!r:.80} here")
             have = ", ".join(self.filters) or "none"
-            raise NoModel("robot", f"no model of {robot.name} is loaded (loaded: {have})")
+            raise NoModel("robot", f"no model of {request.robot} is loaded (loaded: {have})")
         vouched = request.model in ("", UNVERIFIED) or request.model in self.known
-        if not vouched and not self._archived(robot.name, request.model):
+        if not vouched and not self._archived(request.robot, request.model):
             raise StaleModel("model", f"the plan was verified by model {request.model}, which was never in use here")
         return method
 

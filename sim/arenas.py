@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from messaging.robots import Robot
 from messaging.shapes import BOX, CYLINDER, SPHERE, WALL, Obstacle, Shapes
-from messaging.tasks import ArenaKind, MoverKind, task_of
+from messaging.tasks import ArenaKind, MoverKind, RobotWithTask
 from sim.movers import Crowd
 from sim.world import Arena, alike, closing, room_bounds
 
@@ -41,16 +41,16 @@ def bounds_of(kind: ArenaKind) -> tuple[tuple[float, float], ...]:
     return room_bounds(kind.half_width, kind.height)
 
 
-def arena_kind(robot: Robot, name: str) -> ArenaKind:
+def arena_kind(robot: RobotWithTask, name: str) -> ArenaKind:
     """Raises UnknownArena with the names there are for this robot."""
-    kinds = task_of(robot).arenas
+    kinds = robot.task.arenas
     if name not in kinds:
         there = ", ".join(sorted(kinds)) or "none"
         raise UnknownArena(f"no arena is called {name!r}; there are: {there} ({robot.kind})")
     return kinds[name]
 
 
-def draw_arena(name: str, rng: np.random.Generator, robot: Robot) -> Arena:
+def draw_arena(name: str, rng: np.random.Generator, robot: RobotWithTask) -> Arena:
     """An arena of that name in which `robot` can get from start to goal.
 
     Raises:
@@ -76,7 +76,7 @@ def draw_arena(name: str, rng: np.random.Generator, robot: Robot) -> Arena:
     raise NoArena(f"no arena {name!r} with a way from start to goal in {ATTEMPTS} draws")
 
 
-def draw_fleet(name: str, rng: np.random.Generator, robot: Robot, size: int) -> tuple[Arena, ...]:
+def draw_fleet(name: str, rng: np.random.Generator, robot: RobotWithTask, size: int) -> tuple[Arena, ...]:
     """The same arena for several robots, each with a start and a goal of its own.
 
     Raises:
@@ -138,7 +138,7 @@ def _with_movers(arena: Arena, kind: MoverKind, rng: np.random.Generator) -> Are
     return replace(arena, crowd=Crowd(kind, places, arena.shapes, int(rng.integers(2**31))))
 
 
-def tour(arena: Arena, goals: int, rng: np.random.Generator, robot: Robot) -> tuple[Arena, ...]:
+def tour(arena: Arena, goals: int, rng: np.random.Generator, robot: RobotWithTask) -> tuple[Arena, ...]:
     """The same arena with one goal after another, for a robot that is not put back: each start is the goal before.
 
     Raises:

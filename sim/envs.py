@@ -12,9 +12,8 @@ from gymnasium.spaces import Box
 from numpy.typing import NDArray
 
 from messaging.movers import Movers
-from messaging.robots import Robot
 from messaging.shapes import Obstacle
-from messaging.tasks import Reward, task_of
+from messaging.tasks import Reward, RobotWithTask
 from sim.arenas import draw_arena
 from sim.conditions import Conditions
 from sim.estimator import wrap
@@ -27,7 +26,7 @@ from sim.world import Arena
 Array = NDArray[np.float64]
 Observation = NDArray[np.float32]
 Info = dict[str, Any]
-DrawArena = Callable[[str, np.random.Generator, Robot], Arena]
+DrawArena = Callable[[str, np.random.Generator, RobotWithTask], Arena]
 
 OBSERVED_LIMIT = 1.5  # every coordinate of the observation is clipped to ± this
 
@@ -72,7 +71,7 @@ class NavigationEnv(gymnasium.Env[Observation, Any]):
 
     def __init__(
         self,
-        robot: Robot,
+        robot: RobotWithTask,
         arena: str = "default",
         make_vehicle: MakeVehicle | None = None,
         lidar_noise: float = LIDAR_NOISE,
@@ -87,7 +86,7 @@ class NavigationEnv(gymnasium.Env[Observation, Any]):
         draw: makes an episode's arena; perception: where free space comes from; from the map, unless given.
         """
         self.robot, self.arena_name, self.seed_key = robot, arena, seed_key
-        self.task = task_of(robot)
+        self.task = robot.task
         self.reward = reward or self.task.reward
         self.action_space = Box(robot.low().astype(np.float32), robot.high().astype(np.float32), dtype=np.float32)
         limit = np.full(self.task.observation_dim, OBSERVED_LIMIT, dtype=np.float32)

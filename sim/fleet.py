@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from messaging.robots import Robot
+from messaging.tasks import RobotWithTask
 from sim.arenas import arena_kind, draw_fleet
 from sim.conditions import Conditions
 from sim.envs import Info, NavigationEnv, Observation
@@ -29,12 +29,12 @@ class NoFleet(ValueError):
     """There is no world for several robots of this kind."""
 
 
-def check_fleet(robot: Robot, arena: str, size: int, conditions: Conditions) -> None:
+def check_fleet(robot: RobotWithTask, arena: str, size: int, conditions: Conditions) -> None:
     """
     Raises:
         NoFleet: there is no such world, for robots of this kind, in that arena, under these conditions; UnknownArena.
     """
-    if robot != GROUND:
+    if robot.layout() != GROUND.layout():
         raise NoFleet(f"several {robot.name} robots in one world are not there: ground robots are")
     if arena_kind(robot, arena).movers is not None:
         raise NoFleet(f"{arena} has things that move: a fleet's arena has none but its robots")
@@ -117,7 +117,9 @@ class GroundWorld:
 class FleetEnv:
     """A world of `size` robots, drawn anew by each reset; `members` are the robots' own environments."""
 
-    def __init__(self, robot: Robot, arena: str, size: int, seed: int, conditions: Conditions | None = None) -> None:
+    def __init__(
+        self, robot: RobotWithTask, arena: str, size: int, seed: int, conditions: Conditions | None = None
+    ) -> None:
         """seed: sets its episodes apart from those of another seed.
 
         Raises:
@@ -153,7 +155,7 @@ class _Member(NavigationEnv):
     """The environment of the i-th robot: `info` gains `others`, their measured states (size - 1, n)."""
 
     def __init__(self, fleet: FleetEnv, i: int, lidar_noise: float) -> None:
-        def draw(name: str, rng: np.random.Generator, robot: Robot) -> Arena:
+        def draw(name: str, rng: np.random.Generator, robot: RobotWithTask) -> Arena:
             there = fleet.world.robots
 
             def now() -> Array:

@@ -24,7 +24,7 @@ class Lidar:
 
         The noise is normal, cut off at 2 sigma, anew each range; it needs `rng`.
         """
-        self.max_range, self._noise, self._rng = rays.range, noise, rng
+        self.rays, self.max_range, self._noise, self._rng = rays, rays.range, noise, rng
         beams = np.zeros((len(rays.directions), 3))
         beams[:, : arena.dim] = rays.directions
         self._beams = beams

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from messaging.robots import Robot
-from messaging.tasks import task_of
+from messaging.tasks import RobotWithTask
 from sim.estimator import wrap
 from sim.passing import Passing
 from sim.pilots import way_to_nearest
@@ -28,13 +28,13 @@ class UnknownPolicy(ValueError):
     """No scripted policy has that name."""
 
 
-def scripted(name: str, robot: Robot, rng: np.random.Generator) -> Policy:
+def scripted(name: str, robot: RobotWithTask, rng: np.random.Generator) -> Policy:
     """The scripted policy of that name (`task.policies`). It notices new episodes itself.
 
     Raises:
         UnknownPolicy: with the names there are, or because the robot has none.
     """
-    task = task_of(robot)
+    task = robot.task
     if name not in task.policies:
         there = ", ".join(task.policies) or "none"
         raise UnknownPolicy(f"no policy of the {robot.kind} is called {name!r}; there are: {there}")

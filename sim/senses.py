@@ -9,8 +9,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from messaging.robots import Robot
-from messaging.tasks import task_of
+from messaging.tasks import RobotWithTask
 from sim.lidar import Lidar
 from sim.movers import Crowd, Others, Watch
 from sim.world import Arena
@@ -56,9 +55,9 @@ class GroundSenses:
     MOUNT = -0.032  # m, the lidar's place along the robot's x axis from the axle's midpoint
     DISTANCE_SCALE = 5.0  # m, the goal distance that is observed as 1
 
-    def __init__(self, robot: Robot, arena: Arena, rng: np.random.Generator, lidar_noise: float) -> None:
+    def __init__(self, robot: RobotWithTask, arena: Arena, rng: np.random.Generator, lidar_noise: float) -> None:
         self._robot, self._goal = robot, arena.goal
-        self._lidar = Lidar(arena, task_of(robot).rays, lidar_noise, rng)
+        self._lidar = Lidar(arena, robot.task.rays, lidar_noise, rng)
         self._memory = TurnMemory()
 
     def speed(self, state: Array) -> float:
@@ -101,7 +100,7 @@ class TrackingSenses(GroundSenses):
     PACE = 1.2  # m/s
     SOON = 2.0  # s
 
-    def __init__(self, robot: Robot, arena: Arena, rng: np.random.Generator, lidar_noise: float) -> None:
+    def __init__(self, robot: RobotWithTask, arena: Arena, rng: np.random.Generator, lidar_noise: float) -> None:
         super().__init__(robot, arena, rng, lidar_noise)
         self._crowd = arena.crowd
         self._watch = Watch(arena.crowd, rng) if isinstance(arena.crowd, Crowd) else None
@@ -145,9 +144,9 @@ class PlanarSenses:
 
     DISTANCE_SCALE = 5.0  # m, the goal distance that is observed as 1
 
-    def __init__(self, robot: Robot, arena: Arena, rng: np.random.Generator, lidar_noise: float) -> None:
+    def __init__(self, robot: RobotWithTask, arena: Arena, rng: np.random.Generator, lidar_noise: float) -> None:
         self._robot, self._goal = robot, arena.goal
-        self._lidar = Lidar(arena, task_of(robot).rays, lidar_noise, rng)
+        self._lidar = Lidar(arena, robot.task.rays, lidar_noise, rng)
         self._most = np.maximum(np.abs(robot.low()), robot.high())
         full = robot.driving(self._most)[3:]
         self._scales = np.where(full > 0.0, full, 1.0)
@@ -174,9 +173,9 @@ class AirSenses:
 
     NEAR = 5.0  # m
 
-    def __init__(self, robot: Robot, arena: Arena, rng: np.random.Generator, lidar_noise: float) -> None:
+    def __init__(self, robot: RobotWithTask, arena: Arena, rng: np.random.Generator, lidar_noise: float) -> None:
         self._robot, self._goal = robot, np.asarray(arena.goal)
-        self._lidar = Lidar(arena, task_of(robot).rays, lidar_noise, rng)
+        self._lidar = Lidar(arena, robot.task.rays, lidar_noise, rng)
 
     def speed(self, state: Array) -> float:
         return math.hypot(*state[3:6])

@@ -1,7 +1,7 @@
 """The robots that most tests are about."""
 
-from messaging.robots import Robot, robot_named
+from messaging.tasks import RobotWithTask, robot_with_task
 
-GROUND = robot_named("ground")
-QUADROTOR = robot_named("quadrotor")
-ROBOTS: dict[str, Robot] = {robot.name: robot for robot in (GROUND, QUADROTOR)}
+GROUND = robot_with_task("ground")
+QUADROTOR = robot_with_task("quadrotor")
+ROBOTS: dict[str, RobotWithTask] = {robot.name: robot for robot in (GROUND, QUADROTOR)}

@@ -21,7 +21,7 @@ from actors.ros2.clock import Date, RosClock, Simulated
 from actors.ros2.gate import Gate
 from actors.ros2.senses import Blind, Freshness, Senses, Sensing
 from actors.ros2.views import diagnostics, markers
-from messaging.robots import Robot, robot_named
+from messaging.robots import Robot
 from messaging.ros2 import LATCHED, SENSOR, Node, Publisher, RosSettings, Tap
 from messaging.ros2.messages import (
     Clock,
@@ -36,6 +36,7 @@ from messaging.ros2.messages import (
     twist,
 )
 from messaging.shapes import Obstacle
+from messaging.tasks import robot_maybe_with_task
 from safety.wire import KINDS
 
 Array = NDArray[np.float64]
@@ -86,7 +87,7 @@ def driven(name: str) -> Robot:
     Raises:
         UnknownRobot; Unfit: a Twist can't drive it, or odometry can't tell its state.
     """
-    robot = robot_named(name)
+    robot = robot_maybe_with_task(name)
     robot = robot if robot.late else robot.in_real_time()
     if (robot.position_dim, robot.heading, robot.state_dim, robot.action_dim) != (2, 2, 5, 2):
         raise Unfit(f"{robot.kind}: over ROS 2 a robot drives in the plane by speed and turn rate")

@@ -12,7 +12,7 @@ from time import perf_counter
 from deploy.bench import situations
 from deploy.bench.timing import WARM_UP, Figures, milliseconds
 from messaging import brakeline_pb2 as pb
-from messaging.robots import robot_named
+from messaging.tasks import robot_with_task
 from safety.certificates import KINDS
 from safety.filter import Filter
 from safety.model_set import MODES
@@ -34,7 +34,7 @@ def run() -> Figures:
         ("ground by scan, residual direct", "ground", SCANS),
         ("quadrotor by scan, residual direct", "quadrotor", SCANS),
     ):
-        of = robot_named(robot)
+        of = robot_with_task(robot)
         asked = situations.messages(robot=of, conditions=conditions)
         for kind, seconds in _by_kind(Filter(situations.model(robot=of)), asked).items():
             figures[f"{name}: {kind}"] = milliseconds(seconds) | {"count": len(seconds)}

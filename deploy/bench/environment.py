@@ -9,8 +9,8 @@ import numpy as np
 
 from deploy.bench.timing import Figures, timed
 from deploy.vehicles import environment
-from messaging.robots import Robot, robot_named, shipped
-from messaging.tasks import task_of
+from messaging.robots import shipped
+from messaging.tasks import RobotWithTask, robot_with_task
 from sim.lidar import Lidar
 from sim.scene import HEIGHT, map_model
 from sim.world import Arena
@@ -20,13 +20,13 @@ STEPS = 3000
 
 def run() -> Figures:
     figures: Figures = {}
-    for robot in map(robot_named, shipped()):
+    for robot in map(robot_with_task, shipped()):
         figures[f"{robot.name}: environment, lidar included"], arena = _steps(robot)
         figures |= _lidars(robot, arena)
     return figures
 
 
-def _steps(robot: Robot) -> tuple[dict[str, float], Arena]:
+def _steps(robot: RobotWithTask) -> tuple[dict[str, float], Arena]:
     """Speed of random driving; the last arena."""
     env = environment(robot, "default", 0)
     rng = np.random.default_rng(0)
@@ -46,11 +46,11 @@ def _steps(robot: Robot) -> tuple[dict[str, float], Arena]:
     return {"steps/s": STEPS / seconds, "reset ms": 1e3 * resets / episode}, info["arena"]
 
 
-def _lidars(robot: Robot, arena: Arena) -> Figures:
-    lidar, origin = Lidar(arena, task_of(robot).rays), np.asarray(arena.start[: arena.dim])
+def _lidars(robot: RobotWithTask, arena: Arena) -> Figures:
+    lidar, origin = Lidar(arena, robot.task.rays), np.asarray(arena.start[: arena.dim])
     model, data = map_model(arena)
-    ways = np.zeros((len(task_of(robot).rays.directions), 3))
-    ways[:, : arena.dim] = task_of(robot).rays.directions
+    ways = np.zeros((len(robot.task.rays.directions), 3))
+    ways[:, : arena.dim] = robot.task.rays.directions
     point = np.array([*origin, 0.5 * HEIGHT][:3])
     hit, normal = np.zeros(1, np.int32), np.zeros(3)
 

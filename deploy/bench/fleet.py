@@ -25,7 +25,7 @@ from deploy.interpreter import PYTHON
 from logs.metrics import Metrics
 from messaging.bus import Bus, BusSettings, Sample
 from messaging.bus.authority import Authority
-from messaging.robots import robot_named
+from messaging.tasks import robot_with_task
 from messaging.topics import LEARNER, RECORDED
 from safety.methods import DDPC, load
 from safety.recipe import Recipe
@@ -199,7 +199,7 @@ class Fleet:
         write_key(keys)
         signer = Signer.load(keys)
         for name in self.robots:
-            robot = robot_named(name)
+            robot = robot_with_task(name)
             method_for(robot, DDPC, Recipe())
             made = method_path(robot, DDPC, Recipe())
             signer.sign(load(made)).save(self.folder / "data" / robot.name / made.name)

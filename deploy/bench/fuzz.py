@@ -45,8 +45,7 @@ from logs.watch.board import Board
 from logs.watch.server import encode
 from messaging import brakeline_pb2 as pb
 from messaging.bus import BusError, BusSettings, Sample
-from messaging.robots import Robot, robot_named
-from messaging.tasks import layout
+from messaging.tasks import RobotWithTask, robot_with_task
 from messaging.tolerant import Tolerance
 from messaging.topics import DECIDE, FLOW, JOIN, MODEL, RECORDED, TOPICS, WEIGHTS, Topic
 from safety.client import read, request_message
@@ -141,12 +140,12 @@ def watch() -> Party:
     return Party(RECORDED, take, lambda: encode(board.view()), tolerance)
 
 
-def learning(robot: Robot, folder: Path) -> Party:
+def learning(robot: RobotWithTask, folder: Path) -> Party:
     """The learner's loop; it takes steps in and joins, and makes no updates."""
     wire = Wire()
     config = LearnerConfig(steps=10**9, capacity=1000)
     learner = Learner(robot, config)
-    learner.join(pb.Join(robot=robot.name, actor="actor-0", layout=layout(robot)))
+    learner.join(pb.Join(robot=robot.name, actor="actor-0", layout=robot.learning_layout()))
     process: Any = SimpleNamespace(bus=wire, stop=Event(), figures={}, notes={})
     loop = LearnerLoop(process, learner, LearnerSettings(BusSettings(), robot.name, folder, learner=config))
 
@@ -171,7 +170,7 @@ def learning(robot: Robot, folder: Path) -> Party:
     return Party(topics, take, look, wire.tolerance)
 
 
-def actor(robot: Robot) -> Party:
+def actor(robot: RobotWithTask) -> Party:
     wire: Any = Wire()
     student = Student(wire, robot, "actor-0")
 
@@ -200,7 +199,7 @@ def safety() -> Party:
     return Party((DECIDE, MODEL), take, lambda: models.filters, tolerance)
 
 
-def asker(robot: Robot, mill: Mill) -> Party:
+def asker(robot: RobotWithTask, mill: Mill) -> Party:
     """Who asked, and gets an answer of whoever answers."""
     request = request_message(Commitment(robot), [0.0] * robot.state_dim, [0.0] * robot.action_dim, known_free=True)
 
@@ -216,7 +215,7 @@ def asker(robot: Robot, mill: Mill) -> Party:
 
 
 def parties(folder: Path, mill: Mill) -> dict[str, Party]:
-    robot = robot_named("ground")
+    robot = robot_with_task("ground")
     return {
         "launcher": launcher(folder),
         "recorder": recorder(folder),

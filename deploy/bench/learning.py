@@ -13,8 +13,7 @@ from deploy.bench.timing import Figures, timed
 from learner.config import TD3Config
 from learner.replay import Batch
 from learner.td3 import TD3
-from messaging.robots import robot_named
-from messaging.tasks import task_of
+from messaging.tasks import robot_with_task
 from messaging.weights import MLP
 
 UPDATES = 100
@@ -62,8 +61,8 @@ class Plain:
 
 def run() -> Figures:
     torch.set_num_threads(1)
-    robot = robot_named("ground")
-    observations, actions = task_of(robot).observation_dim, robot.action_dim
+    robot = robot_with_task("ground")
+    observations, actions = robot.task.observation_dim, robot.action_dim
     rng = np.random.default_rng(0)
     figures: Figures = {}
     for size in (128, 256):
@@ -79,7 +78,7 @@ def run() -> Figures:
             ("torch.nn and torch.optim", timed(partial(plain.update, *tensors), UPDATES)),
         ):
             figures[f"TD3 update, batch {size}: {name}"] = times | {"updates/s": 1e3 / times["p50 ms"]}
-    mlp, seen = MLP.untrained(robot_named("ground"), 0), rng.uniform(-1, 1, observations).astype(np.float32)
+    mlp, seen = MLP.untrained(robot_with_task("ground"), 0), rng.uniform(-1, 1, observations).astype(np.float32)
     actor, tensor = Plain(TD3Config(), observations, actions).actor, torch.rand(1, observations)
     figures["policy forward, NumPy"] = timed(lambda: mlp(seen), 2000)
     with torch.no_grad():

@@ -16,7 +16,7 @@ from actors.mavlink import Client
 from deploy.bench.timing import Figures
 from deploy.data.store import model_for
 from deploy.study.evaluate import in_process
-from messaging.robots import robot_named
+from messaging.tasks import robot_with_task
 from safety.model_set import Recipe
 from sim.autopilot.endpoint import TICK, Autopilot
 from sim.autopilot.rules import SETPOINT_TIMEOUT
@@ -29,7 +29,7 @@ from sim.world import Arena
 
 Array = NDArray[np.float64]
 
-ROBOT, RULES = robot_named("quadrotor-late"), "px4"
+ROBOT, RULES = robot_with_task("quadrotor-late"), "px4"
 TIMEOUTS = (0.2, 0.3, 0.5, 1.0)  # s; the last is PX4's default
 POLICIES = ("astar", "greedy", "adversary")
 FLIGHTS = 20  # of each policy and timeout

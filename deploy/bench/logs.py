@@ -42,11 +42,11 @@ def real() -> list[tuple[str, Any]]:
     from deploy.data.store import model_for
     from deploy.study.evaluate import in_process
     from deploy.vehicles import environment
-    from messaging.robots import robot_named
+    from messaging.tasks import robot_with_task
     from safety.model_set import Recipe
     from sim.policies import scripted
 
-    ground = robot_named("ground")
+    ground = robot_with_task("ground")
     ask = in_process(model_for(ground, Recipe()))
     driver = Driver(ground, environment(ground, "default", 7), Identity("actor-0", 0, 7))
     policy = scripted("greedy", ground, np.random.default_rng(7))

@@ -20,7 +20,7 @@ from deploy.bench.timing import WARM_UP, Figures
 from deploy.study.evaluate import Evaluation, episode, prepared, prepared_fleet, round_of
 from logs.tally import KINDS
 from messaging import brakeline_pb2 as pb
-from messaging.robots import Robot, robot_named
+from messaging.tasks import RobotWithTask, robot_with_task
 
 STEPS = 600  # periods of each
 SITUATIONS = {
@@ -60,10 +60,10 @@ class Weighed:
 
 
 def run(steps: int = STEPS) -> Figures:
-    return {name: _weighed(robot_named(robot), what, steps) for name, (robot, what) in SITUATIONS.items()}
+    return {name: _weighed(robot_with_task(robot), what, steps) for name, (robot, what) in SITUATIONS.items()}
 
 
-def _weighed(robot: Robot, what: Evaluation, steps: int) -> dict[str, float]:
+def _weighed(robot: RobotWithTask, what: Evaluation, steps: int) -> dict[str, float]:
     sizes: dict[str, list[int]] = defaultdict(list)
     times: dict[str, list[float]] = defaultdict(list)
     for policy in POLICIES:

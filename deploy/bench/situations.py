@@ -13,7 +13,7 @@ from deploy.policies import policy_named
 from deploy.study.evaluate import in_process
 from deploy.vehicles import environment
 from messaging import brakeline_pb2 as pb
-from messaging.robots import Robot, robot_named
+from messaging.tasks import RobotWithTask, robot_with_task
 from safety.filter import Filter
 from safety.model_set import ModelSet, Recipe
 from safety.request import Request
@@ -23,15 +23,15 @@ from sim.conditions import Conditions
 STEPS = 1500
 
 
-def model(certificate: str = "residual", mode: str = "direct", robot: Robot | None = None) -> ModelSet:
-    return model_for(robot or robot_named("ground"), Recipe(certificate, mode))
+def model(certificate: str = "residual", mode: str = "direct", robot: RobotWithTask | None = None) -> ModelSet:
+    return model_for(robot or robot_with_task("ground"), Recipe(certificate, mode))
 
 
 def messages(
-    policy: str = "random", seed: int = 5, robot: Robot | None = None, conditions: Conditions | None = None
+    policy: str = "random", seed: int = 5, robot: RobotWithTask | None = None, conditions: Conditions | None = None
 ) -> list[pb.Request]:
     """The questions of some episodes of a policy behind the default filter."""
-    robot = robot or robot_named("ground")
+    robot = robot or robot_with_task("ground")
     question = in_process(model(robot=robot))
     driver = Driver(robot, environment(robot, "default", seed, conditions), Identity("bench", 0, seed))
     choose = policy_named(policy, robot, seed)

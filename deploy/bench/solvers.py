@@ -12,7 +12,7 @@ import numpy as np
 from deploy.bench import situations
 from deploy.bench.decide import SCANS
 from deploy.bench.timing import Figures, each
-from messaging.robots import Robot, robot_named
+from messaging.tasks import RobotWithTask, robot_with_task
 from safety import filter as filtering
 from safety.filter import Filter
 from safety.solver import ACCURACY, SOLVED, Program, Solution, solve
@@ -28,7 +28,7 @@ QUESTIONS: tuple[tuple[str, str, str, Conditions | None], ...] = (
 )
 
 
-def programs(certificate: str, robot: Robot, conditions: Conditions | None) -> list[Program]:
+def programs(certificate: str, robot: RobotWithTask, conditions: Conditions | None) -> list[Program]:
     """The QPs that come up."""
     seen: list[Program] = []
 
@@ -67,7 +67,7 @@ def disagreements(seen: list[Program], inputs: int) -> dict[str, float]:
 def run() -> Figures:
     figures: Figures = {}
     for name, kind, certificate, conditions in QUESTIONS:
-        robot = robot_named(kind)
+        robot = robot_with_task(kind)
         seen = programs(certificate, robot, conditions)
         count = {"count": float(len(seen))}
         size = f"{name} ({len(seen[0].h)} variables)"

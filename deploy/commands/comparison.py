@@ -22,7 +22,7 @@ from deploy.study.jobs import Job, complete
 from deploy.study.table import markdown, plain, table
 from deploy.study.tune import Tried, best, try_all, values_for
 from learner.config import TD3Config
-from messaging.tasks import address, learnt
+from messaging.tasks import RobotWithTask, address, robot_with_task
 from safety.model_set import Recipe
 from safety.rivals.pretrained import Pretrained
 
@@ -44,12 +44,12 @@ class Pretrain:
     json: bool = False
 
     def run(self) -> int:
-        robot = learnt(self.robot)
+        robot = robot_with_task(self.robot)
         recipe = recipe_for(self.method, robot)
         changed = {name: value for name in ("samples", "seed") if (value := getattr(self, name)) is not None}
         model = pretrained(robot, self.method, replace(recipe, **changed), again=not self.tune)
         if self.tune:
-            return self._tune(model)
+            return self._tune(model, robot)
         path = method_path(robot, self.method, Recipe())
         if self.json:
             say_json({"path": str(path), "version": model.version, "settings": dict(model.settings)} | model.about)
@@ -57,8 +57,8 @@ class Pretrain:
             console.print(f"{path}: {model.version}")
         return 0
 
-    def _tune(self, model: Pretrained) -> int:
-        rows = try_all(model, values_for(model), self.episodes, self._say)
+    def _tune(self, model: Pretrained, robot: RobotWithTask) -> int:
+        rows = try_all(model, robot, values_for(model, robot), self.episodes, self._say)
         chosen = best(rows)
         if self.json:
             say_json({"tried": [row.figures() for row in rows], "best": chosen.value})
@@ -110,7 +110,7 @@ class Compare:
             )
         told: dict[str, Any] = {}
         for name in self.robots:
-            robot = learnt(name).name if name.endswith(".toml") else address(name)
+            robot = address(name)
             self._prepare(robot)
             jobs = self._jobs(robot)
             found = complete(jobs, results, runs, self.workers, again, self._say)
@@ -125,7 +125,7 @@ class Compare:
         """What several cells need is made once, before them."""
         for method in self.methods:
             if method != NONE:
-                method_for(learnt(robot), method, Recipe())
+                method_for(robot_with_task(robot), method, Recipe())
 
     def _jobs(self, robot: str) -> list[Job]:
         seeds = self.seeds[:1] if self.quick else self.seeds

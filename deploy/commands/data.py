@@ -32,7 +32,7 @@ from deploy.progress import under_way
 from logs.tables import Stacking
 from messaging import brakeline_pb2 as pb
 from messaging.bus import Bus
-from messaging.tasks import learnt
+from messaging.tasks import robot_maybe_with_task
 from messaging.topics import MODEL
 from safety.certificates import KINDS, RESIDUAL
 from safety.dataset import Dataset
@@ -80,7 +80,7 @@ class Collect:
     def run(self) -> int:
         if self.url:
             return self._first_flight()
-        robot = learnt(self.robot)
+        robot = robot_maybe_with_task(self.robot)
         path = self.out or record_path(robot)
         data = recorded(robot, path, self.trajectories, self.seed, self.physics.conditions(), again=True)
         figures = {"path": str(path), "trajectories": len(data.trajectories), "periods": data.periods}
@@ -95,7 +95,7 @@ class Collect:
         """Raises ValueError for a robot that does not fly."""
         from deploy.run.maiden import MaidenSettings, fly
 
-        robot = learnt(self.robot)
+        robot = robot_maybe_with_task(self.robot)
         if robot.position_dim != 3:
             raise ValueError(f"a {robot.kind} robot does not fly")
         first = self.first
@@ -223,14 +223,14 @@ class Certify:
     def _load(self) -> tuple[Path, Recorded]:
         """Raises ValueError when there is no such file: what was mistyped is not recorded anew."""
         if self.data is None:
-            robot = learnt(self.robot)
+            robot = robot_maybe_with_task(self.robot)
             path, data = record_path(robot.in_lockstep()), data_for(robot)
         elif self.data.suffix == ".safetensors":
             if not self.data.exists():
                 raise ValueError(f"no data set at {self.data}: `brakeline collect {self.robot} --out FILE` records one")
             path, data = self.data, Dataset.load(self.data)
         else:
-            return self.data, from_log(self.data, learnt(self.robot), self.last)
+            return self.data, from_log(self.data, robot_maybe_with_task(self.robot), self.last)
         return path, Recorded(data, f"{data.periods} recorded periods of {data.robot.name}")
 
     def _publish(self, model: ModelSet, data: Dataset) -> None:

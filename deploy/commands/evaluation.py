@@ -10,8 +10,7 @@ from deploy.progress import under_way
 from deploy.study.evaluate import Evaluation, evaluate, prepared
 from logs.metrics import Tally
 from logs.report import show
-from messaging.robots import Robot as RobotKind
-from messaging.tasks import learnt
+from messaging.tasks import RobotWithTask, robot_with_task
 
 
 @dataclass(frozen=True)
@@ -47,7 +46,7 @@ class Evaluate:
             check_ending(self.render)
         if self.beside and self.render is None:
             raise ValueError("--beside draws: give --render FILE too")
-        robot = learnt(self.robot)
+        robot = robot_with_task(self.robot)
         what = Evaluation(
             policy=self.policy,
             method=self.filtering.method,
@@ -77,7 +76,7 @@ class Evaluate:
                 console.print(conditions(figures["conditions"]))
         return 0
 
-    def _draw(self, robot: RobotKind, what: Evaluation, path: Path) -> None:
+    def _draw(self, robot: RobotWithTask, what: Evaluation, path: Path) -> None:
         from deploy.run.render import record, save
 
         films = []

@@ -10,7 +10,7 @@ import tyro
 
 from deploy.commands.common import LATEST, console, say_json
 from deploy.progress import under_way
-from messaging.tasks import learnt
+from messaging.tasks import robot_with_task
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ class Export:
         from logs.trajectories import ExportError
 
         assert self.csv is not None
-        robot = learnt(self.robot)
+        robot = robot_with_task(self.robot)
         self.csv.parent.mkdir(parents=True, exist_ok=True)
         try:
             with self.csv.open("w", newline="") as file:
@@ -65,7 +65,7 @@ class Export:
         from logs.trajectories import to_minari
 
         assert self.minari is not None
-        written = to_minari(list(self.logs), learnt(self.robot), self.minari)
+        written = to_minari(list(self.logs), robot_with_task(self.robot), self.minari)
         return {"path": str(written.path), "episodes": written.episodes, "steps": written.steps}
 
     def _tlog(self) -> dict[str, Any]:

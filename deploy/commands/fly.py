@@ -16,7 +16,8 @@ from deploy.run.configurations import Embedded, RunConfig
 from deploy.run.display import Display, summary
 from deploy.run.launcher import Launcher, prepare
 from messaging.ports import free_udp_port
-from messaging.tasks import learnt
+from messaging.robots import robot_named
+from messaging.tasks import address_in_real_time
 
 LEARN = "learn"
 TOLD = ("periods ", "lateness", "worst", "link", "true", "estimate")  # beginnings of figures' names
@@ -78,13 +79,13 @@ class Fly:
 
     def config(self) -> RunConfig:
         """The run's configuration. Raises ValueError for a robot that does not fly."""
-        robot = learnt(self.robot)
+        robot = robot_named(self.robot)
         if robot.position_dim != 3:
             raise ValueError(f"a {robot.kind} robot does not fly")
         robot = robot if robot.late else robot.in_real_time()
         flights = self._flights()
         return RunConfig(
-            robots=(robot.name,),
+            robots=(address_in_real_time(self.robot),),
             method=self.filtering.method,
             recipe=self.filtering.recipe(),
             arena=self.arena,

@@ -19,7 +19,7 @@ from deploy.run.configurations import RunConfig
 from deploy.vehicles import environment, fleet_world
 from learner.config import LearnerConfig
 from logs.recorder import Rotation
-from messaging.tasks import learnt
+from messaging.tasks import address, address_in_real_time, robot_maybe_with_task, robot_with_task
 from safety.recipe import check_promises
 
 
@@ -36,8 +36,8 @@ class Safety:
 
         recipe = self.filtering.recipe()
         for robot in self.robots:
-            method_for(learnt(robot), self.filtering.method, recipe)
-        paths = tuple(method_path(learnt(robot), self.filtering.method, recipe) for robot in self.robots)
+            method_for(robot_maybe_with_task(robot), self.filtering.method, recipe)
+        paths = tuple(method_path(robot_maybe_with_task(robot), self.filtering.method, recipe) for robot in self.robots)
         main(SafetySettings(self.endpoints.bus(), paths, data_root(), self.name))
         return 0
 
@@ -63,7 +63,7 @@ class LearnerProcess:
 
         resume = self.resume or (self.resume_if_any and exists(self.out / CHECKPOINT))
         config = replace(self.learner, seed=self.seed, steps=self.steps)
-        main(LearnerSettings(self.endpoints.bus(), learnt(self.robot).name, self.out, resume, self.name, config))
+        main(LearnerSettings(self.endpoints.bus(), address(self.robot), self.out, resume, self.name, config))
         return 0
 
 
@@ -101,13 +101,13 @@ class Actor:
     def run(self) -> int:
         from actors.loop import ActorSettings, run
 
-        robot = learnt(self.robot)
-        robot = robot.in_real_time() if self.url and not robot.late else robot
+        at = address_in_real_time(self.robot) if self.url else address(self.robot)
+        robot = robot_with_task(at)
         if self.fleet:
             check_promises(self.filtering.method)
         settings = ActorSettings(
             bus=self.endpoints.bus(),
-            robot=robot.name,
+            robot=at,
             name=self.name,
             number=self.number,
             robots=self.fleet or self.robots,

@@ -19,7 +19,7 @@ from deploy.progress import under_way
 from deploy.run.replay import ROUNDING, Instead, replay
 from logs.extent import count
 from logs.tables import PLAIN, Stacking
-from messaging.tasks import learnt
+from messaging.robots import Robot
 from messaging.topics import EXCHANGE
 from safety.dataset import Dataset
 from safety.filter import Filter
@@ -81,16 +81,17 @@ class Replay:
             return None
         recipe = Recipe(self.certificate or "residual", self.mode)
         filters: dict[str, Filter] = {}
-        make: Callable[[str], ModelSet]
+        make: Callable[[Robot], ModelSet]
         if self.data is not None:
             model, _ = certified(Dataset.load(self.data), recipe)
-            make = lambda name: model  # noqa: E731
+            make = lambda robot: model  # noqa: E731
         else:
-            make = lambda name: model_for(learnt(name), recipe)  # noqa: E731
+            make = lambda robot: model_for(robot, recipe)  # noqa: E731
 
-        def chosen(name: str) -> Filter:
+        def chosen(robot: Robot) -> Filter:
+            name = robot.name
             if name not in filters:
-                filters[name] = Filter(make(name), self.margin)
+                filters[name] = Filter(make(robot), self.margin)
                 if filters[name].robot.name != name:
                     raise ValueError(f"{self.data} is of {filters[name].robot.name}, and the log of {name}")
             return filters[name]

@@ -13,8 +13,8 @@ from deploy.commands.common import console, errors, say_json
 from deploy.data.portrait import picture, summary
 from logs.tables import PLAIN, Stacking
 from messaging.descriptions import NAME, BadDescription
-from messaging.robots import FOLDER, Robot, robot_named
-from messaging.tasks import UnknownTask, learnt, task_of
+from messaging.robots import FOLDER, robot_named
+from messaging.tasks import RobotWithTask, robot_maybe_with_task
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ class RobotCommand:
 
     def _check(self) -> int:
         try:
-            robot = learnt(self.file)
+            robot = robot_named(self.file)
         except BadDescription as error:
             if self.json:
                 say_json({"file": self.file, "problems": [list(problem) for problem in error.problems]})
@@ -67,7 +67,7 @@ class RobotCommand:
         console.print(f"{robot.name}: {len(robot.state)} coordinates, {len(robot.action)} inputs, no mistake")
         for remark in found["remarks"]:
             console.print(f"  {remark}", markup=False)
-        console.print(f"  {_task(robot)}", markup=False)
+        console.print(f"  {_task(self.file)}", markup=False)
         console.print(f"next: `brakeline import LOG --robot {self.file}`, or `brakeline collect {self.file}`")
         return 0
 
@@ -90,11 +90,11 @@ class RobotCommand:
         return 0
 
 
-def _task(robot: Robot) -> str:
-    try:
-        task = task_of(robot)
-    except UnknownTask:
+def _task(name: str) -> str:
+    robot = robot_maybe_with_task(name)
+    if not isinstance(robot, RobotWithTask):
         return "no task beside it: enough to certify and to filter; to train, write NAME.task.toml (docs/your_robot.md)"
+    task = robot.task
     return f"its task: {task.observation_dim} observed values, arenas {', '.join(task.arenas)}"
 
 

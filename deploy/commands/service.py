@@ -14,10 +14,10 @@ from deploy.commands.common import Endpoints, Flags, Robot, console, say_json
 from logs.tables import PLAIN, Stacking
 from messaging.bus import Bus, Sample
 from messaging.range_images import RangeImage
+from messaging.robots import robot_named
 from messaging.scans import BadScan, Scan
 from messaging.sensed import Sensed
 from messaging.shapes import KINDS, Obstacle
-from messaging.tasks import learnt
 from messaging.topics import HEALTH, LEARNER
 from safety.client import SafetyClient
 
@@ -75,7 +75,7 @@ class Query:
     json: bool = False
 
     def run(self) -> int:
-        robot = learnt(self.robot)
+        robot = robot_named(self.robot)
         near = [
             obstacle_of(tuple(part.split()), robot.position_dim) for part in self.obstacle.split(",") if part.strip()
         ]
@@ -83,7 +83,7 @@ class Query:
         action = self.action or robot.action_high
         scan = None if self.scan is None else sensed_in(self.scan, robot.position_dim)
         with Bus(self.endpoints.bus(), f"client.query-{time.time_ns() % 10**6}") as bus:
-            asker = SafetyClient(bus, robot.name, self.timeout)
+            asker = SafetyClient(bus, robot, self.timeout)
             answer = asker.decide(state, action, near, scan=scan, known_free=self.known_free)
         figures: dict[str, Any] = {
             "decision": answer.kind,

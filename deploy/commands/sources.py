@@ -19,8 +19,8 @@ from deploy.data.resample import HOLD
 from deploy.data.sources.quantities import columns_of
 from deploy.progress import under_way
 from logs.tables import PLAIN, Stacking
-from messaging.robots import Robot as RobotKind
-from messaging.tasks import learnt
+from messaging.robots import robot_named
+from messaging.tasks import RobotWithTask, robot_with_task
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,7 @@ class Import:
     json: bool = False
 
     def run(self) -> int:
-        robot = learnt(self.robot)
+        robot = robot_named(self.robot)
         made = bring.bring(self.sources, robot, self.map, self.delay, self.hold)
         told = coverage(made.data)
         path = self.out or record_path(robot)
@@ -94,15 +94,15 @@ class Excite:
     """With --drive: one JSON object on stdout."""
 
     def run(self) -> int:
-        robot = learnt(self.robot)
+        robot = robot_named(self.robot)
         if self.drive is not None:
-            return self._drive(robot, self.drive)
+            return self._drive(robot_with_task(self.robot), self.drive)
         print(",".join(("time", "run", *columns_of(robot)[1])))
         for row in planned.rows(robot, self.keep, self.minutes, self.seed):
             print(",".join((f"{row.time:.9g}", str(row.run), *(f"{value:.6g}" for value in row.input))))
         return 0
 
-    def _drive(self, robot: RobotKind, path: Path) -> int:
+    def _drive(self, robot: RobotWithTask, path: Path) -> int:
         from deploy.run.excited import drive
 
         with under_way(f"driving {robot.name}", round(60.0 * self.minutes / robot.period)) as advance:

@@ -159,11 +159,11 @@ class Train:
         """As given; offline the logs have an end; else the experiment's."""
         if self.steps is None and self.from_logs and self.actors == 0:
             from deploy.run.feed import count
-            from messaging.tasks import learnt
+            from messaging.tasks import robot_with_task
 
             logs = [str(path) for path in self.from_logs]
             with under_way("counting the logs' steps"):
-                return max(count(logs, learnt(name)) for name in self.robots)
+                return max(count(logs, robot_with_task(name)) for name in self.robots)
         return EXPERIMENTS[self.experiment].steps if self.steps is None else self.steps
 
     def run(self) -> int:

@@ -10,6 +10,7 @@ import numpy as np
 from deploy.data.excite import excitation
 from deploy.vehicles import vehicle_in_yard
 from messaging.robots import Robot
+from messaging.tasks import RobotWithTask
 from safety.dataset import Dataset, Trajectory
 from sim.conditions import Conditions
 
@@ -17,7 +18,9 @@ PERIODS = 300  # a trajectory
 ORIGIN = "collect"
 
 
-def record(robot: Robot, trajectories: int, seed: int, conditions: Conditions, first: int = 0) -> Iterator[Trajectory]:
+def record(
+    robot: RobotWithTask, trajectories: int, seed: int, conditions: Conditions, first: int = 0
+) -> Iterator[Trajectory]:
     """Drive trajectories from number `first` on, each from standing still, with its own generator: (seed, number)."""
     for number in range(first, trajectories):
         rng = np.random.default_rng((seed, number))

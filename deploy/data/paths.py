@@ -2,7 +2,7 @@
 
 data/<robot>/record.safetensors                     the recorded trajectories
 data/<robot>/<certificate>-<mode>.safetensors       the model set in use, made from them
-data/<robot>/<rival>.safetensors                    the rival's networks, pre-trained
+data/<robot>/<rival>.safetensors                    the rival's networks, pre-trained (<rival>+<task>: of another task)
 data/<robot>/models/<version>.safetensors           every version a service has used
 """
 
@@ -11,7 +11,8 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-from messaging.robots import Robot
+from messaging.robots import WITH, Robot
+from messaging.tasks import RobotWithTask
 from safety.recipe import DDPC, Recipe
 
 
@@ -30,4 +31,7 @@ def model_path(robot: Robot, recipe: Recipe) -> Path:
 
 def method_path(robot: Robot, method: str, recipe: Recipe) -> Path:
     """Of the model that the safety service needs for a method."""
-    return model_path(robot, recipe) if method == DDPC else data_root() / robot.name / f"{method}.safetensors"
+    if method == DDPC:
+        return model_path(robot, recipe)
+    other = robot.task.name.partition(WITH)[2] if isinstance(robot, RobotWithTask) else ""
+    return data_root() / robot.name / f"{method}{WITH if other else ''}{other}.safetensors"

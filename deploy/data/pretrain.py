@@ -12,8 +12,7 @@ import numpy as np
 from deploy.data.rollouts import costs, transitions
 from learner.pretrain import Fit, fit_cost, fit_linear
 from messaging.perceptrons import Perceptrons
-from messaging.robots import Robot
-from messaging.tasks import task_of
+from messaging.tasks import RobotWithTask
 from safety.rivals.pretrained import Pretrained
 from safety.rivals.sailr import SAILR
 from safety.rivals.secas import SECAS
@@ -51,9 +50,9 @@ Made = tuple[dict[str, Perceptrons], dict[str, float], dict[str, str]]  # networ
 RECIPES: dict[str, type[SecasRecipe] | type[SailrRecipe]] = {SECAS: SecasRecipe, SAILR: SailrRecipe}
 
 
-def recipe_for(method: str, robot: Robot) -> Recipe:
+def recipe_for(method: str, robot: RobotWithTask) -> Recipe:
     """With the threshold that was found for this robot (deploy/study/experiments.md)."""
-    return RECIPES[method](**getattr(task_of(robot).rivals, method))
+    return RECIPES[method](**getattr(robot.task.rivals, method))
 
 
 def made_by(model: Pretrained, recipe: Recipe) -> bool:
@@ -61,7 +60,7 @@ def made_by(model: Pretrained, recipe: Recipe) -> bool:
     return model.about.get("recipe") == json.dumps(asdict(recipe))
 
 
-def pretrain(robot: Robot, recipe: Recipe, each: Each = lambda: None) -> Pretrained:
+def pretrain(robot: RobotWithTask, recipe: Recipe, each: Each = lambda: None) -> Pretrained:
     """Drive, fit, and say what it took; `each` is called after every driven step.
 
     Raises:
@@ -81,10 +80,10 @@ def pretrain(robot: Robot, recipe: Recipe, each: Each = lambda: None) -> Pretrai
         "seed": str(recipe.seed),
         "seconds": f"{time.perf_counter() - started:.0f}",
     }
-    return Pretrained(robot, method, networks, settings, about, task_of(robot).rays if method == SECAS else None)
+    return Pretrained(robot, method, networks, settings, about, robot.task.rays if method == SECAS else None)
 
 
-def _secas(robot: Robot, recipe: SecasRecipe, each: Each) -> Made:
+def _secas(robot: RobotWithTask, recipe: SecasRecipe, each: Each) -> Made:
     data = transitions(robot, recipe.arena, recipe.samples, recipe.seed, each)
     g, errors = fit_linear(data.observation, data.action, data.change, recipe.fit, recipe.seed)
     about = {
@@ -94,7 +93,7 @@ def _secas(robot: Robot, recipe: SecasRecipe, each: Each) -> Made:
     return {"g": g}, {"clearance": robot.footprint + recipe.margin}, about
 
 
-def _sailr(robot: Robot, recipe: SailrRecipe, each: Each) -> Made:
+def _sailr(robot: RobotWithTask, recipe: SailrRecipe, each: Each) -> Made:
     """V from what braking came to; Q of every driven step from V after it, the more cautious of the two."""
     gamma = recipe.gamma
     data = costs(robot, recipe.arena, recipe.samples, recipe.seed, gamma, recipe.smoothing, recipe.lead, each)

@@ -13,8 +13,8 @@ from deploy.data import collect
 from deploy.data.making import alone
 from deploy.data.paths import record_path
 from deploy.progress import each
-from messaging.robots import Robot, known
-from messaging.tasks import task_of
+from messaging.robots import Robot
+from messaging.tasks import RobotWithTask, needs_task
 from safety.dataset import BadData, Dataset, Trajectory
 from sim.conditions import Conditions
 
@@ -48,10 +48,11 @@ def recorded(
         if path.exists() and not again:
             return Dataset.load(path)
         _spare(path, robot)
-        return _record(robot, path, trajectories or task_of(robot).trajectories, seed, conditions or Conditions())
+        count = trajectories or needs_task(robot).task.trajectories
+        return _record(needs_task(robot), path, count, seed, conditions or Conditions())
 
 
-def _record(robot: Robot, path: Path, trajectories: int, seed: int, conditions: Conditions) -> Dataset:
+def _record(robot: RobotWithTask, path: Path, trajectories: int, seed: int, conditions: Conditions) -> Dataset:
     part = path.with_name(f"{path.stem}.part{path.suffix}")
     driven = _begun(part, robot, trajectories, seed, conditions)
     console.print(
@@ -101,7 +102,7 @@ def _begun(part: Path, robot: Robot, trajectories: int, seed: int, conditions: C
         kept = Dataset.load(part)
     except BadData:
         return []
-    if kept.robot != robot or kept.about != collect.origin(seed, conditions):
+    if kept.robot.layout() != robot.layout() or kept.about != collect.origin(seed, conditions):
         return []
     return [replace(t, before=None) for t in kept.trajectories[:trajectories]]  # as driven: from standing still
 
@@ -118,7 +119,8 @@ def data_for(robot: Robot) -> Dataset:
     Raises:
         BadData: it was recorded of a robot that differs in more than its body, limits and sight.
     """
-    data, now = recorded(robot.in_lockstep()), known(robot.in_lockstep())
-    if replace(data.robot, body=now.body, limits=now.limits, sight=now.sight) != now:
+    now = robot.in_lockstep()
+    data = recorded(now)
+    if replace(data.robot, body=now.body, limits=now.limits, sight=now.sight).layout() != now.layout():
         raise BadData(f"{record_path(now)} was recorded before the description of {now.name} changed")
     return replace(data, robot=robot)

@@ -13,8 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deploy.vehicles import environment
-from messaging.robots import Robot
-from messaging.tasks import task_of
+from messaging.tasks import RobotWithTask
 from safety.backup import brake
 from safety.rivals.sailr import normalised
 from safety.rivals.secas import Constraints
@@ -79,12 +78,12 @@ class _Drive:
 
 
 def transitions(
-    robot: Robot, arena: str, samples: int, seed: int, each: Callable[[], object] = lambda: None
+    robot: RobotWithTask, arena: str, samples: int, seed: int, each: Callable[[], object] = lambda: None
 ) -> Transitions:
     """`samples` steps of random inputs, each held for some periods (Dalal et al. 2018, section 5.1)."""
     drive = _Drive(environment(robot, arena, APART + seed))
     policy = scripted("random", robot, np.random.default_rng((seed, 1)))
-    constraints = Constraints(robot, task_of(robot).rays)
+    constraints = Constraints(robot, robot.task.rays)
     rows: list[tuple[Any, Array, Array]] = []
     while len(rows) < samples:
         drive.ready()
@@ -98,7 +97,7 @@ def transitions(
 
 
 def costs(
-    robot: Robot,
+    robot: RobotWithTask,
     arena: str,
     samples: int,
     seed: int,
@@ -158,12 +157,12 @@ def costs(
     return Costs(states, to_go, pairs, step, after, np.array([row[3] for row in driven]), drive.collisions)
 
 
-def _varied(robot: Robot, action: Array, rng: np.random.Generator) -> Array:
+def _varied(robot: RobotWithTask, action: Array, rng: np.random.Generator) -> Array:
     """Half of the time another action instead: the critics are asked about every one."""
     return action if rng.random() < 0.5 else rng.uniform(robot.low(), robot.high())
 
 
-def _braking(robot: Robot, before: Array) -> Iterator[Array]:
+def _braking(robot: RobotWithTask, before: Array) -> Iterator[Array]:
     """The backup policy's inputs to a stop, and some periods of standing."""
     standing = 0
     while standing < STAND:

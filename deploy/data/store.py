@@ -17,7 +17,8 @@ from rich.console import Console
 from deploy.data.making import alone
 from deploy.data.paths import method_path, model_path
 from deploy.progress import under_way
-from messaging.robots import Robot, known
+from messaging.robots import Robot
+from messaging.tasks import RobotWithTask, needs_task
 from safety.dataset import BadData
 from safety.methods import DDPC, METHODS, Model
 from safety.model_set import BadModel, ModelSet, Recipe
@@ -53,8 +54,7 @@ def _kept_or_made(path: Path, kept: Callable[[], M], made: Callable[[], M], maki
 def _kept(path: Path, robot: Robot) -> ModelSet:
     """Raises BadModel: it is not there, or not of this layout or robot."""
     model = ModelSet.load(path)
-    if model.robot != robot:
-        known(robot)  # and not what the file says of it
+    if model.robot.layout() != robot.layout():
         raise BadModel(f"the description of {robot.name} has changed")
     return model
 
@@ -94,10 +94,11 @@ def method_for(robot: Robot, method: str, recipe: Recipe) -> Model:
         raise ValueError(f"{method} has no real-time mode: its answer counts for the period in which it was asked for")
     from deploy.data.pretrain import recipe_for
 
+    robot = needs_task(robot)
     return pretrained(robot, method, recipe_for(method, robot))
 
 
-def pretrained(robot: Robot, method: str, recipe: RivalRecipe, again: bool = False) -> Pretrained:
+def pretrained(robot: RobotWithTask, method: str, recipe: RivalRecipe, again: bool = False) -> Pretrained:
     """A rival's model of this recipe, pre-trained if it is not there (or `again`)."""
     path = method_path(robot, method, Recipe())
     made = partial(_pretrained, path, robot, method, recipe)
@@ -120,7 +121,7 @@ def _kept_rival(path: Path, recipe: RivalRecipe) -> Pretrained:
     return kept
 
 
-def _pretrained(path: Path, robot: Robot, method: str, recipe: RivalRecipe) -> Pretrained:
+def _pretrained(path: Path, robot: RobotWithTask, method: str, recipe: RivalRecipe) -> Pretrained:
     from deploy.data.pretrain import pretrain
 
     with under_way(f"pre-training {method} for {robot.name}", recipe.samples) as advance:

@@ -13,14 +13,14 @@ from deploy.quadrotors import flight_arena
 from messaging.clock import WallClock
 from messaging.links import open_link
 from messaging.signals import heeded
-from messaging.tasks import task_of
+from messaging.tasks import robot_with_task
 from sim.autopilot.endpoint import Autopilot
 from sim.autopilot.parameters import AT_ONCE
 from sim.autopilot.rules import SETPOINT_TIMEOUT
 from sim.autopilot.server import Tally, Truth, serve
 from sim.flight_estimator import QuadrotorNoise
 from sim.lidar import Lidar
-from sim.quadrotor import QUADROTOR, Quadrotor
+from sim.quadrotor import Quadrotor
 from sim.wind import Wind
 from sim.world import Arena, closing, room_bounds
 
@@ -66,7 +66,7 @@ def vehicle(settings: AutopilotSettings, arena: Arena, system: int) -> Autopilot
     rng = np.random.default_rng((settings.seed, system))
     noise = QuadrotorNoise()
     quadrotor = Quadrotor(arena, rng, noise, settings.wind, floor=None if settings.airborne else PAD)
-    lidar = Lidar(arena, task_of(QUADROTOR).rays, noise.scale * noise.lidar, rng)
+    lidar = Lidar(arena, robot_with_task("quadrotor").task.rays, noise.scale * noise.lidar, rng)
     timeout = settings.setpoint_timeout
     parameters = dict(AT_ONCE[settings.rules]) if settings.at_once else {}
     if timeout is not None:

@@ -34,10 +34,11 @@ from messaging.ros2.messages import (
     twist,
     vector,
 )
+from messaging.tasks import robot_with_task
 from sim.arenas import draw_arena
 from sim.conditions import Conditions
 from sim.driven import SAMPLE, DrivenGround, TurningLidar
-from sim.ground import GROUND, SAMPLES
+from sim.ground import SAMPLES
 
 Array = NDArray[np.float64]
 
@@ -84,7 +85,7 @@ class Bridge:
         """Raises Unreachable, UnknownArena."""
         self.settings, self.outcome = settings, Outcome()
         rng = np.random.default_rng((settings.seed, 11))
-        arena = draw_arena(settings.arena, np.random.default_rng(settings.seed), GROUND)
+        arena = draw_arena(settings.arena, np.random.default_rng(settings.seed), robot_with_task("ground"))
         c = settings.conditions
         self.robot = DrivenGround(arena, rng, c.noise, c.payload_kg, c.floor_friction)
         self._lidar = TurningLidar(arena, rng, c.lidar_noise(flies=False))

@@ -19,6 +19,7 @@ from deploy.run.configurations import RunConfig, load
 from deploy.run.places import CONFIG, LOG, UNFINISHED, Place, client_of, launcher_of, metrics_of, places
 from messaging.bus import BusError, BusSettings
 from messaging.robots import robot_named
+from messaging.tasks import robot_maybe_with_task, robot_with_task
 
 PARENT_DIED = 1  # prctl: PR_SET_PDEATHSIG
 
@@ -28,8 +29,10 @@ def _recorder(place: Place, folder: Path, config: RunConfig, bus: BusSettings) -
     from deploy.run.frames import as_json, both
     from logs import recorder
     from logs.foxglove import Pictures
+    from logs.robots import Robots
 
-    derive = both(Pictures(config.pictures).of_sample, as_json) if config.pictures > 0.0 else as_json
+    robots = Robots(robot_maybe_with_task(name) for name in config.robots)
+    derive = both(Pictures(config.pictures, robots).of_sample, as_json) if config.pictures > 0.0 else as_json
     about, files = metadata(config), attachments(config, folder)
     recorder.main(bus, folder / LOG, about, place.name, files, derive, config.rotation)
     return False
@@ -41,7 +44,7 @@ def _safety(place: Place, folder: Path, config: RunConfig, bus: BusSettings) -> 
     from safety.service import SafetySettings, main
     from safety.sign import Trust
 
-    models = tuple(method_path(robot_named(robot), config.method, config.recipe) for robot in config.robots)
+    models = tuple(method_path(robot_maybe_with_task(robot), config.method, config.recipe) for robot in config.robots)
     trust = None if bus.keys is None else Trust.load(bus.keys)
     newest = (
         newest_model(folder, robot_named(robot).name, trust) or path
@@ -85,12 +88,12 @@ def _actor(place: Place, folder: Path, config: RunConfig, bus: BusSettings) -> b
         mavlink=config.mavlink,
         steps=config.steps,
     )
-    propose = partial(policy_named, config.policy, robot_named(place.robot)) if config.policy else None
+    propose = partial(policy_named, config.policy, robot_with_task(place.robot)) if config.policy else None
     if config.flights:
         from actors import flight
         from deploy.quadrotors import flight_arena
 
-        arena = flight_arena(config.arena, config.seed, robot_named(place.robot))
+        arena = flight_arena(config.arena, config.seed, robot_with_task(place.robot))
         return flight.run(settings, config.flights[place.number], arena, propose, config.conditions)
     worlds = partial(fleet_world, conditions=config.conditions)
     return run(settings, partial(environment, conditions=config.conditions), propose, worlds)

@@ -91,10 +91,10 @@ class RunConfig:
 def _check_arenas(robots: tuple[str, ...], arena: str) -> None:
     """Raises ValueError: a robot or its arena does not exist. Other than the defaults', which need no look: what
     `train --help` reads has no simulator to wait for."""
-    from messaging.tasks import learnt
+    from messaging.tasks import robot_with_task
     from sim.arenas import arena_kind
 
-    kinds = [learnt(robot) for robot in robots]
+    kinds = [robot_with_task(robot) for robot in robots]
     for robot in kinds:
         arena_kind(robot, arena)
     if len({robot.name for robot in kinds}) < len(kinds):
@@ -103,11 +103,11 @@ def _check_arenas(robots: tuple[str, ...], arena: str) -> None:
 
 def _check_fleets(config: RunConfig) -> None:
     """Raises NoFleet."""
-    from messaging.tasks import learnt
+    from messaging.tasks import robot_with_task
     from sim.fleet import check_fleet
 
     for robot in config.robots:
-        check_fleet(learnt(robot), config.arena, config.fleet, config.conditions)
+        check_fleet(robot_with_task(robot), config.arena, config.fleet, config.conditions)
 
 
 EXPERIMENTS: dict[str, RunConfig] = {

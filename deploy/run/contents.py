@@ -10,6 +10,7 @@ from deploy.data.paths import method_path
 from deploy.run.configurations import RunConfig, encode
 from logs.container import attachment
 from messaging.robots import robot_named
+from messaging.tasks import robot_maybe_with_task
 from safety.methods import DDPC, load
 
 
@@ -32,7 +33,7 @@ def metadata(config: RunConfig) -> dict[str, dict[str, str]]:
         "versions": {name: version(name) for name in packages},
         "conditions": config.conditions.describe(),
     }
-    robots = [robot_named(name) for name in config.robots]
+    robots = [robot_maybe_with_task(name) for name in config.robots]
     about["robots"] = {robot.kind: json.dumps(robot.description) for robot in robots}
     for robot in robots if filtered else ():
         model = load(method_path(robot, config.method, config.recipe))
@@ -44,7 +45,7 @@ def attachments(config: RunConfig, folder: Path) -> dict[str, bytes]:
     """The models in use when the log begins, or before (of a run that goes on), so that it alone can be replayed."""
     if not config.filtered:
         return {}
-    models = (load(method_path(robot_named(robot), config.method, config.recipe)) for robot in config.robots)
+    models = (load(method_path(robot_maybe_with_task(robot), config.method, config.recipe)) for robot in config.robots)
     files = {attachment(model.robot.name, model.version): model.encode() for model in models}
     for robot in (robot_named(name).name for name in config.robots):
         archived = (folder / robot / "models").glob("*.safetensors")

@@ -17,7 +17,7 @@ from actors.driver import Driver, Identity
 from deploy.data.planned import Excited, Keep, run_length
 from deploy.study.trials import TrialLog, one_step, thinking
 from deploy.vehicles import YARD, factory
-from messaging.robots import Robot
+from messaging.tasks import RobotWithTask
 from messaging.topics import EPISODE, STEP
 from sim.conditions import Conditions
 from sim.envs import NavigationEnv
@@ -36,7 +36,7 @@ class Driven:
 
 
 def drive(
-    robot: Robot,
+    robot: RobotWithTask,
     keep: Keep,
     minutes: float,
     seed: int,
@@ -76,11 +76,11 @@ def drive(
     return Driven(str(path), runs, periods, outside, collisions)
 
 
-def _yard(keep: Keep) -> Callable[[str, np.random.Generator, Robot], Arena]:
+def _yard(keep: Keep) -> Callable[[str, np.random.Generator, RobotWithTask], Arena]:
     """A place with nothing in it; the start is the region's middle, along x, the goal out of reach."""
     middle = ((keep[0] + keep[2]) / 2.0, (keep[1] + keep[3]) / 2.0)
 
-    def draw(name: str, rng: np.random.Generator, robot: Robot) -> Arena:
+    def draw(name: str, rng: np.random.Generator, robot: RobotWithTask) -> Arena:
         half = YARD[robot.position_dim]
         height = None if robot.position_dim == 2 else 2.0 * half
         up = (0.0,) if height is None else (half,)

@@ -20,7 +20,7 @@ from logs.reader import by_run, find, open_log
 from messaging import brakeline_pb2 as pb
 from messaging.bus import BusSettings, Publisher
 from messaging.process import Process
-from messaging.robots import Robot, robot_named
+from messaging.tasks import RobotWithTask, robot_with_task
 from messaging.topics import LOGGED
 
 log = logging.getLogger("brakeline.feeder")
@@ -46,7 +46,7 @@ class Steps:
     """
 
     logs: Sequence[str]
-    robot: Robot
+    robot: RobotWithTask
     counts: Counter[str] = field(default_factory=Counter)
 
     def __iter__(self) -> Iterator[pb.Step]:
@@ -71,7 +71,7 @@ class Steps:
                 yield step
 
 
-def count(logs: Sequence[str], robot: Robot) -> int:
+def count(logs: Sequence[str], robot: RobotWithTask) -> int:
     """How many steps of a robot kind a learner can take from these logs.
 
     Raises:
@@ -101,7 +101,7 @@ def feed(process: Process, settings: FeederSettings) -> bool:
     Raises:
         RefusedByLearner, NoLog, NotALog: as they say.
     """
-    robot, stop = robot_named(settings.robot), process.stop.is_set
+    robot, stop = robot_with_task(settings.robot), process.stop.is_set
     steps, pupils, figures = Steps(settings.logs, robot), dict[str, Pupil](), Counter[str]()
 
     def refresh() -> None:

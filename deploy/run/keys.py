@@ -10,7 +10,7 @@ from deploy.data.paths import method_path
 from deploy.run.configurations import RunConfig
 from deploy.run.places import places
 from messaging.bus.authority import Authority
-from messaging.robots import robot_named
+from messaging.tasks import robot_maybe_with_task
 from safety.methods import load
 from safety.model_set import BadModel
 from safety.service import archive_path
@@ -43,7 +43,7 @@ def seal_models(config: RunConfig, folder: Path, keys: Path) -> None:
         return
     signer = Signer.load(keys)
     for name in config.robots if config.filtered else ():
-        model = load(method_path(robot_named(name), config.method, config.recipe))
+        model = load(method_path(robot_maybe_with_task(name), config.method, config.recipe))
         archived = archive_path(folder, model.robot.name, model.version)
         if not seal_of(archived).exists():
             signer.sign(model).save(archived)

@@ -17,10 +17,12 @@ from deploy.run.places import CONFIG, LOG, places, say_where
 from deploy.run.view import View
 from deploy.run.watched import Child, LaunchError, last_line
 from logs.metrics import Metrics
+from logs.robots import Robots
 from logs.watch.totals import told, totals
 from messaging.bus import BusError, BusSettings, Sample
 from messaging.process import Process
 from messaging.robots import robot_named
+from messaging.tasks import robot_maybe_with_task
 from messaging.tolerant import Tolerance, headline
 from messaging.topics import RECORDED
 from safety.vouch import write_key
@@ -45,7 +47,7 @@ def prepare(config: RunConfig, folder: Path, resume: bool) -> None:
         raise LaunchError(f"{folder} holds a run already: give --resume {folder}, or another --out")
     if config.filtered:
         for robot in config.robots:
-            method_for(robot_named(robot), config.method, config.recipe)
+            method_for(robot_maybe_with_task(robot), config.method, config.recipe)
     folder.mkdir(parents=True, exist_ok=True)
 
 
@@ -56,7 +58,7 @@ class Launcher:
         """bus: where it listens, and the keys of all processes, if they have any."""
         self.config, self.folder, self.bus = config, folder, bus
         self.children = [Child(place, folder) for place in places(config)]
-        self.metrics = Metrics()
+        self.metrics = Metrics(robots=Robots(robot_named(name) for name in config.robots))
         self.lines: deque[str] = deque(maxlen=200)
         self._inbox: deque[Sample] = deque()
         self._tolerance = Tolerance()  # the bus's, once there is one

@@ -22,7 +22,7 @@ class Place:
 
     name: str
     kind: str  # a key of KINDS
-    robot: str = ""
+    robot: str = ""  # its name or path, as the configuration has it
     number: int = 0
     nice: int = 0  # the robot's safety comes before learning
 
@@ -37,15 +37,16 @@ def places(config: RunConfig) -> list[Place]:
         names = [f"autopilot-{i}" if several else "autopilot" for i in range(len(config.flights))]
         table += [Place(name, "autopilot", number=i) for i, name in enumerate(names)]
     one = len(config.robots) == 1
-    for kind in (robot_named(robot).name for robot in config.robots):
+    for robot in config.robots:
+        kind = robot_named(robot).name
         if not config.policy:
-            table.append(Place("learner" if one else f"learner-{kind}", "learner", kind, nice=10))
+            table.append(Place("learner" if one else f"learner-{kind}", "learner", robot, nice=10))
         if config.from_logs:
-            table.append(Place("feeder" if one else f"feeder-{kind}", "feeder", kind, nice=2))
+            table.append(Place("feeder" if one else f"feeder-{kind}", "feeder", robot, nice=2))
         for i in range(config.actors):
             name = f"actor-{i}" if one else f"actor-{kind}-{i}"
             nice = 0 if config.flights else 2
-            table.append(Place(name, "actor", kind, i * config.robots_per_actor, nice))
+            table.append(Place(name, "actor", robot, i * config.robots_per_actor, nice))
     return table
 
 

@@ -25,7 +25,7 @@ from logs.container import attachment
 from logs.reader import Log, Paths, open_log
 from logs.tally import KINDS
 from messaging import brakeline_pb2 as pb
-from messaging.robots import robot_named
+from messaging.robots import Robot
 from safety.commitment import UNVERIFIED
 from safety.methods import Method, decode, load, ready
 from safety.service import Counts, Models, answerer
@@ -40,7 +40,7 @@ EXAMPLES = 20  # decisions that are told in full: those with the largest differe
 NAMES = {pb.UNKNOWN: "error", **KINDS}
 
 Waiting = dict[tuple[tuple[str, ...], int, int], dict[str, tuple[pb.Request, pb.Reply]]]  # fleets not yet whole
-Instead = Callable[[str], Method]  # by the robot's name: what is asked in place of what was in use
+Instead = Callable[[Robot], Method]  # what is asked about a robot in place of what was in use
 
 
 class ReplayError(ValueError):
@@ -113,7 +113,7 @@ class Comparison:
         """Compare two replies to a request, but for their times and what else is to be ignored."""
         self.requests += 1
         self.kinds[NAMES[logged.decision.kind], NAMES[now.decision.kind]] += 1
-        found = differences(logged, now, robot_named(request.robot).action_dim, (*TIMES, *WORDS, *ignored))
+        found = differences(logged, now, len(request.input_in_force), (*TIMES, *WORDS, *ignored))
         if not found:
             self.identical += 1
         elif all(difference.rounding or name in WORK for name, difference in found.items()):
@@ -223,7 +223,12 @@ def replay(paths: Paths, instead: Instead | None = None, each: Callable[[], Any]
             continue
         for request, logged in questions:
             if instead is not None:
-                _put_to_use(models, request, instead(request.robot))
+                robot = log.robots.named(request.robot)
+                if robot is None:
+                    raise ReplayError(
+                        f"the log does not describe {request.robot!r}, and no such robot comes with the program"
+                    )
+                _put_to_use(models, request, instead(robot))
                 if request.model not in ("", UNVERIFIED):
                     request.model = models.filters[request.robot].version
             elif logged.decision.model:  # else it is an error, of whatever was in use

@@ -23,8 +23,7 @@ from deploy.vehicles import environment
 from learner.config import LearnerConfig, TD3Config
 from learner.core import Learner
 from logs.report import analyse
-from messaging.robots import Robot
-from messaging.tasks import learnt
+from messaging.tasks import RobotWithTask, robot_with_task
 from safety.methods import DDPC, Model
 from safety.model_set import Recipe
 from safety.rivals.pretrained import Pretrained
@@ -100,7 +99,7 @@ def run(study: Study, folder: Path, say: Report = lambda text: None) -> dict[str
         Unconfirmed: a log says something else than was counted.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    robot = learnt(study.robot)
+    robot = robot_with_task(study.robot)
     models: dict[str, Model] = {}
     for method in {study.method, *(trial.method for trial in study.trials())} - {NONE}:
         models[method] = method_for(robot, method, study.recipe)
@@ -109,7 +108,7 @@ def run(study: Study, folder: Path, say: Report = lambda text: None) -> dict[str
     model = models.get(study.method)
     return {
         "study": study.config(),
-        "model": None if model is None else {"version": model.version, **_cost(model)},
+        "model": None if model is None else {"version": model.version, **_cost(model, robot)},
         "policy": hashlib.sha256((folder / "policy.safetensors").read_bytes()).hexdigest()[:16],
         "versions": {name: version(name) for name in PACKAGES},
         "training": training,
@@ -117,14 +116,14 @@ def run(study: Study, folder: Path, say: Report = lambda text: None) -> dict[str
     }
 
 
-def _cost(model: Model) -> dict[str, str]:
+def _cost(model: Model, robot: RobotWithTask) -> dict[str, str]:
     """What was driven beforehand, and how it went. Ours is recorded in an empty yard: there is nothing to touch."""
     if isinstance(model, Pretrained):
         return {name: model.about[name] for name in ("samples", "collisions", "seconds", "error")}
-    return {"samples": str(recorded(model.robot).periods), "collisions": "0"}
+    return {"samples": str(recorded(robot).periods), "collisions": "0"}
 
 
-def _driver(study: Study, trial: Trial, robot: Robot, seed: int, actor: str) -> Driver:
+def _driver(study: Study, trial: Trial, robot: RobotWithTask, seed: int, actor: str) -> Driver:
     env = environment(robot, trial.arena, seed)
     identity, filtered = Identity(actor, 0, study.seed), trial.method != NONE
     # at an intervention training calls the episode off; an evaluation goes on, or its goal rate would mean nothing
@@ -136,7 +135,7 @@ def _question(models: dict[str, Model], method: str) -> Ask | None:
     return None if method == NONE else in_process(models[method])
 
 
-def _train(study: Study, robot: Robot, models: dict[str, Model], folder: Path, say: Report) -> dict[str, Any]:
+def _train(study: Study, robot: RobotWithTask, models: dict[str, Model], folder: Path, say: Report) -> dict[str, Any]:
     trial = Trial(LEARNING, study.method, study.arenas[0], 0)
     config = LearnerConfig(td3=study.td3, seed=study.seed, steps=study.steps)
     driver = _driver(study, trial, robot, study.seed, study.name)
@@ -153,7 +152,7 @@ def _train(study: Study, robot: Robot, models: dict[str, Model], folder: Path, s
 
 
 def _evaluate(
-    study: Study, trial: Trial, robot: Robot, models: dict[str, Model], folder: Path, say: Report
+    study: Study, trial: Trial, robot: RobotWithTask, models: dict[str, Model], folder: Path, say: Report
 ) -> dict[str, Any]:
     say(trial.name)
     name = str(folder / "policy.safetensors") if trial.policy == TRAINED else UNTRAINED

@@ -15,7 +15,7 @@ from typing import Any
 
 from deploy.study import cells
 from deploy.study.cells import METHODS, Study
-from messaging.tasks import learnt, task_of
+from messaging.tasks import robot_with_task
 
 RESULTS, RUNS = Path("results"), Path("runs/compare")
 EPISODES = 500
@@ -45,6 +45,6 @@ class Cell:
 
 def studies(robot: str, seeds: Iterable[int] = SEEDS, quick: bool = False) -> list[Study]:
     """All cells of a robot's table, seed by seed, so that an interrupted comparison has whole seeds."""
-    steps = task_of(learnt(robot)).steps
+    steps = robot_with_task(robot).task.steps
     wanted = [Study(robot, method, seed, steps, EPISODES) for seed in seeds for method in METHODS]
     return [cells.quick(study) for study in wanted] if quick else wanted

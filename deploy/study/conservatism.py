@@ -20,8 +20,7 @@ from deploy.policies import policy_named
 from deploy.study.evaluate import FRESH, in_process
 from deploy.study.trials import Episodes, evaluate
 from deploy.vehicles import environment
-from messaging.robots import Robot
-from messaging.tasks import learnt
+from messaging.tasks import RobotWithTask, robot_with_task
 from safety.certificates import KINDS, CertificateError
 from safety.dataset import BadData
 from safety.model_set import MODES, Recipe
@@ -49,7 +48,7 @@ class Conservatism:
 
     def run(self, folder: Path, say: Callable[[str], object] = lambda text: None) -> dict[str, Any]:
         """A row for each certificate and mode, the refused ones with the reason."""
-        robot = learnt(self.robot)
+        robot = robot_with_task(self.robot)
         data = recorded(robot)
         rows = []
         for certificate in KINDS:
@@ -69,7 +68,7 @@ class Conservatism:
                 rows.append(row | {"driving": driving})
         return {"study": self.config(), "data": data.digest(), "rows": rows}
 
-    def _drive(self, robot: Robot, policy: str, question: Any) -> dict[str, Any]:
+    def _drive(self, robot: RobotWithTask, policy: str, question: Any) -> dict[str, Any]:
         """Closed loop on the first fresh episodes."""
         driver = Driver(robot, environment(robot, self.arena, FRESH), Identity("conservatism", 0, 0))
         found: Episodes = evaluate(driver, policy_named(policy, robot, 0), question, self.episodes)

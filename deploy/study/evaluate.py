@@ -17,7 +17,7 @@ from deploy.vehicles import environment, fleet_world
 from logs.analysis import perception_in
 from logs.metrics import Tally, closed_loop
 from messaging import brakeline_pb2 as pb
-from messaging.robots import Robot
+from messaging.tasks import RobotWithTask
 from safety.methods import DDPC, Model
 from safety.model_set import Recipe
 from safety.recipe import check_promises
@@ -67,7 +67,7 @@ def episode(driver: Driver, policy: Policy, question: Ask | None, number: int) -
         yield driver.execute(proposal, outcome)
 
 
-def prepared(robot: Robot, what: Evaluation) -> tuple[Driver, Policy, Ask | None]:
+def prepared(robot: RobotWithTask, what: Evaluation) -> tuple[Driver, Policy, Ask | None]:
     """What an evaluation is made of: the driver in a fresh environment, the policy, and whom it asks."""
     policy = policy_named(what.policy, robot, what.seed)
     env = environment(robot, what.arena, FRESH + what.seed, what.conditions)
@@ -92,7 +92,7 @@ def round_of(fleet: Fleet, policies: Sequence[Policy], question: Ask | None, num
         yield [step for step in fleet.execute(proposals, outcomes) if step is not None]
 
 
-def prepared_fleet(robot: Robot, what: Evaluation) -> tuple[Fleet, FleetEnv, list[Policy], Ask | None]:
+def prepared_fleet(robot: RobotWithTask, what: Evaluation) -> tuple[Fleet, FleetEnv, list[Policy], Ask | None]:
     """The same for several robots in one world.
 
     Raises:
@@ -109,7 +109,9 @@ def prepared_fleet(robot: Robot, what: Evaluation) -> tuple[Fleet, FleetEnv, lis
     return Fleet(world, drivers, question is not None), world, policies, question
 
 
-def evaluate(robot: Robot, what: Evaluation, each: Callable[[Tally], Any] = lambda tally: None) -> dict[str, Any]:
+def evaluate(
+    robot: RobotWithTask, what: Evaluation, each: Callable[[Tally], Any] = lambda tally: None
+) -> dict[str, Any]:
     """The shared figures of `what.episodes` episodes (of a fleet: of at least so many, each robot's counted); `each` is
     called after every one."""
     if what.fleet:
@@ -123,7 +125,7 @@ def evaluate(robot: Robot, what: Evaluation, each: Callable[[Tally], Any] = lamb
     return closed_loop([tally]) | _about(what)
 
 
-def _together(robot: Robot, what: Evaluation, each: Callable[[Tally], Any]) -> dict[str, Any]:
+def _together(robot: RobotWithTask, what: Evaluation, each: Callable[[Tally], Any]) -> dict[str, Any]:
     """A fleet's figures: of all, by kind and by robot as `analyse` has them, and of its worlds."""
     fleet, world, policies, question = prepared_fleet(robot, what)
     tallies = {driver.identity.actor: Tally() for driver in fleet.drivers}

@@ -21,7 +21,6 @@ from actors.guard import Ask, consult
 from learner.core import Learner
 from logs.segment import Entry, open_segment
 from messaging import brakeline_pb2 as pb
-from messaging.tasks import layout
 from messaging.topics import EPISODE, STEP, Topic
 from messaging.weights import MLP, decode
 from sim.policies import Policy, scripted
@@ -186,7 +185,7 @@ class Trainer:
     def __init__(self, driver: Driver, question: Ask | None, learner: Learner) -> None:
         self.driver, self.question, self.learner = driver, question, learner
         robot = driver.robot
-        reply = learner.join(pb.Join(robot=robot.name, actor=driver.identity.actor, layout=layout(robot)))
+        reply = learner.join(pb.Join(robot=robot.name, actor=driver.identity.actor, layout=robot.learning_layout()))
         self.policy: MLP = decode(reply.weights.file, robot)
 
     def run(self, log: TrialLog | None = None) -> Iterator[pb.Step]:

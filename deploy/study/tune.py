@@ -14,7 +14,7 @@ from deploy.policies import policy_named
 from deploy.study.evaluate import FRESH, in_process
 from deploy.study.trials import evaluate
 from deploy.vehicles import environment
-from messaging.tasks import task_of
+from messaging.tasks import RobotWithTask
 from safety.rivals.pretrained import Pretrained
 from safety.rivals.sailr import SAILR
 from safety.rivals.secas import SECAS
@@ -39,14 +39,13 @@ class Tried:
         return asdict(self)
 
 
-def values_for(model: Pretrained) -> tuple[float, ...]:
+def values_for(model: Pretrained, robot: RobotWithTask) -> tuple[float, ...]:
     """The four that are tried."""
-    return task_of(model.robot).rivals.margins if model.method == SECAS else ADVANTAGES
+    return robot.task.rivals.margins if model.method == SECAS else ADVANTAGES
 
 
-def tried(model: Pretrained, value: float, episodes: int, arena: str = "default") -> Tried:
+def tried(model: Pretrained, robot: RobotWithTask, value: float, episodes: int, arena: str = "default") -> Tried:
     """The model with another threshold, on fresh episodes."""
-    robot = model.robot
     setting = robot.footprint + value if model.method == SECAS else value
     question = in_process(replace(model, settings=dict(model.settings) | {SETTING[model.method]: setting}))
     found = {}
@@ -65,12 +64,16 @@ def tried(model: Pretrained, value: float, episodes: int, arena: str = "default"
 
 
 def try_all(
-    model: Pretrained, values: Sequence[float], episodes: int, say: Callable[[Tried], object] = lambda row: None
+    model: Pretrained,
+    robot: RobotWithTask,
+    values: Sequence[float],
+    episodes: int,
+    say: Callable[[Tried], object] = lambda row: None,
 ) -> list[Tried]:
     """A row for each value, told as soon as it is known."""
     rows = []
     for value in values:
-        rows.append(tried(model, value, episodes))
+        rows.append(tried(model, robot, value, episodes))
         say(rows[-1])
     return rows
 

@@ -45,7 +45,7 @@ def main() -> None:
     adapter = adapter_of(given.robot)
     client = None
     if given.connect != "none":
-        client = SafetyClient.open(given.connect, given.robot, DEADLINE, name="client.episodes")
+        client = SafetyClient.open(given.connect, adapter.robot, DEADLINE, name="client.episodes")
     env = behind(adapter, client)
     with client or nullcontext():
         for seed in missing(given, client is not None):

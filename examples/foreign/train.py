@@ -105,7 +105,7 @@ def main() -> None:
     given = parser.parse_args()
     adapter, done, number, cost = adapter_of(given.robot), 0, 0, 0.0
     started = time.perf_counter()
-    with SafetyClient.open(given.connect, given.robot, DEADLINE, name="client.training") as client:
+    with SafetyClient.open(given.connect, adapter.robot, DEADLINE, name="client.training") as client:
         env = behind(adapter, client, given.penalty)
         pupil = Pupil(adapter, env.observation_space.shape[0], given.steps, given.seed)
         while done < given.steps:

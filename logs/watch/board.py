@@ -10,12 +10,13 @@ from typing import Any
 
 from logs.metrics import SILENT, Crowded, Metrics
 from logs.picture import discs
+from logs.robots import Robots
 from logs.scene import half_width
 from logs.watch.totals import heard, totals
 from messaging import brakeline_pb2 as pb
 from messaging.bus import Sample
 from messaging.explained import explain, fits
-from messaging.robots import Robot, UnknownRobot, robot_named
+from messaging.robots import Robot
 from messaging.shapes import WALL
 from messaging.surroundings import promised, surroundings
 from messaging.tolerant import headline
@@ -134,7 +135,8 @@ class Board:
     """Takes samples in one thread; others ask for its `view`."""
 
     def __init__(self) -> None:
-        self.metrics = Metrics()
+        self._robots = Robots()
+        self.metrics = Metrics(robots=self._robots)
         self._cards: dict[str, Card] = {}
         self._lines: deque[str] = deque(maxlen=LINES)
         self._returns: dict[str, deque[float]] = {}  # by robot kind
@@ -166,10 +168,10 @@ class Board:
     def _robot(self, message: pb.Episode | pb.Step) -> None:
         card = self._cards.get(message.actor)
         if card is None:
-            try:
-                card = Card(robot_named(message.robot), message.actor)
-            except UnknownRobot:
+            robot = self._robots.named(message.robot)
+            if robot is None:
                 return
+            card = Card(robot, message.actor)
             if len(self._cards) == MOST_CARDS:
                 raise Crowded(f"{message.actor} is one robot more than the {MOST_CARDS} that are shown")
             self._cards[message.actor] = card

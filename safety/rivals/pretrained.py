@@ -19,7 +19,7 @@ from messaging.files import write_whole
 from messaging.perceptrons import BadPerceptrons, Perceptrons
 from messaging.rays import Rays
 from messaging.robots import Robot, UnknownRobot, robot_named
-from safety.model_set import BadModel
+from safety.model_set import BadModel, robot_in
 from safety.tensors import pack, unpack
 
 ENTRY = "pretrained"
@@ -55,7 +55,7 @@ class Pretrained:
         return tensors if self.rays is None else tensors | {RAYS: self.rays.directions}
 
     def encode(self) -> bytes:
-        about = {
+        about: dict[str, Any] = {
             "robot": self.robot.name,
             "layout": self.robot.layout(),
             "method": self.method,
@@ -63,6 +63,7 @@ class Pretrained:
             "networks": sorted(self.networks),
             "about": self.about,
             "version": self.version,
+            "description": json.dumps(self.robot.description),  # a text: the order of its names counts
         }
         if self.rays is not None:
             about["range"] = self.rays.range
@@ -79,7 +80,7 @@ class Pretrained:
         """
         try:
             tensors, about = unpack(payload, ENTRY)
-            robot = robot_named(about["robot"])
+            robot = robot_in(about) if "description" in about else robot_named(str(about["robot"]))  # older files
             networks = {str(name): Perceptrons.of(tensors, name) for name in about["networks"]}
             settings = {str(name): float(value) for name, value in about["settings"].items()}
             rays = _rays(tensors, about)

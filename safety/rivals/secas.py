@@ -19,8 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from messaging.rays import Rays
-from messaging.robots import Robot
-from messaging.tasks import UnknownTask, usual_task
+from messaging.robots import Robot, shipped
+from messaging.tasks import robot_with_task
 from safety.backup import braked, braking_plan, within
 from safety.commitment import NO_PREDICTION
 from safety.model_set import BadModel
@@ -110,6 +110,13 @@ def quadratic(r: Array, G: Array, d: Array, low: Array, high: Array) -> tuple[Ar
     return a, solution.status, solution.iterations
 
 
+def _usual_rays(robot: Robot) -> Rays:
+    """Return the rays of a robot's usual task: older files do not hold the rays. Raises BadModel if there is none."""
+    if robot.kind not in shipped():
+        raise BadModel(f"the model of {robot.name} does not hold the lidar's rays: pretrain it again")
+    return robot_with_task(robot.kind).task.rays
+
+
 class Secas:
     """Networks made ready for decisions. Inputs are scaled by the robot's highest: zero stays zero."""
 
@@ -119,10 +126,7 @@ class Secas:
             BadModel: not of this method, or its networks do not fit the robot.
         """
         self.model, self.robot, self.version = model, model.robot, model.version
-        try:
-            rays = model.rays or usual_task(self.robot).rays  # older files do not hold the rays
-        except UnknownTask as error:
-            raise BadModel(f"no model of SECAS for {self.robot.name}: {error}") from error
+        rays = model.rays or _usual_rays(self.robot)
         self.constraints = Constraints(model.robot, rays)
         try:
             self.g, clearance = model.networks["g"], model.settings["clearance"]

@@ -10,13 +10,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from messaging.tasks import task_of
 from sim.autopilot import frames
 from sim.autopilot.dialect import mavlink
 from sim.autopilot.pilot import Landed, Pilot
 from sim.flight_estimator import Estimate
 from sim.lidar import Lidar
-from sim.quadrotor import QUADROTOR
 
 BINS = 72  # of OBSTACLE_DISTANCE, clockwise from straight ahead
 UNKNOWN = 65535  # cm, a bin that no beam belongs to
@@ -172,7 +170,7 @@ class Reports:
     def obstacle_distance(self) -> Message | None:
         if self._lidar is None:
             return None
-        rays = task_of(QUADROTOR).rays
+        rays = self._lidar.rays
         ranges = self._lidar.ranges(self._pilot.vehicle.state()[:3], frames.heading(self.estimate.attitude))
         bins = obstacle_bins(ranges, rays.directions, rays.range)
         return mavlink.MAVLink_obstacle_distance_message(

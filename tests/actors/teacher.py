@@ -2,7 +2,6 @@
 
 from messaging import brakeline_pb2 as pb
 from messaging.bus import Bus
-from messaging.tasks import layout
 from messaging.topics import FLOW, JOIN, WEIGHTS
 from messaging.weights import MLP
 from tests.robots import GROUND
@@ -13,7 +12,7 @@ class Teacher:
 
     def __init__(self, bus: Bus) -> None:
         self.flow = pb.Flow(robot="ground", incarnation=1)
-        self.version, self.layout = 1, layout(GROUND)
+        self.version, self.layout = 1, GROUND.learning_layout()
         self.joins: list[pb.Join] = []
         self._flow, self._weights = bus.publisher(FLOW, robot="ground"), bus.publisher(WEIGHTS, robot="ground")
         bus.serve(JOIN, self._join, robot="ground")

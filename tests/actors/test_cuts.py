@@ -10,7 +10,6 @@ from deploy.vehicles import environment
 from logs.tally import Tally
 from messaging import brakeline_pb2 as pb
 from messaging.bus import NoReply
-from messaging.tasks import task_of
 from tests.robots import GROUND
 from tests.safety.rivals.test_sailr import known
 
@@ -33,7 +32,7 @@ def test_an_intervention_is_a_terminal_step_for_the_learner_alone(driver):
     allowed, cut = (step(driver, proposal, ask) for proposal in (SLOW, FAST))
     assert not allowed.cut and allowed.penalty == 0.0 and allowed.decision == pb.ALLOWED
     assert cut.cut and cut.decision == pb.FAILSAFE and not any(cut.action) and list(cut.proposed) == pytest.approx(FAST)
-    assert cut.reward - cut.penalty == pytest.approx(task_of(GROUND).reward.cut) and cut.reward > -5
+    assert cut.reward - cut.penalty == pytest.approx(GROUND.task.reward.cut) and cut.reward > -5
     assert not cut.terminated and not cut.goal and not cut.collision, "nothing ended in the environment"
     assert cut.truncated and not driver.running, "the robot's episode was called off"
     seen = Tally()

@@ -9,7 +9,6 @@ import pytest
 from actors.student import RefusedByLearner, Student
 from messaging import brakeline_pb2 as pb
 from messaging.bus import Bus
-from messaging.tasks import layout
 from tests.actors.teacher import Teacher
 from tests.robots import GROUND
 from tests.waiting import until
@@ -43,7 +42,7 @@ def test_it_waits_for_a_learner_joins_it_and_is_told_where_to_go_on(buses: tuple
     thread.join(20.0)
     assert answers == [7] and student.policy is not None and student.policy.version == 1
     join = teacher.joins[0]
-    assert (join.actor, join.index, join.episode, join.layout) == ("actor-0", 12, 4, layout(GROUND))
+    assert (join.actor, join.index, join.episode, join.layout) == ("actor-0", 12, 4, GROUND.learning_layout())
 
 
 def test_a_stop_ends_the_wait_for_a_learner(buses: tuple[Bus, Bus]) -> None:

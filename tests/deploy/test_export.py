@@ -13,7 +13,6 @@ from mcap_protobuf.decoder import DecoderFactory
 
 from deploy import cli
 from messaging import brakeline_pb2 as pb
-from messaging.tasks import task_of
 from tests.robots import GROUND
 
 STEPS = 150
@@ -42,7 +41,7 @@ def test_csv_has_every_step_with_every_field(log: Path, tmp_path: Path, capsys: 
         assert float(row["reward"]) == step.reward and int(row["terminated"]) == step.terminated
         assert row["decision"] == pb.Kind.Name(step.decision) and float(row["header.time"]) == step.header.time
         for name, parts in (
-            ("observation", task_of(GROUND).observed),
+            ("observation", GROUND.task.observed),
             ("action", GROUND.action),
             ("state", GROUND.state),
         ):

@@ -19,9 +19,8 @@ from deploy.run.configurations import RunConfig
 from deploy.run.places import places
 from deploy.study.evaluate import FRESH, episode, in_process
 from deploy.vehicles import environment
-from messaging.robots import Robot, known
 from messaging.shapes import BOX, Obstacle
-from messaging.tasks import address, learnt, task_of
+from messaging.tasks import RobotWithTask, address, robot_with_task
 from safety.backup import braking_plan
 from safety.dataset import BadData, Dataset
 from safety.model_set import ModelSet, Recipe
@@ -36,17 +35,17 @@ NAMES = ("car", "omni")
 TRAJECTORIES = 24  # a few seconds of recording each; enough for windows in both parts
 
 
-def robot(name: str) -> Robot:
-    return learnt(str(EXAMPLES / name / f"{name}.toml"))
+def robot(name: str) -> RobotWithTask:
+    return robot_with_task(str(EXAMPLES / name / f"{name}.toml"))
 
 
 @pytest.fixture(scope="module", params=NAMES)
-def kind(request: pytest.FixtureRequest) -> Robot:
+def kind(request: pytest.FixtureRequest) -> RobotWithTask:
     return robot(request.param)
 
 
 @pytest.fixture(scope="module")
-def recorded(kind: Robot) -> Dataset:
+def recorded(kind: RobotWithTask) -> Dataset:
     return collect.dataset(kind, list(collect.record(kind, TRAJECTORIES, 1, Conditions())), 1, Conditions())
 
 
@@ -57,7 +56,7 @@ def model(recorded: Dataset) -> ModelSet:
 
 def exact(name: str) -> Vehicle:
     """Its vehicle, heading east, far from everything, without measurement errors."""
-    made = task_of(robot(name)).code(task_of(robot(name)).simulator)(Conditions(NoiseLevels(scale=0.0)), None)
+    made = robot(name).task.code(robot(name).task.simulator)(Conditions(NoiseLevels(scale=0.0)), None)
     return made(staged_arena(), np.random.default_rng(0))
 
 
@@ -67,13 +66,11 @@ def drive(vehicle: Vehicle, *inputs: list[float]) -> np.ndarray:
     return vehicle.true
 
 
-def test_a_task_observes_what_its_file_names(kind: Robot) -> None:
+def test_a_task_observes_what_its_file_names(kind: RobotWithTask) -> None:
     env = environment(kind, "default", 0)
     observation, info = env.reset(seed=0)
-    assert observation.shape == (task_of(kind).observation_dim,) == env.observation_space.shape
-    assert np.allclose(
-        observation[task_of(kind).rays.directions.shape[0] + 1 :][:2].sum(), sum(_to_goal(info)), atol=0.1
-    )
+    assert observation.shape == (kind.task.observation_dim,) == env.observation_space.shape
+    assert np.allclose(observation[kind.task.rays.directions.shape[0] + 1 :][:2].sum(), sum(_to_goal(info)), atol=0.1)
     assert info["speed"] == pytest.approx(0.0, abs=0.01)
 
 
@@ -143,7 +140,7 @@ def _surface(model: mujoco.MjModel, i: int) -> np.ndarray:
 @pytest.mark.parametrize("name", NAMES)
 def test_driving_into_something_is_a_collision(name: str) -> None:
     """The physics' own contacts judge: the robot stops at a box in its way, with its nose there."""
-    made = task_of(robot(name)).code(task_of(robot(name)).simulator)(Conditions(NoiseLevels(scale=0.0)), None)
+    made = robot(name).task.code(robot(name).task.simulator)(Conditions(NoiseLevels(scale=0.0)), None)
     vehicle = made(staged_arena(Obstacle(BOX, (0.6, 0.0), (0.2, 1.0))), np.random.default_rng(0))
     ahead = np.zeros(robot(name).action_dim)
     ahead[0] = 0.4
@@ -156,7 +153,7 @@ def test_driving_into_something_is_a_collision(name: str) -> None:
 @pytest.mark.parametrize("heading, nose", [(0.0, 0.0), (0.5 * math.pi, 0.11), (-0.5 * math.pi, 0.11)])
 def test_clearance_is_measured_from_the_discs_that_hold_the_body(heading: float, nose: float) -> None:
     """A long car beside a wall is farther from it than one whose nose or tail points there."""
-    made = task_of(robot("car")).code(task_of(robot("car")).simulator)(Conditions(NoiseLevels(scale=0.0)), None)
+    made = robot("car").task.code(robot("car").task.simulator)(Conditions(NoiseLevels(scale=0.0)), None)
     wall = Obstacle(BOX, (0.0, 0.35), (4.0, 0.1))
     vehicle = made(staged_arena(wall, start=(0.0, 0.0, heading)), np.random.default_rng(0))
     for period in (vehicle.standing(), vehicle.step(np.zeros(2))):
@@ -180,13 +177,13 @@ def test_what_was_not_fitted_keeps_to_the_tubes(recorded: Dataset) -> None:
     assert model.robot == recorded.robot
 
 
-def test_nothing_is_touched_in_adversarial_episodes(kind: Robot, model: ModelSet) -> None:
+def test_nothing_is_touched_in_adversarial_episodes(kind: RobotWithTask, model: ModelSet) -> None:
     """Behind the filter; the same drive without it does collide."""
     assert _collisions(kind, in_process(model)) == (0, 0)
     assert _collisions(kind, None)[0] > 0
 
 
-def _collisions(kind: Robot, question: object) -> tuple[int, int]:
+def _collisions(kind: RobotWithTask, question: object) -> tuple[int, int]:
     """Collisions and steps outside of the predicted sets, in some periods of two adversarial episodes."""
     env = environment(kind, "default", FRESH)
     driver = Driver(kind, env, Identity("test", 0, 0), filtered=question is not None)
@@ -201,7 +198,7 @@ def _collisions(kind: Robot, question: object) -> tuple[int, int]:
 
 
 def test_a_description_that_changed_makes_the_model_set_again(
-    kind: Robot, recorded: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    kind: RobotWithTask, recorded: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A model set of a narrower body is never used for a wider one; the recording is, and not for another clock."""
     monkeypatch.setenv("BRAKELINE_DATA", str(tmp_path))
@@ -212,11 +209,14 @@ def test_a_description_that_changed_makes_the_model_set_again(
     assert store.model_for(wider, Recipe()).robot.body == wider.body
     with pytest.raises(BadData, match="changed"):
         recording.data_for(replace(kind, period=0.1))
-    known(kind)
 
 
 def test_what_was_not_recorded_here_is_never_recorded_over(
-    kind: Robot, recorded: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    kind: RobotWithTask,
+    recorded: Dataset,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     """Whether the description changes, or somebody asks for a recording outright."""
     monkeypatch.setenv("BRAKELINE_DATA", str(tmp_path))
@@ -225,18 +225,18 @@ def test_what_was_not_recorded_here_is_never_recorded_over(
     before = path.read_bytes()
     with pytest.raises(BadData, match=r"kept: .* \(import: drive.csv\).*import the log again"):
         store.model_for(replace(kind, period=0.1), Recipe())
-    known(kind)
     assert main(["collect", str(EXAMPLES / kind.name / f"{kind.name}.toml"), "--trajectories", "1"]) == 1
     assert "drive.csv" in capsys.readouterr().err
     assert path.read_bytes() == before
 
 
 def test_a_run_names_its_processes_by_the_robot_and_not_by_its_path() -> None:
-    config = RunConfig(robots=(address(str(EXAMPLES / "car" / "car.toml")),))
-    assert {place.robot for place in places(config) if place.robot} == {"car"}
+    config = RunConfig(robots=tuple(address(str(EXAMPLES / name / f"{name}.toml")) for name in NAMES))
+    names = {place.name for place in places(config) if place.kind == "learner"}
+    assert names == {"learner-car", "learner-omni"}
 
 
-def test_the_trained_policy_lies_beside_the_task(kind: Robot) -> None:
+def test_the_trained_policy_lies_beside_the_task(kind: RobotWithTask) -> None:
     policy = policy_named("trained", kind, 0)
     observation, info = environment(kind, "default", FRESH).reset(seed=0)
     assert policy(observation, info).shape == (kind.action_dim,)

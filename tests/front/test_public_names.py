@@ -70,8 +70,8 @@ def test_a_wheel_has_everything(wheel):
 
 def test_the_trained_policies_are_found_outside_the_checkout(wheel):
     code = (
-        "from deploy.policies import policy_named; from messaging.robots import robot_named; import messaging; "
-        "[policy_named('trained', robot_named(n), 0) for n in ('ground', 'quadrotor')]; "
-        "policy_named('trained-by-scan', robot_named('ground'), 0); print(messaging.__file__)"
+        "from deploy.policies import policy_named; from messaging.tasks import robot_with_task; import messaging; "
+        "[policy_named('trained', robot_with_task(n), 0) for n in ('ground', 'quadrotor')]; "
+        "policy_named('trained-by-scan', robot_with_task('ground'), 0); print(messaging.__file__)"
     )
     assert Path(outside(wheel, code)).is_relative_to(wheel)

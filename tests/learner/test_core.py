@@ -8,7 +8,6 @@ from learner.core import Learner
 from learner.intake import BadStep
 from messaging import brakeline_pb2 as pb
 from messaging import weights
-from messaging.tasks import layout
 from tests.learner.toy import CONFIG, TOY, ToyActor, run, settle
 
 
@@ -126,7 +125,7 @@ def test_duplicates_and_gaps_are_counted():
     ("fields", "wrong"), [({"robot": "ground"}, "robot"), ({"layout": "0123"}, "layout"), ({"actor": ""}, "actor")]
 )
 def test_join_refusals(fields, wrong):
-    join = {"robot": "toy", "actor": "actor-0", "layout": layout(TOY)} | fields
+    join = {"robot": "toy", "actor": "actor-0", "layout": TOY.learning_layout()} | fields
     reply = Learner(TOY, CONFIG).join(pb.Join(**join))
     assert (reply.error.type, reply.error.field) == ("Refused", wrong)
     assert not reply.HasField("weights") and not reply.HasField("flow")
@@ -134,13 +133,13 @@ def test_join_refusals(fields, wrong):
 
 def test_lockstep_takes_one_actor():
     learner, actor = started()
-    assert learner.join(pb.Join(robot="toy", actor="actor-1", layout=layout(TOY))).error.field == "actor"
+    assert learner.join(pb.Join(robot="toy", actor="actor-1", layout=TOY.learning_layout())).error.field == "actor"
     assert not actor.join().HasField("error")
 
 
 def test_a_late_joiner_gets_weights_and_its_place():
     learner, _ = started(replace(CONFIG, lockstep=False))
-    reply = learner.join(pb.Join(robot="toy", actor="actor-1", layout=layout(TOY), index=100, episode=4))
+    reply = learner.join(pb.Join(robot="toy", actor="actor-1", layout=TOY.learning_layout(), index=100, episode=4))
     assert reply.episode == 4
     assert weights.decode(reply.weights.file, TOY).version == reply.flow.weights_version == 1
     assert 100 < reply.flow.limit["actor-1"] <= 100 + CONFIG.window
@@ -150,7 +149,7 @@ def test_a_late_joiner_gets_weights_and_its_place():
 def asynchronous(**changes) -> Learner:
     learner = Learner(TOY, replace(CONFIG, lockstep=False, window=8, ahead=20, publish_every=5, **changes))
     for actor in ("actor-0", "actor-1"):
-        learner.join(pb.Join(robot="toy", actor=actor, layout=layout(TOY)))
+        learner.join(pb.Join(robot="toy", actor=actor, layout=TOY.learning_layout()))
     return learner
 
 
@@ -202,7 +201,7 @@ def test_asynchronous_resume_keeps_open_windows_and_counts_what_was_lost(tmp_pat
     learner.save(tmp_path)
     again = asynchronous()
     again.restore(tmp_path)
-    again.join(pb.Join(robot="toy", actor="actor-0", layout=layout(TOY), index=9, episode=1))
+    again.join(pb.Join(robot="toy", actor="actor-0", layout=TOY.learning_layout(), index=9, episode=1))
     assert again.metrics().missing == 4
     assert not again.insert(step(5, actor="actor-1"))
     assert again.insert(step(6, actor="actor-1"))

@@ -6,7 +6,6 @@ import pytest
 from learner.intake import Intake
 from learner.windows import Move, Windows
 from messaging import brakeline_pb2 as pb
-from messaging.tasks import task_of
 from tests.robots import GROUND
 
 GAMMA = 0.9
@@ -57,7 +56,7 @@ def test_the_steps_after_it_are_learned_from():
 
 
 def test_the_intake_reads_it_from_the_wire():
-    vector = [0.0] * task_of(GROUND).observation_dim
+    vector = [0.0] * GROUND.task.observation_dim
     step = pb.Step(robot="ground", actor="a", index=1, observation=vector, next_observation=vector)
     step.action.extend([0.0, 0.0])
     step.proposed.extend([0.1, 0.0])

@@ -8,7 +8,6 @@ import pytest
 from learner.core import AHEAD, MOST_ACTORS, Learner
 from learner.intake import MOST_OBSERVED, BadStep, Intake
 from messaging import brakeline_pb2 as pb
-from messaging.tasks import layout
 from tests.learner.test_core import step
 from tests.learner.toy import CONFIG, TOY
 
@@ -16,7 +15,7 @@ from tests.learner.toy import CONFIG, TOY
 @pytest.fixture
 def learner() -> Learner:
     learner = Learner(TOY, replace(CONFIG, lockstep=False))
-    learner.join(pb.Join(robot="toy", actor="actor-0", layout=layout(TOY)))
+    learner.join(pb.Join(robot="toy", actor="actor-0", layout=TOY.learning_layout()))
     return learner
 
 
@@ -57,7 +56,7 @@ def test_proposals_out_of_bounds_are_clipped_as_ever(learner: Learner) -> None:
 
 @pytest.mark.parametrize("place", [{"index": 2**64 - 1}, {"episode": 2**32 - 1}])
 def test_an_actor_that_comes_from_nowhere_is_refused(learner: Learner, place: dict) -> None:
-    join = pb.Join(robot="toy", actor="far", layout=layout(TOY), **place)
+    join = pb.Join(robot="toy", actor="far", layout=TOY.learning_layout(), **place)
     assert learner.join(join).error.field == "index"
     assert "far" not in learner.flow().limit
 
@@ -65,7 +64,9 @@ def test_an_actor_that_comes_from_nowhere_is_refused(learner: Learner, place: di
 def test_there_is_an_end_of_actors(learner: Learner, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("learner.core.MOST_ACTORS", 10)
     assert MOST_ACTORS > 1000
-    errors = [learner.join(pb.Join(robot="toy", actor=f"a{n}", layout=layout(TOY))).error.field for n in range(12)]
+    errors = [
+        learner.join(pb.Join(robot="toy", actor=f"a{n}", layout=TOY.learning_layout())).error.field for n in range(12)
+    ]
     assert errors == [""] * 9 + ["actor"] * 3
-    again = pb.Join(robot="toy", actor="a0", layout=layout(TOY))
+    again = pb.Join(robot="toy", actor="a0", layout=TOY.learning_layout())
     assert not learner.join(again).HasField("error"), "who is in may come again"

@@ -17,7 +17,6 @@ from messaging import brakeline_pb2 as pb
 from messaging.bus import Bus, BusSettings, Refused
 from messaging.ports import free_endpoint
 from messaging.robots import UnknownRobot
-from messaging.tasks import layout
 from messaging.topics import FLOW, JOIN, LEARNER, STEP, WEIGHTS
 from messaging.weights import MLP
 from tests.robots import GROUND
@@ -58,7 +57,7 @@ class Actor:
         self._moved.set()
 
     def join(self, **fields: object) -> pb.JoinReply:
-        values = {"robot": "ground", "actor": "actor-0", "layout": layout(GROUND), "index": self.index}
+        values = {"robot": "ground", "actor": "actor-0", "layout": GROUND.learning_layout(), "index": self.index}
         join = pb.Join(**(values | {"episode": self.episode} | fields))
         deadline = time.monotonic() + 20.0
         while True:  # the learner is still starting

@@ -5,10 +5,9 @@ import pytest
 
 from learner.replay import Batch
 from learner.symmetry import Images, image_of, turns_of
-from messaging.tasks import task_of
 from tests.robots import GROUND, QUADROTOR
 
-N = len(task_of(QUADROTOR).rays.directions)
+N = len(QUADROTOR.task.rays.directions)
 
 
 def image(observation, turn):
@@ -33,7 +32,7 @@ def test_the_lidar_of_a_turned_world_sees_the_image(number):
     balls = rng.uniform(-6.0, 6.0, (12, 3))
 
     def seen(centres):
-        along = task_of(QUADROTOR).rays.directions @ centres.T
+        along = QUADROTOR.task.rays.directions @ centres.T
         off = (centres**2).sum(axis=1) - along**2
         hits = np.where((along > 0) & (off < 1.0), along - np.sqrt(np.maximum(1.0 - off, 0.0)), 12.0)
         return hits.min(axis=1) / 12.0
@@ -48,7 +47,7 @@ def test_the_lidar_of_a_turned_world_sees_the_image(number):
 
 
 def test_a_batch_holds_every_image_alike_and_rewards_as_they_were():
-    batch, rng = Batch(16, task_of(QUADROTOR).observation_dim, 3), np.random.default_rng(0)
+    batch, rng = Batch(16, QUADROTOR.task.observation_dim, 3), np.random.default_rng(0)
     for array in batch.arrays:
         array[:] = rng.normal(size=array.shape)
     before = [array.copy() for array in batch.arrays]
@@ -64,10 +63,10 @@ def test_a_batch_holds_every_image_alike_and_rewards_as_they_were():
 
 
 def test_a_robot_without_images_keeps_its_batches():
-    batch = Batch(8, task_of(GROUND).observation_dim, 2)
-    batch.arrays[0][:] = np.arange(task_of(GROUND).observation_dim)
+    batch = Batch(8, GROUND.task.observation_dim, 2)
+    batch.arrays[0][:] = np.arange(GROUND.task.observation_dim)
     Images(GROUND, 8).apply(batch)
-    assert np.array_equal(batch.arrays[0][3], np.arange(task_of(GROUND).observation_dim))
+    assert np.array_equal(batch.arrays[0][3], np.arange(GROUND.task.observation_dim))
 
 
 def test_other_turns_are_no_images():
@@ -78,7 +77,7 @@ def test_other_turns_are_no_images():
 
 def test_rows_of_observations_actions_and_pairs_of_them():
     rng = np.random.default_rng(0)
-    seen = rng.normal(size=(8, task_of(QUADROTOR).observation_dim)).astype(np.float32)
+    seen = rng.normal(size=(8, QUADROTOR.task.observation_dim)).astype(np.float32)
     done = rng.normal(size=(8, 3)).astype(np.float32)
     images = Images(QUADROTOR, 8)
     both = images.rows(np.hstack([seen, done]))

@@ -11,7 +11,7 @@ from learner.config import LearnerConfig, TD3Config
 from learner.core import Learner
 from messaging import brakeline_pb2 as pb
 from messaging import weights
-from messaging.tasks import enlist, layout, task_of
+from messaging.tasks import with_task
 from tests.robots import GROUND
 
 TOY = replace(
@@ -25,7 +25,7 @@ TOY = replace(
     stop=("ramp",),
     follows=(3,),
 )
-enlist(TOY, replace(task_of(GROUND), lidar=None, observation=("position [m]", "goal [m]")))
+TOY = with_task(TOY, replace(GROUND.task, lidar=None, observation=("position [m]", "goal [m]")))
 CONFIG = LearnerConfig(
     td3=TD3Config(hidden=(32, 32), batch=32, n_step=2, warmup=60, actor_rate=1e-3, critic_rate=1e-3, reward_scale=1.0),
     capacity=500,
@@ -50,7 +50,7 @@ class ToyActor:
 
     def join(self) -> pb.JoinReply:
         reply = self.learner.join(
-            pb.Join(robot="toy", actor=self.name, layout=layout(TOY), index=self.index, episode=self.episode)
+            pb.Join(robot="toy", actor=self.name, layout=TOY.learning_layout(), index=self.index, episode=self.episode)
         )
         self.episode = reply.episode
         return reply

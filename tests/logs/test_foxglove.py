@@ -24,7 +24,6 @@ from logs.recorder import Inbox, Recording
 from logs.segment import Entry
 from messaging import brakeline_pb2 as pb
 from messaging.bus import Sample
-from messaging.tasks import task_of
 from messaging.topics import EXCHANGE, STEP
 from tests.robots import GROUND, QUADROTOR
 
@@ -173,8 +172,8 @@ def test_arenas_of_several_actors_do_not_overlap() -> None:
 
 
 def test_the_quadrotors_rays_are_a_cloud_of_the_points_that_were_hit() -> None:
-    rays = task_of(QUADROTOR).rays
-    observation = np.ones(task_of(QUADROTOR).observation_dim)
+    rays = QUADROTOR.task.rays
+    observation = np.ones(QUADROTOR.task.observation_dim)
     observation[7] = 0.25
     cloud = scene.lidar(rays, "actor-0", observation.tolist(), 5)
     assert isinstance(cloud, PointCloud) and cloud.point_stride == 12 and len(cloud.data) == 12

@@ -102,7 +102,7 @@ def test_the_live_page_is_told(say: Say) -> None:
 
 
 def test_a_picture_of_the_report_has_it() -> None:
-    gallery = Gallery("ground")
+    gallery = Gallery(GROUND)
     for actor, x in (("a", 0.0), ("b", 2.0)):
         source = gallery.source(actor)
         source.about.append(episode(actor))

@@ -3,6 +3,7 @@
 import copy
 import json
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,8 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from messaging.descriptions import UNITS, BadDescription, describe, read, robot_of
-from messaging.robots import FOLDER, Robot, UnknownRobot, known, robot_named
-from messaging.tasks import UnknownTask, task_of
+from messaging.robots import FOLDER, Robot, UnknownRobot, robot_named, unless_shipped
+from messaging.tasks import UnknownTask, needs_task, robot_maybe_with_task, robot_with_task
 from messaging.tasks import read as read_task
 from tests.robots import GROUND, QUADROTOR, ROBOTS
 
@@ -49,7 +50,7 @@ def changed(*path_and_value):
     return said
 
 
-@pytest.mark.parametrize("robot", ROBOTS.values(), ids=ROBOTS)
+@pytest.mark.parametrize("robot", [robot_named(name) for name in ROBOTS], ids=ROBOTS)
 def test_a_description_makes_the_same_robot_again(robot):
     assert robot_of(json.loads(json.dumps(robot.description))) == robot
     assert robot.in_real_time().in_lockstep() == robot
@@ -155,14 +156,21 @@ def test_whatever_stands_in_a_field_makes_a_sound_robot_or_is_told(place, value)
     assert all(label.endswith("]") and label[label.rindex("[") + 1 : -1] in UNITS for label in robot.state)
 
 
-def test_a_file_is_found_by_its_path_and_then_by_its_name(tmp_path):
+def test_a_file_is_found_by_its_path_and_never_by_its_name(tmp_path):
     text = (FOLDER / "ground.toml").read_text().replace('name = "ground"', 'name = "minted"')
     (tmp_path / "my.toml").write_text(text)
     robot = robot_named(str(tmp_path / "my.toml"))
-    assert robot.name == "minted" and robot_named("minted") is robot
-    assert robot_named("minted-late").late
+    assert robot.name == "minted" and robot == replace(robot_named("ground"), name="minted")
+    assert robot_named(f"{tmp_path / 'my.toml'}-late") == robot.in_real_time()
+    with pytest.raises(UnknownRobot, match="no robot is called 'minted'"):
+        robot_named("minted")
     with pytest.raises(UnknownTask, match="minted has no task"):
-        task_of(robot)
+        robot_with_task(str(tmp_path / "my.toml"))
+    assert robot_maybe_with_task(str(tmp_path / "my.toml")) == robot
+    with pytest.raises(UnknownTask, match="minted has no task"):
+        needs_task(robot)
+    (tmp_path / "my.toml").write_text(text.replace("minted", "dented"))
+    assert robot_named(str(tmp_path / "my.toml")).name == "dented", "a file that changed is read again"
     with pytest.raises(UnknownRobot, match=r"nowhere\.toml"):
         robot_named(str(tmp_path / "nowhere.toml"))
     (tmp_path / "broken.toml").write_text("name = ")
@@ -174,8 +182,9 @@ def test_nobody_takes_the_name_of_a_robot_that_comes_with_the_program():
     said = copy.deepcopy(GROUND.description)
     said["sight"] = 0.1
     with pytest.raises(UnknownRobot, match="choose another"):
-        known(robot_of(said))
-    assert robot_named("ground") is GROUND
+        unless_shipped(robot_of(said))
+    assert unless_shipped(GROUND) is GROUND
+    assert robot_named("ground").description == GROUND.description
 
 
 def test_a_task_says_what_is_wrong_in_it(tmp_path):
@@ -189,7 +198,7 @@ def test_a_task_says_what_is_wrong_in_it(tmp_path):
 
 
 def test_observations_are_what_they_were():
-    assert (task_of(GROUND).observation_dim, task_of(QUADROTOR).observation_dim) == (26, 189)
+    assert (GROUND.task.observation_dim, QUADROTOR.task.observation_dim) == (26, 189)
 
 
 def test_a_robot_that_stops_by_feedback_brakes_by_what_is_measured():

@@ -12,7 +12,7 @@ from tests.robots import GROUND, ROBOTS
 @pytest.mark.parametrize("robot", ROBOTS.values(), ids=ROBOTS)
 def test_every_robot_is_consistent(robot):
     n, m = robot.state_dim, robot.action_dim
-    assert robot_named(robot.name) is robot
+    assert robot_named(robot.name).layout() == robot.layout()
     for bounds in (robot.action_low, robot.action_high, robot.translates, robot.action_slew):
         assert len(bounds) == m
     assert len(robot.measurement_bound) == n

@@ -7,7 +7,6 @@ import safetensors.numpy
 from hypothesis import given
 from hypothesis import strategies as st
 
-from messaging.tasks import layout, task_of
 from messaging.weights import MLP, BadWeights, decode, encode
 from tests.robots import GROUND
 
@@ -16,7 +15,7 @@ FILE = encode(GROUND, POLICY.layers, version=7, noise=0.25)
 
 
 def observation(seed: int) -> np.ndarray:
-    return np.random.default_rng(seed).uniform(-1, 1, task_of(GROUND).observation_dim)
+    return np.random.default_rng(seed).uniform(-1, 1, GROUND.task.observation_dim)
 
 
 def test_round_trip():
@@ -94,7 +93,7 @@ def test_a_flipped_byte_is_refused_or_harmless(place, flip):
 
 
 def rewritten(tensors=None, **about) -> bytes:
-    fields = {"robot": "ground", "layout": layout(GROUND), "version": 1, "noise": 0.1} | about
+    fields = {"robot": "ground", "layout": GROUND.learning_layout(), "version": 1, "noise": 0.1} | about
     if tensors is None:
         tensors = safetensors.numpy.load(FILE)
     return safetensors.numpy.save(tensors, {"policy": json.dumps(fields)})

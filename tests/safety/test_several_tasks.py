@@ -1,20 +1,92 @@
 """Several tasks of one robot in one process: none changes what the others get."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from messaging.tasks import learnt
+from deploy.data.paths import method_path
+from deploy.vehicles import environment
+from messaging.perceptrons import Perceptrons
+from messaging.robots import FOLDER, UnknownRobot, robot_named
+from messaging.tasks import RobotWithTask, robot_with_task
+from messaging.weights import MLP, BadWeights, decode
 from safety.filter import Filter
+from safety.methods import Method
+from safety.methods import decode as read_model
+from safety.methods import ready as made_ready
+from safety.recipe import SAILR, SECAS, Recipe
+from safety.request import BadRequest
+from safety.rivals.pretrained import Pretrained
 from tests.safety.asked import cylinder, request, same
 
+NAMES = ("ground", "ground+tracks")
+OBSERVED = (26, 50)
 
-@pytest.mark.parametrize("observed", [0, 26, 50])
+
+@pytest.mark.parametrize("observed", [0, *OBSERVED])
 def test_the_filter_decides_the_same_whichever_tasks_are_loaded(ready, observed):
     asked = replace(request(obstacles=[cylinder(0.5, 0.0)]), observation=np.ones(observed, np.float32))
     before = ready.decide(asked)
-    for name in ("ground+tracks", "ground"):
-        learnt(name)
+    for name in (*NAMES, *NAMES[:1]):
+        environment(robot_with_task(name), "default", 0)
         assert same(ready.decide(asked), before)
         assert same(Filter(ready.model).decide(asked), before)
+
+
+def test_two_environments_observe_each_by_its_own_task():
+    environments = [environment(robot_with_task(name), "default", 0) for name in NAMES]
+    for _ in range(2):
+        for env, observed in zip(environments, OBSERVED, strict=True):
+            seen, _ = env.reset(seed=1)
+            assert seen.shape == env.observation_space.shape == (observed,)
+            assert env.step(np.zeros(2))[0].shape == (observed,)
+
+
+def sailr(robot: RobotWithTask) -> Pretrained:
+    """Every proposal is as risky as braking."""
+    seen = robot.task.observation_dim
+    networks = {
+        name: Perceptrons([(np.zeros((2, 1, inputs), np.float32), np.zeros((2, 1), np.float32))])
+        for name, inputs in (("q", seen + robot.action_dim), ("v", seen))
+    }
+    return Pretrained(robot, SAILR, networks, {"threshold": 0.1})
+
+
+def test_two_rivals_read_each_the_observation_of_their_own_task():
+    rivals: list[Method] = [made_ready(sailr(robot_with_task(name))) for name in NAMES]
+    for rival, own in zip(rivals, OBSERVED, strict=True):
+        for observed in OBSERVED:
+            asked = replace(request(), observation=np.zeros(observed, np.float32))
+            if observed == own:
+                assert rival.decide(asked).kind == "allowed"
+            else:
+                with pytest.raises(BadRequest, match="observation has shape"):
+                    rival.decide(asked)
+
+
+def test_rivals_of_two_tasks_lie_in_two_files():
+    usual, other = (robot_with_task(name) for name in NAMES)
+    assert method_path(usual, SECAS, Recipe()).name == method_path(robot_named("ground"), SECAS, Recipe()).name
+    assert method_path(usual, SECAS, Recipe()) != method_path(other, SECAS, Recipe())
+
+
+def test_two_policies_are_read_each_by_its_own_task():
+    usual, other = (robot_with_task(name) for name in NAMES)
+    for own, foreign in ((usual, other), (other, usual)):
+        stored = MLP.untrained(own, 0).encode()
+        assert decode(stored, own).robot == own
+        with pytest.raises(BadWeights, match="layout"):
+            decode(stored, foreign)
+
+
+def test_a_robot_of_ones_own_is_read_from_the_models_file_and_from_nowhere_else(tmp_path: Path):
+    text = (FOLDER / "ground.toml").read_text().replace('name = "ground"', 'name = "minted"')
+    (tmp_path / "my.toml").write_text(text)
+    (tmp_path / "my.task.toml").write_text((FOLDER / "ground.task.toml").read_text())
+    payload = sailr(robot_with_task(str(tmp_path / "my.toml"))).encode()
+    (tmp_path / "my.toml").unlink()
+    with pytest.raises(UnknownRobot):
+        robot_named("minted")
+    assert read_model(payload).robot == replace(robot_named("ground"), name="minted")

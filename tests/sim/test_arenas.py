@@ -11,12 +11,11 @@ from hypothesis import strategies as st
 
 from messaging.robots import Robot
 from messaging.shapes import BOX, CYLINDER, SPHERE, WALL, Obstacle
-from messaging.tasks import task_of
 from sim.arenas import UnknownArena, arena_kind, bounds_of, draw_arena, gaps
 from sim.world import Arena
 from tests.robots import GROUND, QUADROTOR, ROBOTS
 
-ALL = [(ROBOTS[robot], name) for robot in ROBOTS for name in task_of(ROBOTS[robot]).arenas]
+ALL = [(ROBOTS[robot], name) for robot in ROBOTS for name in ROBOTS[robot].task.arenas]
 each_arena = pytest.mark.parametrize(("robot", "name"), ALL, ids=[f"{robot.name}-{name}" for robot, name in ALL])
 
 

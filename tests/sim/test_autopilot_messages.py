@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from messaging.shapes import CYLINDER, Obstacle
-from messaging.tasks import task_of
 from sim.autopilot import frames
 from sim.autopilot.dialect import mavlink
 from sim.autopilot.endpoint import TICK, UnknownRules
@@ -46,7 +45,7 @@ def test_messages_come_at_the_rates_asked_for(station: Station) -> None:
 
 
 def test_every_message_can_be_asked_for() -> None:
-    lidar = Lidar(field(), task_of(QUADROTOR).rays)
+    lidar = Lidar(field(), QUADROTOR.task.rays)
     station = Station("px4", airborne=True, lidar=lidar)
     for name in (
         "ATTITUDE", "ATTITUDE_QUATERNION", "LOCAL_POSITION_NED", "HIGHRES_IMU", "OBSTACLE_DISTANCE", "SYS_STATUS",
@@ -105,7 +104,7 @@ def test_frames_turn_back_and_forth() -> None:
 def test_obstacle_distance_is_the_least_of_each_sector() -> None:
     pillar = Obstacle(CYLINDER, (0.0, -4.0, 10.0), (0.5, 20.0))  # to the south: to the right of who looks east
     arena = field(pillar)
-    station = Station("px4", airborne=True, arena=arena, lidar=Lidar(arena, task_of(QUADROTOR).rays))
+    station = Station("px4", airborne=True, arena=arena, lidar=Lidar(arena, QUADROTOR.task.rays))
     station.command(512, mavlink.MAVLINK_MSG_ID_OBSTACLE_DISTANCE)
     distances = station.last("OBSTACLE_DISTANCE").distances
     assert len(distances) == BINS

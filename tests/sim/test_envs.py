@@ -14,7 +14,6 @@ from gymnasium.utils.env_checker import check_env
 import sim
 from deploy.vehicles import environment
 from messaging.shapes import Shapes
-from messaging.tasks import task_of
 from sim.envs import NavigationEnv, Reward
 from sim.policies import scripted
 from sim.quadrotor import Quadrotor
@@ -50,7 +49,7 @@ ENVS = {
 }
 each_robot = pytest.mark.parametrize("make", ENVS.values(), ids=ENVS)
 each_arena = pytest.mark.parametrize(
-    ("robot", "arena"), [(robot, arena) for robot in ROBOTS for arena in task_of(ROBOTS[robot]).arenas]
+    ("robot", "arena"), [(robot, arena) for robot in ROBOTS for arena in ROBOTS[robot].task.arenas]
 )
 
 

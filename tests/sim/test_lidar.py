@@ -8,14 +8,13 @@ from hypothesis import strategies as st
 
 from messaging.rays import Rays
 from messaging.shapes import BOX, CYLINDER, SPHERE, WALL, Obstacle, rotate
-from messaging.tasks import task_of
 from sim.arenas import draw_arena
 from sim.lidar import Lidar
 from sim.scene import map_model
 from sim.world import Arena, staged_arena
 from tests.robots import GROUND, QUADROTOR
 
-PLANE, SPACE = task_of(GROUND).rays, task_of(QUADROTOR).rays
+PLANE, SPACE = GROUND.task.rays, QUADROTOR.task.rays
 SAMPLES = 60  # along a beam
 
 

@@ -1,6 +1,5 @@
 """Scripted policies of the ground robot, and what they say of its arenas; the random one and the names of both."""
 
-from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -8,7 +7,6 @@ import pytest
 
 from deploy.vehicles import environment
 from messaging.robots import Robot
-from messaging.tasks import UnknownTask
 from sim.policies import UnknownPolicy, scripted
 from tests.robots import GROUND, ROBOTS
 
@@ -85,5 +83,3 @@ def test_the_generator_decides() -> None:
 def test_an_unknown_name_is_refused_with_the_names_there_are() -> None:
     with pytest.raises(UnknownPolicy, match="random, greedy, adversary, astar"):
         scripted("psychic", GROUND, np.random.default_rng(0))
-    with pytest.raises(UnknownTask, match="submarine has no task"):
-        scripted("astar", replace(GROUND, name="submarine"), np.random.default_rng(0))

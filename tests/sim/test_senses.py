@@ -1,13 +1,11 @@
 """What is observed: the documented order, from the measured state; the lidar from the true one."""
 
-from collections.abc import Iterator
-
 import numpy as np
 import pytest
 
-from messaging.robots import FOLDER, Robot, robot_named
+from messaging.robots import FOLDER, robot_named
 from messaging.shapes import CYLINDER, Obstacle
-from messaging.tasks import MoverKind, UnknownTask, address, learnt, read, task_of
+from messaging.tasks import MoverKind, RobotWithTask, UnknownTask, address, read, robot_with_task
 from messaging.weights import MLP, BadWeights, decode
 from sim.fleet import FleetEnv
 from sim.lidar import Lidar
@@ -25,7 +23,7 @@ def test_the_ground_robots_observation_is_in_the_documented_order() -> None:
     input = np.array([0.2, -0.3])
     senses = GroundSenses(GROUND, arena, RNG, 0.0)
     observation = senses.observe(true, measured, input)
-    named = dict(zip(task_of(GROUND).observed, observation.tolist(), strict=True))
+    named = dict(zip(GROUND.task.observed, observation.tolist(), strict=True))
     offset = np.array(arena.goal) - measured[:2]
     angle = np.arctan2(offset[1], offset[0]) - measured[2]
     assert named["goal distance [5 m]"] == pytest.approx(np.linalg.norm(offset) / 5.0)
@@ -37,7 +35,7 @@ def test_the_ground_robots_observation_is_in_the_documented_order() -> None:
     assert named["last turn input [0.5 rad/s]"] == pytest.approx(-0.3 / 0.5)
     assert named["turn memory: low-passed turn rate [0.5 rad/s]"] == pytest.approx((1 - np.exp(-0.1)) * 0.19 / 0.5)
     mount = -0.032 * np.array([np.cos(0.5), np.sin(0.5)])
-    assert observation[:18] == pytest.approx(Lidar(arena, task_of(GROUND).rays).cast(mount, 0.5) / 3.5)
+    assert observation[:18] == pytest.approx(Lidar(arena, GROUND.task.rays).cast(mount, 0.5) / 3.5)
     assert observation[:18].min() < 0.3
     assert senses.speed(true) == 0.1
 
@@ -49,14 +47,14 @@ def test_the_quadrotors_observation_is_in_the_documented_order() -> None:
     input = np.array([1.0, -3.0, 5.0])
     senses = AirSenses(QUADROTOR, arena, RNG, 0.0)
     observation = senses.observe(true, measured, input)
-    assert len(observation) == task_of(QUADROTOR).observation_dim == 189
-    named = dict(zip(task_of(QUADROTOR).observed, observation.tolist(), strict=True))
+    assert len(observation) == QUADROTOR.task.observation_dim == 189
+    named = dict(zip(QUADROTOR.task.observed, observation.tolist(), strict=True))
     offset = np.array(arena.goal) - measured[:3]
     for i, axis in enumerate("xyz"):
         assert named[f"goal - p, {axis} [its length + 5 m]"] == pytest.approx(offset[i] / (np.linalg.norm(offset) + 5))
         assert named[f"v{axis} [5 m/s]"] == pytest.approx(measured[3 + i] / 5.0)
         assert named[f"last v{axis} setpoint [5 m/s]"] == pytest.approx(input[i] / 5.0)
-    assert observation[:180] == pytest.approx(Lidar(arena, task_of(QUADROTOR).rays).cast(true[:3]) / 12.0)
+    assert observation[:180] == pytest.approx(Lidar(arena, QUADROTOR.task.rays).cast(true[:3]) / 12.0)
     assert named["ray 2 [range/12 m]"] == pytest.approx(2.0 / 12.0)  # level, straight ahead
     assert senses.speed(true) == pytest.approx(3.0)
 
@@ -94,7 +92,7 @@ def test_tracks_say_where_something_is_and_where_it_passes() -> None:
 
 
 def test_what_follows_the_rays_is_the_usual_tasks_and_then_tracks() -> None:
-    usual = task_of(GROUND)
+    usual = GROUND.task
     assert TRACKS.observed[: usual.observation_dim] == usual.observed and TRACKS.arenas == usual.arenas
     kind = MoverKind((1, 1), 0.2, 1.2, 1.0, 1.0)
     arena = alike(staged_arena(), crowd=Crowd(kind, np.array([[2.0, 0.0]]), staged_arena().shapes, 0))
@@ -106,10 +104,9 @@ def test_what_follows_the_rays_is_the_usual_tasks_and_then_tracks() -> None:
 
 
 @pytest.fixture
-def tracking() -> Iterator[Robot]:
-    """The ground robot with its other task, for a while."""
-    yield learnt("ground+tracks")
-    learnt("ground")
+def tracking() -> RobotWithTask:
+    """The ground robot with its other task."""
+    return robot_with_task("ground+tracks")
 
 
 def test_robots_of_a_fleet_are_tracks_to_each_other(tracking) -> None:
@@ -122,7 +119,7 @@ def test_robots_of_a_fleet_are_tracks_to_each_other(tracking) -> None:
     own, others = info["state"], info["others"]
     nearest = min(others, key=lambda other: np.hypot(*(other[:2] - own[:2])))
     p, heading = nearest[:2] - own[:2], nearest[2] - own[2]
-    named = dict(zip(task_of(tracking).observed, observation.tolist(), strict=True))
+    named = dict(zip(tracking.task.observed, observation.tolist(), strict=True))
     near = (1.0 - np.hypot(*p) / 3.5) * np.cos(np.arctan2(p[1], p[0]) - own[2])
     assert named["track 1 near·ahead"] == pytest.approx(near, abs=1e-5)
     assert named["track 1 speed ahead [1.2 m/s]"] == pytest.approx(nearest[3] * np.cos(heading) / 1.2, abs=1e-5)
@@ -132,13 +129,11 @@ def test_robots_of_a_fleet_are_tracks_to_each_other(tracking) -> None:
 
 
 def test_a_robots_other_task_is_asked_for_by_name(tracking) -> None:
-    assert tracking is GROUND and task_of(tracking).observation_dim == 50
+    assert tracking.layout() == GROUND.layout() and tracking.task.observation_dim == 50
     assert address("ground+tracks") == "ground+tracks" and robot_named("ground+tracks-late").late
     ours = MLP.untrained(tracking, 0).encode()
-    assert learnt("ground") is GROUND and task_of(GROUND).observation_dim == 26, (
-        "by its plain name it has the usual one"
-    )
+    assert GROUND.task.observation_dim == 26, "by its plain name it has the usual one"
     with pytest.raises(BadWeights, match="layout"):
         decode(ours, GROUND)
     with pytest.raises(UnknownTask, match=r"of ground there are, besides itself: ground\+tracks"):
-        learnt("ground+trucks")
+        robot_with_task("ground+trucks")

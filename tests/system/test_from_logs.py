@@ -8,7 +8,6 @@ import pytest
 
 from deploy.run.configurations import EXPERIMENTS
 from logs.reader import read
-from messaging.tasks import task_of
 from messaging.weights import MLP
 from tests.robots import GROUND
 from tests.system.runs import brakeline
@@ -46,7 +45,7 @@ def test_offline_a_policy_comes_from_the_log_alone(logged_run: Path, logged: dic
     assert set(figures["processes"]) == {"launcher", "recorder", "learner", "feeder"}
     assert not any(record.topic in ("step", "logged") for record in read(tmp_path / "offline"))
     (path,) = figures["policies"]
-    assert MLP.load(Path(path), GROUND).sizes[0] == task_of(GROUND).observation_dim
+    assert MLP.load(Path(path), GROUND).sizes[0] == GROUND.task.observation_dim
 
 
 def test_a_lost_checkpoint_comes_back_from_the_log(logged_run: Path, logged: dict[str, int], tmp_path: Path) -> None:

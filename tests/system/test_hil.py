@@ -23,7 +23,7 @@ from actors.mavlink import Client
 from actors.px4 import FIELD, QUIET, Px4Flight, Px4Vehicle
 from deploy.run.autopilot import PAD, open_field
 from messaging.shapes import CYLINDER, Obstacle
-from messaging.tasks import learnt
+from messaging.tasks import robot_with_task
 from sim.autopilot import frames
 from sim.autopilot.hil import Hil
 from sim.autopilot.px4 import Px4
@@ -155,7 +155,7 @@ def test_px4_flies_our_vehicle_by_its_own_estimate(flight: Flight) -> None:
 
 
 def test_episodes_follow_each_other_in_the_air_and_after_a_crash_px4_starts_again() -> None:
-    robot = learnt(str(ROBOT))
+    robot = robot_with_task(str(ROBOT))
     flight = Px4Flight(PX4, SensorNoise())
     try:
         for episode, wanted in enumerate(((2.0, -1.0, 0.5), (-4.0, 3.0, 0.0), (0.0, 0.0, -3.0))):

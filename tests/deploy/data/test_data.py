@@ -24,10 +24,10 @@ from tests.waiting import PATIENCE
 
 MAKE = """
 from deploy.data import recording, store
-from messaging.robots import robot_named
+from messaging.tasks import robot_with_task
 from safety.recipe import Recipe
-recording.recorded(robot_named("ground"), trajectories=12)
-store.model_for(robot_named("ground"), Recipe())
+recording.recorded(robot_with_task("ground"), trajectories=12)
+store.model_for(robot_with_task("ground"), Recipe())
 """
 
 

@@ -13,8 +13,7 @@ from deploy.policies import policy_named
 from deploy.run.configurations import EXPERIMENTS, RunConfig, decode, encode, load
 from deploy.run.places import places
 from learner.config import LearnerConfig, TD3Config
-from messaging.robots import robot_named
-from messaging.tasks import learnt, task_of
+from messaging.tasks import robot_with_task
 from safety.model_set import Recipe
 from sim.conditions import Conditions, Perception
 from sim.estimator import NoiseLevels
@@ -109,12 +108,9 @@ def test_what_no_world_is_made_for_is_refused_before_anything_starts() -> None:
     ):
         with pytest.raises(ValueError, match=said):
             RunConfig(**wrong)
-    try:
-        config = RunConfig(robots=("ground+tracks",), arena="walkers")
-        assert decode(RunConfig, json.loads(encode(config))) == config
-        assert [place.robot for place in places(config) if place.kind == "learner"] == ["ground"]
-        assert task_of(robot_named("ground")).observation_dim == 50, "whoever reads it has the task"
-        stored = policy_named("trained", robot_named("ground"), 0)
-        assert stored(np.zeros(50, np.float32), {}).shape == (2,), "of its own observation, in a folder of its own"
-    finally:
-        learnt("ground")
+    config = RunConfig(robots=("ground+tracks",), arena="walkers")
+    assert decode(RunConfig, json.loads(encode(config))) == config
+    (place,) = (place for place in places(config) if place.kind == "learner")
+    assert robot_with_task(place.robot).task.observation_dim == 50, "its process has the task"
+    stored = policy_named("trained", robot_with_task(place.robot), 0)
+    assert stored(np.zeros(50, np.float32), {}).shape == (2,), "of its own observation, in a folder of its own"

@@ -14,7 +14,7 @@ from deploy.policies import policy_named
 from deploy.study.evaluate import episode
 from deploy.vehicles import environment
 from logs.reader import read
-from messaging.tasks import learnt
+from messaging.tasks import robot_with_task
 from safety.dataset import BadData, Dataset
 from safety.windows import PLAN, windows
 from tests.robots import GROUND
@@ -31,7 +31,7 @@ def test_a_car_is_driven_inside_the_region_and_its_log_is_imported(tmp_path, cap
     said = json.loads(capsys.readouterr().out)
     steps = [record.message for record in read(log) if record.topic == "step"]
     assert len(steps) == said["periods"] == 600 and said["runs"] == 2 and said["collisions"] == 0
-    robot = learnt(CAR)
+    robot = robot_with_task(CAR)
     truth = np.array([step.true_state for step in steps])
     for disc in robot.body:
         ahead = np.stack([np.cos(truth[:, 2]), np.sin(truth[:, 2])], 1) * disc.at[0]
@@ -46,7 +46,7 @@ def test_a_car_is_driven_inside_the_region_and_its_log_is_imported(tmp_path, cap
 
 
 def test_who_goes_outwards_near_the_edge_brakes_by_the_robots_own_rule():
-    policy = Excited(learnt(CAR), KEEP, np.random.default_rng(0))
+    policy = Excited(robot_with_task(CAR), KEEP, np.random.default_rng(0))
     at = {"time": 0.0, "state": np.zeros(5), "input_in_force": np.zeros(2)}
     policy(None, at)
     driven = np.array([0.4, 0.2])

@@ -15,7 +15,7 @@ from deploy.study.intervals import mean, ratio
 from deploy.study.table import markdown, plain, steps_to_learn, table, without_times
 from learner.pretrain import Fit
 from logs.report import analyse
-from messaging.tasks import learnt
+from messaging.tasks import robot_with_task
 from messaging.weights import MLP
 from safety.model_set import Recipe
 from tests.robots import GROUND
@@ -91,11 +91,9 @@ def test_methods_share_the_episodes_that_they_are_evaluated_on(cells):
 def test_another_task_in_another_arena_has_its_contacts_in_the_table(rivals, tmp_path):
     """Of its own observation, in `many-walkers`; results from before there were walkers have no such rows."""
     study = replace(TINY, robot="ground+tracks", method="ddpc", arenas=("many-walkers",))
-    try:
-        cell = run(study, tmp_path)
-        assert MLP.load(tmp_path / "policy.safetensors", GROUND).sizes == (50, 16, 16, 2)
-    finally:
-        learnt("ground")
+    cell = run(study, tmp_path)
+    tracking = robot_with_task("ground+tracks")
+    assert MLP.load(tmp_path / "policy.safetensors", tracking).sizes == (50, 16, 16, 2)
     episodes = cell["evaluations"]["trained-ddpc-many-walkers"]["episodes"]
     episodes["contact_standing"] = [1]
     rows = table([cell])["parts"]["many-walkers"]["ddpc"]

@@ -21,7 +21,7 @@ def test_safety_counts_among_those_that_cost_the_oracle_nothing():
 def test_a_threshold_that_never_steps_in_and_one_that_always_does():
     model = pretrain(GROUND, SailrRecipe(**LITTLE))
     told = []
-    never, always = try_all(model, (1.0, -1.0), 3, told.append)
+    never, always = try_all(model, GROUND, (1.0, -1.0), 3, told.append)
     assert told == [never, always]
     assert never.oracle_goals == 3 and never.oracle_interventions == 0.0
     assert always.oracle_goals == 0 and always.oracle_interventions == 1.0 and always.greedy_collisions == 0
@@ -29,7 +29,7 @@ def test_a_threshold_that_never_steps_in_and_one_that_always_does():
 
 def test_each_robot_has_values_of_its_own():
     model = pretrain(GROUND, SecasRecipe(**LITTLE))
-    assert max(values_for(model)) <= GROUND.footprint
+    assert max(values_for(model, GROUND)) <= GROUND.footprint
     for method in ("secas", "sailr"):
         for robot in (GROUND, QUADROTOR):
             assert recipe_for(method, robot).samples > 1000

@@ -5,7 +5,6 @@ import pytest
 
 from messaging.perceptrons import Perceptrons
 from messaging.shapes import Shapes
-from messaging.tasks import task_of
 from safety.backup import brake, braking_plan
 from safety.model_set import BadModel
 from safety.request import NOT_FINITE, BadRequest, Request
@@ -33,7 +32,7 @@ def linear(inputs: int, slopes: dict[int, float], offsets: tuple[float, float]) 
 
 def known(threshold=0.1, q=(0.0, 0.0), v=EVEN, robot=GROUND) -> Pretrained:
     """logit Q = q + STEEP · (first input, normalised); V is the same everywhere."""
-    seen, m = task_of(robot).observation_dim, robot.action_dim
+    seen, m = robot.task.observation_dim, robot.action_dim
     networks = {"q": linear(seen + m, {seen: STEEP}, q), "v": linear(seen, {}, v)}
     return Pretrained(robot, "sailr", networks, {"threshold": threshold})
 
@@ -45,7 +44,7 @@ def request(action, before=(0.0, 0.0), robot=GROUND, observation=None) -> Reques
         input_in_force=np.array(before, float),
         plan=np.zeros((robot.horizon, robot.action_dim)),
         obstacles=Shapes.of([], robot.position_dim),
-        observation=np.zeros(task_of(robot).observation_dim, np.float32) if observation is None else observation,
+        observation=np.zeros(robot.task.observation_dim, np.float32) if observation is None else observation,
     )
 
 

@@ -11,7 +11,6 @@ from messaging import brakeline_pb2 as pb
 from messaging.perceptrons import Perceptrons
 from messaging.rays import fan
 from messaging.shapes import Shapes
-from messaging.tasks import task_of
 from safety.asker import accept
 from safety.client import read, request_message
 from safety.commitment import UNVERIFIED, Commitment
@@ -87,10 +86,10 @@ REACT = np.array([0.06, 0.0])  # m that a sector comes nearer at full speed
 
 def known(g=REACT, robot=GROUND, **settings) -> Pretrained:
     """g_i is the same everywhere."""
-    count, m = Constraints(robot, task_of(robot).rays).count, robot.action_dim
-    layers = [(np.zeros((count, m, task_of(robot).observation_dim), np.float32), np.tile(np.float32(g), (count, 1)))]
+    count, m = Constraints(robot, robot.task.rays).count, robot.action_dim
+    layers = [(np.zeros((count, m, robot.task.observation_dim), np.float32), np.tile(np.float32(g), (count, 1)))]
     settings = {"clearance": CLEARANCE} | settings
-    return Pretrained(robot, "secas", {"g": Perceptrons(layers)}, settings, rays=task_of(robot).rays)
+    return Pretrained(robot, "secas", {"g": Perceptrons(layers)}, settings, rays=robot.task.rays)
 
 
 def seen(ahead: float, beside: float = 3.5) -> np.ndarray:
@@ -131,7 +130,7 @@ def test_the_speed_is_cut_to_what_the_linear_model_allows():
 
 
 def test_moving_towards_it_counts_as_nearer():
-    constraints = Constraints(GROUND, task_of(GROUND).rays)
+    constraints = Constraints(GROUND, GROUND.task.rays)
     still, moving = (constraints(seen(0.3), np.array([0, 0, 0, v, 0])) for v in (0.0, 0.25))
     assert still[2] == pytest.approx(-0.3, abs=1e-6)
     assert 0.04 < moving[2] - still[2] <= 0.25 * constraints.stopping
@@ -139,14 +138,14 @@ def test_moving_towards_it_counts_as_nearer():
 
 
 def test_what_is_far_away_is_all_the_same():
-    constraints, at_rest = Constraints(GROUND, task_of(GROUND).rays), np.zeros(5)
+    constraints, at_rest = Constraints(GROUND, GROUND.task.rays), np.zeros(5)
     assert np.array_equal(constraints(seen(3.5), at_rest), constraints(seen(2.0, beside=1.0), at_rest))
 
 
 @pytest.mark.parametrize("robot", [GROUND, QUADROTOR])
 def test_every_ray_is_in_one_sector(robot):
-    constraints = Constraints(robot, task_of(robot).rays)
-    assert sorted(np.concatenate(constraints.sectors)) == list(range(len(task_of(robot).rays.directions)))
+    constraints = Constraints(robot, robot.task.rays)
+    assert sorted(np.concatenate(constraints.sectors)) == list(range(len(robot.task.rays.directions)))
     assert np.allclose(np.linalg.norm(constraints.directions, axis=1), 1.0)
 
 
@@ -156,7 +155,7 @@ def test_a_robot_with_a_slew_is_corrected_within_it():
     before = np.array([3.0, 0.0, 0.0])
     state = np.zeros(robot.state_dim)
     state[3] = 3.0
-    observation = np.full(task_of(robot).observation_dim, 0.2)  # walls 2.4 m away all round: too near at that speed
+    observation = np.full(robot.task.observation_dim, 0.2)  # walls 2.4 m away all round: too near at that speed
     decision = ready.decide(request(observation, (5.0, 0.0, 0.0), before, state, robot))
     assert decision.kind == "adjusted"
     assert decision.plan[0] == pytest.approx((2.2, 0.0, 0.0), abs=1e-3), "as much less as the slew allows"
@@ -205,7 +204,7 @@ def test_a_model_without_rays_has_those_of_the_robots_usual_task():
     asked = request(seen(0.25), (0.25, 0.3))
     older = Secas(replace(known(), rays=None))
     assert np.array_equal(older.decide(asked).plan, Secas(known()).decide(asked).plan)
-    with pytest.raises(BadModel, match="no task of cart"):
+    with pytest.raises(BadModel, match="pretrain it again"):
         Secas(replace(known(), rays=None, robot=replace(GROUND, name="cart")))
 
 

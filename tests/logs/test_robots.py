@@ -1,0 +1,36 @@
+"""Which robot a log's message is about: one that the log describes, or one that comes with the program."""
+
+import json
+from dataclasses import replace
+
+import pytest
+
+from logs.robots import Robots
+from messaging.robots import robot_named
+from messaging.tasks import RobotWithTask
+
+
+def test_what_one_log_describes_no_other_log_knows():
+    minted = replace(robot_named("ground"), name="minted")
+    one, other = Robots(), Robots()
+    one.describe({"minted": json.dumps(minted.description)})
+    assert one.named("minted") == minted and one.named("minted-late") == minted.in_real_time()
+    assert other.named("minted") is None
+
+
+def test_robots_that_come_with_the_program_have_their_tasks():
+    robot = Robots().named("quadrotor-late")
+    assert isinstance(robot, RobotWithTask) and robot.late and robot.task.observation_dim == 189
+
+
+def test_a_description_that_takes_a_shipped_name_is_not_believed(caplog: pytest.LogCaptureFixture):
+    robots = Robots()
+    robots.describe({"ground": json.dumps(replace(robot_named("ground"), sight=0.1).description), "broken": "{"})
+    assert robots.named("ground").sight == robot_named("ground").sight and robots.named("broken") is None
+    assert "choose another" in caplog.text and len(caplog.records) == 2
+
+
+def test_a_message_names_no_path(tmp_path):
+    path = tmp_path / "my.toml"
+    path.write_text("")
+    assert Robots().named(str(path)) is None and Robots().named("../robots/ground") is None
