@@ -20,8 +20,9 @@ from numpy.typing import NDArray
 
 from messaging.scans import OLDEST, Scan
 from safety import reaching
-from safety.commitment import UNVERIFIED, Prediction
+from safety.commitment import UNVERIFIED
 from safety.explain import Stopped
+from safety.in_place import widened
 from safety.inputs import Inputs
 from safety.model_set import ModelSet
 from safety.program import SHARPEN, Builder, Rows
@@ -41,11 +42,10 @@ from safety.request import (
 )
 from safety.scan import shows
 from safety.solver import INFEASIBLE, solve
-from safety.surroundings import Scene, Surroundings
+from safety.surroundings import Scene, Surroundings, turning_extent
 
 Array = NDArray[np.float64]
 
-OUTSIDE_DOMAIN = 0.02  # of the recorded range: how far beyond it a regressor may lie (rounding, not extrapolation)
 BROKEN = "an obstacle was seen outside of what its bounds allow: nothing is known of where it will be"
 
 
@@ -72,6 +72,7 @@ class _Found:
     z: Array
     margin: float
     verified: bool
+    around: Surroundings  # whose tube is that of the plan
     kept: bool = False  # the committed plan goes on as it was verified before
     for_clearance: bool = False  # the proposal's tube is verified too, and is nearer than the clearance margin
 
@@ -89,17 +90,22 @@ class Filter:
         self.robot = robot = model.robot
         self.tube, outer = model.tube(), model.outer_tube()
         self.builder = Builder(robot, outer)
-        spread = OUTSIDE_DOMAIN * (model.domain[1] - model.domain[0])
-        self.domain = np.stack([model.domain[0] - spread, model.domain[1] + spread])
-        self.around = Surroundings(model, self.tube, outer, self.domain, clearance_margin)
+        self.domain = widened(model.domain)
+        turning = model.turning()
+        in_place = self.tube if turning is None else turning.tube()
+        margin = turning_extent(robot, in_place) if clearance_margin is None else clearance_margin
+        self.around = Surroundings(model, self.tube, outer, self.domain, margin)
+        self.in_place: tuple[Array, Surroundings] | None = None  # and for which regressors (2, nz)
+        if turning is not None and model.in_place is not None:
+            box = np.ascontiguousarray(model.in_place.domain(in_place.position.shape[2], robot.regressor_dim))
+            known = box[:, : robot.regressor_dim]
+            own = Surroundings(turning, in_place, in_place, known, margin, self.around.reach)
+            self.in_place = box, own
         self.inputs = Inputs(robot)
         self.ordinary = Ordinary(robot)
-        first, n, whole = model.first, robot.state_dim, np.ascontiguousarray
-        transposed = whole(first.W.T), whole(first.M.T), whole(first.kappa.T)
-        # What `next_state` is told of it.
-        self.first = whole(first.C[:n]), *transposed, first.w, whole(np.abs(first.generators[:n]))
         self.standing = np.array([not moves for moves in robot.translates])
         driven = np.tile(robot.translates, robot.free_steps)
+        self.first_free = robot.regressor_dim + robot.given * robot.action_dim  # of regressors
         self.translating = np.concatenate([np.zeros(robot.regressor_dim), driven])
         self.regressor = np.array(robot.regressor, dtype=np.intp)
         self.clearance_margin, self.reach = self.around.clearance_margin, self.around.reach  # m
@@ -108,7 +114,13 @@ class Filter:
         """[m] of the full stop's set, largest axis, from driving at inputs `speed` (m,) with that input once more."""
         state = self.robot.driving(speed)
         z = np.concatenate([state[self.regressor], speed, np.tile(speed, self.robot.free_steps)])
-        return float(self.tube.half_widths(z)[-1].max())
+        return float(self._around(z).tube.half_widths(z)[-1].max())
+
+    def _around(self, z: Array) -> Surroundings:
+        """What holds the tube of regressors z against scenes: the tube of plans in place, or that of all plans."""
+        if self.in_place is not None and reaching.within(z, self.in_place[0]):
+            return self.in_place[1]
+        return self.around
 
     # --- one decision ------------------------------------------------------------------------------------------
 
@@ -155,35 +167,62 @@ class Filter:
         the proposal if it is verified, else nothing."""
         z = self.inputs.regressors(z_0, proposal)
         if scene.empty and not self.around.far and self.around.limits is None:
-            return _Found(ALLOWED, self.inputs.plan(z), z, self.reach, True)
-        planes = self.around.planes(scene, z)
-        slack = self.around.slack(scene, z, planes)
-        margin = self.around.least(slack, z)
-        if margin >= max(self.clearance_margin, 0.0):
-            return _Found(ALLOWED, self.inputs.plan(z), z, margin, True)
+            return _Found(ALLOWED, self.inputs.plan(z), z, self.reach, True, self._around(z))
+        around = self._around(z)
+        planes = around.planes(scene, z)
+        slack = around.slack(scene, z, planes)
+        margin = around.least(slack, z)
+        # The clearance margin keeps room to turn in; a plan in place, which moves the robot nowhere, may use it up.
+        if margin >= (max(self.clearance_margin, 0.0) if around is self.around else 0.0):
+            return _Found(ALLOWED, self.inputs.plan(z), z, margin, True, around)
         rows = self.around.rows(scene, z, planes)
-        if self.around.least(slack - self.clearance_margin * rows.keep, z, self.clearance_margin) >= 0.0:
-            return _Found(ALLOWED, self.inputs.plan(z), z, margin, True)
+        if around.least(slack - self.clearance_margin * rows.keep, z, self.clearance_margin) >= 0.0:
+            return _Found(ALLOWED, self.inputs.plan(z), z, margin, True, around)
         kept = self._with_clearance_margin(rows, z_0, proposal)
         if margin >= 0.0 and self.around.margin(kept, z) >= 0.0:
-            return _Found(ALLOWED, self.inputs.plan(z), z, margin, True)
+            return _Found(ALLOWED, self.inputs.plan(z), z, margin, True, around)
         attempt.reason = f"the proposal's tube comes within {margin:.3g} m of the free space's edge"
         kept_off = self.clearance_margin * rows.keep if margin >= 0.0 else np.zeros(len(slack))
-        attempt.stopped = self.around.worst_of(scene, z, slack, planes, kept_off)
+        attempt.stopped = around.worst_of(scene, z, slack, planes, kept_off)
         # Keeping the clearance margin, or at least not driving into it; else free space alone: from here even standing
         # still would not do.
+        adjusted = None
         for choice in (kept, rows):
             if choice is rows and margin >= 0.0:
-                return _Found(ALLOWED, self.inputs.plan(z), z, margin, True)
+                return _Found(ALLOWED, self.inputs.plan(z), z, margin, True, around)
             if not np.isfinite(choice.bound).all():
                 break
             candidate = self._closest(choice, z_0, proposal, attempt)
-            if candidate is None or self.around.margin(choice, candidate) < 0.0:
-                continue
-            plan, room = self.inputs.plan(candidate), self.around.margin(rows, candidate)
-            return _Found(ADJUSTED, plan, candidate, room, True, for_clearance=margin >= 0.0)
-        attempt.reason += "; no verified input was found"
-        return None
+            if candidate is not None and self.around.margin(choice, candidate) >= 0.0:
+                plan, room = self.inputs.plan(candidate), self.around.margin(rows, candidate)
+                adjusted = _Found(ADJUSTED, plan, candidate, room, True, self.around, for_clearance=margin >= 0.0)
+                break
+        adjusted = self._turned_only(scene, z_0, proposal, adjusted) or adjusted
+        if adjusted is None:
+            attempt.reason += "; no verified input was found"
+        return adjusted
+
+    def _turned_only(self, scene: Scene, z_0: Array, proposal: Array, adjusted: _Found | None) -> _Found | None:
+        """The proposal without the inputs that move the position, if that is a plan in place with a verified tube, and
+        closer to the proposal than what the QP found."""
+        if self.in_place is None:
+            return None
+        (box, around), m = self.in_place, len(proposal)
+        turn = np.where(self.standing, np.clip(proposal, *box[:, -m:]), self.inputs.nothing)
+        z = self.inputs.regressors(z_0, self.inputs.limited(turn, z_0[-m:]))
+        if not reaching.within(z, box) or (
+            adjusted is not None and self._off(adjusted.z, proposal) <= self._off(z, proposal)
+        ):
+            return None
+        margin, for_clearance = around.margin_in(scene, z), adjusted is not None and adjusted.for_clearance
+        if margin < 0.0:
+            return None
+        return _Found(ADJUSTED, self.inputs.plan(z), z, margin, True, around, for_clearance=for_clearance)
+
+    def _off(self, z: Array, proposal: Array) -> float:
+        """How far the first free input of regressors z is from the proposal, in units of the inputs' ranges."""
+        first = z[self.first_free : self.first_free + len(proposal)]
+        return float(np.linalg.norm((first - proposal) / (self.inputs.high - self.inputs.low)))
 
     def _closest(self, rows: Rows, z_0: Array, proposal: Array, attempt: _Attempt) -> Array | None:
         """The QP's answer, clipped to bounds and slew, as regressors; None if there is no number in it."""
@@ -201,8 +240,11 @@ class Filter:
         """Rows with the clearance margin. Where moving in place would not keep it, the tube may stay as near as the
         free space allows, but no input may translate the robot nearer (one that can't stop at once: not more than
         the strongest braking does): two rows instead of one."""
-        in_place = self.inputs.limited(np.where(self.standing, proposal, self.inputs.nothing), z_0[-len(proposal) :])
+        before = z_0[-len(proposal) :]
+        in_place = self.inputs.limited(np.where(self.standing, proposal, self.inputs.nothing), before)
         stay = self.inputs.regressors(z_0, in_place)
+        if self._around(stay) is not self.around:  # turning has a tube of its own: here room to stand is enough
+            stay = self.inputs.regressors(z_0, self.inputs.limited(self.inputs.nothing, before))
         kept_off = self.clearance_margin * rows.keep
         inside = rows.support(self.tube, stay) > rows.bound - kept_off
         bound = np.where(inside, rows.bound, rows.bound - kept_off)
@@ -234,15 +276,17 @@ class Filter:
         chosen = tail[self.robot.given : self.robot.free_steps].ravel()
         as_committed = np.concatenate([z_0, chosen])
         if attempt.contained and vouched:
-            margin = self.around.margin_in(scene, as_committed)
-            return _Found(FAILSAFE, tail, as_committed, margin, True, kept=True)
+            around = self._around(as_committed)
+            margin = around.margin_in(scene, as_committed)
+            return _Found(FAILSAFE, tail, as_committed, margin, True, around, kept=True)
         brake = self.inputs.regressors(z_0, self.inputs.stop(request.state, before))
         as_committed[len(z_0) :] = self.inputs.within(chosen, before)
         for z in (as_committed, brake):
-            margin = self.around.margin_in(scene, z)
+            around = self._around(z)
+            margin = around.margin_in(scene, z)
             if in_domain and margin >= 0.0:
-                return _Found(FAILSAFE, self.inputs.plan(z), z, margin, True)
-        return _Found(FAILSAFE, self.inputs.plan(brake), brake, margin, False)
+                return _Found(FAILSAFE, self.inputs.plan(z), z, margin, True, around)
+        return _Found(FAILSAFE, self.inputs.plan(brake), brake, margin, False, around)
 
     def _recovered(self, request: Request, scene: Scene, z_0: Array) -> _Found | None:
         """A slow way out, if it stands (or is on such a way) where not even standing can be verified: by more than
@@ -264,7 +308,7 @@ class Filter:
             seeming = 2.0 * float(np.linalg.norm(self.around.measured)) + (
                 self.clearance_margin if self.around.stays else 0.0
             )
-        if self.around.margin_in(parked, stand) >= -seeming:
+        if self._around(stand).margin_in(parked, stand) >= -seeming:
             return None
         planes = self.around.planes(scene, stand, leaving=True)
         rows = self.around.rows(scene, stand, planes)
@@ -294,16 +338,16 @@ class Filter:
                 return None
         else:
             return None
-        return _Found(RECOVERING, self.inputs.plan(z), z, self.around.margin(rows, z), False)
+        return _Found(RECOVERING, self.inputs.plan(z), z, self.around.margin(rows, z), False, self.around)
 
     def _decision(self, request: Request, scene: Scene, found: _Found, attempt: _Attempt) -> Decision:
-        z = found.z
-        centers, half = self.around.sets(scene.start, scene.turn, z)
+        z, around = found.z, found.around
+        centers, half = around.sets(scene.start, scene.turn, z)
         promise = request.promise
         if promise is not None and not found.kept:
-            promise = self._promise(scene.start, centers, half, z)
-        predicted = self._predict(scene, z)
-        margin, at_least = self.around.clear(request, scene, found.z, found.margin)
+            promise = self._promise(around, scene.start, centers, half, z)
+        predicted = around.predict(scene, z)
+        margin, at_least = around.clear(request, scene, z, found.margin)
         total, solved = (perf_counter_ns() - attempt.started) * 1e-6, attempt.solve_ns * 1e-6
         return Decision(
             kind=found.kind,
@@ -333,20 +377,12 @@ class Filter:
         """What a robot promises that stands, and goes on standing, in a measured state (n,)."""
         z = np.concatenate([state[self.regressor], np.tile(self.inputs.nothing, 1 + self.robot.free_steps)])
         heading = float(state[self.robot.heading]) if self.robot.heading is not None else 0.0
-        start = state[: self.robot.position_dim]
-        return self._promise(start, *self.around.sets(start, self.around.turn(heading), z), z)
+        start, around = state[: self.robot.position_dim], self._around(z)
+        return self._promise(around, start, *around.sets(start, around.turn(heading), z), z)
 
-    def _promise(self, start: Array, centers: Array, half: Array, z: Array) -> Promise:
+    def _promise(self, around: Surroundings, start: Array, centers: Array, half: Array, z: Array) -> Promise:
         """Of a tube with these sets (N, d), world, and regressors z."""
-        about = self.tube.magnitudes(z)[self.tube.generators : -1]
-        about[-1] = max(about[-1], float(self.tube.magnitudes(z)[-1]))
-        centers, half = np.vstack([start, centers]), np.vstack([self.around.measured, half])
-        return Promise.of(centers, half, self.robot.footprint + about)
-
-    def _predict(self, scene: Scene, z: Array) -> Prediction:
-        """The set of the next measured state, all coordinates."""
-        regressor = self.model.first_regressor(z)
-        center, half = reaching.next_state(*self.first, regressor, np.ascontiguousarray(scene.start), scene.turn)
-        if self.robot.heading is not None:
-            center[self.robot.heading] += scene.heading
-        return Prediction(center, half, scene.heading)
+        about = around.tube.magnitudes(z)[around.tube.generators :]
+        about[-2] = max(about[-2], about[-1])
+        centers, half = np.vstack([start, centers]), np.vstack([around.measured, half])
+        return Promise.of(centers, half, self.robot.footprint + about[:-1])

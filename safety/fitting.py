@@ -21,12 +21,14 @@ from safety.certificates import (
     whitening,
 )
 from safety.dataset import BadData, Dataset
+from safety.in_place import InPlace, inside, over_plan, standing_limits, turning
 from safety.model_set import DIRECT, RECURSION, ModelSet, Recipe
 from safety.windows import FREE, PLAN, Windows, outputs, quality, standing_at_the_end, stands_from, stops_of, windows
 
 Array = NDArray[np.float64]
 
 FEWEST_STOPS = 5  # that a bound of the way after a stop is worth anything from
+FEWEST_IN_PLACE = 100  # windows in place: fewer regressors play a part in them than in others
 MOST_ATOMS = 120_000  # of a matrix zonotope, over the horizon: the exact check looks at every one
 
 
@@ -72,7 +74,50 @@ def make(data: Dataset, recipe: Recipe) -> ModelSet:
         whitening(whole.z),
         about,
         stands=stands_from(whole, data, kind),
+        in_place=_in_place(fit, bound, recipe),
     )
+
+
+def _in_place(fit: Dataset, bound: Dataset, recipe: Recipe) -> InPlace | None:
+    """The predictors for plans in place, from all windows in place; None where the data do not support them (too few
+    such windows, or no varied turning among them) or the robot has no such plans."""
+    robot = fit.robot
+    limits = standing_limits(robot)
+    if limits is None or recipe.mode != DIRECT:
+        return None
+    steps, known, free = [], robot.regressor_dim, turning(robot)
+    for k in range(1, robot.horizon + 1):
+        columns = _columns(robot, k, FREE)
+        bounds = over_plan(limits, len(columns), known)[:, columns]
+        turns = over_plan(free[None].astype(float), len(columns), known)[0].astype(bool) & columns
+        both = windows(fit, k, FREE), windows(bound, k, FREE)
+        parts = [part.take(inside(part.z[:, columns], bounds)) for part in both]
+        z, z_bound = (np.where(turns, part.z, 0.0) for part in parts)
+        y, y_bound = (outputs(robot, part.y) for part in parts)
+        try:
+            for each in (z, z_bound):
+                quality(each[:, turns], f"windows of {k} periods in place", min(recipe.fewest, FEWEST_IN_PLACE))
+            steps.append(_certificate(z, y, z_bound, y_bound, recipe, turns, MOST_ATOMS // robot.horizon))
+        except (BadData, CertificateError):
+            return None
+    return InPlace(tuple(steps), np.where(free, _range(robot, np.vstack([z, z_bound])), limits))
+
+
+def _range(robot: Robot, z: Array) -> Array:
+    """(2, r + m): the least and the largest [x_0; input in force] and input of the plans among regressors z (T, nz).
+
+    A speed that follows an input may be measured beyond what was recorded of it by its error.
+    """
+    known, m = robot.regressor_dim, robot.action_dim
+    inputs = z[:, known - m :].reshape(-1, m)
+    found = np.stack([np.append(f(z[:, :known], axis=0), f(inputs, axis=0)) for f in (np.min, np.max)])
+    found[:, known - m : known] = found[:, known:]
+    for i, index in enumerate(robot.follows):
+        if index in robot.regressor:
+            at, error = robot.regressor.index(index), robot.measurement_bound[index]
+            found[0, at] = min(found[0, at], found[0, known + i] - error)
+            found[1, at] = max(found[1, at], found[1, known + i] + error)
+    return found
 
 
 def _latch_of_plans(whole: Windows, recipe: Recipe) -> tuple[Array, float]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +16,7 @@ from messaging.descriptions import robot_of
 from messaging.files import write_whole
 from messaging.robots import FORMER_LAYOUTS, LATE, Robot, UnknownRobot, robot_named, unless_shipped
 from safety.certificates import Certificate
+from safety.in_place import InPlace
 from safety.recipe import DIRECT as DIRECT
 from safety.recipe import FREE, PLAN
 from safety.recipe import MODES as MODES
@@ -29,6 +30,7 @@ Array = NDArray[np.float64]
 
 ENTRY = "model_set"
 TENSORS = ("C", "W", "M", "kappa", "w", "generators")
+IN_PLACE, BOX = "in_place.step", "in_place.box"  # optional
 
 
 class BadModel(ValueError):
@@ -49,6 +51,7 @@ class ModelSet:
     about: dict[str, str]
     layout: str = ""  # of the robot when it was made, if that was before robots were files
     stands: int = 0  # so many periods after a plan began the robot stands; 0: no sooner than at its end
+    in_place: InPlace | None = None  # predictors for turning on the spot, where the data support them
 
     @property
     def moving(self) -> int:
@@ -82,6 +85,15 @@ class ModelSet:
         """One that contains it and has few atoms: for the QP."""
         return self._stack([step.outer(whitening_of(step, self.basis)) for step in self.steps])
 
+    def turning(self) -> ModelSet | None:
+        """The same with the predictors for plans in place; None if there are none."""
+        if self.in_place is None:
+            return None
+        steps = self.in_place.steps
+        if self.recipe.windows == PLAN:
+            steps = tuple(step.through(specialised(self.robot)) for step in steps)
+        return replace(self, steps=steps, in_place=None)
+
     def _check_sizes(self) -> None:
         """Raises BadModel unless every array has the size that robot and mode give it."""
         robot = self.robot
@@ -91,6 +103,9 @@ class ModelSet:
         if self.recipe.mode == DIRECT:
             n += robot.position_dim * sum(disc.arm > 0.0 for disc in robot.body)
         expected = [(step, n, one) for step in self.steps]
+        if self.in_place is not None:
+            whole = robot.regressor_dim + robot.horizon * robot.action_dim
+            expected += [(step, n, whole) for step in self.in_place.steps]
         expected += [(self.bulges, robot.horizon, nz), (self.latch, 1, nz)]
         for c, n, width in expected:
             g, q = c.w.size, len(c.W)
@@ -101,6 +116,11 @@ class ModelSet:
                 )
         if self.domain.shape != (2, robot.regressor_dim) or (self.domain[0] > self.domain[1]).any():
             raise BadModel("the model set's domain is none")
+        box = np.zeros((2, robot.regressor_dim + robot.action_dim)) if self.in_place is None else self.in_place.box
+        if box.shape != (2, robot.regressor_dim + robot.action_dim) or (box[0] > box[1]).any():
+            raise BadModel("the bounds of the model set's plans in place are none")
+        if self.in_place is not None and self.recipe.mode != DIRECT:
+            raise BadModel(f"a model set of mode {self.recipe.mode} has no predictors for plans in place")
         if self.basis.shape != (nz, nz) or np.linalg.matrix_rank(self.basis) < nz:
             raise BadModel("the model set's basis is none")
 
@@ -125,8 +145,11 @@ class ModelSet:
 
     def _tensors(self) -> dict[str, Array]:
         named = {"bulges": self.bulges, "latch": self.latch} | {f"step{k}": c for k, c in enumerate(self.steps)}
-        tensors = {f"{n}.{t}": getattr(c, t) for n, c in named.items() for t in TENSORS}
-        return tensors | {"domain": self.domain, "basis": self.basis}
+        more = {"domain": self.domain, "basis": self.basis}
+        if self.in_place is not None:
+            named |= {f"{IN_PLACE}{k}": c for k, c in enumerate(self.in_place.steps)}
+            more |= {BOX: self.in_place.box}
+        return {f"{n}.{t}": getattr(c, t) for n, c in named.items() for t in TENSORS} | more
 
     def encode(self) -> bytes:
         """Bytes of a safetensors file, with the recipe as its metadata."""
@@ -152,10 +175,10 @@ class ModelSet:
             tensors, about = unpack(payload, ENTRY)
             robot = robot_in(about)
             recipe = Recipe(**about["recipe"])
-            certificates = {
-                name: Certificate(*(tensors[f"{name}.{t}"] for t in TENSORS))
-                for name in ("bulges", "latch", *(f"step{k}" for k in range(robot.horizon)))
-            }
+            names = ["bulges", "latch", *(f"step{k}" for k in range(robot.horizon))]
+            if BOX in tensors:
+                names += [f"{IN_PLACE}{k}" for k in range(robot.horizon)]
+            certificates = {name: Certificate(*(tensors[f"{name}.{t}"] for t in TENSORS)) for name in names}
             more = tensors["domain"], tensors["basis"], dict(about["about"])
             stands = int(about.get("stands", 0))
         except (KeyError, TypeError, ValueError, UnknownRobot) as error:
@@ -170,7 +193,11 @@ class ModelSet:
         steps = tuple(certificates[f"step{k}"] for k in range(robot.horizon))
         if not 0 <= stands <= robot.horizon:
             raise BadModel(f"a plan of {robot.horizon} periods can't have come to a stand after {stands}")
-        model = ModelSet(robot, recipe, steps, certificates["bulges"], certificates["latch"], *more, layout, stands)
+        in_place = None
+        if BOX in tensors:
+            in_place = InPlace(tuple(certificates[f"{IN_PLACE}{k}"] for k in range(robot.horizon)), tensors[BOX])
+        bulges, latch = certificates["bulges"], certificates["latch"]
+        model = ModelSet(robot, recipe, steps, bulges, latch, *more, layout, stands, in_place)
         model._check_sizes()
         if model.version != about.get("version"):
             raise BadModel("the model set's content is not what its version says")

@@ -14,6 +14,7 @@ from scipy.special import betaincinv
 
 from safety.dataset import Dataset
 from safety.filter import Filter
+from safety.in_place import inside
 from safety.model_set import DIRECT, ModelSet, needed
 from safety.tube import Tube
 from safety.windows import PLAN, Quality, Windows, apart, outputs, quality, windows
@@ -51,6 +52,9 @@ class Statement:
     half_width_full: float
     clearance_margin: float  # m, kept to obstacles while driving so that turning in place stays possible
     excess: float  # the largest share of its set that any part of a held-out plan came to; above 1: it was outside
+    in_place_windows: int = 0  # of the windows those of turning on the spot, which have predictors of their own
+    in_place_violations: int = 0
+    bound_in_place: float = 1.0  # probability that any part of a plan in place is outside, at 99 % confidence
 
     def figures(self) -> dict[str, Any]:
         return asdict(self)
@@ -66,24 +70,32 @@ def upper_bound(violations: int, count: int) -> float:
 def state(model: ModelSet, fitted: Dataset, held_out: Dataset) -> Statement:
     """The statement of a model set made from `fitted` about trajectories that it has not seen."""
     robot, ready, kind = model.robot, Filter(model), model.recipe.windows
-    tube = model.tube_of_windows()
-    used = windows(fitted, robot.horizon, kind)
-    figures: Quality = quality(used.z, "plan windows", model.recipe.fewest)
+    turning = model.turning()
+    made_of = windows(fitted, robot.horizon, kind)
+    figures: Quality = quality(made_of.z, "plan windows", model.recipe.fewest)
     whole = windows(held_out, robot.horizon, kind)
     plans = apart(whole.take(~np.isnan(whole.latch)) if kind == PLAN else whole, robot.horizon)
     ends = {tuple(start): row for row, start in enumerate(plans.start)}
+    in_place = np.zeros(len(plans), dtype=bool)
+    if model.in_place is not None:
+        in_place = inside(plans.z, model.in_place.domain(plans.z.shape[1], robot.regressor_dim))
+    groups = [(model, ~in_place)] + ([] if turning is None else [(turning, in_place)])
+    tubes = [of.tube_of_windows() for of, _ in groups]
     excess, first = np.zeros(len(plans)), np.zeros(len(plans))
     for k in range(1, robot.horizon + 1):
         seen = windows(held_out, k, kind)
         rows = [i for i, start in enumerate(seen.start) if tuple(start) in ends]
         part = seen.take(np.isin(np.arange(len(seen)), rows))
-        if k == 1:
-            first = _first_excess(model, part)
-            excess = np.maximum(excess, first)
-        excess = np.maximum(excess, _excess(model, tube, part, k))
+        for (of, members), tube in zip(groups, tubes, strict=True):
+            group = part.take(members)
+            if k == 1:
+                first[members] = _first_excess(of, group)
+                excess[members] = first[members]
+            excess[members] = np.maximum(excess[members], _excess(of, tube, group, k))
     full = np.asarray(robot.high())
     outside, steps_outside = int((excess > 1.0).sum()), int((first > 1.0).sum())
     bound_step = upper_bound(steps_outside, len(plans))
+    turns, turns_outside = int(in_place.sum()), int((excess[in_place] > 1.0).sum())
     return Statement(
         certificate=model.recipe.certificate,
         mode=model.recipe.mode,
@@ -104,6 +116,9 @@ def state(model: ModelSet, fitted: Dataset, held_out: Dataset) -> Statement:
         half_width_full=ready.half_width(full),
         clearance_margin=ready.clearance_margin,
         excess=float(excess.max(initial=0.0)),
+        in_place_windows=turns,
+        in_place_violations=turns_outside,
+        bound_in_place=upper_bound(turns_outside, turns),
     )
 
 

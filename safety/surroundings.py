@@ -17,6 +17,7 @@ from messaging.shapes import FARTHEST, Shapes
 from safety import holding, reaching
 from safety import scan as seen
 from safety import shadows as shades
+from safety.commitment import Prediction
 from safety.explain import SIGHT, Around, Planes, Stopped, worst
 from safety.freespace import half_spaces, leading_out
 from safety.limits import Limits, stacked
@@ -98,13 +99,39 @@ class Scene:
         return not len(self.near) and self.moving is None and self.unseen is None and self.promised is None
 
 
+def turning_extent(robot: Robot, tube: Tube) -> float:
+    """The clearance margin [m] that a robot needs by default: as wide as the tube of moving in place ever gets, so that
+    wherever the robot stopped it can still turn.
+
+    Without it a robot may stop so close to an obstacle that no motion can be verified from there, for good.
+    """
+    in_place = np.where([not moves for moves in robot.translates], robot.high(), 0.0)
+    state = robot.driving(in_place)
+    z = np.concatenate([state[list(robot.regressor)], in_place, np.tile(in_place, robot.free_steps)])
+    sizes = tube.magnitudes(z)
+    L, d = tube.generators, robot.position_dim
+    directions = np.random.default_rng(0).normal(size=(64, d))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    width = np.abs(directions[:, None, None, :] @ tube.directions)[:, :, 0] @ sizes[:L]
+    drift = np.abs((directions[:, None, None, :] @ tube.position)[:, :, 0] @ z)
+    return float((width + drift).max() + sizes[L:].max())
+
+
 class Surroundings:
     """A robot's tube, ready to be held against scenes."""
 
-    def __init__(self, model: ModelSet, tube: Tube, outer: Tube, domain: Array, clearance_margin: float | None) -> None:
+    def __init__(
+        self,
+        model: ModelSet,
+        tube: Tube,
+        outer: Tube,
+        domain: Array,
+        clearance_margin: float,
+        reach: float | None = None,
+    ) -> None:
         """tube: the model's; `outer`: the same over-approximated with fewer atoms; domain (2, r): of the recorded
-        regressors; clearance_margin [m]: the distance from the tube to obstacles that the QP keeps; by default as
-        wide as turning in place needs."""
+        regressors; clearance_margin [m]: the distance from the tube to obstacles that the QP keeps; reach [m]: that of
+        the scenes, by default what this tube needs."""
         robot = model.robot
         if robot.position_dim == 3:
             shades.prepare()
@@ -118,38 +145,27 @@ class Surroundings:
         self._filled = parts  # what `filled_by_plans` is told of the tube
         self._sized = whole(tube.W.T), whole(tube.M.T), tube.m_0  # and what its `magnitudes` are
         self._reached = *self._sized, whole(tube.position), whole(tube.directions)
+        first, n = model.first, robot.state_dim
+        transposed = whole(first.W.T), whole(first.M.T), whole(first.kappa.T)
+        # What `next_state` is told of the first period.
+        self._next = whole(first.C[:n]), *transposed, first.w, whole(np.abs(first.generators[:n]))
+        self._regressor = model.first_regressor
         self.boxes = Boxes(tube.position, tube.directions)
         self.limits = Limits(robot, tube) if robot.limits else None
         self.measured = np.asarray(robot.measurement_bound[: robot.position_dim], dtype=float)
         self._unturned = np.eye(robot.position_dim)
         self.body = robot.footprint + float(np.linalg.norm(self.measured))  # m about where the center was measured
-        self.clearance_margin = self._own_clearance_margin() if clearance_margin is None else clearance_margin
+        self.clearance_margin = clearance_margin
         farthest = max((float(np.linalg.norm(disc.at)) for disc in self.discs), default=0.0)
         self._beside = self.measured + self.clearance_margin + ASIDE + farthest  # of a plan's sets, which is looked at
         self.stays = self._stays()
         self.widest = self._widest(outer, domain)
         wanted = self.widest + self.clearance_margin
-        self.reach = min(wanted, robot.sight)  # m from the measured position: an obstacle beyond it decides nothing
+        # m from the measured position: an obstacle beyond it decides nothing
+        self.reach = min(wanted, robot.sight) if reach is None else reach
         self.far = wanted > robot.sight  # a tube may leave what can be seen: every candidate must be looked at
 
     # --- what is known before any request ---------------------------------------------------------------------
-
-    def _own_clearance_margin(self) -> float:
-        """[m]: as wide as the tube of moving in place ever gets, so that wherever the robot stopped it can still turn.
-
-        Without it a robot may stop so close to an obstacle that no motion can be verified from there, for good.
-        """
-        robot = self.robot
-        in_place = np.where([not moves for moves in robot.translates], robot.high(), 0.0)
-        state = robot.driving(in_place)
-        z = np.concatenate([state[list(robot.regressor)], in_place, np.tile(in_place, robot.free_steps)])
-        sizes = self.tube.magnitudes(z)
-        L, d = self.tube.generators, robot.position_dim
-        directions = np.random.default_rng(0).normal(size=(64, d))
-        directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-        width = np.abs(directions[:, None, None, :] @ self.tube.directions)[:, :, 0] @ sizes[:L]
-        drift = np.abs((directions[:, None, None, :] @ self.tube.position)[:, :, 0] @ z)
-        return float((width + drift).max() + sizes[L:].max())
 
     def _stays(self) -> bool:
         """Is it, once it stands, where it stands? Who hovers by an estimate may go on drifting: then standing for a
@@ -238,6 +254,15 @@ class Surroundings:
     def sets(self, start: Array, turn: Array, z: Array) -> tuple[Array, Array]:
         """Where the true positions at the periods' ends lie, world: centers and half-widths (N, d)."""
         return reaching.sets(*self._reached, z, np.ascontiguousarray(start, dtype=float), turn, self.measured)
+
+    def predict(self, scene: Scene, z: Array) -> Prediction:
+        """The set of the next measured state, all coordinates."""
+        center, half = reaching.next_state(
+            *self._next, self._regressor(z), np.ascontiguousarray(scene.start), scene.turn
+        )
+        if self.robot.heading is not None:
+            center[self.robot.heading] += scene.heading
+        return Prediction(center, half, scene.heading)
 
     def margin(self, rows: Rows, z: Array) -> float:
         """Smallest distance [m] of the exact tube to a half-space (of a limit: in its own units)."""

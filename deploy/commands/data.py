@@ -275,6 +275,10 @@ def table(rows: list[tuple[Statement, str]]) -> Stacking:
 def in_words(s: Statement, period: float) -> str:
     """What a statement says of how far its model set can be trusted; period: s between two steps."""
     episode, hour = f"{EPISODE} steps ({EPISODE * period:.0f} s)", f"{round(HOUR / period):,} steps"
+    in_place = (
+        f"  a turn on the spot: at most {s.bound_in_place:.2%} of {s.in_place_windows} such plans leave their tube "
+        f"({s.in_place_violations} did)",
+    )
     lines = (
         f"{s.certificate}, {s.mode}, in words, at {CONFIDENCE:.0%} confidence, from {s.windows} held-out plans:",
         f"  a step: at most {s.bound_step:.2%} of steps leave their predicted set ({s.step_violations} did)",
@@ -282,6 +286,7 @@ def in_words(s: Statement, period: float) -> str:
         f"  an episode of {episode}: at most {s.outside_episode:.2g} steps outside on average; at least one in up to "
         f"{s.bound_episode:.0%} of episodes, if steps are independent",
         f"  an hour of driving ({hour}): at most {s.outside_hour:.3g} steps outside on average",
+        *(in_place if s.in_place_windows else ()),
         "A step outside is no collision by itself, but nothing was verified about where the robot then is.",
         "The bounds hold for driving like the recorded one; more held-out plans make them tighter.",
     )

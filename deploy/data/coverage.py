@@ -12,7 +12,8 @@ from deploy.data.sources.quantities import columns_of, split
 from messaging.robots import Array, Robot
 from safety.dataset import Dataset
 from safety.fitting import FEWEST_STOPS
-from safety.model_set import Recipe
+from safety.in_place import standing_limits
+from safety.model_set import DIRECT, Recipe
 from safety.statement import CONFIDENCE, Statement
 from safety.windows import FREE, PLAN, standing_at_the_end, stops_of, windows
 
@@ -147,11 +148,18 @@ def _windows_missing(plans: int, free: int) -> list[str]:
 
 def more_to_drive(statement: Statement, data: Dataset) -> list[str]:
     """What a statement can't say yet, and how much more driving like this it takes."""
+    turns = []
+    if statement.mode == DIRECT and not statement.in_place_windows and standing_limits(data.robot) is not None:
+        turns = [
+            "too few turns on the spot to bound them apart from driving, so the filter keeps far off obstacles: "
+            f"stand, then turn at various rates for {data.robot.horizon * data.robot.period:.1f} s or more each"
+        ]
     if statement.bound_plan <= AIMED:
-        return []
+        return turns
     wanted = math.ceil(math.log(1.0 - CONFIDENCE) / math.log(1.0 - AIMED))
     minutes = data.periods * data.robot.period / 60.0 * (wanted / max(statement.windows, 1) - 1.0)
     return [
+        *turns,
         f"at most {statement.bound_plan:.1%} of plans leave their sets (99 % confidence); to say {AIMED:.0%} it takes "
-        f"{wanted} held-out plans without one, {max(minutes, 0.0):.0f} more minutes like these"
+        f"{wanted} held-out plans without one, {max(minutes, 0.0):.0f} more minutes like these",
     ]

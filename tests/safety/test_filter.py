@@ -103,8 +103,9 @@ def test_adjusted_is_the_closest_input_that_can_be_verified(ready):
         adjusted += 1
         z_0 = np.concatenate([ask.state[3:], ask.input_in_force])
         scene = ready.around.scene(ask, z_0, ready.builder.reachable(ask.input_in_force))
-        rows = ready.around.rows(scene, np.concatenate([z_0, ready.inputs.limited(ask.action, ask.input_in_force)]))
-        kept = ready._with_clearance_margin(rows, z_0, ready.inputs.limited(ask.action, ask.input_in_force))
+        proposal = ready.inputs.limited(ask.action, ask.input_in_force)
+        rows = ready.around.rows(scene, np.concatenate([z_0, proposal]))
+        kept = ready._with_clearance_margin(rows, z_0, proposal)
         taken = np.linalg.norm((decision.plan[0] - ask.action) / width)
         best = np.inf
         for u in grid:

@@ -99,6 +99,11 @@ def test_tampered_model_sets_are_refused(model):
         ({"domain": model.domain[:1]}, "domain"),
         ({"domain": model.domain[::-1].copy()}, "domain"),
         ({"basis": np.zeros_like(model.basis)}, "basis"),
+        ({"in_place.box": model.in_place.box[::-1].copy()}, "in place"),
+        ({"in_place.box": model.in_place.box[:, :-1]}, "in place"),
+        ({"in_place.step0__C": first.C}, "arrays"),
+        ({"in_place.step1__w": 2.0 * model.in_place.steps[1].w}, "version"),
+        ({"in_place.step1__w": -model.in_place.steps[1].w}, "negative width"),
         ({"basis": model.basis.astype(np.float32)}, "another type"),
     ):
         with pytest.raises(BadModel, match=message):
