@@ -27,7 +27,7 @@ def main() -> None:
 
         filter = Filter(ModelSet.load(folder / "data" / "my-robot" / "residual-direct.safetensors"))
         decide(filter, 2.0)
-        decide(filter, 0.45)
+        decide(filter, 0.4)
 
 
 def decide(filter: Filter, distance: float) -> None:
