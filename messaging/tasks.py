@@ -1,9 +1,11 @@
 """What is learned with a robot: what its policy observes and is paid, in which arenas, and what stands for the robot.
 
 A task is a file beside the robot's: `robots/NAME.task.toml`, or `my.task.toml` beside `my.toml`. A robot that comes
-with the program may have further ones, `robots/NAME+OTHER.task.toml`, each of which says what it is `like`; who asks
-for the robot as `NAME+OTHER` gets it. What a task names as code (`simulator`, `senses`, `policies`) is `module:name`,
-or `file.py:name` beside the task; only `deploy` and `sim` load it.
+with the program may have further ones, `robots/NAME+OTHER.task.toml`, each of which says what it is `like`; give the
+name `NAME+OTHER` to get that task. What a task names as code (`simulator`, `senses`, `policies`) is `module:name`, or
+`file.py:name` beside the task; only `deploy` and `sim` load it.
+
+Robots and tasks are values: a program reads them once, by name or path, and passes them on.
 """
 
 from __future__ import annotations
@@ -172,7 +174,7 @@ def _module_in(path: Path) -> Any:
 
 @dataclass(frozen=True)
 class RobotWithTask(Robot):
-    """A robot together with what is learned with it: what an environment, a policy, and a learner need.
+    """A robot together with its task: what an environment, a policy, and a learner need.
 
     The filter needs a `Robot` alone: a request, a model set, and a data set know no task.
     """
@@ -180,7 +182,7 @@ class RobotWithTask(Robot):
     task: Task = field(kw_only=True, hash=False)
 
     def learning_layout(self) -> str:
-        """Hash of what an actor and a learner must share: the robot's vectors, and what is observed."""
+        """Return the hash of what an actor and a learner must share: the robot's vectors and the observation."""
         words = json.dumps([self.layout(), *self.task.observed])
         return hashlib.sha256(words.encode()).hexdigest()[:16]
 
@@ -190,7 +192,7 @@ class RobotWithTask(Robot):
 
 
 def with_task(robot: Robot, task: Task) -> RobotWithTask:
-    """The robot together with a task."""
+    """Return the robot together with a task."""
     return RobotWithTask(**{part.name: getattr(robot, part.name) for part in fields(Robot)}, task=task)
 
 
@@ -233,7 +235,7 @@ def needs_task(robot: Robot) -> RobotWithTask:
 
 
 def task_path(name: str) -> Path:
-    """The file of the task that belongs to a robot's name or path.
+    """Return the file of the task that belongs to a robot's name or path.
 
     Raises:
         UnknownRobot; UnknownTask: there is no such file.
@@ -256,7 +258,7 @@ def _task_beside(path: str) -> Path:
 
 
 def address(name: str) -> str:
-    """What another process finds the robot and its task by: the name, or the path made absolute.
+    """Return the name or the absolute path from which another process reads the same robot and task.
 
     Raises:
         UnknownRobot; UnknownTask: there is no such robot, or no such task of it.
@@ -269,7 +271,7 @@ def address(name: str) -> str:
 
 
 def address_in_real_time(name: str) -> str:
-    """The same of the robot in real time."""
+    """Return the address of the same robot in real time."""
     return address(name.removesuffix(LATE)) + LATE
 
 

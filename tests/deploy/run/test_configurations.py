@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from actors.loop import Change
+from deploy.commands.fly import Fly
 from deploy.commands.train import Train
 from deploy.policies import policy_named
 from deploy.run.configurations import EXPERIMENTS, RunConfig, decode, encode, load
@@ -114,3 +115,10 @@ def test_what_no_world_is_made_for_is_refused_before_anything_starts() -> None:
     assert robot_with_task(place.robot).task.observation_dim == 50, "its process has the task"
     stored = policy_named("trained", robot_with_task(place.robot), 0)
     assert stored(np.zeros(50, np.float32), {}).shape == (2,), "of its own observation, in a folder of its own"
+
+
+def test_each_process_of_a_flight_can_read_the_robot_by_itself() -> None:
+    """A robot of somebody's own has no name that another process knows."""
+    path = Path(__file__).parents[3] / "examples" / "px4" / "quadrotor_px4.toml"
+    (place,) = (place for place in places(Fly(robot=str(path)).config()) if place.kind == "actor")
+    assert robot_with_task(place.robot).name == "quadrotor-px4-late"
