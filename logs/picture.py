@@ -8,7 +8,7 @@ from typing import Protocol
 
 from logs.tally import KINDS, Figures
 from messaging import brakeline_pb2 as pb
-from messaging.explained import explain, fell_back, fits
+from messaging.explained import bound_in, explain, fell_back, fits
 from messaging.robots import Robot
 from messaging.surroundings import promised, surroundings
 
@@ -94,6 +94,8 @@ def rows(seen: Seen, robot: Robot | None) -> Iterable[Figures]:
             "said": why,
             "margin": decision.margin if decision is not None and decision.tube_center else None,
             "at_least": decision.at_least if decision is not None else False,
+            "verified": decision.verified if decision is not None else None,
+            "bound": bound_in(decision) if decision is not None else None,
             "decide_ms": decision.time_ms if decision is not None else None,
             "round_trip_ms": exchange.round_trip_ms if exchange is not None else None,
             "iterations": decision.iterations if decision is not None else None,
@@ -174,6 +176,7 @@ def _explained(exchange: pb.Exchange, robot: Robot | None) -> Figures:
     about = explain(robot, request, decision)
     return {
         "said": about.said,
+        "trust": about.trust,
         "inputs": [[name, unit, *_rounded((proposed, executed))] for name, unit, proposed, executed in about.inputs],
         "arrows": [_rounded(about.proposed[:2]), _rounded(about.executed[:2])],
         "edge": [*_rounded(about.at[:2]), *_rounded(about.normal[:2])] if len(about.at) else None,

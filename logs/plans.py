@@ -15,6 +15,8 @@ from numpy.typing import NDArray
 from logs.robots import Robots
 from logs.tally import Figures
 from messaging import brakeline_pb2 as pb
+from messaging.bounds import UNSTATED, percent
+from messaging.explained import bound_in
 
 Array = NDArray[np.float64]
 
@@ -27,12 +29,14 @@ _OWN = (int(pb.ALLOWED), int(pb.ADJUSTED))
 class Plans:
     """Of one actor. flown: verified plans that it went on along for more than their first period, for nothing newer was
     verified; outside: of these, in which it was measured outside of the plan's tube, at any period's end; excess: the
-    largest share of a tube's half-width that any position came to."""
+    largest share of a tube's half-width that any position came to; bound: the largest share of them outside that the
+    model sets stated which verified them, None: not all say."""
 
     robots: Robots = field(default_factory=Robots)
     flown: int = 0
     outside: int = 0
     excess: float = 0.0
+    bound: float | None = 0.0
     _own: pb.Exchange | None = None  # the latest with a verified plan of its own
     _tube: tuple[Array, Array] | None = None  # of that plan, once it is gone on along: centers and half-widths (N, d)
     _periods: int = 0  # since then
@@ -87,6 +91,8 @@ class Plans:
             self.flown += 1
             self.outside += self._worst > 1.0
             self.excess = max(self.excess, self._worst)
+            stated = None if self._own is None else bound_in(self._own.reply.decision)
+            self.bound = None if self.bound is None or stated is None else max(self.bound, stated)
         self._own, self._tube, self._periods, self._worst = None, None, 0, 0.0
 
 
@@ -102,9 +108,22 @@ def _tube_of(exchange: pb.Exchange) -> tuple[Array, Array] | None:
 
 def figures(parts: Iterable[Plans]) -> Figures:
     """Of all actors."""
-    parts = list(parts)
+    parts = [part for part in parts if part.flown]
+    stated = [part.bound for part in parts]
+    known = [bound for bound in stated if bound is not None]
     return {
         "flown": sum(part.flown for part in parts),
         "outside": sum(part.outside for part in parts),
         "excess": max((part.excess for part in parts), default=0.0),
+        "bound": max(known) if known and len(known) == len(stated) else None,
     }
+
+
+def stated(plans: Figures) -> str:
+    """What was stated of such plans, beside the count of those whose tubes were left."""
+    bound = plans.get("bound")
+    if bound is None:
+        return "no bound was recorded"
+    if bound == UNSTATED:
+        return "no bound was stated"
+    return f"stated: at most {percent(bound)}, at 99 % confidence"

@@ -10,6 +10,7 @@ from rich.text import Text
 
 from logs.analysis import SETUP, analysed
 from logs.metrics import Figures
+from logs.plans import stated
 from logs.reader import Paths
 from logs.tables import PLAIN, Stacking
 from logs.tally import CONTACTS
@@ -141,8 +142,8 @@ def _add_safety(table: Table, figures: Figures) -> None:
         )
     plans = figures.get("plans") or {}
     if plans.get("flown"):
-        outside = _share(plans["outside"], plans["flown"], None)
-        table.add_row("verified plans that were gone on along", f"{plans['flown']}, outside of their tubes {outside}")
+        outside = f"outside of their tubes {_share(plans['outside'], plans['flown'])}; {stated(plans)}"
+        table.add_row("verified plans that were gone on along", f"{plans['flown']}, {outside}")
     if figures.get("unverified"):
         table.add_row("[red]unverified failsafes[/]", str(figures["unverified"]))
     if figures.get("not_finite"):

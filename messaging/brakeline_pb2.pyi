@@ -586,6 +586,7 @@ class Decision(_message.Message):
     BROKEN_FIELD_NUMBER: _builtins.int
     STOPPED_FIELD_NUMBER: _builtins.int
     FOR_CLEARANCE_FIELD_NUMBER: _builtins.int
+    BOUND_FIELD_NUMBER: _builtins.int
     kind: Global___Kind.ValueType
     predicted_heading: _builtins.float
     """rad, of the frame in which its position part is a box"""
@@ -619,6 +620,10 @@ class Decision(_message.Message):
     for_clearance: _builtins.bool
     """Of an adjusted decision: was the proposal's own tube verified, and replaced only because it came nearer to an
     obstacle than the clearance margin? Absent: another kind of decision, another method, or a log from before.
+    """
+    bound: _builtins.float
+    """The model set's statement: at most this share of the plans that it verifies leave their tubes, at 99 % confidence;
+    1: it states nothing. Absent: another method, or a log from before.
     """
     @_builtins.property
     def plan(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]:
@@ -679,13 +684,19 @@ class Decision(_message.Message):
         broken: _builtins.int = ...,
         stopped: Global___Stopped | None = ...,
         for_clearance: _builtins.bool | None = ...,
+        bound: _builtins.float | None = ...,
     ) -> None: ...
-    _HasFieldArgType: _TypeAlias = _typing.Literal["_for_clearance", b"_for_clearance", "for_clearance", b"for_clearance", "promise", b"promise", "stopped", b"stopped"]  # noqa: Y015
+    _HasFieldArgType: _TypeAlias = _typing.Literal["_bound", b"_bound", "_for_clearance", b"_for_clearance", "bound", b"bound", "for_clearance", b"for_clearance", "promise", b"promise", "stopped", b"stopped"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["_for_clearance", b"_for_clearance", "at_least", b"at_least", "broken", b"broken", "compared", b"compared", "contained", b"contained", "for_clearance", b"for_clearance", "iterations", b"iterations", "kind", b"kind", "margin", b"margin", "model", b"model", "plan", b"plan", "predicted_center", b"predicted_center", "predicted_half_width", b"predicted_half_width", "predicted_heading", b"predicted_heading", "promise", b"promise", "queue_ms", b"queue_ms", "reason", b"reason", "solve_ms", b"solve_ms", "solver", b"solver", "stopped", b"stopped", "time_ms", b"time_ms", "tube_center", b"tube_center", "tube_half_width", b"tube_half_width", "unvouched", b"unvouched", "verified", b"verified", "verify_ms", b"verify_ms", "vouchers", b"vouchers"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["_bound", b"_bound", "_for_clearance", b"_for_clearance", "at_least", b"at_least", "bound", b"bound", "broken", b"broken", "compared", b"compared", "contained", b"contained", "for_clearance", b"for_clearance", "iterations", b"iterations", "kind", b"kind", "margin", b"margin", "model", b"model", "plan", b"plan", "predicted_center", b"predicted_center", "predicted_half_width", b"predicted_half_width", "predicted_heading", b"predicted_heading", "promise", b"promise", "queue_ms", b"queue_ms", "reason", b"reason", "solve_ms", b"solve_ms", "solver", b"solver", "stopped", b"stopped", "time_ms", b"time_ms", "tube_center", b"tube_center", "tube_half_width", b"tube_half_width", "unvouched", b"unvouched", "verified", b"verified", "verify_ms", b"verify_ms", "vouchers", b"vouchers"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    _WhichOneofReturnType__bound: _TypeAlias = _typing.Literal["bound"]  # noqa: Y015
+    _WhichOneofArgType__bound: _TypeAlias = _typing.Literal["_bound", b"_bound"]  # noqa: Y015
     _WhichOneofReturnType__for_clearance: _TypeAlias = _typing.Literal["for_clearance"]  # noqa: Y015
     _WhichOneofArgType__for_clearance: _TypeAlias = _typing.Literal["_for_clearance", b"_for_clearance"]  # noqa: Y015
+    @_typing.overload
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__bound) -> _WhichOneofReturnType__bound | None: ...
+    @_typing.overload
     def WhichOneof(self, oneof_group: _WhichOneofArgType__for_clearance) -> _WhichOneofReturnType__for_clearance | None: ...
 
 Global___Decision: _TypeAlias = Decision  # noqa: Y015

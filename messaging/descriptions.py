@@ -17,7 +17,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
 
-from messaging.robots import FEEDBACK, HOLD, LATE, RAMP, Disc, Limit, Robot, UnknownRobot
+from messaging.robots import ACCEPTED, FEEDBACK, HOLD, LATE, RAMP, Disc, Limit, Robot, UnknownRobot
 
 NAME = re.compile(r"[A-Za-z0-9_.]+(-[A-Za-z0-9_.]+)*")
 LONGEST = 64  # characters of a name
@@ -97,6 +97,9 @@ class Description(_Strict):
     body: Annotated[list[Body], Field(min_length=1, max_length=8)]
     limit: Annotated[list[Bound], Field(max_length=32)] = []
     stopped: Positive | None = None
+    # The largest share of plans outside their tubes, as a model set states it, that is used without a question. It is
+    # below 1, which is what a model set without a statement counts as.
+    accept_bound: Annotated[float, Field(gt=0.0, lt=1.0, allow_inf_nan=False)] = ACCEPTED
 
 
 def read(path: Path) -> Robot:
@@ -168,6 +171,7 @@ def _robot(said: Description) -> Robot:
         feedback=tuple(gains) if FEEDBACK in rules else (),
         stopped=math.inf if said.stopped is None else said.stopped,
         limits=tuple(Limit(bound.name, _weights(names, bound.weights), bound.most) for bound in said.limit),
+        accept_bound=said.accept_bound,
     )
 
 
@@ -221,7 +225,8 @@ def describe(robot: Robot) -> dict[str, Any]:
         "body": [{"at": list(disc.at), "radius": disc.radius} for disc in robot.body],
         "limit": limits,
     }
-    return said | ({"stopped": robot.stopped} if math.isfinite(robot.stopped) else {})
+    said |= {"stopped": robot.stopped} if math.isfinite(robot.stopped) else {}
+    return said | ({"accept_bound": robot.accept_bound} if robot.accept_bound != ACCEPTED else {})
 
 
 def _weights(names: list[str], by_name: dict[str, float]) -> tuple[float, ...]:

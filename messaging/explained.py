@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from messaging import brakeline_pb2 as pb
+from messaging.bounds import UNSTATED, checked, percent, trust
 from messaging.robots import Robot
 
 Array = NDArray[np.float64]
@@ -23,9 +24,9 @@ ARROW = 3  # periods: an input's arrow ends where it would take the robot in tha
 
 @dataclass(frozen=True)
 class Explanation:
-    """said: the sentence; inputs: (name, unit, proposed, executed) of each; proposed, executed (d,): arrows, m, world;
-    at, normal (d,): a point of the edge of the half-space that stopped the proposal, and its normal from the free side
-    on, world; empty if there is none."""
+    """said: the sentence; trust: what `verified` is worth, where the sentence does not say it; inputs: (name, unit,
+    proposed, executed) of each; proposed, executed (d,): arrows, m, world; at, normal (d,): a point of the edge of the
+    half-space that stopped the proposal, and its normal from the free side on, world; empty if there is none."""
 
     said: str
     inputs: list[tuple[str, str, float, float]]
@@ -33,6 +34,7 @@ class Explanation:
     executed: Array
     at: Array
     normal: Array
+    trust: str = ""
 
 
 def explain(robot: Robot, request: pb.Request, decision: pb.Decision) -> Explanation:
@@ -47,7 +49,13 @@ def explain(robot: Robot, request: pb.Request, decision: pb.Decision) -> Explana
         arrow(robot, heading, executed),
         np.array(decision.stopped.at),
         np.array(decision.stopped.normal),
+        "" if decision.kind in (pb.FAILSAFE, pb.RECOVERING) else trust(decision.verified, bound_in(decision)),
     )
+
+
+def bound_in(decision: pb.Decision) -> float | None:
+    """The model set's statement, where the decision has it."""
+    return checked(decision.bound) if decision.HasField("bound") else None
 
 
 def fits(robot: Robot, request: pb.Request, decision: pb.Decision) -> bool:
@@ -88,11 +96,20 @@ def sentence(robot: Robot, request: pb.Request, decision: pb.Decision) -> str:
         did, instead = change(robot, np.array(request.action), np.array(decision.plan[: robot.action_dim]))
         return f"{did}: {instead}, {why}" if why else f"{did}: {decision.reason}"
     if decision.kind == pb.FAILSAFE:
-        how = "braked along the plan verified before" if decision.verified else "braked, though no plan is verified"
+        how = fell_back_on(decision) if decision.verified else "braked, though no plan is verified"
         return f"{how}: as proposed, {why}" if why else f"{how}: {decision.reason}"
     if decision.kind == pb.RECOVERING:
         return f"slowly backs out of where not even standing is verified: as proposed, {why or decision.reason}"
     return "as proposed"
+
+
+def fell_back_on(decision: pb.Decision) -> str:
+    """That the committed plan goes on, and what its having been verified is worth."""
+    bound = bound_in(decision)
+    if bound is None:
+        return "braked along the plan verified before"
+    worth = "no bound is stated" if bound == UNSTATED else f"at most {percent(bound)} of such plans leave their tube"
+    return f"braked along the plan verified before ({worth})"
 
 
 def fell_back() -> str:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Self
@@ -25,6 +25,7 @@ LATE = "-late"  # ends the name of a robot in real time
 WITH = "+"  # stands between a robot's name and that of another task than its usual one (`messaging.tasks`)
 RAMP, HOLD, FEEDBACK = "ramp", "hold", "feedback"
 FOLLOWED = 1e-6  # of an input's range: two inputs this close are the same (they were rounded to single precision)
+ACCEPTED = 0.01  # largest stated share of plans outside their tubes that a robot is driven behind without a question
 FOLDER = Path(__file__).parents[1] / "robots"
 
 
@@ -89,6 +90,9 @@ class Robot:
     stopped: float = math.inf  # residual speed, in units of each followed or regressed coordinate, that counts as none
     limits: tuple[Limit, ...] = ()
     late: bool = False  # an answer counts from the next period on: a plan's first input is the one in force meanwhile
+    # The largest share of plans outside their tubes, as a model set states it, that is used without a question. It says
+    # nothing about the robot's vectors: robots that differ in nothing else are equal, and have one layout.
+    accept_bound: float = field(default=ACCEPTED, compare=False)
 
     @property
     def kind(self) -> str:
@@ -247,7 +251,8 @@ class Robot:
 
     def layout(self) -> str:
         """Hash of everything that two processes must share to understand each other's vectors."""
-        words = json.dumps([self.description, self.late])  # the order of names is part of it
+        shared = {name: value for name, value in self.description.items() if name != "accept_bound"}
+        words = json.dumps([shared, self.late])  # the order of names is part of it
         return hashlib.sha256(words.encode()).hexdigest()[:16]
 
     def understands(self, layout: object) -> bool:

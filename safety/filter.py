@@ -42,6 +42,7 @@ from safety.request import (
 )
 from safety.scan import shows
 from safety.solver import INFEASIBLE, solve
+from safety.stated import stated_bound
 from safety.surroundings import Scene, Surroundings, turning_extent
 
 Array = NDArray[np.float64]
@@ -87,6 +88,7 @@ class Filter:
         turning in place needs."""
         self.model = model
         self.version = model.version
+        self.bound = stated_bound(model.about)
         self.robot = robot = model.robot
         self.tube, outer = model.tube(), model.outer_tube()
         self.builder = Builder(robot, outer)
@@ -371,6 +373,7 @@ class Filter:
             stopped=None if found.kind == ALLOWED else attempt.stopped,
             for_clearance=found.for_clearance if found.kind == ADJUSTED else None,
             promise=promise,
+            bound=self.bound,
         )
 
     def rest(self, state: Array) -> Promise:

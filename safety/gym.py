@@ -38,9 +38,10 @@ class SafetyWrapper(gymnasium.Wrapper[Any, Any, Any, Any]):
     """Replaces each action by the filter's decision on it.
 
     `info` may hold `scan` (`Scan`, in space `RangeImage`) in the obstacles' place. The wrapper adds, after `step`:
-    `safety` (the `Answer`, None if a service gave none), `proposed` (the action given),
-    `penalty`, and `diagnostics`, a dict of plain values: kind, verified, contained, margin [m], time_ms, model, reason,
-    and proposed and executed as inputs of the robot. The penalty is subtracted from the reward.
+    `safety` (the `Answer`, None if a service gave none), `proposed` (the action given), `penalty`, and `diagnostics`, a
+    dict of plain values: kind, verified, contained, margin [m], time_ms, model, reason, bound (the largest share of
+    verified plans that leave their tubes, as stated; NaN: none is), and proposed and executed as inputs of the robot.
+    The penalty is subtracted from the reward.
     """
 
     def __init__(
@@ -52,6 +53,7 @@ class SafetyWrapper(gymnasium.Wrapper[Any, Any, Any, Any]):
         state: View = STATE,
         obstacles: View = OBSTACLES,
         actions: Actions | None = None,
+        accept_bound: float | None = None,
     ) -> None:
         """
         Args:
@@ -61,12 +63,15 @@ class SafetyWrapper(gymnasium.Wrapper[Any, Any, Any, Any]):
             obstacles: likewise -> a list of `Obstacle` with at least those within `filter.reach`, as a map says: where
                 the list has nothing, space is free. None instead of a list: nothing is known, but by a scan.
             actions: between the environment's actions and the robot's inputs; unless given they are the same.
+            accept_bound: of a filter, the largest stated share of plans outside their tubes that is accepted; unless
+                given the limit of the robot's description counts.
 
         Raises:
             Mismatch: the action space is not that of the robot's inputs, and `actions` is not given.
+            TooLoose: the model set's statement is looser than that.
         """
         super().__init__(env)
-        self.asker = filter if isinstance(filter, Asker) else InProcess(filter)
+        self.asker = filter if isinstance(filter, Asker) else InProcess(filter, accept_bound)
         self.penalty, self.commitment = penalty, self.asker.commitment
         self._state, self._obstacles = state, obstacles
         self._actions = actions_of(env.action_space, self.asker.robot, actions)
@@ -79,7 +84,7 @@ class SafetyWrapper(gymnasium.Wrapper[Any, Any, Any, Any]):
         """With the model in a file.
 
         Raises:
-            BadModel: it is none; Mismatch: see above.
+            BadModel: it is none; TooLoose, Mismatch: see above.
         """
         from safety.methods import load, ready  # what only asks a service needs no solver
 
@@ -135,6 +140,7 @@ def diagnostics(answer: Answer | None, reason: str = "") -> dict[str, Any]:
         return {"kind": UNANSWERED, "verified": False, "contained": False, "margin": np.nan, "time_ms": np.nan} | {
             "model": "",
             "reason": reason,
+            "bound": np.nan,
         }
     names = ("kind", "verified", "contained", "margin", "time_ms", "model", "reason")
-    return {name: getattr(answer, name) for name in names}
+    return {name: getattr(answer, name) for name in names} | {"bound": np.nan if answer.bound is None else answer.bound}

@@ -30,7 +30,16 @@ Array = NDArray[np.float64]
 class InProcess:
     """Asks a method about one robot, and keeps its committed plan: `SafetyClient` without a service."""
 
-    def __init__(self, method: Method) -> None:
+    def __init__(self, method: Method, accept_bound: float | None = None) -> None:
+        """accept_bound: the largest stated share of plans outside their tubes that is accepted; unless given the limit
+        of the robot's description counts.
+
+        Raises:
+            TooLoose: the model set states more, or states nothing.
+        """
+        from safety.stated import check_bound  # what only asks a service loads no model
+
+        check_bound(getattr(method, "model", None), method.robot, accept_bound)
         self.method = method
         self.commitment = Commitment(method.robot)
 

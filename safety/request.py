@@ -115,6 +115,9 @@ class Decision:
     broken: int = 0  # movers that were seen outside of what their bounds allowed
     stopped: Stopped | None = None  # of a proposal that was not allowed: what it would have come too near to
     promise: Promise | None = None  # to the other robots of its world
+    # The model set's statement: at most this share of the plans that it verifies leave their tubes, at 99 % confidence;
+    # 1: it states nothing; None: of a method that verifies nothing.
+    bound: float | None = None
     for_clearance: bool | None = None  # adjusted though the proposal's tube was verified; None: not said
 
 

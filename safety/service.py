@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from threading import Lock
@@ -23,6 +24,7 @@ from safety.model_set import BadModel
 from safety.promise import Promise
 from safety.request import BadRequest, StaleModel, check_for_filter
 from safety.sign import Signed, Trust, Untrusted
+from safety.stated import check_bound
 from safety.vouch import Notary
 from safety.wire import batch_of, error_of, message_of, promise_of, request_of
 
@@ -35,9 +37,15 @@ class NoModel(BadRequest):
 
 @dataclass
 class Models:
-    """The method in use for each robot, and every version there has been, with an archive folder if given."""
+    """The method in use for each robot, and every version there has been, with an archive folder if given.
+
+    limits: the largest stated bound that is used without a question, by the robot's name; without it the limit in the
+    model set's own description counts. accept_bound: the largest that is accepted explicitly, in place of both.
+    """
 
     archive: Path | None = None
+    limits: Mapping[str, float] = field(default_factory=dict)
+    accept_bound: float | None = None
     filters: dict[str, Method] = field(default_factory=dict)
     known: set[str] = field(default_factory=set)
     _lock: Lock = field(default_factory=Lock)
@@ -47,7 +55,11 @@ class Models:
 
         Raises:
             BadModel: it does not fit its robot, or its robot has the name of another that comes with the program.
+            TooLoose: its statement is looser than what is used.
         """
+        robot = model.robot
+        limit = self.limits.get(robot.name, robot.accept_bound)
+        check_bound(model, dataclasses.replace(robot, accept_bound=limit), self.accept_bound)
         method = ready(model)
         try:
             unless_shipped(model.robot)
@@ -201,6 +213,8 @@ class SafetySettings:
     models: tuple[Path, ...]  # model files, one a robot; each says which method it is of
     archive: Path | None = None  # where versions that come over the bus are kept
     name: str = "safety"
+    limits: Mapping[str, float] = field(default_factory=dict)  # as those of `Models`
+    accept_bound: float | None = None
     secrets: Path | None = None  # folder with the key of vouchers, where the bus has no keys
 
 
@@ -213,7 +227,7 @@ def main(settings: SafetySettings) -> None:
     import safety.holding  # noqa: F401  # compiled, which takes seconds the first time: before it is seen to live
 
     keys = settings.bus.keys
-    models, counts = Models(settings.archive), Counts()
+    models, counts = Models(settings.archive, settings.limits, settings.accept_bound), Counts()
     with Process(settings.bus, settings.name) as process:
         trust = Trust.load(keys) if keys is not None else None
         notary = Notary.of(keys or settings.secrets)

@@ -12,9 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import betaincinv
 
+from messaging.bounds import CONFIDENCE as CONFIDENCE
 from safety.dataset import Dataset
 from safety.filter import Filter
 from safety.in_place import inside
+from safety.leaving import AFTER, PATH, Leaving, leavings, position_parts, regimes, state_parts
 from safety.model_set import DIRECT, ModelSet, needed
 from safety.tube import Tube
 from safety.windows import PLAN, Quality, Windows, apart, outputs, quality, windows
@@ -22,7 +24,6 @@ from safety.zonotope import facet_normals
 
 Array = NDArray[np.float64]
 
-CONFIDENCE = 0.99
 EPISODE = 300  # steps
 HOUR = 3600.0  # s
 CHUNK = 256  # windows at once: an exact matrix zonotope has thousands of atoms
@@ -55,6 +56,8 @@ class Statement:
     in_place_windows: int = 0  # of the windows those of turning on the spot, which have predictors of their own
     in_place_violations: int = 0
     bound_in_place: float = 1.0  # probability that any part of a plan in place is outside, at 99 % confidence
+    inflation: float = 1.0  # of the envelopes that the model set was made with
+    leaving: tuple[Leaving, ...] = ()  # where the violations are: by which coordinate, and how the robot drove then
 
     def figures(self) -> dict[str, Any]:
         return asdict(self)
@@ -67,8 +70,22 @@ def upper_bound(violations: int, count: int) -> float:
     return float(betaincinv(violations + 1, count - violations, CONFIDENCE))
 
 
+def most_violations(count: int, limit: float) -> int:
+    """The most violations among so many held-out plans with which the bound is still within the limit; -1: even none
+    would be too many, for there are too few plans."""
+    most = -1
+    while most + 1 < count and upper_bound(most + 1, count) <= limit:
+        most += 1
+    return most
+
+
 def state(model: ModelSet, fitted: Dataset, held_out: Dataset) -> Statement:
     """The statement of a model set made from `fitted` about trajectories that it has not seen."""
+    return judged(model, fitted, held_out)[0]
+
+
+def judged(model: ModelSet, fitted: Dataset, held_out: Dataset) -> tuple[Statement, Array]:
+    """The statement, and of each held-out plan the largest share of its set that any part of it came to (plans,)."""
     robot, ready, kind = model.robot, Filter(model), model.recipe.windows
     turning = model.turning()
     made_of = windows(fitted, robot.horizon, kind)
@@ -82,21 +99,33 @@ def state(model: ModelSet, fitted: Dataset, held_out: Dataset) -> Statement:
     groups = [(model, ~in_place)] + ([] if turning is None else [(turning, in_place)])
     tubes = [of.tube_of_windows() for of, _ in groups]
     excess, first = np.zeros(len(plans)), np.zeros(len(plans))
+    parts = [""] * len(plans)
+
+    def take(places: NDArray[np.intp], shares: Array, names: list[str]) -> None:
+        """Of the plans at these places the part that came to the largest share so far; shares (places, names)."""
+        worst, largest = shares.argmax(1), shares.max(1)
+        for row in np.flatnonzero(largest > excess[places]):
+            parts[places[row]] = names[worst[row]]
+        excess[places] = np.maximum(excess[places], largest)
+
     for k in range(1, robot.horizon + 1):
         seen = windows(held_out, k, kind)
         rows = [i for i, start in enumerate(seen.start) if tuple(start) in ends]
         part = seen.take(np.isin(np.arange(len(seen)), rows))
         for (of, members), tube in zip(groups, tubes, strict=True):
-            group = part.take(members)
+            if not members.any():
+                continue
+            group, places = part.take(members), np.flatnonzero(members)
             if k == 1:
-                first[members] = _first_excess(of, group)
-                excess[members] = first[members]
-            excess[members] = np.maximum(excess[members], _excess(of, tube, group, k))
+                shares = _first_excess(of, group)
+                first[members] = shares.max(1)
+                take(places, shares, state_parts(robot, shares.shape[1] - robot.state_dim))
+            take(places, *_excess(of, tube, group, k))
     full = np.asarray(robot.high())
-    outside, steps_outside = int((excess > 1.0).sum()), int((first > 1.0).sum())
+    outside, steps_outside = int((~(excess <= 1.0)).sum()), int((~(first <= 1.0)).sum())
     bound_step = upper_bound(steps_outside, len(plans))
-    turns, turns_outside = int(in_place.sum()), int((excess[in_place] > 1.0).sum())
-    return Statement(
+    turns, turns_outside = int(in_place.sum()), int((~(excess[in_place] <= 1.0)).sum())
+    statement = Statement(
         certificate=model.recipe.certificate,
         mode=model.recipe.mode,
         version=model.version,
@@ -119,7 +148,10 @@ def state(model: ModelSet, fitted: Dataset, held_out: Dataset) -> Statement:
         in_place_windows=turns,
         in_place_violations=turns_outside,
         bound_in_place=upper_bound(turns_outside, turns),
+        inflation=model.recipe.inflation,
+        leaving=leavings(excess, parts, regimes(robot, plans.z)),
     )
+    return statement, excess
 
 
 def _share(off: Array, half: Array) -> Array:
@@ -129,10 +161,10 @@ def _share(off: Array, half: Array) -> Array:
 
 
 def _first_excess(model: ModelSet, w: Windows) -> Array:
-    """How much of its predicted set any coordinate of the state comes to after one period. (T,)"""
+    """How much of its predicted set each coordinate of the state comes to after one period. (T, n)"""
     z = w.z if model.recipe.mode == DIRECT else model.first_regressor(w.z)
     half = np.concatenate([model.first.half_widths(z[i : i + CHUNK]) for i in range(0, len(z), CHUNK)])
-    return np.asarray(_share(np.abs(outputs_of(model, w) - z @ model.first.C.T), half).max(1))
+    return np.asarray(_share(np.abs(outputs_of(model, w) - z @ model.first.C.T), half))
 
 
 def outputs_of(model: ModelSet, w: Windows) -> Array:
@@ -140,14 +172,18 @@ def outputs_of(model: ModelSet, w: Windows) -> Array:
     return outputs(model.robot, w.y) if model.recipe.mode == DIRECT else w.y
 
 
-def _excess(model: ModelSet, tube: Tube, w: Windows, k: int) -> Array:
+def _excess(model: ModelSet, tube: Tube, w: Windows, k: int) -> tuple[Array, list[str]]:
     """How much of the tube the position comes to after k periods (or what else it speaks of), of its bound the path off
-    it between, and of the latch the stop. (T,)"""
-    d, more = model.robot.position_dim, list(needed(model.robot))
+    it between, and of the latch the stop: (T, parts), with the parts' names."""
+    robot = model.robot
+    d, more = robot.position_dim, list(needed(robot))
     normals = facet_normals(tube.directions[k - 1][:, np.abs(tube.directions[k - 1]).any(0)])
     spread = np.abs(normals @ tube.directions[k - 1])  # (facets, L)
     others = outputs_of(model, w)[:, more]
-    found = np.zeros(len(w))
+    predicted = state_parts(robot, others.shape[1])
+    names = [position_parts(robot)[axis] for axis in np.abs(normals).argmax(1)] + [predicted[i] for i in more]
+    names += [PATH, AFTER] if k == tube.horizon else [PATH]
+    found = np.zeros((len(w), len(names)))
     for i in range(0, len(w), CHUNK):
         z = w.z[i : i + CHUNK]
         sizes = tube.magnitudes(z)
@@ -161,5 +197,5 @@ def _excess(model: ModelSet, tube: Tube, w: Windows, k: int) -> Array:
         ]
         if k == tube.horizon:
             parts.append(_share(w.latch[i : i + CHUNK, None], sizes[:, -1, None]))
-        found[i : i + CHUNK] = np.concatenate(parts, axis=1).max(1)
-    return found
+        found[i : i + CHUNK] = np.concatenate(parts, axis=1)
+    return found, names

@@ -41,13 +41,15 @@ class VectorSafetyWrapper(VectorWrapper):
         state: View = STATE,
         obstacles: View = OBSTACLES,
         actions: Actions | None = None,
+        accept_bound: float | None = None,
     ) -> None:
         """
         Raises:
             Mismatch: the action space is not that of the robot's inputs, and `actions` is not given.
+            TooLoose: the model set's statement is looser than what is used (`InProcess`).
         """
         super().__init__(env)
-        self.asker, self.penalty = InProcess(filter), penalty
+        self.asker, self.penalty = InProcess(filter, accept_bound), penalty
         self.commitments = [Commitment(filter.robot) for _ in range(env.num_envs)]
         self._state, self._obstacles = state, obstacles
         self._actions = actions_of(env.single_action_space, filter.robot, actions)

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from messaging import brakeline_pb2 as pb
 from messaging import surroundings
+from messaging.bounds import checked
 from messaging.movers import parted
 from messaging.robots import Robot
 from messaging.scans import BadScan
@@ -178,6 +179,8 @@ def message_of(decision: Decision, queue_ms: float) -> pb.Reply:
         message.stopped.by, message.stopped.room, message.stopped.after = stopped.by, stopped.room, stopped.after
         message.stopped.normal.extend(stopped.normal.tolist())
         message.stopped.at.extend(stopped.at.tolist())
+    if decision.bound is not None:
+        message.bound = decision.bound
     if decision.promise is not None:
         message.promise.CopyFrom(promise_message(decision.promise))
     return pb.Reply(decision=message)
@@ -223,6 +226,7 @@ def decision_of(m: pb.Decision, robot: Robot) -> Decision:
         stopped=stopped,
         promise=promise_of(m.promise, robot) if m.HasField("promise") else None,
         for_clearance=m.for_clearance if m.HasField("for_clearance") else None,
+        bound=checked(m.bound) if m.HasField("bound") else None,
     )
 
 

@@ -13,6 +13,7 @@ from xdist.scheduler import LoadScopeScheduling
 from deploy.bench.timing import stalls
 from deploy.data import recording, store
 from safety.model_set import Recipe
+from tests.accepting import BOUND
 from tests.robots import GROUND, QUADROTOR
 
 # A machine that stalls is no failure of what is tested.
@@ -20,7 +21,7 @@ settings.register_profile("patient", deadline=None, suppress_health_check=[Healt
 settings.load_profile("patient")
 
 FLIGHTS = 60  # trajectories of the quadrotor, recorded in half a minute
-TRAJECTORIES = 50  # enough for every check of the certificates, recorded in ten seconds
+TRAJECTORIES = 55  # the fewest whose held-out plans state the limit of 1 %, late ones too; recorded in eleven seconds
 
 
 # What flies or drives in real time mostly waits, as do real autopilots; whole runs keep both cores busy. One of each at
@@ -96,7 +97,7 @@ def flight_folder(data_folder: Path) -> Path:
     """The same, with a data set of the quadrotor, and its models in lockstep and in real time."""
     recording.recorded(QUADROTOR, trajectories=FLIGHTS)
     for robot in (QUADROTOR, QUADROTOR.in_real_time()):
-        store.model_for(robot, Recipe())
+        store.model_for(robot, Recipe(), BOUND)
     return data_folder
 
 

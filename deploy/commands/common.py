@@ -50,6 +50,15 @@ class Filtering:
 
 
 @dataclass(frozen=True)
+class Serving(Filtering):
+    """Which filter is put to use, and how loose its statement may be."""
+
+    accept_bound: float | None = None
+    """Use model sets that state at most this share of plans outside their tubes (0.26: 26 %). Without it the limit of
+    the robot's description counts: `accept_bound`, 0.01 unless the description has one."""
+
+
+@dataclass(frozen=True)
 class Physics:
     """What may differ between the robot that was recorded and the one that drives."""
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import product
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -38,6 +38,7 @@ from safety.certificates import KINDS, RESIDUAL
 from safety.dataset import Dataset
 from safety.model_set import MODES, ModelSet, Recipe
 from safety.sign import KEY, Signer, seal_of
+from safety.stated import accepted_bound, refusal
 from safety.statement import CONFIDENCE, EPISODE, HOUR, Statement
 
 DIVERGES = 100.0  # m, of a stop's half-width: wider than any arena
@@ -75,6 +76,9 @@ class Collect:
     """The first flight of a vehicle behind udpin:HOST:PORT, udpout:HOST:PORT or tcp:HOST:PORT. It takes off, is excited
     in a box, slow first, and lands; nothing is filtered: nothing may be there."""
     first: Flags[First] = field(default_factory=First)
+    accept_bound: float | None = None
+    """With --url: put a model set to use that states at most this share of plans outside their tubes (0.26: 26 %).
+    Without it the limit of the robot's description counts: `accept_bound`, 0.01 unless it has one."""
     json: bool = False
 
     def run(self) -> int:
@@ -98,6 +102,7 @@ class Collect:
         robot = robot_maybe_with_task(self.robot)
         if robot.position_dim != 3:
             raise ValueError(f"a {robot.kind} robot does not fly")
+        accepted_bound(robot, self.accept_bound)
         first = self.first
         path = self.out or record_path(robot).with_name("flown.safetensors")
         found = fly(
@@ -117,21 +122,30 @@ class Collect:
             found.data.save(path)
         figures: dict[str, Any] = {"path": str(path), "periods": found.data.periods, "minutes": found.seconds / 60.0}
         figures |= {"level": found.level, "missing": found.missing}
+        loose = ""
         if found.model is not None and found.statement is not None:
-            model = model_path(found.model.robot, found.model.recipe)
-            found.model.save(model)
-            figures |= {"model": str(model), "windows_of": found.model.recipe.windows} | found.statement.figures()
+            figures |= {"windows_of": found.model.recipe.windows} | found.statement.figures()
+            loose = refusal(robot, found.model.about, self.accept_bound)
+            if not loose:
+                model = model_path(found.model.robot, found.model.recipe)
+                found.model.save(model)
+                figures["model"] = str(model)
+        if loose:
+            figures["not_used"] = loose
+            errors.print(f"[red]not put to use:[/] {escape(loose)}")
+            errors.print(f"to look at it again: brakeline certify {path} --robot {robot.name} --few", markup=False)
         if self.json:
             say_json(figures)
-            return 0 if found.model is not None else 1
+            return 0 if "model" in figures else 1
         console.print(f"{path}: {found.data.periods} periods in {found.seconds / 60.0:.1f} min of flight", markup=False)
         if found.statement is not None and found.model is not None:
             console.print(table([(found.statement, found.model.recipe.windows)]))
             console.print(in_words(found.statement, robot.period), markup=False)
-            console.print(f"{figures['model']}: in use from now on", markup=False)
+            if not loose:
+                console.print(f"{figures['model']}: in use from now on", markup=False)
         for line in found.missing:
             console.print(f"missing: {line}", markup=False)
-        return 0 if found.model is not None else 1
+        return 0 if "model" in figures else 1
 
 
 @dataclass(frozen=True)
@@ -154,6 +168,9 @@ class Certify:
     """Of a log: so many of the last steps."""
     use: bool = False
     """Write the model sets to where the other commands look for them."""
+    accept_bound: float | None = None
+    """With --use and --publish: put model sets to use that state at most this share of plans outside their tubes
+    (0.26: 26 %). Without it the limit of the robot's description counts: `accept_bound`, 0.01 unless it has one."""
     publish: bool = False
     """Replace the model set of running safety services by the first of `certificates` (mode direct unless given)."""
     endpoints: Flags[Endpoints] = field(default_factory=Endpoints)
@@ -167,6 +184,9 @@ class Certify:
         rows: list[tuple[Statement, str]] = []
         passed: list[str] = []
         chosen: ModelSet | None = None
+        loose: list[str] = []
+        robot = source.data.robot
+        accepted_bound(robot, self.accept_bound)
         modes = (self.mode,) if self.mode else MODES
         with under_way("certifying", len(self.certificates) * len(modes)) as advance:
             for kind, mode in product(self.certificates, modes):
@@ -187,9 +207,14 @@ class Certify:
                 rows.append((statement, model.recipe.windows))
                 passed += [f"{other} windows: {reason}" for other, reason in not_of.items()]
                 told = {"windows_of": model.recipe.windows, "not_of": not_of}
-                results.setdefault(kind, {})[mode] = statement.figures() | told
-                if self.use:
+                why = refusal(robot, model.about, self.accept_bound) if self.use or self.publish else ""
+                if why:
+                    told["not_used"] = why
+                    loose.append(f"{kind}, {mode}")
+                    errors.print(f"[red]{kind}, {mode}: not put to use:[/] {escape(why)}")
+                elif self.use:
                     self._keep(model, source.data)
+                results.setdefault(kind, {})[mode] = statement.figures() | told
         if self.json:
             # The figures of a certificate are those of the direct mode; the recursion's stand beside them.
             flat = {k: modes.get("direct", next(iter(modes.values()))) | modes for k, modes in results.items()}
@@ -200,6 +225,9 @@ class Certify:
                 console.print(in_words(rows[0][0], source.data.robot.period), markup=False)
             for text in dict.fromkeys(passed):
                 console.print(f"not supported: {text}", markup=False)
+            for text in dict.fromkeys(widened(statement) for statement, _ in rows):
+                if text:
+                    console.print(text, markup=False)
             for text in more_to_drive(rows[0][0], source.data) if rows else ():
                 console.print(f"missing: {text}", markup=False)
             console.print(f"{path}: {source.note}", markup=False)
@@ -207,9 +235,9 @@ class Certify:
                 console.print(conditions(source.data.about))
         if chosen is None:
             return 1
-        if self.publish:
+        if self.publish and not refusal(robot, chosen.about, self.accept_bound):
             self._publish(chosen, source.data)
-        return 0
+        return 1 if loose else 0
 
     def _keep(self, model: ModelSet, data: Dataset) -> None:
         """Where the other commands look for it; with a key to sign with, signed."""
@@ -228,7 +256,10 @@ class Certify:
         elif self.data.suffix == ".safetensors":
             if not self.data.exists():
                 raise ValueError(f"no data set at {self.data}: `brakeline collect {self.robot} --out FILE` records one")
+            named = robot_maybe_with_task(self.robot)
             path, data = self.data, Dataset.load(self.data)
+            if named.kind == data.robot.kind:  # the limit is that of the description today, not of when it was recorded
+                data = replace(data, robot=replace(data.robot, accept_bound=named.accept_bound))
         else:
             return self.data, from_log(self.data, robot_maybe_with_task(self.robot), self.last)
         return path, Recorded(data, f"{data.periods} recorded periods of {data.robot.name}")
@@ -242,6 +273,17 @@ class Certify:
                 message.file, message.claim, message.signature = signed.file, signed.claim, signed.signature
             bus.publisher(MODEL, robot=model.robot.name).put(message)
         errors.print(f"published {model.recipe.certificate} {model.version} for {model.robot.name}")
+
+
+def widened(statement: Statement) -> str:
+    """That envelopes were widened, and what for; empty: they are as wide as they always are."""
+    usual = Recipe().inflation
+    if statement.inflation <= usual * 1.001 or statement.inflation == Recipe().of_minutes().inflation:
+        return ""
+    return (
+        f"{statement.certificate}, {statement.mode}: every envelope is widened by {statement.inflation:.3g}, not by "
+        f"{usual:g}, so that no more than {statement.violations} of {statement.windows} held-out plans leave their sets"
+    )
 
 
 def table(rows: list[tuple[Statement, str]]) -> Stacking:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from deploy.commands.common import Filtering, Flags, Physics, Robot, conditions, console, errors, say_json
+from deploy.commands.common import Flags, Physics, Robot, Serving, conditions, console, errors, say_json
 from deploy.progress import under_way
 from deploy.study.evaluate import Evaluation, evaluate, prepared
 from logs.metrics import Tally
@@ -19,7 +19,7 @@ class Evaluate:
     policy: str = "astar"
     """A policy file, inputs (.csv, as `excite` prints them), or trained | trained-by-scan (those in policies/) |
     untrained | random | greedy | adversary | astar | careful (astar with a wide berth)."""
-    filtering: Flags[Filtering] = field(default_factory=Filtering)
+    filtering: Flags[Serving] = field(default_factory=Serving)
     physics: Flags[Physics] = field(default_factory=Physics)
     arena: str = "default"
     """On the ground default | open | dense | few-walkers | walkers | many-walkers | crossing, in the air default |
@@ -51,6 +51,7 @@ class Evaluate:
             policy=self.policy,
             method=self.filtering.method,
             recipe=self.filtering.recipe(),
+            accept_bound=self.filtering.accept_bound,
             arena=self.arena,
             episodes=self.episodes,
             seed=self.seed,

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from actors.flight import FlightSettings
-from deploy.commands.common import Filtering, Flags, Flight, Meeting, Physics, console, errors, say_json
+from deploy.commands.common import Flags, Flight, Meeting, Physics, Serving, console, errors, say_json
 from deploy.commands.train import STOPPED, stamped
 from deploy.quadrotors import flight_arena
 from deploy.run.configurations import Embedded, RunConfig
@@ -43,7 +43,7 @@ class Fly:
     """s without a setpoint until our own autopilot brakes by itself."""
     arena: str = "default"
     seed: int = 0
-    filtering: Flags[Filtering] = field(default_factory=Filtering)
+    filtering: Flags[Serving] = field(default_factory=Serving)
     physics: Flags[Physics] = field(default_factory=Physics)
     practice: float = 0.0
     """Share of steps at which it starts to follow its committed plan to the stop: what `certify LOG` needs."""
@@ -88,6 +88,7 @@ class Fly:
             robots=(address_in_real_time(self.robot),),
             method=self.filtering.method,
             recipe=self.filtering.recipe(),
+            accept_bound=self.filtering.accept_bound,
             arena=self.arena,
             actors=len(flights),
             steps=max(1, round(60.0 * self.minutes / robot.period)),

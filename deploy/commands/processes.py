@@ -11,7 +11,7 @@ from typing import Annotated
 
 import tyro
 
-from deploy.commands.common import Endpoints, Filtering, Flags, Flight, Physics, Robot
+from deploy.commands.common import Endpoints, Filtering, Flags, Flight, Physics, Robot, Serving
 from deploy.data.paths import data_root, method_path
 from deploy.data.store import method_for
 from deploy.policies import policy_named
@@ -27,18 +27,20 @@ from safety.recipe import check_promises
 class Safety:
     robots: Annotated[tuple[str, ...], tyro.conf.Positional] = ("ground",)
     endpoints: Flags[Endpoints] = field(default_factory=Endpoints)
-    filtering: Flags[Filtering] = field(default_factory=Filtering)
+    filtering: Flags[Serving] = field(default_factory=Serving)
     name: str = "safety"
     """On the bus; replicas need different ones."""
 
     def run(self) -> int:
         from safety.service import SafetySettings, main
 
-        recipe = self.filtering.recipe()
-        for robot in self.robots:
-            method_for(robot_maybe_with_task(robot), self.filtering.method, recipe)
-        paths = tuple(method_path(robot_maybe_with_task(robot), self.filtering.method, recipe) for robot in self.robots)
-        main(SafetySettings(self.endpoints.bus(), paths, data_root(), self.name))
+        recipe, accepted = self.filtering.recipe(), self.filtering.accept_bound
+        robots = [robot_maybe_with_task(robot) for robot in self.robots]
+        for robot in robots:
+            method_for(robot, self.filtering.method, recipe, accepted)
+        paths = tuple(method_path(robot, self.filtering.method, recipe) for robot in robots)
+        limits = {robot.name: robot.accept_bound for robot in robots}
+        main(SafetySettings(self.endpoints.bus(), paths, data_root(), self.name, limits, accepted))
         return 0
 
 

@@ -14,7 +14,7 @@ from actors.guard import Ask
 from actors.ros2.frames import Place
 from actors.ros2.process import Ros2Settings, Topics, driven, run
 from actors.ros2.senses import Freshness, Sensing
-from deploy.commands.common import Filtering, Flags, Physics, Robot, default_keys, errors, say_json
+from deploy.commands.common import Flags, Physics, Robot, Serving, default_keys, errors, say_json
 from deploy.data.store import model_for
 from deploy.run.bridge import Bridge, BridgeSettings
 from deploy.study.evaluate import in_process
@@ -62,7 +62,7 @@ class Ros2:
     base_frame: str = "base_footprint"
     """With --tf: the robot's; its origin is what turns on the spot."""
     fresh: Flags[Freshness] = field(default_factory=Freshness)
-    filtering: Flags[Filtering] = field(default_factory=Filtering)
+    filtering: Flags[Serving] = field(default_factory=Serving)
     connect: tuple[str, ...] = ()
     """Ask the safety service on the bus there; without: the filter runs inside."""
     keys: Path | None = None
@@ -107,7 +107,8 @@ class Ros2:
     def _question(self, settings: Ros2Settings) -> Iterator[Ask]:
         robot = driven(self.robot)
         if not self.connect:
-            yield in_process(model_for(robot, self.filtering.recipe()))
+            accepted = self.filtering.accept_bound
+            yield in_process(model_for(robot, self.filtering.recipe(), accepted), accepted)
             return
         deadline = 0.3 * settings.lead  # there may be three questions
 

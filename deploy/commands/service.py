@@ -12,6 +12,7 @@ from rich.markup import escape
 
 from deploy.commands.common import Endpoints, Flags, Robot, console, say_json
 from logs.tables import PLAIN, Stacking
+from messaging.bounds import trust
 from messaging.bus import Bus, Sample
 from messaging.range_images import RangeImage
 from messaging.robots import robot_named
@@ -95,12 +96,15 @@ class Query:
             "time_ms": answer.time_ms,
             "model": answer.model,
             "reason": answer.reason,
+            "verified": answer.verified,
+            "bound": answer.bound,
         }
         if self.json:
             say_json(figures)
             return 0
         why = " for clearance: the proposal is verified too," if answer.for_clearance else ""
-        console.print(f"[bold]{answer.kind}[/]{why} {answer.reason}")
+        console.print(f"[bold]{answer.kind}[/]{why} {escape(answer.reason)}")
+        console.print(trust(answer.verified, answer.bound), markup=False)
         shown = Stacking(**PLAIN)
         for column in ("period", *robot.action, "center [m]", "± [m]"):
             shown.add_column(column)

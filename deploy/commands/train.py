@@ -10,7 +10,7 @@ from typing import Annotated, ClassVar, Self
 import tyro
 
 from actors.settings import Change
-from deploy.commands.common import Filtering, Flags, Meeting, Physics, console, errors, say_json
+from deploy.commands.common import Flags, Meeting, Physics, Serving, console, errors, say_json
 from deploy.progress import under_way
 from deploy.run.configurations import EXPERIMENTS, RunConfig, load
 from learner.config import LearnerConfig
@@ -48,7 +48,7 @@ def stamped() -> Path:
 class Train:
     robots: Annotated[tuple[str, ...], tyro.conf.Positional] = ("ground",)
     """Robot kinds; each has a learner and actors of its own, all share the safety service."""
-    filtering: Flags[Filtering] = field(default_factory=Filtering)
+    filtering: Flags[Serving] = field(default_factory=Serving)
     physics: Flags[Physics] = field(default_factory=Physics)
     actors: int = 2
     """Actor processes a robot kind."""
@@ -134,6 +134,7 @@ class Train:
             robots=tuple(address(name) for name in self.robots),
             method=self.filtering.method,
             recipe=self.filtering.recipe(),
+            accept_bound=self.filtering.accept_bound,
             arena=self.arena,
             actors=1 if self.deterministic else self.actors,
             robots_per_actor=self.fleet or self.robots_per_actor,

@@ -7,18 +7,22 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from deploy.data.certified import HELD_OUT
+from deploy.data.certified import HELD_OUT, WIDEST
 from deploy.data.sources.quantities import columns_of, split
+from messaging.bounds import percent
 from messaging.robots import Array, Robot
 from safety.dataset import Dataset
 from safety.fitting import FEWEST_STOPS
 from safety.in_place import standing_limits
+from safety.leaving import AFTER, BOTH, FAST, PATH, STANDING, TURNING
 from safety.model_set import DIRECT, Recipe
-from safety.statement import CONFIDENCE, Statement
+from safety.stated import plans_needed
+from safety.statement import Statement, upper_bound
 from safety.windows import FREE, PLAN, standing_at_the_end, stops_of, windows
 
 NEAR = 0.05  # of its range: an input this near to a bound has been there
-AIMED = 0.01  # share of plans outside their sets that is to be excluded, with the statement's confidence
+MOST_SHOWN = 3  # groups of violations
+MOST_PLANS = 10**6  # beyond it nobody records
 FEWEST = 20  # periods beyond an eighth of the range: below it nothing was seen there
 
 
@@ -147,19 +151,108 @@ def _windows_missing(plans: int, free: int) -> list[str]:
 
 
 def more_to_drive(statement: Statement, data: Dataset) -> list[str]:
-    """What a statement can't say yet, and how much more driving like this it takes."""
-    turns = []
-    if statement.mode == DIRECT and not statement.in_place_windows and standing_limits(data.robot) is not None:
-        turns = [
-            "too few turns on the spot to bound them apart from driving, so the filter keeps far off obstacles: "
-            f"stand, then turn at various rates for {data.robot.horizon * data.robot.period:.1f} s or more each"
-        ]
-    if statement.bound_plan <= AIMED:
-        return turns
-    wanted = math.ceil(math.log(1.0 - CONFIDENCE) / math.log(1.0 - AIMED))
-    minutes = data.periods * data.robot.period / 60.0 * (wanted / max(statement.windows, 1) - 1.0)
+    """What to record, or to lower, for the statement to come within the robot's limit, and to turn on the spot near
+    obstacles; nothing if it does.
+    """
+    return _turns_missing(statement, data.robot) + _too_loose(statement, data)
+
+
+def _turns_missing(statement: Statement, robot: Robot) -> list[str]:
+    if statement.mode != DIRECT or statement.in_place_windows or standing_limits(robot) is None:
+        return []
     return [
-        *turns,
-        f"at most {statement.bound_plan:.1%} of plans leave their sets (99 % confidence); to say {AIMED:.0%} it takes "
-        f"{wanted} held-out plans without one, {max(minutes, 0.0):.0f} more minutes like these",
+        "too few turns on the spot to bound them apart from driving, so the filter keeps far off obstacles: "
+        f"stand, then turn at various rates for {robot.horizon * robot.period:.1f} s or more each"
     ]
+
+
+def _too_loose(statement: Statement, data: Dataset) -> list[str]:
+    """How the bound can come within the robot's limit. More of the same helps only while the share of held-out plans
+    that leave their sets is below the limit."""
+    limit, plans = data.robot.accept_bound, statement.windows
+    if statement.bound_plan <= limit:
+        return []
+    bound = percent(statement.bound_plan)
+    said = f"at most {bound} of plans leave their sets (99 % confidence), and the limit is {percent(limit)}"
+    wanted = _plans_for(statement.violations, plans, limit)
+    minutes = data.periods * data.robot.period / 60.0
+    more = math.inf if not plans or wanted is None else minutes * (wanted / plans - 1.0)
+    if not statement.violations:
+        how = f": {math.ceil(more)} more minutes like these" if plans else ""
+        return [f"{said}; to state that it takes {wanted} held-out plans, none outside, and there are {plans}{how}"]
+    share = statement.violations / plans
+    left = f"{statement.violations} of {plans} held-out plans ({share:.1%})"
+    found = [f"{said}; {left} left their sets: {_where(statement)}"]
+    if wanted is None:
+        found.append(
+            f"more minutes like these do not make fewer plans leave: {share:.1%} is above the limit of {percent(limit)}"
+        )
+    else:
+        found.append(
+            f"{math.ceil(more)} more minutes like these, {wanted} held-out plans, reach the limit only if no larger "
+            f"share than {share:.1%} of them leaves its sets"
+        )
+    driving = dict.fromkeys(one.regime for one in statement.leaving if one.part not in ABOUT_PARTS)
+    found += [f"{regime}: {_remedy(data.robot, regime)}" for regime in driving]
+    parts = {one.part for one in statement.leaving}
+    found += [text for part, text in ABOUT_PARTS.items() if part in parts]
+    found.append(
+        f"or wider sets: `certify --until-held` widens every envelope {statement.excess:.2g} times, so that none of "
+        f"the {plans} plans leaves its set, and states at most {percent(upper_bound(0, plans))}; from "
+        f"{plans_needed(limit)} held-out plans on `certify` widens them by itself, {WIDEST} times at most"
+    )
+    return found
+
+
+ABOUT_PARTS = {
+    PATH: f"{PATH}: log positions more often than once a period, or state the path's bulge",
+    AFTER: f"{AFTER}: let it stand longer after each stop, or brake for more periods (`plan.brake`, `plan.horizon`)",
+}
+
+
+def _plans_for(violations: int, plans: int, limit: float) -> int | None:
+    """So many held-out plans state the limit if as large a share of them leaves its sets; None: no number does."""
+    if not violations:
+        return plans_needed(limit)
+    share = violations / plans
+    if share >= limit:
+        return None
+    low, high = plans, plans
+    while upper_bound(math.ceil(share * high), high) > limit:
+        low, high = high, 2 * high
+        if high > MOST_PLANS:
+            return None
+    while high - low > 1:
+        middle = (low + high) // 2
+        low, high = (middle, high) if upper_bound(math.ceil(share * middle), middle) > limit else (low, middle)
+    return high
+
+
+def _where(statement: Statement) -> str:
+    """Most of the violations, with the regime's own count beside them."""
+    shown = [
+        f"{one.plans} by {one.part} while {one.regime} (of {one.of} plans there; up to {one.excess:.2g} × its bound)"
+        for one in statement.leaving[:MOST_SHOWN]
+    ]
+    rest = sum(one.plans for one in statement.leaving[MOST_SHOWN:])
+    return ", ".join(shown + ([f"{rest} elsewhere"] if rest else []))
+
+
+def _remedy(robot: Robot, regime: str) -> str:
+    """What to record more of, or which bounds to lower, where plans left their sets while it drove so."""
+    inputs = [split(label)[0] for label in robot.action]
+    moving, turning = (
+        " and ".join(name for name, moves in zip(inputs, robot.translates, strict=True) if moves == wanted)
+        for wanted in (True, False)
+    )
+    if regime == STANDING:
+        return "let it stand between drives and after every stop, with what moves it then (wind, its own estimate)"
+    if regime == TURNING:
+        return f"record more turning on the spot and at low speed, or lower the bounds of {turning}"
+    if regime == FAST:
+        return (
+            f"record more driving above half of its speed, with changes of direction, or lower the bounds of {moving}"
+        )
+    if regime == BOTH:
+        return f"record more turning at speed, or lower the bounds of {moving} or {turning}"
+    return "record more slow driving, with starts and stops"

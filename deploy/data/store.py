@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import suppress
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
@@ -23,6 +24,7 @@ from safety.dataset import BadData
 from safety.methods import DDPC, METHODS, Model
 from safety.model_set import BadModel, ModelSet, Recipe
 from safety.rivals.pretrained import Pretrained
+from safety.stated import accepted_bound, check_bound
 
 if TYPE_CHECKING:
     from deploy.data.pretrain import Recipe as RivalRecipe
@@ -32,10 +34,22 @@ M = TypeVar("M")
 console = Console(stderr=True, highlight=False, soft_wrap=True)
 
 
-def model_for(robot: Robot, recipe: Recipe) -> ModelSet:
-    """The model set in use, made (and its data recorded) if it is not there or not of this layout."""
+def model_for(robot: Robot, recipe: Recipe, accept_bound: float | None = None) -> ModelSet:
+    """The model set in use, made (and its data recorded) if it is not there or not of this layout.
+
+    accept_bound: the largest stated share of plans outside their tubes that is accepted; unless given the limit of the
+    robot's description counts.
+
+    Raises:
+        TooLoose: the model set states more, or states nothing; ValueError: `accept_bound` is no share.
+    """
+    accepted_bound(robot, accept_bound)
     path = model_path(robot, recipe)
-    return _kept_or_made(path, partial(_kept, path, robot), partial(_made, path, robot, recipe), "making the model set")
+    made = partial(_made, path, robot, recipe)
+    model = _kept_or_made(path, partial(_kept, path, robot), made, "making the model set")
+    check_bound(model, robot, accept_bound)
+    limit = robot.accept_bound  # of the description today, not of when the model set was made
+    return replace(model, robot=replace(model.robot, accept_bound=limit))
 
 
 def _kept_or_made(path: Path, kept: Callable[[], M], made: Callable[[], M], making: str) -> M:
@@ -80,14 +94,15 @@ def _made(path: Path, robot: Robot, recipe: Recipe) -> ModelSet:
     return model
 
 
-def method_for(robot: Robot, method: str, recipe: Recipe) -> Model:
+def method_for(robot: Robot, method: str, recipe: Recipe, accept_bound: float | None = None) -> Model:
     """What a method must know of a robot: ours a model set, a rival its networks, made if they are not there.
 
     Raises:
         ValueError: no method of that name needs anything, or it knows nothing of robots in real time.
+        TooLoose: the model set's statement is looser than what is used (`model_for`).
     """
     if method == DDPC:
-        return model_for(robot, recipe)
+        return model_for(robot, recipe, accept_bound)
     if method not in METHODS:
         raise ValueError(f"no method is called {method!r}; there are: {', '.join(METHODS)}")
     if robot.late:

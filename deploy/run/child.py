@@ -18,7 +18,6 @@ from pathlib import Path
 from deploy.run.configurations import RunConfig, load
 from deploy.run.places import CONFIG, LOG, UNFINISHED, Place, client_of, launcher_of, metrics_of, places
 from messaging.bus import BusError, BusSettings
-from messaging.robots import robot_named
 from messaging.tasks import robot_maybe_with_task, robot_with_task
 
 PARENT_DIED = 1  # prctl: PR_SET_PDEATHSIG
@@ -44,13 +43,13 @@ def _safety(place: Place, folder: Path, config: RunConfig, bus: BusSettings) -> 
     from safety.service import SafetySettings, main
     from safety.sign import Trust
 
-    models = tuple(method_path(robot_maybe_with_task(robot), config.method, config.recipe) for robot in config.robots)
+    robots = [robot_maybe_with_task(robot) for robot in config.robots]
+    limits = {robot.name: robot.accept_bound for robot in robots}
+    models = tuple(method_path(robot, config.method, config.recipe) for robot in robots)
     trust = None if bus.keys is None else Trust.load(bus.keys)
-    newest = (
-        newest_model(folder, robot_named(robot).name, trust) or path
-        for robot, path in zip(config.robots, models, strict=True)
-    )
-    main(SafetySettings(bus, tuple(newest), folder, place.name, secrets=folder / KEYS))
+    newest = (newest_model(folder, robot.name, trust) or path for robot, path in zip(robots, models, strict=True))
+    accepted = config.accept_bound
+    main(SafetySettings(bus, tuple(newest), folder, place.name, limits, accepted, secrets=folder / KEYS))
     return False
 
 

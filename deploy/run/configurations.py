@@ -35,6 +35,7 @@ class RunConfig:
     robots: tuple[str, ...] = ("ground",)
     method: str = "ddpc"
     recipe: Recipe = field(default_factory=Recipe)
+    accept_bound: float | None = None  # the largest stated bound that is accepted; None: each robot's own limit
     arena: str = "default"
     actors: int = 2  # processes a robot kind
     robots_per_actor: int = 1  # robots in a process; they share a question to the safety service

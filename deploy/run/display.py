@@ -14,6 +14,7 @@ from rich.table import Table
 from rich.text import Text
 
 from deploy.run.view import View
+from logs.plans import stated
 from logs.report import show
 
 REFRESH = 0.5  # s between two looks at the figures
@@ -108,6 +109,10 @@ def _run(figures: dict[str, Any]) -> Table:
     table.add_row(
         "left the set", share(contained["violations"], contained["steps"]), "no answer", str(figures["fallbacks"])
     )
+    plans = figures["plans"]
+    if plans["flown"]:
+        left = f"{share(plans['outside'], plans['flown'])}; {stated(plans)}"
+        table.add_row("plans that left", left)
     table.add_row("decide p50 / p99", _pair(times), "asked p50 / p99", _pair(trip))
     several = len(figures["learners"]) > 1
     for robot, learner in figures["learners"].items():

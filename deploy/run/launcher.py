@@ -41,13 +41,13 @@ def prepare(config: RunConfig, folder: Path, resume: bool) -> None:
     """See that the folder can take the run, and that there are model sets.
 
     Raises:
-        LaunchError: the folder holds another run.
+        LaunchError: the folder holds another run; TooLoose: a model set states more than is used without a question.
     """
     if not resume and (folder / CONFIG).exists():
         raise LaunchError(f"{folder} holds a run already: give --resume {folder}, or another --out")
     if config.filtered:
         for robot in config.robots:
-            method_for(robot_maybe_with_task(robot), config.method, config.recipe)
+            method_for(robot_maybe_with_task(robot), config.method, config.recipe, config.accept_bound)
     folder.mkdir(parents=True, exist_ok=True)
 
 

@@ -32,7 +32,7 @@ from safety.service import Counts, Models, answerer
 
 TIMES = ("time_ms", "solve_ms", "verify_ms", "queue_ms")
 # What a service says to itself, with a key that no log holds; and what explains a decision, and changes none.
-WORDS = ("vouchers", "unvouched", "stopped")
+WORDS = ("vouchers", "unvouched", "stopped", "bound")
 # How the solver came by an answer: its way may hang on the last bits where its answer does not.
 WORK = ("solver", "iterations")
 ROUNDING = 1e-12  # of a number (of 1, if the number is smaller) by which two decisions may differ and still be equal

@@ -41,11 +41,16 @@ class Evaluation:
     seed: int = 0
     conditions: Conditions = field(default_factory=Conditions)
     fleet: int = 0  # robots in one world; 0: each episode's robot is alone
+    accept_bound: float | None = None  # the largest stated bound that is accepted; None: the robot's own limit
 
 
-def in_process(model: Model) -> Ask:
-    """The safety service's own core, called directly: the same bytes, no bus."""
-    models = Models()
+def in_process(model: Model, accept_bound: float | None = None) -> Ask:
+    """The safety service's own core, called directly: the same bytes, no bus.
+
+    Raises:
+        TooLoose: the model set's statement is looser than the robot's limit, or than `accept_bound`.
+    """
+    models = Models(accept_bound=accept_bound)
     models.install(model)
     answer = answerer(models, Counts())
 
@@ -71,9 +76,16 @@ def prepared(robot: RobotWithTask, what: Evaluation) -> tuple[Driver, Policy, As
     """What an evaluation is made of: the driver in a fresh environment, the policy, and whom it asks."""
     policy = policy_named(what.policy, robot, what.seed)
     env = environment(robot, what.arena, FRESH + what.seed, what.conditions)
-    question = None if what.method == "none" else in_process(method_for(robot, what.method, what.recipe))
+    question = _question(robot, what)
     driver = Driver(robot, env, Identity("evaluate", 0, what.seed), filtered=question is not None)
     return driver, policy, question
+
+
+def _question(robot: RobotWithTask, what: Evaluation) -> Ask | None:
+    """Whom the robot asks: nobody where there is no filter."""
+    if what.method == "none":
+        return None
+    return in_process(method_for(robot, what.method, what.recipe, what.accept_bound), what.accept_bound)
 
 
 def round_of(fleet: Fleet, policies: Sequence[Policy], question: Ask | None, number: int) -> Iterator[list[pb.Step]]:
@@ -101,7 +113,7 @@ def prepared_fleet(robot: RobotWithTask, what: Evaluation) -> tuple[Fleet, Fleet
     check_promises(what.method)
     world = fleet_world(robot, what.arena, what.fleet, FRESH + what.seed, what.conditions)
     policies = [policy_named(what.policy, robot, what.seed + i) for i in range(what.fleet)]
-    question = None if what.method == "none" else in_process(method_for(robot, what.method, what.recipe))
+    question = _question(robot, what)
     drivers = [
         Driver(robot, member, Identity(f"evaluate.{i}", i, what.seed), filtered=question is not None)
         for i, member in enumerate(world.members)

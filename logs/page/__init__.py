@@ -21,6 +21,7 @@ from jinja2 import Environment, FunctionLoader, StrictUndefined
 
 from logs.analysis import SETUP
 from logs.decisions import PARTS
+from logs.plans import stated
 from logs.tally import Figures
 
 STYLES = ("report.css",)
@@ -46,7 +47,7 @@ def render(figures: Figures, runs: Mapping[str, tuple[Figures, Figures]]) -> str
         loader=FunctionLoader(_text), autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
     environment.filters.update(number=number, percent=percent, moment=moment, pretty=pretty, raw=raw, hashed=hashed)
-    environment.filters.update(within=within)
+    environment.filters.update(within=within, stated=stated)
     return environment.get_template(PAGE).render(
         f=figures,
         several=len(runs) > 1,

@@ -5,7 +5,7 @@ function why(episode, k) {
   if (!t) return KINDS[episode.kinds[k]].name;
   const inputs = t.inputs?.map(([name, unit, proposed, executed]) => `${name} ${figure(proposed)} → ${figure(executed)} ${unit}`) ?? [`${t.proposed.join(", ")} → ${t.plan.join(", ")}`];
   const said = (episode.kinds[k] !== "l" && t.said) || t.reason;
-  return `${KINDS[episode.kinds[k]].name}${said ? `: ${said}` : ""}; proposed → executed: ${inputs.join(", ")}; margin ${t.at_least ? "> " : ""}${figure(100 * t.margin)} cm`;
+  return `${KINDS[episode.kinds[k]].name}${said ? `: ${said}` : ""}; proposed → executed: ${inputs.join(", ")}; margin ${t.at_least ? "> " : ""}${figure(100 * t.margin)} cm${t.trust ? `; ${t.trust}` : ""}`;
 }
 
 /** The nearest misses of all robot kinds, worst first. */

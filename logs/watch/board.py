@@ -10,6 +10,7 @@ from typing import Any
 
 from logs.metrics import SILENT, Crowded, Metrics
 from logs.picture import discs
+from logs.plans import stated
 from logs.robots import Robots
 from logs.scene import half_width
 from logs.watch.totals import heard, totals
@@ -46,6 +47,7 @@ class Card:
     margin: float | None = None
     at_least: bool = False  # the margin is a lower bound
     said: str = ""  # why it was not as proposed
+    trust: str = ""  # what the plan's having been verified is worth, where `said` does not say it
     inputs: list[tuple[str, str, float, float]] = field(default_factory=list)  # name, unit, proposed, executed
     arrows: list[list[float]] = field(default_factory=list)  # of the proposed and the executed input, m
     edge: list[float] = field(default_factory=list)  # of what stopped the proposal: a point, and the normal there
@@ -97,11 +99,12 @@ class Card:
             return
         about = explain(self.robot, request, decision)
         self.said = "" if decision.kind == pb.ALLOWED else about.said
+        self.trust = about.trust
         self.inputs, self.arrows = about.inputs, [about.proposed[:2].tolist(), about.executed[:2].tolist()]
         self.edge = [*about.at[:2].tolist(), *about.normal[:2].tolist()] if len(about.at) else []
 
     def _unexplained(self) -> None:
-        self.said, self.inputs, self.arrows, self.edge = "", [], [], []
+        self.said, self.trust, self.inputs, self.arrows, self.edge = "", "", [], [], []
 
     def step(self, step: pb.Step) -> None:
         self._stand(list(step.state))
@@ -124,7 +127,7 @@ class Card:
     def view(self) -> dict[str, Any]:
         names = (
             *("actor", "number", "arena", "pose", "height", "kind", "tube", "margin", "at_least", "reward", "ended"),
-            *("said", "inputs", "arrows", "edge", "around"),
+            *("said", "trust", "inputs", "arrows", "edge", "around"),
         )
         about = {name: getattr(self, name) for name in names}
         lists = {"trail": list(self.trail), "marks": list(self.marks)}
@@ -211,6 +214,7 @@ class Board:
             # Counts of the whole run, or only of what was seen here.
             "since": None if whole else time.monotonic() - self._begun,
             "totals": {robot: _means(counts) for robot, counts in sorted(counted.items())},
+            "plans": figures["plans"] | {"stated": stated(figures["plans"])},
             "decide": {"p50": times.get("p50"), "p99": times.get("p99")},
             "learners": learners,
             "processes": {name: self._state(name) for name in sorted(figures["processes"])},

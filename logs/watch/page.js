@@ -63,7 +63,7 @@ function drawRobot(robot) {
   if (robot.ended) words.push(`before: ${robot.ended}`);
   note.textContent = words.join(" · ");
   const inputs = robot.inputs.map(([name, unit, proposed, executed]) => `${name} ${number(proposed, 2)} → ${number(executed, 2)} ${unit}`);
-  why.textContent = robot.kind === "" ? "" : [robot.said, inputs.join(", ")].filter(Boolean).join(" · ");
+  why.textContent = robot.kind === "" ? "" : [robot.said, inputs.join(", "), robot.trust].filter(Boolean).join(" · ");
   if (!robot.arena.half) return;
   drawMap(map, robot, [0, 0], 1.04 * robot.arena.half);
   drawMap(near, robot, robot.pose, CLOSE * robot.footprint);
@@ -264,7 +264,9 @@ function drawFigures(view) {
   );
   const times = `decision p50 / p99: ${number(view.decide.p50, 2)} / ${number(view.decide.p99, 2)} ms, since this page's server listens`;
   const scope = view.since === null ? "Counts are of the whole run since it was started." : `Counts are of the ${view.since.toFixed(0)} s that were watched: no launcher tells of what was before.`;
-  at("scope").textContent = view.decide.p50 === null ? scope : `${scope} ${times}.`;
+  const { flown, outside, stated } = view.plans;
+  const left = flown ? ` Of ${flown} verified plans that were gone on along, ${outside} were left (${stated}).` : "";
+  at("scope").textContent = view.decide.p50 === null ? scope : `${scope} ${times}.${left}`;
 }
 
 /** The run's name, how it is set up, and how far it is. */

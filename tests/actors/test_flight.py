@@ -14,6 +14,7 @@ from sim.envs import NavigationEnv
 from sim.late import late
 from sim.quadrotor import Quadrotor
 from sim.world import Arena, staged_arena
+from tests.accepting import BOUND
 from tests.robots import QUADROTOR
 
 
@@ -33,7 +34,7 @@ def stage(gap: float) -> Arena:
 @pytest.mark.usefixtures("flight_folder")
 def test_it_does_not_take_off_where_it_could_not_hover() -> None:
     robot = QUADROTOR.in_real_time()
-    question = in_process(model_for(robot, Recipe()))
+    question = in_process(model_for(robot, Recipe(), BOUND), BOUND)
     assert answered(question, robot, stage(2.0), True, lambda: False)
     with pytest.raises(NoRoom, match=r"0\.\d+ m from the nearest obstacle.*collect more data"):
         answered(question, robot, stage(0.02), True, lambda: False)
@@ -44,7 +45,7 @@ def test_it_does_not_take_off_where_it_could_not_hover() -> None:
 def test_in_real_time_a_way_out_is_gone_on_with_period_after_period() -> None:
     """Not every other one: a real vehicle does not answer to velocities that last for a period."""
     robot = QUADROTOR.in_real_time()
-    question = in_process(model_for(robot, Recipe()))
+    question = in_process(model_for(robot, Recipe(), BOUND), BOUND)
     make = late(Quadrotor, robot)
     env = NavigationEnv(
         robot, "default", make, draw=lambda *_: staged_arena(start=(0.0, 0.0, 3.0), goal=(-4.0, -4.0, 3.0), height=6.0)

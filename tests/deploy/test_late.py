@@ -9,6 +9,7 @@ from actors.driver import Driver, Identity
 from actors.guard import consult
 from deploy.data.logged import trajectories_of
 from deploy.study.evaluate import Evaluation, episode, evaluate, prepared
+from tests.accepting import BOUND
 from tests.robots import QUADROTOR
 
 ROBOT = QUADROTOR.in_real_time()
@@ -17,19 +18,19 @@ pytestmark = pytest.mark.usefixtures("flight_folder")
 
 @pytest.mark.parametrize("policy", ["adversary", "greedy", "random"])
 def test_nothing_is_hit_and_states_are_where_they_were_predicted(policy: str) -> None:
-    figures = evaluate(ROBOT, Evaluation(policy, episodes=3))
+    figures = evaluate(ROBOT, Evaluation(policy, episodes=3, accept_bound=BOUND))
     assert figures["collisions"] == 0
     assert figures["containment"]["violations"] <= 0.01 * figures["containment"]["steps"]
 
 
 def test_a_pilot_that_knows_of_its_delay_gets_there() -> None:
-    figures = evaluate(ROBOT, Evaluation("astar", episodes=5))
+    figures = evaluate(ROBOT, Evaluation("astar", episodes=5, accept_bound=BOUND))
     assert figures["goals"] == 5 and figures["collisions"] == 0
     assert figures["mean_speed"] > 3.5
 
 
 def test_without_answers_it_brakes_along_the_plan_that_it_was_committed_to(flight_folder: Path) -> None:
-    driver, policy, question = prepared(ROBOT, Evaluation("greedy"))
+    driver, policy, question = prepared(ROBOT, Evaluation("greedy", accept_bound=BOUND))
     assert question is not None
     driver.begin(0)
 
@@ -49,7 +50,7 @@ def test_without_answers_it_brakes_along_the_plan_that_it_was_committed_to(fligh
 
 
 def test_a_flight_that_goes_on_keeps_its_plan_from_goal_to_goal() -> None:
-    driver, _, question = prepared(ROBOT, Evaluation("greedy"))
+    driver, _, question = prepared(ROBOT, Evaluation("greedy", accept_bound=BOUND))
     assert question is not None
     flying = Driver(ROBOT, driver.env, Identity("a", 0, 0), goes_on=True)
     flying.begin(0)
@@ -62,7 +63,7 @@ def test_a_flight_that_goes_on_keeps_its_plan_from_goal_to_goal() -> None:
 
 
 def test_a_log_tells_which_input_was_in_force() -> None:
-    driver, policy, question = prepared(ROBOT, Evaluation("greedy"))
+    driver, policy, question = prepared(ROBOT, Evaluation("greedy", accept_bound=BOUND))
     steps, in_force = [], []
     for step in episode(driver, policy, question, 0):
         steps.append(step)

@@ -9,6 +9,7 @@ from deploy.bench import perception
 from deploy.study.evaluate import Evaluation, episode, prepared
 from logs.tally import KINDS
 from sim.conditions import Conditions, Faults, Perception
+from tests.accepting import BOUND
 from tests.robots import QUADROTOR
 
 
@@ -29,7 +30,8 @@ FAULTS = {"whole": Faults(), "ailing": Faults(dropped=0.1, ghosts=0.01, late=1),
 @pytest.mark.parametrize("faults", FAULTS)
 @pytest.mark.parametrize("policy", ["adversary", "greedy"])
 def test_who_flies_by_range_images_alone_hits_nothing(flight_folder, policy, faults):
-    what = Evaluation(policy, conditions=Conditions(perception=Perception("scan", FAULTS[faults])))
+    conditions = Conditions(perception=Perception("scan", FAULTS[faults]))
+    what = Evaluation(policy, conditions=conditions, accept_bound=BOUND)
     driver, choose, question = prepared(QUADROTOR, what)
     weighed = perception.Weighed(question)
     steps = list(islice(episode(driver, choose, weighed, 0), 40))

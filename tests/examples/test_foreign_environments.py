@@ -24,6 +24,7 @@ from messaging.topics import DECIDE
 from safety.dataset import Dataset
 from safety.model_set import Recipe
 from safety.service import Counts, Models, answerer
+from tests.accepting import BOUND
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 
@@ -62,7 +63,7 @@ def test_driving_at_hazards_costs_nothing_behind_a_filter_of_own_data(tmp_path, 
     python = python_of(folder)
     record, lines = tmp_path / f"{robot}.safetensors", tmp_path / "lines.jsonl"
     told(python, "collect.py", robot, str(record), str(periods))
-    models = Models()
+    models = Models(accept_bound=BOUND)
     models.install(certified(Dataset.load(record), Recipe())[0])
     endpoint = free_endpoint()
     words = [robot, "adversarial", "--seeds", "0", "1", "--steps", "300"]

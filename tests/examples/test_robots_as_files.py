@@ -29,6 +29,7 @@ from sim.estimator import NoiseLevels
 from sim.policies import scripted
 from sim.vehicle import Vehicle
 from sim.world import staged_arena
+from tests.accepting import BOUND
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 NAMES = ("car", "omni")
@@ -179,7 +180,7 @@ def test_what_was_not_fitted_keeps_to_the_tubes(recorded: Dataset) -> None:
 
 def test_nothing_is_touched_in_adversarial_episodes(kind: RobotWithTask, model: ModelSet) -> None:
     """Behind the filter; the same drive without it does collide."""
-    assert _collisions(kind, in_process(model)) == (0, 0)
+    assert _collisions(kind, in_process(model, BOUND)) == (0, 0)
     assert _collisions(kind, None)[0] > 0
 
 
@@ -203,10 +204,10 @@ def test_a_description_that_changed_makes_the_model_set_again(
     """A model set of a narrower body is never used for a wider one; the recording is, and not for another clock."""
     monkeypatch.setenv("BRAKELINE_DATA", str(tmp_path))
     recorded.save(paths.record_path(kind))
-    before = store.model_for(kind, Recipe())
-    assert store.model_for(kind, Recipe()).version == before.version
+    before = store.model_for(kind, Recipe(), BOUND)
+    assert store.model_for(kind, Recipe(), BOUND).version == before.version
     wider = replace(kind, body=tuple(replace(disc, radius=disc.radius + 0.05) for disc in kind.body))
-    assert store.model_for(wider, Recipe()).robot.body == wider.body
+    assert store.model_for(wider, Recipe(), BOUND).robot.body == wider.body
     with pytest.raises(BadData, match="changed"):
         recording.data_for(replace(kind, period=0.1))
 

@@ -1,12 +1,16 @@
 """Plans that robots went on along, beside the tubes that had been verified for them."""
 
+import io
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from rich.console import Console
 
-from logs.metrics import Metrics
-from logs.plans import Plans, figures
+from logs.metrics import Metrics, closed_loop
+from logs.plans import Plans, figures, stated
+from logs.report import show
 from messaging import brakeline_pb2 as pb
 
 N = 4  # periods of a plan
@@ -120,5 +124,33 @@ def test_it_is_one_of_a_runs_figures():
             "flown": 1,
             "outside": 1,
             "excess": pytest.approx(16.0),
+            "bound": None,
         }
     )
+
+
+def left(*bounds):
+    """A plan for each bound, whose tube was left; None: its decision has none, as in old logs."""
+    plans = []
+    for bound in bounds:
+        first = asked(0, pb.ALLOWED)
+        if bound is not None:
+            first.reply.decision.bound = bound
+        plans.append(of(first, asked(1, pb.FAILSAFE, 0.1, 1), asked(2, pb.ADJUSTED, 0.9, 2)))
+    return figures(plans)
+
+
+def test_what_was_stated_stands_beside_the_count():
+    assert left(0.0113)["bound"] == 0.0113 and stated(left(0.0113)) == "stated: at most 1.2 %, at 99 % confidence"
+    assert left(0.01, 0.26)["bound"] == 0.26, "that of the loosest"
+    assert left(0.01, None)["bound"] is None and stated(left(None)) == "no bound was recorded"
+    assert stated(left(float("nan"))) == "no bound was stated"
+    assert figures([]) == {"flown": 0, "outside": 0, "excess": 0.0, "bound": None}
+
+
+def test_the_table_of_a_run_shows_both():
+    figures_of = closed_loop([]) | {"plans": left(0.26)}
+    console = Console(file=io.StringIO(), width=160)
+    console.print(show(figures_of))
+    shown = console.file.getvalue()
+    assert "1, outside of their tubes 1 (100.0%); stated: at most 26 %, at 99 % confidence" in shown

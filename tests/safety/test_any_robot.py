@@ -70,7 +70,7 @@ def name_of(info):
 
 
 def filtered(env, filter):
-    return SafetyWrapper(env, filter, state=seen, obstacles=near, actions=normalised(filter.robot))
+    return SafetyWrapper(env, filter, accept_bound=1.0, state=seen, obstacles=near, actions=normalised(filter.robot))
 
 
 @pytest.mark.parametrize("name", ["hold", "profile", "discs", "feedback"])

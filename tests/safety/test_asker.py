@@ -38,7 +38,7 @@ class Wire:
     """The client's part and the service's core, without a bus."""
 
     def __init__(self, model):
-        models = Models()
+        models = Models(accept_bound=1.0)
         models.install(model)
         self.ask, self.robot, self.commitment = answerer(models, Counts()), model.robot, Commitment(model.robot)
 
@@ -59,7 +59,7 @@ def equal(one, other):
 
 
 def test_an_answer_in_process_is_the_answer_of_a_service(model):
-    alone, asked = InProcess(Filter(model)), Wire(model)
+    alone, asked = InProcess(Filter(model), accept_bound=1.0), Wire(model)
     kinds = set()
     for action, away in (([0.1, 0.1], 3.0), ([float("nan"), 0.0], 3.0), ([0.25, 0.0], 0.4), ([0.25, 0.0], 0.3)):
         one, other = (asker.decide(np.zeros(5), action, [cylinder(away, 0.0)]) for asker in (alone, asked))
@@ -71,7 +71,9 @@ def test_an_answer_in_process_is_the_answer_of_a_service(model):
     assert kinds == {"allowed", "adjusted", "failsafe"}
 
 
-@pytest.mark.parametrize("ask", [lambda model: InProcess(Filter(model)), Wire], ids=["in process", "service"])
+@pytest.mark.parametrize(
+    "ask", [lambda model: InProcess(Filter(model), accept_bound=1.0), Wire], ids=["in process", "service"]
+)
 def test_the_action_of_a_late_robot_is_the_input_of_the_next_period(late, ask):
     asker = ask(late)
     far = [Obstacle("cylinder", (3.0, 0.0), (0.1,))]
@@ -94,7 +96,7 @@ class Unsent(SafetyClient):
         self.robot, self.commitment, self.deadline = model.robot, Commitment(model.robot), 0.1
 
 
-@pytest.fixture(params=[lambda model: InProcess(Filter(model)), Unsent], ids=["in process", "client"])
+@pytest.fixture(params=[lambda model: InProcess(Filter(model), accept_bound=1.0), Unsent], ids=["in process", "client"])
 def asker(request, model):
     return request.param(model)
 
@@ -145,7 +147,7 @@ def test_another_type_is_refused_by_the_field(asker, field, more, said):
 
 def test_where_nothing_is_known_nothing_is_decided(model):
     """Before, an empty list said that all space is free, and so did a scan that was dropped."""
-    alone, asked = InProcess(Filter(model)), Wire(model)
+    alone, asked = InProcess(Filter(model), accept_bound=1.0), Wire(model)
     blocked = [asker.decide(np.zeros(5), [0.25, 0.0], [], scan=WALL) for asker in (alone, asked)]
     assert [answer.kind for answer in blocked] == ["failsafe", "failsafe"]
     for nothing in ((), (None,), ([],)):

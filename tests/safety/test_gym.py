@@ -60,7 +60,7 @@ def test_inputs_as_normalised_actions_and_back(share):
 
 def test_normalised_actions_are_never_taken_for_metres_a_second(ready):
     with pytest.raises(Mismatch, match=r"speed \[m/s\] from 0 to 0.6.*actions=normalised\(robot\)"):
-        SafetyWrapper(Toy(CAR), ready)
+        SafetyWrapper(Toy(CAR), ready, accept_bound=1.0)
     with pytest.raises(Mismatch, match="normalised"):
         collect(Toy(CAR), CAR, 10, state=seen, shown=False)
 
@@ -74,13 +74,13 @@ def test_an_action_space_of_another_kind_is_refused_unless_mapped(space):
 
 
 def test_what_is_missing_is_said_by_name(ready):
-    env = SafetyWrapper(Toy(CAR), ready, actions=normalised(CAR))
+    env = SafetyWrapper(Toy(CAR), ready, accept_bound=1.0, actions=normalised(CAR))
     with pytest.raises(gymnasium.error.ResetNeeded):
         env.step(np.zeros(2))
     env.reset(seed=0)
     with pytest.raises(Mismatch, match=r"no 'state' \(the measured state.*give state=, a callable"):
         env.step(np.zeros(2))
-    env = SafetyWrapper(Toy(CAR), ready, state=seen, actions=normalised(CAR))
+    env = SafetyWrapper(Toy(CAR), ready, accept_bound=1.0, state=seen, actions=normalised(CAR))
     env.reset(seed=0)
     with pytest.raises(Mismatch, match="no 'obstacles'"):
         env.step(np.zeros(2))
@@ -89,7 +89,7 @@ def test_what_is_missing_is_said_by_name(ready):
 
 def test_the_wrapper_from_a_file_tells_what_it_did(tmp_path, model):
     model.save(tmp_path / "model.safetensors")
-    env = SafetyWrapper.load(Toy(CAR, discs()), tmp_path / "model.safetensors", penalty=1.0, **HOW)
+    env = SafetyWrapper.load(Toy(CAR, discs()), tmp_path / "model.safetensors", penalty=1.0, accept_bound=1.0, **HOW)
     env.reset(seed=0)
     _, reward, _, _, info = env.step(np.array([-1.0, 0.0]))
     told = info["diagnostics"]
@@ -100,7 +100,7 @@ def test_the_wrapper_from_a_file_tells_what_it_did(tmp_path, model):
 
 
 def test_without_an_environment_it_decides_the_same(ready):
-    env, alone = SafetyWrapper(Toy(CAR, discs()), ready, **HOW), InProcess(ready)
+    env, alone = SafetyWrapper(Toy(CAR, discs()), ready, accept_bound=1.0, **HOW), InProcess(ready, accept_bound=1.0)
     observation, _ = env.reset(seed=1)
     for _ in range(30):
         alone.decide(observation, [0.6, 0.0], discs())
@@ -137,7 +137,7 @@ def test_a_vector_decides_as_its_environments_do_alone(ready, mode):
     make_one = lambda: Toy(CAR, discs(), steps=12)  # noqa: E731
     vector = gymnasium.vector.SyncVectorEnv([make_one] * count, autoreset_mode=mode)
     views = {"state": seen, "obstacles": each(near), "actions": normalised(CAR)}
-    many = VectorSafetyWrapper(vector, ready, 0.5, **views)
+    many = VectorSafetyWrapper(vector, ready, 0.5, accept_bound=1.0, **views)
     observations, _ = many.reset(seed=[0, 1, 2])
     alone = [Commitment(CAR) for _ in range(count)]
     fresh = np.zeros(count, dtype=bool)  # environments that the next step resets
@@ -146,7 +146,7 @@ def test_a_vector_decides_as_its_environments_do_alone(ready, mode):
         resets = fresh if mode == gymnasium.vector.AutoresetMode.NEXT_STEP else np.zeros(count, dtype=bool)
         wanted = []
         for i in np.flatnonzero(~resets):
-            one = InProcess(ready)
+            one = InProcess(ready, accept_bound=1.0)
             one.commitment = alone[i]
             wanted.append((i, one.decide(observations[i], normalised(CAR).action_to_control(actions[i]), discs())))
         observations, rewards, terminated, truncated, infos = many.step(actions)
@@ -183,12 +183,11 @@ class Walled(Toy):
 
 
 def test_a_vector_decides_by_scans_too(ready):
-    vector = VectorSafetyWrapper(
-        gymnasium.vector.SyncVectorEnv([lambda: Walled(CAR)] * 2), ready, state=seen, actions=normalised(CAR)
-    )
+    many = gymnasium.vector.SyncVectorEnv([lambda: Walled(CAR)] * 2)
+    vector = VectorSafetyWrapper(many, ready, accept_bound=1.0, state=seen, actions=normalised(CAR))
     vector.reset(seed=0)
     *_, infos = vector.step(np.ones((2, 2), np.float32))
-    alone = SafetyWrapper(Walled(CAR), ready, state=seen, actions=normalised(CAR))
+    alone = SafetyWrapper(Walled(CAR), ready, accept_bound=1.0, state=seen, actions=normalised(CAR))
     alone.reset(seed=0)
     *_, info = alone.step(np.ones(2, np.float32))
     assert info["diagnostics"]["margin"] < 0.3, "it is near"
@@ -197,7 +196,9 @@ def test_a_vector_decides_by_scans_too(ready):
 
 def test_a_view_of_a_vector_that_tells_nothing_is_no_world_without_obstacles(ready):
     vector = gymnasium.vector.SyncVectorEnv([lambda: Toy(CAR, discs())] * 2)
-    env = VectorSafetyWrapper(vector, ready, state=seen, obstacles=lambda *_: [], actions=normalised(CAR))
+    env = VectorSafetyWrapper(
+        vector, ready, accept_bound=1.0, state=seen, obstacles=lambda *_: [], actions=normalised(CAR)
+    )
     env.reset(seed=0)
     with pytest.raises(Mismatch, match="0 of 2 environments: give a list for each"):
         env.step(np.ones((2, 2), np.float32))
@@ -210,7 +211,8 @@ def test_an_empty_list_says_that_space_is_free_and_none_says_nothing(ready, many
         if many:
             env = gymnasium.vector.SyncVectorEnv([lambda: Toy(CAR)])
         wrapper = VectorSafetyWrapper if many else SafetyWrapper
-        env = wrapper(env, ready, state=seen, obstacles=lambda *_: [near] if many else near, actions=normalised(CAR))
+        how = {"state": seen, "actions": normalised(CAR)}
+        env = wrapper(env, ready, accept_bound=1.0, obstacles=lambda *_: [near] if many else near, **how)
         env.reset(seed=0)
         *_, info = env.step(np.ones((1, 2) if many else 2, np.float32))
         return info["diagnostics"]["kind"]
@@ -221,7 +223,7 @@ def test_an_empty_list_says_that_space_is_free_and_none_says_nothing(ready, many
 
 
 def test_a_scan_that_does_not_come_is_not_a_world_without_obstacles(ready):
-    env = SafetyWrapper(Walled(CAR), ready, state=seen, actions=normalised(CAR))
+    env = SafetyWrapper(Walled(CAR), ready, accept_bound=1.0, state=seen, actions=normalised(CAR))
     env.reset(seed=0)
     *_, before = env.step(np.array([-1.0, 0.0]))
     env.unwrapped.blind = True
@@ -241,7 +243,8 @@ def test_before_the_first_scan_nothing_is_free(ready, many):
     env.blind = True
     if many:
         env = gymnasium.vector.SyncVectorEnv([lambda: env])
-    env = (VectorSafetyWrapper if many else SafetyWrapper)(env, ready, state=seen, actions=normalised(CAR))
+    wrap = VectorSafetyWrapper if many else SafetyWrapper
+    env = wrap(env, ready, accept_bound=1.0, state=seen, actions=normalised(CAR))
     env.reset(seed=0)
     *_, info = env.step(np.ones((1, 2) if many else 2, np.float32))
     assert np.all(info["diagnostics"]["kind"] == "failsafe")

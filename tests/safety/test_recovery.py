@@ -154,7 +154,10 @@ def long_filter(data):
 @pytest.mark.parametrize("wall", [0.09, 0.1, 0.12])
 @pytest.mark.parametrize("errors", [{}, {"position_error": 0.03, "heading_error": 0.05}])
 def test_a_long_body_beside_a_wall_does_not_swing_its_rear_into_it(long_filter, wall, errors):
-    robot, safety = Unicycle((0.0, 0.0, 0.0), np.random.default_rng(0), noise=0.0), InProcess(long_filter)
+    robot, safety = (
+        Unicycle((0.0, 0.0, 0.0), np.random.default_rng(0), noise=0.0),
+        InProcess(long_filter, accept_bound=1.0),
+    )
     for _ in range(12):
         state = robot.measure()
         up = np.sin(TURN + state[2])
@@ -168,7 +171,7 @@ def test_a_long_body_beside_a_wall_does_not_swing_its_rear_into_it(long_filter, 
 
 def test_away_is_from_the_nearest_of_map_and_scan(ready):
     """A wall 6 cm to the left that the scan shows; farther off on the other side a post of the map."""
-    robot, safety = Unicycle((0.0, 0.0, 0.0), np.random.default_rng(0), noise=0.0), InProcess(ready)
+    robot, safety = Unicycle((0.0, 0.0, 0.0), np.random.default_rng(0), noise=0.0), InProcess(ready, accept_bound=1.0)
     wall, kinds = BODY + 0.06 - 0.075, []
     for _ in range(60):
         state = robot.measure()

@@ -31,7 +31,7 @@ class Service:
     """The core, called with bytes."""
 
     def __init__(self, *models: ModelSet, archive=None):
-        self.models, self.counts = Models(archive), Counts()
+        self.models, self.counts = Models(archive, accept_bound=1.0), Counts()
         for model in models:
             self.models.install(model)
         self.answer = answerer(self.models, self.counts)

@@ -121,7 +121,8 @@ from pathlib import Path
 from messaging.bus import BusSettings
 from safety.service import SafetySettings, main
 endpoint, keys, model, archive = sys.argv[1:]
-main(SafetySettings(BusSettings(connect=(endpoint,), keys=Path(keys)), (Path(model),), Path(archive)))
+bus = BusSettings(connect=(endpoint,), keys=Path(keys))
+main(SafetySettings(bus, (Path(model),), Path(archive), accept_bound=1.0))
 """
 
 

@@ -24,7 +24,7 @@ LATE = QUADROTOR.in_real_time()
 
 class Service:
     def __init__(self, model: ModelSet, key: bytes = KEY) -> None:
-        self.counts, models = Counts(), Models()
+        self.counts, models = Counts(), Models(accept_bound=1.0)
         models.install(model)
         self._answer = answerer(models, self.counts, Notary(key))
 
@@ -79,7 +79,7 @@ def test_what_no_service_verified_does_not_count_as_verified(model: ModelSet, ch
     assert (decision.kind, decision.verified, decision.unvouched) == (pb.FAILSAFE, False, True)
     assert not decision.vouchers, "and nobody vouches for what was not verified"
     assert service.counts.unvouched == 1
-    trusting = Models()
+    trusting = Models(accept_bound=1.0)
     trusting.install(model)
     payload = pb.RequestBatch(requests=[request]).SerializeToString()
     believed = pb.ReplyBatch.FromString(answerer(trusting, Counts())(payload)).replies[0].decision

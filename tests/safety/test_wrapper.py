@@ -50,7 +50,7 @@ class Yard(gymnasium.Env):
 
 
 def test_the_wrapper_lets_through_what_is_safe(ready):
-    env = SafetyWrapper(Yard(Obstacle("cylinder", (3.0, 0.0), (0.1,))), ready, penalty=2.0)
+    env = SafetyWrapper(Yard(Obstacle("cylinder", (3.0, 0.0), (0.1,))), ready, penalty=2.0, accept_bound=1.0)
     env.reset(seed=0)
     _, reward, _, _, info = env.step(np.array([0.2, 0.25], np.float32))
     assert np.array_equal(env.unwrapped.executed[0], np.array([0.2, 0.25], np.float32))
@@ -62,7 +62,7 @@ def test_the_wrapper_lets_through_what_is_safe(ready):
 
 
 def test_the_wrapper_replaces_and_penalises_what_is_not(ready):
-    env = SafetyWrapper(Yard(), ready, penalty=2.0)
+    env = SafetyWrapper(Yard(), ready, penalty=2.0, accept_bound=1.0)
     env.reset(seed=1)
     kinds, costs = set(), []
     for _ in range(60):
@@ -79,7 +79,7 @@ def test_the_wrapper_replaces_and_penalises_what_is_not(ready):
 
 @pytest.mark.parametrize("wrong", [NAN, INF, -INF])
 def test_a_proposal_that_is_not_finite_is_a_failsafe(ready, wrong):
-    env = SafetyWrapper(Yard(), ready, penalty=1.0)
+    env = SafetyWrapper(Yard(), ready, penalty=1.0, accept_bound=1.0)
     env.reset(seed=2)
     _, reward, _, _, info = env.step(np.array([wrong, 0.1]))
     assert not env.unwrapped.executed[0].any()
@@ -89,7 +89,7 @@ def test_a_proposal_that_is_not_finite_is_a_failsafe(ready, wrong):
 
 
 def test_every_episode_starts_standing(ready):
-    env = SafetyWrapper(Yard(), ready)
+    env = SafetyWrapper(Yard(), ready, accept_bound=1.0)
     env.reset(seed=3)
     env.step(np.array([0.25, 0.1]))
     assert env.commitment.input_in_force.any()

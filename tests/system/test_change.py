@@ -5,6 +5,7 @@ import signal
 
 from logs.reader import open_log
 from messaging import brakeline_pb2 as pb
+from tests.accepting import WORDS
 from tests.system.runs import Run, brakeline
 from tests.waiting import until
 
@@ -19,11 +20,11 @@ def share(steps):
 
 def test_a_payload_is_noticed_and_a_new_model_set_takes_over_in_mid_run(data_folder, tmp_path):
     change = ("--change.after", BEFORE // 2, "--change.payload-kg", 2, "--practice", 0.15)
-    with Run(tmp_path / "run", "--steps", ENDLESS, "--learner.td3.warmup", ENDLESS, *change) as run:
+    with Run(tmp_path / "run", "--steps", ENDLESS, "--learner.td3.warmup", ENDLESS, *change, *WORDS) as run:
         metrics = run.watch()
         run.until_steps(BEFORE + DURING)
         words = ("--last", DURING - 500, "--certificates", "residual", "--mode", "direct", "--publish", "--json")
-        certify = brakeline("certify", run.folder, *words, *run.there)
+        certify = brakeline("certify", run.folder, *words, *WORDS, *run.there)
         assert certify.returncode == 0, certify.stderr
         published = json.loads(certify.stdout)["residual"]
         processes = metrics.processes

@@ -22,6 +22,7 @@ from deploy.run.configurations import load
 from deploy.run.places import CONFIG
 from logs.reader import Record, read
 from messaging import brakeline_pb2 as pb
+from tests.accepting import WORDS
 from tests.robots import QUADROTOR
 from tests.system.runs import Run, until
 
@@ -40,7 +41,7 @@ class Flight(Run):
     """`brakeline fly` in progress."""
 
     def __init__(self, folder: Path, *arguments: object) -> None:
-        super().__init__(folder, "--setpoint-timeout", TIMEOUT, *arguments, command=("fly", "quadrotor"))
+        super().__init__(folder, "--setpoint-timeout", TIMEOUT, *WORDS, *arguments, command=("fly", "quadrotor"))
 
 
 def follows_the_plan(records: list[Record]) -> int:

@@ -14,6 +14,7 @@ from safety.commitment import Commitment
 from safety.filter import Filter
 from safety.model_set import ModelSet, Recipe
 from safety.request import Request
+from tests.accepting import WORDS
 from tests.deploy.data.porter import FILE, Porter, drive, porter, write_csv
 from tests.system.runs import BRAKELINE, brakeline
 from tests.waiting import until
@@ -31,7 +32,7 @@ def certified(tmp_path_factory):
         patch.setenv("BRAKELINE_DATA", str(folder / "data"))
         imported = brakeline("import", log, "--robot", FILE, "--json")
         assert imported.returncode == 0, imported.stderr
-        words = ("--use", "--certificates", "residual", "--mode", "direct", "--json")
+        words = ("--use", *WORDS, "--certificates", "residual", "--mode", "direct", "--json")
         made = brakeline("certify", "--robot", FILE, *words)
         assert made.returncode == 0, made.stderr
         yield folder, json.loads(imported.stdout), json.loads(made.stdout)
@@ -49,7 +50,9 @@ def test_four_commands_from_a_csv_to_an_answer(certified, tmp_path):
     assert "rank" in made["residual"]["not_of"]["plan"]
     endpoint = free_endpoint()
     with (tmp_path / "safety.err").open("w") as err:
-        service = subprocess.Popen([*BRAKELINE, "safety", str(FILE), "--listen", endpoint], stderr=err, stdout=err)
+        service = subprocess.Popen(
+            [*BRAKELINE, "safety", str(FILE), "--listen", endpoint, *map(str, WORDS)], stderr=err, stdout=err
+        )
         try:
             words = ("--connect", endpoint, "--obstacle", "cylinder 0.5 0 0.1", "--timeout", 5, "--json")
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from logs.reader import read
+from tests.accepting import WORDS
 from tests.system.runs import Run
 
 MIXED = ("train", "ground", "quadrotor", "--experiment", "debug")
@@ -12,7 +13,7 @@ KINDS = ("ground", "quadrotor")
 
 
 def test_two_of_each_learn_and_all_stop_when_the_service_dies(flight_folder: Path, tmp_path: Path) -> None:
-    with Run(tmp_path / "run", "--steps", 400, "--actors", 2, "--mavlink", command=MIXED) as run:
+    with Run(tmp_path / "run", "--steps", 400, "--actors", 2, "--mavlink", *WORDS, command=MIXED) as run:
         run.until_steps(250)
         run.kill("safety-0")
         figures = run.end()

@@ -20,6 +20,7 @@ from actors.mavlink_decoder import OFFBOARD
 from actors.mavlink_vehicle import MavlinkVehicle
 from deploy.bench.timing import stalls
 from messaging.links import open_link
+from tests.accepting import WORDS
 from tests.real import KINDS, autopilot, autopilots
 from tests.robots import QUADROTOR
 from tests.system.runs import Run
@@ -118,7 +119,7 @@ def test_all_fly_a_minute_behind_one_filter_and_hover_when_their_actors_die(tmp_
         there = [stack.enter_context(vehicle) for vehicle in autopilots(tmp_path)]
         urls, systems = zip(*there, strict=True)
         how = ["--url", *urls, "--systems", *systems, "--minutes", AFTER * QUADROTOR.period / 60.0]
-        how += ["--policy", "astar", "--at-start", "--raise-limits", "--pictures", 0]
+        how += ["--policy", "astar", "--at-start", "--raise-limits", "--pictures", 0, *WORDS]
         with stalls(0.01) as lost, Run(tmp_path / "run", *how, command=("fly", "quadrotor")) as run:
             actors = run.watch().actors
             names = [f"actor-{i}" for i in range(len(there))]

@@ -18,6 +18,7 @@ from messaging import brakeline_pb2 as pb
 from safety.dataset import BadData, Dataset
 from safety.model_set import ModelSet, Recipe
 from safety.windows import windows
+from tests.accepting import BOUND
 from tests.robots import GROUND
 from tests.safety.toys import car
 from tests.waiting import PATIENCE
@@ -27,7 +28,7 @@ from deploy.data import recording, store
 from messaging.tasks import robot_with_task
 from safety.recipe import Recipe
 recording.recorded(robot_with_task("ground"), trajectories=12)
-store.model_for(robot_with_task("ground"), Recipe())
+store.model_for(robot_with_task("ground"), Recipe(), 0.3)
 """
 
 
@@ -72,20 +73,20 @@ def elsewhere(tmp_path, monkeypatch):
 
 
 def test_the_store_makes_what_is_missing_and_only_that(elsewhere, capsys):
-    model = store.model_for(GROUND, Recipe())
+    model = store.model_for(GROUND, Recipe(), BOUND)
     assert paths.record_path(GROUND).exists() and len(elsewhere) == 1
     assert ModelSet.load(paths.model_path(GROUND, Recipe())).version == model.version
-    assert store.model_for(GROUND, Recipe()).version == model.version
-    other = store.model_for(GROUND, Recipe("set-membership"))
+    assert store.model_for(GROUND, Recipe(), BOUND).version == model.version
+    other = store.model_for(GROUND, Recipe("set-membership"), BOUND)
     assert other.version != model.version and len(elsewhere) == 1, "one recording for all"
     assert float(model.about["bound_step"]) <= float(model.about["bound_plan"]) < 1.0
     paths.model_path(GROUND, Recipe()).write_bytes(b"damaged")
-    assert store.model_for(GROUND, Recipe()).version == model.version
+    assert store.model_for(GROUND, Recipe(), BOUND).version == model.version
     said = capsys.readouterr()
     assert "making the model set again" in said.err and said.out == ""
     paths.model_path(GROUND, Recipe()).unlink()
     paths.record_path(GROUND).write_bytes(b"damaged")
-    assert store.model_for(GROUND, Recipe()).version == model.version, "the same seed, the same data"
+    assert store.model_for(GROUND, Recipe(), BOUND).version == model.version, "the same seed, the same data"
     assert len(elsewhere) == 2
 
 

@@ -1,0 +1,102 @@
+"""No command puts a model set to use that states less than the robot's limit asks for, unless that is accepted."""
+
+import json
+
+import pytest
+
+from deploy.cli import main
+from deploy.data import recording
+from messaging.descriptions import read
+from messaging.robots import FOLDER
+from safety.model_set import ModelSet
+from tests.robots import GROUND
+
+
+@pytest.fixture(scope="module")
+def few(tmp_path_factory):
+    """A data folder with some minutes of driving, and the model set that `certify --use` makes of them."""
+    folder = tmp_path_factory.mktemp("few")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("BRAKELINE_DATA", str(folder))
+        recording.recorded(GROUND, trajectories=24)
+        yield folder
+
+
+CERTIFY = ("certify", "--robot", "ground", "--certificates", "residual", "--mode", "direct", "--use")
+
+
+def run(capsys, *words):
+    status = main([str(word) for word in words])
+    said = capsys.readouterr()
+    return status, said.out, said.err
+
+
+def model_of(folder):
+    return folder / "ground" / "residual-direct.safetensors"
+
+
+def test_certify_use_refuses_and_puts_nothing_there(few, capsys):
+    model_of(few).unlink(missing_ok=True)
+    status, out, err = run(capsys, *CERTIFY, "--json")
+    assert status == 1 and not model_of(few).exists()
+    assert "not put to use" in err and "limit of ground is 1 %" in err and "--accept-bound 0." in err
+    said = json.loads(out)["residual"]
+    assert said["bound_plan"] > 0.01 and "--accept-bound" in said["not_used"]
+
+
+def test_certify_use_takes_what_is_accepted(few, capsys):
+    status, out, err = run(capsys, *CERTIFY, "--accept-bound", 0.5, "--json")
+    assert status == 0 and "not put to use" not in err
+    assert ModelSet.load(model_of(few)).about["bound_plan"] == f"{json.loads(out)['residual']['bound_plan']:.6g}"
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        "safety ground --listen tcp/127.0.0.1:0",
+        "evaluate ground --episodes 1 --policy random",
+        "train ground --steps 300 --out {out}",
+        "ros2 ground --seconds 1",
+    ],
+)
+def test_whoever_drives_behind_it_refuses(words, few, capsys, tmp_path):
+    run(capsys, *CERTIFY, "--accept-bound", 0.5, "--json")
+    status, _, err = run(capsys, *words.format(out=tmp_path / "run").split())
+    assert status == 1, err
+    assert "of plans leave their tubes" in err and "is 1 %" in err and "--accept-bound 0." in err
+    assert not (tmp_path / "run").exists()
+
+
+def test_evaluate_drives_behind_what_is_accepted(few, capsys):
+    run(capsys, *CERTIFY, "--accept-bound", 0.5, "--json")
+    words = ("evaluate", "ground", "--episodes", 1, "--policy", "random", "--json")
+    assert run(capsys, *words, "--accept-bound", 0.5)[0] == 0
+    status, _, err = run(capsys, *words, "--accept-bound", 0.001)
+    assert status == 1 and "--accept-bound accepts is 0.1 %" in err
+    status, _, err = run(capsys, *words, "--accept-bound", 2)
+    assert status == 1 and "above 0 and at most 1" in err
+
+
+@pytest.mark.parametrize("bound", [None, "nan", "a few"])
+def test_a_set_without_a_readable_statement_is_refused(bound, few, capsys):
+    run(capsys, *CERTIFY, "--accept-bound", 0.5, "--json")
+    model = ModelSet.load(model_of(few))
+    model.about.pop("bound_plan")
+    model.about.update({} if bound is None else {"bound_plan": bound})
+    model.save(model_of(few))
+    words = ("evaluate", "ground", "--episodes", 1, "--policy", "random", "--accept-bound", 0.99)
+    status, _, err = run(capsys, *words)
+    assert status == 1 and "any share may leave their tubes" in err and "--accept-bound 1 " in err
+
+
+def test_a_description_may_have_a_limit_of_its_own(tmp_path):
+    text = (FOLDER / "ground.toml").read_text()
+    mine = tmp_path / "mine.toml"
+    mine.write_text(text.replace('name = "ground"', 'name = "mine"\naccept_bound = 0.05'))
+    robot = read(mine)
+    assert robot.accept_bound == 0.05 and robot.description["accept_bound"] == 0.05
+    assert robot.in_real_time().accept_bound == 0.05
+    (tmp_path / "plain.toml").write_text(mine.read_text().replace("accept_bound = 0.05\n", ""))
+    plain = read(tmp_path / "plain.toml")
+    assert plain == robot and plain.layout() == robot.layout(), "it says nothing about vectors"
+    assert plain.accept_bound == 0.01 and "accept_bound" not in plain.description

@@ -1,0 +1,163 @@
+"""A statement that is looser than the robot's limit is not used without a question, whoever puts it to use."""
+
+import dataclasses
+import math
+
+import gymnasium
+import numpy as np
+import pytest
+
+from messaging import brakeline_pb2 as pb
+from messaging.bounds import percent, rounded_up, trust
+from messaging.explained import bound_in, explain
+from messaging.shapes import Shapes
+from safety.filter import Filter
+from safety.gym import SafetyWrapper
+from safety.inprocess import InProcess
+from safety.request import Request
+from safety.service import Counts, Models, answerer
+from safety.stated import TooLoose, accepted_bound, check_bound, plans_needed, refusal, stated_bound
+from safety.vector import VectorSafetyWrapper
+from safety.wire import decision_of, message_of
+from tests.robots import GROUND
+from tests.safety.rivals.test_sailr import known as rival
+
+FLOWN = {"bound_plan": "0.2613", "windows": "15", "violations": "0", "minutes": "15"}
+TIGHT = {"bound_plan": "0.0042", "windows": "1981", "violations": "2", "minutes": "200"}
+LAX = dataclasses.replace(GROUND, accept_bound=0.3)
+
+
+def message():
+    """A question at rest, with nothing near."""
+    sizes = {"state": [0.0] * 5, "action": [0.1, 0.0], "input_in_force": [0.0] * 2, "plan": [0.0] * 6}
+    return pb.Request(robot="ground", actor="a", known_free=True, **sizes)
+
+
+def said(model, about):
+    return dataclasses.replace(model, about=about)
+
+
+@pytest.mark.parametrize(
+    "about",
+    [{}, *({"bound_plan": word} for word in ("nan", "-0.1", "1.5", "inf", "-inf", "many", "", None, [0.001]))],
+    ids=str,
+)
+def test_what_is_no_statement_counts_as_one_that_says_nothing(about, model):
+    assert stated_bound(about) == 1.0
+    with pytest.raises(TooLoose):
+        check_bound(said(model, about), LAX)
+    with pytest.raises(TooLoose):
+        check_bound(said(model, about), GROUND, 0.99)
+    check_bound(said(model, about), GROUND, 1.0)
+
+
+def test_the_limit_is_the_robots_own_unless_more_is_accepted(model):
+    loose, tight = said(model, FLOWN), said(model, TIGHT)
+    check_bound(tight, GROUND)
+    check_bound(loose, LAX)
+    check_bound(loose, GROUND, 0.27)
+    for robot, accepted in ((GROUND, None), (GROUND, 0.26), (LAX, 0.2)):
+        with pytest.raises(TooLoose):
+            check_bound(loose, robot, accepted)
+    with pytest.raises(TooLoose, match=r"0\.42 %"):
+        check_bound(tight, GROUND, 0.001)
+
+
+@pytest.mark.parametrize("share", [0.0, -0.1, 1.1, math.nan, math.inf])
+def test_what_is_accepted_is_a_share(share):
+    with pytest.raises(ValueError, match="above 0"):
+        accepted_bound(GROUND, share)
+
+
+def test_a_refusal_says_the_bound_the_limit_and_what_to_do():
+    why = refusal(GROUND, FLOWN)
+    assert "at most 27 %" in why and "99 % confidence" in why and "limit of ground is 1 %" in why
+    assert "Record 444 more minutes" in why, "459 held-out plans instead of 15"
+    assert "--accept-bound 0.27" in why and not refusal(GROUND, FLOWN, 0.27)
+    left = refusal(GROUND, FLOWN | {"violations": "3"})
+    assert "3 of 15 held-out plans left their tubes" in left and "more minutes" not in left
+    assert "no statement" in refusal(GROUND, {}) and "certify" in refusal(GROUND, {})
+
+
+def test_what_is_suggested_is_accepted_and_what_is_shown_is_no_less_than_stated():
+    for bound in (*np.random.default_rng(0).random(200), 0.01, 0.07, 0.29, 0.58, 1e-5, 1.0):
+        assert bound <= rounded_up(bound) <= min(1.1 * bound, 1.0)
+        assert float(f"{rounded_up(bound):g}") >= bound
+    assert [percent(bound) for bound in (0.01, 0.0113, 0.2613)] == ["1 %", "1.2 %", "27 %"]
+    assert plans_needed(0.01) == 459
+
+
+def test_whoever_puts_a_model_set_to_use_in_process_refuses_a_loose_one(model, tmp_path):
+    loose = said(model, FLOWN)
+    loose.save(tmp_path / "model.safetensors")
+    for use in (
+        lambda **how: InProcess(Filter(loose), **how),
+        lambda **how: Models(**how).install(loose),
+        lambda **how: Models(limits={"ground": 0.2}, **how).install(loose),
+    ):
+        with pytest.raises(TooLoose, match=r"accept-bound 0\.27"):
+            use()
+        use(accept_bound=0.27)
+    Models(limits={"ground": 0.3}).install(loose)
+    for wrap, env in (
+        (SafetyWrapper, Nothing()),
+        (VectorSafetyWrapper, gymnasium.vector.SyncVectorEnv([Nothing])),
+    ):
+        with pytest.raises(TooLoose):
+            wrap(env, Filter(loose))
+    with pytest.raises(TooLoose):
+        SafetyWrapper.load(Nothing(), tmp_path / "model.safetensors")
+    with pytest.raises(TooLoose):
+        InProcess(Filter(said(model, {})))
+
+
+class Nothing(gymnasium.Env):
+    """An environment that no filter gets in front of."""
+
+    action_space = gymnasium.spaces.Box(-1.0, 1.0, (2,))
+    observation_space = gymnasium.spaces.Box(-1.0, 1.0, (2,))
+
+
+def test_a_service_goes_on_with_its_model_set_when_a_loose_one_is_refused(model):
+    models = Models()
+    models.install(said(model, TIGHT))
+    in_use = models.filters["ground"]
+    with pytest.raises(TooLoose):
+        models.install(said(model, FLOWN))
+    assert models.filters["ground"] is in_use
+
+
+def test_a_rival_states_nothing_and_is_not_asked_to():
+    check_bound(rival(0.3), GROUND)
+
+
+def test_every_decision_carries_the_bound_there_and_back(model):
+    for about, bound in ((TIGHT, 0.0042), ({}, 1.0), ({"bound_plan": "nan"}, 1.0)):
+        models = Models(accept_bound=1.0)
+        models.install(said(model, about))
+        batch = pb.RequestBatch(requests=[message()]).SerializeToString()
+        reply = pb.ReplyBatch.FromString(answerer(models, Counts())(batch)).replies[0]
+        assert bound_in(reply.decision) == bound
+        assert decision_of(reply.decision, GROUND).bound == bound
+
+
+def test_a_decision_of_an_old_log_or_of_a_rival_has_none(model):
+    state = np.zeros(5)
+    plan = np.zeros((GROUND.horizon, 2))
+    decision = Filter(model).decide(Request(state, np.zeros(2), np.zeros(2), plan, Shapes.of([], 2), known_free=True))
+    old = message_of(dataclasses.replace(decision, bound=None), 0.0).decision
+    assert not old.HasField("bound") and decision_of(old, GROUND).bound is None
+    old.bound = math.nan
+    assert decision_of(old, GROUND).bound == 1.0, "what is no share says nothing"
+
+
+def test_verified_is_said_with_what_it_is_worth(model):
+    assert trust(True, 0.0113) == "verified; at most 1.2 % of such plans leave their tube, at 99 % confidence"
+    assert trust(False, 0.001) == "not verified"
+    assert "no bound" in trust(True, None) and "states no bound" in trust(True, 1.0)
+    request = message()
+    decision = pb.Decision(kind=pb.ALLOWED, verified=True, plan=[0.0] * 6, bound=0.26)
+    assert "at most 26 %" in explain(GROUND, request, decision).trust
+    decision.kind, decision.reason = pb.FAILSAFE, "the proposal's tube comes too near"
+    about = explain(GROUND, request, decision)
+    assert "verified before (at most 26 % of such plans leave their tube)" in about.said and not about.trust
