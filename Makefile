@@ -22,7 +22,7 @@ test: check unit
 check: setup
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
-	$(BIN)/python -c 'import safety.filter, safety.shadows as s; s.prepare()' & $(BIN)/mypy; found=$$?; wait; exit $$found
+	$(BIN)/python -c 'import brakeline.safety.filter.filter, brakeline.safety.perception.occluded_regions as s; s.prepare()' & $(BIN)/mypy; found=$$?; wait; exit $$found
 	$(BIN)/lint-imports
 
 # Real time in one process, real autopilots in another, whole runs in a third, then the rest at a lower priority
@@ -42,7 +42,7 @@ test-fast: setup
 		tests/safety/test_freespace.py tests/safety/test_tube.py tests/deploy/run/test_stored.py tests/front
 
 bench: setup
-	$(BIN)/python -m deploy.bench
+	$(BIN)/python -m benchmarks
 
 # docs/ as a static site with a search, in site/; to search in it, serve it: `.venv/bin/mkdocs serve`.
 docs: setup

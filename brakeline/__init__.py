@@ -15,52 +15,52 @@ from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from messaging.bus import BusError, BusSettings, Late, NoReply, Refused, Unreachable
-    from messaging.descriptions import BadDescription
-    from messaging.motion import Motion
-    from messaging.range_images import RangeImage
-    from messaging.robots import Disc, Limit, Robot, UnknownRobot, robot_named
-    from messaging.scans import BadScan, Scan
-    from messaging.shapes import BadShape, Obstacle, Shapes
-    from messaging.tasks import RobotWithTask, Task, robot_with_task
-    from safety.asker import Answer, Asker
-    from safety.certificates import CertificateError
-    from safety.client import SafetyClient, SafetyError
-    from safety.commitment import Commitment, Prediction
-    from safety.dataset import BadData, Dataset, Trajectory
-    from safety.filter import Filter
-    from safety.fitting import make
-    from safety.fleet_client import FleetClient
-    from safety.gym import SafetyWrapper
-    from safety.image_memory import filled, memory_of
-    from safety.inprocess import InProcess
-    from safety.model_set import BadModel, ModelSet, Recipe
-    from safety.request import BadRequest, Decision, Request
-    from safety.statement import Statement, state
+    from brakeline.messaging.bus import BusError, BusSettings, Late, NoReply, Refused, Unreachable
+    from brakeline.messaging.obstacle import BadShape, Obstacle, Shapes
+    from brakeline.messaging.obstacle_motion import Motion
+    from brakeline.messaging.range_image import RangeImage
+    from brakeline.messaging.robot import Disc, Limit, Robot, UnknownRobot, robot_named
+    from brakeline.messaging.robot_description import BadDescription
+    from brakeline.messaging.scan import BadScan, Scan
+    from brakeline.messaging.task import RobotWithTask, Task, robot_with_task
+    from brakeline.safety.filter.backup_plan import Commitment, Prediction
+    from brakeline.safety.filter.filter import Filter
+    from brakeline.safety.filter.request import BadRequest, Decision, Request
+    from brakeline.safety.gym import SafetyWrapper
+    from brakeline.safety.model.dataset import BadData, Dataset, Trajectory
+    from brakeline.safety.model.error_bounds import CertificateError
+    from brakeline.safety.model.fitting import make
+    from brakeline.safety.model.model_set import BadModel, ModelSet, Recipe
+    from brakeline.safety.model.validation import Statement, state
+    from brakeline.safety.perception.image_memory import filled, memory_of
+    from brakeline.safety.service.asker import Answer, Asker
+    from brakeline.safety.service.client import SafetyClient, SafetyError
+    from brakeline.safety.service.fleet_client import FleetClient
+    from brakeline.safety.service.in_process import InProcess
 
 PLACES = {
-    "messaging.bus": ("BusError", "BusSettings", "Late", "NoReply", "Refused", "Unreachable"),
-    "messaging.descriptions": ("BadDescription",),
-    "messaging.motion": ("Motion",),
-    "messaging.range_images": ("RangeImage",),
-    "messaging.robots": ("Disc", "Limit", "Robot", "UnknownRobot", "robot_named"),
-    "messaging.scans": ("BadScan", "Scan"),
-    "messaging.shapes": ("BadShape", "Obstacle", "Shapes"),
-    "messaging.tasks": ("RobotWithTask", "Task", "robot_with_task"),
-    "safety.certificates": ("CertificateError",),
-    "safety.asker": ("Answer", "Asker"),
-    "safety.client": ("SafetyClient", "SafetyError"),
-    "safety.commitment": ("Commitment", "Prediction"),
-    "safety.dataset": ("BadData", "Dataset", "Trajectory"),
-    "safety.filter": ("Filter",),
-    "safety.fitting": ("make",),
-    "safety.fleet_client": ("FleetClient",),
-    "safety.gym": ("SafetyWrapper",),
-    "safety.image_memory": ("filled", "memory_of"),
-    "safety.inprocess": ("InProcess",),
-    "safety.model_set": ("BadModel", "ModelSet", "Recipe"),
-    "safety.request": ("BadRequest", "Decision", "Request"),
-    "safety.statement": ("Statement", "state"),
+    "brakeline.messaging.bus": ("BusError", "BusSettings", "Late", "NoReply", "Refused", "Unreachable"),
+    "brakeline.messaging.robot_description": ("BadDescription",),
+    "brakeline.messaging.obstacle_motion": ("Motion",),
+    "brakeline.messaging.range_image": ("RangeImage",),
+    "brakeline.messaging.robot": ("Disc", "Limit", "Robot", "UnknownRobot", "robot_named"),
+    "brakeline.messaging.scan": ("BadScan", "Scan"),
+    "brakeline.messaging.obstacle": ("BadShape", "Obstacle", "Shapes"),
+    "brakeline.messaging.task": ("RobotWithTask", "Task", "robot_with_task"),
+    "brakeline.safety.model.error_bounds": ("CertificateError",),
+    "brakeline.safety.service.asker": ("Answer", "Asker"),
+    "brakeline.safety.service.client": ("SafetyClient", "SafetyError"),
+    "brakeline.safety.filter.backup_plan": ("Commitment", "Prediction"),
+    "brakeline.safety.model.dataset": ("BadData", "Dataset", "Trajectory"),
+    "brakeline.safety.filter.filter": ("Filter",),
+    "brakeline.safety.model.fitting": ("make",),
+    "brakeline.safety.service.fleet_client": ("FleetClient",),
+    "brakeline.safety.gym": ("SafetyWrapper",),
+    "brakeline.safety.perception.image_memory": ("filled", "memory_of"),
+    "brakeline.safety.service.in_process": ("InProcess",),
+    "brakeline.safety.model.model_set": ("BadModel", "ModelSet", "Recipe"),
+    "brakeline.safety.filter.request": ("BadRequest", "Decision", "Request"),
+    "brakeline.safety.model.validation": ("Statement", "state"),
 }
 _PLACE_OF = {name: module for module, names in PLACES.items() for name in names}
 

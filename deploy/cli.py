@@ -41,12 +41,14 @@ COMMANDS: dict[str, Command] = {
         "brakeline keys keys safety learner recorder actor-0 actor-1 --host 10.0.0.1",
     ),
     "robot": Command(
-        "robots:RobotCommand",
+        "robot_command:RobotCommand",
         "a robot is a file: write a new description, check it, look at it",
         "brakeline robot new my.toml",
     ),
     "safety": Command(
-        "processes:Safety", "the safety service alone", "brakeline safety ground --listen tls/0.0.0.0:7447 --keys keys"
+        "single_processes:Safety",
+        "the safety service alone",
+        "brakeline safety ground --listen tls/0.0.0.0:7447 --keys keys",
     ),
     "router": Command(
         "router:Router",
@@ -54,12 +56,12 @@ COMMANDS: dict[str, Command] = {
         "brakeline router --listen tls/0.0.0.0:7447 --connect tls/10.0.0.2:7447 --keys keys",
     ),
     "learner": Command(
-        "processes:LearnerProcess",
+        "single_processes:LearnerProcess",
         "a learner alone",
         "brakeline learner ground --connect tls/10.0.0.1:7447 --keys keys",
     ),
     "actor": Command(
-        "processes:Actor",
+        "single_processes:Actor",
         "one actor process alone, with one or several robots",
         "brakeline actor ground --connect tls/10.0.0.1:7447 --keys keys --name actor-7 --number 7",
     ),
@@ -74,64 +76,64 @@ COMMANDS: dict[str, Command] = {
         "brakeline autopilot --rules px4 --url udpout:127.0.0.1:14540 --arena default",
     ),
     "ros2": Command(
-        "ros2:Ros2",
+        "ros2_command:Ros2",
         "the filter in front of a ROS 2 robot's base: cmd_vel_raw in, cmd_vel out; needs no ROS here",
         "brakeline ros2 ground --router tcp/localhost:7447",
     ),
     "bridge-sim": Command(
-        "ros2:BridgeSim",
+        "ros2_command:BridgeSim",
         "a simulated ground robot as a ROS 2 robot: odom, scan, tf, clock, cmd_vel",
         "brakeline bridge-sim --arena dense --seed 3",
     ),
     "recorder": Command(
-        "processes:Recorder",
+        "single_processes:Recorder",
         "the recorder alone",
         "brakeline recorder runs/a/run.mcap --connect tls/10.0.0.1:7447 --keys keys",
     ),
     "collect": Command(
-        "data:Collect", "record the data that the filter learns a robot from", "brakeline collect ground --seed 1"
+        "certify:Collect", "record the data that the filter learns a robot from", "brakeline collect ground --seed 1"
     ),
     "import": Command(
-        "sources:Import",
+        "import_command:Import",
         "a data set from a log of any robot: CSV, Parquet, ROS 2 bags, ArduPilot, PX4, runs",
         "brakeline import drive.csv --robot my.toml --picture driven.png",
     ),
     "excite": Command(
-        "sources:Excite",
+        "import_command:Excite",
         "print, or drive in its simulator, the inputs that a robot is best driven with to be learned, within a region",
         "brakeline excite my.toml --keep -2 -2 2 2 --minutes 10",
     ),
     "certify": Command(
-        "data:Certify",
+        "certify:Certify",
         "what held-out data say about each certificate; make and publish model sets",
         "brakeline certify --robot ground",
     ),
     "evaluate": Command(
-        "evaluation:Evaluate",
+        "evaluate_command:Evaluate",
         "a policy through the filter, in process, on fresh episodes",
         "brakeline evaluate ground --policy astar --episodes 100 --json",
     ),
     "pretrain": Command(
-        "comparison:Pretrain",
+        "compare_command:Pretrain",
         "what a rival must know of a robot, driven and fitted, with its cost",
         "brakeline pretrain secas ground",
     ),
     "compare": Command(
-        "comparison:Compare",
+        "compare_command:Compare",
         "every method from the same seeds, as tables and figures; resumes from results/",
         "brakeline compare ground --quick",
     ),
     "query": Command(
-        "service:Query",
+        "query:Query",
         "ask a running safety service about a state and an action",
         "brakeline query ground --action 0.25 0 --obstacle 'cylinder 0.3 0 0.1'",
     ),
-    "status": Command("service:Status", "which processes live, and how they fare", "brakeline status"),
+    "status": Command("query:Status", "which processes live, and how they fare", "brakeline status"),
     "watch": Command(
-        "watch:Watch", "a running system, live: on a web page, and in Foxglove", "brakeline watch --port 8787"
+        "watch_command:Watch", "a running system, live: on a web page, and in Foxglove", "brakeline watch --port 8787"
     ),
     "replay": Command(
-        "replay:Replay",
+        "replay_command:Replay",
         "ask every logged question again: is the same decided, to within 1e-12? And what with another model set?",
         "brakeline replay runs/latest --certificate set-membership",
     ),
@@ -141,11 +143,11 @@ COMMANDS: dict[str, Command] = {
         "brakeline export runs/latest --csv steps.csv",
     ),
     "analyse": Command(
-        "analysis:Analyse",
+        "analyse:Analyse",
         "figures of logs, whole or cut off, one run or many; a report as a page",
         "brakeline analyse runs/latest --html report.html",
     ),
-    "recover": Command("analysis:Recover", "make damaged logs whole", "brakeline recover runs/latest"),
+    "recover": Command("analyse:Recover", "make damaged logs whole", "brakeline recover runs/latest"),
 }
 
 
@@ -162,7 +164,7 @@ def overview(console: Console) -> None:
 def find(name: str) -> Any:
     """The dataclass of a command."""
     module, _, kind = COMMANDS[name].place.partition(":")
-    return getattr(importlib.import_module(f"deploy.commands.{module}"), kind)
+    return getattr(importlib.import_module(f"brakeline.deploy.commands.{module}"), kind)
 
 
 def abridged(kind: Any) -> Any:
@@ -181,8 +183,8 @@ def abridged(kind: Any) -> Any:
 
 def expected() -> tuple[type[Exception], ...]:
     """Errors whose message says enough. Who raised them has imported their modules."""
-    from logs.reader import LogError
-    from messaging.bus import BusError
+    from brakeline.logs.reader import LogError
+    from brakeline.messaging.bus import BusError
 
     return BusError, LogError, ValueError, OSError, RuntimeError
 

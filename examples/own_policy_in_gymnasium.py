@@ -3,14 +3,14 @@
 import gymnasium
 import numpy as np
 
-from deploy.data.certified import certified
-from deploy.data.episodes import collect
-from messaging.descriptions import robot_of
-from messaging.shapes import Obstacle
-from safety.filter import Filter
-from safety.gym import SafetyWrapper
-from safety.model_set import Recipe
-from safety.spaces import normalised
+from brakeline.deploy.data.certification import certified
+from brakeline.deploy.data.environment_episodes import collect
+from brakeline.messaging.obstacle import Obstacle
+from brakeline.messaging.robot_description import robot_of
+from brakeline.safety.action_mapping import normalised
+from brakeline.safety.filter.filter import Filter
+from brakeline.safety.gym import SafetyWrapper
+from brakeline.safety.model.model_set import Recipe
 
 
 class Cart(gymnasium.Env):

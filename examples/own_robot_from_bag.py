@@ -10,7 +10,7 @@ from pathlib import Path
 import small_log
 
 from brakeline import Filter, ModelSet
-from deploy.cli import main as brakeline
+from brakeline.deploy.cli import main as brakeline
 
 
 def main() -> None:

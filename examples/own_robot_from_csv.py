@@ -11,7 +11,7 @@ import numpy as np
 import small_log
 
 from brakeline import Commitment, Filter, ModelSet, Obstacle, Request, Shapes
-from deploy.cli import main as brakeline
+from brakeline.deploy.cli import main as brakeline
 
 
 def main() -> None:

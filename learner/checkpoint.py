@@ -19,7 +19,7 @@ import numpy as np
 import safetensors
 import safetensors.numpy
 
-from learner.state import State
+from brakeline.learner.checkpoint_state import State
 
 FORMAT = 1
 CHECKPOINT = "checkpoint"  # the folder of a run's checkpoints

@@ -13,7 +13,7 @@ from itertools import pairwise
 import torch
 from torch import Tensor
 
-from learner.config import Precision
+from brakeline.learner.learner_config import Precision
 
 WIDE = 64  # a product is worth rounding to bfloat16 from this width on
 

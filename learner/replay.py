@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from learner.state import BadState, State
+from brakeline.learner.checkpoint_state import BadState, State
 
 Vector = NDArray[np.float32]
 

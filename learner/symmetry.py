@@ -16,8 +16,8 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
-from learner.replay import Batch, Replay
-from messaging.tasks import RobotWithTask
+from brakeline.learner.replay import Batch, Replay
+from brakeline.messaging.task import RobotWithTask
 
 Indices = NDArray[np.intp]
 Matrix = NDArray[np.float64]

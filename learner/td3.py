@@ -1,6 +1,6 @@
 """TD3 (Fujimoto et al. 2018): twin critics, a smoothed target, a delayed actor.
 
-Actions are normalised to [−1, 1] per coordinate. A transition spans k ≤ n steps (`learner/windows.py`):
+Actions are normalised to [−1, 1] per coordinate. A transition spans k ≤ n steps (`learner/n_step.py`):
 
     y     = c·R + d · min_i Q̄_i(s', clip(π̄(s') + ε, −1, 1)),   ε = clip(N(0, σ²), −η, η)
     L_Q   = Σ_i mean (Q_i(s, a) − y)²
@@ -19,11 +19,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from learner.adam import Adam
-from learner.config import TD3Config
-from learner.networks import Network
-from learner.replay import Batch
-from learner.state import State
+from brakeline.learner.adam import Adam
+from brakeline.learner.checkpoint_state import State
+from brakeline.learner.learner_config import TD3Config
+from brakeline.learner.networks import Network
+from brakeline.learner.replay import Batch
 
 
 @dataclass

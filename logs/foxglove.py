@@ -17,16 +17,16 @@ from typing import Any
 import numpy as np
 from google.protobuf.message import Message
 
-from logs import scene
-from logs.reader import Record
-from logs.robots import Robots
-from logs.segment import Entry
-from messaging import brakeline_pb2 as pb
-from messaging.bus import Sample
-from messaging.robots import Robot, UnknownRobot
-from messaging.surroundings import promised
-from messaging.tasks import RobotWithTask
-from messaging.topics import EPISODE, EXCHANGE, LOG, STEP
+from brakeline.logs import foxglove_scene
+from brakeline.logs.reader import Record
+from brakeline.logs.recorded_robots import Robots
+from brakeline.logs.segment import Entry
+from brakeline.messaging import brakeline_pb2 as pb
+from brakeline.messaging.bus import Sample
+from brakeline.messaging.robot import Robot, UnknownRobot
+from brakeline.messaging.task import RobotWithTask
+from brakeline.messaging.topics import EPISODE, EXCHANGE, LOG, STEP
+from brakeline.safety.perception.displayed_map import promised
 
 log = logging.getLogger("brakeline.foxglove")
 
@@ -111,12 +111,12 @@ class Pictures:
         robot, name = self._robots.named(episode.robot), episode.actor
         if robot is None:
             raise UnknownRobot(f"no robot is called {episode.robot!r}")
-        site = self._sites.of(robot.name, name, 2.0 * scene.half_width(episode))
+        site = self._sites.of(robot.name, name, 2.0 * foxglove_scene.half_width(episode))
         actor = self._actors.setdefault(_source(key), _Actor(robot, name, site))
         actor.waiting = None
         return [
-            _entry(actor, "arena", scene.arena(robot, episode, time), time),
-            _entry(actor, "frames", scene.frames(robot, name, site, episode.start, time), time),
+            _entry(actor, "arena", foxglove_scene.arena(robot, episode, time), time),
+            _entry(actor, "frames", foxglove_scene.frames(robot, name, site, episode.start, time), time),
         ]
 
     def _exchange(self, key: str, decode: Decode, time: int) -> list[Entry]:
@@ -154,11 +154,13 @@ class Pictures:
         actor.waiting, actor.drawn = None, time * 1e-9
         robot, name = actor.robot, actor.name
         pictures = [
-            _entry(actor, "frames", scene.frames(robot, name, actor.site, step.state, time), time),
-            _entry(actor, "decision", scene.decision(robot, step, exchange, time, self._promises(exchange)), time),
+            _entry(actor, "frames", foxglove_scene.frames(robot, name, actor.site, step.state, time), time),
+            _entry(
+                actor, "decision", foxglove_scene.decision(robot, step, exchange, time, self._promises(exchange)), time
+            ),
         ]
         if isinstance(robot, RobotWithTask):
-            rays = scene.lidar(robot.task.rays, name, step.next_observation, time)
+            rays = foxglove_scene.lidar(robot.task.rays, name, step.next_observation, time)
             pictures.append(_entry(actor, "lidar", rays, time))
         return pictures
 
@@ -171,7 +173,7 @@ class Pictures:
         return [promised(robot, last) for robot, last in told]
 
     def _log_line(self, key: str, decode: Decode, time: int) -> list[Entry]:
-        return [_stored(f"{ROOT}/log", scene.log_line(decode(), time), time)]
+        return [_stored(f"{ROOT}/log", foxglove_scene.log_line(decode(), time), time)]
 
 
 def _source(key: str) -> str:

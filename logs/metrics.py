@@ -15,14 +15,14 @@ from typing import Any, TypeVar
 
 from google.protobuf.message import Message
 
-from logs import plans
-from logs.decisions import Decisions, joined
-from logs.plans import Plans
-from logs.robots import Robots
-from logs.sketch import Histogram, spread
-from logs.tally import KINDS, Figures, Tally, closed_loop
-from messaging import brakeline_pb2 as pb
-from messaging.topics import HEALTH, RECORDED, STEP, Topic
+from brakeline.logs import tube_stats
+from brakeline.logs.decision_stats import Decisions, joined
+from brakeline.logs.episode_stats import KINDS, Figures, Tally, closed_loop
+from brakeline.logs.quantiles import Histogram, spread
+from brakeline.logs.recorded_robots import Robots
+from brakeline.logs.tube_stats import Plans
+from brakeline.messaging import brakeline_pb2 as pb
+from brakeline.messaging.topics import HEALTH, RECORDED, STEP, Topic
 
 K = TypeVar("K")
 V = TypeVar("V")
@@ -258,7 +258,7 @@ def together(runs: Mapping[str, Metrics]) -> Figures:
         "actors": {name: closed_loop([actors[name]]) for name in names},
         "learners": {robot: learner(learners[robot]) for robot in sorted(learners)},
         **joined([decisions[name] for name in sorted(decisions)]).figures(),
-        "plans": plans.figures(part for run in runs.values() for part in run.plans.copy().values()),
+        "plans": tube_stats.figures(part for run in runs.values() for part in run.plans.copy().values()),
         "topics": _summed([run.topics() for run in runs.values()]),
         "processes": {
             prefix + name: run.process(name) for prefix, run in runs.items() for name in sorted(run.processes)

@@ -16,11 +16,11 @@ from typing import Any, NamedTuple
 from google.protobuf.message import DecodeError, Message
 from mcap.records import Attachment, Metadata
 
-from logs.container import Damage, NotMcap, Row, Series, records
-from logs.robots import Robots
-from logs.segment import being_written, name_of, number_of
-from messaging.plausible import Implausible, check
-from messaging.topics import TOPICS
+from brakeline.logs.mcap_container import Damage, NotMcap, Row, Series, records
+from brakeline.logs.recorded_robots import Robots
+from brakeline.logs.segment import being_written, name_of, number_of
+from brakeline.messaging.message_checks import Implausible, check
+from brakeline.messaging.topics import TOPICS
 
 Paths = str | os.PathLike[str] | Iterable[str | os.PathLike[str]]
 

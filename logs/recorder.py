@@ -15,12 +15,12 @@ from collections.abc import Callable, Iterable
 from functools import partial
 from pathlib import Path
 
-from logs.rotation import Rotation as Rotation
-from logs.segment import Attachments, Entry, Metadata, Segment, open_segment
-from messaging.bus import BusSettings, Sample
-from messaging.process import Process
-from messaging.tolerant import Tolerance
-from messaging.topics import RECORDED
+from brakeline.logs.segment import Attachments, Entry, Metadata, Segment, open_segment
+from brakeline.logs.segment_rotation import Rotation as Rotation
+from brakeline.messaging.bus import BusSettings, Sample
+from brakeline.messaging.process_runtime import Process
+from brakeline.messaging.rejected_messages import Tolerance
+from brakeline.messaging.topics import RECORDED
 
 log = logging.getLogger("brakeline.recorder")
 

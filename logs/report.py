@@ -8,12 +8,12 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from logs.analysis import SETUP, analysed
-from logs.metrics import Figures
-from logs.plans import stated
-from logs.reader import Paths
-from logs.tables import PLAIN, Stacking
-from logs.tally import CONTACTS
+from brakeline.logs.console_tables import PLAIN, Stacking
+from brakeline.logs.episode_stats import CONTACTS
+from brakeline.logs.log_analysis import SETUP, analysed
+from brakeline.logs.metrics import Figures
+from brakeline.logs.reader import Paths
+from brakeline.logs.tube_stats import stated
 
 BLOCKS = "▁▂▃▄▅▆▇█"
 

@@ -3,7 +3,7 @@
 `{robot}` and `{source}` in a key are filled in by the publisher and are wildcards for a subscriber. Who asks a query
 publishes it, and who listens answers; the answer is a message too. Liveness follows from `rate`: three periods without
 a message is stale. Where processes have keys, their routers let nothing pass that is not in this table
-(messaging/bus/access.py).
+(messaging/bus/access_control.py).
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from enum import Enum
 
 from google.protobuf.message import Message
 
-from messaging import brakeline_pb2 as pb
+from brakeline.messaging import brakeline_pb2 as pb
 
 # What a process is to the others. A name begins with its role: "actor-7", "learner-ground", "safety".
 ROLES = (

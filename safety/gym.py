@@ -17,17 +17,17 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from messaging.bus import BusError
-from messaging.sensed import Sensed
-from safety.asker import Answer, Asker
-from safety.commitment import correction_penalty
-from safety.image_memory import filled, memory_of
-from safety.inprocess import InProcess, sendable
-from safety.spaces import Actions, actions_of, cast
-from safety.views import OBSTACLES, STATE, View
+from brakeline.messaging.bus import BusError
+from brakeline.messaging.sensor_messages import Sensed
+from brakeline.safety.action_mapping import Actions, actions_of, cast
+from brakeline.safety.environment_views import OBSTACLES, STATE, View
+from brakeline.safety.filter.backup_plan import correction_penalty
+from brakeline.safety.perception.image_memory import filled, memory_of
+from brakeline.safety.service.asker import Answer, Asker
+from brakeline.safety.service.in_process import InProcess, sendable
 
 if TYPE_CHECKING:
-    from safety.methods import Method
+    from brakeline.safety.methods import Method
 
 Array = NDArray[np.float64]
 
@@ -86,7 +86,7 @@ class SafetyWrapper(gymnasium.Wrapper[Any, Any, Any, Any]):
         Raises:
             BadModel: it is none; TooLoose, Mismatch: see above.
         """
-        from safety.methods import load, ready  # what only asks a service needs no solver
+        from brakeline.safety.methods import load, ready  # what only asks a service needs no solver
 
         return cls(env, ready(load(Path(model))), penalty, **how)
 

@@ -9,15 +9,15 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Protocol
 
-from messaging.robots import Robot
-from safety.filter import Filter
-from safety.model_set import BadModel, ModelSet
-from safety.recipe import DDPC as DDPC
-from safety.request import Decision, Request
-from safety.rivals.pretrained import ENTRY, Pretrained
-from safety.rivals.sailr import SAILR, Sailr
-from safety.rivals.secas import SECAS, Secas
-from safety.tensors import holds
+from brakeline.messaging.robot import Robot
+from brakeline.safety.filter.filter import Filter
+from brakeline.safety.filter.request import Decision, Request
+from brakeline.safety.model.model_config import DDPC as DDPC
+from brakeline.safety.model.model_set import BadModel, ModelSet
+from brakeline.safety.model.tensor_file import holds
+from brakeline.safety.rivals.pretrained import ENTRY, Pretrained
+from brakeline.safety.rivals.sailr import SAILR, Sailr
+from brakeline.safety.rivals.secas import SECAS, Secas
 
 Model = ModelSet | Pretrained
 

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sim.conditions import QuadrotorNoise as QuadrotorNoise
-from sim.estimator import cut_normal
-from sim.flight import GRAVITY, Vector
+from brakeline.sim.flight_controller import GRAVITY, Vector
+from brakeline.sim.ground_estimator import cut_normal
+from brakeline.sim.sim_conditions import QuadrotorNoise as QuadrotorNoise
 
 Quaternion = tuple[float, float, float, float]  # w, x, y, z; world from body
 

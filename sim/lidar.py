@@ -6,11 +6,11 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from messaging.rays import Rays
-from messaging.shapes import rotate
-from sim.estimator import cut_normal
-from sim.scene import HEIGHT, Moving, map_model
-from sim.world import Arena
+from brakeline.messaging.obstacle import rotate
+from brakeline.messaging.ray_directions import Rays
+from brakeline.sim.arena import Arena
+from brakeline.sim.ground_estimator import cut_normal
+from brakeline.sim.mujoco_obstacles import HEIGHT, Moving, map_model
 
 Array = NDArray[np.float64]
 

@@ -12,8 +12,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from messaging.robots import Robot
-from sim.planner import ClearanceMap
+from brakeline.messaging.robot import Robot
+from brakeline.sim.grid_planner import ClearanceMap
 
 Array = NDArray[np.float64]
 

@@ -11,13 +11,13 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from messaging.robots import robot_named
-from sim.flight import GRAVITY, Body, FlightController, Gains, Vector
-from sim.flight_estimator import Estimate, FlightEstimator, QuadrotorNoise, rotate
-from sim.scene import Moving, add_movers, add_obstacles
-from sim.vehicle import Period, executed
-from sim.wind import Air, Wind
-from sim.world import Arena
+from brakeline.messaging.robot import robot_named
+from brakeline.sim.arena import Arena
+from brakeline.sim.flight_controller import GRAVITY, Body, FlightController, Gains, Vector
+from brakeline.sim.flight_estimator import Estimate, FlightEstimator, QuadrotorNoise, rotate
+from brakeline.sim.mujoco_obstacles import Moving, add_movers, add_obstacles
+from brakeline.sim.vehicle import Period, executed
+from brakeline.sim.wind import Air, Wind
 
 Array = NDArray[np.float64]
 

@@ -9,8 +9,8 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from messaging.robots import Robot
-from sim.world import Arena
+from brakeline.messaging.robot import Robot
+from brakeline.sim.arena import Arena
 
 Array = NDArray[np.float64]
 

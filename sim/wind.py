@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from sim.conditions import Wind as Wind
+from brakeline.sim.sim_conditions import Wind as Wind
 
 GUST_CUT = 3.0  # sigma at which a gust is cut off
 

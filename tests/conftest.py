@@ -10,9 +10,9 @@ import pytest
 from hypothesis import HealthCheck, settings
 from xdist.scheduler import LoadScopeScheduling
 
-from deploy.bench.timing import stalls
-from deploy.data import recording, store
-from safety.model_set import Recipe
+from benchmarks.timing import stalls
+from brakeline.deploy.data import model_store, simulated_recording
+from brakeline.safety.model.model_set import Recipe
 from tests.accepting import BOUND
 from tests.robots import GROUND, QUADROTOR
 
@@ -83,8 +83,8 @@ def data_folder(shared_folder: Path) -> Iterator[Path]:
     folder = shared_folder / "recorded"
     folder.mkdir(exist_ok=True)
     os.environ["BRAKELINE_DATA"] = str(folder)
-    recording.recorded(GROUND, trajectories=TRAJECTORIES)
-    store.model_for(GROUND, Recipe())
+    simulated_recording.recorded(GROUND, trajectories=TRAJECTORIES)
+    model_store.model_for(GROUND, Recipe())
     yield folder
     if before is None:
         del os.environ["BRAKELINE_DATA"]
@@ -95,9 +95,9 @@ def data_folder(shared_folder: Path) -> Iterator[Path]:
 @pytest.fixture(scope="session")
 def flight_folder(data_folder: Path) -> Path:
     """The same, with a data set of the quadrotor, and its models in lockstep and in real time."""
-    recording.recorded(QUADROTOR, trajectories=FLIGHTS)
+    simulated_recording.recorded(QUADROTOR, trajectories=FLIGHTS)
     for robot in (QUADROTOR, QUADROTOR.in_real_time()):
-        store.model_for(robot, Recipe(), BOUND)
+        model_store.model_for(robot, Recipe(), BOUND)
     return data_folder
 
 

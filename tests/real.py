@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from deploy.bench import sitl
-from deploy.bench.sitl import KINDS as KINDS
+from benchmarks import sitl
+from benchmarks.sitl import KINDS as KINDS
 
 ROOT = Path(__file__).parents[1]
 

@@ -1,6 +1,6 @@
 """The robots that most tests are about."""
 
-from messaging.tasks import RobotWithTask, robot_with_task
+from brakeline.messaging.task import RobotWithTask, robot_with_task
 
 GROUND = robot_with_task("ground")
 QUADROTOR = robot_with_task("quadrotor")

@@ -1,1 +1,1 @@
-"""The commands of `deploy.cli`, a dataclass each: its fields are the options, `run` does the work."""
+"""The commands of `brakeline.deploy.cli`, a dataclass each: its fields are the options, `run` does the work."""

@@ -7,15 +7,15 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Literal
 
-from deploy.commands.common import errors, say_json
-from deploy.run.autopilot import AutopilotSettings, fly
-from deploy.run.hil import HilSettings
-from deploy.run.hil import fly as fly_px4
-from sim.autopilot.rules import SETPOINT_TIMEOUT
-from sim.autopilot.sensors import SensorNoise
-from sim.quadrotor import Quadrotor
-from sim.wind import Wind
-from sim.world import Arena
+from brakeline.deploy.commands.common_options import errors, say_json
+from brakeline.deploy.run.autopilot_run import AutopilotSettings, fly
+from brakeline.deploy.run.px4_simulation import HilSettings
+from brakeline.deploy.run.px4_simulation import fly as fly_px4
+from brakeline.sim.arena import Arena
+from brakeline.sim.autopilot.autopilot_rules import SETPOINT_TIMEOUT
+from brakeline.sim.autopilot.hil_sensors import SensorNoise
+from brakeline.sim.quadrotor import Quadrotor
+from brakeline.sim.wind import Wind
 
 
 @dataclass(frozen=True)

@@ -8,9 +8,9 @@ from typing import Annotated, Any
 
 import tyro
 
-from deploy.commands.common import LATEST, console, say_json
-from deploy.progress import under_way
-from messaging.tasks import robot_with_task
+from brakeline.deploy.commands.common_options import LATEST, console, say_json
+from brakeline.deploy.progress import under_way
+from brakeline.messaging.task import robot_with_task
 
 
 @dataclass(frozen=True)
@@ -47,8 +47,8 @@ class Export:
         return 0
 
     def _csv(self) -> dict[str, Any]:
-        from logs.export import to_csv
-        from logs.trajectories import ExportError
+        from brakeline.logs.log_export import to_csv
+        from brakeline.logs.minari_export import ExportError
 
         assert self.csv is not None
         robot = robot_with_task(self.robot)
@@ -62,21 +62,21 @@ class Export:
             raise
 
     def _minari(self) -> dict[str, Any]:
-        from logs.trajectories import to_minari
+        from brakeline.logs.minari_export import to_minari
 
         assert self.minari is not None
         written = to_minari(list(self.logs), robot_with_task(self.robot), self.minari)
         return {"path": str(written.path), "episodes": written.episodes, "steps": written.steps}
 
     def _tlog(self) -> dict[str, Any]:
-        from logs.tlog import to_tlog
+        from brakeline.logs.tlog_export import to_tlog
 
         assert self.tlog is not None
         with self.tlog.open("wb") as file:
             return {"path": str(self.tlog), "frames": to_tlog(list(self.logs), file)}
 
     def _foxglove(self) -> dict[str, Any]:
-        from logs.export import to_foxglove
+        from brakeline.logs.log_export import to_foxglove
 
         assert self.foxglove is not None
         return {"path": str(self.foxglove), "messages": to_foxglove(list(self.logs), self.foxglove)}

@@ -8,16 +8,16 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from actors.flight import FlightSettings
-from deploy.commands.common import Flags, Flight, Meeting, Physics, Serving, console, errors, say_json
-from deploy.commands.train import STOPPED, stamped
-from deploy.quadrotors import flight_arena
-from deploy.run.configurations import Embedded, RunConfig
-from deploy.run.display import Display, summary
-from deploy.run.launcher import Launcher, prepare
-from messaging.ports import free_udp_port
-from messaging.robots import robot_named
-from messaging.tasks import address_in_real_time
+from brakeline.actors.flight_process import FlightSettings
+from brakeline.deploy.commands.common_options import Flags, Flight, Meeting, Physics, Serving, console, errors, say_json
+from brakeline.deploy.commands.train import STOPPED, stamped
+from brakeline.deploy.quadrotor_vehicles import flight_arena
+from brakeline.deploy.run.display import Display, summary
+from brakeline.deploy.run.launcher import Launcher, prepare
+from brakeline.deploy.run.run_config import Embedded, RunConfig
+from brakeline.messaging.free_ports import free_udp_port
+from brakeline.messaging.robot import robot_named
+from brakeline.messaging.task import address_in_real_time
 
 LEARN = "learn"
 TOLD = ("periods ", "lateness", "worst", "link", "true", "estimate")  # beginnings of figures' names

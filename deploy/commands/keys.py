@@ -8,15 +8,15 @@ from typing import Annotated
 
 import tyro
 
-from deploy.commands.common import console
-from messaging.bus.authority import DAYS, Authority
-from messaging.bus.identity import SERVERS, role_of
-from messaging.files import write_secret
-from safety.methods import load
-from safety.sign import ANY, SIGNERS, Signer, seal_of, write_signer
-from safety.sign import KEY as SIGNER
-from safety.vouch import KEY as VOUCHERS
-from safety.vouch import write_key
+from brakeline.deploy.commands.common_options import console
+from brakeline.messaging.atomic_files import write_secret
+from brakeline.messaging.bus.certificate_authority import DAYS, Authority
+from brakeline.messaging.bus.identity import SERVERS, role_of
+from brakeline.safety.methods import load
+from brakeline.safety.service.plan_token import KEY as VOUCHERS
+from brakeline.safety.service.plan_token import write_key
+from brakeline.safety.service.signature import ANY, SIGNERS, Signer, seal_of, write_signer
+from brakeline.safety.service.signature import KEY as SIGNER
 
 
 @dataclass(frozen=True)

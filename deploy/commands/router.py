@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from deploy.commands.common import Endpoints, Flags
+from brakeline.deploy.commands.common_options import Endpoints, Flags
 
 
 @dataclass(frozen=True)
@@ -14,7 +14,7 @@ class Router:
     """On the bus; each router has its own."""
 
     def run(self) -> int:
-        from messaging.process import Process
+        from brakeline.messaging.process_runtime import Process
 
         settings = self.endpoints.bus()
         if not settings.listen:

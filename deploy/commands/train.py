@@ -9,12 +9,12 @@ from typing import Annotated, ClassVar, Self
 
 import tyro
 
-from actors.settings import Change
-from deploy.commands.common import Flags, Meeting, Physics, Serving, console, errors, say_json
-from deploy.progress import under_way
-from deploy.run.configurations import EXPERIMENTS, RunConfig, load
-from learner.config import LearnerConfig
-from logs.rotation import Rotation
+from brakeline.actors.actor_settings import Change
+from brakeline.deploy.commands.common_options import Flags, Meeting, Physics, Serving, console, errors, say_json
+from brakeline.deploy.progress import under_way
+from brakeline.deploy.run.run_config import EXPERIMENTS, RunConfig, load
+from brakeline.learner.learner_config import LearnerConfig
+from brakeline.logs.segment_rotation import Rotation
 
 
 def launch(config: RunConfig, folder: Path, resume: bool, meeting: Meeting, as_json: bool) -> int:
@@ -22,8 +22,8 @@ def launch(config: RunConfig, folder: Path, resume: bool, meeting: Meeting, as_j
     shown = errors if as_json else console
     what = f"{', '.join(config.robots)}, method {config.method}, arena {config.arena}, {config.steps} steps"
     with under_way(f"{folder}: {what}"):  # seconds go into these alone
-        from deploy.run.display import Display, summary
-        from deploy.run.launcher import Launcher, prepare
+        from brakeline.deploy.run.display import Display, summary
+        from brakeline.deploy.run.launcher import Launcher, prepare
 
     prepare(config, folder, resume)
     if resume:
@@ -120,13 +120,13 @@ class Train:
     def config(self) -> RunConfig:
         """The run's configuration; a resumed run's is its own, but for the steps."""
         if self.resume is not None:
-            from deploy.run.places import CONFIG
+            from brakeline.deploy.run.processes import CONFIG
 
             resumed = load(self.resume / CONFIG)
             from_logs = tuple(map(str, self.from_logs)) or resumed.from_logs
             return replace(resumed, steps=self.steps or resumed.steps, from_logs=from_logs)
-        from messaging.tasks import address
-        from safety.recipe import check_promises
+        from brakeline.messaging.task import address
+        from brakeline.safety.model.model_config import check_promises
 
         if self.fleet:
             check_promises(self.filtering.method)
@@ -159,8 +159,8 @@ class Train:
     def _steps(self) -> int:
         """As given; offline the logs have an end; else the experiment's."""
         if self.steps is None and self.from_logs and self.actors == 0:
-            from deploy.run.feed import count
-            from messaging.tasks import robot_with_task
+            from brakeline.deploy.run.log_feed import count
+            from brakeline.messaging.task import robot_with_task
 
             logs = [str(path) for path in self.from_logs]
             with under_way("counting the logs' steps"):

@@ -7,12 +7,12 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from deploy.data.excite import excitation
-from deploy.vehicles import vehicle_in_yard
-from messaging.robots import Robot
-from messaging.tasks import RobotWithTask
-from safety.dataset import Dataset, Trajectory
-from sim.conditions import Conditions
+from brakeline.deploy.data.excitation import excitation
+from brakeline.deploy.vehicle_factory import vehicle_in_yard
+from brakeline.messaging.robot import Robot
+from brakeline.messaging.task import RobotWithTask
+from brakeline.safety.model.dataset import Dataset, Trajectory
+from brakeline.sim.sim_conditions import Conditions
 
 PERIODS = 300  # a trajectory
 ORIGIN = "collect"

@@ -7,18 +7,18 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from deploy.data.certified import HELD_OUT, WIDEST
-from deploy.data.sources.quantities import columns_of, split
-from messaging.bounds import percent
-from messaging.robots import Array, Robot
-from safety.dataset import Dataset
-from safety.fitting import FEWEST_STOPS
-from safety.in_place import standing_limits
-from safety.leaving import AFTER, BOTH, FAST, PATH, STANDING, TURNING
-from safety.model_set import DIRECT, Recipe
-from safety.stated import plans_needed
-from safety.statement import Statement, upper_bound
-from safety.windows import FREE, PLAN, standing_at_the_end, stops_of, windows
+from brakeline.deploy.data.certification import HELD_OUT, WIDEST
+from brakeline.deploy.data.sources.quantity_names import columns_of, split
+from brakeline.messaging.robot import Array, Robot
+from brakeline.messaging.stated_share import percent
+from brakeline.safety.model.dataset import Dataset
+from brakeline.safety.model.error_causes import AFTER, BOTH, FAST, PATH, STANDING, TURNING
+from brakeline.safety.model.fitting import FEWEST_STOPS
+from brakeline.safety.model.model_set import DIRECT, Recipe
+from brakeline.safety.model.stated_bound import plans_needed
+from brakeline.safety.model.turning_in_place import standing_limits
+from brakeline.safety.model.validation import Statement, upper_bound
+from brakeline.safety.model.windows import FREE, PLAN, standing_at_the_end, stops_of, windows
 
 NEAR = 0.05  # of its range: an input this near to a bound has been there
 MOST_SHOWN = 3  # groups of violations

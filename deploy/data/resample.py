@@ -13,12 +13,12 @@ from itertools import pairwise
 
 import numpy as np
 
-from deploy.data.delay import followed, lag
-from deploy.data.sources.quantities import columns_of, resolve, split
-from deploy.data.sources.table import Array, NoSource, Table
-from messaging.robots import Robot
-from messaging.shapes import rotate
-from safety.dataset import Dataset, Trajectory
+from brakeline.deploy.data.input_delay import followed, lag
+from brakeline.deploy.data.sources.quantity_names import columns_of, resolve, split
+from brakeline.deploy.data.sources.source_table import Array, NoSource, Table
+from brakeline.messaging.obstacle import rotate
+from brakeline.messaging.robot import Robot
+from brakeline.safety.model.dataset import Dataset, Trajectory
 
 HOLD = 1.0  # s that an input counts for after its last message: then who sent it may be gone
 MOSTLY = 0.9  # of a period: an input held for so long is the period's

@@ -13,9 +13,9 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 from rich.text import Text
 
-from deploy.run.view import View
-from logs.plans import stated
-from logs.report import show
+from brakeline.deploy.run.run_view import View
+from brakeline.logs.report import show
+from brakeline.logs.tube_stats import stated
 
 REFRESH = 0.5  # s between two looks at the figures
 PLAIN = 10.0  # s between two lines where there is no terminal

@@ -10,22 +10,22 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from deploy.data.store import method_for
-from deploy.run.configurations import RunConfig, encode
-from deploy.run.keys import KEYS, seal_models
-from deploy.run.places import CONFIG, LOG, places, say_where
-from deploy.run.view import View
-from deploy.run.watched import Child, LaunchError, last_line
-from logs.metrics import Metrics
-from logs.robots import Robots
-from logs.watch.totals import told, totals
-from messaging.bus import BusError, BusSettings, Sample
-from messaging.process import Process
-from messaging.robots import robot_named
-from messaging.tasks import robot_maybe_with_task
-from messaging.tolerant import Tolerance, headline
-from messaging.topics import RECORDED
-from safety.vouch import write_key
+from brakeline.deploy.data.model_store import method_for
+from brakeline.deploy.run.processes import CONFIG, LOG, places, say_where
+from brakeline.deploy.run.run_config import RunConfig, encode
+from brakeline.deploy.run.run_keys import KEYS, seal_models
+from brakeline.deploy.run.run_view import View
+from brakeline.deploy.run.supervisor import Child, LaunchError, last_line
+from brakeline.logs.metrics import Metrics
+from brakeline.logs.recorded_robots import Robots
+from brakeline.logs.watch.run_totals import told, totals
+from brakeline.messaging.bus import BusError, BusSettings, Sample
+from brakeline.messaging.process_runtime import Process
+from brakeline.messaging.rejected_messages import Tolerance, headline
+from brakeline.messaging.robot import robot_named
+from brakeline.messaging.task import robot_maybe_with_task
+from brakeline.messaging.topics import RECORDED
+from brakeline.safety.service.plan_token import write_key
 
 log = logging.getLogger("brakeline.launcher")
 

@@ -9,8 +9,8 @@ from typing import Any
 import gymnasium
 import numpy as np
 
+from brakeline.messaging.obstacle import Obstacle
 from examples.foreign.adapter import Adapter, Array
-from messaging.shapes import Obstacle
 
 ROOM = 9.9  # m from the middle to each wall
 WANDER = 0.1  # m: its simulated joints creep, so that the car never quite stands, whatever throttle it is given

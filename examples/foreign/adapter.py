@@ -11,9 +11,9 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from messaging.robots import robot_named
-from messaging.shapes import WALL, Obstacle
-from safety.spaces import Actions
+from brakeline.messaging.obstacle import WALL, Obstacle
+from brakeline.messaging.robot import robot_named
+from brakeline.safety.action_mapping import Actions
 
 Array = NDArray[np.float64]
 

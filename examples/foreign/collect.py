@@ -7,7 +7,7 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
 
-from deploy.data.episodes import collect
+from brakeline.deploy.data.environment_episodes import collect
 from examples.foreign.robots import adapter_of
 
 

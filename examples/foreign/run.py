@@ -22,11 +22,11 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
 
+from brakeline.safety.gym import SafetyWrapper
+from brakeline.safety.service.client import SafetyClient
 from examples.foreign.adapter import Adapter
 from examples.foreign.policies import POLICIES
 from examples.foreign.robots import FOLDERS, adapter_of
-from safety.client import SafetyClient
-from safety.gym import SafetyWrapper
 
 DEADLINE = 1.0  # s: the environment waits, a busy machine must not count
 

@@ -3,7 +3,7 @@
 python train.py car --steps 60000 --out car.jsonl
 
 The environment asks the service for every step, in training as afterwards. What is learned from is what was executed,
-and what was proposed with a penalty (`learner/windows.py`). Every episode is a line of JSON with its cost. The policy
+and what was proposed with a penalty (`learner/n_step.py`). Every episode is a line of JSON with its cost. The policy
 is stored beside the robot's description; `run.py car trained` drives it.
 """
 
@@ -20,16 +20,16 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
 
+from brakeline.learner.learner_config import TD3Config
+from brakeline.learner.n_step import Move, Windows
+from brakeline.learner.replay import Batch, Replay
+from brakeline.learner.td3 import TD3
+from brakeline.safety.action_mapping import normalised
+from brakeline.safety.service.client import SafetyClient
 from examples.foreign.adapter import Adapter
 from examples.foreign.robots import FOLDERS, adapter_of
 from examples.foreign.run import DEADLINE, Tally, behind
 from examples.foreign.trained import Trained, Vector, scale, seen
-from learner.config import TD3Config
-from learner.replay import Batch, Replay
-from learner.td3 import TD3
-from learner.windows import Move, Windows
-from safety.client import SafetyClient
-from safety.spaces import normalised
 
 CONFIG = TD3Config(
     hidden=(128, 128), gamma=0.98, reward_scale=1.0, actor_rate=5e-4, critic_rate=5e-4, exploration_noise=0.2

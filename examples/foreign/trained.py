@@ -10,8 +10,8 @@ import numpy as np
 import safetensors.numpy
 from numpy.typing import NDArray
 
+from brakeline.messaging.robot import Robot
 from examples.foreign.adapter import Array
-from messaging.robots import Robot
 
 Vector = NDArray[np.float32]
 FARTHEST = 5.0  # of a normalised observation

@@ -7,8 +7,8 @@ from itertools import product
 
 import numpy as np
 
+from brakeline.messaging.obstacle import CYLINDER, Obstacle
 from examples.foreign.adapter import Adapter, Array
-from messaging.shapes import CYLINDER, Obstacle
 
 CELL = 0.25  # of the body's radius: edge of a cell, and what is kept to the discs
 AHEAD = 6  # cells

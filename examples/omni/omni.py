@@ -10,14 +10,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from messaging.robots import Robot, robot_named
-from sim import policies
-from sim.conditions import Conditions
-from sim.estimator import NoiseLevels
-from sim.planar import PlanarRobot
-from sim.policies import bearing
-from sim.vehicle import MakeVehicle
-from sim.world import Arena
+from brakeline.messaging.robot import Robot, robot_named
+from brakeline.sim import scripted_policies
+from brakeline.sim.arena import Arena
+from brakeline.sim.ground_estimator import NoiseLevels
+from brakeline.sim.planar_robot import PlanarRobot
+from brakeline.sim.scripted_policies import bearing
+from brakeline.sim.sim_conditions import Conditions
+from brakeline.sim.vehicle import MakeVehicle
 
 Array = NDArray[np.float64]
 
@@ -44,7 +44,7 @@ class Omni(PlanarRobot):
 
 
 def simulated(conditions: Conditions, tap: object = None) -> MakeVehicle:
-    """Makes the task's vehicles: see `messaging.tasks.Task.simulator`."""
+    """Makes the task's vehicles: see `brakeline.messaging.task.Task.simulator`."""
     return partial(Omni, noise=conditions.noise)
 
 
@@ -78,7 +78,7 @@ class Adversary:
         return _towards(self._robot, angle, float(self._rng.choice([-1.0, 0.0, 1.0]) * self._robot.high()[2]))
 
 
-class MapDriver(policies.MapDriver):
+class MapDriver(scripted_policies.MapDriver):
     """Along the best way on the map, at half speed, without turning."""
 
     def _pursue(self, angle: float) -> Array:

@@ -11,8 +11,8 @@ from typing import Any
 import gymnasium
 import numpy as np
 
+from brakeline.messaging.obstacle import Obstacle
 from examples.foreign.adapter import Adapter, Array
-from messaging.shapes import Obstacle
 
 STEP = {"car": 0.04, "point": 0.02}  # s, of the environment
 FORWARD = {"car": np.array([0.0, -1.0]), "point": np.array([1.0, 0.0])}  # of the agent's body

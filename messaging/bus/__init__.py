@@ -4,7 +4,7 @@ A process that is given `listen` is a router; the others are clients of one of t
 show who they are, and the router lets each say and hear what the table of topics grants it.
 """
 
-from messaging.bus.errors import (
+from brakeline.messaging.bus.bus_errors import (
     BadKeys,
     BusError,
     Busy,
@@ -16,10 +16,10 @@ from messaging.bus.errors import (
     Refused,
     Unreachable,
 )
-from messaging.bus.publisher import Publisher
-from messaging.bus.session import Bus
-from messaging.bus.settings import BusSettings, configuration
-from messaging.bus.subscription import Listener, Sample, Subscription
+from brakeline.messaging.bus.bus_settings import BusSettings, configuration
+from brakeline.messaging.bus.publisher import Publisher
+from brakeline.messaging.bus.session import Bus
+from brakeline.messaging.bus.subscription import Listener, Sample, Subscription
 
 __all__ = [
     "BadKeys",

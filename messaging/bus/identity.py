@@ -1,11 +1,12 @@
-"""Who a process is to the others: its certificate, from a folder of keys (messaging/bus/authority.py makes one)."""
+"""Who a process is to the others: its certificate, from a folder of keys (messaging/bus/certificate_authority.py
+makes one)."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
-from messaging.bus.errors import BadKeys
-from messaging.topics import ROLES
+from brakeline.messaging.bus.bus_errors import BadKeys
+from brakeline.messaging.topics import ROLES
 
 SERVERS = ("safety", "launcher", "router")  # roles that may be a router; others' certificates are a client's only
 

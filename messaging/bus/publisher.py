@@ -8,9 +8,9 @@ import time
 import zenoh
 from google.protobuf.message import Message
 
-from messaging import brakeline_pb2 as pb
-from messaging.bus.errors import typed
-from messaging.topics import Topic
+from brakeline.messaging import brakeline_pb2 as pb
+from brakeline.messaging.bus.bus_errors import typed
+from brakeline.messaging.topics import Topic
 
 
 class Publisher:

@@ -17,16 +17,16 @@ from typing import Any, Self
 import zenoh
 from zenoh.handlers import FifoChannel, RingChannel
 
-from messaging.bus.access import ALIVE
-from messaging.bus.asking import Asker
-from messaging.bus.keys import exact_key, key_of, own_key
-from messaging.bus.publisher import Publisher
-from messaging.bus.service import Service
-from messaging.bus.settings import BusSettings, open_session
-from messaging.bus.subscription import Listener, Receiving, Sample, Subscription
-from messaging.plausible import NAME
-from messaging.tolerant import Tolerance
-from messaging.topics import Delivery, Topic
+from brakeline.messaging.bus.access_control import ALIVE
+from brakeline.messaging.bus.bus_settings import BusSettings, open_session
+from brakeline.messaging.bus.publisher import Publisher
+from brakeline.messaging.bus.query_client import Asker
+from brakeline.messaging.bus.query_server import Service
+from brakeline.messaging.bus.subscription import Listener, Receiving, Sample, Subscription
+from brakeline.messaging.bus.topic_keys import exact_key, key_of, own_key
+from brakeline.messaging.message_checks import NAME
+from brakeline.messaging.rejected_messages import Tolerance
+from brakeline.messaging.topics import Delivery, Topic
 
 log = logging.getLogger("brakeline.bus")
 

@@ -12,11 +12,11 @@ from typing import Any
 import zenoh
 from google.protobuf.message import DecodeError
 
-from messaging.bus.errors import Malformed, typed
-from messaging.bus.keys import names_of
-from messaging.plausible import NAME, Implausible, check
-from messaging.tolerant import Tolerance
-from messaging.topics import Topic
+from brakeline.messaging.bus.bus_errors import Malformed, typed
+from brakeline.messaging.bus.topic_keys import names_of
+from brakeline.messaging.message_checks import NAME, Implausible, check
+from brakeline.messaging.rejected_messages import Tolerance
+from brakeline.messaging.topics import Topic
 
 MOST_KEYS = 2048  # that one subscription listens to; samples of further ones are passed over
 

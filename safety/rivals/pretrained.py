@@ -15,12 +15,12 @@ from typing import Any
 
 import numpy as np
 
-from messaging.files import write_whole
-from messaging.perceptrons import BadPerceptrons, Perceptrons
-from messaging.rays import Rays
-from messaging.robots import Robot, UnknownRobot, robot_named
-from safety.model_set import BadModel, robot_in
-from safety.tensors import pack, unpack
+from brakeline.messaging.atomic_files import write_whole
+from brakeline.messaging.perceptrons import BadPerceptrons, Perceptrons
+from brakeline.messaging.ray_directions import Rays
+from brakeline.messaging.robot import Robot, UnknownRobot, robot_named
+from brakeline.safety.model.model_set import BadModel, robot_in
+from brakeline.safety.model.tensor_file import pack, unpack
 
 ENTRY = "pretrained"
 RAYS = "rays"  # the name of the tensor with the directions

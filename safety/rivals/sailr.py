@@ -5,9 +5,11 @@ and V(s) are the costs to be expected from a followed by the backup policy μ, a
 
     intervene  ⟺  Q(s, a) − V(s) > η                 (their eq. 6: the advantage of a over μ); then execute μ(s)
 
-Q and V are learned beforehand, two networks each: the larger Q and the smaller V count. μ brakes (`safety/backup.py`).
+Q and V are learned beforehand, two networks each: the larger Q and the smaller V count. μ brakes
+(`safety/filter/braking.py`).
 In training an intervention ends the episode: for the learner with a terminal step and the lowest reward, for the robot
-as one that was called off (`actors/driver.py`, `learner/windows.py`). In use the rule applies at every step anew.
+as one that was called off (`actors/episode_runner.py`, `learner/n_step.py`). In use the rule applies at every step
+anew.
 """
 
 from __future__ import annotations
@@ -17,13 +19,13 @@ from time import perf_counter_ns
 import numpy as np
 from numpy.typing import NDArray
 
-from messaging.robots import Robot
-from safety.backup import braked, braking_plan, within
-from safety.commitment import NO_PREDICTION
-from safety.model_set import BadModel
-from safety.recipe import SAILR as SAILR
-from safety.request import ALLOWED, NOT_FINITE, Decision, Request, check_for_rival
-from safety.rivals.pretrained import Pretrained
+from brakeline.messaging.robot import Robot
+from brakeline.safety.filter.backup_plan import NO_PREDICTION
+from brakeline.safety.filter.braking import braked, braking_plan, within
+from brakeline.safety.filter.request import ALLOWED, NOT_FINITE, Decision, Request, check_for_rival
+from brakeline.safety.model.model_config import SAILR as SAILR
+from brakeline.safety.model.model_set import BadModel
+from brakeline.safety.rivals.pretrained import Pretrained
 
 Array = NDArray[np.float64]
 

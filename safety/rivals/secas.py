@@ -18,16 +18,16 @@ from time import perf_counter_ns
 import numpy as np
 from numpy.typing import NDArray
 
-from messaging.rays import Rays
-from messaging.robots import Robot, shipped
-from messaging.tasks import robot_with_task
-from safety.backup import braked, braking_plan, within
-from safety.commitment import NO_PREDICTION
-from safety.model_set import BadModel
-from safety.recipe import SECAS as SECAS
-from safety.request import ADJUSTED, ALLOWED, NOT_FINITE, Decision, Request, check_for_rival
-from safety.rivals.pretrained import Pretrained
-from safety.solver import Program, solve
+from brakeline.messaging.ray_directions import Rays
+from brakeline.messaging.robot import Robot, shipped
+from brakeline.messaging.task import robot_with_task
+from brakeline.safety.filter.backup_plan import NO_PREDICTION
+from brakeline.safety.filter.braking import braked, braking_plan, within
+from brakeline.safety.filter.qp_solver import Program, solve
+from brakeline.safety.filter.request import ADJUSTED, ALLOWED, NOT_FINITE, Decision, Request, check_for_rival
+from brakeline.safety.model.model_config import SECAS as SECAS
+from brakeline.safety.model.model_set import BadModel
+from brakeline.safety.rivals.pretrained import Pretrained
 
 Array = NDArray[np.float64]
 

@@ -7,14 +7,14 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from sim.autopilot import frames
-from sim.autopilot.dialect import mavlink
-from sim.autopilot.parameters import BadParameter
-from sim.autopilot.pilot import Mode, Pilot, Refused, Unknown
-from sim.autopilot.rules import RULES
-from sim.autopilot.telemetry import BUILDERS, Reports, Schedule
-from sim.lidar import Lidar
-from sim.quadrotor import Quadrotor
+from brakeline.sim.autopilot import ned_frames
+from brakeline.sim.autopilot.autopilot_rules import RULES
+from brakeline.sim.autopilot.common_dialect import mavlink
+from brakeline.sim.autopilot.flight_modes import Mode, Pilot, Refused, Unknown
+from brakeline.sim.autopilot.parameters import BadParameter
+from brakeline.sim.autopilot.telemetry_sender import BUILDERS, Reports, Schedule
+from brakeline.sim.lidar import Lidar
+from brakeline.sim.quadrotor import Quadrotor
 
 TICK = 0.02  # s between two looks at modes, timeouts and streams; the vehicle's own control runs faster
 HEARTBEAT = mavlink.MAVLINK_MSG_ID_HEARTBEAT
@@ -147,7 +147,7 @@ class Autopilot:
 
     def _heading(self) -> float:
         """rad from north."""
-        return frames.yaw(frames.heading(self.reports.estimate.attitude))
+        return ned_frames.yaw(ned_frames.heading(self.reports.estimate.attitude))
 
     def _on_setpoint(self, message: mavlink.MAVLink_set_position_target_local_ned_message) -> None:
         try:

@@ -6,7 +6,7 @@ import math
 import struct
 from dataclasses import dataclass
 
-from sim.autopilot.dialect import mavlink
+from brakeline.sim.autopilot.common_dialect import mavlink
 
 INTEGER, REAL = mavlink.MAV_PARAM_TYPE_INT32, mavlink.MAV_PARAM_TYPE_REAL32
 

@@ -4,8 +4,8 @@ from collections.abc import Iterator
 
 import pytest
 
-from messaging.bus import Bus, BusSettings
-from messaging.ports import free_endpoint
+from brakeline.messaging.bus import Bus, BusSettings
+from brakeline.messaging.free_ports import free_endpoint
 
 
 @pytest.fixture

@@ -1,9 +1,9 @@
 """A learner that the tests play."""
 
-from messaging import brakeline_pb2 as pb
-from messaging.bus import Bus
-from messaging.topics import FLOW, JOIN, WEIGHTS
-from messaging.weights import MLP
+from brakeline.messaging import brakeline_pb2 as pb
+from brakeline.messaging.bus import Bus
+from brakeline.messaging.policy_weights import MLP
+from brakeline.messaging.topics import FLOW, JOIN, WEIGHTS
 from tests.robots import GROUND
 
 

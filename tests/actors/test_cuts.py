@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
-from actors.driver import Driver, Identity
-from actors.guard import consult
-from deploy.study.evaluate import in_process
-from deploy.vehicles import environment
-from logs.tally import Tally
-from messaging import brakeline_pb2 as pb
-from messaging.bus import NoReply
+from brakeline.actors.decision_guard import consult
+from brakeline.actors.episode_runner import Driver, Identity
+from brakeline.deploy.experiments.evaluate import in_process
+from brakeline.deploy.vehicle_factory import environment
+from brakeline.logs.episode_stats import Tally
+from brakeline.messaging import brakeline_pb2 as pb
+from brakeline.messaging.bus import NoReply
 from tests.robots import GROUND
 from tests.safety.rivals.test_sailr import known
 

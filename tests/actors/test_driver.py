@@ -3,16 +3,16 @@
 import numpy as np
 import pytest
 
-from actors.driver import Driver, Identity
-from actors.guard import consult
-from deploy.study.evaluate import in_process
-from deploy.vehicles import environment
-from learner.intake import Intake
-from messaging import brakeline_pb2 as pb
-from messaging.bus import NoReply
-from safety.model_set import Recipe
-from safety.request import NOT_FINITE
-from safety.wire import KINDS
+from brakeline.actors.decision_guard import consult
+from brakeline.actors.episode_runner import Driver, Identity
+from brakeline.deploy.experiments.evaluate import in_process
+from brakeline.deploy.vehicle_factory import environment
+from brakeline.learner.transition_reader import Intake
+from brakeline.messaging import brakeline_pb2 as pb
+from brakeline.messaging.bus import NoReply
+from brakeline.safety.filter.request import NOT_FINITE
+from brakeline.safety.model.model_set import Recipe
+from brakeline.safety.service.wire import KINDS
 from tests.robots import GROUND
 
 FAST = np.array([0.25, 0.1])
@@ -24,7 +24,7 @@ def driver(number: int = 0, seed: int = 0, **more) -> Driver:
 
 @pytest.fixture(scope="module")
 def ask(data_folder):
-    from deploy.data.store import model_for
+    from brakeline.deploy.data.model_store import model_for
 
     return in_process(model_for(GROUND, Recipe()))
 
@@ -120,7 +120,7 @@ def test_a_step_has_the_number_of_its_question_though_periods_pass_unseen_meanwh
     robot.begin(0)
     drive = robot.env.step
 
-    def slow(action):  # as `actors.flight` counts them
+    def slow(action):  # as `brakeline.actors.flight_process` counts them
         robot.commitment.fallback()
         robot.step += 1
         return drive(action)

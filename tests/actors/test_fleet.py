@@ -6,18 +6,18 @@ from itertools import combinations
 import numpy as np
 import pytest
 
-from actors.driver import Driver, Identity
-from actors.fleet import Fleet
-from actors.guard import Outcome, consult
-from deploy.data.store import model_for
-from deploy.study.evaluate import in_process
-from messaging import brakeline_pb2 as pb
-from messaging.bus import NoReply
-from safety.filter import Filter
-from safety.model_set import Recipe
-from safety.promise import Promises
-from sim.fleet import FleetEnv
-from sim.policies import scripted
+from brakeline.actors.decision_guard import Outcome, consult
+from brakeline.actors.episode_runner import Driver, Identity
+from brakeline.actors.joint_episode import Fleet
+from brakeline.deploy.data.model_store import model_for
+from brakeline.deploy.experiments.evaluate import in_process
+from brakeline.messaging import brakeline_pb2 as pb
+from brakeline.messaging.bus import NoReply
+from brakeline.safety.filter.filter import Filter
+from brakeline.safety.filter.reservation import Promises
+from brakeline.safety.model.model_set import Recipe
+from brakeline.sim.scripted_policies import scripted
+from brakeline.sim.shared_world import FleetEnv
 from tests.robots import GROUND
 
 SIZE = 4

@@ -3,17 +3,17 @@
 import numpy as np
 import pytest
 
-from actors.driver import Driver, Identity
-from actors.flight import NoRoom, answered
-from actors.guard import consult
-from deploy.data.store import model_for
-from deploy.study.evaluate import in_process
-from messaging.shapes import Obstacle
-from safety.recipe import Recipe
-from sim.envs import NavigationEnv
-from sim.late import late
-from sim.quadrotor import Quadrotor
-from sim.world import Arena, staged_arena
+from brakeline.actors.decision_guard import consult
+from brakeline.actors.episode_runner import Driver, Identity
+from brakeline.actors.flight_process import NoRoom, answered
+from brakeline.deploy.data.model_store import model_for
+from brakeline.deploy.experiments.evaluate import in_process
+from brakeline.messaging.obstacle import Obstacle
+from brakeline.safety.model.model_config import Recipe
+from brakeline.sim.arena import Arena, staged_arena
+from brakeline.sim.delayed_vehicle import late
+from brakeline.sim.navigation_env import NavigationEnv
+from brakeline.sim.quadrotor import Quadrotor
 from tests.accepting import BOUND
 from tests.robots import QUADROTOR
 

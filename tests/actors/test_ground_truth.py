@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from actors.ground_truth import MavlinkGroundTruth
-from actors.telemetry import Place
+from brakeline.actors.mavlink.ground_truth import MavlinkGroundTruth
+from brakeline.actors.mavlink.telemetry import Place
 
 METRES = 0.0111195  # of latitude, a ten millionth of a degree
 

@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from actors.guard import at_rest, consult, next_input
-from messaging import brakeline_pb2 as pb
-from messaging.bus import BusError, Late, NoReply, Refused
-from safety.client import request_message
-from safety.commitment import Commitment
+from brakeline.actors.decision_guard import at_rest, consult, next_input
+from brakeline.messaging import brakeline_pb2 as pb
+from brakeline.messaging.bus import BusError, Late, NoReply, Refused
+from brakeline.safety.filter.backup_plan import Commitment
+from brakeline.safety.service.client import request_message
 from tests.robots import GROUND
 
 PLAN = np.array([[0.2, 0.3], [0.1, 0.15], [0.0, 0.0]])

@@ -7,10 +7,10 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from actors.ground_truth import MOST_DATAGRAMS, UdpGroundTruth
-from actors.mavlink import Client
-from messaging.ports import free_udp_port
-from messaging.tolerant import Tolerance
+from brakeline.actors.mavlink.autopilot_commands import Client
+from brakeline.actors.mavlink.ground_truth import MOST_DATAGRAMS, UdpGroundTruth
+from brakeline.messaging.free_ports import free_udp_port
+from brakeline.messaging.rejected_messages import Tolerance
 
 STATE = [1.0, 2.0, 3.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]
 TOLD = {"system": 1, "time": 1.0, "state": STATE, "collisions": 2, "clearance": 0.5}

@@ -8,15 +8,15 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from actors.guard import Outcome
-from actors.loop import PRACTISED, ActorSettings, Practice, run
-from deploy.vehicles import environment, fleet_world
-from messaging import brakeline_pb2 as pb
-from messaging.bus import Bus, BusSettings
-from messaging.topics import DECIDE, EXCHANGE, STEP
-from safety.commitment import Commitment
-from safety.model_set import Recipe
-from safety.service import Counts, Models, answerer
+from brakeline.actors.actor_process import PRACTISED, ActorSettings, Practice, run
+from brakeline.actors.decision_guard import Outcome
+from brakeline.deploy.vehicle_factory import environment, fleet_world
+from brakeline.messaging import brakeline_pb2 as pb
+from brakeline.messaging.bus import Bus, BusSettings
+from brakeline.messaging.topics import DECIDE, EXCHANGE, STEP
+from brakeline.safety.filter.backup_plan import Commitment
+from brakeline.safety.model.model_set import Recipe
+from brakeline.safety.service.server import Counts, Models, answerer
 from tests.actors.teacher import Teacher
 from tests.robots import GROUND
 from tests.waiting import until
@@ -28,7 +28,7 @@ class Service:
     """Safety in the test's process: it can be away, and says what it was asked."""
 
     def __init__(self, bus: Bus, data_folder) -> None:
-        from deploy.data.store import model_for
+        from brakeline.deploy.data.model_store import model_for
 
         models = Models()
         models.install(model_for(GROUND, Recipe()))

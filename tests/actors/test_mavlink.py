@@ -7,19 +7,19 @@ import json
 import numpy as np
 import pytest
 
-from actors.dialect import mavlink
-from actors.flying import MavlinkVehicle
-from actors.frames import Frame
-from actors.mavlink import Client, CommandRefused, NoAutopilot
-from messaging.shapes import CYLINDER, Obstacle
-from sim.autopilot.endpoint import Autopilot
-from sim.autopilot.parameters import AT_ONCE
-from sim.autopilot.pilot import Mode
-from sim.autopilot.rules import SETPOINT_TIMEOUT as TIMEOUT
-from sim.flight_estimator import QuadrotorNoise
-from sim.quadrotor import SAMPLES, Quadrotor
-from sim.vehicle import BadInput
-from sim.world import Arena, staged_arena
+from brakeline.actors.mavlink.ardupilot_dialect import mavlink
+from brakeline.actors.mavlink.autopilot_commands import Client, CommandRefused, NoAutopilot
+from brakeline.actors.mavlink.frame_log import Frame
+from brakeline.actors.mavlink.lockstep_quadrotor import MavlinkVehicle
+from brakeline.messaging.obstacle import CYLINDER, Obstacle
+from brakeline.sim.arena import Arena, staged_arena
+from brakeline.sim.autopilot.autopilot_rules import SETPOINT_TIMEOUT as TIMEOUT
+from brakeline.sim.autopilot.endpoint import Autopilot
+from brakeline.sim.autopilot.flight_modes import Mode
+from brakeline.sim.autopilot.parameters import AT_ONCE
+from brakeline.sim.flight_estimator import QuadrotorNoise
+from brakeline.sim.quadrotor import SAMPLES, Quadrotor
+from brakeline.sim.vehicle import BadInput
 from tests.robots import QUADROTOR
 
 RULES = ("px4", "ardupilot")

@@ -10,19 +10,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from actors.frames import Frame
-from actors.ground_truth import UdpGroundTruth
-from actors.mavlink_vehicle import MavlinkVehicle
-from actors.telemetry import ATTITUDE
-from actors.timing import Offset
-from messaging.clock import WallClock
-from messaging.links import open_link
-from messaging.ports import free_udp_port
-from sim.autopilot import server
-from sim.autopilot.endpoint import Autopilot
-from sim.autopilot.pilot import Mode
-from sim.autopilot.rules import SETPOINT_TIMEOUT as TIMEOUT
-from sim.vehicle import BadInput
+from brakeline.actors.mavlink.flight_timing import Offset
+from brakeline.actors.mavlink.frame_log import Frame
+from brakeline.actors.mavlink.ground_truth import UdpGroundTruth
+from brakeline.actors.mavlink.mavlink_vehicle import MavlinkVehicle
+from brakeline.actors.mavlink.telemetry import ATTITUDE
+from brakeline.messaging.byte_links import open_link
+from brakeline.messaging.free_ports import free_udp_port
+from brakeline.messaging.process_clock import WallClock
+from brakeline.sim.autopilot import autopilot_server
+from brakeline.sim.autopilot.autopilot_rules import SETPOINT_TIMEOUT as TIMEOUT
+from brakeline.sim.autopilot.endpoint import Autopilot
+from brakeline.sim.autopilot.flight_modes import Mode
+from brakeline.sim.vehicle import BadInput
 from tests.actors.test_mavlink import RULES, quadrotor
 from tests.robots import QUADROTOR
 
@@ -37,8 +37,10 @@ def live(request: pytest.FixtureRequest) -> Iterator[Live]:
     link, stop, frames = open_link("udpin:127.0.0.1:0"), threading.Event(), list[Frame]()
     truth_port = free_udp_port()
     autopilot = Autopilot(quadrotor(floor=0.02), request.param, parameters={TIMEOUT[request.param]: 1.0})
-    channel = server.Truth("127.0.0.1", truth_port)
-    thread = threading.Thread(target=server.serve, args=([autopilot], link, WallClock(), stop.is_set, channel))
+    channel = autopilot_server.Truth("127.0.0.1", truth_port)
+    thread = threading.Thread(
+        target=autopilot_server.serve, args=([autopilot], link, WallClock(), stop.is_set, channel)
+    )
     thread.start()
     there = open_link(f"udpout:127.0.0.1:{link.port}")  # type: ignore[union-attr]
     try:

@@ -7,10 +7,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from actors.dialect import mavlink
-from actors.mavlink import Client, MavlinkError
-from actors.position_lookahead import LATENCY, PARAMETERS, AxisLookahead, PositionLookahead
-from actors.telemetry import MOTION
+from brakeline.actors.mavlink.ardupilot_dialect import mavlink
+from brakeline.actors.mavlink.autopilot_commands import Client, MavlinkError
+from brakeline.actors.mavlink.position_lookahead import LATENCY, PARAMETERS, AxisLookahead, PositionLookahead
+from brakeline.actors.mavlink.telemetry import MOTION
 
 VALUES = {
     "ardupilot": dict(zip(PARAMETERS["ardupilot"], (2.0, 1.0, 500.0, 300.0), strict=True)),

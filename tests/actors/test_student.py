@@ -6,9 +6,9 @@ from collections.abc import Callable
 
 import pytest
 
-from actors.student import RefusedByLearner, Student
-from messaging import brakeline_pb2 as pb
-from messaging.bus import Bus
+from brakeline.actors.learner_client import RefusedByLearner, Student
+from brakeline.messaging import brakeline_pb2 as pb
+from brakeline.messaging.bus import Bus
 from tests.actors.teacher import Teacher
 from tests.robots import GROUND
 from tests.waiting import until
@@ -93,7 +93,7 @@ def test_a_new_incarnation_is_joined_and_its_weights_taken_older_or_not(buses: t
 
 
 def test_without_permission_it_joins_again(buses: tuple[Bus, Bus], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("actors.student.REJOIN_AFTER", 0.2)
+    monkeypatch.setattr("brakeline.actors.learner_client.REJOIN_AFTER", 0.2)
     teacher, student = joined(buses)
     result = waiting(student, 5)
     until(lambda: len(teacher.joins) >= 4)

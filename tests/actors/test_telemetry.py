@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from actors.autopilot_limits import AUTOPILOT_LIMITS, demand, limits_below_demand
-from actors.dialect import mavlink
-from actors.mavlink import Client, NotTold, message_id
-from actors.telemetry import (
+from brakeline.actors.mavlink.ardupilot_dialect import mavlink
+from brakeline.actors.mavlink.autopilot_commands import Client, NotTold, message_id
+from brakeline.actors.mavlink.autopilot_limits import AUTOPILOT_LIMITS, demand, limits_below_demand
+from brakeline.actors.mavlink.telemetry import (
     ATTITUDE,
     ESTIMATED,
     FORCE,
@@ -25,7 +25,7 @@ from actors.telemetry import (
     mode_name,
     turned,
 )
-from sim.autopilot import frames
+from brakeline.sim.autopilot import ned_frames
 from tests.robots import QUADROTOR
 
 ROLL, PITCH, YAW = 0.2, -0.3, 1.1  # rad
@@ -108,8 +108,8 @@ def test_the_turn_agrees_with_the_autopilots_own_edge() -> None:
     """What is felt along its body, turned by what it says of its attitude, is what the simulator knows."""
     body = (0.3, -0.2, 9.0)  # forward-left-up
     own = quaternion()  # taken for ENU from forward-left-up
-    there = np.array(frames.rotate(own, body))
-    north, east, down = turned(frames.attitude(own), frames.body(body))
+    there = np.array(ned_frames.rotate(own, body))
+    north, east, down = turned(ned_frames.attitude(own), ned_frames.body(body))
     assert [east, north, -down] == pytest.approx(there)
 
 

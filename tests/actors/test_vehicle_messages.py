@@ -10,10 +10,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from actors.mavlink import CommandRefused, MavlinkError
-from actors.mavlink_vehicle import ControlPeriod
-from actors.settings import FlightSettings
-from actors.vehicle_messages import (
+from brakeline.actors.actor_settings import FlightSettings
+from brakeline.actors.mavlink.autopilot_commands import CommandRefused, MavlinkError
+from brakeline.actors.mavlink.mavlink_vehicle import ControlPeriod
+from brakeline.actors.mavlink.vehicle_messages import (
     FlightRequest,
     HandoverRefused,
     error_message,
@@ -25,13 +25,13 @@ from actors.vehicle_messages import (
     request_of,
     text_of,
 )
-from actors.vehicle_socket import LARGEST, BadMessage
-from messaging import brakeline_pb2 as pb
-from messaging.links import BadLink
-from messaging.motion import Motion
-from messaging.shapes import Obstacle
-from sim.quadrotor import SAMPLES
-from sim.vehicle import BadInput, Period
+from brakeline.actors.mavlink.vehicle_socket import LARGEST, BadMessage
+from brakeline.messaging import brakeline_pb2 as pb
+from brakeline.messaging.byte_links import BadLink
+from brakeline.messaging.obstacle import Obstacle
+from brakeline.messaging.obstacle_motion import Motion
+from brakeline.sim.quadrotor import SAMPLES
+from brakeline.sim.vehicle import BadInput, Period
 from tests.robots import GROUND, QUADROTOR
 
 LATE = QUADROTOR.in_real_time()

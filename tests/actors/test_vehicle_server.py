@@ -17,25 +17,33 @@ from typing import Any
 import numpy as np
 import pytest
 
-from actors import vehicle_client
-from actors.frames import decoded
-from actors.mavlink import MavlinkError
-from actors.mavlink_vehicle import ControlPeriod
-from actors.settings import FlightSettings
-from actors.vehicle_client import VehicleClient
-from actors.vehicle_messages import FlightRequest, period_message
-from actors.vehicle_server import FRAMES_PER_UPDATE, MOST_QUEUED, Outbox, next_actor
-from actors.vehicle_socket import LARGEST, BadMessage, MessageSocket, address, connect, listening, same_user
-from messaging import brakeline_pb2 as pb
-from messaging.clock import WallClock
-from messaging.links import open_link
-from messaging.tolerant import Tolerance
-from sim.autopilot import server
-from sim.autopilot.endpoint import Autopilot
-from sim.autopilot.pilot import Mode
-from sim.quadrotor import SAMPLES
-from sim.vehicle import BadInput, Period
-from sim.world import staged_arena
+from brakeline.actors.actor_settings import FlightSettings
+from brakeline.actors.mavlink import vehicle_client
+from brakeline.actors.mavlink.autopilot_commands import MavlinkError
+from brakeline.actors.mavlink.frame_log import decoded
+from brakeline.actors.mavlink.mavlink_vehicle import ControlPeriod
+from brakeline.actors.mavlink.vehicle_client import VehicleClient
+from brakeline.actors.mavlink.vehicle_messages import FlightRequest, period_message
+from brakeline.actors.mavlink.vehicle_server import FRAMES_PER_UPDATE, MOST_QUEUED, Outbox, next_actor
+from brakeline.actors.mavlink.vehicle_socket import (
+    LARGEST,
+    BadMessage,
+    MessageSocket,
+    address,
+    connect,
+    listening,
+    same_user,
+)
+from brakeline.messaging import brakeline_pb2 as pb
+from brakeline.messaging.byte_links import open_link
+from brakeline.messaging.process_clock import WallClock
+from brakeline.messaging.rejected_messages import Tolerance
+from brakeline.sim.arena import staged_arena
+from brakeline.sim.autopilot import autopilot_server as server
+from brakeline.sim.autopilot.endpoint import Autopilot
+from brakeline.sim.autopilot.flight_modes import Mode
+from brakeline.sim.quadrotor import SAMPLES
+from brakeline.sim.vehicle import BadInput, Period
 from tests.actors.test_mavlink import quadrotor
 from tests.robots import QUADROTOR
 from tests.waiting import until
@@ -216,7 +224,7 @@ def test_what_is_no_command_is_lost_and_the_flight_goes_on(
 
 def test_what_is_no_flight_request_is_answered_and_the_next_actor_is_served(flown: tuple[str, Autopilot]) -> None:
     url, _ = flown
-    server = subprocess.Popen([sys.executable, "-P", "-m", "actors.vehicle_server", url, "1"])
+    server = subprocess.Popen([sys.executable, "-P", "-m", "brakeline.actors.mavlink.vehicle_server", url, "1"])
     try:
         until(lambda: (probe := connect(url, 1)) is not None and (probe.close() or True), "the server listens")
         for command, why in (

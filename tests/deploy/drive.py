@@ -9,19 +9,19 @@ from pathlib import Path
 
 import numpy as np
 
-from actors.driver import Driver, Identity
-from actors.guard import consult
-from deploy.data.store import model_for
-from deploy.study.evaluate import in_process
-from deploy.vehicles import environment
-from logs.container import attachment
-from logs.recorder import entry
-from logs.segment import open_segment
-from messaging import brakeline_pb2 as pb
-from messaging.bus import Sample
-from messaging.topics import EPISODE, EXCHANGE, STEP, Topic
-from safety.model_set import Recipe
-from sim.policies import scripted
+from brakeline.actors.decision_guard import consult
+from brakeline.actors.episode_runner import Driver, Identity
+from brakeline.deploy.data.model_store import model_for
+from brakeline.deploy.experiments.evaluate import in_process
+from brakeline.deploy.vehicle_factory import environment
+from brakeline.logs.mcap_container import attachment
+from brakeline.logs.recorder import entry
+from brakeline.logs.segment import open_segment
+from brakeline.messaging import brakeline_pb2 as pb
+from brakeline.messaging.bus import Sample
+from brakeline.messaging.topics import EPISODE, EXCHANGE, STEP, Topic
+from brakeline.safety.model.model_set import Recipe
+from brakeline.sim.scripted_policies import scripted
 from tests.robots import GROUND
 
 Change = Callable[[pb.Exchange], None]

@@ -12,17 +12,18 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from deploy import progress
-from deploy.cli import COMMANDS, find, main
-from deploy.commands.data import table
-from deploy.commands.service import obstacle_of, sensed_in
-from logs.report import analyse
-from logs.segment import open_segment
-from messaging.range_images import RangeImage
-from messaging.scans import BadScan, Scan
-from messaging.shapes import Obstacle
-from safety import methods, recipe
-from safety.statement import Statement
+from brakeline.deploy import progress
+from brakeline.deploy.cli import COMMANDS, find, main
+from brakeline.deploy.commands.certify import table
+from brakeline.deploy.commands.query import obstacle_of, sensed_in
+from brakeline.logs.report import analyse
+from brakeline.logs.segment import open_segment
+from brakeline.messaging.obstacle import Obstacle
+from brakeline.messaging.range_image import RangeImage
+from brakeline.messaging.scan import BadScan, Scan
+from brakeline.safety import methods
+from brakeline.safety.model import model_config
+from brakeline.safety.model.validation import Statement
 
 SHARED = {
     *("episodes", "goals", "collisions", "timeouts", "steps", "interventions", "failsafes", "mean_speed", "max_speed"),
@@ -301,7 +302,7 @@ HEAVY = ("torch", "mujoco", "zenoh", "scipy", "numpy", "pymavlink", "proxsuite",
 def test_help_and_typing_mistakes_wait_for_nothing_heavy(words, status):
     script = f"""
 import sys
-from deploy.cli import main
+from brakeline.deploy.cli import main
 try:
     status = main({words!r})
 except SystemExit as end:
@@ -336,7 +337,7 @@ def test_the_version_is_told(command):
 
 
 def test_a_configuration_may_say_every_method_that_can_be_served():
-    assert recipe.METHODS == methods.METHODS
+    assert model_config.METHODS == methods.METHODS
 
 
 def test_a_scan_is_read_from_a_file(tmp_path):

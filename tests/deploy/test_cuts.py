@@ -1,4 +1,4 @@
-"""What `deploy.bench cuts` cuts with, and what `flights` makes of a flight that never was."""
+"""What `benchmarks cuts` cuts with, and what `flights` makes of a flight that never was."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from pathlib import Path
 
 import pytest
 
-from deploy.bench import flights
-from deploy.bench.cuts import Outcomes, Relay, Steps
-from deploy.bench.flights import Failed, Flights, flown
-from messaging.links import Tcp, Udp, open_link
-from messaging.ports import free_udp_port
+from benchmarks import flights
+from benchmarks.flights import Failed, Flights, flown
+from benchmarks.link_faults import Outcomes, Relay, Steps
+from brakeline.messaging.byte_links import Tcp, Udp, open_link
+from brakeline.messaging.free_ports import free_udp_port
 from tests.waiting import until
 
 

@@ -11,8 +11,8 @@ import pytest
 from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 
-from deploy import cli
-from messaging import brakeline_pb2 as pb
+from brakeline.deploy import cli
+from brakeline.messaging import brakeline_pb2 as pb
 from tests.robots import GROUND
 
 STEPS = 150

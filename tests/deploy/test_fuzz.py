@@ -1,4 +1,4 @@
-"""A short fuzz of every process that listens; the long one is `python -m deploy.bench fuzz`."""
+"""A short fuzz of every process that listens; the long one is `python -m benchmarks fuzz`."""
 
 from collections.abc import Iterator
 
@@ -6,9 +6,9 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from deploy.bench.fuzz import Party, fuzz, parties
-from deploy.bench.mill import Mill
-from messaging.topics import TOPICS
+from benchmarks.message_fuzz import Party, fuzz, parties
+from benchmarks.message_fuzzer import Mill
+from brakeline.messaging.topics import TOPICS
 
 
 def test_no_message_ends_a_process_and_a_report_of_them_can_be_read() -> None:

@@ -5,10 +5,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from actors.driver import Driver, Identity
-from actors.guard import consult
-from deploy.data.logged import trajectories_of
-from deploy.study.evaluate import Evaluation, episode, evaluate, prepared
+from brakeline.actors.decision_guard import consult
+from brakeline.actors.episode_runner import Driver, Identity
+from brakeline.deploy.data.run_dataset import trajectories_of
+from brakeline.deploy.experiments.evaluate import Evaluation, episode, evaluate, prepared
 from tests.accepting import BOUND
 from tests.robots import QUADROTOR
 

@@ -4,11 +4,11 @@ import json
 
 import pytest
 
-from deploy.cli import main
-from deploy.data import recording
-from messaging.descriptions import read
-from messaging.robots import FOLDER
-from safety.model_set import ModelSet
+from brakeline.deploy.cli import main
+from brakeline.deploy.data import simulated_recording
+from brakeline.messaging.robot import FOLDER
+from brakeline.messaging.robot_description import read
+from brakeline.safety.model.model_set import ModelSet
 from tests.robots import GROUND
 
 
@@ -18,7 +18,7 @@ def few(tmp_path_factory):
     folder = tmp_path_factory.mktemp("few")
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("BRAKELINE_DATA", str(folder))
-        recording.recorded(GROUND, trajectories=24)
+        simulated_recording.recorded(GROUND, trajectories=24)
         yield folder
 
 

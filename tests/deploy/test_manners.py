@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import pytest
 
-from deploy.bench import sitl
-from deploy.bench.manners import embedded, on_the_ground
-from deploy.bench.station import Station
-from deploy.run.autopilot import AutopilotSettings, open_field, vehicle
-from messaging.links import open_link
+from benchmarks import sitl
+from benchmarks.autopilot_conformance import embedded, on_the_ground
+from benchmarks.ground_station import Station
+from brakeline.deploy.run.autopilot_run import AutopilotSettings, open_field, vehicle
+from brakeline.messaging.byte_links import open_link
 
 
 def test_an_embedded_one_answers_on_the_ground() -> None:

@@ -5,20 +5,20 @@ from itertools import islice
 
 import pytest
 
-from deploy.bench import perception
-from deploy.study.evaluate import Evaluation, episode, prepared
-from logs.tally import KINDS
-from sim.conditions import Conditions, Faults, Perception
+from benchmarks import perception_cost
+from brakeline.deploy.experiments.evaluate import Evaluation, episode, prepared
+from brakeline.logs.episode_stats import KINDS
+from brakeline.sim.sim_conditions import Conditions, Faults, Perception
 from tests.accepting import BOUND
 from tests.robots import QUADROTOR
 
 
 def test_a_scan_weighs_kilobytes_and_a_map_hundreds_of_bytes(data_folder, monkeypatch):
-    monkeypatch.setattr(perception, "POLICIES", ("random",))
+    monkeypatch.setattr(perception_cost, "POLICIES", ("random",))
     names = ("map", "scan", "fleet of 2")
-    monkeypatch.setattr(perception, "SITUATIONS", {name: perception.SITUATIONS[name] for name in names})
-    monkeypatch.setattr(perception, "WARM_UP", 0)
-    figures = perception.run(6)
+    monkeypatch.setattr(perception_cost, "SITUATIONS", {name: perception_cost.SITUATIONS[name] for name in names})
+    monkeypatch.setattr(perception_cost, "WARM_UP", 0)
+    figures = perception_cost.run(6)
     alone, scan, fleet = (figures[name]["request p50 B"] for name in names)
     assert 300 < alone < fleet < 1000 < 3000 < scan < 5000
     assert all(row["answer p50 ms"] > 0.0 and row["reply p50 B"] > 200 for row in figures.values())
@@ -33,7 +33,7 @@ def test_who_flies_by_range_images_alone_hits_nothing(flight_folder, policy, fau
     conditions = Conditions(perception=Perception("scan", FAULTS[faults]))
     what = Evaluation(policy, conditions=conditions, accept_bound=BOUND)
     driver, choose, question = prepared(QUADROTOR, what)
-    weighed = perception.Weighed(question)
+    weighed = perception_cost.Weighed(question)
     steps = list(islice(episode(driver, choose, weighed, 0), 40))
     assert len(steps) > 10 and not any(step.collision for step in steps)
     kinds = Counter(KINDS[step.decision] for step in steps)

@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from deploy import cli
+from brakeline.deploy import cli
 
 
 def run(capsys, *words):

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from deploy.bench import sitl
+from benchmarks import sitl
 
 
 @pytest.fixture(autouse=True)

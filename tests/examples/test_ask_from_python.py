@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from messaging.ports import free_endpoint
+from brakeline.messaging.free_ports import free_endpoint
 from tests.system.runs import BRAKELINE
 from tests.waiting import until
 

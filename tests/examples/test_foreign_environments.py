@@ -11,19 +11,19 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from deploy.data.certified import certified
+from brakeline.deploy.data.certification import certified
+from brakeline.messaging.bus import Bus, BusSettings
+from brakeline.messaging.free_ports import free_endpoint
+from brakeline.messaging.obstacle import Obstacle
+from brakeline.messaging.robot import robot_named
+from brakeline.messaging.topics import DECIDE
+from brakeline.safety.model.dataset import Dataset
+from brakeline.safety.model.model_set import Recipe
+from brakeline.safety.service.server import Counts, Models, answerer
 from examples.foreign import table, train
 from examples.foreign.run import missing
 from examples.foreign.trained import Trained, scale
 from examples.foreign.ways import Ways
-from messaging.bus import Bus, BusSettings
-from messaging.ports import free_endpoint
-from messaging.robots import robot_named
-from messaging.shapes import Obstacle
-from messaging.topics import DECIDE
-from safety.dataset import Dataset
-from safety.model_set import Recipe
-from safety.service import Counts, Models, answerer
 from tests.accepting import BOUND
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
@@ -52,7 +52,7 @@ def told(python, script, *words):
 def test_who_asks_and_records_needs_no_solver_and_no_simulator():
     """Their virtual environments have neither."""
     missing = "import sys; sys.modules |= dict.fromkeys(('proxsuite', 'scipy', 'torch', 'mcap'))"
-    needed = "import safety.client, safety.gym, deploy.data.episodes"
+    needed = "import brakeline.safety.service.client, safety.gym, deploy.data.episodes"
     subprocess.run([sys.executable, "-c", f"{missing}; {needed}"], check=True, cwd=EXAMPLES.parent)
 
 

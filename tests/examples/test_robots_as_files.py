@@ -10,25 +10,25 @@ import mujoco
 import numpy as np
 import pytest
 
-from actors.driver import Driver, Identity
-from deploy.cli import main
-from deploy.data import collect, paths, recording, store
-from deploy.data.certified import certified
-from deploy.policies import policy_named
-from deploy.run.configurations import RunConfig
-from deploy.run.places import places
-from deploy.study.evaluate import FRESH, episode, in_process
-from deploy.vehicles import environment
-from messaging.shapes import BOX, Obstacle
-from messaging.tasks import RobotWithTask, address, robot_with_task
-from safety.backup import braking_plan
-from safety.dataset import BadData, Dataset
-from safety.model_set import ModelSet, Recipe
-from sim.conditions import Conditions
-from sim.estimator import NoiseLevels
-from sim.policies import scripted
-from sim.vehicle import Vehicle
-from sim.world import staged_arena
+from brakeline.actors.episode_runner import Driver, Identity
+from brakeline.deploy.cli import main
+from brakeline.deploy.data import collect, data_paths, model_store, simulated_recording
+from brakeline.deploy.data.certification import certified
+from brakeline.deploy.experiments.evaluate import FRESH, episode, in_process
+from brakeline.deploy.policy_loading import policy_named
+from brakeline.deploy.run.processes import places
+from brakeline.deploy.run.run_config import RunConfig
+from brakeline.deploy.vehicle_factory import environment
+from brakeline.messaging.obstacle import BOX, Obstacle
+from brakeline.messaging.task import RobotWithTask, address, robot_with_task
+from brakeline.safety.filter.braking import braking_plan
+from brakeline.safety.model.dataset import BadData, Dataset
+from brakeline.safety.model.model_set import ModelSet, Recipe
+from brakeline.sim.arena import staged_arena
+from brakeline.sim.ground_estimator import NoiseLevels
+from brakeline.sim.scripted_policies import scripted
+from brakeline.sim.sim_conditions import Conditions
+from brakeline.sim.vehicle import Vehicle
 from tests.accepting import BOUND
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
@@ -203,13 +203,13 @@ def test_a_description_that_changed_makes_the_model_set_again(
 ) -> None:
     """A model set of a narrower body is never used for a wider one; the recording is, and not for another clock."""
     monkeypatch.setenv("BRAKELINE_DATA", str(tmp_path))
-    recorded.save(paths.record_path(kind))
-    before = store.model_for(kind, Recipe(), BOUND)
-    assert store.model_for(kind, Recipe(), BOUND).version == before.version
+    recorded.save(data_paths.record_path(kind))
+    before = model_store.model_for(kind, Recipe(), BOUND)
+    assert model_store.model_for(kind, Recipe(), BOUND).version == before.version
     wider = replace(kind, body=tuple(replace(disc, radius=disc.radius + 0.05) for disc in kind.body))
-    assert store.model_for(wider, Recipe(), BOUND).robot.body == wider.body
+    assert model_store.model_for(wider, Recipe(), BOUND).robot.body == wider.body
     with pytest.raises(BadData, match="changed"):
-        recording.data_for(replace(kind, period=0.1))
+        simulated_recording.data_for(replace(kind, period=0.1))
 
 
 def test_what_was_not_recorded_here_is_never_recorded_over(
@@ -221,11 +221,11 @@ def test_what_was_not_recorded_here_is_never_recorded_over(
 ) -> None:
     """Whether the description changes, or somebody asks for a recording outright."""
     monkeypatch.setenv("BRAKELINE_DATA", str(tmp_path))
-    path = paths.record_path(kind)
+    path = data_paths.record_path(kind)
     replace(recorded, about={"origin": "import", "sources": "drive.csv"}).save(path)
     before = path.read_bytes()
     with pytest.raises(BadData, match=r"kept: .* \(import: drive.csv\).*import the log again"):
-        store.model_for(replace(kind, period=0.1), Recipe())
+        model_store.model_for(replace(kind, period=0.1), Recipe())
     assert main(["collect", str(EXAMPLES / kind.name / f"{kind.name}.toml"), "--trajectories", "1"]) == 1
     assert "drive.csv" in capsys.readouterr().err
     assert path.read_bytes() == before

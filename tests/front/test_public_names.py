@@ -1,5 +1,6 @@
-"""The front door: the names that `brakeline` offers, and what an installed wheel holds."""
+"""The front door: the names that `brakeline` offers, and what an installed package holds and hides."""
 
+import os
 import subprocess
 import sys
 import zipfile
@@ -10,21 +11,22 @@ import pytest
 import brakeline
 
 ROOT = Path(__file__).parents[2]
+PARTS = ("messaging", "sim", "safety", "actors", "learner", "logs", "deploy", "robots", "policies")
 
 
 @pytest.mark.parametrize("name", brakeline.__all__)
-def test_every_name_is_there(name):
+def test_every_public_name_can_be_imported(name):
     assert getattr(brakeline, name) is not None
 
 
-def test_no_name_is_forgotten():
+def test_the_table_of_names_is_complete():
     offered = {name for names in brakeline.PLACES.values() for name in names}
     assert offered | {"__version__"} == set(brakeline.__all__)
     with pytest.raises(AttributeError, match="SafetyClient"):
         _ = brakeline.SaftyClient
 
 
-def test_an_asker_needs_no_simulator_and_no_solver():
+def test_a_client_imports_no_simulator_and_no_solver():
     heavy = ("mujoco", "torch", "proxsuite", "scipy", "gymnasium", "matplotlib")
     code = (
         "import sys; from brakeline import Obstacle, SafetyClient, robot_named; robot_named('ground'); "
@@ -36,42 +38,107 @@ def test_an_asker_needs_no_simulator_and_no_solver():
 
 @pytest.fixture(scope="module")
 def wheel(tmp_path_factory):
-    """The unpacked wheel, and where to work: nowhere near the checkout."""
+    """Unpack a wheel in a folder outside the checkout."""
     folder = tmp_path_factory.mktemp("wheel")
     words = [sys.executable, "-m", "pip", "wheel", "--quiet", "--no-deps", "--wheel-dir", str(folder), str(ROOT)]
-    made = subprocess.run(words, check=False, capture_output=True, text=True)
-    if made.returncode:
-        pytest.skip(f"no wheel can be built here: {made.stderr.strip().splitlines()[-1]}")
+    built = subprocess.run(words, check=False, capture_output=True, text=True)
+    if built.returncode:
+        pytest.skip(f"no wheel can be built here: {built.stderr.strip().splitlines()[-1]}")
     site = folder / "site"
     zipfile.ZipFile(next(folder.glob("brakeline-*.whl"))).extractall(site)
     return site
 
 
+@pytest.fixture(scope="module")
+def editable(tmp_path_factory):
+    """Install the checkout in editable mode in a folder of its own."""
+    site = tmp_path_factory.mktemp("editable")
+    words = [
+        sys.executable,
+        "-m",
+        "pip",
+        "install",
+        "--quiet",
+        "--no-deps",
+        "--target",
+        str(site),
+        "--editable",
+        str(ROOT),
+    ]
+    made = subprocess.run(words, check=False, capture_output=True, text=True)
+    if made.returncode:
+        pytest.skip(f"nothing can be installed here: {made.stderr.strip().splitlines()[-1]}")
+    return site
+
+
+@pytest.fixture(scope="module")
+def crowded(tmp_path_factory):
+    """A user's folder whose own modules have the names of our parts."""
+    folder = tmp_path_factory.mktemp("crowded")
+    for name in PARTS:
+        (folder / f"{name}.py").write_text("MINE = True\n")
+    (folder / "safety.py").unlink()
+    (folder / "safety").mkdir()
+    (folder / "safety" / "__init__.py").write_text("MINE = True\n")
+    return folder
+
+
+@pytest.mark.parametrize("install", ["wheel", "editable"])
+def test_a_users_own_modules_do_not_shadow_ours(install, crowded, request):
+    """From such a folder our package imports its own parts, and the user's imports find the user's modules."""
+    site = request.getfixturevalue(install)
+    code = (
+        f"import site; site.addsitedir({str(site)!r}); from brakeline import Filter, SafetyClient, robot_named; "
+        "robot_named('ground'); import messaging, safety, sim; assert messaging.MINE and safety.MINE and sim.MINE; "
+        "import brakeline.messaging.robot as ours; print(ours.__file__)"
+    )
+    clean = {name: value for name, value in os.environ.items() if name not in ("PYTHONPATH", "PYTHONSAFEPATH")}
+    # -I would also ignore the working directory, which is what this test is about.
+    found = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=False, cwd=crowded, env=clean
+    )
+    assert found.returncode == 0, found.stderr
+    assert Path(found.stdout.strip()).is_relative_to(site if install == "wheel" else ROOT)
+
+
+@pytest.mark.parametrize("install", ["wheel", "editable"])
+def test_nothing_but_brakeline_is_installed(install, request):
+    site = request.getfixturevalue(install)
+    names = {path.name.partition("-")[0] for path in site.iterdir() if not path.name.startswith(("__", "bin"))}
+    assert names == {"brakeline"}
+
+
 def outside(wheel: Path, code: str) -> str:
-    """What code prints that runs with the wheel alone, outside the checkout."""
+    """Return what code prints that runs with the wheel alone, outside the checkout."""
     run = f"import sys; sys.path.insert(0, {str(wheel)!r}); {code}"
     words = [sys.executable, "-P", "-c", run]
     return subprocess.run(words, capture_output=True, text=True, check=True, cwd=wheel.parent).stdout.strip()
 
 
 def test_a_wheel_has_everything(wheel):
-    files = {path.relative_to(wheel).as_posix() for path in wheel.rglob("*") if path.is_file()}
+    files = {
+        path.relative_to(wheel / "brakeline").as_posix() for path in (wheel / "brakeline").rglob("*") if path.is_file()
+    }
     for needed in (
-        *("brakeline/py.typed", "robots/ground.toml", "robots/quadrotor.task.toml", "robots/template.txt"),
-        *("policies/ground/trained.safetensors", "sim/ground.xml", "sim/quadrotor.xml", "deploy/study/paper.json"),
-        *("logs/page/report.html.j2", "logs/brakeline.foxglove-layout.json", "messaging/brakeline.proto"),
+        *("py.typed", "robots/ground.toml", "robots/quadrotor.task.toml", "robots/template.txt"),
+        *(
+            "policies/ground/trained.safetensors",
+            "sim/ground.xml",
+            "sim/quadrotor.xml",
+            "deploy/experiments/paper.json",
+        ),
+        *("logs/report_page/report.html.j2", "logs/brakeline.foxglove-layout.json", "messaging/brakeline.proto"),
     ):
         assert needed in files, needed
-    python = {p for p in files if p.endswith(".py")}
-    packages = ("brakeline", "messaging", "sim", "safety", "actors", "learner", "logs", "deploy", "robots")
-    tracked = subprocess.run(["git", "ls-files", *packages], capture_output=True, text=True, check=True, cwd=ROOT)
-    assert {p for p in tracked.stdout.split() if p.endswith(".py")} <= python, "a package is missing in pyproject.toml"
+    tracked = subprocess.run(["git", "ls-files", *PARTS], capture_output=True, text=True, check=True, cwd=ROOT)
+    assert {p for p in tracked.stdout.split() if p.endswith(".py")} <= files, "a package is missing in pyproject.toml"
 
 
 def test_the_trained_policies_are_found_outside_the_checkout(wheel):
     code = (
-        "from deploy.policies import policy_named; from messaging.tasks import robot_with_task; import messaging; "
+        "from brakeline.deploy.policy_loading import policy_named; "
+        "from brakeline.messaging.task import robot_with_task; "
         "[policy_named('trained', robot_with_task(n), 0) for n in ('ground', 'quadrotor')]; "
-        "policy_named('trained-by-scan', robot_with_task('ground'), 0); print(messaging.__file__)"
+        "policy_named('trained-by-scan', robot_with_task('ground'), 0); import brakeline; print(brakeline.__file__)"
     )
     assert Path(outside(wheel, code)).is_relative_to(wheel)

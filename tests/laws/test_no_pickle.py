@@ -38,7 +38,7 @@ def pickling(source: str) -> Iterator[str]:
         if any(module == name or module.startswith(f"{name}.") for name in PICKLES):
             yield f"import of {module}"
     starts_processes = any(module.split(".")[0] == "multiprocessing" for module in modules)
-    starts_processes |= "deploy.interpreter.spawning" in modules
+    starts_processes |= "brakeline.deploy.interpreter.spawning" in modules
     for node in ast.walk(tree):
         if isinstance(node, ast.keyword) and node.arg == "allow_pickle":
             yield f"allow_pickle in line {node.value.lineno}"
@@ -68,7 +68,7 @@ def test_no_module_pickles():
         "from multiprocessing.managers import SyncManager",
         "import multiprocessing\nmultiprocessing.Manager()",
         "from multiprocessing.connection import Connection\ndef f(c: Connection): c.send(1)",
-        "from deploy.interpreter import spawning\nmine, theirs = spawning().Pipe()\nmine.recv()",
+        "from brakeline.deploy.interpreter import spawning\nmine, theirs = spawning().Pipe()\nmine.recv()",
         "import numpy as np\nnp.load('f', allow_pickle=True)",
         "import torch\ntorch.load('f')",
     ],

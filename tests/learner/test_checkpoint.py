@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from learner import checkpoint
-from learner.state import BadState, State
+from brakeline.learner import checkpoint
+from brakeline.learner.checkpoint_state import BadState, State
 
 NAMES = ("big", "small")
 

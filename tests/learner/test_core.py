@@ -3,11 +3,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from learner.checkpoint import DamagedPart, NoCheckpoint, OtherRun
-from learner.core import Learner
-from learner.intake import BadStep
-from messaging import brakeline_pb2 as pb
-from messaging import weights
+from brakeline.learner.checkpoint import DamagedPart, NoCheckpoint, OtherRun
+from brakeline.learner.learner import Learner
+from brakeline.learner.transition_reader import BadStep
+from brakeline.messaging import brakeline_pb2 as pb
+from brakeline.messaging import policy_weights
 from tests.learner.toy import CONFIG, TOY, ToyActor, run, settle
 
 
@@ -81,7 +81,7 @@ def test_it_learns():
     learner, actor = started(replace(CONFIG, steps=2500, capacity=2500))
     run(learner, actor)
     assert np.mean(actor.rewards[-20:]) > 0.5 * np.mean(actor.rewards[:5])
-    policy = weights.decode(learner.weights().file, TOY)
+    policy = policy_weights.decode(learner.weights().file, TOY)
     assert policy(np.array([-1.0, 1.0]))[0] > 1.5 and policy(np.array([1.0, -1.0]))[0] < 0.5
 
 
@@ -141,7 +141,7 @@ def test_a_late_joiner_gets_weights_and_its_place():
     learner, _ = started(replace(CONFIG, lockstep=False))
     reply = learner.join(pb.Join(robot="toy", actor="actor-1", layout=TOY.learning_layout(), index=100, episode=4))
     assert reply.episode == 4
-    assert weights.decode(reply.weights.file, TOY).version == reply.flow.weights_version == 1
+    assert policy_weights.decode(reply.weights.file, TOY).version == reply.flow.weights_version == 1
     assert 100 < reply.flow.limit["actor-1"] <= 100 + CONFIG.window
     assert reply.flow.warmup and not reply.flow.done
 

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from learner.intake import Intake
-from learner.windows import Move, Windows
-from messaging import brakeline_pb2 as pb
+from brakeline.learner.n_step import Move, Windows
+from brakeline.learner.transition_reader import Intake
+from brakeline.messaging import brakeline_pb2 as pb
 from tests.robots import GROUND
 
 GAMMA = 0.9

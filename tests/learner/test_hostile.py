@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from learner.core import AHEAD, MOST_ACTORS, Learner
-from learner.intake import MOST_OBSERVED, BadStep, Intake
-from messaging import brakeline_pb2 as pb
+from brakeline.learner.learner import AHEAD, MOST_ACTORS, Learner
+from brakeline.learner.transition_reader import MOST_OBSERVED, BadStep, Intake
+from brakeline.messaging import brakeline_pb2 as pb
 from tests.learner.test_core import step
 from tests.learner.toy import CONFIG, TOY
 
@@ -62,7 +62,7 @@ def test_an_actor_that_comes_from_nowhere_is_refused(learner: Learner, place: di
 
 
 def test_there_is_an_end_of_actors(learner: Learner, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("learner.core.MOST_ACTORS", 10)
+    monkeypatch.setattr("brakeline.learner.learner.MOST_ACTORS", 10)
     assert MOST_ACTORS > 1000
     errors = [
         learner.join(pb.Join(robot="toy", actor=f"a{n}", layout=TOY.learning_layout())).error.field for n in range(12)

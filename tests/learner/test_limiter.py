@@ -2,7 +2,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from learner.limiter import Limiter
+from brakeline.learner.rate_limiter import Limiter
 
 RATIOS = st.sampled_from([0.5, 1.0, 4.0, 8.0, 16.0, 64.0])
 

@@ -7,11 +7,11 @@ import pytest
 import torch
 from torch.nn.functional import linear, relu
 
-from learner.adam import Adam
-from learner.config import TD3Config
-from learner.networks import Network
-from learner.replay import Batch
-from learner.td3 import TD3
+from brakeline.learner.adam import Adam
+from brakeline.learner.learner_config import TD3Config
+from brakeline.learner.networks import Network
+from brakeline.learner.replay import Batch
+from brakeline.learner.td3 import TD3
 
 SMALL = TD3Config(hidden=(24, 16), batch=32)
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from learner.pretrain import Fit, TooFew, fit_cost, fit_linear
+from brakeline.learner.rival_networks import Fit, TooFew, fit_cost, fit_linear
 from tests.robots import GROUND
 
 HOW = Fit(hidden=(32, 32), rate=3e-3, batch=64, epochs=25)

@@ -7,10 +7,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from learner.ledger import Ledger, mark
-from learner.replay import Batch, Replay, Transition
-from learner.state import BadState, State
-from learner.windows import Move, Windows
+from brakeline.learner.checkpoint_state import BadState, State
+from brakeline.learner.n_step import Move, Windows
+from brakeline.learner.replay import Batch, Replay, Transition
+from brakeline.learner.step_ledger import Ledger, mark
 
 GAMMA = 0.9
 

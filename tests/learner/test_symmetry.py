@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from learner.replay import Batch
-from learner.symmetry import Images, image_of, turns_of
+from brakeline.learner.replay import Batch
+from brakeline.learner.symmetry import Images, image_of, turns_of
 from tests.robots import GROUND, QUADROTOR
 
 N = len(QUADROTOR.task.rays.directions)

@@ -7,11 +7,11 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from learner.config import LearnerConfig, TD3Config
-from learner.core import Learner
-from messaging import brakeline_pb2 as pb
-from messaging import weights
-from messaging.tasks import with_task
+from brakeline.learner.learner import Learner
+from brakeline.learner.learner_config import LearnerConfig, TD3Config
+from brakeline.messaging import brakeline_pb2 as pb
+from brakeline.messaging import policy_weights
+from brakeline.messaging.task import with_task
 from tests.robots import GROUND
 
 TOY = replace(
@@ -69,7 +69,7 @@ class ToyActor:
             assert flow.limit[self.name] > self.index
             message = self.learner.weights()
             assert message.version == flow.weights_version
-            policy = weights.decode(message.file, TOY)
+            policy = policy_weights.decode(message.file, TOY)
             before = [position, goal]
             action = generator.uniform(0, 2, 1) if flow.warmup else policy.explore(np.array(before), generator)
             position = float(np.clip(position + 0.2 * (action[0] - 1.0), -2, 2))

@@ -8,12 +8,12 @@ from typing import Any
 
 import pytest
 
-from logs.analysis import Look, analysed
-from logs.page import render
-from messaging import brakeline_pb2 as pb
-from messaging.bus import Sample
-from messaging.bus.keys import names_of
-from messaging.topics import TOPICS
+from brakeline.logs.log_analysis import Look, analysed
+from brakeline.logs.report_page import render
+from brakeline.messaging import brakeline_pb2 as pb
+from brakeline.messaging.bus import Sample
+from brakeline.messaging.bus.topic_keys import names_of
+from brakeline.messaging.topics import TOPICS
 from tests.browser import Page, drawn
 from tests.logs.mixed import mixed
 

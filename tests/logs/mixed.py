@@ -13,9 +13,9 @@ import numpy as np
 from mcap.reader import NonSeekingReader
 from mcap_protobuf.decoder import DecoderFactory
 
-from logs.segment import Entry, open_segment
-from messaging import brakeline_pb2 as pb
-from messaging.robots import robot_named
+from brakeline.logs.segment import Entry, open_segment
+from brakeline.messaging import brakeline_pb2 as pb
+from brakeline.messaging.robot import robot_named
 
 SECOND = 10**9
 BEGIN = 1_700_000_000 * SECOND

@@ -10,15 +10,15 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from logs.analysis import Look, analysed
-from logs.gallery import SPREAD
-from logs.places import MOST_CELLS, Places
-from logs.reader import by_run, find, open_log
-from logs.report import analyse, show, show_episode
-from logs.timeline import MOST_BINS as MOST_TIMES
-from logs.timeline import Timeline
-from logs.training import MOST_BINS, Training
-from messaging import brakeline_pb2 as pb
+from brakeline.logs.episode_sampler import SPREAD
+from brakeline.logs.intervention_map import MOST_CELLS, Places
+from brakeline.logs.learning_curve import MOST_BINS, Training
+from brakeline.logs.log_analysis import Look, analysed
+from brakeline.logs.process_timeline import MOST_BINS as MOST_TIMES
+from brakeline.logs.process_timeline import Timeline
+from brakeline.logs.reader import by_run, find, open_log
+from brakeline.logs.report import analyse, show, show_episode
+from brakeline.messaging import brakeline_pb2 as pb
 from tests.logs.mixed import ABOUT, BEGIN, SECOND, Writer, agree, counted, decoded, mixed, once
 
 
@@ -192,7 +192,7 @@ def test_it_is_shown_whole(log: Path) -> None:
 
 def test_memory_does_not_grow_with_the_log(tmp_path: Path) -> None:
     """Five times the messages need hardly more: bins of histograms that were empty before. (How much for gigabytes,
-    with all that is not Python's: `python -m deploy.bench logs-2gb`.)"""
+    with all that is not Python's: `python -m benchmarks logs-2gb`.)"""
     held = []
     for name, rounds in (("short", 50), ("long", 250)):
         writer = Writer(3, losses=0.0)

@@ -8,10 +8,10 @@ from mcap.records import Message
 from mcap.stream_reader import StreamReader
 from rosbags.highlevel import AnyReader
 
-from logs import bag as bags
-from logs.bag import Bag
-from messaging.ros2 import SENSOR, Qos
-from messaging.ros2.messages import Clock, Twist, encode, time_of, twist
+from brakeline.logs import bag_writer as bags
+from brakeline.logs.bag_writer import Bag
+from brakeline.messaging.ros2 import SENSOR, Qos
+from brakeline.messaging.ros2.cdr_messages import Clock, Twist, encode, time_of, twist
 
 
 def test_a_bag_holds_every_message_with_its_type_and_qos(tmp_path):

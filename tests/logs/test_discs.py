@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from deploy.run.render import Film, Frame, _Stage
-from logs import scene
-from logs.picture import discs
-from logs.watch.board import Card
-from messaging.robots import robot_named
-from sim.world import staged_arena
+from brakeline.deploy.run.episode_render import Film, Frame, _Stage
+from brakeline.logs import foxglove_scene
+from brakeline.logs.episode_view import discs
+from brakeline.logs.watch.live_board import Card
+from brakeline.messaging.robot import robot_named
+from brakeline.sim.arena import staged_arena
 from tests.browser import CHROMIUM, Page
 from tests.robots import GROUND
 
@@ -22,7 +22,7 @@ AT, HEADING = np.array([1.0, 2.0]), math.pi / 2
 
 
 def test_foxglove_has_a_drum_a_disc() -> None:
-    drums = scene._body(CAR, "actor-0", 0).cylinders
+    drums = foxglove_scene._body(CAR, "actor-0", 0).cylinders
     assert [(d.pose.position.x, d.pose.position.y, d.size.x) for d in drums] == [(0.11, 0, 0.31), (-0.11, 0, 0.31)]
 
 

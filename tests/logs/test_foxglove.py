@@ -17,14 +17,14 @@ from foxglove_schemas_protobuf.Log_pb2 import Log
 from foxglove_schemas_protobuf.PointCloud_pb2 import PointCloud
 from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 
-import logs
-from logs import scene
-from logs.foxglove import Pictures, Sites
-from logs.recorder import Inbox, Recording
-from logs.segment import Entry
-from messaging import brakeline_pb2 as pb
-from messaging.bus import Sample
-from messaging.topics import EXCHANGE, STEP
+import brakeline.logs
+from brakeline.logs import foxglove_scene
+from brakeline.logs.foxglove import Pictures, Sites
+from brakeline.logs.recorder import Inbox, Recording
+from brakeline.logs.segment import Entry
+from brakeline.messaging import brakeline_pb2 as pb
+from brakeline.messaging.bus import Sample
+from brakeline.messaging.topics import EXCHANGE, STEP
 from tests.robots import GROUND, QUADROTOR
 
 Say = Callable[..., Sample]
@@ -175,15 +175,15 @@ def test_the_quadrotors_rays_are_a_cloud_of_the_points_that_were_hit() -> None:
     rays = QUADROTOR.task.rays
     observation = np.ones(QUADROTOR.task.observation_dim)
     observation[7] = 0.25
-    cloud = scene.lidar(rays, "actor-0", observation.tolist(), 5)
+    cloud = foxglove_scene.lidar(rays, "actor-0", observation.tolist(), 5)
     assert isinstance(cloud, PointCloud) and cloud.point_stride == 12 and len(cloud.data) == 12
     assert struct.unpack("<3f", cloud.data) == pytest.approx(rays.directions[7] * 0.25 * rays.range, abs=1e-6)
     state = [1.0, 2.0, 3.0] + [0.0] * 6
     made = pb.Decision(tube_center=[1.0, 2.0, 3.0] * 12, tube_half_width=[0.1] * 36)
     asked = pb.Exchange(request=pb.Request(state=state), reply=pb.Reply(decision=made))
-    shown = scene.decision(QUADROTOR, pb.Step(actor="a", state=state), asked, 5).entities[0]
+    shown = foxglove_scene.decision(QUADROTOR, pb.Step(actor="a", state=state), asked, 5).entities[0]
     assert len(shown.cubes) == 12 and shown.cubes[3].pose.position.z == 3.0 and shown.spheres
-    body = scene.frames(QUADROTOR, "a", (0.0, 0.0), state, 5).transforms[1]
+    body = foxglove_scene.frames(QUADROTOR, "a", (0.0, 0.0), state, 5).transforms[1]
     assert (body.translation.z, body.rotation.w) == (3.0, 1.0)
 
 
@@ -198,7 +198,7 @@ def test_a_room_in_space_is_drawn_without_its_lid() -> None:
     lid = pb.Obstacle(kind="box", position=(0.0, 0.0, 5.0), size=(14.0, 14.0, 2.0))
     walls = [pb.Obstacle(kind="wall", position=(*wall.position, 2.0), yaw=wall.yaw) for wall in WALLS]
     ball = pb.Obstacle(kind="sphere", position=(1.0, 1.0, 1.0), size=(0.5,))
-    room = scene.arena(
+    room = foxglove_scene.arena(
         QUADROTOR, episode(robot="quadrotor", obstacles=[ball, *walls, lid], goal=(4, 4, 2), start=(0,) * 9), 5
     ).entities[0]
     assert len(room.cubes) == 2 and room.cubes[0].size.z == 4.0, "two walls up to the ceiling, and no ceiling"
@@ -238,7 +238,7 @@ def test_a_recording_has_the_pictures_beside_the_messages(say: Say, tmp_path: Pa
 
 
 def logs_of(folder: Path) -> list[Any]:
-    return list(importlib.import_module("logs.reader").read(folder))
+    return list(importlib.import_module("brakeline.logs.reader").read(folder))
 
 
 def test_all_schemas_are_foxgloves_well_known_ones(studio: Studio) -> None:
@@ -259,7 +259,7 @@ def test_the_layout_speaks_of_topics_and_fields_that_there_are(studio: Studio) -
     studio("exchange/ground/actor-0", exchange(0))
     studio("step/ground/actor-0", step(0))
     roots = {entry.key.rsplit("/", 2)[0] for entry in studio.entries}
-    layout = json.loads((Path(logs.__file__).parent / "brakeline.foxglove-layout.json").read_text())
+    layout = json.loads((Path(brakeline.logs.__file__).parent / "brakeline.foxglove-layout.json").read_text())
     panels = layout["configById"]
     topics = panels["3D!scene"]["topics"]
     assert {topic.rsplit("/", 2)[0] for topic in topics} == roots - {"foxglove/frames"}

@@ -13,19 +13,19 @@ import lz4.frame
 import pytest
 import zstandard
 
-from deploy.commands.watch import _show
-from logs.analysis import Look, analysed
-from logs.foxglove import Pictures
-from logs.reader import open_log
-from logs.recorder import Inbox, Recording
-from logs.recover import recover
-from logs.segment import MOST_CHANNELS, Entry
-from logs.watch.board import Board
-from logs.watch.server import encode
-from messaging import brakeline_pb2 as pb
-from messaging.bus import Sample
-from messaging.tolerant import Tolerance
-from messaging.topics import EPISODE, EXCHANGE, FRAMES, LOG, STEP, Topic
+from brakeline.deploy.commands.watch_command import _show
+from brakeline.logs.foxglove import Pictures
+from brakeline.logs.log_analysis import Look, analysed
+from brakeline.logs.log_recovery import recover
+from brakeline.logs.reader import open_log
+from brakeline.logs.recorder import Inbox, Recording
+from brakeline.logs.segment import MOST_CHANNELS, Entry
+from brakeline.logs.watch.live_board import Board
+from brakeline.logs.watch.live_page_server import encode
+from brakeline.messaging import brakeline_pb2 as pb
+from brakeline.messaging.bus import Sample
+from brakeline.messaging.rejected_messages import Tolerance
+from brakeline.messaging.topics import EPISODE, EXCHANGE, FRAMES, LOG, STEP, Topic
 
 Say = Callable[..., Sample]
 

@@ -10,16 +10,16 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from logs.decisions import Decisions, joined
-from logs.figures import draw
-from logs.metrics import Metrics, Tally, closed_loop, spread
-from logs.recorder import entry
-from logs.report import analyse, for_clearance, show
-from logs.segment import open_segment
-from logs.training import Training
-from messaging import brakeline_pb2 as pb
-from messaging.bus import Sample
-from messaging.topics import LOG
+from brakeline.logs.decision_stats import Decisions, joined
+from brakeline.logs.learning_curve import Training
+from brakeline.logs.metrics import Metrics, Tally, closed_loop, spread
+from brakeline.logs.recorder import entry
+from brakeline.logs.report import analyse, for_clearance, show
+from brakeline.logs.run_plots import draw
+from brakeline.logs.segment import open_segment
+from brakeline.messaging import brakeline_pb2 as pb
+from brakeline.messaging.bus import Sample
+from brakeline.messaging.topics import LOG
 
 Say = Callable[..., Sample]
 

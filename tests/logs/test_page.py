@@ -10,9 +10,9 @@ from typing import Any
 
 import pytest
 
-from deploy.cli import main
-from logs.analysis import Look, analysed
-from logs.page import embedded, names, number, percent, render
+from brakeline.deploy.cli import main
+from brakeline.logs.log_analysis import Look, analysed
+from brakeline.logs.report_page import embedded, names, number, percent, render
 from tests.browser import CHROMIUM, Page, drawn
 from tests.logs.mixed import ABOUT, mixed
 
@@ -290,7 +290,7 @@ def test_on_paper_pages_are_full(page: Page) -> None:
 
 
 def test_an_empty_log_has_a_page_too(tmp_path: Path, report: tuple[Path, dict[str, Any]]) -> None:
-    from logs.segment import open_segment
+    from brakeline.logs.segment import open_segment
 
     open_segment(tmp_path / "run.mcap", {"run": {"method": TRICKS}, "odd": {TRICKS: TRICKS}}).finish()
     assert main(["analyse", str(tmp_path / "run.mcap"), "--html", str(tmp_path / "a" / "page.html"), "--json"]) == 0
@@ -318,7 +318,7 @@ def test_numbers_are_for_people() -> None:
 
 
 def test_what_a_page_is_made_of_is_packaged() -> None:
-    folder = Path(__file__).parents[2] / "logs" / "page"
+    folder = Path(__file__).parents[2] / "logs" / "report_page"
     assert {item.name for item in folder.iterdir() if item.suffix in (".j2", ".css", ".js")} == set(names())
 
 

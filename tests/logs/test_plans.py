@@ -8,10 +8,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from rich.console import Console
 
-from logs.metrics import Metrics, closed_loop
-from logs.plans import Plans, figures, stated
-from logs.report import show
-from messaging import brakeline_pb2 as pb
+from brakeline.logs.metrics import Metrics, closed_loop
+from brakeline.logs.report import show
+from brakeline.logs.tube_stats import Plans, figures, stated
+from brakeline.messaging import brakeline_pb2 as pb
 
 N = 4  # periods of a plan
 PLAN = [0.3, 0.2, 0.1, 0.0]  # of one input

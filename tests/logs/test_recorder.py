@@ -14,15 +14,15 @@ from typing import IO, Any, cast
 import pytest
 from mcap.reader import make_reader
 
-from logs import recorder
-from logs.metrics import Metrics
-from logs.reader import open_log, read
-from logs.recorder import Inbox, Recording, as_it_came
-from logs.segment import Entry, Metadata, Segment, name_of, open_segment
-from messaging import brakeline_pb2 as pb
-from messaging.bus import Bus, BusSettings, Sample
-from messaging.ports import free_endpoint
-from messaging.topics import EPISODE, EXCHANGE, HEALTH, LEARNER, LOG, STEP
+from brakeline.logs import recorder
+from brakeline.logs.metrics import Metrics
+from brakeline.logs.reader import open_log, read
+from brakeline.logs.recorder import Inbox, Recording, as_it_came
+from brakeline.logs.segment import Entry, Metadata, Segment, name_of, open_segment
+from brakeline.messaging import brakeline_pb2 as pb
+from brakeline.messaging.bus import Bus, BusSettings, Sample
+from brakeline.messaging.free_ports import free_endpoint
+from brakeline.messaging.topics import EPISODE, EXCHANGE, HEALTH, LEARNER, LOG, STEP
 
 Say = Callable[..., Sample]
 Start = Callable[[Path], "subprocess.Popen[bytes]"]
@@ -30,8 +30,8 @@ Start = Callable[[Path], "subprocess.Popen[bytes]"]
 RECORDER = """
 import sys
 from pathlib import Path
-from logs.recorder import main
-from messaging.bus import BusSettings
+from brakeline.logs.recorder import main
+from brakeline.messaging.bus import BusSettings
 main(BusSettings(connect=(sys.argv[1],)), Path(sys.argv[2]), {"run": {"method": "none"}})
 """
 
@@ -183,7 +183,7 @@ def test_a_full_disk_keeps_what_is_recorded_and_goes_on_when_there_is_space(
     tmp_path: Path, say: Say, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     caplog.set_level("INFO")
-    monkeypatch.setattr("logs.recorder.RETRY", 0.0)
+    monkeypatch.setattr("brakeline.logs.recorder.RETRY", 0.0)
     disk = SmallDisk(30_000)
     inbox = Inbox(limit=100_000)
     recording = Recording(tmp_path / "run.mcap", {}, inbox, disk.open_segment)

@@ -16,15 +16,15 @@ from mcap.writer import CompressionType, IndexType
 from mcap.writer import Writer as McapWriter
 from mcap_protobuf.decoder import DecoderFactory
 
-from deploy.cli import main
-from logs.reader import Log, NotALog, open_log
-from logs.recorder import Inbox, Recording, Rotation, as_it_came
-from logs.recover import BeingRecorded, recover
-from logs.segment import being_written, open_segment
-from messaging import brakeline_pb2 as pb
-from messaging.bus import Bus, BusSettings, Sample
-from messaging.ports import free_endpoint
-from messaging.topics import HEALTH, STEP
+from brakeline.deploy.cli import main
+from brakeline.logs.log_recovery import BeingRecorded, recover
+from brakeline.logs.reader import Log, NotALog, open_log
+from brakeline.logs.recorder import Inbox, Recording, Rotation, as_it_came
+from brakeline.logs.segment import being_written, open_segment
+from brakeline.messaging import brakeline_pb2 as pb
+from brakeline.messaging.bus import Bus, BusSettings, Sample
+from brakeline.messaging.free_ports import free_endpoint
+from brakeline.messaging.topics import HEALTH, STEP
 from tests.logs.mixed import ABOUT, Writer
 from tests.waiting import until
 
@@ -34,8 +34,8 @@ KILLS = 10
 RECORDER = """
 import sys
 from pathlib import Path
-from logs.recorder import Rotation, main
-from messaging.bus import BusSettings
+from brakeline.logs.recorder import Rotation, main
+from brakeline.messaging.bus import BusSettings
 main(BusSettings(connect=(sys.argv[1],)), Path(sys.argv[2]), {"run": {"seed": "3"}}, rotation=Rotation(0.02, 1.5))
 """
 
@@ -140,7 +140,7 @@ def test_files_rotate_by_size_and_by_time_and_each_is_whole(
     tmp_path: Path, say: Say, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     now = [100.0]
-    monkeypatch.setattr("logs.recorder.time.monotonic", lambda: now[0])
+    monkeypatch.setattr("brakeline.logs.recorder.time.monotonic", lambda: now[0])
     inbox = Inbox()
     recording = Recording(tmp_path / "run.mcap", ABOUT, inbox, rotation=Rotation(mib=0.02, seconds=60.0))
     for _ in range(12):

@@ -5,9 +5,9 @@ from dataclasses import replace
 
 import pytest
 
-from logs.robots import Robots
-from messaging.robots import robot_named
-from messaging.tasks import RobotWithTask
+from brakeline.logs.recorded_robots import Robots
+from brakeline.messaging.robot import robot_named
+from brakeline.messaging.task import RobotWithTask
 
 
 def test_what_one_log_describes_no_other_log_knows():

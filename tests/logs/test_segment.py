@@ -10,12 +10,12 @@ from mcap.exceptions import DecoderNotFoundError
 from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 
-from logs.reader import NoLog, NotALog, find, open_log, read
-from logs.recorder import as_it_came, entry
-from logs.segment import Entry, Segment, number_of, open_segment, segments
-from messaging import brakeline_pb2 as pb
-from messaging.bus import Sample
-from messaging.topics import STEP
+from brakeline.logs.reader import NoLog, NotALog, find, open_log, read
+from brakeline.logs.recorder import as_it_came, entry
+from brakeline.logs.segment import Entry, Segment, number_of, open_segment, segments
+from brakeline.messaging import brakeline_pb2 as pb
+from brakeline.messaging.bus import Sample
+from brakeline.messaging.topics import STEP
 
 Say = Callable[..., Sample]
 

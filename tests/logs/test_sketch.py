@@ -10,8 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import binomtest, chi2
 
-from logs.intervals import Clustered, clopper_pearson, poisson
-from logs.sketch import BATCH, RESOLUTION, Histogram, merged, spread, summary
+from brakeline.logs.proportion_intervals import Clustered, clopper_pearson, poisson
+from brakeline.logs.quantiles import BATCH, RESOLUTION, Histogram, merged, spread, summary
 
 VALUES = st.lists(st.floats(-1e6, 1e6).filter(lambda x: x == 0.0 or abs(x) > 1e-6), min_size=1, max_size=300)
 

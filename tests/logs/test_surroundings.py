@@ -6,21 +6,21 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from logs import scene
-from logs.analysis import Look, analysed
-from logs.foxglove import Pictures
-from logs.gallery import Gallery
-from logs.page import render
-from logs.watch.board import Board
-from logs.watch.server import Server
-from messaging import brakeline_pb2 as pb
-from messaging.motion import Motion
-from messaging.range_images import RangeImage
-from messaging.scans import Scan
-from messaging.sensed import add_sensed, scan_message
-from messaging.shapes import CYLINDER, Obstacle
-from messaging.surroundings import surroundings
-from safety.client import obstacle_messages
+from brakeline.logs import foxglove_scene
+from brakeline.logs.episode_sampler import Gallery
+from brakeline.logs.foxglove import Pictures
+from brakeline.logs.log_analysis import Look, analysed
+from brakeline.logs.report_page import render
+from brakeline.logs.watch.live_board import Board
+from brakeline.logs.watch.live_page_server import Server
+from brakeline.messaging import brakeline_pb2 as pb
+from brakeline.messaging.obstacle import CYLINDER, Obstacle
+from brakeline.messaging.obstacle_motion import Motion
+from brakeline.messaging.range_image import RangeImage
+from brakeline.messaging.scan import Scan
+from brakeline.messaging.sensor_messages import add_sensed, scan_message
+from brakeline.safety.perception.displayed_map import surroundings
+from brakeline.safety.service.client import obstacle_messages
 from tests.browser import CHROMIUM, Page
 from tests.logs.mixed import Writer
 from tests.logs.test_foxglove import Say, Studio, episode, step
@@ -61,7 +61,9 @@ def test_foxgloves_scene_has_it(say: Say) -> None:
     swept = surroundings(GROUND, told("b").request).swept[0, :, 2].round(3).tolist()
     assert 0.2 in discs and set(swept) <= set(discs)
     boxes = [
-        (c.pose.position.x, round(c.size.x, 6), round(c.size.y, 6)) for c in shown.cubes if c.color == scene.PROMISE
+        (c.pose.position.x, round(c.size.x, 6), round(c.size.y, 6))
+        for c in shown.cubes
+        if c.color == foxglove_scene.PROMISE
     ]
     assert boxes == [(0.0, 0.5, 0.7)] * 3, "the other's alone"
     assert shown.texts[0].color.r == pytest.approx(142 / 255), "recovering is violet"
@@ -74,9 +76,9 @@ def test_of_a_range_image_so_few_hits_are_drawn_that_a_recorder_keeps_up(say: Sa
     exchange = pb.Exchange(request=pb.Request(robot="quadrotor", actor="q", state=[0.0] * 9, action=[0.0] * 3))
     add_sensed(exchange.request, RangeImage(ranges, (1.0, 0.0, 2.0), low=-edge, high=edge))
     exchange.reply.decision.kind = pb.ADJUSTED
-    drawn = scene.decision(QUADROTOR, pb.Step(actor="q", state=[0.0] * 9, decision=pb.ADJUSTED), exchange, 0)
+    drawn = foxglove_scene.decision(QUADROTOR, pb.Step(actor="q", state=[0.0] * 9, decision=pb.ADJUSTED), exchange, 0)
     (hits,) = (line for line in drawn.entities[0].lines if line.type == line.LINE_LIST)
-    assert scene.MARKED <= len(hits.points) <= 2 * scene.MARKED and drawn.ByteSize() < 2**16
+    assert foxglove_scene.MARKED <= len(hits.points) <= 2 * foxglove_scene.MARKED and drawn.ByteSize() < 2**16
     away = [np.linalg.norm([p.x - 1.0, p.y, p.z - 2.0]) for p in hits.points[::2]]
     assert np.allclose(away, 5.0)
 

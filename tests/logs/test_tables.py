@@ -5,7 +5,7 @@ import io
 import pytest
 from rich.console import Console
 
-from logs.tables import Stacking
+from brakeline.logs.console_tables import Stacking
 
 CELLS = [f"the cell of column {i}, which is not short" for i in range(6)]
 

@@ -10,9 +10,9 @@ import pytest
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
-from logs.watch.board import Board
-from logs.watch.live import Live
-from logs.watch.server import Server
+from brakeline.logs.watch.foxglove_server import Live
+from brakeline.logs.watch.live_board import Board
+from brakeline.logs.watch.live_page_server import Server
 
 
 @pytest.fixture

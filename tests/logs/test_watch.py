@@ -6,11 +6,11 @@ from typing import Any
 
 import pytest
 
-from logs.metrics import Metrics
-from logs.watch.board import Board
-from logs.watch.server import Server
-from logs.watch.totals import heard, told, totals
-from messaging import brakeline_pb2 as pb
+from brakeline.logs.metrics import Metrics
+from brakeline.logs.watch.live_board import Board
+from brakeline.logs.watch.live_page_server import Server
+from brakeline.logs.watch.run_totals import heard, told, totals
+from brakeline.messaging import brakeline_pb2 as pb
 from tests.browser import CHROMIUM, Page
 from tests.logs.conftest import Say
 

@@ -6,8 +6,8 @@ from collections.abc import Callable, Iterator
 
 import pytest
 
-from messaging.bus import Bus, BusSettings
-from messaging.ports import free_endpoint
+from brakeline.messaging.bus import Bus, BusSettings
+from brakeline.messaging.free_ports import free_endpoint
 
 Join = Callable[..., Bus]
 

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from messaging.bus.authority import Authority
+from brakeline.messaging.bus.certificate_authority import Authority
 
 NAMES = (
     *("launcher", "safety", "safety-1", "learner", "actor-0", "actor-1", "recorder", "certify", "viewer", "client"),

@@ -3,16 +3,16 @@
 import subprocess
 from collections.abc import Callable
 
-from messaging.bus import Bus, BusError
-from messaging.topics import DECIDE
+from brakeline.messaging.bus import Bus, BusError
+from brakeline.messaging.topics import DECIDE
 
 Join = Callable[..., Bus]
 Spawn = Callable[[str], "subprocess.Popen[str]"]
 
 SERVICE = """
 import os, sys, time
-from messaging.bus import Bus, BusSettings
-from messaging.topics import DECIDE
+from brakeline.messaging.bus import Bus, BusSettings
+from brakeline.messaging.topics import DECIDE
 bus = Bus(BusSettings({place}=("{endpoint}",)), "safety-{name}")
 bus.serve(DECIDE, lambda payload: b"{name}:" + payload)
 print("ready", flush=True)
@@ -21,7 +21,7 @@ time.sleep(60)
 
 ROUTER = """
 import sys, time
-from messaging.bus import Bus, BusSettings
+from brakeline.messaging.bus import Bus, BusSettings
 bus = Bus(BusSettings(listen=("{endpoint}",)), "router")
 print("ready", flush=True)
 time.sleep(60)

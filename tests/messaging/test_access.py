@@ -14,13 +14,23 @@ from pathlib import Path
 import pytest
 import zenoh
 
-from messaging import brakeline_pb2 as pb
-from messaging.bus import BadKeys, Bus, BusError, BusSettings, Insecure, NoReply, Sample, Unreachable, configuration
-from messaging.bus.access import grants
-from messaging.bus.settings import local
-from messaging.ports import HERE, free_endpoint
-from messaging.process import Process
-from messaging.topics import (
+from brakeline.messaging import brakeline_pb2 as pb
+from brakeline.messaging.bus import (
+    BadKeys,
+    Bus,
+    BusError,
+    BusSettings,
+    Insecure,
+    NoReply,
+    Sample,
+    Unreachable,
+    configuration,
+)
+from brakeline.messaging.bus.access_control import grants
+from brakeline.messaging.bus.bus_settings import local
+from brakeline.messaging.free_ports import HERE, free_endpoint
+from brakeline.messaging.process_runtime import Process
+from brakeline.messaging.topics import (
     DECIDE,
     FLOW,
     HEALTH,

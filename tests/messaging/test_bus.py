@@ -8,10 +8,10 @@ from collections.abc import Callable
 
 import pytest
 
-from messaging import brakeline_pb2 as pb
-from messaging.bus import Bus, BusError, BusSettings, Late, Malformed, NoReply, Sample, Unreachable
-from messaging.ports import free_endpoint
-from messaging.topics import DECIDE, HEALTH, LOG, STEP, WEIGHTS
+from brakeline.messaging import brakeline_pb2 as pb
+from brakeline.messaging.bus import Bus, BusError, BusSettings, Late, Malformed, NoReply, Sample, Unreachable
+from brakeline.messaging.free_ports import free_endpoint
+from brakeline.messaging.topics import DECIDE, HEALTH, LOG, STEP, WEIGHTS
 from tests.messaging.programs import ROUTER, SERVICE, Join, Spawn, answers
 from tests.waiting import until
 
@@ -218,7 +218,7 @@ def test_closing_ends_the_handlers_and_what_comes_after_is_an_error(join: Join) 
 def test_keys_of_nobody_and_too_many_or_too_large_ones_are_passed_over(
     join: Join, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("messaging.bus.subscription.MOST_KEYS", 3)
+    monkeypatch.setattr("brakeline.messaging.bus.subscription.MOST_KEYS", 3)
     router, stranger = join("launcher", listen=True), join("stranger")
     got: list[str] = []
     router.subscribe(LOG, lambda sample: got.append(sample.key))

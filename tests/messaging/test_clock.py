@@ -1,6 +1,6 @@
 import time
 
-from messaging.clock import Clock, SimulatedClock, WallClock
+from brakeline.messaging.process_clock import Clock, SimulatedClock, WallClock
 
 
 def test_simulated_time_passes_by_sleeping_and_at_once() -> None:

@@ -10,10 +10,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from messaging.descriptions import UNITS, BadDescription, describe, read, robot_of
-from messaging.robots import FOLDER, Robot, UnknownRobot, robot_named, unless_shipped
-from messaging.tasks import UnknownTask, needs_task, robot_maybe_with_task, robot_with_task
-from messaging.tasks import read as read_task
+from brakeline.messaging.robot import FOLDER, Robot, UnknownRobot, robot_named, unless_shipped
+from brakeline.messaging.robot_description import UNITS, BadDescription, describe, read, robot_of
+from brakeline.messaging.task import UnknownTask, needs_task, robot_maybe_with_task, robot_with_task
+from brakeline.messaging.task import read as read_task
 from tests.robots import GROUND, QUADROTOR, ROBOTS
 
 CAR = {

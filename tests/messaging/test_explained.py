@@ -5,9 +5,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from messaging import brakeline_pb2 as pb
-from messaging.descriptions import read
-from messaging.explained import arrow, explain, fits, sentence
+from brakeline.logs.decision_explanation import arrow, explain, fits, sentence
+from brakeline.messaging import brakeline_pb2 as pb
+from brakeline.messaging.robot_description import read
 from tests.robots import GROUND, QUADROTOR
 
 OMNI = read(Path(__file__).parents[2] / "examples" / "omni" / "omni.toml")

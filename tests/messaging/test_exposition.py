@@ -9,11 +9,11 @@ from pathlib import Path
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
-from messaging.bus import BusSettings
-from messaging.exposition import FIGURES, Exposition, State
-from messaging.ports import free_endpoint
-from messaging.process import Process
-from messaging.topics import LOG
+from brakeline.messaging.bus import BusSettings
+from brakeline.messaging.free_ports import free_endpoint
+from brakeline.messaging.metrics_endpoint import FIGURES, Exposition, State
+from brakeline.messaging.process_runtime import Process
+from brakeline.messaging.topics import LOG
 from tests.waiting import until
 
 DEPLOY = Path(__file__).parents[2] / "deploy"

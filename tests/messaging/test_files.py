@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from messaging.files import write_secret, write_whole
+from brakeline.messaging.atomic_files import write_secret, write_whole
 
 
 def test_of_many_who_write_at_once_the_whole_of_one_stays(tmp_path: Path) -> None:

@@ -4,7 +4,7 @@ import time
 
 import pytest
 
-from messaging.links import BadLink, Link, Tcp, TcpServer, Udp, open_link
+from brakeline.messaging.byte_links import BadLink, Link, Tcp, TcpServer, Udp, open_link
 
 
 def arrives(link: Link, expected: bytes) -> bool:

@@ -7,10 +7,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from messaging import compiled
-from messaging.nearby import farthest_of_meshes, forget_ghosts, least_of
-from messaging.patches import Window
-from messaging.range_images import directions
+from brakeline.messaging.range_image import directions
+from brakeline.safety import compilation
+from brakeline.safety.perception.image_coverage import Window
+from brakeline.safety.perception.kernels.proximity_kernels import farthest_of_meshes, forget_ghosts, least_of
 
 
 @settings(max_examples=40)
@@ -69,5 +69,5 @@ def test_where_nothing_can_be_kept_it_is_compiled_anew(monkeypatch):
             raise RuntimeError("cannot cache function: no locator available")
         return lambda function: function
 
-    monkeypatch.setattr(compiled, "njit", njit)
-    assert compiled.compiled("f8(f8)")(abs) is abs and len(tried) == 2
+    monkeypatch.setattr(compilation, "njit", njit)
+    assert compilation.compiled("f8(f8)")(abs) is abs and len(tried) == 2

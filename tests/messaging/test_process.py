@@ -9,16 +9,16 @@ from typing import Any
 
 import pytest
 
-from messaging.bus import Bus, BusSettings, Sample
-from messaging.process import Process
-from messaging.topics import HEALTH, LOG
+from brakeline.messaging.bus import Bus, BusSettings, Sample
+from brakeline.messaging.process_runtime import Process
+from brakeline.messaging.topics import HEALTH, LOG
 
 Join = Callable[..., Bus]
 Spawn = Callable[[str], "subprocess.Popen[str]"]
 
 PROCESS = """
-from messaging.bus import BusSettings
-from messaging.process import Process
+from brakeline.messaging.bus import BusSettings
+from brakeline.messaging.process_runtime import Process
 with Process(BusSettings(connect=("{endpoint}",)), "worker") as process:
     process.figures["rate"] = 2.5
     process.announce()

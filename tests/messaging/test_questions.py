@@ -8,11 +8,11 @@ from contextlib import ExitStack
 
 import pytest
 
-from messaging import brakeline_pb2 as pb
-from messaging.bus import Bus, BusSettings, Late, NoReply, Refused
-from messaging.bus.asking import HELD, Asker
-from messaging.ports import free_endpoint
-from messaging.topics import DECIDE, STEP
+from brakeline.messaging import brakeline_pb2 as pb
+from brakeline.messaging.bus import Bus, BusSettings, Late, NoReply, Refused
+from brakeline.messaging.bus.query_client import HELD, Asker
+from brakeline.messaging.free_ports import free_endpoint
+from brakeline.messaging.topics import DECIDE, STEP
 from tests.messaging.programs import ROUTER, SERVICE, Join, Spawn, answers
 from tests.waiting import until
 

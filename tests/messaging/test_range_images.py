@@ -8,13 +8,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from messaging import brakeline_pb2 as pb
-from messaging.patches import Cover, Grid, seen_free
-from messaging.range_images import RangeImage, directions
-from messaging.scans import BadScan, Scan
-from messaging.sensed import add_sensed, image_of, sensed_of
-from messaging.shapes import Obstacle, Shapes
-from messaging.surroundings import surroundings
+from brakeline.messaging import brakeline_pb2 as pb
+from brakeline.messaging.obstacle import Obstacle, Shapes
+from brakeline.messaging.range_image import RangeImage, directions
+from brakeline.messaging.scan import BadScan, Scan
+from brakeline.messaging.sensor_messages import add_sensed, image_of, sensed_of
+from brakeline.safety.perception.displayed_map import surroundings
+from brakeline.safety.perception.image_coverage import Cover, Grid, seen_free
 from tests.messaging.test_shapes import sample
 from tests.robots import QUADROTOR
 

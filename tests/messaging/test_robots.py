@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from messaging.robots import Disc, UnknownRobot, robot_named
+from brakeline.messaging.robot import Disc, UnknownRobot, robot_named
 from tests.robots import GROUND, ROBOTS
 
 

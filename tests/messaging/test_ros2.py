@@ -13,11 +13,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rosbags.typesys.stores import Stores, get_typestore
 
-from messaging.bus import Malformed, Unreachable
-from messaging.ports import free_endpoint
-from messaging.ros2 import LATCHED, SENSOR, BadName, Entity, Node, Qos, RosSettings
-from messaging.ros2.attachment import Attachment, gid_of
-from messaging.ros2.messages import (
+from brakeline.messaging.bus import Malformed, Unreachable
+from brakeline.messaging.free_ports import free_endpoint
+from brakeline.messaging.ros2 import LATCHED, SENSOR, BadName, Entity, Node, Qos, RosSettings
+from brakeline.messaging.ros2.cdr_messages import (
     Clock,
     DiagnosticArray,
     LaserScan,
@@ -37,7 +36,8 @@ from messaging.ros2.messages import (
     type_of,
     yaw_of,
 )
-from messaging.ros2.names import NODE, PUBLISHER, SUBSCRIPTION, full_name, ros_type, topic_key
+from brakeline.messaging.ros2.rmw_attachment import Attachment, gid_of
+from brakeline.messaging.ros2.rmw_names import NODE, PUBLISHER, SUBSCRIPTION, full_name, ros_type, topic_key
 from tests.waiting import until
 
 KINDS = (Clock, DiagnosticArray, LaserScan, MarkerArray, Odometry, TFMessage, Twist, TwistStamped)

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from messaging.shapes import BOX, CYLINDER, SPHERE, WALL, BadShape, Obstacle, Shapes, rotate
+from brakeline.messaging.obstacle import BOX, CYLINDER, SPHERE, WALL, BadShape, Obstacle, Shapes, rotate
 
 COORDINATE = st.floats(-4, 4)
 SIZE = st.floats(0.05, 2)

@@ -5,12 +5,12 @@ import subprocess
 import sys
 import threading
 
-from messaging.signals import heeded
+from brakeline.messaging.stop_signals import heeded
 
 WAITS = """
 import signal
 import threading
-from messaging.signals import heeded
+from brakeline.messaging.stop_signals import heeded
 signal.signal(signal.SIGTERM, signal.SIG_IGN)  # the rest of a volley comes when it is through
 print("born", flush=True)
 with heeded(threading.Event()) as stop:

@@ -6,16 +6,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from messaging import brakeline_pb2 as pb
-from messaging.motion import Motion
-from messaging.scans import Followed
-from messaging.sensed import scan_message, scan_of
-from messaging.shapes import BOX, CYLINDER, Obstacle
-from messaging.surroundings import promised, surroundings
-from safety.client import obstacle_messages
-from sim.conditions import Perception
-from sim.scanner import FanScanner
-from sim.world import staged_arena
+from brakeline.messaging import brakeline_pb2 as pb
+from brakeline.messaging.obstacle import BOX, CYLINDER, Obstacle
+from brakeline.messaging.obstacle_motion import Motion
+from brakeline.messaging.scan import Followed
+from brakeline.messaging.sensor_messages import scan_message, scan_of
+from brakeline.safety.perception.displayed_map import promised, surroundings
+from brakeline.safety.service.client import obstacle_messages
+from brakeline.sim.arena import staged_arena
+from brakeline.sim.range_sensors import FanScanner
+from brakeline.sim.sim_conditions import Perception
 from tests.robots import GROUND, QUADROTOR
 
 

@@ -5,11 +5,11 @@ import math
 
 import pytest
 
-from messaging import brakeline_pb2 as pb
-from messaging.bus import Malformed, Sample
-from messaging.plausible import MOST_NUMBERS, MOST_OBSTACLES
-from messaging.tolerant import LONGEST, Tolerance, headline
-from messaging.topics import EPISODE, EXCHANGE, HEALTH, LOG, STEP, Topic
+from brakeline.messaging import brakeline_pb2 as pb
+from brakeline.messaging.bus import Malformed, Sample
+from brakeline.messaging.message_checks import MOST_NUMBERS, MOST_OBSTACLES
+from brakeline.messaging.rejected_messages import LONGEST, Tolerance, headline
+from brakeline.messaging.topics import EPISODE, EXCHANGE, HEALTH, LOG, STEP, Topic
 
 
 def test_what_fails_is_counted_and_named_once_a_second(caplog: pytest.LogCaptureFixture) -> None:

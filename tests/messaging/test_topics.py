@@ -4,8 +4,8 @@ import string
 
 import pytest
 
-from messaging import brakeline_pb2 as pb
-from messaging.topics import RECORDED, TOPICS, Delivery, Topic
+from brakeline.messaging import brakeline_pb2 as pb
+from brakeline.messaging.topics import RECORDED, TOPICS, Delivery, Topic
 
 each = pytest.mark.parametrize("topic", TOPICS, ids=lambda topic: topic.name)
 

@@ -8,11 +8,11 @@ from typing import Any
 
 import pytest
 
-from messaging.bus import BusError, service
-from messaging.bus import turns as module
-from messaging.bus.asking import PATIENT
-from messaging.bus.turns import EACH, T, Turns
-from messaging.topics import DECIDE
+from brakeline.messaging.bus import BusError, query_server
+from brakeline.messaging.bus import fair_queue as module
+from brakeline.messaging.bus.fair_queue import EACH, T, Turns
+from brakeline.messaging.bus.query_client import PATIENT
+from brakeline.messaging.topics import DECIDE
 from tests.messaging.test_bus import Join
 from tests.waiting import PATIENCE, until
 
@@ -74,7 +74,7 @@ def test_a_question_for_which_nobody_waits_is_dropped_with_a_warning(
             came_in.append(question)
             return super().add(who, question)
 
-    monkeypatch.setattr(service, "Turns", Noted)
+    monkeypatch.setattr(query_server, "Turns", Noted)
     router, actor = join("launcher", listen=True), join("actor-0")
     answered: list[bytes] = []
     held, release = threading.Event(), threading.Event()

@@ -7,7 +7,7 @@ import safetensors.numpy
 from hypothesis import given
 from hypothesis import strategies as st
 
-from messaging.weights import MLP, BadWeights, decode, encode
+from brakeline.messaging.policy_weights import MLP, BadWeights, decode, encode
 from tests.robots import GROUND
 
 POLICY = MLP.untrained(GROUND, seed=1, hidden=(16, 8))

@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from messaging.shapes import Obstacle, Shapes, rotate
-from safety.model_set import ModelSet
-from safety.request import Request
+from brakeline.messaging.obstacle import Obstacle, Shapes, rotate
+from brakeline.safety.filter.request import Request
+from brakeline.safety.model.model_set import ModelSet
 from tests.robots import GROUND
 
 NONE = Shapes.of([], 2)

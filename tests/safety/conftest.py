@@ -2,10 +2,10 @@
 
 import pytest
 
-from safety.dataset import Dataset
-from safety.filter import Filter
-from safety.fitting import make
-from safety.model_set import ModelSet, Recipe
+from brakeline.safety.filter.filter import Filter
+from brakeline.safety.model.dataset import Dataset
+from brakeline.safety.model.fitting import make
+from brakeline.safety.model.model_set import ModelSet, Recipe
 from tests.safety.unicycle import record
 
 

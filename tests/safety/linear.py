@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from safety.certificates import Certificate
-from safety.tube import Recursion, Tube, stack_recursive
+from brakeline.safety.filter.reachable_tube import Recursion, Tube, stack_recursive
+from brakeline.safety.model.error_bounds import Certificate
 
 PUBLISHED = json.loads((Path(__file__).parents[1] / "truth" / "published.json").read_text())
 

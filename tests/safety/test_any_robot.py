@@ -4,14 +4,14 @@ adversary; whether anything was hit is the simulator's word."""
 import numpy as np
 import pytest
 
-from deploy.data.episodes import collect
-from messaging.shapes import Obstacle, Shapes
-from safety.filter import Filter
-from safety.fitting import make
-from safety.gym import SafetyWrapper
-from safety.model_set import Recipe
-from safety.request import ADJUSTED, ALLOWED, FAILSAFE, Request
-from safety.spaces import normalised
+from brakeline.deploy.data.environment_episodes import collect
+from brakeline.messaging.obstacle import Obstacle, Shapes
+from brakeline.safety.action_mapping import normalised
+from brakeline.safety.filter.filter import Filter
+from brakeline.safety.filter.request import ADJUSTED, ALLOWED, FAILSAFE, Request
+from brakeline.safety.gym import SafetyWrapper
+from brakeline.safety.model.fitting import make
+from brakeline.safety.model.model_set import Recipe
 from tests.safety.toys import Toy, car, discs, hostile, near, puck, seen
 
 LONG = (((0.15, 0.0), 0.12), ((-0.15, 0.0), 0.12))

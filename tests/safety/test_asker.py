@@ -6,18 +6,18 @@ from inspect import signature
 import numpy as np
 import pytest
 
-from messaging import brakeline_pb2 as pb
-from messaging.motion import Motion
-from messaging.movers import Movers
-from messaging.scans import Scan
-from messaging.shapes import Obstacle
-from safety.asker import Answer, Asker, accept
-from safety.client import SafetyClient, SafetyError, read, request_message
-from safety.commitment import Commitment, Prediction
-from safety.filter import Filter
-from safety.inprocess import InProcess
-from safety.request import BadRequest, check_for_filter
-from safety.service import Counts, Models, answerer
+from brakeline.messaging import brakeline_pb2 as pb
+from brakeline.messaging.moving_obstacles import Movers
+from brakeline.messaging.obstacle import Obstacle
+from brakeline.messaging.obstacle_motion import Motion
+from brakeline.messaging.scan import Scan
+from brakeline.safety.filter.backup_plan import Commitment, Prediction
+from brakeline.safety.filter.filter import Filter
+from brakeline.safety.filter.request import BadRequest, check_for_filter
+from brakeline.safety.service.asker import Answer, Asker, accept
+from brakeline.safety.service.client import SafetyClient, SafetyError, read, request_message
+from brakeline.safety.service.in_process import InProcess
+from brakeline.safety.service.server import Counts, Models, answerer
 from tests.robots import GROUND
 from tests.safety.asked import cylinder, request
 
@@ -28,8 +28,8 @@ MEASURED = ("time_ms", "solve_ms", "verify_ms", "queue_ms", "vouchers")
 
 @pytest.fixture(scope="module")
 def late(data_folder):
-    from deploy.data.store import model_for
-    from safety.model_set import Recipe
+    from brakeline.deploy.data.model_store import model_for
+    from brakeline.safety.model.model_set import Recipe
 
     return model_for(LATE, Recipe())
 

@@ -7,7 +7,8 @@ from hypothesis import strategies as st
 from scipy.linalg import expm
 from scipy.optimize import linprog
 
-from safety.certificates import (
+from brakeline.safety.filter.reachable_tube import Recursion, stack_recursive
+from brakeline.safety.model.error_bounds import (
     Certificate,
     CertificateError,
     envelope,
@@ -18,7 +19,6 @@ from safety.certificates import (
     set_membership,
     whitening,
 )
-from safety.tube import Recursion, stack_recursive
 from tests.safety.linear import PUBLISHED, count_outside, double_integrator, lti5
 
 HORIZON = 5

@@ -5,11 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from messaging.robots import Disc
-from messaging.shapes import Obstacle, Shapes, rotate
-from safety.commitment import Commitment
-from safety.filter import Filter
-from safety.request import ADJUSTED, ALLOWED, FAILSAFE, Request
+from brakeline.messaging.obstacle import Obstacle, Shapes, rotate
+from brakeline.messaging.robot import Disc
+from brakeline.safety.filter.backup_plan import Commitment
+from brakeline.safety.filter.filter import Filter
+from brakeline.safety.filter.request import ADJUSTED, ALLOWED, FAILSAFE, Request
 from tests.robots import GROUND
 from tests.safety.asked import NONE, cylinder, fits, request
 from tests.safety.unicycle import Unicycle

@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from safety.commitment import UNVERIFIED, Commitment, Prediction
-from safety.filter import _Attempt
-from safety.request import ALLOWED, FAILSAFE
+from brakeline.safety.filter.backup_plan import UNVERIFIED, Commitment, Prediction
+from brakeline.safety.filter.filter import _Attempt
+from brakeline.safety.filter.request import ALLOWED, FAILSAFE
 from tests.robots import GROUND
 from tests.safety.asked import STILL, cylinder, request
 

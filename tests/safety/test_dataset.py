@@ -9,10 +9,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from messaging.shapes import rotate
-from safety.dataset import ENTRY, BadData, Dataset, Trajectory
-from safety.tensors import pack, unpack
-from safety.windows import apart, displacement, quality, windows
+from brakeline.messaging.obstacle import rotate
+from brakeline.safety.model.dataset import ENTRY, BadData, Dataset, Trajectory
+from brakeline.safety.model.tensor_file import pack, unpack
+from brakeline.safety.model.windows import apart, displacement, quality, windows
 from tests.robots import GROUND
 from tests.safety.unicycle import record
 

@@ -5,13 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from messaging.motion import Motion
-from messaging.movers import Movers
-from messaging.robots import Limit
-from messaging.shapes import Obstacle
-from safety.explain import SIGHT
-from safety.filter import Filter
-from safety.request import ALLOWED
+from brakeline.messaging.moving_obstacles import Movers
+from brakeline.messaging.obstacle import Obstacle
+from brakeline.messaging.obstacle_motion import Motion
+from brakeline.messaging.robot import Limit
+from brakeline.safety.filter.blocking_constraint import SIGHT
+from brakeline.safety.filter.filter import Filter
+from brakeline.safety.filter.request import ALLOWED
 from tests.safety.asked import cylinder, random_request, request
 
 

@@ -5,15 +5,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from messaging.shapes import Obstacle, Shapes
-from safety import filter as filter_module
-from safety.certificates import KINDS, Certificate
-from safety.commitment import Prediction, correction_penalty
-from safety.filter import Filter
-from safety.model_set import ModelSet, Recipe
-from safety.request import ADJUSTED, ALLOWED, FAILSAFE, MOST_OBSERVED, NOT_FINITE, BadRequest
-from safety.solver import INFEASIBLE
-from safety.wire import message_of
+from brakeline.messaging.obstacle import Obstacle, Shapes
+from brakeline.safety.filter import filter as filter_module
+from brakeline.safety.filter.backup_plan import Prediction, correction_penalty
+from brakeline.safety.filter.filter import Filter
+from brakeline.safety.filter.qp_solver import INFEASIBLE
+from brakeline.safety.filter.request import ADJUSTED, ALLOWED, FAILSAFE, MOST_OBSERVED, NOT_FINITE, BadRequest
+from brakeline.safety.model.error_bounds import KINDS, Certificate
+from brakeline.safety.model.model_set import ModelSet, Recipe
+from brakeline.safety.service.wire import message_of
 from tests.robots import GROUND, QUADROTOR
 from tests.safety.asked import cylinder, fits, random_request, request, same
 from tests.safety.unicycle import FIX, Unicycle

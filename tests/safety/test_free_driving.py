@@ -5,14 +5,14 @@ import itertools
 import numpy as np
 import pytest
 
-from deploy.data.excite import excitation
-from messaging.descriptions import robot_of
-from safety.certificates import KINDS, RESIDUAL
-from safety.dataset import BadData, Dataset, Trajectory
-from safety.fitting import make
-from safety.model_set import MODES, Recipe
-from safety.statement import state
-from safety.windows import FREE, PLAN, specialised, windows
+from brakeline.deploy.data.excitation import excitation
+from brakeline.messaging.robot_description import robot_of
+from brakeline.safety.model.dataset import BadData, Dataset, Trajectory
+from brakeline.safety.model.error_bounds import KINDS, RESIDUAL
+from brakeline.safety.model.fitting import make
+from brakeline.safety.model.model_set import MODES, Recipe
+from brakeline.safety.model.validation import state
+from brakeline.safety.model.windows import FREE, PLAN, specialised, windows
 
 ROBOT = robot_of(
     {

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from messaging.shapes import Obstacle, Shapes
-from safety.freespace import half_spaces, leading_out
+from brakeline.messaging.obstacle import Obstacle, Shapes
+from brakeline.safety.filter.halfspaces import half_spaces, leading_out
 from tests.messaging.test_shapes import obstacles, sample
 
 BODY = 0.1

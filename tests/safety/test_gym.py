@@ -6,21 +6,21 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from deploy.data.episodes import collect
-from messaging.scans import OLDEST, Scan
-from messaging.shapes import Obstacle
-from safety.client import SafetyClient
-from safety.commitment import Commitment
-from safety.dataset import BadData
-from safety.filter import Filter
-from safety.fitting import make
-from safety.gym import UNANSWERED, SafetyWrapper
-from safety.inprocess import InProcess
-from safety.model_set import ModelSet, Recipe
-from safety.request import BadRequest
-from safety.spaces import Actions, Mismatch, actions_of, normalised
-from safety.vector import VectorSafetyWrapper, each
-from safety.views import STATE
+from brakeline.deploy.data.environment_episodes import collect
+from brakeline.messaging.obstacle import Obstacle
+from brakeline.messaging.scan import OLDEST, Scan
+from brakeline.safety.action_mapping import Actions, Mismatch, actions_of, normalised
+from brakeline.safety.environment_views import STATE
+from brakeline.safety.filter.backup_plan import Commitment
+from brakeline.safety.filter.filter import Filter
+from brakeline.safety.filter.request import BadRequest
+from brakeline.safety.gym import UNANSWERED, SafetyWrapper
+from brakeline.safety.gym_vector import VectorSafetyWrapper, each
+from brakeline.safety.model.dataset import BadData
+from brakeline.safety.model.fitting import make
+from brakeline.safety.model.model_set import ModelSet, Recipe
+from brakeline.safety.service.client import SafetyClient
+from brakeline.safety.service.in_process import InProcess
 from tests.safety.toys import Toy, car, discs, near, puck, seen
 
 CAR, PUCK = car("gym-car"), puck("gym-puck")
@@ -118,7 +118,7 @@ class Silent(SafetyClient):
         self.robot, self.commitment = CAR, Commitment(CAR)
 
     def decide(self, *asked, **more):
-        from messaging.bus import NoReply
+        from brakeline.messaging.bus import NoReply
 
         raise NoReply("nobody serves")
 

@@ -5,9 +5,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from safety.holding import filled_by_plans, that_matter
-from safety.program import Layout
-from safety.tube import Tube
+from brakeline.safety.filter.kernels.halfspace_kernels import filled_by_plans, that_matter
+from brakeline.safety.filter.qp import Layout
+from brakeline.safety.filter.reachable_tube import Tube
 
 SEEDS = st.integers(0, 2**32 - 1)
 

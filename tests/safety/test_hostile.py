@@ -9,10 +9,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from messaging import brakeline_pb2 as pb
-from messaging.shapes import BOX, CYLINDER, FARTHEST, SPHERE, WALL, BadShape, Obstacle, Shapes
-from safety.request import BadRequest
-from safety.wire import LARGEST, MOST_REQUESTS, _fields, batch_of
+from brakeline.messaging import brakeline_pb2 as pb
+from brakeline.messaging.obstacle import BOX, CYLINDER, FARTHEST, SPHERE, WALL, BadShape, Obstacle, Shapes
+from brakeline.safety.filter.request import BadRequest
+from brakeline.safety.service.wire import LARGEST, MOST_REQUESTS, _fields, batch_of
 
 NEAR = 1e-6  # m: what rounding may hide of a distance
 

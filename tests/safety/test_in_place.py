@@ -5,18 +5,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from messaging.descriptions import robot_of
-from messaging.robots import Disc
-from messaging.shapes import Shapes, rotate
-from safety.commitment import Commitment
-from safety.dataset import Dataset, Trajectory
-from safety.filter import Filter
-from safety.fitting import make
-from safety.in_place import standing_limits
-from safety.model_set import ModelSet, Recipe
-from safety.request import ADJUSTED, ALLOWED, FAILSAFE, Request
-from safety.statement import state, upper_bound
-from safety.windows import FREE, PLAN
+from brakeline.messaging.obstacle import Shapes, rotate
+from brakeline.messaging.robot import Disc
+from brakeline.messaging.robot_description import robot_of
+from brakeline.safety.filter.backup_plan import Commitment
+from brakeline.safety.filter.filter import Filter
+from brakeline.safety.filter.request import ADJUSTED, ALLOWED, FAILSAFE, Request
+from brakeline.safety.model.dataset import Dataset, Trajectory
+from brakeline.safety.model.fitting import make
+from brakeline.safety.model.model_set import ModelSet, Recipe
+from brakeline.safety.model.turning_in_place import standing_limits
+from brakeline.safety.model.validation import state, upper_bound
+from brakeline.safety.model.windows import FREE, PLAN
 from tests.robots import GROUND, QUADROTOR
 from tests.safety.asked import cylinder
 from tests.safety.test_closed_loop import ROOM

@@ -8,12 +8,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from messaging.range_images import RangeImage
-from messaging.scans import Scan
-from messaging.shapes import Shapes
-from safety.image_memory import ImageMemory
-from safety.memory import FanMemory
-from safety.scan import gaps
+from brakeline.messaging.obstacle import Shapes
+from brakeline.messaging.range_image import RangeImage
+from brakeline.messaging.scan import Scan
+from brakeline.safety.perception.image_memory import ImageMemory
+from brakeline.safety.perception.scan_free_space import gaps
+from brakeline.safety.perception.visibility_memory import FanMemory
 from tests.safety.test_scan import FAN, FAR, WIDTH, cast, scene
 
 BODY, BLIND = 0.02, math.radians(30.0)  # rad on either side of straight behind

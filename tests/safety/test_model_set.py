@@ -5,13 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from safety.certificates import KINDS, CertificateError, least_squares
-from safety.dataset import BadData
-from safety.filter import Filter
-from safety.fitting import make
-from safety.model_set import ENTRY, MODES, BadModel, ModelSet, Recipe
-from safety.tensors import pack, unpack
-from safety.windows import stands_from, windows
+from brakeline.safety.filter.filter import Filter
+from brakeline.safety.model.dataset import BadData
+from brakeline.safety.model.error_bounds import KINDS, CertificateError, least_squares
+from brakeline.safety.model.fitting import make
+from brakeline.safety.model.model_set import ENTRY, MODES, BadModel, ModelSet, Recipe
+from brakeline.safety.model.tensor_file import pack, unpack
+from brakeline.safety.model.windows import stands_from, windows
 from tests.robots import GROUND
 from tests.safety.unicycle import record
 

@@ -5,16 +5,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from messaging.motion import Motion, Sighting
-from messaging.movers import Movers, parted
-from messaging.shapes import Obstacle, Shapes
-from safety.client import obstacle_messages
-from safety.commitment import Commitment
-from safety.filter import Filter
-from safety.request import ADJUSTED, ALLOWED, FAILSAFE, BadRequest
-from safety.wire import obstacles_of
-from sim.movers import Crowd, MoverKind, Watch
-from sim.world import closing
+from brakeline.messaging.moving_obstacles import Movers, parted
+from brakeline.messaging.obstacle import Obstacle, Shapes
+from brakeline.messaging.obstacle_motion import Motion, Sighting
+from brakeline.safety.filter.backup_plan import Commitment
+from brakeline.safety.filter.filter import Filter
+from brakeline.safety.filter.request import ADJUSTED, ALLOWED, FAILSAFE, BadRequest
+from brakeline.safety.service.client import obstacle_messages
+from brakeline.safety.service.wire import obstacles_of
+from brakeline.sim.arena import closing
+from brakeline.sim.traffic import Crowd, MoverKind, Watch
 from tests.robots import GROUND
 from tests.safety.asked import request, same
 from tests.safety.unicycle import Unicycle

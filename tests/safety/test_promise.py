@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from safety.promise import Promise, Promises, promised_half_spaces
+from brakeline.safety.filter.reservation import Promise, Promises, promised_half_spaces
 
 FINITE = st.floats(-1.0, 1.0)
 N = 3

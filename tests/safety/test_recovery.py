@@ -6,19 +6,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from deploy.data.episodes import collect
-from messaging.descriptions import robot_of
-from messaging.robots import Disc
-from messaging.scans import Scan
-from messaging.shapes import Obstacle, Shapes
-from safety.commitment import Commitment
-from safety.filter import Filter
-from safety.fitting import make
-from safety.inprocess import InProcess
-from safety.model_set import Recipe
-from safety.recovery import least_violating, lower, slow_inputs
-from safety.request import RECOVERING
-from safety.spaces import normalised
+from brakeline.deploy.data.environment_episodes import collect
+from brakeline.messaging.obstacle import Obstacle, Shapes
+from brakeline.messaging.robot import Disc
+from brakeline.messaging.robot_description import robot_of
+from brakeline.messaging.scan import Scan
+from brakeline.safety.action_mapping import normalised
+from brakeline.safety.filter.backup_plan import Commitment
+from brakeline.safety.filter.filter import Filter
+from brakeline.safety.filter.recovery import least_violating, lower, slow_inputs
+from brakeline.safety.filter.request import RECOVERING
+from brakeline.safety.model.fitting import make
+from brakeline.safety.model.model_set import Recipe
+from brakeline.safety.service.in_process import InProcess
 from tests.robots import GROUND, QUADROTOR
 from tests.safety.asked import request
 from tests.safety.toys import SUBSTEPS, Toy, seen

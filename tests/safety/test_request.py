@@ -7,10 +7,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from messaging.robots import robot_named
-from messaging.shapes import FARTHEST, Shapes
-from safety.commitment import Prediction
-from safety.request import MOST_OBSERVED, BadRequest, Ordinary, Request, check_for_filter
+from brakeline.messaging.obstacle import FARTHEST, Shapes
+from brakeline.messaging.robot import robot_named
+from brakeline.safety.filter.backup_plan import Prediction
+from brakeline.safety.filter.request import MOST_OBSERVED, BadRequest, Ordinary, Request, check_for_filter
 from tests.safety.asked import cylinder, request, same
 from tests.safety.toys import car
 

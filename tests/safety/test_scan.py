@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from messaging.scans import BadScan, Scan
-from messaging.shapes import Obstacle, Shapes
-from safety.scan import cells, gaps, half_spaces
+from brakeline.messaging.obstacle import Obstacle, Shapes
+from brakeline.messaging.scan import BadScan, Scan
+from brakeline.safety.perception.scan_free_space import cells, gaps, half_spaces
 from tests.messaging.test_shapes import sample
 
 FAR, WIDTH = 3.5, 0.1

@@ -6,16 +6,16 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 
-from messaging import brakeline_pb2 as pb
-from messaging.range_images import RangeImage
-from messaging.scans import Scan
-from messaging.sensed import scan_message, scan_of
-from messaging.shapes import Obstacle, Shapes
-from safety.client import request_message
-from safety.commitment import Commitment
-from safety.memory import FanMemory
-from safety.request import ALLOWED, FAILSAFE, BadRequest, check_for_filter
-from safety.wire import batch_of, request_of
+from brakeline.messaging import brakeline_pb2 as pb
+from brakeline.messaging.obstacle import Obstacle, Shapes
+from brakeline.messaging.range_image import RangeImage
+from brakeline.messaging.scan import Scan
+from brakeline.messaging.sensor_messages import scan_message, scan_of
+from brakeline.safety.filter.backup_plan import Commitment
+from brakeline.safety.filter.request import ALLOWED, FAILSAFE, BadRequest, check_for_filter
+from brakeline.safety.perception.visibility_memory import FanMemory
+from brakeline.safety.service.client import request_message
+from brakeline.safety.service.wire import batch_of, request_of
 from tests.robots import GROUND, QUADROTOR
 from tests.safety.asked import request
 from tests.safety.test_scan import FAN, FAR, WIDTH, cast

@@ -5,16 +5,16 @@ import logging
 import numpy as np
 import pytest
 
-from messaging import brakeline_pb2 as pb
-from messaging.bus import NoReply, Refused
-from messaging.shapes import Obstacle
-from messaging.topics import DECIDE
-from safety.client import SafetyClient, SafetyError, ask, read, request_message
-from safety.commitment import UNVERIFIED, Commitment
-from safety.model_set import ModelSet
-from safety.request import NOT_FINITE, BadRequest
-from safety.service import Counts, Models, answerer
-from safety.wire import LARGEST, request_of
+from brakeline.messaging import brakeline_pb2 as pb
+from brakeline.messaging.bus import NoReply, Refused
+from brakeline.messaging.obstacle import Obstacle
+from brakeline.messaging.topics import DECIDE
+from brakeline.safety.filter.backup_plan import UNVERIFIED, Commitment
+from brakeline.safety.filter.request import NOT_FINITE, BadRequest
+from brakeline.safety.model.model_set import ModelSet
+from brakeline.safety.service.client import SafetyClient, SafetyError, ask, read, request_message
+from brakeline.safety.service.server import Counts, Models, answerer
+from brakeline.safety.service.wire import LARGEST, request_of
 from tests.messaging.conftest import endpoint, join  # noqa: F401 - fixtures
 from tests.robots import GROUND, QUADROTOR
 from tests.safety.unicycle import Unicycle

@@ -6,19 +6,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from deploy.data.paths import method_path
-from deploy.vehicles import environment
-from messaging.perceptrons import Perceptrons
-from messaging.robots import FOLDER, UnknownRobot, robot_named
-from messaging.tasks import RobotWithTask, robot_with_task
-from messaging.weights import MLP, BadWeights, decode
-from safety.filter import Filter
-from safety.methods import Method
-from safety.methods import decode as read_model
-from safety.methods import ready as made_ready
-from safety.recipe import SAILR, SECAS, Recipe
-from safety.request import BadRequest
-from safety.rivals.pretrained import Pretrained
+from brakeline.deploy.data.data_paths import method_path
+from brakeline.deploy.vehicle_factory import environment
+from brakeline.messaging.perceptrons import Perceptrons
+from brakeline.messaging.policy_weights import MLP, BadWeights, decode
+from brakeline.messaging.robot import FOLDER, UnknownRobot, robot_named
+from brakeline.messaging.task import RobotWithTask, robot_with_task
+from brakeline.safety.filter.filter import Filter
+from brakeline.safety.filter.request import BadRequest
+from brakeline.safety.methods import Method
+from brakeline.safety.methods import decode as read_model
+from brakeline.safety.methods import ready as made_ready
+from brakeline.safety.model.model_config import SAILR, SECAS, Recipe
+from brakeline.safety.rivals.pretrained import Pretrained
 from tests.safety.asked import cylinder, request, same
 
 NAMES = ("ground", "ground+tracks")

@@ -9,12 +9,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from messaging.patches import seen_free
-from messaging.range_images import RangeImage
-from messaging.shapes import FARTHEST
-from safety.casting import complete, nearest_of_patches, rounding
-from safety.shading import rooms, supporting
-from safety.shadows import Room, Shadows, _patches, half_spaces, shadows
+from brakeline.messaging.obstacle import FARTHEST
+from brakeline.messaging.range_image import RangeImage
+from brakeline.safety.perception.image_coverage import seen_free
+from brakeline.safety.perception.kernels.occlusion_kernels import rooms, supporting
+from brakeline.safety.perception.kernels.shadow_kernels import complete, nearest_of_patches, rounding
+from brakeline.safety.perception.occluded_regions import Room, Shadows, _patches, half_spaces, shadows
 from tests.messaging.test_range_images import COLUMNS, EDGE, RINGS
 from tests.safety.test_shadows import NOTHING, room
 
@@ -225,7 +225,8 @@ def test_a_way_that_is_no_number_frees_nothing_from_there_on(period):
 def test_all_that_reads_an_image_is_ready_before_the_first_one():
     """In an interpreter of its own: here others have imported it."""
     code = (
-        "import sys; from safety.shadows import prepare; prepare();"
-        " assert {'messaging.nearby', 'safety.casting', 'safety.shading'} <= set(sys.modules)"
+        "import sys; from brakeline.safety.perception.occluded_regions import prepare; prepare();"
+        " names = ('proximity_kernels', 'shadow_kernels', 'occlusion_kernels');"
+        " assert {f'brakeline.safety.perception.kernels.{name}' for name in names} <= set(sys.modules)"
     )
     subprocess.run([sys.executable, "-c", code], check=True)

@@ -8,11 +8,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from messaging.patches import seen_free
-from messaging.range_images import RangeImage, directions
-from messaging.shapes import Obstacle
-from safety.image_memory import AWAY, ImageMemory, _Seen
-from safety.shadows import FACES, PLANES, Room, _patches, half_spaces, shadows
+from brakeline.messaging.obstacle import Obstacle
+from brakeline.messaging.range_image import RangeImage, directions
+from brakeline.safety.perception.image_coverage import seen_free
+from brakeline.safety.perception.image_memory import AWAY, ImageMemory, _Seen
+from brakeline.safety.perception.occluded_regions import FACES, PLANES, Room, _patches, half_spaces, shadows
 from tests.messaging.test_range_images import (
     COLUMNS,
     EDGE,
@@ -108,8 +108,8 @@ def test_from_a_whole_sensor_the_start_is_rarely_said_to_be_occupied():
 @pytest.mark.parametrize("seed", range(4))
 def test_whatever_is_not_shown_to_be_free_is_beyond_some_half_space(seed, monkeypatch):
     """Not what is solid alone: all of every patch, behind what its beams say; with nothing given up besides."""
-    monkeypatch.setattr("safety.shadows.GIVE", 0.0)
-    monkeypatch.setattr("safety.shadows.PLANES", 1500)
+    monkeypatch.setattr("brakeline.safety.perception.occluded_regions.GIVE", 0.0)
+    monkeypatch.setattr("brakeline.safety.perception.occluded_regions.PLANES", 1500)
     rng = np.random.default_rng(seed)
     image = clear(ranges=np.repeat(np.repeat(rng.uniform(1.5, 6.0, (RINGS // 5, COLUMNS // 5)), 5, 0), 5, 1))
     nominal = np.cumsum(rng.uniform(-0.1, 0.1, (3, 3)), axis=0)

@@ -11,15 +11,24 @@ import numpy as np
 import pytest
 from cryptography.hazmat.primitives.serialization import load_pem_private_key
 
-from deploy.run.keys import newest_model
-from messaging import brakeline_pb2 as pb
-from messaging.bus import Bus, BusSettings
-from messaging.ports import free_endpoint
-from messaging.topics import HEALTH, MODEL
-from safety.certificates import Certificate
-from safety.model_set import BadModel, ModelSet
-from safety.service import SafetySettings, archive_path, main
-from safety.sign import CONTEXT, Signed, Signer, Trust, Untrusted, recorded_domain, seal_of, write_signer
+from brakeline.deploy.run.run_keys import newest_model
+from brakeline.messaging import brakeline_pb2 as pb
+from brakeline.messaging.bus import Bus, BusSettings
+from brakeline.messaging.free_ports import free_endpoint
+from brakeline.messaging.topics import HEALTH, MODEL
+from brakeline.safety.model.error_bounds import Certificate
+from brakeline.safety.model.model_set import BadModel, ModelSet
+from brakeline.safety.service.server import SafetySettings, archive_path, main
+from brakeline.safety.service.signature import (
+    CONTEXT,
+    Signed,
+    Signer,
+    Trust,
+    Untrusted,
+    recorded_domain,
+    seal_of,
+    write_signer,
+)
 from tests.messaging.keyring import keyring
 from tests.waiting import until
 
@@ -118,8 +127,8 @@ def test_a_restart_goes_on_with_the_newest_that_somebody_signed(model: ModelSet,
 SERVICE = """
 import sys
 from pathlib import Path
-from messaging.bus import BusSettings
-from safety.service import SafetySettings, main
+from brakeline.messaging.bus import BusSettings
+from brakeline.safety.service.server import SafetySettings, main
 endpoint, keys, model, archive = sys.argv[1:]
 bus = BusSettings(connect=(endpoint,), keys=Path(keys))
 main(SafetySettings(bus, (Path(model),), Path(archive), accept_bound=1.0))

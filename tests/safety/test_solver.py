@@ -7,13 +7,13 @@ import daqp
 import numpy as np
 import pytest
 
-from messaging.shapes import Obstacle, Shapes
-from safety import solver
-from safety.deciding import come_by
-from safety.freespace import half_spaces
-from safety.model_set import ModelSet
-from safety.program import Builder, Layout
-from safety.solver import ACCURACY, Program, Solution, solve
+from brakeline.messaging.obstacle import Obstacle, Shapes
+from brakeline.safety.filter import qp_solver
+from brakeline.safety.filter.halfspaces import half_spaces
+from brakeline.safety.filter.kernels.active_set_kernels import come_by
+from brakeline.safety.filter.qp import Builder, Layout
+from brakeline.safety.filter.qp_solver import ACCURACY, Program, Solution, solve
+from brakeline.safety.model.model_set import ModelSet
 
 
 def programs(model: ModelSet, count, seed=0):
@@ -71,7 +71,7 @@ def test_of_many_rows_those_that_decide_give_the_answer_to_all(monkeypatch):
     programs = [crowded(np.random.default_rng(seed)) for seed in range(200)]
     parts = []
     monkeypatch.setattr(
-        solver, "_solved", lambda part, of=solver._solved, **how: parts.append(len(part.b)) or of(part, **how)
+        qp_solver, "_solved", lambda part, of=qp_solver._solved, **how: parts.append(len(part.b)) or of(part, **how)
     )
     impossible = 0
     for program in programs:
@@ -90,11 +90,11 @@ def test_rows_that_are_come_by_save_rounds_and_change_no_answer(monkeypatch):
     found = [one for one in map(crowded, map(np.random.default_rng, range(300))) if by_daqp(one)[1] >= 1]
     parts, rounds = [], []
     monkeypatch.setattr(
-        solver, "_solved", lambda part, of=solver._solved, **how: parts.append(len(part.b)) or of(part, **how)
+        qp_solver, "_solved", lambda part, of=qp_solver._solved, **how: parts.append(len(part.b)) or of(part, **how)
     )
-    for steps in (solver.STEPS, 0):
+    for steps in (qp_solver.STEPS, 0):
         parts.clear()
-        monkeypatch.setattr(solver, "STEPS", steps)
+        monkeypatch.setattr(qp_solver, "STEPS", steps)
         for program in found:
             assert value(program, solve(program).x) == pytest.approx(value(program, by_daqp(program)[0]), abs=1e-5)
         rounds.append(len(parts))
@@ -109,12 +109,12 @@ def test_a_row_that_is_no_number_is_not_come_by():
 def test_that_few_can_not_be_met_is_not_taken_for_granted(monkeypatch):
     """The solver is quicker to say so of few rows, exactly, and is wrong at times."""
     program = next(one for one in map(crowded, map(np.random.default_rng, range(200))) if by_daqp(one)[1] >= 1)
-    rows, whole = len(program.b), solver._solved
+    rows, whole = len(program.b), qp_solver._solved
 
     def hasty(part, **how):
         return whole(part, **how) if len(part.b) == rows else Solution(np.zeros(6), "primal_infeasible", 1, 1.0)
 
-    monkeypatch.setattr(solver, "_solved", hasty)
+    monkeypatch.setattr(qp_solver, "_solved", hasty)
     assert solve(program).status == "solved"
 
 
@@ -122,7 +122,7 @@ def test_few_rows_are_not_called_solved_before_they_are():
     """Rows that decided for a quadrotor behind a scan: by the residuals alone the answer was 0.07 of a range off."""
     stored = json.loads((Path(__file__).parents[1] / "stored" / "few-rows.json").read_text())
     program = Program(*(np.array(stored[name]) for name in ("h", "g", "A", "b")))
-    ours, (theirs, flag) = solver._solved(program, few=True), by_daqp(program)
+    ours, (theirs, flag) = qp_solver._solved(program, few=True), by_daqp(program)
     assert flag >= 1 and ours.status == "solved"
     assert np.abs(ours.x - theirs)[:3].max() < 1e-5
 

@@ -7,18 +7,25 @@ import gymnasium
 import numpy as np
 import pytest
 
-from messaging import brakeline_pb2 as pb
-from messaging.bounds import percent, rounded_up, trust
-from messaging.explained import bound_in, explain
-from messaging.shapes import Shapes
-from safety.filter import Filter
-from safety.gym import SafetyWrapper
-from safety.inprocess import InProcess
-from safety.request import Request
-from safety.service import Counts, Models, answerer
-from safety.stated import TooLoose, accepted_bound, check_bound, plans_needed, refusal, stated_bound
-from safety.vector import VectorSafetyWrapper
-from safety.wire import decision_of, message_of
+from brakeline.logs.decision_explanation import bound_in, explain
+from brakeline.messaging import brakeline_pb2 as pb
+from brakeline.messaging.obstacle import Shapes
+from brakeline.messaging.stated_share import percent, rounded_up, trust
+from brakeline.safety.filter.filter import Filter
+from brakeline.safety.filter.request import Request
+from brakeline.safety.gym import SafetyWrapper
+from brakeline.safety.gym_vector import VectorSafetyWrapper
+from brakeline.safety.model.stated_bound import (
+    TooLoose,
+    accepted_bound,
+    check_bound,
+    plans_needed,
+    refusal,
+    stated_bound,
+)
+from brakeline.safety.service.in_process import InProcess
+from brakeline.safety.service.server import Counts, Models, answerer
+from brakeline.safety.service.wire import decision_of, message_of
 from tests.robots import GROUND
 from tests.safety.rivals.test_sailr import known as rival
 

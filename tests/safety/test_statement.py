@@ -6,10 +6,10 @@ from math import comb
 import numpy as np
 import pytest
 
-from safety.certificates import KINDS
-from safety.model_set import MODES
-from safety.statement import state, upper_bound
-from safety.windows import windows
+from brakeline.safety.model.error_bounds import KINDS
+from brakeline.safety.model.model_set import MODES
+from brakeline.safety.model.validation import state, upper_bound
+from brakeline.safety.model.windows import windows
 from tests.safety.unicycle import record
 
 ALL = [(kind, mode) for kind in KINDS for mode in MODES]

@@ -7,11 +7,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from messaging.motion import Motion, Sighting
-from messaging.movers import Movers, parted
-from messaging.shapes import BadShape, Obstacle, Shapes
-from safety.freespace import half_spaces
-from safety.sweep import swept_half_spaces
+from brakeline.messaging.moving_obstacles import Movers, parted
+from brakeline.messaging.obstacle import BadShape, Obstacle, Shapes
+from brakeline.messaging.obstacle_motion import Motion, Sighting
+from brakeline.safety.filter.halfspaces import half_spaces
+from brakeline.safety.filter.moving_halfspaces import swept_half_spaces
 from tests.messaging.test_shapes import obstacles, sample
 
 BODY, PERIOD, PERIODS = 0.1, 0.2, 4

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from safety.tensors import BadTensors, content, holds, pack, unpack
+from brakeline.safety.model.tensor_file import BadTensors, content, holds, pack, unpack
 
 WORDS = st.dictionaries(st.text(max_size=5), st.one_of(st.text(max_size=5), st.integers(), st.booleans()), max_size=5)
 ARRAYS = st.dictionaries(st.text("abcx.", min_size=1, max_size=4), arrays(np.float64, (2, 3)), max_size=3)

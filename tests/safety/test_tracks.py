@@ -9,16 +9,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial import ConvexHull
 
-from messaging.gaps import gaps_and_ways
-from messaging.scans import BadScan, Followed, Scan
-from messaging.sensed import scan_message, scan_of
-from messaging.shapes import Obstacle, Shapes
-from safety import hidden, tracks
-from safety import scan as seen
-from safety.memory import FanMemory
-from safety.request import ALLOWED
-from safety.scan import Cells, cells
-from safety.tracks import Follower
+from brakeline.messaging.obstacle import Obstacle, Shapes
+from brakeline.messaging.scan import BadScan, Followed, Scan
+from brakeline.messaging.sensor_messages import scan_message, scan_of
+from brakeline.safety.filter.request import ALLOWED
+from brakeline.safety.perception import occlusion_exits, scan_tracking
+from brakeline.safety.perception import scan_free_space as seen
+from brakeline.safety.perception.scan_coverage import gaps_and_ways
+from brakeline.safety.perception.scan_free_space import Cells, cells
+from brakeline.safety.perception.scan_tracking import Follower
+from brakeline.safety.perception.visibility_memory import FanMemory
 from tests.robots import GROUND
 from tests.safety.asked import request
 from tests.safety.test_scan import FAN, FAR, WIDTH, cast
@@ -223,7 +223,7 @@ def test_what_is_new_may_go_anywhere_and_what_nothing_bounds_is_not_followed():
     assert not new.followed.which[np.abs(FAN) < 0.1].any() and new.followed.which[np.abs(FAN) > 0.5].any()
     scan = taken(ROOM, np.zeros(2), np.random.default_rng(0))
     for unknown in (replace(scan, acceleration=0.0), replace(scan, speed=0.0)):
-        assert tracks.Follower().follow(unknown) is unknown
+        assert scan_tracking.Follower().follow(unknown) is unknown
 
 
 def test_where_a_scan_does_not_come_what_was_followed_is_older():
@@ -243,11 +243,11 @@ def test_who_hides_needs_room():
     width = np.full(360, math.radians(1.0))
     for half, least, most in ((0.2, 1.0, 1.1), (0.1, 1.3, 1.8)):  # the smallest disc is 1.0 and 2.0 m off
         shadow = np.where(np.abs(angles + 0.5 * width) < math.asin(half), 1.0, free)
-        near = hidden.outlets(angles, width, shadow, SIZE).near
+        near = occlusion_exits.outlets(angles, width, shadow, SIZE).near
         assert len(near) == 2 and (least < near).all() and (near < most).all()
-        assert (hidden.outlets(angles, width, shadow, 0.0).near == 1.0).all()
+        assert (occlusion_exits.outlets(angles, width, shadow, 0.0).near == 1.0).all()
     narrow = np.where(np.abs(angles + 0.5 * width) < math.asin(0.05), 1.0, free)
-    assert hidden.outlets(angles, width, narrow, SIZE).near.min() > 2.0  # only beyond sight is room: 4 m off
+    assert occlusion_exits.outlets(angles, width, narrow, SIZE).near.min() > 2.0  # only beyond sight is room: 4 m off
 
 
 def test_by_what_stood_it_drives_and_where_somebody_may_come_out_it_does_not(ready, monkeypatch):

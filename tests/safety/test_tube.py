@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from safety.certificates import KINDS, Certificate
-from safety.model_set import MODES
-from safety.tube import Recursion, stack_direct, stack_recursive
+from brakeline.safety.filter.reachable_tube import Recursion, stack_direct, stack_recursive
+from brakeline.safety.model.error_bounds import KINDS, Certificate
+from brakeline.safety.model.model_set import MODES
 from tests.robots import GROUND
 from tests.safety.unicycle import Unicycle
 

@@ -5,16 +5,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from messaging import brakeline_pb2 as pb
-from messaging.robots import Robot
-from messaging.shapes import Obstacle
-from safety.asker import Answer, accept
-from safety.client import read, request_message
-from safety.commitment import UNVERIFIED, Commitment
-from safety.model_set import ModelSet
-from safety.service import Counts, Models, answerer
-from safety.vouch import SIZE, BadKey, Notary, write_key
-from safety.wire import decision_of
+from brakeline.messaging import brakeline_pb2 as pb
+from brakeline.messaging.obstacle import Obstacle
+from brakeline.messaging.robot import Robot
+from brakeline.safety.filter.backup_plan import UNVERIFIED, Commitment
+from brakeline.safety.model.model_set import ModelSet
+from brakeline.safety.service.asker import Answer, accept
+from brakeline.safety.service.client import read, request_message
+from brakeline.safety.service.plan_token import SIZE, BadKey, Notary, write_key
+from brakeline.safety.service.server import Counts, Models, answerer
+from brakeline.safety.service.wire import decision_of
 from tests.robots import GROUND, QUADROTOR
 
 KEY = bytes(range(32))

@@ -6,14 +6,14 @@ import gymnasium
 import numpy as np
 import pytest
 
-from messaging.bus import NoReply
-from messaging.shapes import Obstacle
-from safety.client import SafetyClient
-from safety.commitment import Commitment
-from safety.filter import Filter
-from safety.gym import SafetyWrapper
-from safety.request import NOT_FINITE
-from sim.envs import NavigationEnv
+from brakeline.messaging.bus import NoReply
+from brakeline.messaging.obstacle import Obstacle
+from brakeline.safety.filter.backup_plan import Commitment
+from brakeline.safety.filter.filter import Filter
+from brakeline.safety.filter.request import NOT_FINITE
+from brakeline.safety.gym import SafetyWrapper
+from brakeline.safety.service.client import SafetyClient
+from brakeline.sim.navigation_env import NavigationEnv
 from tests.messaging.conftest import endpoint, join  # noqa: F401 - fixtures
 from tests.robots import GROUND
 from tests.safety.unicycle import Unicycle

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from safety.zonotope import Zonotope, facet_normals
+from brakeline.safety.model.zonotope import Zonotope, facet_normals
 from tests.safety.linear import PUBLISHED
 
 NUMBERS = st.floats(-5, 5).map(lambda value: round(value, 3))

@@ -7,8 +7,8 @@ import math
 import gymnasium
 import numpy as np
 
-from messaging.descriptions import robot_of
-from messaging.shapes import Obstacle
+from brakeline.messaging.obstacle import Obstacle
+from brakeline.messaging.robot_description import robot_of
 
 SUBSTEPS = 20
 

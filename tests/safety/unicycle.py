@@ -6,8 +6,8 @@ import itertools
 
 import numpy as np
 
-from deploy.data.excite import excitation
-from safety.dataset import Dataset, Trajectory
+from brakeline.deploy.data.excitation import excitation
+from brakeline.safety.model.dataset import Dataset, Trajectory
 from tests.robots import GROUND
 
 SUBSTEPS = 10

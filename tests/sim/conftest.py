@@ -2,7 +2,7 @@
 
 import pytest
 
-from sim.autopilot.parameters import AT_ONCE
+from brakeline.sim.autopilot.parameters import AT_ONCE
 from tests.sim.station import Station
 
 

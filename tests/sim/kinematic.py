@@ -4,8 +4,8 @@ import math
 
 import numpy as np
 
-from sim.vehicle import Period
-from sim.world import Arena
+from brakeline.sim.arena import Arena
+from brakeline.sim.vehicle import Period
 from tests.robots import QUADROTOR
 
 SAMPLES = 10
@@ -14,7 +14,7 @@ BODY = 0.28  # m
 
 
 class PointMass:
-    """Stands in for a quadrotor; see `sim.vehicle.Vehicle`."""
+    """Stands in for a quadrotor; see `brakeline.sim.vehicle.Vehicle`."""
 
     def __init__(self, arena: Arena, rng: np.random.Generator) -> None:
         self.arena, self._rng = arena, rng

@@ -7,13 +7,13 @@ from typing import Any
 
 import numpy as np
 
-from messaging.shapes import Obstacle
-from sim.autopilot.dialect import mavlink
-from sim.autopilot.endpoint import Autopilot
-from sim.autopilot.pilot import Landed
-from sim.flight_estimator import QuadrotorNoise
-from sim.quadrotor import Quadrotor
-from sim.world import Arena, staged_arena
+from brakeline.messaging.obstacle import Obstacle
+from brakeline.sim.arena import Arena, staged_arena
+from brakeline.sim.autopilot.common_dialect import mavlink
+from brakeline.sim.autopilot.endpoint import Autopilot
+from brakeline.sim.autopilot.flight_modes import Landed
+from brakeline.sim.flight_estimator import QuadrotorNoise
+from brakeline.sim.quadrotor import Quadrotor
 
 LOCAL, BODY, BODY_OFFSET = mavlink.MAV_FRAME_LOCAL_NED, mavlink.MAV_FRAME_BODY_NED, mavlink.MAV_FRAME_BODY_OFFSET_NED
 VELOCITY, VELOCITY_YAW, VELOCITY_RATE = 0x0DC7, 0x09C7, 0x05C7

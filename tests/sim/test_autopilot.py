@@ -7,8 +7,8 @@ import math
 import numpy as np
 import pytest
 
-from sim.autopilot.dialect import mavlink
-from sim.autopilot.pilot import Landed, Mode
+from brakeline.sim.autopilot.common_dialect import mavlink
+from brakeline.sim.autopilot.flight_modes import Landed, Mode
 from tests.sim.station import (
     ACCEPTED,
     ARM,
@@ -205,7 +205,7 @@ def test_setpoints_are_not_flown_in_another_mode() -> None:
 def test_what_an_arducopter_flies_follows_setpoints_by_an_acceleration(
     acceleration: float | None, speed: float, way: float
 ) -> None:
-    """As the real one does (`python -m deploy.bench manners`): as delivered it takes seconds, and as long to stop."""
+    """As the real one does (`python -m benchmarks manners`): as delivered it takes seconds, and as long to stop."""
     station = Station("ardupilot", parameters={} if acceleration is None else {"WPNAV_ACCEL": acceleration})
     station.into_the_air()
     for k in range(50):
@@ -251,7 +251,7 @@ def test_what_follows_lost_setpoints_is_a_parameter_of_px4s(action: float, mode:
 
 
 def test_a_px4_that_has_landed_is_in_the_mode_of_before(flying: Station) -> None:
-    """As the real ones (`python -m deploy.bench manners`): an ArduCopter stays in its landing mode."""
+    """As the real ones (`python -m benchmarks manners`): an ArduCopter stays in its landing mode."""
     rules = flying.autopilot.rules.name
     flying.fly(0, 0, 0, seconds=0.2)
     assert flying.command(MODE, 1, *{"px4": (4, 6), "ardupilot": (COPTER_LAND,)}[rules]) == ACCEPTED
@@ -262,7 +262,7 @@ def test_a_px4_that_has_landed_is_in_the_mode_of_before(flying: Station) -> None
 
 
 def test_setpoints_that_come_again_are_flown_unless_somebody_chose_another_mode(flying: Station) -> None:
-    """As a real PX4 does (`python -m deploy.bench manners`): a stall of who sends them is not the end of the flight."""
+    """As a real PX4 does (`python -m benchmarks manners`): a stall of who sends them is not the end of the flight."""
     flying.fly(0, 3, 0)
     flying.wait(4.0)
     flying.wait(0.1)

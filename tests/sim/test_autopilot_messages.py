@@ -8,14 +8,14 @@ import struct
 import numpy as np
 import pytest
 
-from messaging.shapes import CYLINDER, Obstacle
-from sim.autopilot import frames
-from sim.autopilot.dialect import mavlink
-from sim.autopilot.endpoint import TICK, UnknownRules
-from sim.autopilot.parameters import BadParameter
-from sim.autopilot.pilot import Mode
-from sim.autopilot.telemetry import BINS, obstacle_bins
-from sim.lidar import Lidar
+from brakeline.messaging.obstacle import CYLINDER, Obstacle
+from brakeline.sim.autopilot import ned_frames
+from brakeline.sim.autopilot.common_dialect import mavlink
+from brakeline.sim.autopilot.endpoint import TICK, UnknownRules
+from brakeline.sim.autopilot.flight_modes import Mode
+from brakeline.sim.autopilot.parameters import BadParameter
+from brakeline.sim.autopilot.telemetry_sender import BINS, obstacle_bins
+from brakeline.sim.lidar import Lidar
 from tests.robots import QUADROTOR
 from tests.sim.station import (
     ACCEPTED,
@@ -57,7 +57,7 @@ def test_every_message_can_be_asked_for() -> None:
 
 
 def test_what_arducopter_does_not_know_is_refused() -> None:
-    """So 4.0 answers; `deploy.bench manners` asks a real one."""
+    """So 4.0 answers; `benchmarks manners` asks a real one."""
     station = Station("ardupilot", airborne=True)
     for name in ("ATTITUDE_QUATERNION", "HIGHRES_IMU", "ODOMETRY"):
         kind = getattr(mavlink, f"MAVLINK_MSG_ID_{name}")
@@ -94,11 +94,11 @@ def test_frames_turn_back_and_forth() -> None:
     for _ in range(20):
         w, x, y, z = (q := rng.standard_normal(4)) / np.linalg.norm(q)
         q, v = (w, x, y, z), tuple(rng.standard_normal(3))
-        assert frames.world(frames.world(v)) == pytest.approx(v)
-        turned = frames.rotate(frames.attitude(q), frames.body(v))
-        assert turned == pytest.approx(frames.world(frames.rotate(q, v)))
-        assert frames.into_body(q, frames.rotate(q, v)) == pytest.approx(v)
-    assert frames.yaw(frames.yaw(0.3)) == pytest.approx(0.3)
+        assert ned_frames.world(ned_frames.world(v)) == pytest.approx(v)
+        turned = ned_frames.rotate(ned_frames.attitude(q), ned_frames.body(v))
+        assert turned == pytest.approx(ned_frames.world(ned_frames.rotate(q, v)))
+        assert ned_frames.into_body(q, ned_frames.rotate(q, v)) == pytest.approx(v)
+    assert ned_frames.yaw(ned_frames.yaw(0.3)) == pytest.approx(0.3)
 
 
 def test_obstacle_distance_is_the_least_of_each_sector() -> None:

@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 
-import sim
-from deploy.vehicles import environment
-from messaging.shapes import Shapes
-from sim.envs import NavigationEnv, Reward
-from sim.policies import scripted
-from sim.quadrotor import Quadrotor
+import brakeline.sim
+from brakeline.deploy.vehicle_factory import environment
+from brakeline.messaging.obstacle import Shapes
+from brakeline.sim.navigation_env import NavigationEnv, Reward
+from brakeline.sim.quadrotor import Quadrotor
+from brakeline.sim.scripted_policies import scripted
 from tests.robots import GROUND, QUADROTOR, ROBOTS
 from tests.sim.kinematic import PointMass
 
@@ -71,7 +71,7 @@ def episode(env: NavigationEnv, policy: str, options: dict[str, Any], steps: int
 
 
 def test_ours_is_imported() -> None:
-    assert Path(sim.__file__).parent == Path(__file__).parents[2] / "sim"
+    assert Path(brakeline.sim.__file__).parent == Path(__file__).parents[2] / "sim"
 
 
 @pytest.mark.filterwarnings("ignore:.*symmetric and normalized space.*")  # actions are physical: speed is not negative

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from sim.estimator import CUT, Estimator, NoiseLevels, cut_normal, steady_gain, wrap
+from brakeline.sim.ground_estimator import CUT, Estimator, NoiseLevels, cut_normal, steady_gain, wrap
 from tests.robots import GROUND
 
 SAMPLE, RADIUS, SAMPLES = 0.02, 0.033, 10

@@ -5,12 +5,12 @@ import math
 import numpy as np
 import pytest
 
-from sim.arenas import draw_fleet
-from sim.conditions import Conditions, Perception
-from sim.fleet import FleetEnv, GroundWorld, NoFleet
-from sim.ground import GroundRobot
-from sim.policies import scripted
-from sim.world import alike, staged_arena
+from brakeline.sim.arena import alike, staged_arena
+from brakeline.sim.arena_generator import draw_fleet
+from brakeline.sim.ground_robot import GroundRobot
+from brakeline.sim.scripted_policies import scripted
+from brakeline.sim.shared_world import FleetEnv, GroundWorld, NoFleet
+from brakeline.sim.sim_conditions import Conditions, Perception
 from tests.robots import GROUND, QUADROTOR
 
 AHEAD = np.array([0.25, 0.0])

@@ -5,14 +5,14 @@ import math
 import numpy as np
 import pytest
 
-from deploy.vehicles import environment
-from messaging.shapes import BOX, CYLINDER, Obstacle
-from sim.estimator import NoiseLevels
-from sim.ground import GroundRobot
-from sim.policies import scripted
-from sim.vehicle import BadInput, Period
-from sim.world import Arena
-from sim.world import staged_arena as room
+from brakeline.deploy.vehicle_factory import environment
+from brakeline.messaging.obstacle import BOX, CYLINDER, Obstacle
+from brakeline.sim.arena import Arena
+from brakeline.sim.arena import staged_arena as room
+from brakeline.sim.ground_estimator import NoiseLevels
+from brakeline.sim.ground_robot import GroundRobot
+from brakeline.sim.scripted_policies import scripted
+from brakeline.sim.vehicle import BadInput, Period
 from tests.robots import GROUND
 
 QUIET = NoiseLevels(scale=0.0)
@@ -155,7 +155,8 @@ def test_the_floor_is_no_collision_and_a_wall_is_one() -> None:
 
 
 def body_gap(state: np.ndarray, arena: Arena) -> float:
-    """From the outline of plates and wheels to the nearest obstacle, m, by the distances of `messaging.shapes`."""
+    """From the outline of plates and wheels to the nearest obstacle, m, by the distances of
+    `brakeline.messaging.obstacle`."""
     angles = np.linspace(0.0, 2.0 * math.pi, 90, endpoint=False)
     circle = np.stack((np.cos(angles), np.sin(angles)), axis=1)
     wheel, left = circle * (0.033, 0.009), np.array([0.0, 0.08])

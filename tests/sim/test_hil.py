@@ -12,15 +12,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sim.autopilot import frames
-from sim.autopilot.dialect import mavlink
-from sim.autopilot.hil import AutopilotGone, Hil
-from sim.autopilot.px4 import Px4, Px4Error
-from sim.autopilot.sensors import DECLINATION, INCLINATION, SensorNoise, Sensors
-from sim.flight import GRAVITY
-from sim.flight_estimator import Estimate, QuadrotorNoise
-from sim.quadrotor import Quadrotor
-from sim.world import Arena, staged_arena
+from brakeline.sim.arena import Arena, staged_arena
+from brakeline.sim.autopilot import ned_frames
+from brakeline.sim.autopilot.common_dialect import mavlink
+from brakeline.sim.autopilot.hil_link import AutopilotGone, Hil
+from brakeline.sim.autopilot.hil_sensors import DECLINATION, INCLINATION, SensorNoise, Sensors
+from brakeline.sim.autopilot.px4_process import Px4, Px4Error
+from brakeline.sim.flight_controller import GRAVITY
+from brakeline.sim.flight_estimator import Estimate, QuadrotorNoise
+from brakeline.sim.quadrotor import Quadrotor
 
 HOVER = 1.2 * 9.81 / 4.0 / 8.8  # of a rotor's full thrust
 
@@ -49,11 +49,11 @@ def test_sensors_without_errors_tell_the_truth_in_their_own_frames(heading: floa
     assert math.remainder(compass - from_north, 360.0) == pytest.approx(0.0, abs=1e-6)
     assert math.atan2(imu.zmag, math.hypot(imu.xmag, imu.ymag)) == pytest.approx(INCLINATION)
     height = (1.0 - (imu.abs_pressure / 1013.25) ** (1.0 / 5.25588)) / 2.25577e-5
-    assert height == pytest.approx(frames.ALTITUDE + 7.0) and imu.pressure_alt == pytest.approx(height)
+    assert height == pytest.approx(ned_frames.ALTITUDE + 7.0) and imu.pressure_alt == pytest.approx(height)
 
-    north = math.radians(1e-7 * fix.lat - frames.LATITUDE) * 6371000.0
-    east = math.radians(1e-7 * fix.lon - frames.LONGITUDE) * 6371000.0 * math.cos(math.radians(frames.LATITUDE))
-    assert (east, north, 1e-3 * fix.alt) == pytest.approx((30.0, 40.0, frames.ALTITUDE + 7.0), abs=0.02)
+    north = math.radians(1e-7 * fix.lat - ned_frames.LATITUDE) * 6371000.0
+    east = math.radians(1e-7 * fix.lon - ned_frames.LONGITUDE) * 6371000.0 * math.cos(math.radians(ned_frames.LATITUDE))
+    assert (east, north, 1e-3 * fix.alt) == pytest.approx((30.0, 40.0, ned_frames.ALTITUDE + 7.0), abs=0.02)
     assert (fix.vn, fix.ve, fix.vd) == (200, 100, -50)
     assert fix.cog == round(100.0 * math.degrees(math.atan2(1.0, 2.0)))
 
@@ -116,7 +116,7 @@ def test_the_command_of_every_step_moves_the_vehicle_and_time_waits_for_it() -> 
 def test_an_autopilot_without_lockstep_or_without_answers_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
     with stand_in(lockstep=0) as (hil, _), pytest.raises(AutopilotGone, match="lockstep"):
         hil.tick()
-    monkeypatch.setattr("sim.autopilot.hil.PATIENCE", 0.02)
+    monkeypatch.setattr("brakeline.sim.autopilot.hil_link.PATIENCE", 0.02)
     with stand_in(answers=3) as (hil, _), pytest.raises(AutopilotGone, match="has not answered"):
         for _ in range(100):
             hil.tick()

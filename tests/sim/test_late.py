@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
-from sim.arenas import arena_kind, draw_arena, tour
-from sim.late import late
-from sim.pilots import MapPilot
-from sim.quadrotor import Quadrotor
-from sim.vehicle import BadInput
-from sim.world import staged_arena
+from brakeline.sim.arena import staged_arena
+from brakeline.sim.arena_generator import arena_kind, draw_arena, tour
+from brakeline.sim.delayed_vehicle import late
+from brakeline.sim.quadrotor import Quadrotor
+from brakeline.sim.quadrotor_policies import MapPilot
+from brakeline.sim.vehicle import BadInput
 from tests.robots import GROUND, QUADROTOR
 
 ROBOT = QUADROTOR.in_real_time()

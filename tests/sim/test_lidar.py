@@ -6,12 +6,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from messaging.rays import Rays
-from messaging.shapes import BOX, CYLINDER, SPHERE, WALL, Obstacle, rotate
-from sim.arenas import draw_arena
-from sim.lidar import Lidar
-from sim.scene import map_model
-from sim.world import Arena, staged_arena
+from brakeline.messaging.obstacle import BOX, CYLINDER, SPHERE, WALL, Obstacle, rotate
+from brakeline.messaging.ray_directions import Rays
+from brakeline.sim.arena import Arena, staged_arena
+from brakeline.sim.arena_generator import draw_arena
+from brakeline.sim.lidar import Lidar
+from brakeline.sim.mujoco_obstacles import map_model
 from tests.robots import GROUND, QUADROTOR
 
 PLANE, SPACE = GROUND.task.rays, QUADROTOR.task.rays

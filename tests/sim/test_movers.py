@@ -5,15 +5,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from messaging.rays import Rays
-from messaging.shapes import Obstacle, Shapes
-from sim.arenas import draw_arena
-from sim.envs import NavigationEnv
-from sim.ground import GroundRobot
-from sim.lidar import Lidar
-from sim.movers import Crowd, MoverKind, Watch
-from sim.quadrotor import Quadrotor
-from sim.world import closing, staged_arena
+from brakeline.messaging.obstacle import Obstacle, Shapes
+from brakeline.messaging.ray_directions import Rays
+from brakeline.sim.arena import closing, staged_arena
+from brakeline.sim.arena_generator import draw_arena
+from brakeline.sim.ground_robot import GroundRobot
+from brakeline.sim.lidar import Lidar
+from brakeline.sim.navigation_env import NavigationEnv
+from brakeline.sim.quadrotor import Quadrotor
+from brakeline.sim.traffic import Crowd, MoverKind, Watch
 from tests.robots import GROUND
 
 KIND = MoverKind(count=(4, 4), radius=0.2, speed=1.2, acceleration=1.0, keep=1.0)

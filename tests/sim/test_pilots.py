@@ -5,12 +5,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from messaging.shapes import BOX, CYLINDER, Obstacle
-from sim.envs import NavigationEnv
-from sim.pilots import CarefulPilot, MapPilot, StopModel, full_speed
-from sim.policies import scripted
-from sim.quadrotor import Quadrotor
-from sim.world import Arena, staged_arena
+from brakeline.messaging.obstacle import BOX, CYLINDER, Obstacle
+from brakeline.sim.arena import Arena, staged_arena
+from brakeline.sim.navigation_env import NavigationEnv
+from brakeline.sim.quadrotor import Quadrotor
+from brakeline.sim.quadrotor_policies import CarefulPilot, MapPilot, StopModel, full_speed
+from brakeline.sim.scripted_policies import scripted
 from tests.robots import QUADROTOR
 from tests.sim.kinematic import PointMass
 

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from scipy.ndimage import label
 
-from messaging.robots import Robot
-from messaging.shapes import BOX, CYLINDER, SPHERE, Obstacle
-from sim.arenas import draw_arena
-from sim.planner import Routes
-from sim.world import Arena, staged_arena
+from brakeline.messaging.obstacle import BOX, CYLINDER, SPHERE, Obstacle
+from brakeline.messaging.robot import Robot
+from brakeline.sim.arena import Arena, staged_arena
+from brakeline.sim.arena_generator import draw_arena
+from brakeline.sim.grid_planner import Routes
 from tests.robots import GROUND, QUADROTOR
 
 

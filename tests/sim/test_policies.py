@@ -5,9 +5,9 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from deploy.vehicles import environment
-from messaging.robots import Robot
-from sim.policies import UnknownPolicy, scripted
+from brakeline.deploy.vehicle_factory import environment
+from brakeline.messaging.robot import Robot
+from brakeline.sim.scripted_policies import UnknownPolicy, scripted
 from tests.robots import GROUND, ROBOTS
 
 

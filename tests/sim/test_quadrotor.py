@@ -6,13 +6,13 @@ import mujoco
 import numpy as np
 import pytest
 
-from messaging.shapes import CYLINDER, Obstacle
-from sim.flight import FlightController, VelocityAxis
-from sim.flight_estimator import QuadrotorNoise
-from sim.quadrotor import MODEL, SAMPLES, Quadrotor
-from sim.vehicle import BadInput
-from sim.wind import Air, Wind
-from sim.world import Arena, staged_arena
+from brakeline.messaging.obstacle import CYLINDER, Obstacle
+from brakeline.sim.arena import Arena, staged_arena
+from brakeline.sim.flight_controller import FlightController, VelocityAxis
+from brakeline.sim.flight_estimator import QuadrotorNoise
+from brakeline.sim.quadrotor import MODEL, SAMPLES, Quadrotor
+from brakeline.sim.vehicle import BadInput
+from brakeline.sim.wind import Air, Wind
 from tests.robots import QUADROTOR
 
 QUIET = QuadrotorNoise(scale=0.0)

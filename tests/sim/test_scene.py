@@ -1,13 +1,13 @@
-"""Obstacles as geoms: they are where `messaging.shapes` says."""
+"""Obstacles as geoms: they are where `brakeline.messaging.obstacle` says."""
 
 import mujoco
 import numpy as np
 import pytest
 
-from messaging.shapes import SPHERE, Obstacle
-from sim.arenas import draw_arena
-from sim.scene import HEIGHT, add_obstacles
-from sim.world import Arena, staged_arena
+from brakeline.messaging.obstacle import SPHERE, Obstacle
+from brakeline.sim.arena import Arena, staged_arena
+from brakeline.sim.arena_generator import draw_arena
+from brakeline.sim.mujoco_obstacles import HEIGHT, add_obstacles
 from tests.robots import GROUND, QUADROTOR
 
 REACH = 3.0  # m

@@ -3,15 +3,15 @@
 import numpy as np
 import pytest
 
-from messaging.robots import FOLDER, robot_named
-from messaging.shapes import CYLINDER, Obstacle
-from messaging.tasks import MoverKind, RobotWithTask, UnknownTask, address, read, robot_with_task
-from messaging.weights import MLP, BadWeights, decode
-from sim.fleet import FleetEnv
-from sim.lidar import Lidar
-from sim.movers import Crowd
-from sim.senses import AirSenses, GroundSenses, TrackingSenses, TurnMemory
-from sim.world import alike, staged_arena
+from brakeline.messaging.obstacle import CYLINDER, Obstacle
+from brakeline.messaging.policy_weights import MLP, BadWeights, decode
+from brakeline.messaging.robot import FOLDER, robot_named
+from brakeline.messaging.task import MoverKind, RobotWithTask, UnknownTask, address, read, robot_with_task
+from brakeline.sim.arena import alike, staged_arena
+from brakeline.sim.lidar import Lidar
+from brakeline.sim.observations import AirSenses, GroundSenses, TrackingSenses, TurnMemory
+from brakeline.sim.shared_world import FleetEnv
+from brakeline.sim.traffic import Crowd
 from tests.robots import GROUND, QUADROTOR
 
 RNG = np.random.default_rng(0)

@@ -6,7 +6,7 @@ import subprocess
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from messaging.ports import free_udp_port
+from brakeline.messaging.free_ports import free_udp_port
 from tests.system.runs import BRAKELINE
 
 

@@ -11,14 +11,14 @@ from typing import Any, Self
 
 import psutil
 
-from deploy.interpreter import PYTHON
-from deploy.run.places import client_of, launcher_of
-from logs.metrics import Metrics
-from messaging.bus import Bus, BusSettings, Sample
-from messaging.topics import RECORDED
+from brakeline.deploy.interpreter import PYTHON
+from brakeline.deploy.run.processes import client_of, launcher_of
+from brakeline.logs.metrics import Metrics
+from brakeline.messaging.bus import Bus, BusSettings, Sample
+from brakeline.messaging.topics import RECORDED
 from tests.waiting import PATIENCE, until
 
-BRAKELINE = (*PYTHON, "-m", "deploy.cli")
+BRAKELINE = (*PYTHON, "-m", "brakeline.deploy.cli")
 STRIDE = 200  # steps of a run that take no longer
 
 
@@ -65,7 +65,7 @@ class Run:
         found = {}
         for process in psutil.process_iter(["cmdline"]):
             words = process.info["cmdline"] or []
-            if "deploy.run.child" in words and str(self.folder) in words:
+            if "brakeline.deploy.run.run_process" in words and str(self.folder) in words:
                 found[words[-1]] = process
         return found
 

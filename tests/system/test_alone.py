@@ -5,11 +5,11 @@ import subprocess
 
 import pytest
 
-from logs.report import analyse
-from messaging.bus import Bus, BusSettings
-from messaging.ports import free_endpoint
-from messaging.shapes import Obstacle
-from safety.client import SafetyClient
+from brakeline.logs.report import analyse
+from brakeline.messaging.bus import Bus, BusSettings
+from brakeline.messaging.free_ports import free_endpoint
+from brakeline.messaging.obstacle import Obstacle
+from brakeline.safety.service.client import SafetyClient
 from tests.system.runs import BRAKELINE, brakeline
 from tests.waiting import until
 

@@ -4,7 +4,7 @@ import csv
 import json
 from pathlib import Path
 
-from logs.reader import find
+from brakeline.logs.reader import find
 from tests.logs.mixed import agree, counted, decoded
 from tests.system.runs import Run, brakeline
 

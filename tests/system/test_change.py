@@ -3,8 +3,8 @@
 import json
 import signal
 
-from logs.reader import open_log
-from messaging import brakeline_pb2 as pb
+from brakeline.logs.reader import open_log
+from brakeline.messaging import brakeline_pb2 as pb
 from tests.accepting import WORDS
 from tests.system.runs import Run, brakeline
 from tests.waiting import until

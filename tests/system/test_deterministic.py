@@ -5,10 +5,10 @@ from pathlib import Path
 
 import pytest
 
-from deploy.run.configurations import load
-from deploy.run.places import CONFIG
-from learner.checkpoint import exists
-from logs.reader import read
+from brakeline.deploy.run.processes import CONFIG
+from brakeline.deploy.run.run_config import load
+from brakeline.learner.checkpoint import exists
+from brakeline.logs.reader import read
 from tests.system.runs import Run
 from tests.waiting import until
 

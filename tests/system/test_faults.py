@@ -12,12 +12,12 @@ import numpy as np
 import psutil
 import pytest
 
-from deploy.interpreter import PYTHON
-from deploy.run.configurations import EXPERIMENTS, encode
-from deploy.run.places import CONFIG
-from learner.checkpoint import exists
-from logs.reader import open_log, read
-from logs.report import analyse
+from brakeline.deploy.interpreter import PYTHON
+from brakeline.deploy.run.processes import CONFIG
+from brakeline.deploy.run.run_config import EXPERIMENTS, encode
+from brakeline.learner.checkpoint import exists
+from brakeline.logs.reader import open_log, read
+from brakeline.logs.report import analyse
 from tests.robots import GROUND
 from tests.system.runs import Run, alive, brakeline
 from tests.waiting import PATIENCE, until
@@ -169,7 +169,9 @@ def test_what_fails_again_and_again_ends_the_run_and_says_why(data_folder, tmp_p
         assert "learner ended with 1" in errors and "5th time in a row" in errors and "'latest' is missing" in errors
         assert "Traceback" not in errors and run.children() == {}
     words = (folder / "logs" / "learner.log").read_text()
-    assert len(re.findall(r"deploy/run/child.py\", line \d+, in <module>", words)) == 5, "one traceback for each start"
+    assert len(re.findall(r"deploy/run/run_process.py\", line \d+, in <module>", words)) == 5, (
+        "one traceback for each start"
+    )
     assert json.loads((folder / "figures.json").read_text())["restarts"]["learner"] == 4
 
 
@@ -189,7 +191,7 @@ def test_a_child_whose_launcher_is_gone_ends_without_a_word_to_the_bus(tmp_path)
     with socket.create_server(("127.0.0.1", 0)) as bus:
         endpoint = f"tcp/127.0.0.1:{bus.getsockname()[1]}"
         (tmp_path / "endpoint").write_text(json.dumps({"endpoint": endpoint, "pid": nobody}))
-        child = [*PYTHON, "-m", "deploy.run.child", str(tmp_path), "actor-0"]
+        child = [*PYTHON, "-m", "brakeline.deploy.run.run_process", str(tmp_path), "actor-0"]
         assert subprocess.run(child, check=False, timeout=PATIENCE).returncode != 0
         bus.setblocking(False)
         with pytest.raises(BlockingIOError):

@@ -15,13 +15,13 @@ import psutil
 import pytest
 from pymavlink import mavutil
 
-from actors.frames import decoded
-from deploy import cli
-from deploy.bench.timing import stalls
-from deploy.run.configurations import load
-from deploy.run.places import CONFIG
-from logs.reader import Record, read
-from messaging import brakeline_pb2 as pb
+from benchmarks.timing import stalls
+from brakeline.actors.mavlink.frame_log import decoded
+from brakeline.deploy import cli
+from brakeline.deploy.run.processes import CONFIG
+from brakeline.deploy.run.run_config import load
+from brakeline.logs.reader import Record, read
+from brakeline.messaging import brakeline_pb2 as pb
 from tests.accepting import WORDS
 from tests.robots import QUADROTOR
 from tests.system.runs import Run, until
@@ -169,7 +169,9 @@ def keeper(run: Run) -> psutil.Process:
     """The process that keeps the vehicle of a run."""
     url = load(run.folder / CONFIG).flights[0].url
     words = {process: process.info["cmdline"] or [] for process in psutil.process_iter(["cmdline"])}  # none: a zombie's
-    (found,) = (process for process, own in words.items() if "actors.vehicle_server" in own and url in own)
+    (found,) = (
+        process for process, own in words.items() if "brakeline.actors.mavlink.vehicle_server" in own and url in own
+    )
     return found
 
 

@@ -6,14 +6,14 @@ import subprocess
 import numpy as np
 import pytest
 
-from deploy.data import paths
-from messaging.movers import parted
-from messaging.ports import free_endpoint
-from messaging.shapes import Obstacle
-from safety.commitment import Commitment
-from safety.filter import Filter
-from safety.model_set import ModelSet, Recipe
-from safety.request import Request
+from brakeline.deploy.data import data_paths
+from brakeline.messaging.free_ports import free_endpoint
+from brakeline.messaging.moving_obstacles import parted
+from brakeline.messaging.obstacle import Obstacle
+from brakeline.safety.filter.backup_plan import Commitment
+from brakeline.safety.filter.filter import Filter
+from brakeline.safety.filter.request import Request
+from brakeline.safety.model.model_set import ModelSet, Recipe
 from tests.accepting import WORDS
 from tests.deploy.data.porter import FILE, Porter, drive, porter, write_csv
 from tests.system.runs import BRAKELINE, brakeline
@@ -40,7 +40,7 @@ def certified(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def ready(certified):
-    return Filter(ModelSet.load(paths.model_path(porter(), Recipe())))
+    return Filter(ModelSet.load(data_paths.model_path(porter(), Recipe())))
 
 
 def test_four_commands_from_a_csv_to_an_answer(certified, tmp_path):

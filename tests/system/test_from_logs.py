@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from deploy.run.configurations import EXPERIMENTS
-from logs.reader import read
-from messaging.weights import MLP
+from brakeline.deploy.run.run_config import EXPERIMENTS
+from brakeline.logs.reader import read
+from brakeline.messaging.policy_weights import MLP
 from tests.robots import GROUND
 from tests.system.runs import brakeline
 

@@ -17,18 +17,18 @@ import numpy as np
 import psutil
 import pytest
 
-from actors.dialect import mavlink
-from actors.frames import Frame
-from actors.mavlink import Client
-from actors.px4 import FIELD, QUIET, Px4Flight, Px4Vehicle
-from deploy.run.autopilot import PAD, open_field
-from messaging.shapes import CYLINDER, Obstacle
-from messaging.tasks import robot_with_task
-from sim.autopilot import frames
-from sim.autopilot.hil import Hil
-from sim.autopilot.px4 import Px4
-from sim.autopilot.sensors import SensorNoise, Sensors
-from sim.quadrotor import Quadrotor
+from brakeline.actors.mavlink.ardupilot_dialect import mavlink
+from brakeline.actors.mavlink.autopilot_commands import Client
+from brakeline.actors.mavlink.frame_log import Frame
+from brakeline.actors.mavlink.px4_lockstep import FIELD, QUIET, Px4Flight, Px4Vehicle
+from brakeline.deploy.run.autopilot_run import PAD, open_field
+from brakeline.messaging.obstacle import CYLINDER, Obstacle
+from brakeline.messaging.task import robot_with_task
+from brakeline.sim.autopilot import ned_frames
+from brakeline.sim.autopilot.hil_link import Hil
+from brakeline.sim.autopilot.hil_sensors import SensorNoise, Sensors
+from brakeline.sim.autopilot.px4_process import Px4
+from brakeline.sim.quadrotor import Quadrotor
 from tests.system.runs import BRAKELINE
 from tests.waiting import until
 
@@ -77,10 +77,10 @@ class Flight:
     def hear(self, frame: Frame) -> None:
         message = frame.message
         if message.get_type() == "GPS_GLOBAL_ORIGIN":
-            north, east = 1e-7 * message.latitude - frames.LATITUDE, 1e-7 * message.longitude - frames.LONGITUDE
-            east *= math.cos(math.radians(frames.LATITUDE))
-            up = 1e-3 * message.altitude - frames.ALTITUDE
-            self.begins = np.array([east / frames.DEGREES, north / frames.DEGREES, up])
+            north, east = 1e-7 * message.latitude - ned_frames.LATITUDE, 1e-7 * message.longitude - ned_frames.LONGITUDE
+            east *= math.cos(math.radians(ned_frames.LATITUDE))
+            up = 1e-3 * message.altitude - ned_frames.ALTITUDE
+            self.begins = np.array([east / ned_frames.DEGREES, north / ned_frames.DEGREES, up])
 
     def find_frame(self) -> None:
         """On a busy machine it hears the first fixes late: its frame may begin decimetres above or below the ground."""

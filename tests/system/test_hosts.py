@@ -1,17 +1,17 @@
 """A run over five hosts, robots far from the rest, whose clocks are hours apart: robots that are cut off brake,
 everybody finds another router and another replica, the learner moves, and every step counts once. The long form is
-`python -m deploy.bench chaos`."""
+`python -m benchmarks chaos`."""
 
 from collections import Counter
 from contextlib import suppress
 
 import pytest
 
-from deploy.bench.fleet import MOVED, Fleet
-from deploy.bench.hosts import Hosts, NoHosts
-from learner.checkpoint import exists
-from learner.config import LearnerConfig
-from logs.reader import read
+from benchmarks.five_hosts import MOVED, Fleet
+from benchmarks.network_hosts import Hosts, NoHosts
+from brakeline.learner.checkpoint import exists
+from brakeline.learner.learner_config import LearnerConfig
+from brakeline.logs.reader import read
 from tests.waiting import until
 
 DELAY = 0.005  # s each way, and up to as much again, between the robot and the routers

@@ -2,13 +2,13 @@
 
 import os
 
-from actors.ros2.process import Ros2Settings
-from deploy.commands.ros2 import Ros2
-from deploy.data.paths import method_path
-from messaging import brakeline_pb2 as pb
-from messaging.bus import Bus, BusSettings
-from messaging.ports import free_endpoint
-from safety.model_set import Recipe
+from brakeline.actors.ros2.ros2_process import Ros2Settings
+from brakeline.deploy.commands.ros2_command import Ros2
+from brakeline.deploy.data.data_paths import method_path
+from brakeline.messaging import brakeline_pb2 as pb
+from brakeline.messaging.bus import Bus, BusSettings
+from brakeline.messaging.free_ports import free_endpoint
+from brakeline.safety.model.model_set import Recipe
 from tests.robots import GROUND
 from tests.system.runs import brakeline
 from tests.system.test_alone import start  # noqa: F401 - a fixture

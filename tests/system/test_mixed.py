@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from logs.reader import read
+from brakeline.logs.reader import read
 from tests.accepting import WORDS
 from tests.system.runs import Run
 

@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from deploy.study.evaluate import Evaluation, evaluate
-from logs.tally import Tally
+from brakeline.deploy.experiments.evaluate import Evaluation, evaluate
+from brakeline.logs.episode_stats import Tally
 from tests.robots import GROUND
 from tests.system.runs import brakeline
 

@@ -13,13 +13,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from actors.dialect import mavlink
-from actors.frames import Frame
-from actors.mavlink import message_id
-from actors.mavlink_decoder import OFFBOARD
-from actors.mavlink_vehicle import MavlinkVehicle
-from deploy.bench.timing import stalls
-from messaging.links import open_link
+from benchmarks.timing import stalls
+from brakeline.actors.mavlink.ardupilot_dialect import mavlink
+from brakeline.actors.mavlink.autopilot_commands import message_id
+from brakeline.actors.mavlink.frame_log import Frame
+from brakeline.actors.mavlink.mavlink_decoder import OFFBOARD
+from brakeline.actors.mavlink.mavlink_vehicle import MavlinkVehicle
+from brakeline.messaging.byte_links import open_link
 from tests.accepting import WORDS
 from tests.real import KINDS, autopilot, autopilots
 from tests.robots import QUADROTOR

@@ -23,9 +23,9 @@ from mcap_ros2_support_fast.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 
-from deploy.data import store
-from messaging.ports import free_endpoint
-from safety.model_set import Recipe
+from brakeline.deploy.data import model_store
+from brakeline.messaging.free_ports import free_endpoint
+from brakeline.safety.model.model_set import Recipe
 from tests.robots import GROUND
 from tests.system.runs import BRAKELINE
 from tests.waiting import PATIENCE, until
@@ -49,7 +49,7 @@ print(json.dumps({"topics": found, "publishers": [(end.node_name, end.qos) for e
 @pytest.fixture(scope="session")
 def late_folder(data_folder: Path) -> Path:
     """`$BRAKELINE_DATA` with the ground robot's model set in real time."""
-    store.model_for(GROUND.in_real_time(), Recipe())
+    model_store.model_for(GROUND.in_real_time(), Recipe())
     return data_folder
 
 

@@ -8,9 +8,9 @@ import pytest
 from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 
-from deploy.run.configurations import EXPERIMENTS, load
-from logs.report import analyse
-from messaging.weights import MLP
+from brakeline.deploy.run.run_config import EXPERIMENTS, load
+from brakeline.logs.report import analyse
+from brakeline.messaging.policy_weights import MLP
 from tests.robots import GROUND
 from tests.system.runs import brakeline
 

@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from deploy.data.sources.quantities import AXES
-from deploy.data.sources.table import Array, Table
+from brakeline.deploy.data.sources.quantity_names import AXES
+from brakeline.deploy.data.sources.source_table import Array, Table
 
 FORCE = tuple(f"force.{axis}" for axis in AXES)  # m/s², felt forward, right, down
 ATTITUDE = ("attitude.yaw", "attitude.pitch", "attitude.roll")  # rad, one after the other, from NED to that frame

@@ -3,16 +3,16 @@
 import numpy as np
 import pytest
 
-from actors.ros2.gate import BLIND, LATE, NO_ANSWER, ROOM, Gate, grown
-from actors.ros2.process import Ros2Settings, Unfit, driven
-from actors.ros2.senses import Command
-from actors.ros2.views import diagnostics, markers
-from messaging import brakeline_pb2 as pb
-from messaging.bus import NoReply
-from messaging.ros2.messages import DiagnosticArray, DiagnosticStatus, MarkerArray, decode, encode
-from messaging.shapes import Obstacle, Shapes
-from safety.request import NOT_FINITE
-from safety.wire import decision_of
+from brakeline.actors.ros2.command_gate import BLIND, LATE, NO_ANSWER, ROOM, Gate, grown
+from brakeline.actors.ros2.ros2_process import Ros2Settings, Unfit, driven
+from brakeline.actors.ros2.ros_inputs import Command
+from brakeline.actors.ros2.ros_views import diagnostics, markers
+from brakeline.messaging import brakeline_pb2 as pb
+from brakeline.messaging.bus import NoReply
+from brakeline.messaging.obstacle import Obstacle, Shapes
+from brakeline.messaging.ros2.cdr_messages import DiagnosticArray, DiagnosticStatus, MarkerArray, decode, encode
+from brakeline.safety.filter.request import NOT_FINITE
+from brakeline.safety.service.wire import decision_of
 from tests.robots import GROUND
 
 ROBOT = GROUND.in_real_time()

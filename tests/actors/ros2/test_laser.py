@@ -7,14 +7,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from actors.ros2.frames import Place
-from actors.ros2.laser import BadScan, Errors, _joined, obstacles, read
-from messaging.rays import Rays
-from messaging.ros2.messages import LaserScan, header
-from messaging.shapes import Shapes
-from sim.arenas import draw_arena
-from sim.driven import TurningLidar
-from sim.lidar import Lidar
+from brakeline.actors.ros2.laser_obstacles import BadScan, Errors, _joined, obstacles, read
+from brakeline.actors.ros2.sensor_frames import Place
+from brakeline.messaging.obstacle import Shapes
+from brakeline.messaging.ray_directions import Rays
+from brakeline.messaging.ros2.cdr_messages import LaserScan, header
+from brakeline.sim.arena_generator import draw_arena
+from brakeline.sim.ground_realtime import TurningLidar
+from brakeline.sim.lidar import Lidar
 from tests.robots import GROUND
 
 BEAMS = 360

@@ -8,12 +8,12 @@ from contextlib import contextmanager
 import numpy as np
 import pytest
 
-from actors.ros2.gate import LATE
-from actors.ros2.process import Ros2Settings, Steering
-from actors.ros2.senses import Command, Freshness, Sensing
-from messaging.ports import free_endpoint
-from messaging.ros2 import LATCHED, SENSOR, Node, RosSettings
-from messaging.ros2.messages import (
+from brakeline.actors.ros2.command_gate import LATE
+from brakeline.actors.ros2.ros2_process import Ros2Settings, Steering
+from brakeline.actors.ros2.ros_inputs import Command, Freshness, Sensing
+from brakeline.messaging.free_ports import free_endpoint
+from brakeline.messaging.ros2 import LATCHED, SENSOR, Node, RosSettings
+from brakeline.messaging.ros2.cdr_messages import (
     Clock,
     DiagnosticArray,
     LaserScan,

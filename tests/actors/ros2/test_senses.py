@@ -5,11 +5,11 @@ import math
 import numpy as np
 import pytest
 
-from actors.ros2.clock import Date, Simulated
-from actors.ros2.frames import Frames, Place
-from actors.ros2.odometry import KEPT, Track
-from actors.ros2.senses import Blind, Freshness, Senses, Sensing
-from messaging.ros2.messages import (
+from brakeline.actors.ros2.odometry import KEPT, Track
+from brakeline.actors.ros2.ros_clock import Date, Simulated
+from brakeline.actors.ros2.ros_inputs import Blind, Freshness, Senses, Sensing
+from brakeline.actors.ros2.sensor_frames import Frames, Place
+from brakeline.messaging.ros2.cdr_messages import (
     Clock,
     Odometry,
     PoseWithCovariance,

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from messaging.robots import Robot, robot_named
+from brakeline.messaging.robot import Robot, robot_named
 
 FILE = Path(__file__).with_suffix(".toml")
 STEP = 0.02  # s: what a log has a row for

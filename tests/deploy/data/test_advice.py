@@ -5,12 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from deploy.data.certified import WIDEST, certified
-from deploy.data.coverage import more_to_drive
-from safety.fitting import make
-from safety.leaving import BOTH, FAST, SLOW, STANDING, TURNING, Leaving, regimes
-from safety.model_set import Recipe
-from safety.statement import most_violations, state, upper_bound
+from brakeline.deploy.data.certification import WIDEST, certified
+from brakeline.deploy.data.coverage import more_to_drive
+from brakeline.safety.model.error_causes import BOTH, FAST, SLOW, STANDING, TURNING, Leaving, regimes
+from brakeline.safety.model.fitting import make
+from brakeline.safety.model.model_set import Recipe
+from brakeline.safety.model.validation import most_violations, state, upper_bound
 from tests.robots import GROUND, QUADROTOR
 from tests.safety.unicycle import record
 

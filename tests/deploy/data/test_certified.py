@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from deploy.data.certified import certified
-from safety.model_set import Recipe
-from safety.statement import state, upper_bound
+from brakeline.deploy.data.certification import certified
+from brakeline.safety.model.model_set import Recipe
+from brakeline.safety.model.validation import state, upper_bound
 from tests.safety.unicycle import record
 
 

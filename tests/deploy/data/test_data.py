@@ -9,26 +9,26 @@ from functools import partial
 import numpy as np
 import pytest
 
-from deploy.data import collect, paths, recording, store
-from deploy.data.excite import excitation
-from deploy.data.logged import from_log, trajectories_of
-from deploy.data.making import LOCK
-from logs.segment import Entry, open_segment
-from messaging import brakeline_pb2 as pb
-from safety.dataset import BadData, Dataset
-from safety.model_set import ModelSet, Recipe
-from safety.windows import windows
+from brakeline.deploy.data import collect, data_paths, model_store, simulated_recording
+from brakeline.deploy.data.build_lock import LOCK
+from brakeline.deploy.data.excitation import excitation
+from brakeline.deploy.data.run_dataset import from_log, trajectories_of
+from brakeline.logs.segment import Entry, open_segment
+from brakeline.messaging import brakeline_pb2 as pb
+from brakeline.safety.model.dataset import BadData, Dataset
+from brakeline.safety.model.model_set import ModelSet, Recipe
+from brakeline.safety.model.windows import windows
 from tests.accepting import BOUND
 from tests.robots import GROUND
 from tests.safety.toys import car
 from tests.waiting import PATIENCE
 
 MAKE = """
-from deploy.data import recording, store
-from messaging.tasks import robot_with_task
-from safety.recipe import Recipe
-recording.recorded(robot_with_task("ground"), trajectories=12)
-store.model_for(robot_with_task("ground"), Recipe(), 0.3)
+from brakeline.deploy.data import model_store, simulated_recording
+from brakeline.messaging.task import robot_with_task
+from brakeline.safety.model.model_config import Recipe
+simulated_recording.recorded(robot_with_task("ground"), trajectories=12)
+model_store.model_for(robot_with_task("ground"), Recipe(), 0.3)
 """
 
 
@@ -56,7 +56,7 @@ def test_lead_ins_of_inputs_held_for_long_are_sometimes_restless(held, least, mo
 
 
 def test_recorded_plans_are_found_as_windows(data_folder):
-    data = Dataset.load(paths.record_path(GROUND))
+    data = Dataset.load(data_paths.record_path(GROUND))
     assert len(windows(data, GROUND.horizon)) > 0.1 * data.periods
     assert all(len(t.inputs) == 300 for t in data.trajectories)
 
@@ -66,27 +66,27 @@ def elsewhere(tmp_path, monkeypatch):
     """An empty store, with small recordings only."""
     monkeypatch.setenv("BRAKELINE_DATA", str(tmp_path / "data"))
     recordings = []
-    original = recording.collect.record
-    monkeypatch.setattr(recording, "recorded", partial(recording.recorded, trajectories=12))
-    monkeypatch.setattr(recording.collect, "record", lambda *a: (recordings.append(a), original(*a))[1])
+    original = simulated_recording.collect.record
+    monkeypatch.setattr(simulated_recording, "recorded", partial(simulated_recording.recorded, trajectories=12))
+    monkeypatch.setattr(simulated_recording.collect, "record", lambda *a: (recordings.append(a), original(*a))[1])
     return recordings
 
 
 def test_the_store_makes_what_is_missing_and_only_that(elsewhere, capsys):
-    model = store.model_for(GROUND, Recipe(), BOUND)
-    assert paths.record_path(GROUND).exists() and len(elsewhere) == 1
-    assert ModelSet.load(paths.model_path(GROUND, Recipe())).version == model.version
-    assert store.model_for(GROUND, Recipe(), BOUND).version == model.version
-    other = store.model_for(GROUND, Recipe("set-membership"), BOUND)
+    model = model_store.model_for(GROUND, Recipe(), BOUND)
+    assert data_paths.record_path(GROUND).exists() and len(elsewhere) == 1
+    assert ModelSet.load(data_paths.model_path(GROUND, Recipe())).version == model.version
+    assert model_store.model_for(GROUND, Recipe(), BOUND).version == model.version
+    other = model_store.model_for(GROUND, Recipe("set-membership"), BOUND)
     assert other.version != model.version and len(elsewhere) == 1, "one recording for all"
     assert float(model.about["bound_step"]) <= float(model.about["bound_plan"]) < 1.0
-    paths.model_path(GROUND, Recipe()).write_bytes(b"damaged")
-    assert store.model_for(GROUND, Recipe(), BOUND).version == model.version
+    data_paths.model_path(GROUND, Recipe()).write_bytes(b"damaged")
+    assert model_store.model_for(GROUND, Recipe(), BOUND).version == model.version
     said = capsys.readouterr()
     assert "making the model set again" in said.err and said.out == ""
-    paths.model_path(GROUND, Recipe()).unlink()
-    paths.record_path(GROUND).write_bytes(b"damaged")
-    assert store.model_for(GROUND, Recipe(), BOUND).version == model.version, "the same seed, the same data"
+    data_paths.model_path(GROUND, Recipe()).unlink()
+    data_paths.record_path(GROUND).write_bytes(b"damaged")
+    assert model_store.model_for(GROUND, Recipe(), BOUND).version == model.version, "the same seed, the same data"
     assert len(elsewhere) == 2
 
 
@@ -101,9 +101,9 @@ def test_of_two_that_find_nothing_one_records_and_the_other_waits_for_it(tmp_pat
 
 
 def test_what_is_imported_meanwhile_is_not_recorded_over(elsewhere, monkeypatch):
-    data = recording.recorded(GROUND, trajectories=1)
+    data = simulated_recording.recorded(GROUND, trajectories=1)
     driven = replace(data, about={"origin": "a log", "source": "drive.csv"})
-    path, record = paths.record_path(GROUND), collect.record
+    path, record = data_paths.record_path(GROUND), collect.record
 
     def interrupted(*how):
         driven.save(path)
@@ -113,10 +113,10 @@ def test_what_is_imported_meanwhile_is_not_recorded_over(elsewhere, monkeypatch)
     for again in (True, False):
         path.unlink()
         with pytest.raises(BadData, match="is kept"):
-            recording.recorded(GROUND, trajectories=1, again=again)
+            simulated_recording.recorded(GROUND, trajectories=1, again=again)
         assert Dataset.about_of(path)["source"] == "drive.csv"
     with pytest.raises(BadData, match="is kept"):
-        recording.recorded(GROUND, trajectories=1, again=True)
+        simulated_recording.recorded(GROUND, trajectories=1, again=True)
 
 
 def steps(actor: str, episode: int, numbers, run: int = 1) -> list[pb.Step]:
@@ -163,20 +163,20 @@ def test_the_last_steps_of_a_log(tmp_path):
 
 
 def test_an_interrupted_recording_is_gone_on_from(elsewhere, monkeypatch, capsys):
-    drive = recording.collect.record
+    drive = simulated_recording.collect.record
 
     def interrupted(*given):
         yield from itertools.islice(drive(*given), 5)
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(recording.collect, "record", interrupted)
+        patch.setattr(simulated_recording.collect, "record", interrupted)
         with pytest.raises(KeyboardInterrupt):
-            recording.recorded(GROUND)
-    assert not paths.record_path(GROUND).exists()
+            simulated_recording.recorded(GROUND)
+    assert not data_paths.record_path(GROUND).exists()
     assert "recording ground once" in (told := capsys.readouterr().err) and "kept 5 of 12" in told
-    whole = recording.recorded(GROUND)
+    whole = simulated_recording.recorded(GROUND)
     assert elsewhere[-1][-1] == 5, "only what was missing is driven"
-    assert {path.name for path in paths.record_path(GROUND).parent.iterdir()} == {"record.safetensors", LOCK}
-    fresh = recording.recorded(GROUND, paths.record_path(GROUND).with_name("fresh.safetensors"))
+    assert {path.name for path in data_paths.record_path(GROUND).parent.iterdir()} == {"record.safetensors", LOCK}
+    fresh = simulated_recording.recorded(GROUND, data_paths.record_path(GROUND).with_name("fresh.safetensors"))
     assert whole.digest() == fresh.digest(), "the same data as in one go"

@@ -14,11 +14,11 @@ from pymavlink import DFReader
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 from pyulog import ULog
 
-from deploy.data.bring import bring, tables_of
-from deploy.data.coverage import coverage
-from deploy.data.sources.quantities import resolve
-from deploy.data.sources.table import NoSource
-from deploy.data.sources.tlog import _frames
+from brakeline.deploy.data.coverage import coverage
+from brakeline.deploy.data.importer import bring, tables_of
+from brakeline.deploy.data.sources.quantity_names import resolve
+from brakeline.deploy.data.sources.source_table import NoSource
+from brakeline.deploy.data.sources.tlog_file import _frames
 from tests.robots import QUADROTOR
 
 FLOWN = Path(__file__).parent / "flown"

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from rosbags.rosbag2 import StoragePlugin
 
-from deploy.cli import main
-from deploy.data.bring import bring, tables_of
-from deploy.data.resample import resample
-from deploy.data.sources.table import NoSource, Table
-from messaging.descriptions import robot_of
-from safety.dataset import Dataset
-from safety.windows import _off_chord
+from brakeline.deploy.cli import main
+from brakeline.deploy.data.importer import bring, tables_of
+from brakeline.deploy.data.resample import resample
+from brakeline.deploy.data.sources.source_table import NoSource, Table
+from brakeline.messaging.robot_description import robot_of
+from brakeline.safety.model.dataset import Dataset
+from brakeline.safety.model.windows import _off_chord
 from tests.deploy.data.bags import write_bag, write_bin, write_parquet, write_tlog, write_ulg
 from tests.deploy.data.porter import COLUMNS, FILE, STEP, Porter, drive, porter, write_csv
 

@@ -7,12 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from actors.mavlink_vehicle import ControlPeriod
-from deploy.data.maiden import LEVELS, Box, Maiden, homeward, stretch
-from safety.dataset import Dataset
-from safety.windows import PLAN, windows
-from sim.quadrotor import SAMPLES, slewed
-from sim.vehicle import Period
+from brakeline.actors.mavlink.mavlink_vehicle import ControlPeriod
+from brakeline.deploy.data.first_flight import LEVELS, Box, Maiden, homeward, stretch
+from brakeline.safety.model.dataset import Dataset
+from brakeline.safety.model.windows import PLAN, windows
+from brakeline.sim.quadrotor import SAMPLES, slewed
+from brakeline.sim.vehicle import Period
 from tests.robots import QUADROTOR
 
 LATE = QUADROTOR.in_real_time()

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from deploy.data.pretrain import RECIPES, SailrRecipe, SecasRecipe, made_by, pretrain
-from deploy.data.rollouts import costs, transitions
-from learner.pretrain import Fit
-from safety.methods import ready
+from brakeline.deploy.data.rival_pretraining import RECIPES, SailrRecipe, SecasRecipe, made_by, pretrain
+from brakeline.deploy.data.rival_rollouts import costs, transitions
+from brakeline.learner.rival_networks import Fit
+from brakeline.safety.methods import ready
 from tests.robots import GROUND
 
 

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from mcap.writer import Writer
 
-from deploy.cli import main
-from deploy.data.bring import bring, tables_of
-from deploy.data.sources.table import NoSource, Table
-from deploy.data.told import told
-from messaging.robots import FOLDER as ROBOTS
-from messaging.robots import robot_named
+from brakeline.deploy.cli import main
+from brakeline.deploy.data.importer import bring, tables_of
+from brakeline.deploy.data.schema_inference import told
+from brakeline.deploy.data.sources.source_table import NoSource, Table
+from brakeline.messaging.robot import FOLDER as ROBOTS
+from brakeline.messaging.robot import robot_named
 from tests.deploy.data.bags import write_bag
 from tests.deploy.data.porter import COLUMNS, drive, write_csv
 

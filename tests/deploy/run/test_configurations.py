@@ -7,17 +7,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from actors.loop import Change
-from deploy.commands.fly import Fly
-from deploy.commands.train import Train
-from deploy.policies import policy_named
-from deploy.run.configurations import EXPERIMENTS, RunConfig, decode, encode, load
-from deploy.run.places import places
-from learner.config import LearnerConfig, TD3Config
-from messaging.tasks import robot_with_task
-from safety.model_set import Recipe
-from sim.conditions import Conditions, Perception
-from sim.estimator import NoiseLevels
+from brakeline.actors.actor_process import Change
+from brakeline.deploy.commands.fly import Fly
+from brakeline.deploy.commands.train import Train
+from brakeline.deploy.policy_loading import policy_named
+from brakeline.deploy.run.processes import places
+from brakeline.deploy.run.run_config import EXPERIMENTS, RunConfig, decode, encode, load
+from brakeline.learner.learner_config import LearnerConfig, TD3Config
+from brakeline.messaging.task import robot_with_task
+from brakeline.safety.model.model_set import Recipe
+from brakeline.sim.ground_estimator import NoiseLevels
+from brakeline.sim.sim_conditions import Conditions, Perception
 
 CHANGED = RunConfig(
     robots=("ground",),

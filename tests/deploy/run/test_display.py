@@ -8,14 +8,14 @@ import pytest
 from rich.console import Console
 from rich.progress import Progress
 
-from deploy.commands import common
-from deploy.run.configurations import RunConfig
-from deploy.run.display import Display, doing, line, live, summary
-from deploy.run.places import places
-from deploy.run.view import View
-from deploy.run.watched import Child
-from logs.metrics import Metrics
-from messaging import brakeline_pb2 as pb
+from brakeline.deploy.commands import common_options
+from brakeline.deploy.run.display import Display, doing, line, live, summary
+from brakeline.deploy.run.processes import places
+from brakeline.deploy.run.run_config import RunConfig
+from brakeline.deploy.run.run_view import View
+from brakeline.deploy.run.supervisor import Child
+from brakeline.logs.metrics import Metrics
+from brakeline.messaging import brakeline_pb2 as pb
 
 
 def step(number: int) -> pb.Step:
@@ -69,7 +69,7 @@ def test_without_a_terminal_it_says_a_line_now_and_then(view: View, monkeypatch:
             display(view)
         said = console.file.getvalue()  # type: ignore[attr-defined]
         assert said.startswith("starting recorder, safety-0,") and said.count("\n") == 1, "what it does, at once"
-        monkeypatch.setattr("deploy.run.display.PLAIN", 0.0)
+        monkeypatch.setattr("brakeline.deploy.run.display.PLAIN", 0.0)
         display(view)
         monkeypatch.undo()
         view.ending = True
@@ -79,7 +79,7 @@ def test_without_a_terminal_it_says_a_line_now_and_then(view: View, monkeypatch:
 
 
 def test_the_summary_has_the_paths_whole(view: View) -> None:
-    console = Console(file=io.StringIO(), soft_wrap=common.console.soft_wrap)
+    console = Console(file=io.StringIO(), soft_wrap=common_options.console.soft_wrap)
     folder = "/very/long" * 12
     paths = {"folder": folder, "log": f"{folder}/run.mcap", "policies": [f"{folder}/policy.safetensors"]}
     summary(console, view.metrics.figures() | paths | {"finished": False, "restarts": {"learner": 2, "safety-0": 1}})

@@ -7,16 +7,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from actors.driver import Driver, Identity
-from deploy.cli import main
-from deploy.data.planned import Excited
-from deploy.policies import policy_named
-from deploy.study.evaluate import episode
-from deploy.vehicles import environment
-from logs.reader import read
-from messaging.tasks import robot_with_task
-from safety.dataset import BadData, Dataset
-from safety.windows import PLAN, windows
+from brakeline.actors.episode_runner import Driver, Identity
+from brakeline.deploy.cli import main
+from brakeline.deploy.data.excitation_plan import Excited
+from brakeline.deploy.experiments.evaluate import episode
+from brakeline.deploy.policy_loading import policy_named
+from brakeline.deploy.vehicle_factory import environment
+from brakeline.logs.reader import read
+from brakeline.messaging.task import robot_with_task
+from brakeline.safety.model.dataset import BadData, Dataset
+from brakeline.safety.model.windows import PLAN, windows
 from tests.robots import GROUND
 
 CAR = str(Path(__file__).parents[3] / "examples" / "car" / "car.toml")

@@ -5,12 +5,12 @@ from pathlib import Path
 
 import pytest
 
-from deploy.run.configurations import EXPERIMENTS, RunConfig
-from deploy.run.feed import Steps, count
-from deploy.run.places import places
-from logs.segment import Entry, open_segment
-from messaging import brakeline_pb2 as pb
-from messaging.topics import STEP
+from brakeline.deploy.run.log_feed import Steps, count
+from brakeline.deploy.run.processes import places
+from brakeline.deploy.run.run_config import EXPERIMENTS, RunConfig
+from brakeline.logs.segment import Entry, open_segment
+from brakeline.messaging import brakeline_pb2 as pb
+from brakeline.messaging.topics import STEP
 from tests.robots import GROUND, QUADROTOR
 
 

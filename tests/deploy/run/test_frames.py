@@ -7,19 +7,19 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 
-from actors.flying import MavlinkVehicle
-from actors.tape import Tape
-from deploy.run.frames import ENCODING, as_json, both
-from logs.reader import read
-from logs.recorder import Inbox, Recording
-from logs.tlog import to_tlog
-from logs.trajectories import ExportError
-from messaging import brakeline_pb2 as pb
-from messaging.bus import Malformed, Sample
-from messaging.topics import FRAMES, LOG
-from sim.autopilot.endpoint import Autopilot
-from sim.quadrotor import Quadrotor
-from sim.world import staged_arena
+from brakeline.actors.mavlink.frame_recorder import Tape
+from brakeline.actors.mavlink.lockstep_quadrotor import MavlinkVehicle
+from brakeline.deploy.run.mavlink_json import ENCODING, as_json, both
+from brakeline.logs.minari_export import ExportError
+from brakeline.logs.reader import read
+from brakeline.logs.recorder import Inbox, Recording
+from brakeline.logs.tlog_export import to_tlog
+from brakeline.messaging import brakeline_pb2 as pb
+from brakeline.messaging.bus import Malformed, Sample
+from brakeline.messaging.topics import FRAMES, LOG
+from brakeline.sim.arena import staged_arena
+from brakeline.sim.autopilot.endpoint import Autopilot
+from brakeline.sim.quadrotor import Quadrotor
 from tests.robots import QUADROTOR
 
 

@@ -5,14 +5,14 @@ from pathlib import Path
 
 import pytest
 
-from deploy.interpreter import spawning
-from deploy.run.configurations import EXPERIMENTS, RunConfig, encode
-from deploy.run.launcher import Launcher
-from deploy.run.places import UNFINISHED, Place
-from deploy.run.watched import Child
-from messaging import brakeline_pb2 as pb
-from messaging.bus import BusSettings, Sample
-from messaging.topics import EPISODE, EXCHANGE, HEALTH, LOG, STEP, Topic
+from brakeline.deploy.interpreter import spawning
+from brakeline.deploy.run.launcher import Launcher
+from brakeline.deploy.run.processes import UNFINISHED, Place
+from brakeline.deploy.run.run_config import EXPERIMENTS, RunConfig, encode
+from brakeline.deploy.run.supervisor import Child
+from brakeline.messaging import brakeline_pb2 as pb
+from brakeline.messaging.bus import BusSettings, Sample
+from brakeline.messaging.topics import EPISODE, EXCHANGE, HEALTH, LOG, STEP, Topic
 
 
 @pytest.fixture
@@ -43,8 +43,8 @@ def test_what_it_cannot_handle_is_passed_over(launcher: Launcher) -> None:
 
 
 def test_its_figures_stay_bounded(launcher: Launcher, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("logs.metrics.MOST_STREAMS", 100)
-    monkeypatch.setattr("logs.metrics.MOST_NAMES", 100)
+    monkeypatch.setattr("brakeline.logs.metrics.MOST_STREAMS", 100)
+    monkeypatch.setattr("brakeline.logs.metrics.MOST_NAMES", 100)
     for number in range(300):
         header = pb.Header(run=number)
         say(launcher, STEP, pb.Step(header=header, actor=f"a{number}"))

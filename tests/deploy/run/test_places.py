@@ -2,8 +2,8 @@
 
 import pytest
 
-from deploy.run.places import client_of, metrics_of, say_where
-from messaging.bus import BusSettings
+from brakeline.deploy.run.processes import client_of, metrics_of, say_where
+from brakeline.messaging.bus import BusSettings
 
 
 @pytest.mark.parametrize(

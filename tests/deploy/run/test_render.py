@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from deploy.run.render import Film, record, save
-from deploy.study.evaluate import Evaluation, prepared
+from brakeline.deploy.experiments.evaluate import Evaluation, prepared
+from brakeline.deploy.run.episode_render import Film, record, save
 from tests.robots import GROUND
 
 

@@ -8,14 +8,14 @@ from typing import Any
 
 import pytest
 
-from deploy import cli
-from deploy.data.paths import record_path
-from deploy.data.store import model_for
-from deploy.run.replay import APART, Difference, ReplayError, differences, replay
-from deploy.study.evaluate import in_process
-from messaging import brakeline_pb2 as pb
-from safety.filter import Filter
-from safety.model_set import Recipe
+from brakeline.deploy import cli
+from brakeline.deploy.data.data_paths import record_path
+from brakeline.deploy.data.model_store import model_for
+from brakeline.deploy.experiments.evaluate import in_process
+from brakeline.deploy.run.replay_run import APART, Difference, ReplayError, differences, replay
+from brakeline.messaging import brakeline_pb2 as pb
+from brakeline.safety.filter.filter import Filter
+from brakeline.safety.model.model_set import Recipe
 from tests.deploy.drive import drive
 from tests.robots import GROUND
 

@@ -11,13 +11,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from deploy.data.store import model_for
-from deploy.run.replay import differences
-from logs.reader import open_log
-from messaging import brakeline_pb2 as pb
-from safety.filter import Filter
-from safety.model_set import Recipe
-from safety.wire import message_of, request_of
+from brakeline.deploy.data.model_store import model_for
+from brakeline.deploy.run.replay_run import differences
+from brakeline.logs.reader import open_log
+from brakeline.messaging import brakeline_pb2 as pb
+from brakeline.safety.filter.filter import Filter
+from brakeline.safety.model.model_set import Recipe
+from brakeline.safety.service.wire import message_of, request_of
 from tests.robots import GROUND
 
 LINE = 64  # bytes: the widest vector that a processor loads at once
@@ -25,7 +25,7 @@ LINE = 64  # bytes: the widest vector that a processor loads at once
 
 def test_with_another_processors_linear_algebra_no_decision_differs(log: Path) -> None:
     """The kernels of a processor without wide vectors, where there is a choice (x86), add in another order."""
-    words = (sys.executable, "-m", "deploy.cli", "replay", str(log), "--json")
+    words = (sys.executable, "-m", "brakeline.deploy.cli", "replay", str(log), "--json")
     done = subprocess.run(
         words, env=os.environ | {"OPENBLAS_CORETYPE": "Prescott"}, capture_output=True, text=True, check=False
     )
@@ -52,7 +52,7 @@ def owners(thing: object, seen: set[int]) -> Iterator[dict[str, Any]]:
     if isinstance(thing, tuple | list):
         for part in thing:
             yield from owners(part, seen)
-    elif type(thing).__module__.startswith("safety") and hasattr(thing, "__dict__"):
+    elif type(thing).__module__.startswith("brakeline.safety") and hasattr(thing, "__dict__"):
         yield vars(thing)
         for part in list(vars(thing).values()):
             yield from owners(part, seen)

@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from deploy.run.replay import replay
-from safety import solver
+from brakeline.deploy.run.replay_run import replay
+from brakeline.safety.filter import qp_solver
 
 STORED = Path(__file__).parents[2] / "stored"
 ROUNDING = 1e-9  # m/s, rad/s, m
@@ -19,7 +19,7 @@ ROUNDING = 1e-9  # m/s, rad/s, m
 
 @pytest.mark.parametrize(("robot", "count", "allowed_now"), [("ground", 400, 0), ("quadrotor", 250, 1)])
 def test_stored_questions_are_decided_as_they_were(robot, count, allowed_now, monkeypatch):
-    monkeypatch.setattr(solver, "_by_few", lambda program: None)
+    monkeypatch.setattr(qp_solver, "_by_few", lambda program: None)
     result = replay(STORED / f"{robot}-before-files.mcap")
     assert (result.requests, result.unanswered) == (count, 0)
     changed = {kinds: number for kinds, number in result.kinds.items() if kinds[0] != kinds[1]}

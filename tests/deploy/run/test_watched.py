@@ -6,16 +6,16 @@ from pathlib import Path
 
 import pytest
 
-from deploy.run import watched
-from deploy.run.places import Place
-from deploy.run.watched import HEALTHY_AFTER, MOST_FAILURES, SPEAKS_AFTER, Child, LaunchError
+from brakeline.deploy.run import supervisor
+from brakeline.deploy.run.processes import Place
+from brakeline.deploy.run.supervisor import HEALTHY_AFTER, MOST_FAILURES, SPEAKS_AFTER, Child, LaunchError
 
 
 @pytest.fixture
 def clock(monkeypatch: pytest.MonkeyPatch) -> list[float]:
     """Its one entry is what time it is, s."""
     now = [1000.0]
-    monkeypatch.setattr(watched.time, "monotonic", lambda: now[0])
+    monkeypatch.setattr(supervisor.time, "monotonic", lambda: now[0])
     return now
 
 
@@ -25,7 +25,7 @@ class Failing(Child):
     def start(self) -> None:
         self.popen = subprocess.Popen([sys.executable, "-c", "raise SystemExit(1)"])
         self.popen.wait()
-        self.started, self.spoke = watched.time.monotonic(), None
+        self.started, self.spoke = supervisor.time.monotonic(), None
 
 
 def lives(child: Child, clock: list[float], until_it_speaks: float | None, after: float) -> None:

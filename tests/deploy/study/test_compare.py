@@ -7,17 +7,17 @@ from functools import partial
 import numpy as np
 import pytest
 
-from deploy.data import pretrain, store
-from deploy.study.cells import METHODS, Study, Trial, quick, run
-from deploy.study.compare import Cell, studies
-from deploy.study.curves import learning_curves, seeds_as_points
-from deploy.study.intervals import mean, ratio
-from deploy.study.table import markdown, plain, steps_to_learn, table, without_times
-from learner.pretrain import Fit
-from logs.report import analyse
-from messaging.tasks import robot_with_task
-from messaging.weights import MLP
-from safety.model_set import Recipe
+from brakeline.deploy.data import model_store, rival_pretraining
+from brakeline.deploy.experiments.bootstrap import mean, ratio
+from brakeline.deploy.experiments.compare import Cell, studies
+from brakeline.deploy.experiments.comparison_cells import METHODS, Study, Trial, quick, run
+from brakeline.deploy.experiments.comparison_plots import learning_curves, seeds_as_points
+from brakeline.deploy.experiments.comparison_table import markdown, plain, steps_to_learn, table, without_times
+from brakeline.learner.rival_networks import Fit
+from brakeline.logs.report import analyse
+from brakeline.messaging.policy_weights import MLP
+from brakeline.messaging.task import robot_with_task
+from brakeline.safety.model.model_set import Recipe
 from tests.robots import GROUND
 
 DEAR = ("decision_ms", "milliseconds")
@@ -33,13 +33,16 @@ TINY = replace(TINY, td3=replace(TINY.td3, hidden=(16, 16), batch=16, warmup=60)
 def rivals(data_folder):
     """Rivals that know next to nothing, made in seconds."""
     little = {"samples": 300, "fit": Fit(hidden=(8, 8), epochs=1, batch=32)}
-    made = {"secas": partial(pretrain.SecasRecipe, **little), "sailr": partial(pretrain.SailrRecipe, **little)}
-    before = dict(pretrain.RECIPES)
-    pretrain.RECIPES.update(made)
+    made = {
+        "secas": partial(rival_pretraining.SecasRecipe, **little),
+        "sailr": partial(rival_pretraining.SailrRecipe, **little),
+    }
+    before = dict(rival_pretraining.RECIPES)
+    rival_pretraining.RECIPES.update(made)
     for method in made:
-        store.method_for(GROUND, method, Recipe())
+        model_store.method_for(GROUND, method, Recipe())
     yield made
-    pretrain.RECIPES.update(before)
+    rival_pretraining.RECIPES.update(before)
 
 
 @pytest.fixture(scope="module")
@@ -79,7 +82,7 @@ def test_a_cell_says_what_its_logs_say(cells, method):
 
 
 def test_methods_share_the_episodes_that_they_are_evaluated_on(cells):
-    from logs.reader import read as records
+    from brakeline.logs.reader import read as records
 
     arenas = []
     for method in METHODS:

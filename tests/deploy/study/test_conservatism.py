@@ -1,7 +1,7 @@
 """The certificates' table: what was driven, what was refused, and what is too wide to drive."""
 
-from deploy.study import conservatism
-from deploy.study.conservatism import Conservatism
+from brakeline.deploy.experiments import conservatism
+from brakeline.deploy.experiments.conservatism import Conservatism
 
 SAID = {"half_width_rest": 0.0056, "half_width_full": 0.0081, "violations": 2, "windows": 1981, "bound_plan": 0.0042}
 

@@ -2,9 +2,9 @@
 
 import pytest
 
-from deploy.run.replay import _question
-from deploy.study.evaluate import Evaluation, evaluate
-from messaging import brakeline_pb2 as pb
+from brakeline.deploy.experiments.evaluate import Evaluation, evaluate
+from brakeline.deploy.run.replay_run import _question
+from brakeline.messaging import brakeline_pb2 as pb
 from tests.robots import GROUND
 
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import psutil
 import pytest
 
-from deploy.study.jobs import OtherConfiguration, complete, read, write
+from brakeline.deploy.experiments.experiment_jobs import OtherConfiguration, complete, read, write
 from tests.waiting import until
 
 
@@ -70,7 +70,7 @@ class Nap(Errand):
 
 NAPS = """
 from pathlib import Path
-from deploy.study.jobs import complete
+from brakeline.deploy.experiments.experiment_jobs import complete
 from tests.deploy.study.test_jobs import Nap
 if __name__ == "__main__":
     complete([Nap(1), Nap(2)], Path({0!r}) / "results", Path({0!r}) / "runs", workers=2)

@@ -1,8 +1,8 @@
 """How a rival's threshold is chosen: by what came of it in closed loop, not by what the model was stored with."""
 
-from deploy.data.pretrain import SailrRecipe, SecasRecipe, pretrain, recipe_for
-from deploy.study.tune import Tried, best, try_all, values_for
-from learner.pretrain import Fit
+from brakeline.deploy.data.rival_pretraining import SailrRecipe, SecasRecipe, pretrain, recipe_for
+from brakeline.deploy.experiments.rival_tuning import Tried, best, try_all, values_for
+from brakeline.learner.rival_networks import Fit
 from tests.robots import GROUND, QUADROTOR
 
 LITTLE = {"samples": 300, "fit": Fit(hidden=(8,), epochs=1, batch=32)}

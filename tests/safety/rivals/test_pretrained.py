@@ -5,12 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from messaging.perceptrons import BadPerceptrons, Perceptrons
-from safety.methods import decode, load, ready
-from safety.model_set import BadModel, ModelSet
-from safety.rivals.pretrained import Pretrained
-from safety.rivals.sailr import Sailr
-from safety.rivals.secas import Secas
+from brakeline.messaging.perceptrons import BadPerceptrons, Perceptrons
+from brakeline.safety.methods import decode, load, ready
+from brakeline.safety.model.model_set import BadModel, ModelSet
+from brakeline.safety.rivals.pretrained import Pretrained
+from brakeline.safety.rivals.sailr import Sailr
+from brakeline.safety.rivals.secas import Secas
 from tests.robots import GROUND, QUADROTOR
 from tests.safety.rivals import test_sailr, test_secas
 

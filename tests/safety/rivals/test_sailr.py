@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
-from messaging.perceptrons import Perceptrons
-from messaging.shapes import Shapes
-from safety.backup import brake, braking_plan
-from safety.model_set import BadModel
-from safety.request import NOT_FINITE, BadRequest, Request
-from safety.rivals.pretrained import Pretrained
-from safety.rivals.sailr import Sailr
+from brakeline.messaging.obstacle import Shapes
+from brakeline.messaging.perceptrons import Perceptrons
+from brakeline.safety.filter.braking import brake, braking_plan
+from brakeline.safety.filter.request import NOT_FINITE, BadRequest, Request
+from brakeline.safety.model.model_set import BadModel
+from brakeline.safety.rivals.pretrained import Pretrained
+from brakeline.safety.rivals.sailr import Sailr
 from tests.robots import GROUND, QUADROTOR
 
 STEEP = 3.0

@@ -7,18 +7,18 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from messaging import brakeline_pb2 as pb
-from messaging.perceptrons import Perceptrons
-from messaging.rays import fan
-from messaging.shapes import Shapes
-from safety.asker import accept
-from safety.client import read, request_message
-from safety.commitment import UNVERIFIED, Commitment
-from safety.model_set import BadModel
-from safety.request import NOT_FINITE, BadRequest, Request
-from safety.rivals.pretrained import Pretrained
-from safety.rivals.secas import Constraints, Secas, closed_form, quadratic
-from safety.service import Counts, Models, answerer
+from brakeline.messaging import brakeline_pb2 as pb
+from brakeline.messaging.obstacle import Shapes
+from brakeline.messaging.perceptrons import Perceptrons
+from brakeline.messaging.ray_directions import fan
+from brakeline.safety.filter.backup_plan import UNVERIFIED, Commitment
+from brakeline.safety.filter.request import NOT_FINITE, BadRequest, Request
+from brakeline.safety.model.model_set import BadModel
+from brakeline.safety.rivals.pretrained import Pretrained
+from brakeline.safety.rivals.secas import Constraints, Secas, closed_form, quadratic
+from brakeline.safety.service.asker import accept
+from brakeline.safety.service.client import read, request_message
+from brakeline.safety.service.server import Counts, Models, answerer
 from tests.robots import GROUND, QUADROTOR
 
 WIDE = np.full(3, 10.0)

@@ -1,0 +1,1 @@
+"""Vehicles behind MAVLink, seen from an actor."""

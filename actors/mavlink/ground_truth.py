@@ -1,0 +1,118 @@
+"""Ground truth of a simulated flight: it judges the flight, and nothing flies by it.
+
+Two sources exist. Our own simulator sends it over UDP beside MAVLink (`UdpGroundTruth`). A real autopilot that runs in
+a simulator sends it over MAVLink beside the estimate (`MavlinkGroundTruth`).
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import socket
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from brakeline.actors.mavlink.telemetry import Array, Place
+from brakeline.messaging.rejected_messages import Tolerance
+from brakeline.sim.quadrotor import QUADROTOR
+
+FARTHEST = 1e5  # m, m/s, ...: no vehicle is farther away, or faster
+MOST_DATAGRAMS = 100  # read in one call of `poll`
+
+
+class UdpGroundTruth:
+    """The latest ground truth that a simulator on this machine sends over UDP
+    (`brakeline.sim.autopilot.autopilot_server`).
+
+    Attributes:
+        state: (9,) true state; None before the first datagram.
+        collisions: number of times that the vehicle began to touch an obstacle.
+        clearance: m from the body to the nearest obstacle; inf if the simulator sends none.
+    """
+
+    def __init__(self, port: int, system: int, tolerance: Tolerance | None = None) -> None:
+        """Listen on a UDP port of the loopback interface, for the vehicle of this MAVLink system id.
+
+        Raises:
+            OSError: the port is in use.
+        """
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._socket.bind(("127.0.0.1", port))
+        self._socket.setblocking(False)
+        self._system, self._tolerance = system, tolerance or Tolerance()
+        self.state: Array | None = None
+        self.collisions = 0
+        self.clearance = math.inf
+
+    def poll(self) -> None:
+        """Read the datagrams that have arrived, `MOST_DATAGRAMS` at most: a flood must not hold up the flight."""
+        for _ in range(MOST_DATAGRAMS):
+            try:
+                data = self._socket.recv(4096)
+            except BlockingIOError:
+                return
+            with self._tolerance.over("truth"):
+                self._take(json.loads(data))
+
+    def close(self) -> None:
+        """Stop listening."""
+        self._socket.close()
+
+    def _take(self, values: Any) -> None:
+        """Raises ValueError, TypeError, KeyError: the datagram is not one of our simulator."""
+        if values["system"] != self._system:
+            return
+        state, clearance = np.array(values["state"], float), values["clearance"]
+        clearance = math.inf if clearance is None else float(clearance)
+        if state.shape != (QUADROTOR.state_dim,) or not (np.abs(state) < FARTHEST).all() or math.isnan(clearance):
+            raise ValueError(f"state {values['state']}, clearance {clearance}")
+        if type(values["collisions"]) is not int:
+            raise ValueError(f"collisions {values['collisions']!r}")
+        self.state, self.collisions, self.clearance = state, values["collisions"], clearance
+
+
+@dataclass
+class MavlinkGroundTruth:
+    """Ground truth of one flight, from the latitude and longitude that an autopilot's simulator sends over MAVLink.
+
+    The first message lays the map so that truth and estimate agree. From then on the drift of the estimate counts
+    against the flight.
+
+    Attributes:
+        clearance_of: the clearance [m] of a position (3,) from the nearest obstacle; below 0 the body touches it.
+        state: (9,) true state; its acceleration is unknown and 0. None before the first message.
+        collisions: number of times that the vehicle began to touch an obstacle.
+        clearance: m, the latest.
+        least: m, the smallest clearance so far.
+        worst: m, the largest horizontal distance so far from the estimate to the truth.
+    """
+
+    clearance_of: Callable[[Array], float]
+    state: Array | None = None
+    collisions: int = 0
+    clearance: float = math.inf
+    least: float = math.inf
+    worst: float = 0.0
+    _start: tuple[Place, Array] | None = None
+    _touching: bool = False
+
+    def take(self, place: Place, estimate: Array, velocity: Array) -> None:
+        """Take the true place, and the estimated position (3,) [m] and velocity (3,) [m/s] of about the same moment.
+
+        If `place` has no altitude, the estimate's height stands for it.
+        """
+        if self._start is None:
+            self._start = place, estimate.copy()
+        first, origin = self._start
+        position = origin + place.since(first)
+        if place.altitude is None:
+            position[2] = estimate[2]
+        self.worst = max(self.worst, math.hypot(*(position - estimate)[:2]))
+        self.state = np.concatenate((position, velocity, np.zeros(3)))
+        self.clearance = now = self.clearance_of(position)
+        self.least = min(self.least, now)
+        self.collisions += now < 0.0 and not self._touching
+        self._touching = now < 0.0

@@ -1,0 +1,97 @@
+"""A quadrotor behind MAVLink in memory, in lockstep with its simulated autopilot."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Protocol
+
+import numpy as np
+
+from brakeline.actors.mavlink.autopilot_commands import Client, CommandRefused, message_id
+from brakeline.actors.mavlink.frame_log import Tap
+from brakeline.actors.mavlink.telemetry import ATTITUDE, FORCE, MOTION, SOURCES, Array
+from brakeline.messaging.robot import Robot
+from brakeline.sim.quadrotor import SAMPLES, Quadrotor
+from brakeline.sim.vehicle import Period, executed
+
+
+class Endpoint(Protocol):
+    """A simulated autopilot in memory: sim.autopilot.endpoint.Autopilot."""
+
+    vehicle: Quadrotor
+
+    def receive(self, data: bytes) -> None: ...
+
+    def take(self) -> bytes: ...
+
+    def advance(self, seconds: float) -> None: ...
+
+
+class MavlinkVehicle:
+    """A quadrotor flown over the bytes of an embedded autopilot, in lockstep: time passes only in `step`.
+
+    What is measured comes from telemetry, what is true and what was touched from the simulator. The autopilot starts in
+    the air; setpoints and mode are exchanged before time begins.
+    """
+
+    def __init__(self, endpoint: Endpoint, robot: Robot, tap: Tap | None = None) -> None:
+        """tap: is called with every MAVLink frame. Raises MavlinkError when the autopilot refuses something."""
+        self._endpoint, self._client = endpoint, Client(endpoint.receive, tap=tap)
+        self._robot, period = robot, robot.period
+        self.input = np.zeros(robot.action_dim)
+        wait = self._wait
+        for what, interval in ((MOTION, period / SAMPLES), (ATTITUDE, period), (FORCE, period)):
+            self._listen(what, interval)
+        self._client.follow_setpoints(wait)
+        self.true, self.measured = endpoint.vehicle.state(), self._measured()
+
+    def step(self, input: Array) -> Period:
+        """Fly one period at a velocity setpoint (3,) [m/s], clipped to bounds and slew.
+
+        Raises:
+            BadInput: when the input is not three finite numbers.
+        """
+        self.input = executed(self._robot, input, self.input)
+        client, endpoint, start = self._client, self._endpoint, self.measured[:3]
+        client.path.clear()
+        client.setpoint(self.input)
+        endpoint.vehicle.watch()
+        endpoint.advance(self._robot.period)
+        client.feed(endpoint.take())
+        self.measured = self._measured()
+        path = np.array([position for _, position in client.path]) - start
+        period = endpoint.vehicle.watched(self.measured, path)
+        self.true = period.true
+        return period
+
+    def standing(self) -> Period:
+        """The present state as a period in which nothing happened: what there is to say before the first step."""
+        clearance = float(self._endpoint.vehicle.clearance(self.true[:3]))
+        return Period(self.measured, self.true, False, clearance, clearance, np.zeros((SAMPLES, 3)), 0.0)
+
+    def alter(self, **changes: float) -> None:
+        """Of the simulated vehicle: see Quadrotor.alter."""
+        self._endpoint.vehicle.alter(**changes)
+
+    def _measured(self) -> Array:
+        """The state (9,) by the latest telemetry."""
+        client = self._client
+        assert client.position is not None
+        return np.concatenate((client.position, client.velocity, client.acceleration))
+
+    def _listen(self, what: str, interval: float) -> None:
+        """Have the best message that it grants sent every `interval` s, and once now. Raises CommandRefused."""
+        names = [source.message for source in SOURCES[what]]
+        for name in names:
+            try:
+                self._client.stream(message_id(name), interval, self._wait)
+                self._client.request(message_id(name), self._wait)
+                return
+            except CommandRefused:
+                if name == names[-1]:
+                    raise
+
+    def _wait(self, condition: Callable[[], bool], _: float) -> bool:
+        """Answers come at once or not at all."""
+        self._client.feed(self._endpoint.take())
+        return condition()

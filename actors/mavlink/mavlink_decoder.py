@@ -1,0 +1,239 @@
+"""Decode the MAVLink 2 messages of one autopilot.
+
+The frames NED and forward-right-down end here: every value that comes out is in ENU and SI units. The caller feeds the
+bytes; the decoder has no thread, no clock and no socket.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections import Counter, deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from brakeline.actors.mavlink import telemetry
+from brakeline.actors.mavlink.ardupilot_dialect import mavlink
+from brakeline.actors.mavlink.frame_log import Frame, Tap
+from brakeline.actors.mavlink.telemetry import (
+    ATTITUDE,
+    FORCE,
+    GRAVITY,
+    LANDED,
+    MOTION,
+    SOURCES,
+    TRUTH,
+    Array,
+    Motion,
+    Place,
+)
+
+STATION, COMPONENT = 245, int(mavlink.MAV_COMP_ID_ONBOARD_COMPUTER)  # who we are
+AUTOPILOT = int(mavlink.MAV_COMP_ID_AUTOPILOT1)
+FULL = 100.0  # %
+KINDS = {int(mavlink.MAV_AUTOPILOT_PX4): "px4", int(mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA): "ardupilot"}
+SIDES = {1: "least altitude", 2: "greatest altitude", 3: "boundary"}  # FENCE_BREACH
+OFFBOARD = {"px4": (6, 6 << 16), "ardupilot": (4, 4)}  # DO_SET_MODE's param2, and HEARTBEAT's custom mode
+
+
+class MavlinkDecoder:
+    """The latest values from one autopilot's messages.
+
+    Until `choose` has selected a message for a quantity, the decoder uses the best one that arrives.
+
+    Attributes:
+        path: (time [s since its boot], position (3,)) of each position since the caller last emptied the list.
+        position, velocity: (3,) m and m/s; the position is None before the first message.
+        acceleration: (3,) m/s², the accelerometer's reading in the world frame without gravity: few autopilots send it.
+        message_counts: messages by the quantity that they carry (a key of `SOURCES`); heartbeats count as "mode".
+        received, missed: number of the autopilot's frames, by their sequence numbers.
+    """
+
+    def __init__(
+        self,
+        send: Callable[[bytes], object],
+        system: int = 1,
+        tap: Tap | None = None,
+        say: Callable[[str], object] | None = None,
+    ) -> None:
+        """system: the autopilot's id; tap: called with each frame from it or to it; say: called with its texts."""
+        self.system = system
+        self.kind: str | None = None
+        self.armed = False
+        self.custom_mode = 0
+        self.emergency = False
+        self.airborne: bool | None = None  # None: unknown
+        self.message_counts: Counter[str] = Counter()
+        self.time = 0.0  # s since its boot, of the latest position
+        self.position: Array | None = None
+        self.velocity = np.zeros(3)
+        self.path: list[tuple[float, Array]] = []
+        self.truth: Place | None = None  # ground truth of the autopilot's simulator
+        self.texts: list[str] = []
+        self.estimator: int | None = None  # flags, see telemetry.ESTIMATED
+        self.battery: float | None = None  # %; None: unknown
+        self.outside = ""  # the side of its geofence that it has crossed; empty: none
+        self.answers: list[tuple[int, int]] = []  # ns, from TIMESYNC: our clock when we asked, the autopilot's then
+        self.chosen: dict[str, str] = {}  # message by key of SOURCES
+        self.received = self.missed = 0
+        self._sequence: int | None = None
+        self._came: Counter[str] = Counter()  # messages by name
+        self._best: dict[str, int] = {}  # index in SOURCES of the best message so far, until one is chosen
+        self._attitude: telemetry.Quaternion = (1.0, 0.0, 0.0, 0.0)  # NED from forward-right-down
+        self._forces: deque[telemetry.Triple] = deque([(0.0, 0.0, -GRAVITY)], 1)
+        self._acks: dict[int, int] = {}
+        self._parameters: dict[str, float] = {}
+        self._types: dict[str, int] = {}  # MAV_PARAM_TYPE of each of them
+        self._tap, self._say = tap, say
+        self._mav = mavlink.MAVLink(_Pipe(send), srcSystem=STATION, srcComponent=COMPONENT)
+        self._mav.robust_parsing = True
+        if tap is not None:
+            self._mav.set_send_callback(lambda message: tap(Frame(True, bytes(message.get_msgbuf()), message)))
+
+    @property
+    def acceleration(self) -> Array:
+        """(3,) m/s², ENU."""
+        count = len(self._forces)
+        x, y, z = (sum(force[axis] for force in self._forces) / count for axis in range(3))
+        return telemetry.acceleration(self._attitude, (x, y, z))
+
+    @property
+    def offboard(self) -> bool:
+        """Whether the autopilot follows setpoints, by its last heartbeat."""
+        return self.kind is not None and self.custom_mode == OFFBOARD[self.kind][1]
+
+    @property
+    def mode(self) -> str:
+        """The name of its mode, by its last heartbeat."""
+        return "no mode yet" if self.kind is None else telemetry.mode_name(self.kind, self.custom_mode)
+
+    def feed(self, data: bytes) -> None:
+        """Decode bytes from the link, in pieces of any size."""
+        for message in self._mav.parse_buffer(data) or ():
+            if message.get_srcSystem() != self.system or message.get_srcComponent() != AUTOPILOT:
+                continue
+            self._count(message.get_seq())
+            if self._tap is not None:
+                self._tap(Frame(False, bytes(message.get_msgbuf()), message))
+            name = message.get_type()
+            self._came[name] += 1
+            for what, place in SENDERS.get(name, ()):
+                self._take(what, place, message)
+            handler = HANDLERS.get(message.get_msgId())
+            if handler is not None:
+                handler(self, message)
+
+    def smooth(self, readings: int) -> None:
+        """Average this many readings of the accelerometer from now on."""
+        self._forces = deque(self._forces, readings)
+
+    def _count(self, sequence: int) -> None:
+        if self._sequence is not None:
+            self.missed += (sequence - self._sequence - 1) % 256
+        self._sequence = sequence
+        self.received += 1
+
+    def _take(self, what: str, place: int, message: Any) -> None:
+        """Take the quantity `what` from a message, unless a better message provides it."""
+        source = SOURCES[what][place]
+        if self.kind is not None and self.kind not in source.kinds:
+            return
+        chosen = self.chosen.get(what)
+        if (chosen or source.message) != source.message or (not chosen and place > self._best.get(what, place)):
+            return
+        value = telemetry.told(source, message)
+        if value is None:
+            return
+        self._best[what] = place
+        self.message_counts[what] += 1
+        TAKERS[what](self, value)
+
+    def _move(self, motion: Motion) -> None:
+        self.time, self.position, self.velocity = motion.time, motion.position, motion.velocity
+        self.path.append((motion.time, motion.position))
+
+    def _turn(self, attitude: telemetry.Quaternion) -> None:
+        self._attitude = attitude
+
+    def _feel(self, force: telemetry.Triple) -> None:
+        self._forces.append(force)
+
+    def _lift(self, airborne: bool) -> None:
+        self.airborne = airborne
+
+    def _locate(self, place: Place) -> None:
+        self.truth = place
+
+    def _on_heartbeat(self, message: Any) -> None:
+        if message.autopilot not in KINDS:
+            return
+        self.kind = KINDS[message.autopilot]
+        self.armed = bool(message.base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED)
+        self.emergency = message.system_status in (mavlink.MAV_STATE_CRITICAL, mavlink.MAV_STATE_EMERGENCY)
+        self.custom_mode = message.custom_mode
+        self.message_counts["mode"] += 1
+
+    def _on_ack(self, message: Any) -> None:
+        if message.result != mavlink.MAV_RESULT_IN_PROGRESS:
+            self._acks[message.command] = message.result
+
+    def _on_text(self, message: Any) -> None:
+        fresh = not self.texts or self.texts[-1] != message.text
+        self.texts.append(message.text)
+        if fresh and self._say is not None:
+            self._say(message.text)
+
+    def _on_estimator(self, message: Any) -> None:
+        self.estimator = message.flags
+
+    def _on_status(self, message: Any) -> None:
+        if 0 <= message.battery_remaining <= FULL:
+            self.battery = float(message.battery_remaining)
+
+    def _on_fence(self, message: Any) -> None:
+        side = SIDES.get(message.breach_type, "") or "geofence"
+        self.outside = side if message.breach_status else ""
+
+    def _on_parameter(self, message: Any) -> None:
+        value = message.param_value
+        if self.kind == "px4" and message.param_type == mavlink.MAV_PARAM_TYPE_INT32:  # its bits, not its value
+            value = struct.unpack("<i", struct.pack("<f", value))[0]
+        self._parameters[message.param_id], self._types[message.param_id] = float(value), message.param_type
+
+    def _on_time(self, message: Any) -> None:
+        if message.tc1 == 0:
+            return  # a request of the autopilot for our clock
+        self.answers.append((message.ts1, message.tc1))
+
+
+HANDLERS: dict[int, Callable[[MavlinkDecoder, Any], None]] = {
+    mavlink.MAVLINK_MSG_ID_HEARTBEAT: MavlinkDecoder._on_heartbeat,
+    mavlink.MAVLINK_MSG_ID_COMMAND_ACK: MavlinkDecoder._on_ack,
+    mavlink.MAVLINK_MSG_ID_STATUSTEXT: MavlinkDecoder._on_text,
+    mavlink.MAVLINK_MSG_ID_EKF_STATUS_REPORT: MavlinkDecoder._on_estimator,
+    mavlink.MAVLINK_MSG_ID_ESTIMATOR_STATUS: MavlinkDecoder._on_estimator,
+    mavlink.MAVLINK_MSG_ID_SYS_STATUS: MavlinkDecoder._on_status,
+    mavlink.MAVLINK_MSG_ID_FENCE_STATUS: MavlinkDecoder._on_fence,
+    mavlink.MAVLINK_MSG_ID_PARAM_VALUE: MavlinkDecoder._on_parameter,
+    mavlink.MAVLINK_MSG_ID_TIMESYNC: MavlinkDecoder._on_time,
+}
+TAKERS: dict[str, Callable[[MavlinkDecoder, Any], None]] = {
+    MOTION: MavlinkDecoder._move,
+    ATTITUDE: MavlinkDecoder._turn,
+    FORCE: MavlinkDecoder._feel,
+    LANDED: MavlinkDecoder._lift,
+    TRUTH: MavlinkDecoder._locate,
+}
+SENDERS: dict[str, list[tuple[str, int]]] = {}  # by message: the quantities in it, each with its index in SOURCES
+for _what, _sources in SOURCES.items():
+    for _place, _source in enumerate(_sources):
+        SENDERS.setdefault(_source.message, []).append((_what, _place))
+
+
+@dataclass(frozen=True)
+class _Pipe:
+    """The part of a file that pymavlink uses."""
+
+    write: Callable[[bytes], object]

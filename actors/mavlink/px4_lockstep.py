@@ -1,0 +1,249 @@
+"""A quadrotor behind the real PX4, in lockstep: it stays in the air from episode to episode, and the arenas change."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import select
+import socket
+import time
+import weakref
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from brakeline.actors.mavlink.autopilot_commands import Client, MavlinkError
+from brakeline.actors.mavlink.frame_log import Frame, Tap
+from brakeline.messaging.robot import Robot
+from brakeline.sim.arena import Arena, closing, room_bounds
+from brakeline.sim.autopilot.common_dialect import mavlink
+from brakeline.sim.autopilot.hil_link import AutopilotGone, Hil
+from brakeline.sim.autopilot.hil_sensors import SensorNoise, Sensors
+from brakeline.sim.autopilot.px4_process import Px4
+from brakeline.sim.flight_estimator import QuadrotorNoise
+from brakeline.sim.quadrotor import SAMPLES, Quadrotor
+from brakeline.sim.vehicle import Period, executed
+
+Array = NDArray[np.float64]
+
+LISTEN_EVERY, TELL_EVERY = 4, 20  # physics steps between two looks, two setpoints
+INTERVALS = {
+    mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED: 0.01,
+    mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION: 0.005,
+    mavlink.MAVLINK_MSG_ID_HIGHRES_IMU: 0.005,
+}  # s between two messages of a kind, as often as each is made
+FRESH, LATEST = 0.0125, 0.25  # s; a message that is older is waited for, so long in real time
+READY_IN, UP_IN, STANDS_IN = 90.0, 20.0, 10.0  # s until it knows where it is, has climbed, has come to a stop
+SETTLES_IN = 15.0  # s of hovering until what a takeoff does to its estimate is forgotten
+HEIGHT, CLIMB = 3.0, 1.5  # m, m/s, of the takeoff
+STANDING, LEVEL = 0.1, 0.1  # m/s, rad: slower and more upright than that, it hovers
+FAR = 500.0  # m to whatever closes the field
+QUIET = QuadrotorNoise(scale=0.0)  # the estimator is PX4's
+FIELD = Arena(
+    "field", closing(FAR, 2.0 * FAR), (0.0, 0.0, FAR), (0.5 * FAR, 0.0, FAR), 1.0, 10**9, room_bounds(FAR, 2.0 * FAR)
+)
+
+
+class Px4Flight:
+    """One PX4, started at the first need and again when it cannot go on, as after a crash.
+
+    `enter` puts another vehicle in the place of the one that flies. For PX4 all arenas are corners of one large field.
+    """
+
+    def __init__(
+        self, folder: Path, noise: SensorNoise, parameters: dict[str, float] | None = None, tap: Tap | None = None
+    ) -> None:
+        """folder, parameters: see Px4; tap: is called with every MAVLink frame between it and its companion."""
+        self._folder, self._noise, self._parameters, self._tap = folder, noise, parameters, tap
+        self._px4: Px4 | None = None
+        self._count = 0
+        self._told = dict.fromkeys(INTERVALS, 0.0)  # s, time of the newest message of a kind
+        self.setpoint = np.zeros(3)
+        self.starts = 0  # of PX4
+
+    @property
+    def flies(self) -> bool:
+        """PX4 lives and follows setpoints."""
+        return self._px4 is not None and self._px4.alive and self.hil.armed and self.client.offboard
+
+    def enter(self, vehicle: Quadrotor) -> None:
+        """Hover at the start of that vehicle's arena, as that vehicle.
+
+        Raises:
+            Px4Error, MavlinkError: PX4 does not start, or does not take off; AutopilotGone: nor does it answer.
+        """
+        try:
+            hovers = self.flies and self._stop()
+        except AutopilotGone:
+            hovers = False
+        if not hovers:
+            self._begin()
+        self._become(vehicle)
+
+    def tell(self, velocity: Array) -> None:
+        """The setpoint (3,) [m/s] from now on."""
+        self.setpoint, self._count = velocity, 0
+
+    def advance(self, seconds: float) -> None:
+        """Let time pass. Raises AutopilotGone."""
+        for _ in range(round(seconds / self.hil.vehicle.timestep)):
+            if self._count % TELL_EVERY == 0:
+                self.client.setpoint(self.setpoint)
+                self.client.heartbeat()
+            self._count += 1
+            self.hil.tick()
+            if self._count % LISTEN_EVERY == 0:
+                self._listen()
+
+    def wait(self, condition: Callable[[], bool], seconds: float) -> bool:
+        """Until it holds, at most so many seconds of simulated time; whether it does."""
+        end = self.hil.time + seconds
+        while not condition():
+            if self.hil.time >= end:
+                return False
+            self.advance(0.05)
+        return True
+
+    def settle(self) -> None:
+        """Time stands still, but threads of PX4 may not have said yet what they know."""
+        end = time.monotonic() + LATEST
+        self._listen()
+        while min(self._told.values()) < self.hil.time - FRESH and (left := end - time.monotonic()) > 0.0:
+            select.select([self._link], [], [], left)
+            self._listen()
+
+    def close(self) -> None:
+        """Also when nobody refers to it any more, and at the end of the program."""
+        if self._px4 is not None:
+            self._shut()
+            self._px4 = None
+
+    def _begin(self) -> None:
+        """Start PX4 and take off."""
+        self.close()
+        self._link = link = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        link.bind(("127.0.0.1", 0))
+        link.setblocking(False)
+        try:
+            self._px4 = px4 = Px4(self._folder, link.getsockname()[1], self._parameters)
+        except BaseException:
+            link.close()
+            raise
+        self._shut = weakref.finalize(self, _shut, px4, link)
+        self.starts += 1
+        rng = np.random.default_rng(self.starts)
+        vehicle = Quadrotor(FIELD, rng, QUIET, floor=FAR)
+        self.hil = Hil(px4.connection, vehicle, Sensors(self._noise, rng, vehicle.timestep))
+        self.client = Client(lambda data: link.sendto(data, ("127.0.0.1", px4.local)), tap=self._hear)
+        self._told = dict.fromkeys(INTERVALS, 0.0)
+        self.tell(np.zeros(3))
+        while not self.hil.answering:
+            self.hil.tick()
+        if not self.wait(lambda: self.client.position is not None, READY_IN):
+            raise MavlinkError(f"PX4 does not know where it is; its last words:\n{px4.last_words()}")
+        for kind, interval in INTERVALS.items():
+            self.client.stream(kind, interval, self.wait)
+        self.client.follow_setpoints(self.wait)
+        self.client.arm(self.wait)
+        self.tell(np.array([0.0, 0.0, CLIMB]))
+        if not self.wait(lambda: vehicle.state()[2] > FAR + HEIGHT, UP_IN) or not self._stop():
+            raise MavlinkError(f"PX4 does not take off; its last words:\n{px4.last_words()}")
+        self.advance(SETTLES_IN)
+
+    def _stop(self) -> bool:
+        """Come to a stop where there is nothing to touch; whether it did."""
+        self._become(Quadrotor(FIELD, np.random.default_rng(0), QUIET))
+        self.tell(np.zeros(3))
+        return self.wait(self._hovers, STANDS_IN)
+
+    def _hovers(self) -> bool:
+        truth = self.hil.vehicle.truth()
+        tilt = 2.0 * math.hypot(truth.attitude[1], truth.attitude[2])
+        return math.hypot(*truth.velocity) < STANDING and tilt < LEVEL
+
+    def _become(self, vehicle: Quadrotor) -> None:
+        """It goes on as this vehicle, from this one's place: for PX4 nothing has changed."""
+        hil = self.hil
+        (x, y, z), (a, b, c), (p, q, r) = hil.shift, hil.vehicle.truth().position, vehicle.truth().position
+        vehicle.resume(hil.vehicle)
+        hil.vehicle, hil.shift = vehicle, (x + a - p, y + b - q, z + c - r)
+
+    def _hear(self, frame: Frame) -> None:
+        message = frame.message
+        if not frame.outgoing and message.get_msgId() in self._told:
+            micro = getattr(message, "time_usec", None)
+            self._told[message.get_msgId()] = 1e-3 * message.time_boot_ms if micro is None else 1e-6 * micro
+        if self._tap is not None:
+            self._tap(frame)
+
+    def _listen(self) -> None:
+        with contextlib.suppress(BlockingIOError):
+            while True:
+                self.client.feed(self._link.recv(65536))
+
+
+def _shut(px4: Px4, link: socket.socket) -> None:
+    px4.close()
+    link.close()
+
+
+class Px4Vehicle:
+    """A quadrotor flown by PX4 over MAVLink, for one episode: time passes only in `step`.
+
+    What is measured is PX4's estimate, what is true and what was touched is the simulator's. At the start, where it
+    hovers, its local frame is laid onto the arena's, as by somebody who switches it on at a known place.
+    """
+
+    def __init__(self, flight: Px4Flight, vehicle: Quadrotor, robot: Robot) -> None:
+        """Raises what `Px4Flight.enter` does."""
+        self._flight, self._vehicle, self._robot = flight, vehicle, robot
+        self.input = np.zeros(robot.action_dim)
+        flight.enter(vehicle)
+        flight.tell(self.input)
+        flight.settle()
+        self._offset = np.zeros(3)
+        self.true = vehicle.state()
+        self._offset = self.true[:3] - self._estimate()[:3]
+        self.measured = self._estimate()
+
+    def step(self, input: Array) -> Period:
+        """Fly one period at a velocity setpoint (3,) [m/s], clipped to bounds and slew.
+
+        Raises:
+            BadInput: when the input is not three finite numbers; AutopilotGone.
+        """
+        self.input = executed(self._robot, input, self.input)
+        flight, client, start, begin = self._flight, self._flight.client, self.measured[:3], self._flight.hil.time
+        client.path.clear()
+        self._vehicle.watch()
+        flight.tell(self.input)
+        flight.advance(self._robot.period)
+        flight.settle()
+        self.measured = self._estimate()
+        times = [begin, *(at for at, _ in client.path), flight.hil.time]
+        places = np.array([start, *(where + self._offset for _, where in client.path), self.measured[:3]])
+        samples = begin + self._robot.period * np.arange(1, SAMPLES + 1) / SAMPLES
+        path = np.column_stack([np.interp(samples, times, places[:, axis]) for axis in range(3)])
+        period = self._vehicle.watched(self.measured, path - start)
+        self.true = period.true
+        return period
+
+    def standing(self) -> Period:
+        """The present state as a period in which nothing happened: what there is to say before the first step."""
+        clearance = float(self._vehicle.clearance(self.true[:3]))
+        return Period(self.measured, self.true, False, clearance, clearance, np.zeros((SAMPLES, 3)), 0.0)
+
+    def alter(self, **changes: float) -> None:
+        """Of the simulated vehicle: see Quadrotor.alter."""
+        self._vehicle.alter(**changes)
+
+    def _estimate(self) -> Array:
+        """The state (9,) by the latest telemetry, carried on to the present."""
+        client = self._flight.client
+        assert client.position is not None
+        age, acceleration = max(self._flight.hil.time - client.time, 0.0), client.acceleration
+        velocity = client.velocity + age * acceleration
+        position = client.position + self._offset + age * client.velocity + 0.5 * age**2 * acceleration
+        return np.concatenate((position, velocity, acceleration))

@@ -1,0 +1,73 @@
+"""Real autopilots that are not what they were: wind, weak motors, a load, noise; a GPS that jumps, cameras that go out.
+
+After `flights`, whose folder it works in: A* flies among obstacles behind the model set that was made there, the model
+set is made again of that flight's log, and A* flies behind the new one. In real time: eight minutes for each.
+"""
+
+from __future__ import annotations
+
+import shutil
+import sys
+from functools import partial
+from pathlib import Path
+
+from benchmarks import sitl
+from benchmarks.flights import HEARING, INDOORS, LED, OUTDOORS, PRACTICE, SETUPS, Flights, Upset, certified, flown
+from benchmarks.timing import Words
+
+BEFORE, AFTER = 5.0, 3.0  # minutes
+JUMP = 4e-5  # degrees, 4.4 m
+
+LASTING: dict[str, dict[str, Upset]] = {  # by kind of autopilot
+    "ardupilot": {
+        "wind of 5 m/s, turbulent": Upset({"SIM_WIND_SPD": 5.0, "SIM_WIND_TURB": 1.0}),
+        "a motor at 80 %": Upset({"SIM_ENGINE_MUL": 0.8}),
+        "GPS noise of 0.5 m": Upset({"SIM_GPS_NOISE": 0.5}),
+    },
+    "px4": {
+        "20 % heavier": Upset({"SIH_MASS": 1.2}),
+        "motors at 80 %": Upset({"SIH_T_MAX": 4.0}),
+    },
+}
+JUMPS = {"GPS off by 4.4 m for 10 s": Upset({"SIM_GPS_GLITCH_X": JUMP}, 150.0, 160.0, {"SIM_GPS_GLITCH_X": 0.0})}
+PASSING: dict[str, dict[str, Upset]] = {  # by setup
+    OUTDOORS: JUMPS,
+    LED: JUMPS,
+    HEARING: {"no GPS for 10 s": Upset({"SIM_GPS_USED": 3}, 150.0, 160.0, {"SIM_GPS_USED": 10})},
+    INDOORS: {"no cameras for 3 s": Upset({"EKF2_EV_CTRL": 0}, 150.0, 153.0, {"EKF2_EV_CTRL": 7})},
+}
+
+
+def run(folder: Path) -> Words:
+    """Rows: what was changed, before the model set was made again, how that went, and after it."""
+    rows: Words = {}
+    for name, setup in SETUPS.items():
+        try:
+            flights = Flights(name, sitl.program(setup.kind), folder / name)
+        except sitl.NoAutopilot as none:
+            print(none, file=sys.stderr)
+            continue
+        rows |= _upsets(flights, name, LASTING[setup.kind], PASSING[name])
+    return rows
+
+
+def _upsets(flights: Flights, setup: str, lasting: dict[str, Upset], passing: dict[str, Upset]) -> Words:
+    rows: Words = {}
+    for what, upset in (lasting | passing).items():
+        name = what.replace(" ", "-").replace("/", "").replace("%", "").replace(",", "")
+        row = flown(partial(flights.upset, name, BEFORE, upset, "--practice", PRACTICE))
+        rows[f"{setup}: {what}"] = row
+        if what in lasting and "failed" not in row:
+            rows |= _again(flights, setup, what, name, upset)
+    return rows
+
+
+def _again(flights: Flights, setup: str, what: str, name: str, upset: Upset) -> Words:
+    """The model set of the flight's log, and a flight behind it."""
+    renewed = Flights.beside(flights, name)
+    shutil.copytree(flights.data, renewed.data, dirs_exist_ok=True)
+    found = flights.certify(name, renewed.data, "--few")
+    rows: Words = {f"{setup}: {what}, certified again": certified(found)}
+    if "refused" not in found:
+        rows[f"{setup}: {what}, behind that"] = flown(partial(renewed.upset, f"{name}-again", AFTER, upset))
+    return rows

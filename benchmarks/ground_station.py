@@ -1,0 +1,83 @@
+"""A ground station for comparisons: sends what it is told to, and keeps what it hears. It judges nothing."""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from collections.abc import Callable
+from typing import Any
+
+from brakeline.messaging.byte_links import Link
+from brakeline.sim.autopilot.common_dialect import mavlink
+
+OURSELVES = 254  # system id
+STEP = 0.02  # s between two looks
+STREAM = 0.05  # s between two setpoints
+PATIENCE = 3.0  # s for an answer
+VELOCITY_ONLY = 0b0000_1101_1100_0111  # type mask: position, acceleration, yaw and its rate are to be ignored
+RESULTS = {value: name.removeprefix("MAV_RESULT_").lower().replace("_", " ") for name, value in vars(mavlink).items()
+           if name.startswith("MAV_RESULT_") and isinstance(value, int)}  # fmt: skip
+
+
+class Station:
+    """Talks to one vehicle. `last` holds the newest message of each type, `heard` how many there were of each."""
+
+    def __init__(self, link: Link, system: int) -> None:
+        self._link, self.system = link, system
+        self._mav = mavlink.MAVLink(self, srcSystem=OURSELVES, srcComponent=mavlink.MAV_COMP_ID_MISSIONPLANNER)
+        self._mav.robust_parsing = True
+        self.last: dict[str, Any] = {}
+        self.heard: Counter[str] = Counter()
+        self.velocity: tuple[float, float, float] | None = None  # m/s NED, streamed while it is not None
+        self.frame, self.mask = int(mavlink.MAV_FRAME_LOCAL_NED), VELOCITY_ONLY
+        self._beaten = self._streamed = -1.0
+
+    def write(self, data: bytes) -> None:
+        """For pymavlink."""
+        self._link.send(bytes(data))
+
+    def listen(self, seconds: float, until: Callable[[], object] = lambda: False) -> float:
+        """Hear, and stream what is to be streamed; returns how long [s] it took until `until` held."""
+        started = time.monotonic()
+        while (passed := time.monotonic() - started) < seconds:
+            self._speak(time.monotonic())
+            for message in self._mav.parse_buffer(self._link.receive()) or ():
+                if message.get_srcSystem() == self.system:
+                    self.last[message.get_type()] = message
+                    self.heard[message.get_type()] += 1
+            if until():
+                break
+            time.sleep(STEP)
+        return passed
+
+    def command(self, number: int, *params: float) -> str:
+        """COMMAND_LONG; its result in words, "silence" if there is none."""
+        self.last.pop("COMMAND_ACK", None)
+        self._mav.command_long_send(self.system, 1, number, 0, *params, *[0.0] * (7 - len(params)))
+
+        def answered() -> bool:
+            ack = self.last.get("COMMAND_ACK")
+            return ack is not None and ack.command == number
+
+        self.listen(PATIENCE, answered)
+        return RESULTS.get(self.last["COMMAND_ACK"].result, "?") if answered() else "silence"
+
+    @property
+    def armed(self) -> bool:
+        beat = self.last.get("HEARTBEAT")
+        return beat is not None and bool(beat.base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED)
+
+    @property
+    def mode(self) -> int:
+        """As its heartbeat says."""
+        return int(self.last["HEARTBEAT"].custom_mode)
+
+    def _speak(self, now: float) -> None:
+        if now - self._beaten > 1.0:
+            self._beaten = now
+            self._mav.heartbeat_send(mavlink.MAV_TYPE_GCS, mavlink.MAV_AUTOPILOT_INVALID, 0, 0, 0)
+        if self.velocity is not None and now - self._streamed > STREAM:
+            self._streamed = now
+            self._mav.set_position_target_local_ned_send(
+                0, self.system, 1, self.frame, self.mask, 0, 0, 0, *self.velocity, 0, 0, 0, 0, 0
+            )

@@ -1,0 +1,297 @@
+"""Messages of all kinds against every process that listens to them, in this process: does anything raise, or grow?
+
+Of each topic: valid messages with every field drawn (extremes, wrong sizes, names that are none), such messages with
+bits turned, bytes cut off or doubled, and noise. What a process can't handle it must pass over; what it says of itself
+and shows must still come. `python -m benchmarks fuzz` sends a million, the tests some thousands.
+"""
+
+from __future__ import annotations
+
+import logging
+import tempfile
+import time
+import traceback
+from collections import Counter, deque
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from threading import Event
+from types import SimpleNamespace
+from typing import Any
+
+import psutil
+from google.protobuf.message import DecodeError
+
+from benchmarks.message_fuzzer import Mill
+from benchmarks.timing import Figures
+from brakeline.actors.learner_client import Student
+from brakeline.deploy.commands.watch_command import _show
+from brakeline.deploy.run.display import line
+from brakeline.deploy.run.launcher import Launcher
+from brakeline.deploy.run.mavlink_json import as_json, both
+from brakeline.deploy.run.run_config import RunConfig
+from brakeline.learner.learner import Learner
+from brakeline.learner.learner_config import LearnerConfig
+from brakeline.learner.learner_process import LearnerLoop, LearnerSettings
+from brakeline.logs.foxglove import Pictures
+from brakeline.logs.log_analysis import Analysis, Look
+from brakeline.logs.reader import Log
+from brakeline.logs.recorder import Inbox, Recording, Rotation
+from brakeline.logs.report_page import render
+from brakeline.logs.segment import Metadata, Segment
+from brakeline.logs.watch.live_board import Board
+from brakeline.logs.watch.live_page_server import encode
+from brakeline.messaging import brakeline_pb2 as pb
+from brakeline.messaging.bus import BusError, BusSettings, Sample
+from brakeline.messaging.rejected_messages import Tolerance
+from brakeline.messaging.task import RobotWithTask, robot_with_task
+from brakeline.messaging.topics import DECIDE, FLOW, JOIN, MODEL, RECORDED, TOPICS, WEIGHTS, Topic
+from brakeline.safety.filter.backup_plan import Commitment
+from brakeline.safety.filter.request import BadRequest
+from brakeline.safety.methods import decode
+from brakeline.safety.model.model_set import BadModel
+from brakeline.safety.service.client import read, request_message
+from brakeline.safety.service.server import Counts, Models, answerer
+
+LOOK = 25_000  # messages between two looks at what the processes say and show
+SETTLED = 0.3  # of the messages: by then tables are as full as they get
+LATER = 0.67  # of the messages: what grows from here on is a leak
+
+
+class Wire:
+    """A bus that goes nowhere: what is published is dropped, handlers are kept."""
+
+    run = 1
+
+    def __init__(self) -> None:
+        self.tolerance = Tolerance()
+        self.handlers: dict[str, Callable[[Sample], None]] = {}
+
+    def publisher(self, topic: Topic, **names: str) -> Any:
+        return SimpleNamespace(put=lambda message: message.SerializeToString(), count=0)
+
+    def subscribe(self, topic: Topic, handler: Callable[[Sample], None], **names: str) -> None:
+        self.handlers[topic.name] = handler
+
+    def serve(self, topic: Topic, handler: Callable[[bytes], bytes], **names: str) -> None: ...
+
+
+@dataclass
+class Party:
+    """A process: what it does with a sample, what it says of itself and shows, and what it passed over."""
+
+    topics: tuple[Topic, ...]
+    take: Callable[[Sample], None]
+    look: Callable[[], object]
+    tolerance: Tolerance = field(default_factory=Tolerance)
+    close: Callable[[], object] = lambda: None
+    names: frozenset[str] = frozenset()
+    messages: int = 0
+    crashes: Counter[str] = field(default_factory=Counter)
+
+    def __post_init__(self) -> None:
+        self.names = frozenset(topic.name for topic in self.topics)
+
+    def try_(self, work: Callable[[], object]) -> None:
+        try:
+            work()
+        except Exception as error:  # it would have ended the process
+            place = traceback.extract_tb(error.__traceback__)[-1]
+            self.crashes[f"{type(error).__name__} at {Path(place.filename).name}:{place.lineno}: {error}"[:200]] += 1
+
+
+def launcher(folder: Path) -> Party:
+    one = Launcher(RunConfig(), folder, BusSettings(listen=("tcp/127.0.0.1:1",)))
+
+    def take(sample: Sample) -> None:
+        one._inbox.append(sample)
+        one._drain()
+
+    return Party(RECORDED, take, lambda: (line(one.metrics.figures()), one.figures()), one._tolerance)
+
+
+def recorder(folder: Path) -> Party:
+    """Into a file that is begun anew all the time, so that the disk does not fill up."""
+    path, tolerance, inbox = folder / "fuzz.mcap", Tolerance(), Inbox()
+
+    def open_one(run: Path, metadata: Metadata) -> Segment:
+        path.unlink(missing_ok=True)
+        return Segment(path, path.open("wb", buffering=0), metadata)
+
+    derive = both(Pictures().of_sample, as_json)
+    recording = Recording(path, {}, inbox, open_one, derive, Rotation(mib=16.0), tolerance)
+
+    def take(sample: Sample) -> None:
+        inbox.put(sample)
+        if inbox.bytes > 2**16:
+            recording.save()
+
+    return Party(RECORDED, take, recording.save, tolerance, recording.finish)
+
+
+def watch() -> Party:
+    board, tolerance = Board(), Tolerance()
+
+    def take(sample: Sample) -> None:
+        _show(deque([sample]), board, None, tolerance)
+
+    return Party(RECORDED, take, lambda: encode(board.view()), tolerance)
+
+
+def learning(robot: RobotWithTask, folder: Path) -> Party:
+    """The learner's loop; it takes steps in and joins, and makes no updates."""
+    wire = Wire()
+    config = LearnerConfig(steps=10**9, capacity=1000)
+    learner = Learner(robot, config)
+    learner.join(pb.Join(robot=robot.name, actor="actor-0", layout=robot.learning_layout()))
+    process: Any = SimpleNamespace(bus=wire, stop=Event(), figures={}, notes={})
+    loop = LearnerLoop(process, learner, LearnerSettings(BusSettings(), robot.name, folder, learner=config))
+
+    def take(sample: Sample) -> None:
+        if sample.topic is JOIN:
+            try:
+                join = pb.Join.FromString(sample.payload)
+            except DecodeError:
+                return
+            learner.join(join).SerializeToString()
+        else:
+            with wire.tolerance.over(sample.key):
+                wire.handlers[sample.topic.name](sample)
+            loop._take_steps()
+
+    topics = tuple(topic for topic in TOPICS if "learner" in topic.subscribers)
+
+    def look() -> None:
+        loop._say_flow()
+        loop._say_metrics()
+
+    return Party(topics, take, look, wire.tolerance)
+
+
+def actor(robot: RobotWithTask) -> Party:
+    wire: Any = Wire()
+    student = Student(wire, robot, "actor-0")
+
+    def take(sample: Sample) -> None:
+        with wire.tolerance.over(sample.key):
+            wire.handlers[sample.topic.name](sample)
+
+    return Party((WEIGHTS, FLOW), take, lambda: (student.welcome, student.done), wire.tolerance)
+
+
+def safety() -> Party:
+    """Questions and models; what is refused goes back to who asked."""
+    models, tolerance = Models(), Tolerance()
+    answer = answerer(models, Counts())
+
+    def take(sample: Sample) -> None:
+        try:
+            if sample.topic is DECIDE:
+                answer(sample.payload)
+            else:
+                with tolerance.over(sample.key):
+                    models.install(decode(sample.message().file))
+        except (BadRequest, BadModel):
+            return
+
+    return Party((DECIDE, MODEL), take, lambda: models.filters, tolerance)
+
+
+def asker(robot: RobotWithTask, mill: Mill) -> Party:
+    """Who asked, and gets an answer of whoever answers."""
+    request = request_message(Commitment(robot), [0.0] * robot.state_dim, [0.0] * robot.action_dim, known_free=True)
+
+    def take(sample: Sample) -> None:
+        message = pb.Reply(robot=robot.name)
+        mill.fill(message, mill.random.choice(message.DESCRIPTOR.fields))
+        try:
+            read(message, request, robot)
+        except BusError:
+            return
+
+    return Party((DECIDE,), take, lambda: None)
+
+
+def parties(folder: Path, mill: Mill) -> dict[str, Party]:
+    robot = robot_with_task("ground")
+    return {
+        "launcher": launcher(folder),
+        "recorder": recorder(folder),
+        "watch": watch(),
+        "learner": learning(robot, folder),
+        "actor": actor(robot),
+        "safety": safety(),
+        "asker": asker(robot, mill),
+    }
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """A line about each message that is passed over would be most of the work."""
+    log = logging.getLogger("brakeline")
+    level = log.level
+    log.setLevel(logging.CRITICAL)
+    try:
+        yield
+    finally:
+        log.setLevel(level)
+
+
+def fuzz(messages: int, seed: int = 0) -> Figures:
+    """Draw so many messages, and hand each to all that listen to its topic; then read a log of the last ones."""
+    mill, begun = Mill(seed), time.monotonic()
+    with tempfile.TemporaryDirectory() as name, _quiet():
+        folder = Path(name)
+        everybody = parties(folder, mill)
+        settled, later, process = 0, 0, psutil.Process()
+        for number in range(messages):
+            sample = mill.sample(mill.random.choice(TOPICS))
+            for party in everybody.values():
+                if sample.topic.name in party.names:
+                    party.messages += 1
+                    party.try_(partial(party.take, sample))
+            if number % LOOK == LOOK - 1 or number == messages - 1:
+                for party in everybody.values():
+                    party.try_(party.look)
+            if number == int(SETTLED * messages):
+                settled = process.memory_info().rss
+            if number == int(LATER * messages):
+                later = process.memory_info().rss
+        grown = process.memory_info().rss - settled
+        grown_last = grown - (later - settled)
+        for party in everybody.values():
+            party.try_(party.close)
+        everybody["analyse"] = reader(folder)
+    rows: Figures = {
+        name: {"messages": party.messages, "passed over": party.tolerance.count, "crashes": party.crashes.total()}
+        for name, party in everybody.items()
+    }
+    rows["all"] = {
+        "messages": messages,
+        "crashes": sum(party.crashes.total() for party in everybody.values()),
+        "RSS grown MiB": grown / 2**20,
+        "of that in the last third MiB": grown_last / 2**20,
+        "RSS settled MiB": settled / 2**20,
+        "seconds": time.monotonic() - begun,
+    }
+    for name, party in everybody.items():
+        for crash, count in party.crashes.items():
+            rows[f"{name}: {crash}"] = {"crashes": count}
+    return rows
+
+
+def reader(folder: Path) -> Party:
+    """What the recorder has left, as a report."""
+    party = Party(RECORDED, lambda sample: None, lambda: None)
+
+    def look() -> None:
+        log = Log((folder / "fuzz.mcap",))
+        analysis = Analysis("fuzz", log, Look(pictures=True), "")
+        render(analysis.figures(), {"fuzz": (analysis.figures(), analysis.pictures())})
+        party.messages = sum(segment.messages for segment in log.segments)
+        party.tolerance.count = log.malformed
+
+    party.try_(look)
+    return party

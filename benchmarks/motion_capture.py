@@ -1,0 +1,101 @@
+"""A motion capture system: tells a PX4 with its own simulator where it is, and how fast, as cameras would."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+
+from benchmarks.repeated import repeated
+from brakeline.messaging.byte_links import Link, open_link
+from brakeline.sim.autopilot.common_dialect import mavlink
+
+OURSELVES = 250  # system id
+EVERY = 0.02  # s between two pictures
+LOOKS = 0.002  # s between two looks at what has come
+ERROR, SPEED_ERROR = 0.01, 0.02  # m, m/s: σ an axis; what the simulator tells is rounded to 1 cm, cm/s besides
+UNKNOWN = [math.nan, *[0.0] * 20]  # a covariance
+DEGREE = math.radians(1.0) * 6_371_000.0  # m of latitude, as that simulator has it
+
+# What its estimator is to make of it: position and velocity from here, none from GPS. And what its controller can, that
+# is told velocities so good: as delivered it comes to 2.4 m/s of 3, and takes 3 s to a stop.
+PARAMETERS = {
+    "MPC_XY_VEL_P_ACC": 4.0,
+    "MPC_XY_VEL_I_ACC": 2.0,
+    "EKF2_EV_CTRL": 7,
+    "EKF2_EVP_NOISE": 0.02,
+    "EKF2_EVV_NOISE": 0.05,
+    "EKF2_EV_DELAY": 10.0,
+    "EKF2_GPS_CTRL": 0,
+    "EKF2_HGT_REF": 3,
+}
+
+
+@contextmanager
+def captured(url: str, system: int, seed: int = 0) -> Iterator[None]:
+    """Meanwhile it is told, at an address that nobody else talks to it at."""
+    link = open_link(url)
+    try:
+        with repeated(_Cameras(link, system, seed).look, LOOKS):
+            yield
+    finally:
+        link.close()
+
+
+class _Cameras:
+    def __init__(self, link: Link, system: int, seed: int) -> None:
+        self._link, self._system, self._rng = link, system, np.random.default_rng(seed)
+        self._mav = mavlink.MAVLink(
+            self, srcSystem=OURSELVES, srcComponent=mavlink.MAV_COMP_ID_VISUAL_INERTIAL_ODOMETRY
+        )
+        self._mav.robust_parsing = True
+        self._home: Any = None  # the first place that it told
+        self._flies, self._beaten = False, -math.inf
+
+    def write(self, data: bytes) -> None:
+        """For pymavlink."""
+        self._link.send(bytes(data))
+
+    def look(self) -> None:
+        """Answer every place that it tells with what is seen of it."""
+        if time.monotonic() - self._beaten > 1.0:
+            self._beaten = time.monotonic()
+            self._mav.heartbeat_send(mavlink.MAV_TYPE_ONBOARD_CONTROLLER, mavlink.MAV_AUTOPILOT_INVALID, 0, 0, 0)
+            _introduce(self._mav, self._system, None if self._flies else self._home)
+        for message in self._mav.parse_buffer(self._link.receive()) or ():
+            if message.get_srcSystem() != self._system:
+                continue
+            if message.get_type() == "HEARTBEAT":
+                self._flies = bool(message.base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED)
+            elif message.get_type() == "HIL_STATE_QUATERNION":
+                self._home = message if self._home is None else self._home
+                _tell(self._mav, message, self._home, self._rng)
+
+
+def _introduce(mav: Any, system: int, home: Any) -> None:
+    """Ask for what is needed, and say where on Earth the hall is."""
+    if home is None:
+        what = mavlink.MAVLINK_MSG_ID_HIL_STATE_QUATERNION
+        mav.command_long_send(system, 1, mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, 0, what, 1e6 * EVERY, *[0.0] * 5)
+    else:
+        mav.set_gps_global_origin_send(system, home.lat, home.lon, home.alt)
+
+
+def _tell(mav: Any, message: Any, home: Any, rng: np.random.Generator) -> None:
+    place = _place(message, home) + ERROR * rng.normal(size=3)
+    velocity = 0.01 * np.array([message.vx, message.vy, message.vz]) + SPEED_ERROR * rng.normal(size=3)
+    ned, whose = mavlink.MAV_FRAME_LOCAL_NED, mavlink.MAV_ESTIMATOR_TYPE_VISION  # as MOCAP it would be logged alone
+    turn = list(message.attitude_quaternion)
+    rates = message.rollspeed, message.pitchspeed, message.yawspeed
+    mav.odometry_send(message.time_usec, ned, ned, *place, turn, *velocity, *rates, UNKNOWN, UNKNOWN, 0, whose, 100)
+
+
+def _place(message: Any, home: Any) -> np.ndarray[Any, np.dtype[np.float64]]:
+    """North, east, down from there, m."""
+    narrow = math.cos(math.radians(1e-7 * home.lat))
+    north, east = 1e-7 * DEGREE * (message.lat - home.lat), 1e-7 * DEGREE * narrow * (message.lon - home.lon)
+    return np.array([north, east, -1e-3 * (message.alt - home.alt)])

@@ -1,0 +1,89 @@
+"""What free space costs by where it comes from: size on the wire and time, for a map, a scan, things that move,
+fleets, and in the air. A period's question of a fleet is one message with a request for each of its robots.
+
+Times by kind are those in `decide`, by the clock; `answer` is a request's share of its question's processor time,
+decoding and encoding included, which other work on the machine changes less.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Sequence
+from itertools import islice
+from time import process_time
+
+import numpy as np
+
+from benchmarks.decide import SCANS
+from benchmarks.timing import WARM_UP, Figures
+from brakeline.actors.decision_guard import Ask
+from brakeline.deploy.experiments.evaluate import Evaluation, episode, prepared, prepared_fleet, round_of
+from brakeline.logs.episode_stats import KINDS
+from brakeline.messaging import brakeline_pb2 as pb
+from brakeline.messaging.task import RobotWithTask, robot_with_task
+
+STEPS = 600  # periods of each
+SITUATIONS = {
+    "map": ("ground", Evaluation()),
+    "map, dense": ("ground", Evaluation(arena="dense")),
+    "scan": ("ground", Evaluation(conditions=SCANS)),
+    "scan, dense": ("ground", Evaluation(arena="dense", conditions=SCANS)),
+    "map, walkers": ("ground", Evaluation(arena="walkers")),
+    "map, many-walkers": ("ground", Evaluation(arena="many-walkers")),
+    "fleet of 2": ("ground", Evaluation(arena="crossing", fleet=2)),
+    "fleet of 4": ("ground", Evaluation(arena="crossing", fleet=4)),
+    "fleet of 8": ("ground", Evaluation(arena="crossing", fleet=8)),
+    "air, map": ("quadrotor", Evaluation()),
+    "air, scan": ("quadrotor", Evaluation(conditions=SCANS)),
+    "air, scan, dense": ("quadrotor", Evaluation(arena="dense", conditions=SCANS)),
+}
+POLICIES = ("trained", "random")  # most of the one's inputs are allowed, half of the other's are not
+
+
+class Weighed:
+    """Asks, and notes what each request and reply weighs, and how long each kind of decision took [ms]."""
+
+    def __init__(self, question: Ask) -> None:
+        self._question = question
+        self.sizes: dict[str, list[int]] = defaultdict(list)
+        self.times: dict[str, list[float]] = defaultdict(list)
+
+    def __call__(self, requests: Sequence[pb.Request]) -> list[pb.Reply]:
+        before = process_time()
+        replies = list(self._question(requests))
+        self.times["answer"].append(1e3 * (process_time() - before) / len(requests))
+        for request, reply in zip(requests, replies, strict=True):
+            self.sizes["request"].append(request.ByteSize())
+            self.sizes["reply"].append(reply.ByteSize())
+            self.times[KINDS[reply.decision.kind]].append(reply.decision.time_ms)
+        return replies
+
+
+def run(steps: int = STEPS) -> Figures:
+    return {name: _weighed(robot_with_task(robot), what, steps) for name, (robot, what) in SITUATIONS.items()}
+
+
+def _weighed(robot: RobotWithTask, what: Evaluation, steps: int) -> dict[str, float]:
+    sizes: dict[str, list[int]] = defaultdict(list)
+    times: dict[str, list[float]] = defaultdict(list)
+    for policy in POLICIES:
+        asked = Evaluation(policy, arena=what.arena, conditions=what.conditions, fleet=what.fleet)
+        if what.fleet:
+            fleet, _, policies, question = prepared_fleet(robot, asked)
+            assert question is not None
+            weighed = Weighed(question)
+            taken = (1 for k in range(steps) for _ in round_of(fleet, policies, weighed, k))
+        else:
+            driver, choose, question = prepared(robot, asked)
+            assert question is not None
+            weighed = Weighed(question)
+            taken = (1 for k in range(steps) for _ in episode(driver, choose, weighed, k))
+        sum(islice(taken, steps // max(1, what.fleet)))
+        for name, values in weighed.sizes.items():
+            sizes[name] += values
+        for name, spent in weighed.times.items():
+            times[name] += spent[WARM_UP:]
+    figures = {f"{name} p50 B": float(np.median(values)) for name, values in sizes.items()}
+    figures["request most B"] = float(max(sizes["request"]))
+    figures |= {f"{kind} p50 ms": float(np.median(spent)) for kind, spent in times.items() if spent}
+    return figures | {f"{kind} p99 ms": float(np.percentile(spent, 99)) for kind, spent in times.items() if spent}

@@ -1,0 +1,37 @@
+"""Where data sets and model sets lie. Nothing heavy here: every process of a run reads it.
+
+data/<robot>/record.safetensors                     the recorded trajectories
+data/<robot>/<certificate>-<mode>.safetensors       the model set in use, made from them
+data/<robot>/<rival>.safetensors                    the rival's networks, pre-trained (<rival>+<task>: of another task)
+data/<robot>/models/<version>.safetensors           every version a service has used
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+from brakeline.messaging.robot import WITH, Robot
+from brakeline.messaging.task import RobotWithTask
+from brakeline.safety.model.model_config import DDPC, Recipe
+
+
+def data_root() -> Path:
+    """`$BRAKELINE_DATA`, else `data` in the working directory."""
+    return Path(os.environ.get("BRAKELINE_DATA", "data"))
+
+
+def record_path(robot: Robot) -> Path:
+    return data_root() / robot.name / "record.safetensors"
+
+
+def model_path(robot: Robot, recipe: Recipe) -> Path:
+    return data_root() / robot.name / f"{recipe.certificate}-{recipe.mode}.safetensors"
+
+
+def method_path(robot: Robot, method: str, recipe: Recipe) -> Path:
+    """Of the model that the safety service needs for a method."""
+    if method == DDPC:
+        return model_path(robot, recipe)
+    other = robot.task.name.partition(WITH)[2] if isinstance(robot, RobotWithTask) else ""
+    return data_root() / robot.name / f"{method}{WITH if other else ''}{other}.safetensors"

@@ -1,0 +1,93 @@
+"""A robot's description to look at: what it amounts to, and a picture."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from brakeline.messaging.robot import FEEDBACK, HOLD, RAMP, Robot
+
+Array = NDArray[np.float64]
+
+
+def profile(robot: Robot) -> Array:
+    """The inputs (N, m) of the plan that begins at every input's bound of larger size."""
+    largest = np.where(np.abs(robot.low()) > np.abs(robot.high()), robot.low(), robot.high())
+    return np.asarray(robot.schedule() @ np.tile(largest, robot.free_steps)).reshape(robot.horizon, -1)
+
+
+def way(robot: Robot) -> float:
+    """m, at most, of a full stop if it did at once what its inputs say: an order of magnitude, no bound."""
+    speeds = [i for i, label in enumerate(robot.action) if label.endswith("[m/s]") and robot.translates[i]]
+    return float(np.linalg.norm(np.abs(profile(robot)[:, speeds]).sum(0))) * robot.period
+
+
+def remarks(robot: Robot) -> list[str]:
+    """What is no mistake and yet worth a thought."""
+    found = []
+    if way(robot) + robot.footprint > robot.sight:
+        found.append(
+            f"sight: a stop from full speed takes about {way(robot):.2f} m, the body reaches {robot.footprint:.2f} m, "
+            f"but obstacles are seen from {robot.sight:g} m on: fast driving will rarely be verified"
+        )
+    if robot.horizon == robot.free_steps + robot.brake_steps and RAMP in robot.stop:
+        found.append("plan.horizon: no period of standing after the ramp: a robot with lag has not stopped by then")
+    if any(index < 0 for index in robot.follows):
+        free = [robot.action[i] for i, index in enumerate(robot.follows) if index < 0]
+        found.append(f"state: nothing follows {', '.join(free)}: half-widths are shown for rest, not for full speed")
+    return found
+
+
+def summary(robot: Robot) -> dict[str, Any]:
+    """What a description amounts to."""
+    return {
+        "name": robot.name,
+        "period_s": robot.period,
+        "state": list(robot.state),
+        "inputs": {
+            label: {"low": low, "high": high, "stop": list(rule) if isinstance(rule, tuple) else rule}
+            for label, low, high, rule in zip(
+                robot.action, robot.action_low, robot.action_high, robot.stop, strict=True
+            )
+        },
+        "plan_s": robot.horizon * robot.period,
+        "braking_s": robot.brake_steps * robot.period,
+        "way_to_a_stop_m": way(robot),
+        "footprint_m": robot.footprint,
+        "discs": len(robot.body),
+        "limits": [limit.name for limit in robot.limits],
+        "regressors": [robot.state[i] for i in robot.regressor],
+        "layout": robot.layout(),
+        "remarks": remarks(robot),
+    }
+
+
+def picture(robot: Robot, path: Path) -> None:
+    """The body from above, and each input's stop, as an image file."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
+    from matplotlib.patches import Circle
+
+    figure, (body, plan) = pyplot.subplots(1, 2, figsize=(9.0, 3.6), layout="constrained")
+    for disc in robot.body:
+        body.add_patch(Circle((disc.at[0], disc.at[1]), disc.radius, alpha=0.3))
+    body.add_patch(Circle((0.0, 0.0), robot.footprint, fill=False, linestyle=":"))
+    body.annotate("", (robot.footprint, 0.0), (0.0, 0.0), arrowprops={"arrowstyle": "->"})
+    body.set(
+        aspect="equal", xlabel="x [m]", ylabel="y [m]", title=f"{robot.name}: body, and what holds it in any attitude"
+    )
+    reach = 1.2 * robot.footprint
+    body.set(xlim=(-reach, reach), ylim=(-reach, reach))
+    times = robot.period * np.arange(robot.horizon + 1)
+    for label, rule, values in zip(robot.action, robot.stop, profile(robot).T, strict=True):
+        how = {RAMP: "ramp", HOLD: "held", FEEDBACK: "by feedback"}.get(str(rule), "profile")
+        plan.stairs(values, times, baseline=None, label=f"{label}: {how}", linewidth=1.5)
+    plan.set(xlabel="time [s]", ylabel="input", title="a plan from the largest inputs")
+    plan.legend(fontsize="small")
+    figure.savefig(path, dpi=120)
+    pyplot.close(figure)

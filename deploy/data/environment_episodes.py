@@ -1,0 +1,164 @@
+"""Data from a Gymnasium environment: excitation episodes, as a data set.
+
+data = collect(env, robot, periods=30_000, state=state, actions=normalised(robot))
+model, statement = certified(data, Recipe())
+env = SafetyWrapper(env, Filter(model), state=state, obstacles=obstacles, actions=normalised(robot))
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Generator, Iterator
+from typing import Any
+
+import gymnasium
+import numpy as np
+from numpy.typing import NDArray
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+from brakeline.deploy.data.excitation import MOST_HELD, excitation
+from brakeline.messaging.robot import Robot
+from brakeline.safety.action_mapping import Actions, actions_of, cast
+from brakeline.safety.environment_views import STATE, View
+from brakeline.safety.model.dataset import BadData, Dataset, Trajectory
+from brakeline.safety.model.windows import displacement
+
+Array = NDArray[np.float64]
+
+FEWEST = 3  # periods of a trajectory that is worth keeping
+LONGEST = 300  # periods of a trajectory; then the environment is reset
+FRUITLESS = 1000  # episodes in a row that end before that
+
+
+def collect(
+    env: gymnasium.Env[Any, Any],
+    robot: Robot,
+    periods: int = 30_000,
+    *,
+    seed: int = 0,
+    held: int = MOST_HELD,
+    state: View = STATE,
+    actions: Actions | None = None,
+    disturbed: Callable[[Any, Any, dict[str, Any]], bool] = lambda env, observation, info: False,
+    bulge: float | None = None,
+    options: dict[str, Any] | None = None,
+    shown: bool = True,
+) -> Dataset:
+    """Drives the environment with `excitation` until so many periods are recorded; a period is one `step`.
+
+    An episode that ends in `terminated` (a collision, say) loses its last period, and where `disturbed` says that
+    something else than the input moved the robot in the last period, the trajectory ends before it.
+
+    Args:
+        held: periods that an input is held for at most: enough to come to the highest speed.
+        state: (env, observation, info) -> measured state (n,); unless given, `info["state"]`.
+        actions: as `SafetyWrapper` takes them.
+        bulge: m that the path may leave its chord by within a period, where `info` has no `subsamples` and `turned`
+            (`NavigationEnv`); None: twice what the recorded accelerations make of it.
+        options: of every `reset`.
+        shown: progress, on the terminal.
+
+    Raises:
+        Mismatch: no state is to be had, or the action space is not that of the robot's inputs; BadData: what was
+        recorded is no data set, or every episode ends at once.
+    """
+    between = actions_of(env.action_space, robot, actions)
+    columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
+    trajectories: list[Trajectory] = []
+    fruitless = number = 0
+    with Progress(*columns, console=Console(stderr=True), disable=not shown) as progress:
+        task = progress.add_task(f"driving {robot.name}", total=periods)
+        while not progress.finished:
+            rng = np.random.default_rng((seed, number))
+            first = seed if number == 0 else None
+            left = periods - int(progress.tasks[0].completed)
+            new = [
+                t
+                for t in _episode(
+                    env,
+                    robot,
+                    excitation(robot, rng, held),
+                    first,
+                    min(LONGEST, left),
+                    options,
+                    between,
+                    state,
+                    disturbed,
+                )
+                if len(t.inputs) >= min(FEWEST, left)
+            ]
+            number += 1
+            fruitless = 0 if new else fruitless + 1
+            if fruitless >= FRUITLESS:
+                raise BadData(f"{FRUITLESS} episodes in a row ended before period {FEWEST}: nothing to learn from")
+            trajectories += new
+            progress.advance(task, sum(len(t.inputs) for t in new))
+    sampled = any(t.paths.shape[1] > 1 for t in trajectories)
+    off = bulge if bulge is not None else 0.0 if sampled else _bulge(robot, trajectories)
+    about = {"origin": str(getattr(env.spec, "id", None) or type(env.unwrapped).__name__), "seed": str(seed)}
+    data = Dataset(robot, tuple(trajectories), about, off)
+    data.check()
+    return data
+
+
+def _episode(
+    env: gymnasium.Env[Any, Any],
+    robot: Robot,
+    inputs: Generator[Array, Array | None, None],
+    seed: int | None,
+    most: int,
+    options: dict[str, Any] | None,
+    between: Actions,
+    state: View,
+    disturbed: Callable[[Any, Any, dict[str, Any]], bool],
+) -> Iterator[Trajectory]:
+    """The undisturbed stretches of one episode."""
+    observation, info = env.reset(seed=seed, options=options)
+    measured = np.array(state(env, observation, info), dtype=float)
+    u, before = next(inputs), None
+    record = _Record(robot, measured, before)
+    for _ in range(most):
+        made = cast(between.control_to_action(u), env.action_space)
+        observation, _, terminated, truncated, info = env.step(made)
+        if terminated:
+            break
+        measured = np.array(state(env, observation, info), dtype=float)
+        executed = np.clip(np.asarray(info.get("input_in_force", u), dtype=float), robot.low(), robot.high())
+        if disturbed(env, observation, info):
+            yield from record.done()
+            record = _Record(robot, measured, executed)
+        else:
+            record.add(executed, measured, info)
+        if truncated:
+            break
+        u = inputs.send(measured)
+    yield from record.done()
+
+
+class _Record:
+    """A trajectory under way."""
+
+    def __init__(self, robot: Robot, state: Array, before: Array | None) -> None:
+        self.robot, self.before = robot, before
+        self.states, self.inputs = [state], list[Array]()
+        self.paths, self.turned = list[Array](), list[float]()
+
+    def add(self, executed: Array, state: Array, info: dict[str, Any]) -> None:
+        seen = displacement(self.robot, self.states[-1], state)
+        turned = 0.0 if self.robot.heading is None else float(seen[self.robot.heading])
+        self.paths.append(np.asarray(info.get("subsamples", seen[None, : self.robot.position_dim]), dtype=float))
+        self.turned.append(float(info.get("turned", turned)))
+        self.states.append(state)
+        self.inputs.append(executed)
+
+    def done(self) -> Iterator[Trajectory]:
+        if self.inputs:
+            states, inputs, paths = np.array(self.states), np.array(self.inputs), np.array(self.paths)
+            yield Trajectory(states, inputs, paths, np.array(self.turned), self.before)
+
+
+def _bulge(robot: Robot, trajectories: list[Trajectory]) -> float:
+    """[m] a·T²/8 is what a path of acceleration a leaves its chord by in a period T; a·T² are the second differences
+    of the positions. Twice that."""
+    bends = [np.diff(t.states[:, : robot.position_dim], n=2, axis=0) for t in trajectories if len(t.inputs) > 1]
+    return max((float(np.linalg.norm(bend, axis=1).max()) for bend in bends), default=0.0) / 4.0

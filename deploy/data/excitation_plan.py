@@ -1,0 +1,156 @@
+"""`brakeline excite`: excitation that stays within a region: by what the inputs would do to a robot without lag, or, of
+one that is driven, by where it is measured to be."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from brakeline.deploy.data.description_plot import way
+from brakeline.deploy.data.excitation import excitation
+from brakeline.deploy.data.sources.quantity_names import columns_of, quantities
+from brakeline.messaging.robot import Array, Robot
+from brakeline.safety.filter.braking import braking_plan
+from brakeline.safety.model.dataset import BadData
+
+Keep = tuple[float, float, float, float]  # x and y, least and most [m]
+
+RUN = 60.0  # s: then the robot is put back to the middle, for what was reckoned here drifts away from where it is
+TRIES = 400  # excitations that are looked at for one that stays inside
+LEAD = 4  # periods, at least, that one is made of
+
+
+@dataclass(frozen=True)
+class Row:
+    time: float  # s, anew in each run
+    run: int
+    input: Array
+
+
+def rows(robot: Robot, keep: Keep, minutes: float, seed: int) -> Iterator[Row]:
+    """Inputs to give a robot, one a period; each run begins at rest in the region's middle, heading along x.
+
+    Raises:
+        BadData: the region has no room for the robot, or nobody can tell from its inputs where it goes.
+    """
+    low, high = _room(robot, keep)
+    motion = _motion(robot)
+    if robot.heading is not None and not motion[2].any():
+        raise BadData(f"{robot.name}: how it turns can't be told from {', '.join(robot.action)}: let --drive see it")
+    rng = np.random.default_rng(seed)
+    length = run_length(robot)
+    for run in range(max(math.ceil(60.0 * minutes / RUN), 1)):
+        pose = np.array([*(low + high) / 2.0, 0.0])
+        done: list[Array] = []
+        while len(done) < length:
+            before = done[-1] if done else robot.at_zero()
+            inputs, pose = _stretch(robot, rng, motion, pose, low, high, before)
+            done += inputs
+        yield from (Row(k * robot.period, run, u) for k, u in enumerate(done))
+
+
+def run_length(robot: Robot) -> int:
+    """Periods of a run."""
+    return round(RUN / robot.period)
+
+
+def _room(robot: Robot, keep: Keep) -> tuple[Array, Array]:
+    """Where the position may be, least and most (2,)."""
+    low, high = np.array(keep[:2]) + robot.footprint, np.array(keep[2:]) - robot.footprint
+    if not (low < high).all():
+        raise BadData(f"the region {keep} has no room for a robot of {robot.footprint:g} m about its position")
+    return low, high
+
+
+class Excited:
+    """Excitation as a policy, `(observation, info) -> input`.
+
+    Each stretch from rest to rest is chosen from where the robot is measured to be. How it really moves only driving
+    shows, so a robot that goes outwards within a stop's way of the edge brakes, and begins anew from there.
+    """
+
+    def __init__(self, robot: Robot, keep: Keep, rng: np.random.Generator) -> None:
+        """
+        Raises:
+            BadData: the region has no room to drive and stop, or nobody can tell from its inputs where the robot goes.
+        """
+        self._robot, self._rng, self._motion = robot, rng, _motion(robot)
+        self._low, self._high = _room(robot, keep)
+        top = np.abs(self._motion[:2]) @ np.maximum(np.abs(robot.low()), robot.high())
+        self._to_stop = way(robot) + float(np.linalg.norm(top)) * robot.period  # a period late
+        if not (self._low + self._to_stop < self._high - self._to_stop).all():
+            raise BadData(f"the region {keep} has no room to stop in: about {self._to_stop:.2f} m on each side")
+        self._left: list[Array] = []
+        self._out = 0.0
+
+    def __call__(self, observation: NDArray[np.float32], info: dict[str, Any]) -> Array:
+        state, before = info["state"], info["input_in_force"]
+        if info["time"] == 0.0:
+            self._left, self._out = [], 0.0
+        beyond = np.maximum(self._low + self._to_stop - state[:2], state[:2] - self._high + self._to_stop)
+        out, last = float(beyond.max()), self._out
+        self._out = out
+        if out > max(last, 0.0) and not self._robot.rests(before):
+            self._left = list(braking_plan(self._robot, before)[1:])
+        if not self._left:
+            heading = 0.0 if self._robot.heading is None else state[self._robot.heading]
+            pose = np.array([*state[:2], heading])
+            # From near the edge no farther out: to brake there it would be too late.
+            low, high = (
+                np.minimum(self._low + self._to_stop, pose[:2]),
+                np.maximum(self._high - self._to_stop, pose[:2]),
+            )
+            self._left = _stretch(self._robot, self._rng, self._motion, pose, low, high, before)[0]
+        return self._left.pop(0)
+
+
+def _stretch(
+    robot: Robot, rng: np.random.Generator, motion: Array, pose: Array, low: Array, high: Array, before: Array
+) -> tuple[list[Array], Array]:
+    """Inputs from rest to rest that stay inside, the first found, and the pose after them. before (m,): the input in
+    force, of which a stop may hold some."""
+    for _ in range(TRIES):
+        inputs = _to_rest(robot, rng, before)
+        after = pose
+        for u in inputs:
+            after = _moved(robot, motion, after, u)
+            if not ((after[:2] >= low) & (after[:2] <= high)).all():
+                break
+        else:
+            return inputs, after
+    raise BadData("no excitation stays within the region: give it more room (--keep)")
+
+
+def _to_rest(robot: Robot, rng: np.random.Generator, before: Array) -> list[Array]:
+    """One lead-in, plan and stop."""
+    drawn = excitation(robot, rng, before=before)
+    inputs = list(itertools.islice(drawn, LEAD))
+    for u in drawn:
+        inputs.append(u)
+        if robot.rests(inputs[-1]) and robot.rests(inputs[-2]):
+            return inputs
+    raise AssertionError("excitation has no end")
+
+
+def _motion(robot: Robot) -> Array:
+    """(3, m): forward, left, turn (with a heading), or along x, along y, none, of each input."""
+    usual, inputs = quantities(robot), columns_of(robot)[1]
+    kinds = ("body.x", "body.y", "yaw rate") if robot.heading is not None else ("velocity.x", "velocity.y", "")
+    motion = np.array([[usual.get(name) == f"command.{kind}" for name in inputs] for kind in kinds], float)
+    if not motion[:2].any():
+        raise BadData(f"{robot.name}: where it goes can't be told from {', '.join(robot.action)}: speeds are needed")
+    return motion
+
+
+def _moved(robot: Robot, motion: Array, pose: Array, u: Array) -> Array:
+    forward, left, turn = motion @ u * robot.period
+    heading = pose[2] + turn / 2.0
+    cos, sin = math.cos(heading), math.sin(heading)
+    step = np.array([cos * forward - sin * left, sin * forward + cos * left, turn])
+    return np.asarray(pose + step)

@@ -1,0 +1,107 @@
+"""From any sources to a data set: the reader that fits, then resampling; own logs come with periods already."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from mcap.exceptions import McapError
+from mcap.reader import make_reader
+
+from brakeline.deploy.data.resample import HOLD, Imported, Report, resample
+from brakeline.deploy.data.run_dataset import from_log
+from brakeline.deploy.data.sources.quantity_names import mapping
+from brakeline.deploy.data.sources.source_table import NoSource, Table
+from brakeline.messaging.robot import Robot
+from brakeline.safety.model.dataset import Dataset
+
+ROS2 = "ros2_bag:read"
+READERS = {
+    ".csv": "column_files:read_csv",
+    ".parquet": "column_files:read_parquet",
+    ".db3": ROS2,
+    ".bin": "ardupilot_log:read",
+    ".tlog": "tlog_file:read",
+    ".ulg": "px4_log:read",
+}
+KINDS = f"{', '.join(READERS)}, the folder of a ROS 2 bag, .mcap (a ROS 2 bag, or a log of a run)"
+LAST = 1_000_000  # steps of an own log: all
+
+
+def tables_of(path: Path) -> list[Table]:
+    """What a source holds, by its ending.
+
+    Raises:
+        NoSource: there is none, no reader knows it, or it is damaged.
+    """
+    if not path.exists():
+        raise NoSource(f"{path}: there is no such file or folder")
+    place = ROS2 if is_bag(path) else READERS.get(path.suffix.lower())
+    if place is None:
+        raise NoSource(f"{path}: what can be read is {KINDS}")
+    module, _, name = place.partition(":")
+    tables: list[Table] = getattr(importlib.import_module(f"brakeline.deploy.data.sources.{module}"), name)(path)
+    return tables
+
+
+def is_bag(path: Path) -> bool:
+    """Is it a ROS 2 bag: a folder with its metadata, or an MCAP file that says so?"""
+    if path.is_dir():
+        return (path / "metadata.yaml").is_file()
+    if path.suffix != ".mcap":
+        return False
+    try:
+        with path.open("rb") as file:
+            return make_reader(file).get_header().profile == "ros2"
+    except McapError:
+        return False  # damaged: only our own reader goes on from there
+
+
+def own_log(path: Path) -> bool:
+    """Is it the log of a run, a file or a folder?"""
+    return (path.suffix == ".mcap" or path.is_dir()) and path.exists() and not is_bag(path)
+
+
+def bring(
+    paths: Sequence[Path], robot: Robot, words: Sequence[str] = (), delay: float = 0.0, hold: float = HOLD
+) -> Imported:
+    """The data set in several sources of one robot. words: `--map` options.
+
+    Raises:
+        BadData: with the source and what is wrong; LogError: an own log is none.
+    """
+    chosen = mapping(words, robot)
+    parts = [_one(path, robot, chosen, delay, hold) for path in paths]
+    samples = {part.report.samples for part in parts}
+    if len(samples) > 1:
+        raise NoSource(f"the sources have {samples} positions a period: import them one by one")
+    data = Dataset(
+        robot,
+        tuple(t for part in parts for t in part.data.trajectories),
+        {"origin": "import", "sources": ", ".join(path.name for path in paths)},
+        max(part.data.bulge for part in parts),
+    )
+    several = len(paths) > 1
+    notes = [
+        f"{path.name}: {n}" if several else n for path, p in zip(paths, parts, strict=True) for n in p.report.notes
+    ]
+    uneven = sum(p.report.uneven * p.report.periods for p in parts) / data.periods
+    delays = {name: seconds for p in parts for name, seconds in p.report.delays.items()}
+    report = Report(data.periods, len(data.trajectories), samples.pop(), data.bulge, delays, uneven, tuple(notes))
+    return Imported(data, report)
+
+
+def _one(path: Path, robot: Robot, chosen: dict[str, str], delay: float, hold: float) -> Imported:
+    if own_log(path):
+        recorded = from_log(path, robot, LAST)
+        data = recorded.data
+        samples = data.trajectories[0].paths.shape[1]
+        return Imported(data, Report(data.periods, len(data.trajectories), samples, 0.0, {}, 0.0, (recorded.note,)))
+    try:
+        made = resample(tables_of(path), robot, chosen, delay, hold)
+    except NoSource as error:
+        text = str(error)
+        raise NoSource(text if text.startswith(str(path)) else f"{path}: {text}") from error
+    return replace(made, data=replace(made.data, about=made.data.about | {"source": path.name}))

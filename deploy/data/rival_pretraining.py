@@ -1,0 +1,109 @@
+"""`brakeline pretrain`: what a rival must know of a robot before it can filter anything, and what that costs."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field
+
+import numpy as np
+
+from brakeline.deploy.data.rival_rollouts import costs, transitions
+from brakeline.learner.rival_networks import Fit, fit_cost, fit_linear
+from brakeline.messaging.perceptrons import Perceptrons
+from brakeline.messaging.task import RobotWithTask
+from brakeline.safety.rivals.pretrained import Pretrained
+from brakeline.safety.rivals.sailr import SAILR
+from brakeline.safety.rivals.secas import SECAS
+
+Each = Callable[[], object]
+
+
+@dataclass(frozen=True)
+class SecasRecipe:
+    """Dalal et al. have one hidden layer of 10 units, Adam at 1e-4, 1000 episodes of random actions."""
+
+    samples: int = 40_000
+    arena: str = "default"
+    seed: int = 20_261
+    fit: Fit = field(default_factory=lambda: Fit(hidden=(64, 64)))
+    margin: float = 0.1  # m beside the footprint: the bound C, tuned
+
+
+@dataclass(frozen=True)
+class SailrRecipe:
+    """Wagener et al.: three hidden layers of 256, Adam at 1e-3, γ 0.99, cost smoothed over 0.5, η 0.08."""
+
+    samples: int = 80_000
+    arena: str = "default"
+    seed: int = 20_262
+    fit: Fit = field(default_factory=lambda: Fit(hidden=(256, 256, 256), epochs=10))
+    gamma: float = 0.99
+    smoothing: float = 0.5  # m of clearance
+    threshold: float = 0.08  # η, tuned
+    lead: int = 5  # periods of driving before braking, at the most
+
+
+Recipe = SecasRecipe | SailrRecipe
+Made = tuple[dict[str, Perceptrons], dict[str, float], dict[str, str]]  # networks, settings, about
+RECIPES: dict[str, type[SecasRecipe] | type[SailrRecipe]] = {SECAS: SecasRecipe, SAILR: SailrRecipe}
+
+
+def recipe_for(method: str, robot: RobotWithTask) -> Recipe:
+    """With the threshold that was found for this robot (deploy/experiments/experiments.md)."""
+    return RECIPES[method](**getattr(robot.task.rivals, method))
+
+
+def made_by(model: Pretrained, recipe: Recipe) -> bool:
+    """Was the model made by this recipe?"""
+    return model.about.get("recipe") == json.dumps(asdict(recipe))
+
+
+def pretrain(robot: RobotWithTask, recipe: Recipe, each: Each = lambda: None) -> Pretrained:
+    """Drive, fit, and say what it took; `each` is called after every driven step.
+
+    Raises:
+        TooFew: samples; ValueError: no simulator for the robot.
+    """
+    started = time.perf_counter()
+    if isinstance(recipe, SecasRecipe):
+        networks, settings, about = _secas(robot, recipe, each)
+        method = SECAS
+    else:
+        networks, settings, about = _sailr(robot, recipe, each)
+        method = SAILR
+    about |= {
+        "recipe": json.dumps(asdict(recipe)),
+        "samples": str(recipe.samples),
+        "arena": recipe.arena,
+        "seed": str(recipe.seed),
+        "seconds": f"{time.perf_counter() - started:.0f}",
+    }
+    return Pretrained(robot, method, networks, settings, about, robot.task.rays if method == SECAS else None)
+
+
+def _secas(robot: RobotWithTask, recipe: SecasRecipe, each: Each) -> Made:
+    data = transitions(robot, recipe.arena, recipe.samples, recipe.seed, each)
+    g, errors = fit_linear(data.observation, data.action, data.change, recipe.fit, recipe.seed)
+    about = {
+        "collisions": str(data.collisions),
+        "error": f"{errors[0].mean():.4f} m rms of predicted changes of constraints of {errors[1].mean():.4f} m rms",
+    }
+    return {"g": g}, {"clearance": robot.footprint + recipe.margin}, about
+
+
+def _sailr(robot: RobotWithTask, recipe: SailrRecipe, each: Each) -> Made:
+    """V from what braking came to; Q of every driven step from V after it, the more cautious of the two."""
+    gamma = recipe.gamma
+    data = costs(robot, recipe.arena, recipe.samples, recipe.seed, gamma, recipe.smoothing, recipe.lead, each)
+    v, v_error = fit_cost(robot, data.braked, data.braked_cost, 2, recipe.fit, recipe.seed)
+    after = np.array([1.0 / (1.0 + np.exp(-v(x).astype(float).max())) for x in data.after])
+    cost = np.where(data.collided, 1.0, np.minimum(data.step_cost + gamma * after, 1.0))
+    q, q_error = fit_cost(robot, data.driven, cost, 2, recipe.fit, recipe.seed + 1)
+    about = {
+        "collisions": str(data.collisions),
+        "error": f"{v_error:.4f} mean of |V - cost|, {q_error:.4f} of |Q - cost|, costs in [0, 1]",
+    }
+    settings = {"threshold": recipe.threshold, "gamma": gamma, "smoothing": recipe.smoothing}
+    return {"q": q, "v": v}, settings, about

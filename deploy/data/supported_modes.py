@@ -1,0 +1,43 @@
+"""Which model sets a data set supports: from plans where there are enough of them, else from free driving."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from brakeline.deploy.data.certification import certified
+from brakeline.safety.model.dataset import BadData, Dataset
+from brakeline.safety.model.error_bounds import CertificateError
+from brakeline.safety.model.model_set import ModelSet, Recipe
+from brakeline.safety.model.validation import Statement
+from brakeline.safety.model.windows import FREE, PLAN
+
+AUTO = "auto"
+NO_PLANS = " (of driving like the filter's plans: a chosen input, then the stop rules of the description)"
+
+
+class Unsupported(BadData):
+    """No kind of windows serves; the message has each with its reason, `reasons` too."""
+
+    def __init__(self, reasons: dict[str, str]) -> None:
+        super().__init__("; ".join(f"{kind} windows: {reason}" for kind, reason in reasons.items()))
+        self.reasons = reasons
+
+
+def supported(
+    data: Dataset, recipe: Recipe, windows: str = AUTO, until_held: bool = False
+) -> tuple[ModelSet, Statement, dict[str, str]]:
+    """The model set of the first kind of windows that serves, its statement, and why the kinds before it did not.
+    until_held: see `certified`.
+
+    Raises:
+        Unsupported: none does.
+    """
+    reasons: dict[str, str] = {}
+    for kind in (PLAN, FREE) if windows == AUTO else (windows,):
+        try:
+            model, statement = certified(data, replace(recipe, windows=kind), until_held)
+        except (BadData, CertificateError) as error:
+            reasons[kind] = str(error) + (NO_PLANS if kind == PLAN else "")
+        else:
+            return model, statement, reasons
+    raise Unsupported(reasons)

@@ -1,0 +1,50 @@
+"""`brakeline compare`: every method from the same seeds, cell by cell, two at once, resuming from what is there.
+
+results/<robot>/<method>-s<seed>.json      one cell: its configuration, its figures, an episode a row
+results/<robot>/conservatism.json          every certificate and mode, with the stored policy and the map's oracle
+results/<robot>/table.md table.json curves.png seeds.png      drawn from these files alone
+runs/compare/<robot>/<cell>/               logs and policy of a cell that was run here (not in git)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from brakeline.deploy.experiments import comparison_cells
+from brakeline.deploy.experiments.comparison_cells import METHODS, Study
+from brakeline.messaging.task import robot_with_task
+
+RESULTS, RUNS = Path("results"), Path("runs/compare")
+EPISODES = 500
+SEEDS = (0, 1, 2)
+
+
+@dataclass(frozen=True)
+class Cell:
+    """A study as a job."""
+
+    study: Study
+
+    @property
+    def robot(self) -> str:
+        return self.study.robot
+
+    @property
+    def name(self) -> str:
+        return self.study.name
+
+    def config(self) -> dict[str, Any]:
+        return self.study.config()
+
+    def run(self, folder: Path, say: Callable[[str], object]) -> dict[str, Any]:
+        return comparison_cells.run(self.study, folder, say)
+
+
+def studies(robot: str, seeds: Iterable[int] = SEEDS, quick: bool = False) -> list[Study]:
+    """All cells of a robot's table, seed by seed, so that an interrupted comparison has whole seeds."""
+    steps = robot_with_task(robot).task.steps
+    wanted = [Study(robot, method, seed, steps, EPISODES) for seed in seeds for method in METHODS]
+    return [comparison_cells.quick(study) for study in wanted] if quick else wanted

@@ -1,0 +1,104 @@
+"""Pictures of a comparison: learning curves of every method, and each seed's figures as points."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from brakeline.deploy.experiments.bootstrap import Estimate
+from brakeline.deploy.experiments.comparison_cells import METHODS
+from brakeline.deploy.experiments.comparison_table import NAMES, WINDOW
+
+Array = NDArray[np.float64]
+
+COLOURS = dict(zip(METHODS, ("#0072b2", "#e69f00", "#009e73", "#d55e00"), strict=True))  # told apart by anyone
+POINTS = 200  # of a curve
+
+
+def _smooth(values: Array) -> Array:
+    """Means over the last `WINDOW` episodes, fewer at the start."""
+    sums = np.concatenate([[0.0], np.cumsum(values)])
+    ends = np.arange(1, len(values) + 1)
+    starts = np.maximum(0, ends - WINDOW)
+    return np.asarray((sums[ends] - sums[starts]) / (ends - starts))
+
+
+def _lines(results: Sequence[dict[str, Any]], name: str, grid: Array) -> Array:
+    """(seeds, POINTS): a figure of training on a grid of steps; collisions are counted, the others averaged."""
+    lines = []
+    for result in results:
+        episodes = result["training"]["episodes"]
+        ends, values = np.cumsum(episodes["steps"]), np.array(episodes[name], float)
+        if name == "interventions":
+            values = values / np.array(episodes["steps"], float)
+        curve = np.cumsum(values) if name == "collision" else _smooth(values)
+        before = 0.0 if name == "collision" else np.nan  # until an episode has ended nothing is known
+        lines.append(np.interp(grid, ends, curve, left=before))
+    return np.array(lines)
+
+
+def learning_curves(results: Sequence[dict[str, Any]], png: Path) -> None:
+    """Goals, collisions so far, reward and interventions over training steps; thin: a seed, thick: their mean."""
+    picture = Figure(figsize=(10.0, 7.0), layout="constrained")
+    rows = [("goal", "goals reached"), ("collision", "collisions so far"), ("reward", "reward of an episode")]
+    rows.append(("interventions", "share of steps with an intervention"))
+    panels: list[Axes] = list(picture.subplots(2, 2, sharex=True).ravel())
+    steps = results[0]["study"]["steps"]
+    grid = np.linspace(0.0, steps, POINTS)
+    for axes, (name, label) in zip(panels, rows, strict=True):
+        for method in METHODS:
+            own = [result for result in results if result["study"]["method"] == method]
+            if not own:
+                continue
+            lines = _lines(own, name, grid)
+            axes.plot(grid, lines.T, color=COLOURS[method], alpha=0.3, linewidth=0.8)
+            axes.plot(grid, lines.mean(axis=0), color=COLOURS[method], linewidth=2.0, label=NAMES[method])
+        axes.set_title(label, fontsize=10)
+        axes.grid(alpha=0.3)
+        axes.margins(x=0.01)
+        if name in ("goal", "interventions"):
+            axes.set_ylim(-0.02, 1.02)
+    panels[0].legend(loc="best", frameon=False)
+    for axes in panels[2:]:
+        axes.set_xlabel(f"steps (means over {WINDOW} episodes)")
+    png.parent.mkdir(parents=True, exist_ok=True)
+    picture.savefig(png, dpi=120, metadata={"Software": None})
+
+
+def seeds_as_points(found: dict[str, Any], png: Path) -> None:
+    """Each part's goal and collision rates: the interval as a line, every seed as a point."""
+    parts = [part for part in found["parts"] if part != "deployment"]
+    picture = Figure(figsize=(3.4 * len(parts), 5.6), layout="constrained")
+    grid = picture.subplots(2, len(parts), squeeze=False)
+    for column, part in enumerate(parts):
+        for row, name in enumerate(("goal rate", "collision rate")):
+            axes: Axes = grid[row][column]
+            methods = {m: figures[name] for m, figures in found["parts"][part].items() if name in figures}
+            if not methods:
+                axes.set_axis_off()
+                continue
+            for place, (method, estimate) in enumerate(methods.items()):
+                _point(axes, place, estimate, COLOURS[method])
+            axes.set_xticks(range(len(methods)), [NAMES[m] for m in methods])
+            axes.set_title(f"{part}: {name} [%]", fontsize=10)
+            axes.grid(axis="y", alpha=0.3)
+            axes.set_xlim(-0.6, len(methods) - 0.4)
+            if name == "goal rate":
+                axes.set_ylim(-2.0, 102.0)
+            else:
+                axes.set_ylim(bottom=-0.5)
+    png.parent.mkdir(parents=True, exist_ok=True)
+    picture.savefig(png, dpi=120, metadata={"Software": None})
+
+
+def _point(axes: Axes, place: int, estimate: Estimate, colour: str) -> None:
+    axes.plot([place, place], [100.0 * estimate.low, 100.0 * estimate.high], color=colour, linewidth=2.0)
+    axes.plot(place, 100.0 * estimate.value, marker="_", markersize=16, color=colour)
+    offsets = place + 0.22 + 0.08 * (np.arange(len(estimate.seeds)) - 0.5 * (len(estimate.seeds) - 1))
+    axes.scatter(offsets, 100.0 * np.array(estimate.seeds), s=14, color=colour, alpha=0.7)

@@ -1,0 +1,118 @@
+"""How conservative each certificate is in both modes: its tubes, and what they cost (docs/method.md §6).
+
+Half-widths of a full stop, what held-out plans say of the bound, and closed-loop goal rates of the map's oracle (A*)
+and of the stored policy, which was trained behind the default. Where a full stop's set is wider than the arena, no
+plan of moving can be verified, and nothing is driven.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from brakeline.actors.episode_runner import Driver, Identity
+from brakeline.deploy.data.certification import certified
+from brakeline.deploy.data.simulated_recording import recorded
+from brakeline.deploy.experiments.evaluate import FRESH, in_process
+from brakeline.deploy.experiments.trials import Episodes, evaluate
+from brakeline.deploy.policy_loading import policy_named
+from brakeline.deploy.vehicle_factory import environment
+from brakeline.messaging.task import RobotWithTask, robot_with_task
+from brakeline.safety.model.dataset import BadData
+from brakeline.safety.model.error_bounds import KINDS, CertificateError
+from brakeline.safety.model.model_set import MODES, Recipe
+from brakeline.sim.arena_generator import arena_kind
+
+ORACLE = "astar"
+ANY_BOUND = 1.0  # in a simulator: how loose each is, is what is to be seen
+
+
+@dataclass(frozen=True)
+class Conservatism:
+    """A job of `deploy/experiments/experiment_jobs.py`."""
+
+    robot: str
+    episodes: int = 60
+    arena: str = "default"
+    policies: tuple[str, ...] = (ORACLE, "trained")
+
+    @property
+    def name(self) -> str:
+        return "conservatism"
+
+    def config(self) -> dict[str, Any]:
+        config: dict[str, Any] = json.loads(json.dumps(asdict(self)))
+        return config
+
+    def run(self, folder: Path, say: Callable[[str], object] = lambda text: None) -> dict[str, Any]:
+        """A row for each certificate and mode, the refused ones with the reason."""
+        robot = robot_with_task(self.robot)
+        data = recorded(robot)
+        rows = []
+        for certificate in KINDS:
+            for mode in MODES:
+                say(f"{certificate}, {mode}")
+                recipe = Recipe(certificate, mode)
+                row: dict[str, Any] = asdict(recipe)
+                try:
+                    model, statement = certified(data, recipe)
+                except (BadData, CertificateError) as error:
+                    rows.append(row | {"refused": str(error)})
+                    continue
+                row |= {"model": model.version, "statement": statement.figures()}
+                driving = None
+                if statement.half_width_full <= arena_kind(robot, self.arena).half_width:
+                    ask = in_process(model, ANY_BOUND)
+                    driving = {policy: self._drive(robot, policy, ask) for policy in self.policies}
+                rows.append(row | {"driving": driving})
+        return {"study": self.config(), "data": data.digest(), "rows": rows}
+
+    def _drive(self, robot: RobotWithTask, policy: str, question: Any) -> dict[str, Any]:
+        """Closed loop on the first fresh episodes."""
+        driver = Driver(robot, environment(robot, self.arena, FRESH), Identity("conservatism", 0, 0))
+        found: Episodes = evaluate(driver, policy_named(policy, robot, 0), question, self.episodes)
+        columns, steps = found.columns(), found.decisions
+        return {
+            "goals": sum(columns["goal"]),
+            "collisions": sum(columns["collision"]),
+            "interventions": sum(columns["interventions"]) / max(steps, 1),
+            "steps": steps,
+            "decision_ms": found.decision_ms(),
+        }
+
+
+def markdown(result: dict[str, Any]) -> str:
+    """The rows as a table."""
+    policies, episodes = result["study"]["policies"], result["study"]["episodes"]
+    heads = ["certificate", "mode", "stop from rest", "from full speed", "plans outside", "at most"]
+    heads += [f"{policy}: goals of {episodes}, interventions" for policy in policies]
+    lines = [f"# Conservatism: {result['study']['robot']}", "", "| " + " | ".join(heads) + " |"]
+    lines.append("|---" * len(heads) + "|")
+    for row in result["rows"]:
+        if "refused" in row:
+            figures = [f"refused: {row['refused']}"] + [""] * (len(heads) - 3)
+        else:
+            figures = _figures(row, policies)
+        lines.append("| " + " | ".join([row["certificate"], row["mode"], *figures]) + " |")
+    lines += [
+        "",
+        "Half-widths of a full stop's set on its widest axis; held-out plans outside their tubes, and the bound on "
+        "that at 99 % confidence.",
+    ]
+    return "\n".join(lines)
+
+
+def _length(metres: float) -> str:
+    return f"{1e3 * metres:.1f} mm" if metres < 1.0 else f"{metres:.3g} m"
+
+
+def _figures(row: dict[str, Any], policies: Sequence[str]) -> list[str]:
+    said, driving = row["statement"], row["driving"]
+    figures = [_length(said[name]) for name in ("half_width_rest", "half_width_full")]
+    figures += [f"{said['violations']} of {said['windows']}", f"{said['bound_plan']:.2%}"]
+    if driving is None:
+        return figures + ["not driven: wider than the arena"] + [""] * (len(policies) - 1)
+    return figures + [f"{driving[policy]['goals']}, {driving[policy]['interventions']:.1%}" for policy in policies]

@@ -1,0 +1,176 @@
+"""`brakeline evaluate`: a policy through the filter, in process, on fresh episodes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from brakeline.actors.decision_guard import Ask, Outcome, consult
+from brakeline.actors.episode_runner import Driver, Identity
+from brakeline.actors.joint_episode import Fleet
+from brakeline.deploy.data.model_store import method_for
+from brakeline.deploy.policy_loading import policy_named
+from brakeline.deploy.vehicle_factory import environment, fleet_world
+from brakeline.logs.log_analysis import perception_in
+from brakeline.logs.metrics import Tally, closed_loop
+from brakeline.messaging import brakeline_pb2 as pb
+from brakeline.messaging.task import RobotWithTask
+from brakeline.safety.methods import DDPC, Model
+from brakeline.safety.model.model_config import check_promises
+from brakeline.safety.model.model_set import Recipe
+from brakeline.safety.service.server import Counts, Models, answerer
+from brakeline.sim.scripted_policies import Policy
+from brakeline.sim.shared_world import FleetEnv
+from brakeline.sim.sim_conditions import Conditions
+
+FRESH = 1_000_000  # added to the seed: no training run draws its episodes from there
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """What to evaluate."""
+
+    policy: str = "astar"  # a file, or trained | untrained | random | greedy | adversary | astar
+    method: str = "ddpc"
+    recipe: Recipe = field(default_factory=Recipe)
+    arena: str = "default"
+    episodes: int = 100
+    seed: int = 0
+    conditions: Conditions = field(default_factory=Conditions)
+    fleet: int = 0  # robots in one world; 0: each episode's robot is alone
+    accept_bound: float | None = None  # the largest stated bound that is accepted; None: the robot's own limit
+
+
+def in_process(model: Model, accept_bound: float | None = None) -> Ask:
+    """The safety service's own core, called directly: the same bytes, no bus.
+
+    Raises:
+        TooLoose: the model set's statement is looser than the robot's limit, or than `accept_bound`.
+    """
+    models = Models(accept_bound=accept_bound)
+    models.install(model)
+    answer = answerer(models, Counts())
+
+    def ask(requests: Sequence[pb.Request]) -> list[pb.Reply]:
+        payload = pb.RequestBatch(requests=requests).SerializeToString()
+        return list(pb.ReplyBatch.FromString(answer(payload)).replies)
+
+    return ask
+
+
+def episode(driver: Driver, policy: Policy, question: Ask | None, number: int) -> Iterator[pb.Step]:
+    """The steps of one episode."""
+    driver.begin(number)
+    while driver.running:
+        proposal = np.asarray(policy(driver.observation, driver.info), dtype=float)
+        outcome = None
+        if question is not None:
+            outcome = consult(question, [driver.request(proposal)], driver.robot)[0]
+        yield driver.execute(proposal, outcome)
+
+
+def prepared(robot: RobotWithTask, what: Evaluation) -> tuple[Driver, Policy, Ask | None]:
+    """What an evaluation is made of: the driver in a fresh environment, the policy, and whom it asks."""
+    policy = policy_named(what.policy, robot, what.seed)
+    env = environment(robot, what.arena, FRESH + what.seed, what.conditions)
+    question = _question(robot, what)
+    driver = Driver(robot, env, Identity("evaluate", 0, what.seed), filtered=question is not None)
+    return driver, policy, question
+
+
+def _question(robot: RobotWithTask, what: Evaluation) -> Ask | None:
+    """Whom the robot asks: nobody where there is no filter."""
+    if what.method == "none":
+        return None
+    return in_process(method_for(robot, what.method, what.recipe, what.accept_bound), what.accept_bound)
+
+
+def round_of(fleet: Fleet, policies: Sequence[Policy], question: Ask | None, number: int) -> Iterator[list[pb.Step]]:
+    """The steps of one episode of every robot of a world, period by period."""
+    fleet.begin(number)
+    while fleet.running:
+        proposals = [
+            np.asarray(policy(driver.observation, driver.info), dtype=float)
+            if driver.running
+            else driver.robot.at_zero()
+            for driver, policy in zip(fleet.drivers, policies, strict=True)
+        ]
+        outcomes: list[Outcome | None] = [None] * len(proposals)
+        if question is not None:
+            outcomes = list(consult(question, fleet.requests(proposals), fleet.drivers[0].robot))
+        yield [step for step in fleet.execute(proposals, outcomes) if step is not None]
+
+
+def prepared_fleet(robot: RobotWithTask, what: Evaluation) -> tuple[Fleet, FleetEnv, list[Policy], Ask | None]:
+    """The same for several robots in one world.
+
+    Raises:
+        NoFleet: there is none of this kind, or in that arena; ValueError: this method makes no promises.
+    """
+    check_promises(what.method)
+    world = fleet_world(robot, what.arena, what.fleet, FRESH + what.seed, what.conditions)
+    policies = [policy_named(what.policy, robot, what.seed + i) for i in range(what.fleet)]
+    question = _question(robot, what)
+    drivers = [
+        Driver(robot, member, Identity(f"evaluate.{i}", i, what.seed), filtered=question is not None)
+        for i, member in enumerate(world.members)
+    ]
+    return Fleet(world, drivers, question is not None), world, policies, question
+
+
+def evaluate(
+    robot: RobotWithTask, what: Evaluation, each: Callable[[Tally], Any] = lambda tally: None
+) -> dict[str, Any]:
+    """The shared figures of `what.episodes` episodes (of a fleet: of at least so many, each robot's counted); `each` is
+    called after every one."""
+    if what.fleet:
+        return _together(robot, what, each) | _about(what)
+    driver, policy, question = prepared(robot, what)
+    tally = Tally()
+    for number in range(what.episodes):
+        for step in episode(driver, policy, question, number):
+            tally.step(step)
+        each(tally)
+    return closed_loop([tally]) | _about(what)
+
+
+def _together(robot: RobotWithTask, what: Evaluation, each: Callable[[Tally], Any]) -> dict[str, Any]:
+    """A fleet's figures: of all, by kind and by robot as `analyse` has them, and of its worlds."""
+    fleet, world, policies, question = prepared_fleet(robot, what)
+    tallies = {driver.identity.actor: Tally() for driver in fleet.drivers}
+    rounds, periods = -(-what.episodes // what.fleet), 0
+    for number in range(rounds):
+        for steps in round_of(fleet, policies, question, number):
+            periods += 1
+            for step in steps:
+                tallies[step.actor].step(step)
+        for tally in tallies.values():
+            each(tally)
+    figures = closed_loop(tallies.values())
+    seconds = periods * robot.period
+    return figures | {
+        "robots": {robot.name: figures},
+        "actors": {name: closed_loop([tally]) for name, tally in tallies.items()},
+        "worlds": {
+            "count": rounds,
+            "robot_steps": periods * what.fleet,  # of those that stand at their goals, too
+            "touches": world.touches,  # of two robots, whatever they did
+            "goals_per_minute": 60.0 * figures["goals"] / seconds if seconds else None,
+        },
+    }
+
+
+def _about(what: Evaluation) -> dict[str, Any]:
+    return {
+        "method": what.method,
+        "certificate": what.recipe.certificate if what.method == DDPC else None,
+        "mode": what.recipe.mode if what.method == DDPC else None,
+        "policy": what.policy,
+        "arena": what.arena,
+        "perception": perception_in(what.conditions.describe()),
+        "seed": what.seed,
+        "conditions": what.conditions.describe(),
+    }

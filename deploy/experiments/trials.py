@@ -1,0 +1,213 @@
+"""A policy's training or evaluation in one process, step by step and logged: what `compare` repeats bit for bit.
+
+The same parts as in a launched run (driver, safety service's core, learner, one buffer), called in turn instead of over
+the bus, so that nothing depends on timing but the times themselves. Steps and episodes go to an MCAP log of the same
+schema; the observations stay out of it, which the figures do not need.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from brakeline.actors.decision_guard import Ask, consult
+from brakeline.actors.episode_runner import Driver
+from brakeline.learner.learner import Learner
+from brakeline.logs.segment import Entry, open_segment
+from brakeline.messaging import brakeline_pb2 as pb
+from brakeline.messaging.policy_weights import MLP, decode
+from brakeline.messaging.topics import EPISODE, STEP, Topic
+from brakeline.sim.scripted_policies import Policy, scripted
+
+FLUSH = 2000  # messages between two writes
+RUN = 1  # in place of a process's random number
+CONTACTS = ("contact_moving", "contact_standing")
+COLUMNS = (
+    *("steps", "goal", "collision", "timeout", "reward", "speed", "fastest", "interventions", "milliseconds"),
+    *CONTACTS,
+)
+
+
+class TrialLog:
+    """Steps and episodes in an MCAP file, as a recorder would have stored them. A file that is there is replaced."""
+
+    def __init__(self, path: Path, metadata: dict[str, dict[str, str]]) -> None:
+        path.unlink(missing_ok=True)
+        self.path = path
+        self._segment = open_segment(path, metadata)
+        self._waiting: list[Entry] = []
+        self._count: dict[str, int] = {}
+
+    def put(self, topic: Topic, message: pb.Step | pb.Episode) -> None:
+        key = topic.at(robot=message.robot, source=message.actor)
+        self._count[key] = number = self._count.get(key, 0) + 1
+        header, now = message.header, time.time_ns()
+        header.sequence, header.source, header.run, header.wall_time = number, message.actor, RUN, now
+        self._waiting.append(
+            Entry(key, type(message), message.SerializeToString(), now, int(header.time * 1e9) or now, number)
+        )
+        if len(self._waiting) >= FLUSH:
+            self._save()
+
+    def _save(self) -> None:
+        self._segment.save(self._waiting)
+        self._waiting = []
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        if kind is None:
+            self._save()
+        self._segment.finish()
+
+
+@dataclass
+class Episodes:
+    """One row per finished episode, and the times of every decision.
+
+    steps; goal, collision, timeout (0 or 1); reward without penalties; speed [m/s] summed over steps, and the highest;
+    interventions; milliseconds of policy and method, summed over steps; contact with what moves, moving and standing.
+    """
+
+    rows: list[tuple[float, ...]] = field(default_factory=list)
+    decisions: int = 0
+    milliseconds: float = 0.0
+    squares: float = 0.0  # ms²
+    _running: list[float] = field(default_factory=lambda: [0.0] * len(COLUMNS))
+
+    def step(self, step: pb.Step) -> None:
+        """Take the next step, in order."""
+        row, spent = self._running, step.propose_ms + step.decide_ms
+        failsafe = step.fallback or step.decision == pb.FAILSAFE
+        row[0] += 1
+        row[1] += step.goal
+        row[2] = max(row[2], float(step.collision))
+        row[3] += step.truncated and not step.terminated and not step.cut
+        row[4] += step.reward
+        row[5] += step.speed
+        row[6] = max(row[6], step.speed)
+        row[7] += failsafe or step.decision in (pb.ADJUSTED, pb.RECOVERING)
+        row[8] += spent
+        row[9] += step.contact_moving
+        row[10] += step.contact_standing
+        self.decisions += 1
+        self.milliseconds += spent
+        self.squares += spent * spent
+        if step.terminated or step.truncated:
+            self.rows.append(tuple(row))
+            self._running = [0.0] * len(COLUMNS)
+
+    def columns(self) -> dict[str, list[float]]:
+        """Rounded to what a table could ever show; counts are integers."""
+        table = np.array(self.rows).reshape(-1, len(COLUMNS)).T
+        whole = {"steps", "goal", "collision", "timeout", "interventions", *CONTACTS}
+        return {
+            name: [int(v) for v in values] if name in whole else [round(float(v), 4) for v in values]
+            for name, values in zip(COLUMNS, table, strict=True)
+        }
+
+    def decision_ms(self) -> dict[str, float]:
+        mean = self.milliseconds / max(self.decisions, 1)
+        return {"mean": mean, "std": max(self.squares / max(self.decisions, 1) - mean * mean, 0.0) ** 0.5}
+
+
+@dataclass(frozen=True)
+class Proposal:
+    """An action (m,) and how long it took to think of, ms."""
+
+    action: NDArray[np.float64]
+    ms: float
+
+
+Propose = Callable[[Driver], Proposal]
+
+
+def thinking(policy: Policy) -> Propose:
+    """A policy, timed."""
+
+    def propose(driver: Driver) -> Proposal:
+        before = time.perf_counter_ns()
+        action = np.asarray(policy(driver.observation, driver.info), dtype=float)
+        return Proposal(action, (time.perf_counter_ns() - before) * 1e-6)
+
+    return propose
+
+
+def one_step(driver: Driver, propose: Propose, question: Ask | None, version: int = 0) -> pb.Step:
+    """Propose, ask, act."""
+    proposal = propose(driver)
+    outcome = None
+    if question is not None:
+        outcome = consult(question, [driver.request(proposal.action)], driver.robot)[0]
+        if outcome.answer is None:
+            raise RuntimeError(f"no decision: {outcome.failure}")  # in one process that is a defect, never the network
+    step = driver.execute(proposal.action, outcome, version)
+    step.propose_ms = proposal.ms
+    return step
+
+
+def without_observations(step: pb.Step) -> pb.Step:
+    kept = pb.Step()
+    kept.CopyFrom(step)
+    kept.ClearField("observation")
+    kept.ClearField("next_observation")
+    kept.ClearField("path")
+    return kept
+
+
+def evaluate(
+    driver: Driver, policy: Policy, question: Ask | None, episodes: int, log: TrialLog | None = None
+) -> Episodes:
+    """The policy without exploration, through episodes 0 to `episodes` − 1 of the driver's environment."""
+    found, propose = Episodes(), thinking(policy)
+    for number in range(episodes):
+        message = driver.begin(number)
+        if log is not None:
+            log.put(EPISODE, message)
+        while driver.running:
+            step = one_step(driver, propose, question)
+            found.step(step)
+            if log is not None:
+                log.put(STEP, without_observations(step))
+    return found
+
+
+class Trainer:
+    """One driver and one learner in lockstep: every step is learned from, as far as it is due, before the next."""
+
+    def __init__(self, driver: Driver, question: Ask | None, learner: Learner) -> None:
+        self.driver, self.question, self.learner = driver, question, learner
+        robot = driver.robot
+        reply = learner.join(pb.Join(robot=robot.name, actor=driver.identity.actor, layout=robot.learning_layout()))
+        self.policy: MLP = decode(reply.weights.file, robot)
+
+    def run(self, log: TrialLog | None = None) -> Iterator[pb.Step]:
+        """The steps of the whole run, as they are taken."""
+        episode = 0
+        while not self.learner.done:
+            if not self.driver.running:
+                message = self.driver.begin(episode)
+                episode += 1
+                self._random = scripted("random", self.driver.robot, self.driver.rng)
+                if log is not None:
+                    log.put(EPISODE, message)
+            step = one_step(self.driver, thinking(self._explore), self.question, self.policy.version)
+            self.learner.insert(step)
+            self.learner.work(1 << 30)
+            if self.learner.weights_due():
+                self.policy = decode(self.learner.publish().file, self.driver.robot)
+            if log is not None:
+                log.put(STEP, without_observations(step))
+            yield step
+
+    def _explore(self, observation: NDArray[np.float32], info: dict[str, Any]) -> NDArray[np.float64]:
+        if self.learner.warming_up:
+            return np.asarray(self._random(observation, info))
+        return self.policy.explore(observation, self.driver.rng)

@@ -1,0 +1,82 @@
+"""A policy by its name or file: scripted, trained and stored with the program, untrained, a person's own weights, or
+inputs that were written down."""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from brakeline.deploy.data.sources.quantity_names import columns_of
+from brakeline.deploy.data.sources.source_table import NoSource
+from brakeline.messaging.policy_weights import MLP, BadWeights
+from brakeline.messaging.task import RobotWithTask
+from brakeline.sim.scripted_policies import Policy, scripted
+
+UNTRAINED, TRAINED = "untrained", "trained"
+POLICY_FOLDER = Path(__file__).parents[1] / "policies"
+
+
+def policy_named(name: str, robot: RobotWithTask, seed: int) -> Policy:
+    """A scripted policy, a stored one (`trained` and others in policies/, or beside the robot's own task), an untrained
+    one, or a file's: weights, or inputs as `brakeline excite` prints them (.csv).
+
+    Raises:
+        ValueError: neither a name nor a file; BadWeights: a file that is no policy of this robot.
+    """
+    policies = robot.task.policies
+    if name in policies:
+        return scripted(name, robot, np.random.default_rng(seed))
+    if name == UNTRAINED:
+        return driving(MLP.untrained(robot, seed))
+    if name.endswith(".csv"):
+        return replayed(Path(name), robot)
+    stored = _stored(robot)
+    path = stored.get(name, Path(name))
+    if not path.is_file():
+        names = ", ".join([*sorted(stored), UNTRAINED, *policies])
+        raise ValueError(f"no policy is called {name!r} and no such file exists; there are: {names}, or a file's path")
+    if robot.late:
+        with suppress(BadWeights):  # it may have been trained in lockstep: it proposes in real time too
+            return driving(MLP.load(path, robot.in_lockstep()))
+    return driving(MLP.load(path, robot))
+
+
+def _stored(robot: RobotWithTask) -> dict[str, Path]:
+    """By name: beside the task's file, as robots of other people have it, or in the folder of this repository."""
+    task = robot.task
+    beside = task.folder / f"{TRAINED}.safetensors"
+    folder = POLICY_FOLDER / (task.name or robot.kind)
+    return {path.stem: path for path in folder.glob("*.safetensors")} | ({TRAINED: beside} if beside.is_file() else {})
+
+
+def driving(mlp: MLP) -> Policy:
+    """The network as a policy, without exploration."""
+    return lambda observation, info: mlp(observation)
+
+
+def replayed(path: Path, robot: RobotWithTask) -> Policy:
+    """The inputs in a file of columns, one a period; an episode is a run of it, and after the last row it stands.
+
+    Raises:
+        NoSource: it is no such file, or has not all inputs of the robot.
+    """
+    from brakeline.deploy.data.sources.column_files import read_csv  # pyarrow with it, which no other policy needs
+
+    (table,) = read_csv(path)
+    names = columns_of(robot)[1]
+    if missing := [name for name in names if name not in table.columns]:
+        raise NoSource(f"{path}: no column {', '.join(missing)}; there are: {', '.join(table.columns)}")
+    inputs = np.stack([table.columns[name] for name in names], axis=1)
+    runs = iter([inputs[table.run == run] for run in np.unique(table.run)])
+    left: list[NDArray[np.float64]] = []
+
+    def policy(observation: NDArray[np.float32], info: dict[str, Any]) -> NDArray[np.float64]:
+        if info["time"] == 0.0:
+            left[:] = list(next(runs, np.zeros((0, len(names)))))
+        return left.pop(0) if left else np.where(robot.stopping, 0.0, info["input_in_force"])
+
+    return policy

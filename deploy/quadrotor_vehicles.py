@@ -1,0 +1,69 @@
+"""What makes quadrotors: behind their own autopilots in memory, or behind a real PX4 (`simulator` in a task's file)."""
+
+from __future__ import annotations
+
+import os
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from brakeline.actors.mavlink.frame_log import Tap
+from brakeline.actors.mavlink.lockstep_quadrotor import MavlinkVehicle
+from brakeline.actors.mavlink.px4_lockstep import QUIET, Px4Flight, Px4Vehicle
+from brakeline.messaging.task import RobotWithTask, robot_with_task
+from brakeline.sim.arena import Arena
+from brakeline.sim.arena_generator import draw_arena
+from brakeline.sim.autopilot.autopilot_rules import SETPOINT_TIMEOUT
+from brakeline.sim.autopilot.endpoint import Autopilot
+from brakeline.sim.autopilot.hil_sensors import SensorNoise
+from brakeline.sim.flight_estimator import QuadrotorNoise
+from brakeline.sim.quadrotor import QUADROTOR, Quadrotor
+from brakeline.sim.sim_conditions import Conditions
+from brakeline.sim.vehicle import MakeVehicle
+from brakeline.sim.wind import Wind
+
+
+def embedded(conditions: Conditions, tap: Tap | None = None) -> MakeVehicle:
+    """Makes quadrotors behind their own autopilots."""
+    return partial(embedded_quadrotor, noise=conditions.flight_noise, wind=conditions.wind, tap=tap)
+
+
+def embedded_quadrotor(
+    arena: Arena,
+    rng: np.random.Generator,
+    noise: QuadrotorNoise | None = None,
+    wind: Wind | None = None,
+    rules: str = "px4",
+    *,
+    tap: Tap | None = None,
+) -> MavlinkVehicle:
+    """A quadrotor behind its own autopilot, over MAVLink in memory.
+
+    It brakes by itself when a setpoint is overdue by a period. tap: is called with every MAVLink frame.
+    """
+    parameters = {SETPOINT_TIMEOUT[rules]: QUADROTOR.period}
+    autopilot = Autopilot(Quadrotor(arena, rng, noise, wind), rules, parameters=parameters, quiet=True)
+    return MavlinkVehicle(autopilot, QUADROTOR, tap)
+
+
+def behind_px4(conditions: Conditions, tap: Tap | None = None) -> MakeVehicle:
+    """Makes quadrotors behind the real PX4 in the folder `$BRAKELINE_PX4`: one process flies all their episodes.
+
+    Raises:
+        ValueError: there is no such folder.
+    """
+    folder = os.environ.get("BRAKELINE_PX4")
+    if not folder:
+        raise ValueError("set BRAKELINE_PX4 to the folder of a PX4 that was built for SITL")
+    flight = Px4Flight(Path(folder), SensorNoise(scale=conditions.flight_noise.scale), tap=tap)
+
+    def make(arena: Arena, rng: np.random.Generator) -> Px4Vehicle:
+        return Px4Vehicle(flight, Quadrotor(arena, rng, QUIET, conditions.wind), QUADROTOR)
+
+    return make
+
+
+def flight_arena(name: str, seed: int, robot: RobotWithTask | None = None) -> Arena:
+    """The one arena of a flight in real time: the autopilot's world, and the actor's map."""
+    return draw_arena(name, np.random.default_rng(seed), robot or robot_with_task("quadrotor"))

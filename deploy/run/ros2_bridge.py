@@ -1,0 +1,208 @@
+"""Our simulated ground robot as a ROS 2 robot: odometry, scan, transforms, clock and collisions out, cmd_vel in.
+
+Its base does what bases do: it drives at the last command, and stops when none has come for `timeout` s. Time is this
+machine's, or its own on /clock: then as fast as `factor` allows, and with `lockstep` each period waits for a command,
+so that however busy the machine is nothing is late because of it.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from brakeline.messaging.ros2 import LATCHED, SENSOR, Node, RosSettings, Tap
+from brakeline.messaging.ros2.cdr_messages import (
+    Clock,
+    LaserScan,
+    Odometry,
+    PoseWithCovariance,
+    TFMessage,
+    Transform,
+    TransformStamped,
+    Twist,
+    TwistStamped,
+    TwistWithCovariance,
+    header,
+    pose,
+    quaternion,
+    time_of,
+    twist,
+    vector,
+)
+from brakeline.messaging.task import robot_with_task
+from brakeline.sim.arena_generator import draw_arena
+from brakeline.sim.ground_realtime import SAMPLE, DrivenGround, TurningLidar
+from brakeline.sim.ground_robot import SAMPLES
+from brakeline.sim.sim_conditions import Conditions
+
+Array = NDArray[np.float64]
+
+ODOM, BASE, LASER = "odom", "base_footprint", "base_scan"
+BEHIND = 0.2  # s behind real time at which it is no longer caught up with
+
+
+@dataclass(frozen=True)
+class BridgeSettings:
+    ros: RosSettings = field(default_factory=lambda: RosSettings(listen=("tcp/127.0.0.1:7447",)))
+    arena: str = "default"
+    seed: int = 0
+    sim_time: bool = False  # its own, on /clock
+    factor: float = 1.0  # of real time, at most; 0: as fast as it goes
+    lockstep: bool = False  # each period waits for its command
+    patience: float = 1.0  # s of this machine that a period waits
+    timeout: float = 0.3  # s without a command until the base stops
+    stamped: bool = False  # commands are TwistStamped
+    seconds: float = 0.0  # of its time until it ends; 0: when asked to
+    conditions: Conditions = field(default_factory=Conditions)
+
+
+@dataclass
+class Outcome:
+    """What happened so far."""
+
+    seconds: float = 0.0
+    collisions: int = 0
+    closest: float = float("inf")  # m from the body's disc to an obstacle
+    driven: float = 0.0  # m
+    commands: int = 0
+    timeouts: int = 0  # times that the base stopped for want of a command
+    missed: int = 0  # periods of lockstep that got none
+    slips: int = 0  # times that it could not keep up with real time
+
+    def figures(self) -> dict[str, Any]:
+        return asdict(self)
+
+
+class Bridge:
+    """One robot in one arena, as a node."""
+
+    def __init__(self, settings: BridgeSettings, tap: Tap | None = None) -> None:
+        """Raises Unreachable, UnknownArena."""
+        self.settings, self.outcome = settings, Outcome()
+        rng = np.random.default_rng((settings.seed, 11))
+        arena = draw_arena(settings.arena, np.random.default_rng(settings.seed), robot_with_task("ground"))
+        c = settings.conditions
+        self.robot = DrivenGround(arena, rng, c.noise, c.payload_kg, c.floor_friction)
+        self._lidar = TurningLidar(arena, rng, c.lidar_noise(flies=False))
+        self._begun = 1.0 if settings.sim_time else time.time()  # its time at the first sample
+        self._samples = 0
+        self._heard = threading.Condition()
+        self._command: Array | None = None
+        self._commanded = -np.inf  # its time of the last command
+        self._stopped = True
+        self.node = Node(settings.ros, "brakeline_sim", tap)
+        self._clock = self.node.publisher("/clock", Clock, SENSOR) if settings.sim_time else None
+        self._odometry = self.node.publisher("odom", Odometry)
+        self._transforms = self.node.publisher("/tf", TFMessage)
+        self._scans = self.node.publisher("scan", LaserScan, SENSOR)
+        fixed = self.node.publisher("/tf_static", TFMessage, LATCHED)
+        fixed.put(TFMessage(transforms=[_transform(self._begun, BASE, LASER, self._lidar.mount, 0.0, 0.0)]))
+        if settings.stamped:
+            self.node.subscribe("cmd_vel", TwistStamped, lambda message: self._hear(message.twist))
+        else:
+            self.node.subscribe("cmd_vel", Twist, self._hear)
+
+    @property
+    def now(self) -> float:
+        """Its time [s]."""
+        return self._begun + self._samples * SAMPLE
+
+    def run(self, stop: threading.Event) -> None:
+        """Until asked to stop, or its time is over."""
+        settings = self.settings
+        if not settings.sim_time:
+            self._begun = time.time() - self._samples * SAMPLE
+        anchor, since = time.monotonic(), self.now
+        while not stop.is_set() and not 0.0 < settings.seconds <= self.outcome.seconds:
+            self._sample()
+            if settings.lockstep and self._samples % SAMPLES == 0:
+                self._await_command(stop)
+            if settings.factor > 0.0:
+                ahead = (self.now - since) / settings.factor - (time.monotonic() - anchor)
+                if ahead > 0.0:
+                    stop.wait(ahead)
+                elif ahead < -BEHIND:
+                    self.outcome.slips += not settings.lockstep
+                    anchor, since = time.monotonic(), self.now
+                    if not settings.sim_time:
+                        self._begun = time.time() - self._samples * SAMPLE
+                        since = self.now
+
+    def close(self) -> None:
+        self.node.close()
+
+    def _sample(self) -> None:
+        """The next sample: drive, sense, tell."""
+        robot = self.robot
+        with self._heard:
+            command, self._command = self._command, None
+        if command is not None:
+            robot.drive(command)
+            self._commanded, self._stopped = self.now, False
+        elif not self._stopped and self.now - self._commanded > self.settings.timeout:
+            robot.drive(np.zeros(2))
+            self._stopped = True
+            self.outcome.timeouts += 1
+        robot.advance()
+        self._samples += 1
+        self._tell()
+        self.outcome.seconds = self._samples * SAMPLE
+        self.outcome.collisions, self.outcome.closest = robot.collisions, robot.closest
+        self.outcome.driven = robot.driven
+
+    def _tell(self) -> None:
+        now, (x, y, yaw, speed, turn_rate) = self.now, self.robot.measured.tolist()
+        unknown = np.zeros(36)
+        self._odometry.put(
+            Odometry(
+                header=header(now, ODOM),
+                child_frame_id=BASE,
+                pose=PoseWithCovariance(pose=pose(x, y, yaw), covariance=unknown),
+                twist=TwistWithCovariance(twist=twist(speed, turn_rate), covariance=unknown),
+            )
+        )
+        self._transforms.put(TFMessage(transforms=[_transform(now, ODOM, BASE, x, y, yaw)]))
+        ranges = self._lidar.look(self.robot.true)
+        if ranges is not None:
+            self._scans.put(self._scan(ranges))
+        if self._clock is not None:
+            self._clock.put(Clock(clock=time_of(now)))
+
+    def _scan(self, ranges: Array) -> LaserScan:
+        """Beams are told evenly in time; each was cast at its sample's end, so at most half a sample from that."""
+        lidar, turn = self._lidar, SAMPLES * SAMPLE
+        return LaserScan(
+            header=header(self.now - turn + 0.5 * SAMPLE, LASER),
+            angle_min=0.0,
+            angle_max=lidar.gap * (len(ranges) - 1),
+            angle_increment=lidar.gap,
+            time_increment=turn / len(ranges),
+            scan_time=turn,
+            range_min=lidar.nearest,
+            range_max=lidar.farthest,
+            ranges=ranges.astype(np.float32),
+            intensities=np.zeros(0, dtype=np.float32),
+        )
+
+    def _hear(self, told: Twist) -> None:
+        action = np.array([told.linear.x, told.angular.z])
+        if np.isfinite(action).all():
+            with self._heard:
+                self._command = action
+                self.outcome.commands += 1
+                self._heard.notify_all()
+
+    def _await_command(self, stop: threading.Event) -> None:
+        with self._heard:
+            heard = self._heard.wait_for(lambda: self._command is not None or stop.is_set(), self.settings.patience)
+        self.outcome.missed += not heard
+
+
+def _transform(at: float, parent: str, child: str, x: float, y: float, yaw: float) -> TransformStamped:
+    transform = Transform(translation=vector(x, y), rotation=quaternion(yaw))
+    return TransformStamped(header=header(at, parent), child_frame_id=child, transform=transform)

@@ -1,0 +1,325 @@
+"""The learner without a bus: steps go in; weights, permissions and figures come out.
+
+    insert ── ledger (duplicates, gaps) ── windows (n-step) ── replay ── TD3 ── weights
+                                             limiter: who waits for whom ── flow
+
+Everything that decides about the weights is in here and in its checkpoint, so a run can be replayed bit for bit: in
+lockstep an actor may publish step i only once everything due after step i − 1 is done.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+
+from brakeline.learner import checkpoint
+from brakeline.learner.checkpoint_state import State
+from brakeline.learner.learner_config import LearnerConfig
+from brakeline.learner.n_step import Windows
+from brakeline.learner.rate_limiter import Limiter
+from brakeline.learner.replay import Batch, Replay
+from brakeline.learner.step_ledger import Ledger
+from brakeline.learner.symmetry import Images
+from brakeline.learner.td3 import TD3
+from brakeline.learner.transition_reader import LATEST, BadStep, Intake
+from brakeline.messaging import brakeline_pb2 as pb
+from brakeline.messaging import policy_weights as policy
+from brakeline.messaging.task import RobotWithTask
+
+MOST_ACTORS = 2048
+AHEAD = 1000  # steps beyond its permission that an actor may be: it had it from the learner before
+
+
+class Part(Protocol):
+    def state(self) -> State: ...
+    def restore(self, state: State) -> None: ...
+
+
+class Learner:
+    """Not for several threads at once."""
+
+    def __init__(
+        self,
+        robot: RobotWithTask,
+        config: LearnerConfig,
+        incarnation: int = 0,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        """`incarnation` tells actors of a restart: they join again when it changes."""
+        self._intake = Intake(robot)
+        td3, dims = config.td3, (robot.task.observation_dim, robot.action_dim)
+        self.robot, self.config, self.incarnation = robot, config, incarnation
+        networks, draws = np.random.SeedSequence(config.seed).spawn(2)
+        self._td3 = TD3(*dims, td3, seed=int(networks.generate_state(1)[0]))
+        self._draws = np.random.default_rng(draws)
+        self._replay, self._batch = Replay(config.capacity, *dims), Batch(td3.batch, *dims)
+        self._images = Images(robot, td3.batch) if td3.symmetric else None
+        self._windows, self._ledger = Windows(td3.n_step, td3.gamma, td3.stored), Ledger()
+        ahead = 0.0 if config.lockstep else config.ahead
+        self._limiter = Limiter(td3.updates_per_step * td3.batch, td3.batch, td3.warmup, ahead)
+        self._limits: dict[str, int] = {}
+        self._episode_ended = True  # by the last step taken in
+        self._saved_at = 0  # steps
+        self.surplus = 0  # steps that came after the run's last one
+        self.rejected = 0
+        self._version, self._published_updates = 0, 0
+        self._clock = clock
+        self._mark = (clock(), 0, 0)  # time, steps and updates at the last figures
+        self._ages: list[int] = []  # versions that steps were behind, since the last figures
+        self.publish()
+
+    # --- in ---
+
+    def insert(self, step: pb.Step) -> bool:
+        """Take in one step; False: a duplicate, or one after the end.
+
+        Raises:
+            BadStep: sizes or values are wrong, or its actor was never taken in, or not so far; it is counted and
+                nothing else is changed.
+        """
+        try:
+            move = self._intake.move(step)
+            self._check_place(step)
+        except BadStep:
+            self.rejected += 1
+            raise
+        if self._enough():
+            self.surplus += 1
+            return False
+        if not self._ledger.record(step.actor, step.episode, step.step, step.index):
+            return False
+        for transition in self._windows.push(step.actor, move):
+            self._replay.insert(transition)
+        self._limiter.insert()
+        self._episode_ended = step.terminated or step.truncated
+        self._ages.append(self._version - step.weights_version)
+        return True
+
+    def _check_place(self, step: pb.Step) -> None:
+        """Raises BadStep for a step of nobody, or one that nobody allowed."""
+        place = self._ledger.places.get(step.actor)
+        if place is None:
+            raise BadStep("actor", f"{step.actor} never joined")
+        if step.index > max(place.last_index, self._limits.get(step.actor, 0)) + AHEAD:
+            raise BadStep("index", f"{step.index}, where {step.actor} is at {place.last_index}")
+
+    def join(self, join: pb.Join) -> pb.JoinReply:
+        """Take an actor in, or say in `error` why not."""
+        refusal = self._refusal(join)
+        if refusal is not None:
+            return pb.JoinReply(error=refusal)
+        episode = self._ledger.join(join.actor, join.index, join.episode)
+        self._limits[join.actor] = join.index
+        return pb.JoinReply(weights=self.weights(), flow=self.flow(), episode=episode)
+
+    def _refusal(self, join: pb.Join) -> pb.Error | None:
+        if join.robot != self.robot.name:
+            field, why = "robot", f"{join.robot!r} where {self.robot.name!r} is learned"
+        elif join.layout != self.robot.learning_layout():
+            field, why = "layout", f"{join.layout!r} where {self.robot.name} has {self.robot.learning_layout()!r} here"
+        elif not join.actor:
+            field, why = "actor", "empty"
+        elif join.index >= LATEST or join.episode >= LATEST:
+            field, why = "index", f"{join.index} steps, episode {join.episode}"
+        elif join.actor not in self._limits and len(self._limits) == MOST_ACTORS:
+            field, why = "actor", f"{join.actor!r} is one more than {MOST_ACTORS}"
+        elif self.config.lockstep and self._limits.keys() - {join.actor}:
+            field, why = "actor", f"{join.actor!r}, but lockstep has one, {next(iter(self._limits))!r}"
+        else:
+            return None
+        return pb.Error(type="Refused", field=field, message=why)
+
+    # --- work ---
+
+    def work(self, most: int) -> int:
+        """Make the updates that are due, `most` at the most; returns how many it made."""
+        made = 0
+        while made < most and self._limiter.may_sample() and len(self._replay) > 0:
+            self._replay.sample(self._draws, self._batch)
+            if self._images is not None:
+                self._images.apply(self._batch)
+            self._td3.update(self._batch)
+            self._limiter.sample()
+            made += 1
+        return made
+
+    def _enough(self) -> bool:
+        """All steps of the run are there."""
+        return self._limiter.inserts >= self.config.steps and (self._episode_ended or not self.config.lockstep)
+
+    @property
+    def done(self) -> bool:
+        return self._enough() and not self._limiter.may_sample()
+
+    @property
+    def steps(self) -> int:
+        return self._limiter.inserts
+
+    @property
+    def updates(self) -> int:
+        return self._td3.updates
+
+    @property
+    def warming_up(self) -> bool:
+        """Are there too few steps yet to learn from? Until then actors act at random."""
+        return self._limiter.warming_up
+
+    # --- out ---
+
+    def weights_due(self) -> bool:
+        new = self._td3.updates - self._published_updates
+        if self.config.lockstep or self.done:
+            return new > 0 and not self._limiter.may_sample()
+        return new >= self.config.publish_every
+
+    def publish(self) -> pb.Weights:
+        """The actor as it is, as a new version; from now on `weights` and `flow` speak of it."""
+        self._version += 1
+        self._published_updates = self._td3.updates
+        self._encode()
+        return self._weights
+
+    def _encode(self) -> None:
+        noise = self.config.td3.exploration_noise
+        file = policy.encode(self.robot, self._td3.policy_layers(), self._version, noise)
+        self._weights = pb.Weights(
+            robot=self.robot.name, version=self._version, layout=self.robot.learning_layout(), file=file
+        )
+
+    def weights(self) -> pb.Weights:
+        """The version published last."""
+        return self._weights
+
+    def flow(self) -> pb.Flow:
+        """Who may publish how far. A limit never falls."""
+        if not (self.config.lockstep and (self._limiter.may_sample() or self.weights_due())):
+            self._grant()
+        return pb.Flow(
+            robot=self.robot.name,
+            incarnation=self.incarnation,
+            limit=self._limits,
+            weights_version=self._version,
+            warmup=self._limiter.warming_up,
+            done=self.done,
+        )
+
+    def _grant(self) -> None:
+        room = 0 if self._enough() else self._limiter.room()
+        if not self.config.lockstep:
+            room = min(room, self.config.steps - self._limiter.inserts)
+        if room < 1 or not self._limits:
+            return
+        # Nothing is reserved, so a dead actor holds up nobody; the band is exceeded by an actor's share at the most.
+        share = 1 if self.config.lockstep else max(1, min(self.config.window, room // len(self._limits)))
+        for actor, limit in self._limits.items():
+            self._limits[actor] = max(limit, self._ledger.places[actor].last_index + share)
+
+    def metrics(self) -> pb.LearnerMetrics:
+        """Rates and staleness are of the time since the last call."""
+        now, steps, updates = self._clock(), self._limiter.inserts, self._td3.updates
+        then, steps_then, updates_then = self._mark
+        elapsed = max(now - then, 1e-9)
+        self._mark = (now, steps, updates)
+        ages, self._ages = self._ages, []
+        return pb.LearnerMetrics(
+            robot=self.robot.name,
+            steps=steps,
+            updates=updates,
+            weights_version=self._version,
+            critic_loss=self._td3.losses.critic,
+            actor_loss=self._td3.losses.actor,
+            mean_q=self._td3.losses.mean_q,
+            steps_per_s=(steps - steps_then) / elapsed,
+            updates_per_s=(updates - updates_then) / elapsed,
+            replay_size=len(self._replay),
+            duplicates=self._ledger.duplicates,
+            missing=self._ledger.missing,
+            staleness=float(np.mean(ages)) if ages else 0.0,
+            limiter_error=self._limiter.error,
+            done=self.done,
+        )
+
+    # --- checkpoints ---
+
+    def may_save(self) -> bool:
+        """In lockstep only between episodes, everything due done: an actor goes on with a new episode."""
+        settled = self._episode_ended and not self._limiter.may_sample() and not self.weights_due()
+        return settled or not self.config.lockstep
+
+    def checkpoint_due(self) -> bool:
+        return self.steps - self._saved_at >= self.config.checkpoint_every and self.may_save()
+
+    def save(self, root: Path) -> Path:
+        """
+        Raises:
+            CheckpointError: it could not be written; the one before is untouched.
+        """
+        saved_before, self._saved_at = self._saved_at, self.steps
+        parts = {name: part.state() for name, part in self._parts().items()} | {"run": self._run_state()}
+        try:
+            return checkpoint.save(root, parts, self._about())
+        except checkpoint.CheckpointError:
+            self._saved_at = saved_before
+            raise
+
+    def restore(self, root: Path) -> None:
+        """Become what the latest checkpoint under `root` holds. After an error this learner is of no use.
+
+        Raises:
+            CheckpointError: there is none, it is damaged or incomplete, or it is of another run.
+        """
+        states, about = checkpoint.load(root, (*self._parts(), "run"))
+        self._compare(root, about)
+        restorers = {name: part.restore for name, part in self._parts().items()} | {"run": self._restore_run}
+        for name, restore in restorers.items():
+            try:
+                restore(states[name])
+            except (ValueError, TypeError, KeyError, IndexError) as error:
+                raise checkpoint.DamagedPart(name, root, str(error)) from error
+        self._encode()
+        if self._published_updates != self._td3.updates:
+            self.publish()
+
+    def _parts(self) -> dict[str, Part]:
+        return {
+            "td3": self._td3,
+            "replay": self._replay,
+            "windows": self._windows,
+            "ledger": self._ledger,
+            "limiter": self._limiter,
+        }
+
+    def _about(self) -> dict[str, Any]:
+        about = {"robot": self.robot.name, "layout": self.robot.learning_layout(), "steps": self.steps}
+        return about | {"config": self.config.lasting()}
+
+    def _compare(self, root: Path, about: dict[str, Any]) -> None:
+        ours = self._about()
+        for name in ("robot", "layout", "config"):
+            theirs = about.get(name)
+            if isinstance(theirs, dict):
+                names = sorted(key for key in ours[name] | theirs if ours[name].get(key) != theirs.get(key))
+            else:
+                names = [name] if theirs != ours[name] else []
+            if names:
+                raise checkpoint.OtherRun(", ".join(names), root)
+
+    def _run_state(self) -> State:
+        values = {
+            "draws": self._draws.bit_generator.state,
+            "version": self._version,
+            "published_updates": self._published_updates,
+            "episode_ended": self._episode_ended,
+            "saved_at": self._saved_at,
+        }
+        return State({}, values)
+
+    def _restore_run(self, state: State) -> None:
+        self._draws.bit_generator.state = state.value("draws")
+        self._version, self._published_updates = state.integer("version"), state.integer("published_updates")
+        self._episode_ended, self._saved_at = bool(state.value("episode_ended")), state.integer("saved_at")
+        self._mark = (self._clock(), self.steps, self.updates)

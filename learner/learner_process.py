@@ -1,0 +1,219 @@
+"""PROCESS: one robot kind's learner on the bus; a thin loop around `Learner`.
+
+The bus's threads only put things into queues; the loop alone touches the learner, so what happens depends on the order
+of the messages and on nothing else.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections import deque
+from collections.abc import Callable
+from concurrent.futures import Future
+from dataclasses import dataclass, field
+from pathlib import Path
+from threading import Event
+
+from brakeline.learner.checkpoint import CHECKPOINT, CheckpointError, exists
+from brakeline.learner.learner import Learner
+from brakeline.learner.learner_config import LearnerConfig
+from brakeline.learner.transition_reader import BadStep
+from brakeline.messaging import brakeline_pb2 as pb
+from brakeline.messaging.atomic_files import write_whole
+from brakeline.messaging.bus import BusSettings, Sample
+from brakeline.messaging.process_runtime import Process
+from brakeline.messaging.task import robot_with_task
+from brakeline.messaging.topics import FLOW, JOIN, LEARNER, LOGGED, STEP, WEIGHTS
+
+log = logging.getLogger("brakeline.learner")
+
+POLICY = "policy.safetensors"
+UPDATES_A_TURN = 4  # about 20 ms: how long a joining actor or a lockstep step may wait
+FLOW_SPACING = 0.02  # s between two flows, except in lockstep, where every change goes out
+FLOW_PERIOD = 0.5  # s, the longest without one
+METRICS_PERIOD = 1.0  # s
+JOIN_PATIENCE = 10.0  # s, a checkpoint included
+RETRY = 30.0  # s to the next attempt after a checkpoint could not be written
+LINGER = 1.0  # s that the end of a run is announced before the process goes
+
+
+@dataclass(frozen=True)
+class LearnerSettings:
+    bus: BusSettings
+    robot: str = "ground"
+    out: Path = Path("runs/learner")
+    resume: bool = False  # from the checkpoint in `out`; that there is one is demanded then
+    source: str = "learner"
+    learner: LearnerConfig = field(default_factory=LearnerConfig)
+
+
+def main(settings: LearnerSettings) -> bool:
+    """Learn until the run's last step (True), SIGINT or SIGTERM; end with a checkpoint and a policy file.
+
+    Raises:
+        CheckpointError: `resume` was asked for and is impossible, or was not and there is a checkpoint in the folder.
+        UnknownRobot, Unreachable: as they say.
+    """
+    robot = robot_with_task(settings.robot)
+    with Process(settings.bus, settings.source) as process:
+        root = settings.out / CHECKPOINT
+        if exists(root) and not settings.resume:
+            raise CheckpointError(f"{root}: holds a checkpoint already; resume it, or choose another folder")
+        learner = Learner(robot, settings.learner, incarnation=process.bus.run)
+        if settings.resume:
+            learner.restore(root)
+            log.info("resumed at step %d, update %d", learner.steps, learner.updates)
+        loop = LearnerLoop(process, learner, settings)
+        process.announce()
+        loop.run()
+        return learner.done
+
+
+class LearnerLoop:
+    """Takes steps and joins from the queues, lets the learner work, and publishes what it has to say."""
+
+    def __init__(
+        self,
+        process: Process,
+        learner: Learner,
+        settings: LearnerSettings,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._process, self._learner, self._settings, self._clock = process, learner, settings, clock
+        self._steps: deque[Sample] = deque()
+        self._joins: deque[tuple[bytes, Future[bytes]]] = deque()
+        self._wake = Event()
+        self._said: object = None  # the content of the last flow
+        self._flow_at = self._metrics_at = self._retry_at = -1e9
+        bus, robot = process.bus, learner.robot.name
+        self._weights, self._flow = bus.publisher(WEIGHTS, robot=robot), bus.publisher(FLOW, robot=robot)
+        self._metrics = bus.publisher(LEARNER, robot=robot)
+        self._weights.put(learner.weights())
+        for topic in (STEP, LOGGED):
+            bus.subscribe(topic, self._receive, robot=robot)
+        bus.serve(JOIN, self._answer, robot=robot)
+
+    # --- in the bus's threads ---
+
+    def _receive(self, sample: Sample) -> None:
+        self._steps.append(sample)
+        self._wake.set()
+
+    def _answer(self, payload: bytes) -> bytes:
+        answer: Future[bytes] = Future()
+        self._joins.append((payload, answer))
+        self._wake.set()
+        return answer.result(JOIN_PATIENCE)
+
+    # --- in the loop's ---
+
+    def run(self) -> None:
+        """Until told to stop, or a moment after the run's end."""
+        end: float | None = None
+        while not self._process.stop.is_set():
+            if not self.turn():
+                self._wake.wait(FLOW_SPACING)
+            self._wake.clear()
+            if self._learner.done and not self._learner.weights_due():
+                end = end or self._clock() + LINGER
+                if self._clock() > end:
+                    break
+        self._finish()
+
+    def turn(self) -> bool:
+        """One pass; False: there was nothing to do."""
+        busy = self._take_joins() + self._take_steps() + self._learner.work(UPDATES_A_TURN) > 0
+        if self._learner.weights_due():
+            self._weights.put(self._learner.publish())
+        if self._learner.checkpoint_due() and self._clock() > self._retry_at:
+            self._save()
+        self._say_flow()
+        if self._clock() - self._metrics_at > METRICS_PERIOD:
+            self._say_metrics()
+        return busy
+
+    def _take_joins(self) -> int:
+        taken = 0
+        while self._joins:
+            payload, answer = self._joins.popleft()
+            taken += 1
+            try:
+                join = pb.Join.FromString(payload)
+                reply = self._learner.join(join)
+                outcome = f"refused: {reply.error.message}" if reply.HasField("error") else "taken in"
+                log.info("actor %s: %s", join.actor, outcome)
+                answer.set_result(reply.SerializeToString())
+            except Exception as error:  # it goes back to who asked
+                answer.set_exception(error)
+        return taken
+
+    def _take_steps(self) -> int:
+        taken = 0
+        while self._steps:
+            sample = self._steps.popleft()
+            taken += 1
+            with self._process.bus.tolerance.over(sample.key):
+                step = sample.message()
+                if sample.key.rpartition("/")[2] != step.actor:
+                    raise BadStep("actor", f"{step.actor!r} published at {sample.key}")
+                self._learner.insert(step)
+        return taken
+
+    def _say_flow(self) -> None:
+        flow = self._learner.flow()
+        content = (dict(flow.limit), flow.weights_version, flow.warmup, flow.done)
+        age = self._clock() - self._flow_at
+        spacing = 0.0 if self._settings.learner.lockstep else FLOW_SPACING
+        if age > FLOW_PERIOD or (content != self._said and age >= spacing):
+            self._said, self._flow_at = content, self._clock()
+            self._flow.put(flow)
+
+    def _say_metrics(self) -> None:
+        self._metrics_at = self._clock()
+        metrics = self._learner.metrics()
+        self._process.figures = {
+            "steps": metrics.steps,
+            "updates_per_s": metrics.updates_per_s,
+            "missing": metrics.missing,
+            "duplicates": metrics.duplicates,
+            "refused": self._learner.rejected,
+            "surplus": self._learner.surplus,
+            "waiting": len(self._steps),
+        }
+        self._metrics.put(metrics)
+
+    def _save(self) -> None:
+        """A checkpoint and the policy, or a note why there are none; learning goes on."""
+        try:
+            place = self._learner.save(self._settings.out / CHECKPOINT)
+            self._process.notes["checkpoint"] = f"step {self._learner.steps}"
+            log.info("checkpoint of step %d in %s", self._learner.steps, place)
+        except CheckpointError as error:
+            self._retry_at = self._clock() + RETRY
+            self._process.notes["checkpoint"] = str(error)
+            log.error("%s", error)
+        self._write_policy()
+
+    def _write_policy(self) -> None:
+        path = self._settings.out / POLICY
+        try:
+            write_whole(path, self._learner.weights().file)
+        except OSError as error:
+            log.error("the policy was not written: %s", error)
+
+    def _finish(self) -> None:
+        """What arrived is learned from as far as it is due, and kept."""
+        self._take_joins()
+        self._take_steps()
+        if self._settings.learner.lockstep:
+            while self._learner.work(UPDATES_A_TURN):
+                pass
+        if self._learner.weights_due():
+            self._weights.put(self._learner.publish())
+        if self._learner.may_save():
+            self._save()
+        else:
+            log.warning("stopped within an episode: in lockstep the checkpoint of an earlier one stays the latest")
+            self._write_policy()
+        self._say_metrics()

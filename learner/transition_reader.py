@@ -1,0 +1,82 @@
+"""From a step on the wire to a move to learn from: sizes and values are checked, the action is normalised."""
+
+from __future__ import annotations
+
+from dataclasses import astuple
+from typing import Any
+
+import numpy as np
+
+from brakeline.learner.n_step import Move
+from brakeline.learner.replay import Vector
+from brakeline.messaging import brakeline_pb2 as pb
+from brakeline.messaging.task import RobotWithTask
+
+# What no task pays and no sensor says: far beyond any, and far below what would drown the networks.
+AT_ONCE = 10.0  # times all that a task pays, a metre's progress included: no step is paid as much
+MOST_OBSERVED = 10.0  # observations are clipped at 1.5
+MOST_PROPOSED = 1e2  # half ranges from the middle: policies may propose what is out of bounds, and are clipped
+ROUNDING = 1e-3  # of half a range, of an executed action at its bounds
+LATEST = 2**31  # number of an episode or a step
+
+
+class BadStep(ValueError):
+    """A step that cannot be learned from; `field` names what is wrong with it."""
+
+    def __init__(self, field: str, why: str) -> None:
+        super().__init__(f"{field}: {why}")
+        self.field = field
+
+
+class Intake:
+    """Reads the steps of one kind of robot. The reward learned is `reward − penalty`."""
+
+    def __init__(self, robot: RobotWithTask) -> None:
+        self.robot = robot
+        self.most_reward = AT_ONCE * sum(map(abs, astuple(robot.task.reward)))
+        self._centre, self._half = (robot.high() + robot.low()) / 2.0, (robot.high() - robot.low()) / 2.0
+
+    def move(self, step: pb.Step) -> Move:
+        """
+        Raises:
+            BadStep: it cannot be learned from.
+        """
+        if step.robot != self.robot.name:
+            raise BadStep("robot", f"{step.robot!r} where {self.robot.name!r} is learned")
+        if not step.actor:
+            raise BadStep("actor", "empty")
+        if step.index == 0:
+            raise BadStep("index", "counts from 1")
+        if max(step.episode, step.step) >= LATEST:
+            raise BadStep("episode", f"{step.episode}, step {step.step}")
+        if not (abs(step.reward) <= self.most_reward and 0.0 <= step.penalty <= self.most_reward):  # NaN fails too
+            raise BadStep("reward", f"{step.reward} - {step.penalty}")
+        action = self._normalised("action", step.action, 1.0 + ROUNDING)
+        proposed = self._normalised("proposed", step.proposed, MOST_PROPOSED)
+        observation = self._observed("observation", step.observation)
+        after = self._observed("next_observation", step.next_observation)
+        values = action, proposed, step.reward, step.penalty
+        return Move(step.episode, step.step, observation, *values, after, step.terminated, step.truncated, step.cut)
+
+    def _normalised(self, name: str, values: Any, most: float) -> Vector:
+        """An action in [-1, 1]: what is out of bounds, by not too much, would have been clipped."""
+        normalised = (_vector(name, values, self.robot.action_dim) - self._centre) / self._half
+        if np.abs(normalised).max() > most:
+            raise BadStep(name, f"{list(values)}, out of the robot's bounds")
+        clipped: Vector = np.clip(normalised, -1.0, 1.0).astype(np.float32)
+        return clipped
+
+    def _observed(self, name: str, values: Any) -> Vector:
+        vector = _vector(name, values, self.robot.task.observation_dim)
+        if np.abs(vector).max() > MOST_OBSERVED:
+            raise BadStep(name, f"{float(np.abs(vector).max())} is not plausible")
+        return vector
+
+
+def _vector(name: str, values: Any, size: int) -> Vector:
+    vector = np.array(values, np.float32)
+    if vector.shape != (size,):
+        raise BadStep(name, f"{len(values)} values where {size} belong")
+    if not np.isfinite(vector).all():
+        raise BadStep(name, "not finite")
+    return vector

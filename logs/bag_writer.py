@@ -1,0 +1,105 @@
+"""What a ROS 2 node heard and sent, as a bag: a folder with `metadata.yaml` and an MCAP file of `ros2msg` schemas.
+
+It is written by `rosbags`, so that `ros2 bag`, Foxglove and every other reader of bags take it.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+from rosbags.interfaces import Connection, Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer, WriterError
+from rosbags.rosbag2.storage_mcap import McapWriter
+
+from brakeline.messaging import ros2
+from brakeline.messaging.ros2.cdr_messages import definition_of, digest_of, type_of
+
+log = logging.getLogger("brakeline.bag")
+
+PERIOD = 1.0  # s: a process that is killed loses what came since
+FOREVER = QosTime(sec=9223372036, nsec=854775807)
+
+
+class Bag:
+    """Records into a folder that is not there yet; a `brakeline.messaging.ros2.Tap`.
+
+    Raises:
+        OSError: the folder is there already, or can't be made.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder, self.count = folder, 0
+        try:
+            self._writer = Writer(folder, version=9, storage_plugin=StoragePlugin.MCAP)
+            self._writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
+            self._writer.open()
+        except WriterError as error:
+            raise FileExistsError(str(error)) from error
+        self._topics: dict[tuple[str, str], Connection] = {}
+        self._lock = threading.Lock()
+        self._flushed = time.monotonic()
+        self._failed = False
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None) -> None:
+        with self._lock:
+            self._failed = True  # nothing comes after the end
+            try:
+                self._writer.close()
+            except OSError as failure:
+                log.error("%s has no end: %s", self.folder, failure)
+
+    def __call__(self, topic: str, kind: type, payload: bytes, at: int, qos: ros2.Qos) -> None:
+        """One message. A disk that is full ends the recording, and is said once; the robot drives on."""
+        with self._lock:
+            if self._failed:
+                return
+            try:
+                self._writer.write(self._connection(topic, kind, qos), at, payload)
+                self.count += 1
+                if time.monotonic() - self._flushed > PERIOD:
+                    self._flushed = time.monotonic()
+                    self._flush()
+            except OSError as error:
+                self._failed = True
+                log.error("NOT RECORDING any more: %s", error)
+
+    def _connection(self, topic: str, kind: type, qos: ros2.Qos) -> Connection:
+        name = type_of(kind)
+        if (topic, name) not in self._topics:
+            self._topics[topic, name] = self._writer.add_connection(
+                topic,
+                name,
+                msgdef=definition_of(kind),
+                rihs01=digest_of(kind),
+                offered_qos_profiles=[_profile(qos)],
+            )
+        return self._topics[topic, name]
+
+    def _flush(self) -> None:
+        """Hand what has come to the operating system."""
+        storage = self._writer.storage
+        assert isinstance(storage, McapWriter)
+        storage.close_chunk()
+        storage.bio.flush()
+
+
+def _profile(qos: ros2.Qos) -> Qos:
+    return Qos(
+        history=QosHistory.KEEP_LAST,
+        depth=qos.depth,
+        reliability=QosReliability.RELIABLE if qos.reliable else QosReliability.BEST_EFFORT,
+        durability=QosDurability.TRANSIENT_LOCAL if qos.latched else QosDurability.VOLATILE,
+        deadline=FOREVER,
+        lifespan=FOREVER,
+        liveliness=QosLiveliness.AUTOMATIC,
+        liveliness_lease_duration=FOREVER,
+        avoid_ros_namespace_conventions=False,
+    )

@@ -1,0 +1,231 @@
+"""A decision explained: what was done instead of the proposal and what for, in a sentence and for a picture."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from brakeline.messaging import brakeline_pb2 as pb
+from brakeline.messaging.robot import Robot
+from brakeline.messaging.stated_share import UNSTATED, checked, percent, trust
+
+Array = NDArray[np.float64]
+
+LEAST = 0.02  # of an input's range: a smaller change is none to speak of
+AHEAD = math.radians(40.0)
+BEHIND = math.radians(140.0)
+UPRIGHT = 0.8  # of a unit vector: more than that is up or down
+NEARER = "verified, but nearer than the clearance margin"
+ARROW = 3  # periods: an input's arrow ends where it would take the robot in that time, followed at once
+
+
+@dataclass(frozen=True)
+class Explanation:
+    """said: the sentence; trust: what `verified` is worth, where the sentence does not say it; inputs: (name, unit,
+    proposed, executed) of each; proposed, executed (d,): arrows, m, world; at, normal (d,): a point of the edge of the
+    half-space that stopped the proposal, and its normal from the free side on, world; empty if there is none."""
+
+    said: str
+    inputs: list[tuple[str, str, float, float]]
+    proposed: Array
+    executed: Array
+    at: Array
+    normal: Array
+    trust: str = ""
+
+
+def explain(robot: Robot, request: pb.Request, decision: pb.Decision) -> Explanation:
+    """For whoever draws a decision. A proposal with NaN or infinity has an arrow of length zero."""
+    proposed, executed = np.array(request.action), np.array(decision.plan[: robot.action_dim])
+    heading = 0.0 if robot.heading is None else request.state[robot.heading]
+    names = [split(label) for label in robot.action]
+    return Explanation(
+        sentence(robot, request, decision),
+        [(*name, float(p), float(e)) for name, p, e in zip(names, proposed, executed, strict=True)],
+        arrow(robot, heading, proposed if np.isfinite(proposed).all() else np.zeros(robot.action_dim)),
+        arrow(robot, heading, executed),
+        np.array(decision.stopped.at),
+        np.array(decision.stopped.normal),
+        "" if decision.kind in (pb.FAILSAFE, pb.RECOVERING) else trust(decision.verified, bound_in(decision)),
+    )
+
+
+def bound_in(decision: pb.Decision) -> float | None:
+    """The model set's statement, where the decision has it."""
+    return checked(decision.bound) if decision.HasField("bound") else None
+
+
+def fits(robot: Robot, request: pb.Request, decision: pb.Decision) -> bool:
+    """Have question and answer the robot's sizes? Else nothing of them can be explained."""
+    sizes = len(request.state), len(request.action), len(decision.plan)
+    edge = {len(decision.stopped.normal), len(decision.stopped.at)}
+    whole = sizes == (robot.state_dim, robot.action_dim, robot.horizon * robot.action_dim)
+    return whole and edge in ({0}, {robot.position_dim})
+
+
+def split(label: str) -> tuple[str, str]:
+    """("turn rate", "rad/s") of "turn rate [rad/s]"."""
+    name, _, unit = label.removesuffix("]").partition(" [")
+    return name, unit
+
+
+def arrow(robot: Robot, heading: float, inputs: Array) -> Array:
+    """(d,) m, world: where an input would take the robot in `ARROW` periods; steering bends it half its way."""
+    seconds, d = ARROW * robot.period, robot.position_dim
+    vector = seconds * _moves(robot, inputs)[:d]
+    if robot.heading is None:
+        return vector
+    turning = [
+        value * (0.5 * seconds if split(label)[1] == "rad/s" else 0.5)
+        for value, label, moves in zip(inputs, robot.action, robot.translates, strict=True)
+        if not moves and split(label)[1] in ("rad", "rad/s")
+    ]
+    angle = heading + sum(turning)
+    cos, sin = math.cos(angle), math.sin(angle)
+    vector[:2] = cos * vector[0] - sin * vector[1], sin * vector[0] + cos * vector[1]
+    return vector
+
+
+def sentence(robot: Robot, request: pb.Request, decision: pb.Decision) -> str:
+    """E.g. "turned left: straight on, the stop would have come 3 cm too close to the cylinder ahead"."""
+    why = _why(robot, request, decision)
+    if decision.kind == pb.ADJUSTED:
+        did, instead = change(robot, np.array(request.action), np.array(decision.plan[: robot.action_dim]))
+        return f"{did}: {instead}, {why}" if why else f"{did}: {decision.reason}"
+    if decision.kind == pb.FAILSAFE:
+        how = fell_back_on(decision) if decision.verified else "braked, though no plan is verified"
+        return f"{how}: as proposed, {why}" if why else f"{how}: {decision.reason}"
+    if decision.kind == pb.RECOVERING:
+        return f"slowly backs out of where not even standing is verified: as proposed, {why or decision.reason}"
+    return "as proposed"
+
+
+def fell_back_on(decision: pb.Decision) -> str:
+    """That the committed plan goes on, and what its having been verified is worth."""
+    bound = bound_in(decision)
+    if bound is None:
+        return "braked along the plan verified before"
+    worth = "no bound is stated" if bound == UNSTATED else f"at most {percent(bound)} of such plans leave their tube"
+    return f"braked along the plan verified before ({worth})"
+
+
+def fell_back() -> str:
+    """Where there was no decision."""
+    return "no answer in time: braked along the plan verified before"
+
+
+def _why(robot: Robot, request: pb.Request, decision: pb.Decision) -> str:
+    """What would have come of the proposal; empty: it is not said."""
+    if not decision.HasField("stopped") or decision.broken:
+        return ""
+    stopped = decision.stopped
+    if any(limit.name == stopped.by for limit in robot.limits):
+        return f"the limit {stopped.by} would have been passed by {-stopped.room:.2g} after {stopped.after:.1f} s"
+    end = robot.horizon * robot.period
+    what = "the stop" if stopped.after >= end - 1e-9 else f"it (after {stopped.after:.1f} s)"
+    if stopped.by == "sight" and decision.for_clearance:
+        return f"the stop could have come within {_length(stopped.room)} of the end of sight: {NEARER}"
+    if stopped.by == "sight":
+        return "the stop could have been beyond what is seen"
+    thing = "what is not seen" if stopped.by == "unseen" else f"the {stopped.by}"
+    place = f"{thing}{_where(robot, request, stopped)}"
+    if not stopped.normal:
+        return f"{place} is touched already"
+    if stopped.room < 0.0:
+        return f"{what} would have come {_length(-stopped.room)} too close to {place}"
+    within = f"{what} would have come within {_length(stopped.room)} of {place}"
+    if decision.for_clearance:
+        return f"{within}: {NEARER}"
+    return f"{within}, too near to move from there"
+
+
+def _length(metres: float) -> str:
+    if metres < 0.0095:
+        return f"{1000.0 * metres:.0f} mm" if metres >= 0.0005 else "less than 1 mm"
+    return f"{100.0 * metres:.0f} cm" if metres < 0.995 else f"{metres:.1f} m"
+
+
+def _where(robot: Robot, request: pb.Request, stopped: pb.Stopped) -> str:
+    """Ahead, to the left ... as the robot looks, or where it looks nowhere, as it would have moved."""
+    normal = np.array(stopped.normal)
+    if not len(normal):
+        return ""
+    if len(normal) == 3 and abs(normal[2]) > UPRIGHT:
+        return " above" if normal[2] > 0.0 else " below"
+    if robot.heading is not None:
+        looks = request.state[robot.heading]
+        if sum(robot.translates) == 1 and _moves(robot, np.array(request.action))[0] < 0.0:
+            looks += math.pi  # it sees, and is said to see, where it drives
+    else:
+        moves = _moves(robot, np.array(request.action))
+        if np.hypot(*moves[:2]) < 1e-6:
+            return ""
+        looks = math.atan2(moves[1], moves[0])
+    angle = math.remainder(math.atan2(normal[1], normal[0]) - looks, 2.0 * math.pi)
+    if abs(angle) < AHEAD:
+        return " in its way" if robot.heading is None else " ahead"
+    if abs(angle) > BEHIND:
+        return " behind"
+    return " on the left" if angle > 0.0 else " on the right"
+
+
+def change(robot: Robot, proposed: Array, executed: Array) -> tuple[str, str]:
+    """What was done instead, and how the proposal is called: ("turned left", "straight on")."""
+    width = robot.high() - robot.low()
+    difference = (executed - proposed) / np.where(width > 0.0, width, 1.0)
+    if np.abs(difference).max() < LEAST:
+        return "changed it a little", "as proposed"
+    if robot.heading is not None:
+        return _of_wheels(robot, proposed, executed, difference)
+    return _of_vector(_moves(robot, proposed), _moves(robot, executed)) or _of_input(robot, proposed, executed)
+
+
+def _of_wheels(robot: Robot, proposed: Array, executed: Array, difference: Array) -> tuple[str, str]:
+    """Of what has a heading: inputs that translate it, and others that turn it."""
+    most = int(np.abs(difference).argmax())
+    turns = [i for i, moves in enumerate(robot.translates) if not moves]
+    if most in turns:
+        way = "turned left" if executed[most] > proposed[most] else "turned right"
+        straight = abs(proposed[most]) < LEAST * (robot.high()[most] - robot.low()[most])
+        return way, "straight on" if straight else "as proposed"
+    if sum(robot.translates) > 1:  # a vector, as it looks
+        return _of_vector(_moves(robot, proposed), _moves(robot, executed)) or _of_input(robot, proposed, executed)
+    before, now = proposed[most], executed[most]
+    if before * now < 0.0:
+        return ("backed off" if now < 0.0 else "went forward"), "as proposed"
+    if abs(now) < LEAST * (robot.high()[most] - robot.low()[most]):
+        return "stopped", "going on"
+    return ("slowed down" if abs(now) < abs(before) else "sped up"), "as proposed"
+
+
+def _moves(robot: Robot, inputs: Array) -> Array:
+    """The inputs that translate a robot, as a vector (>= 2,)."""
+    vector = inputs[np.asarray(robot.translates)]
+    return np.concatenate([vector, np.zeros(max(0, 2 - len(vector)))])
+
+
+def _of_vector(before: Array, now: Array) -> tuple[str, str] | None:
+    """Of what moves by a vector of speeds; None: it is not that."""
+    fast, slow = float(np.linalg.norm(before)), float(np.linalg.norm(now))
+    if len(before) not in (2, 3) or fast < 1e-9:
+        return None
+    if slow < 0.05 * fast:
+        return "stopped", "going on"
+    if now @ before > 0.985 * fast * slow:
+        return ("slowed down" if slow < fast else "sped up"), "as proposed"
+    aside = now - before * float(now @ before) / fast**2
+    if len(aside) == 3 and abs(aside[2]) > UPRIGHT * float(np.linalg.norm(aside)):
+        return ("climbed" if aside[2] > 0.0 else "sank"), "straight on"
+    left = before[0] * now[1] - before[1] * now[0] > 0.0
+    return f"turned aside to the {'left' if left else 'right'}", "straight on"
+
+
+def _of_input(robot: Robot, proposed: Array, executed: Array) -> tuple[str, str]:
+    """The input that changed most, by its name."""
+    width = robot.high() - robot.low()
+    most = int(np.abs((executed - proposed) / np.where(width > 0.0, width, 1.0)).argmax())
+    name, unit = split(robot.action[most])
+    return f"{name} {proposed[most]:.2f} became {executed[most]:.2f} {unit}".rstrip(), "as proposed"

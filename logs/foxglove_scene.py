@@ -1,0 +1,321 @@
+"""Our messages drawn with Foxglove's well-known schemas: arena, robot, tube, plan, lidar, frames, log lines.
+
+Frames: `world` — ACTOR (an arena's own frame, where the messages' coordinates are) — ACTOR/body. Lengths in m, ENU.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+from foxglove_schemas_protobuf.ArrowPrimitive_pb2 import ArrowPrimitive
+from foxglove_schemas_protobuf.Color_pb2 import Color
+from foxglove_schemas_protobuf.CubePrimitive_pb2 import CubePrimitive
+from foxglove_schemas_protobuf.CylinderPrimitive_pb2 import CylinderPrimitive
+from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
+from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms
+from foxglove_schemas_protobuf.LaserScan_pb2 import LaserScan
+from foxglove_schemas_protobuf.LinePrimitive_pb2 import LinePrimitive
+from foxglove_schemas_protobuf.Log_pb2 import Log
+from foxglove_schemas_protobuf.PackedElementField_pb2 import PackedElementField
+from foxglove_schemas_protobuf.Point3_pb2 import Point3
+from foxglove_schemas_protobuf.PointCloud_pb2 import PointCloud
+from foxglove_schemas_protobuf.Pose_pb2 import Pose
+from foxglove_schemas_protobuf.Quaternion_pb2 import Quaternion
+from foxglove_schemas_protobuf.SceneEntity_pb2 import SceneEntity
+from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
+from foxglove_schemas_protobuf.SpherePrimitive_pb2 import SpherePrimitive
+from foxglove_schemas_protobuf.TextPrimitive_pb2 import TextPrimitive
+from foxglove_schemas_protobuf.Vector3_pb2 import Vector3
+from google.protobuf.timestamp_pb2 import Timestamp
+
+from brakeline.logs.decision_explanation import Explanation, explain, fell_back, fits
+from brakeline.messaging import brakeline_pb2 as pb
+from brakeline.messaging.obstacle import BOX, CYLINDER, SPHERE, WALL
+from brakeline.messaging.ray_directions import Rays
+from brakeline.messaging.robot import Robot
+from brakeline.safety.perception.displayed_map import Surroundings, surroundings
+
+WORLD = "world"
+HEIGHT = 0.4  # m, of what is drawn of a plane's obstacles
+MARKED = 400  # hits of a scan that are drawn at the most: the request in the log has all
+FLAT = 0.02  # m, of what is drawn on a plane's floor, and half of it the thickness of walls
+LEVELS = {"DEBUG": Log.DEBUG, "INFO": Log.INFO, "WARNING": Log.WARNING, "ERROR": Log.ERROR}
+
+
+def _color(red: int, green: int, blue: int, alpha: float = 1.0) -> Color:
+    return Color(r=red / 255, g=green / 255, b=blue / 255, a=alpha)
+
+
+SOLID, WALLS, GOAL = _color(120, 128, 140), _color(120, 128, 140, 0.25), _color(52, 168, 100, 0.35)
+PROPOSED, EXECUTED, EDGE = _color(199, 125, 0), _color(31, 95, 191), _color(192, 32, 48, 0.5)
+FREE, HIT, PROMISE = _color(20, 140, 120), _color(90, 40, 140), _color(40, 96, 190, 0.18)
+MOVER, SWEPT = _color(170, 90, 40), _color(170, 90, 40, 0.15)
+BODY, NOSE = _color(40, 96, 190), _color(250, 250, 250)
+KINDS: dict[int, tuple[int, int, int]] = {
+    pb.ALLOWED: (52, 168, 100),
+    pb.ADJUSTED: (240, 150, 30),
+    pb.FAILSAFE: (214, 48, 60),
+    pb.RECOVERING: (142, 68, 173),
+}
+WORDS = {pb.ADJUSTED: "adjusted", pb.FAILSAFE: "failsafe", pb.RECOVERING: "recovering"}
+
+
+def body_frame(actor: str) -> str:
+    return f"{actor}/body"
+
+
+def stamp(time: int) -> Timestamp:
+    """A time in ns since the Unix epoch."""
+    return Timestamp(seconds=time // 10**9, nanos=time % 10**9)
+
+
+def half_width(episode: pb.Episode) -> float:
+    """Half of the edge of the square about the origin that holds an episode's arena, m."""
+    walls = [o.position[:2] for o in episode.obstacles if o.kind == WALL]
+    points = walls or [o.position[:2] for o in episode.obstacles] + [episode.goal[:2], episode.start[:2]]
+    return max((abs(value) for point in points for value in point), default=1.0) or 1.0
+
+
+def arena(robot: Robot, episode: pb.Episode, time: int) -> SceneUpdate:
+    """Obstacles, walls, goal and the robot's body, to be sent at the start of an episode."""
+    half = half_width(episode)
+    room = SceneEntity(timestamp=stamp(time), frame_id=episode.actor, id="arena")
+    height = _ceiling(episode, half)
+    for obstacle in episode.obstacles:
+        _draw(room, obstacle, half, height)
+    radius = 2.0 * episode.goal_radius
+    if robot.position_dim == 3:
+        room.spheres.append(SpherePrimitive(pose=_pose(episode.goal), size=_vector(radius, radius, radius), color=GOAL))
+    else:
+        disc = CylinderPrimitive(pose=_pose(episode.goal), size=_vector(radius, radius, FLAT), color=GOAL)
+        disc.bottom_scale = disc.top_scale = 1.0
+        room.cylinders.append(disc)
+    return SceneUpdate(entities=[room, _body(robot, episode.actor, time)])
+
+
+def _ceiling(episode: pb.Episode, half: float) -> float:
+    """How high the walls are drawn: up to the box above the start that closes the room, if there is one."""
+    lids = [o.position[2] - 0.5 * o.size[2] for o in episode.obstacles if _closes(o, half)]
+    return max(lids, default=0.0) or HEIGHT
+
+
+def _closes(obstacle: pb.Obstacle, half: float) -> bool:
+    """Is it a floor or a ceiling?"""
+    return obstacle.kind == BOX and len(obstacle.size) == 3 and min(obstacle.size[:2]) >= 2.0 * half
+
+
+def _draw(room: SceneEntity, obstacle: pb.Obstacle, half: float, height: float) -> None:
+    """Add an obstacle. A ceiling, and a floor that the grid shows as well, would only hide what is between them."""
+    if _closes(obstacle, half):
+        return
+    flat = len(obstacle.position) == 2
+    position = (*obstacle.position, 0.5 * height) if flat else tuple(obstacle.position)
+    if obstacle.kind == WALL:
+        x, y = (at - FLAT * turn(obstacle.yaw) for at, turn in zip(position, (math.cos, math.sin), strict=False))
+        size = _vector(2.0 * FLAT, 2.0 * half, height)
+        room.cubes.append(CubePrimitive(pose=_pose((x, y, 0.5 * height), obstacle.yaw), size=size, color=WALLS))
+    elif obstacle.kind == BOX:
+        size = _vector(*obstacle.size, *([height] if flat else []))
+        room.cubes.append(CubePrimitive(pose=_pose(position, obstacle.yaw), size=size, color=SOLID))
+    elif obstacle.kind == CYLINDER or flat:
+        radius = 2.0 * obstacle.size[0]
+        size = _vector(radius, radius, height if flat else obstacle.size[1])
+        shape = CylinderPrimitive(pose=_pose(position), size=size, color=SOLID, bottom_scale=1.0, top_scale=1.0)
+        room.cylinders.append(shape)
+    elif obstacle.kind == SPHERE:
+        radius = 2.0 * obstacle.size[0]
+        room.spheres.append(SpherePrimitive(pose=_pose(position), size=_vector(radius, radius, radius), color=SOLID))
+
+
+def _body(robot: Robot, actor: str, time: int) -> SceneEntity:
+    """Its discs or spheres; they move with the robot's frame."""
+    body = SceneEntity(timestamp=stamp(time), frame_id=body_frame(actor), id="body", frame_locked=True)
+    tall = 0.5 * HEIGHT
+    for disc in robot.body:
+        edge = 2.0 * disc.radius
+        if robot.position_dim == 3:
+            body.spheres.append(SpherePrimitive(pose=_pose(disc.at), size=_vector(edge, edge, edge), color=BODY))
+            continue
+        place = _pose((*disc.at, 0.5 * tall))
+        drum = CylinderPrimitive(
+            pose=place, size=_vector(edge, edge, tall), color=BODY, bottom_scale=1.0, top_scale=1.0
+        )
+        body.cylinders.append(drum)
+    if robot.position_dim == 2:
+        nose = _pose((0.5 * robot.front, 0.0, tall))
+        body.cubes.append(CubePrimitive(pose=nose, size=_vector(robot.front, 2.0 * FLAT, FLAT), color=NOSE))
+    body.texts.append(_text(actor, (0.0, 0.0, HEIGHT + robot.footprint), _color(60, 60, 60)))
+    return body
+
+
+def decision(
+    robot: Robot, step: pb.Step, exchange: pb.Exchange | None, time: int, promises: Iterable[np.ndarray] = ()
+) -> SceneUpdate:
+    """What was decided for the period that ended with this step: the tube's boxes, that of standstill with the body
+    about it, the plan's way through their middles, a word if the filter stepped in; and what the filter was told of the
+    surroundings. promises: of the other robots of its world, as
+    `brakeline.safety.perception.displayed_map.promised`."""
+    kind = pb.FAILSAFE if step.fallback else step.decision
+    entity = SceneEntity(timestamp=stamp(time), frame_id=step.actor, id="decision")
+    color = KINDS.get(kind, (120, 120, 120))
+    d, said = robot.position_dim, ""
+    if exchange is not None and exchange.reply.HasField("decision"):
+        made = exchange.reply.decision
+        centers = [made.tube_center[i : i + d] for i in range(0, len(made.tube_center), d)]
+        halves = [made.tube_half_width[i : i + d] for i in range(0, len(made.tube_half_width), d)]
+        for center, half in zip(centers, halves, strict=True):
+            edges = [2.0 * h for h in half] + [FLAT] * (3 - d)
+            entity.cubes.append(CubePrimitive(pose=_pose(center), size=_vector(*edges), color=_color(*color, 0.6)))
+        if centers:
+            _stop(entity, centers[-1], 2.0 * (math.hypot(*halves[-1]) + robot.footprint), _color(*color, 0.2))
+        points = [_point(at) for at in (exchange.request.state[:d], *centers)]
+        way = LinePrimitive(type=LinePrimitive.LINE_STRIP, pose=_pose(()), thickness=3.0, scale_invariant=True)
+        way.points.extend(points)
+        way.color.CopyFrom(_color(*color))
+        entity.lines.append(way)
+        if kind in WORDS and not step.fallback and fits(robot, exchange.request, made):
+            about = explain(robot, exchange.request, made)
+            said = f"{WORDS[kind]}: {about.said}"
+            _explained(entity, exchange.request.state[:d], about, robot.footprint)
+    if exchange is not None:
+        _told(entity, surroundings(robot, exchange.request), promises)
+    if kind in WORDS:
+        word = fell_back() if step.fallback else said or WORDS[kind]
+        above = HEIGHT + 3.0 * robot.footprint
+        entity.texts.append(_text(word, step.state[:d], _color(*color), above))
+    return SceneUpdate(entities=[entity])
+
+
+def _explained(entity: SceneEntity, start: Sequence[float], about: Explanation, size: float) -> None:
+    """Add the proposed and the executed input as arrows, and the edge of the half-space that stopped the proposal."""
+    for way, color in ((about.proposed, PROPOSED), (about.executed, EXECUTED)):
+        length = float(np.linalg.norm(way))
+        if length > 0.0:
+            thick = 0.15 * size
+            shape = ArrowPrimitive(pose=_along(start, way / length), color=color)
+            shape.shaft_length, shape.head_length = 0.8 * length, 0.2 * length
+            shape.shaft_diameter, shape.head_diameter = thick, 2.0 * thick
+            entity.arrows.append(shape)
+    if len(about.at):
+        edge = CubePrimitive(pose=_along(about.at, about.normal), color=EDGE)
+        across = 5.0 * size
+        edge.size.CopyFrom(_vector(FLAT, across, across if len(about.at) == 3 else FLAT))
+        entity.cubes.append(edge)
+
+
+def _told(entity: SceneEntity, about: Surroundings, promises: Iterable[np.ndarray]) -> None:
+    """Add where beams ended, the outline of what they showed to be free, what moves with where it may come to, and the
+    boxes that others promise to be in."""
+    if len(about.free):
+        free = LinePrimitive(type=LinePrimitive.LINE_LOOP, pose=_pose(()), thickness=2.0, scale_invariant=True)
+        free.points.extend(map(_point, about.free))
+        free.color.CopyFrom(FREE)
+        hits = LinePrimitive(type=LinePrimitive.LINE_LIST, pose=_pose(()), thickness=4.0, scale_invariant=True)
+        hits.points.extend(map(_point, _marks(about.hits)))
+        hits.color.CopyFrom(HIT)
+        entity.lines.extend([free, hits])
+    swept = about.swept.reshape(-1, about.swept.shape[-1])
+    for discs, color, tall in ((about.movers, MOVER, HEIGHT), (swept, SWEPT, FLAT)):
+        for *at, radius in discs:
+            if len(at) == 3:
+                ball = _vector(*[2.0 * radius] * 3)
+                entity.spheres.append(SpherePrimitive(pose=_pose(at), size=ball, color=color))
+                continue
+            size, place = _vector(2.0 * radius, 2.0 * radius, tall), _pose((*at, 0.5 * tall))
+            entity.cylinders.append(
+                CylinderPrimitive(pose=place, size=size, color=color, bottom_scale=1.0, top_scale=1.0)
+            )
+    for boxes in promises:
+        for box in boxes:
+            d = len(box) // 2
+            edges = [2.0 * (half + box[-1]) for half in box[d:-1]] + [FLAT] * (3 - d)
+            entity.cubes.append(CubePrimitive(pose=_pose(box[:d]), size=_vector(*edges), color=PROMISE))
+
+
+def _marks(hits: np.ndarray) -> list[list[float]]:
+    """Ends of a short upright line at some of the points (k, d)."""
+    some = hits[:: max(1, -(-len(hits) // MARKED))]
+    ends = np.zeros((len(some), 2, 3))
+    ends[..., : some.shape[1]] = some[:, None]
+    ends[:, 1, 2] += FLAT
+    return list(ends.reshape(-1, 3).tolist())
+
+
+def _along(at: Iterable[float], way: Sequence[float] | np.ndarray) -> Pose:
+    """A pose whose x axis points along a unit vector."""
+    x, y, z = [*way, 0.0, 0.0][:3]
+    yaw, pitch = math.atan2(y, x), -math.asin(max(-1.0, min(1.0, z)))
+    cy, sy, cp, sp = math.cos(0.5 * yaw), math.sin(0.5 * yaw), math.cos(0.5 * pitch), math.sin(0.5 * pitch)
+    pose = _pose(at)
+    pose.orientation.CopyFrom(Quaternion(x=-sy * sp, y=cy * sp, z=sy * cp, w=cy * cp))
+    return pose
+
+
+def _stop(entity: SceneEntity, center: Sequence[float], across: float, color: Color) -> None:
+    """Add the disc (ball) that holds the body wherever in its last box the robot comes to a stop."""
+    if len(center) == 3:
+        entity.spheres.append(SpherePrimitive(pose=_pose(center), size=_vector(across, across, across), color=color))
+        return
+    disc = CylinderPrimitive(pose=_pose(center), size=_vector(across, across, FLAT), color=color)
+    disc.bottom_scale = disc.top_scale = 1.0
+    entity.cylinders.append(disc)
+
+
+def frames(robot: Robot, actor: str, site: tuple[float, float], state: Sequence[float], time: int) -> FrameTransforms:
+    """Where the actor's arena stands in the world, and where its robot in the arena."""
+    at, d = stamp(time), robot.position_dim
+    yaw = 0.0 if robot.heading is None else state[robot.heading]
+    place = FrameTransform(timestamp=at, parent_frame_id=WORLD, child_frame_id=actor)
+    place.translation.CopyFrom(_vector(*site, 0.0))
+    place.rotation.CopyFrom(_turn(0.0))
+    body = FrameTransform(timestamp=at, parent_frame_id=actor, child_frame_id=body_frame(actor))
+    body.translation.CopyFrom(_vector(*state[:d], *[0.0] * (3 - d)))
+    body.rotation.CopyFrom(_turn(yaw))
+    return FrameTransforms(transforms=[place, body])
+
+
+def lidar(rays: Rays, actor: str, observation: Sequence[float], time: int) -> LaserScan | PointCloud:
+    """The rays of an observation: a scan in the plane; in space a cloud of the points that were hit."""
+    ranges = np.asarray(observation[: len(rays.directions)], float) * rays.range
+    frame, at = body_frame(actor), stamp(time)
+    if rays.directions.shape[1] == 2:
+        first, last = (math.atan2(y, x) for x, y in rays.directions[[0, -1]])
+        return LaserScan(
+            timestamp=at, frame_id=frame, pose=_pose(()), start_angle=first, end_angle=last, ranges=ranges.tolist()
+        )
+    hit = ranges < rays.range
+    points = (rays.directions[hit] * ranges[hit, None]).astype("<f4")
+    fields = [
+        PackedElementField(name=name, offset=4 * i, type=PackedElementField.FLOAT32) for i, name in enumerate("xyz")
+    ]
+    return PointCloud(
+        timestamp=at, frame_id=frame, pose=_pose(()), point_stride=12, fields=fields, data=points.tobytes()
+    )
+
+
+def log_line(line: pb.LogLine, time: int) -> Log:
+    return Log(timestamp=stamp(time), level=LEVELS.get(line.level, Log.UNKNOWN), message=line.text, name=line.process)
+
+
+def _vector(x: float, y: float, z: float) -> Vector3:
+    return Vector3(x=x, y=y, z=z)
+
+
+def _point(values: Iterable[float]) -> Point3:
+    return Point3(**dict(zip("xyz", values, strict=False)))
+
+
+def _pose(position: Iterable[float], yaw: float = 0.0) -> Pose:
+    return Pose(position=_vector(*[*position, 0.0, 0.0, 0.0][:3]), orientation=_turn(yaw))
+
+
+def _turn(yaw: float) -> Quaternion:
+    return Quaternion(z=math.sin(0.5 * yaw), w=math.cos(0.5 * yaw))
+
+
+def _text(words: str, at: Iterable[float], color: Color, above: float = 0.0) -> TextPrimitive:
+    pose = _pose(at)
+    pose.position.z += above
+    return TextPrimitive(pose=pose, billboard=True, font_size=14.0, scale_invariant=True, color=color, text=words)

@@ -1,0 +1,53 @@
+"""Where the filter stepped in: a top-down map of bounded size, of all episodes together."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from brakeline.logs.episode_stats import Figures
+from brakeline.messaging import brakeline_pb2 as pb
+
+FIRST_CELL = 0.1  # m
+MOST_CELLS = 6400
+
+_ADJUSTED, _FAILSAFE = int(pb.ADJUSTED), int(pb.FAILSAFE)
+
+
+class Places:
+    """Counts of steps by the cell of the plane in which they ended. Too many cells become fewer, twice as wide."""
+
+    def __init__(self) -> None:
+        self.cell = FIRST_CELL
+        self.cells: dict[tuple[int, int], list[int]] = {}  # steps, adjusted, failsafes, collisions
+
+    def step(self, state: Sequence[float], step: pb.Step) -> None:
+        """`state` is the step's, taken out of it; the first two coordinates are x and y in m."""
+        cell = self.cell
+        place = int(state[0] // cell), int(state[1] // cell)
+        counts = self.cells.get(place)
+        if counts is None:
+            counts = self.cells[place] = [0, 0, 0, 0]
+            if len(self.cells) > MOST_CELLS:
+                self._coarsen()
+                counts = self.cells[place[0] // 2, place[1] // 2]
+        counts[0] += 1
+        kind = step.decision
+        if step.fallback or kind == _FAILSAFE:
+            counts[2] += 1
+        elif kind == _ADJUSTED:
+            counts[1] += 1
+        if step.collision:
+            counts[3] += 1
+
+    def _coarsen(self) -> None:
+        self.cell *= 2.0
+        coarse: dict[tuple[int, int], list[int]] = {}
+        for (x, y), counts in self.cells.items():
+            sums = coarse.setdefault((x // 2, y // 2), [0, 0, 0, 0])
+            for i, count in enumerate(counts):
+                sums[i] += count
+        self.cells = coarse
+
+    def figures(self) -> Figures:
+        """`cells`: [x, y of the cell's lower left corner in cells, steps, adjusted, failsafes, collisions]."""
+        return {"cell": self.cell, "cells": [[x, y, *counts] for (x, y), counts in sorted(self.cells.items())]}

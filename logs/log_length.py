@@ -1,0 +1,30 @@
+"""How many messages a log holds, from its files' summaries: for progress displays, and known at once."""
+
+from __future__ import annotations
+
+from mcap.exceptions import McapError
+from mcap.reader import make_reader
+
+from brakeline.logs.mcap_container import BROKEN
+from brakeline.logs.reader import Paths, find
+from brakeline.messaging.topics import Topic
+
+
+def count(paths: Paths, topic: Topic) -> int | None:
+    """Messages of a topic in the log at `paths`; None if a file has no summary, as a killed recorder leaves it.
+
+    Raises:
+        NoLog: there is none.
+    """
+    root, total = topic.key.split("/", 1)[0], 0
+    for path in find(paths):
+        with path.open("rb") as file:
+            try:
+                summary = make_reader(file).get_summary()
+            except (*BROKEN, McapError):
+                return None
+        if summary is None or summary.statistics is None:
+            return None
+        for number, messages in summary.statistics.channel_message_counts.items():
+            total += messages if summary.channels[number].topic.split("/", 1)[0] == root else 0
+    return total

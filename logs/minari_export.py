@@ -1,0 +1,130 @@
+"""The steps of a log as episodes, and these as a Minari data set: what other offline learners read."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Collection, Iterator
+from dataclasses import dataclass
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from brakeline.logs.reader import Paths, open_log
+from brakeline.messaging import brakeline_pb2 as pb
+from brakeline.messaging.task import RobotWithTask
+
+BATCH = 100  # episodes that are written at once
+# Per step, besides what Minari knows; `infos` of a data set.
+INFOS = ("penalty", "goal", "collision", "decision", "clearance", "speed", "weights_version")
+
+
+class ExportError(ValueError):
+    """Nothing can be written; the message says why."""
+
+
+def nothing_of(robot: RobotWithTask, others: Collection[str]) -> str:
+    """What to say of a log without a step of this robot, and what to give instead."""
+    if not others:
+        return f"no step of {robot.name} in the log, nor of any other robot"
+    names = ", ".join(sorted(others))
+    return f"no step of {robot.name} in the log; it has those of {names}: give --robot NAME, or its description's path"
+
+
+def episodes(paths: Paths, robot: RobotWithTask) -> Iterator[list[pb.Step]]:
+    """Consecutive steps of one episode of one actor, in the order in which they ended.
+
+    An episode that is cut off, by the log's end or by a lost step, comes in parts whose last step does not end it.
+    A step that is there twice counts once.
+    """
+    running: dict[str, list[pb.Step]] = {}
+    for record in open_log(paths):
+        if record.topic != "step" or record.message.robot != robot.name:
+            continue
+        step: pb.Step = record.message
+        steps = running.setdefault(step.actor, [])
+        if steps:
+            last = steps[-1]
+            here, there = (step.episode, step.step), (last.episode, last.step)
+            if step.header.run == last.header.run and here <= there:
+                continue
+            if here != (there[0], there[1] + 1) or step.header.run != last.header.run:
+                yield steps
+                steps = running[step.actor] = []
+        steps.append(step)
+        if step.terminated or step.truncated:
+            yield steps
+            running[step.actor] = []
+    yield from (steps for steps in running.values() if steps)
+
+
+@dataclass(frozen=True)
+class Written:
+    """A Minari data set."""
+
+    path: Path
+    episodes: int
+    steps: int
+
+
+def to_minari(paths: Paths, robot: RobotWithTask, name: str) -> Written:
+    """Write the episodes of a robot kind as the local Minari data set `name`, e.g. "brakeline/ground-v0".
+
+    Actions are those executed, rewards without the penalty; the proposed actions, the penalty and what the filter did
+    are in `infos`. An episode that was cut off ends truncated. It lies under `$MINARI_DATASETS_PATH`, else in
+    ~/.minari/datasets.
+
+    Raises:
+        ExportError: there is such a data set, or the log holds no step of this robot; NoLog, NotALog: there is no log.
+    """
+    import gymnasium
+    import minari
+    from minari.storage.datasets_root_dir import get_dataset_path
+
+    path = Path(get_dataset_path(name))
+    if path.exists():
+        raise ExportError(f"{path} is there already: give another name, e.g. with the next -v<number>")
+    about: dict[str, Any] = {
+        "observation_space": gymnasium.spaces.Box(-np.inf, np.inf, (robot.task.observation_dim,), np.float32),
+        "action_space": gymnasium.spaces.Box(robot.low().astype(np.float32), robot.high().astype(np.float32)),
+        "algorithm_name": "logged by brakeline",
+        "author": "brakeline",
+        "author_email": "none",
+        "code_permalink": "none",
+        "description": f"{robot.name}: observation {robot.task.observed}; action {robot.action}",
+    }
+    every = episodes(paths, robot)
+    dataset: Any = None
+    count = steps = 0
+    while batch := [_buffer(number, episode) for number, episode in enumerate(islice(every, BATCH), count)]:
+        if dataset is None:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", UserWarning)  # it has no environment of Gymnasium's registry
+                dataset = minari.create_dataset_from_buffers(name, batch, **about)
+        else:
+            dataset.update_dataset_from_buffer(batch)
+        count += len(batch)
+        steps += sum(len(buffer.rewards) for buffer in batch)
+    if dataset is None:
+        there = {record.message.robot for record in open_log(paths) if record.topic == "step"}
+        raise ExportError(nothing_of(robot, there))
+    return Written(path, count, steps)
+
+
+def _buffer(number: int, steps: list[pb.Step]) -> Any:
+    from minari.data_collector import EpisodeBuffer
+
+    observations = [steps[0].observation, *(step.next_observation for step in steps)]
+    truncations = [step.truncated for step in steps]
+    truncations[-1] |= not steps[-1].terminated
+    infos = {name: np.array([getattr(step, name) for step in steps]) for name in INFOS}
+    return EpisodeBuffer(
+        id=number,
+        observations=np.array(observations, np.float32),
+        actions=np.array([step.action for step in steps], np.float32),
+        rewards=[step.reward for step in steps],
+        terminations=[step.terminated for step in steps],
+        truncations=truncations,
+        infos=infos | {"proposed": np.array([step.proposed for step in steps], np.float32)},
+    )

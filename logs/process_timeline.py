@@ -1,0 +1,84 @@
+"""How the processes of a run fared over its time: when each lived, fell silent, was started again, and complained."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import asdict, dataclass, field
+
+from brakeline.logs.episode_stats import Figures
+from brakeline.logs.metrics import SILENT
+from brakeline.messaging import brakeline_pb2 as pb
+
+MOST_LIVES = 500
+MOST_LINES = 200  # log lines kept: the first half of them and the last
+MOST_BINS = 240
+LEVELS = ("WARNING", "ERROR")
+
+
+@dataclass
+class Life:
+    """A stretch of time in which a process gave a sign of life at least every few seconds."""
+
+    process: str
+    start: float  # s since the Unix epoch
+    end: float
+    run: int = field(repr=False)  # its start
+    goodbye: bool = False  # it ended in order
+    restart: bool = False  # it was started again, not merely heard of again
+
+
+class Timeline:
+    """Takes what says how processes fare; steps only as times."""
+
+    def __init__(self) -> None:
+        self.lives: list[Life] = []
+        self.lines: list[Figures] = []
+        self.last_lines: deque[Figures] = deque(maxlen=MOST_LINES // 2)
+        self.begin: float | None = None
+        self.width = 1.0  # s of a bin
+        self.steps: dict[int, int] = {}  # taken, by bin
+        self._latest: dict[str, Life] = {}
+
+    def health(self, name: str, health: pb.Health) -> None:
+        now, run = health.header.wall_time * 1e-9, health.header.run
+        life = self._latest.get(name)
+        if life is not None and life.run == run and (now - life.end <= SILENT or len(self.lives) >= MOST_LIVES):
+            life.end = max(life.end, now)
+        elif len(self.lives) < MOST_LIVES:
+            restart = life is not None and life.run != run
+            life = self._latest[name] = Life(name, now, now, run, restart=restart)
+            self.lives.append(life)
+        if life is not None and life.run == run:
+            life.goodbye = health.last
+
+    def line(self, name: str, line: pb.LogLine) -> None:
+        if line.level in LEVELS:
+            row = {"t": line.header.wall_time * 1e-9, "process": name, "level": line.level, "text": line.text[:300]}
+            if len(self.lines) < MOST_LINES // 2:
+                self.lines.append(row)
+            else:
+                self.last_lines.append(row)
+
+    def step(self, wall_time: int) -> None:
+        """A step was published at that time, in ns."""
+        now = wall_time * 1e-9
+        if self.begin is None:
+            self.begin = now
+        place = int((now - self.begin) / self.width)
+        self.steps[place] = self.steps.get(place, 0) + 1
+        if len(self.steps) > MOST_BINS:
+            self.width *= 2.0
+            coarse: dict[int, int] = {}
+            for bin_, count in self.steps.items():
+                coarse[bin_ // 2] = coarse.get(bin_ // 2, 0) + count
+            self.steps = coarse
+
+    def figures(self) -> Figures:
+        """Times in s since the Unix epoch; `steps`: (beginning of the bin, steps per second)."""
+        begin = self.begin or 0.0
+        return {
+            "lives": [{name: value for name, value in asdict(life).items() if name != "run"} for life in self.lives],
+            "lines": [*self.lines, *self.last_lines],
+            "bin_s": self.width,
+            "steps": [(begin + place * self.width, self.steps[place] / self.width) for place in sorted(self.steps)],
+        }

@@ -1,0 +1,49 @@
+"""The robots that the messages of one log, or one run, name."""
+
+from __future__ import annotations
+
+import json
+import logging
+from collections.abc import Iterable, Mapping
+
+from brakeline.messaging.robot import LATE, Robot, UnknownRobot, shipped, unless_shipped
+from brakeline.messaging.robot_description import robot_of
+from brakeline.messaging.task import robot_with_task
+
+log = logging.getLogger("brakeline.logs")
+
+
+class Robots:
+    """Robots by name: those that the log describes, and those that come with the program, with their usual tasks."""
+
+    def __init__(self, robots: Iterable[Robot] = ()) -> None:
+        self._robots = {robot.name: robot for robot in robots}
+
+    def describe(self, descriptions: Mapping[str, str]) -> None:
+        """Add the robots that a log's metadata describe; warn of a description that cannot be read, and go on."""
+        for name, text in descriptions.items():
+            try:
+                robot = unless_shipped(robot_of(json.loads(text), f"the log's {name}"))
+            except ValueError as error:
+                log.warning("%s", error)
+                continue
+            if robot.name not in shipped():
+                self._robots.setdefault(robot.name, robot)
+
+    def named(self, name: str) -> Robot | None:
+        """The robot of that name, or None. It reads no path: names come from messages."""
+        if name not in self._robots and (robot := self._found(name)) is not None:
+            self._robots[name] = robot
+        return self._robots.get(name)
+
+    def _found(self, name: str) -> Robot | None:
+        base = name.removesuffix(LATE)
+        robot = self._robots.get(base)
+        if robot is None and base in shipped():
+            robot = robot_with_task(base)
+        if robot is None or base == name:
+            return robot
+        try:
+            return robot.in_real_time()
+        except UnknownRobot:
+            return None

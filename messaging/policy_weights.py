@@ -1,0 +1,180 @@
+"""Policies as bytes, on the wire and on disk alike, and their forward pass without torch.
+
+A file is safetensors: `layers.K.weight` (out, in) and `layers.K.bias` (out,), float32, K from 0; one metadata entry
+`policy` holds, as JSON, the robot's name, the hash of its layout, the version and the exploration noise. Nothing in it
+is executable, and nothing of it is believed before it was checked.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import safetensors
+import safetensors.numpy
+from numpy.typing import NDArray
+
+from brakeline.messaging.robot import LATE, Array, shipped
+from brakeline.messaging.task import RobotWithTask, robot_with_task
+
+Matrix = NDArray[np.float32]
+Layers = Sequence[tuple[Matrix, Matrix]]  # weight (out, in), bias (out,)
+
+
+class BadWeights(ValueError):
+    """Not a policy, or not one of this robot; the message says which part is wrong."""
+
+
+class MLP:
+    """A policy: observation → ReLU layers → tanh, scaled to the robot's [low, high].
+
+    Working memory is allocated once, so one `MLP` belongs to one thread.
+    """
+
+    def __init__(self, robot: RobotWithTask, layers: Layers, version: int = 0, noise: float = 0.0) -> None:
+        """`noise`: standard deviation of the exploration, as a fraction of half an action's range.
+
+        Raises:
+            BadWeights: the layers do not fit each other or the robot, or are not finite.
+        """
+        _check(robot, layers)
+        self.robot, self.version, self.noise = robot, version, noise
+        self.layers = [(np.array(weight, np.float32), np.array(bias, np.float32)) for weight, bias in layers]
+        self._input = np.zeros(robot.task.observation_dim, np.float32)
+        self._outputs = [np.zeros_like(bias) for _, bias in self.layers]
+        self._low, self._high = robot.low(), robot.high()
+        self._centre, self._half = (self._high + self._low) / 2.0, (self._high - self._low) / 2.0
+
+    @classmethod
+    def untrained(cls, robot: RobotWithTask, seed: int, hidden: tuple[int, ...] = (256, 256)) -> MLP:
+        """Uniform in ±1/√(inputs of the layer), as the learner starts."""
+        generator = np.random.default_rng(seed)
+        layers = []
+        for inputs, outputs in pairwise((robot.task.observation_dim, *hidden, robot.action_dim)):
+            bound = 1.0 / np.sqrt(inputs)
+            draw = generator.uniform(-bound, bound, (outputs, inputs + 1)).astype(np.float32)
+            layers.append((draw[:, :inputs], draw[:, inputs]))
+        return cls(robot, layers)
+
+    @property
+    def sizes(self) -> tuple[int, ...]:
+        return (self.robot.task.observation_dim, *(len(bias) for _, bias in self.layers))
+
+    def __call__(self, observation: NDArray[Any]) -> Array:
+        """The action (action_dim,), in the robot's units."""
+        return self._centre + self._half * self.normalised(observation)
+
+    def explore(self, observation: NDArray[Any], generator: np.random.Generator) -> Array:
+        """The action with Gaussian noise, clipped to the bounds."""
+        draw = generator.standard_normal(self.robot.action_dim)
+        action = self._centre + self._half * (self.normalised(observation) + self.noise * draw)
+        return np.clip(action, self._low, self._high)
+
+    def normalised(self, observation: NDArray[Any]) -> Matrix:
+        """The action in [−1, 1]; valid until the next call."""
+        value = self._input
+        value[:] = observation
+        for (weight, bias), outputs in zip(self.layers, self._outputs, strict=True):
+            if value is not self._input:
+                np.maximum(value, 0.0, out=value)
+            np.dot(weight, value, out=outputs)
+            value = np.add(outputs, bias, out=outputs)
+        return np.tanh(value, out=value)
+
+    def encode(self) -> bytes:
+        return encode(self.robot, self.layers, self.version, self.noise)
+
+    def save(self, path: Path) -> None:
+        path.write_bytes(self.encode())
+
+    @classmethod
+    def load(cls, path: Path, robot: RobotWithTask | None = None) -> MLP:
+        """
+        Raises:
+            BadWeights: the file is not a policy (of that robot, if one is given).
+            OSError: it cannot be read.
+        """
+        return decode(path.read_bytes(), robot)
+
+
+def encode(robot: RobotWithTask, layers: Layers, version: int, noise: float = 0.0) -> bytes:
+    """The same arguments give the same bytes."""
+    tensors = {}
+    for number, (weight, bias) in enumerate(layers):
+        tensors[f"layers.{number}.weight"] = np.ascontiguousarray(weight, np.float32)
+        tensors[f"layers.{number}.bias"] = np.ascontiguousarray(bias, np.float32)
+    about = {"robot": robot.name, "layout": robot.learning_layout(), "version": version, "noise": noise}
+    # One entry: the order of several would change from call to call.
+    return safetensors.numpy.save(tensors, {"policy": json.dumps(about, sort_keys=True)})
+
+
+def decode(data: bytes, robot: RobotWithTask | None = None) -> MLP:
+    """The policy in `data`; `robot` is the one it must be for, else the one that it names.
+
+    Raises:
+        BadWeights: it is not one.
+    """
+    try:
+        read: Any = safetensors.deserialize  # Any: it comes without types
+        entries = dict(read(data))
+        header = json.loads(data[8 : 8 + int.from_bytes(data[:8], "little")])
+        about = json.loads(header["__metadata__"]["policy"])
+    except (safetensors.SafetensorError, ValueError, KeyError, TypeError) as error:
+        raise BadWeights(f"not a policy file: {error}") from error
+    robot = _robot(about, robot)
+    version, noise = about.get("version"), about.get("noise")
+    if type(version) is not int or not 0 <= version < 2**32:
+        raise BadWeights(f"version: {version!r}")
+    if type(noise) not in (int, float) or not 0.0 <= noise < np.inf:
+        raise BadWeights(f"noise: {noise!r}")
+    count = len(entries) // 2
+    try:
+        layers = [
+            (_array(entries, f"layers.{number}.weight"), _array(entries, f"layers.{number}.bias"))
+            for number in range(count)
+        ]
+    except KeyError as error:
+        raise BadWeights(f"{error.args[0]}: missing") from error
+    if len(entries) != 2 * count:
+        raise BadWeights(f"{len(entries)} arrays where layers have two each")
+    return MLP(robot, layers, version, float(noise))
+
+
+def _robot(about: Any, robot: RobotWithTask | None) -> RobotWithTask:
+    if not isinstance(about, dict) or not isinstance(about.get("robot"), str):
+        raise BadWeights("robot: missing")
+    if robot is None:
+        if about["robot"].removesuffix(LATE) not in shipped():  # the name is from outside: no path is read
+            raise BadWeights(f"robot: unknown, {about['robot']!r}")
+        robot = robot_with_task(about["robot"])
+    if about["robot"] != robot.name:
+        raise BadWeights(f"robot: of {about['robot']!r} where {robot.name!r} is meant")
+    if not robot.accepts_learning_layout(about.get("layout")):
+        raise BadWeights(f"layout: {about.get('layout')!r} where {robot.name} has {robot.learning_layout()!r}")
+    return robot
+
+
+def _array(entries: dict[str, Any], name: str) -> Matrix:
+    entry = entries[name]
+    if entry["dtype"] != "F32":
+        raise BadWeights(f"{name}: {entry['dtype']} where F32 belongs")
+    array: Matrix = np.frombuffer(entry["data"], np.float32).reshape(entry["shape"])
+    return array
+
+
+def _check(robot: RobotWithTask, layers: Layers) -> None:
+    if not layers:
+        raise BadWeights("layers: there are none")
+    inputs = robot.task.observation_dim
+    for number, (weight, bias) in enumerate(layers):
+        if weight.ndim != 2 or weight.shape[1] != inputs or bias.shape != weight.shape[:1] or not len(bias):
+            raise BadWeights(f"layers.{number}: {weight.shape} and {bias.shape} behind {inputs} inputs")
+        if not (np.isfinite(weight).all() and np.isfinite(bias).all()):
+            raise BadWeights(f"layers.{number}: not finite")
+        inputs = len(bias)
+    if inputs != robot.action_dim:
+        raise BadWeights(f"layers.{len(layers) - 1}: {inputs} outputs where {robot.name} has {robot.action_dim} inputs")

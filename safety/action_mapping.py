@@ -1,0 +1,72 @@
+"""Between an environment's actions and a robot's inputs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import gymnasium
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from brakeline.messaging.robot import Robot
+
+Array = NDArray[np.float64]
+
+SAME_BOUND = 1e-6  # of an input's range: bounds are often held in single precision
+
+
+class Mismatch(ValueError):
+    """The environment is not one of this robot, as it stands; the message says what to give."""
+
+
+@dataclass(frozen=True)
+class Actions:
+    """action_to_control: an action of the environment as the robot's input (m,); control_to_action: the way back.
+    Both also of many at once, (k, m), where a vector environment is to be wrapped."""
+
+    action_to_control: Callable[[Any], ArrayLike]
+    control_to_action: Callable[[Array], Any]
+
+
+SAME = Actions(lambda action: action, lambda control: control)
+
+
+def normalised(robot: Robot) -> Actions:
+    """Actions in [-1, 1], as RL libraries like them: -1 is each input's lowest value, 1 its highest."""
+    low, width = robot.low(), robot.high() - robot.low()
+    return Actions(
+        lambda action: low + 0.5 * width * (np.clip(np.asarray(action, float), -1.0, 1.0) + 1.0),
+        lambda control: np.clip(2.0 * (control - low) / width - 1.0, -1.0, 1.0),
+    )
+
+
+def actions_of(space: gymnasium.Space[Any], robot: Robot, given: Actions | None) -> Actions:
+    """Those given, or none needed: the space is that of the robot's inputs.
+
+    Raises:
+        Mismatch: it is not, and nothing is given.
+    """
+    if given is not None:
+        return given
+    wanted = ", ".join(
+        f"{name} from {low:g} to {high:g}"
+        for name, low, high in zip(robot.action, robot.action_low, robot.action_high, strict=True)
+    )
+    give = "give actions=Actions(action_to_control, control_to_action)"
+    if not isinstance(space, gymnasium.spaces.Box) or space.shape != (robot.action_dim,):
+        raise Mismatch(f"the action space {space} is not that of {robot.name}'s inputs ({wanted}): {give}")
+    near = SAME_BOUND * (robot.high() - robot.low())
+    if (np.abs(space.low - robot.low()) > near).any() or (np.abs(space.high - robot.high()) > near).any():
+        if (space.low == -1.0).all() and (space.high == 1.0).all():
+            give = f"give actions=normalised(robot) if ±1 stands for the bounds, else {give.removeprefix('give ')}"
+        raise Mismatch(f"the action space {space} has other bounds than {robot.name}'s inputs ({wanted}): {give}")
+    return SAME
+
+
+def cast(action: Any, space: gymnasium.Space[Any]) -> Any:
+    """The action in the type that the environment takes."""
+    if isinstance(space, gymnasium.spaces.Box):
+        return np.asarray(action, dtype=space.dtype).reshape(space.shape)
+    return action

@@ -1,0 +1,128 @@
+"""What a proposal was not allowed for: of all half-spaces the one that its tube comes nearest to, or crosses most."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from brakeline.messaging.moving_obstacles import Movers
+from brakeline.messaging.obstacle import Shapes
+from brakeline.messaging.robot import Robot
+from brakeline.safety.filter.moving_halfspaces import swept_half_spaces
+from brakeline.safety.filter.reservation import Promises
+from brakeline.safety.perception.occluded_regions import Shadows
+from brakeline.safety.perception.scan_free_space import Cells
+from brakeline.safety.perception.scan_free_space import half_spaces as unseen_half_spaces
+
+Array = NDArray[np.float64]
+
+UNSEEN, SIGHT, ROBOT = "unseen", "sight", "robot"
+
+
+@dataclass(frozen=True)
+class Stopped:
+    """by: cylinder | box | sphere | wall, `moving ` before it where it moves, `unseen`, `robot` (its promise),
+    `sight` (the tube leaves what can be seen), or a limit's name; room [m, of a limit in its own units]: from the tube
+    to the half-space, negative: beyond it; after [s]: when, from now. normal (d,), at (d,): of the half-space, world,
+    from the free side on, through the obstacle's nearest point; empty where there is none."""
+
+    by: str
+    room: float
+    after: float
+    normal: Array
+    at: Array
+
+    @staticmethod
+    def nowhere(by: str, room: float, after: float) -> Stopped:
+        return Stopped(by, room, after, np.zeros(0), np.zeros(0))
+
+
+@dataclass(frozen=True)
+class Around:
+    """What half-spaces are about, in the order of their rows, one disc of the body after the other."""
+
+    near: Shapes
+    moving: Movers | None
+    unseen: Cells | Shadows | None
+    promised: Promises | None = None  # these come last, once for the whole body
+
+    @property
+    def told(self) -> int:
+        """How many half-spaces a period are about obstacles that were told of."""
+        return len(self.near) + (len(self.moving) if self.moving is not None else 0)
+
+
+@dataclass(frozen=True)
+class Planes:
+    """Half-spaces for one disc of the body: start (d,) and ends (N, d), world, of its centre's nominal way; normals
+    (n, N, d) and offsets (n, N) about `start`, in the order of `Around`, of obstacles that keep_off [m] and measured
+    (d,) have been taken from."""
+
+    start: Array
+    ends: Array
+    normals: Array
+    offsets: Array
+    keep_off: float
+    measured: Array
+
+    def itself(self, which: int, period: int, margin: float = 0.0) -> tuple[Array, float]:
+        """The half-space (d,), () that the surface is of an obstacle of that margin, whatever is to be kept to it."""
+        normal = self.normals[which, period]
+        kept = max(self.keep_off + margin, 0.0) + float(np.abs(normal) @ self.measured)
+        return normal, float(self.offsets[which, period]) + kept
+
+
+def worst(row: int, room: float, robot: Robot, around: Around, planes: list[Planes]) -> Stopped:
+    """What a row is about; planes: of each disc, under the proposal."""
+    N, T = robot.horizon, robot.period
+    number = row
+    for disc in planes:
+        rows = (2 * N + 1) * len(disc.normals)
+        if number < rows:
+            return _about_an_obstacle(number, room, robot, around, disc)
+        number -= rows
+    if around.promised is not None:
+        each = (N + 1) << robot.position_dim  # of a robot
+        if number < len(around.promised) * each:
+            period = (number % each) >> robot.position_dim
+            return Stopped.nowhere(ROBOT, room, T * min(period + 1, N))
+        number -= len(around.promised) * each
+    period, limit = divmod(number, len(robot.limits))
+    return Stopped.nowhere(robot.limits[limit].name, room, T * min(period + 1, N))
+
+
+def _about_an_obstacle(row: int, room: float, robot: Robot, around: Around, planes: Planes) -> Stopped:
+    """The same of a disc's row."""
+    N, T = robot.horizon, robot.period
+    which, end = divmod(row, 2 * N + 1)
+    period = end if end < N else min(end - N, N - 1)
+    when = end if end < N else min(end - N + 1, N)
+    start, ends = planes.start, planes.ends
+    if isinstance(around.unseen, Shadows) and which >= around.told:
+        by, (normal, level) = UNSEEN, planes.itself(which, period)
+    elif which < len(around.near):
+        by, (normal, level) = (
+            around.near.kind(which),
+            planes.itself(which, period, float(around.near.margin[which])),
+        )
+    else:
+        by, normals, offsets = _moving_or_unseen(which - len(around.near), robot, around, start, ends)
+        normal, level = normals[0, period], float(offsets[0, period])
+    if not np.isfinite(level):
+        return Stopped.nowhere(by, room, T * when)
+    there = (ends[when - 1] if when else start) - start
+    return Stopped(by, room, T * when, normal, start + there + normal * (level - normal @ there))
+
+
+def _moving_or_unseen(which: int, robot: Robot, around: Around, start: Array, ends: Array) -> tuple[str, Array, Array]:
+    """The name of what does not stand still, and its half-spaces (1, N, d), (1, N) themselves."""
+    one, exact = np.array([which]), np.zeros(len(start))
+    if around.moving is not None:
+        if which < len(around.moving):
+            mover = around.moving.take(one)
+            return f"moving {mover.shapes.kind(0)}", *swept_half_spaces(mover, start, ends, 0.0, exact, robot.period)
+        one -= len(around.moving)
+    assert isinstance(around.unseen, Cells)
+    return UNSEEN, *unseen_half_spaces(around.unseen.take(one), start, ends, 0.0, exact, robot.period)

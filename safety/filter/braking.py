@@ -1,0 +1,55 @@
+"""The backup policy μ that every robot has, and the plans that rest on it: brake as fast as the slew allows.
+
+    μ(u_before) = u_before − clip(u_before, −slew, slew)      (the ground robot has no slew: zero at once;
+                                                               what a stop holds is held)
+
+A plan here is only what to do when no answer comes; the rivals verify nothing.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from brakeline.messaging.robot import Array, Robot
+from brakeline.safety.filter.backup_plan import NO_PREDICTION
+from brakeline.safety.filter.request import FAILSAFE, Decision, Request
+
+
+def brake(robot: Robot, before: Array) -> Array:
+    """μ: the input (m,) that follows the input `before` (m,) while braking."""
+    slew = np.asarray(robot.action_slew)
+    return np.where(robot.stopping, before - np.clip(before, -slew, slew), before)
+
+
+def within(robot: Robot, wanted: Array, before: Array) -> Array:
+    """The input (m,) closest to the wanted one within bounds and slew of the one in force."""
+    slew = np.asarray(robot.action_slew)
+    low, high = np.maximum(robot.low(), before - slew), np.minimum(robot.high(), before + slew)
+    return np.asarray(np.minimum(np.maximum(wanted, low), high))
+
+
+def braking_plan(robot: Robot, first: Array) -> Array:
+    """(N, m): `first`, then μ; the last input is zero (`horizon` periods suffice to brake from any input)."""
+    plan = np.zeros((robot.horizon, robot.action_dim))
+    plan[0] = first
+    for k in range(1, robot.horizon):
+        plan[k] = brake(robot, plan[k - 1])
+    return plan
+
+
+def braked(robot: Robot, request: Request, version: str, reason: str, total: float) -> Decision:
+    """The failsafe of a method that verifies nothing: μ from the input in force on. total [ms]: inside `decide`."""
+    before = request.input_in_force
+    return Decision(
+        kind=FAILSAFE,
+        plan=braking_plan(robot, within(robot, brake(robot, before), before)),
+        tube_center=np.zeros((0, robot.position_dim)),
+        tube_half_width=np.zeros((0, robot.position_dim)),
+        predicted=NO_PREDICTION,
+        margin=0.0,
+        model=version,
+        reason=reason,
+        verified=False,
+        time_ms=total,
+        verify_ms=total,
+    )

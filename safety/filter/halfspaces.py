@@ -1,0 +1,94 @@
+"""Free space about a nominal plan, as half-spaces `a·p <= b` (docs/method.md §3).
+
+A supporting half-space per near obstacle and period: the obstacle is convex, so the plane through its point closest
+to some nominal position, normal to the line between them, has all of it on the far side. The same half-space holds for
+both ends of the period, so that the chord between them is inside too: of the planes seen from the period's start,
+middle and end the one is taken that leaves both ends the most room. A fast robot passes by an obstacle within a
+period, and the plane seen from one end alone would cut off the other.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from brakeline.messaging.obstacle import Shapes
+
+Array = NDArray[np.float64]
+
+TOUCHING = 1e-6  # m; nearer than this a direction can't be told
+
+
+def half_spaces(near: Shapes, start: Array, nominal: Array, keep_off: float, measured: Array) -> tuple[Array, Array]:
+    """Half-spaces for the *measured* position that keep the body off the obstacles.
+
+    Args:
+        near: n obstacles.
+        start: (d,) the position now.
+        nominal: (N, d) positions at the ends of the periods.
+        keep_off: the footprint's radius [m].
+        measured: (d,) Z_v: half-widths of |measured - true|.
+
+    Returns:
+        normals a (n, N, d) and offsets b (n, N), relative to `start`: `a·(p - start) <= b`. An obstacle that the
+        start touches gets `b = -inf`: nothing there can be verified.
+    """
+    between = np.concatenate([np.zeros((1, nominal.shape[1])), nominal - start])
+    seen_from = np.empty((2 * len(nominal) + 1, nominal.shape[1]))  # relative to the start
+    seen_from[::2] = between
+    seen_from[1::2] = 0.5 * (between[1:] + between[:-1])
+    towards = near.towards(start + seen_from)  # (n, 2N+1, d)
+    gap = np.sqrt(np.einsum("nqd,nqd->nq", towards, towards))
+    unit = towards / np.maximum(gap, TOUCHING)[..., None]
+    level = np.einsum("nqd,nqd->nq", unit, towards + seen_from)
+    inside = ~(gap > TOUCHING)  # true for NaN, too
+    level[inside | inside[:, :1]] = -np.inf
+    choice = roomiest(unit, level, between)
+    each = np.arange(len(choice))[:, None]
+    normal = unit[each, choice]
+    return normal, level[each, choice] - np.maximum(keep_off + near.margin, 0.0)[:, None] - np.abs(normal) @ measured
+
+
+def leading_out(
+    near: Shapes, start: Array, keep_off: float, measured: Array, planes: tuple[Array, Array]
+) -> tuple[Array, Array]:
+    """The same half-spaces, but of an obstacle that the start is inside of, the one behind which it is left soonest:
+    nothing that is verified, but a way out (docs/method.md §11)."""
+    out = near.out_of(start)
+    depth = np.sqrt(np.einsum("nd,nd->n", out, out))
+    inside = depth > TOUCHING
+    if not inside.any():
+        return planes
+    normals, offsets = planes[0].copy(), planes[1].copy()
+    normals[inside] = (-out[inside] / depth[inside, None])[:, None]
+    kept = np.maximum(keep_off + near.margin[inside], 0.0) + np.abs(normals[inside, 0]) @ measured
+    offsets[inside] = -(depth[inside] + kept)[:, None]
+    return normals, offsets
+
+
+def roomiest(unit: Array, level: Array, ends: Array) -> NDArray[np.intp]:
+    """Which of the planes (n, 2N+1) serves which period, the ends (N+1, d) of which are nominal: (n, N).
+
+    From the first period on whose ends no plane keeps apart from the obstacle, the nominal plan goes through it: the
+    last plane before stays in force, for one beyond the obstacle would hold on the wrong side.
+    """
+    places, periods = _places(len(ends) - 1)
+    along = unit @ ends.T  # (n, 2N+1, N+1)
+    room = level[:, places] - np.maximum(along[:, places, periods], along[:, places, periods + 1])  # (n, N, 3)
+    best = room.argmax(axis=2)
+    choice: NDArray[np.intp] = 2 * periods[:, 0] + best
+    through = np.logical_or.accumulate(~(room.max(axis=2) > 0.0), axis=1)
+    if not through.any():
+        return choice
+    before = (~through).sum(axis=1)  # periods until then
+    last = np.where(before > 0, choice[np.arange(len(choice)), before - 1], 0)
+    return np.asarray(np.where(through, last[:, None], choice))
+
+
+@cache
+def _places(periods: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Of each period: where its start, middle and end are among the places, (N, 3), and its number, (N, 1)."""
+    number = np.arange(periods)[:, None]
+    return 2 * number + np.arange(3), number

@@ -1,0 +1,56 @@
+"""Free space beside what moves: half-spaces that hold for the whole sweep of a period (docs/method.md §8).
+
+In period k = [t_k, t_{k+1}] an obstacle lies within O + c t ⊕ ball(r(t)). For a unit normal n that points from the
+robot to it, `n·p <= b` keeps the robot off all of it at all of these times if
+
+    b = min over t in {t_k, t_{k+1}} of (the least n·o over O + c t)  -  r(t_{k+1})
+
+O is convex and only translates, so the two ends suffice; r grows, so its last value does. Normals are taken from the
+nominal position to the closest point of the moved shape at the start, the middle and the end of every period up to this
+one; the one serves that leaves both ends the most room.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from brakeline.messaging.moving_obstacles import Movers
+from brakeline.safety.filter.halfspaces import TOUCHING
+
+Array = NDArray[np.float64]
+
+
+def swept_half_spaces(
+    near: Movers, start: Array, nominal: Array, keep_off: float, measured: Array, period: float
+) -> tuple[Array, Array]:
+    """As `freespace.half_spaces`, for what moves; period: s, between two of the nominal positions."""
+    n, (N, d) = len(near), nominal.shape
+    ends = np.concatenate([np.zeros((1, d)), nominal - start])
+    places = np.empty((2 * N + 1, d))  # relative to the start
+    places[::2] = ends
+    places[1::2] = 0.5 * (ends[1:] + ends[:-1])
+    seen_from = places - near.moved(0.5 * period * np.arange(2 * N + 1))  # (n, q, d), as if the obstacle stood
+    each = np.arange(n)
+    towards = near.shapes.each_towards(start + seen_from)
+    gap = np.sqrt(np.einsum("nqd,nqd->nq", towards, towards))
+    unit = towards / np.maximum(gap, TOUCHING)[..., None]
+    level = np.einsum("nqd,nqd->nq", unit, towards + seen_from)  # least n·o over O where it was measured
+    level[~(gap > TOUCHING)] = -np.inf  # true for NaN, too
+    times = period * np.arange(N + 1)
+    along = np.einsum("nqd,nkd->nqk", unit, near.moved(times))
+    bound = level[:, :, None] + np.minimum(along[:, :, :-1], along[:, :, 1:]) - near.radius(times[1:])[:, None]
+    room = unit @ ends.T
+    room = bound - np.maximum(room[:, :, :-1], room[:, :, 1:])  # (n, q, N)
+    room = np.where(np.arange(2 * N + 1)[:, None] <= 2 * np.arange(1, N + 1), room, -np.inf)
+    room[np.isnan(room)] = -np.inf
+    choice = room.argmax(axis=1)  # (n, N)
+    # From the first period on that no plane keeps apart from it, the nominal plan meets it: the plane before stays.
+    met = np.logical_or.accumulate(~(room.max(axis=1) > 0.0), axis=1)
+    before = (~met).sum(axis=1)
+    last = np.where(before > 0, choice[each, before - 1], 0)
+    choice = np.where(met, last[:, None], choice)
+    normal = unit[each[:, None], choice]
+    offset = bound[each[:, None], choice, np.arange(N)] - np.maximum(keep_off + near.shapes.margin, 0.0)[:, None]
+    offset -= np.abs(normal) @ measured
+    return normal, np.where(np.isnan(offset), -np.inf, offset)

@@ -1,0 +1,247 @@
+"""A question to the filter and its answer, and what makes a question one that can't be decided on."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import Any, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from brakeline.messaging.moving_obstacles import Movers
+from brakeline.messaging.obstacle import FARTHEST, Shapes
+from brakeline.messaging.range_image import RangeImage
+from brakeline.messaging.robot import Robot
+from brakeline.messaging.scan import Scan
+from brakeline.messaging.sensor_messages import Sensed
+from brakeline.safety.filter.backup_plan import Prediction
+from brakeline.safety.filter.blocking_constraint import Stopped
+from brakeline.safety.filter.reservation import Promise, Promises
+
+Array = NDArray[np.float64]
+
+ALLOWED, ADJUSTED, FAILSAFE, RECOVERING = "allowed", "adjusted", "failsafe", "recovering"
+MOST_OBSERVED = 4096  # numbers in an observation
+FEW = 64  # numbers
+NOT_FINITE = "the proposed action holds NaN or infinity"  # the reason of a failsafe
+NOTHING_KNOWN = (
+    "nothing is known of the space around the robot: give obstacles, or a scan, or say known_free if a map says that "
+    "all space within reach is free"
+)
+STOPPED = 0.9e-9  # of an input: surely one of a stop (`Robot.rests`)
+
+Named: TypeAlias = dict[str, tuple[NDArray[np.floating[Any]], tuple[int, ...]]]  # arrays, and the shapes they must have
+
+
+class BadRequest(ValueError):
+    """A request that can't be decided on: `field` names what is wrong."""
+
+    def __init__(self, field: str, message: str) -> None:
+        super().__init__(message)
+        self.field = field
+
+
+class StaleModel(BadRequest):
+    """The committed plan was verified by a model set that this filter never had."""
+
+
+@dataclass(frozen=True)
+class Request:
+    """state (n,) measured; action (m,) proposed; input_in_force (m,) of the period before; plan (N, m): the committed
+    plan's tail (of a late robot: from the input on that is in force now), verified by model set `model` (empty:
+    standing still; `UNVERIFIED`: by none); obstacles: at least those within `Filter.reach`; predicted: what the last
+    decision said of this state, if there was one; movers: obstacles that move, at least those that may come within
+    reach before the plan ends; scan: in the place of obstacles, or beside them: what is not seen free in it counts as
+    occupied; promise: its own, if other robots share its world, and promised: theirs, to be kept off; known_free:
+    nothing but the obstacles is near, so all other space within reach is free; needed without obstacles and scan."""
+
+    state: Array
+    action: Array
+    input_in_force: Array
+    plan: Array
+    obstacles: Shapes
+    model: str = ""
+    predicted: Prediction | None = None
+    movers: Movers | None = None
+    scan: Sensed | None = None
+    promise: Promise | None = None
+    promised: Promises | None = None
+    observation: NDArray[np.float32] = field(default_factory=lambda: np.zeros(0, np.float32))
+    known_free: bool = False
+
+    def __post_init__(self) -> None:
+        """Of one type and memory layout, which compiled code relies on, whatever arrays they come as."""
+        for name in ("state", "action", "input_in_force", "plan"):
+            object.__setattr__(self, name, np.ascontiguousarray(getattr(self, name), dtype=float))
+
+    @property
+    def finite(self) -> bool:
+        """Is every number of the proposed action finite? If not, no method lets the proposal pass: the robot brakes."""
+        return all(map(math.isfinite, self.action.ravel().tolist()))
+
+    def still(self, robot: Robot) -> bool:
+        """Is the robot said to stand, and to be committed to that? Needs no model's word."""
+        committed = not self.model and bool(robot.rests(self.plan).all()) and robot.may_stand(self.input_in_force)
+        return committed and robot.stands(self.state)
+
+
+@dataclass(frozen=True)
+class Decision:
+    """kind: allowed | adjusted | failsafe | recovering (never verified); plan (N, m), its first row is for now (of a
+    late robot: is in force, and the second is for the next period); tube: true positions at the N periods' ends,
+    centers and half-widths (N, d), world, of the plan's free inputs and the ramp after them; predicted: the next
+    measured state; margin [m] of that tube to the nearest obstacle's half-space, `at_least`: it is a lower bound, for
+    what is nearest is beyond reach. A failsafe's may be negative though it is verified: it was so when it was made,
+    this is how it looks from the new measurement."""
+
+    kind: str
+    plan: Array
+    tube_center: Array
+    tube_half_width: Array
+    predicted: Prediction
+    margin: float
+    model: str
+    at_least: bool = False
+    reason: str = ""
+    verified: bool = True
+    contained: bool = True
+    compared: bool = False
+    time_ms: float = 0.0
+    solve_ms: float = 0.0
+    verify_ms: float = 0.0
+    solver: str = ""
+    iterations: int = 0
+    broken: int = 0  # movers that were seen outside of what their bounds allowed
+    stopped: Stopped | None = None  # of a proposal that was not allowed: what it would have come too near to
+    promise: Promise | None = None  # to the other robots of its world
+    # The model set's statement: at most this share of the plans that it verifies leave their tubes, at 99 % confidence;
+    # 1: it states nothing; None: of a method that verifies nothing.
+    bound: float | None = None
+    for_clearance: bool | None = None  # adjusted though the proposal's tube was verified; None: not said
+
+
+def check_for_filter(robot: Robot, request: Request) -> None:
+    """All fields, for our filter; the observation only if there is one.
+
+    Raises:
+        BadRequest: a value is missing, not finite or of the wrong size, with the field's name. A proposed action with
+        NaN or infinity raises nothing: the decision on it is a failsafe.
+    """
+    predicted = request.predicted
+    further: Named = {"plan": (request.plan, (robot.horizon, robot.action_dim))}
+    if request.observation.size > MOST_OBSERVED:
+        raise BadRequest("observation", f"an observation has at most {MOST_OBSERVED} numbers")
+    further["observation"] = request.observation, (request.observation.size,)
+    if predicted is not None:
+        further["predicted_center"] = predicted.center, (robot.state_dim,)
+        further["predicted_half_width"] = predicted.half_width, (robot.state_dim,)
+    _check_motion(robot, request, further)
+    _within_bounds(robot, "plan", request.plan)
+    if not robot.rests(request.plan[-1]):
+        raise BadRequest("plan", "the committed plan does not end in a stop")
+    check_surroundings(robot, request)
+    if predicted is not None:
+        if min(predicted.half_width.tolist()) < 0.0:
+            raise BadRequest("predicted_half_width", "a predicted set has a negative half-width")
+        if not math.isfinite(predicted.heading):
+            raise BadRequest("predicted_heading", "predicted_heading is NaN or infinite")
+
+
+def check_surroundings(robot: Robot, request: Request) -> None:
+    """Check that a request says something about the space around the robot, of a kind that this robot meets.
+
+    Raises:
+        BadRequest: it does not, with the field's name.
+    """
+    moving = request.movers is not None and len(request.movers)
+    if not (len(request.obstacles) or moving or request.scan is not None or request.known_free):
+        raise BadRequest("obstacles", NOTHING_KNOWN)
+    if request.obstacles.center.shape[1] != robot.position_dim:
+        raise BadRequest("obstacles", f"a {robot.name} robot's obstacles have {robot.position_dim} coordinates")
+    if request.movers is not None and request.movers.drift.shape[1] != robot.position_dim:
+        raise BadRequest("obstacles", f"a {robot.name} robot's movers have {robot.position_dim} coordinates")
+    if isinstance(request.scan, Scan) and (robot.position_dim != 2 or robot.heading is None):
+        raise BadRequest("scan", f"a {robot.name} robot has no fan in the plane: give obstacles, or a range image")
+    if isinstance(request.scan, RangeImage) and robot.position_dim != 3:
+        raise BadRequest("image", f"a {robot.name} robot has no range image in space: give obstacles, or a scan")
+
+
+class Ordinary:
+    """All of a request's numbers at once: what nearly every one takes, in a third of the time."""
+
+    def __init__(self, robot: Robot) -> None:
+        n, m, most = robot.state_dim, robot.action_dim, np.finfo(float).max
+        self.sizes = n, m, (robot.horizon, m)
+        low, high = (np.tile(bound, (robot.horizon, 1)) for bound in robot.bounds)
+        low[-1, robot.stopping], high[-1, robot.stopping] = -STOPPED, STOPPED
+        fixed = [np.full(n, FARTHEST), np.full(m, most)]
+        self.low = np.concatenate([*(-part for part in fixed), robot.bounds[0], low.ravel()])
+        self.high = np.concatenate([*fixed, robot.bounds[1], high.ravel()])
+        self.predicted_low = np.concatenate([self.low, [-most], np.full(n, -most), np.zeros(n)])
+        self.predicted_high = np.concatenate([self.high, np.full(2 * n + 1, most)])
+
+    def __call__(self, request: Request) -> bool:
+        """False: `check_for_filter` may find something in them, and says what."""
+        (n, m, planned), observed = self.sizes, request.observation
+        inputs = request.action, request.input_in_force, request.plan.ravel()
+        sized = request.state.shape == (n,) and inputs[0].shape == inputs[1].shape == (m,)
+        if not (sized and request.plan.shape == planned):
+            return False
+        if observed.shape != (0,):
+            # A product that is no number, or infinite, is of an observation in which one is, or which is very large.
+            bounded = observed.ndim == 1 and observed.size <= MOST_OBSERVED
+            if not (bounded and math.isfinite(np.dot(observed, observed))):
+                return False
+        predicted = request.predicted
+        if predicted is None:
+            told, low, high = np.concatenate((request.state, *inputs)), self.low, self.high
+        else:
+            if not predicted.center.shape == predicted.half_width.shape == (n,):
+                return False
+            sets = (predicted.heading,), predicted.center, predicted.half_width
+            told = np.concatenate((request.state, *inputs, *sets))
+            low, high = self.predicted_low, self.predicted_high
+        return bool(((told >= low) & (told <= high)).all())
+
+
+def check_for_rival(robot: Robot, request: Request, observed: int) -> None:
+    """Check the fields that the rivals read; `observed` is the number of values that the rival's networks observe.
+
+    Raises:
+        BadRequest: a value is missing, not finite or of the wrong size, with the field's name.
+    """
+    _check_motion(robot, request, {"observation": (request.observation, (observed,))})
+
+
+def _check_motion(robot: Robot, request: Request, further: Named) -> None:
+    """Where the robot is, and its inputs; and that what else is named is of its size, and finite."""
+    inputs = (robot.action_dim,)
+    named: Named = {
+        "state": (request.state, (robot.state_dim,)),
+        "input_in_force": (request.input_in_force, inputs),
+    }
+    _sized(robot, "action", request.action, inputs)
+    _finite(robot, named | further)
+    if max(map(abs, request.state.tolist())) > FARTHEST:  # in any unit
+        raise BadRequest("state", f"a state beyond ±{FARTHEST:g} is not plausible")
+    _within_bounds(robot, "input_in_force", request.input_in_force)
+
+
+def _within_bounds(robot: Robot, name: str, inputs: Array) -> None:
+    low, high = robot.bounds
+    if not ((inputs >= low) & (inputs <= high)).all():
+        raise BadRequest(name, f"{name}: an input is out of the robot's bounds")
+
+
+def _sized(robot: Robot, name: str, value: NDArray[np.floating[Any]], shape: tuple[int, ...]) -> None:
+    if value.shape != shape:
+        raise BadRequest(name, f"{name} has shape {value.shape}, a {robot.name} robot's has {shape}")
+
+
+def _finite(robot: Robot, named: Named) -> None:
+    for name, (value, shape) in named.items():
+        _sized(robot, name, value, shape)
+        few = value.size <= FEW  # sooner looked at one by one
+        if not (all(map(math.isfinite, value.ravel().tolist())) if few else np.isfinite(value).all()):
+            raise BadRequest(name, f"{name} holds NaN or infinity")

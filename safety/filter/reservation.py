@@ -1,0 +1,157 @@
+"""What robots of one world promise each other: where each is in each period, and for ever after (docs/method.md §9).
+
+A tube with sets S_0 (where the robot is), S_1, ..., S_N at the ends of its periods keeps the body, in period k, within
+
+    box(S_k ∪ S_{k+1}) ⊕ ball(ρ_k),    ρ_k = the body's disc + the period's bulge (after the last: the latch)
+
+an axis-parallel box in the world. The last one holds from then on: there it stands. While time passes a promise loses
+its first box and keeps its last. Promises of robots that are decided one after the other, each against those of all the
+others at that moment, stay pairwise disjoint: who gets no new plan keeps its old one, which the others were held
+against. So what is verified is the promise itself, corners of its boxes included, not the tube inside it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import product
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from brakeline.messaging.obstacle import Shapes
+from brakeline.safety.filter.halfspaces import TOUCHING
+
+if TYPE_CHECKING:
+    from brakeline.safety.filter.qp import Rows
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Promise:
+    """Of one robot from now on: center, half_width (N, d) [m] of boxes, radius (N,) [m] that is added about them."""
+
+    center: Array
+    half_width: Array
+    radius: Array
+
+    @staticmethod
+    def of(center: Array, half_width: Array, radius: Array) -> Promise:
+        """From a tube's sets as boxes (N+1, d), the first where the robot is now; radius (N,)."""
+        low, high = center - half_width, center + half_width
+        low, high = np.minimum(low[:-1], low[1:]), np.maximum(high[:-1], high[1:])
+        return Promise(0.5 * (low + high), 0.5 * (high - low), radius)
+
+    def later(self) -> Promise:
+        """The same a period later."""
+        parts = self.center, self.half_width, self.radius
+        return Promise(*(np.concatenate([part[1:], part[-1:]]) for part in parts))
+
+    def apart(self, other: Promise) -> float:
+        """m between the two in the period in which they are nearest; 0 or less: they overlap."""
+        between = np.abs(self.center - other.center) - self.half_width - other.half_width
+        return float((np.linalg.norm(np.maximum(between, 0.0), axis=1) - self.radius - other.radius).min())
+
+
+@dataclass(frozen=True)
+class Promises:
+    """Those of n others, stacked: their boxes (n·N) as shapes, with what is added about them as margin."""
+
+    shapes: Shapes
+    periods: int
+
+    def __len__(self) -> int:
+        return len(self.shapes) // self.periods
+
+    @staticmethod
+    def to(others: Sequence[Promise]) -> Promises | None:
+        """None: there are none."""
+        if not others:
+            return None
+        center, half = (np.concatenate([getattr(p, name) for p in others]) for name in ("center", "half_width"))
+        (count, d), periods = center.shape, len(others[0].center)
+        axes = np.broadcast_to(np.eye(d), (count, d, d))
+        margin = np.concatenate([p.radius for p in others])
+        return Promises(Shapes(center, axes, half, np.zeros(count), np.ones((count, d)), margin), periods)
+
+    def nearest(self, point: Array) -> Array:
+        """(n,) m: how near each comes to a point (d,)."""
+        return np.asarray((self.shapes.distance(point) - self.shapes.margin).reshape(-1, self.periods).min(axis=1))
+
+    def take(self, chosen: NDArray[np.bool_]) -> Promises:
+        """The chosen (n,) ones."""
+        return Promises(self.shapes.take(np.repeat(chosen, self.periods)), self.periods)
+
+
+def promised_half_spaces(
+    near: Promises, start: Array, nominal: Array, keep_off: float, measured: Array
+) -> tuple[Array, Array]:
+    """As `freespace.half_spaces`, for boxes that are each there for one period.
+
+    Normals are taken from the places of the nominal plan up to the period's end; the one serves that leaves both ends
+    of the period the most room.
+    """
+    n, (N, d) = len(near), nominal.shape
+    ends = np.concatenate([np.zeros((1, d)), nominal - start])
+    places = np.empty((2 * N + 1, d))  # relative to the start
+    places[::2] = ends
+    places[1::2] = 0.5 * (ends[1:] + ends[:-1])
+    towards = near.shapes.towards(start + places).reshape(n, N, 2 * N + 1, d)
+    gap = np.sqrt(np.einsum("nkqd,nkqd->nkq", towards, towards))
+    unit = towards / np.maximum(gap, TOUCHING)[..., None]
+    level = np.einsum("nkqd,nkqd->nkq", unit, towards + places)
+    level[~(gap > TOUCHING)] = -np.inf  # true for NaN, too
+    along = np.maximum(
+        np.einsum("nkqd,kd->nkq", unit, ends[:-1]),
+        np.einsum("nkqd,kd->nkq", unit, ends[1:]),
+    )
+    room = np.where(np.arange(2 * N + 1) <= 2 * np.arange(1, N + 1)[:, None], level - along, -np.inf)
+    room[np.isnan(room)] = -np.inf
+    choice = room.argmax(axis=2)  # (n, N)
+    # From the first period on in which no plane keeps apart, the nominal plan meets it: the place seen from stays.
+    met = np.logical_or.accumulate(~(room.max(axis=2) > 0.0), axis=1)
+    before = (~met).sum(axis=1)
+    each = np.arange(n)
+    last = np.where(before > 0, choice[each, before - 1], 0)
+    choice = np.where(met, last[:, None], choice)
+    at = each[:, None], np.arange(N), choice
+    margin = near.shapes.margin.reshape(n, N)
+    return unit[at], level[at] - np.maximum(keep_off + margin, 0.0) - np.abs(unit[at]) @ measured
+
+
+class Boxes:
+    """Rows that hold a robot's own boxes to half-spaces, as linear in z and its magnitudes as those about its tube.
+
+    The support of box(S_k ∪ S_{k+1}) in a direction n is, coordinate by coordinate, that of the one end or the other:
+
+        Σ_i max over e in {k, k+1} of  n_i c_{e,i} + |n_i| h_{e,i}
+
+    one row for each of the 2^d choices of ends, with the period's bulge; the last period's once more with the latch.
+    """
+
+    def __init__(self, position: Array, directions: Array) -> None:
+        """position (N, d, nz), directions (N, d, L): the tube's."""
+        N, d, nz = position.shape
+        self._position = np.concatenate([np.zeros((1, d, nz)), position])
+        self._directions = np.concatenate([np.zeros((1, d, directions.shape[2])), directions])
+        choices = np.array(list(product((0, 1), repeat=d)))  # (2^d, d)
+        self.period = np.repeat([*range(N), N - 1], len(choices))  # (R,)
+        self._end = self.period[:, None] + np.tile(choices, (N + 1, 1))  # (R, d)
+        self._extra = np.eye(N + 1)[np.repeat(np.arange(N + 1), len(choices))]
+        self._axis = np.arange(d)
+
+    def rows(self, normals: Array, offsets: Array, turn: Array) -> Rows:
+        """Rows for half-spaces `a·p <= b` relative to where the robot is, a (n, N, d) in the world, b (n, N); turn
+        (d, d): world from the frame of now."""
+        n = len(normals)
+        center = (turn @ self._position)[self._end, self._axis]  # (R, d, nz)
+        half = np.abs(turn @ self._directions)[self._end, self._axis]  # (R, d, L)
+        normals = normals[:, self.period]  # (n, R, d)
+        gradient = np.einsum("nrd,rdz->nrz", normals, center).reshape(n * len(self.period), -1)
+        spread = np.einsum("nrd,rdl->nrl", np.abs(normals), half).reshape(len(gradient), -1)
+        extra = np.tile(self._extra, (n, 1))
+        from brakeline.safety.filter.qp import Rows  # who only keeps a promise, as a client does, needs no solver
+
+        return Rows(gradient, np.hstack([spread, extra]), offsets[:, self.period].ravel(), np.ones(len(gradient)))

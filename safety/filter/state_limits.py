@@ -1,0 +1,65 @@
+"""A robot's limits (speed, tilt, keep-in box) as rows of the same kind as obstacles make."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from brakeline.messaging.robot import Robot
+from brakeline.safety.filter.qp import Rows
+from brakeline.safety.filter.reachable_tube import Tube
+from brakeline.safety.model.model_set import needed
+
+Array = NDArray[np.float64]
+
+
+class Limits:
+    """`weights · y_k <= most` at every period's end, y_k the true state; where it is about the position, between them
+    too, and after the stop.
+
+    With y_k relative to the frame of now (position p_0, heading θ_0, turn R):
+
+        weights · y_k = a·p_0 + b θ_0 + (aᵀR) p_k + rest        a: weights of the position, b: of the heading
+
+    so each period gives a row `gradient z + spread m(z) <= most - a·p_0 - b θ_0 - |weights|·Z_v`.
+    """
+
+    def __init__(self, robot: Robot, tube: Tube) -> None:
+        d, n, N = robot.position_dim, robot.state_dim, tube.horizon
+        self.count, self.heading = len(robot.limits), robot.heading
+        weights = np.array([limit.weights for limit in robot.limits]).reshape(-1, n)
+        self.most = np.array([limit.most for limit in robot.limits]) - np.abs(weights) @ robot.measurement_bound
+        self.place, self.turn = weights[:, :d], np.zeros(self.count)
+        if robot.heading is not None:
+            self.turn = weights[:, robot.heading]
+        kept = [i for i in needed(robot) if i < n]
+        other = weights[:, kept]
+        which = [needed(robot).index(i) for i in kept]
+        maps = np.concatenate([tube.more, tube.more_directions], axis=2)[:, which]
+        self.rest = np.einsum("cr,nrz->ncz", other, maps).reshape(N, self.count, maps.shape[2])
+        self.path = np.concatenate([tube.position, tube.directions], axis=2)  # (N, d, nz + L)
+        self.nz, self.extra = tube.position.shape[2], np.eye(N + 1)
+
+    def rows(self, start: Array, heading: float, turn: Array) -> Rows:
+        """Rows for a robot at `start` (d,) with that heading, `turn` (d, d) world from the frame of now."""
+        N = len(self.path)
+        both = (self.place @ turn) @ self.path + self.rest  # (N, limits, nz + L)
+        bound = self.most - self.place @ start - self.turn * heading
+        way = np.linalg.norm(self.place, axis=1)
+        ends = np.concatenate([np.arange(N), [N - 1]])
+        both = both[ends]
+        # The bulge of every period, and the latch once more at the last end.
+        extra = self.extra[:, None, :] * way[None, :, None]
+        gradient = both[..., : self.nz].reshape(-1, self.nz)
+        spread = np.concatenate([np.abs(both[..., self.nz :]), extra], axis=2)
+        count = len(gradient)
+        return Rows(gradient, spread.reshape(count, -1), np.tile(bound, N + 1), np.zeros(count))
+
+
+def stacked(parts: list[Rows]) -> Rows:
+    """All rows of several parts."""
+    if len(parts) == 1:
+        return parts[0]
+    return Rows(
+        *(np.concatenate([getattr(p, name) for p in parts]) for name in ("gradient", "spread", "bound", "keep"))
+    )

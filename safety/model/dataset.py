@@ -1,0 +1,192 @@
+"""Recorded trajectories, and the checks that they must pass."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from brakeline.messaging.atomic_files import write_whole
+from brakeline.messaging.robot import Robot, UnknownRobot, robot_named, unless_shipped
+from brakeline.messaging.robot_description import robot_of
+from brakeline.safety.model.tensor_file import pack, unpack
+
+Array = NDArray[np.float64]
+
+ENTRY = "dataset"
+
+
+class BadData(ValueError):
+    """A data set that must not be used; the message says which check failed."""
+
+
+@dataclass(frozen=True, eq=False)
+class Trajectory:
+    """One uninterrupted recording; nothing pairs its last sample with another's first. Compared by identity.
+
+    states: (T+1, n) measured; inputs: (T, m) executed.
+    paths: (T, S, d) positions within each period relative to its start, in the frame of its start, from
+    dead reckoning; turned: (T,) heading change over each period, likewise [rad].
+    """
+
+    states: Array
+    inputs: Array
+    paths: Array
+    turned: Array
+    before: Array | None = None  # (m,) the input in force at the start; None: standing still
+
+
+@dataclass(frozen=True)
+class Dataset:
+    robot: Robot
+    trajectories: tuple[Trajectory, ...]
+    about: dict[str, str] = field(default_factory=dict)  # where it comes from: noise levels, seed, payload ...
+    bulge: float = 0.0  # m that a path may leave its chord by between the samples that the source has
+
+    @property
+    def periods(self) -> int:
+        return sum(len(t.inputs) for t in self.trajectories)
+
+    def check(self) -> None:
+        """Raises BadData unless dimensions agree, everything is finite and inputs are within bounds."""
+        robot = self.robot
+        if not self.trajectories:
+            raise BadData("the data set holds no trajectory")
+        for i, t in enumerate(self.trajectories):
+            periods = len(t.inputs)
+            shapes = t.states.shape, t.inputs.shape, t.paths.shape, t.turned.shape
+            samples = max(t.paths.shape[1], 1) if t.paths.ndim == 3 else 1
+            wanted = (
+                (periods + 1, robot.state_dim),
+                (periods, robot.action_dim),
+                (periods, samples, robot.position_dim),
+                (periods,),
+            )
+            if shapes != wanted or not periods:
+                raise BadData(f"trajectory {i}: shapes {shapes} where {wanted} belong")
+            if t.before is not None and t.before.shape != (robot.action_dim,):
+                raise BadData(f"trajectory {i}: the input before it has shape {t.before.shape}")
+            for name in ("states", "inputs", "paths", "turned", "before"):
+                if getattr(t, name) is not None and not np.isfinite(getattr(t, name)).all():
+                    raise BadData(f"trajectory {i}: {name} holds NaN or infinity")
+            inputs = t.inputs if t.before is None else np.vstack([t.before, t.inputs])
+            if (inputs < robot.low() - 1e-9).any() or (inputs > robot.high() + 1e-9).any():
+                raise BadData(f"trajectory {i}: an input is out of the robot's bounds")
+            jumps = np.flatnonzero(_jump(robot, t) > 0.0)
+            if len(jumps):
+                raise BadData(f"trajectory {i}: the position jumps in period {jumps[0]}: two recordings in one?")
+
+    def split(self, shares: Sequence[float]) -> list[Dataset]:
+        """Whole trajectories dealt out in turn, by shares that add up to 1."""
+        edges = np.cumsum([0.0, *shares])
+        place = (np.arange(len(self.trajectories)) * 0.6180339887) % 1.0  # low discrepancy: even over the recording
+        parts = np.searchsorted(edges, place, side="right") - 1
+        return [
+            replace(self, trajectories=tuple(t for t, p in zip(self.trajectories, parts, strict=True) if p == i))
+            for i in range(len(shares))
+        ]
+
+    def save(self, path: Path | str) -> None:
+        """Writes a safetensors file: trajectories one after the other, with their lengths."""
+        names = ("states", "inputs", "paths", "turned")
+        tensors = {n: np.concatenate([getattr(t, n) for t in self.trajectories]) for n in names}
+        still = np.zeros(self.robot.action_dim)
+        tensors["before"] = np.array([still if t.before is None else t.before for t in self.trajectories])
+        tensors["lengths"] = np.array([len(t.inputs) for t in self.trajectories])
+        robot = self.robot.in_lockstep()
+        about: dict[str, Any] = {"robot": robot.name, "layout": robot.layout(), "about": self.about}
+        about["bulge"] = self.bulge
+        about["description"] = json.dumps(robot.description)  # a text: the order of its names counts
+        write_whole(Path(path), pack(tensors, ENTRY, about))
+
+    @staticmethod
+    def load(path: Path | str) -> Dataset:
+        """Reads and checks a data set.
+
+        Raises:
+            BadData: not such a file, of another robot layout, or a check fails.
+        """
+        try:
+            tensors, about = unpack(Path(path).read_bytes(), ENTRY)
+            about_data = dict(about.get("about", {}))
+        except (OSError, ValueError, TypeError) as error:
+            raise BadData(f"{path} is no data set: {error}") from error
+        missing = {"states", "inputs", "paths", "turned", "before", "lengths"} - tensors.keys()
+        if missing or "robot" not in about:
+            raise BadData(f"{path} is no data set: {', '.join(sorted(missing)) or 'its robot'} is missing")
+        try:
+            name = str(about["robot"])
+            described = about.get("description")
+            robot = robot_named(name) if described is None else unless_shipped(robot_of(json.loads(described), name))
+        except (UnknownRobot, ValueError, TypeError) as error:
+            raise BadData(f"{path}: {error}") from error
+        if robot.name != name:
+            raise BadData(f"{path} is of robot {name!r}, its description of {robot.name!r}")
+        if not robot.understands(about.get("layout")):
+            raise BadData(f"{path} was recorded for another layout of {robot.name}: record it again")
+        lengths = tensors.pop("lengths")
+        tensors = {name: np.atleast_1d(tensor).astype(float) for name, tensor in tensors.items()}
+        if lengths.ndim != 1 or lengths.dtype.kind != "i" or (lengths <= 0).any():
+            raise BadData(f"{path}: the trajectories' lengths are no lengths")
+        total = lengths.sum()
+        wanted = {
+            "states": total + len(lengths),
+            "inputs": total,
+            "paths": total,
+            "turned": total,
+            "before": len(lengths),
+        }
+        if any(len(tensors[name]) != count for name, count in wanted.items()):
+            raise BadData(f"{path}: the trajectories' lengths do not add up")
+        ends = np.cumsum(lengths)
+        trajectories = tuple(
+            Trajectory(
+                tensors["states"][start + i : end + i + 1],
+                tensors["inputs"][start:end],
+                tensors["paths"][start:end],
+                tensors["turned"][start:end],
+                tensors["before"][i],
+            )
+            for i, (start, end) in enumerate(zip(ends - lengths, ends, strict=True))
+        )
+        bulge = about.get("bulge", 0.0)
+        if not isinstance(bulge, int | float) or not 0.0 <= bulge < math.inf:
+            raise BadData(f"{path}: a bulge of {bulge!r} is none")
+        data = Dataset(robot, trajectories, about_data, float(bulge))
+        data.check()
+        return data
+
+    @staticmethod
+    def about_of(path: Path) -> dict[str, str]:
+        """What a data set says of where it comes from, whatever robot it is of; nothing if the file is none."""
+        try:
+            return dict(unpack(path.read_bytes(), ENTRY)[1].get("about", {}))
+        except (OSError, ValueError, TypeError):
+            return {}
+
+    def digest(self) -> str:
+        """Hash of the recorded numbers."""
+        sha = hashlib.sha256()
+        for t in self.trajectories:
+            sha.update(t.states.tobytes())
+            sha.update(t.inputs.tobytes())
+            sha.update(t.paths.tobytes())
+            sha.update(t.turned.tobytes())
+            sha.update(b"" if t.before is None else t.before.tobytes())
+        return sha.hexdigest()[:12]
+
+
+def _jump(robot: Robot, t: Trajectory) -> Array:
+    """How much farther [m] the measured position moved in each period than dead reckoning and noise explain: (T,)."""
+    moved = np.linalg.norm(np.diff(t.states[:, : robot.position_dim], axis=0), axis=1)
+    steps = np.diff(t.paths, axis=1, prepend=0.0)
+    way = np.linalg.norm(steps, axis=2).sum(1)
+    noise = 2.0 * np.linalg.norm(robot.measurement_bound[: robot.position_dim])
+    return np.asarray(moved - 2.0 * (way + noise))  # twice: it is for gross errors, not for a slipping wheel

@@ -1,0 +1,231 @@
+"""What recorded data say about the next step: one form, three certificates (docs/method.md §1, paper lemmas 1 and 2).
+
+Every certificate bounds one step from a regressor z = [x; u] (column vector of length nz) by
+
+    y+ ∈ C z + Σ_j ( M_j·|W z| + κ_j·|z| + w_j ) g_j [-1, 1]
+
+which is (1) of docs/method.md with `H_j = diag(M_j) W` factored, because the H_j of one data set share their rows W.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from brakeline.safety.model.model_config import KINDS as KINDS
+from brakeline.safety.model.model_config import MATRIX_ZONOTOPE as MATRIX_ZONOTOPE
+from brakeline.safety.model.model_config import RESIDUAL as RESIDUAL
+from brakeline.safety.model.model_config import SET_MEMBERSHIP as SET_MEMBERSHIP
+
+Array = NDArray[np.float64]
+
+ROWS_A_ROUND = 64  # constraints added a round when an LP over all samples is solved on few of them
+
+
+class CertificateError(ValueError):
+    """The data do not support the certificate; the message says why."""
+
+
+@dataclass(frozen=True)
+class Certificate:
+    """C (n, nz), W (q, nz), M (g, q) >= 0, kappa (g, nz) >= 0, w (g,) >= 0, generators (n, g)."""
+
+    C: Array
+    W: Array
+    M: Array
+    kappa: Array
+    w: Array
+    generators: Array
+
+    def __post_init__(self) -> None:
+        """One memory layout, whether made or read: the order of summation, and so the last bit, depends on it."""
+        for name in ("C", "W", "M", "kappa", "w", "generators"):
+            object.__setattr__(self, name, np.ascontiguousarray(getattr(self, name), dtype=float))
+
+    def magnitudes(self, z: Array) -> Array:
+        """Lengths of the generators for regressors z (..., nz): (..., g)."""
+        return np.asarray(np.abs(z @ self.W.T) @ self.M.T + np.abs(z) @ self.kappa.T + self.w)
+
+    def half_widths(self, z: Array) -> Array:
+        """Half-widths of the interval hull of the next step's set: (..., n)."""
+        return np.asarray(self.magnitudes(z) @ np.abs(self.generators).T)
+
+    def matrix_hull(self) -> tuple[Array, Array]:
+        """Lower and upper interval matrix of the model set `C + Σ_j g_j (M_j β) W` (n, nz)."""
+        half = np.abs(self.generators) @ self.M @ np.abs(self.W)
+        return self.C - half, self.C + half
+
+    def through(self, T: Array) -> Certificate:
+        """The same for regressors z' = T z (nz', nz), as a certificate of z."""
+        unbent = np.zeros((len(self.w), T.shape[1]))
+        return Certificate(
+            self.C @ T,
+            np.vstack([self.W @ T, T]),
+            np.hstack([self.M, self.kappa]),
+            unbent,
+            self.w,
+            self.generators,
+        )
+
+    def outer(self, basis: Array) -> Certificate:
+        """The same with W replaced by `basis` (nz, nz), never narrower: for the QP, whose size goes with W's rows.
+
+        `M_j·|W z| = M_j·|(W basis⁻¹)(basis z)| <= (M_j |W basis⁻¹|)·|basis z|`: the zonotope of W's rows, boxed in
+        the coordinates in which the data are white.
+        """
+        if len(self.W) <= len(basis):
+            return self
+        spread = np.abs(np.linalg.solve(basis.T, self.W.T).T)
+        return Certificate(self.C, basis, self.M @ spread, self.kappa, self.w, self.generators)
+
+
+def least_squares(z: Array, y: Array, columns: NDArray[np.bool_] | None = None) -> Array:
+    """C (n, nz) of least squares for regressors z (T, nz) and targets y (T, n); other `columns` are zero."""
+    C = np.zeros((y.shape[1], z.shape[1]))
+    chosen = slice(None) if columns is None else columns
+    C[:, chosen] = np.linalg.lstsq(z[:, chosen], y, rcond=None)[0].T
+    return C
+
+
+def whitening(z: Array) -> Array:
+    """B (nz, nz) with `B z` white over the samples z (T, nz). Raises CertificateError if they span less."""
+    moment = z.T @ z / len(z)
+    try:
+        return np.asarray(np.linalg.inv(np.linalg.cholesky(moment)))
+    except np.linalg.LinAlgError:
+        raise CertificateError("the regressors do not span their space: record more varied inputs") from None
+
+
+def envelope(features: Array, values: Array, inflation: float) -> tuple[Array, float]:
+    """The smallest `κ·f + w >= v` over all samples, f (T, q) >= 0, v (T,) >= 0, scaled by `inflation`.
+
+    Minimises the mean of the bound over the samples, by an LP to which violated samples are added until none is; what
+    the solver's tolerance leaves violated is added to w.
+    """
+    from scipy.optimize import linprog  # half a second, and nothing that a service needs
+
+    if not len(values):
+        raise CertificateError("no sample to bound")
+    cost = np.append(features.mean(0), 1.0)
+    rows = np.column_stack([features, np.ones(len(features))])
+    active = np.unique(np.concatenate([np.argsort(values)[-ROWS_A_ROUND:], rows.argmax(0)]))
+    scale = float(values.max()) or 1.0
+    while True:
+        found = linprog(cost, A_ub=-rows[active], b_ub=-values[active] / scale, bounds=(0, None), method="highs")
+        if found.status != 0:
+            raise CertificateError(f"no envelope of the residuals: {found.message}")
+        bound = np.maximum(found.x, 0.0)
+        short = values / scale - rows @ bound
+        worst = np.argsort(short)[-ROWS_A_ROUND:]
+        more = np.union1d(active, worst[short[worst] > 1e-7])
+        if len(more) == len(active):
+            bound[-1] += max(float(short.max()), 0.0) + 1e-9
+            bound *= scale * inflation
+            return bound[:-1], float(bound[-1])
+        active = more
+
+
+def residual(z: Array, y: Array, C: Array, inflation: float = 1.0) -> Certificate:
+    """(c): C is trusted, the residual is bounded by an envelope over the samples z (T, nz), y (T, n); axes as g_j."""
+    n, nz = C.shape
+    rest = np.abs(y - z @ C.T)
+    bounds = [envelope(np.abs(z), rest[:, j], inflation) for j in range(n)]
+    kappa, w = np.array([b[0] for b in bounds]), np.array([b[1] for b in bounds])
+    return Certificate(C, np.zeros((0, nz)), np.zeros((n, 0)), kappa, w, np.eye(n))
+
+
+def matrix_zonotope(z: Array, y: Array, generators: Array, sizes: Array, kappa: Array, w: Array) -> Certificate:
+    """(a): all matrices `(Y+ - noise) Z⁺` of lemma 1, exactly, and the noise of the step itself (lemma 2).
+
+    The noise at sample t is `Σ_j sizes[j, t] g_j [-1, 1]`, centred: every generator matrix has rank one,
+    `g_j h_tᵀ` with h_t row t of Z⁺, and for a fixed z the terms of one g_j are parallel.
+
+    Args:
+        z: (T, nz); y: (T, n), the noise's centre subtracted; generators: (n, g); sizes: (g, T).
+        kappa, w: (g, nz) and (g,), the noise of the predicted step.
+    """
+    pseudo = np.asarray(np.linalg.pinv(z.T), dtype=float)
+    return Certificate(y.T @ pseudo, pseudo, sizes, kappa, w, generators)
+
+
+def set_membership(z: Array, y: Array, sizes: Array, kappa: Array, w: Array) -> Certificate:
+    """(b): row by row, all a with `|y_t - a·z_t| <= sizes[t]` for every sample, boxed in whitened coordinates.
+
+    Args:
+        z: (T, nz); y: (T, n); sizes: (n, T); kappa, w: (n, nz) and (n,), the noise of the predicted step.
+
+    Raises:
+        CertificateError: no matrix is consistent with all samples: the noise bound is too small.
+    """
+    basis = whitening(z)
+    white = z @ basis.T
+    low, high = np.zeros((y.shape[1], z.shape[1])), np.zeros((y.shape[1], z.shape[1]))
+    for j in range(y.shape[1]):
+        low[j], high[j] = _row_box(white, y[:, j], sizes[j])
+    C, half = 0.5 * (low + high) @ basis, 0.5 * (high - low)
+    return Certificate(C, basis, half, kappa, w, np.eye(y.shape[1]))
+
+
+def _row_box(white: Array, y: Array, size: Array) -> tuple[Array, Array]:
+    """Interval hull of the polytope `|y_t - a·white_t| <= size_t`, by 2 nz LPs that share their active samples.
+
+    Leaving samples out only widens it, so it holds whatever the loop stops at.
+    """
+    from scipy.optimize import linprog
+
+    nz, unit = white.shape[1], float(size.mean()) or 1.0
+    y, size = y / unit, size / unit  # the solver's tolerances are absolute
+    active = np.unique(np.concatenate([np.argsort(size)[:ROWS_A_ROUND], np.abs(white).argmax(0)]))
+    corners = np.zeros((2, nz))
+    for axis in range(nz):
+        for side, sign in enumerate((1.0, -1.0)):
+            while True:
+                rows, values, bound = white[active], y[active], size[active]
+                found = linprog(
+                    sign * np.eye(nz)[axis],
+                    A_ub=np.vstack([rows, -rows]),
+                    b_ub=np.concatenate([values + bound, bound - values]),
+                    bounds=(None, None),
+                )
+                if found.status in (3, 4) and len(active) < len(y):  # unbounded, so it seems, on so few samples
+                    spread = np.arange(0, len(y), max(1, len(y) // (4 * ROWS_A_ROUND)))
+                    more = np.union1d(active, spread)
+                    active = more if len(more) > len(active) else np.arange(len(y))
+                    continue
+                if found.status == 3:
+                    raise CertificateError("the samples do not bound the matrix")
+                if found.status == 2:
+                    raise CertificateError("no matrix is consistent with all samples: the noise bound is too small")
+                if found.status != 0:
+                    raise CertificateError(f"no bound of the consistent matrices: {found.message}")
+                over = np.abs(y - white @ found.x) - size
+                worst = np.argsort(over)[-ROWS_A_ROUND:]
+                more = np.union1d(active, worst[over[worst] > 1e-6])
+                if len(more) == len(active):
+                    break
+                active = more
+            corners[side, axis] = found.x[axis] - sign * 1e-6
+    return unit * corners[0], unit * corners[1]
+
+
+def measured_noise(z: Array, y: Array, w_half: Array, v_half: Array) -> Array:
+    """Half-widths of `w + v+ - A v` for a linear system with box noise, without knowing A (docs/method.md §1).
+
+    `|A v| <= s = (|C_A| v̄ + β (w̄ + v̄)) / (1 - β)`, `β = Σ_i v̄_i ‖Z⁺_{:,i}‖₁`, where the state comes first in z.
+
+    Args:
+        z: (T, nz) measured regressors; y: (T, n); w_half, v_half: (n,).
+
+    Raises:
+        CertificateError: β >= 1: the measurements are too noisy for the data to bound A.
+    """
+    n = y.shape[1]
+    pseudo = np.linalg.pinv(z.T)
+    beta = float(v_half @ np.abs(pseudo[:, :n]).sum(0))
+    if beta >= 1.0:
+        raise CertificateError(f"β = {beta:.3g} >= 1: the measurement noise is too large for a bound on A v")
+    C = y.T @ pseudo
+    s = (np.abs(C[:, :n]) @ v_half + beta * (w_half + v_half)) / (1.0 - beta)
+    return np.asarray(w_half + v_half + s)

@@ -1,0 +1,264 @@
+"""A model set: everything the filter knows about a robot, made from recorded data, versioned by its content."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from brakeline.messaging.atomic_files import write_whole
+from brakeline.messaging.robot import FORMER_LAYOUTS, LATE, Robot, UnknownRobot, robot_named, unless_shipped
+from brakeline.messaging.robot_description import robot_of
+from brakeline.safety.filter.reachable_tube import Tube, recursion_of, stack_direct, stack_recursive
+from brakeline.safety.model.error_bounds import Certificate
+from brakeline.safety.model.model_config import DIRECT as DIRECT
+from brakeline.safety.model.model_config import FREE, PLAN
+from brakeline.safety.model.model_config import MODES as MODES
+from brakeline.safety.model.model_config import RECURSION as RECURSION
+from brakeline.safety.model.model_config import Recipe as Recipe
+from brakeline.safety.model.tensor_file import content, pack, unpack
+from brakeline.safety.model.turning_in_place import InPlace
+from brakeline.safety.model.windows import specialised
+
+Array = NDArray[np.float64]
+
+ENTRY = "model_set"
+TENSORS = ("C", "W", "M", "kappa", "w", "generators")
+IN_PLACE, BOX = "in_place.step", "in_place.box"  # optional
+
+
+class BadModel(ValueError):
+    """A model set that must not be used; the message says why."""
+
+
+@dataclass(frozen=True)
+class ModelSet:
+    """steps[k]: direct, what k+1 periods do to z; recursion, what period k does to z_k. bulges: one row a step."""
+
+    robot: Robot
+    recipe: Recipe
+    steps: tuple[Certificate, ...]
+    bulges: Certificate
+    latch: Certificate
+    domain: Array  # (2, regressor_dim): smallest and largest recorded [x_0; input in force]
+    basis: Array  # (nz, nz): coordinates in which the recorded z are white
+    about: dict[str, str]
+    layout: str = ""  # of the robot when it was made, if that was before robots were files
+    stands: int = 0  # so many periods after a plan began the robot stands; 0: no sooner than at its end
+    in_place: InPlace | None = None  # predictors for turning on the spot, where the data support them
+
+    @property
+    def moving(self) -> int:
+        """So many of a plan's periods the robot may move in."""
+        return self.stands or self.robot.horizon
+
+    @property
+    def first(self) -> Certificate:
+        """What one period does: for comparing the next measurement with its prediction."""
+        return self.steps[0]
+
+    def first_regressor(self, z: Array) -> Array:
+        """The regressor of `first` from z (..., nz): [.. ; input in force; first input]."""
+        robot = self.robot
+        if self.recipe.mode == DIRECT:
+            return z if self.recipe.windows == PLAN else z @ specialised(robot).T
+        reg, m = len(robot.regressor), robot.action_dim
+        missing = robot.state_dim - robot.position_dim - reg  # coordinates that are zero in the frame of now
+        zeros = np.zeros((*z.shape[:-1], missing))
+        return np.concatenate([zeros, z[..., : reg + 2 * m]], axis=-1)
+
+    def tube(self) -> Tube:
+        """The stacked tube with every generator as it is: for checks."""
+        return self._stack(self.steps)
+
+    def tube_of_windows(self) -> Tube:
+        """The same of the windows that it was made from: their regressors may be all inputs of a plan, one by one."""
+        return self._stack(self.steps, plans=False)
+
+    def outer_tube(self) -> Tube:
+        """One that contains it and has few atoms: for the QP."""
+        return self._stack([step.outer(whitening_of(step, self.basis)) for step in self.steps])
+
+    def turning(self) -> ModelSet | None:
+        """The same with the predictors for plans in place; None if there are none."""
+        if self.in_place is None:
+            return None
+        steps = self.in_place.steps
+        if self.recipe.windows == PLAN:
+            steps = tuple(step.through(specialised(self.robot)) for step in steps)
+        return replace(self, steps=steps, in_place=None)
+
+    def _check_sizes(self) -> None:
+        """Raises BadModel unless every array has the size that robot and mode give it."""
+        robot = self.robot
+        nz = regressors(robot, self.recipe)
+        one = nz if self.recipe.mode == DIRECT else robot.state_dim - robot.position_dim + 2 * robot.action_dim
+        n = robot.state_dim
+        if self.recipe.mode == DIRECT:
+            n += robot.position_dim * sum(disc.arm > 0.0 for disc in robot.body)
+        expected = [(step, n, one) for step in self.steps]
+        if self.in_place is not None:
+            whole = robot.regressor_dim + robot.horizon * robot.action_dim
+            expected += [(step, n, whole) for step in self.in_place.steps]
+        expected += [(self.bulges, robot.horizon, nz), (self.latch, 1, nz)]
+        for c, n, width in expected:
+            g, q = c.w.size, len(c.W)
+            sizes = [(n, width), (q, width), (g, q), (g, width), (g,), (n, g)]
+            if [getattr(c, name).shape for name in TENSORS] != sizes:
+                raise BadModel(
+                    f"the model set's arrays are not those of a {robot.name} robot in mode {self.recipe.mode}"
+                )
+        if self.domain.shape != (2, robot.regressor_dim) or (self.domain[0] > self.domain[1]).any():
+            raise BadModel("the model set's domain is none")
+        box = np.zeros((2, robot.regressor_dim + robot.action_dim)) if self.in_place is None else self.in_place.box
+        if box.shape != (2, robot.regressor_dim + robot.action_dim) or (box[0] > box[1]).any():
+            raise BadModel("the bounds of the model set's plans in place are none")
+        if self.in_place is not None and self.recipe.mode != DIRECT:
+            raise BadModel(f"a model set of mode {self.recipe.mode} has no predictors for plans in place")
+        if self.basis.shape != (nz, nz) or np.linalg.matrix_rank(self.basis) < nz:
+            raise BadModel("the model set's basis is none")
+
+    def _stack(self, steps: Sequence[Certificate], plans: bool = True) -> Tube:
+        d, bulges, latch, more = self.robot.position_dim, self.bulges, self.latch, needed(self.robot)
+        if plans and self.recipe.windows == FREE:
+            T = specialised(self.robot)
+            bulges, latch = bulges.through(T), latch.through(T)
+            steps = [step.through(T) for step in steps] if self.recipe.mode == DIRECT else steps
+        if self.recipe.mode == DIRECT:
+            return stack_direct(steps, d, bulges, latch, more)
+        how = recursion_of(self.robot, plans or self.recipe.windows == PLAN)
+        return stack_recursive(steps, how, d, bulges, latch, more=more)
+
+    @property
+    def version(self) -> str:
+        """Hash of the content and of what it means, so that one name can't mean two models."""
+        layout = self.layout or self.robot.layout()
+        meaning = f"{layout} {self.recipe.certificate} {self.recipe.mode} "
+        meaning += f"stands {self.stands} " if self.moving < self.robot.horizon else ""
+        return hashlib.sha256(meaning.encode() + content(self._tensors())).hexdigest()[:12]
+
+    def _tensors(self) -> dict[str, Array]:
+        named = {"bulges": self.bulges, "latch": self.latch} | {f"step{k}": c for k, c in enumerate(self.steps)}
+        more = {"domain": self.domain, "basis": self.basis}
+        if self.in_place is not None:
+            named |= {f"{IN_PLACE}{k}": c for k, c in enumerate(self.in_place.steps)}
+            more |= {BOX: self.in_place.box}
+        return {f"{n}.{t}": getattr(c, t) for n, c in named.items() for t in TENSORS} | more
+
+    def encode(self) -> bytes:
+        """Bytes of a safetensors file, with the recipe as its metadata."""
+        about = {
+            "robot": self.robot.name,
+            "layout": self.layout or self.robot.layout(),
+            "recipe": asdict(self.recipe),
+            "about": self.about,
+            "stands": self.stands,
+            "version": self.version,
+        }
+        if not self.layout:
+            about["description"] = json.dumps(self.robot.description)  # a text: the order of its names counts
+        return pack(self._tensors(), ENTRY, about)
+
+    def save(self, path: Path | str) -> None:
+        write_whole(Path(path), self.encode())
+
+    @staticmethod
+    def decode(payload: bytes) -> ModelSet:
+        """Raises BadModel unless the bytes are a complete, finite model set of a robot that this program knows."""
+        try:
+            tensors, about = unpack(payload, ENTRY)
+            robot = robot_in(about)
+            recipe = Recipe(**about["recipe"])
+            names = ["bulges", "latch", *(f"step{k}" for k in range(robot.horizon))]
+            if BOX in tensors:
+                names += [f"{IN_PLACE}{k}" for k in range(robot.horizon)]
+            certificates = {name: Certificate(*(tensors[f"{name}.{t}"] for t in TENSORS)) for name in names}
+            more = tensors["domain"], tensors["basis"], dict(about["about"])
+            stands = int(about.get("stands", 0))
+        except (KeyError, TypeError, ValueError, UnknownRobot) as error:
+            raise BadModel(f"no model set: {error!r}") from error
+        if not robot.understands(about.get("layout")):
+            raise BadModel(f"the model set is for another layout of {robot.name}: make it again from data")
+        layout = "" if about["layout"] == robot.layout() else str(about["layout"])
+        if not all(t.dtype == np.float64 and np.isfinite(t).all() for t in tensors.values()):
+            raise BadModel("the model set holds NaN, infinity or numbers of another type")
+        if any((c.M < 0).any() or (c.kappa < 0).any() or (c.w < 0).any() for c in certificates.values()):
+            raise BadModel("the model set has a negative width")
+        steps = tuple(certificates[f"step{k}"] for k in range(robot.horizon))
+        if not 0 <= stands <= robot.horizon:
+            raise BadModel(f"a plan of {robot.horizon} periods can't have come to a stand after {stands}")
+        in_place = None
+        if BOX in tensors:
+            in_place = InPlace(tuple(certificates[f"{IN_PLACE}{k}"] for k in range(robot.horizon)), tensors[BOX])
+        bulges, latch = certificates["bulges"], certificates["latch"]
+        model = ModelSet(robot, recipe, steps, bulges, latch, *more, layout, stands, in_place)
+        model._check_sizes()
+        if model.version != about.get("version"):
+            raise BadModel("the model set's content is not what its version says")
+        return model
+
+    @staticmethod
+    def load(path: Path | str) -> ModelSet:
+        """Raises BadModel, naming the file."""
+        try:
+            model = ModelSet.decode(Path(path).read_bytes())
+            unless_shipped(model.robot)
+            return model
+        except OSError as error:
+            raise BadModel(f"{path}: {error}") from error
+        except (BadModel, UnknownRobot) as error:
+            raise BadModel(f"{path}: {error}") from error
+
+
+def robot_in(about: dict[str, Any]) -> Robot:
+    """The robot that a model set is of: it carries its description, unless it is older than those.
+
+    Raises:
+        UnknownRobot: its description is none, or another's name.
+    """
+    name = str(about["robot"])
+    if "description" not in about:
+        if about.get("layout") != FORMER_LAYOUTS.get(name):
+            raise UnknownRobot(f"{name}: neither a description nor the layout of a robot known before there were any")
+        return robot_named(name)
+    robot = robot_of(json.loads(about["description"]), "the model set's robot")
+    robot = robot.in_real_time() if name.endswith(LATE) else robot
+    if robot.name != name:
+        raise UnknownRobot(f"the model set is of {name!r}, its description of {robot.name!r}")
+    return robot
+
+
+def regressors(robot: Robot, recipe: Recipe) -> int:
+    """Length of the regressors of the windows that a recipe takes."""
+    chosen = robot.free_steps if recipe.windows == PLAN else robot.horizon
+    return robot.regressor_dim + chosen * robot.action_dim
+
+
+def needed(robot: Robot) -> tuple[int, ...]:
+    """The predicted coordinates besides the position that a limit or a further disc of the body needs."""
+    d, n = robot.position_dim, robot.state_dim
+    limited = {i for limit in robot.limits for i, weight in enumerate(limit.weights) if weight and i >= d}
+    discs = d * sum(disc.arm > 0.0 for disc in robot.body)
+    return (*sorted(limited), *range(n, n + discs))
+
+
+def whitening_of(step: Certificate, basis: Array) -> Array:
+    """The basis for a step whose regressor may have more coordinates than z (the recursion's has the heading)."""
+    if step.C.shape[1] == len(basis):
+        return basis
+    return np.eye(step.C.shape[1]) if not len(step.W) else whitening_from(step.W)
+
+
+def whitening_from(pseudo: Array) -> Array:
+    """Rows of Z⁺ have the inverse second moment of the regressors: its root whitens. Unused coordinates stay."""
+    inverse = pseudo.T @ pseudo
+    used = np.diag(inverse) > 0.0
+    basis = np.eye(len(inverse))
+    basis[np.ix_(used, used)] = np.linalg.cholesky(inverse[np.ix_(used, used)]).T
+    return basis

@@ -1,0 +1,201 @@
+"""How often tubes fail to hold held-out windows, bounded at 99 % confidence (docs/method.md §12).
+
+A statement about the distribution that was recorded, and about no other.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import betaincinv
+
+from brakeline.messaging.stated_share import CONFIDENCE as CONFIDENCE
+from brakeline.safety.filter.filter import Filter
+from brakeline.safety.filter.reachable_tube import Tube
+from brakeline.safety.model.dataset import Dataset
+from brakeline.safety.model.error_causes import AFTER, PATH, Leaving, leavings, position_parts, regimes, state_parts
+from brakeline.safety.model.model_set import DIRECT, ModelSet, needed
+from brakeline.safety.model.turning_in_place import inside
+from brakeline.safety.model.windows import PLAN, Quality, Windows, apart, outputs, quality, windows
+from brakeline.safety.model.zonotope import facet_normals
+
+Array = NDArray[np.float64]
+
+EPISODE = 300  # steps
+HOUR = 3600.0  # s
+CHUNK = 256  # windows at once: an exact matrix zonotope has thousands of atoms
+
+
+@dataclass(frozen=True)
+class Statement:
+    """Of one model set. The unit is a plan window that overlaps no other and whose stop was recorded for a period at
+    least; a violation is any part of it outside."""
+
+    certificate: str
+    mode: str
+    version: str
+    samples: int  # plan windows that the predictors were fitted and bounded on
+    rank: int
+    smallest_singular: float
+    condition: float
+    windows: int  # held out
+    violations: int  # windows of which some step, bulge or the stop latch was outside
+    step_violations: int  # windows of which the first step was outside, in any coordinate
+    bound_step: float  # probability that a step's measured state is outside, at 99 % confidence
+    bound_plan: float  # the same of any part of a plan
+    bound_episode: float  # of any step in an episode of `EPISODE`, from bound_step, if steps were independent
+    outside_episode: float  # steps outside in such an episode, on average, at most; from bound_step, independent or not
+    outside_hour: float  # the same in an hour of driving
+    half_width_rest: float  # m, of a full stop, largest axis, position noise of the estimate not included
+    half_width_full: float
+    clearance_margin: float  # m, kept to obstacles while driving so that turning in place stays possible
+    excess: float  # the largest share of its set that any part of a held-out plan came to; above 1: it was outside
+    in_place_windows: int = 0  # of the windows those of turning on the spot, which have predictors of their own
+    in_place_violations: int = 0
+    bound_in_place: float = 1.0  # probability that any part of a plan in place is outside, at 99 % confidence
+    inflation: float = 1.0  # of the envelopes that the model set was made with
+    leaving: tuple[Leaving, ...] = ()  # where the violations are: by which coordinate, and how the robot drove then
+
+    def figures(self) -> dict[str, Any]:
+        return asdict(self)
+
+
+def upper_bound(violations: int, count: int) -> float:
+    """Clopper-Pearson: the largest probability with which so few violations are not surprising at 99 % confidence."""
+    if count == 0 or violations >= count:
+        return 1.0
+    return float(betaincinv(violations + 1, count - violations, CONFIDENCE))
+
+
+def most_violations(count: int, limit: float) -> int:
+    """The most violations among so many held-out plans with which the bound is still within the limit; -1: even none
+    would be too many, for there are too few plans."""
+    most = -1
+    while most + 1 < count and upper_bound(most + 1, count) <= limit:
+        most += 1
+    return most
+
+
+def state(model: ModelSet, fitted: Dataset, held_out: Dataset) -> Statement:
+    """The statement of a model set made from `fitted` about trajectories that it has not seen."""
+    return judged(model, fitted, held_out)[0]
+
+
+def judged(model: ModelSet, fitted: Dataset, held_out: Dataset) -> tuple[Statement, Array]:
+    """The statement, and of each held-out plan the largest share of its set that any part of it came to (plans,)."""
+    robot, ready, kind = model.robot, Filter(model), model.recipe.windows
+    turning = model.turning()
+    made_of = windows(fitted, robot.horizon, kind)
+    figures: Quality = quality(made_of.z, "plan windows", model.recipe.fewest)
+    whole = windows(held_out, robot.horizon, kind)
+    plans = apart(whole.take(~np.isnan(whole.latch)) if kind == PLAN else whole, robot.horizon)
+    ends = {tuple(start): row for row, start in enumerate(plans.start)}
+    in_place = np.zeros(len(plans), dtype=bool)
+    if model.in_place is not None:
+        in_place = inside(plans.z, model.in_place.domain(plans.z.shape[1], robot.regressor_dim))
+    groups = [(model, ~in_place)] + ([] if turning is None else [(turning, in_place)])
+    tubes = [of.tube_of_windows() for of, _ in groups]
+    excess, first = np.zeros(len(plans)), np.zeros(len(plans))
+    parts = [""] * len(plans)
+
+    def take(places: NDArray[np.intp], shares: Array, names: list[str]) -> None:
+        """Of the plans at these places the part that came to the largest share so far; shares (places, names)."""
+        worst, largest = shares.argmax(1), shares.max(1)
+        for row in np.flatnonzero(largest > excess[places]):
+            parts[places[row]] = names[worst[row]]
+        excess[places] = np.maximum(excess[places], largest)
+
+    for k in range(1, robot.horizon + 1):
+        seen = windows(held_out, k, kind)
+        rows = [i for i, start in enumerate(seen.start) if tuple(start) in ends]
+        part = seen.take(np.isin(np.arange(len(seen)), rows))
+        for (of, members), tube in zip(groups, tubes, strict=True):
+            if not members.any():
+                continue
+            group, places = part.take(members), np.flatnonzero(members)
+            if k == 1:
+                shares = _first_excess(of, group)
+                first[members] = shares.max(1)
+                take(places, shares, state_parts(robot, shares.shape[1] - robot.state_dim))
+            take(places, *_excess(of, tube, group, k))
+    full = np.asarray(robot.high())
+    outside, steps_outside = int((~(excess <= 1.0)).sum()), int((~(first <= 1.0)).sum())
+    bound_step = upper_bound(steps_outside, len(plans))
+    turns, turns_outside = int(in_place.sum()), int((~(excess[in_place] <= 1.0)).sum())
+    statement = Statement(
+        certificate=model.recipe.certificate,
+        mode=model.recipe.mode,
+        version=model.version,
+        samples=figures.samples,
+        rank=figures.rank,
+        smallest_singular=figures.smallest,
+        condition=figures.condition,
+        windows=len(plans),
+        violations=outside,
+        step_violations=steps_outside,
+        bound_step=bound_step,
+        bound_plan=upper_bound(outside, len(plans)),
+        bound_episode=1.0 - (1.0 - bound_step) ** EPISODE,
+        outside_episode=bound_step * EPISODE,
+        outside_hour=bound_step * HOUR / robot.period,
+        half_width_rest=ready.half_width(np.zeros(robot.action_dim)),
+        half_width_full=ready.half_width(full),
+        clearance_margin=ready.clearance_margin,
+        excess=float(excess.max(initial=0.0)),
+        in_place_windows=turns,
+        in_place_violations=turns_outside,
+        bound_in_place=upper_bound(turns_outside, turns),
+        inflation=model.recipe.inflation,
+        leaving=leavings(excess, parts, regimes(robot, plans.z)),
+    )
+    return statement, excess
+
+
+def _share(off: Array, half: Array) -> Array:
+    """How much of half a set's width something is off its middle; of a set without a width nothing, or all."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.where(off > 0.0, off / half, 0.0)
+
+
+def _first_excess(model: ModelSet, w: Windows) -> Array:
+    """How much of its predicted set each coordinate of the state comes to after one period. (T, n)"""
+    z = w.z if model.recipe.mode == DIRECT else model.first_regressor(w.z)
+    half = np.concatenate([model.first.half_widths(z[i : i + CHUNK]) for i in range(0, len(z), CHUNK)])
+    return np.asarray(_share(np.abs(outputs_of(model, w) - z @ model.first.C.T), half))
+
+
+def outputs_of(model: ModelSet, w: Windows) -> Array:
+    """What the model set's certificates predict of these windows."""
+    return outputs(model.robot, w.y) if model.recipe.mode == DIRECT else w.y
+
+
+def _excess(model: ModelSet, tube: Tube, w: Windows, k: int) -> tuple[Array, list[str]]:
+    """How much of the tube the position comes to after k periods (or what else it speaks of), of its bound the path off
+    it between, and of the latch the stop: (T, parts), with the parts' names."""
+    robot = model.robot
+    d, more = robot.position_dim, list(needed(robot))
+    normals = facet_normals(tube.directions[k - 1][:, np.abs(tube.directions[k - 1]).any(0)])
+    spread = np.abs(normals @ tube.directions[k - 1])  # (facets, L)
+    others = outputs_of(model, w)[:, more]
+    predicted = state_parts(robot, others.shape[1])
+    names = [position_parts(robot)[axis] for axis in np.abs(normals).argmax(1)] + [predicted[i] for i in more]
+    names += [PATH, AFTER] if k == tube.horizon else [PATH]
+    found = np.zeros((len(w), len(names)))
+    for i in range(0, len(w), CHUNK):
+        z = w.z[i : i + CHUNK]
+        sizes = tube.magnitudes(z)
+        made = sizes[:, : tube.generators]
+        away = np.abs((w.y[i : i + CHUNK, :d] - z @ tube.position[k - 1].T) @ normals.T)
+        off = np.abs(others[i : i + CHUNK] - z @ tube.more[k - 1].T)
+        parts = [
+            _share(away, made @ spread.T),
+            _share(off, made @ np.abs(tube.more_directions[k - 1]).T),
+            _share(w.bulge[i : i + CHUNK, None], sizes[:, tube.generators + k - 1, None]),
+        ]
+        if k == tube.horizon:
+            parts.append(_share(w.latch[i : i + CHUNK, None], sizes[:, -1, None]))
+        found[i : i + CHUNK] = np.concatenate(parts, axis=1)
+    return found, names

@@ -1,0 +1,256 @@
+"""The windows that model sets are made from: a state, the inputs after it, and what came of them.
+
+A *plan window* of length k starts at a period whose inputs follow the robot's schedule (chosen inputs, then its stop
+rules) for k periods; a *free window* at any period, and has every one of its inputs as a regressor. Displacement is
+taken in the robot's frame at the window's start, so position is no regressor.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from weakref import WeakKeyDictionary
+
+import numpy as np
+from numpy.typing import NDArray
+
+from brakeline.messaging.obstacle import rotate
+from brakeline.messaging.robot import FOLLOWED, Robot
+from brakeline.safety.model.dataset import BadData, Dataset, Trajectory
+from brakeline.safety.model.model_config import FREE as FREE
+from brakeline.safety.model.model_config import PLAN as PLAN
+from brakeline.safety.model.model_config import Recipe
+
+Array = NDArray[np.float64]
+
+FEWEST_WINDOWS = Recipe.fewest
+WORST_CONDITION = 1e4  # of the whitened regressors' second moment
+
+
+@dataclass(frozen=True)
+class Windows:
+    """Windows of k periods: z (T, nz) = [x_0; u_prev; free inputs], targets y (T, n) after k periods, in the frame of
+    the start (position: displacement, heading: change, else the value); bulge (T,) [m] of the last period off its
+    chord; latch (T,) [m] travelled after the window while the inputs stay those of a stop, NaN where they do not."""
+
+    z: Array
+    y: Array
+    bulge: Array
+    latch: Array
+    start: NDArray[np.intp]  # (T, 2): trajectory, period
+
+    def __len__(self) -> int:
+        return len(self.z)
+
+    def take(self, index: NDArray[np.bool_]) -> Windows:
+        return Windows(self.z[index], self.y[index], self.bulge[index], self.latch[index], self.start[index])
+
+
+def displacement(robot: Robot, start: Array, end: Array) -> Array:
+    """`end` (..., n) as seen from `start` (..., n): position and heading relative, in the frame of the start."""
+    seen = end.copy()
+    position = end[..., : robot.position_dim] - start[..., : robot.position_dim]
+    if robot.heading is not None:
+        position = rotate(position, -start[..., robot.heading])
+        turn = end[..., robot.heading] - start[..., robot.heading]
+        seen[..., robot.heading] = (turn + np.pi) % (2.0 * np.pi) - np.pi
+    seen[..., : robot.position_dim] = position
+    return seen
+
+
+def windows(data: Dataset, k: int, kind: str = PLAN) -> Windows:
+    """All windows of k periods in the data, within trajectories only. Raises BadData when there is no trajectory."""
+    if not data.trajectories:
+        raise BadData("no trajectory: record more of them")
+    cut = _plans_of if kind == PLAN else _free_of
+    parts = [_windows_of(data, t, k, i, *cut(data.robot, t, k)) for i, t in enumerate(data.trajectories)]
+    return Windows(*(np.concatenate([getattr(p, n) for p in parts]) for n in ("z", "y", "bulge", "latch", "start")))
+
+
+def specialised(robot: Robot) -> Array:
+    """T with `z' = T z`: the regressors of a free window (all inputs of a plan) from those of a plan window."""
+    known = robot.regressor_dim
+    S = robot.schedule()
+    T = np.zeros((known + len(S), known + S.shape[1]))
+    T[:known, :known] = np.eye(known)
+    T[known:, known:] = S
+    return T
+
+
+def _plans_of(robot: Robot, t: Trajectory, k: int) -> tuple[NDArray[np.intp], Array]:
+    """Where plan windows of k periods start, and their chosen inputs (T, F·m)."""
+    m, free = robot.action_dim, robot.free_steps
+    count = max(len(t.inputs) - k + 1, 0)
+    padded = np.vstack([t.inputs, np.zeros((free, m))])  # the free inputs beyond k play no part
+    chosen = np.hstack([padded[j : j + count] for j in range(free)])
+    planned = chosen @ robot.schedule()[: k * m].T
+    actual = np.hstack([t.inputs[j : j + count] for j in range(k)]).reshape(count, k * m)
+    if robot.feedback:
+        made = _braked(robot, t)
+        for j in range(1, k):
+            row = slice(j * m, (j + 1) * m)
+            planned[:, row] = np.where(robot.by_state, made[j : j + count], planned[:, row])
+        near = np.tile(FOLLOWED * (robot.high() - robot.low()), k)
+    else:
+        near = np.full(k * m, 1e-9)
+    start = np.flatnonzero((np.abs(planned - actual) < near).all(1))
+    return start, chosen[start]
+
+
+def _free_of(robot: Robot, t: Trajectory, k: int) -> tuple[NDArray[np.intp], Array]:
+    """Every start, and all inputs of the horizon (T, N·m), zero from the k-th on."""
+    m = robot.action_dim
+    count = max(len(t.inputs) - k + 1, 0)
+    inputs = np.zeros((count, robot.horizon * m))
+    for j in range(k):
+        inputs[:, j * m : (j + 1) * m] = t.inputs[j : j + count]
+    return np.arange(count), inputs
+
+
+def _windows_of(data: Dataset, t: Trajectory, k: int, number: int, start: NDArray[np.intp], chosen: Array) -> Windows:
+    robot = data.robot
+    earlier = np.zeros(robot.action_dim) if t.before is None else t.before
+    before = np.vstack([earlier, t.inputs])[start]
+    z = np.hstack([t.states[start][:, list(robot.regressor)], before, chosen])
+    y = displacement(robot, t.states[start], t.states[start + k])
+    off, travel = _ways(robot, t)
+    bulge = (off + data.bulge)[start + k - 1]
+    latch = travel[np.minimum(start + k, len(t.inputs))]
+    return Windows(z, y, bulge, latch, np.column_stack([np.full(len(start), number), start]))
+
+
+def _ways(robot: Robot, t: Trajectory) -> tuple[Array, Array]:
+    """Of each period the largest distance from its chord (T,) [m], and the way while stopping (T+1,) [m]; found once
+    for the windows of all lengths."""
+    known = _found.get(t)
+    if known is None or known[0] != robot:
+        # The disc farthest from the regressed position goes off its chord by what turning does to it, too.
+        swing = max(disc.arm for disc in robot.body) * np.abs(t.turned)
+        known = _found[t] = robot, _off_chord(t.paths) + swing, _rest_travel(robot, t)
+    return known[1:]
+
+
+_found: WeakKeyDictionary[Trajectory, tuple[Robot, Array, Array]] = WeakKeyDictionary()
+
+
+def _braked(robot: Robot, t: Trajectory) -> Array:
+    """What the stop rules make of each state when every input is on its way to zero: (T, m)."""
+    earlier = np.zeros((1, robot.action_dim)) if t.before is None else t.before[None]
+    return robot.braked(np.zeros_like(t.inputs), t.states[:-1], np.vstack([earlier, t.inputs[:-1]]))
+
+
+def resting(robot: Robot, t: Trajectory) -> NDArray[np.bool_]:
+    """In which periods are the inputs those of a stop? (T,)"""
+    if not robot.feedback:
+        return robot.rests(t.inputs)
+    near = FOLLOWED * (robot.high() - robot.low())
+    return np.asarray((np.abs(t.inputs - _braked(robot, t)) < near)[:, robot.stopping].all(1))
+
+
+def outputs(robot: Robot, y: Array) -> Array:
+    """What certificates predict: y (T, n), and the displacement of the centre of each disc that is not about the
+    regressed position, in the frame of the start. (T, n + d·discs)"""
+    if robot.heading is None:
+        return y
+    arms = [np.asarray(disc.at) for disc in robot.body if disc.arm > 0.0]
+    moved = [y[:, : robot.position_dim] + rotate(np.tile(arm, (len(y), 1)), y[:, robot.heading]) - arm for arm in arms]
+    return np.hstack([y, *moved])
+
+
+def _off_chord(paths: Array) -> Array:
+    """Largest distance of the positions (T, S, d) within a period from the chord of its ends: (T,)."""
+    chord = paths[:, -1:]
+    length2 = np.maximum((chord**2).sum(-1, keepdims=True), 1e-18)
+    along = np.clip((paths * chord).sum(-1, keepdims=True) / length2, 0.0, 1.0)
+    return np.asarray(np.sqrt(((paths - along * chord) ** 2).sum(-1)).max(1))
+
+
+def _rest_travel(robot: Robot, t: Trajectory) -> Array:
+    """At each period: the way from there [m] while the inputs stay those of a stop; NaN if they are not. (T+1,)."""
+    travel = np.full(len(t.inputs) + 1, np.nan)
+    arm = max(disc.arm for disc in robot.body)
+    zero = resting(robot, t)
+    runs = np.flatnonzero(np.diff(np.concatenate([[False], zero, [False]]).astype(int)))
+    for begin, end in zip(runs[::2], runs[1::2], strict=True):
+        turned = np.concatenate([[0.0], np.cumsum(t.turned[begin:end])[:-1]])
+        paths = t.paths[begin:end]
+        if paths.shape[-1] >= 2:
+            paths = rotate(paths, np.broadcast_to(turned[:, None], paths.shape[:2]))
+        ends = np.vstack([np.zeros((1, paths.shape[-1])), np.cumsum(paths[:, -1], 0)])
+        points = paths + ends[:-1, None]
+        for at in range(begin, end):
+            reach = points[at - begin :] - ends[at - begin]
+            travel[at] = np.sqrt((reach**2).sum(-1)).max()
+            if arm:
+                travel[at] += arm * np.abs(np.cumsum(t.turned[at:end])).max()
+    return travel
+
+
+def standing_at_the_end(robot: Robot) -> int:
+    """So many of a plan's last inputs are those of a stop: one at least."""
+    left = robot.fractions()[:, robot.stopping]
+    moving = np.flatnonzero(np.abs(left).max(1, initial=0.0) > 0.0)
+    return max(robot.horizon - robot.free_steps - int(moving[-1]), 1)
+
+
+def stands_from(whole: Windows, data: Dataset, kind: str) -> int:
+    """So many periods after a plan began the robot stood, whatever the plan was, and went on standing: no measured
+    speed was more than its error can make of none. As many as a plan has where that was not so, or no plans were
+    recorded.
+
+    whole: the windows of all of a plan's periods.
+    """
+    robot = data.robot
+    speeds, none = list(robot.regressor), np.asarray(robot.measurement_bound)[list(robot.regressor)]
+    if kind != PLAN:
+        return robot.horizon
+    for k in range(robot.horizon, 0, -1):
+        after = np.array([data.trajectories[number].states[start + k, speeds] for number, start in whole.start])
+        if not (np.abs(after) <= none).all():
+            return min(k + 1, robot.horizon)
+    return 1
+
+
+def stops_of(robot: Robot, t: Trajectory, rested: int) -> Array:
+    """The ways [m] still travelled from wherever the inputs had been those of a stop for `rested` periods."""
+    still = resting(robot, t)
+    lasted = np.zeros(len(still) + 1, dtype=int)
+    for i, rests in enumerate(still):
+        lasted[i + 1] = lasted[i] + 1 if rests else 0
+    travel = _ways(robot, t)[1]
+    return np.asarray(travel[(lasted == rested) & ~np.isnan(travel)])
+
+
+def apart(w: Windows, length: int) -> Windows:
+    """Those of the windows that do not overlap: each starts at least `length` periods after the one before."""
+    chosen = np.zeros(len(w), dtype=bool)
+    last = (-1, 0)
+    for i, (trajectory, period) in enumerate(w.start):
+        if trajectory != last[0] or period >= last[1] + length:
+            chosen[i] = True
+            last = (trajectory, period)
+    return w.take(chosen)
+
+
+@dataclass(frozen=True)
+class Quality:
+    """Of a set of regressors, each scaled by its largest value."""
+
+    samples: int
+    rank: int
+    smallest: float  # singular value, per sqrt(sample)
+    condition: float
+
+
+def quality(z: Array, name: str, fewest: int = FEWEST_WINDOWS) -> Quality:
+    """Raises BadData when regressors (T, nz) are too few, rank-deficient or nearly collinear."""
+    if len(z) < fewest:
+        raise BadData(f"{name}: {len(z)} windows, at least {fewest} are needed: record more")
+    scaled = z / np.maximum(np.abs(z).max(0), 1e-12)
+    singular = np.linalg.svd(scaled / np.sqrt(len(z)), compute_uv=False)
+    rank = int((singular > 1e-6).sum())
+    condition = float(singular[0] / max(singular[-1], 1e-300))
+    if rank < z.shape[1]:
+        raise BadData(f"{name}: the regressors have rank {rank} of {z.shape[1]}: record more varied inputs")
+    if condition > WORST_CONDITION:
+        raise BadData(f"{name}: condition number {condition:.3g} is above {WORST_CONDITION:.0g}: vary the inputs more")
+    return Quality(len(z), rank, float(singular[-1]), condition)

@@ -1,0 +1,1 @@
+"""Free space from what a sensor measures."""

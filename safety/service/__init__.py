@@ -1,0 +1,1 @@
+"""The safety service as a process, and every way to ask the filter."""

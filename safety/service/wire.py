@@ -1,0 +1,244 @@
+"""Requests and decisions, between messages and the filter's own types; every field of a request is checked here or
+in `Filter.decide` before it is used."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+
+import numpy as np
+from google.protobuf.message import DecodeError
+from numpy.typing import NDArray
+
+from brakeline.messaging import brakeline_pb2 as pb
+from brakeline.messaging.moving_obstacles import parted
+from brakeline.messaging.obstacle import FARTHEST, BadShape, Obstacle
+from brakeline.messaging.robot import Robot
+from brakeline.messaging.scan import BadScan
+from brakeline.messaging.sensor_messages import Sensed, sensed_of
+from brakeline.messaging.stated_share import checked
+from brakeline.safety.filter.backup_plan import Prediction
+from brakeline.safety.filter.blocking_constraint import Stopped
+from brakeline.safety.filter.request import ADJUSTED, ALLOWED, FAILSAFE, RECOVERING, BadRequest, Decision, Request
+from brakeline.safety.filter.reservation import Promise, Promises
+from brakeline.safety.perception import displayed_map
+
+KINDS = {ALLOWED: pb.ALLOWED, ADJUSTED: pb.ADJUSTED, FAILSAFE: pb.FAILSAFE, RECOVERING: pb.RECOVERING}
+NAMES = {number: name for name, number in KINDS.items()}
+# What a batch may cost, known before it is worked on: its bytes to decode, its requests and obstacles to decide on.
+LARGEST = 2**20  # bytes of a request batch: some thirty with a range image each
+MOST_REQUESTS = 64
+FIXED_64, LENGTH, FIXED_32 = 1, 2, 5  # how protobuf writes a field; else as one number
+MOST_OBSTACLES = 1000  # of all its requests
+
+
+def batch_of(payload: bytes) -> pb.RequestBatch:
+    """Raises BadRequest for anything that is not a batch of a sensible size."""
+    if len(payload) > LARGEST:
+        raise BadRequest("payload", f"{len(payload)} bytes; a request batch has at most {LARGEST}")
+    if _fields(payload, MOST_REQUESTS) > MOST_REQUESTS:
+        raise BadRequest("requests", f"a batch has at most {MOST_REQUESTS} requests")
+    try:
+        batch = pb.RequestBatch.FromString(payload)
+    except DecodeError as error:
+        raise BadRequest("payload", f"not a request batch: {error}") from error
+    if not batch.requests:
+        raise BadRequest("requests", "the batch holds no request")
+    obstacles = sum(len(request.obstacles) for request in batch.requests)
+    if obstacles > MOST_OBSTACLES:
+        raise BadRequest("obstacles", f"{obstacles} obstacles; at most {MOST_OBSTACLES} can be decided on at once")
+    return batch
+
+
+def _fields(payload: bytes, most: int) -> int:
+    """How many fields a message has on the wire, counted no further than one beyond `most`: decoding half a million
+    empty requests would take longer than a robot can wait."""
+    at = count = 0
+    while at < len(payload) and count <= most:
+        count += 1
+        tag, at = _varint(payload, at)
+        kind = tag & 7
+        if kind in (FIXED_64, FIXED_32):
+            at += 8 if kind == FIXED_64 else 4
+        else:
+            value, at = _varint(payload, at)
+            at += value if kind == LENGTH else 0
+    return count
+
+
+def _varint(payload: bytes, at: int) -> tuple[int, int]:
+    """A number and where it ends; a cut one as far as it goes."""
+    value = shift = 0
+    while at < len(payload):
+        byte = payload[at]
+        value, shift, at = value | (byte & 127) << shift, shift + 7, at + 1
+        if byte < 128 or shift > 63:
+            break
+    return value, at
+
+
+def request_of(
+    message: pb.Request, robot: Robot, promise: Promise | None = None, promised: Promises | None = None
+) -> Request:
+    """The request in a message; promise, promised: of a fleet's robot, its own and the others'.
+
+    Raises:
+        BadRequest: an obstacle, a size or a value is wrong, with the field's name.
+    """
+    predicted = None
+    if message.predicted_center or message.predicted_half_width:
+        center, half = numbers(message.predicted_center), numbers(message.predicted_half_width)
+        predicted = Prediction(center, half, message.predicted_heading)
+    plan = numbers(message.plan)
+    if plan.size != robot.horizon * robot.action_dim:
+        wanted = f"{robot.horizon} x {robot.action_dim}"
+        raise BadRequest("plan", f"plan has {plan.size} numbers, a {robot.name} robot's has {wanted}")
+    obstacles, movers = parted(obstacles_of(message.obstacles, robot.position_dim), robot.position_dim)
+    return Request(
+        state=numbers(message.state),
+        action=numbers(message.action),
+        input_in_force=numbers(message.input_in_force),
+        plan=plan.reshape(robot.horizon, robot.action_dim),
+        obstacles=obstacles,
+        movers=movers,
+        scan=seen(message),
+        model=message.model,
+        predicted=predicted,
+        promise=promise,
+        promised=promised,
+        observation=np.fromiter(message.observation, np.float32, len(message.observation)),
+        known_free=message.known_free,
+    )
+
+
+def numbers(field: Collection[float]) -> NDArray[np.float64]:
+    """A repeated field as an array: `np.array` takes five times as long for it."""
+    return np.fromiter(field, np.float64, len(field))
+
+
+def obstacles_of(messages: Sequence[pb.Obstacle], dim: int) -> list[Obstacle]:
+    """Raises BadRequest naming the obstacle and its field."""
+    obstacles = []
+    for i, o in enumerate(messages):
+        try:
+            if len(o.position) != dim:
+                raise BadShape("position", f"{len(o.position)} coordinates; this robot's obstacles have {dim}")
+            motion = displayed_map.motion_of(o.motion) if o.HasField("motion") else None
+            obstacles.append(Obstacle(o.kind, tuple(o.position), tuple(o.size), o.yaw, o.margin, motion))
+        except BadShape as error:
+            raise BadRequest(f"obstacles[{i}].{error.field}", str(error)) from error
+    return obstacles
+
+
+def seen(message: pb.Request) -> Sensed | None:
+    """Raises BadRequest: it is none."""
+    try:
+        return sensed_of(message)
+    except BadScan as error:
+        raise BadRequest("scan", str(error)) from error
+
+
+def promise_of(m: pb.Promise, robot: Robot) -> Promise:
+    """Raises BadRequest: it is none of this robot's."""
+    shape = robot.horizon, robot.position_dim
+    if {len(m.center), len(m.half_width)} != {shape[0] * shape[1]} or len(m.radius) != shape[0]:
+        raise BadRequest("promise", f"a {robot.name} robot's promise has {shape[0]} boxes in {shape[1]} coordinates")
+    center, half, radius = numbers(m.center), numbers(m.half_width), numbers(m.radius)
+    within = all((np.abs(part) <= FARTHEST).all() for part in (center, half, radius))  # NaN fails too
+    if not within or (half < 0.0).any() or (radius < 0.0).any():
+        raise BadRequest("promise", "a promise's boxes are within reason and not negative")
+    return Promise(center.reshape(shape), half.reshape(shape), radius)
+
+
+def message_of(decision: Decision, queue_ms: float) -> pb.Reply:
+    message = pb.Decision(
+        kind=KINDS[decision.kind],
+        plan=decision.plan.ravel().tolist(),
+        tube_center=decision.tube_center.ravel().tolist(),
+        tube_half_width=decision.tube_half_width.ravel().tolist(),
+        predicted_center=decision.predicted.center.tolist(),
+        predicted_half_width=decision.predicted.half_width.tolist(),
+        predicted_heading=decision.predicted.heading,
+        margin=decision.margin,
+        at_least=decision.at_least,
+        model=decision.model,
+        reason=decision.reason,
+        verified=decision.verified,
+        contained=decision.contained,
+        compared=decision.compared,
+        time_ms=decision.time_ms,
+        solve_ms=decision.solve_ms,
+        verify_ms=decision.verify_ms,
+        queue_ms=queue_ms,
+        solver=decision.solver,
+        iterations=decision.iterations,
+        broken=decision.broken,
+    )
+    if decision.for_clearance is not None:
+        message.for_clearance = decision.for_clearance
+    if (stopped := decision.stopped) is not None:
+        message.stopped.by, message.stopped.room, message.stopped.after = stopped.by, stopped.room, stopped.after
+        message.stopped.normal.extend(stopped.normal.tolist())
+        message.stopped.at.extend(stopped.at.tolist())
+    if decision.bound is not None:
+        message.bound = decision.bound
+    if decision.promise is not None:
+        message.promise.CopyFrom(promise_message(decision.promise))
+    return pb.Reply(decision=message)
+
+
+def decision_of(m: pb.Decision, robot: Robot) -> Decision:
+    """The decision in a message, its plan's size having been checked.
+
+    Raises:
+        BadRequest: its kind, tube or promise is none of this robot's, with the field's name.
+    """
+    if m.kind not in NAMES:
+        raise BadRequest("kind", f"kind {m.kind}")
+    d = robot.position_dim
+    tube = numbers(m.tube_center), numbers(m.tube_half_width)
+    if {part.size for part in tube} not in ({0}, {robot.horizon * d}):  # the rivals have none
+        raise BadRequest("tube_center", "a tube of the wrong size")
+    if not all(np.isfinite(part).all() for part in tube):
+        raise BadRequest("tube_center", "a tube that holds NaN or infinity")
+    stopped = None
+    if m.HasField("stopped"):
+        where = numbers(m.stopped.normal), numbers(m.stopped.at)
+        stopped = Stopped(m.stopped.by, m.stopped.room, m.stopped.after, *where)
+    return Decision(
+        kind=NAMES[m.kind],
+        plan=numbers(m.plan).reshape(robot.horizon, robot.action_dim),
+        tube_center=tube[0].reshape(-1, d),
+        tube_half_width=tube[1].reshape(-1, d),
+        predicted=Prediction(numbers(m.predicted_center), numbers(m.predicted_half_width), m.predicted_heading),
+        margin=m.margin,
+        at_least=m.at_least,
+        model=m.model,
+        reason=m.reason,
+        verified=m.verified,
+        contained=m.contained,
+        compared=m.compared,
+        time_ms=m.time_ms,
+        solve_ms=m.solve_ms,
+        verify_ms=m.verify_ms,
+        solver=m.solver,
+        iterations=m.iterations,
+        broken=m.broken,
+        stopped=stopped,
+        promise=promise_of(m.promise, robot) if m.HasField("promise") else None,
+        for_clearance=m.for_clearance if m.HasField("for_clearance") else None,
+        bound=checked(m.bound) if m.HasField("bound") else None,
+    )
+
+
+def promise_message(promise: Promise) -> pb.Promise:
+    return pb.Promise(
+        center=promise.center.ravel().tolist(),
+        half_width=promise.half_width.ravel().tolist(),
+        radius=promise.radius.tolist(),
+    )
+
+
+def error_of(error: Exception) -> pb.Reply:
+    """An error reply: type, field if it has one, and what to do."""
+    name = type(error).__name__
+    return pb.Reply(error=pb.Error(type=name, field=str(getattr(error, "field", "")), message=str(error)))

@@ -1,0 +1,153 @@
+"""A PX4 process whose physics come from outside: found, told what it flies, started, ended."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import re
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+from brakeline.messaging.free_ports import free_udp_port
+from brakeline.sim.flight_controller import GRAVITY, Body
+
+AIRFRAME = "none_iris"  # the one of PX4's own that expects its simulator at a TCP port
+FIRST_PORT = 4560  # of the simulator of instance 0; PX4's scripts add the instance
+INSTANCES = range(10, 200)  # PX4's own tools start with 0
+# Becomes PX4, and ends with us: without a simulator it would wait forever (1: PR_SET_PDEATHSIG, 9: SIGKILL)
+LAUNCH = "import ctypes, os, sys; ctypes.CDLL(None).prctl(1, 9); os.execv(sys.argv[1], sys.argv[1:])"
+TRACES = ("px4-sock-{}", "px4_lock-{}")  # files of an instance in the folder for such
+STARTS_IN = 30.0  # s until it must have connected
+ALIAS = re.compile(r"^alias (\w+)='px4-", re.MULTILINE)
+
+BODY = Body()
+ARM, TORQUE = BODY.arm, BODY.rotor_torque
+
+# What PX4 must know of the vehicle in sim/quadrotor.xml, and of a companion that sends velocities
+PARAMETERS: dict[str, float] = {
+    "MAV_SYS_ID": 1,
+    "IMU_INTEG_RATE": 200,  # Hz, as the physics
+    "CA_ROTOR0_PX": ARM, "CA_ROTOR0_PY": ARM, "CA_ROTOR0_KM": TORQUE,
+    "CA_ROTOR1_PX": -ARM, "CA_ROTOR1_PY": -ARM, "CA_ROTOR1_KM": TORQUE,
+    "CA_ROTOR2_PX": ARM, "CA_ROTOR2_PY": -ARM, "CA_ROTOR2_KM": -TORQUE,
+    "CA_ROTOR3_PX": -ARM, "CA_ROTOR3_PY": ARM, "CA_ROTOR3_KM": -TORQUE,
+    "THR_MDL_FAC": 0.0,  # thrust is proportional to the command
+    "MPC_THR_HOVER": 0.25 * BODY.mass * GRAVITY / BODY.most_thrust,
+    "MPC_XY_VEL_MAX": 7.1, "MPC_Z_VEL_MAX_UP": 5.0, "MPC_Z_VEL_MAX_DN": 5.0,  # m/s, what the filter may ask for
+    "MPC_XY_VEL_P_ACC": 4.0, "MPC_XY_VEL_I_ACC": 1.0, "MPC_Z_VEL_P_ACC": 6.0,  # it is nimbler than what PX4 expects
+    "COM_OF_LOSS_T": 0.5,  # s without a setpoint
+    "COM_RC_IN_MODE": 4, "NAV_RCL_ACT": 0, "NAV_DLL_ACT": 0, "COM_RCL_EXCEPT": 4,  # nobody holds a stick
+    "EKF2_MULTI_IMU": 0, "SENS_IMU_MODE": 1,  # one IMU is simulated: one estimator
+    "EKF2_HGT_REF": 1,  # GPS: its height is of the same map
+    "SDLOG_MODE": -1,  # no log of its own
+}  # fmt: skip
+
+
+class Px4Error(RuntimeError):
+    """There is no PX4 in that folder, or it did not start."""
+
+
+class Px4:
+    """A running PX4. It sends MAVLink to `127.0.0.1:remote` from `local`, and waits for sensors on `connection`."""
+
+    def __init__(self, folder: Path, remote: int, parameters: dict[str, float] | None = None) -> None:
+        """folder: with `px4` or `bin/px4`, and `etc`, as a build for SITL leaves them; parameters: besides
+        `PARAMETERS`.
+
+        Raises:
+            Px4Error.
+        """
+        binary, aliases, etc = _parts(folder)
+        self.remote, self.local = remote, free_udp_port()
+        self._place = tempfile.TemporaryDirectory(prefix="px4-")
+        root = Path(self._place.name)
+        for name in ("bin", "rootfs"):
+            (root / name).mkdir()
+        self.log = root / "px4.log"
+        for name in ("px4", *(f"px4-{word}" for word in ALIAS.findall(aliases.read_text()))):
+            (root / "bin" / name).symlink_to(binary)
+        (root / "bin" / "px4-alias.sh").symlink_to(aliases)
+        # PX4's start script looks for these two in PATH first
+        values = PARAMETERS | (parameters or {})
+        lines = [f"param set {name} {value:.9g}\n" for name, value in values.items()]
+        (root / "bin" / "px4-rc.params").write_text("#!/bin/sh\n" + "".join(lines))
+        mavlink = f"mavlink start -x -u {self.local} -r 4000000 -f -m onboard -o {remote}\n"
+        (root / "bin" / "px4-rc.mavlink").write_text("#!/bin/sh\n" + mavlink)
+        instance, self._listener = _free_instance()
+        self._traces = [Path(tempfile.gettempdir(), name.format(instance)) for name in TRACES]
+        environment = os.environ | {"PX4_SIM_MODEL": AIRFRAME, "PATH": f"{root / 'bin'}:{os.environ['PATH']}"}
+        program = [str(root / "bin" / "px4"), "-d", "-i", str(instance), "-w", str(root / "rootfs"), str(etc)]
+        with self.log.open("wb") as output:
+            self._process = subprocess.Popen(
+                [sys.executable, "-I", "-c", LAUNCH, *program, "-s", "etc/init.d-posix/rcS"],
+                cwd=root / "rootfs",
+                env=environment,
+                stdin=subprocess.DEVNULL,
+                stdout=output,
+                stderr=output,
+                start_new_session=True,  # ^C is ours
+            )
+        try:
+            self.connection = self._accept()
+        except BaseException:
+            self._end()
+            raise
+        self.connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+
+    @property
+    def alive(self) -> bool:
+        return self._process.poll() is None
+
+    def last_words(self) -> str:
+        """The end of what it printed."""
+        return "\n".join(self.log.read_text(errors="replace").strip().splitlines()[-8:])
+
+    def close(self) -> None:
+        """End it, and leave nothing behind."""
+        self.connection.close()
+        self._end()
+
+    def _end(self) -> None:
+        self._process.kill()  # asked kindly it would wait for a clock that stands still
+        self._process.wait()
+        self._listener.close()
+        for trace in self._traces:
+            trace.unlink(missing_ok=True)
+        self._place.cleanup()
+
+    def _accept(self) -> socket.socket:
+        end = time.monotonic() + STARTS_IN
+        self._listener.settimeout(0.1)
+        while time.monotonic() < end and self.alive:
+            try:
+                return self._listener.accept()[0]
+            except TimeoutError:
+                continue
+        raise Px4Error(f"PX4 did not ask for its simulator; its last words:\n{self.last_words()}")
+
+
+def _parts(folder: Path) -> tuple[Path, Path, Path]:
+    """The program, its script of aliases, and its scripts' folder."""
+    folder = folder.resolve()
+    for place in (folder / "bin", folder):
+        if (place / "px4").is_file() and (place / "px4-alias.sh").is_file() and (folder / "etc").is_dir():
+            return place / "px4", place / "px4-alias.sh", folder / "etc"
+    raise Px4Error(
+        f"{folder} holds no PX4 for SITL: px4 and px4-alias.sh (or both in bin/), and etc/ are expected there"
+    )
+
+
+def _free_instance() -> tuple[int, socket.socket]:
+    """One that no other PX4 of this machine has, and where its simulator is to listen."""
+    for instance in INSTANCES:
+        with Path(tempfile.gettempdir(), TRACES[1].format(instance)).open("a") as lock:
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                return instance, socket.create_server(("127.0.0.1", FIRST_PORT + instance))
+            except OSError:
+                continue
+    raise Px4Error("too many instances of PX4 run on this machine")

@@ -1,0 +1,243 @@
+"""What the autopilot tells about its vehicle: a builder for each message, and who is due when."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from brakeline.sim.autopilot import ned_frames
+from brakeline.sim.autopilot.common_dialect import mavlink
+from brakeline.sim.autopilot.flight_modes import Landed, Pilot
+from brakeline.sim.flight_estimator import Estimate
+from brakeline.sim.lidar import Lidar
+
+BINS = 72  # of OBSTACLE_DISTANCE, clockwise from straight ahead
+UNKNOWN = 65535  # cm, a bin that no beam belongs to
+SENSORS = (
+    mavlink.MAV_SYS_STATUS_SENSOR_3D_GYRO
+    | mavlink.MAV_SYS_STATUS_SENSOR_3D_ACCEL
+    | mavlink.MAV_SYS_STATUS_SENSOR_3D_MAG
+    | mavlink.MAV_SYS_STATUS_SENSOR_ABSOLUTE_PRESSURE
+    | mavlink.MAV_SYS_STATUS_SENSOR_GPS
+    | mavlink.MAV_SYS_STATUS_AHRS
+    | mavlink.MAV_SYS_STATUS_PREARM_CHECK
+)
+VOLTAGE, CHARGE = 16.2, 100  # V, %: the battery is no part of the simulation
+MILLIGRAVITY = 9.80665e-3  # m/s²
+NO_COVARIANCE = [math.nan, *[0.0] * 20]
+LANDED = {
+    Landed.ON_GROUND: mavlink.MAV_LANDED_STATE_ON_GROUND,
+    Landed.TAKING_OFF: mavlink.MAV_LANDED_STATE_TAKEOFF,
+    Landed.IN_AIR: mavlink.MAV_LANDED_STATE_IN_AIR,
+    Landed.LANDING: mavlink.MAV_LANDED_STATE_LANDING,
+}
+Message = Any  # pymavlink is untyped
+
+
+def obstacle_bins(ranges: NDArray[np.float64], directions: NDArray[np.float64], farthest: float) -> list[int]:
+    """Distances [cm] in `BINS` sectors about the vehicle, each the least of its beams' horizontal parts.
+
+    ranges (R,) and farthest: m; directions (R, 3): unit vectors, forward-left-up. A sector between two beams gets the
+    lesser of its neighbours; farthest + 1 cm: nothing there.
+    """
+    top = round(100.0 * farthest)
+    sector = np.round(-np.arctan2(directions[:, 1], directions[:, 0]) * (BINS / math.tau)).astype(int) % BINS
+    level = np.hypot(directions[:, 0], directions[:, 1])
+    seen = np.where(ranges < farthest, np.floor(100.0 * ranges * level), top + 1)
+    bins = np.full(BINS, UNKNOWN)
+    np.minimum.at(bins, sector, seen.astype(int))
+    between = np.minimum(np.roll(bins, 1), np.roll(bins, -1))
+    return [int(value) for value in np.where(bins == UNKNOWN, between, bins)]
+
+
+class Reports:
+    """Builds messages about one vehicle; `BUILDERS` has them by message id."""
+
+    def __init__(self, pilot: Pilot, lidar: Lidar | None) -> None:
+        self._pilot, self._lidar = pilot, lidar
+        self._estimate: tuple[float, Estimate] | None = None  # the time it is of
+
+    @property
+    def estimate(self) -> Estimate:
+        """All messages of one moment tell of one reading."""
+        now = self._pilot.time
+        if self._estimate is None or self._estimate[0] != now:
+            self._estimate = (now, self._pilot.vehicle.estimate())
+        return self._estimate[1]
+
+    @property
+    def milliseconds(self) -> int:
+        return round(1e3 * self._pilot.time)
+
+    @property
+    def microseconds(self) -> int:
+        return round(1e6 * self._pilot.time)
+
+    def build(self, kind: int) -> Message | None:
+        """The message with that id; None when there is nothing to say."""
+        return BUILDERS[kind](self)
+
+    def sys_status(self) -> Message:
+        return mavlink.MAVLink_sys_status_message(
+            SENSORS, SENSORS, SENSORS, 200, round(1e3 * VOLTAGE), -1, CHARGE, 0, 0, 0, 0, 0, 0
+        )
+
+    def battery_status(self) -> Message:
+        cells = [round(1e3 * VOLTAGE / 4.0)] * 4 + [UNKNOWN] * 6
+        return mavlink.MAVLink_battery_status_message(0, 0, 3, 32767, cells, -1, -1, -1, CHARGE)
+
+    def extended_sys_state(self) -> Message:
+        return mavlink.MAVLink_extended_sys_state_message(0, LANDED[self._pilot.landed])
+
+    def attitude(self) -> Message:
+        roll, pitch, yaw = ned_frames.euler(ned_frames.attitude(self.estimate.attitude))
+        return mavlink.MAVLink_attitude_message(
+            self.milliseconds, roll, pitch, yaw, *ned_frames.body(self.estimate.rates)
+        )
+
+    def attitude_quaternion(self) -> Message:
+        q, rates = ned_frames.attitude(self.estimate.attitude), ned_frames.body(self.estimate.rates)
+        return mavlink.MAVLink_attitude_quaternion_message(self.milliseconds, *q, *rates)
+
+    def local_position_ned(self) -> Message:
+        position, velocity = self._pilot.vehicle.seen()
+        return mavlink.MAVLink_local_position_ned_message(
+            self.milliseconds, *ned_frames.world(position), *ned_frames.world(velocity)
+        )
+
+    def global_position_int(self) -> Message:
+        position, velocity = self._pilot.vehicle.seen()
+        latitude, longitude, altitude = ned_frames.globe(position)
+        vx, vy, vz = (round(100.0 * v) for v in ned_frames.world(velocity))
+        heading = math.degrees(ned_frames.yaw(ned_frames.heading(self.estimate.attitude))) % 360.0
+        above_home = position[2] - self._pilot.home[2]
+        return mavlink.MAVLink_global_position_int_message(
+            self.milliseconds, round(1e7 * latitude), round(1e7 * longitude), round(1e3 * altitude),
+            round(1e3 * above_home), vx, vy, vz, round(100.0 * heading) % 36000,
+        )  # fmt: skip
+
+    def gps_raw_int(self) -> Message:
+        position, velocity = self._pilot.vehicle.seen()
+        latitude, longitude, altitude = ned_frames.globe(position)
+        speed = round(100.0 * math.hypot(velocity[0], velocity[1]))
+        return mavlink.MAVLink_gps_raw_int_message(
+            self.microseconds, mavlink.GPS_FIX_TYPE_3D_FIX, round(1e7 * latitude), round(1e7 * longitude),
+            round(1e3 * altitude), 70, 80, speed, UNKNOWN, 14,
+        )  # fmt: skip
+
+    def highres_imu(self) -> Message:
+        acceleration, rates = ned_frames.body(self.estimate.specific_force), ned_frames.body(self.estimate.rates)
+        fields = 0x3F  # accelerometer and gyro are fresh
+        return mavlink.MAVLink_highres_imu_message(
+            self.microseconds, *acceleration, *rates, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, fields
+        )
+
+    def scaled_imu(self) -> Message:
+        """In thousandths of g and of rad/s."""
+        acceleration, rates = ned_frames.body(self.estimate.specific_force), ned_frames.body(self.estimate.rates)
+        felt, turning = (round(value / MILLIGRAVITY) for value in acceleration), (round(1e3 * rate) for rate in rates)
+        return mavlink.MAVLink_scaled_imu_message(self.milliseconds, *felt, *turning, 0, 0, 0)
+
+    def odometry(self) -> Message:
+        """Position in NED, velocity along the body's axes, as PX4 sends them."""
+        position, velocity = self._pilot.vehicle.seen()
+        q = ned_frames.attitude(self.estimate.attitude)
+        along = ned_frames.into_body(q, ned_frames.world(velocity))
+        return mavlink.MAVLink_odometry_message(
+            self.microseconds, mavlink.MAV_FRAME_LOCAL_NED, mavlink.MAV_FRAME_BODY_FRD, *ned_frames.world(position), q,
+            *along, *ned_frames.body(self.estimate.rates), NO_COVARIANCE, NO_COVARIANCE,
+        )  # fmt: skip
+
+    def vfr_hud(self) -> Message:
+        position, velocity = self._pilot.vehicle.seen()
+        heading = round(math.degrees(ned_frames.yaw(ned_frames.heading(self.estimate.attitude)))) % 360
+        speed = math.hypot(velocity[0], velocity[1])
+        throttle = 50 if self._pilot.vehicle.flying else 0
+        return mavlink.MAVLink_vfr_hud_message(
+            speed, speed, heading, throttle, ned_frames.ALTITUDE + position[2], velocity[2]
+        )
+
+    def home_position(self) -> Message:
+        latitude, longitude, altitude = ned_frames.globe(self._pilot.home)
+        return mavlink.MAVLink_home_position_message(
+            round(1e7 * latitude), round(1e7 * longitude), round(1e3 * altitude), *ned_frames.world(self._pilot.home),
+            [1.0, 0.0, 0.0, 0.0], 0.0, 0.0, 0.0,
+        )  # fmt: skip
+
+    def obstacle_distance(self) -> Message | None:
+        if self._lidar is None:
+            return None
+        rays = self._lidar.rays
+        ranges = self._lidar.ranges(self._pilot.vehicle.state()[:3], ned_frames.heading(self.estimate.attitude))
+        bins = obstacle_bins(ranges, rays.directions, rays.range)
+        return mavlink.MAVLink_obstacle_distance_message(
+            self.microseconds, mavlink.MAV_DISTANCE_SENSOR_LASER, bins, 0, 20, round(100.0 * rays.range),
+            360.0 / BINS, 0.0, mavlink.MAV_FRAME_BODY_FRD,
+        )  # fmt: skip
+
+    def autopilot_version(self) -> Message:
+        capabilities = (
+            mavlink.MAV_PROTOCOL_CAPABILITY_MAVLINK2
+            | mavlink.MAV_PROTOCOL_CAPABILITY_COMMAND_INT
+            | mavlink.MAV_PROTOCOL_CAPABILITY_SET_POSITION_TARGET_LOCAL_NED
+        )
+        none = [0] * 8
+        return mavlink.MAVLink_autopilot_version_message(capabilities, 1 << 24, 0, 0, 0, none, none, none, 0, 0, 1)
+
+
+BUILDERS: dict[int, Callable[[Reports], Message | None]] = {
+    mavlink.MAVLINK_MSG_ID_SYS_STATUS: Reports.sys_status,
+    mavlink.MAVLINK_MSG_ID_BATTERY_STATUS: Reports.battery_status,
+    mavlink.MAVLINK_MSG_ID_EXTENDED_SYS_STATE: Reports.extended_sys_state,
+    mavlink.MAVLINK_MSG_ID_ATTITUDE: Reports.attitude,
+    mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION: Reports.attitude_quaternion,
+    mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED: Reports.local_position_ned,
+    mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT: Reports.global_position_int,
+    mavlink.MAVLINK_MSG_ID_GPS_RAW_INT: Reports.gps_raw_int,
+    mavlink.MAVLINK_MSG_ID_HIGHRES_IMU: Reports.highres_imu,
+    mavlink.MAVLINK_MSG_ID_SCALED_IMU: Reports.scaled_imu,
+    mavlink.MAVLINK_MSG_ID_ODOMETRY: Reports.odometry,
+    mavlink.MAVLINK_MSG_ID_VFR_HUD: Reports.vfr_hud,
+    mavlink.MAVLINK_MSG_ID_HOME_POSITION: Reports.home_position,
+    mavlink.MAVLINK_MSG_ID_OBSTACLE_DISTANCE: Reports.obstacle_distance,
+    mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION: Reports.autopilot_version,
+}
+
+
+@dataclass
+class Stream:
+    interval: float  # s
+    due: float  # s, when it is to be sent next
+
+
+class Schedule:
+    """Which messages are due. Times are multiples of the autopilot's tick, but for rounding: half a tick is allowed."""
+
+    def __init__(self, tick: float) -> None:
+        self._slack = 0.5 * tick
+        self._streams: dict[int, Stream] = {}
+
+    def set(self, kind: int, interval: float, now: float) -> None:
+        """Send it every so many seconds from now on; 0 or less: no more."""
+        self._streams.pop(kind, None)
+        if interval > 0.0:
+            self._streams[kind] = Stream(interval, now + interval)
+
+    def interval(self, kind: int) -> float:
+        """s; 0: it is not sent."""
+        stream = self._streams.get(kind)
+        return 0.0 if stream is None else stream.interval
+
+    def due(self, now: float) -> list[int]:
+        """Those to be sent now."""
+        kinds = []
+        for kind, stream in self._streams.items():
+            if now >= stream.due - self._slack:
+                stream.due = max(stream.due + stream.interval, now)
+                kinds.append(kind)
+        return kinds

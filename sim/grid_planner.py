@@ -1,0 +1,178 @@
+"""Ways through an arena on a grid: each cell's distance from the obstacles, the best way from every cell to a goal.
+
+SciPy is imported by who looks for a way: every actor's process draws arenas, and it takes a third of its start.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from itertools import product
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from brakeline.messaging.obstacle import Obstacle, Shapes
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_array
+
+Array = NDArray[np.float64]
+
+CELL = {2: 0.05, 3: 0.625}  # m, edge of a cell in the plane and in space
+MOST_CELLS = {2: 110**2, 3: 65_536}  # larger rooms get larger cells
+
+
+class ClearanceMap:
+    """Distance from every cell's centre to the nearest obstacle: `clearance`, m, one index per axis, x first."""
+
+    def __init__(self, obstacles: Sequence[Obstacle], bounds: Sequence[tuple[float, float]]) -> None:
+        """bounds: lowest and highest coordinate of each of the d = 2 or 3 axes, m.
+
+        Cells are cubes that fill the first axis; along the others the last may end half a cell beside the bound.
+        """
+        widths = [high - low for low, high in bounds]
+        self.dim = len(bounds)
+        self.low: Array = np.array([low for low, _ in bounds])
+        cell: float = max(CELL[self.dim], (math.prod(widths) / MOST_CELLS[self.dim]) ** (1.0 / self.dim))
+        self.cell: float = widths[0] / round(widths[0] / cell)
+        self.shape = tuple(round(width / self.cell) for width in widths)
+        axes = [low + self.cell * (np.arange(n) + 0.5) for low, n in zip(self.low, self.shape, strict=True)]
+        self.centres: Array = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, self.dim)
+        plan = np.stack(np.meshgrid(*axes[:2], indexing="ij"), axis=-1).reshape(-1, 2)
+        shapes = Shapes.of(obstacles, dim=self.dim)
+        self.clearance: Array = _nearest(shapes, plan, *axes[2:]).reshape(self.shape)
+
+    def index(self, points: Array) -> NDArray[np.intp]:
+        """Cells of points (..., d), the outermost ones for points beyond the walls: (..., d)."""
+        cells = np.floor((points - self.low) / self.cell).astype(np.intp)
+        return np.clip(cells, 0, np.array(self.shape) - 1)
+
+    def number(self, points: Array) -> NDArray[np.intp]:
+        """Cells of points (..., d) as places in `centres`: (...)."""
+        return np.asarray(np.ravel_multi_index(tuple(np.moveaxis(self.index(points), -1, 0)), self.shape))
+
+    def at(self, points: Array) -> Array:
+        """Clearance of the cells that hold points (..., d), in m."""
+        return np.asarray(self.clearance[tuple(np.moveaxis(self.index(points), -1, 0))])
+
+    def between(self, values: Array, points: Array) -> Array:
+        """Values of the cells (as `clearance` is shaped), interpolated linearly at points (..., d): (...)."""
+        from scipy.ndimage import map_coordinates
+
+        places = np.moveaxis((points - self.low) / self.cell - 0.5, -1, 0)
+        return np.asarray(map_coordinates(values, places, order=1, mode="nearest"))
+
+    def connected(self, start: Sequence[float], goal: Sequence[float], clearance: float) -> bool:
+        """Whether a disc (ball) of radius `clearance` (m) can go from start to goal.
+
+        Between two cells h = cell·√d apart, both at least c from a point, the way is at least √(c² − h²/4) from it.
+        """
+        least = float(np.hypot(clearance, 0.5 * self.cell * np.sqrt(self.dim)))
+        free = np.pad(self.clearance >= least, 1)  # what is outside is solid
+        first, last = np.ravel_multi_index(tuple((self.index(np.array([start, goal])) + 1).T), free.shape)
+        beside = np.array(list(product((-1, 0, 1), repeat=self.dim))) @ free.strides  # a cell is a byte
+        to_reach, front = free.ravel(), np.array([first])
+        place = np.zeros(free.size, np.intp)
+        if not (to_reach[first] and to_reach[last]):
+            return False
+        while to_reach[last] and len(front):  # a cell farther each time
+            front = (front[:, None] + beside).ravel()
+            front = front[to_reach[front]]
+            to_reach[front] = False
+            places = np.arange(len(front))
+            place[front] = places
+            front = front[place[front] == places]  # each once
+        return bool(not to_reach[last])
+
+
+def _nearest(shapes: Shapes, plan: Array, heights: Array | None = None) -> Array:
+    """Distances to the nearest shape from points (p, 2); with heights (q,): from all points above these, (p, q).
+
+    `Shapes.distance`, ten times faster for many points: shapes turn about the vertical only, so what lies in the plan
+    is the same for all heights.
+    """
+    x, y = np.ascontiguousarray(plan.T)
+    least = np.full(len(plan) if heights is None else (len(plan), len(heights)), np.inf)
+    square = least.copy()  # of the distance to all but balls, in space: it takes one root for all
+    scratch = np.empty_like(least)
+    for center, axes, half, rho, rounded in zip(
+        shapes.center, shapes.axes, shapes.half, shapes.rho, shapes.round, strict=True
+    ):
+        along = np.abs((x - center[0]) * axes[0, 0] + (y - center[1]) * axes[1, 0]) - half[0]
+        across = np.abs((x - center[0]) * axes[0, 1] + (y - center[1]) * axes[1, 1]) - half[1]
+        beside = np.hypot(np.maximum(along, 0.0), np.maximum(across, 0.0))
+        if heights is None:
+            np.minimum(least, beside - rho, out=least)
+            continue
+        above = np.maximum(np.abs(heights - center[2]) - half[2], 0.0)
+        ball = rho > 0.0 and rounded[2] > 0.0
+        np.add.outer((beside if ball else np.maximum(beside - rho, 0.0)) ** 2, above**2, out=scratch)
+        if ball:
+            np.minimum(least, np.sqrt(scratch, out=scratch) - rho, out=least)
+        else:
+            np.minimum(square, scratch, out=square)
+    if heights is not None:
+        np.minimum(least, np.sqrt(square), out=least)
+    return np.asarray(np.maximum(least, 0.0))
+
+
+class Routes:
+    """The best way from every cell to one goal, as Dijkstra's algorithm finds it.
+
+    A way costs its length times 1 + `AVOIDANCE`·(lack/comfort)², where lack is what the clearance misses to `comfort`;
+    cells that the body does not fit in cost `BLOCKED` times their length, so that a robot that strayed into one gets
+    out again. One run serves the whole episode: whoever leaves the way follows the one from the new cell.
+    """
+
+    AVOIDANCE = 30.0
+    BLOCKED = 1e4
+
+    def __init__(self, grid: ClearanceMap, goal: Sequence[float], footprint: float, comfort: float) -> None:
+        """footprint, comfort: m; distances from the position to an obstacle that are possible, and that are liked."""
+        from scipy.ndimage import minimum_filter
+        from scipy.sparse.csgraph import dijkstra
+
+        self.grid = grid
+        lack = np.clip((comfort - grid.clearance) / (comfort - footprint), 0.0, 1.0)
+        free = grid.clearance > footprint
+        weight = np.where(free, 1.0 + self.AVOIDANCE * lack**2, self.BLOCKED)
+        self._goal = int(grid.number(np.asarray(goal, dtype=np.float64)))
+        cost, before = dijkstra(_graph(weight, grid.cell), directed=False, indices=self._goal, return_predecessors=True)
+        self._next = before
+        self._cost = cost.reshape(grid.shape)
+        # For interpolation: no free cell's neighbour may look as far from the goal as crossing a solid is
+        around = minimum_filter(self._cost, size=3) + grid.cell
+        self._cost[~free] = np.minimum(self._cost, around)[~free]
+
+    def to_go(self, points: Array) -> Array:
+        """Cost of the best way from points (..., d) to the goal, interpolated between cells, m: (...)."""
+        return self.grid.between(self._cost, points)
+
+    def way(self, position: Array, length: float) -> Array:
+        """Centres of the next cells from a position (d,) on towards the goal, up to `length` m: (k, d), k ≥ 1."""
+        cell = int(self.grid.number(position))
+        cells = [cell]
+        while cell != self._goal and len(cells) * self.grid.cell < length:
+            cell = int(self._next[cell])
+            cells.append(cell)
+        return np.asarray(self.grid.centres[cells])
+
+
+def _graph(weight: Array, cell: float) -> csr_array:
+    """Edges from every cell to half of its neighbours (the others are these reversed), each length times weight."""
+    from scipy.sparse import csr_array
+
+    ids = np.arange(weight.size).reshape(weight.shape)
+    rows, columns, costs = [], [], []
+    for step in product((-1, 0, 1), repeat=weight.ndim):
+        if step <= (0,) * weight.ndim:
+            continue
+        here = tuple(slice(max(0, -d), n - max(0, d)) for d, n in zip(step, weight.shape, strict=True))
+        there = tuple(slice(max(0, d), n - max(0, -d)) for d, n in zip(step, weight.shape, strict=True))
+        rows.append(ids[here].ravel())
+        columns.append(ids[there].ravel())
+        costs.append((0.5 * np.linalg.norm(step) * cell * (weight[here] + weight[there])).ravel())
+    pairs = (np.concatenate(rows), np.concatenate(columns))
+    return csr_array((np.concatenate(costs), pairs), shape=(weight.size, weight.size))
