@@ -13,11 +13,11 @@ import numpy as np
 
 from brakeline.actors.actor_settings import Change as Change
 from brakeline.actors.decision_guard import Ask, Outcome, consult
-from brakeline.actors.episode_runner import EPISODE_STRIDE, Driver, Environment, Identity
+from brakeline.actors.episode_runner import EPISODE_STRIDE, Environment, EpisodeRunner, Identity
 from brakeline.actors.joint_episode import Fleet, World, as_one
-from brakeline.actors.learner_client import Student
+from brakeline.actors.learner_client import LearnerClient
 from brakeline.actors.mavlink.frame_recorder import Puts, Tape
-from brakeline.actors.policies import Fixed, FlyingPupil, MakePolicy, Proposer, Pupil, check
+from brakeline.actors.policies import Fixed, FlyingPupil, LearnedPolicy, MakePolicy, Proposer, check
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.bus import BusSettings, Publisher
 from brakeline.messaging.process_runtime import Process
@@ -75,7 +75,7 @@ class Practice:
         self.share, self._left = share, 0
         self.running = False  # is the last proposal part of a stop?
 
-    def instead(self, driver: Driver, proposal: Array) -> Array:
+    def instead(self, driver: EpisodeRunner, proposal: Array) -> Array:
         """The committed plan's next input while a stop is practised, else the proposal."""
         if self._left == 0 and self.share > 0.0 and driver.rng.random() < self.share:
             self._left = driver.robot.horizon - 1 + STANDING
@@ -83,18 +83,18 @@ class Practice:
         if not self.running:
             return proposal
         self._left -= 1
-        return np.asarray(driver.commitment.plan[driver.robot.given])
+        return np.asarray(driver.backup_plan.plan[driver.robot.given])
 
-    def kept(self, driver: Driver, outcome: Outcome) -> Outcome:
+    def kept(self, driver: EpisodeRunner, outcome: Outcome) -> Outcome:
         """A stop that was begun goes on as it was verified, also where the filter would do something else by now: it
         keeps more distance than is needed. Not where what was verified does not hold any more."""
         answer = outcome.answer
-        if not self.running or answer is None or answer.kind == ALLOWED or not driver.commitment.holds:
+        if not self.running or answer is None or answer.kind == ALLOWED or not driver.backup_plan.holds:
             return outcome
         return replace(outcome, answer=None, failure=PRACTISED)
 
 
-class Rider:
+class ActorRunner:
     """A driver with its link to the learner and its publishers."""
 
     waits = True  # standing, for the safety service, instead of letting time pass
@@ -119,10 +119,10 @@ class Rider:
         tap = self.tape.take if settings.mavlink else None
         env = env or make(robot, settings.arena, settings.seed, tap=tap)
         filtered, cuts = settings.method != "none", settings.method == "sailr"
-        self.driver = Driver(robot, env, identity, settings.penalty, filtered, cuts, goes_on)
+        self.driver = EpisodeRunner(robot, env, identity, settings.penalty, filtered, cuts, goes_on)
         if propose is None:
-            student = Student(process.bus, robot, actor, settings.lockstep)
-            self.proposer: Proposer = FlyingPupil(student) if goes_on else Pupil(student)
+            student = LearnerClient(process.bus, robot, actor, settings.lockstep)
+            self.proposer: Proposer = FlyingPupil(student) if goes_on else LearnedPolicy(student)
         else:
             self.proposer = Fixed(propose, settings.seed + identity.number, settings.steps)
         self.next_episode = 0
@@ -210,7 +210,7 @@ class Tally:
         }
 
 
-def cycle(riders: list[Rider], question: Ask | None, tally: Tally, stop: Callable[[], bool]) -> bool:
+def cycle(riders: list[ActorRunner], question: Ask | None, tally: Tally, stop: Callable[[], bool]) -> bool:
     """One period of all robots of the process; False: the end."""
     for rider in riders:
         if not rider.ready(stop):
@@ -236,7 +236,7 @@ def cycle(riders: list[Rider], question: Ask | None, tally: Tally, stop: Callabl
 
 
 def cycle_together(
-    fleet: Fleet, riders: list[Rider], question: Ask | None, tally: Tally, stop: Callable[[], bool]
+    fleet: Fleet, riders: list[ActorRunner], question: Ask | None, tally: Tally, stop: Callable[[], bool]
 ) -> bool:
     """One period of the robots of one world; False: the end. Time passes for all of them or for none."""
     if not fleet.running:
@@ -292,8 +292,8 @@ def run(
             number = settings.seed * EPISODE_STRIDE + settings.number
             world = make_world(robot_with_task(settings.robot), settings.arena, settings.robots, number)
         places: Sequence[Environment | None] = [None] * settings.robots if world is None else world.members
-        riders = [Rider(process, settings, i, make, propose, env=env) for i, env in enumerate(places)]
-        one_period: Callable[[list[Rider], Ask | None, Tally, Callable[[], bool]], bool] = cycle
+        riders = [ActorRunner(process, settings, i, make, propose, env=env) for i, env in enumerate(places)]
+        one_period: Callable[[list[ActorRunner], Ask | None, Tally, Callable[[], bool]], bool] = cycle
         if world is not None:
             fleet = Fleet(world, [rider.driver for rider in riders], settings.method != "none")
             one_period = partial(cycle_together, fleet)

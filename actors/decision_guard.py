@@ -9,7 +9,7 @@ from time import perf_counter_ns
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.bus import BusError
 from brakeline.messaging.robot import Robot
-from brakeline.safety.filter.backup_plan import Array, Commitment
+from brakeline.safety.filter.backup_plan import Array, BackupPlan
 from brakeline.safety.service.asker import Answer, accept
 from brakeline.safety.service.client import SafetyError, read
 
@@ -56,14 +56,14 @@ def _outcome(request: pb.Request, reply: pb.Reply | None, failure: str, elapsed:
     return Outcome(request, reply, answer, failure, elapsed)
 
 
-def next_input(commitment: Commitment, outcome: Outcome) -> Array:
+def next_input(backup_plan: BackupPlan, outcome: Outcome) -> Array:
     """The input to execute now: the answer's, else the committed plan's."""
     if outcome.answer is not None:
-        return accept(commitment, outcome.answer)
-    return commitment.fallback()
+        return accept(backup_plan, outcome.answer)
+    return backup_plan.fallback()
 
 
-def at_rest(commitment: Commitment) -> bool:
+def at_rest(backup_plan: BackupPlan) -> bool:
     """Is the robot standing, and committed to that? Then it can wait for the service for as long as it takes."""
-    robot = commitment.robot
-    return bool(robot.rests(commitment.input_in_force) and robot.rests(commitment.plan).all())
+    robot = backup_plan.robot
+    return bool(robot.rests(backup_plan.input_in_force) and robot.rests(backup_plan.plan).all())

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from brakeline.actors.decision_guard import Outcome, at_rest, next_input
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.task import RobotWithTask
-from brakeline.safety.filter.backup_plan import Array, Commitment, Prediction, correction_penalty
+from brakeline.safety.filter.backup_plan import Array, BackupPlan, Prediction, correction_penalty
 from brakeline.safety.perception.image_memory import filled, memory_of
 from brakeline.safety.service.client import obstacle_messages, request_message
 from brakeline.safety.service.wire import KINDS
@@ -49,7 +49,7 @@ class Identity:
         return np.random.default_rng((self.seed, self.number, episode))
 
 
-class Driver:
+class EpisodeRunner:
     """Everything about one robot but the bus and the policy."""
 
     def __init__(
@@ -68,7 +68,7 @@ class Driver:
         goes_on: a reset gives another goal to a robot that goes on as it was, and so does its committed plan."""
         self.robot, self.env, self.identity, self.penalty, self.filtered = robot, env, identity, penalty, filtered
         self.cuts, self._goes_on = cuts, goes_on
-        self.commitment = Commitment(robot)
+        self.backup_plan = BackupPlan(robot)
         self._memory = memory_of(robot)
         self.index = 0  # steps so far
         self.running = False
@@ -80,7 +80,7 @@ class Driver:
         seed = self.identity.episode_seed(episode)
         self.observation, self.info = self.env.reset(options={"episode_seed": seed})
         if not self._goes_on:
-            self.commitment.reset()
+            self.backup_plan.reset()
             self._memory.reset()
         self._remember()
         self.episode, self.step, self._number, self.running = episode, 0, 0, True
@@ -103,7 +103,7 @@ class Driver:
     def request(self, proposal: Array) -> pb.Request:
         """The question about a proposal in the present state."""
         return request_message(
-            self.commitment,
+            self.backup_plan,
             self.info["state"],
             proposal,
             self.info["obstacles"],
@@ -119,7 +119,7 @@ class Driver:
 
     def skip(self) -> None:
         """A period went by unseen: the plan went on, and the steps' numbers show a gap."""
-        self.commitment.fallback()
+        self.backup_plan.fallback()
         self._memory.later(self.robot.period)
         self.step += 1
 
@@ -129,7 +129,7 @@ class Driver:
 
     def may_wait(self, outcome: Outcome) -> bool:
         """No answer, and nothing moves: better to ask again than to let the episode pass."""
-        return outcome.answer is None and at_rest(self.commitment)
+        return outcome.answer is None and at_rest(self.backup_plan)
 
     def execute(self, proposal: Array, outcome: Outcome | None, weights_version: int = 0) -> pb.Step:
         """Do what the outcome says (without a filter: the proposal) for one period."""
@@ -143,7 +143,7 @@ class Driver:
         if outcome is None:
             proposal = proposal if np.isfinite(proposal).all() else self.robot.at_zero()
             return np.asarray(np.clip(proposal, self.robot.low(), self.robot.high()))
-        return next_input(self.commitment, outcome)
+        return next_input(self.backup_plan, outcome)
 
     def stood(self, result: Result) -> None:
         """A period passed in which it had nothing to do: its episode is over, its world is not."""
@@ -212,7 +212,7 @@ class Driver:
             step.for_clearance = answer.for_clearance
         if self.cuts:
             self._cut(step)
-        predicted: Prediction | None = self.commitment.predicted
+        predicted: Prediction | None = self.backup_plan.predicted
         if predicted is not None:
             step.compared = True
             step.contained = predicted.contains(self.robot, self.info["state"])

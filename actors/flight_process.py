@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from google.protobuf.message import Message
 
-from brakeline.actors.actor_process import PRACTISED, ActorSettings, Make, Rider, Tally, cycle
+from brakeline.actors.actor_process import PRACTISED, ActorRunner, ActorSettings, Make, Tally, cycle
 from brakeline.actors.actor_settings import FlightSettings as FlightSettings
 from brakeline.actors.decision_guard import Ask, Outcome, consult
 from brakeline.actors.mavlink.frame_log import Tap
@@ -33,7 +33,7 @@ from brakeline.messaging.bus import BusError
 from brakeline.messaging.process_runtime import Process
 from brakeline.messaging.robot import Robot
 from brakeline.messaging.task import RobotWithTask, robot_with_task
-from brakeline.safety.filter.backup_plan import Array, Commitment
+from brakeline.safety.filter.backup_plan import Array, BackupPlan
 from brakeline.safety.service.client import ask, request_message
 from brakeline.sim.arena import Arena
 from brakeline.sim.arena_generator import tour
@@ -139,7 +139,7 @@ class Flight:
         raise ValueError(f"a vehicle behind a link cannot be altered: {', '.join(changes)}")
 
 
-class FlightRider(Rider):
+class FlightRider(ActorRunner):
     """A rider whose world does not wait."""
 
     waits = False
@@ -248,7 +248,7 @@ def answered(question: Ask, robot: Robot, stage: Arena, filtered: bool, stop: Ca
     seen = [obstacle for obstacle, far in zip(stage.obstacles, away, strict=True) if far <= robot.sight]
     said = ""
     while not stop():
-        request = request_message(Commitment(robot), state, np.zeros(robot.action_dim), seen, known_free=True)
+        request = request_message(BackupPlan(robot), state, np.zeros(robot.action_dim), seen, known_free=True)
         outcome = consult(question, [request], robot)[0]
         if outcome.answer is not None:
             if filtered and outcome.answer.kind not in ("allowed", "adjusted"):

@@ -11,7 +11,7 @@ from dataclasses import replace
 from typing import Any, Protocol
 
 from brakeline.actors.decision_guard import Outcome
-from brakeline.actors.episode_runner import Driver, Environment, Result
+from brakeline.actors.episode_runner import Environment, EpisodeRunner, Result
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.safety.filter.backup_plan import Array
 
@@ -33,7 +33,7 @@ class World(Protocol):
 class Fleet:
     """The drivers of one world."""
 
-    def __init__(self, world: World, drivers: Sequence[Driver], promising: bool = True) -> None:
+    def __init__(self, world: World, drivers: Sequence[EpisodeRunner], promising: bool = True) -> None:
         """promising: they ask for promises; without, they know nothing of each other."""
         self.world, self.drivers = world, list(drivers)
         for driver in self.drivers:

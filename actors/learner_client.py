@@ -27,7 +27,7 @@ class RefusedByLearner(RuntimeError):
     """The learner does not take this actor: layouts differ, or it has enough."""
 
 
-class Student:
+class LearnerClient:
     """The link of one actor name to the learner. `policy` is the newest, None before the first join."""
 
     def __init__(self, bus: Bus, robot: RobotWithTask, actor: str, lockstep: bool = False) -> None:

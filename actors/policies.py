@@ -10,7 +10,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from brakeline.actors.learner_client import Student
+from brakeline.actors.learner_client import LearnerClient
 from brakeline.safety.filter.backup_plan import Array
 from brakeline.sim.scripted_policies import Policy, scripted
 
@@ -40,10 +40,10 @@ class Proposer(Protocol):
         """A proposal (m,), whatever it may be."""
 
 
-class Pupil:
+class LearnedPolicy:
     """Explores with the newest weights of a learner, and goes no further ahead than it allows."""
 
-    def __init__(self, student: Student) -> None:
+    def __init__(self, student: LearnerClient) -> None:
         self.student = student
 
     @property
@@ -72,7 +72,7 @@ class Pupil:
         return np.asarray(policy.explore(observation, self._rng), dtype=float)
 
 
-class FlyingPupil(Pupil):
+class FlyingPupil(LearnedPolicy):
     """A pupil that cannot stand and wait: it flies on with the weights that it has, and joins again meanwhile."""
 
     _joining: threading.Thread | None = None

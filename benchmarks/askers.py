@@ -36,7 +36,7 @@ from brakeline.messaging.free_ports import free_endpoint
 from brakeline.messaging.robot import robot_named
 from brakeline.messaging.topics import DECIDE
 from brakeline.safety.service.client import ask
-from brakeline.safety.service.plan_token import Notary, write_key
+from brakeline.safety.service.plan_token import PlanAuthenticator, write_key
 from brakeline.safety.service.server import Counts, Models, answerer
 
 REPLICAS = (1, 2, 4)
@@ -64,7 +64,7 @@ def _serve(settings: BusSettings, name: str, ready: Event, stop: Event) -> None:
     models.install(situations.model())
     assert settings.keys is not None
     with Bus(settings, name) as bus:
-        bus.serve(DECIDE, answerer(models, Counts(), Notary.of(settings.keys)))
+        bus.serve(DECIDE, answerer(models, Counts(), PlanAuthenticator.of(settings.keys)))
         ready.set()
         stop.wait()
 
@@ -193,9 +193,9 @@ def run() -> Figures:
             authority.issue(f"safety-{i}")
         authority.issue("client")
         write_key(keys)
-        notary, asked = Notary.of(keys), situations.messages("trained")
+        notary, asked = PlanAuthenticator.of(keys), situations.messages("trained")
         for question in asked:
-            question.voucher = notary.voucher(question, robot_named(question.robot))
+            question.plan_token = notary.plan_token(question, robot_named(question.robot))
         questions = [question.SerializeToString() for question in asked]
         for replicas in REPLICAS:
             endpoints, services, routers = stack.enter_context(cells(replicas, keys))

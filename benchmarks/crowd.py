@@ -38,7 +38,7 @@ from brakeline.messaging.bus.certificate_authority import Authority
 from brakeline.messaging.robot import robot_named
 from brakeline.messaging.topics import DECIDE, STEP
 from brakeline.safety.service.client import ask
-from brakeline.safety.service.plan_token import Notary, write_key
+from brakeline.safety.service.plan_token import PlanAuthenticator, write_key
 
 RATE = 50.0  # Hz of the asker
 DEADLINE = 0.1  # s
@@ -175,9 +175,9 @@ def run(rate: int = JUNK) -> Figures:
         for one in ("router-0", "safety-0", "client", "actor-0", "recorder"):
             authority.issue(one)
         write_key(keys)
-        notary, questions = Notary.of(keys), situations.messages("trained")
+        notary, questions = PlanAuthenticator.of(keys), situations.messages("trained")
         for question in questions:
-            question.voucher = notary.voucher(question, robot_named(question.robot))
+            question.plan_token = notary.plan_token(question, robot_named(question.robot))
         with cells(1, keys) as (endpoints, services, routers):
             settings = BusSettings(connect=tuple(endpoints), keys=keys)
             alone = _ask(settings, questions)

@@ -28,7 +28,7 @@ from brakeline.messaging.bus.certificate_authority import Authority
 from brakeline.messaging.task import robot_with_task
 from brakeline.messaging.topics import LEARNER, RECORDED
 from brakeline.safety.methods import DDPC, load
-from brakeline.safety.model.model_config import Recipe
+from brakeline.safety.model.model_config import ModelConfig
 from brakeline.safety.service.plan_token import write_key
 from brakeline.safety.service.signature import Signer, write_signer
 
@@ -200,8 +200,8 @@ class Fleet:
         signer = Signer.load(keys)
         for name in self.robots:
             robot = robot_with_task(name)
-            method_for(robot, DDPC, Recipe())
-            made = method_path(robot, DDPC, Recipe())
+            method_for(robot, DDPC, ModelConfig())
+            made = method_path(robot, DDPC, ModelConfig())
             signer.sign(load(made)).save(self.folder / "data" / robot.name / made.name)
 
     def _add(self, name: str, host: int, *words: object) -> None:

@@ -11,13 +11,13 @@ from numpy.typing import NDArray
 
 from benchmarks.timing import Figures
 from brakeline.actors.decision_guard import Ask, consult
-from brakeline.actors.episode_runner import Driver, Identity
+from brakeline.actors.episode_runner import EpisodeRunner, Identity
 from brakeline.actors.mavlink.autopilot_commands import Client
 from brakeline.actors.mavlink.lockstep_quadrotor import MavlinkVehicle
 from brakeline.deploy.data.model_store import model_for
 from brakeline.deploy.experiments.evaluate import in_process
 from brakeline.messaging.task import robot_with_task
-from brakeline.safety.model.model_set import Recipe
+from brakeline.safety.model.model_set import ModelConfig
 from brakeline.sim.arena import Arena
 from brakeline.sim.autopilot.autopilot_rules import SETPOINT_TIMEOUT
 from brakeline.sim.autopilot.endpoint import TICK, Autopilot
@@ -57,16 +57,16 @@ class Loss:
         """m: how far the worst position after the actor's death was outside of what the committed plan's tube sweeps,
         along the worst axis; not above 0: never outside."""
         rng = np.random.default_rng(number)
-        propose, driver = scripted(policy, ROBOT, rng), Driver(ROBOT, self._env, Identity("actor", 0, 0))
+        propose, driver = scripted(policy, ROBOT, rng), EpisodeRunner(ROBOT, self._env, Identity("actor", 0, 0))
         driver.begin(number)
         for _ in range(int(rng.integers(3, LONGEST))):
             outcome = consult(self._question, [driver.request(propose(driver.observation, driver.info))], ROBOT)[0]
-            driver.execute(driver.commitment.plan[0], outcome)
+            driver.execute(driver.backup_plan.plan[0], outcome)
             if not driver.running:
                 break
         assert outcome.answer is not None, "nobody kills the filter here"
         center, half = outcome.answer.tube_center, outcome.answer.tube_half_width
-        positions = self._die(driver.commitment.plan[0])
+        positions = self._die(driver.backup_plan.plan[0])
         return float(excess(positions, center, half).max())
 
     def _die(self, input: Array) -> Array:
@@ -92,7 +92,7 @@ class Loss:
 
 
 def run() -> Figures:
-    question = in_process(model_for(ROBOT, Recipe()))
+    question = in_process(model_for(ROBOT, ModelConfig()))
     figures: Figures = {}
     for timeout in TIMEOUTS:
         loss = Loss(question, timeout)

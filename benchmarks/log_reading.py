@@ -38,17 +38,17 @@ def real() -> list[tuple[str, Any]]:
     import numpy as np
 
     from brakeline.actors.decision_guard import consult
-    from brakeline.actors.episode_runner import Driver, Identity
+    from brakeline.actors.episode_runner import EpisodeRunner, Identity
     from brakeline.deploy.data.model_store import model_for
     from brakeline.deploy.experiments.evaluate import in_process
     from brakeline.deploy.vehicle_factory import environment
     from brakeline.messaging.task import robot_with_task
-    from brakeline.safety.model.model_set import Recipe
+    from brakeline.safety.model.model_set import ModelConfig
     from brakeline.sim.scripted_policies import scripted
 
     ground = robot_with_task("ground")
-    ask = in_process(model_for(ground, Recipe()))
-    driver = Driver(ground, environment(ground, "default", 7), Identity("actor-0", 0, 7))
+    ask = in_process(model_for(ground, ModelConfig()))
+    driver = EpisodeRunner(ground, environment(ground, "default", 7), Identity("actor-0", 0, 7))
     policy = scripted("greedy", ground, np.random.default_rng(7))
     found: list[tuple[str, Any]] = []
     for number in range(EPISODES):

@@ -26,7 +26,7 @@ from google.protobuf.message import DecodeError
 
 from benchmarks.message_fuzzer import Mill
 from benchmarks.timing import Figures
-from brakeline.actors.learner_client import Student
+from brakeline.actors.learner_client import LearnerClient
 from brakeline.deploy.commands.watch_command import _show
 from brakeline.deploy.run.display import line
 from brakeline.deploy.run.launcher import Launcher
@@ -48,7 +48,7 @@ from brakeline.messaging.bus import BusError, BusSettings, Sample
 from brakeline.messaging.rejected_messages import Tolerance
 from brakeline.messaging.task import RobotWithTask, robot_with_task
 from brakeline.messaging.topics import DECIDE, FLOW, JOIN, MODEL, RECORDED, TOPICS, WEIGHTS, Topic
-from brakeline.safety.filter.backup_plan import Commitment
+from brakeline.safety.filter.backup_plan import BackupPlan
 from brakeline.safety.filter.request import BadRequest
 from brakeline.safety.methods import decode
 from brakeline.safety.model.model_set import BadModel
@@ -172,7 +172,7 @@ def learning(robot: RobotWithTask, folder: Path) -> Party:
 
 def actor(robot: RobotWithTask) -> Party:
     wire: Any = Wire()
-    student = Student(wire, robot, "actor-0")
+    student = LearnerClient(wire, robot, "actor-0")
 
     def take(sample: Sample) -> None:
         with wire.tolerance.over(sample.key):
@@ -201,7 +201,7 @@ def safety() -> Party:
 
 def asker(robot: RobotWithTask, mill: Mill) -> Party:
     """Who asked, and gets an answer of whoever answers."""
-    request = request_message(Commitment(robot), [0.0] * robot.state_dim, [0.0] * robot.action_dim, known_free=True)
+    request = request_message(BackupPlan(robot), [0.0] * robot.state_dim, [0.0] * robot.action_dim, known_free=True)
 
     def take(sample: Sample) -> None:
         message = pb.Reply(robot=robot.name)

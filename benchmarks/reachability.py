@@ -6,10 +6,10 @@ import numpy as np
 
 from benchmarks import situations
 from benchmarks.timing import Figures, timed
-from brakeline.safety.model.error_bounds import Certificate
+from brakeline.safety.model.error_bounds import ErrorBound
 
 
-def multiplied_out(step: Certificate, z: np.ndarray) -> np.ndarray:
+def multiplied_out(step: ErrorBound, z: np.ndarray) -> np.ndarray:
     """Half-widths from all generator matrices `M_jt g_j h_tᵀ`, as a matrix zonotope is usually stored."""
     matrices = step.generators.T[:, None, :, None] * (step.M[:, :, None] * step.W[None])[:, :, None, :]
     spread = np.abs(matrices.reshape(-1, *step.C.shape) @ z).sum(0)

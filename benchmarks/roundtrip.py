@@ -26,7 +26,7 @@ from brakeline.messaging.free_ports import free_endpoint
 from brakeline.messaging.robot import robot_named
 from brakeline.messaging.topics import DECIDE
 from brakeline.safety.service.client import ask
-from brakeline.safety.service.plan_token import Notary, write_key
+from brakeline.safety.service.plan_token import PlanAuthenticator, write_key
 from brakeline.safety.service.server import Counts, Models, answerer
 
 QUESTIONS = 500
@@ -36,7 +36,7 @@ PLAIN, KEYS, SOCKET = "TCP", "with keys", "Unix socket"
 def _serve(settings: BusSettings, ready: Event, stop: Event) -> None:
     models = Models()
     models.install(situations.model())
-    notary = None if settings.keys is None else Notary.of(settings.keys)
+    notary = None if settings.keys is None else PlanAuthenticator.of(settings.keys)
     with Bus(settings, "safety") as bus:
         bus.serve(DECIDE, answerer(models, Counts(), notary))
         ready.set()
@@ -78,10 +78,10 @@ def _measure(listen: bool, questions: list[pb.Request]) -> Figures:
         for process in ("safety", "router", "client"):
             authority.issue(process)
         write_key(folder)
-        notary = Notary.of(folder)
+        notary = PlanAuthenticator.of(folder)
         buses = {how: stack.enter_context(_client(how, listen, folder)) for how in seconds}
         for i, question in enumerate(questions):
-            question.voucher = notary.voucher(question, robot_named(question.robot))
+            question.plan_token = notary.plan_token(question, robot_named(question.robot))
             hows = list(seconds)
             for how in hows[i % 3 :] + hows[: i % 3]:
                 before = perf_counter()

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from brakeline.actors.decision_guard import consult
-from brakeline.actors.episode_runner import Driver, Identity
+from brakeline.actors.episode_runner import EpisodeRunner, Identity
 from brakeline.deploy.data.model_store import model_for
 from brakeline.deploy.experiments.evaluate import in_process
 from brakeline.deploy.policy_loading import policy_named
@@ -16,7 +16,7 @@ from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.task import RobotWithTask, robot_with_task
 from brakeline.safety.filter.filter import Filter
 from brakeline.safety.filter.request import Request
-from brakeline.safety.model.model_set import ModelSet, Recipe
+from brakeline.safety.model.model_set import ModelConfig, ModelSet
 from brakeline.safety.service.wire import request_of
 from brakeline.sim.sim_conditions import Conditions
 
@@ -24,7 +24,7 @@ STEPS = 1500
 
 
 def model(certificate: str = "residual", mode: str = "direct", robot: RobotWithTask | None = None) -> ModelSet:
-    return model_for(robot or robot_with_task("ground"), Recipe(certificate, mode))
+    return model_for(robot or robot_with_task("ground"), ModelConfig(certificate, mode))
 
 
 def messages(
@@ -33,7 +33,7 @@ def messages(
     """The questions of some episodes of a policy behind the default filter."""
     robot = robot or robot_with_task("ground")
     question = in_process(model(robot=robot))
-    driver = Driver(robot, environment(robot, "default", seed, conditions), Identity("bench", 0, seed))
+    driver = EpisodeRunner(robot, environment(robot, "default", seed, conditions), Identity("bench", 0, seed))
     choose = policy_named(policy, robot, seed)
     asked: list[pb.Request] = []
     episode = 0

@@ -23,15 +23,15 @@ if TYPE_CHECKING:
     from brakeline.messaging.robot_description import BadDescription
     from brakeline.messaging.scan import BadScan, Scan
     from brakeline.messaging.task import RobotWithTask, Task, robot_with_task
-    from brakeline.safety.filter.backup_plan import Commitment, Prediction
+    from brakeline.safety.filter.backup_plan import BackupPlan, Prediction
     from brakeline.safety.filter.filter import Filter
     from brakeline.safety.filter.request import BadRequest, Decision, Request
     from brakeline.safety.gym import SafetyWrapper
     from brakeline.safety.model.dataset import BadData, Dataset, Trajectory
-    from brakeline.safety.model.error_bounds import CertificateError
+    from brakeline.safety.model.error_bounds import ErrorBoundError
     from brakeline.safety.model.fitting import make
-    from brakeline.safety.model.model_set import BadModel, ModelSet, Recipe
-    from brakeline.safety.model.validation import Statement, state
+    from brakeline.safety.model.model_set import BadModel, ModelConfig, ModelSet
+    from brakeline.safety.model.validation import ValidationReport, state
     from brakeline.safety.perception.image_memory import filled, memory_of
     from brakeline.safety.service.asker import Answer, Asker
     from brakeline.safety.service.client import SafetyClient, SafetyError
@@ -47,10 +47,10 @@ PLACES = {
     "brakeline.messaging.scan": ("BadScan", "Scan"),
     "brakeline.messaging.obstacle": ("BadShape", "Obstacle", "Shapes"),
     "brakeline.messaging.task": ("RobotWithTask", "Task", "robot_with_task"),
-    "brakeline.safety.model.error_bounds": ("CertificateError",),
+    "brakeline.safety.model.error_bounds": ("ErrorBoundError",),
     "brakeline.safety.service.asker": ("Answer", "Asker"),
     "brakeline.safety.service.client": ("SafetyClient", "SafetyError"),
-    "brakeline.safety.filter.backup_plan": ("Commitment", "Prediction"),
+    "brakeline.safety.filter.backup_plan": ("BackupPlan", "Prediction"),
     "brakeline.safety.model.dataset": ("BadData", "Dataset", "Trajectory"),
     "brakeline.safety.filter.filter": ("Filter",),
     "brakeline.safety.model.fitting": ("make",),
@@ -58,15 +58,16 @@ PLACES = {
     "brakeline.safety.gym": ("SafetyWrapper",),
     "brakeline.safety.perception.image_memory": ("filled", "memory_of"),
     "brakeline.safety.service.in_process": ("InProcess",),
-    "brakeline.safety.model.model_set": ("BadModel", "ModelSet", "Recipe"),
+    "brakeline.safety.model.model_set": ("BadModel", "ModelSet", "ModelConfig"),
     "brakeline.safety.filter.request": ("BadRequest", "Decision", "Request"),
-    "brakeline.safety.model.validation": ("Statement", "state"),
+    "brakeline.safety.model.validation": ("ValidationReport", "state"),
 }
 _PLACE_OF = {name: module for module, names in PLACES.items() for name in names}
 
 __all__ = [
     "Answer",
     "Asker",
+    "BackupPlan",
     "BadData",
     "BadDescription",
     "BadModel",
@@ -75,23 +76,22 @@ __all__ = [
     "BadShape",
     "BusError",
     "BusSettings",
-    "CertificateError",
-    "Commitment",
     "Dataset",
     "Decision",
     "Disc",
+    "ErrorBoundError",
     "Filter",
     "FleetClient",
     "InProcess",
     "Late",
     "Limit",
+    "ModelConfig",
     "ModelSet",
     "Motion",
     "NoReply",
     "Obstacle",
     "Prediction",
     "RangeImage",
-    "Recipe",
     "Refused",
     "Request",
     "Robot",
@@ -101,11 +101,11 @@ __all__ = [
     "SafetyWrapper",
     "Scan",
     "Shapes",
-    "Statement",
     "Task",
     "Trajectory",
     "UnknownRobot",
     "Unreachable",
+    "ValidationReport",
     "__version__",
     "filled",
     "make",

@@ -10,7 +10,7 @@ from brakeline.messaging.robot_description import robot_of
 from brakeline.safety.action_mapping import normalised
 from brakeline.safety.filter.filter import Filter
 from brakeline.safety.gym import SafetyWrapper
-from brakeline.safety.model.model_set import Recipe
+from brakeline.safety.model.model_set import ModelConfig
 
 
 class Cart(gymnasium.Env):
@@ -47,7 +47,7 @@ robot = robot_of(
 )
 how = {"state": lambda env, seen, info: seen, "actions": normalised(robot)}
 data = collect(Cart(), robot, 25_000, **how)  # so many that held-out plans state a bound within the robot's limit
-model, statement = certified(data, Recipe())
+model, statement = certified(data, ModelConfig())
 env = SafetyWrapper(Cart(), Filter(model), obstacles=lambda *_: [Obstacle("wall", (1.0, 0.0), yaw=np.pi)], **how)
 
 observation, _ = env.reset()

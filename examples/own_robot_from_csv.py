@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import small_log
 
-from brakeline import Commitment, Filter, ModelSet, Obstacle, Request, Shapes
+from brakeline import BackupPlan, Filter, ModelSet, Obstacle, Request, Shapes
 from brakeline.deploy.cli import main as brakeline
 
 
@@ -33,7 +33,7 @@ def main() -> None:
 
 def decide(filter: Filter, distance: float) -> None:
     """Full speed ahead, at a pillar, from standing still."""
-    kept = Commitment(filter.robot)  # the committed plan and the input in force: what an asker keeps between questions
+    kept = BackupPlan(filter.robot)  # the committed plan and the input in force: what an asker keeps between questions
     near = Shapes.of([Obstacle("cylinder", (distance, 0.0), (0.1,))], 2)
     answer = filter.decide(Request(np.zeros(5), np.array([0.4, 0.0]), kept.input_in_force, kept.plan, near))
     print(f"pillar at {distance} m: {answer.kind}, {answer.plan[0][0]:.2f} m/s")

@@ -88,7 +88,7 @@ class Source:
         return next((about for about in self.about if about.episode == number), None)
 
 
-class Gallery:
+class EpisodeSampler:
     """Takes the messages of one robot kind, and keeps the episodes that are worth it.
 
     `wanted` is the number of an episode that is kept whatever happens in it, of every actor (or of `actor` alone).

@@ -193,8 +193,8 @@ def _told(exchange: pb.Exchange, beside: Iterable[pb.Exchange], robot: Robot | N
         return {}
     d = robot.position_dim
     boxes = [box for other in beside for box in promised(robot, other)]
-    promises = [_rounded((*box[:2], *(box[d : d + 2] + box[-1]))) for box in boxes]
-    return {name: told for name, told in (around | {"promises": promises}).items() if told}
+    reservations = [_rounded((*box[:2], *(box[d : d + 2] + box[-1]))) for box in boxes]
+    return {name: told for name, told in (around | {"promises": reservations}).items() if told}
 
 
 def _obstacle(item: pb.Obstacle) -> Figures:

@@ -35,7 +35,7 @@ from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.obstacle import BOX, CYLINDER, SPHERE, WALL
 from brakeline.messaging.ray_directions import Rays
 from brakeline.messaging.robot import Robot
-from brakeline.safety.perception.displayed_map import Surroundings, surroundings
+from brakeline.safety.perception.displayed_map import DisplayedMap, surroundings
 
 WORLD = "world"
 HEIGHT = 0.4  # m, of what is drawn of a plane's obstacles
@@ -151,7 +151,7 @@ def _body(robot: Robot, actor: str, time: int) -> SceneEntity:
 
 
 def decision(
-    robot: Robot, step: pb.Step, exchange: pb.Exchange | None, time: int, promises: Iterable[np.ndarray] = ()
+    robot: Robot, step: pb.Step, exchange: pb.Exchange | None, time: int, reservations: Iterable[np.ndarray] = ()
 ) -> SceneUpdate:
     """What was decided for the period that ended with this step: the tube's boxes, that of standstill with the body
     about it, the plan's way through their middles, a word if the filter stepped in; and what the filter was told of the
@@ -180,7 +180,7 @@ def decision(
             said = f"{WORDS[kind]}: {about.said}"
             _explained(entity, exchange.request.state[:d], about, robot.footprint)
     if exchange is not None:
-        _told(entity, surroundings(robot, exchange.request), promises)
+        _told(entity, surroundings(robot, exchange.request), reservations)
     if kind in WORDS:
         word = fell_back() if step.fallback else said or WORDS[kind]
         above = HEIGHT + 3.0 * robot.footprint
@@ -205,7 +205,7 @@ def _explained(entity: SceneEntity, start: Sequence[float], about: Explanation, 
         entity.cubes.append(edge)
 
 
-def _told(entity: SceneEntity, about: Surroundings, promises: Iterable[np.ndarray]) -> None:
+def _told(entity: SceneEntity, about: DisplayedMap, reservations: Iterable[np.ndarray]) -> None:
     """Add where beams ended, the outline of what they showed to be free, what moves with where it may come to, and the
     boxes that others promise to be in."""
     if len(about.free):
@@ -227,7 +227,7 @@ def _told(entity: SceneEntity, about: Surroundings, promises: Iterable[np.ndarra
             entity.cylinders.append(
                 CylinderPrimitive(pose=place, size=size, color=color, bottom_scale=1.0, top_scale=1.0)
             )
-    for boxes in promises:
+    for boxes in reservations:
         for box in boxes:
             d = len(box) // 2
             edges = [2.0 * (half + box[-1]) for half in box[d:-1]] + [FLAT] * (3 - d)

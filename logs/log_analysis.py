@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from brakeline.logs.episode_sampler import Gallery, Source
+from brakeline.logs.episode_sampler import EpisodeSampler, Source
 from brakeline.logs.episode_stats import Figures
 from brakeline.logs.intervention_map import Places
 from brakeline.logs.learning_curve import Training
@@ -42,9 +42,9 @@ class Analysis:
         self.metrics = Metrics(robots=log.robots)
         self.training: dict[str, Training] = {}  # by robot kind
         self.places: dict[str, Places] = {}
-        self.galleries: dict[str, Gallery] = {}
+        self.galleries: dict[str, EpisodeSampler] = {}
         self.timeline = Timeline()
-        self._drawn: dict[Series, tuple[Places, Gallery, Source]] = {}
+        self._drawn: dict[Series, tuple[Places, EpisodeSampler, Source]] = {}
         self._kept: dict[Series, deque[Any]] = {}
         self._tolerance = Tolerance()
         self._take(log)
@@ -120,10 +120,12 @@ class Analysis:
             kept = self._kept[series] = source.exchanges if series.topic == EXCHANGE.name else source.about
         kept.append(message)
 
-    def _gallery(self, robot: str) -> Gallery:
+    def _gallery(self, robot: str) -> EpisodeSampler:
         gallery = self.galleries.get(robot)
         if gallery is None:
-            gallery = self.galleries[robot] = Gallery(self.log.robots.named(robot), self.look.episode, self.look.actor)
+            gallery = self.galleries[robot] = EpisodeSampler(
+                self.log.robots.named(robot), self.look.episode, self.look.actor
+            )
             gallery.label = self.prefix
         return gallery
 

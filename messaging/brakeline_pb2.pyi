@@ -100,7 +100,7 @@ class Obstacle(_message.Message):
     MARGIN_FIELD_NUMBER: _builtins.int
     MOTION_FIELD_NUMBER: _builtins.int
     kind: _builtins.str
-    """box | cylinder | sphere | wall (messaging/shapes.py)"""
+    """box | cylinder | sphere | wall (messaging/obstacle.py)"""
     yaw: _builtins.float
     """rad"""
     margin: _builtins.float
@@ -137,7 +137,7 @@ Global___Obstacle: _TypeAlias = Obstacle  # noqa: Y015
 
 @_typing.final
 class Motion(_message.Message):
-    """How an obstacle moves (messaging/motion.py): one of `acceleration` and `speed` bounds it."""
+    """How an obstacle moves (messaging/obstacle_motion.py): one of `acceleration` and `speed` bounds it."""
 
     DESCRIPTOR: _descriptor.Descriptor
 
@@ -201,8 +201,8 @@ class Motion(_message.Message):
 Global___Motion: _TypeAlias = Motion  # noqa: Y015
 
 @_typing.final
-class Promise(_message.Message):
-    """Where a robot will be, period by period, and then for ever (safety/promise.py): boxes in the world."""
+class Reservation(_message.Message):
+    """Where a robot will be, period by period, and then for ever (safety/filter/reservation.py): boxes in the world."""
 
     DESCRIPTOR: _descriptor.Descriptor
 
@@ -234,11 +234,11 @@ class Promise(_message.Message):
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 
-Global___Promise: _TypeAlias = Promise  # noqa: Y015
+Global___Reservation: _TypeAlias = Reservation  # noqa: Y015
 
 @_typing.final
 class Scan(_message.Message):
-    """One turn of a ranging sensor in the plane (messaging/scans.py): free space where there is no map."""
+    """One turn of a ranging sensor in the plane (messaging/scan.py): free space where there is no map."""
 
     DESCRIPTOR: _descriptor.Descriptor
 
@@ -330,7 +330,7 @@ Global___Scan: _TypeAlias = Scan  # noqa: Y015
 
 @_typing.final
 class RangeImage(_message.Message):
-    """One turn of a ranging sensor with beams all about (messaging/range_images.py): free space in the air."""
+    """One turn of a ranging sensor with beams all about (messaging/range_image.py): free space in the air."""
 
     DESCRIPTOR: _descriptor.Descriptor
 
@@ -435,9 +435,9 @@ class Request(_message.Message):
     PREDICTED_CENTER_FIELD_NUMBER: _builtins.int
     PREDICTED_HALF_WIDTH_FIELD_NUMBER: _builtins.int
     PREDICTED_HEADING_FIELD_NUMBER: _builtins.int
-    VOUCHER_FIELD_NUMBER: _builtins.int
+    PLAN_TOKEN_FIELD_NUMBER: _builtins.int
     FLEET_FIELD_NUMBER: _builtins.int
-    PROMISE_FIELD_NUMBER: _builtins.int
+    RESERVATION_FIELD_NUMBER: _builtins.int
     SCAN_FIELD_NUMBER: _builtins.int
     IMAGE_FIELD_NUMBER: _builtins.int
     KNOWN_FREE_FIELD_NUMBER: _builtins.int
@@ -451,8 +451,8 @@ class Request(_message.Message):
     """version that verified it; empty: standing still; "unverified": none did"""
     predicted_heading: _builtins.float
     """rad, of the frame in which that set's position part is a box"""
-    voucher: _builtins.bytes
-    """the service's word that `model` verified `plan` (safety/vouch.py)"""
+    plan_token: _builtins.bytes
+    """the service's word that `model` verified `plan` (safety/service/plan_token.py)"""
     known_free: _builtins.bool
     """Nothing but `obstacles` is near: all other space within reach is free. Needed without obstacles, scan and image."""
     @_builtins.property
@@ -488,7 +488,7 @@ class Request(_message.Message):
         """the actors of all robots of its world; empty: it is alone"""
 
     @_builtins.property
-    def promise(self) -> Global___Promise:
+    def reservation(self) -> Global___Reservation:
         """what is left of what the last decision promised; none: it stands"""
 
     @_builtins.property
@@ -517,16 +517,16 @@ class Request(_message.Message):
         predicted_center: _abc.Iterable[_builtins.float] | None = ...,
         predicted_half_width: _abc.Iterable[_builtins.float] | None = ...,
         predicted_heading: _builtins.float = ...,
-        voucher: _builtins.bytes = ...,
+        plan_token: _builtins.bytes = ...,
         fleet: _abc.Iterable[_builtins.str] | None = ...,
-        promise: Global___Promise | None = ...,
+        reservation: Global___Reservation | None = ...,
         scan: Global___Scan | None = ...,
         image: Global___RangeImage | None = ...,
         known_free: _builtins.bool = ...,
     ) -> None: ...
-    _HasFieldArgType: _TypeAlias = _typing.Literal["image", b"image", "promise", b"promise", "scan", b"scan"]  # noqa: Y015
+    _HasFieldArgType: _TypeAlias = _typing.Literal["image", b"image", "reservation", b"reservation", "scan", b"scan"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["action", b"action", "actor", b"actor", "episode", b"episode", "fleet", b"fleet", "image", b"image", "input_in_force", b"input_in_force", "known_free", b"known_free", "model", b"model", "observation", b"observation", "obstacles", b"obstacles", "plan", b"plan", "predicted_center", b"predicted_center", "predicted_half_width", b"predicted_half_width", "predicted_heading", b"predicted_heading", "promise", b"promise", "robot", b"robot", "scan", b"scan", "state", b"state", "step", b"step", "time", b"time", "voucher", b"voucher"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["action", b"action", "actor", b"actor", "episode", b"episode", "fleet", b"fleet", "image", b"image", "input_in_force", b"input_in_force", "known_free", b"known_free", "model", b"model", "observation", b"observation", "obstacles", b"obstacles", "plan", b"plan", "plan_token", b"plan_token", "predicted_center", b"predicted_center", "predicted_half_width", b"predicted_half_width", "predicted_heading", b"predicted_heading", "reservation", b"reservation", "robot", b"robot", "scan", b"scan", "state", b"state", "step", b"step", "time", b"time"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 
@@ -580,9 +580,9 @@ class Decision(_message.Message):
     QUEUE_MS_FIELD_NUMBER: _builtins.int
     SOLVER_FIELD_NUMBER: _builtins.int
     ITERATIONS_FIELD_NUMBER: _builtins.int
-    VOUCHERS_FIELD_NUMBER: _builtins.int
+    PLAN_TOKENS_FIELD_NUMBER: _builtins.int
     UNVOUCHED_FIELD_NUMBER: _builtins.int
-    PROMISE_FIELD_NUMBER: _builtins.int
+    RESERVATION_FIELD_NUMBER: _builtins.int
     BROKEN_FIELD_NUMBER: _builtins.int
     STOPPED_FIELD_NUMBER: _builtins.int
     FOR_CLEARANCE_FIELD_NUMBER: _builtins.int
@@ -644,11 +644,11 @@ class Decision(_message.Message):
     @_builtins.property
     def predicted_half_width(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]: ...
     @_builtins.property
-    def vouchers(self) -> _containers.RepeatedScalarFieldContainer[_builtins.bytes]:
+    def plan_tokens(self) -> _containers.RepeatedScalarFieldContainer[_builtins.bytes]:
         """for the requests of the next periods, in their order"""
 
     @_builtins.property
-    def promise(self) -> Global___Promise:
+    def reservation(self) -> Global___Reservation:
         """of a fleet's robot, from now on"""
 
     @_builtins.property
@@ -678,17 +678,17 @@ class Decision(_message.Message):
         queue_ms: _builtins.float = ...,
         solver: _builtins.str = ...,
         iterations: _builtins.int = ...,
-        vouchers: _abc.Iterable[_builtins.bytes] | None = ...,
+        plan_tokens: _abc.Iterable[_builtins.bytes] | None = ...,
         unvouched: _builtins.bool = ...,
-        promise: Global___Promise | None = ...,
+        reservation: Global___Reservation | None = ...,
         broken: _builtins.int = ...,
         stopped: Global___Stopped | None = ...,
         for_clearance: _builtins.bool | None = ...,
         bound: _builtins.float | None = ...,
     ) -> None: ...
-    _HasFieldArgType: _TypeAlias = _typing.Literal["_bound", b"_bound", "_for_clearance", b"_for_clearance", "bound", b"bound", "for_clearance", b"for_clearance", "promise", b"promise", "stopped", b"stopped"]  # noqa: Y015
+    _HasFieldArgType: _TypeAlias = _typing.Literal["_bound", b"_bound", "_for_clearance", b"_for_clearance", "bound", b"bound", "for_clearance", b"for_clearance", "reservation", b"reservation", "stopped", b"stopped"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["_bound", b"_bound", "_for_clearance", b"_for_clearance", "at_least", b"at_least", "bound", b"bound", "broken", b"broken", "compared", b"compared", "contained", b"contained", "for_clearance", b"for_clearance", "iterations", b"iterations", "kind", b"kind", "margin", b"margin", "model", b"model", "plan", b"plan", "predicted_center", b"predicted_center", "predicted_half_width", b"predicted_half_width", "predicted_heading", b"predicted_heading", "promise", b"promise", "queue_ms", b"queue_ms", "reason", b"reason", "solve_ms", b"solve_ms", "solver", b"solver", "stopped", b"stopped", "time_ms", b"time_ms", "tube_center", b"tube_center", "tube_half_width", b"tube_half_width", "unvouched", b"unvouched", "verified", b"verified", "verify_ms", b"verify_ms", "vouchers", b"vouchers"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["_bound", b"_bound", "_for_clearance", b"_for_clearance", "at_least", b"at_least", "bound", b"bound", "broken", b"broken", "compared", b"compared", "contained", b"contained", "for_clearance", b"for_clearance", "iterations", b"iterations", "kind", b"kind", "margin", b"margin", "model", b"model", "plan", b"plan", "plan_tokens", b"plan_tokens", "predicted_center", b"predicted_center", "predicted_half_width", b"predicted_half_width", "predicted_heading", b"predicted_heading", "queue_ms", b"queue_ms", "reason", b"reason", "reservation", b"reservation", "solve_ms", b"solve_ms", "solver", b"solver", "stopped", b"stopped", "time_ms", b"time_ms", "tube_center", b"tube_center", "tube_half_width", b"tube_half_width", "unvouched", b"unvouched", "verified", b"verified", "verify_ms", b"verify_ms"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     _WhichOneofReturnType__bound: _TypeAlias = _typing.Literal["bound"]  # noqa: Y015
     _WhichOneofArgType__bound: _TypeAlias = _typing.Literal["_bound", b"_bound"]  # noqa: Y015
@@ -839,9 +839,9 @@ class Model(_message.Message):
     robot: _builtins.str
     version: _builtins.str
     file: _builtins.bytes
-    """as safety/model_set.py writes it (safetensors)"""
+    """as safety/model/model_set.py writes it (safetensors)"""
     claim: _builtins.bytes
-    """what is said of the file (safety/sign.py), ..."""
+    """what is said of the file (safety/service/signature.py), ..."""
     signature: _builtins.bytes
     """... and who says it"""
     @_builtins.property
@@ -1433,7 +1433,7 @@ Global___MavlinkFrames: _TypeAlias = MavlinkFrames  # noqa: Y015
 
 @_typing.final
 class FlightRequest(_message.Message):
-    """--- an actor and its vehicle server (actors/vehicle_messages.py) ----------------------------------------------------
+    """--- an actor and its vehicle server (actors/mavlink/vehicle_messages.py) ----------------------------------------------------
 
     The vehicle to fly: the first command of an actor.
     """
@@ -1463,7 +1463,7 @@ class FlightRequest(_message.Message):
     lead: _builtins.bool
     """send positions ahead of the vehicle instead of velocities"""
     robot: _builtins.str
-    """the robot's description as JSON (messaging/descriptions.py)"""
+    """the robot's description as JSON (messaging/robot_description.py)"""
     late: _builtins.bool
     """the robot in real time"""
     @_builtins.property

@@ -72,7 +72,7 @@ class SafetyWrapper(gymnasium.Wrapper[Any, Any, Any, Any]):
         """
         super().__init__(env)
         self.asker = filter if isinstance(filter, Asker) else InProcess(filter, accept_bound)
-        self.penalty, self.commitment = penalty, self.asker.commitment
+        self.penalty, self.backup_plan = penalty, self.asker.backup_plan
         self._state, self._obstacles = state, obstacles
         self._actions = actions_of(env.action_space, self.asker.robot, actions)
         self._now: tuple[Any, dict[str, Any]] | None = None
@@ -92,7 +92,7 @@ class SafetyWrapper(gymnasium.Wrapper[Any, Any, Any, Any]):
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         self._now = self.env.reset(seed=seed, options=options)
-        self.commitment.reset()
+        self.backup_plan.reset()
         self._memory.reset()
         self._remember()
         return self._now
@@ -100,10 +100,10 @@ class SafetyWrapper(gymnasium.Wrapper[Any, Any, Any, Any]):
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         if self._now is None:
             raise gymnasium.error.ResetNeeded("reset the environment before anything else")
-        before = self.commitment.due
+        before = self.backup_plan.next_input
         wanted = np.asarray(self._actions.action_to_control(action), dtype=float)
         answer, reason = self._decide(wanted)
-        executed = self.commitment.due
+        executed = self.backup_plan.next_input
         made = cast(self._actions.control_to_action(executed), self.env.action_space)
         observation, reward, terminated, truncated, info = self.env.step(made)
         cost = correction_penalty(self.asker.robot, wanted, before, executed, self.penalty)

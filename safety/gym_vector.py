@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from brakeline.messaging.sensor_messages import Sensed
 from brakeline.safety.action_mapping import Actions, Mismatch, actions_of
 from brakeline.safety.environment_views import OBSTACLES, STATE, View
-from brakeline.safety.filter.backup_plan import Commitment, correction_penalty
+from brakeline.safety.filter.backup_plan import BackupPlan, correction_penalty
 from brakeline.safety.gym import diagnostics
 from brakeline.safety.perception.image_memory import filled, memory_of
 from brakeline.safety.service.in_process import InProcess, sendable
@@ -50,7 +50,7 @@ class VectorSafetyWrapper(VectorWrapper):
         """
         super().__init__(env)
         self.asker, self.penalty = InProcess(filter, accept_bound), penalty
-        self.commitments = [Commitment(filter.robot) for _ in range(env.num_envs)]
+        self.backup_plans = [BackupPlan(filter.robot) for _ in range(env.num_envs)]
         self._state, self._obstacles = state, obstacles
         self._actions = actions_of(env.single_action_space, filter.robot, actions)
         self._mode = AutoresetMode(env.metadata.get("autoreset_mode", AutoresetMode.NEXT_STEP))
@@ -73,7 +73,7 @@ class VectorSafetyWrapper(VectorWrapper):
         # In the mode NEXT_STEP an environment that has ended takes no action, it is reset.
         resets = self._ended if self._mode == AutoresetMode.NEXT_STEP else np.zeros(self.num_envs, dtype=bool)
         deciding = np.flatnonzero(~resets)
-        before = np.array([kept.due for kept in self.commitments])
+        before = np.array([kept.next_input for kept in self.backup_plans])
         states, near = self._state(self.env, *seen), self._obstacles(self.env, *seen)
         near = [] if near is None else near
         if not len(near) and all(scan is not None for scan in self._scans):  # only these say what is free
@@ -81,7 +81,7 @@ class VectorSafetyWrapper(VectorWrapper):
         if len(near) != self.num_envs:
             raise Mismatch(f"obstacles were told for {len(near)} of {self.num_envs} environments: give a list for each")
         answers = self.asker.decide_all(
-            [self.commitments[i] for i in deciding],
+            [self.backup_plans[i] for i in deciding],
             [states[i] for i in deciding],
             [wanted[i] for i in deciding],
             [near[i] for i in deciding],
@@ -89,7 +89,7 @@ class VectorSafetyWrapper(VectorWrapper):
             observations=[sendable(seen[0][i] if isinstance(seen[0], np.ndarray) else None) for i in deciding],
             known_free=[near[i] is not None for i in deciding],
         )
-        executed = np.array([kept.due for kept in self.commitments])
+        executed = np.array([kept.next_input for kept in self.backup_plans])
         executed[resets] = robot.at_zero()
         space = self.env.action_space
         made = np.asarray(self._actions.control_to_action(executed), dtype=space.dtype).reshape(space.shape)
@@ -114,7 +114,7 @@ class VectorSafetyWrapper(VectorWrapper):
     def _begin(self, which: NDArray[np.bool_]) -> None:
         """These environments stand at an episode's start."""
         for i in np.flatnonzero(which):
-            self.commitments[i].reset()
+            self.backup_plans[i].reset()
             self._memories[i].reset()
             self._ended[i] = False
 

@@ -12,7 +12,7 @@ from xdist.scheduler import LoadScopeScheduling
 
 from benchmarks.timing import stalls
 from brakeline.deploy.data import model_store, simulated_recording
-from brakeline.safety.model.model_set import Recipe
+from brakeline.safety.model.model_set import ModelConfig
 from tests.accepting import BOUND
 from tests.robots import GROUND, QUADROTOR
 
@@ -84,7 +84,7 @@ def data_folder(shared_folder: Path) -> Iterator[Path]:
     folder.mkdir(exist_ok=True)
     os.environ["BRAKELINE_DATA"] = str(folder)
     simulated_recording.recorded(GROUND, trajectories=TRAJECTORIES)
-    model_store.model_for(GROUND, Recipe())
+    model_store.model_for(GROUND, ModelConfig())
     yield folder
     if before is None:
         del os.environ["BRAKELINE_DATA"]
@@ -97,7 +97,7 @@ def flight_folder(data_folder: Path) -> Path:
     """The same, with a data set of the quadrotor, and its models in lockstep and in real time."""
     simulated_recording.recorded(QUADROTOR, trajectories=FLIGHTS)
     for robot in (QUADROTOR, QUADROTOR.in_real_time()):
-        model_store.model_for(robot, Recipe(), BOUND)
+        model_store.model_for(robot, ModelConfig(), BOUND)
     return data_folder
 
 

@@ -18,7 +18,7 @@ from brakeline.actors.decision_guard import Ask, Outcome, consult, next_input
 from brakeline.actors.ros2.ros_inputs import Command
 from brakeline.messaging.obstacle import BOX, Obstacle, Shapes
 from brakeline.messaging.robot import Robot
-from brakeline.safety.filter.backup_plan import Commitment
+from brakeline.safety.filter.backup_plan import BackupPlan
 from brakeline.safety.filter.request import ADJUSTED, ALLOWED
 from brakeline.safety.service.client import request_message
 from brakeline.safety.service.wire import KINDS
@@ -72,7 +72,7 @@ class Gate:
     def __init__(self, robot: Robot, ask: Ask, name: str = "ros2") -> None:
         """robot: in real time (`Robot.late`)."""
         assert robot.late, "in real time an answer counts from the next period on"
-        self.robot, self.commitment, self.tally = robot, Commitment(robot), Tally()
+        self.robot, self.backup_plan, self.tally = robot, BackupPlan(robot), Tally()
         self.input = np.zeros(robot.action_dim)  # of the running period
         self.reason = "not begun"  # why the next input is not the command; empty: it is
         self.kind = BLIND
@@ -95,7 +95,7 @@ class Gate:
 
         def ask(action: Array, around: Sequence[Obstacle]) -> Outcome:
             request = request_message(
-                self.commitment,
+                self.backup_plan,
                 state,
                 action,
                 around,
@@ -125,7 +125,7 @@ class Gate:
             tally.outside += answer.compared and not answer.contained
             tally.decide_ms.append(answer.time_ms)
             self.kind, self.reason = answer.kind, answer.reason
-            self.input = next_input(self.commitment, outcome)
+            self.input = next_input(self.backup_plan, outcome)
             if command is None:
                 self.reason = self.reason or "no command"
             else:
@@ -137,7 +137,7 @@ class Gate:
                 self.kind, self.reason = NO_ANSWER, outcome.failure
             else:
                 self.kind, self.reason = LATE, "the answer came after its period had begun"
-            self.input = self.commitment.fallback()
+            self.input = self.backup_plan.fallback()
         tally.kinds[self.kind] += 1
         return self.input
 

@@ -122,7 +122,7 @@ class Steering:
         while not self._stop.is_set() and due < ends:
             due = self._period(due, self._stop)
         self._ending, unasked = True, threading.Event()
-        while self.gate.commitment.plan.any():
+        while self.gate.backup_plan.plan.any():
             due = self._period(due, unasked)
         self._send(np.zeros(self.robot.action_dim))
 

@@ -36,9 +36,9 @@ from brakeline.messaging.task import robot_maybe_with_task
 from brakeline.messaging.topics import MODEL
 from brakeline.safety.model.dataset import Dataset
 from brakeline.safety.model.error_bounds import KINDS, RESIDUAL
-from brakeline.safety.model.model_set import MODES, ModelSet, Recipe
+from brakeline.safety.model.model_set import MODES, ModelConfig, ModelSet
 from brakeline.safety.model.stated_bound import accepted_bound, refusal
-from brakeline.safety.model.validation import CONFIDENCE, EPISODE, HOUR, Statement
+from brakeline.safety.model.validation import CONFIDENCE, EPISODE, HOUR, ValidationReport
 from brakeline.safety.service.signature import KEY, Signer, seal_of
 
 DIVERGES = 100.0  # m, of a stop's half-width: wider than any arena
@@ -124,10 +124,10 @@ class Collect:
         figures |= {"level": found.level, "missing": found.missing}
         loose = ""
         if found.model is not None and found.statement is not None:
-            figures |= {"windows_of": found.model.recipe.windows} | found.statement.figures()
+            figures |= {"windows_of": found.model.model_config.windows} | found.statement.figures()
             loose = refusal(robot, found.model.about, self.accept_bound)
             if not loose:
-                model = model_path(found.model.robot, found.model.recipe)
+                model = model_path(found.model.robot, found.model.model_config)
                 found.model.save(model)
                 figures["model"] = str(model)
         if loose:
@@ -139,7 +139,7 @@ class Collect:
             return 0 if "model" in figures else 1
         console.print(f"{path}: {found.data.periods} periods in {found.seconds / 60.0:.1f} min of flight", markup=False)
         if found.statement is not None and found.model is not None:
-            console.print(table([(found.statement, found.model.recipe.windows)]))
+            console.print(table([(found.statement, found.model.model_config.windows)]))
             console.print(in_words(found.statement, robot.period), markup=False)
             if not loose:
                 console.print(f"{figures['model']}: in use from now on", markup=False)
@@ -181,7 +181,7 @@ class Certify:
     def run(self) -> int:
         path, source = self._load()
         results: dict[str, Any] = {}
-        rows: list[tuple[Statement, str]] = []
+        rows: list[tuple[ValidationReport, str]] = []
         passed: list[str] = []
         chosen: ModelSet | None = None
         loose: list[str] = []
@@ -191,10 +191,10 @@ class Certify:
         with under_way("certifying", len(self.certificates) * len(modes)) as advance:
             for kind, mode in product(self.certificates, modes):
                 advance(0, f"certifying {kind}, {mode}")
-                recipe = Recipe(kind, mode)
+                model_config = ModelConfig(kind, mode)
                 try:
-                    recipe = recipe.of_minutes() if self.few else recipe
-                    model, statement, not_of = supported(source.data, recipe, self.windows, self.until_held)
+                    model_config = model_config.of_minutes() if self.few else model_config
+                    model, statement, not_of = supported(source.data, model_config, self.windows, self.until_held)
                 except Unsupported as error:
                     results.setdefault(kind, {})[mode] = {"refused": str(error)}
                     errors.print(f"[red]{kind}, {mode}: refused:[/] {escape(str(error))}")
@@ -204,9 +204,9 @@ class Certify:
                 finally:
                     advance()
                 chosen = chosen or model
-                rows.append((statement, model.recipe.windows))
+                rows.append((statement, model.model_config.windows))
                 passed += [f"{other} windows: {reason}" for other, reason in not_of.items()]
-                told = {"windows_of": model.recipe.windows, "not_of": not_of}
+                told = {"windows_of": model.model_config.windows, "not_of": not_of}
                 why = refusal(robot, model.about, self.accept_bound) if self.use or self.publish else ""
                 if why:
                     told["not_used"] = why
@@ -241,7 +241,7 @@ class Certify:
 
     def _keep(self, model: ModelSet, data: Dataset) -> None:
         """Where the other commands look for it; with a key to sign with, signed."""
-        path, keys = model_path(model.robot, model.recipe), self.endpoints.keys or default_keys()
+        path, keys = model_path(model.robot, model.model_config), self.endpoints.keys or default_keys()
         seal_of(path).unlink(missing_ok=True)
         if keys is not None and (keys / KEY).exists():
             Signer.load(keys).sign(model, data).save(path)
@@ -272,13 +272,13 @@ class Certify:
                 signed = Signer.load(settings.keys).sign(model, data)
                 message.file, message.claim, message.signature = signed.file, signed.claim, signed.signature
             bus.publisher(MODEL, robot=model.robot.name).put(message)
-        errors.print(f"published {model.recipe.certificate} {model.version} for {model.robot.name}")
+        errors.print(f"published {model.model_config.certificate} {model.version} for {model.robot.name}")
 
 
-def widened(statement: Statement) -> str:
+def widened(statement: ValidationReport) -> str:
     """That envelopes were widened, and what for; empty: they are as wide as they always are."""
-    usual = Recipe().inflation
-    if statement.inflation <= usual * 1.001 or statement.inflation == Recipe().of_minutes().inflation:
+    usual = ModelConfig().inflation
+    if statement.inflation <= usual * 1.001 or statement.inflation == ModelConfig().of_minutes().inflation:
         return ""
     return (
         f"{statement.certificate}, {statement.mode}: every envelope is widened by {statement.inflation:.3g}, not by "
@@ -286,7 +286,7 @@ def widened(statement: Statement) -> str:
     )
 
 
-def table(rows: list[tuple[Statement, str]]) -> Stacking:
+def table(rows: list[tuple[ValidationReport, str]]) -> Stacking:
     shown = Stacking(title="what held-out plans say (bounds at 99 % confidence)")
     for column in (
         *("certificate", "mode", "driving", "samples", "rank", "condition", "plans", "violations"),
@@ -314,7 +314,7 @@ def table(rows: list[tuple[Statement, str]]) -> Stacking:
     return shown
 
 
-def in_words(s: Statement, period: float) -> str:
+def in_words(s: ValidationReport, period: float) -> str:
     """What a statement says of how far its model set can be trusted; period: s between two steps."""
     episode, hour = f"{EPISODE} steps ({EPISODE * period:.0f} s)", f"{round(HOUR / period):,} steps"
     in_place = (

@@ -17,7 +17,7 @@ from rich.console import Console
 
 from brakeline.actors.actor_settings import FlightSettings
 from brakeline.logs.console_tables import PLAIN, Stacking
-from brakeline.safety.model.model_config import Recipe
+from brakeline.safety.model.model_config import ModelConfig
 from brakeline.sim.sim_conditions import Conditions, Faults, NoiseLevels, Perception, QuadrotorNoise, Wind
 
 if TYPE_CHECKING:
@@ -45,8 +45,8 @@ class Filtering:
     mode: Mode = "direct"
     """A predictor for each step of the plan, or the paper's recursion."""
 
-    def recipe(self) -> Recipe:
-        return Recipe(self.certificate, self.mode)
+    def model_config(self) -> ModelConfig:
+        return ModelConfig(self.certificate, self.mode)
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,7 @@ from brakeline.deploy.experiments.experiment_jobs import Job, complete
 from brakeline.deploy.experiments.rival_tuning import Tried, best, try_all, values_for
 from brakeline.learner.learner_config import TD3Config
 from brakeline.messaging.task import RobotWithTask, address, robot_with_task
-from brakeline.safety.model.model_set import Recipe
+from brakeline.safety.model.model_set import ModelConfig
 from brakeline.safety.rivals.pretrained import Pretrained
 
 QUICK = Path("runs/quick")
@@ -50,7 +50,7 @@ class Pretrain:
         model = pretrained(robot, self.method, replace(recipe, **changed), again=not self.tune)
         if self.tune:
             return self._tune(model, robot)
-        path = method_path(robot, self.method, Recipe())
+        path = method_path(robot, self.method, ModelConfig())
         if self.json:
             say_json({"path": str(path), "version": model.version, "settings": dict(model.settings)} | model.about)
         else:
@@ -125,7 +125,7 @@ class Compare:
         """What several cells need is made once, before them."""
         for method in self.methods:
             if method != NONE:
-                method_for(robot_with_task(robot), method, Recipe())
+                method_for(robot_with_task(robot), method, ModelConfig())
 
     def _jobs(self, robot: str) -> list[Job]:
         seeds = self.seeds[:1] if self.quick else self.seeds

@@ -59,7 +59,7 @@ class Evaluate:
         what = Evaluation(
             policy=self.policy,
             method=self.filtering.method,
-            recipe=self.filtering.recipe(),
+            model_config=self.filtering.model_config(),
             accept_bound=self.filtering.accept_bound,
             arena=self.arena,
             episodes=self.episodes,

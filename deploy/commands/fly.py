@@ -87,7 +87,7 @@ class Fly:
         return RunConfig(
             robots=(address_in_real_time(self.robot),),
             method=self.filtering.method,
-            recipe=self.filtering.recipe(),
+            model_config=self.filtering.model_config(),
             accept_bound=self.filtering.accept_bound,
             arena=self.arena,
             actors=len(flights),

@@ -23,7 +23,7 @@ from brakeline.messaging.robot import Robot
 from brakeline.messaging.topics import EXCHANGE
 from brakeline.safety.filter.filter import Filter
 from brakeline.safety.model.dataset import Dataset
-from brakeline.safety.model.model_set import ModelSet, Recipe
+from brakeline.safety.model.model_set import ModelConfig, ModelSet
 
 ANY_BOUND = 1.0  # no robot is driven: what would have been decided is asked, however loose the statement
 DIFFERENT = 1  # exit status: decisions differ by more than rounding though nothing was asked to be different
@@ -80,14 +80,14 @@ class Replay:
         """The filter to be asked in place of the one that was in use, made once for each robot; None: the same."""
         if self.certificate is None and self.data is None and self.margin is None:
             return None
-        recipe = Recipe(self.certificate or "residual", self.mode)
+        model_config = ModelConfig(self.certificate or "residual", self.mode)
         filters: dict[str, Filter] = {}
         make: Callable[[Robot], ModelSet]
         if self.data is not None:
-            model, _ = certified(Dataset.load(self.data), recipe)
+            model, _ = certified(Dataset.load(self.data), model_config)
             make = lambda robot: model  # noqa: E731
         else:
-            make = lambda robot: model_for(robot, recipe, ANY_BOUND)  # noqa: E731
+            make = lambda robot: model_for(robot, model_config, ANY_BOUND)  # noqa: E731
 
         def chosen(robot: Robot) -> Filter:
             name = robot.name

@@ -108,7 +108,7 @@ class Ros2:
         robot = driven(self.robot)
         if not self.connect:
             accepted = self.filtering.accept_bound
-            yield in_process(model_for(robot, self.filtering.recipe(), accepted), accepted)
+            yield in_process(model_for(robot, self.filtering.model_config(), accepted), accepted)
             return
         deadline = 0.3 * settings.lead  # there may be three questions
 

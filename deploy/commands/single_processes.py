@@ -20,7 +20,7 @@ from brakeline.deploy.vehicle_factory import environment, fleet_world
 from brakeline.learner.learner_config import LearnerConfig
 from brakeline.logs.recorder import Rotation
 from brakeline.messaging.task import address, address_in_real_time, robot_maybe_with_task, robot_with_task
-from brakeline.safety.model.model_config import check_promises
+from brakeline.safety.model.model_config import check_reservations
 
 
 @dataclass(frozen=True)
@@ -34,11 +34,11 @@ class Safety:
     def run(self) -> int:
         from brakeline.safety.service.server import SafetySettings, main
 
-        recipe, accepted = self.filtering.recipe(), self.filtering.accept_bound
+        model_config, accepted = self.filtering.model_config(), self.filtering.accept_bound
         robots = [robot_maybe_with_task(robot) for robot in self.robots]
         for robot in robots:
-            method_for(robot, self.filtering.method, recipe, accepted)
-        paths = tuple(method_path(robot, self.filtering.method, recipe) for robot in robots)
+            method_for(robot, self.filtering.method, model_config, accepted)
+        paths = tuple(method_path(robot, self.filtering.method, model_config) for robot in robots)
         limits = {robot.name: robot.accept_bound for robot in robots}
         main(SafetySettings(self.endpoints.bus(), paths, data_root(), self.name, limits, accepted))
         return 0
@@ -106,7 +106,7 @@ class Actor:
         at = address_in_real_time(self.robot) if self.url else address(self.robot)
         robot = robot_with_task(at)
         if self.fleet:
-            check_promises(self.filtering.method)
+            check_reservations(self.filtering.method)
         settings = ActorSettings(
             bus=self.endpoints.bus(),
             robot=at,

@@ -126,14 +126,14 @@ class Train:
             from_logs = tuple(map(str, self.from_logs)) or resumed.from_logs
             return replace(resumed, steps=self.steps or resumed.steps, from_logs=from_logs)
         from brakeline.messaging.task import address
-        from brakeline.safety.model.model_config import check_promises
+        from brakeline.safety.model.model_config import check_reservations
 
         if self.fleet:
-            check_promises(self.filtering.method)
+            check_reservations(self.filtering.method)
         return RunConfig(
             robots=tuple(address(name) for name in self.robots),
             method=self.filtering.method,
-            recipe=self.filtering.recipe(),
+            model_config=self.filtering.model_config(),
             accept_bound=self.filtering.accept_bound,
             arena=self.arena,
             actors=1 if self.deterministic else self.actors,

@@ -9,8 +9,8 @@ import numpy as np
 
 from brakeline.safety.model.dataset import Dataset
 from brakeline.safety.model.fitting import make
-from brakeline.safety.model.model_set import ModelSet, Recipe
-from brakeline.safety.model.validation import Array, Statement, judged, most_violations
+from brakeline.safety.model.model_set import ModelConfig, ModelSet
+from brakeline.safety.model.validation import Array, ValidationReport, judged, most_violations
 
 HELD_OUT = 0.3  # of the trajectories, for the statement about a model set
 WIDEST = 1.25  # times: sets that have to be wider for the limit are not what the data support, and are left as they are
@@ -18,7 +18,7 @@ TRIES = 4  # bounds that mix data and envelopes do not widen in proportion
 ROUNDING = 1e-6
 
 
-def certified(data: Dataset, recipe: Recipe, until_held: bool = False) -> tuple[ModelSet, Statement]:
+def certified(data: Dataset, model_config: ModelConfig, until_held: bool = False) -> tuple[ModelSet, ValidationReport]:
     """A model set from 70 % of the trajectories, with its statement about the others.
 
     The envelopes are widened where that brings the statement within the robot's limit (`accept_bound`): by the factor
@@ -34,7 +34,7 @@ def certified(data: Dataset, recipe: Recipe, until_held: bool = False) -> tuple[
         BadData, CertificateError: the data do not support it; the message says why.
     """
     fitted, held_out = data.split((1.0 - HELD_OUT, HELD_OUT))
-    model = make(fitted, recipe)
+    model = make(fitted, model_config)
     statement, scores = judged(model, fitted, held_out)
     most = 0 if until_held else most_violations(len(scores), data.robot.accept_bound)
     if not until_held and _widening(scores, most) > WIDEST:
@@ -43,13 +43,13 @@ def certified(data: Dataset, recipe: Recipe, until_held: bool = False) -> tuple[
         factor = _widening(scores, most)
         if factor <= 1.0 or not math.isfinite(factor):
             break
-        recipe = replace(recipe, inflation=recipe.inflation * factor * (1.0 + ROUNDING))
-        model = make(fitted, recipe)
+        model_config = replace(model_config, inflation=model_config.inflation * factor * (1.0 + ROUNDING))
+        model = make(fitted, model_config)
         statement, scores = judged(model, fitted, held_out)
     about = model.about | {"bound_step": f"{statement.bound_step:.6g}", "bound_plan": f"{statement.bound_plan:.6g}"}
     about |= {"bound_episode": f"{statement.bound_episode:.6g}", "outside_hour": f"{statement.outside_hour:.6g}"}
     about |= {"windows": str(statement.windows), "violations": str(statement.violations)}
-    about |= {"minutes": f"{data.periods * data.robot.period / 60.0:.6g}", "inflation": f"{recipe.inflation:.6g}"}
+    about |= {"minutes": f"{data.periods * data.robot.period / 60.0:.6g}", "inflation": f"{model_config.inflation:.6g}"}
     return replace(model, about=about), statement
 
 

@@ -14,10 +14,10 @@ from brakeline.messaging.stated_share import percent
 from brakeline.safety.model.dataset import Dataset
 from brakeline.safety.model.error_causes import AFTER, BOTH, FAST, PATH, STANDING, TURNING
 from brakeline.safety.model.fitting import FEWEST_STOPS
-from brakeline.safety.model.model_set import DIRECT, Recipe
+from brakeline.safety.model.model_set import DIRECT, ModelConfig
 from brakeline.safety.model.stated_bound import plans_needed
 from brakeline.safety.model.turning_in_place import standing_limits
-from brakeline.safety.model.validation import Statement, upper_bound
+from brakeline.safety.model.validation import ValidationReport, upper_bound
 from brakeline.safety.model.windows import FREE, PLAN, standing_at_the_end, stops_of, windows
 
 NEAR = 0.05  # of its range: an input this near to a bound has been there
@@ -139,7 +139,7 @@ def _no_braking(one: Seen) -> list[str]:
 
 
 def _windows_missing(plans: int, free: int) -> list[str]:
-    enough = math.ceil(Recipe().fewest / (1.0 - HELD_OUT))
+    enough = math.ceil(ModelConfig().fewest / (1.0 - HELD_OUT))
     if free < enough:
         return [f"only {free} windows of a plan's length, about {enough} are needed: drive on"]
     if plans < enough:
@@ -150,14 +150,14 @@ def _windows_missing(plans: int, free: int) -> list[str]:
     return []
 
 
-def more_to_drive(statement: Statement, data: Dataset) -> list[str]:
+def more_to_drive(statement: ValidationReport, data: Dataset) -> list[str]:
     """What to record, or to lower, for the statement to come within the robot's limit, and to turn on the spot near
     obstacles; nothing if it does.
     """
     return _turns_missing(statement, data.robot) + _too_loose(statement, data)
 
 
-def _turns_missing(statement: Statement, robot: Robot) -> list[str]:
+def _turns_missing(statement: ValidationReport, robot: Robot) -> list[str]:
     if statement.mode != DIRECT or statement.in_place_windows or standing_limits(robot) is None:
         return []
     return [
@@ -166,7 +166,7 @@ def _turns_missing(statement: Statement, robot: Robot) -> list[str]:
     ]
 
 
-def _too_loose(statement: Statement, data: Dataset) -> list[str]:
+def _too_loose(statement: ValidationReport, data: Dataset) -> list[str]:
     """How the bound can come within the robot's limit. More of the same helps only while the share of held-out plans
     that leave their sets is below the limit."""
     limit, plans = data.robot.accept_bound, statement.windows
@@ -228,7 +228,7 @@ def _plans_for(violations: int, plans: int, limit: float) -> int | None:
     return high
 
 
-def _where(statement: Statement) -> str:
+def _where(statement: ValidationReport) -> str:
     """Most of the violations, with the regime's own count beside them."""
     shown = [
         f"{one.plans} by {one.part} while {one.regime} (of {one.of} plans there; up to {one.excess:.2g} × its bound)"

@@ -13,7 +13,7 @@ from pathlib import Path
 
 from brakeline.messaging.robot import WITH, Robot
 from brakeline.messaging.task import RobotWithTask
-from brakeline.safety.model.model_config import DDPC, Recipe
+from brakeline.safety.model.model_config import DDPC, ModelConfig
 
 
 def data_root() -> Path:
@@ -25,13 +25,13 @@ def record_path(robot: Robot) -> Path:
     return data_root() / robot.name / "record.safetensors"
 
 
-def model_path(robot: Robot, recipe: Recipe) -> Path:
-    return data_root() / robot.name / f"{recipe.certificate}-{recipe.mode}.safetensors"
+def model_path(robot: Robot, model_config: ModelConfig) -> Path:
+    return data_root() / robot.name / f"{model_config.certificate}-{model_config.mode}.safetensors"
 
 
-def method_path(robot: Robot, method: str, recipe: Recipe) -> Path:
+def method_path(robot: Robot, method: str, model_config: ModelConfig) -> Path:
     """Of the model that the safety service needs for a method."""
     if method == DDPC:
-        return model_path(robot, recipe)
+        return model_path(robot, model_config)
     other = robot.task.name.partition(WITH)[2] if isinstance(robot, RobotWithTask) else ""
     return data_root() / robot.name / f"{method}{WITH if other else ''}{other}.safetensors"

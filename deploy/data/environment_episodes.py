@@ -40,7 +40,7 @@ def collect(
     state: View = STATE,
     actions: Actions | None = None,
     disturbed: Callable[[Any, Any, dict[str, Any]], bool] = lambda env, observation, info: False,
-    bulge: float | None = None,
+    chord_deviation: float | None = None,
     options: dict[str, Any] | None = None,
     shown: bool = True,
 ) -> Dataset:
@@ -94,7 +94,7 @@ def collect(
             trajectories += new
             progress.advance(task, sum(len(t.inputs) for t in new))
     sampled = any(t.paths.shape[1] > 1 for t in trajectories)
-    off = bulge if bulge is not None else 0.0 if sampled else _bulge(robot, trajectories)
+    off = chord_deviation if chord_deviation is not None else 0.0 if sampled else _bulge(robot, trajectories)
     about = {"origin": str(getattr(env.spec, "id", None) or type(env.unwrapped).__name__), "seed": str(seed)}
     data = Dataset(robot, tuple(trajectories), about, off)
     data.check()

@@ -20,8 +20,8 @@ from brakeline.deploy.data.excitation import random_target, towards
 from brakeline.deploy.data.supported_modes import Unsupported, supported
 from brakeline.messaging.robot import Robot
 from brakeline.safety.model.dataset import BadData, Dataset, Trajectory
-from brakeline.safety.model.model_set import ModelSet, Recipe
-from brakeline.safety.model.validation import Statement
+from brakeline.safety.model.model_set import ModelConfig, ModelSet
+from brakeline.safety.model.validation import ValidationReport
 from brakeline.safety.model.windows import FREE, windows
 
 Array = NDArray[np.float64]
@@ -124,7 +124,7 @@ class Found:
 
     data: Dataset
     model: ModelSet | None
-    statement: Statement | None
+    statement: ValidationReport | None
     level: float  # share of the largest inputs that was flown and predicted
     missing: tuple[str, ...]
     seconds: float
@@ -246,10 +246,10 @@ class Maiden:
         C = np.linalg.lstsq(fitted.z, fitted.y[:, :3], rcond=None)[0]
         return float(np.quantile(np.linalg.norm(held_out.y[:, :3] - held_out.z @ C, axis=1), 0.95))
 
-    def _model(self, data: Dataset, missing: list[str]) -> tuple[ModelSet, Statement] | tuple[None, None]:
+    def _model(self, data: Dataset, missing: list[str]) -> tuple[ModelSet, ValidationReport] | tuple[None, None]:
         """While the vehicle hovers."""
         try:
-            model, statement, _ = supported(replace(data, robot=self._robot), Recipe().of_minutes())
+            model, statement, _ = supported(replace(data, robot=self._robot), ModelConfig().of_minutes())
         except (BadData, Unsupported) as error:
             missing.append(f"there is no model set: {error}")
             return None, None

@@ -81,7 +81,7 @@ def bring(
         robot,
         tuple(t for part in parts for t in part.data.trajectories),
         {"origin": "import", "sources": ", ".join(path.name for path in paths)},
-        max(part.data.bulge for part in parts),
+        max(part.data.chord_deviation for part in parts),
     )
     several = len(paths) > 1
     notes = [
@@ -89,7 +89,9 @@ def bring(
     ]
     uneven = sum(p.report.uneven * p.report.periods for p in parts) / data.periods
     delays = {name: seconds for p in parts for name, seconds in p.report.delays.items()}
-    report = Report(data.periods, len(data.trajectories), samples.pop(), data.bulge, delays, uneven, tuple(notes))
+    report = Report(
+        data.periods, len(data.trajectories), samples.pop(), data.chord_deviation, delays, uneven, tuple(notes)
+    )
     return Imported(data, report)
 
 

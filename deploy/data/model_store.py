@@ -22,19 +22,19 @@ from brakeline.messaging.robot import Robot
 from brakeline.messaging.task import RobotWithTask, needs_task
 from brakeline.safety.methods import DDPC, METHODS, Model
 from brakeline.safety.model.dataset import BadData
-from brakeline.safety.model.model_set import BadModel, ModelSet, Recipe
+from brakeline.safety.model.model_set import BadModel, ModelConfig, ModelSet
 from brakeline.safety.model.stated_bound import accepted_bound, check_bound
 from brakeline.safety.rivals.pretrained import Pretrained
 
 if TYPE_CHECKING:
-    from brakeline.deploy.data.rival_pretraining import Recipe as RivalRecipe
+    from brakeline.deploy.data.rival_pretraining import ModelConfig as RivalRecipe
 
 M = TypeVar("M")
 
 console = Console(stderr=True, highlight=False, soft_wrap=True)
 
 
-def model_for(robot: Robot, recipe: Recipe, accept_bound: float | None = None) -> ModelSet:
+def model_for(robot: Robot, model_config: ModelConfig, accept_bound: float | None = None) -> ModelSet:
     """The model set in use, made (and its data recorded) if it is not there or not of this layout.
 
     accept_bound: the largest stated share of plans outside their tubes that is accepted; unless given the limit of the
@@ -44,8 +44,8 @@ def model_for(robot: Robot, recipe: Recipe, accept_bound: float | None = None) -
         TooLoose: the model set states more, or states nothing; ValueError: `accept_bound` is no share.
     """
     accepted_bound(robot, accept_bound)
-    path = model_path(robot, recipe)
-    made = partial(_made, path, robot, recipe)
+    path = model_path(robot, model_config)
+    made = partial(_made, path, robot, model_config)
     model = _kept_or_made(path, partial(_kept, path, robot), made, "making the model set")
     check_bound(model, robot, accept_bound)
     limit = robot.accept_bound  # of the description today, not of when the model set was made
@@ -73,7 +73,7 @@ def _kept(path: Path, robot: Robot) -> ModelSet:
     return model
 
 
-def _made(path: Path, robot: Robot, recipe: Recipe) -> ModelSet:
+def _made(path: Path, robot: Robot, model_config: ModelConfig) -> ModelSet:
     from brakeline.deploy.data.certification import certified
     from brakeline.deploy.data.simulated_recording import data_for, recorded
 
@@ -83,10 +83,11 @@ def _made(path: Path, robot: Robot, recipe: Recipe) -> ModelSet:
         console.print(f"[yellow]recording again:[/] {error}")
         recorded(robot.in_lockstep(), again=True)
         data = data_for(robot)
-    with under_way(f"certifying {robot.name}: {recipe.certificate}, {recipe.mode}"):
-        model, statement = certified(data, recipe)
+    with under_way(f"certifying {robot.name}: {model_config.certificate}, {model_config.mode}"):
+        model, statement = certified(data, model_config)
     console.print(
-        f"{robot.name}: {recipe.certificate} ({recipe.mode}) {model.version}: {statement.violations} violations in "
+        f"{robot.name}: {model_config.certificate} ({model_config.mode}) {model.version}: "
+        f"{statement.violations} violations in "
         f"{statement.windows} held-out plans, at most {statement.bound_plan:.2%} of plans and "
         f"{statement.bound_step:.2%} of steps leave their sets (99 % confidence)"
     )
@@ -94,7 +95,7 @@ def _made(path: Path, robot: Robot, recipe: Recipe) -> ModelSet:
     return model
 
 
-def method_for(robot: Robot, method: str, recipe: Recipe, accept_bound: float | None = None) -> Model:
+def method_for(robot: Robot, method: str, model_config: ModelConfig, accept_bound: float | None = None) -> Model:
     """What a method must know of a robot: ours a model set, a rival its networks, made if they are not there.
 
     Raises:
@@ -102,7 +103,7 @@ def method_for(robot: Robot, method: str, recipe: Recipe, accept_bound: float | 
         TooLoose: the model set's statement is looser than what is used (`model_for`).
     """
     if method == DDPC:
-        return model_for(robot, recipe, accept_bound)
+        return model_for(robot, model_config, accept_bound)
     if method not in METHODS:
         raise ValueError(f"no method is called {method!r}; there are: {', '.join(METHODS)}")
     if robot.late:
@@ -113,17 +114,17 @@ def method_for(robot: Robot, method: str, recipe: Recipe, accept_bound: float | 
     return pretrained(robot, method, recipe_for(method, robot))
 
 
-def pretrained(robot: RobotWithTask, method: str, recipe: RivalRecipe, again: bool = False) -> Pretrained:
+def pretrained(robot: RobotWithTask, method: str, model_config: RivalRecipe, again: bool = False) -> Pretrained:
     """A rival's model of this recipe, pre-trained if it is not there (or `again`)."""
-    path = method_path(robot, method, Recipe())
-    made = partial(_pretrained, path, robot, method, recipe)
+    path = method_path(robot, method, ModelConfig())
+    made = partial(_pretrained, path, robot, method, model_config)
     if again:
         with alone(path.parent):
             return made()
-    return _kept_or_made(path, partial(_kept_rival, path, recipe), made, f"pre-training {method}")
+    return _kept_or_made(path, partial(_kept_rival, path, model_config), made, f"pre-training {method}")
 
 
-def _kept_rival(path: Path, recipe: RivalRecipe) -> Pretrained:
+def _kept_rival(path: Path, model_config: RivalRecipe) -> Pretrained:
     """Raises BadModel: it is not there, or not of this layout or recipe."""
     from brakeline.deploy.data.rival_pretraining import made_by
 
@@ -131,16 +132,16 @@ def _kept_rival(path: Path, recipe: RivalRecipe) -> Pretrained:
         kept = Pretrained.decode(path.read_bytes())
     except OSError as error:
         raise BadModel(f"{path}: {error}") from error
-    if not made_by(kept, recipe):
+    if not made_by(kept, model_config):
         raise BadModel(f"{path} is of another recipe")
     return kept
 
 
-def _pretrained(path: Path, robot: RobotWithTask, method: str, recipe: RivalRecipe) -> Pretrained:
+def _pretrained(path: Path, robot: RobotWithTask, method: str, model_config: RivalRecipe) -> Pretrained:
     from brakeline.deploy.data.rival_pretraining import pretrain
 
-    with under_way(f"pre-training {method} for {robot.name}", recipe.samples) as advance:
-        model = pretrain(robot, recipe, advance)
+    with under_way(f"pre-training {method} for {robot.name}", model_config.samples) as advance:
+        model = pretrain(robot, model_config, advance)
     model.save(path)
     about = model.about
     console.print(

@@ -37,7 +37,7 @@ class Report:
     periods: int
     trajectories: int
     samples: int  # positions a period that the source has
-    bulge: float  # m, beyond them
+    chord_deviation: float  # m, beyond them
     delays: dict[str, float]  # s, from an input to the coordinate that follows it
     uneven: float  # share of periods within which an input changed
     notes: tuple[str, ...]
@@ -86,13 +86,13 @@ def resample(
         raise NoSource("; ".join((*notes, f"no {FEWEST_PERIODS} periods in a row are left")))
     longest = int(np.clip(sum(len(t.inputs) for t in pieces) // PARTS, 4 * robot.horizon, LONGEST))
     parts = tuple(part for t in pieces for part in _dealt(t, longest))
-    bulge = _between(robot, parts, samples)
-    data = Dataset(robot, parts, {"origin": "import"}, bulge)
+    chord_deviation = _between(robot, parts, samples)
+    data = Dataset(robot, parts, {"origin": "import"}, chord_deviation)
     data.check()
     share = float(np.concatenate(changed).mean())
     delays = _delays(recordings, robot)
-    notes += _words(robot, samples, bulge, share, delays)
-    return Imported(data, Report(data.periods, len(parts), samples, bulge, delays, share, tuple(notes)))
+    notes += _words(robot, samples, chord_deviation, share, delays)
+    return Imported(data, Report(data.periods, len(parts), samples, chord_deviation, delays, share, tuple(notes)))
 
 
 # --- recordings without gaps --------------------------------------------------------------------------------------
@@ -300,7 +300,7 @@ def _delays(recordings: list[_Recording], robot: Robot) -> dict[str, float]:
     return found
 
 
-def _words(robot: Robot, samples: int, bulge: float, uneven: float, delays: dict[str, float]) -> list[str]:
+def _words(robot: Robot, samples: int, chord_deviation: float, uneven: float, delays: dict[str, float]) -> list[str]:
     notes = [f"{name}: its motion follows {1e3 * d:.0f} ms later (cross-correlation)" for name, d in delays.items()]
     notes += [
         f"{name}: that is more than a period ({robot.period:g} s), and predictions know one earlier input only: shift "
@@ -311,10 +311,12 @@ def _words(robot: Robot, samples: int, bulge: float, uneven: float, delays: dict
     if samples == 1:
         notes.append(
             f"the source has one position a period: how far paths leave their chords in between is bounded from the "
-            f"periods' ends and the acceleration seen, by {1e3 * bulge:.1f} mm"
+            f"periods' ends and the acceleration seen, by {1e3 * chord_deviation:.1f} mm"
         )
     else:
-        notes.append(f"paths within a period from {samples} positions, {1e3 * bulge:.2f} mm more between them")
+        notes.append(
+            f"paths within a period from {samples} positions, {1e3 * chord_deviation:.2f} mm more between them"
+        )
     if uneven > 0.0:
         notes.append(f"in {uneven:.0%} of the periods an input changed within: its mean counts")
     return notes

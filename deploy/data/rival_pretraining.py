@@ -45,22 +45,22 @@ class SailrRecipe:
     lead: int = 5  # periods of driving before braking, at the most
 
 
-Recipe = SecasRecipe | SailrRecipe
+ModelConfig = SecasRecipe | SailrRecipe
 Made = tuple[dict[str, Perceptrons], dict[str, float], dict[str, str]]  # networks, settings, about
 RECIPES: dict[str, type[SecasRecipe] | type[SailrRecipe]] = {SECAS: SecasRecipe, SAILR: SailrRecipe}
 
 
-def recipe_for(method: str, robot: RobotWithTask) -> Recipe:
+def recipe_for(method: str, robot: RobotWithTask) -> ModelConfig:
     """With the threshold that was found for this robot (deploy/experiments/experiments.md)."""
     return RECIPES[method](**getattr(robot.task.rivals, method))
 
 
-def made_by(model: Pretrained, recipe: Recipe) -> bool:
+def made_by(model: Pretrained, recipe: ModelConfig) -> bool:
     """Was the model made by this recipe?"""
     return model.about.get("recipe") == json.dumps(asdict(recipe))
 
 
-def pretrain(robot: RobotWithTask, recipe: Recipe, each: Each = lambda: None) -> Pretrained:
+def pretrain(robot: RobotWithTask, recipe: ModelConfig, each: Each = lambda: None) -> Pretrained:
     """Drive, fit, and say what it took; `each` is called after every driven step.
 
     Raises:

@@ -6,9 +6,9 @@ from dataclasses import replace
 
 from brakeline.deploy.data.certification import certified
 from brakeline.safety.model.dataset import BadData, Dataset
-from brakeline.safety.model.error_bounds import CertificateError
-from brakeline.safety.model.model_set import ModelSet, Recipe
-from brakeline.safety.model.validation import Statement
+from brakeline.safety.model.error_bounds import ErrorBoundError
+from brakeline.safety.model.model_set import ModelConfig, ModelSet
+from brakeline.safety.model.validation import ValidationReport
 from brakeline.safety.model.windows import FREE, PLAN
 
 AUTO = "auto"
@@ -24,8 +24,8 @@ class Unsupported(BadData):
 
 
 def supported(
-    data: Dataset, recipe: Recipe, windows: str = AUTO, until_held: bool = False
-) -> tuple[ModelSet, Statement, dict[str, str]]:
+    data: Dataset, model_config: ModelConfig, windows: str = AUTO, until_held: bool = False
+) -> tuple[ModelSet, ValidationReport, dict[str, str]]:
     """The model set of the first kind of windows that serves, its statement, and why the kinds before it did not.
     until_held: see `certified`.
 
@@ -35,8 +35,8 @@ def supported(
     reasons: dict[str, str] = {}
     for kind in (PLAN, FREE) if windows == AUTO else (windows,):
         try:
-            model, statement = certified(data, replace(recipe, windows=kind), until_held)
-        except (BadData, CertificateError) as error:
+            model, statement = certified(data, replace(model_config, windows=kind), until_held)
+        except (BadData, ErrorBoundError) as error:
             reasons[kind] = str(error) + (NO_PLANS if kind == PLAN else "")
         else:
             return model, statement, reasons

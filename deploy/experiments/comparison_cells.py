@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from brakeline.actors.decision_guard import Ask
-from brakeline.actors.episode_runner import Driver, Identity
+from brakeline.actors.episode_runner import EpisodeRunner, Identity
 from brakeline.deploy.data.model_store import method_for
 from brakeline.deploy.data.simulated_recording import recorded
 from brakeline.deploy.experiments.evaluate import FRESH, in_process
@@ -25,7 +25,7 @@ from brakeline.learner.learner_config import LearnerConfig, TD3Config
 from brakeline.logs.report import analyse
 from brakeline.messaging.task import RobotWithTask, robot_with_task
 from brakeline.safety.methods import DDPC, Model
-from brakeline.safety.model.model_set import Recipe
+from brakeline.safety.model.model_set import ModelConfig
 from brakeline.safety.rivals.pretrained import Pretrained
 from brakeline.safety.rivals.sailr import SAILR
 from brakeline.safety.rivals.secas import SECAS
@@ -64,7 +64,7 @@ class Study:
     episodes: int
     arenas: tuple[str, ...] = ("default", "dense")  # of the evaluation; training is in the first
     penalty: float = 1.0
-    recipe: Recipe = field(default_factory=Recipe)
+    model_config: ModelConfig = field(default_factory=ModelConfig)
     td3: TD3Config = field(default_factory=TD3Config)
     untrained: int = 100  # episodes of the untrained policy, which take their full time
 
@@ -102,7 +102,7 @@ def run(study: Study, folder: Path, say: Report = lambda text: None) -> dict[str
     robot = robot_with_task(study.robot)
     models: dict[str, Model] = {}
     for method in {study.method, *(trial.method for trial in study.trials())} - {NONE}:
-        models[method] = method_for(robot, method, study.recipe)
+        models[method] = method_for(robot, method, study.model_config)
     training = _train(study, robot, models, folder, say)
     evaluations = {trial.name: _evaluate(study, trial, robot, models, folder, say) for trial in study.trials()}
     model = models.get(study.method)
@@ -123,12 +123,12 @@ def _cost(model: Model, robot: RobotWithTask) -> dict[str, str]:
     return {"samples": str(recorded(robot).periods), "collisions": "0"}
 
 
-def _driver(study: Study, trial: Trial, robot: RobotWithTask, seed: int, actor: str) -> Driver:
+def _driver(study: Study, trial: Trial, robot: RobotWithTask, seed: int, actor: str) -> EpisodeRunner:
     env = environment(robot, trial.arena, seed)
     identity, filtered = Identity(actor, 0, study.seed), trial.method != NONE
     # at an intervention training calls the episode off; an evaluation goes on, or its goal rate would mean nothing
     cuts = trial.method == SAILR and trial.policy == LEARNING
-    return Driver(robot, env, identity, study.penalty, filtered, cuts)
+    return EpisodeRunner(robot, env, identity, study.penalty, filtered, cuts)
 
 
 def _question(models: dict[str, Model], method: str) -> Ask | None:
@@ -165,7 +165,7 @@ def _evaluate(
 
 
 def _metadata(study: Study, trial: Trial) -> dict[str, dict[str, str]]:
-    certificate = {"certificate": study.recipe.certificate} if trial.method == DDPC else {}
+    certificate = {"certificate": study.model_config.certificate} if trial.method == DDPC else {}
     about = {"method": trial.method, "policy": trial.policy, "arena": trial.arena, "seed": str(study.seed)}
     return {"run": about | certificate, "configuration": {"json": json.dumps(study.config())}}
 

@@ -13,7 +13,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from brakeline.actors.episode_runner import Driver, Identity
+from brakeline.actors.episode_runner import EpisodeRunner, Identity
 from brakeline.deploy.data.certification import certified
 from brakeline.deploy.data.simulated_recording import recorded
 from brakeline.deploy.experiments.evaluate import FRESH, in_process
@@ -22,8 +22,8 @@ from brakeline.deploy.policy_loading import policy_named
 from brakeline.deploy.vehicle_factory import environment
 from brakeline.messaging.task import RobotWithTask, robot_with_task
 from brakeline.safety.model.dataset import BadData
-from brakeline.safety.model.error_bounds import KINDS, CertificateError
-from brakeline.safety.model.model_set import MODES, Recipe
+from brakeline.safety.model.error_bounds import KINDS, ErrorBoundError
+from brakeline.safety.model.model_set import MODES, ModelConfig
 from brakeline.sim.arena_generator import arena_kind
 
 ORACLE = "astar"
@@ -55,11 +55,11 @@ class Conservatism:
         for certificate in KINDS:
             for mode in MODES:
                 say(f"{certificate}, {mode}")
-                recipe = Recipe(certificate, mode)
-                row: dict[str, Any] = asdict(recipe)
+                model_config = ModelConfig(certificate, mode)
+                row: dict[str, Any] = asdict(model_config)
                 try:
-                    model, statement = certified(data, recipe)
-                except (BadData, CertificateError) as error:
+                    model, statement = certified(data, model_config)
+                except (BadData, ErrorBoundError) as error:
                     rows.append(row | {"refused": str(error)})
                     continue
                 row |= {"model": model.version, "statement": statement.figures()}
@@ -72,7 +72,7 @@ class Conservatism:
 
     def _drive(self, robot: RobotWithTask, policy: str, question: Any) -> dict[str, Any]:
         """Closed loop on the first fresh episodes."""
-        driver = Driver(robot, environment(robot, self.arena, FRESH), Identity("conservatism", 0, 0))
+        driver = EpisodeRunner(robot, environment(robot, self.arena, FRESH), Identity("conservatism", 0, 0))
         found: Episodes = evaluate(driver, policy_named(policy, robot, 0), question, self.episodes)
         columns, steps = found.columns(), found.decisions
         return {

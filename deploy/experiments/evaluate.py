@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from brakeline.actors.decision_guard import Ask, Outcome, consult
-from brakeline.actors.episode_runner import Driver, Identity
+from brakeline.actors.episode_runner import EpisodeRunner, Identity
 from brakeline.actors.joint_episode import Fleet
 from brakeline.deploy.data.model_store import method_for
 from brakeline.deploy.policy_loading import policy_named
@@ -19,8 +19,8 @@ from brakeline.logs.metrics import Tally, closed_loop
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.task import RobotWithTask
 from brakeline.safety.methods import DDPC, Model
-from brakeline.safety.model.model_config import check_promises
-from brakeline.safety.model.model_set import Recipe
+from brakeline.safety.model.model_config import check_reservations
+from brakeline.safety.model.model_set import ModelConfig
 from brakeline.safety.service.server import Counts, Models, answerer
 from brakeline.sim.scripted_policies import Policy
 from brakeline.sim.shared_world import FleetEnv
@@ -35,7 +35,7 @@ class Evaluation:
 
     policy: str = "astar"  # a file, or trained | untrained | random | greedy | adversary | astar
     method: str = "ddpc"
-    recipe: Recipe = field(default_factory=Recipe)
+    model_config: ModelConfig = field(default_factory=ModelConfig)
     arena: str = "default"
     episodes: int = 100
     seed: int = 0
@@ -61,7 +61,7 @@ def in_process(model: Model, accept_bound: float | None = None) -> Ask:
     return ask
 
 
-def episode(driver: Driver, policy: Policy, question: Ask | None, number: int) -> Iterator[pb.Step]:
+def episode(driver: EpisodeRunner, policy: Policy, question: Ask | None, number: int) -> Iterator[pb.Step]:
     """The steps of one episode."""
     driver.begin(number)
     while driver.running:
@@ -72,12 +72,12 @@ def episode(driver: Driver, policy: Policy, question: Ask | None, number: int) -
         yield driver.execute(proposal, outcome)
 
 
-def prepared(robot: RobotWithTask, what: Evaluation) -> tuple[Driver, Policy, Ask | None]:
+def prepared(robot: RobotWithTask, what: Evaluation) -> tuple[EpisodeRunner, Policy, Ask | None]:
     """What an evaluation is made of: the driver in a fresh environment, the policy, and whom it asks."""
     policy = policy_named(what.policy, robot, what.seed)
     env = environment(robot, what.arena, FRESH + what.seed, what.conditions)
     question = _question(robot, what)
-    driver = Driver(robot, env, Identity("evaluate", 0, what.seed), filtered=question is not None)
+    driver = EpisodeRunner(robot, env, Identity("evaluate", 0, what.seed), filtered=question is not None)
     return driver, policy, question
 
 
@@ -85,7 +85,7 @@ def _question(robot: RobotWithTask, what: Evaluation) -> Ask | None:
     """Whom the robot asks: nobody where there is no filter."""
     if what.method == "none":
         return None
-    return in_process(method_for(robot, what.method, what.recipe, what.accept_bound), what.accept_bound)
+    return in_process(method_for(robot, what.method, what.model_config, what.accept_bound), what.accept_bound)
 
 
 def round_of(fleet: Fleet, policies: Sequence[Policy], question: Ask | None, number: int) -> Iterator[list[pb.Step]]:
@@ -110,12 +110,12 @@ def prepared_fleet(robot: RobotWithTask, what: Evaluation) -> tuple[Fleet, Fleet
     Raises:
         NoFleet: there is none of this kind, or in that arena; ValueError: this method makes no promises.
     """
-    check_promises(what.method)
+    check_reservations(what.method)
     world = fleet_world(robot, what.arena, what.fleet, FRESH + what.seed, what.conditions)
     policies = [policy_named(what.policy, robot, what.seed + i) for i in range(what.fleet)]
     question = _question(robot, what)
     drivers = [
-        Driver(robot, member, Identity(f"evaluate.{i}", i, what.seed), filtered=question is not None)
+        EpisodeRunner(robot, member, Identity(f"evaluate.{i}", i, what.seed), filtered=question is not None)
         for i, member in enumerate(world.members)
     ]
     return Fleet(world, drivers, question is not None), world, policies, question
@@ -166,8 +166,8 @@ def _together(robot: RobotWithTask, what: Evaluation, each: Callable[[Tally], An
 def _about(what: Evaluation) -> dict[str, Any]:
     return {
         "method": what.method,
-        "certificate": what.recipe.certificate if what.method == DDPC else None,
-        "mode": what.recipe.mode if what.method == DDPC else None,
+        "certificate": what.model_config.certificate if what.method == DDPC else None,
+        "mode": what.model_config.mode if what.method == DDPC else None,
         "policy": what.policy,
         "arena": what.arena,
         "perception": perception_in(what.conditions.describe()),

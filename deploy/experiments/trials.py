@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brakeline.actors.decision_guard import Ask, consult
-from brakeline.actors.episode_runner import Driver
+from brakeline.actors.episode_runner import EpisodeRunner
 from brakeline.learner.learner import Learner
 from brakeline.logs.segment import Entry, open_segment
 from brakeline.messaging import brakeline_pb2 as pb
@@ -126,13 +126,13 @@ class Proposal:
     ms: float
 
 
-Propose = Callable[[Driver], Proposal]
+Propose = Callable[[EpisodeRunner], Proposal]
 
 
 def thinking(policy: Policy) -> Propose:
     """A policy, timed."""
 
-    def propose(driver: Driver) -> Proposal:
+    def propose(driver: EpisodeRunner) -> Proposal:
         before = time.perf_counter_ns()
         action = np.asarray(policy(driver.observation, driver.info), dtype=float)
         return Proposal(action, (time.perf_counter_ns() - before) * 1e-6)
@@ -140,7 +140,7 @@ def thinking(policy: Policy) -> Propose:
     return propose
 
 
-def one_step(driver: Driver, propose: Propose, question: Ask | None, version: int = 0) -> pb.Step:
+def one_step(driver: EpisodeRunner, propose: Propose, question: Ask | None, version: int = 0) -> pb.Step:
     """Propose, ask, act."""
     proposal = propose(driver)
     outcome = None
@@ -163,7 +163,7 @@ def without_observations(step: pb.Step) -> pb.Step:
 
 
 def evaluate(
-    driver: Driver, policy: Policy, question: Ask | None, episodes: int, log: TrialLog | None = None
+    driver: EpisodeRunner, policy: Policy, question: Ask | None, episodes: int, log: TrialLog | None = None
 ) -> Episodes:
     """The policy without exploration, through episodes 0 to `episodes` − 1 of the driver's environment."""
     found, propose = Episodes(), thinking(policy)
@@ -182,7 +182,7 @@ def evaluate(
 class Trainer:
     """One driver and one learner in lockstep: every step is learned from, as far as it is due, before the next."""
 
-    def __init__(self, driver: Driver, question: Ask | None, learner: Learner) -> None:
+    def __init__(self, driver: EpisodeRunner, question: Ask | None, learner: Learner) -> None:
         self.driver, self.question, self.learner = driver, question, learner
         robot = driver.robot
         reply = learner.join(pb.Join(robot=robot.name, actor=driver.identity.actor, layout=robot.learning_layout()))

@@ -21,13 +21,13 @@ from matplotlib.transforms import Affine2D
 from numpy.typing import NDArray
 
 from brakeline.actors.decision_guard import Ask, consult
-from brakeline.actors.episode_runner import Driver
+from brakeline.actors.episode_runner import EpisodeRunner
 from brakeline.logs.decision_explanation import Explanation, explain
 from brakeline.logs.episode_stats import KINDS as DECISIONS
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.obstacle import BOX, WALL, Obstacle
 from brakeline.messaging.robot import Robot
-from brakeline.safety.perception.displayed_map import Surroundings, surroundings
+from brakeline.safety.perception.displayed_map import DisplayedMap, surroundings
 from brakeline.sim.scripted_policies import Policy
 
 Array = NDArray[np.float64]
@@ -60,7 +60,7 @@ class Frame:
     center: Array
     margin: float
     why: Explanation | None = None  # of a decision, one that was not as proposed or not
-    around: Surroundings | None = None  # what the filter, or whoever might have been asked, was told
+    around: DisplayedMap | None = None  # what the filter, or whoever might have been asked, was told
 
 
 @dataclass(frozen=True)
@@ -74,7 +74,7 @@ class Film:
     end: str
 
 
-def record(driver: Driver, policy: Policy, question: Ask | None, number: int) -> Film:
+def record(driver: EpisodeRunner, policy: Policy, question: Ask | None, number: int) -> Film:
     """Drive episode `number` and keep what can be seen."""
     driver.begin(number)
     d = driver.robot.position_dim
@@ -236,7 +236,7 @@ class _Stage:
             drawn += self.axes.plot(ends[:, 0], ends[:, 1], color=EDGE, linewidth=2.5, zorder=9)
         return drawn
 
-    def _told(self, about: Surroundings | None, alpha: float = 1.0) -> list[Any]:
+    def _told(self, about: DisplayedMap | None, alpha: float = 1.0) -> list[Any]:
         """Where beams ended, what they showed to be free, what moves and where it may come to while a plan lasts."""
         if about is None:
             return []

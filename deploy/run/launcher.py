@@ -15,7 +15,7 @@ from brakeline.deploy.run.processes import CONFIG, LOG, places, say_where
 from brakeline.deploy.run.run_config import RunConfig, encode
 from brakeline.deploy.run.run_keys import KEYS, seal_models
 from brakeline.deploy.run.run_view import View
-from brakeline.deploy.run.supervisor import Child, LaunchError, last_line
+from brakeline.deploy.run.supervisor import LaunchError, SupervisedProcess, last_line
 from brakeline.logs.metrics import Metrics
 from brakeline.logs.recorded_robots import Robots
 from brakeline.logs.watch.run_totals import told, totals
@@ -47,7 +47,7 @@ def prepare(config: RunConfig, folder: Path, resume: bool) -> None:
         raise LaunchError(f"{folder} holds a run already: give --resume {folder}, or another --out")
     if config.filtered:
         for robot in config.robots:
-            method_for(robot_maybe_with_task(robot), config.method, config.recipe, config.accept_bound)
+            method_for(robot_maybe_with_task(robot), config.method, config.model_config, config.accept_bound)
     folder.mkdir(parents=True, exist_ok=True)
 
 
@@ -57,7 +57,7 @@ class Launcher:
     def __init__(self, config: RunConfig, folder: Path, bus: BusSettings) -> None:
         """bus: where it listens, and the keys of all processes, if they have any."""
         self.config, self.folder, self.bus = config, folder, bus
-        self.children = [Child(place, folder) for place in places(config)]
+        self.children = [SupervisedProcess(place, folder) for place in places(config)]
         self.metrics = Metrics(robots=Robots(robot_named(name) for name in config.robots))
         self.lines: deque[str] = deque(maxlen=200)
         self._inbox: deque[Sample] = deque()
@@ -125,7 +125,7 @@ class Launcher:
         """As `analyse` would give them for the log, with what only the launcher knows."""
         setup = {
             "method": self.config.method,
-            "certificate": self.config.recipe.certificate if self.config.method == "ddpc" else None,
+            "certificate": self.config.model_config.certificate if self.config.method == "ddpc" else None,
             "policy": self.config.policy or "learning",
             "arena": self.config.arena,
             "seed": self.config.seed,
@@ -151,7 +151,7 @@ class Launcher:
             return all(done["actor"])
         return all(done["learner"]) or (self.config.actors == 0 and all(done["feeder"]))
 
-    def _must_wait(self, child: Child) -> bool:
+    def _must_wait(self, child: SupervisedProcess) -> bool:
         """Robots start when what the logs hold of their kind was learned from."""
         feeders = (c for c in self.children if c.place.kind == "feeder" and c.place.robot == child.place.robot)
         return child.place.kind == "actor" and not all(feeder.finished for feeder in feeders)

@@ -25,7 +25,7 @@ def metadata(config: RunConfig) -> dict[str, dict[str, str]]:
         "robots": ",".join(robot_named(name).name for name in config.robots),
     }
     if config.method == DDPC:
-        run |= {"certificate": config.recipe.certificate, "mode": config.recipe.mode}
+        run |= {"certificate": config.model_config.certificate, "mode": config.model_config.mode}
     packages = ("brakeline", "mujoco", "proxsuite", "numpy", "torch", "eclipse-zenoh", "mcap")
     about = {
         "run": run,
@@ -36,7 +36,7 @@ def metadata(config: RunConfig) -> dict[str, dict[str, str]]:
     robots = [robot_maybe_with_task(name) for name in config.robots]
     about["robots"] = {robot.kind: json.dumps(robot.description) for robot in robots}
     for robot in robots if filtered else ():
-        model = load(method_path(robot, config.method, config.recipe))
+        model = load(method_path(robot, config.method, config.model_config))
         about[f"model {robot.name}"] = {"version": model.version, **model.about}
     return about
 
@@ -45,7 +45,9 @@ def attachments(config: RunConfig, folder: Path) -> dict[str, bytes]:
     """The models in use when the log begins, or before (of a run that goes on), so that it alone can be replayed."""
     if not config.filtered:
         return {}
-    models = (load(method_path(robot_maybe_with_task(robot), config.method, config.recipe)) for robot in config.robots)
+    models = (
+        load(method_path(robot_maybe_with_task(robot), config.method, config.model_config)) for robot in config.robots
+    )
     files = {attachment(model.robot.name, model.version): model.encode() for model in models}
     for robot in (robot_named(name).name for name in config.robots):
         archived = (folder / robot / "models").glob("*.safetensors")

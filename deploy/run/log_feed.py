@@ -13,7 +13,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 
-from brakeline.actors.learner_client import Student
+from brakeline.actors.learner_client import LearnerClient
 from brakeline.learner.step_ledger import Ledger
 from brakeline.learner.transition_reader import BadStep, Intake
 from brakeline.logs.reader import by_run, find, open_log
@@ -84,10 +84,10 @@ def count(logs: Sequence[str], robot: RobotWithTask) -> int:
 
 
 @dataclass
-class Pupil:
+class LearnedPolicy:
     """A logged actor's link to the learner, and its publisher."""
 
-    student: Student
+    student: LearnerClient
     steps: Publisher
     begin: int  # the episode to go on with
     index: int = 0
@@ -102,7 +102,7 @@ def feed(process: Process, settings: FeederSettings) -> bool:
         RefusedByLearner, NoLog, NotALog: as they say.
     """
     robot, stop = robot_with_task(settings.robot), process.stop.is_set
-    steps, pupils, figures = Steps(settings.logs, robot), dict[str, Pupil](), Counter[str]()
+    steps, pupils, figures = Steps(settings.logs, robot), dict[str, LearnedPolicy](), Counter[str]()
 
     def refresh() -> None:
         process.figures.update({name: float(figures[name]) for name in ("published", "known")})
@@ -112,13 +112,13 @@ def feed(process: Process, settings: FeederSettings) -> bool:
     process.announce()
     for step in steps:
         if step.actor not in pupils:
-            student = Student(process.bus, robot, step.actor)
+            student = LearnerClient(process.bus, robot, step.actor)
             begin = student.join(0, step.episode, stop)
             if begin is None:
                 return False
             publisher = process.bus.publisher(LOGGED, robot=robot.name, source=step.actor)
             # A learner that knows nothing of this actor lets it begin where the log does.
-            pupils[step.actor] = Pupil(student, publisher, begin)
+            pupils[step.actor] = LearnedPolicy(student, publisher, begin)
         pupil = pupils[step.actor]
         if step.episode < pupil.begin:
             figures["known"] += 1
@@ -135,7 +135,7 @@ def feed(process: Process, settings: FeederSettings) -> bool:
     return not stop()
 
 
-def _readdress(step: pb.Step, pupil: Pupil) -> None:
+def _readdress(step: pb.Step, pupil: LearnedPolicy) -> None:
     """The number among this actor's steps, and the weights' version, are the present learner's to count."""
     moment = step.header.time
     step.ClearField("header")
@@ -144,7 +144,7 @@ def _readdress(step: pb.Step, pupil: Pupil) -> None:
     step.weights_version = 0 if pupil.student.policy is None else pupil.student.policy.version
 
 
-def _await_the_end(pupils: dict[str, Pupil], stop: Callable[[], bool]) -> None:
+def _await_the_end(pupils: dict[str, LearnedPolicy], stop: Callable[[], bool]) -> None:
     """Leave the learner the time to make its last updates."""
     deadline = time.monotonic() + LAST_UPDATES
     while time.monotonic() < deadline and not stop() and not any(p.student.done for p in pupils.values()):

@@ -17,7 +17,7 @@ UNFINISHED = 75  # exit status: asked to end before its work was done
 
 
 @dataclass(frozen=True)
-class Place:
+class ProcessSpec:
     """A process's name, and how it is called on in a run."""
 
     name: str
@@ -27,26 +27,26 @@ class Place:
     nice: int = 0  # the robot's safety comes before learning
 
 
-def places(config: RunConfig) -> list[Place]:
+def places(config: RunConfig) -> list[ProcessSpec]:
     """THE table of a run's processes, in the order in which they start."""
-    table = [Place("recorder", "recorder", nice=5 if config.flights else 0)] if config.record else []
+    table = [ProcessSpec("recorder", "recorder", nice=5 if config.flights else 0)] if config.record else []
     if config.filtered:
-        table += [Place(f"safety-{i}", "safety") for i in range(config.replicas)]
+        table += [ProcessSpec(f"safety-{i}", "safety") for i in range(config.replicas)]
     if config.autopilot is not None:
         several = len(config.flights) > 1
         names = [f"autopilot-{i}" if several else "autopilot" for i in range(len(config.flights))]
-        table += [Place(name, "autopilot", number=i) for i, name in enumerate(names)]
+        table += [ProcessSpec(name, "autopilot", number=i) for i, name in enumerate(names)]
     one = len(config.robots) == 1
     for robot in config.robots:
         kind = robot_named(robot).name
         if not config.policy:
-            table.append(Place("learner" if one else f"learner-{kind}", "learner", robot, nice=10))
+            table.append(ProcessSpec("learner" if one else f"learner-{kind}", "learner", robot, nice=10))
         if config.from_logs:
-            table.append(Place("feeder" if one else f"feeder-{kind}", "feeder", robot, nice=2))
+            table.append(ProcessSpec("feeder" if one else f"feeder-{kind}", "feeder", robot, nice=2))
         for i in range(config.actors):
             name = f"actor-{i}" if one else f"actor-{kind}-{i}"
             nice = 0 if config.flights else 2
-            table.append(Place(name, "actor", robot, i * config.robots_per_actor, nice))
+            table.append(ProcessSpec(name, "actor", robot, i * config.robots_per_actor, nice))
     return table
 
 

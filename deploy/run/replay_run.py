@@ -32,7 +32,7 @@ from brakeline.safety.service.server import Counts, Models, answerer
 
 TIMES = ("time_ms", "solve_ms", "verify_ms", "queue_ms")
 # What a service says to itself, with a key that no log holds; and what explains a decision, and changes none.
-WORDS = ("vouchers", "unvouched", "stopped", "bound")
+WORDS = ("plan_tokens", "unvouched", "stopped", "bound")
 # How the solver came by an answer: its way may hang on the last bits where its answer does not.
 WORK = ("solver", "iterations")
 ROUNDING = 1e-12  # of a number (of 1, if the number is smaller) by which two decisions may differ and still be equal
@@ -181,7 +181,7 @@ APART = Difference(math.inf, False)
 def _difference(one: Any, other: Any) -> Difference:
     if isinstance(one, str | bool):
         return APART
-    if isinstance(one, pb.Promise):
+    if isinstance(one, pb.Reservation):
         one, other = ([*p.center, *p.half_width, *p.radius] for p in (one, other))
     elif isinstance(one, Message):
         return APART

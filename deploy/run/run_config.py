@@ -14,7 +14,7 @@ from brakeline.actors.actor_settings import Change, FlightSettings
 from brakeline.learner.learner_config import LearnerConfig, TD3Config
 from brakeline.logs.segment_rotation import Rotation
 from brakeline.safety.model.model_config import METHODS as FILTERS
-from brakeline.safety.model.model_config import Recipe
+from brakeline.safety.model.model_config import ModelConfig
 from brakeline.sim.sim_conditions import Conditions
 
 METHODS = (*FILTERS, "none")
@@ -34,7 +34,7 @@ class RunConfig:
 
     robots: tuple[str, ...] = ("ground",)
     method: str = "ddpc"
-    recipe: Recipe = field(default_factory=Recipe)
+    model_config: ModelConfig = field(default_factory=ModelConfig)
     accept_bound: float | None = None  # the largest stated bound that is accepted; None: each robot's own limit
     arena: str = "default"
     actors: int = 2  # processes a robot kind
@@ -124,6 +124,10 @@ EXPERIMENTS: dict[str, RunConfig] = {
 }
 
 
+# Names that fields had in older files.
+FORMER = {"recipe": "model_config"}
+
+
 def encode(config: Any) -> str:
     """JSON of a configuration."""
     return json.dumps(dataclasses.asdict(config), indent=2)
@@ -138,6 +142,7 @@ def decode(kind: type[Any], values: Any) -> Any:
     if not isinstance(values, dict):
         raise ValueError(f"{kind.__name__} is an object of named values, not {values!r}")
     hints = typing.get_type_hints(kind)
+    values = {FORMER.get(name, name): value for name, value in values.items()}
     unknown = values.keys() - {f.name for f in dataclasses.fields(kind)}
     if unknown:
         raise ValueError(f"{kind.__name__} has no {', '.join(sorted(unknown))}: written by another version?")

@@ -43,7 +43,7 @@ def seal_models(config: RunConfig, folder: Path, keys: Path) -> None:
         return
     signer = Signer.load(keys)
     for name in config.robots if config.filtered else ():
-        model = load(method_path(robot_maybe_with_task(name), config.method, config.recipe))
+        model = load(method_path(robot_maybe_with_task(name), config.method, config.model_config))
         archived = archive_path(folder, model.robot.name, model.version)
         if not seal_of(archived).exists():
             signer.sign(model).save(archived)

@@ -15,7 +15,16 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
-from brakeline.deploy.run.processes import CONFIG, LOG, UNFINISHED, Place, client_of, launcher_of, metrics_of, places
+from brakeline.deploy.run.processes import (
+    CONFIG,
+    LOG,
+    UNFINISHED,
+    ProcessSpec,
+    client_of,
+    launcher_of,
+    metrics_of,
+    places,
+)
 from brakeline.deploy.run.run_config import RunConfig, load
 from brakeline.messaging.bus import BusError, BusSettings
 from brakeline.messaging.task import robot_maybe_with_task, robot_with_task
@@ -23,7 +32,7 @@ from brakeline.messaging.task import robot_maybe_with_task, robot_with_task
 PARENT_DIED = 1  # prctl: PR_SET_PDEATHSIG
 
 
-def _recorder(place: Place, folder: Path, config: RunConfig, bus: BusSettings) -> bool:
+def _recorder(place: ProcessSpec, folder: Path, config: RunConfig, bus: BusSettings) -> bool:
     from brakeline.deploy.run.log_contents import attachments, metadata
     from brakeline.deploy.run.mavlink_json import as_json, both
     from brakeline.logs import recorder
@@ -37,7 +46,7 @@ def _recorder(place: Place, folder: Path, config: RunConfig, bus: BusSettings) -
     return False
 
 
-def _safety(place: Place, folder: Path, config: RunConfig, bus: BusSettings) -> bool:
+def _safety(place: ProcessSpec, folder: Path, config: RunConfig, bus: BusSettings) -> bool:
     from brakeline.deploy.data.data_paths import method_path
     from brakeline.deploy.run.run_keys import KEYS, newest_model
     from brakeline.safety.service.server import SafetySettings, main
@@ -45,7 +54,7 @@ def _safety(place: Place, folder: Path, config: RunConfig, bus: BusSettings) -> 
 
     robots = [robot_maybe_with_task(robot) for robot in config.robots]
     limits = {robot.name: robot.accept_bound for robot in robots}
-    models = tuple(method_path(robot, config.method, config.recipe) for robot in robots)
+    models = tuple(method_path(robot, config.method, config.model_config) for robot in robots)
     trust = None if bus.keys is None else Trust.load(bus.keys)
     newest = (newest_model(folder, robot.name, trust) or path for robot, path in zip(robots, models, strict=True))
     accepted = config.accept_bound
@@ -53,7 +62,7 @@ def _safety(place: Place, folder: Path, config: RunConfig, bus: BusSettings) -> 
     return False
 
 
-def _learner(place: Place, folder: Path, config: RunConfig, bus: BusSettings) -> bool:
+def _learner(place: ProcessSpec, folder: Path, config: RunConfig, bus: BusSettings) -> bool:
     from brakeline.learner.checkpoint import CHECKPOINT, exists, latest
 
     out = folder / place.name
@@ -64,7 +73,7 @@ def _learner(place: Place, folder: Path, config: RunConfig, bus: BusSettings) ->
     return main(LearnerSettings(bus, place.robot, out, resume, place.name, config.learning()))
 
 
-def _actor(place: Place, folder: Path, config: RunConfig, bus: BusSettings) -> bool:
+def _actor(place: ProcessSpec, folder: Path, config: RunConfig, bus: BusSettings) -> bool:
     from brakeline.actors.actor_process import ActorSettings, run
     from brakeline.deploy.policy_loading import policy_named
     from brakeline.deploy.vehicle_factory import environment, fleet_world
@@ -98,7 +107,7 @@ def _actor(place: Place, folder: Path, config: RunConfig, bus: BusSettings) -> b
     return run(settings, partial(environment, conditions=config.conditions), propose, worlds)
 
 
-def _autopilot(place: Place, folder: Path, config: RunConfig, bus: BusSettings) -> bool:
+def _autopilot(place: ProcessSpec, folder: Path, config: RunConfig, bus: BusSettings) -> bool:
     from brakeline.deploy.run.autopilot_run import AutopilotSettings, fly
 
     assert config.autopilot is not None
@@ -120,14 +129,14 @@ def _autopilot(place: Place, folder: Path, config: RunConfig, bus: BusSettings) 
     return False
 
 
-def _feeder(place: Place, folder: Path, config: RunConfig, bus: BusSettings) -> bool:
+def _feeder(place: ProcessSpec, folder: Path, config: RunConfig, bus: BusSettings) -> bool:
     from brakeline.deploy.run.log_feed import FeederSettings, main
 
     return main(FeederSettings(bus, config.from_logs, place.robot, place.name, config.actors == 0))
 
 
 # Each runs until its work is done (True) or it is asked to end; a recorder's and a safety service's never is.
-KINDS: dict[str, Callable[[Place, Path, RunConfig, BusSettings], bool]] = {
+KINDS: dict[str, Callable[[ProcessSpec, Path, RunConfig, BusSettings], bool]] = {
     "recorder": _recorder,
     "safety": _safety,
     "learner": _learner,

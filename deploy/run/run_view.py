@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from brakeline.deploy.run.run_config import RunConfig
-from brakeline.deploy.run.supervisor import Child
+from brakeline.deploy.run.supervisor import SupervisedProcess
 from brakeline.logs.metrics import Metrics
 
 
@@ -18,6 +18,6 @@ class View:
     config: RunConfig
     folder: Path
     metrics: Metrics
-    children: list[Child]
+    children: list[SupervisedProcess]
     lines: deque[str]
     ending: bool = False

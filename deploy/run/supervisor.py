@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from brakeline.deploy.interpreter import PYTHON
-from brakeline.deploy.run.processes import UNFINISHED, Place
+from brakeline.deploy.run.processes import UNFINISHED, ProcessSpec
 
 log = logging.getLogger("brakeline.launcher")
 
@@ -26,10 +26,10 @@ class LaunchError(RuntimeError):
 
 
 @dataclass
-class Child:
+class SupervisedProcess:
     """A process of the run, through its restarts."""
 
-    place: Place
+    place: ProcessSpec
     folder: Path
     restarts: int = 0
     failures: int = 0  # in a row

@@ -16,7 +16,10 @@ def main(robot: str, out: str, periods: str = "20000") -> None:
     env, how = adapter.make(free=True), {"held": adapter.held, "actions": adapter.actions()}
     data = collect(env, adapter.robot, int(periods), **how)
     data.save(Path(out))
-    print(f"{out}: {data.periods} periods in {len(data.trajectories)} trajectories, bulge {1e3 * data.bulge:.2f} mm")
+    print(
+        f"{out}: {data.periods} periods in {len(data.trajectories)} trajectories, "
+        f"chord deviation {1e3 * data.chord_deviation:.2f} mm"
+    )
 
 
 if __name__ == "__main__":

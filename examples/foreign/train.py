@@ -38,7 +38,7 @@ HELD = 10  # periods at most of an input at random, before there is a policy
 SAME = 1e-6  # of an input's half range: what was executed is what was proposed
 
 
-class Pupil:
+class LearnedPolicy:
     """TD3 of observations as they come: they are normalised by what the steps at random saw."""
 
     def __init__(self, adapter: Adapter, size: int, steps: int, seed: int) -> None:
@@ -77,7 +77,7 @@ class Pupil:
         self.policy = Trained(self.robot, self.td3.policy_layers(), self._middle, self._spread)
 
 
-def episode(env: Any, pupil: Pupil, number: int) -> Tally:
+def episode(env: Any, pupil: LearnedPolicy, number: int) -> Tally:
     tally, step, ended = Tally(), 0, False
     observation, _ = env.reset(seed=10_000 + number)  # none of those that are counted afterwards
     while not ended:
@@ -107,7 +107,7 @@ def main() -> None:
     started = time.perf_counter()
     with SafetyClient.open(given.connect, adapter.robot, DEADLINE, name="client.training") as client:
         env = behind(adapter, client, given.penalty)
-        pupil = Pupil(adapter, env.observation_space.shape[0], given.steps, given.seed)
+        pupil = LearnedPolicy(adapter, env.observation_space.shape[0], given.steps, given.seed)
         while done < given.steps:
             told = episode(env, pupil, number).told()
             done, number, cost = done + told["steps"], number + 1, cost + told["cost"]

@@ -51,9 +51,9 @@ class Card:
     inputs: list[tuple[str, str, float, float]] = field(default_factory=list)  # name, unit, proposed, executed
     arrows: list[list[float]] = field(default_factory=list)  # of the proposed and the executed input, m
     edge: list[float] = field(default_factory=list)  # of what stopped the proposal: a point, and the normal there
-    around: dict[str, list[Any]] = field(default_factory=dict)  # `Surroundings.flat`
+    around: dict[str, list[Any]] = field(default_factory=dict)  # `DisplayedMap.flat`
     fleet: list[str] = field(default_factory=list)  # the actors of its world
-    promise: list[list[float]] = field(default_factory=list)  # boxes: center x, y, half-width x, y with the radius
+    reservation: list[list[float]] = field(default_factory=list)  # boxes: center x, y, half-width x, y with the radius
     trail: deque[tuple[float, float]] = field(default_factory=lambda: deque(maxlen=TRAIL))
     marks: deque[tuple[float, float, str]] = field(default_factory=lambda: deque(maxlen=TRAIL))  # interventions
     reward: float = 0.0
@@ -90,7 +90,7 @@ class Card:
         self.around = surroundings(self.robot, exchange.request).flat()
         self.fleet = list(exchange.request.fleet)
         boxes = promised(self.robot, exchange)
-        self.promise = [[*box[:2].tolist(), *(box[d : d + 2] + box[-1]).tolist()] for box in boxes]
+        self.reservation = [[*box[:2].tolist(), *(box[d : d + 2] + box[-1]).tolist()] for box in boxes]
         self._explain(exchange.request, decision)
 
     def _explain(self, request: pb.Request, decision: pb.Decision) -> None:
@@ -197,7 +197,7 @@ class Board:
     def _promises(self, name: str) -> list[list[float]]:
         """The boxes in which the other robots of its world promise to be."""
         others = (self._cards[actor] for actor in self._cards[name].fleet if actor != name and actor in self._cards)
-        return [box for card in others for box in card.promise]
+        return [box for card in others for box in card.reservation]
 
     def _count(self) -> dict[str, Any]:
         figures = self.metrics.figures()

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from brakeline.messaging.robot import Robot
-from brakeline.safety.filter.reservation import Promise
+from brakeline.safety.filter.reservation import Reservation
 
 Array = NDArray[np.float64]
 
@@ -42,7 +42,7 @@ class Prediction:
 NO_PREDICTION = Prediction(np.zeros(0), np.zeros(0), 0.0)  # of a method that predicts nothing
 
 
-class Commitment:
+class BackupPlan:
     """The committed plan of one robot: verified when it was made, from then to standstill.
 
     plan (N, m) is its tail: the first row is what to execute if no better answer comes; of a late robot what is being
@@ -61,19 +61,19 @@ class Commitment:
         self.plan: Array = np.tile(self.input_in_force, (self.robot.horizon, 1))
         self.model = ""
         self.predicted: Prediction | None = None
-        self.promise: Promise | None = None
+        self.reservation: Reservation | None = None
         self.seen: Array = np.zeros(self.robot.state_dim)  # the last measured state: of feedback, a stop is made of it
         self._compare = False  # was it measured where the prediction speaks of it?
         self._still = self.robot.horizon  # periods of a stop's inputs
         self._vouchers: tuple[bytes, ...] = ()  # of this period and those to come; the last stays
 
     @property
-    def due(self) -> Array:
+    def next_input(self) -> Array:
         """(m,) the input to execute in the coming period, after `accept` or `fallback`."""
         return self.plan[0].copy() if self.robot.late else self.input_in_force
 
     @property
-    def voucher(self) -> bytes:
+    def plan_token(self) -> bytes:
         """For the next request; empty: the service gave none."""
         return self._vouchers[0] if self._vouchers else b""
 
@@ -88,12 +88,12 @@ class Commitment:
         model: str,
         predicted: Prediction | None,
         verified: bool,
-        vouchers: Iterable[bytes] = (),
-        promise: Promise | None = None,
+        plan_tokens: Iterable[bytes] = (),
+        reservation: Reservation | None = None,
     ) -> Array:
         """A decision's plan becomes the committed one; returns the input to execute next."""
-        self.promise = promise
-        self._vouchers = (b"", *vouchers)
+        self.reservation = reservation
+        self._vouchers = (b"", *plan_tokens)
         self.plan, self.model = plan, model if verified else UNVERIFIED
         self.predicted = predicted if predicted is not None and len(predicted.center) else None
         return self._advance()
@@ -119,7 +119,7 @@ class Commitment:
         self._compare = False
         now: Array = self.plan[0].copy()
         self._vouchers = self._vouchers[1:] or self._vouchers
-        self.promise = None if self.promise is None else self.promise.later()
+        self.reservation = None if self.reservation is None else self.reservation.later()
         rests = robot.keeps_still(now, self.seen, self.input_in_force)
         last = np.where(robot.stopping, 0.0, self.plan[-1])
         self.plan = np.vstack([self.plan[1:], last[None]])
@@ -128,7 +128,7 @@ class Commitment:
         stopped = self.model != UNVERIFIED or self._still >= robot.horizon
         if stopped and rests and robot.rests(self.plan).all():
             self.model = ""  # standing still needs nobody's word
-        return self.due
+        return self.next_input
 
 
 def correction_penalty(

@@ -12,7 +12,7 @@ from brakeline.messaging.obstacle import Shapes
 from brakeline.messaging.robot import Robot
 from brakeline.safety.filter.moving_halfspaces import swept_half_spaces
 from brakeline.safety.filter.reservation import Promises
-from brakeline.safety.perception.occluded_regions import Shadows
+from brakeline.safety.perception.occluded_regions import OccludedRegions
 from brakeline.safety.perception.scan_free_space import Cells
 from brakeline.safety.perception.scan_free_space import half_spaces as unseen_half_spaces
 
@@ -45,7 +45,7 @@ class Around:
 
     near: Shapes
     moving: Movers | None
-    unseen: Cells | Shadows | None
+    unseen: Cells | OccludedRegions | None
     promised: Promises | None = None  # these come last, once for the whole body
 
     @property
@@ -100,7 +100,7 @@ def _about_an_obstacle(row: int, room: float, robot: Robot, around: Around, plan
     period = end if end < N else min(end - N, N - 1)
     when = end if end < N else min(end - N + 1, N)
     start, ends = planes.start, planes.ends
-    if isinstance(around.unseen, Shadows) and which >= around.told:
+    if isinstance(around.unseen, OccludedRegions) and which >= around.told:
         by, (normal, level) = UNSEEN, planes.itself(which, period)
     elif which < len(around.near):
         by, (normal, level) = (

@@ -66,7 +66,7 @@ def _discs(robot: Robot, tube: Tube) -> list[_Disc]:
 
 
 @dataclass(frozen=True)
-class Scene:
+class LocalMap:
     """start (d,): the measured position; turn (d, d): world from the frame of now; near: the obstacles that
     count; beyond [m]: no other that was told of is nearer, nor the end of sight."""
 
@@ -76,11 +76,11 @@ class Scene:
     near: Shapes
     beyond: float
     moving: Movers | None = None  # that may meet the tube
-    unseen: seen.Cells | shades.Shadows | None = None  # what a scan does not show to be free
+    unseen: seen.Cells | shades.OccludedRegions | None = None  # what a scan does not show to be free
     promised: Promises | None = None  # to other robots
 
     @property
-    def parked(self) -> Scene:
+    def parked(self) -> LocalMap:
         """The same for one that stands: what moves, or may, may stand by, that is its own affair."""
         unseen = None if self.unseen is not None and self.unseen.speed > 0.0 else self.unseen
         return replace(self, moving=None, unseen=unseen)
@@ -117,7 +117,7 @@ def turning_extent(robot: Robot, tube: Tube) -> float:
     return float((width + drift).max() + sizes[L:].max())
 
 
-class Surroundings:
+class TubeConstraints:
     """A robot's tube, ready to be held against scenes."""
 
     def __init__(
@@ -196,7 +196,7 @@ class Surroundings:
 
     # --- one scene ---------------------------------------------------------------------------------------------
 
-    def scene(self, request: Request, z_0: Array, inputs: tuple[Array, Array]) -> Scene:
+    def scene(self, request: Request, z_0: Array, inputs: tuple[Array, Array]) -> LocalMap:
         """inputs: center and half-widths of what a plan's free inputs may be, after z_0."""
         d, robot = self.robot.position_dim, self.robot
         start, near = np.ascontiguousarray(request.state[:d]), request.obstacles
@@ -214,12 +214,12 @@ class Surroundings:
         if promised is not None:
             beyond, counts = self._parted(promised.nearest(start), beyond)
             promised = promised.take(counts) if counts.any() else None
-        unseen: seen.Cells | shades.Shadows | None = None
+        unseen: seen.Cells | shades.OccludedRegions | None = None
         if isinstance(request.scan, RangeImage):
             unseen = shades.shadows(request.scan, self._room(z_0, inputs, start, turn), self.body, start)
         elif request.scan is not None:
             unseen = self._unseen(request.scan, start)
-        return Scene(start, heading, turn, near, beyond, moving, unseen, promised)
+        return LocalMap(start, heading, turn, near, beyond, moving, unseen, promised)
 
     def _parted(self, away: Array, beyond: float) -> tuple[float, NDArray[np.bool_]]:
         """How near [m] the nearest beyond reach is, of these and what was looked at before, and which (n,) are within;
@@ -255,7 +255,7 @@ class Surroundings:
         """Where the true positions at the periods' ends lie, world: centers and half-widths (N, d)."""
         return tube_kernels.sets(*self._reached, z, np.ascontiguousarray(start, dtype=float), turn, self.measured)
 
-    def predict(self, scene: Scene, z: Array) -> Prediction:
+    def predict(self, scene: LocalMap, z: Array) -> Prediction:
         """The set of the next measured state, all coordinates."""
         center, half = tube_kernels.next_state(
             *self._next, self._regressor(z), np.ascontiguousarray(scene.start), scene.turn
@@ -268,7 +268,7 @@ class Surroundings:
         """Smallest distance [m] of the exact tube to a half-space (of a limit: in its own units)."""
         return self.least(rows.bound - rows.support(self.tube, z), z)
 
-    def margin_in(self, scene: Scene, z: Array) -> float:
+    def margin_in(self, scene: LocalMap, z: Array) -> float:
         """The same, to those about the rollout of regressors z."""
         return self.least(self.slack(scene, z), z)
 
@@ -280,7 +280,7 @@ class Surroundings:
             margin = min(margin, most - self.extent(z))
         return max(margin, -self.reach) if margin == margin else -self.reach
 
-    def planes(self, scene: Scene, z: Array, leaving: bool = False) -> list[Planes]:
+    def planes(self, scene: LocalMap, z: Array, leaving: bool = False) -> list[Planes]:
         """Half-spaces about the rollout of regressors z, of each disc of the body; leaving: where it is inside of an
         obstacle, those that lead out of it."""
         found = []
@@ -298,7 +298,7 @@ class Surroundings:
                 beside.append(swept_half_spaces(scene.moving, start, ends, disc.radius, measured, self.robot.period))
                 self._let_pass(beside[-1][1])
             if scene.unseen is not None:
-                of = shades if isinstance(scene.unseen, shades.Shadows) else seen
+                of = shades if isinstance(scene.unseen, shades.OccludedRegions) else seen
                 beside.append(of.half_spaces(scene.unseen, start, ends, disc.radius, measured, self.robot.period))
                 if isinstance(scene.unseen, seen.Cells) and scene.unseen.speed > 0.0:
                     self._let_pass(beside[-1][1])
@@ -312,7 +312,7 @@ class Surroundings:
         late = levels[:, self.stands :]
         late[late == late] = FARTHEST  # not of NaN
 
-    def rows(self, scene: Scene, z: Array, planes: list[Planes] | None = None) -> Rows:
+    def rows(self, scene: LocalMap, z: Array, planes: list[Planes] | None = None) -> Rows:
         """Half-spaces about the rollout of regressors z, as rows of the tube (and of the QP's: its generators are the
         same, only their magnitudes are not). planes: if they are known already."""
         planes = planes or self.planes(scene, z)
@@ -320,7 +320,7 @@ class Surroundings:
         parts = [disc.layout.rows(self._turned(plane.normals, scene), plane.offsets) for disc, plane in discs]
         return stacked(parts + self._further(scene, z))
 
-    def slack(self, scene: Scene, z: Array, planes: list[Planes] | None = None) -> Array:
+    def slack(self, scene: LocalMap, z: Array, planes: list[Planes] | None = None) -> Array:
         """What the same rows leave, `bound - support` (rows,)."""
         sizes = tube_kernels.magnitudes(*self._sized, z)
         found = [
@@ -330,11 +330,11 @@ class Surroundings:
         found += [rows.bound - rows.support(self.tube, z) for rows in self._further(scene, z)]
         return found[0] if len(found) == 1 else np.concatenate(found)
 
-    def _turned(self, normals: Array, scene: Scene) -> Array:
+    def _turned(self, normals: Array, scene: LocalMap) -> Array:
         """Into the frame of now."""
         return normals if self.robot.heading is None else normals @ scene.turn
 
-    def _further(self, scene: Scene, z: Array) -> list[Rows]:
+    def _further(self, scene: LocalMap, z: Array) -> list[Rows]:
         """The rows that are not a disc's own."""
         parts = []
         if scene.promised is not None:
@@ -346,7 +346,7 @@ class Surroundings:
             parts.append(self.limits.rows(scene.start, scene.heading, scene.turn))
         return parts
 
-    def worst_of(self, scene: Scene, z: Array, slack: Array, planes: list[Planes], kept_off: Array) -> Stopped:
+    def worst_of(self, scene: LocalMap, z: Array, slack: Array, planes: list[Planes], kept_off: Array) -> Stopped:
         """What the proposal, regressors z, comes nearest to; kept_off (rows,): so much nearer than it is each counts,
         and the end of sight as much as the most of them."""
         beyond = self.reach - self.extent(z) if self.far else np.inf
@@ -357,14 +357,14 @@ class Surroundings:
         around = Around(scene.near, scene.moving, scene.unseen, scene.promised)
         return worst(row, max(float(slack[row]), -self.reach), self.robot, around, planes)
 
-    def clear(self, request: Request, scene: Scene, z: Array, margin: float) -> tuple[float, bool]:
+    def clear(self, request: Request, scene: LocalMap, z: Array, margin: float) -> tuple[float, bool]:
         """Smallest distance [m] of the tube to what is in sight, given that to what is within reach; True: it is only a
         lower bound.
 
         What is beyond the reach decides nothing, but it may be what is nearest to the tube. Of it the bound is told:
         how far it is, less how far the tube goes.
         """
-        if isinstance(scene.unseen, shades.Shadows) and margin >= ASIDE:
+        if isinstance(scene.unseen, shades.OccludedRegions) and margin >= ASIDE:
             return margin, True
         if not self.far and margin + self.widest <= self.reach:
             return margin, False

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from brakeline.messaging.scan import OLDEST, Scan
 from brakeline.safety.filter.backup_plan import UNVERIFIED
 from brakeline.safety.filter.blocking_constraint import Stopped
-from brakeline.safety.filter.constraints import Scene, Surroundings, turning_extent
+from brakeline.safety.filter.constraints import LocalMap, TubeConstraints, turning_extent
 from brakeline.safety.filter.kernels import tube_kernels
 from brakeline.safety.filter.plan_inputs import Inputs
 from brakeline.safety.filter.qp import SHARPEN, Builder, Rows
@@ -39,7 +39,7 @@ from brakeline.safety.filter.request import (
     check_for_filter,
     check_surroundings,
 )
-from brakeline.safety.filter.reservation import Promise
+from brakeline.safety.filter.reservation import Reservation
 from brakeline.safety.model.model_set import ModelSet
 from brakeline.safety.model.stated_bound import stated_bound
 from brakeline.safety.model.turning_in_place import widened
@@ -73,7 +73,7 @@ class _Found:
     z: Array
     margin: float
     verified: bool
-    around: Surroundings  # whose tube is that of the plan
+    around: TubeConstraints  # whose tube is that of the plan
     kept: bool = False  # the committed plan goes on as it was verified before
     for_clearance: bool = False  # the proposal's tube is verified too, and is nearer than the clearance margin
 
@@ -96,12 +96,12 @@ class Filter:
         turning = model.turning()
         in_place = self.tube if turning is None else turning.tube()
         margin = turning_extent(robot, in_place) if clearance_margin is None else clearance_margin
-        self.around = Surroundings(model, self.tube, outer, self.domain, margin)
-        self.in_place: tuple[Array, Surroundings] | None = None  # and for which regressors (2, nz)
+        self.around = TubeConstraints(model, self.tube, outer, self.domain, margin)
+        self.in_place: tuple[Array, TubeConstraints] | None = None  # and for which regressors (2, nz)
         if turning is not None and model.in_place is not None:
             box = np.ascontiguousarray(model.in_place.domain(in_place.position.shape[2], robot.regressor_dim))
             known = box[:, : robot.regressor_dim]
-            own = Surroundings(turning, in_place, in_place, known, margin, self.around.reach)
+            own = TubeConstraints(turning, in_place, in_place, known, margin, self.around.reach)
             self.in_place = box, own
         self.inputs = Inputs(robot)
         self.ordinary = Ordinary(robot)
@@ -118,7 +118,7 @@ class Filter:
         z = np.concatenate([state[self.regressor], speed, np.tile(speed, self.robot.free_steps)])
         return float(self._around(z).tube.half_widths(z)[-1].max())
 
-    def _around(self, z: Array) -> Surroundings:
+    def _around(self, z: Array) -> TubeConstraints:
         """What holds the tube of regressors z against scenes: the tube of plans in place, or that of all plans."""
         if self.in_place is not None and tube_kernels.within(z, self.in_place[0]):
             return self.in_place[1]
@@ -160,11 +160,11 @@ class Filter:
             attempt.reason = "the state is outside the domain that was recorded"
         if found is None:
             found = self._committed(request, scene, z_0, attempt, in_domain)
-            if in_domain and not blind and request.promise is None:  # others rely on a promise
+            if in_domain and not blind and request.reservation is None:  # others rely on a promise
                 found = self._recovered(request, scene, z_0) or found
         return self._decision(request, scene, found, attempt)
 
-    def _search(self, scene: Scene, z_0: Array, proposal: Array, attempt: _Attempt) -> _Found | None:
+    def _search(self, scene: LocalMap, z_0: Array, proposal: Array, attempt: _Attempt) -> _Found | None:
         """The proposal if it is verified and keeps the clearance margin, else the QP's answer if that is verified, else
         the proposal if it is verified, else nothing."""
         z = self.inputs.regressors(z_0, proposal)
@@ -204,7 +204,7 @@ class Filter:
             attempt.reason += "; no verified input was found"
         return adjusted
 
-    def _turned_only(self, scene: Scene, z_0: Array, proposal: Array, adjusted: _Found | None) -> _Found | None:
+    def _turned_only(self, scene: LocalMap, z_0: Array, proposal: Array, adjusted: _Found | None) -> _Found | None:
         """The proposal without the inputs that move the position, if that is a plan in place with a verified tube, and
         closer to the proposal than what the QP found."""
         if self.in_place is None:
@@ -260,7 +260,7 @@ class Filter:
             np.concatenate([rows.keep, np.zeros(len(closer))]),
         )
 
-    def _committed(self, request: Request, scene: Scene, z_0: Array, attempt: _Attempt, in_domain: bool) -> _Found:
+    def _committed(self, request: Request, scene: LocalMap, z_0: Array, attempt: _Attempt, in_domain: bool) -> _Found:
         """The committed plan; if it no longer counts as verified, braking that is verified anew; else just braking.
 
         It counts if the measured state is where it was predicted, and this model set verified it against obstacles
@@ -290,7 +290,7 @@ class Filter:
                 return _Found(FAILSAFE, self.inputs.plan(z), z, margin, True, around)
         return _Found(FAILSAFE, self.inputs.plan(brake), brake, margin, False, around)
 
-    def _recovered(self, request: Request, scene: Scene, z_0: Array) -> _Found | None:
+    def _recovered(self, request: Request, scene: LocalMap, z_0: Array) -> _Found | None:
         """A slow way out, if it stands (or is on such a way) where not even standing can be verified: by more than
         the errors of two measurements could make it seem so; of who stays where it stands, and than that its stop was
         verified to end nearer."""
@@ -342,12 +342,12 @@ class Filter:
             return None
         return _Found(RECOVERING, self.inputs.plan(z), z, self.around.margin(rows, z), False, self.around)
 
-    def _decision(self, request: Request, scene: Scene, found: _Found, attempt: _Attempt) -> Decision:
+    def _decision(self, request: Request, scene: LocalMap, found: _Found, attempt: _Attempt) -> Decision:
         z, around = found.z, found.around
         centers, half = around.sets(scene.start, scene.turn, z)
-        promise = request.promise
-        if promise is not None and not found.kept:
-            promise = self._promise(around, scene.start, centers, half, z)
+        reservation = request.reservation
+        if reservation is not None and not found.kept:
+            reservation = self._promise(around, scene.start, centers, half, z)
         predicted = around.predict(scene, z)
         margin, at_least = around.clear(request, scene, z, found.margin)
         total, solved = (perf_counter_ns() - attempt.started) * 1e-6, attempt.solve_ns * 1e-6
@@ -372,20 +372,20 @@ class Filter:
             broken=attempt.broken,
             stopped=None if found.kind == ALLOWED else attempt.stopped,
             for_clearance=found.for_clearance if found.kind == ADJUSTED else None,
-            promise=promise,
+            reservation=reservation,
             bound=self.bound,
         )
 
-    def rest(self, state: Array) -> Promise:
+    def rest(self, state: Array) -> Reservation:
         """What a robot promises that stands, and goes on standing, in a measured state (n,)."""
         z = np.concatenate([state[self.regressor], np.tile(self.inputs.nothing, 1 + self.robot.free_steps)])
         heading = float(state[self.robot.heading]) if self.robot.heading is not None else 0.0
         start, around = state[: self.robot.position_dim], self._around(z)
         return self._promise(around, start, *around.sets(start, around.turn(heading), z), z)
 
-    def _promise(self, around: Surroundings, start: Array, centers: Array, half: Array, z: Array) -> Promise:
+    def _promise(self, around: TubeConstraints, start: Array, centers: Array, half: Array, z: Array) -> Reservation:
         """Of a tube with these sets (N, d), world, and regressors z."""
         about = around.tube.magnitudes(z)[around.tube.generators :]
         about[-2] = max(about[-2], about[-1])
         centers, half = np.vstack([start, centers]), np.vstack([around.measured, half])
-        return Promise.of(centers, half, self.robot.footprint + about[:-1])
+        return Reservation.of(centers, half, self.robot.footprint + about[:-1])

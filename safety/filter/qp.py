@@ -52,11 +52,14 @@ class Layout:
         directions = np.concatenate([np.zeros((1, d, L)), directions])[ends]
         used = np.abs(directions).max(axis=1, initial=0.0) > 0.0  # a generator may be a period's own
         most = int(used.sum(axis=1).max(initial=0))
-        period, bulge = np.concatenate([at_start, at_start, [N - 1]]), L + np.concatenate([at_start, at_start, [N]])
+        period, chord_deviation = (
+            np.concatenate([at_start, at_start, [N - 1]]),
+            L + np.concatenate([at_start, at_start, [N]]),
+        )
         ways = np.ascontiguousarray(np.concatenate([np.zeros((1, d, nz)), position])[ends])
         columns = np.ascontiguousarray(np.argsort(~used, axis=1, kind="stable")[:, :most])
         spans = np.ascontiguousarray(np.take_along_axis(directions, columns[:, None, :], axis=2))
-        self.parts = period, ways, spans, columns, bulge
+        self.parts = period, ways, spans, columns, chord_deviation
         self.sizes = L + N + 1
 
     def rows(self, normals: Array, offsets: Array) -> Rows:
@@ -129,7 +132,7 @@ class Builder:
         center, radius = self.reachable(z_0[-m:])
         atom, give = offset + self.W_f @ center, self.give @ radius
         atoms = np.stack([np.maximum(np.abs(atom) - give, 0.0), np.abs(atom) + give])
-        count, A, b = halfspace_kernels.that_matter(
+        count, A, b = halfspace_kernels.presolve_rows(
             rows.gradient, rows.spread, rows.bound, z_0, constant, self.M_t, center, radius, atoms, self.scale, SHARPEN
         )
         if count < 0:

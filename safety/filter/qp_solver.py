@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from proxsuite import proxqp
 
-from brakeline.safety.filter.kernels.active_set_kernels import come_by
+from brakeline.safety.filter.kernels.active_set_kernels import hildreth_active_set
 
 Array = NDArray[np.float64]
 
@@ -64,7 +64,7 @@ def solve(program: Program) -> Solution:
 
 def _by_few(program: Program) -> Solution | None:
     """By as few rows as will do; None if that does not come soon."""
-    inside, iterations = come_by(program.h, program.g, program.A, program.b, STEPS), 0
+    inside, iterations = hildreth_active_set(program.h, program.g, program.A, program.b, STEPS), 0
     inside[len(program.b) - program.always :] = True
     for _ in range(ROUNDS):
         part = _solved(replace(program, A=program.A[inside], b=program.b[inside]), few=True)

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brakeline.messaging.robot import Robot
-from brakeline.safety.model.error_bounds import Certificate
+from brakeline.safety.model.error_bounds import ErrorBound
 
 Array = NDArray[np.float64]
 
@@ -61,7 +61,11 @@ class Tube:
 
 
 def stack_direct(
-    steps: Sequence[Certificate], position_dim: int, bulges: Certificate, latch: Certificate, more: Sequence[int] = ()
+    steps: Sequence[ErrorBound],
+    position_dim: int,
+    chord_deviations: ErrorBound,
+    stopping_distance: ErrorBound,
+    more: Sequence[int] = (),
 ) -> Tube:
     """One predictor per horizon step: step i has generators of its own and nothing compounds.
 
@@ -75,7 +79,7 @@ def stack_direct(
         at = sum(count[:i])
         directions[i, :, at : at + count[i]] = step.generators[kept]
     useful = np.abs(directions).sum((0, 1)) > 0.0  # those of the velocity coordinates never touch the position
-    atoms = [_atoms(c) for c in (*steps, bulges, latch)]
+    atoms = [_atoms(c) for c in (*steps, chord_deviations, stopping_distance)]
     W = np.vstack([w for w, _, _ in atoms])
     M = _block_diagonal([m for _, m, _ in atoms])
     rows = np.concatenate([useful, np.ones(len(steps) + 1, dtype=bool)])
@@ -129,11 +133,11 @@ def recursion_of(robot: Robot, plans: bool = True) -> Recursion:
 
 
 def stack_recursive(
-    steps: Sequence[Certificate],
+    steps: Sequence[ErrorBound],
     how: Recursion,
     position_dim: int,
-    bulges: Certificate | None = None,
-    latch: Certificate | None = None,
+    chord_deviations: ErrorBound | None = None,
+    stopping_distance: ErrorBound | None = None,
     initial: Array | None = None,
     more: Sequence[int] = (),
 ) -> Tube:
@@ -176,7 +180,7 @@ def stack_recursive(
         directions[i, :, : spread.shape[1]] = spread
     M = np.vstack([np.zeros((start, M.shape[1])), M])
     m_0 = np.concatenate([np.ones(start), m_0])
-    extra = [_atoms(c) for c in (bulges, latch) if c is not None]
+    extra = [_atoms(c) for c in (chord_deviations, stopping_distance) if c is not None]
     if not extra:
         extra = [(np.zeros((0, nz)), np.zeros((len(steps) + 1, 0)), np.zeros(len(steps) + 1))]
     W = np.vstack([W, *(w for w, _, _ in extra)])
@@ -186,7 +190,7 @@ def stack_recursive(
     return Tube(stacked[:, :d], directions[:, :d], W, M, m_0, stacked[:, d:], directions[:, d:])
 
 
-def _atoms(step: Certificate) -> tuple[Array, Array, Array]:
+def _atoms(step: ErrorBound) -> tuple[Array, Array, Array]:
     """A certificate's κ as further rows of W: (W, M, w)."""
     W = np.vstack([step.W, np.eye(step.kappa.shape[1])])
     return W, np.hstack([step.M, step.kappa]), step.w

@@ -17,7 +17,7 @@ from brakeline.messaging.scan import Scan
 from brakeline.messaging.sensor_messages import Sensed
 from brakeline.safety.filter.backup_plan import Prediction
 from brakeline.safety.filter.blocking_constraint import Stopped
-from brakeline.safety.filter.reservation import Promise, Promises
+from brakeline.safety.filter.reservation import Promises, Reservation
 
 Array = NDArray[np.float64]
 
@@ -65,7 +65,7 @@ class Request:
     predicted: Prediction | None = None
     movers: Movers | None = None
     scan: Sensed | None = None
-    promise: Promise | None = None
+    reservation: Reservation | None = None
     promised: Promises | None = None
     observation: NDArray[np.float32] = field(default_factory=lambda: np.zeros(0, np.float32))
     known_free: bool = False
@@ -114,7 +114,7 @@ class Decision:
     iterations: int = 0
     broken: int = 0  # movers that were seen outside of what their bounds allowed
     stopped: Stopped | None = None  # of a proposal that was not allowed: what it would have come too near to
-    promise: Promise | None = None  # to the other robots of its world
+    reservation: Reservation | None = None  # to the other robots of its world
     # The model set's statement: at most this share of the plans that it verifies leave their tubes, at 99 % confidence;
     # 1: it states nothing; None: of a method that verifies nothing.
     bound: float | None = None

@@ -30,7 +30,7 @@ Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Promise:
+class Reservation:
     """Of one robot from now on: center, half_width (N, d) [m] of boxes, radius (N,) [m] that is added about them."""
 
     center: Array
@@ -38,18 +38,18 @@ class Promise:
     radius: Array
 
     @staticmethod
-    def of(center: Array, half_width: Array, radius: Array) -> Promise:
+    def of(center: Array, half_width: Array, radius: Array) -> Reservation:
         """From a tube's sets as boxes (N+1, d), the first where the robot is now; radius (N,)."""
         low, high = center - half_width, center + half_width
         low, high = np.minimum(low[:-1], low[1:]), np.maximum(high[:-1], high[1:])
-        return Promise(0.5 * (low + high), 0.5 * (high - low), radius)
+        return Reservation(0.5 * (low + high), 0.5 * (high - low), radius)
 
-    def later(self) -> Promise:
+    def later(self) -> Reservation:
         """The same a period later."""
         parts = self.center, self.half_width, self.radius
-        return Promise(*(np.concatenate([part[1:], part[-1:]]) for part in parts))
+        return Reservation(*(np.concatenate([part[1:], part[-1:]]) for part in parts))
 
-    def apart(self, other: Promise) -> float:
+    def apart(self, other: Reservation) -> float:
         """m between the two in the period in which they are nearest; 0 or less: they overlap."""
         between = np.abs(self.center - other.center) - self.half_width - other.half_width
         return float((np.linalg.norm(np.maximum(between, 0.0), axis=1) - self.radius - other.radius).min())
@@ -66,7 +66,7 @@ class Promises:
         return len(self.shapes) // self.periods
 
     @staticmethod
-    def to(others: Sequence[Promise]) -> Promises | None:
+    def to(others: Sequence[Reservation]) -> Promises | None:
         """None: there are none."""
         if not others:
             return None

@@ -48,7 +48,7 @@ class Dataset:
     robot: Robot
     trajectories: tuple[Trajectory, ...]
     about: dict[str, str] = field(default_factory=dict)  # where it comes from: noise levels, seed, payload ...
-    bulge: float = 0.0  # m that a path may leave its chord by between the samples that the source has
+    chord_deviation: float = 0.0  # m that a path may leave its chord by between the samples that the source has
 
     @property
     def periods(self) -> int:
@@ -102,7 +102,7 @@ class Dataset:
         tensors["lengths"] = np.array([len(t.inputs) for t in self.trajectories])
         robot = self.robot.in_lockstep()
         about: dict[str, Any] = {"robot": robot.name, "layout": robot.layout(), "about": self.about}
-        about["bulge"] = self.bulge
+        about["bulge"] = self.chord_deviation
         about["description"] = json.dumps(robot.description)  # a text: the order of its names counts
         write_whole(Path(path), pack(tensors, ENTRY, about))
 
@@ -156,10 +156,10 @@ class Dataset:
             )
             for i, (start, end) in enumerate(zip(ends - lengths, ends, strict=True))
         )
-        bulge = about.get("bulge", 0.0)
-        if not isinstance(bulge, int | float) or not 0.0 <= bulge < math.inf:
-            raise BadData(f"{path}: a bulge of {bulge!r} is none")
-        data = Dataset(robot, trajectories, about_data, float(bulge))
+        chord_deviation = about.get("bulge", 0.0)
+        if not isinstance(chord_deviation, int | float) or not 0.0 <= chord_deviation < math.inf:
+            raise BadData(f"{path}: a bulge of {chord_deviation!r} is none")
+        data = Dataset(robot, trajectories, about_data, float(chord_deviation))
         data.check()
         return data
 

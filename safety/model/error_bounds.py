@@ -24,12 +24,12 @@ Array = NDArray[np.float64]
 ROWS_A_ROUND = 64  # constraints added a round when an LP over all samples is solved on few of them
 
 
-class CertificateError(ValueError):
+class ErrorBoundError(ValueError):
     """The data do not support the certificate; the message says why."""
 
 
 @dataclass(frozen=True)
-class Certificate:
+class ErrorBound:
     """C (n, nz), W (q, nz), M (g, q) >= 0, kappa (g, nz) >= 0, w (g,) >= 0, generators (n, g)."""
 
     C: Array
@@ -57,10 +57,10 @@ class Certificate:
         half = np.abs(self.generators) @ self.M @ np.abs(self.W)
         return self.C - half, self.C + half
 
-    def through(self, T: Array) -> Certificate:
+    def through(self, T: Array) -> ErrorBound:
         """The same for regressors z' = T z (nz', nz), as a certificate of z."""
         unbent = np.zeros((len(self.w), T.shape[1]))
-        return Certificate(
+        return ErrorBound(
             self.C @ T,
             np.vstack([self.W @ T, T]),
             np.hstack([self.M, self.kappa]),
@@ -69,7 +69,7 @@ class Certificate:
             self.generators,
         )
 
-    def outer(self, basis: Array) -> Certificate:
+    def outer(self, basis: Array) -> ErrorBound:
         """The same with W replaced by `basis` (nz, nz), never narrower: for the QP, whose size goes with W's rows.
 
         `M_j·|W z| = M_j·|(W basis⁻¹)(basis z)| <= (M_j |W basis⁻¹|)·|basis z|`: the zonotope of W's rows, boxed in
@@ -78,7 +78,7 @@ class Certificate:
         if len(self.W) <= len(basis):
             return self
         spread = np.abs(np.linalg.solve(basis.T, self.W.T).T)
-        return Certificate(self.C, basis, self.M @ spread, self.kappa, self.w, self.generators)
+        return ErrorBound(self.C, basis, self.M @ spread, self.kappa, self.w, self.generators)
 
 
 def least_squares(z: Array, y: Array, columns: NDArray[np.bool_] | None = None) -> Array:
@@ -95,7 +95,7 @@ def whitening(z: Array) -> Array:
     try:
         return np.asarray(np.linalg.inv(np.linalg.cholesky(moment)))
     except np.linalg.LinAlgError:
-        raise CertificateError("the regressors do not span their space: record more varied inputs") from None
+        raise ErrorBoundError("the regressors do not span their space: record more varied inputs") from None
 
 
 def envelope(features: Array, values: Array, inflation: float) -> tuple[Array, float]:
@@ -107,7 +107,7 @@ def envelope(features: Array, values: Array, inflation: float) -> tuple[Array, f
     from scipy.optimize import linprog  # half a second, and nothing that a service needs
 
     if not len(values):
-        raise CertificateError("no sample to bound")
+        raise ErrorBoundError("no sample to bound")
     cost = np.append(features.mean(0), 1.0)
     rows = np.column_stack([features, np.ones(len(features))])
     active = np.unique(np.concatenate([np.argsort(values)[-ROWS_A_ROUND:], rows.argmax(0)]))
@@ -115,7 +115,7 @@ def envelope(features: Array, values: Array, inflation: float) -> tuple[Array, f
     while True:
         found = linprog(cost, A_ub=-rows[active], b_ub=-values[active] / scale, bounds=(0, None), method="highs")
         if found.status != 0:
-            raise CertificateError(f"no envelope of the residuals: {found.message}")
+            raise ErrorBoundError(f"no envelope of the residuals: {found.message}")
         bound = np.maximum(found.x, 0.0)
         short = values / scale - rows @ bound
         worst = np.argsort(short)[-ROWS_A_ROUND:]
@@ -127,16 +127,16 @@ def envelope(features: Array, values: Array, inflation: float) -> tuple[Array, f
         active = more
 
 
-def residual(z: Array, y: Array, C: Array, inflation: float = 1.0) -> Certificate:
+def residual(z: Array, y: Array, C: Array, inflation: float = 1.0) -> ErrorBound:
     """(c): C is trusted, the residual is bounded by an envelope over the samples z (T, nz), y (T, n); axes as g_j."""
     n, nz = C.shape
     rest = np.abs(y - z @ C.T)
     bounds = [envelope(np.abs(z), rest[:, j], inflation) for j in range(n)]
     kappa, w = np.array([b[0] for b in bounds]), np.array([b[1] for b in bounds])
-    return Certificate(C, np.zeros((0, nz)), np.zeros((n, 0)), kappa, w, np.eye(n))
+    return ErrorBound(C, np.zeros((0, nz)), np.zeros((n, 0)), kappa, w, np.eye(n))
 
 
-def matrix_zonotope(z: Array, y: Array, generators: Array, sizes: Array, kappa: Array, w: Array) -> Certificate:
+def matrix_zonotope(z: Array, y: Array, generators: Array, sizes: Array, kappa: Array, w: Array) -> ErrorBound:
     """(a): all matrices `(Y+ - noise) Z⁺` of lemma 1, exactly, and the noise of the step itself (lemma 2).
 
     The noise at sample t is `Σ_j sizes[j, t] g_j [-1, 1]`, centred: every generator matrix has rank one,
@@ -147,10 +147,10 @@ def matrix_zonotope(z: Array, y: Array, generators: Array, sizes: Array, kappa: 
         kappa, w: (g, nz) and (g,), the noise of the predicted step.
     """
     pseudo = np.asarray(np.linalg.pinv(z.T), dtype=float)
-    return Certificate(y.T @ pseudo, pseudo, sizes, kappa, w, generators)
+    return ErrorBound(y.T @ pseudo, pseudo, sizes, kappa, w, generators)
 
 
-def set_membership(z: Array, y: Array, sizes: Array, kappa: Array, w: Array) -> Certificate:
+def set_membership(z: Array, y: Array, sizes: Array, kappa: Array, w: Array) -> ErrorBound:
     """(b): row by row, all a with `|y_t - a·z_t| <= sizes[t]` for every sample, boxed in whitened coordinates.
 
     Args:
@@ -165,7 +165,7 @@ def set_membership(z: Array, y: Array, sizes: Array, kappa: Array, w: Array) -> 
     for j in range(y.shape[1]):
         low[j], high[j] = _row_box(white, y[:, j], sizes[j])
     C, half = 0.5 * (low + high) @ basis, 0.5 * (high - low)
-    return Certificate(C, basis, half, kappa, w, np.eye(y.shape[1]))
+    return ErrorBound(C, basis, half, kappa, w, np.eye(y.shape[1]))
 
 
 def _row_box(white: Array, y: Array, size: Array) -> tuple[Array, Array]:
@@ -195,11 +195,11 @@ def _row_box(white: Array, y: Array, size: Array) -> tuple[Array, Array]:
                     active = more if len(more) > len(active) else np.arange(len(y))
                     continue
                 if found.status == 3:
-                    raise CertificateError("the samples do not bound the matrix")
+                    raise ErrorBoundError("the samples do not bound the matrix")
                 if found.status == 2:
-                    raise CertificateError("no matrix is consistent with all samples: the noise bound is too small")
+                    raise ErrorBoundError("no matrix is consistent with all samples: the noise bound is too small")
                 if found.status != 0:
-                    raise CertificateError(f"no bound of the consistent matrices: {found.message}")
+                    raise ErrorBoundError(f"no bound of the consistent matrices: {found.message}")
                 over = np.abs(y - white @ found.x) - size
                 worst = np.argsort(over)[-ROWS_A_ROUND:]
                 more = np.union1d(active, worst[over[worst] > 1e-6])
@@ -225,7 +225,7 @@ def measured_noise(z: Array, y: Array, w_half: Array, v_half: Array) -> Array:
     pseudo = np.linalg.pinv(z.T)
     beta = float(v_half @ np.abs(pseudo[:, :n]).sum(0))
     if beta >= 1.0:
-        raise CertificateError(f"β = {beta:.3g} >= 1: the measurement noise is too large for a bound on A v")
+        raise ErrorBoundError(f"β = {beta:.3g} >= 1: the measurement noise is too large for a bound on A v")
     C = y.T @ pseudo
     s = (np.abs(C[:, :n]) @ v_half + beta * (w_half + v_half)) / (1.0 - beta)
     return np.asarray(w_half + v_half + s)

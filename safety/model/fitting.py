@@ -12,8 +12,8 @@ from brakeline.safety.model.error_bounds import (
     MATRIX_ZONOTOPE,
     RESIDUAL,
     SET_MEMBERSHIP,
-    Certificate,
-    CertificateError,
+    ErrorBound,
+    ErrorBoundError,
     envelope,
     least_squares,
     matrix_zonotope,
@@ -21,7 +21,7 @@ from brakeline.safety.model.error_bounds import (
     set_membership,
     whitening,
 )
-from brakeline.safety.model.model_set import DIRECT, RECURSION, ModelSet, Recipe
+from brakeline.safety.model.model_set import DIRECT, RECURSION, ModelConfig, ModelSet
 from brakeline.safety.model.turning_in_place import InPlace, inside, over_plan, standing_limits, turning
 from brakeline.safety.model.windows import (
     FREE,
@@ -42,58 +42,60 @@ FEWEST_IN_PLACE = 100  # windows in place: fewer regressors play a part in them 
 MOST_ATOMS = 120_000  # of a matrix zonotope, over the horizon: the exact check looks at every one
 
 
-def make(data: Dataset, recipe: Recipe) -> ModelSet:
+def make(data: Dataset, model_config: ModelConfig) -> ModelSet:
     """A model set from two parts of the data: one fits C, the other bounds what is left (held-out data: certify).
 
     Raises:
         BadData: a check failed; CertificateError: the data do not support the certificate.
     """
-    robot, kind = data.robot, recipe.windows
-    if recipe.mode == RECURSION and any(disc.arm for disc in robot.body):
-        raise CertificateError("the recursion knows no body of discs beside the regressed position: use mode direct")
+    robot, kind = data.robot, model_config.windows
+    if model_config.mode == RECURSION and any(disc.arm for disc in robot.body):
+        raise ErrorBoundError("the recursion knows no body of discs beside the regressed position: use mode direct")
     if kind == FREE and robot.feedback:
-        raise CertificateError("what a feedback makes of the state has to be recorded: drive plans, not freely")
+        raise ErrorBoundError("what a feedback makes of the state has to be recorded: drive plans, not freely")
     fit, bound = data.split((0.5, 0.5))
-    steps, bulges = [], []
+    steps, chord_deviations = [], []
     horizon = robot.horizon
     for k in range(1, horizon + 1):
         seen, rest = windows(fit, k, kind), windows(bound, k, kind)
         columns = _columns(robot, k, kind)
         for part in (seen, rest):
-            quality(part.z[:, columns], f"windows of {k} periods", recipe.fewest)
+            quality(part.z[:, columns], f"windows of {k} periods", model_config.fewest)
         every = windows(data, k, kind)  # no predictor is fitted to bulges: both parts may bound them
-        bulges.append(envelope(np.abs(every.z), every.bulge, recipe.inflation))
-        if recipe.mode == DIRECT:
+        chord_deviations.append(envelope(np.abs(every.z), every.chord_deviation, model_config.inflation))
+        if model_config.mode == DIRECT:
             after, later = outputs(robot, seen.y), outputs(robot, rest.y)
-            steps.append(_certificate(seen.z, after, rest.z, later, recipe, columns, MOST_ATOMS // horizon))
+            steps.append(_certificate(seen.z, after, rest.z, later, model_config, columns, MOST_ATOMS // horizon))
         else:
-            steps.append(_recursive_step(robot, windows(fit, 1), windows(bound, 1), k - 1, recipe))
+            steps.append(_recursive_step(robot, windows(fit, 1), windows(bound, 1), k - 1, model_config))
     whole = windows(data, horizon, kind)
     nz = whole.z.shape[1]
-    latch = _latch_of_plans(whole, recipe) if kind == PLAN else (np.zeros(nz), _latch_of_stops(data, recipe))
+    stopping_distance = (
+        _latch_of_plans(whole, model_config) if kind == PLAN else (np.zeros(nz), _latch_of_stops(data, model_config))
+    )
     known = windows(data, 1).z[:, : robot.regressor_dim]
     domain = np.stack([known.min(0), known.max(0)])
     about = data.about | {"data": data.digest(), "periods": str(data.periods)}
     return ModelSet(
         robot,
-        recipe,
+        model_config,
         tuple(steps),
-        _scalar(bulges, nz),
-        _scalar([latch], nz),
+        _scalar(chord_deviations, nz),
+        _scalar([stopping_distance], nz),
         domain,
         whitening(whole.z),
         about,
         stands=stands_from(whole, data, kind),
-        in_place=_in_place(fit, bound, recipe),
+        in_place=_in_place(fit, bound, model_config),
     )
 
 
-def _in_place(fit: Dataset, bound: Dataset, recipe: Recipe) -> InPlace | None:
+def _in_place(fit: Dataset, bound: Dataset, model_config: ModelConfig) -> InPlace | None:
     """The predictors for plans in place, from all windows in place; None where the data do not support them (too few
     such windows, or no varied turning among them) or the robot has no such plans."""
     robot = fit.robot
     limits = standing_limits(robot)
-    if limits is None or recipe.mode != DIRECT:
+    if limits is None or model_config.mode != DIRECT:
         return None
     steps, known, free = [], robot.regressor_dim, turning(robot)
     for k in range(1, robot.horizon + 1):
@@ -106,9 +108,9 @@ def _in_place(fit: Dataset, bound: Dataset, recipe: Recipe) -> InPlace | None:
         y, y_bound = (outputs(robot, part.y) for part in parts)
         try:
             for each in (z, z_bound):
-                quality(each[:, turns], f"windows of {k} periods in place", min(recipe.fewest, FEWEST_IN_PLACE))
-            steps.append(_certificate(z, y, z_bound, y_bound, recipe, turns, MOST_ATOMS // robot.horizon))
-        except (BadData, CertificateError):
+                quality(each[:, turns], f"windows of {k} periods in place", min(model_config.fewest, FEWEST_IN_PLACE))
+            steps.append(_certificate(z, y, z_bound, y_bound, model_config, turns, MOST_ATOMS // robot.horizon))
+        except (BadData, ErrorBoundError):
             return None
     return InPlace(tuple(steps), np.where(free, _range(robot, np.vstack([z, z_bound])), limits))
 
@@ -130,15 +132,15 @@ def _range(robot: Robot, z: Array) -> Array:
     return found
 
 
-def _latch_of_plans(whole: Windows, recipe: Recipe) -> tuple[Array, float]:
+def _latch_of_plans(whole: Windows, model_config: ModelConfig) -> tuple[Array, float]:
     """The way still travelled after a plan's last input, bounded by what the plan was."""
-    still = ~np.isnan(whole.latch)
+    still = ~np.isnan(whole.stopping_distance)
     if not still.any():
         raise BadData("no plan's stop was recorded: let the robot stand after braking")
-    return envelope(np.abs(whole.z[still]), whole.latch[still], recipe.inflation)
+    return envelope(np.abs(whole.z[still]), whole.stopping_distance[still], model_config.inflation)
 
 
-def _latch_of_stops(data: Dataset, recipe: Recipe) -> float:
+def _latch_of_stops(data: Dataset, model_config: ModelConfig) -> float:
     """The same whatever the plan was: from wherever inputs had been those of a stop for as long as they are at a
     plan's end.
 
@@ -153,7 +155,7 @@ def _latch_of_stops(data: Dataset, recipe: Recipe) -> float:
             f"{len(travels)} stops in the data, at least {FEWEST_STOPS} are needed: from every speed give zero input "
             f"and let the robot stand for {(rested + 2) * robot.period:.1f} s or more"
         )
-    return recipe.inflation * float(travels.max())
+    return model_config.inflation * float(travels.max())
 
 
 def _columns(robot: Robot, k: int, kind: str) -> NDArray[np.bool_]:
@@ -164,50 +166,56 @@ def _columns(robot: Robot, k: int, kind: str) -> NDArray[np.bool_]:
     return used
 
 
-def _scalar(bounds: list[tuple[Array, float]], nz: int) -> Certificate:
+def _scalar(bounds: list[tuple[Array, float]], nz: int) -> ErrorBound:
     """Bounds of lengths as a certificate: nothing but κ and w."""
     n = len(bounds)
     kappa, w = np.array([b[0] for b in bounds]), np.array([b[1] for b in bounds])
-    return Certificate(np.zeros((n, nz)), np.zeros((0, nz)), np.zeros((n, 0)), kappa, w, np.eye(n))
+    return ErrorBound(np.zeros((n, nz)), np.zeros((0, nz)), np.zeros((n, 0)), kappa, w, np.eye(n))
 
 
 def _certificate(
-    z: Array, y: Array, z_bound: Array, y_bound: Array, recipe: Recipe, columns: NDArray[np.bool_], most_atoms: int
-) -> Certificate:
+    z: Array,
+    y: Array,
+    z_bound: Array,
+    y_bound: Array,
+    model_config: ModelConfig,
+    columns: NDArray[np.bool_],
+    most_atoms: int,
+) -> ErrorBound:
     """The recipe's certificate: the noise of all three is the residual's envelope, they differ in trusting C.
 
     A matrix zonotope has an atom a sample and more samples do not shrink it: it takes no more than `most_atoms`,
     evenly over the data.
     """
-    trusted = residual(z_bound, y_bound, least_squares(z, y, columns), recipe.inflation)
-    if recipe.certificate == RESIDUAL:
+    trusted = residual(z_bound, y_bound, least_squares(z, y, columns), model_config.inflation)
+    if model_config.certificate == RESIDUAL:
         return trusted
-    if recipe.certificate == MATRIX_ZONOTOPE and len(z_bound) > most_atoms:
+    if model_config.certificate == MATRIX_ZONOTOPE and len(z_bound) > most_atoms:
         chosen = np.linspace(0, len(z_bound) - 1, most_atoms).astype(int)
         z_bound, y_bound = z_bound[chosen], y_bound[chosen]
     z_in = z_bound[:, columns]
     sizes = (np.abs(z_bound) @ trusted.kappa.T + trusted.w).T
     kappa, w = trusted.kappa, trusted.w
-    if recipe.certificate == SET_MEMBERSHIP:
+    if model_config.certificate == SET_MEMBERSHIP:
         small = set_membership(z_in, y_bound, sizes, kappa[:, columns], w)
     else:
-        assert recipe.certificate == MATRIX_ZONOTOPE
+        assert model_config.certificate == MATRIX_ZONOTOPE
         small = matrix_zonotope(z_in, y_bound, np.eye(y.shape[1]), sizes, kappa[:, columns], w)
     C, W = np.zeros_like(trusted.C), np.zeros((len(small.W), len(columns)))
     C[:, columns], W[:, columns] = small.C, small.W
-    return Certificate(C, W, small.M, kappa, w, small.generators)
+    return ErrorBound(C, W, small.M, kappa, w, small.generators)
 
 
-def _recursive_step(robot: Robot, fit: Windows, bound: Windows, k: int, recipe: Recipe) -> Certificate:
+def _recursive_step(robot: Robot, fit: Windows, bound: Windows, k: int, model_config: ModelConfig) -> ErrorBound:
     """Period k of the recursion: z_k = [heading, ...; u_prev; u] from one-period windows turned by a random offset.
 
     After k periods the robot may have turned by k ω_max dt against the frame of now, as measured a bit more; without
     offsets the heading would be zero in every window and the data would say nothing about it.
     """
-    rng = np.random.default_rng((recipe.seed, k))
+    rng = np.random.default_rng((model_config.seed, k))
     turned = [_turned(robot, w, k, rng) for w in (fit, bound)]
     columns = np.abs(turned[0][0]).max(0) > 0.0
-    return _certificate(*turned[0], *turned[1], recipe, columns, MOST_ATOMS // robot.horizon)
+    return _certificate(*turned[0], *turned[1], model_config, columns, MOST_ATOMS // robot.horizon)
 
 
 def _turned(robot: Robot, w: Windows, k: int, rng: np.random.Generator) -> tuple[Array, Array]:

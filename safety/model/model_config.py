@@ -16,7 +16,7 @@ METHODS = (DDPC, SECAS, SAILR)  # of a safety service
 
 
 @dataclass(frozen=True)
-class Recipe:
+class ModelConfig:
     """How a model set is made from a data set."""
 
     certificate: str = RESIDUAL
@@ -36,12 +36,12 @@ class Recipe:
         if not 1.0 <= self.inflation < math.inf:
             raise ValueError(f"an envelope scaled by {self.inflation} bounds nothing")
 
-    def of_minutes(self) -> Recipe:
+    def of_minutes(self) -> ModelConfig:
         """The same from minutes of driving instead of hours: fewer windows, and every envelope half as wide again."""
         return replace(self, inflation=1.5, fewest=60)
 
 
-def check_promises(method: str) -> None:
+def check_reservations(method: str) -> None:
     """Raises ValueError: robots that share a world are promised nothing by this method."""
     if method not in (DDPC, "none"):
         raise ValueError(f"{method} predicts nothing, so it makes no promises: a fleet's method is {DDPC} or none")

@@ -16,12 +16,12 @@ from brakeline.messaging.atomic_files import write_whole
 from brakeline.messaging.robot import FORMER_LAYOUTS, LATE, Robot, UnknownRobot, robot_named, unless_shipped
 from brakeline.messaging.robot_description import robot_of
 from brakeline.safety.filter.reachable_tube import Tube, recursion_of, stack_direct, stack_recursive
-from brakeline.safety.model.error_bounds import Certificate
+from brakeline.safety.model.error_bounds import ErrorBound
 from brakeline.safety.model.model_config import DIRECT as DIRECT
 from brakeline.safety.model.model_config import FREE, PLAN
 from brakeline.safety.model.model_config import MODES as MODES
 from brakeline.safety.model.model_config import RECURSION as RECURSION
-from brakeline.safety.model.model_config import Recipe as Recipe
+from brakeline.safety.model.model_config import ModelConfig as ModelConfig
 from brakeline.safety.model.tensor_file import content, pack, unpack
 from brakeline.safety.model.turning_in_place import InPlace
 from brakeline.safety.model.windows import specialised
@@ -42,10 +42,10 @@ class ModelSet:
     """steps[k]: direct, what k+1 periods do to z; recursion, what period k does to z_k. bulges: one row a step."""
 
     robot: Robot
-    recipe: Recipe
-    steps: tuple[Certificate, ...]
-    bulges: Certificate
-    latch: Certificate
+    model_config: ModelConfig
+    steps: tuple[ErrorBound, ...]
+    chord_deviations: ErrorBound
+    stopping_distance: ErrorBound
     domain: Array  # (2, regressor_dim): smallest and largest recorded [x_0; input in force]
     basis: Array  # (nz, nz): coordinates in which the recorded z are white
     about: dict[str, str]
@@ -59,15 +59,15 @@ class ModelSet:
         return self.stands or self.robot.horizon
 
     @property
-    def first(self) -> Certificate:
+    def first(self) -> ErrorBound:
         """What one period does: for comparing the next measurement with its prediction."""
         return self.steps[0]
 
     def first_regressor(self, z: Array) -> Array:
         """The regressor of `first` from z (..., nz): [.. ; input in force; first input]."""
         robot = self.robot
-        if self.recipe.mode == DIRECT:
-            return z if self.recipe.windows == PLAN else z @ specialised(robot).T
+        if self.model_config.mode == DIRECT:
+            return z if self.model_config.windows == PLAN else z @ specialised(robot).T
         reg, m = len(robot.regressor), robot.action_dim
         missing = robot.state_dim - robot.position_dim - reg  # coordinates that are zero in the frame of now
         zeros = np.zeros((*z.shape[:-1], missing))
@@ -90,61 +90,68 @@ class ModelSet:
         if self.in_place is None:
             return None
         steps = self.in_place.steps
-        if self.recipe.windows == PLAN:
+        if self.model_config.windows == PLAN:
             steps = tuple(step.through(specialised(self.robot)) for step in steps)
         return replace(self, steps=steps, in_place=None)
 
     def _check_sizes(self) -> None:
         """Raises BadModel unless every array has the size that robot and mode give it."""
         robot = self.robot
-        nz = regressors(robot, self.recipe)
-        one = nz if self.recipe.mode == DIRECT else robot.state_dim - robot.position_dim + 2 * robot.action_dim
+        nz = regressors(robot, self.model_config)
+        one = nz if self.model_config.mode == DIRECT else robot.state_dim - robot.position_dim + 2 * robot.action_dim
         n = robot.state_dim
-        if self.recipe.mode == DIRECT:
+        if self.model_config.mode == DIRECT:
             n += robot.position_dim * sum(disc.arm > 0.0 for disc in robot.body)
         expected = [(step, n, one) for step in self.steps]
         if self.in_place is not None:
             whole = robot.regressor_dim + robot.horizon * robot.action_dim
             expected += [(step, n, whole) for step in self.in_place.steps]
-        expected += [(self.bulges, robot.horizon, nz), (self.latch, 1, nz)]
+        expected += [(self.chord_deviations, robot.horizon, nz), (self.stopping_distance, 1, nz)]
         for c, n, width in expected:
             g, q = c.w.size, len(c.W)
             sizes = [(n, width), (q, width), (g, q), (g, width), (g,), (n, g)]
             if [getattr(c, name).shape for name in TENSORS] != sizes:
                 raise BadModel(
-                    f"the model set's arrays are not those of a {robot.name} robot in mode {self.recipe.mode}"
+                    f"the model set's arrays are not those of a {robot.name} robot in mode {self.model_config.mode}"
                 )
         if self.domain.shape != (2, robot.regressor_dim) or (self.domain[0] > self.domain[1]).any():
             raise BadModel("the model set's domain is none")
         box = np.zeros((2, robot.regressor_dim + robot.action_dim)) if self.in_place is None else self.in_place.box
         if box.shape != (2, robot.regressor_dim + robot.action_dim) or (box[0] > box[1]).any():
             raise BadModel("the bounds of the model set's plans in place are none")
-        if self.in_place is not None and self.recipe.mode != DIRECT:
-            raise BadModel(f"a model set of mode {self.recipe.mode} has no predictors for plans in place")
+        if self.in_place is not None and self.model_config.mode != DIRECT:
+            raise BadModel(f"a model set of mode {self.model_config.mode} has no predictors for plans in place")
         if self.basis.shape != (nz, nz) or np.linalg.matrix_rank(self.basis) < nz:
             raise BadModel("the model set's basis is none")
 
-    def _stack(self, steps: Sequence[Certificate], plans: bool = True) -> Tube:
-        d, bulges, latch, more = self.robot.position_dim, self.bulges, self.latch, needed(self.robot)
-        if plans and self.recipe.windows == FREE:
+    def _stack(self, steps: Sequence[ErrorBound], plans: bool = True) -> Tube:
+        d, chord_deviations, stopping_distance, more = (
+            self.robot.position_dim,
+            self.chord_deviations,
+            self.stopping_distance,
+            needed(self.robot),
+        )
+        if plans and self.model_config.windows == FREE:
             T = specialised(self.robot)
-            bulges, latch = bulges.through(T), latch.through(T)
-            steps = [step.through(T) for step in steps] if self.recipe.mode == DIRECT else steps
-        if self.recipe.mode == DIRECT:
-            return stack_direct(steps, d, bulges, latch, more)
-        how = recursion_of(self.robot, plans or self.recipe.windows == PLAN)
-        return stack_recursive(steps, how, d, bulges, latch, more=more)
+            chord_deviations, stopping_distance = chord_deviations.through(T), stopping_distance.through(T)
+            steps = [step.through(T) for step in steps] if self.model_config.mode == DIRECT else steps
+        if self.model_config.mode == DIRECT:
+            return stack_direct(steps, d, chord_deviations, stopping_distance, more)
+        how = recursion_of(self.robot, plans or self.model_config.windows == PLAN)
+        return stack_recursive(steps, how, d, chord_deviations, stopping_distance, more=more)
 
     @property
     def version(self) -> str:
         """Hash of the content and of what it means, so that one name can't mean two models."""
         layout = self.layout or self.robot.layout()
-        meaning = f"{layout} {self.recipe.certificate} {self.recipe.mode} "
+        meaning = f"{layout} {self.model_config.certificate} {self.model_config.mode} "
         meaning += f"stands {self.stands} " if self.moving < self.robot.horizon else ""
         return hashlib.sha256(meaning.encode() + content(self._tensors())).hexdigest()[:12]
 
     def _tensors(self) -> dict[str, Array]:
-        named = {"bulges": self.bulges, "latch": self.latch} | {f"step{k}": c for k, c in enumerate(self.steps)}
+        named = {"bulges": self.chord_deviations, "latch": self.stopping_distance} | {
+            f"step{k}": c for k, c in enumerate(self.steps)
+        }
         more = {"domain": self.domain, "basis": self.basis}
         if self.in_place is not None:
             named |= {f"{IN_PLACE}{k}": c for k, c in enumerate(self.in_place.steps)}
@@ -156,7 +163,7 @@ class ModelSet:
         about = {
             "robot": self.robot.name,
             "layout": self.layout or self.robot.layout(),
-            "recipe": asdict(self.recipe),
+            "recipe": asdict(self.model_config),
             "about": self.about,
             "stands": self.stands,
             "version": self.version,
@@ -174,11 +181,11 @@ class ModelSet:
         try:
             tensors, about = unpack(payload, ENTRY)
             robot = robot_in(about)
-            recipe = Recipe(**about["recipe"])
+            model_config = ModelConfig(**about["recipe"])
             names = ["bulges", "latch", *(f"step{k}" for k in range(robot.horizon))]
             if BOX in tensors:
                 names += [f"{IN_PLACE}{k}" for k in range(robot.horizon)]
-            certificates = {name: Certificate(*(tensors[f"{name}.{t}"] for t in TENSORS)) for name in names}
+            certificates = {name: ErrorBound(*(tensors[f"{name}.{t}"] for t in TENSORS)) for name in names}
             more = tensors["domain"], tensors["basis"], dict(about["about"])
             stands = int(about.get("stands", 0))
         except (KeyError, TypeError, ValueError, UnknownRobot) as error:
@@ -196,8 +203,10 @@ class ModelSet:
         in_place = None
         if BOX in tensors:
             in_place = InPlace(tuple(certificates[f"{IN_PLACE}{k}"] for k in range(robot.horizon)), tensors[BOX])
-        bulges, latch = certificates["bulges"], certificates["latch"]
-        model = ModelSet(robot, recipe, steps, bulges, latch, *more, layout, stands, in_place)
+        chord_deviations, stopping_distance = certificates["bulges"], certificates["latch"]
+        model = ModelSet(
+            robot, model_config, steps, chord_deviations, stopping_distance, *more, layout, stands, in_place
+        )
         model._check_sizes()
         if model.version != about.get("version"):
             raise BadModel("the model set's content is not what its version says")
@@ -234,9 +243,9 @@ def robot_in(about: dict[str, Any]) -> Robot:
     return robot
 
 
-def regressors(robot: Robot, recipe: Recipe) -> int:
+def regressors(robot: Robot, model_config: ModelConfig) -> int:
     """Length of the regressors of the windows that a recipe takes."""
-    chosen = robot.free_steps if recipe.windows == PLAN else robot.horizon
+    chosen = robot.free_steps if model_config.windows == PLAN else robot.horizon
     return robot.regressor_dim + chosen * robot.action_dim
 
 
@@ -248,7 +257,7 @@ def needed(robot: Robot) -> tuple[int, ...]:
     return (*sorted(limited), *range(n, n + discs))
 
 
-def whitening_of(step: Certificate, basis: Array) -> Array:
+def whitening_of(step: ErrorBound, basis: Array) -> Array:
     """The basis for a step whose regressor may have more coordinates than z (the recursion's has the heading)."""
     if step.C.shape[1] == len(basis):
         return basis

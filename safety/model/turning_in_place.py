@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brakeline.messaging.robot import FOLLOWED, Robot
-from brakeline.safety.model.error_bounds import Certificate
+from brakeline.safety.model.error_bounds import ErrorBound
 
 Array = NDArray[np.float64]
 
@@ -30,7 +30,7 @@ class InPlace:
     which they hold.
     """
 
-    steps: tuple[Certificate, ...]
+    steps: tuple[ErrorBound, ...]
     box: Array
 
     def domain(self, regressors: int, known: int) -> Array:

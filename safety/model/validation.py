@@ -30,7 +30,7 @@ CHUNK = 256  # windows at once: an exact matrix zonotope has thousands of atoms
 
 
 @dataclass(frozen=True)
-class Statement:
+class ValidationReport:
     """Of one model set. The unit is a plan window that overlaps no other and whose stop was recorded for a period at
     least; a violation is any part of it outside."""
 
@@ -79,19 +79,19 @@ def most_violations(count: int, limit: float) -> int:
     return most
 
 
-def state(model: ModelSet, fitted: Dataset, held_out: Dataset) -> Statement:
+def state(model: ModelSet, fitted: Dataset, held_out: Dataset) -> ValidationReport:
     """The statement of a model set made from `fitted` about trajectories that it has not seen."""
     return judged(model, fitted, held_out)[0]
 
 
-def judged(model: ModelSet, fitted: Dataset, held_out: Dataset) -> tuple[Statement, Array]:
+def judged(model: ModelSet, fitted: Dataset, held_out: Dataset) -> tuple[ValidationReport, Array]:
     """The statement, and of each held-out plan the largest share of its set that any part of it came to (plans,)."""
-    robot, ready, kind = model.robot, Filter(model), model.recipe.windows
+    robot, ready, kind = model.robot, Filter(model), model.model_config.windows
     turning = model.turning()
     made_of = windows(fitted, robot.horizon, kind)
-    figures: Quality = quality(made_of.z, "plan windows", model.recipe.fewest)
+    figures: Quality = quality(made_of.z, "plan windows", model.model_config.fewest)
     whole = windows(held_out, robot.horizon, kind)
-    plans = apart(whole.take(~np.isnan(whole.latch)) if kind == PLAN else whole, robot.horizon)
+    plans = apart(whole.take(~np.isnan(whole.stopping_distance)) if kind == PLAN else whole, robot.horizon)
     ends = {tuple(start): row for row, start in enumerate(plans.start)}
     in_place = np.zeros(len(plans), dtype=bool)
     if model.in_place is not None:
@@ -125,9 +125,9 @@ def judged(model: ModelSet, fitted: Dataset, held_out: Dataset) -> tuple[Stateme
     outside, steps_outside = int((~(excess <= 1.0)).sum()), int((~(first <= 1.0)).sum())
     bound_step = upper_bound(steps_outside, len(plans))
     turns, turns_outside = int(in_place.sum()), int((~(excess[in_place] <= 1.0)).sum())
-    statement = Statement(
-        certificate=model.recipe.certificate,
-        mode=model.recipe.mode,
+    statement = ValidationReport(
+        certificate=model.model_config.certificate,
+        mode=model.model_config.mode,
         version=model.version,
         samples=figures.samples,
         rank=figures.rank,
@@ -148,7 +148,7 @@ def judged(model: ModelSet, fitted: Dataset, held_out: Dataset) -> tuple[Stateme
         in_place_windows=turns,
         in_place_violations=turns_outside,
         bound_in_place=upper_bound(turns_outside, turns),
-        inflation=model.recipe.inflation,
+        inflation=model.model_config.inflation,
         leaving=leavings(excess, parts, regimes(robot, plans.z)),
     )
     return statement, excess
@@ -162,14 +162,14 @@ def _share(off: Array, half: Array) -> Array:
 
 def _first_excess(model: ModelSet, w: Windows) -> Array:
     """How much of its predicted set each coordinate of the state comes to after one period. (T, n)"""
-    z = w.z if model.recipe.mode == DIRECT else model.first_regressor(w.z)
+    z = w.z if model.model_config.mode == DIRECT else model.first_regressor(w.z)
     half = np.concatenate([model.first.half_widths(z[i : i + CHUNK]) for i in range(0, len(z), CHUNK)])
     return np.asarray(_share(np.abs(outputs_of(model, w) - z @ model.first.C.T), half))
 
 
 def outputs_of(model: ModelSet, w: Windows) -> Array:
     """What the model set's certificates predict of these windows."""
-    return outputs(model.robot, w.y) if model.recipe.mode == DIRECT else w.y
+    return outputs(model.robot, w.y) if model.model_config.mode == DIRECT else w.y
 
 
 def _excess(model: ModelSet, tube: Tube, w: Windows, k: int) -> tuple[Array, list[str]]:
@@ -193,9 +193,9 @@ def _excess(model: ModelSet, tube: Tube, w: Windows, k: int) -> tuple[Array, lis
         parts = [
             _share(away, made @ spread.T),
             _share(off, made @ np.abs(tube.more_directions[k - 1]).T),
-            _share(w.bulge[i : i + CHUNK, None], sizes[:, tube.generators + k - 1, None]),
+            _share(w.chord_deviation[i : i + CHUNK, None], sizes[:, tube.generators + k - 1, None]),
         ]
         if k == tube.horizon:
-            parts.append(_share(w.latch[i : i + CHUNK, None], sizes[:, -1, None]))
+            parts.append(_share(w.stopping_distance[i : i + CHUNK, None], sizes[:, -1, None]))
         found[i : i + CHUNK] = np.concatenate(parts, axis=1)
     return found, names

@@ -18,11 +18,11 @@ from brakeline.messaging.robot import FOLLOWED, Robot
 from brakeline.safety.model.dataset import BadData, Dataset, Trajectory
 from brakeline.safety.model.model_config import FREE as FREE
 from brakeline.safety.model.model_config import PLAN as PLAN
-from brakeline.safety.model.model_config import Recipe
+from brakeline.safety.model.model_config import ModelConfig
 
 Array = NDArray[np.float64]
 
-FEWEST_WINDOWS = Recipe.fewest
+FEWEST_WINDOWS = ModelConfig.fewest
 WORST_CONDITION = 1e4  # of the whitened regressors' second moment
 
 
@@ -34,15 +34,17 @@ class Windows:
 
     z: Array
     y: Array
-    bulge: Array
-    latch: Array
+    chord_deviation: Array
+    stopping_distance: Array
     start: NDArray[np.intp]  # (T, 2): trajectory, period
 
     def __len__(self) -> int:
         return len(self.z)
 
     def take(self, index: NDArray[np.bool_]) -> Windows:
-        return Windows(self.z[index], self.y[index], self.bulge[index], self.latch[index], self.start[index])
+        return Windows(
+            self.z[index], self.y[index], self.chord_deviation[index], self.stopping_distance[index], self.start[index]
+        )
 
 
 def displacement(robot: Robot, start: Array, end: Array) -> Array:
@@ -63,7 +65,12 @@ def windows(data: Dataset, k: int, kind: str = PLAN) -> Windows:
         raise BadData("no trajectory: record more of them")
     cut = _plans_of if kind == PLAN else _free_of
     parts = [_windows_of(data, t, k, i, *cut(data.robot, t, k)) for i, t in enumerate(data.trajectories)]
-    return Windows(*(np.concatenate([getattr(p, n) for p in parts]) for n in ("z", "y", "bulge", "latch", "start")))
+    return Windows(
+        *(
+            np.concatenate([getattr(p, n) for p in parts])
+            for n in ("z", "y", "chord_deviation", "stopping_distance", "start")
+        )
+    )
 
 
 def specialised(robot: Robot) -> Array:
@@ -113,9 +120,9 @@ def _windows_of(data: Dataset, t: Trajectory, k: int, number: int, start: NDArra
     z = np.hstack([t.states[start][:, list(robot.regressor)], before, chosen])
     y = displacement(robot, t.states[start], t.states[start + k])
     off, travel = _ways(robot, t)
-    bulge = (off + data.bulge)[start + k - 1]
-    latch = travel[np.minimum(start + k, len(t.inputs))]
-    return Windows(z, y, bulge, latch, np.column_stack([np.full(len(start), number), start]))
+    chord_deviation = (off + data.chord_deviation)[start + k - 1]
+    stopping_distance = travel[np.minimum(start + k, len(t.inputs))]
+    return Windows(z, y, chord_deviation, stopping_distance, np.column_stack([np.full(len(start), number), start]))
 
 
 def _ways(robot: Robot, t: Trajectory) -> tuple[Array, Array]:

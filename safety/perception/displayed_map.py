@@ -27,7 +27,7 @@ SLICE = 0.5  # m above and below the sensor: what was hit within is drawn from a
 
 
 @dataclass(frozen=True)
-class Surroundings:
+class DisplayedMap:
     """Of one question, in the world's frame, m.
 
     hits (k, d): where beams ended; free (c, d): the outline of what they showed to be free, as the filter takes it (in
@@ -55,7 +55,7 @@ class Surroundings:
         }
 
 
-def surroundings(robot: Robot, request: pb.Request, corners: int = OUTLINE) -> Surroundings:
+def surroundings(robot: Robot, request: pb.Request, corners: int = OUTLINE) -> DisplayedMap:
     """What the request tells; corners: of the outline, about.
 
     Raises BadShape, BadScan: the request tells of none that are.
@@ -74,7 +74,7 @@ def surroundings(robot: Robot, request: pb.Request, corners: int = OUTLINE) -> S
     movers, sweeps = np.column_stack([shapes.center, across]), np.concatenate(swept, axis=2)
     if followed is not None:
         movers, sweeps = np.concatenate([movers, followed[0]]), np.concatenate([sweeps, followed[1]])
-    return Surroundings(hits, free, movers, sweeps)
+    return DisplayedMap(hits, free, movers, sweeps)
 
 
 def _followed(robot: Robot, scan: Scan) -> tuple[Array, Array]:
@@ -162,10 +162,10 @@ def promised(robot: Robot, exchange: pb.Exchange) -> Array:
     """What a robot of a fleet promises the others from this question on, boxes (N, 2d+1): center, half-widths, and the
     radius about them; (0, 2d+1): nothing."""
     decision = exchange.reply.decision
-    promise = decision.promise if decision.HasField("promise") else exchange.request.promise
+    reservation = decision.reservation if decision.HasField("reservation") else exchange.request.reservation
     d = robot.position_dim
-    sizes = len(promise.center), len(promise.half_width), d * len(promise.radius)
+    sizes = len(reservation.center), len(reservation.half_width), d * len(reservation.radius)
     if len(set(sizes)) != 1:
         return np.zeros((0, 2 * d + 1))
-    boxes = np.reshape(promise.center, (-1, d)), np.reshape(promise.half_width, (-1, d))
-    return np.column_stack([*boxes, np.asarray(promise.radius, float)])
+    boxes = np.reshape(reservation.center, (-1, d)), np.reshape(reservation.half_width, (-1, d))
+    return np.column_stack([*boxes, np.asarray(reservation.radius, float)])

@@ -40,7 +40,7 @@ class Room:
 
 
 @dataclass(frozen=True)
-class Shadows:
+class OccludedRegions:
     """n of them, as `lines` (11, n) from their near ends to their far ones, from an origin (3,), world: `casting.py`
     says what a line is, and the hull of balls about both ends holds the shadow. room: all that come into it. speed
     [m/s]: whatever they hold may move as fast since `age` s ago."""
@@ -67,7 +67,7 @@ def _compiled() -> tuple[Callable[..., Single], Callable[..., tuple[Array, Array
     return behind, about_way
 
 
-def shadows(image: RangeImage, room: Room, body: float, origin: Array) -> Shadows:
+def shadows(image: RangeImage, room: Room, body: float, origin: Array) -> OccludedRegions:
     """All that is not known to be free and that a body of that radius [m], with its middle in the room, may touch; from
     an origin (3,) in the room."""
     grid, free = seen_free(image)
@@ -76,7 +76,7 @@ def shadows(image: RangeImage, room: Room, body: float, origin: Array) -> Shadow
     pose = image.attitude, image.at, image.mount
     behind, _ = _compiled()
     lines = behind(free, *_patches(grid), *pose, room.boxes, beside, about, image.sensor_error, origin)
-    return Shadows(lines, origin, room, image.speed, image.age)
+    return OccludedRegions(lines, origin, room, image.speed, image.age)
 
 
 @lru_cache(maxsize=16)
@@ -95,7 +95,7 @@ def _patches(grid: Grid) -> tuple[NDArray[np.int64], Single]:
 
 
 def half_spaces(
-    near: Shadows, start: Array, nominal: Array, keep_off: float, measured: Array, period: float
+    near: OccludedRegions, start: Array, nominal: Array, keep_off: float, measured: Array, period: float
 ) -> tuple[Array, Array]:
     """As `freespace.half_spaces`: as many as any period needs, up to `PLANES`, and the room's faces. Those that a
     period does not need hold everywhere."""

@@ -19,7 +19,7 @@ from brakeline.messaging.range_image import RangeImage
 from brakeline.messaging.robot import Robot
 from brakeline.messaging.scan import Scan
 from brakeline.messaging.sensor_messages import Sensed
-from brakeline.safety.filter.backup_plan import Commitment
+from brakeline.safety.filter.backup_plan import BackupPlan
 from brakeline.safety.filter.request import BadRequest, Decision
 
 Array = NDArray[np.float64]
@@ -40,7 +40,7 @@ class Answer(Decision):
     action: Array
     queue_ms: float = 0.0
     unvouched: bool = False
-    vouchers: tuple[bytes, ...] = ()
+    plan_tokens: tuple[bytes, ...] = ()
 
     @staticmethod
     def of(decision: Decision, robot: Robot, **more: Any) -> Answer:
@@ -56,7 +56,7 @@ class Asker(Protocol):
     def robot(self) -> Robot: ...
 
     @property
-    def commitment(self) -> Commitment: ...
+    def backup_plan(self) -> BackupPlan: ...
 
     def decide(
         self,
@@ -139,8 +139,8 @@ def known_free_in(given: bool) -> bool:
     return bool(given)
 
 
-def accept(commitment: Commitment, answer: Answer) -> Array:
+def accept(backup_plan: BackupPlan, answer: Answer) -> Array:
     """Commit to an answer's plan; returns the input to execute next, which is `answer.action`."""
-    return commitment.accept(
-        answer.plan, answer.model, answer.predicted, answer.verified, answer.vouchers, answer.promise
+    return backup_plan.accept(
+        answer.plan, answer.model, answer.predicted, answer.verified, answer.plan_tokens, answer.reservation
     )

@@ -24,11 +24,11 @@ from brakeline.messaging.obstacle import Obstacle
 from brakeline.messaging.robot import FEEDBACK, Robot, robot_named
 from brakeline.messaging.sensor_messages import Sensed, add_sensed
 from brakeline.messaging.topics import DECIDE
-from brakeline.safety.filter.backup_plan import Commitment
+from brakeline.safety.filter.backup_plan import BackupPlan
 from brakeline.safety.filter.request import BadRequest
 from brakeline.safety.service.asker import Answer, accept, known_free_in, observation_in, obstacles_in, scan_in
 from brakeline.safety.service.request_digest import digest
-from brakeline.safety.service.wire import decision_of, promise_message, promise_of
+from brakeline.safety.service.wire import decision_of, reservation_message, reservation_of
 
 Array = NDArray[np.float64]
 
@@ -71,7 +71,7 @@ def _motion(obstacle: Obstacle) -> pb.Motion | None:
 
 
 def request_message(
-    commitment: Commitment,
+    backup_plan: BackupPlan,
     state: ArrayLike,
     action: ArrayLike,
     obstacles: Iterable[Obstacle] | None = None,
@@ -86,15 +86,15 @@ def request_message(
     fleet: Sequence[str] = (),
 ) -> pb.Request:
     """The question about an action. Raises BadRequest: a value is of another type."""
-    commitment.measured(np.asarray(state, float))
+    backup_plan.measured(np.asarray(state, float))
     message = pb.Request(
-        robot=commitment.robot.name,
+        robot=backup_plan.robot.name,
         state=np.asarray(state, float).tolist(),
         action=np.asarray(action, float).tolist(),
-        input_in_force=commitment.input_in_force.tolist(),
-        plan=commitment.plan.ravel().tolist(),
-        model=commitment.model,
-        voucher=commitment.voucher,
+        input_in_force=backup_plan.input_in_force.tolist(),
+        plan=backup_plan.plan.ravel().tolist(),
+        model=backup_plan.model,
+        plan_token=backup_plan.plan_token,
         obstacles=obstacle_messages(obstacles_in(obstacles)),
         observation=observation_in(observation).tolist(),
         known_free=known_free_in(known_free),
@@ -105,12 +105,12 @@ def request_message(
         fleet=fleet,
     )
     add_sensed(message, scan_in(scan))
-    if commitment.predicted is not None:
-        message.predicted_center.extend(commitment.predicted.center.tolist())
-        message.predicted_half_width.extend(commitment.predicted.half_width.tolist())
-        message.predicted_heading = commitment.predicted.heading
-    if message.fleet and commitment.promise is not None:
-        message.promise.CopyFrom(promise_message(commitment.promise))
+    if backup_plan.predicted is not None:
+        message.predicted_center.extend(backup_plan.predicted.center.tolist())
+        message.predicted_half_width.extend(backup_plan.predicted.half_width.tolist())
+        message.predicted_heading = backup_plan.predicted.heading
+    if message.fleet and backup_plan.reservation is not None:
+        message.reservation.CopyFrom(reservation_message(backup_plan.reservation))
     return message
 
 
@@ -144,12 +144,12 @@ def read(reply: pb.Reply, request: pb.Request, robot: Robot) -> Answer:
         raise _bad_reply("predicted_center", "a predicted state or a margin that is none")
     try:
         if request.fleet:
-            promise_of(decision.promise, robot)
+            reservation_of(decision.reservation, robot)
         found = decision_of(decision, robot)
     except BadRequest as error:
         raise _bad_reply(error.field, str(error)) from error
-    vouchers = tuple(decision.vouchers)
-    return Answer.of(found, robot, queue_ms=decision.queue_ms, unvouched=decision.unvouched, vouchers=vouchers)
+    plan_tokens = tuple(decision.plan_tokens)
+    return Answer.of(found, robot, queue_ms=decision.queue_ms, unvouched=decision.unvouched, plan_tokens=plan_tokens)
 
 
 def _follows(plan: Array, request: pb.Request, robot: Robot) -> bool:
@@ -202,13 +202,13 @@ class BusAsker:
 class SafetyClient(BusAsker):
     """Asks the safety service about one robot, and keeps its committed plan.
 
-    Not for several threads at once; a program with several robots has a client (or a `Commitment`) for each, and a
+    Not for several threads at once; a program with several robots has a client (or a `BackupPlan`) for each, and a
     `FleetClient` for those that share a world.
     """
 
     def __init__(self, bus: Bus, robot: Robot | str, deadline: float = DEADLINE) -> None:
         super().__init__(bus, robot, deadline)
-        self.commitment = Commitment(self.robot)
+        self.backup_plan = BackupPlan(self.robot)
 
     @classmethod
     def open(
@@ -256,7 +256,7 @@ class SafetyClient(BusAsker):
             NoReply, Late, Refused, SafetyError: no decision; execute `fallback()` instead.
         """
         request = request_message(
-            self.commitment,
+            self.backup_plan,
             state,
             action,
             obstacles,
@@ -269,16 +269,16 @@ class SafetyClient(BusAsker):
             time=time,
         )
         answer = read(ask(self.bus, [request], self.deadline)[0], request, self.robot)
-        accept(self.commitment, answer)
+        accept(self.backup_plan, answer)
         return answer
 
     def fallback(self) -> Array:
         """The committed plan's next input, for when there is no decision."""
-        return self.commitment.fallback()
+        return self.backup_plan.fallback()
 
     def reset(self) -> None:
         """An episode begins, standing still."""
-        self.commitment.reset()
+        self.backup_plan.reset()
 
 
 def ask(bus: Bus, requests: Sequence[pb.Request], deadline: float) -> list[pb.Reply]:

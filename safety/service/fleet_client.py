@@ -17,7 +17,7 @@ from brakeline.messaging.bus import Bus
 from brakeline.messaging.obstacle import Obstacle
 from brakeline.messaging.robot import Robot
 from brakeline.messaging.sensor_messages import Sensed
-from brakeline.safety.filter.backup_plan import Commitment
+from brakeline.safety.filter.backup_plan import BackupPlan
 from brakeline.safety.service.asker import Answer, accept
 from brakeline.safety.service.client import DEADLINE, Array, BusAsker, ask, bus_at, read, request_message
 
@@ -39,7 +39,7 @@ class FleetClient(BusAsker):
             raise ValueError(f"a fleet has two robots or more, each with a name of its own, not {list(names)}")
         super().__init__(bus, robot, deadline)
         self.names = tuple(names)
-        self.commitments = [Commitment(self.robot) for _ in self.names]
+        self.backup_plans = [BackupPlan(self.robot) for _ in self.names]
         self._episode = self._step = 0
 
     @classmethod
@@ -82,7 +82,7 @@ class FleetClient(BusAsker):
         """
         nothing: list[None] = [None] * len(self.names)
         surroundings = nothing if obstacles is None else obstacles, nothing if scans is None else scans
-        asked = zip(self.names, self.commitments, states, actions, *surroundings, strict=True)
+        asked = zip(self.names, self.backup_plans, states, actions, *surroundings, strict=True)
         requests = [
             request_message(
                 kept,
@@ -100,7 +100,7 @@ class FleetClient(BusAsker):
         ]
         replies = zip(ask(self.bus, requests, self.deadline), requests, strict=True)
         answers = [read(reply, request, self.robot) for reply, request in replies]
-        for kept, answer in zip(self.commitments, answers, strict=True):
+        for kept, answer in zip(self.backup_plans, answers, strict=True):
             accept(kept, answer)
         self._step += 1
         return answers
@@ -108,10 +108,10 @@ class FleetClient(BusAsker):
     def fallback(self) -> list[Array]:
         """The committed plans' next inputs, for when there is no decision: all brake along what they promised."""
         self._step += 1
-        return [kept.fallback() for kept in self.commitments]
+        return [kept.fallback() for kept in self.backup_plans]
 
     def reset(self) -> None:
         """They stand somewhere else, and have promised each other nothing."""
-        for kept in self.commitments:
+        for kept in self.backup_plans:
             kept.reset()
         self._episode, self._step = self._episode + 1, 0

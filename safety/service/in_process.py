@@ -17,7 +17,7 @@ from brakeline.messaging.moving_obstacles import parted
 from brakeline.messaging.obstacle import Obstacle
 from brakeline.messaging.robot import Robot
 from brakeline.messaging.sensor_messages import Sensed
-from brakeline.safety.filter.backup_plan import Commitment
+from brakeline.safety.filter.backup_plan import BackupPlan
 from brakeline.safety.filter.request import MOST_OBSERVED, Request
 from brakeline.safety.service.asker import Answer, accept, known_free_in, observation_in, obstacles_in, scan_in
 
@@ -41,7 +41,7 @@ class InProcess:
 
         check_bound(getattr(method, "model", None), method.robot, accept_bound)
         self.method = method
-        self.commitment = Commitment(method.robot)
+        self.backup_plan = BackupPlan(method.robot)
 
     @property
     def robot(self) -> Robot:
@@ -63,7 +63,7 @@ class InProcess:
             BadRequest, BadShape: a value is missing, not finite, of the wrong size or type; `field` names it.
         """
         return self.decide_all(
-            [self.commitment],
+            [self.backup_plan],
             [state],
             [action],
             [obstacles],
@@ -74,7 +74,7 @@ class InProcess:
 
     def decide_all(
         self,
-        commitments: Sequence[Commitment],
+        backup_plans: Sequence[BackupPlan],
         states: Sequence[ArrayLike],
         actions: Sequence[ArrayLike],
         obstacles: Sequence[Iterable[Obstacle] | None],
@@ -85,23 +85,23 @@ class InProcess:
     ) -> list[Answer]:
         """The same of several robots of the kind, each with a commitment of its own. Raises as `decide` does, before
         any plan is committed to."""
-        asked = zip(commitments, states, actions, obstacles, scans, observations, known_free, strict=True)
+        asked = zip(backup_plans, states, actions, obstacles, scans, observations, known_free, strict=True)
         answers = [Answer.of(self.method.decide(self._request(*one)), self.robot) for one in asked]
-        for kept, answer in zip(commitments, answers, strict=True):
+        for kept, answer in zip(backup_plans, answers, strict=True):
             accept(kept, answer)
         return answers
 
     def fallback(self) -> Array:
         """The committed plan's next input, for when there is no decision."""
-        return self.commitment.fallback()
+        return self.backup_plan.fallback()
 
     def reset(self) -> None:
         """An episode begins, standing still."""
-        self.commitment.reset()
+        self.backup_plan.reset()
 
     def _request(
         self,
-        kept: Commitment,
+        kept: BackupPlan,
         state: ArrayLike,
         action: ArrayLike,
         obstacles: Iterable[Obstacle] | None,

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.safety.filter.request import BadRequest
-from brakeline.safety.filter.reservation import Promise, Promises
+from brakeline.safety.filter.reservation import Promises, Reservation
 
 
 class AskedApart(BadRequest):
@@ -28,11 +28,11 @@ class Together:
     """The robots of one world in a batch: what each promises at this moment, by its actor's name."""
 
     names: tuple[str, ...]
-    promises: dict[str, Promise] = field(default_factory=dict)
+    reservations: dict[str, Reservation] = field(default_factory=dict)
 
     def to(self, name: str) -> Promises | None:
         """What the others promise to one of them."""
-        return Promises.to([promise for other, promise in self.promises.items() if other != name])
+        return Promises.to([reservation for other, reservation in self.reservations.items() if other != name])
 
 
 def check_together(requests: Sequence[pb.Request]) -> None:
@@ -74,7 +74,7 @@ def worlds(requests: Sequence[pb.Request]) -> list[list[int]]:
     return alone + list(shared.values())
 
 
-def together(requests: Sequence[pb.Request], standing: Callable[[pb.Request], Promise]) -> Together:
+def joint_request(requests: Sequence[pb.Request], standing: Callable[[pb.Request], Reservation]) -> Together:
     """What the robots of one world are committed to before any of them is decided.
 
     standing: of a robot that has promised nothing yet; raises BadRequest unless it stands.
@@ -85,5 +85,5 @@ def together(requests: Sequence[pb.Request], standing: Callable[[pb.Request], Pr
     check_together(requests)
     found = Together(tuple(request.actor for request in requests))
     for request in requests:
-        found.promises[request.actor] = standing(request)
+        found.reservations[request.actor] = standing(request)
     return found

@@ -40,7 +40,7 @@ def write_key(folder: Path) -> None:
         write_secret(folder / KEY, secrets.token_bytes(LEAST))
 
 
-class Notary:
+class PlanAuthenticator:
     """Makes vouchers, and knows its own."""
 
     def __init__(self, key: bytes) -> None:
@@ -49,7 +49,7 @@ class Notary:
         self._key = key
 
     @classmethod
-    def of(cls, folder: Path | None) -> Notary:
+    def of(cls, folder: Path | None) -> PlanAuthenticator:
         """With the key in a folder of keys; without one, with a key that nobody else has.
 
         Raises:
@@ -60,7 +60,7 @@ class Notary:
         log.info("no %s: plans that another replica verified will count as unverified here", KEY)
         return cls(secrets.token_bytes(LEAST))
 
-    def vouchers(self, request: pb.Request, decision: pb.Decision, robot: Robot) -> list[bytes]:
+    def plan_tokens(self, request: pb.Request, decision: pb.Decision, robot: Robot) -> list[bytes]:
         """For a decision on a request: the first for the next period, the last for all from there on, when the plan's
         tail no longer changes."""
         m, n = robot.action_dim, robot.horizon
@@ -86,9 +86,9 @@ class Notary:
             return True
         if len(request.input_in_force) != robot.action_dim:
             return False
-        return hmac.compare_digest(self.voucher(request, robot), request.voucher)
+        return hmac.compare_digest(self.plan_token(request, robot), request.plan_token)
 
-    def voucher(self, request: pb.Request, robot: Robot) -> bytes:
+    def plan_token(self, request: pb.Request, robot: Robot) -> bytes:
         """The one that a request needs."""
         held = _bytes(_planned(request.input_in_force, robot))
         said = _words(robot.name, request.actor, request.model) + held + _bytes(request.plan)

@@ -18,15 +18,15 @@ from brakeline.messaging.topics import DECIDE, MODEL
 from brakeline.safety.filter.backup_plan import UNVERIFIED
 from brakeline.safety.filter.filter import Filter
 from brakeline.safety.filter.request import BadRequest, StaleModel, check_for_filter
-from brakeline.safety.filter.reservation import Promise
+from brakeline.safety.filter.reservation import Reservation
 from brakeline.safety.methods import Method, Model, load, ready
 from brakeline.safety.model.model_set import BadModel
 from brakeline.safety.model.stated_bound import check_bound
-from brakeline.safety.service.joint_request import Together, together, worlds
-from brakeline.safety.service.plan_token import Notary
+from brakeline.safety.service.joint_request import Together, joint_request, worlds
+from brakeline.safety.service.plan_token import PlanAuthenticator
 from brakeline.safety.service.request_digest import digest
 from brakeline.safety.service.signature import Signed, Trust, Untrusted
-from brakeline.safety.service.wire import batch_of, error_of, message_of, promise_of, request_of
+from brakeline.safety.service.wire import batch_of, error_of, message_of, request_of, reservation_of
 
 log = logging.getLogger("brakeline.safety")
 
@@ -125,7 +125,7 @@ class Counts:
         }
 
 
-def answerer(models: Models, counts: Counts, notary: Notary | None = None) -> Callable[[bytes], bytes]:
+def answerer(models: Models, counts: Counts, notary: PlanAuthenticator | None = None) -> Callable[[bytes], bytes]:
     """The service's core: bytes of a RequestBatch to bytes of a ReplyBatch. Raises BadRequest for no batch at all.
 
     notary: who knows which plans were verified; without one (in process, and when a log is replayed) what requests say
@@ -142,7 +142,7 @@ def answerer(models: Models, counts: Counts, notary: Notary | None = None) -> Ca
             if shared is None:
                 request = request_of(message, chosen.robot)
             else:
-                own = shared.promises[message.actor]
+                own = shared.reservations[message.actor]
                 request = request_of(message, chosen.robot, own, shared.to(message.actor))
             queue_ms = (perf_counter_ns() - received) * 1e-6
             decision = chosen.decide(request)
@@ -161,15 +161,15 @@ def answerer(models: Models, counts: Counts, notary: Notary | None = None) -> Ca
         if not decision.contained:
             counts.violations += 1
             log.warning("%s, step %d: outside the predicted set", message.actor or message.robot, message.step)
-        if shared is not None and decision.promise is not None:
-            shared.promises[message.actor] = decision.promise
+        if shared is not None and decision.reservation is not None:
+            shared.reservations[message.actor] = decision.reservation
         reply = message_of(decision, queue_ms)
         reply.robot, reply.decision.unvouched = chosen.robot.name, not believed
         if notary is not None and decision.verified:
-            reply.decision.vouchers.extend(notary.vouchers(message, reply.decision, chosen.robot))
+            reply.decision.plan_tokens.extend(notary.plan_tokens(message, reply.decision, chosen.robot))
         return reply
 
-    def committed(message: pb.Request) -> Promise:
+    def committed(message: pb.Request) -> Reservation:
         """What a fleet's robot has promised; one that stands and has not: to go on standing."""
         method = models.filter_for(message)
         if not isinstance(method, Filter):
@@ -177,12 +177,12 @@ def answerer(models: Models, counts: Counts, notary: Notary | None = None) -> Ca
         robot = method.robot
         if robot.late:
             raise BadRequest("fleet", f"{robot.name}: what is asked in real time is decided too late for promises")
-        if message.HasField("promise"):
-            return promise_of(message.promise, robot)
+        if message.HasField("reservation"):
+            return reservation_of(message.reservation, robot)
         request = request_of(message, robot)
         check_for_filter(robot, request)
         if not request.still(robot):
-            raise BadRequest("promise", f"{message.actor} moves and has promised nothing: nobody can keep off it")
+            raise BadRequest("reservation", f"{message.actor} moves and has promised nothing: nobody can keep off it")
         return method.rest(request.state)
 
     def answer(payload: bytes) -> bytes:
@@ -192,7 +192,7 @@ def answerer(models: Models, counts: Counts, notary: Notary | None = None) -> Ca
         for world in worlds(batch.requests):
             members = [batch.requests[i] for i in world]
             try:
-                shared = together(members, committed) if members[0].fleet else None
+                shared = joint_request(members, committed) if members[0].fleet else None
             except (BadRequest, UnknownRobot) as error:
                 counts.errors += len(members)
                 for i in world:
@@ -230,7 +230,7 @@ def main(settings: SafetySettings) -> None:
     models, counts = Models(settings.archive, settings.limits, settings.accept_bound), Counts()
     with Process(settings.bus, settings.name) as process:
         trust = Trust.load(keys) if keys is not None else None
-        notary = Notary.of(keys or settings.secrets)
+        notary = PlanAuthenticator.of(keys or settings.secrets)
         for path in settings.models:
             if trust is None:
                 models.install(load(path))

@@ -19,7 +19,7 @@ from brakeline.messaging.stated_share import checked
 from brakeline.safety.filter.backup_plan import Prediction
 from brakeline.safety.filter.blocking_constraint import Stopped
 from brakeline.safety.filter.request import ADJUSTED, ALLOWED, FAILSAFE, RECOVERING, BadRequest, Decision, Request
-from brakeline.safety.filter.reservation import Promise, Promises
+from brakeline.safety.filter.reservation import Promises, Reservation
 from brakeline.safety.perception import displayed_map
 
 KINDS = {ALLOWED: pb.ALLOWED, ADJUSTED: pb.ADJUSTED, FAILSAFE: pb.FAILSAFE, RECOVERING: pb.RECOVERING}
@@ -77,7 +77,7 @@ def _varint(payload: bytes, at: int) -> tuple[int, int]:
 
 
 def request_of(
-    message: pb.Request, robot: Robot, promise: Promise | None = None, promised: Promises | None = None
+    message: pb.Request, robot: Robot, reservation: Reservation | None = None, promised: Promises | None = None
 ) -> Request:
     """The request in a message; promise, promised: of a fleet's robot, its own and the others'.
 
@@ -103,7 +103,7 @@ def request_of(
         scan=seen(message),
         model=message.model,
         predicted=predicted,
-        promise=promise,
+        reservation=reservation,
         promised=promised,
         observation=np.fromiter(message.observation, np.float32, len(message.observation)),
         known_free=message.known_free,
@@ -137,16 +137,18 @@ def seen(message: pb.Request) -> Sensed | None:
         raise BadRequest("scan", str(error)) from error
 
 
-def promise_of(m: pb.Promise, robot: Robot) -> Promise:
+def reservation_of(m: pb.Reservation, robot: Robot) -> Reservation:
     """Raises BadRequest: it is none of this robot's."""
     shape = robot.horizon, robot.position_dim
     if {len(m.center), len(m.half_width)} != {shape[0] * shape[1]} or len(m.radius) != shape[0]:
-        raise BadRequest("promise", f"a {robot.name} robot's promise has {shape[0]} boxes in {shape[1]} coordinates")
+        raise BadRequest(
+            "reservation", f"a {robot.name} robot's promise has {shape[0]} boxes in {shape[1]} coordinates"
+        )
     center, half, radius = numbers(m.center), numbers(m.half_width), numbers(m.radius)
     within = all((np.abs(part) <= FARTHEST).all() for part in (center, half, radius))  # NaN fails too
     if not within or (half < 0.0).any() or (radius < 0.0).any():
-        raise BadRequest("promise", "a promise's boxes are within reason and not negative")
-    return Promise(center.reshape(shape), half.reshape(shape), radius)
+        raise BadRequest("reservation", "a promise's boxes are within reason and not negative")
+    return Reservation(center.reshape(shape), half.reshape(shape), radius)
 
 
 def message_of(decision: Decision, queue_ms: float) -> pb.Reply:
@@ -181,8 +183,8 @@ def message_of(decision: Decision, queue_ms: float) -> pb.Reply:
         message.stopped.at.extend(stopped.at.tolist())
     if decision.bound is not None:
         message.bound = decision.bound
-    if decision.promise is not None:
-        message.promise.CopyFrom(promise_message(decision.promise))
+    if decision.reservation is not None:
+        message.reservation.CopyFrom(reservation_message(decision.reservation))
     return pb.Reply(decision=message)
 
 
@@ -224,17 +226,17 @@ def decision_of(m: pb.Decision, robot: Robot) -> Decision:
         iterations=m.iterations,
         broken=m.broken,
         stopped=stopped,
-        promise=promise_of(m.promise, robot) if m.HasField("promise") else None,
+        reservation=reservation_of(m.reservation, robot) if m.HasField("reservation") else None,
         for_clearance=m.for_clearance if m.HasField("for_clearance") else None,
         bound=checked(m.bound) if m.HasField("bound") else None,
     )
 
 
-def promise_message(promise: Promise) -> pb.Promise:
-    return pb.Promise(
-        center=promise.center.ravel().tolist(),
-        half_width=promise.half_width.ravel().tolist(),
-        radius=promise.radius.tolist(),
+def reservation_message(reservation: Reservation) -> pb.Reservation:
+    return pb.Reservation(
+        center=reservation.center.ravel().tolist(),
+        half_width=reservation.half_width.ravel().tolist(),
+        radius=reservation.radius.tolist(),
     )
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from brakeline.actors.decision_guard import consult
-from brakeline.actors.episode_runner import Driver, Identity
+from brakeline.actors.episode_runner import EpisodeRunner, Identity
 from brakeline.deploy.experiments.evaluate import in_process
 from brakeline.deploy.vehicle_factory import environment
 from brakeline.logs.episode_stats import Tally
@@ -17,13 +17,13 @@ SLOW, FAST = np.array([0.05, 0.1]), np.array([0.25, 0.1])
 
 
 @pytest.fixture
-def driver() -> Driver:
-    made = Driver(GROUND, environment(GROUND, "default", 0), Identity("a", 0, 0), penalty=5.0, cuts=True)
+def driver() -> EpisodeRunner:
+    made = EpisodeRunner(GROUND, environment(GROUND, "default", 0), Identity("a", 0, 0), penalty=5.0, cuts=True)
     made.begin(0)
     return made
 
 
-def step(driver: Driver, proposal, ask) -> pb.Step:
+def step(driver: EpisodeRunner, proposal, ask) -> pb.Step:
     return driver.execute(proposal, consult(ask, [driver.request(proposal)], GROUND)[0])
 
 
@@ -42,7 +42,7 @@ def test_an_intervention_is_a_terminal_step_for_the_learner_alone(driver):
 
 
 def test_in_use_the_episode_goes_on_behind_the_rule():
-    driver = Driver(GROUND, environment(GROUND, "default", 0), Identity("a", 0, 0))
+    driver = EpisodeRunner(GROUND, environment(GROUND, "default", 0), Identity("a", 0, 0))
     driver.begin(0)
     ask = in_process(known(threshold=0.3))
     for number, proposal in enumerate((FAST, FAST, SLOW)):

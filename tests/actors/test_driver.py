@@ -4,29 +4,29 @@ import numpy as np
 import pytest
 
 from brakeline.actors.decision_guard import consult
-from brakeline.actors.episode_runner import Driver, Identity
+from brakeline.actors.episode_runner import EpisodeRunner, Identity
 from brakeline.deploy.experiments.evaluate import in_process
 from brakeline.deploy.vehicle_factory import environment
 from brakeline.learner.transition_reader import Intake
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.bus import NoReply
 from brakeline.safety.filter.request import NOT_FINITE
-from brakeline.safety.model.model_set import Recipe
+from brakeline.safety.model.model_set import ModelConfig
 from brakeline.safety.service.wire import KINDS
 from tests.robots import GROUND
 
 FAST = np.array([0.25, 0.1])
 
 
-def driver(number: int = 0, seed: int = 0, **more) -> Driver:
-    return Driver(GROUND, environment(GROUND, "default", seed), Identity("actor-0", number, seed), **more)
+def driver(number: int = 0, seed: int = 0, **more) -> EpisodeRunner:
+    return EpisodeRunner(GROUND, environment(GROUND, "default", seed), Identity("actor-0", number, seed), **more)
 
 
 @pytest.fixture(scope="module")
 def ask(data_folder):
     from brakeline.deploy.data.model_store import model_for
 
-    return in_process(model_for(GROUND, Recipe()))
+    return in_process(model_for(GROUND, ModelConfig()))
 
 
 def test_the_steps_of_an_episode(ask):
@@ -63,7 +63,7 @@ def test_containment_is_of_the_state_after_the_step_and_unknown_after_a_fallback
         step = robot.execute(FAST, outcome)
         assert step.compared and step.contained is not wrong
     missing = consult(lambda requests: (_ for _ in ()).throw(NoReply("gone")), [robot.request(FAST)], GROUND)[0]
-    plan = robot.commitment.plan.copy()
+    plan = robot.backup_plan.plan.copy()
     step = robot.execute(FAST, missing)
     assert step.fallback and step.decision == pb.FAILSAFE and not step.compared
     assert np.allclose(step.action, plan[0])
@@ -121,7 +121,7 @@ def test_a_step_has_the_number_of_its_question_though_periods_pass_unseen_meanwh
     drive = robot.env.step
 
     def slow(action):  # as `brakeline.actors.flight_process` counts them
-        robot.commitment.fallback()
+        robot.backup_plan.fallback()
         robot.step += 1
         return drive(action)
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from brakeline.actors.decision_guard import Outcome, consult
-from brakeline.actors.episode_runner import Driver, Identity
+from brakeline.actors.episode_runner import EpisodeRunner, Identity
 from brakeline.actors.joint_episode import Fleet
 from brakeline.deploy.data.model_store import model_for
 from brakeline.deploy.experiments.evaluate import in_process
@@ -15,7 +15,7 @@ from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.bus import NoReply
 from brakeline.safety.filter.filter import Filter
 from brakeline.safety.filter.reservation import Promises
-from brakeline.safety.model.model_set import Recipe
+from brakeline.safety.model.model_set import ModelConfig
 from brakeline.sim.scripted_policies import scripted
 from brakeline.sim.shared_world import FleetEnv
 from tests.robots import GROUND
@@ -26,12 +26,12 @@ ROUNDING = 1e-6  # m
 
 @pytest.fixture(scope="module")
 def ask(data_folder):
-    return in_process(model_for(GROUND, Recipe()))
+    return in_process(model_for(GROUND, ModelConfig()))
 
 
 def fleet_of(size=SIZE, arena="crossing", promising=True):
     world = FleetEnv(GROUND, arena, size, 0)
-    drivers = [Driver(GROUND, member, Identity(f"robot.{i}", i, 0)) for i, member in enumerate(world.members)]
+    drivers = [EpisodeRunner(GROUND, member, Identity(f"robot.{i}", i, 0)) for i, member in enumerate(world.members)]
     return Fleet(world, drivers, promising)
 
 
@@ -55,7 +55,7 @@ def gathered(fleet, seed=0):
 
 
 def disjoint(fleet):
-    made = [d.commitment.promise for d in fleet.drivers if d.commitment.promise is not None]
+    made = [d.backup_plan.reservation for d in fleet.drivers if d.backup_plan.reservation is not None]
     return min((a.apart(b) for a, b in combinations(made, 2)), default=np.inf)
 
 
@@ -100,7 +100,7 @@ def test_without_promises_the_same_robots_touch(ask):
 
 def test_who_forgets_the_others_promises_touches_them(data_folder, monkeypatch):
     """The mutant: promises are made, and nobody keeps off them."""
-    ask = in_process(model_for(GROUND, Recipe()))
+    ask = in_process(model_for(GROUND, ModelConfig()))
     monkeypatch.setattr(Promises, "nearest", lambda self, point: np.full(len(self), np.inf))
     fleet = fleet_of()
     gathered(fleet)
@@ -112,16 +112,16 @@ def test_when_nobody_answers_all_stop_within_what_they_promised(ask):
     fleet = fleet_of()
     gathered(fleet)
     drive(fleet, ask, "random", 15)
-    promised = [driver.commitment.promise for driver in fleet.drivers]
+    promised = [driver.backup_plan.reservation for driver in fleet.drivers]
     silent = consult(
         lambda requests: (_ for _ in ()).throw(NoReply("gone")), fleet.requests([np.zeros(2)] * SIZE), GROUND
     )
     for k in range(6):
         fleet.execute([np.zeros(2)] * SIZE, silent)
-        for promise, robot in zip(promised, fleet.world.world.robots, strict=True):
-            at = min(k, len(promise.center) - 1)
-            body = promise.radius[at] - GROUND.footprint
-            assert (np.abs(robot.true[:2] - promise.center[at]) <= promise.half_width[at] + body).all()
+        for reservation, robot in zip(promised, fleet.world.world.robots, strict=True):
+            at = min(k, len(reservation.center) - 1)
+            body = reservation.radius[at] - GROUND.footprint
+            assert (np.abs(robot.true[:2] - reservation.center[at]) <= reservation.half_width[at] + body).all()
     assert all(abs(robot.true[3]) < 0.01 for robot in fleet.world.world.robots) and fleet.world.touches == 0
 
 
@@ -180,15 +180,15 @@ def test_who_moves_and_has_promised_nothing_is_refused(ask):
     moving = pb.Request.FromString(requests[0].SerializeToString())
     moving.input_in_force[0], moving.model = 0.2, "unverified"
     refused = ask([moving, requests[1]])
-    assert {reply.error.field for reply in refused} == {"promise"} and "robot.0 moves" in refused[1].error.message
+    assert {reply.error.field for reply in refused} == {"reservation"} and "robot.0 moves" in refused[1].error.message
     for change in ({"center": [0.0]}, {"radius": [float("nan")] * 3}, {"half_width": [-1.0] * 6}):
         bad = pb.Request.FromString(requests[1].SerializeToString())
-        bad.promise.center[:], bad.promise.half_width[:] = [0.0] * 6, [0.0] * 6
-        bad.promise.radius[:] = [0.1] * 3
+        bad.reservation.center[:], bad.reservation.half_width[:] = [0.0] * 6, [0.0] * 6
+        bad.reservation.radius[:] = [0.1] * 3
         assert replies(ask, [requests[0], bad]) == ["decided"] * 2
         for name, value in change.items():
-            getattr(bad.promise, name)[:] = value
-        assert [reply.error.field for reply in ask([requests[0], bad])] == ["promise"] * 2
+            getattr(bad.reservation, name)[:] = value
+        assert [reply.error.field for reply in ask([requests[0], bad])] == ["reservation"] * 2
         assert set(replies(ask, [requests[0], bad])) == {"BadRequest"}
 
 
@@ -198,7 +198,7 @@ def test_no_answer_about_one_is_no_answer_about_any(ask):
     gathered(fleet)
     drive(fleet, ask, "random", 8)
     outcomes = consult(ask, fleet.requests([np.array([0.2, 0.1])] * SIZE), GROUND)
-    before = [driver.commitment.plan.copy() for driver in fleet.drivers]
+    before = [driver.backup_plan.plan.copy() for driver in fleet.drivers]
     outcomes[2] = replace(outcomes[2], answer=None, reply=None, failure="garbled")
     steps = fleet.execute([np.zeros(2)] * SIZE, outcomes)
     assert all(step.fallback for step in steps)
@@ -213,4 +213,4 @@ def test_who_is_done_stands_and_is_kept_off(ask):
     first.running = False
     results = fleet.execute([np.zeros(2)] * 2, consult(ask, fleet.requests([np.zeros(2)] * 2), GROUND))
     assert results[0] is None and results[1].actor == "robot.1" and results[1].fleet == 2
-    assert (first.step, second.step) == (1, 1) and first.commitment.promise is not None
+    assert (first.step, second.step) == (1, 1) and first.backup_plan.reservation is not None

@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 
 from brakeline.actors.decision_guard import consult
-from brakeline.actors.episode_runner import Driver, Identity
+from brakeline.actors.episode_runner import EpisodeRunner, Identity
 from brakeline.actors.flight_process import NoRoom, answered
 from brakeline.deploy.data.model_store import model_for
 from brakeline.deploy.experiments.evaluate import in_process
 from brakeline.messaging.obstacle import Obstacle
-from brakeline.safety.model.model_config import Recipe
+from brakeline.safety.model.model_config import ModelConfig
 from brakeline.sim.arena import Arena, staged_arena
 from brakeline.sim.delayed_vehicle import late
 from brakeline.sim.navigation_env import NavigationEnv
@@ -34,7 +34,7 @@ def stage(gap: float) -> Arena:
 @pytest.mark.usefixtures("flight_folder")
 def test_it_does_not_take_off_where_it_could_not_hover() -> None:
     robot = QUADROTOR.in_real_time()
-    question = in_process(model_for(robot, Recipe(), BOUND), BOUND)
+    question = in_process(model_for(robot, ModelConfig(), BOUND), BOUND)
     assert answered(question, robot, stage(2.0), True, lambda: False)
     with pytest.raises(NoRoom, match=r"0\.\d+ m from the nearest obstacle.*collect more data"):
         answered(question, robot, stage(0.02), True, lambda: False)
@@ -45,12 +45,12 @@ def test_it_does_not_take_off_where_it_could_not_hover() -> None:
 def test_in_real_time_a_way_out_is_gone_on_with_period_after_period() -> None:
     """Not every other one: a real vehicle does not answer to velocities that last for a period."""
     robot = QUADROTOR.in_real_time()
-    question = in_process(model_for(robot, Recipe(), BOUND), BOUND)
+    question = in_process(model_for(robot, ModelConfig(), BOUND), BOUND)
     make = late(Quadrotor, robot)
     env = NavigationEnv(
         robot, "default", make, draw=lambda *_: staged_arena(start=(0.0, 0.0, 3.0), goal=(-4.0, -4.0, 3.0), height=6.0)
     )
-    driver = Driver(robot, env, Identity("actor", 0, 0))
+    driver = EpisodeRunner(robot, env, Identity("actor", 0, 0))
     driver.begin(0)
     kinds = []
     for _ in range(25):

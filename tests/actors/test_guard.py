@@ -6,7 +6,7 @@ import pytest
 from brakeline.actors.decision_guard import at_rest, consult, next_input
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.bus import BusError, Late, NoReply, Refused
-from brakeline.safety.filter.backup_plan import Commitment
+from brakeline.safety.filter.backup_plan import BackupPlan
 from brakeline.safety.service.client import request_message
 from tests.robots import GROUND
 
@@ -33,9 +33,9 @@ def outcome_of(reply):
 
 def committed():
     """A robot that just executes the first input of PLAN."""
-    commitment = Commitment(GROUND)
-    assert (next_input(commitment, outcome_of(decision())) == PLAN[0]).all()
-    return commitment
+    backup_plan = BackupPlan(GROUND)
+    assert (next_input(backup_plan, outcome_of(decision())) == PLAN[0]).all()
+    return backup_plan
 
 
 FAILURES = {
@@ -58,13 +58,13 @@ FAILURES = {
 
 @pytest.mark.parametrize("failure", FAILURES.values(), ids=FAILURES.keys())
 def test_without_a_decision_the_plan_is_followed_to_standstill_and_beyond(failure):
-    commitment, executed = committed(), []
+    backup_plan, executed = committed(), []
     for _ in range(5):
         outcome = outcome_of(failure)
         assert outcome.answer is None and outcome.failure
-        executed.append(next_input(commitment, outcome))
+        executed.append(next_input(backup_plan, outcome))
     assert np.array(executed).tolist() == [[0.1, 0.15], [0, 0], [0, 0], [0, 0], [0, 0]]
-    assert commitment.predicted is None, "nobody predicted where it is now"
+    assert backup_plan.predicted is None, "nobody predicted where it is now"
 
 
 def test_what_failed_is_recorded_with_its_reason_and_the_reply_if_one_came():
@@ -78,28 +78,28 @@ def test_what_failed_is_recorded_with_its_reason_and_the_reply_if_one_came():
 
 
 def test_it_waits_only_when_it_stands_and_is_committed_to_that():
-    commitment = Commitment(GROUND)
-    assert at_rest(commitment)
-    next_input(commitment, outcome_of(decision()))
+    backup_plan = BackupPlan(GROUND)
+    assert at_rest(backup_plan)
+    next_input(backup_plan, outcome_of(decision()))
     moving = []
     for _ in range(3):
-        moving.append(at_rest(commitment))
-        next_input(commitment, outcome_of(FAILURES["nobody"]))
+        moving.append(at_rest(backup_plan))
+        next_input(backup_plan, outcome_of(FAILURES["nobody"]))
     assert moving == [False, False, True], "it still moves while the last but one input, the first zero, is executed"
-    commitment = Commitment(GROUND)
-    next_input(commitment, outcome_of(decision(np.array([[0.0, 0.0], [0.1, 0.0], [0.0, 0.0]]))))
-    assert not at_rest(commitment), "it stands, but has committed to move"
+    backup_plan = BackupPlan(GROUND)
+    next_input(backup_plan, outcome_of(decision(np.array([[0.0, 0.0], [0.1, 0.0], [0.0, 0.0]]))))
+    assert not at_rest(backup_plan), "it stands, but has committed to move"
 
 
 def test_it_goes_on_when_the_service_is_back():
-    commitment = committed()
-    next_input(commitment, outcome_of(FAILURES["late"]))
+    backup_plan = committed()
+    next_input(backup_plan, outcome_of(FAILURES["late"]))
     again = np.array([[0.25, -0.5], [0.0, 0.0], [0.0, 0.0]])
-    assert (next_input(commitment, outcome_of(decision(again))) == again[0]).all()
-    assert commitment.model == "abc" and commitment.predicted is not None
+    assert (next_input(backup_plan, outcome_of(decision(again))) == again[0]).all()
+    assert backup_plan.model == "abc" and backup_plan.predicted is not None
     for _ in range(3):
-        next_input(commitment, outcome_of(FAILURES["late"]))
-    request = request_message(commitment, np.zeros(5), np.zeros(2), known_free=True)
+        next_input(backup_plan, outcome_of(FAILURES["late"]))
+    request = request_message(backup_plan, np.zeros(5), np.zeros(2), known_free=True)
     assert request.model == "" and not any(request.plan), "standing still needs nobody's word"
 
 

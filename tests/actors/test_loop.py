@@ -14,8 +14,8 @@ from brakeline.deploy.vehicle_factory import environment, fleet_world
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.bus import Bus, BusSettings
 from brakeline.messaging.topics import DECIDE, EXCHANGE, STEP
-from brakeline.safety.filter.backup_plan import Commitment
-from brakeline.safety.model.model_set import Recipe
+from brakeline.safety.filter.backup_plan import BackupPlan
+from brakeline.safety.model.model_set import ModelConfig
 from brakeline.safety.service.server import Counts, Models, answerer
 from tests.actors.teacher import Teacher
 from tests.robots import GROUND
@@ -31,7 +31,7 @@ class Service:
         from brakeline.deploy.data.model_store import model_for
 
         models = Models()
-        models.install(model_for(GROUND, Recipe()))
+        models.install(model_for(GROUND, ModelConfig()))
         self._answer = answerer(models, Counts())
         self.batches: list[list[str]] = []
         self.proposals: list[list[float]] = []  # of the first robot
@@ -81,8 +81,8 @@ def scene(buses, data_folder):
 
 def test_a_practised_stop_goes_on_as_it_was_verified_unless_that_does_not_hold():
     """Beside something the filter may prefer another input by now: then no stop would ever be recorded whole."""
-    driver = SimpleNamespace(robot=GROUND, commitment=Commitment(GROUND), rng=np.random.default_rng(0))
-    driver.commitment.accept(np.full((GROUND.horizon, 2), 0.2), "a model", None, True)
+    driver = SimpleNamespace(robot=GROUND, backup_plan=BackupPlan(GROUND), rng=np.random.default_rng(0))
+    driver.backup_plan.accept(np.full((GROUND.horizon, 2), 0.2), "a model", None, True)
     answers = {kind: SimpleNamespace(kind=kind) for kind in ("allowed", "adjusted", "failsafe", "recovering")}
     asked = {kind: Outcome(pb.Request(), pb.Reply(), answer, "", 1.0) for kind, answer in answers.items()}
     practice, never = Practice(1.0), Practice(0.0)
@@ -91,7 +91,7 @@ def test_a_practised_stop_goes_on_as_it_was_verified_unless_that_does_not_hold()
     assert [kind for kind, outcome in asked.items() if practice.kept(driver, outcome).answer] == ["allowed"]
     assert practice.kept(driver, asked["adjusted"]).failure == PRACTISED
     assert all(never.kept(driver, outcome) is outcome for outcome in asked.values())
-    driver.commitment.accept(np.full((GROUND.horizon, 2), 0.2), "a model", None, False)
+    driver.backup_plan.accept(np.full((GROUND.horizon, 2), 0.2), "a model", None, False)
     assert all(practice.kept(driver, outcome) is outcome for outcome in asked.values())
 
 
@@ -155,4 +155,4 @@ def test_a_fleet_stops_together_when_the_service_is_gone_and_goes_on_together(sc
     assert {step.fleet for step in steps} == {3} and not any(step.fallback for step in steps[quiet:])
     assert all(batch == names for batch in service.batches)
     asked = [e.request for e in list(exchanges) if e.request.step and not e.failure]
-    assert asked and all(list(request.fleet) == names and request.HasField("promise") for request in asked)
+    assert asked and all(list(request.fleet) == names and request.HasField("reservation") for request in asked)

@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import pytest
 
-from brakeline.actors.learner_client import RefusedByLearner, Student
+from brakeline.actors.learner_client import LearnerClient, RefusedByLearner
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.bus import Bus
 from tests.actors.teacher import Teacher
@@ -18,13 +18,13 @@ def never() -> bool:
     return False
 
 
-def joined(buses: tuple[Bus, Bus], lockstep: bool = False) -> tuple[Teacher, Student]:
-    teacher, student = Teacher(buses[0]), Student(buses[1], GROUND, "actor-0", lockstep)
+def joined(buses: tuple[Bus, Bus], lockstep: bool = False) -> tuple[Teacher, LearnerClient]:
+    teacher, student = Teacher(buses[0]), LearnerClient(buses[1], GROUND, "actor-0", lockstep)
     assert student.join(0, 0, never) == 3
     return teacher, student
 
 
-def waiting(student: Student, index: int, stop: Callable[[], bool] = never) -> list[bool]:
+def waiting(student: LearnerClient, index: int, stop: Callable[[], bool] = never) -> list[bool]:
     """The result of `wait`, once there is one."""
     results: list[bool] = []
     threading.Thread(target=lambda: results.append(student.wait(index, 7, stop)), daemon=True).start()
@@ -32,7 +32,7 @@ def waiting(student: Student, index: int, stop: Callable[[], bool] = never) -> l
 
 
 def test_it_waits_for_a_learner_joins_it_and_is_told_where_to_go_on(buses: tuple[Bus, Bus]) -> None:
-    student = Student(buses[1], GROUND, "actor-0")
+    student = LearnerClient(buses[1], GROUND, "actor-0")
     answers: list[int | None] = []
     thread = threading.Thread(target=lambda: answers.append(student.join(12, 4, never)))
     thread.start()
@@ -46,7 +46,7 @@ def test_it_waits_for_a_learner_joins_it_and_is_told_where_to_go_on(buses: tuple
 
 
 def test_a_stop_ends_the_wait_for_a_learner(buses: tuple[Bus, Bus]) -> None:
-    student = Student(buses[1], GROUND, "actor-0")
+    student = LearnerClient(buses[1], GROUND, "actor-0")
     stop = threading.Event()
     threading.Timer(0.3, stop.set).start()
     assert student.join(0, 0, stop.is_set) is None
@@ -55,7 +55,7 @@ def test_a_stop_ends_the_wait_for_a_learner(buses: tuple[Bus, Bus]) -> None:
 def test_another_layout_is_refused(buses: tuple[Bus, Bus]) -> None:
     Teacher(buses[0]).layout = "that of another version"
     with pytest.raises(RefusedByLearner, match="layout: another"):
-        Student(buses[1], GROUND, "actor-0").join(0, 0, never)
+        LearnerClient(buses[1], GROUND, "actor-0").join(0, 0, never)
 
 
 def test_it_goes_as_far_as_it_may(buses: tuple[Bus, Bus]) -> None:
@@ -155,7 +155,7 @@ def test_a_permission_that_no_learner_gives_is_passed_over(buses: tuple[Bus, Bus
 
 
 def test_nothing_is_taken_before_a_learner_has_taken_it_in(buses: tuple[Bus, Bus]) -> None:
-    teacher, student = Teacher(buses[0]), Student(buses[1], GROUND, "actor-0")
+    teacher, student = Teacher(buses[0]), LearnerClient(buses[1], GROUND, "actor-0")
     for version in range(1, 11):
         teacher.publish(version)
         time.sleep(0.02)

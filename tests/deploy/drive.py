@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from brakeline.actors.decision_guard import consult
-from brakeline.actors.episode_runner import Driver, Identity
+from brakeline.actors.episode_runner import EpisodeRunner, Identity
 from brakeline.deploy.data.model_store import model_for
 from brakeline.deploy.experiments.evaluate import in_process
 from brakeline.deploy.vehicle_factory import environment
@@ -20,7 +20,7 @@ from brakeline.logs.segment import open_segment
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.bus import Sample
 from brakeline.messaging.topics import EPISODE, EXCHANGE, STEP, Topic
-from brakeline.safety.model.model_set import Recipe
+from brakeline.safety.model.model_set import ModelConfig
 from brakeline.sim.scripted_policies import scripted
 from tests.robots import GROUND
 
@@ -31,9 +31,9 @@ def drive(
     log: Path, steps: int = 150, change: Change | None = None, attach: bool = True, actor: str = "actor-0"
 ) -> str:
     """Drive and record; `change` may falsify what is recorded of an exchange. Returns the model set's version."""
-    model = model_for(GROUND, Recipe())
+    model = model_for(GROUND, ModelConfig())
     ask = in_process(model)
-    driver = Driver(GROUND, environment(GROUND, "dense", 7), Identity(actor, 0, 0), penalty=1.0)
+    driver = EpisodeRunner(GROUND, environment(GROUND, "dense", 7), Identity(actor, 0, 0), penalty=1.0)
     attachments = {attachment("ground", model.version): model.encode()} if attach else None
     segment = open_segment(log, {"run": {"method": "ddpc"}}, attachments)
     numbers: dict[str, Iterator[int]] = {}

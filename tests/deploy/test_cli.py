@@ -23,7 +23,7 @@ from brakeline.messaging.range_image import RangeImage
 from brakeline.messaging.scan import BadScan, Scan
 from brakeline.safety import methods
 from brakeline.safety.model import model_config
-from brakeline.safety.model.validation import Statement
+from brakeline.safety.model.validation import ValidationReport
 
 SHARED = {
     *("episodes", "goals", "collisions", "timeouts", "steps", "interventions", "failsafes", "mean_speed", "max_speed"),
@@ -231,7 +231,7 @@ def said(**figures):
     plain |= {"outside_hour": 180.0}
     sizes = {"half_width_rest": 0.0012, "half_width_full": 149810.138, "clearance_margin": 1.5}
     about = {"certificate": "matrix-zonotope", "mode": "recursion", "version": "a"}
-    return Statement(**{**plain, **sizes, **about, "excess": 0.8, **figures})
+    return ValidationReport(**{**plain, **sizes, **about, "excess": 0.8, **figures})
 
 
 @pytest.mark.parametrize("columns", [60, 80, 160])

@@ -18,7 +18,7 @@ from brakeline.messaging.obstacle import Obstacle
 from brakeline.messaging.robot import robot_named
 from brakeline.messaging.topics import DECIDE
 from brakeline.safety.model.dataset import Dataset
-from brakeline.safety.model.model_set import Recipe
+from brakeline.safety.model.model_set import ModelConfig
 from brakeline.safety.service.server import Counts, Models, answerer
 from examples.foreign import table, train
 from examples.foreign.run import missing
@@ -64,7 +64,7 @@ def test_driving_at_hazards_costs_nothing_behind_a_filter_of_own_data(tmp_path, 
     record, lines = tmp_path / f"{robot}.safetensors", tmp_path / "lines.jsonl"
     told(python, "collect.py", robot, str(record), str(periods))
     models = Models(accept_bound=BOUND)
-    models.install(certified(Dataset.load(record), Recipe())[0])
+    models.install(certified(Dataset.load(record), ModelConfig())[0])
     endpoint = free_endpoint()
     words = [robot, "adversarial", "--seeds", "0", "1", "--steps", "300"]
     with Bus(BusSettings(listen=(endpoint,)), "safety") as bus:
@@ -155,7 +155,7 @@ def test_training_learns_from_what_was_executed_and_from_what_was_proposed(monke
     small = dataclasses.replace(train.CONFIG, hidden=(8, 8), batch=8, warmup=20, n_step=1)
     monkeypatch.setattr(train, "CONFIG", small)
     robot = robot_named(str(EXAMPLES / "safety_gymnasium" / "point.toml"))
-    pupil = train.Pupil(SimpleNamespace(robot=robot), size=3, steps=30, seed=0)
+    pupil = train.LearnedPolicy(SimpleNamespace(robot=robot), size=3, steps=30, seed=0)
     told = train.episode(Corrected(), pupil, 0).told()
     assert (told["steps"], told["cost"], told["reward"]) == (30, 30.0, 30.0)
     stored = pupil.replay.state().tensors

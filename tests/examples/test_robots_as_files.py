@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from brakeline.actors.episode_runner import Driver, Identity
+from brakeline.actors.episode_runner import EpisodeRunner, Identity
 from brakeline.deploy.cli import main
 from brakeline.deploy.data import collect, data_paths, model_store, simulated_recording
 from brakeline.deploy.data.certification import certified
@@ -23,7 +23,7 @@ from brakeline.messaging.obstacle import BOX, Obstacle
 from brakeline.messaging.task import RobotWithTask, address, robot_with_task
 from brakeline.safety.filter.braking import braking_plan
 from brakeline.safety.model.dataset import BadData, Dataset
-from brakeline.safety.model.model_set import ModelSet, Recipe
+from brakeline.safety.model.model_set import ModelConfig, ModelSet
 from brakeline.sim.arena import staged_arena
 from brakeline.sim.ground_estimator import NoiseLevels
 from brakeline.sim.scripted_policies import scripted
@@ -52,7 +52,7 @@ def recorded(kind: RobotWithTask) -> Dataset:
 
 @pytest.fixture(scope="module")
 def model(recorded: Dataset) -> ModelSet:
-    return certified(recorded, Recipe())[0]
+    return certified(recorded, ModelConfig())[0]
 
 
 def exact(name: str) -> Vehicle:
@@ -172,7 +172,7 @@ def test_recorded_inputs_keep_the_steering_at_a_stop() -> None:
 
 def test_what_was_not_fitted_keeps_to_the_tubes(recorded: Dataset) -> None:
     """The share of held-out plans that leave their tubes is what the statement says it can be; narrower tubes fail."""
-    model, statement = certified(recorded, Recipe())
+    model, statement = certified(recorded, ModelConfig())
     assert statement.windows > 50 and statement.violations <= 0.05 * statement.windows
     assert statement.bound_plan < 0.2
     assert model.robot == recorded.robot
@@ -187,7 +187,7 @@ def test_nothing_is_touched_in_adversarial_episodes(kind: RobotWithTask, model: 
 def _collisions(kind: RobotWithTask, question: object) -> tuple[int, int]:
     """Collisions and steps outside of the predicted sets, in some periods of two adversarial episodes."""
     env = environment(kind, "default", FRESH)
-    driver = Driver(kind, env, Identity("test", 0, 0), filtered=question is not None)
+    driver = EpisodeRunner(kind, env, Identity("test", 0, 0), filtered=question is not None)
     policy = scripted("adversary", kind, np.random.default_rng(0))
     touched = left = 0
     for number in range(2):
@@ -204,10 +204,10 @@ def test_a_description_that_changed_makes_the_model_set_again(
     """A model set of a narrower body is never used for a wider one; the recording is, and not for another clock."""
     monkeypatch.setenv("BRAKELINE_DATA", str(tmp_path))
     recorded.save(data_paths.record_path(kind))
-    before = model_store.model_for(kind, Recipe(), BOUND)
-    assert model_store.model_for(kind, Recipe(), BOUND).version == before.version
+    before = model_store.model_for(kind, ModelConfig(), BOUND)
+    assert model_store.model_for(kind, ModelConfig(), BOUND).version == before.version
     wider = replace(kind, body=tuple(replace(disc, radius=disc.radius + 0.05) for disc in kind.body))
-    assert model_store.model_for(wider, Recipe(), BOUND).robot.body == wider.body
+    assert model_store.model_for(wider, ModelConfig(), BOUND).robot.body == wider.body
     with pytest.raises(BadData, match="changed"):
         simulated_recording.data_for(replace(kind, period=0.1))
 
@@ -225,7 +225,7 @@ def test_what_was_not_recorded_here_is_never_recorded_over(
     replace(recorded, about={"origin": "import", "sources": "drive.csv"}).save(path)
     before = path.read_bytes()
     with pytest.raises(BadData, match=r"kept: .* \(import: drive.csv\).*import the log again"):
-        model_store.model_for(replace(kind, period=0.1), Recipe())
+        model_store.model_for(replace(kind, period=0.1), ModelConfig())
     assert main(["collect", str(EXAMPLES / kind.name / f"{kind.name}.toml"), "--trajectories", "1"]) == 1
     assert "drive.csv" in capsys.readouterr().err
     assert path.read_bytes() == before

@@ -7,7 +7,7 @@ import pytest
 from PIL import Image
 
 from brakeline.logs import foxglove_scene
-from brakeline.logs.episode_sampler import Gallery
+from brakeline.logs.episode_sampler import EpisodeSampler
 from brakeline.logs.foxglove import Pictures
 from brakeline.logs.log_analysis import Look, analysed
 from brakeline.logs.report_page import render
@@ -32,8 +32,10 @@ WALKER = Obstacle(CYLINDER, (1.0, 0.5), (0.2,), motion=Motion((0.5, 0.0), 0.03, 
 
 def told(actor: str, number: int = 0, x: float = 0.0) -> pb.Exchange:
     """A robot of a fleet of two that has a scan and sees a walker, and promises to be about x."""
-    promise = pb.Promise(center=[x, 0.0] * 3, half_width=[0.1, 0.2] * 3, radius=[0.15] * 3)
-    decision = pb.Decision(kind=pb.RECOVERING, tube_center=[x, 0.0] * 3, tube_half_width=[0.01] * 6, promise=promise)
+    reservation = pb.Reservation(center=[x, 0.0] * 3, half_width=[0.1, 0.2] * 3, radius=[0.15] * 3)
+    decision = pb.Decision(
+        kind=pb.RECOVERING, tube_center=[x, 0.0] * 3, tube_half_width=[0.01] * 6, reservation=reservation
+    )
     decision.plan[:] = [0.0] * 6
     request = pb.Request(
         robot="ground",
@@ -104,7 +106,7 @@ def test_the_live_page_is_told(say: Say) -> None:
 
 
 def test_a_picture_of_the_report_has_it() -> None:
-    gallery = Gallery(GROUND)
+    gallery = EpisodeSampler(GROUND)
     for actor, x in (("a", 0.0), ("b", 2.0)):
         source = gallery.source(actor)
         source.about.append(episode(actor))

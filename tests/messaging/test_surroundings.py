@@ -78,12 +78,12 @@ def test_a_flat_view_of_what_flies_has_the_radius_last() -> None:
 
 
 def test_a_promise_is_the_new_one_or_what_is_left_of_the_old() -> None:
-    old, new = (pb.Promise(center=[x, 0.0], half_width=[0.1, 0.2], radius=[0.15]) for x in (1.0, 2.0))
-    asked = pb.Exchange(request=pb.Request(promise=old))
+    old, new = (pb.Reservation(center=[x, 0.0], half_width=[0.1, 0.2], radius=[0.15]) for x in (1.0, 2.0))
+    asked = pb.Exchange(request=pb.Request(reservation=old))
     assert promised(GROUND, asked).tolist() == [[1.0, 0.0, 0.1, 0.2, 0.15]]
-    asked.reply.decision.promise.CopyFrom(new)
+    asked.reply.decision.reservation.CopyFrom(new)
     assert promised(GROUND, asked)[0, 0] == 2.0
-    asked.reply.decision.promise.radius.append(1.0)
+    asked.reply.decision.reservation.radius.append(1.0)
     assert len(promised(GROUND, asked)) == 0, "that is none"
 
 

@@ -70,18 +70,18 @@ def fits(model: ModelSet, ask: Request, free):
     for step in model.steps:
         half = (np.abs(step.W @ z) @ step.M.T + np.abs(z) @ step.kappa.T + step.w)[:2]
         corners.append(step.C[:2] @ z + half * np.array([[1, 1], [1, -1], [-1, -1], [-1, 1]]))
-    bulge = np.abs(z) @ model.bulges.kappa.T + model.bulges.w
-    latch = (np.abs(z) @ model.latch.kappa.T + model.latch.w)[0]
+    chord_deviation = np.abs(z) @ model.chord_deviations.kappa.T + model.chord_deviations.w
+    stopping_distance = (np.abs(z) @ model.stopping_distance.kappa.T + model.stopping_distance.w)[0]
     noise = np.array(GROUND.measurement_bound[:2]) * np.array([[1, 1], [1, -1], [-1, -1], [-1, 1]])
     worst = np.inf
     for k in range(len(model.steps)):
         pairs = [(a, b) for a in corners[k] for b in corners[k + 1]]
         share = np.linspace(0, 1, 9)[:, None]
         chords = np.concatenate([a + share * (b - a) for a, b in pairs])
-        grown = (chords[:, None] + GROUND.footprint * circle + bulge[k] * circle).reshape(-1, 2)
+        grown = (chords[:, None] + GROUND.footprint * circle + chord_deviation[k] * circle).reshape(-1, 2)
         world = ask.state[:2] + rotate(grown, ask.state[2])
         world = (world[:, None] + noise).reshape(-1, 2)
         worst = min(worst, float(ask.obstacles.distance(world).min()))
-    stopped = corners[-1][:, None] + (GROUND.footprint + latch) * circle
+    stopped = corners[-1][:, None] + (GROUND.footprint + stopping_distance) * circle
     world = ask.state[:2] + rotate(stopped.reshape(-1, 2), ask.state[2])
     return min(worst, float(ask.obstacles.distance((world[:, None] + noise).reshape(-1, 2)).min()))

@@ -5,7 +5,7 @@ import pytest
 from brakeline.safety.filter.filter import Filter
 from brakeline.safety.model.dataset import Dataset
 from brakeline.safety.model.fitting import make
-from brakeline.safety.model.model_set import ModelSet, Recipe
+from brakeline.safety.model.model_set import ModelConfig, ModelSet
 from tests.safety.unicycle import record
 
 
@@ -25,9 +25,9 @@ class Made(dict[tuple[str, str], ModelSet]):
     def __init__(self, data: Dataset) -> None:
         self._data = data
 
-    def __missing__(self, recipe: tuple[str, str]) -> ModelSet:
-        self[recipe] = make(self._data, Recipe(*recipe))
-        return self[recipe]
+    def __missing__(self, model_config: tuple[str, str]) -> ModelSet:
+        self[model_config] = make(self._data, ModelConfig(*model_config))
+        return self[model_config]
 
 
 @pytest.fixture(scope="session")

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from brakeline.safety.filter.reachable_tube import Recursion, Tube, stack_recursive
-from brakeline.safety.model.error_bounds import Certificate
+from brakeline.safety.model.error_bounds import ErrorBound
 
 PUBLISHED = json.loads((Path(__file__).parents[1] / "truth" / "published.json").read_text())
 
@@ -39,7 +39,7 @@ class Linear:
                 y.append(measured)
         return np.array(z), np.array(y)
 
-    def tube(self, certificate: Certificate, horizon: int) -> Tube:
+    def tube(self, certificate: ErrorBound, horizon: int) -> Tube:
         """Of `z = [y_0; input in force; u_0 .. u_{N-1}]`; the input in force plays no part."""
         n, m = self.B.shape
         first = np.hstack([np.eye(n), np.zeros((n, m + horizon * m))])
@@ -68,13 +68,13 @@ class Linear:
         return np.stack(states, axis=1)
 
 
-def with_previous_input(c: Certificate, n: int, m: int) -> Certificate:
+def with_previous_input(c: ErrorBound, n: int, m: int) -> ErrorBound:
     """The certificate with columns of zeros for the input in force, after the n states."""
 
     def wider(a):
         return np.hstack([a[:, :n], np.zeros((len(a), m)), a[:, n:]])
 
-    return Certificate(wider(c.C), wider(c.W), c.M, wider(c.kappa), c.w, c.generators)
+    return ErrorBound(wider(c.C), wider(c.W), c.M, wider(c.kappa), c.w, c.generators)
 
 
 def lti5(v_half=0.0) -> Linear:

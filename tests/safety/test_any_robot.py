@@ -11,7 +11,7 @@ from brakeline.safety.filter.filter import Filter
 from brakeline.safety.filter.request import ADJUSTED, ALLOWED, FAILSAFE, Request
 from brakeline.safety.gym import SafetyWrapper
 from brakeline.safety.model.fitting import make
-from brakeline.safety.model.model_set import Recipe
+from brakeline.safety.model.model_set import ModelConfig
 from tests.safety.toys import Toy, car, discs, hostile, near, puck, seen
 
 LONG = (((0.15, 0.0), 0.12), ((-0.15, 0.0), 0.12))
@@ -39,7 +39,7 @@ def ready(name):
         periods, held = (9000, 6) if robot.feedback else (6000, 5)
         env = Toy(robot, steps=10_000)
         data = collect(env, robot, periods, held=held, state=seen, actions=normalised(robot), shown=False)
-        _made[name] = Filter(make(data, Recipe()))
+        _made[name] = Filter(make(data, ModelConfig()))
     return _made[name]
 
 

@@ -11,7 +11,7 @@ from brakeline.messaging.moving_obstacles import Movers
 from brakeline.messaging.obstacle import Obstacle
 from brakeline.messaging.obstacle_motion import Motion
 from brakeline.messaging.scan import Scan
-from brakeline.safety.filter.backup_plan import Commitment, Prediction
+from brakeline.safety.filter.backup_plan import BackupPlan, Prediction
 from brakeline.safety.filter.filter import Filter
 from brakeline.safety.filter.request import BadRequest, check_for_filter
 from brakeline.safety.service.asker import Answer, Asker, accept
@@ -23,15 +23,15 @@ from tests.safety.asked import cylinder, request
 
 LATE = GROUND.in_real_time()
 AHEAD = cylinder(0.34, 0.0)
-MEASURED = ("time_ms", "solve_ms", "verify_ms", "queue_ms", "vouchers")
+MEASURED = ("time_ms", "solve_ms", "verify_ms", "queue_ms", "plan_tokens")
 
 
 @pytest.fixture(scope="module")
 def late(data_folder):
     from brakeline.deploy.data.model_store import model_for
-    from brakeline.safety.model.model_set import Recipe
+    from brakeline.safety.model.model_set import ModelConfig
 
-    return model_for(LATE, Recipe())
+    return model_for(LATE, ModelConfig())
 
 
 class Wire:
@@ -40,13 +40,13 @@ class Wire:
     def __init__(self, model):
         models = Models(accept_bound=1.0)
         models.install(model)
-        self.ask, self.robot, self.commitment = answerer(models, Counts()), model.robot, Commitment(model.robot)
+        self.ask, self.robot, self.backup_plan = answerer(models, Counts()), model.robot, BackupPlan(model.robot)
 
     def decide(self, state, action, obstacles=None, **more):
-        asked = request_message(self.commitment, state, action, obstacles, **more)
+        asked = request_message(self.backup_plan, state, action, obstacles, **more)
         batch = pb.ReplyBatch.FromString(self.ask(pb.RequestBatch(requests=[asked]).SerializeToString()))
         answer = read(batch.replies[0], asked, self.robot)
-        accept(self.commitment, answer)
+        accept(self.backup_plan, answer)
         return answer
 
 
@@ -79,10 +79,10 @@ def test_the_action_of_a_late_robot_is_the_input_of_the_next_period(late, ask):
     far = [Obstacle("cylinder", (3.0, 0.0), (0.1,))]
     first = asker.decide(np.zeros(5), [0.25, 0.0], far)
     assert first.kind == "allowed" and not first.plan[0].any(), "zero is in force while the answer is on its way"
-    assert np.array_equal(first.action, [0.25, 0.0]) and np.array_equal(first.action, asker.commitment.due)
+    assert np.array_equal(first.action, [0.25, 0.0]) and np.array_equal(first.action, asker.backup_plan.next_input)
     second = asker.decide(np.zeros(5), [0.1, 0.2], far)
     assert np.array_equal(second.plan[0], [0.25, 0.0]), "what was answered before is in force now"
-    assert np.array_equal(second.action, asker.commitment.due)
+    assert np.array_equal(second.action, asker.backup_plan.next_input)
 
 
 FAN = np.linspace(-np.pi, np.pi, 360, endpoint=False)
@@ -93,7 +93,7 @@ class Unsent(SafetyClient):
     """A client of a bus that nobody is on: what it refuses it refuses before it asks."""
 
     def __init__(self, model):
-        self.robot, self.commitment, self.deadline = model.robot, Commitment(model.robot), 0.1
+        self.robot, self.backup_plan, self.deadline = model.robot, BackupPlan(model.robot), 0.1
 
 
 @pytest.fixture(params=[lambda model: InProcess(Filter(model), accept_bound=1.0), Unsent], ids=["in process", "client"])
@@ -158,9 +158,9 @@ def test_where_nothing_is_known_nothing_is_decided(model):
             asked.decide(np.zeros(5), [0.25, 0.0], *nothing)
         assert refused.value.field == "obstacles"
     for asker in (alone, asked):
-        asker.commitment.reset()
+        asker.backup_plan.reset()
         assert asker.decide(np.zeros(5), [0.25, 0.0], known_free=True).kind == "allowed"
-        asker.commitment.reset()
+        asker.backup_plan.reset()
         assert asker.decide(np.zeros(5), [0.25, 0.0], scan=WALL, known_free=True).kind == "failsafe", "the scan counts"
 
 
@@ -179,7 +179,7 @@ def test_the_quick_check_and_the_whole_one_both_ask_what_is_known(ready, predict
 
 def test_a_tube_that_is_none_of_this_robots_is_no_answer(model):
     asked = Wire(model)
-    question = request_message(asked.commitment, np.zeros(5), [0.1, 0.0], [AHEAD])
+    question = request_message(asked.backup_plan, np.zeros(5), [0.1, 0.0], [AHEAD])
     payload = pb.RequestBatch(requests=[question]).SerializeToString()
     for change in (lambda d: d.tube_center.pop(), lambda d: d.tube_half_width.__setitem__(0, float("inf"))):
         (reply,) = pb.ReplyBatch.FromString(asked.ask(payload)).replies

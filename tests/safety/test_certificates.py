@@ -9,8 +9,8 @@ from scipy.optimize import linprog
 
 from brakeline.safety.filter.reachable_tube import Recursion, stack_recursive
 from brakeline.safety.model.error_bounds import (
-    Certificate,
-    CertificateError,
+    ErrorBound,
+    ErrorBoundError,
     envelope,
     least_squares,
     matrix_zonotope,
@@ -57,7 +57,7 @@ def test_published_reachable_set_of_the_five_dimensional_system():
     truth = PUBLISHED["cora_linear_dt_5d"]
     n, k = 5, truth["k"]
     A, half = np.array(truth["A"]), np.array(truth["e_half"])
-    step = Certificate(A, np.zeros((0, n)), np.zeros((n, 0)), np.zeros((n, n)), half, np.eye(n))
+    step = ErrorBound(A, np.zeros((0, n)), np.zeros((n, 0)), np.zeros((n, n)), half, np.eye(n))
     how = Recursion(tuple(range(n)), 0, 0, np.zeros((0, 0)), np.eye(n))
     tube = stack_recursive([step] * k, how, n, initial=truth["x0_half"] * np.eye(n))
     start = np.array(truth["x0_center"], float)
@@ -104,7 +104,7 @@ def test_a_tube_of_half_the_noise_is_left():
     """The check above can fail."""
     system = lti5()
     made = certificates(system)["set-membership"]
-    narrow = Certificate(made.C, made.W, 0.0 * made.M, made.kappa, 0.5 * made.w, made.generators)
+    narrow = ErrorBound(made.C, made.W, 0.0 * made.M, made.kappa, 0.5 * made.w, made.generators)
     rng = np.random.default_rng(7)
     plan = np.full((HORIZON, 1), 8.0)
     states = system.rollouts(rng, np.zeros(5), plan, 1000, worst=True)
@@ -125,7 +125,7 @@ def test_the_true_matrices_are_in_both_sets():
 def test_too_much_measurement_noise_is_refused():
     system = lti5(v_half=0.5)
     z, y = system.data(0, trajectories=5)
-    with pytest.raises(CertificateError, match="β"):
+    with pytest.raises(ErrorBoundError, match="β"):
         measured_noise(z, y, np.full(5, 0.005), np.full(5, 0.5))
 
 
@@ -191,14 +191,14 @@ def test_set_membership_shrinks_with_data_and_the_matrix_zonotope_does_not():
 def test_too_small_a_noise_bound_is_refused():
     z, y = lti5().data(0)
     sizes = np.full((5, len(z)), 0.001)
-    with pytest.raises(CertificateError, match="too small"):
+    with pytest.raises(ErrorBoundError, match="too small"):
         set_membership(z, y, sizes, np.zeros((5, 6)), np.full(5, 0.001))
 
 
 def test_samples_that_leave_a_direction_open_are_refused():
     z = np.zeros((300, 2))
     z[:, 0] = np.linspace(-1, 1, 300)
-    with pytest.raises(CertificateError, match="span"):
+    with pytest.raises(ErrorBoundError, match="span"):
         set_membership(z, z[:, :1], np.ones((1, 300)), np.zeros((1, 2)), np.ones(1))
 
 
@@ -207,7 +207,7 @@ def test_samples_that_leave_a_direction_open_are_refused():
 def test_the_outer_form_is_never_narrower(seed, rows):
     rng = np.random.default_rng(seed)
     nz, g = 4, 3
-    made = Certificate(
+    made = ErrorBound(
         rng.normal(size=(2, nz)),
         rng.normal(size=(rows, nz)),
         rng.uniform(size=(g, rows)),
@@ -249,7 +249,7 @@ def test_the_envelope_bounds_whatever_the_scale(seed, scale):
 def test_envelopes_of_nothing():
     kappa, w = envelope(np.ones((50, 2)), np.zeros(50), 1.0)
     assert kappa @ np.ones(2) + w < 1e-6
-    with pytest.raises(CertificateError, match="no sample"):
+    with pytest.raises(ErrorBoundError, match="no sample"):
         envelope(np.ones((0, 2)), np.zeros(0), 1.0)
 
 
@@ -308,7 +308,7 @@ def test_trap_pairs_across_trajectories_are_no_data():
     shifted = np.vstack([z[1:, :5], z[:1, :5]])  # what a program takes for y that forgets the boundaries
     assert np.allclose(shifted[:10], y[:10])
     sizes = np.full((5, len(z)), 0.005)
-    with pytest.raises(CertificateError, match="no matrix"):
+    with pytest.raises(ErrorBoundError, match="no matrix"):
         set_membership(z, shifted, sizes, np.zeros((5, 6)), np.full(5, 0.005))
 
 

@@ -7,7 +7,7 @@ import pytest
 
 from brakeline.messaging.obstacle import Obstacle, Shapes, rotate
 from brakeline.messaging.robot import Disc
-from brakeline.safety.filter.backup_plan import Commitment
+from brakeline.safety.filter.backup_plan import BackupPlan
 from brakeline.safety.filter.filter import Filter
 from brakeline.safety.filter.request import ADJUSTED, ALLOWED, FAILSAFE, Request
 from tests.robots import GROUND
@@ -49,7 +49,7 @@ def drive(ready, obstacles, policy, steps, seed, start=(0, 0, 0)):
     """Kinds, smallest clearance of the disc at any sub-step, violations, longest wait for a wanted turn."""
     rng = np.random.default_rng(seed)
     robot = Unicycle(start, rng)
-    kept, shapes = Commitment(GROUND), Shapes.of(obstacles, 2)
+    kept, shapes = BackupPlan(GROUND), Shapes.of(obstacles, 2)
     counts, least, violations, waiting, longest = dict.fromkeys((ALLOWED, ADJUSTED, FAILSAFE), 0), np.inf, 0, 0, 0
     for k in range(steps):
         state, action = robot.measure(), np.array(policy(k, rng, robot))
@@ -105,7 +105,7 @@ def test_the_recursion_hits_nothing_either(models):
 
 def test_a_robot_that_slips_more_than_recorded_is_noticed(ready):
     rng = np.random.default_rng(14)
-    robot, kept, violations = Unicycle((0, 0, 0), rng, slip=0.3), Commitment(GROUND), 0
+    robot, kept, violations = Unicycle((0, 0, 0), rng, slip=0.3), BackupPlan(GROUND), 0
     for _ in range(100):
         decision = ready.decide(
             Request(
@@ -139,11 +139,13 @@ def without_measurement_error(model):
 
 
 def without_bulge(model):
-    return Filter(replace(model, bulges=replace(model.bulges, w=model.bulges.w - EXTRA)))
+    return Filter(replace(model, chord_deviations=replace(model.chord_deviations, w=model.chord_deviations.w - EXTRA)))
 
 
 def without_latch(model):
-    return Filter(replace(model, latch=replace(model.latch, w=model.latch.w - EXTRA)))
+    return Filter(
+        replace(model, stopping_distance=replace(model.stopping_distance, w=model.stopping_distance.w - EXTRA))
+    )
 
 
 EXTRA = 0.02  # m; this robot hardly bulges and stops at once: let it be worse
@@ -153,9 +155,16 @@ EXTRA = 0.02  # m; this robot hardly bulges and stops at once: let it be worse
     "mutant", [without_footprint, with_half_the_width, without_measurement_error, without_bulge, without_latch]
 )
 def test_what_is_left_out_is_noticed(model, mutant):
-    bulges, latch = replace(model.bulges, w=model.bulges.w + EXTRA), replace(model.latch, w=model.latch.w + EXTRA)
+    chord_deviations, stopping_distance = (
+        replace(model.chord_deviations, w=model.chord_deviations.w + EXTRA),
+        replace(model.stopping_distance, w=model.stopping_distance.w + EXTRA),
+    )
     if mutant in (without_bulge, without_latch):
-        model = replace(model, bulges=bulges) if mutant is without_bulge else replace(model, latch=latch)
+        model = (
+            replace(model, chord_deviations=chord_deviations)
+            if mutant is without_bulge
+            else replace(model, stopping_distance=stopping_distance)
+        )
     ready, honest = mutant(model), Filter(model)
     noticed = 0
     for x in np.linspace(0.11, 0.2, 150):  # a wall ahead: from right before it to well off

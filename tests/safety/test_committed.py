@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from brakeline.safety.filter.backup_plan import UNVERIFIED, Commitment, Prediction
+from brakeline.safety.filter.backup_plan import UNVERIFIED, BackupPlan, Prediction
 from brakeline.safety.filter.filter import _Attempt
 from brakeline.safety.filter.request import ALLOWED, FAILSAFE
 from tests.robots import GROUND
@@ -87,7 +87,7 @@ def test_standing_still_needs_nobodys_word(ready):
 
 
 def test_what_was_not_verified_stays_so_until_the_robot_stands():
-    kept = Commitment(GROUND)
+    kept = BackupPlan(GROUND)
     assert kept.model == ""
     kept.accept(np.array([[0.2, 0.1], [0, 0], [0, 0]]), "v1", None, True)
     assert kept.model == "v1"
@@ -121,12 +121,12 @@ def test_a_prediction_that_did_not_hold_is_not_forgotten_because_nobody_answered
     driven = Prediction(np.array([0.05, 0.0, 0.0, 0.25, 0.0]), np.full(5, 0.01), 0.0)
     tail = np.array(((0.2, 0.0), (0, 0), (0, 0)), float)
     for x, model in ((0.05, ready.version), (0.2, UNVERIFIED)):
-        kept = Commitment(GROUND)
+        kept = BackupPlan(GROUND)
         kept.accept(np.vstack([[0.25, 0.0], tail[:-1]]), ready.version, driven, True, (b"word",) * 3)
         kept.measured(np.array([x, 0.0, 0.0, 0.25, 0.0]))
         kept.fallback()
-        assert kept.model == model and bool(kept.voucher) == (model == ready.version)
-    kept = Commitment(GROUND)
+        assert kept.model == model and bool(kept.plan_token) == (model == ready.version)
+    kept = BackupPlan(GROUND)
     kept.accept(np.vstack([[0.25, 0.0], tail[:-1]]), ready.version, driven, True)
     kept.fallback()  # nothing was measured where the prediction speaks of it
     assert kept.model == ready.version
@@ -134,7 +134,7 @@ def test_a_prediction_that_did_not_hold_is_not_forgotten_because_nobody_answered
 
 @pytest.mark.parametrize("bad", [np.full(5, np.nan), np.zeros(4), np.array([0.0, 0.0, np.inf, 0.0, 0.0])])
 def test_what_is_no_state_is_not_kept(bad):
-    kept = Commitment(GROUND)
+    kept = BackupPlan(GROUND)
     kept.measured(np.arange(5.0))
     kept.measured(bad)
     assert np.array_equal(kept.seen, np.arange(5.0))

@@ -173,15 +173,15 @@ def test_bulge_and_latch_against_brute_force(small):
         path = np.vstack([np.zeros(2), t.paths[start + 2]])
         along = path[0] + np.linspace(0, 1, 4001)[:, None] * (path[-1] - path[0])
         brute = np.linalg.norm(path[:, None] - along[None], axis=2).min(1).max()
-        assert found.bulge[row] == pytest.approx(brute, abs=1e-5)
+        assert found.chord_deviation[row] == pytest.approx(brute, abs=1e-5)
         at, position, heading, farthest = start + 3, np.zeros(2), 0.0, np.nan
         while at < len(t.inputs) and not t.inputs[at].any():
             points = position + rotate(t.paths[at], heading)
             farthest = np.nanmax([farthest, np.linalg.norm(points, axis=1).max()])
             position, heading, at = points[-1], heading + t.turned[at], at + 1
-        assert found.latch[row] == pytest.approx(farthest, abs=1e-12, nan_ok=True)
-    assert np.isnan(found.latch).any()
-    assert not np.isnan(found.latch).all()
+        assert found.stopping_distance[row] == pytest.approx(farthest, abs=1e-12, nan_ok=True)
+    assert np.isnan(found.stopping_distance).any()
+    assert not np.isnan(found.stopping_distance).all()
 
 
 STATE = arrays(float, 5, elements=st.floats(-3, 3))

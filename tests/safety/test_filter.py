@@ -11,8 +11,8 @@ from brakeline.safety.filter.backup_plan import Prediction, correction_penalty
 from brakeline.safety.filter.filter import Filter
 from brakeline.safety.filter.qp_solver import INFEASIBLE
 from brakeline.safety.filter.request import ADJUSTED, ALLOWED, FAILSAFE, MOST_OBSERVED, NOT_FINITE, BadRequest
-from brakeline.safety.model.error_bounds import KINDS, Certificate
-from brakeline.safety.model.model_set import ModelSet, Recipe
+from brakeline.safety.model.error_bounds import KINDS, ErrorBound
+from brakeline.safety.model.model_set import ModelConfig, ModelSet
 from brakeline.safety.service.wire import message_of
 from tests.robots import GROUND, QUADROTOR
 from tests.safety.asked import cylinder, fits, random_request, request, same
@@ -69,7 +69,7 @@ def test_a_slew_limit_is_kept():
 
     def certificate(C, w):
         n, nz = C.shape
-        return Certificate(C, np.zeros((0, nz)), np.zeros((n, 0)), np.zeros((n, nz)), np.full(n, w), np.eye(n))
+        return ErrorBound(C, np.zeros((0, nz)), np.zeros((n, 0)), np.zeros((n, nz)), np.full(n, w), np.eye(n))
 
     steps = []
     for _ in range(3):
@@ -78,7 +78,7 @@ def test_a_slew_limit_is_kept():
         steps.append(certificate(C, 0.002))
     domain = np.array([[-0.1, -0.6, 0.0, -0.5], [0.3, 0.6, 0.25, 0.5]])
     nothing = certificate(np.zeros((3, 6)), 0.001), certificate(np.zeros((1, 6)), 0.001)
-    ready = Filter(ModelSet(robot, Recipe(), tuple(steps), *nothing, domain, np.eye(6), {}))
+    ready = Filter(ModelSet(robot, ModelConfig(), tuple(steps), *nothing, domain, np.eye(6), {}))
     found = ready.decide(request((0, 0, 0, 0.2, 0), (0.0, 0.5), [cylinder(2, 0)]))
     assert found.kind == ALLOWED
     assert np.allclose(found.plan[0], [0.15, 0.1])

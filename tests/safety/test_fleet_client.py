@@ -51,12 +51,12 @@ def test_who_drives_at_each_other_does_not_meet(fleet):
         for robot, answer in zip(robots, answers, strict=True):
             robot.step(answer.action)
         moved = max(moved, robots[0].state[0] + 0.25)
-        one, other = (kept.promise for kept in fleet.commitments)
+        one, other = (kept.reservation for kept in fleet.backup_plans)
         assert one.apart(other) > 0.0
         assert apart(robots) > 2.0 * GROUND.footprint
     assert moved > 0.02, "they stood all the time"
     fleet.reset()
-    assert all(kept.promise is None and not kept.plan.any() for kept in fleet.commitments)
+    assert all(kept.reservation is None and not kept.plan.any() for kept in fleet.backup_plans)
 
 
 def test_an_answer_that_misses_one_counts_for_none(fleet):
@@ -64,12 +64,12 @@ def test_an_answer_that_misses_one_counts_for_none(fleet):
     answers = decided(fleet, robots, [[0.1, 0.0], [0.1, 0.0]])
     for robot, answer in zip(robots, answers, strict=True):
         robot.step(answer.action)
-    before = [(kept.plan.copy(), kept.input_in_force, kept.promise) for kept in fleet.commitments]
+    before = [(kept.plan.copy(), kept.input_in_force, kept.reservation) for kept in fleet.backup_plans]
     with pytest.raises(SafetyError) as caught:
         decided(fleet, robots, [[0.2, 0.3], [0.0]])
     assert caught.value.field == "action"
-    for kept, (plan, held, promise) in zip(fleet.commitments, before, strict=True):
-        assert np.array_equal(kept.plan, plan) and kept.input_in_force is held and kept.promise is promise
+    for kept, (plan, held, reservation) in zip(fleet.backup_plans, before, strict=True):
+        assert np.array_equal(kept.plan, plan) and kept.input_in_force is held and kept.reservation is reservation
     inputs = fleet.fallback()
     assert all(np.array_equal(given, plan[0]) for given, (plan, *_) in zip(inputs, before, strict=True))
     for robot, given in zip(robots, inputs, strict=True):

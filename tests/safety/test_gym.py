@@ -11,14 +11,14 @@ from brakeline.messaging.obstacle import Obstacle
 from brakeline.messaging.scan import OLDEST, Scan
 from brakeline.safety.action_mapping import Actions, Mismatch, actions_of, normalised
 from brakeline.safety.environment_views import STATE
-from brakeline.safety.filter.backup_plan import Commitment
+from brakeline.safety.filter.backup_plan import BackupPlan
 from brakeline.safety.filter.filter import Filter
 from brakeline.safety.filter.request import BadRequest
 from brakeline.safety.gym import UNANSWERED, SafetyWrapper
 from brakeline.safety.gym_vector import VectorSafetyWrapper, each
 from brakeline.safety.model.dataset import BadData
 from brakeline.safety.model.fitting import make
-from brakeline.safety.model.model_set import ModelSet, Recipe
+from brakeline.safety.model.model_set import ModelConfig, ModelSet
 from brakeline.safety.service.client import SafetyClient
 from brakeline.safety.service.in_process import InProcess
 from tests.safety.toys import Toy, car, discs, near, puck, seen
@@ -34,7 +34,7 @@ def data():
 
 @pytest.fixture(scope="module")
 def model(data):
-    return make(data, Recipe())
+    return make(data, ModelConfig())
 
 
 @pytest.fixture(scope="module")
@@ -105,17 +105,17 @@ def test_without_an_environment_it_decides_the_same(ready):
     for _ in range(30):
         alone.decide(observation, [0.6, 0.0], discs())
         observation, _, _, _, info = env.step(np.array([1.0, 0.0]))
-        assert np.array_equal(alone.commitment.due, info["diagnostics"]["executed"])
-    assert np.array_equal(alone.fallback(), alone.commitment.input_in_force)
+        assert np.array_equal(alone.backup_plan.next_input, info["diagnostics"]["executed"])
+    assert np.array_equal(alone.fallback(), alone.backup_plan.input_in_force)
     alone.reset()
-    assert not alone.commitment.input_in_force.any()
+    assert not alone.backup_plan.input_in_force.any()
 
 
 class Silent(SafetyClient):
     """A client whose service is away."""
 
     def __init__(self):
-        self.robot, self.commitment = CAR, Commitment(CAR)
+        self.robot, self.backup_plan = CAR, BackupPlan(CAR)
 
     def decide(self, *asked, **more):
         from brakeline.messaging.bus import NoReply
@@ -139,7 +139,7 @@ def test_a_vector_decides_as_its_environments_do_alone(ready, mode):
     views = {"state": seen, "obstacles": each(near), "actions": normalised(CAR)}
     many = VectorSafetyWrapper(vector, ready, 0.5, accept_bound=1.0, **views)
     observations, _ = many.reset(seed=[0, 1, 2])
-    alone = [Commitment(CAR) for _ in range(count)]
+    alone = [BackupPlan(CAR) for _ in range(count)]
     fresh = np.zeros(count, dtype=bool)  # environments that the next step resets
     for _ in range(30):
         actions = policy.uniform(-1.0, 1.0, (count, 2)).astype(np.float32)
@@ -147,7 +147,7 @@ def test_a_vector_decides_as_its_environments_do_alone(ready, mode):
         wanted = []
         for i in np.flatnonzero(~resets):
             one = InProcess(ready, accept_bound=1.0)
-            one.commitment = alone[i]
+            one.backup_plan = alone[i]
             wanted.append((i, one.decide(observations[i], normalised(CAR).action_to_control(actions[i]), discs())))
         observations, rewards, terminated, truncated, infos = many.step(actions)
         for i, decision in wanted:
@@ -283,7 +283,7 @@ def test_a_stop_by_feedback_follows_the_measured_state():
 @given(st.floats(0.0, 0.05), st.floats(-1.0, 1.0))
 def test_a_puck_keeps_still_only_by_its_feedback(residual, push):
     state = np.array([0.0, 0.0, residual, 0.0])
-    kept = Commitment(PUCK)
+    kept = BackupPlan(PUCK)
     kept.seen = state
     plan = np.zeros((PUCK.horizon, 2))
     plan[0] = PUCK.braked(plan[0], state, plan[0])
@@ -291,7 +291,7 @@ def test_a_puck_keeps_still_only_by_its_feedback(residual, push):
     moving[0, 1] = push
     kept.accept(plan, "v", None, True)
     assert (kept.model == "") == (residual <= PUCK.stopped)
-    other = Commitment(PUCK)
+    other = BackupPlan(PUCK)
     other.seen = state
     other.accept(moving, "v", None, True)
     assert other.model == ("" if residual <= PUCK.stopped and abs(push) <= 2e-6 else "v"), "a push is no standing"

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from brakeline.safety.filter.kernels.halfspace_kernels import filled_by_plans, that_matter
+from brakeline.safety.filter.kernels.halfspace_kernels import filled_by_plans, presolve_rows
 from brakeline.safety.filter.qp import Layout
 from brakeline.safety.filter.reachable_tube import Tube
 
@@ -85,7 +85,7 @@ def test_rows_that_are_left_out_do_not_matter(seed: int) -> None:
     bound[::2] = reached.max(axis=0)[::2] - rng.uniform(0.0, 0.2, rows // 2)  # a corner or so is just beyond
     atom, give = W @ center + offset, np.abs(W) @ radius
     within = np.stack([np.maximum(np.abs(atom) - give, 0.0), np.abs(atom) + give])
-    count, A, b = that_matter(gradient, spread, bound, z_0, constant, M, center, radius, within, scale, 1e-6)
+    count, A, b = presolve_rows(gradient, spread, bound, z_0, constant, M, center, radius, within, scale, 1e-6)
     left = bound - 1e-6 - reached
     if count < 0:
         assert (left.min(axis=1) < 1e-9).all(), "it can't be met, and no plan meets it"
@@ -115,8 +115,8 @@ def test_no_plan_leaves_the_boxes_about_all_of_them(d: int, seed: int) -> None:
         sizes, centers = tube.magnitudes(plan), np.vstack([np.zeros(d), tube.centers(plan)])
         signs = rng.choice([-1.0, 1.0], (20, tube.generators))
         reached = np.einsum("kdl,sl->skd", tube.directions, signs * sizes[: tube.generators])
-        bulge = float(sizes[tube.generators :].max())
+        chord_deviation = float(sizes[tube.generators :].max())
         for end in range(tube.horizon + 1):
             points = centers[end] + (reached[:, end - 1] if end else np.zeros((1, d)))
-            points = start + (points + (bulge + beside) * rng.uniform(-1.0, 1.0, points.shape)) @ turn.T
+            points = start + (points + (chord_deviation + beside) * rng.uniform(-1.0, 1.0, points.shape)) @ turn.T
             assert (points >= low[end] - 1e-9).all() and (points <= high[end] + 1e-9).all()

@@ -8,12 +8,12 @@ import pytest
 from brakeline.messaging.obstacle import Shapes, rotate
 from brakeline.messaging.robot import Disc
 from brakeline.messaging.robot_description import robot_of
-from brakeline.safety.filter.backup_plan import Commitment
+from brakeline.safety.filter.backup_plan import BackupPlan
 from brakeline.safety.filter.filter import Filter
 from brakeline.safety.filter.request import ADJUSTED, ALLOWED, FAILSAFE, Request
 from brakeline.safety.model.dataset import Dataset, Trajectory
 from brakeline.safety.model.fitting import make
-from brakeline.safety.model.model_set import ModelSet, Recipe
+from brakeline.safety.model.model_set import ModelConfig, ModelSet
 from brakeline.safety.model.turning_in_place import standing_limits
 from brakeline.safety.model.validation import state, upper_bound
 from brakeline.safety.model.windows import FREE, PLAN
@@ -85,13 +85,13 @@ def driving():
 
 @pytest.fixture(scope="module")
 def turner(driving):
-    return make(driving, Recipe(windows=FREE))
+    return make(driving, ModelConfig(windows=FREE))
 
 
 @pytest.fixture(scope="module")
 def long_turner(driving):
     """The same robot with a body that is not round."""
-    return make(replace(driving, robot=replace(ROBOT, name="long-turner", body=LONG)), Recipe(windows=FREE))
+    return make(replace(driving, robot=replace(ROBOT, name="long-turner", body=LONG)), ModelConfig(windows=FREE))
 
 
 def pillars(gap, count, radius=0.1, body=0.15):
@@ -105,7 +105,7 @@ def turn(ready, obstacles, rate, noise=0.0, steps=80, seed=1, sides=(-1.0, 1.0))
     the body to an obstacle [m])."""
     rng = np.random.default_rng(seed)
     robot = ready.robot
-    vehicle, kept, shapes = Unicycle((0.0, 0.0, 0.0), rng), Commitment(robot), Shapes.of(obstacles, 2)
+    vehicle, kept, shapes = Unicycle((0.0, 0.0, 0.0), rng), BackupPlan(robot), Shapes.of(obstacles, 2)
     decisions, angle, least, side = [], 0.0, np.inf, 0.0
     for k in range(steps):
         side = rng.choice(sides) if k % 5 == 0 else side
@@ -166,7 +166,7 @@ def test_fresh_turns_stay_in_the_tubes_that_were_verified_for_them(turner):
     ready, rng, outside, plans = Filter(turner), np.random.default_rng(5), 0, 400
     shapes = Shapes.of(pillars(0.04, 4), 2)
     for _ in range(plans):
-        vehicle, kept = Unicycle((0.0, 0.0, rng.uniform(-3, 3)), rng), Commitment(ROBOT)
+        vehicle, kept = Unicycle((0.0, 0.0, rng.uniform(-3, 3)), rng), BackupPlan(ROBOT)
         for _ in range(int(rng.integers(4))):  # in force before
             vehicle.step(before := np.array([0.0, rng.uniform(-FAST, FAST)]))
             kept.input_in_force = before
@@ -209,7 +209,7 @@ def test_they_are_used_for_plans_in_place_of_a_standing_robot_and_no_others(turn
 
 def test_a_robot_without_such_plans_or_such_data_has_none():
     assert standing_limits(QUADROTOR) is None
-    assert make(record(2, turns=False), Recipe(windows=FREE)).in_place is None
+    assert make(record(2, turns=False), ModelConfig(windows=FREE)).in_place is None
 
 
 def test_a_file_without_them_is_read_and_decides_by_one_tube(turner):
@@ -235,7 +235,7 @@ def wild(k, rng):
 def test_a_robot_from_free_driving_hits_nothing_and_does_not_get_stuck(turner, policy):
     """It keeps a tenth of the clearance that one bound for all plans asks for."""
     ready, rng, shapes = Filter(turner), np.random.default_rng(2), Shapes.of(ROOM, 2)
-    vehicle, kept, least, waiting, longest, way = Unicycle((0, 0, 0), rng), Commitment(ROBOT), np.inf, 0, 0, 0.0
+    vehicle, kept, least, waiting, longest, way = Unicycle((0, 0, 0), rng), BackupPlan(ROBOT), np.inf, 0, 0, 0.0
     failsafe = 0
     for k in range(700):
         action = np.array(policy(k, rng))
@@ -253,7 +253,7 @@ def test_a_robot_from_free_driving_hits_nothing_and_does_not_get_stuck(turner, p
 
 @pytest.mark.parametrize("certificate", ["set-membership", "matrix-zonotope"])
 def test_the_other_certificates_have_them_too(driving, certificate):
-    model = make(driving, Recipe(certificate, windows=FREE))
+    model = make(driving, ModelConfig(certificate, windows=FREE))
     decisions, angle, _ = turn(Filter(model), pillars(0.05, 4), 0.5, steps=20)
     assert {decision.kind for decision in decisions} == {ALLOWED} and angle > 1.4
 
@@ -261,7 +261,7 @@ def test_the_other_certificates_have_them_too(driving, certificate):
 def test_recorded_plans_have_them_too():
     """The ground robot's plans, whose windows have fewer regressors than all inputs."""
     data = record_ground(trajectories=40, periods=300)
-    model = make(data, Recipe())
-    assert model.recipe.windows == PLAN and model.in_place is not None
+    model = make(data, ModelConfig())
+    assert model.model_config.windows == PLAN and model.in_place is not None
     found = state(model, data, record_ground(trajectories=40, periods=300, seed=3))
     assert found.in_place_windows > 100 and found.in_place_violations <= 0.02 * found.in_place_windows

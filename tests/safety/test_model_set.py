@@ -7,9 +7,9 @@ import pytest
 
 from brakeline.safety.filter.filter import Filter
 from brakeline.safety.model.dataset import BadData
-from brakeline.safety.model.error_bounds import KINDS, CertificateError, least_squares
+from brakeline.safety.model.error_bounds import KINDS, ErrorBoundError, least_squares
 from brakeline.safety.model.fitting import make
-from brakeline.safety.model.model_set import ENTRY, MODES, BadModel, ModelSet, Recipe
+from brakeline.safety.model.model_set import ENTRY, MODES, BadModel, ModelConfig, ModelSet
 from brakeline.safety.model.tensor_file import pack, unpack
 from brakeline.safety.model.windows import stands_from, windows
 from tests.robots import GROUND
@@ -23,7 +23,7 @@ def test_what_is_encoded_is_decoded(models, which, tmp_path):
     model = models[which]
     again = ModelSet.decode(model.encode())
     assert again.version == model.version
-    assert again.recipe == model.recipe
+    assert again.model_config == model.model_config
     assert again.about == model.about
     model.save(tmp_path / "deep" / "model.safetensors")
     assert ModelSet.load(tmp_path / "deep" / "model.safetensors").version == model.version
@@ -37,11 +37,11 @@ def test_what_is_encoded_is_decoded(models, which, tmp_path):
 
 def test_the_version_is_the_content(models, model, data):
     assert len({models[which].version for which in ALL}) == len(ALL)
-    assert make(data, Recipe()).version == model.version
-    wider = replace(model, latch=replace(model.latch, w=model.latch.w + 1e-6))
+    assert make(data, ModelConfig()).version == model.version
+    wider = replace(model, stopping_distance=replace(model.stopping_distance, w=model.stopping_distance.w + 1e-6))
     assert wider.version != model.version
     assert replace(model, about={"note": "another"}).version == model.version
-    assert replace(model, recipe=replace(model.recipe, mode="recursion")).version != model.version
+    assert replace(model, model_config=replace(model.model_config, mode="recursion")).version != model.version
 
 
 def test_from_when_on_a_robot_stands_is_what_was_recorded(model, data):
@@ -91,11 +91,11 @@ def test_tampered_model_sets_are_refused(model):
         ({"step0__w": first.w * 0.5}, "version"),
         ({"step0__C": first.C + 1e-12}, "version"),
         ({"step0__w": np.full_like(first.w, np.nan)}, "NaN"),
-        ({"latch__w": -model.latch.w}, "negative width"),
+        ({"latch__w": -model.stopping_distance.w}, "negative width"),
         ({"step1__kappa": -model.steps[1].kappa}, "negative width"),
         ({"step0__w": first.w[:-1]}, "arrays"),
         ({"step2__C": first.C[:, :-1]}, "arrays"),
-        ({"bulges__C": model.latch.C}, "arrays"),
+        ({"bulges__C": model.stopping_distance.C}, "arrays"),
         ({"domain": model.domain[:1]}, "domain"),
         ({"domain": model.domain[::-1].copy()}, "domain"),
         ({"basis": np.zeros_like(model.basis)}, "basis"),
@@ -124,17 +124,17 @@ def test_tampered_model_sets_are_refused(model):
 def test_recipes_that_mean_nothing_are_refused():
     for bad in ({"certificate": "hope"}, {"mode": "magic"}, {"inflation": 0.9}, {"inflation": float("nan")}):
         with pytest.raises(ValueError, match=r"certificate|mode|envelope"):
-            Recipe(**bad)
+            ModelConfig(**bad)
 
 
 def test_data_that_support_no_model_are_refused(data):
     with pytest.raises(BadData, match="trajectory"):
-        make(replace(data, trajectories=data.trajectories[:1]), Recipe())
+        make(replace(data, trajectories=data.trajectories[:1]), ModelConfig())
     with pytest.raises(BadData, match="at least"):
-        make(record(trajectories=4, periods=60), Recipe())
+        make(record(trajectories=4, periods=60), ModelConfig())
     slow = tuple(replace(t, inputs=t.inputs * [1.0, 0.0]) for t in data.trajectories)
-    with pytest.raises((BadData, CertificateError)):
-        make(replace(data, trajectories=slow), Recipe())
+    with pytest.raises((BadData, ErrorBoundError)):
+        make(replace(data, trajectories=slow), ModelConfig())
 
 
 @pytest.mark.parametrize("which", ALL, ids="-".join)
@@ -144,10 +144,10 @@ def test_every_model_bounds_the_data_it_was_bounded_on(models, data, which):
     w = windows(bound, 1)
     z = model.first_regressor(w.z)
     assert (np.abs(w.y - z @ model.first.C.T) <= model.first.half_widths(z) + 1e-12).all()
-    assert (w.bulge <= model.bulges.half_widths(w.z)[:, 0]).all()
+    assert (w.chord_deviation <= model.chord_deviations.half_widths(w.z)[:, 0]).all()
     whole = windows(data, 3)
-    seen = ~np.isnan(whole.latch)
-    assert (whole.latch[seen] <= model.latch.half_widths(whole.z[seen])[:, 0]).all()
+    seen = ~np.isnan(whole.stopping_distance)
+    assert (whole.stopping_distance[seen] <= model.stopping_distance.half_widths(whole.z[seen])[:, 0]).all()
 
 
 def test_the_residual_certificate_is_the_narrowest_and_the_envelope_serves_all(models, data):

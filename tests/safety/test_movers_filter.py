@@ -8,7 +8,7 @@ import pytest
 from brakeline.messaging.moving_obstacles import Movers, parted
 from brakeline.messaging.obstacle import Obstacle, Shapes
 from brakeline.messaging.obstacle_motion import Motion, Sighting
-from brakeline.safety.filter.backup_plan import Commitment
+from brakeline.safety.filter.backup_plan import BackupPlan
 from brakeline.safety.filter.filter import Filter
 from brakeline.safety.filter.request import ADJUSTED, ALLOWED, FAILSAFE, BadRequest
 from brakeline.safety.service.client import obstacle_messages
@@ -130,7 +130,7 @@ def contacts(ready, policy, seed, sees=True, steps=300):
     """(touched while moving, touched while standing), judged by the discs at every substep."""
     crowd = Crowd(KIND, PLACES, Shapes.of(ROOM, 2), seed)
     rng = np.random.default_rng(seed)
-    robot, watch, kept = Unicycle((0.0, 0.0, 0.0), rng), Watch(crowd, rng), Commitment(GROUND)
+    robot, watch, kept = Unicycle((0.0, 0.0, 0.0), rng), Watch(crowd, rng), BackupPlan(GROUND)
     moving = standing = 0
     touching = False
     for k in range(steps):

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from brakeline.safety.filter.reservation import Promise, Promises, promised_half_spaces
+from brakeline.safety.filter.reservation import Promises, Reservation, promised_half_spaces
 
 FINITE = st.floats(-1.0, 1.0)
 N = 3
@@ -20,22 +20,22 @@ def drawn(rng, middle=0.0, size=0.05):
 def test_a_promise_contains_every_way_between_the_sets_that_it_was_made_of(seed):
     rng = np.random.default_rng(seed)
     centers, half, radius = drawn(rng)
-    promise = Promise.of(centers, half, radius)
+    reservation = Reservation.of(centers, half, radius)
     points = centers + half * rng.uniform(-1, 1, (N + 1, 2))
     for k in range(N):
         between = points[k] + rng.random((20, 1)) * (points[k + 1] - points[k])
-        assert (np.abs(between - promise.center[k]) <= promise.half_width[k] + 1e-12).all()
+        assert (np.abs(between - reservation.center[k]) <= reservation.half_width[k] + 1e-12).all()
 
 
 def test_time_takes_the_first_box_and_the_last_stays():
     rng = np.random.default_rng(0)
-    promise = Promise.of(*drawn(rng))
-    later = promise.later()
-    assert np.array_equal(later.center[:-1], promise.center[1:])
-    assert np.array_equal(later.center[-1], promise.center[-1])
+    reservation = Reservation.of(*drawn(rng))
+    later = reservation.later()
+    assert np.array_equal(later.center[:-1], reservation.center[1:])
+    assert np.array_equal(later.center[-1], reservation.center[-1])
     for _ in range(5):
         later = later.later()
-    assert (later.center == promise.center[-1]).all() and (later.half_width == promise.half_width[-1]).all()
+    assert (later.center == reservation.center[-1]).all() and (later.half_width == reservation.half_width[-1]).all()
 
 
 @settings(max_examples=200)
@@ -43,7 +43,7 @@ def test_time_takes_the_first_box_and_the_last_stays():
 def test_who_keeps_to_the_half_spaces_keeps_off_the_promise_in_every_period(seed):
     """Any two points within period k's half-space, and all between them, are off period k's box."""
     rng = np.random.default_rng(seed)
-    others = [Promise.of(*drawn(rng, middle=rng.uniform(-0.6, 0.6, 2))) for _ in range(3)]
+    others = [Reservation.of(*drawn(rng, middle=rng.uniform(-0.6, 0.6, 2))) for _ in range(3)]
     start, nominal = np.zeros(2), np.cumsum(rng.normal(scale=0.06, size=(N, 2)), axis=0)
     measured = 0.01 * rng.random(2)
     normals, offsets = promised_half_spaces(Promises.to(others), start, nominal, 0.105, measured)
@@ -58,7 +58,7 @@ def test_who_keeps_to_the_half_spaces_keeps_off_the_promise_in_every_period(seed
 def test_a_promise_that_passes_by_leaves_room_behind_it():
     """A box is there in its own period only: one that was hit by all of them would have nowhere to go."""
     centers = np.array([[0.35, 0.0], [0.35, 0.6], [0.35, 1.2], [0.35, 1.8]])
-    gone = Promise.of(centers, np.full((4, 2), 0.01), np.full(3, 0.1))
+    gone = Reservation.of(centers, np.full((4, 2), 0.01), np.full(3, 0.1))
     nominal = np.array([[0.05, 0.0], [0.1, 0.0], [0.15, 0.0]])
     normals, offsets = promised_half_spaces(Promises.to([gone]), np.zeros(2), nominal, 0.105, np.zeros(2))
     room = offsets[0] - np.einsum("kd,kd->k", normals[0], nominal)
@@ -66,14 +66,16 @@ def test_a_promise_that_passes_by_leaves_room_behind_it():
 
 
 def test_a_promise_that_is_touched_leaves_no_room():
-    here = Promise.of(np.zeros((4, 2)), np.full((4, 2), 0.05), np.full(3, 0.1))
+    here = Reservation.of(np.zeros((4, 2)), np.full((4, 2), 0.05), np.full(3, 0.1))
     _, offsets = promised_half_spaces(Promises.to([here]), np.zeros(2), np.zeros((3, 2)), 0.105, np.zeros(2))
     assert (offsets == -np.inf).all()
 
 
 @pytest.mark.parametrize("away", [0.2, 0.5, 2.0])
 def test_only_what_is_within_reach_counts(away):
-    other = Promise.of(np.full((4, 2), [away + 0.1, 0.0]), np.zeros((4, 2)), np.full(3, 0.1))
+    other = Reservation.of(np.full((4, 2), [away + 0.1, 0.0]), np.zeros((4, 2)), np.full(3, 0.1))
     assert (Promises.to([other]).nearest(np.zeros(2))[0] < 1.0) == (away < 1.0)
     assert Promises.to([]) is None
-    assert other.apart(Promise.of(np.zeros((4, 2)), np.zeros((4, 2)), np.full(3, 0.05))) == pytest.approx(away - 0.05)
+    assert other.apart(Reservation.of(np.zeros((4, 2)), np.zeros((4, 2)), np.full(3, 0.05))) == pytest.approx(
+        away - 0.05
+    )

@@ -12,12 +12,12 @@ from brakeline.messaging.robot import Disc
 from brakeline.messaging.robot_description import robot_of
 from brakeline.messaging.scan import Scan
 from brakeline.safety.action_mapping import normalised
-from brakeline.safety.filter.backup_plan import Commitment
+from brakeline.safety.filter.backup_plan import BackupPlan
 from brakeline.safety.filter.filter import Filter
 from brakeline.safety.filter.recovery import least_violating, lower, slow_inputs
 from brakeline.safety.filter.request import RECOVERING
 from brakeline.safety.model.fitting import make
-from brakeline.safety.model.model_set import Recipe
+from brakeline.safety.model.model_set import ModelConfig
 from brakeline.safety.service.in_process import InProcess
 from tests.robots import GROUND, QUADROTOR
 from tests.safety.asked import request
@@ -49,7 +49,7 @@ def test_who_was_put_too_close_gets_away_and_drives_on(ready, angle):
     near = 0.1 + BODY - 0.045
     obstacles = Shapes.of([Obstacle("cylinder", (near * math.cos(angle), near * math.sin(angle)), (0.1,))], 2)
     rng = np.random.default_rng(0)
-    robot, kept = Unicycle((0.0, 0.0, 0.0), rng), Commitment(GROUND)
+    robot, kept = Unicycle((0.0, 0.0, 0.0), rng), BackupPlan(GROUND)
     kinds, gaps = [], []
     for _ in range(120):
         state = robot.measure()
@@ -81,7 +81,7 @@ def test_who_was_put_too_close_gets_away_and_drives_on(ready, angle):
 def test_who_came_to_stand_inside_of_what_only_its_middle_must_not_be_in_is_led_out(ready, obstacle):
     """A hazard counts the body's middle, so the margin takes the body off; a policy that wants straight ahead."""
     obstacles = Shapes.of([obstacle], 2)
-    robot, kept = Unicycle((0.0, 0.0, 0.0), np.random.default_rng(0)), Commitment(GROUND)
+    robot, kept = Unicycle((0.0, 0.0, 0.0), np.random.default_rng(0)), BackupPlan(GROUND)
     kinds, depths = [], []
     for _ in range(300):
         ask = request(robot.measure(), (0.25, 0.0), obstacles, input_in_force=kept.input_in_force, plan=kept.plan)
@@ -130,7 +130,7 @@ def test_where_a_scan_shows_nothing_no_way_out_is_known(ready, beams, least):
 def test_by_a_scan_too_who_was_put_too_close_gets_away(ready, angle):
     """A pillar into which the body's disc reaches, which every scan shows."""
     pillar, radius = (0.1 + BODY - 0.045) * np.array([math.cos(angle), math.sin(angle)]), 0.1
-    robot, kept, kinds, gaps = Unicycle((0.0, 0.0, 0.0), np.random.default_rng(0)), Commitment(GROUND), [], []
+    robot, kept, kinds, gaps = Unicycle((0.0, 0.0, 0.0), np.random.default_rng(0)), BackupPlan(GROUND), [], []
     for _ in range(120):
         state = robot.measure()
         scan = Scan(ranges_to(pillar, radius, robot.state[:3]), TURN, tuple(state[:3]), position_error=0.02)
@@ -148,7 +148,7 @@ def test_by_a_scan_too_who_was_put_too_close_gets_away(ready, angle):
 def long_filter(data):
     """A body of five discs, half a metre long."""
     body = tuple(Disc((x, 0.0), 0.08) for x in (-0.25, -0.12, 0.0, 0.12, 0.25))
-    return Filter(make(replace(data, robot=replace(data.robot, body=body)), Recipe("residual", "direct")))
+    return Filter(make(replace(data, robot=replace(data.robot, body=body)), ModelConfig("residual", "direct")))
 
 
 @pytest.mark.parametrize("wall", [0.09, 0.1, 0.12])
@@ -164,7 +164,7 @@ def test_a_long_body_beside_a_wall_does_not_swing_its_rear_into_it(long_filter, 
         to = np.where(up > 1e-9, (wall - state[1]) / np.maximum(up, 1e-9), 3.5)
         scan = Scan(np.clip(to, 0.02, 3.5), TURN, tuple(state[:3]), range_error=0.02, **errors)
         safety.decide(state, [0.1, 0.0], [], scan=scan)
-        robot.step(safety.commitment.due)
+        robot.step(safety.backup_plan.next_input)
         nearest = robot.state[1] + 0.25 * abs(math.sin(robot.state[2])) + 0.08
         assert nearest < wall - 0.002
 
@@ -180,7 +180,7 @@ def test_away_is_from_the_nearest_of_map_and_scan(ready):
         scan = Scan(np.clip(to, 0.02, 3.5), TURN, tuple(state[:3]), range_error=0.02)
         post = Obstacle("cylinder", (-0.3, -0.1), (0.08,))
         kinds.append(safety.decide(state, [0.25, 0.0], [post], scan=scan).kind)
-        robot.step(safety.commitment.due)
+        robot.step(safety.backup_plan.next_input)
     assert kinds[0] == RECOVERING and kinds[-1] != RECOVERING
 
 
@@ -241,14 +241,14 @@ class Hoverer(Toy):
 def test_who_drifts_where_it_hovers_moves_away_before_it_touches():
     """A stop that was verified may end beside a wall; whoever does not stay there must not be taken to stand."""
     env = Hoverer(HOVERER, capsule=((0.0, 0.0), (0.0, 0.0), 0.3), steps=100_000)
-    filter = Filter(make(collect(env, HOVERER, 6000, held=6, state=seen, actions=normalised(HOVERER)), Recipe()))
+    filter = Filter(make(collect(env, HOVERER, 6000, held=6, state=seen, actions=normalised(HOVERER)), ModelConfig()))
     assert not filter.around.stays
     touched = {True: 0, False: 0}
     for episode in range(12):
         for stays in (False, True):  # True: as it was before
             filter.around.stays = stays
             env.reset(seed=episode)
-            env.obstacles, env.worst, kept = [Obstacle("cylinder", (1.42, 0.0), (1.0,))], np.inf, Commitment(HOVERER)
+            env.obstacles, env.worst, kept = [Obstacle("cylinder", (1.42, 0.0), (1.0,))], np.inf, BackupPlan(HOVERER)
             for _ in range(150):
                 shapes = Shapes.of(env.obstacles, 2)
                 ask = request(env.state, (1.0, 0.0), shapes, input_in_force=kept.input_in_force, plan=kept.plan)

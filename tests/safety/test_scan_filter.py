@@ -11,7 +11,7 @@ from brakeline.messaging.obstacle import Obstacle, Shapes
 from brakeline.messaging.range_image import RangeImage
 from brakeline.messaging.scan import Scan
 from brakeline.messaging.sensor_messages import scan_message, scan_of
-from brakeline.safety.filter.backup_plan import Commitment
+from brakeline.safety.filter.backup_plan import BackupPlan
 from brakeline.safety.filter.request import ALLOWED, FAILSAFE, BadRequest, check_for_filter
 from brakeline.safety.perception.visibility_memory import FanMemory
 from brakeline.safety.service.client import request_message
@@ -62,7 +62,7 @@ def test_who_stands_where_something_comes_near_stays_where_it_is(ready):
 @pytest.mark.parametrize("blind", [0.0, math.radians(30.0)])
 def test_a_hostile_driver_touches_nothing_and_is_not_held_for_good(ready, blind):
     rng = np.random.default_rng(1)
-    robot, kept, memory = Unicycle((0.0, 0.0, 0.5), rng), Commitment(GROUND), FanMemory(GROUND.footprint)
+    robot, kept, memory = Unicycle((0.0, 0.0, 0.5), rng), BackupPlan(GROUND), FanMemory(GROUND.footprint)
     shapes, closest, turned = Shapes.of(ROOM, 2), math.inf, 0.0
     for k in range(100):
         state = robot.measure()
@@ -96,17 +96,17 @@ def test_a_scan_crosses_the_wire():
     assert np.allclose(got.ranges, sent.ranges) and np.allclose(got.angles, sent.angles)
     names = [field.name for field in fields(Scan) if field.name not in ("ranges", "angles")]
     assert [getattr(got, name) for name in names] == [getattr(sent, name) for name in names]
-    message = request_message(Commitment(GROUND), np.zeros(5), np.zeros(2), scan=sent)
+    message = request_message(BackupPlan(GROUND), np.zeros(5), np.zeros(2), scan=sent)
     assert request_of(message, GROUND).scan is not None and message.ByteSize() < 3500
 
 
 def test_scans_that_are_none_are_refused(ready):
-    message = request_message(Commitment(GROUND), np.zeros(5), np.zeros(2), scan=Scan(np.ones(360), FAN, (0.0,) * 3))
+    message = request_message(BackupPlan(GROUND), np.zeros(5), np.zeros(2), scan=Scan(np.ones(360), FAN, (0.0,) * 3))
     message.scan.ranges[5] = -1.0
     with pytest.raises(BadRequest) as error:
         request_of(message, GROUND)
     assert error.value.field == "scan"
-    message = request_message(Commitment(QUADROTOR), np.zeros(9), np.zeros(3))
+    message = request_message(BackupPlan(QUADROTOR), np.zeros(9), np.zeros(3))
     message.scan.CopyFrom(scan_message(Scan(np.ones(360), FAN, (0.0,) * 3)))
     with pytest.raises(BadRequest) as error:
         check_for_filter(QUADROTOR, request_of(message, QUADROTOR))
@@ -115,11 +115,11 @@ def test_scans_that_are_none_are_refused(ready):
 
 def test_an_image_is_for_robots_in_space(ready):
     image = RangeImage(np.ones((45, 90)), (0.0, 0.0, 0.0))
-    message = request_message(Commitment(GROUND), np.zeros(5), np.zeros(2), scan=image)
+    message = request_message(BackupPlan(GROUND), np.zeros(5), np.zeros(2), scan=image)
     with pytest.raises(BadRequest) as error:
         check_for_filter(GROUND, request_of(message, GROUND))
     assert error.value.field == "image"
-    message = request_message(Commitment(QUADROTOR), np.zeros(9), np.zeros(3), scan=image)
+    message = request_message(BackupPlan(QUADROTOR), np.zeros(9), np.zeros(3), scan=image)
     check_for_filter(QUADROTOR, request_of(message, QUADROTOR))
     message.scan.CopyFrom(scan_message(Scan(np.ones(360), FAN, (0.0,) * 3)))
     with pytest.raises(BadRequest, match="not both"):
@@ -128,7 +128,7 @@ def test_an_image_is_for_robots_in_space(ready):
 
 def test_an_actors_batch_of_many_images_is_none_too_large():
     image = RangeImage(np.ones((90, 180)), (0.0, 0.0, 0.0))
-    message = request_message(Commitment(QUADROTOR), np.zeros(9), np.zeros(3), scan=image)
+    message = request_message(BackupPlan(QUADROTOR), np.zeros(9), np.zeros(3), scan=image)
     assert len(batch_of(pb.RequestBatch(requests=[message] * 24).SerializeToString()).requests) == 24
     with pytest.raises(BadRequest, match="a request batch has at most"):
         batch_of(pb.RequestBatch(requests=[message] * 48).SerializeToString())

@@ -9,7 +9,7 @@ from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.bus import NoReply, Refused
 from brakeline.messaging.obstacle import Obstacle
 from brakeline.messaging.topics import DECIDE
-from brakeline.safety.filter.backup_plan import UNVERIFIED, Commitment
+from brakeline.safety.filter.backup_plan import UNVERIFIED, BackupPlan
 from brakeline.safety.filter.request import NOT_FINITE, BadRequest
 from brakeline.safety.model.model_set import ModelSet
 from brakeline.safety.service.client import SafetyClient, SafetyError, ask, read, request_message
@@ -24,7 +24,7 @@ AHEAD = Obstacle("cylinder", (0.34, 0.0), (0.1,))
 
 
 def good(**more):
-    return request_message(Commitment(GROUND), np.zeros(5), [0.2, 0.1], [AHEAD], actor="actor-0", **more)
+    return request_message(BackupPlan(GROUND), np.zeros(5), [0.2, 0.1], [AHEAD], actor="actor-0", **more)
 
 
 class Service:
@@ -276,7 +276,7 @@ def test_a_recorded_reply_is_no_answer_at_another_place(service):
             return recorded[-1]
 
     assert read(ask(Recording(b""), [good()], 0.1)[0], good(), GROUND).verified
-    elsewhere = request_message(Commitment(GROUND), np.ones(5) * 0.1, [0.2, 0.1], [AHEAD])
+    elsewhere = request_message(BackupPlan(GROUND), np.ones(5) * 0.1, [0.2, 0.1], [AHEAD])
     for question in (good(), elsewhere):
         with pytest.raises(SafetyError) as caught:
             ask(FakeBus(recorded[0]), [question], 0.1)
@@ -286,7 +286,7 @@ def test_a_recorded_reply_is_no_answer_at_another_place(service):
 def test_a_plan_that_no_actuator_could_follow_is_not_believed():
     """Its first input must follow the one in force within the slew, every other the one before; and it is about this
     robot."""
-    flying = Commitment(QUADROTOR)
+    flying = BackupPlan(QUADROTOR)
     question = request_message(flying, np.zeros(QUADROTOR.state_dim), [1.0, 0.0, 0.0], known_free=True)
     zero = np.zeros(QUADROTOR.state_dim)
 
@@ -325,7 +325,7 @@ def test_a_client_over_the_bus(join, endpoint, service):  # noqa: F811
             done += 1
         assert np.hypot(*(robot.state[:2] - [0.34, 0.0])) > 0.1 + GROUND.footprint
         assert robot.state[0] > 0.02
-        assert client.commitment.model in ("", answer.model)
+        assert client.backup_plan.model in ("", answer.model)
         refused = client.decide(robot.measure(), [NAN, 0.0], [AHEAD])
         assert (refused.kind, refused.reason) == ("failsafe", NOT_FINITE)
         assert service.counts.figures()["not_finite"] == 1

@@ -17,7 +17,7 @@ from brakeline.safety.filter.request import BadRequest
 from brakeline.safety.methods import Method
 from brakeline.safety.methods import decode as read_model
 from brakeline.safety.methods import ready as made_ready
-from brakeline.safety.model.model_config import SAILR, SECAS, Recipe
+from brakeline.safety.model.model_config import SAILR, SECAS, ModelConfig
 from brakeline.safety.rivals.pretrained import Pretrained
 from tests.safety.asked import cylinder, request, same
 
@@ -68,8 +68,10 @@ def test_two_rivals_read_each_the_observation_of_their_own_task():
 
 def test_rivals_of_two_tasks_lie_in_two_files():
     usual, other = (robot_with_task(name) for name in NAMES)
-    assert method_path(usual, SECAS, Recipe()).name == method_path(robot_named("ground"), SECAS, Recipe()).name
-    assert method_path(usual, SECAS, Recipe()) != method_path(other, SECAS, Recipe())
+    assert (
+        method_path(usual, SECAS, ModelConfig()).name == method_path(robot_named("ground"), SECAS, ModelConfig()).name
+    )
+    assert method_path(usual, SECAS, ModelConfig()) != method_path(other, SECAS, ModelConfig())
 
 
 def test_two_policies_are_read_each_by_its_own_task():

@@ -16,7 +16,7 @@ from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.bus import Bus, BusSettings
 from brakeline.messaging.free_ports import free_endpoint
 from brakeline.messaging.topics import HEALTH, MODEL
-from brakeline.safety.model.error_bounds import Certificate
+from brakeline.safety.model.error_bounds import ErrorBound
 from brakeline.safety.model.model_set import BadModel, ModelSet
 from brakeline.safety.service.server import SafetySettings, archive_path, main
 from brakeline.safety.service.signature import (
@@ -41,7 +41,7 @@ def keys(tmp_path: Path) -> Path:
 
 def shrunken(model: ModelSet) -> ModelSet:
     """The attack: sets a tenth as wide, and a hash that is right."""
-    steps = tuple(Certificate(s.C, s.W, 0.1 * s.M, 0.1 * s.kappa, 0.1 * s.w, s.generators) for s in model.steps)
+    steps = tuple(ErrorBound(s.C, s.W, 0.1 * s.M, 0.1 * s.kappa, 0.1 * s.w, s.generators) for s in model.steps)
     return replace(model, steps=steps)
 
 

@@ -10,7 +10,7 @@ import pytest
 from brakeline.messaging.obstacle import Obstacle, Shapes
 from brakeline.safety.filter import qp_solver
 from brakeline.safety.filter.halfspaces import half_spaces
-from brakeline.safety.filter.kernels.active_set_kernels import come_by
+from brakeline.safety.filter.kernels.active_set_kernels import hildreth_active_set
 from brakeline.safety.filter.qp import Builder, Layout
 from brakeline.safety.filter.qp_solver import ACCURACY, Program, Solution, solve
 from brakeline.safety.model.model_set import ModelSet
@@ -103,7 +103,7 @@ def test_rows_that_are_come_by_save_rounds_and_change_no_answer(monkeypatch):
 
 def test_a_row_that_is_no_number_is_not_come_by():
     A, b = np.array([[1.0, 0.0], [np.nan, 1.0], [0.0, 1.0], [0.0, 0.0]]), np.array([-1.0, -5.0, np.nan, -1.0])
-    assert come_by(np.ones(2), np.zeros(2), A, b, 20).tolist() == [True, False, False, False]
+    assert hildreth_active_set(np.ones(2), np.zeros(2), A, b, 20).tolist() == [True, False, False, False]
 
 
 def test_that_few_can_not_be_met_is_not_taken_for_granted(monkeypatch):

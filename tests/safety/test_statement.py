@@ -49,7 +49,7 @@ def test_a_narrowed_model_shows_its_violations(model, data, held_out):
     found = state(narrow, data, held_out)
     assert found.violations > 0.2 * found.windows
     assert found.bound_plan > 20 * honest.bound_plan
-    for part in ("bulges", "latch"):
+    for part in ("chord_deviations", "stopping_distance"):
         thin = getattr(model, part)
         gone = replace(model, **{part: replace(thin, kappa=0.0 * thin.kappa, w=0.0 * thin.w)})
         assert state(gone, data, held_out).violations > 0.2 * honest.windows
@@ -63,4 +63,4 @@ def test_a_robot_that_changed_is_noticed(model, data):
 def test_only_stops_that_were_seen_count(model, data, held_out):
     cut = replace(held_out, trajectories=tuple(replace(t) for t in held_out.trajectories[:5]))
     whole = windows(cut, 3)
-    assert state(model, data, cut).windows <= (~np.isnan(whole.latch)).sum()
+    assert state(model, data, cut).windows <= (~np.isnan(whole.stopping_distance)).sum()

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from brakeline.safety.filter.reachable_tube import Recursion, stack_direct, stack_recursive
-from brakeline.safety.model.error_bounds import KINDS, Certificate
+from brakeline.safety.model.error_bounds import KINDS, ErrorBound
 from brakeline.safety.model.model_set import MODES
 from tests.robots import GROUND
 from tests.safety.unicycle import Unicycle
@@ -33,20 +33,20 @@ def rollouts():
             robot.step(before)
         start = robot.measure()
         u = np.where(rng.random(2) < 0.5, rng.uniform(low, high), rng.choice([low, high]))
-        ends, bulges = [], []
+        ends, chord_deviations = [], []
         for now in (u, np.zeros(2), np.zeros(2)):
             path, _ = robot.step(now)
             ends.append(rotated(robot.measure()[:2] - start[:2], -start[2]))
             chord = path[-1]
             along = np.clip(path @ chord / max(chord @ chord, 1e-18), 0, 1)
-            bulges.append(np.linalg.norm(path - along[:, None] * chord, axis=1).max())
+            chord_deviations.append(np.linalg.norm(path - along[:, None] * chord, axis=1).max())
         stopped = robot.state[:2].copy()
         way = 0.0
         for _ in range(5):
             robot.step(np.zeros(2))
             way = max(way, np.linalg.norm(robot.state[:2] - stopped))
         z = np.concatenate([start[3:], before, u])
-        found.append((z, np.array(ends), np.array(bulges), way))
+        found.append((z, np.array(ends), np.array(chord_deviations), way))
     return found
 
 
@@ -55,10 +55,10 @@ def violations(tube, rollouts):
     angles = np.linspace(0, np.pi, 90)
     directions = np.stack([np.cos(angles), np.sin(angles)], axis=1)
     bad = 0
-    for z, ends, bulges, way in rollouts:
+    for z, ends, chord_deviations, way in rollouts:
         sizes = np.abs(tube.W @ z) @ tube.M.T + tube.m_0
         L = tube.generators
-        outside = (bulges > sizes[L : L + 3]).any() or way > sizes[-1]
+        outside = (chord_deviations > sizes[L : L + 3]).any() or way > sizes[-1]
         for k in range(3):
             reach = np.abs(directions @ tube.directions[k]) @ sizes[:L]
             outside |= (np.abs(directions @ (ends[k] - tube.position[k] @ z)) > reach).any()
@@ -88,12 +88,16 @@ def test_a_direct_tube_has_the_half_widths_of_its_steps(model):
             by_hand = np.abs(step.W @ z) @ step.M.T + np.abs(z) @ step.kappa.T + step.w
             assert np.allclose(tube.half_widths(z)[k], by_hand[:2], rtol=1e-9)
             assert np.allclose(tube.centers(z)[k], step.C[:2] @ z)
-        assert np.allclose(tube.magnitudes(z)[-1], np.abs(z) @ model.latch.kappa[0] + model.latch.w[0])
-        assert np.allclose(tube.magnitudes(z)[-4:-1], model.bulges.kappa @ np.abs(z) + model.bulges.w)
+        assert np.allclose(
+            tube.magnitudes(z)[-1], np.abs(z) @ model.stopping_distance.kappa[0] + model.stopping_distance.w[0]
+        )
+        assert np.allclose(
+            tube.magnitudes(z)[-4:-1], model.chord_deviations.kappa @ np.abs(z) + model.chord_deviations.w
+        )
 
 
 def random_certificate(rng, n, nz, g, rows):
-    return Certificate(
+    return ErrorBound(
         0.5 * rng.normal(size=(n, nz)),
         rng.normal(size=(rows, nz)),
         0.1 * rng.uniform(size=(g, rows)),
@@ -147,7 +151,7 @@ def test_the_recursion_is_the_explicit_one(seed):
 
 def test_relative_coordinates_are_carried_on():
     """Position is predicted as displacement and is no regressor: the sets of the steps add up."""
-    step = Certificate(
+    step = ErrorBound(
         np.array([[0.2], [0.5]]), np.zeros((0, 1)), np.zeros((2, 0)), np.zeros((2, 1)), np.ones(2), np.eye(2)
     )
     how = Recursion((1,), 1, 0, np.zeros((0, 0)), np.array([[0.0], [1.0]]))
@@ -160,10 +164,8 @@ def test_parallel_rows_are_merged_without_loss():
     rng = np.random.default_rng(5)
     row = rng.normal(size=(1, 4))
     W = np.vstack([row, -2.0 * row, rng.normal(size=(2, 4)), np.zeros((1, 4))])
-    step = Certificate(rng.normal(size=(2, 4)), W, rng.uniform(size=(2, 5)), np.zeros((2, 4)), np.ones(2), np.eye(2))
-    nothing = Certificate(
-        np.zeros((1, 4)), np.zeros((0, 4)), np.zeros((1, 0)), np.zeros((1, 4)), np.zeros(1), np.eye(1)
-    )
+    step = ErrorBound(rng.normal(size=(2, 4)), W, rng.uniform(size=(2, 5)), np.zeros((2, 4)), np.ones(2), np.eye(2))
+    nothing = ErrorBound(np.zeros((1, 4)), np.zeros((0, 4)), np.zeros((1, 0)), np.zeros((1, 4)), np.zeros(1), np.eye(1))
     tube = stack_direct([step], 2, nothing, nothing)
     assert len(tube.W) == 3
     for z in rng.normal(size=(20, 4)):

@@ -8,11 +8,11 @@ import pytest
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.obstacle import Obstacle
 from brakeline.messaging.robot import Robot
-from brakeline.safety.filter.backup_plan import UNVERIFIED, Commitment
+from brakeline.safety.filter.backup_plan import UNVERIFIED, BackupPlan
 from brakeline.safety.model.model_set import ModelSet
 from brakeline.safety.service.asker import Answer, accept
 from brakeline.safety.service.client import read, request_message
-from brakeline.safety.service.plan_token import SIZE, BadKey, Notary, write_key
+from brakeline.safety.service.plan_token import SIZE, BadKey, PlanAuthenticator, write_key
 from brakeline.safety.service.server import Counts, Models, answerer
 from brakeline.safety.service.wire import decision_of
 from tests.robots import GROUND, QUADROTOR
@@ -26,35 +26,35 @@ class Service:
     def __init__(self, model: ModelSet, key: bytes = KEY) -> None:
         self.counts, models = Counts(), Models(accept_bound=1.0)
         models.install(model)
-        self._answer = answerer(models, self.counts, Notary(key))
+        self._answer = answerer(models, self.counts, PlanAuthenticator(key))
 
     def __call__(self, request: pb.Request) -> pb.Reply:
         payload = pb.RequestBatch(requests=[request]).SerializeToString()
         return pb.ReplyBatch.FromString(self._answer(payload)).replies[0]
 
 
-def driving(service: Service) -> tuple[Commitment, pb.Request]:
+def driving(service: Service) -> tuple[BackupPlan, pb.Request]:
     """A robot that drives, and its next honest question, before a wall that has come up."""
-    commitment = Commitment(GROUND)
-    request = request_message(commitment, np.zeros(5), [0.25, 0.1], known_free=True, actor="actor-0")
-    accept(commitment, read(service(request), request, GROUND))
-    state = np.array(commitment.predicted.center)
-    return commitment, request_message(commitment, state, [0.25, 0.0], [WALL], actor="actor-0")
+    backup_plan = BackupPlan(GROUND)
+    request = request_message(backup_plan, np.zeros(5), [0.25, 0.1], known_free=True, actor="actor-0")
+    accept(backup_plan, read(service(request), request, GROUND))
+    state = np.array(backup_plan.predicted.center)
+    return backup_plan, request_message(backup_plan, state, [0.25, 0.0], [WALL], actor="actor-0")
 
 
 def test_an_honest_question_is_believed(model: ModelSet) -> None:
     service = Service(model)
     _, request = driving(service)
-    assert len(request.voucher) == SIZE
+    assert len(request.plan_token) == SIZE
     decision = service(request).decision
     assert (decision.kind, decision.verified, decision.unvouched) == (pb.FAILSAFE, True, False)
     assert service.counts.unvouched == 0
 
 
 FORGERIES = {
-    "made up": {"voucher": b"\0" * SIZE},
-    "none": {"voucher": b""},
-    "short": {"voucher": b"\0"},
+    "made up": {"plan_token": b"\0" * SIZE},
+    "none": {"plan_token": b""},
+    "short": {"plan_token": b"\0"},
     "another actor's": {"actor": "actor-1"},
     "another plan": {"plan": [0.1, 0.0, 0.0, 0.0, 0.0, 0.0]},
     "from another input": {"input_in_force": [0.2, 0.1]},
@@ -77,7 +77,7 @@ def test_what_no_service_verified_does_not_count_as_verified(model: ModelSet, ch
             setattr(request, name, value)
     decision = service(request).decision
     assert (decision.kind, decision.verified, decision.unvouched) == (pb.FAILSAFE, False, True)
-    assert not decision.vouchers, "and nobody vouches for what was not verified"
+    assert not decision.plan_tokens, "and nobody vouches for what was not verified"
     assert service.counts.unvouched == 1
     trusting = Models(accept_bound=1.0)
     trusting.install(model)
@@ -94,7 +94,7 @@ def test_replicas_share_the_key_and_others_do_not(model: ModelSet) -> None:
 
 
 def test_standing_still_needs_nobodys_word(model: ModelSet) -> None:
-    request = request_message(Commitment(GROUND), np.zeros(5), [0.0, 0.0], [WALL], actor="actor-0")
+    request = request_message(BackupPlan(GROUND), np.zeros(5), [0.0, 0.0], [WALL], actor="actor-0")
     decision = Service(model)(request).decision
     assert decision.verified and not decision.unvouched
 
@@ -109,34 +109,34 @@ def plan_of(robot: Robot, rng: np.random.Generator) -> np.ndarray:
 @pytest.mark.parametrize("robot", [GROUND, QUADROTOR, LATE], ids=lambda robot: robot.name)
 def test_each_period_has_its_voucher_until_the_robot_stands(robot: Robot) -> None:
     """Law: without a better answer the commitment goes on, and every request on the way is vouched for."""
-    notary, rng = Notary(KEY), np.random.default_rng(0)
+    notary, rng = PlanAuthenticator(KEY), np.random.default_rng(0)
     for _ in range(50):
-        commitment, plan = Commitment(robot), plan_of(robot, rng)
+        backup_plan, plan = BackupPlan(robot), plan_of(robot, rng)
         request = pb.Request(robot=robot.name, actor="a")
         decision = pb.Decision(plan=plan.ravel().tolist(), model="abc", verified=True, predicted_heading=-0.0)
         decision.kind = pb.ALLOWED
         decision.predicted_center.extend(rng.normal(size=robot.state_dim).tolist())
         decision.predicted_half_width.extend(rng.random(robot.state_dim).tolist())
-        decision.vouchers.extend(notary.vouchers(request, decision, robot))
+        decision.plan_tokens.extend(notary.plan_tokens(request, decision, robot))
         wire = pb.Decision.FromString(decision.SerializeToString())
-        accept(commitment, Answer.of(decision_of(wire, robot), robot, vouchers=tuple(wire.vouchers)))
+        accept(backup_plan, Answer.of(decision_of(wire, robot), robot, plan_tokens=tuple(wire.plan_tokens)))
         for _ in range(robot.horizon + 2):
-            predicted = commitment.predicted
+            predicted = backup_plan.predicted
             state = np.zeros(robot.state_dim) if predicted is None else predicted.center
-            asked = request_message(commitment, state, plan[0], known_free=True, actor="a")
+            asked = request_message(backup_plan, state, plan[0], known_free=True, actor="a")
             asked = pb.Request.FromString(asked.SerializeToString())
             assert notary.vouches(asked, robot)
-            moving = bool(np.any(commitment.plan) or np.any(commitment.input_in_force))
-            assert bool(asked.model) == moving and len(asked.voucher) == SIZE
-            commitment.fallback()
+            moving = bool(np.any(backup_plan.plan) or np.any(backup_plan.input_in_force))
+            assert bool(asked.model) == moving and len(asked.plan_token) == SIZE
+            backup_plan.fallback()
 
 
 def test_a_plan_that_nobody_verified_gets_no_voucher_and_needs_none(model: ModelSet) -> None:
     service = Service(model)
     _, request = driving(service)
-    request.model, request.voucher = UNVERIFIED, b""
+    request.model, request.plan_token = UNVERIFIED, b""
     decision = service(request).decision
-    assert not decision.verified and not decision.unvouched and not decision.vouchers
+    assert not decision.verified and not decision.unvouched and not decision.plan_tokens
 
 
 def test_the_key_is_kept_where_the_keys_are(tmp_path: Path) -> None:
@@ -147,8 +147,10 @@ def test_the_key_is_kept_where_the_keys_are(tmp_path: Path) -> None:
     assert (tmp_path / "vouchers.key").stat().st_mode & 0o077 == 0
     said = pb.Decision(plan=[0.1, 0, 0, 0, 0, 0], model="abc")
     asked = pb.Request(robot="ground")
-    made = [Notary.of(folder).vouchers(asked, said, GROUND) for folder in (tmp_path, tmp_path, None, None)]
+    made = [
+        PlanAuthenticator.of(folder).plan_tokens(asked, said, GROUND) for folder in (tmp_path, tmp_path, None, None)
+    ]
     assert made[0] == made[1] and made[2] != made[3] and made[0] != made[2]
     (tmp_path / "vouchers.key").write_bytes(b"short")
     with pytest.raises(BadKey):
-        Notary.of(tmp_path)
+        PlanAuthenticator.of(tmp_path)

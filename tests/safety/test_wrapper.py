@@ -8,7 +8,7 @@ import pytest
 
 from brakeline.messaging.bus import NoReply
 from brakeline.messaging.obstacle import Obstacle
-from brakeline.safety.filter.backup_plan import Commitment
+from brakeline.safety.filter.backup_plan import BackupPlan
 from brakeline.safety.filter.filter import Filter
 from brakeline.safety.filter.request import NOT_FINITE
 from brakeline.safety.gym import SafetyWrapper
@@ -92,10 +92,10 @@ def test_every_episode_starts_standing(ready):
     env = SafetyWrapper(Yard(), ready, accept_bound=1.0)
     env.reset(seed=3)
     env.step(np.array([0.25, 0.1]))
-    assert env.commitment.input_in_force.any()
+    assert env.backup_plan.input_in_force.any()
     env.reset(seed=4)
-    assert not env.commitment.input_in_force.any()
-    assert env.commitment.predicted is None
+    assert not env.backup_plan.input_in_force.any()
+    assert env.backup_plan.predicted is None
 
 
 def test_a_filter_needs_no_more_than_the_model_set(model):
@@ -106,7 +106,7 @@ class Hearing(SafetyClient):
     """A client of a service that answers nothing."""
 
     def __init__(self) -> None:
-        self.robot, self.commitment, self.asked = GROUND, Commitment(GROUND), {}
+        self.robot, self.backup_plan, self.asked = GROUND, BackupPlan(GROUND), {}
 
     def decide(self, *asked, **more):
         self.asked = more

@@ -22,8 +22,8 @@ def said(folder: Path, *words: object) -> str:
 def test_the_first_screen_leads_from_the_demo_to_a_report_a_replay_and_an_evaluation(data_folder, tmp_path):
     screen = (ROOT / "README.md").read_text().partition("## Data flow")[0]
     assert "    make demo " in screen and "    make test " in screen, "the two commands"
-    recipe = (ROOT / "Makefile").read_text().partition("demo: setup\n")[2].splitlines()[0]
-    assert recipe.strip() == "$(BIN)/brakeline demo"
+    model_config = (ROOT / "Makefile").read_text().partition("demo: setup\n")[2].splitlines()[0]
+    assert model_config.strip() == "$(BIN)/brakeline demo"
 
     told = said(tmp_path, "demo", "--steps", 600, "--out", "runs/first")
     assert "collisions" in told and "log:    runs/first/run.mcap" in told

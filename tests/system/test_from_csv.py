@@ -10,10 +10,10 @@ from brakeline.deploy.data import data_paths
 from brakeline.messaging.free_ports import free_endpoint
 from brakeline.messaging.moving_obstacles import parted
 from brakeline.messaging.obstacle import Obstacle
-from brakeline.safety.filter.backup_plan import Commitment
+from brakeline.safety.filter.backup_plan import BackupPlan
 from brakeline.safety.filter.filter import Filter
 from brakeline.safety.filter.request import Request
-from brakeline.safety.model.model_set import ModelSet, Recipe
+from brakeline.safety.model.model_set import ModelConfig, ModelSet
 from tests.accepting import WORDS
 from tests.deploy.data.porter import FILE, Porter, drive, porter, write_csv
 from tests.system.runs import BRAKELINE, brakeline
@@ -40,7 +40,7 @@ def certified(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def ready(certified):
-    return Filter(ModelSet.load(data_paths.model_path(porter(), Recipe())))
+    return Filter(ModelSet.load(data_paths.model_path(porter(), ModelConfig())))
 
 
 def test_four_commands_from_a_csv_to_an_answer(certified, tmp_path):
@@ -81,7 +81,7 @@ def episode(ready, seed):
             discs.append((at, radius))
     centers, radii = np.array([at for at, _ in discs]), np.array([radius for _, radius in discs])
     shapes, _ = parted([Obstacle("cylinder", tuple(at), (radius,)) for at, radius in discs], 2)
-    plant, kept = Porter(rng, (0.0, 0.0, rng.uniform(-3, 3))), Commitment(robot)
+    plant, kept = Porter(rng, (0.0, 0.0, rng.uniform(-3, 3))), BackupPlan(robot)
     least, outside, way = np.inf, 0, 0.0
     for _ in range(STEPS):
         state = plant.measured()

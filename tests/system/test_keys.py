@@ -8,7 +8,7 @@ from brakeline.deploy.data.data_paths import method_path
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.bus import Bus, BusSettings
 from brakeline.messaging.free_ports import free_endpoint
-from brakeline.safety.model.model_set import Recipe
+from brakeline.safety.model.model_set import ModelConfig
 from tests.robots import GROUND
 from tests.system.runs import brakeline
 from tests.system.test_alone import start  # noqa: F401 - a fixture
@@ -24,7 +24,7 @@ def test_a_service_with_the_keys_that_were_handed_out_to_it(start, data_folder, 
     assert {path.name for path in (parts / "actor-0").iterdir()} == {"ca.pem", "actor-0.pem", "actor-0.key"}
     assert not list(parts.rglob("ca.key")) and (parts / "certify" / "signer.key").exists()
 
-    model = method_path(GROUND, "ddpc", Recipe())
+    model = method_path(GROUND, "ddpc", ModelConfig())
     unsigned = brakeline("safety", "ground", "--listen", endpoint, "--keys", parts / "safety")
     assert unsigned.returncode == 1 and "no seal" in unsigned.stderr and "Traceback" not in unsigned.stderr
     signed = brakeline("keys", parts / "certify", "--sign", model)

@@ -25,7 +25,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from brakeline.deploy.data import model_store
 from brakeline.messaging.free_ports import free_endpoint
-from brakeline.safety.model.model_set import Recipe
+from brakeline.safety.model.model_set import ModelConfig
 from tests.robots import GROUND
 from tests.system.runs import BRAKELINE
 from tests.waiting import PATIENCE, until
@@ -49,7 +49,7 @@ print(json.dumps({"topics": found, "publishers": [(end.node_name, end.qos) for e
 @pytest.fixture(scope="session")
 def late_folder(data_folder: Path) -> Path:
     """`$BRAKELINE_DATA` with the ground robot's model set in real time."""
-    model_store.model_for(GROUND.in_real_time(), Recipe())
+    model_store.model_for(GROUND.in_real_time(), ModelConfig())
     return data_folder
 
 

@@ -13,7 +13,7 @@ LITTLE = 1e-14  # of the objective: who gains no more by a step is there
 
 
 @compiled("b1[::1](f8[::1], f8[::1], f8[:,::1], f8[::1], i8)")
-def come_by(h: Array, g: Array, A: Array, b: Array, steps: int) -> NDArray[np.bool_]:
+def hildreth_active_set(h: Array, g: Array, A: Array, b: Array, steps: int) -> NDArray[np.bool_]:
     """Of `min ½ xᵀ diag(h) x + gᵀ x  s.t.  A x <= b`, n unknowns: which rows (r,) so many steps look at, each time the
     one by whose multiplier the dual gains most, from the answer without any."""
     rows, n = A.shape

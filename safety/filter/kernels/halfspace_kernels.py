@@ -91,7 +91,7 @@ def least(left: Array, most: float) -> float:
     "Tuple((i8, f8[:,::1], f8[::1]))"
     "(f8[:,::1], f8[:,::1], f8[::1], f8[::1], f8[::1], f8[:,::1], f8[::1], f8[::1], f8[:,::1], f8[::1], f8)"
 )
-def that_matter(
+def presolve_rows(
     gradient: Array,
     spread: Array,
     bound: Array,
@@ -190,11 +190,11 @@ def filled_by_plans(
     for k in range(len(sizes)):
         for i in range(q):
             sizes[k] += M[k, i] * atoms[i]
-    bulge = sizes[L:].max()
+    chord_deviation = sizes[L:].max()
     way, half, boxes = np.empty(d), np.empty(d), np.zeros((2, N + 1, d))
     for k in range(N):
         for axis in range(d):
-            way[axis], half[axis] = 0.0, beside[axis] + bulge
+            way[axis], half[axis] = 0.0, beside[axis] + chord_deviation
             for j in range(len(z)):
                 way[axis] += position[k, axis, j] * z[j]
             for j in range(len(radius)):

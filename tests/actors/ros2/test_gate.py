@@ -62,7 +62,7 @@ def test_without_an_answer_it_brakes_along_the_plan():
         gate.decide(STATE, (), command(0.25), 0.2, 1 + k)
         inputs.append(gate.begin(0.4 + 0.2 * k)[0])
         assert gate.kind == NO_ANSWER and "nobody" in gate.reason
-    assert inputs == [0.0] * 4 and not gate.commitment.plan.any()
+    assert inputs == [0.0] * 4 and not gate.backup_plan.plan.any()
 
 
 @pytest.mark.parametrize(

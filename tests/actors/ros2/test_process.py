@@ -194,5 +194,5 @@ def test_clocks_that_differ_stop_the_robot():
 def test_it_ends_with_a_stop():
     with steered() as (robot, steering):
         robot.drives()
-    assert robot.said[-1] == 0.0 and not steering.gate.commitment.plan.any()
+    assert robot.said[-1] == 0.0 and not steering.gate.backup_plan.plan.any()
     assert steering.gate.tally.kinds["allowed"] > 0

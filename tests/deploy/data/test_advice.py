@@ -9,7 +9,7 @@ from brakeline.deploy.data.certification import WIDEST, certified
 from brakeline.deploy.data.coverage import more_to_drive
 from brakeline.safety.model.error_causes import BOTH, FAST, SLOW, STANDING, TURNING, Leaving, regimes
 from brakeline.safety.model.fitting import make
-from brakeline.safety.model.model_set import Recipe
+from brakeline.safety.model.model_set import ModelConfig
 from brakeline.safety.model.validation import most_violations, state, upper_bound
 from tests.robots import GROUND, QUADROTOR
 from tests.safety.unicycle import record
@@ -23,7 +23,7 @@ def data():
 @pytest.fixture(scope="module")
 def held(data):
     """A statement without a violation in some dozens of plans."""
-    _, statement = certified(data, Recipe(), until_held=True)
+    _, statement = certified(data, ModelConfig(), until_held=True)
     assert statement.violations == 0 and statement.bound_plan > 0.01
     return statement
 
@@ -71,7 +71,7 @@ def test_how_it_drove_is_told_by_inputs_and_speeds():
 def test_where_it_left_its_sets_is_found(data):
     """A robot whose wheels slip a little more, at speed, than in the data that the set was made from."""
     slipping = record(trajectories=12, periods=150, seed=9, slip=0.05)
-    statement = state(make(data, Recipe()), data, slipping)
+    statement = state(make(data, ModelConfig()), data, slipping)
     assert statement.violations == sum(one.plans for one in statement.leaving) > 0
     most = statement.leaving[0]
     assert most.part in ("position ahead", "speed") and most.regime in (FAST, BOTH) and most.excess > 1.0
@@ -81,13 +81,15 @@ def test_where_it_left_its_sets_is_found(data):
 @pytest.mark.parametrize("limit", [0.01, 0.05, 0.3])
 def test_sets_are_widened_only_as_far_as_the_limit_asks_for(data, limit):
     narrow = replace(data, robot=replace(GROUND, accept_bound=limit))
-    model, statement = certified(narrow, Recipe(inflation=1.0))
+    model, statement = certified(narrow, ModelConfig(inflation=1.0))
     most = most_violations(statement.windows, limit)
-    plain = certified(replace(data, robot=replace(GROUND, accept_bound=1e-6)), Recipe(inflation=1.0))[1]
+    plain = certified(replace(data, robot=replace(GROUND, accept_bound=1e-6)), ModelConfig(inflation=1.0))[1]
     if most < 0 or plain.violations <= most or plain.excess > WIDEST:
-        assert model.recipe.inflation == 1.0, "too few plans for the limit, or it holds already, or it takes too much"
+        assert model.model_config.inflation == 1.0, (
+            "too few plans for the limit, or it holds already, or it takes too much"
+        )
     else:
-        assert model.recipe.inflation > 1.0 and statement.violations == most and statement.bound_plan <= limit
+        assert model.model_config.inflation > 1.0 and statement.violations == most and statement.bound_plan <= limit
 
 
 @pytest.mark.parametrize(("count", "most"), [(458, -1), (459, 0), (661, 0), (662, 1), (1283, 4)])

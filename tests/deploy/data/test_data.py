@@ -16,7 +16,7 @@ from brakeline.deploy.data.run_dataset import from_log, trajectories_of
 from brakeline.logs.segment import Entry, open_segment
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.safety.model.dataset import BadData, Dataset
-from brakeline.safety.model.model_set import ModelSet, Recipe
+from brakeline.safety.model.model_set import ModelConfig, ModelSet
 from brakeline.safety.model.windows import windows
 from tests.accepting import BOUND
 from tests.robots import GROUND
@@ -73,20 +73,20 @@ def elsewhere(tmp_path, monkeypatch):
 
 
 def test_the_store_makes_what_is_missing_and_only_that(elsewhere, capsys):
-    model = model_store.model_for(GROUND, Recipe(), BOUND)
+    model = model_store.model_for(GROUND, ModelConfig(), BOUND)
     assert data_paths.record_path(GROUND).exists() and len(elsewhere) == 1
-    assert ModelSet.load(data_paths.model_path(GROUND, Recipe())).version == model.version
-    assert model_store.model_for(GROUND, Recipe(), BOUND).version == model.version
-    other = model_store.model_for(GROUND, Recipe("set-membership"), BOUND)
+    assert ModelSet.load(data_paths.model_path(GROUND, ModelConfig())).version == model.version
+    assert model_store.model_for(GROUND, ModelConfig(), BOUND).version == model.version
+    other = model_store.model_for(GROUND, ModelConfig("set-membership"), BOUND)
     assert other.version != model.version and len(elsewhere) == 1, "one recording for all"
     assert float(model.about["bound_step"]) <= float(model.about["bound_plan"]) < 1.0
-    data_paths.model_path(GROUND, Recipe()).write_bytes(b"damaged")
-    assert model_store.model_for(GROUND, Recipe(), BOUND).version == model.version
+    data_paths.model_path(GROUND, ModelConfig()).write_bytes(b"damaged")
+    assert model_store.model_for(GROUND, ModelConfig(), BOUND).version == model.version
     said = capsys.readouterr()
     assert "making the model set again" in said.err and said.out == ""
-    data_paths.model_path(GROUND, Recipe()).unlink()
+    data_paths.model_path(GROUND, ModelConfig()).unlink()
     data_paths.record_path(GROUND).write_bytes(b"damaged")
-    assert model_store.model_for(GROUND, Recipe(), BOUND).version == model.version, "the same seed, the same data"
+    assert model_store.model_for(GROUND, ModelConfig(), BOUND).version == model.version, "the same seed, the same data"
     assert len(elsewhere) == 2
 
 

@@ -32,7 +32,7 @@ def same(one: Dataset, other: Dataset, within: float) -> None:
     for a, b in zip(one.trajectories, other.trajectories, strict=True):
         for name in ("states", "inputs", "paths", "turned", "before"):
             assert np.allclose(getattr(a, name), getattr(b, name), rtol=0.0, atol=within), name
-    assert one.bulge == pytest.approx(other.bulge, abs=within)
+    assert one.chord_deviation == pytest.approx(other.chord_deviation, abs=within)
 
 
 @pytest.mark.parametrize("storage", StoragePlugin)
@@ -189,7 +189,7 @@ def test_paths_between_samples_are_within_the_bound_that_is_said():
     made = resample([table(0.2 * np.arange(400), np.array(rows))], porter(), {})
     assert made.report.samples == 1 and "one position a period" in " ".join(made.report.notes)
     away = _off_chord(np.array(truth))
-    assert away.max() <= made.data.bulge < 0.08, (away.max(), made.data.bulge)
+    assert away.max() <= made.data.chord_deviation < 0.08, (away.max(), made.data.chord_deviation)
 
 
 def test_what_is_missing_is_named_with_what_there_is(tmp_path, driven):

@@ -15,14 +15,14 @@ from brakeline.deploy.run.processes import places
 from brakeline.deploy.run.run_config import EXPERIMENTS, RunConfig, decode, encode, load
 from brakeline.learner.learner_config import LearnerConfig, TD3Config
 from brakeline.messaging.task import robot_with_task
-from brakeline.safety.model.model_set import Recipe
+from brakeline.safety.model.model_set import ModelConfig
 from brakeline.sim.ground_estimator import NoiseLevels
 from brakeline.sim.sim_conditions import Conditions, Perception
 
 CHANGED = RunConfig(
     robots=("ground",),
     method="none",
-    recipe=Recipe("set-membership", "recursion"),
+    model_config=ModelConfig("set-membership", "recursion"),
     arena="dense",
     deadline=0.25,
     change=Change(after=500, payload_kg=1.0),

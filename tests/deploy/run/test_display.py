@@ -13,7 +13,7 @@ from brakeline.deploy.run.display import Display, doing, line, live, summary
 from brakeline.deploy.run.processes import places
 from brakeline.deploy.run.run_config import RunConfig
 from brakeline.deploy.run.run_view import View
-from brakeline.deploy.run.supervisor import Child
+from brakeline.deploy.run.supervisor import SupervisedProcess
 from brakeline.logs.metrics import Metrics
 from brakeline.messaging import brakeline_pb2 as pb
 
@@ -37,7 +37,7 @@ def view() -> View:
     metrics.add("exchange/ground/actor-0", exchange)
     folder = Path("/a/folder/with [brackets] in its name")
     lines = deque(["safety-0: [red]no[/] markup " + "and very long " * 20])
-    children = [Child(place, folder) for place in places(RunConfig(replicas=2))]
+    children = [SupervisedProcess(place, folder) for place in places(RunConfig(replicas=2))]
     return View(RunConfig(), folder, metrics, children, lines)
 
 

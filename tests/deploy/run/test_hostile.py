@@ -7,9 +7,9 @@ import pytest
 
 from brakeline.deploy.interpreter import spawning
 from brakeline.deploy.run.launcher import Launcher
-from brakeline.deploy.run.processes import UNFINISHED, Place
+from brakeline.deploy.run.processes import UNFINISHED, ProcessSpec
 from brakeline.deploy.run.run_config import EXPERIMENTS, RunConfig, encode
-from brakeline.deploy.run.supervisor import Child
+from brakeline.deploy.run.supervisor import SupervisedProcess
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.bus import BusSettings, Sample
 from brakeline.messaging.topics import EPISODE, EXCHANGE, HEALTH, LOG, STEP, Topic
@@ -67,7 +67,7 @@ def test_modules_in_the_working_directory_are_not_run_by_children(
     monkeypatch.chdir(tmp_path)
     (tmp_path / "config.json").write_text(encode(EXPERIMENTS["debug"]))
     (tmp_path / "endpoint").write_text('{"endpoint": "tcp/127.0.0.1:1", "pid": 1}')
-    child = Child(Place("actor-0", "actor", "ground"), tmp_path)
+    child = SupervisedProcess(ProcessSpec("actor-0", "actor", "ground"), tmp_path)
     child.start()
     assert child.popen is not None and child.popen.wait(60.0) == UNFINISHED, "its launcher is another"
     worker = spawning().Process(target=os.getcwd)

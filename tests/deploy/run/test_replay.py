@@ -15,7 +15,7 @@ from brakeline.deploy.experiments.evaluate import in_process
 from brakeline.deploy.run.replay_run import APART, Difference, ReplayError, differences, replay
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.safety.filter.filter import Filter
-from brakeline.safety.model.model_set import Recipe
+from brakeline.safety.model.model_set import ModelConfig
 from tests.deploy.drive import drive
 from tests.robots import GROUND
 
@@ -48,7 +48,7 @@ def test_a_log_without_models_is_replayed_from_its_folder_or_not_at_all(
     data_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     version = drive(tmp_path / "run.mcap", 20, attach=False)
-    model = model_for(GROUND, Recipe())
+    model = model_for(GROUND, ModelConfig())
     monkeypatch.setenv("BRAKELINE_DATA", str(tmp_path / "nothing"))
     with pytest.raises(ReplayError, match=version):
         replay(tmp_path)
@@ -60,7 +60,7 @@ def test_a_log_without_models_is_replayed_from_its_folder_or_not_at_all(
 def test_another_margin_decides_otherwise_and_it_is_told_by_how_much(
     log: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    margin = Filter(model_for(GROUND, Recipe())).clearance_margin
+    margin = Filter(model_for(GROUND, ModelConfig())).clearance_margin
     status, figures = run(capsys, "replay", log, "--margin", margin + 0.05)
     assert status == 0, "it was asked for"
     assert figures["different"] > 0 and figures["instead"] == {"margin": margin + 0.05}
@@ -81,7 +81,7 @@ def test_another_certificate_and_other_data_can_be_asked(log: Path, capsys: pyte
 
 
 def test_questions_from_before_known_free_are_asked_as_they_were_meant(data_folder: Path, tmp_path: Path) -> None:
-    ask = in_process(model_for(GROUND, Recipe()))
+    ask = in_process(model_for(GROUND, ModelConfig()))
 
     def before(exchange: pb.Exchange) -> None:
         request = exchange.request

@@ -16,7 +16,7 @@ from brakeline.deploy.run.replay_run import differences
 from brakeline.logs.reader import open_log
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.safety.filter.filter import Filter
-from brakeline.safety.model.model_set import Recipe
+from brakeline.safety.model.model_set import ModelConfig
 from brakeline.safety.service.wire import message_of, request_of
 from tests.robots import GROUND
 
@@ -76,7 +76,7 @@ def move_arrays(thing: object, offset: int) -> int:
 
 @pytest.mark.parametrize("offset", range(8, LINE, 8))
 def test_wherever_arrays_lie_in_memory_no_decision_differs(log: Path, offset: int) -> None:
-    ready, elsewhere = (Filter(model_for(GROUND, Recipe())) for _ in range(2))
+    ready, elsewhere = (Filter(model_for(GROUND, ModelConfig())) for _ in range(2))
     assert move_arrays(elsewhere, offset) > 30
     assert elsewhere.tube.W.ctypes.data % LINE == offset
     kinds = set()

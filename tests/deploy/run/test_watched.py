@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 from brakeline.deploy.run import supervisor
-from brakeline.deploy.run.processes import Place
-from brakeline.deploy.run.supervisor import HEALTHY_AFTER, MOST_FAILURES, SPEAKS_AFTER, Child, LaunchError
+from brakeline.deploy.run.processes import ProcessSpec
+from brakeline.deploy.run.supervisor import HEALTHY_AFTER, MOST_FAILURES, SPEAKS_AFTER, LaunchError, SupervisedProcess
 
 
 @pytest.fixture
@@ -19,7 +19,7 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> list[float]:
     return now
 
 
-class Failing(Child):
+class Failing(SupervisedProcess):
     """Ends with 1 at once; by the clock, when the test says."""
 
     def start(self) -> None:
@@ -28,7 +28,7 @@ class Failing(Child):
         self.started, self.spoke = supervisor.time.monotonic(), None
 
 
-def lives(child: Child, clock: list[float], until_it_speaks: float | None, after: float) -> None:
+def lives(child: SupervisedProcess, clock: list[float], until_it_speaks: float | None, after: float) -> None:
     """One life: how long until its first sign of life, None: it gives none; and how long after that."""
     clock[0] = max(clock[0], child.due)
     child.watch()
@@ -45,7 +45,7 @@ def lives(child: Child, clock: list[float], until_it_speaks: float | None, after
 def test_however_slowly_it_starts_the_fifth_failure_in_a_row_ends_the_run(
     speaks: float, clock: list[float], tmp_path: Path
 ) -> None:
-    child = Failing(Place("learner", "learner", "ground"), tmp_path)
+    child = Failing(ProcessSpec("learner", "learner", "ground"), tmp_path)
     for _ in range(MOST_FAILURES - 1):
         lives(child, clock, speaks, 2.0)
     with pytest.raises(LaunchError, match="5th time in a row"):
@@ -56,7 +56,7 @@ def test_however_slowly_it_starts_the_fifth_failure_in_a_row_ends_the_run(
 def test_who_was_healthy_before_may_fail_as_often_as_it_likes(
     speaks: float | None, after: float, clock: list[float], tmp_path: Path
 ) -> None:
-    child = Failing(Place("autopilot", "autopilot"), tmp_path)
+    child = Failing(ProcessSpec("autopilot", "autopilot"), tmp_path)
     for _ in range(3 * MOST_FAILURES):
         lives(child, clock, speaks, after)
     assert child.restarts == 3 * MOST_FAILURES and child.failures == 1

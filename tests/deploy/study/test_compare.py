@@ -17,7 +17,7 @@ from brakeline.learner.rival_networks import Fit
 from brakeline.logs.report import analyse
 from brakeline.messaging.policy_weights import MLP
 from brakeline.messaging.task import robot_with_task
-from brakeline.safety.model.model_set import Recipe
+from brakeline.safety.model.model_set import ModelConfig
 from tests.robots import GROUND
 
 DEAR = ("decision_ms", "milliseconds")
@@ -40,7 +40,7 @@ def rivals(data_folder):
     before = dict(rival_pretraining.RECIPES)
     rival_pretraining.RECIPES.update(made)
     for method in made:
-        model_store.method_for(GROUND, method, Recipe())
+        model_store.method_for(GROUND, method, ModelConfig())
     yield made
     rival_pretraining.RECIPES.update(before)
 

@@ -11,7 +11,7 @@ from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.obstacle import Shapes
 from brakeline.messaging.perceptrons import Perceptrons
 from brakeline.messaging.ray_directions import fan
-from brakeline.safety.filter.backup_plan import UNVERIFIED, Commitment
+from brakeline.safety.filter.backup_plan import UNVERIFIED, BackupPlan
 from brakeline.safety.filter.request import NOT_FINITE, BadRequest, Request
 from brakeline.safety.model.model_set import BadModel
 from brakeline.safety.rivals.pretrained import Pretrained
@@ -211,14 +211,14 @@ def test_a_model_without_rays_has_those_of_the_robots_usual_task():
 def test_the_service_answers_with_it_and_the_asker_brakes_when_it_falls_silent():
     models = Models()
     models.install(known())
-    answer, commitment = answerer(models, Counts()), Commitment(GROUND)
+    answer, backup_plan = answerer(models, Counts()), BackupPlan(GROUND)
     for _ in range(2):  # the second request carries a plan that nobody vouches for
         message = request_message(
-            commitment, np.zeros(5), [0.25, 0.3], known_free=True, observation=seen(0.25).tolist()
+            backup_plan, np.zeros(5), [0.25, 0.3], known_free=True, observation=seen(0.25).tolist()
         )
         payload = pb.RequestBatch(requests=[message]).SerializeToString()
         reply = read(pb.ReplyBatch.FromString(answer(payload)).replies[0], message, GROUND)
-        executed = accept(commitment, reply)
+        executed = accept(backup_plan, reply)
         assert reply.kind == "adjusted" and executed == pytest.approx((0.25 * 0.05 / 0.06, 0.3), abs=1e-5)
-        assert commitment.model == UNVERIFIED and commitment.predicted is None
-    assert not commitment.fallback().any()
+        assert backup_plan.model == UNVERIFIED and backup_plan.predicted is None
+    assert not backup_plan.fallback().any()
