@@ -11,13 +11,13 @@ from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
-from brakeline.actors.actor_settings import Change as Change
-from brakeline.actors.decision_guard import Ask, Outcome, consult
-from brakeline.actors.episode_runner import EPISODE_STRIDE, Environment, EpisodeRunner, Identity
-from brakeline.actors.joint_episode import Fleet, World, as_one
+from brakeline.actors.actor_settings import PhysicsChange as PhysicsChange
+from brakeline.actors.decision_guard import Ask, DecisionOutcome, request_decisions
+from brakeline.actors.episode_runner import EPISODE_STRIDE, ActorIdentity, Environment, EpisodeRunner
+from brakeline.actors.joint_episode import RobotGroup, SharedWorld, joint_outcomes
 from brakeline.actors.learner_client import LearnerClient
-from brakeline.actors.mavlink.frame_recorder import Puts, Tape
-from brakeline.actors.policies import Fixed, FlyingPupil, LearnedPolicy, MakePolicy, Proposer, check
+from brakeline.actors.mavlink.frame_recorder import FrameRecorder, MessageSink
+from brakeline.actors.policies import FixedPolicy, LearnedPolicy, PolicyFactory, Proposer, RealTimePolicy, check
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.bus import BusSettings, Publisher
 from brakeline.messaging.process_runtime import Process
@@ -28,7 +28,7 @@ from brakeline.safety.filter.request import ALLOWED
 from brakeline.safety.service.client import ask
 
 if TYPE_CHECKING:
-    from brakeline.actors.mavlink.frame_log import Tap
+    from brakeline.actors.mavlink.frame_log import FrameTap
 
 log = logging.getLogger("brakeline.actor")
 
@@ -50,24 +50,26 @@ class ActorSettings:
     deadline: float = 0.1  # s for an answer of the safety service
     lockstep: bool = False
     practice: float = 0.0  # share of steps at which a robot starts to follow its committed plan to the stop
-    change: Change = field(default_factory=Change)
+    change: PhysicsChange = field(default_factory=PhysicsChange)
     mavlink: bool = False  # log every frame of quadrotors in memory; in real time it is always done
     steps: int = 0  # of each robot with a policy that does not learn; 0: no end
 
 
-class Make(Protocol):
+class EnvironmentFactory(Protocol):
     """Makes a robot's environment; tap: is to be called with every MAVLink frame, if there are any."""
 
-    def __call__(self, robot: RobotWithTask, arena: str, seed: int, *, tap: Tap | None = None) -> Environment: ...
+    def __call__(self, robot: RobotWithTask, arena: str, seed: int, *, tap: FrameTap | None = None) -> Environment: ...
 
 
-MakeWorld = Callable[[RobotWithTask, str, int, int], World]  # of robots of a kind in an arena, so many, from a seed
+WorldFactory = Callable[
+    [RobotWithTask, str, int, int], SharedWorld
+]  # of robots of a kind in an arena, so many, from a seed
 
-PRACTISED = "Practised: the stop goes on as it was verified"  # instead of an answer
+STOP_PRACTICE = "Practised: the stop goes on as it was verified"  # instead of an answer
 STANDING = 2  # periods that a practised stop lasts beyond its plan
 
 
-class Practice:
+class StopPractice:
     """Now and then the committed plan to its end: safe, for it was verified, and the only way to go on recording what
     a stop is like (`brakeline certify LOG`)."""
 
@@ -85,13 +87,13 @@ class Practice:
         self._left -= 1
         return np.asarray(driver.backup_plan.plan[driver.robot.given])
 
-    def kept(self, driver: EpisodeRunner, outcome: Outcome) -> Outcome:
+    def kept(self, driver: EpisodeRunner, outcome: DecisionOutcome) -> DecisionOutcome:
         """A stop that was begun goes on as it was verified, also where the filter would do something else by now: it
         keeps more distance than is needed. Not where what was verified does not hold any more."""
         answer = outcome.answer
         if not self.running or answer is None or answer.kind == ALLOWED or not driver.backup_plan.holds:
             return outcome
-        return replace(outcome, answer=None, failure=PRACTISED)
+        return replace(outcome, answer=None, failure=STOP_PRACTICE)
 
 
 class ActorRunner:
@@ -104,35 +106,35 @@ class ActorRunner:
         process: Process,
         settings: ActorSettings,
         offset: int,
-        make: Make,
-        propose: MakePolicy | None = None,
+        make: EnvironmentFactory,
+        propose: PolicyFactory | None = None,
         goes_on: bool = False,
         env: Environment | None = None,
     ) -> None:
         """propose: instead of learning; goes_on: see Driver; env: its place in a world that others share."""
         robot = robot_with_task(settings.robot)
         actor = settings.name if settings.robots == 1 else f"{settings.name}.{offset}"
-        identity = Identity(actor, settings.number + offset, settings.seed)
+        identity = ActorIdentity(actor, settings.number + offset, settings.seed)
         publisher: Callable[..., Publisher] = process.bus.publisher
         frames = publisher(FRAMES, robot=robot.name, source=actor)
-        self.tape = Tape(frames, robot.name, actor)
+        self.tape = FrameRecorder(frames, robot.name, actor)
         tap = self.tape.take if settings.mavlink else None
         env = env or make(robot, settings.arena, settings.seed, tap=tap)
         filtered, cuts = settings.method != "none", settings.method == "sailr"
         self.driver = EpisodeRunner(robot, env, identity, settings.penalty, filtered, cuts, goes_on)
         if propose is None:
             student = LearnerClient(process.bus, robot, actor, settings.lockstep)
-            self.proposer: Proposer = FlyingPupil(student) if goes_on else LearnedPolicy(student)
+            self.proposer: Proposer = RealTimePolicy(student) if goes_on else LearnedPolicy(student)
         else:
-            self.proposer = Fixed(propose, settings.seed + identity.number, settings.steps)
+            self.proposer = FixedPolicy(propose, settings.seed + identity.number, settings.steps)
         self.next_episode = 0
         self.waiting = False  # for the safety service, standing
         self.proposal = np.zeros(robot.action_dim)  # the last one
         self.braking = False  # for want of a decision
-        self.practice, self.change = Practice(settings.practice), settings.change
-        self.steps: Puts = publisher(STEP, robot=robot.name, source=actor)
-        self.episodes: Puts = publisher(EPISODE, robot=robot.name, source=actor)
-        self.exchanges: Puts = publisher(EXCHANGE, robot=robot.name, source=actor)
+        self.practice, self.change = StopPractice(settings.practice), settings.change
+        self.steps: MessageSink = publisher(STEP, robot=robot.name, source=actor)
+        self.episodes: MessageSink = publisher(EPISODE, robot=robot.name, source=actor)
+        self.exchanges: MessageSink = publisher(EXCHANGE, robot=robot.name, source=actor)
 
     def join(self, stop: Callable[[], bool]) -> bool:
         """Wait until there are proposals; False: told to stop."""
@@ -164,7 +166,7 @@ class ActorRunner:
             self.proposal = self.practice.instead(driver, proposal)
         return self.proposal
 
-    def settle(self, outcome: Outcome) -> Outcome:
+    def settle(self, outcome: DecisionOutcome) -> DecisionOutcome:
         """The last word on an outcome, when it is to be put into action."""
         if (outcome.answer is None) != self.braking:
             self.braking = outcome.answer is None
@@ -172,7 +174,7 @@ class ActorRunner:
                 log.warning("no decision, braking along the committed plan: %s", outcome.failure)
         return outcome
 
-    def act(self, proposal: Array, outcome: Outcome | None) -> pb.Step:
+    def act(self, proposal: Array, outcome: DecisionOutcome | None) -> pb.Step:
         if outcome is not None:
             outcome = self.settle(self.practice.kept(self.driver, outcome))
             self.exchanges.put(outcome.exchange(self.driver.info["time"]))
@@ -183,7 +185,7 @@ class ActorRunner:
 
 
 @dataclass
-class Tally:
+class ActorStats:
     steps: int = 0
     fallbacks: int = 0
     waits: int = 0
@@ -210,16 +212,16 @@ class Tally:
         }
 
 
-def cycle(riders: list[ActorRunner], question: Ask | None, tally: Tally, stop: Callable[[], bool]) -> bool:
+def cycle(riders: list[ActorRunner], question: Ask | None, tally: ActorStats, stop: Callable[[], bool]) -> bool:
     """One period of all robots of the process; False: the end."""
     for rider in riders:
         if not rider.ready(stop):
             return False
     proposals = [rider.propose() for rider in riders]
-    outcomes: list[Outcome | None] = [None] * len(riders)
+    outcomes: list[DecisionOutcome | None] = [None] * len(riders)
     if question is not None:
         requests = [rider.driver.request(p) for rider, p in zip(riders, proposals, strict=True)]
-        outcomes = list(consult(question, requests, riders[0].driver.robot))
+        outcomes = list(request_decisions(question, requests, riders[0].driver.robot))
     for rider, proposal, outcome in zip(riders, proposals, outcomes, strict=True):
         if outcome is not None:
             tally.round_trip_ms += outcome.round_trip_ms
@@ -236,7 +238,7 @@ def cycle(riders: list[ActorRunner], question: Ask | None, tally: Tally, stop: C
 
 
 def cycle_together(
-    fleet: Fleet, riders: list[ActorRunner], question: Ask | None, tally: Tally, stop: Callable[[], bool]
+    fleet: RobotGroup, riders: list[ActorRunner], question: Ask | None, tally: ActorStats, stop: Callable[[], bool]
 ) -> bool:
     """One period of the robots of one world; False: the end. Time passes for all of them or for none."""
     if not fleet.running:
@@ -250,9 +252,9 @@ def cycle_together(
     if not all(rider.ready(stop) for rider in riders if rider.driver.running):
         return False
     proposals = [rider.propose() if rider.driver.running else rider.driver.robot.at_zero() for rider in riders]
-    outcomes: list[Outcome | None] = [None] * len(riders)
+    outcomes: list[DecisionOutcome | None] = [None] * len(riders)
     if question is not None:
-        outcomes = as_one(consult(question, fleet.requests(proposals), riders[0].driver.robot))
+        outcomes = joint_outcomes(request_decisions(question, fleet.requests(proposals), riders[0].driver.robot))
     told = list(zip(riders, outcomes, strict=True))
     waits = all(outcome is not None and rider.driver.may_wait(outcome) for rider, outcome in told)
     for rider in riders:
@@ -276,7 +278,10 @@ def cycle_together(
 
 
 def run(
-    settings: ActorSettings, make: Make, propose: MakePolicy | None = None, make_world: MakeWorld | None = None
+    settings: ActorSettings,
+    make: EnvironmentFactory,
+    propose: PolicyFactory | None = None,
+    make_world: WorldFactory | None = None,
 ) -> bool:
     """Drive until the learner says the run is done (True), or SIGINT or SIGTERM. propose: a policy instead of learning,
     for as many steps as the settings say (of a fleet: until one robot has taken them); make_world: of a fleet.
@@ -284,7 +289,7 @@ def run(
     Raises:
         RefusedByLearner, Unreachable: with what to do.
     """
-    tally = Tally()
+    tally = ActorStats()
     with Process(settings.bus, settings.name) as process:
         stop = process.stop.is_set
         world = None
@@ -293,9 +298,9 @@ def run(
             world = make_world(robot_with_task(settings.robot), settings.arena, settings.robots, number)
         places: Sequence[Environment | None] = [None] * settings.robots if world is None else world.members
         riders = [ActorRunner(process, settings, i, make, propose, env=env) for i, env in enumerate(places)]
-        one_period: Callable[[list[ActorRunner], Ask | None, Tally, Callable[[], bool]], bool] = cycle
+        one_period: Callable[[list[ActorRunner], Ask | None, ActorStats, Callable[[], bool]], bool] = cycle
         if world is not None:
-            fleet = Fleet(world, [rider.driver for rider in riders], settings.method != "none")
+            fleet = RobotGroup(world, [rider.driver for rider in riders], settings.method != "none")
             one_period = partial(cycle_together, fleet)
         started = time.monotonic()
 

@@ -6,7 +6,7 @@ from dataclasses import asdict, dataclass
 
 
 @dataclass(frozen=True)
-class Change:
+class PhysicsChange:
     """What becomes of each robot after so many steps: the robot that was recorded is not the one that drives on.
 
     What is None stays as it is; a robot kind refuses what it does not have.

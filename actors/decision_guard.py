@@ -17,7 +17,7 @@ Ask = Callable[[Sequence[pb.Request]], list[pb.Reply]]  # raises BusError when t
 
 
 @dataclass(frozen=True)
-class Outcome:
+class DecisionOutcome:
     """Of one question about one robot: an answer, or why there is none."""
 
     request: pb.Request
@@ -34,7 +34,7 @@ class Outcome:
         return message
 
 
-def consult(ask: Ask, requests: Sequence[pb.Request], robot: Robot) -> list[Outcome]:
+def request_decisions(ask: Ask, requests: Sequence[pb.Request], robot: Robot) -> list[DecisionOutcome]:
     """One question for all robots of a process. Whatever goes wrong, each has an outcome."""
     before = perf_counter_ns()
     replies: Sequence[pb.Reply | None]
@@ -46,17 +46,19 @@ def consult(ask: Ask, requests: Sequence[pb.Request], robot: Robot) -> list[Outc
     return [_outcome(request, reply, failure, elapsed, robot) for request, reply in zip(requests, replies, strict=True)]
 
 
-def _outcome(request: pb.Request, reply: pb.Reply | None, failure: str, elapsed: float, robot: Robot) -> Outcome:
+def _outcome(
+    request: pb.Request, reply: pb.Reply | None, failure: str, elapsed: float, robot: Robot
+) -> DecisionOutcome:
     answer = None
     if reply is not None:
         try:
             answer = read(reply, request, robot)
         except SafetyError as error:
             failure = str(error)
-    return Outcome(request, reply, answer, failure, elapsed)
+    return DecisionOutcome(request, reply, answer, failure, elapsed)
 
 
-def next_input(backup_plan: BackupPlan, outcome: Outcome) -> Array:
+def next_input(backup_plan: BackupPlan, outcome: DecisionOutcome) -> Array:
     """The input to execute now: the answer's, else the committed plan's."""
     if outcome.answer is not None:
         return accept(backup_plan, outcome.answer)

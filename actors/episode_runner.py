@@ -8,7 +8,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from brakeline.actors.decision_guard import Outcome, at_rest, next_input
+from brakeline.actors.decision_guard import DecisionOutcome, at_rest, next_input
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.task import RobotWithTask
 from brakeline.safety.filter.backup_plan import Array, BackupPlan, Prediction, correction_penalty
@@ -16,7 +16,7 @@ from brakeline.safety.perception.image_memory import filled, memory_of
 from brakeline.safety.service.client import obstacle_messages, request_message
 from brakeline.safety.service.wire import KINDS
 
-Result = tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]  # of a step
+StepResult = tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]  # of a step
 EPISODE_STRIDE = 4096  # episodes of different robots of a run never share a seed: seed = episode · stride + number
 
 
@@ -27,14 +27,14 @@ class Environment(Protocol):
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[NDArray[np.float32], dict[str, Any]]: ...
 
-    def step(self, action: Array) -> Result: ...
+    def step(self, action: Array) -> StepResult: ...
 
     def alter(self, **changes: float) -> None:
         """Change the robot's physics, from now on."""
 
 
 @dataclass(frozen=True)
-class Identity:
+class ActorIdentity:
     """Who drives: its name on the bus, its number in the run, and the run's seed."""
 
     actor: str
@@ -56,7 +56,7 @@ class EpisodeRunner:
         self,
         robot: RobotWithTask,
         env: Environment,
-        identity: Identity,
+        identity: ActorIdentity,
         penalty: float = 0.0,
         filtered: bool = True,
         cuts: bool = False,
@@ -127,16 +127,16 @@ class EpisodeRunner:
         """Fill in the scan, if there is one, with what was seen free before."""
         self._scan = filled(self._memory, self.info, self.robot.period)
 
-    def may_wait(self, outcome: Outcome) -> bool:
+    def may_wait(self, outcome: DecisionOutcome) -> bool:
         """No answer, and nothing moves: better to ask again than to let the episode pass."""
         return outcome.answer is None and at_rest(self.backup_plan)
 
-    def execute(self, proposal: Array, outcome: Outcome | None, weights_version: int = 0) -> pb.Step:
+    def execute(self, proposal: Array, outcome: DecisionOutcome | None, weights_version: int = 0) -> pb.Step:
         """Do what the outcome says (without a filter: the proposal) for one period."""
         action = self.command(proposal, outcome)
         return self.took(proposal, outcome, action, self.env.step(action), weights_version)
 
-    def command(self, proposal: Array, outcome: Outcome | None) -> Array:
+    def command(self, proposal: Array, outcome: DecisionOutcome | None) -> Array:
         """The input of the coming period; the committed plan moves on. Without a filter a proposal with NaN or infinity
         counts as standing still."""
         self._number = self.step
@@ -145,14 +145,19 @@ class EpisodeRunner:
             return np.asarray(np.clip(proposal, self.robot.low(), self.robot.high()))
         return next_input(self.backup_plan, outcome)
 
-    def stood(self, result: Result) -> None:
+    def stood(self, result: StepResult) -> None:
         """A period passed in which it had nothing to do: its episode is over, its world is not."""
         self.observation, _, _, _, self.info = result
         self._remember()
         self.step += 1
 
     def took(
-        self, proposal: Array, outcome: Outcome | None, action: Array, result: Result, weights_version: int = 0
+        self,
+        proposal: Array,
+        outcome: DecisionOutcome | None,
+        action: Array,
+        result: StepResult,
+        weights_version: int = 0,
     ) -> pb.Step:
         """The step that came of a command."""
         before, held = self.observation, self.info["input_in_force"]
@@ -200,7 +205,7 @@ class EpisodeRunner:
         self.step += 1
         return step
 
-    def _note(self, step: pb.Step, outcome: Outcome) -> None:
+    def _note(self, step: pb.Step, outcome: DecisionOutcome) -> None:
         """What the filter did about this step, and whether the state after it is where the filter said."""
         if outcome.answer is None:
             step.fallback = True

@@ -20,15 +20,22 @@ from typing import Any
 import numpy as np
 from google.protobuf.message import Message
 
-from brakeline.actors.actor_process import PRACTISED, ActorRunner, ActorSettings, Make, Tally, cycle
+from brakeline.actors.actor_process import (
+    STOP_PRACTICE,
+    ActorRunner,
+    ActorSettings,
+    ActorStats,
+    EnvironmentFactory,
+    cycle,
+)
 from brakeline.actors.actor_settings import FlightSettings as FlightSettings
-from brakeline.actors.decision_guard import Ask, Outcome, consult
-from brakeline.actors.mavlink.frame_log import Tap
-from brakeline.actors.mavlink.frame_recorder import Puts
+from brakeline.actors.decision_guard import Ask, DecisionOutcome, request_decisions
+from brakeline.actors.mavlink.frame_log import FrameTap
+from brakeline.actors.mavlink.frame_recorder import MessageSink
 from brakeline.actors.mavlink.mavlink_vehicle import ControlPeriod
 from brakeline.actors.mavlink.vehicle_client import VehicleClient
 from brakeline.actors.mavlink.vehicle_messages import FlightRequest
-from brakeline.actors.policies import MakePolicy
+from brakeline.actors.policies import PolicyFactory
 from brakeline.messaging.bus import BusError
 from brakeline.messaging.process_runtime import Process
 from brakeline.messaging.robot import Robot
@@ -47,23 +54,23 @@ GOALS = 12  # after which they come again: what a policy works out about a goal 
 PATIENCE = 0.2  # s between questions to a service that does not answer yet
 
 
-class Unfiltered(ValueError):
+class FilterRequired(ValueError):
     """In real time nobody flies without the filter: its plan is what is flown when nothing else comes."""
 
 
-class NoRoom(ValueError):
+class TakeoffNotVerified(ValueError):
     """Not even hovering can be verified where the flight is to begin."""
 
 
-class Outbox:
+class BackgroundPublisher:
     """Publishes in a thread of its own: a receiver that does not drain may block it, and not the flight."""
 
     def __init__(self) -> None:
-        self._queue: SimpleQueue[tuple[Puts, Message] | None] = SimpleQueue()
+        self._queue: SimpleQueue[tuple[MessageSink, Message] | None] = SimpleQueue()
         self._thread = Thread(target=self._run, name="outbox", daemon=True)
         self._thread.start()
 
-    def at(self, publisher: Puts) -> Posting:
+    def at(self, publisher: MessageSink) -> Posting:
         """What publishes there."""
         return Posting(publisher, self._queue)
 
@@ -85,15 +92,15 @@ class Outbox:
 class Posting:
     """A publisher behind an outbox."""
 
-    publisher: Puts
-    queue: SimpleQueue[tuple[Puts, Message] | None]
+    publisher: MessageSink
+    queue: SimpleQueue[tuple[MessageSink, Message] | None]
 
     def put(self, message: Message) -> None:
         """Never waits."""
         self.queue.put((self.publisher, message))
 
 
-class Flight:
+class RealTimeVehicle:
     """A live vehicle as the environment sees it: `step` ends with the period; what was committed is carried out.
 
     What is true is not known here: the estimate stands for it, also where rays are cast.
@@ -139,7 +146,7 @@ class Flight:
         raise ValueError(f"a vehicle behind a link cannot be altered: {', '.join(changes)}")
 
 
-class FlightRider(ActorRunner):
+class FlightRunner(ActorRunner):
     """A rider whose world does not wait."""
 
     waits = False
@@ -149,37 +156,37 @@ class FlightRider(ActorRunner):
         process: Process,
         settings: ActorSettings,
         stages: Sequence[Arena],
-        propose: MakePolicy | None,
-        outbox: Outbox,
+        propose: PolicyFactory | None,
+        outbox: BackgroundPublisher,
         conditions: Conditions,
     ) -> None:
         super().__init__(process, settings, 0, self._environment(stages, conditions), propose, goes_on=True)
-        self._flight: Flight | None = None
+        self._flight: RealTimeVehicle | None = None
         self.answers: Counter[str] = Counter()  # in time | late | none | lost
         self.steps, self.episodes, self.exchanges = map(outbox.at, (self.steps, self.episodes, self.exchanges))
         self.tape.publisher = outbox.at(self.tape.publisher)
 
     @property
-    def flight(self) -> Flight:
+    def flight(self) -> RealTimeVehicle:
         """Once it has begun."""
         assert self._flight is not None, "begin the flight first"
         return self._flight
 
     def take(self, vehicle: VehicleClient) -> None:
         """From here on it flies this one, which hovers. What is slow the first time is done once before."""
-        self._flight = Flight(vehicle, self.driver.skip)
+        self._flight = RealTimeVehicle(vehicle, self.driver.skip)
         observation, info = self.driver.env.reset(options={"episode_seed": 0})
         self.proposer.begin(np.random.default_rng(0))
         self.proposer.propose(observation, info)
         self._stage = -1
         self._flight.catch_up()
 
-    def settle(self, outcome: Outcome) -> Outcome:
+    def settle(self, outcome: DecisionOutcome) -> DecisionOutcome:
         """Hand the plan over, if it comes in time and what it was made from counts; else there is no answer."""
         period, answer = self.flight.current_period, outcome.answer
         if period.lost:
             what, outcome = "lost", replace(outcome, answer=None, failure=f"Lost: {period.lost}")
-        elif outcome.failure == PRACTISED:
+        elif outcome.failure == STOP_PRACTICE:
             what = "not needed"
         elif answer is None:
             what = "none"
@@ -207,7 +214,7 @@ class FlightRider(ActorRunner):
             **self._flight.vehicle.figures(),
         }
 
-    def _environment(self, stages: Sequence[Arena], conditions: Conditions) -> Make:
+    def _environment(self, stages: Sequence[Arena], conditions: Conditions) -> EnvironmentFactory:
         """Obstacles are virtual: what a scan shows is cast from the estimated pose."""
         seeing = conditions.perception.kind == "scan"
         noise = conditions.lidar_noise(flies=True) if seeing else 0.0
@@ -218,14 +225,14 @@ class FlightRider(ActorRunner):
 
         self._stage = -1
 
-        def make(robot: RobotWithTask, arena: str, seed: int, *, tap: Tap | None = None) -> NavigationEnv:
+        def make(robot: RobotWithTask, arena: str, seed: int, *, tap: FrameTap | None = None) -> NavigationEnv:
             vehicle = lambda arena, rng: self.flight  # noqa: E731
             return NavigationEnv(robot, arena, vehicle, noise, seed, draw=draw, perception=conditions.perception)
 
         return make
 
 
-def prepared(propose: MakePolicy, stages: Sequence[Arena], seed: int) -> Any:
+def prepared(propose: PolicyFactory, stages: Sequence[Arena], seed: int) -> Any:
     """The policy, with what it must know of the map worked out."""
     policy = propose(seed)
     if hasattr(policy, "prepare"):
@@ -240,7 +247,7 @@ def answered(question: Ask, robot: Robot, stage: Arena, filtered: bool, stop: Ca
     filtered: by our own filter, which knows whether it could.
 
     Raises:
-        NoRoom: hovering there can't be verified, let alone a flight from there.
+        TakeoffNotVerified: hovering there can't be verified, let alone a flight from there.
     """
     start = np.array(stage.start[: robot.position_dim])
     state = np.concatenate([start, np.zeros(robot.state_dim - len(start))])
@@ -249,10 +256,10 @@ def answered(question: Ask, robot: Robot, stage: Arena, filtered: bool, stop: Ca
     said = ""
     while not stop():
         request = request_message(BackupPlan(robot), state, np.zeros(robot.action_dim), seen, known_free=True)
-        outcome = consult(question, [request], robot)[0]
+        outcome = request_decisions(question, [request], robot)[0]
         if outcome.answer is not None:
             if filtered and outcome.answer.kind not in ("allowed", "adjusted"):
-                raise NoRoom(
+                raise TakeoffNotVerified(
                     f"not taking off: hovering at the start, {away.min():.2f} m from the nearest obstacle, can't be "
                     f"verified ({outcome.answer.reason}). Where this vehicle drifts to is known too badly for "
                     "that much room: collect more data, or fly where there is more"
@@ -269,27 +276,27 @@ def run(
     settings: ActorSettings,
     flight: FlightSettings,
     arena: Arena,
-    propose: MakePolicy | None = None,
+    propose: PolicyFactory | None = None,
     conditions: Conditions | None = None,
 ) -> bool:
     """Fly from goal to goal on the arena's map until the learner's run is done or the policy's steps are taken (True),
     or SIGINT or SIGTERM; then brake, and leave the vehicle to its autopilot. Of the conditions, perception counts.
 
     Raises:
-        Unfiltered, NoRoom, RefusedByLearner, Unreachable, BadLink: with what to do.
+        FilterRequired, TakeoffNotVerified, RefusedByLearner, Unreachable, BadLink: with what to do.
         MavlinkError: no autopilot, it refuses something, or nobody flies it any more.
     """
     robot = robot_with_task(settings.robot)
     if settings.method == "none" or not robot.late:
-        raise Unfiltered("in real time a robot flies behind the filter, with plans that reckon with the delay")
+        raise FilterRequired("in real time a robot flies behind the filter, with plans that reckon with the delay")
     stages = tour(arena, GOALS, np.random.default_rng(settings.seed), robot)
     if propose is not None:
         policy = prepared(propose, stages, settings.seed)
         propose = lambda _: policy  # noqa: E731
-    tally, outbox = Tally(), Outbox()
+    tally, outbox = ActorStats(), BackgroundPublisher()
     with Process(settings.bus, settings.name) as process:
         stop, started = process.stop.is_set, time.monotonic()
-        rider = FlightRider(process, settings, stages, propose, outbox, conditions or Conditions())
+        rider = FlightRunner(process, settings, stages, propose, outbox, conditions or Conditions())
         process.refresh = lambda: process.figures.update(tally.figures(time.monotonic() - started) | rider.figures())
         process.announce()
         question = partial(ask, process.bus, deadline=settings.deadline)

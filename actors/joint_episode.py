@@ -10,13 +10,13 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, Protocol
 
-from brakeline.actors.decision_guard import Outcome
-from brakeline.actors.episode_runner import Environment, EpisodeRunner, Result
+from brakeline.actors.decision_guard import DecisionOutcome
+from brakeline.actors.episode_runner import Environment, EpisodeRunner, StepResult
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.safety.filter.backup_plan import Array
 
 
-class World(Protocol):
+class SharedWorld(Protocol):
     """Several robots in one physics: `brakeline.sim.shared_world.FleetEnv`."""
 
     @property
@@ -30,10 +30,10 @@ class World(Protocol):
         """One period of all robots: what each member's `step` would return."""
 
 
-class Fleet:
+class RobotGroup:
     """The drivers of one world."""
 
-    def __init__(self, world: World, drivers: Sequence[EpisodeRunner], promising: bool = True) -> None:
+    def __init__(self, world: SharedWorld, drivers: Sequence[EpisodeRunner], promising: bool = True) -> None:
         """promising: they ask for promises; without, they know nothing of each other."""
         self.world, self.drivers = world, list(drivers)
         for driver in self.drivers:
@@ -53,12 +53,15 @@ class Fleet:
         return [driver.request(proposal) for driver, proposal in zip(self.drivers, proposals, strict=True)]
 
     def execute(
-        self, proposals: Sequence[Array], outcomes: Sequence[Outcome | None], versions: Sequence[int] | None = None
+        self,
+        proposals: Sequence[Array],
+        outcomes: Sequence[DecisionOutcome | None],
+        versions: Sequence[int] | None = None,
     ) -> list[pb.Step | None]:
         """One period of all; None for those whose episode was over."""
-        told = list(zip(self.drivers, proposals, as_one(outcomes), strict=True))
+        told = list(zip(self.drivers, proposals, joint_outcomes(outcomes), strict=True))
         inputs = [driver.command(proposal, outcome) for driver, proposal, outcome in told]
-        results: list[Result] = self.world.step(inputs)
+        results: list[StepResult] = self.world.step(inputs)
         versions = versions or [0] * len(told)
         steps: list[pb.Step | None] = []
         for (driver, proposal, outcome), action, result, version in zip(told, inputs, results, versions, strict=True):
@@ -70,7 +73,7 @@ class Fleet:
         return steps
 
 
-def as_one(outcomes: Sequence[Outcome | None]) -> list[Outcome | None]:
+def joint_outcomes(outcomes: Sequence[DecisionOutcome | None]) -> list[DecisionOutcome | None]:
     """If there is no answer about one robot there is none about any: the others' new plans may rest on that one's."""
     missing = next((o for o in outcomes if o is not None and o.answer is None), None)
     if missing is None:

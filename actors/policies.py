@@ -17,7 +17,7 @@ from brakeline.sim.scripted_policies import Policy, scripted
 log = logging.getLogger("brakeline.actor")
 
 Stop = Callable[[], bool]
-MakePolicy = Callable[[int], Policy]  # from a seed
+PolicyFactory = Callable[[int], Policy]  # from a seed
 
 
 class Proposer(Protocol):
@@ -72,7 +72,7 @@ class LearnedPolicy:
         return np.asarray(policy.explore(observation, self._rng), dtype=float)
 
 
-class FlyingPupil(LearnedPolicy):
+class RealTimePolicy(LearnedPolicy):
     """A pupil that cannot stand and wait: it flies on with the weights that it has, and joins again meanwhile."""
 
     _joining: threading.Thread | None = None
@@ -86,12 +86,12 @@ class FlyingPupil(LearnedPolicy):
         return not self.student.done
 
 
-class Fixed:
+class FixedPolicy:
     """A policy that learns nothing; after so many steps it is done (0: never)."""
 
     version = 0
 
-    def __init__(self, make: MakePolicy, seed: int, steps: int = 0) -> None:
+    def __init__(self, make: PolicyFactory, seed: int, steps: int = 0) -> None:
         self.policy, self._steps = make(seed), steps
 
     def join(self, index: int, episode: int, stop: Stop) -> int | None:

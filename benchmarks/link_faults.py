@@ -29,7 +29,7 @@ from benchmarks import sitl
 from benchmarks.flights import SETUPS, switched_on
 from benchmarks.repeated import repeated
 from benchmarks.timing import Words
-from brakeline.actors.mavlink.autopilot_commands import Client, MavlinkError
+from brakeline.actors.mavlink.autopilot_commands import AutopilotClient, MavlinkError
 from brakeline.actors.mavlink.ground_truth import MavlinkGroundTruth
 from brakeline.actors.mavlink.telemetry import MOTION, TRUTH, Array
 from brakeline.deploy.interpreter import PYTHON
@@ -262,7 +262,7 @@ def relayed(url: str) -> Iterator[Relay]:
 class Judge:
     """Hears truth and estimate beside whoever flies, and compares with the map: all since it was last asked."""
 
-    client: Client
+    client: AutopilotClient
     link: Link
     truth: MavlinkGroundTruth
     airborne: bool = False
@@ -306,7 +306,7 @@ ORIGIN = (MAP.start[0], MAP.start[1], 0.0)  # of the autopilot's local frame, on
 def judged(url: str, system: int) -> Iterator[Judge]:
     robot = robot_named("quadrotor-late")
     link = open_link(url)
-    client = Client(link.send, system)
+    client = AutopilotClient(link.send, system)
     judge = Judge(client, link, MavlinkGroundTruth(lambda at: float(MAP.shapes.distance(at).min()) - robot.footprint))
 
     def wait(condition: Callable[[], bool], seconds: float) -> bool:

@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.timing import Figures
-from brakeline.actors.decision_guard import Ask, consult
-from brakeline.actors.episode_runner import EpisodeRunner, Identity
-from brakeline.actors.mavlink.autopilot_commands import Client
-from brakeline.actors.mavlink.lockstep_quadrotor import MavlinkVehicle
+from brakeline.actors.decision_guard import Ask, request_decisions
+from brakeline.actors.episode_runner import ActorIdentity, EpisodeRunner
+from brakeline.actors.mavlink.autopilot_commands import AutopilotClient
+from brakeline.actors.mavlink.lockstep_quadrotor import LockstepQuadrotor
 from brakeline.deploy.data.model_store import model_for
 from brakeline.deploy.experiments.evaluate import in_process
 from brakeline.messaging.task import robot_with_task
@@ -57,10 +57,12 @@ class Loss:
         """m: how far the worst position after the actor's death was outside of what the committed plan's tube sweeps,
         along the worst axis; not above 0: never outside."""
         rng = np.random.default_rng(number)
-        propose, driver = scripted(policy, ROBOT, rng), EpisodeRunner(ROBOT, self._env, Identity("actor", 0, 0))
+        propose, driver = scripted(policy, ROBOT, rng), EpisodeRunner(ROBOT, self._env, ActorIdentity("actor", 0, 0))
         driver.begin(number)
         for _ in range(int(rng.integers(3, LONGEST))):
-            outcome = consult(self._question, [driver.request(propose(driver.observation, driver.info))], ROBOT)[0]
+            outcome = request_decisions(
+                self._question, [driver.request(propose(driver.observation, driver.info))], ROBOT
+            )[0]
             driver.execute(driver.backup_plan.plan[0], outcome)
             if not driver.running:
                 break
@@ -72,7 +74,7 @@ class Loss:
     def _die(self, input: Array) -> Array:
         """The last input for a period, again at its end, then silence: true positions (K, 3), one a tick."""
         endpoint = self._endpoint
-        client = Client(endpoint.receive)
+        client = AutopilotClient(endpoint.receive)
         client.setpoint(input)
         endpoint.vehicle.watch()
         endpoint.advance(ROBOT.period - TICK)
@@ -88,7 +90,7 @@ class Loss:
     def _vehicle(self, arena: Arena, rng: np.random.Generator) -> Vehicle:
         parameters = {SETPOINT_TIMEOUT[RULES]: self._timeout}
         self._endpoint = Autopilot(Quadrotor(arena, rng), RULES, parameters=parameters, quiet=True)
-        return LateVehicle(MavlinkVehicle(self._endpoint, ROBOT.in_lockstep()), ROBOT)
+        return LateVehicle(LockstepQuadrotor(self._endpoint, ROBOT.in_lockstep()), ROBOT)
 
 
 def run() -> Figures:

@@ -37,8 +37,8 @@ def real() -> list[tuple[str, Any]]:
     """Keys and messages of some episodes, driven in process (what it takes is not loaded where memory is measured)."""
     import numpy as np
 
-    from brakeline.actors.decision_guard import consult
-    from brakeline.actors.episode_runner import EpisodeRunner, Identity
+    from brakeline.actors.decision_guard import request_decisions
+    from brakeline.actors.episode_runner import ActorIdentity, EpisodeRunner
     from brakeline.deploy.data.model_store import model_for
     from brakeline.deploy.experiments.evaluate import in_process
     from brakeline.deploy.vehicle_factory import environment
@@ -48,14 +48,14 @@ def real() -> list[tuple[str, Any]]:
 
     ground = robot_with_task("ground")
     ask = in_process(model_for(ground, ModelConfig()))
-    driver = EpisodeRunner(ground, environment(ground, "default", 7), Identity("actor-0", 0, 7))
+    driver = EpisodeRunner(ground, environment(ground, "default", 7), ActorIdentity("actor-0", 0, 7))
     policy = scripted("greedy", ground, np.random.default_rng(7))
     found: list[tuple[str, Any]] = []
     for number in range(EPISODES):
         found.append(("episode/ground/actor-0", driver.begin(number)))
         while driver.running:
             proposal = np.asarray(policy(driver.observation, driver.info), dtype=float)
-            outcome = consult(ask, [driver.request(proposal)], ground)[0]
+            outcome = request_decisions(ask, [driver.request(proposal)], ground)[0]
             found.append(("exchange/ground/actor-0", outcome.exchange(driver.info["time"])))
             found.append(("step/ground/actor-0", driver.execute(proposal, outcome)))
         found.append(("health/actor-0", pb.Health(process="actor-0", figures={"steps_per_s": 100.0, "steps": number})))

@@ -14,7 +14,7 @@ from tempfile import gettempdir
 
 from filelock import FileLock, Timeout
 
-from brakeline.actors.mavlink.autopilot_commands import Client
+from brakeline.actors.mavlink.autopilot_commands import AutopilotClient
 from brakeline.messaging.byte_links import open_link
 
 KINDS = ("ardupilot", "px4")
@@ -77,7 +77,7 @@ def hall(system: int) -> str:
 def configure(url: str, system: int, parameters: Mapping[str, float]) -> None:
     """Set them, and wait until they are in a file. Raises NoAutopilot: it does not take one of them."""
     link = open_link(url)
-    client = Client(link.send, system)
+    client = AutopilotClient(link.send, system)
 
     def wait(condition: Callable[[], bool], seconds: float) -> bool:
         end = time.monotonic() + seconds

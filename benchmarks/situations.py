@@ -6,8 +6,8 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from brakeline.actors.decision_guard import consult
-from brakeline.actors.episode_runner import EpisodeRunner, Identity
+from brakeline.actors.decision_guard import request_decisions
+from brakeline.actors.episode_runner import ActorIdentity, EpisodeRunner
 from brakeline.deploy.data.model_store import model_for
 from brakeline.deploy.experiments.evaluate import in_process
 from brakeline.deploy.policy_loading import policy_named
@@ -33,7 +33,7 @@ def messages(
     """The questions of some episodes of a policy behind the default filter."""
     robot = robot or robot_with_task("ground")
     question = in_process(model(robot=robot))
-    driver = EpisodeRunner(robot, environment(robot, "default", seed, conditions), Identity("bench", 0, seed))
+    driver = EpisodeRunner(robot, environment(robot, "default", seed, conditions), ActorIdentity("bench", 0, seed))
     choose = policy_named(policy, robot, seed)
     asked: list[pb.Request] = []
     episode = 0
@@ -43,7 +43,7 @@ def messages(
         while driver.running and len(asked) < STEPS:
             proposal = np.asarray(choose(driver.observation, driver.info), dtype=float)
             asked.append(driver.request(proposal))
-            driver.execute(proposal, consult(question, [asked[-1]], robot)[0])
+            driver.execute(proposal, request_decisions(question, [asked[-1]], robot)[0])
     return asked
 
 

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from brakeline.actors.mavlink.frame_log import Tap
-from brakeline.actors.mavlink.lockstep_quadrotor import MavlinkVehicle
+from brakeline.actors.mavlink.frame_log import FrameTap
+from brakeline.actors.mavlink.lockstep_quadrotor import LockstepQuadrotor
 from brakeline.actors.mavlink.px4_lockstep import QUIET, Px4Flight, Px4Vehicle
 from brakeline.messaging.task import RobotWithTask, robot_with_task
 from brakeline.sim.arena import Arena
@@ -24,7 +24,7 @@ from brakeline.sim.vehicle import MakeVehicle
 from brakeline.sim.wind import Wind
 
 
-def embedded(conditions: Conditions, tap: Tap | None = None) -> MakeVehicle:
+def embedded(conditions: Conditions, tap: FrameTap | None = None) -> MakeVehicle:
     """Makes quadrotors behind their own autopilots."""
     return partial(embedded_quadrotor, noise=conditions.flight_noise, wind=conditions.wind, tap=tap)
 
@@ -36,18 +36,18 @@ def embedded_quadrotor(
     wind: Wind | None = None,
     rules: str = "px4",
     *,
-    tap: Tap | None = None,
-) -> MavlinkVehicle:
+    tap: FrameTap | None = None,
+) -> LockstepQuadrotor:
     """A quadrotor behind its own autopilot, over MAVLink in memory.
 
     It brakes by itself when a setpoint is overdue by a period. tap: is called with every MAVLink frame.
     """
     parameters = {SETPOINT_TIMEOUT[rules]: QUADROTOR.period}
     autopilot = Autopilot(Quadrotor(arena, rng, noise, wind), rules, parameters=parameters, quiet=True)
-    return MavlinkVehicle(autopilot, QUADROTOR, tap)
+    return LockstepQuadrotor(autopilot, QUADROTOR, tap)
 
 
-def behind_px4(conditions: Conditions, tap: Tap | None = None) -> MakeVehicle:
+def behind_px4(conditions: Conditions, tap: FrameTap | None = None) -> MakeVehicle:
     """Makes quadrotors behind the real PX4 in the folder `$BRAKELINE_PX4`: one process flies all their episodes.
 
     Raises:

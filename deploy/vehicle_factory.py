@@ -19,13 +19,13 @@ from brakeline.sim.sim_conditions import Conditions
 from brakeline.sim.vehicle import MakeVehicle, Vehicle
 
 if TYPE_CHECKING:
-    from brakeline.actors.mavlink.frame_log import Tap
+    from brakeline.actors.mavlink.frame_log import FrameTap
     from brakeline.sim.shared_world import FleetEnv
 
 YARD = {2: 50.0, 3: 500.0}  # m to the walls of the place where data are recorded: farther than a trajectory can go
 
 
-def factory(robot: RobotWithTask, conditions: Conditions, tap: Tap | None = None) -> MakeVehicle:
+def factory(robot: RobotWithTask, conditions: Conditions, tap: FrameTap | None = None) -> MakeVehicle:
     """What makes a vehicle of that kind under these conditions; tap: see `environment`.
 
     Raises:
@@ -39,7 +39,7 @@ def factory(robot: RobotWithTask, conditions: Conditions, tap: Tap | None = None
 
 
 def environment(
-    robot: RobotWithTask, arena: str, seed: int, conditions: Conditions | None = None, *, tap: Tap | None = None
+    robot: RobotWithTask, arena: str, seed: int, conditions: Conditions | None = None, *, tap: FrameTap | None = None
 ) -> NavigationEnv:
     """A Gymnasium environment; `seed` sets its episodes apart from those of another seed; tap: is called with every
     MAVLink frame of a robot that has any.

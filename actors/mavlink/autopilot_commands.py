@@ -43,11 +43,11 @@ class CommandRefused(MavlinkError):
     """A COMMAND_ACK with another result than accepted, or none."""
 
 
-class NotTold(MavlinkError):
+class TelemetryMissing(MavlinkError):
     """Something that is needed comes by none of the messages that could tell it."""
 
 
-class Client(MavlinkDecoder):
+class AutopilotClient(MavlinkDecoder):
     """Commands to an autopilot, and what it tells: see `MavlinkDecoder`."""
 
     lookahead: PositionLookahead | None = None  # it is told places in place of velocities
@@ -58,7 +58,7 @@ class Client(MavlinkDecoder):
         Asked for one after the other, the best first; a grant counts for nothing until the message comes, at its rate.
 
         Raises:
-            NotTold: with what became of each.
+            TelemetryMissing: with what became of each.
         """
         kind, tried, rates = self.identify(wait), [], dict[str, float]()
         for source in SOURCES[what]:
@@ -77,7 +77,7 @@ class Client(MavlinkDecoder):
         best = max(rates, key=lambda name: rates[name], default="")
         if not best or rates[best] < min(SLOWEST, PROMPT / interval):
             del self.chosen[what]
-            raise NotTold(f"it does not tell its {what}: {', '.join(tried)}")
+            raise TelemetryMissing(f"it does not tell its {what}: {', '.join(tried)}")
         self.chosen[what] = best
         for name in rates.keys() - set(self.chosen.values()):
             with contextlib.suppress(CommandRefused):

@@ -12,7 +12,7 @@ KEPT = 10_000  # latest beginnings whose lateness is remembered
 
 
 @dataclass
-class Timing:
+class FlightTiming:
     """How real time was kept."""
 
     periods: int = 0
@@ -39,7 +39,7 @@ class Timing:
         }
 
 
-class Offset:
+class ClockOffset:
     """Our clock less the autopilot's [s], by the messages that came soonest.
 
     It falls at once and rises with the clocks' drift: milliseconds on a busy machine must not move it, for at 7 m/s

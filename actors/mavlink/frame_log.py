@@ -11,7 +11,7 @@ from brakeline.actors.mavlink.ardupilot_dialect import mavlink
 
 
 @dataclass(frozen=True)
-class Frame:
+class CapturedFrame:
     """One MAVLink frame as it was sent or received."""
 
     outgoing: bool
@@ -37,16 +37,16 @@ class Frame:
         return {"header": header, "message": {"type": fields.pop("mavpackettype"), **fields}}
 
 
-Tap = Callable[[Frame], None]
+FrameTap = Callable[[CapturedFrame], None]
 
 
-def decoded(raw: bytes, outgoing: bool) -> Frame | None:
+def decode_frame(raw: bytes, outgoing: bool) -> CapturedFrame | None:
     """A frame from its bytes; None if they are none."""
     try:
         message = mavlink.MAVLink(None).decode(bytearray(raw))
     except mavlink.MAVError:
         return None
-    return Frame(outgoing, raw, message)
+    return CapturedFrame(outgoing, raw, message)
 
 
 def _plain(value: Any) -> Any:

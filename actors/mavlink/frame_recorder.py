@@ -11,27 +11,27 @@ from google.protobuf.message import Message
 from brakeline.messaging import brakeline_pb2 as pb
 
 if TYPE_CHECKING:
-    from brakeline.actors.mavlink.frame_log import Frame
+    from brakeline.actors.mavlink.frame_log import CapturedFrame
 
 
 PART = 1000  # frames in a message, at most
 
 
-class Puts(Protocol):
+class MessageSink(Protocol):
     """A publisher, or what stands before one."""
 
     def put(self, message: Message) -> None:
         """Publish it."""
 
 
-class Tape:
+class FrameRecorder:
     """Takes frames, in whatever thread, and publishes those of a period as one message."""
 
-    def __init__(self, publisher: Puts, robot: str, actor: str) -> None:
+    def __init__(self, publisher: MessageSink, robot: str, actor: str) -> None:
         self.publisher, self._robot, self._actor = publisher, robot, actor
         self._frames: deque[pb.MavlinkFrame] = deque()
 
-    def take(self, frame: Frame) -> None:
+    def take(self, frame: CapturedFrame) -> None:
         """A frame that was sent or received now."""
         self.keep(pb.MavlinkFrame(wall_time=time.time_ns(), outgoing=frame.outgoing, raw=frame.raw))
 

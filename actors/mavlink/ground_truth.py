@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from brakeline.actors.mavlink.telemetry import Array, Place
+from brakeline.actors.mavlink.telemetry import Array, GeoPosition
 from brakeline.messaging.rejected_messages import Tolerance
 from brakeline.sim.quadrotor import QUADROTOR
 
@@ -96,10 +96,10 @@ class MavlinkGroundTruth:
     clearance: float = math.inf
     least: float = math.inf
     worst: float = 0.0
-    _start: tuple[Place, Array] | None = None
+    _start: tuple[GeoPosition, Array] | None = None
     _touching: bool = False
 
-    def take(self, place: Place, estimate: Array, velocity: Array) -> None:
+    def take(self, place: GeoPosition, estimate: Array, velocity: Array) -> None:
         """Take the true place, and the estimated position (3,) [m] and velocity (3,) [m/s] of about the same moment.
 
         If `place` has no altitude, the estimate's height stands for it.

@@ -7,8 +7,8 @@ from typing import Protocol
 
 import numpy as np
 
-from brakeline.actors.mavlink.autopilot_commands import Client, CommandRefused, message_id
-from brakeline.actors.mavlink.frame_log import Tap
+from brakeline.actors.mavlink.autopilot_commands import AutopilotClient, CommandRefused, message_id
+from brakeline.actors.mavlink.frame_log import FrameTap
 from brakeline.actors.mavlink.telemetry import ATTITUDE, FORCE, MOTION, SOURCES, Array
 from brakeline.messaging.robot import Robot
 from brakeline.sim.quadrotor import SAMPLES, Quadrotor
@@ -27,16 +27,16 @@ class Endpoint(Protocol):
     def advance(self, seconds: float) -> None: ...
 
 
-class MavlinkVehicle:
+class LockstepQuadrotor:
     """A quadrotor flown over the bytes of an embedded autopilot, in lockstep: time passes only in `step`.
 
     What is measured comes from telemetry, what is true and what was touched from the simulator. The autopilot starts in
     the air; setpoints and mode are exchanged before time begins.
     """
 
-    def __init__(self, endpoint: Endpoint, robot: Robot, tap: Tap | None = None) -> None:
+    def __init__(self, endpoint: Endpoint, robot: Robot, tap: FrameTap | None = None) -> None:
         """tap: is called with every MAVLink frame. Raises MavlinkError when the autopilot refuses something."""
-        self._endpoint, self._client = endpoint, Client(endpoint.receive, tap=tap)
+        self._endpoint, self._client = endpoint, AutopilotClient(endpoint.receive, tap=tap)
         self._robot, period = robot, robot.period
         self.input = np.zeros(robot.action_dim)
         wait = self._wait

@@ -16,7 +16,7 @@ import numpy as np
 
 from brakeline.actors.mavlink import telemetry
 from brakeline.actors.mavlink.ardupilot_dialect import mavlink
-from brakeline.actors.mavlink.frame_log import Frame, Tap
+from brakeline.actors.mavlink.frame_log import CapturedFrame, FrameTap
 from brakeline.actors.mavlink.telemetry import (
     ATTITUDE,
     FORCE,
@@ -26,8 +26,8 @@ from brakeline.actors.mavlink.telemetry import (
     SOURCES,
     TRUTH,
     Array,
-    Motion,
-    Place,
+    GeoPosition,
+    MotionSample,
 )
 
 STATION, COMPONENT = 245, int(mavlink.MAV_COMP_ID_ONBOARD_COMPUTER)  # who we are
@@ -55,7 +55,7 @@ class MavlinkDecoder:
         self,
         send: Callable[[bytes], object],
         system: int = 1,
-        tap: Tap | None = None,
+        tap: FrameTap | None = None,
         say: Callable[[str], object] | None = None,
     ) -> None:
         """system: the autopilot's id; tap: called with each frame from it or to it; say: called with its texts."""
@@ -70,7 +70,7 @@ class MavlinkDecoder:
         self.position: Array | None = None
         self.velocity = np.zeros(3)
         self.path: list[tuple[float, Array]] = []
-        self.truth: Place | None = None  # ground truth of the autopilot's simulator
+        self.truth: GeoPosition | None = None  # ground truth of the autopilot's simulator
         self.texts: list[str] = []
         self.estimator: int | None = None  # flags, see telemetry.ESTIMATED
         self.battery: float | None = None  # %; None: unknown
@@ -90,7 +90,7 @@ class MavlinkDecoder:
         self._mav = mavlink.MAVLink(_Pipe(send), srcSystem=STATION, srcComponent=COMPONENT)
         self._mav.robust_parsing = True
         if tap is not None:
-            self._mav.set_send_callback(lambda message: tap(Frame(True, bytes(message.get_msgbuf()), message)))
+            self._mav.set_send_callback(lambda message: tap(CapturedFrame(True, bytes(message.get_msgbuf()), message)))
 
     @property
     def acceleration(self) -> Array:
@@ -116,7 +116,7 @@ class MavlinkDecoder:
                 continue
             self._count(message.get_seq())
             if self._tap is not None:
-                self._tap(Frame(False, bytes(message.get_msgbuf()), message))
+                self._tap(CapturedFrame(False, bytes(message.get_msgbuf()), message))
             name = message.get_type()
             self._came[name] += 1
             for what, place in SENDERS.get(name, ()):
@@ -150,7 +150,7 @@ class MavlinkDecoder:
         self.message_counts[what] += 1
         TAKERS[what](self, value)
 
-    def _move(self, motion: Motion) -> None:
+    def _move(self, motion: MotionSample) -> None:
         self.time, self.position, self.velocity = motion.time, motion.position, motion.velocity
         self.path.append((motion.time, motion.position))
 
@@ -163,7 +163,7 @@ class MavlinkDecoder:
     def _lift(self, airborne: bool) -> None:
         self.airborne = airborne
 
-    def _locate(self, place: Place) -> None:
+    def _locate(self, place: GeoPosition) -> None:
         self.truth = place
 
     def _on_heartbeat(self, message: Any) -> None:

@@ -11,9 +11,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from brakeline.actors.mavlink.autopilot_commands import Client, MavlinkError, NotTold
-from brakeline.actors.mavlink.flight_timing import Offset, Timing
-from brakeline.actors.mavlink.frame_log import Tap
+from brakeline.actors.mavlink.autopilot_commands import AutopilotClient, MavlinkError, TelemetryMissing
+from brakeline.actors.mavlink.flight_timing import ClockOffset, FlightTiming
+from brakeline.actors.mavlink.frame_log import FrameTap
 from brakeline.actors.mavlink.ground_truth import MavlinkGroundTruth, UdpGroundTruth
 from brakeline.actors.mavlink.takeoff import TELEMETRY, Takeoff
 from brakeline.actors.mavlink.telemetry import IN_FLIGHT, TRUTH, Array
@@ -74,7 +74,7 @@ class MavlinkVehicle:
         height: float = 3.0,
         origin: tuple[float, float, float] = (0.0, 0.0, 0.0),
         truth: UdpGroundTruth | None = None,
-        tap: Tap | None = None,
+        tap: FrameTap | None = None,
         tolerance: Tolerance | None = None,
         stop: Callable[[], bool] = lambda: False,
         raise_limits: bool = False,
@@ -104,9 +104,9 @@ class MavlinkVehicle:
         self._robot, self._told_to_stop = robot, stop
         self._link, self._truth = link, truth
         self._mavlink_truth = mavlink_truth if truth is None else None
-        self._client = Client(link.send, system, tap, lambda text: log.info("it says: %s", text))
+        self._client = AutopilotClient(link.send, system, tap, lambda text: log.info("it says: %s", text))
         self._origin, self._tolerance = np.asarray(origin), tolerance or Tolerance()
-        self.timing = Timing()
+        self.timing = FlightTiming()
         self._plan: list[Array] = []  # the inputs after the one in force
         self._sent_at = self._heartbeat_at = self._synced_at = -math.inf
         self._counted: dict[str, int] = {}  # messages by their quantity
@@ -115,7 +115,7 @@ class MavlinkVehicle:
         self._takeoff = Takeoff(self._client, robot, self._wait, self._hold, raise_limits, lead)
         self.notes = self._takeoff.notes
         self._velocity: Array | None = None  # the setpoint that is repeated
-        self._offsets = Offset()
+        self._offsets = ClockOffset()
         self._changed, self._ended, self._failure = threading.Condition(), threading.Event(), ""
         try:
             self._takeoff.fly(height)
@@ -223,7 +223,7 @@ class MavlinkVehicle:
     def _request_truth(self) -> None:
         try:
             self._takeoff.note(self._client.choose(TRUTH, TELEMETRY, self._wait))
-        except NotTold:
+        except TelemetryMissing:
             self._mavlink_truth = None
 
     # --- in the thread, once it runs --------------------------------------------------------------------------

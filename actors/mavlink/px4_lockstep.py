@@ -14,8 +14,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from brakeline.actors.mavlink.autopilot_commands import Client, MavlinkError
-from brakeline.actors.mavlink.frame_log import Frame, Tap
+from brakeline.actors.mavlink.autopilot_commands import AutopilotClient, MavlinkError
+from brakeline.actors.mavlink.frame_log import CapturedFrame, FrameTap
 from brakeline.messaging.robot import Robot
 from brakeline.sim.arena import Arena, closing, room_bounds
 from brakeline.sim.autopilot.common_dialect import mavlink
@@ -53,7 +53,7 @@ class Px4Flight:
     """
 
     def __init__(
-        self, folder: Path, noise: SensorNoise, parameters: dict[str, float] | None = None, tap: Tap | None = None
+        self, folder: Path, noise: SensorNoise, parameters: dict[str, float] | None = None, tap: FrameTap | None = None
     ) -> None:
         """folder, parameters: see Px4; tap: is called with every MAVLink frame between it and its companion."""
         self._folder, self._noise, self._parameters, self._tap = folder, noise, parameters, tap
@@ -136,7 +136,7 @@ class Px4Flight:
         rng = np.random.default_rng(self.starts)
         vehicle = Quadrotor(FIELD, rng, QUIET, floor=FAR)
         self.hil = Hil(px4.connection, vehicle, Sensors(self._noise, rng, vehicle.timestep))
-        self.client = Client(lambda data: link.sendto(data, ("127.0.0.1", px4.local)), tap=self._hear)
+        self.client = AutopilotClient(lambda data: link.sendto(data, ("127.0.0.1", px4.local)), tap=self._hear)
         self._told = dict.fromkeys(INTERVALS, 0.0)
         self.tell(np.zeros(3))
         while not self.hil.answering:
@@ -170,7 +170,7 @@ class Px4Flight:
         vehicle.resume(hil.vehicle)
         hil.vehicle, hil.shift = vehicle, (x + a - p, y + b - q, z + c - r)
 
-    def _hear(self, frame: Frame) -> None:
+    def _hear(self, frame: CapturedFrame) -> None:
         message = frame.message
         if not frame.outgoing and message.get_msgId() in self._told:
             micro = getattr(message, "time_usec", None)

@@ -10,7 +10,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from brakeline.actors.mavlink.autopilot_commands import Client, MavlinkError, NotTold, message_id
+from brakeline.actors.mavlink.autopilot_commands import AutopilotClient, MavlinkError, TelemetryMissing, message_id
 from brakeline.actors.mavlink.autopilot_limits import (
     AUTOPILOT_LIMITS,
     FIXED_TIMEOUT,
@@ -42,7 +42,7 @@ class Takeoff:
 
     def __init__(
         self,
-        client: Client,
+        client: AutopilotClient,
         robot: Robot,
         wait: Wait,
         hold: Callable[[Array | None], None],
@@ -69,7 +69,7 @@ class Takeoff:
         for what, interval in ((LANDED, 0.2), (ATTITUDE, TELEMETRY), (FORCE, TELEMETRY), (MOTION, TELEMETRY)):
             self.note(client.choose(what, interval, wait))
         if not wait(lambda: client.position is not None and client.airborne is not None, 3.0):
-            raise NotTold("it does not tell its position, or whether it flies")
+            raise TelemetryMissing("it does not tell its position, or whether it flies")
         self._smooth()
         for message, interval in STATUS[kind].items():
             with contextlib.suppress(MavlinkError):

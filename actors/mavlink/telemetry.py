@@ -31,7 +31,7 @@ Message = Any  # pymavlink is untyped
 
 
 @dataclass(frozen=True)
-class Motion:
+class MotionSample:
     """time [s] by the autopilot's clock, position [m] in its local frame, velocity [m/s]; (3,) each, ENU."""
 
     time: float
@@ -40,7 +40,7 @@ class Motion:
 
 
 @dataclass(frozen=True)
-class Place:
+class GeoPosition:
     """Latitude and longitude [1e-7 degrees], altitude [m] if it is told, and how many m of latitude one of these is:
     each simulator has an Earth of its own."""
 
@@ -49,7 +49,7 @@ class Place:
     altitude: float | None
     metres: float
 
-    def since(self, first: Place) -> Array:
+    def since(self, first: GeoPosition) -> Array:
         """(3,) m, ENU, from another; a height that is not told is 0."""
         narrow = math.cos(math.radians(1e-7 * first.latitude))
         up = 0.0 if self.altitude is None or first.altitude is None else self.altitude - first.altitude
@@ -58,7 +58,7 @@ class Place:
 
 
 @dataclass(frozen=True)
-class Source:
+class TelemetrySource:
     """A message that tells something; `read` gives None when it does not this time."""
 
     message: str
@@ -66,13 +66,13 @@ class Source:
     kinds: tuple[str, ...] = ("px4", "ardupilot")  # whose it is to be understood so
 
 
-def told(source: Source, message: Message) -> Any:
+def told(source: TelemetrySource, message: Message) -> Any:
     """What a message says; None: nothing, for what is no number is not told."""
     try:
         said = source.read(message)
     except (ValueError, OverflowError):  # of an infinite angle there is no sine
         return None
-    if isinstance(said, Motion):
+    if isinstance(said, MotionSample):
         numbers = math.isfinite(said.time) and bool(np.isfinite([said.position, said.velocity]).all())
     else:
         numbers = not isinstance(said, tuple) or all(map(math.isfinite, said))
@@ -99,18 +99,18 @@ def acceleration(attitude: Quaternion, force: Triple) -> Array:
     return np.array([east, north, -down - GRAVITY])
 
 
-def _position(m: Message) -> Motion:
-    return Motion(1e-3 * m.time_boot_ms, world((m.x, m.y, m.z)), world((m.vx, m.vy, m.vz)))
+def _position(m: Message) -> MotionSample:
+    return MotionSample(1e-3 * m.time_boot_ms, world((m.x, m.y, m.z)), world((m.vx, m.vy, m.vz)))
 
 
-def _odometry(m: Message) -> Motion | None:
+def _odometry(m: Message) -> MotionSample | None:
     """Only in the local frame; its velocity may be along the body."""
     velocity = (m.vx, m.vy, m.vz)
     if m.frame_id not in LOCAL or m.child_frame_id not in LOCAL + BODY:
         return None
     if m.child_frame_id in BODY:
         velocity = turned(tuple(m.q), velocity)
-    return Motion(1e-6 * m.time_usec, world((m.x, m.y, m.z)), world(velocity))
+    return MotionSample(1e-6 * m.time_usec, world((m.x, m.y, m.z)), world(velocity))
 
 
 def _quaternion(m: Message) -> Quaternion:
@@ -146,29 +146,32 @@ def _airborne(m: Message) -> bool | None:
     return None if m.landed_state == UNKNOWN else m.landed_state != ON_GROUND
 
 
-def _simstate(m: Message) -> Place:
-    return Place(m.lat, m.lng, None, 1e-7 * math.radians(1.0) * COPTER_EARTH)
+def _simstate(m: Message) -> GeoPosition:
+    return GeoPosition(m.lat, m.lng, None, 1e-7 * math.radians(1.0) * COPTER_EARTH)
 
 
-def _hil_state(m: Message) -> Place:
-    return Place(m.lat, m.lon, 1e-3 * m.alt, 1e-7 * math.radians(1.0) * PX4_EARTH)
+def _hil_state(m: Message) -> GeoPosition:
+    return GeoPosition(m.lat, m.lon, 1e-3 * m.alt, 1e-7 * math.radians(1.0) * PX4_EARTH)
 
 
-SOURCES: dict[str, tuple[Source, ...]] = {
+SOURCES: dict[str, tuple[TelemetrySource, ...]] = {
     ATTITUDE: (
-        Source("ATTITUDE_QUATERNION", _quaternion),
-        Source("ODOMETRY", _odometry_attitude),
-        Source("ATTITUDE", _euler),
+        TelemetrySource("ATTITUDE_QUATERNION", _quaternion),
+        TelemetrySource("ODOMETRY", _odometry_attitude),
+        TelemetrySource("ATTITUDE", _euler),
     ),
     FORCE: (
-        Source("HIGHRES_IMU", _metric),
-        Source("SCALED_IMU", _milligravities),
-        Source("RAW_IMU", _milligravities, ("ardupilot",)),  # raw by the book; there it is what SCALED_IMU has
-        Source("SCALED_IMU2", _milligravities),
+        TelemetrySource("HIGHRES_IMU", _metric),
+        TelemetrySource("SCALED_IMU", _milligravities),
+        TelemetrySource("RAW_IMU", _milligravities, ("ardupilot",)),  # raw by the book; there it is what SCALED_IMU has
+        TelemetrySource("SCALED_IMU2", _milligravities),
     ),
-    LANDED: (Source("EXTENDED_SYS_STATE", _airborne),),
-    MOTION: (Source("LOCAL_POSITION_NED", _position), Source("ODOMETRY", _odometry)),
-    TRUTH: (Source("SIMSTATE", _simstate, ("ardupilot",)), Source("HIL_STATE_QUATERNION", _hil_state, ("px4",))),
+    LANDED: (TelemetrySource("EXTENDED_SYS_STATE", _airborne),),
+    MOTION: (TelemetrySource("LOCAL_POSITION_NED", _position), TelemetrySource("ODOMETRY", _odometry)),
+    TRUTH: (
+        TelemetrySource("SIMSTATE", _simstate, ("ardupilot",)),
+        TelemetrySource("HIL_STATE_QUATERNION", _hil_state, ("px4",)),
+    ),
 }
 IN_FLIGHT = (MOTION, ATTITUDE, FORCE)  # what is lost when it stops coming
 

@@ -26,7 +26,7 @@ from queue import SimpleQueue
 import numpy as np
 
 from brakeline.actors.mavlink.autopilot_commands import MavlinkError
-from brakeline.actors.mavlink.frame_log import Frame
+from brakeline.actors.mavlink.frame_log import CapturedFrame
 from brakeline.actors.mavlink.ground_truth import MavlinkGroundTruth, UdpGroundTruth
 from brakeline.actors.mavlink.mavlink_vehicle import ControlPeriod, MavlinkVehicle
 from brakeline.actors.mavlink.takeoff import REST, STOPPING
@@ -240,7 +240,7 @@ class VehicleServer:
             return pb.CommitReply(number=command.number, error=error_message(error))
         return pb.CommitReply(number=command.number, in_time=in_time)
 
-    def _store_frame(self, frame: Frame) -> None:
+    def _store_frame(self, frame: CapturedFrame) -> None:
         self._frames.append(pb.MavlinkFrame(wall_time=time.time_ns(), outgoing=frame.outgoing, raw=frame.raw))
 
     def _send_updates(self) -> None:

@@ -14,8 +14,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from brakeline.actors.decision_guard import Ask, Outcome, consult, next_input
-from brakeline.actors.ros2.ros_inputs import Command
+from brakeline.actors.decision_guard import Ask, DecisionOutcome, next_input, request_decisions
+from brakeline.actors.ros2.ros_inputs import RawCommand
 from brakeline.messaging.obstacle import BOX, Obstacle, Shapes
 from brakeline.messaging.robot import Robot
 from brakeline.safety.filter.backup_plan import BackupPlan
@@ -30,14 +30,14 @@ KEPT = 10_000  # latest delays that are remembered
 NO_ANSWER, LATE, BLIND = "no answer", "late", "blind"
 
 
-def grown(obstacle: Obstacle, room: float) -> Obstacle:
+def inflated(obstacle: Obstacle, room: float) -> Obstacle:
     """A box or a disc with that much [m] around it."""
     more = 2.0 * room if obstacle.kind == BOX else room
     return replace(obstacle, size=tuple(size + more for size in obstacle.size))
 
 
 @dataclass
-class Tally:
+class GateStats:
     """What became of the periods so far."""
 
     periods: int = 0
@@ -66,23 +66,23 @@ class Tally:
         }
 
 
-class Gate:
+class CommandGate:
     """The committed plan, and who is asked about the next one."""
 
     def __init__(self, robot: Robot, ask: Ask, name: str = "ros2") -> None:
         """robot: in real time (`Robot.late`)."""
         assert robot.late, "in real time an answer counts from the next period on"
-        self.robot, self.backup_plan, self.tally = robot, BackupPlan(robot), Tally()
+        self.robot, self.backup_plan, self.tally = robot, BackupPlan(robot), GateStats()
         self.input = np.zeros(robot.action_dim)  # of the running period
         self.reason = "not begun"  # why the next input is not the command; empty: it is
         self.kind = BLIND
-        self.outcome: Outcome | None = None  # of this period's question
+        self.outcome: DecisionOutcome | None = None  # of this period's question
         self._ask, self._name = ask, name
-        self._command: Command | None = None  # that was asked about
+        self._command: RawCommand | None = None  # that was asked about
         self._known = 0  # number of the last command whose delay is known
 
     def decide(
-        self, state: Array, obstacles: Sequence[Obstacle], command: Command | None, time: float, step: int
+        self, state: Array, obstacles: Sequence[Obstacle], command: RawCommand | None, time: float, step: int
     ) -> None:
         """Ask about a command (None: to stand) in the state of the period's beginning. obstacles: all that a scan
         shows; space is known to be free where it shows nothing.
@@ -93,7 +93,7 @@ class Gate:
         """
         proposal = np.zeros(self.robot.action_dim) if command is None else command.action
 
-        def ask(action: Array, around: Sequence[Obstacle]) -> Outcome:
+        def ask(action: Array, around: Sequence[Obstacle]) -> DecisionOutcome:
             request = request_message(
                 self.backup_plan,
                 state,
@@ -104,9 +104,9 @@ class Gate:
                 step=step & 0xFFFFFFFF,
                 time=time,
             )
-            return consult(self._ask, [request], self.robot)[0]
+            return request_decisions(self._ask, [request], self.robot)[0]
 
-        outcome = ask(proposal, [grown(obstacle, ROOM) for obstacle in obstacles])
+        outcome = ask(proposal, [inflated(obstacle, ROOM) for obstacle in obstacles])
         if self._stuck(outcome) and obstacles:
             outcome = ask(proposal, obstacles)
             if not self._stuck(outcome) and self._nearer(outcome, state, obstacles):
@@ -141,11 +141,11 @@ class Gate:
         tally.kinds[self.kind] += 1
         return self.input
 
-    def _stuck(self, outcome: Outcome) -> bool:
+    def _stuck(self, outcome: DecisionOutcome) -> bool:
         """Was there an answer, and was nothing verified?"""
         return outcome.answer is not None and outcome.answer.kind not in (ALLOWED, ADJUSTED)
 
-    def _nearer(self, outcome: Outcome, state: Array, obstacles: Sequence[Obstacle]) -> bool:
+    def _nearer(self, outcome: DecisionOutcome, state: Array, obstacles: Sequence[Obstacle]) -> bool:
         """Does the answer's plan end nearer to what stands around than the robot is now?"""
         assert outcome.answer is not None
         d = self.robot.position_dim
@@ -153,7 +153,7 @@ class Gate:
         here, there = Shapes.of(obstacles, d).distance(ends).min(axis=0)
         return bool(there < here)
 
-    def _note(self, command: Command, now: float) -> None:
+    def _note(self, command: RawCommand, now: float) -> None:
         self.tally.commands += command.number != self._known
         if command.number != self._known:
             self._known = command.number

@@ -20,7 +20,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from brakeline.actors.ros2.sensor_frames import Place
+from brakeline.actors.ros2.sensor_frames import PlanarPose
 from brakeline.messaging.obstacle import BOX, CYLINDER, Obstacle
 from brakeline.messaging.robot import Robot
 from brakeline.messaging.ros2.cdr_messages import LaserScan, seconds
@@ -37,7 +37,7 @@ class BadScan(ValueError):
 
 
 @dataclass(frozen=True)
-class Errors:
+class HitErrors:
     """Of a hit's place: range [m]; heading [rad] and position [m] of the pose that it was seen from."""
 
     range: float
@@ -45,15 +45,15 @@ class Errors:
     position: float
 
     @staticmethod
-    def of(robot: Robot, range_error: float) -> Errors:
+    def of(robot: Robot, range_error: float) -> HitErrors:
         """With the pose as wrong as the robot's measurements may be."""
         assert robot.heading is not None
         bound = robot.measurement_bound
-        return Errors(range_error, bound[robot.heading], math.hypot(*bound[: robot.position_dim]))
+        return HitErrors(range_error, bound[robot.heading], math.hypot(*bound[: robot.position_dim]))
 
 
 @dataclass(frozen=True)
-class Beams:
+class LaserBeams:
     """What a scan says, beam by beam: time [s], angle [rad] in the sensor's frame, range [m] up to which it is free: to
     a hit, or to where the sensor sees no farther. blind: which say nothing; they have no range."""
 
@@ -64,7 +64,7 @@ class Beams:
     gap: float  # rad between neighbours
 
 
-def read(scan: LaserScan, zero_is_free: bool = False) -> Beams:
+def read(scan: LaserScan, zero_is_free: bool = False) -> LaserBeams:
     """zero_is_free: the driver reports 0 where nothing is within range, as some do (by REP 117 it should be inf).
 
     Raises:
@@ -88,7 +88,7 @@ def read(scan: LaserScan, zero_is_free: bool = False) -> Beams:
     known = np.concatenate([known, np.full(len(unseen), np.nan)])
     times = np.concatenate([times, np.full(len(unseen), times[-1])])
     ways = np.asarray(known, dtype=float)
-    return Beams(np.asarray(times, float), np.concatenate([angles, unseen]), ways, np.isnan(ways), abs(gap))
+    return LaserBeams(np.asarray(times, float), np.concatenate([angles, unseen]), ways, np.isnan(ways), abs(gap))
 
 
 def _unseen(first: float, gap: float, count: int) -> Array:
@@ -99,7 +99,7 @@ def _unseen(first: float, gap: float, count: int) -> Array:
 
 
 def obstacles(
-    beams: Beams, poses: Array, mount: Place, robot: Robot, errors: Errors, around: Array
+    beams: LaserBeams, poses: Array, mount: PlanarPose, robot: Robot, errors: HitErrors, around: Array
 ) -> tuple[Obstacle, ...]:
     """What may stand near `around` (2,) [m], in the frame of the poses (n, 3) that the robot had at the beams' times.
 

@@ -17,7 +17,7 @@ STEP = 1e-4  # s: two odometries that are no farther apart are one
 SLOPE = 0.1  # s over which speeds are taken from poses that come without any
 
 
-class Track:
+class OdometryHistory:
     """Odometry by its own time stamps: rows of time [s], x, y [m], heading [rad], speed [m/s], turn rate [rad/s]."""
 
     def __init__(self, gap: float = GAP) -> None:

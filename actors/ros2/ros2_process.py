@@ -17,13 +17,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brakeline.actors.decision_guard import Ask
-from brakeline.actors.ros2.command_gate import Gate
-from brakeline.actors.ros2.ros_clock import Date, RosClock, Simulated
-from brakeline.actors.ros2.ros_inputs import Blind, Freshness, Senses, Sensing
+from brakeline.actors.ros2.command_gate import CommandGate
+from brakeline.actors.ros2.ros_clock import RosClock, SimulatedClock, SystemClock
+from brakeline.actors.ros2.ros_inputs import AgeLimits, InputMissing, RosInputs, SensorSettings
 from brakeline.actors.ros2.ros_views import diagnostics, markers
 from brakeline.messaging.obstacle import Obstacle
 from brakeline.messaging.robot import Robot
-from brakeline.messaging.ros2 import LATCHED, SENSOR, Node, Publisher, RosSettings, Tap
+from brakeline.messaging.ros2 import LATCHED, SENSOR, MessageTap, RosNode, RosPublisher, RosSettings
 from brakeline.messaging.ros2.cdr_messages import (
     Clock,
     DiagnosticArray,
@@ -49,7 +49,7 @@ LATE = 0.02  # s after a period's beginning at which an answer to it is too late
 TELL = 1.0  # s between two diagnostics; a change is told at once
 
 
-class Unfit(ValueError):
+class UnsupportedRobot(ValueError):
     """Not a robot that Twist messages drive."""
 
 
@@ -76,8 +76,8 @@ class Ros2Settings:
     stamped: bool = False  # TwistStamped instead of Twist, in and out
     sim_time: bool = False
     lead: float = 0.04  # s before a period at which its input is decided on
-    sensing: Sensing = field(default_factory=Sensing)
-    fresh: Freshness = field(default_factory=Freshness)
+    sensing: SensorSettings = field(default_factory=SensorSettings)
+    fresh: AgeLimits = field(default_factory=AgeLimits)
     seconds: float = 0.0  # by the robot's clock, until it ends; 0: when asked to
 
 
@@ -85,30 +85,32 @@ def driven(name: str) -> Robot:
     """The robot of that name in real time.
 
     Raises:
-        UnknownRobot; Unfit: a Twist can't drive it, or odometry can't tell its state.
+        UnknownRobot; UnsupportedRobot: a Twist can't drive it, or odometry can't tell its state.
     """
     robot = robot_maybe_with_task(name)
     robot = robot if robot.late else robot.in_real_time()
     if (robot.position_dim, robot.heading, robot.state_dim, robot.action_dim) != (2, 2, 5, 2):
-        raise Unfit(f"{robot.kind}: over ROS 2 a robot drives in the plane by speed and turn rate")
+        raise UnsupportedRobot(f"{robot.kind}: over ROS 2 a robot drives in the plane by speed and turn rate")
     return robot
 
 
-class Steering:
+class FilterNode:
     """A robot's node, and the loop that keeps its periods."""
 
-    def __init__(self, settings: Ros2Settings, question: Ask, stop: threading.Event, tap: Tap | None = None) -> None:
-        """Raises Unreachable, BadName, UnknownRobot, Unfit."""
+    def __init__(
+        self, settings: Ros2Settings, question: Ask, stop: threading.Event, tap: MessageTap | None = None
+    ) -> None:
+        """Raises Unreachable, BadRosName, UnknownRobot, UnsupportedRobot."""
         self.settings, self.robot, self._stop = settings, driven(settings.robot), stop
-        self.senses = Senses(self.robot, settings.sensing, settings.fresh)
-        self.gate = Gate(self.robot, question, settings.name)
-        self.clock: RosClock = Simulated() if settings.sim_time else Date()
+        self.senses = RosInputs(self.robot, settings.sensing, settings.fresh)
+        self.gate = CommandGate(self.robot, question, settings.name)
+        self.clock: RosClock = SimulatedClock() if settings.sim_time else SystemClock()
         self._why, self._ending = "not begun", False
         self._told = (-math.inf, "", "")  # when diagnostics went out, and what they said
-        self.node = Node(settings.ros, settings.name, tap)
+        self.node = RosNode(settings.ros, settings.name, tap)
         names = settings.topics
         if settings.stamped:
-            self._stamped: Publisher[TwistStamped] | None = self.node.publisher(names.command, TwistStamped)
+            self._stamped: RosPublisher[TwistStamped] | None = self.node.publisher(names.command, TwistStamped)
         else:
             self._stamped, self._plain = None, self.node.publisher(names.command, Twist)
         self._markers = self.node.publisher(names.markers, MarkerArray)
@@ -171,10 +173,10 @@ class Steering:
         now = self.clock.now()
         try:
             if self._ending:
-                raise Blind("the filter ends")
+                raise InputMissing("the filter ends")
             state = self.senses.state(began, now)
             around: tuple[Obstacle, ...] = self.senses.obstacles(state[:2], now)
-        except Blind as error:
+        except InputMissing as error:
             self._why = str(error)
             return
         self.gate.decide(state, around, self.senses.command(now), began, number)
@@ -215,7 +217,7 @@ class Steering:
 
     def _listen(self) -> None:
         names, senses, subscribe = self.settings.topics, self.senses, self.node.subscribe
-        if isinstance(self.clock, Simulated):
+        if isinstance(self.clock, SimulatedClock):
             subscribe("/clock", Clock, self.clock.hear, SENSOR)
         subscribe(names.fixed_transforms, TFMessage, senses.hear_fixed_transforms, LATCHED)
         if self.settings.sensing.base_frame:
@@ -230,9 +232,11 @@ class Steering:
             subscribe(names.raw, Twist, hear)
 
 
-def run(settings: Ros2Settings, question: Ask, stop: threading.Event, tap: Tap | None = None) -> dict[str, float]:
+def run(
+    settings: Ros2Settings, question: Ask, stop: threading.Event, tap: MessageTap | None = None
+) -> dict[str, float]:
     """Steer until asked to stop; returns what became of the periods."""
-    steering = Steering(settings, question, stop, tap)
+    steering = FilterNode(settings, question, stop, tap)
     try:
         steering.run()
     finally:

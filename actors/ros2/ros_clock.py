@@ -24,7 +24,7 @@ class RosClock(Protocol):
         """By how much it was set since the last call [s]; what was to come is later by as much."""
 
 
-class Date:
+class SystemClock:
     """This machine's. In between it runs evenly: who sets the date must not stop whoever waits."""
 
     def __init__(self) -> None:
@@ -44,7 +44,7 @@ class Date:
         return off
 
 
-class Simulated:
+class SimulatedClock:
     """What /clock says."""
 
     BACK = 1.0  # s: a clock that goes back by more was begun anew

@@ -9,9 +9,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from brakeline.actors.ros2.laser_obstacles import BadScan, Beams, Errors, obstacles, read
-from brakeline.actors.ros2.odometry import Track
-from brakeline.actors.ros2.sensor_frames import Frames, Place, name_of, place_of
+from brakeline.actors.ros2.laser_obstacles import BadScan, HitErrors, LaserBeams, obstacles, read
+from brakeline.actors.ros2.odometry import OdometryHistory
+from brakeline.actors.ros2.sensor_frames import PlanarPose, TransformTree, name_of, place_of
 from brakeline.messaging.obstacle import Obstacle
 from brakeline.messaging.rejected_messages import headline
 from brakeline.messaging.robot import Robot
@@ -22,12 +22,12 @@ Array = NDArray[np.float64]
 LONGEST_FRAME = 100  # characters of a frame's name
 
 
-class Blind(Exception):
+class InputMissing(Exception):
     """Something that a decision needs is missing or stale: the message says what."""
 
 
 @dataclass(frozen=True)
-class Freshness:
+class AgeLimits:
     """How old [s] what the decision is made on may be; older is as good as missing."""
 
     odometry: float = 0.15
@@ -37,19 +37,19 @@ class Freshness:
 
 
 @dataclass(frozen=True)
-class Sensing:
+class SensorSettings:
     """mount: of the lidar in the robot's frame; None: as the transforms say. odometry_frame, base_frame: of TF, where
     it stands for odometry; empty base_frame: it does not."""
 
     range_error: float = 0.02  # m, at most
     zero_is_free: bool = False
-    mount: Place | None = None
+    mount: PlanarPose | None = None
     odometry_frame: str = "odom"
     base_frame: str = ""
 
 
 @dataclass(frozen=True)
-class Command:
+class RawCommand:
     """A raw command (speed [m/s], turn rate [rad/s]), and when it came by the robot's clock."""
 
     action: Array
@@ -57,19 +57,19 @@ class Command:
     number: int
 
 
-class Senses:
+class RosInputs:
     """The latest of each. The handlers are called by the node's threads, the rest by whoever decides."""
 
-    def __init__(self, robot: Robot, sensing: Sensing, fresh: Freshness) -> None:
+    def __init__(self, robot: Robot, sensing: SensorSettings, fresh: AgeLimits) -> None:
         self.robot, self.sensing, self.fresh = robot, sensing, fresh
         self.frame = sensing.odometry_frame  # in which the state is
-        self._errors = Errors.of(robot, sensing.range_error)
+        self._errors = HitErrors.of(robot, sensing.range_error)
         self._lock = threading.Lock()
-        self._track, self._frames = Track(fresh.odometry), Frames()
+        self._track, self._frames = OdometryHistory(fresh.odometry), TransformTree()
         self._base = sensing.base_frame
-        self._scan: tuple[Beams, str] | None = None
+        self._scan: tuple[LaserBeams, str] | None = None
         self._bad_scan = ""
-        self._command: Command | None = None
+        self._command: RawCommand | None = None
         self._commands = 0
 
     # --- handlers -------------------------------------------------------------------------------------------------
@@ -115,44 +115,44 @@ class Senses:
         twist = message.twist if isinstance(message, TwistStamped) else message
         with self._lock:
             self._commands += 1
-            self._command = Command(np.array([twist.linear.x, twist.angular.z]), now, self._commands)
+            self._command = RawCommand(np.array([twist.linear.x, twist.angular.z]), now, self._commands)
 
     # --- what there is to decide on -----------------------------------------------------------------------------------
 
     def forget(self) -> None:
         """The clock was set: nothing that came before counts."""
         with self._lock:
-            self._track, self._scan, self._command = Track(self.fresh.odometry), None, None
+            self._track, self._scan, self._command = OdometryHistory(self.fresh.odometry), None, None
 
     def state(self, at: float, now: float) -> Array:
-        """(5,) as measured at that time. Raises Blind."""
+        """(5,) as measured at that time. Raises InputMissing."""
         with self._lock:
             newest, state = self._track.newest, self._track.state(at)
         if newest == -math.inf:
-            raise Blind("no odometry yet")
+            raise InputMissing("no odometry yet")
         self._check("odometry", newest, now, self.fresh.odometry)
         if state is None:
-            raise Blind("no odometry of when the period began")
+            raise InputMissing("no odometry of when the period began")
         return state
 
     def obstacles(self, around: Array, now: float) -> tuple[Obstacle, ...]:
-        """Those that the last scan speaks of near a position (2,), in the odometry's frame. Raises Blind."""
+        """Those that the last scan speaks of near a position (2,), in the odometry's frame. Raises InputMissing."""
         with self._lock:
             if self._bad_scan:
-                raise Blind(f"no scan that makes sense: {self._bad_scan}")
+                raise InputMissing(f"no scan that makes sense: {self._bad_scan}")
             if self._scan is None:
-                raise Blind("no scan yet")
+                raise InputMissing("no scan yet")
             beams, frame = self._scan
             self._check("the scan", float(beams.times[0]), now, self.fresh.scan)
             poses = self._track.at(beams.times)
             mount = self.sensing.mount or self._frames.place(frame, self._base or frame)
         if poses is None:
-            raise Blind("no odometry of when the scan was made")
+            raise InputMissing("no odometry of when the scan was made")
         if mount is None:
-            raise Blind(f"no level transform from {self._base!r} to {frame!r}: give the lidar's place")
+            raise InputMissing(f"no level transform from {self._base!r} to {frame!r}: give the lidar's place")
         return obstacles(beams, poses, mount, self.robot, self._errors, around)
 
-    def command(self, now: float) -> Command | None:
+    def command(self, now: float) -> RawCommand | None:
         """The last one; None: none lately."""
         with self._lock:
             command = self._command
@@ -163,6 +163,8 @@ class Senses:
     def _check(self, what: str, stamp: float, now: float, limit: float) -> None:
         age = now - stamp
         if age > limit:
-            raise Blind(f"{what} is {age:.2f} s old" if age < 1e3 else f"{what} is of another time: compare the clocks")
+            raise InputMissing(
+                f"{what} is {age:.2f} s old" if age < 1e3 else f"{what} is of another time: compare the clocks"
+            )
         if age < -self.fresh.ahead:
-            raise Blind(f"{what} is {-age:.2f} s in the future: compare the clocks")
+            raise InputMissing(f"{what} is {-age:.2f} s in the future: compare the clocks")

@@ -12,8 +12,8 @@ from pathlib import Path
 
 from brakeline.actors.decision_guard import Ask
 from brakeline.actors.ros2.ros2_process import Ros2Settings, Topics, driven, run
-from brakeline.actors.ros2.ros_inputs import Freshness, Sensing
-from brakeline.actors.ros2.sensor_frames import Place
+from brakeline.actors.ros2.ros_inputs import AgeLimits, SensorSettings
+from brakeline.actors.ros2.sensor_frames import PlanarPose
 from brakeline.deploy.commands.common_options import Flags, Physics, Robot, Serving, default_keys, errors, say_json
 from brakeline.deploy.data.model_store import model_for
 from brakeline.deploy.experiments.evaluate import in_process
@@ -52,16 +52,16 @@ class Ros2:
     """s before a period at which its input is decided on; default: 0.04, with --connect 0.12."""
     mount: tuple[float, float, float] | None = None
     """x y yaw of the lidar in the robot's frame [m, rad]; without: as /tf_static says."""
-    range_error: float = Sensing.range_error
+    range_error: float = SensorSettings.range_error
     """m, of a lidar's range, at most."""
     zero_is_free: bool = False
     """The lidar's driver reports 0 where it sees nothing within its range."""
     tf: bool = False
     """Take the robot's pose from /tf instead of odometry messages."""
-    odometry_frame: str = Sensing.odometry_frame
+    odometry_frame: str = SensorSettings.odometry_frame
     base_frame: str = "base_footprint"
     """With --tf: the robot's; its origin is what turns on the spot."""
-    fresh: Flags[Freshness] = field(default_factory=Freshness)
+    fresh: Flags[AgeLimits] = field(default_factory=AgeLimits)
     filtering: Flags[Serving] = field(default_factory=Serving)
     connect: tuple[str, ...] = ()
     """Ask the safety service on the bus there; without: the filter runs inside."""
@@ -84,10 +84,10 @@ class Ros2:
             stamped=self.stamped,
             sim_time=self.sim_time,
             lead=self.lead or (0.12 if self.connect else Ros2Settings.lead),
-            sensing=Sensing(
+            sensing=SensorSettings(
                 self.range_error,
                 self.zero_is_free,
-                Place(*self.mount) if self.mount else None,
+                PlanarPose(*self.mount) if self.mount else None,
                 self.odometry_frame,
                 self.base_frame if self.tf else "",
             ),

@@ -9,7 +9,7 @@ from typing import Annotated, ClassVar, Self
 
 import tyro
 
-from brakeline.actors.actor_settings import Change
+from brakeline.actors.actor_settings import PhysicsChange
 from brakeline.deploy.commands.common_options import Flags, Meeting, Physics, Serving, console, errors, say_json
 from brakeline.deploy.progress import under_way
 from brakeline.deploy.run.run_config import EXPERIMENTS, RunConfig, load
@@ -77,7 +77,7 @@ class Train:
     alone, with a --resume whose checkpoint is lost from the run's own."""
     practice: float = 0.0
     """Share of steps at which a robot follows its committed plan to the stop: the stops that `certify LOG` needs."""
-    change: Change = field(default_factory=Change)
+    change: PhysicsChange = field(default_factory=PhysicsChange)
     """Load the robots or change the floor in mid-run, e.g. --change.after 5000 --change.payload-kg 1."""
     deterministic: bool = False
     """One actor, lockstep, no deadlines: the same seed gives the same weights, bit for bit."""

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from brakeline.actors.decision_guard import Ask
-from brakeline.actors.episode_runner import EpisodeRunner, Identity
+from brakeline.actors.episode_runner import ActorIdentity, EpisodeRunner
 from brakeline.deploy.data.model_store import method_for
 from brakeline.deploy.data.simulated_recording import recorded
 from brakeline.deploy.experiments.evaluate import FRESH, in_process
@@ -125,7 +125,7 @@ def _cost(model: Model, robot: RobotWithTask) -> dict[str, str]:
 
 def _driver(study: Study, trial: Trial, robot: RobotWithTask, seed: int, actor: str) -> EpisodeRunner:
     env = environment(robot, trial.arena, seed)
-    identity, filtered = Identity(actor, 0, study.seed), trial.method != NONE
+    identity, filtered = ActorIdentity(actor, 0, study.seed), trial.method != NONE
     # at an intervention training calls the episode off; an evaluation goes on, or its goal rate would mean nothing
     cuts = trial.method == SAILR and trial.policy == LEARNING
     return EpisodeRunner(robot, env, identity, study.penalty, filtered, cuts)

@@ -13,7 +13,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from brakeline.actors.episode_runner import EpisodeRunner, Identity
+from brakeline.actors.episode_runner import ActorIdentity, EpisodeRunner
 from brakeline.deploy.data.certification import certified
 from brakeline.deploy.data.simulated_recording import recorded
 from brakeline.deploy.experiments.evaluate import FRESH, in_process
@@ -72,7 +72,7 @@ class Conservatism:
 
     def _drive(self, robot: RobotWithTask, policy: str, question: Any) -> dict[str, Any]:
         """Closed loop on the first fresh episodes."""
-        driver = EpisodeRunner(robot, environment(robot, self.arena, FRESH), Identity("conservatism", 0, 0))
+        driver = EpisodeRunner(robot, environment(robot, self.arena, FRESH), ActorIdentity("conservatism", 0, 0))
         found: Episodes = evaluate(driver, policy_named(policy, robot, 0), question, self.episodes)
         columns, steps = found.columns(), found.decisions
         return {

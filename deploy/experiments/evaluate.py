@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from brakeline.actors.decision_guard import Ask, Outcome, consult
-from brakeline.actors.episode_runner import EpisodeRunner, Identity
-from brakeline.actors.joint_episode import Fleet
+from brakeline.actors.decision_guard import Ask, DecisionOutcome, request_decisions
+from brakeline.actors.episode_runner import ActorIdentity, EpisodeRunner
+from brakeline.actors.joint_episode import RobotGroup
 from brakeline.deploy.data.model_store import method_for
 from brakeline.deploy.policy_loading import policy_named
 from brakeline.deploy.vehicle_factory import environment, fleet_world
@@ -68,7 +68,7 @@ def episode(driver: EpisodeRunner, policy: Policy, question: Ask | None, number:
         proposal = np.asarray(policy(driver.observation, driver.info), dtype=float)
         outcome = None
         if question is not None:
-            outcome = consult(question, [driver.request(proposal)], driver.robot)[0]
+            outcome = request_decisions(question, [driver.request(proposal)], driver.robot)[0]
         yield driver.execute(proposal, outcome)
 
 
@@ -77,7 +77,7 @@ def prepared(robot: RobotWithTask, what: Evaluation) -> tuple[EpisodeRunner, Pol
     policy = policy_named(what.policy, robot, what.seed)
     env = environment(robot, what.arena, FRESH + what.seed, what.conditions)
     question = _question(robot, what)
-    driver = EpisodeRunner(robot, env, Identity("evaluate", 0, what.seed), filtered=question is not None)
+    driver = EpisodeRunner(robot, env, ActorIdentity("evaluate", 0, what.seed), filtered=question is not None)
     return driver, policy, question
 
 
@@ -88,7 +88,9 @@ def _question(robot: RobotWithTask, what: Evaluation) -> Ask | None:
     return in_process(method_for(robot, what.method, what.model_config, what.accept_bound), what.accept_bound)
 
 
-def round_of(fleet: Fleet, policies: Sequence[Policy], question: Ask | None, number: int) -> Iterator[list[pb.Step]]:
+def round_of(
+    fleet: RobotGroup, policies: Sequence[Policy], question: Ask | None, number: int
+) -> Iterator[list[pb.Step]]:
     """The steps of one episode of every robot of a world, period by period."""
     fleet.begin(number)
     while fleet.running:
@@ -98,13 +100,13 @@ def round_of(fleet: Fleet, policies: Sequence[Policy], question: Ask | None, num
             else driver.robot.at_zero()
             for driver, policy in zip(fleet.drivers, policies, strict=True)
         ]
-        outcomes: list[Outcome | None] = [None] * len(proposals)
+        outcomes: list[DecisionOutcome | None] = [None] * len(proposals)
         if question is not None:
-            outcomes = list(consult(question, fleet.requests(proposals), fleet.drivers[0].robot))
+            outcomes = list(request_decisions(question, fleet.requests(proposals), fleet.drivers[0].robot))
         yield [step for step in fleet.execute(proposals, outcomes) if step is not None]
 
 
-def prepared_fleet(robot: RobotWithTask, what: Evaluation) -> tuple[Fleet, FleetEnv, list[Policy], Ask | None]:
+def prepared_fleet(robot: RobotWithTask, what: Evaluation) -> tuple[RobotGroup, FleetEnv, list[Policy], Ask | None]:
     """The same for several robots in one world.
 
     Raises:
@@ -115,10 +117,10 @@ def prepared_fleet(robot: RobotWithTask, what: Evaluation) -> tuple[Fleet, Fleet
     policies = [policy_named(what.policy, robot, what.seed + i) for i in range(what.fleet)]
     question = _question(robot, what)
     drivers = [
-        EpisodeRunner(robot, member, Identity(f"evaluate.{i}", i, what.seed), filtered=question is not None)
+        EpisodeRunner(robot, member, ActorIdentity(f"evaluate.{i}", i, what.seed), filtered=question is not None)
         for i, member in enumerate(world.members)
     ]
-    return Fleet(world, drivers, question is not None), world, policies, question
+    return RobotGroup(world, drivers, question is not None), world, policies, question
 
 
 def evaluate(

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 
-from brakeline.actors.episode_runner import EpisodeRunner, Identity
+from brakeline.actors.episode_runner import ActorIdentity, EpisodeRunner
 from brakeline.deploy.experiments.evaluate import FRESH, in_process
 from brakeline.deploy.experiments.trials import evaluate
 from brakeline.deploy.policy_loading import policy_named
@@ -50,7 +50,7 @@ def tried(model: Pretrained, robot: RobotWithTask, value: float, episodes: int, 
     question = in_process(replace(model, settings=dict(model.settings) | {SETTING[model.method]: setting}))
     found = {}
     for name in (ORACLE, GREEDY):
-        driver = EpisodeRunner(robot, environment(robot, arena, FRESH), Identity("tune", 0, 0))
+        driver = EpisodeRunner(robot, environment(robot, arena, FRESH), ActorIdentity("tune", 0, 0))
         found[name] = evaluate(driver, policy_named(name, robot, 0), question, episodes)
     oracle, greedy = found[ORACLE].columns(), found[GREEDY].columns()
     return Tried(

@@ -20,7 +20,7 @@ from matplotlib.patches import Circle, FancyArrow, FancyBboxPatch, Patch, Polygo
 from matplotlib.transforms import Affine2D
 from numpy.typing import NDArray
 
-from brakeline.actors.decision_guard import Ask, consult
+from brakeline.actors.decision_guard import Ask, request_decisions
 from brakeline.actors.episode_runner import EpisodeRunner
 from brakeline.logs.decision_explanation import Explanation, explain
 from brakeline.logs.episode_stats import KINDS as DECISIONS
@@ -82,7 +82,7 @@ def record(driver: EpisodeRunner, policy: Policy, question: Ask | None, number: 
     while driver.running:
         proposal = np.asarray(policy(driver.observation, driver.info), dtype=float)
         asked = driver.request(proposal)
-        outcome = consult(question, [asked], driver.robot)[0] if question is not None else None
+        outcome = request_decisions(question, [asked], driver.robot)[0] if question is not None else None
         reply = None if outcome is None or outcome.answer is None else outcome.reply
         decision = pb.Decision() if reply is None else reply.decision
         before = np.asarray(driver.info["true_state"])

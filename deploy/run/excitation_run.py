@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from brakeline.actors.episode_runner import EpisodeRunner, Identity
+from brakeline.actors.episode_runner import ActorIdentity, EpisodeRunner
 from brakeline.deploy.data.excitation_plan import Excited, Keep, run_length
 from brakeline.deploy.experiments.trials import TrialLog, one_step, thinking
 from brakeline.deploy.vehicle_factory import YARD, factory
@@ -53,7 +53,7 @@ def drive(
         raise FileExistsError(f"{path} is there already")
     policy = Excited(robot, keep, np.random.default_rng(seed))
     env = NavigationEnv(robot, make_vehicle=factory(robot, conditions or Conditions()), seed_key=seed, draw=_yard(keep))
-    driver = EpisodeRunner(robot, env, Identity("excite", 0, seed), filtered=False)
+    driver = EpisodeRunner(robot, env, ActorIdentity("excite", 0, seed), filtered=False)
     low, high = np.array(keep[:2]) + robot.footprint, np.array(keep[2:]) - robot.footprint
     about = {
         "run": {"method": "none", "policy": "excitation", "robots": robot.name, "seed": str(seed)},

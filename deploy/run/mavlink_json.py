@@ -9,7 +9,7 @@ import json
 import logging
 from collections.abc import Callable, Iterable
 
-from brakeline.actors.mavlink.frame_log import decoded
+from brakeline.actors.mavlink.frame_log import decode_frame
 from brakeline.logs.segment import Entry
 from brakeline.messaging.bus import Sample
 from brakeline.messaging.topics import FRAMES
@@ -30,7 +30,7 @@ def as_json(sample: Sample) -> list[Entry]:
         return []
     entries = []
     for frame in sample.message().frames:
-        message = decoded(frame.raw, frame.outgoing)
+        message = decode_frame(frame.raw, frame.outgoing)
         if message is not None:
             text = json.dumps(message.described).encode()
             entries.append(Entry(message.name, ENCODING, text, sample.received, frame.wall_time, 0))

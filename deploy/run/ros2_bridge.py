@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from brakeline.messaging.ros2 import LATCHED, SENSOR, Node, RosSettings, Tap
+from brakeline.messaging.ros2 import LATCHED, SENSOR, MessageTap, RosNode, RosSettings
 from brakeline.messaging.ros2.cdr_messages import (
     Clock,
     LaserScan,
@@ -81,7 +81,7 @@ class Outcome:
 class Bridge:
     """One robot in one arena, as a node."""
 
-    def __init__(self, settings: BridgeSettings, tap: Tap | None = None) -> None:
+    def __init__(self, settings: BridgeSettings, tap: MessageTap | None = None) -> None:
         """Raises Unreachable, UnknownArena."""
         self.settings, self.outcome = settings, Outcome()
         rng = np.random.default_rng((settings.seed, 11))
@@ -95,7 +95,7 @@ class Bridge:
         self._command: Array | None = None
         self._commanded = -np.inf  # its time of the last command
         self._stopped = True
-        self.node = Node(settings.ros, "brakeline_sim", tap)
+        self.node = RosNode(settings.ros, "brakeline_sim", tap)
         self._clock = self.node.publisher("/clock", Clock, SENSOR) if settings.sim_time else None
         self._odometry = self.node.publisher("odom", Odometry)
         self._transforms = self.node.publisher("/tf", TFMessage)

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from brakeline.actors.actor_settings import Change, FlightSettings
+from brakeline.actors.actor_settings import FlightSettings, PhysicsChange
 from brakeline.learner.learner_config import LearnerConfig, TD3Config
 from brakeline.logs.segment_rotation import Rotation
 from brakeline.safety.model.model_config import METHODS as FILTERS
@@ -51,7 +51,7 @@ class RunConfig:
     rotation: Rotation = field(default_factory=Rotation)  # of the log's files
     pictures: float = 10.0  # a second and robot, drawn for Foxglove in the log; 0: none
     practice: float = 0.0  # share of steps at which a robot starts to follow its committed plan to the stop
-    change: Change = field(default_factory=Change)  # of the robots, in mid-run
+    change: PhysicsChange = field(default_factory=PhysicsChange)  # of the robots, in mid-run
     conditions: Conditions = field(default_factory=Conditions)
     policy: str = ""  # a file or a name, as `evaluate` takes it; empty: one is learned
     flights: tuple[

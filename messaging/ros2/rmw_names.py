@@ -18,7 +18,7 @@ NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 RELIABLE, BEST_EFFORT, TRANSIENT_LOCAL, VOLATILE = 1, 2, 1, 2  # as rmw numbers them
 
 
-class BadName(ValueError):
+class BadRosName(ValueError):
     """Not a name that ROS takes."""
 
 
@@ -46,14 +46,14 @@ def full_name(name: str, namespace: str = "/", node: str = "") -> str:
     """A topic's name as it is in the graph: `scan` in `/robot1` is `/robot1/scan`; `~/tube` is below the node's own.
 
     Raises:
-        BadName: a part of it is none.
+        BadRosName: a part of it is none.
     """
     if name.startswith("~/"):
         name = f"{node}/{name[2:]}"
     whole = name if name.startswith("/") else f"{namespace.rstrip('/')}/{name}"
     parts = whole.strip("/").split("/")
     if wrong := [part for part in parts if not NAME.fullmatch(part)]:
-        raise BadName(f"{whole!r}: {wrong[0]!r} is no name in ROS: letters, digits and '_', not a digit first")
+        raise BadRosName(f"{whole!r}: {wrong[0]!r} is no name in ROS: letters, digits and '_', not a digit first")
     return "/" + "/".join(parts)
 
 
@@ -75,7 +75,7 @@ def topic_key(domain: int, topic: str, kind: str, digest: str = ANY_HASH) -> str
 
 
 @dataclass(frozen=True)
-class Entity:
+class GraphEntity:
     """A node, or a publisher or subscription of one, as a token tells of it. id: its own in the session, as `node_id`
     is its node's; topic, type, digest, qos: empty for a node."""
 
@@ -101,8 +101,8 @@ class Entity:
         return "/".join(parts)
 
     @staticmethod
-    def parse(token: str) -> Entity:
-        """Raises BadName: it is no token of a node, publisher or subscription."""
+    def parse(token: str) -> GraphEntity:
+        """Raises BadRosName: it is no token of a node, publisher or subscription."""
         parts = token.split("/")
         try:
             space, domain, session, node_id, own, kind, _, namespace, node, *topic = parts
@@ -110,11 +110,11 @@ class Entity:
                 raise ValueError(kind)
             where = int(domain), session, int(node_id), int(own), kind, _plain(namespace), node
             if kind == NODE:
-                return Entity(*where)
+                return GraphEntity(*where)
             name, type_, digest, qos = topic
-            return Entity(*where, _plain(name), ros_type(type_), digest, qos)
+            return GraphEntity(*where, _plain(name), ros_type(type_), digest, qos)
         except ValueError as error:
-            raise BadName(f"no token: {token!r}") from error
+            raise BadRosName(f"no token: {token!r}") from error
 
 
 def _mangled(name: str) -> str:

@@ -37,8 +37,8 @@ from brakeline.messaging.ros2.rmw_names import (
     PUBLISHER,
     SPACE,
     SUBSCRIPTION,
-    BadName,
-    Entity,
+    BadRosName,
+    GraphEntity,
     Qos,
     full_name,
     topic_key,
@@ -52,7 +52,7 @@ RELIABLE = Qos()
 LARGEST = 2**20  # bytes of a message that is listened to
 
 
-class Tap(Protocol):
+class MessageTap(Protocol):
     """Is called with every message that a node hears or sends, as bytes: a bag."""
 
     def __call__(self, topic: str, kind: type, payload: bytes, at: int, qos: Qos) -> object:
@@ -96,10 +96,10 @@ class RosSettings:
         return config
 
 
-class Publisher(Generic[M]):
+class RosPublisher(Generic[M]):
     """Publishes messages of one type on one topic."""
 
-    def __init__(self, entity: Entity, kind: type[M], qos: Qos, sender: Any, tap: Tap | None) -> None:
+    def __init__(self, entity: GraphEntity, kind: type[M], qos: Qos, sender: Any, tap: MessageTap | None) -> None:
         self.entity, self.count = entity, 0
         self._kind, self._qos, self._sender, self._tap = kind, qos, sender, tap
         self._gid = gid_of(entity.token)
@@ -122,17 +122,17 @@ class Publisher(Generic[M]):
             self._tap(self.entity.topic, self._kind, payload, now, self._qos)
 
 
-class Node:
+class RosNode:
     """A node of that name; it is in the graph until `close`.
 
     What its handlers can't handle is passed over, and counted in `tolerance`.
 
     Raises:
         Unreachable: no router answered within `patience`, or an endpoint cannot be listened on.
-        BadName: the name or the namespace is none.
+        BadRosName: the name or the namespace is none.
     """
 
-    def __init__(self, settings: RosSettings, name: str, tap: Tap | None = None) -> None:
+    def __init__(self, settings: RosSettings, name: str, tap: MessageTap | None = None) -> None:
         self.settings, self.name = settings, name
         full_name(f"/{name}")  # is it one?
         self.tolerance = Tolerance()
@@ -172,11 +172,11 @@ class Node:
             subscription.join(timeout)
 
     def full_name(self, topic: str) -> str:
-        """The topic's name in the graph. Raises BadName."""
+        """The topic's name in the graph. Raises BadRosName."""
         return full_name(topic, self.settings.namespace, self.name)
 
-    def publisher(self, topic: str, kind: type[M], qos: Qos = RELIABLE) -> Publisher[M]:
-        """Raises BadName."""
+    def publisher(self, topic: str, kind: type[M], qos: Qos = RELIABLE) -> RosPublisher[M]:
+        """Raises BadRosName."""
         entity = self._entity(PUBLISHER, self.full_name(topic), kind, qos)
         options: dict[str, Any] = {
             "congestion_control": zenoh.CongestionControl.DROP,
@@ -198,12 +198,12 @@ class Node:
             sender = self._session.declare_publisher(key, **options)
         self._senders.append(sender)
         self._declare(entity)
-        return Publisher(entity, kind, qos, sender, self._tap)
+        return RosPublisher(entity, kind, qos, sender, self._tap)
 
     def subscribe(self, topic: str, kind: type[M], handler: Callable[[M], None], qos: Qos = RELIABLE) -> Subscription:
         """Call `handler` with every message, in a thread of its own; one that is slow misses the oldest.
 
-        What is no message of that type is passed over, as is one at which the handler raises. Raises BadName.
+        What is no message of that type is passed over, as is one at which the handler raises. Raises BadRosName.
         """
         entity = self._entity(SUBSCRIPTION, self.full_name(topic), kind, qos)
         key = topic_key(self.settings.domain, entity.topic, entity.type)
@@ -233,7 +233,7 @@ class Node:
         self._declare(entity)
         return subscription
 
-    def graph(self, timeout: float = 1.0) -> tuple[Entity, ...]:
+    def graph(self, timeout: float = 1.0) -> tuple[GraphEntity, ...]:
         """Every node, publisher and subscription of the domain that is there now, this node's too."""
         found = []
         where = f"{SPACE}/{self.settings.domain}/**"
@@ -241,19 +241,19 @@ class Node:
         for reply in replies:
             if reply.ok is not None:
                 try:
-                    found.append(Entity.parse(str(reply.ok.key_expr)))
-                except BadName:
+                    found.append(GraphEntity.parse(str(reply.ok.key_expr)))
+                except BadRosName:
                     continue  # a service's, or one that is none
         return tuple(found)
 
-    def _entity(self, kind: str, topic: str = "", message: type | None = None, qos: Qos = RELIABLE) -> Entity:
+    def _entity(self, kind: str, topic: str = "", message: type | None = None, qos: Qos = RELIABLE) -> GraphEntity:
         with self._lock:
             own = len(self._tokens)
         of_topic = () if message is None else (topic, type_of(message), digest_of(message), qos.token())
         settings = self.settings
-        return Entity(settings.domain, self._zid, 0, own, kind, settings.namespace, self.name, *of_topic)
+        return GraphEntity(settings.domain, self._zid, 0, own, kind, settings.namespace, self.name, *of_topic)
 
-    def _declare(self, entity: Entity) -> None:
+    def _declare(self, entity: GraphEntity) -> None:
         token = self._session.liveliness().declare_token(entity.token)
         with self._lock:
             self._tokens.append(token)

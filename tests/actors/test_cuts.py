@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from brakeline.actors.decision_guard import consult
-from brakeline.actors.episode_runner import EpisodeRunner, Identity
+from brakeline.actors.decision_guard import request_decisions
+from brakeline.actors.episode_runner import ActorIdentity, EpisodeRunner
 from brakeline.deploy.experiments.evaluate import in_process
 from brakeline.deploy.vehicle_factory import environment
 from brakeline.logs.episode_stats import Tally
@@ -18,13 +18,13 @@ SLOW, FAST = np.array([0.05, 0.1]), np.array([0.25, 0.1])
 
 @pytest.fixture
 def driver() -> EpisodeRunner:
-    made = EpisodeRunner(GROUND, environment(GROUND, "default", 0), Identity("a", 0, 0), penalty=5.0, cuts=True)
+    made = EpisodeRunner(GROUND, environment(GROUND, "default", 0), ActorIdentity("a", 0, 0), penalty=5.0, cuts=True)
     made.begin(0)
     return made
 
 
 def step(driver: EpisodeRunner, proposal, ask) -> pb.Step:
-    return driver.execute(proposal, consult(ask, [driver.request(proposal)], GROUND)[0])
+    return driver.execute(proposal, request_decisions(ask, [driver.request(proposal)], GROUND)[0])
 
 
 def test_an_intervention_is_a_terminal_step_for_the_learner_alone(driver):
@@ -42,7 +42,7 @@ def test_an_intervention_is_a_terminal_step_for_the_learner_alone(driver):
 
 
 def test_in_use_the_episode_goes_on_behind_the_rule():
-    driver = EpisodeRunner(GROUND, environment(GROUND, "default", 0), Identity("a", 0, 0))
+    driver = EpisodeRunner(GROUND, environment(GROUND, "default", 0), ActorIdentity("a", 0, 0))
     driver.begin(0)
     ask = in_process(known(threshold=0.3))
     for number, proposal in enumerate((FAST, FAST, SLOW)):
@@ -60,6 +60,6 @@ def test_a_collision_while_braking_is_still_paid_for_as_one(driver):
 
 def test_a_missing_answer_is_no_intervention(driver):
     step(driver, SLOW, in_process(known(threshold=0.3)))
-    lost = consult(lambda requests: (_ for _ in ()).throw(NoReply("gone")), [driver.request(SLOW)], GROUND)[0]
+    lost = request_decisions(lambda requests: (_ for _ in ()).throw(NoReply("gone")), [driver.request(SLOW)], GROUND)[0]
     fallen = driver.execute(SLOW, lost)
     assert fallen.fallback and not fallen.cut and fallen.penalty >= 0.0

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from brakeline.actors.decision_guard import consult
-from brakeline.actors.episode_runner import EpisodeRunner, Identity
+from brakeline.actors.decision_guard import request_decisions
+from brakeline.actors.episode_runner import ActorIdentity, EpisodeRunner
 from brakeline.deploy.experiments.evaluate import in_process
 from brakeline.deploy.vehicle_factory import environment
 from brakeline.learner.transition_reader import Intake
@@ -19,7 +19,7 @@ FAST = np.array([0.25, 0.1])
 
 
 def driver(number: int = 0, seed: int = 0, **more) -> EpisodeRunner:
-    return EpisodeRunner(GROUND, environment(GROUND, "default", seed), Identity("actor-0", number, seed), **more)
+    return EpisodeRunner(GROUND, environment(GROUND, "default", seed), ActorIdentity("actor-0", number, seed), **more)
 
 
 @pytest.fixture(scope="module")
@@ -36,7 +36,7 @@ def test_the_steps_of_an_episode(ask):
     assert episode.obstacles and len(episode.start) == 5 and episode.goal_radius > 0
     observation = robot.observation
     for number in range(40):
-        outcome = consult(ask, [robot.request(FAST)], GROUND)[0]
+        outcome = request_decisions(ask, [robot.request(FAST)], GROUND)[0]
         step = robot.execute(FAST, outcome, weights_version=3)
         assert (step.episode, step.step, step.index, step.weights_version) == (5, number, number + 1, 3)
         assert np.array_equal(np.float32(step.observation), observation)
@@ -57,12 +57,14 @@ def test_containment_is_of_the_state_after_the_step_and_unknown_after_a_fallback
     robot = driver()
     robot.begin(0)
     for wrong in (False, True):
-        outcome = consult(ask, [robot.request(FAST)], GROUND)[0]
+        outcome = request_decisions(ask, [robot.request(FAST)], GROUND)[0]
         if wrong:  # a prediction that cannot come true
             outcome.answer.predicted.center[0] += 1.0
         step = robot.execute(FAST, outcome)
         assert step.compared and step.contained is not wrong
-    missing = consult(lambda requests: (_ for _ in ()).throw(NoReply("gone")), [robot.request(FAST)], GROUND)[0]
+    missing = request_decisions(lambda requests: (_ for _ in ()).throw(NoReply("gone")), [robot.request(FAST)], GROUND)[
+        0
+    ]
     plan = robot.backup_plan.plan.copy()
     step = robot.execute(FAST, missing)
     assert step.fallback and step.decision == pb.FAILSAFE and not step.compared
@@ -81,8 +83,8 @@ def test_without_a_filter_the_proposal_is_executed_within_bounds():
 def test_a_proposal_that_is_not_finite_is_a_failsafe_and_a_step_to_learn_from(ask, wrong):
     robot = driver(penalty=2.0)
     robot.begin(0)
-    robot.execute(FAST, consult(ask, [robot.request(FAST)], GROUND)[0])
-    outcome = consult(ask, [robot.request(np.array(wrong))], GROUND)[0]
+    robot.execute(FAST, request_decisions(ask, [robot.request(FAST)], GROUND)[0])
+    outcome = request_decisions(ask, [robot.request(np.array(wrong))], GROUND)[0]
     assert np.array_equal(outcome.exchange(0.2).request.action, wrong, equal_nan=True)
     assert (outcome.answer.kind, outcome.answer.reason) == ("failsafe", NOT_FINITE)
     step = robot.execute(np.array(wrong), outcome)
@@ -98,7 +100,9 @@ def test_without_a_filter_a_proposal_that_is_not_finite_is_standing_still():
 
 def test_no_two_robots_of_a_run_ever_see_the_same_episode():
     seeds = {
-        Identity(f"actor-{number}", number, 0).episode_seed(episode) for number in range(64) for episode in range(200)
+        ActorIdentity(f"actor-{number}", number, 0).episode_seed(episode)
+        for number in range(64)
+        for episode in range(200)
     }
     assert len(seeds) == 64 * 200
     arenas = {
@@ -128,4 +132,4 @@ def test_a_step_has_the_number_of_its_question_though_periods_pass_unseen_meanwh
     for number in (0, 1, 3):
         asked = robot.request(FAST)
         monkeypatch.setattr(robot.env, "step", slow if number == 1 else drive)
-        assert robot.execute(FAST, consult(ask, [asked], GROUND)[0]).step == asked.step == number
+        assert robot.execute(FAST, request_decisions(ask, [asked], GROUND)[0]).step == asked.step == number

@@ -6,9 +6,9 @@ from itertools import combinations
 import numpy as np
 import pytest
 
-from brakeline.actors.decision_guard import Outcome, consult
-from brakeline.actors.episode_runner import EpisodeRunner, Identity
-from brakeline.actors.joint_episode import Fleet
+from brakeline.actors.decision_guard import DecisionOutcome, request_decisions
+from brakeline.actors.episode_runner import ActorIdentity, EpisodeRunner
+from brakeline.actors.joint_episode import RobotGroup
 from brakeline.deploy.data.model_store import model_for
 from brakeline.deploy.experiments.evaluate import in_process
 from brakeline.messaging import brakeline_pb2 as pb
@@ -31,8 +31,10 @@ def ask(data_folder):
 
 def fleet_of(size=SIZE, arena="crossing", promising=True):
     world = FleetEnv(GROUND, arena, size, 0)
-    drivers = [EpisodeRunner(GROUND, member, Identity(f"robot.{i}", i, 0)) for i, member in enumerate(world.members)]
-    return Fleet(world, drivers, promising)
+    drivers = [
+        EpisodeRunner(GROUND, member, ActorIdentity(f"robot.{i}", i, 0)) for i, member in enumerate(world.members)
+    ]
+    return RobotGroup(world, drivers, promising)
 
 
 def policies(name, size=SIZE, seed=0):
@@ -72,7 +74,7 @@ def drive(fleet, ask, policy, periods, lost=0.0, seed=0):
                 raise NoReply("out of order")
             return ask(requests)
 
-        outcomes = consult(answer, fleet.requests(proposals), GROUND)
+        outcomes = request_decisions(answer, fleet.requests(proposals), GROUND)
         steps = fleet.execute(proposals, outcomes)
         kinds += [step.decision for step in steps if step is not None]
         least = min(least, disjoint(fleet))
@@ -113,7 +115,7 @@ def test_when_nobody_answers_all_stop_within_what_they_promised(ask):
     gathered(fleet)
     drive(fleet, ask, "random", 15)
     promised = [driver.backup_plan.reservation for driver in fleet.drivers]
-    silent = consult(
+    silent = request_decisions(
         lambda requests: (_ for _ in ()).throw(NoReply("gone")), fleet.requests([np.zeros(2)] * SIZE), GROUND
     )
     for k in range(6):
@@ -144,7 +146,7 @@ def test_robots_take_turns(ask):
             ask(requests)
             states = [tuple(request.state[:2]) for request in requests]
             assert asked == states[turn % 3 :] + states[: turn % 3]
-            fleet.execute([np.zeros(2)] * 3, consult(ask, requests, GROUND))
+            fleet.execute([np.zeros(2)] * 3, request_decisions(ask, requests, GROUND))
     finally:
         Filter.decide = kept
 
@@ -197,13 +199,13 @@ def test_no_answer_about_one_is_no_answer_about_any(ask):
     fleet = fleet_of()
     gathered(fleet)
     drive(fleet, ask, "random", 8)
-    outcomes = consult(ask, fleet.requests([np.array([0.2, 0.1])] * SIZE), GROUND)
+    outcomes = request_decisions(ask, fleet.requests([np.array([0.2, 0.1])] * SIZE), GROUND)
     before = [driver.backup_plan.plan.copy() for driver in fleet.drivers]
     outcomes[2] = replace(outcomes[2], answer=None, reply=None, failure="garbled")
     steps = fleet.execute([np.zeros(2)] * SIZE, outcomes)
     assert all(step.fallback for step in steps)
     assert all(np.allclose(step.action, plan[0]) for step, plan in zip(steps, before, strict=True))
-    assert isinstance(outcomes[0], Outcome) and disjoint(fleet) >= -ROUNDING
+    assert isinstance(outcomes[0], DecisionOutcome) and disjoint(fleet) >= -ROUNDING
 
 
 def test_who_is_done_stands_and_is_kept_off(ask):
@@ -211,6 +213,6 @@ def test_who_is_done_stands_and_is_kept_off(ask):
     fleet.begin(0)
     first, second = fleet.drivers
     first.running = False
-    results = fleet.execute([np.zeros(2)] * 2, consult(ask, fleet.requests([np.zeros(2)] * 2), GROUND))
+    results = fleet.execute([np.zeros(2)] * 2, request_decisions(ask, fleet.requests([np.zeros(2)] * 2), GROUND))
     assert results[0] is None and results[1].actor == "robot.1" and results[1].fleet == 2
     assert (first.step, second.step) == (1, 1) and first.backup_plan.reservation is not None

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 from brakeline.actors.mavlink.ground_truth import MavlinkGroundTruth
-from brakeline.actors.mavlink.telemetry import Place
+from brakeline.actors.mavlink.telemetry import GeoPosition
 
 METRES = 0.0111195  # of latitude, a ten millionth of a degree
 
 
-def at(north: float, altitude: float | None = 10.0) -> Place:
-    return Place(round(north / METRES), 0, altitude, METRES)
+def at(north: float, altitude: float | None = 10.0) -> GeoPosition:
+    return GeoPosition(round(north / METRES), 0, altitude, METRES)
 
 
 def test_a_touch_is_judged_by_the_truth_and_counted_once() -> None:

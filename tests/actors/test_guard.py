@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from brakeline.actors.decision_guard import at_rest, consult, next_input
+from brakeline.actors.decision_guard import at_rest, next_input, request_decisions
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.bus import BusError, Late, NoReply, Refused
 from brakeline.safety.filter.backup_plan import BackupPlan
@@ -28,7 +28,7 @@ def outcome_of(reply):
             raise reply
         return [reply] * len(requests)
 
-    return consult(ask, [REQUEST], GROUND)[0]
+    return request_decisions(ask, [REQUEST], GROUND)[0]
 
 
 def committed():
@@ -105,7 +105,7 @@ def test_it_goes_on_when_the_service_is_back():
 
 def test_a_wrong_reply_about_one_robot_leaves_the_others_theirs():
     replies = [decision(), FAILURES["error"], decision()]
-    outcomes = consult(lambda requests: replies, [REQUEST] * 3, GROUND)
+    outcomes = request_decisions(lambda requests: replies, [REQUEST] * 3, GROUND)
     assert [outcome.answer is not None for outcome in outcomes] == [True, False, True]
-    lost = consult(lambda requests: (_ for _ in ()).throw(NoReply("gone")), [REQUEST] * 3, GROUND)
+    lost = request_decisions(lambda requests: (_ for _ in ()).throw(NoReply("gone")), [REQUEST] * 3, GROUND)
     assert [outcome.failure for outcome in lost] == ["NoReply: gone"] * 3

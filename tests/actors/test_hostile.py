@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from brakeline.actors.mavlink.autopilot_commands import Client
+from brakeline.actors.mavlink.autopilot_commands import AutopilotClient
 from brakeline.actors.mavlink.ground_truth import MOST_DATAGRAMS, UdpGroundTruth
 from brakeline.messaging.free_ports import free_udp_port
 from brakeline.messaging.rejected_messages import Tolerance
@@ -76,7 +76,7 @@ def test_who_sends_without_end_does_not_hold_up_the_flight(say: Said) -> None:
 
 
 def test_noise_on_a_link_is_passed_over() -> None:
-    random, client = np.random.default_rng(0), Client(lambda data: None, 1)
+    random, client = np.random.default_rng(0), AutopilotClient(lambda data: None, 1)
     for _ in range(2000):
         start = b"\xfd" if random.random() < 0.5 else b""
         client.feed(start + random.integers(0, 256, int(random.integers(0, 300)), np.uint8).tobytes())

@@ -8,8 +8,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from brakeline.actors.actor_process import PRACTISED, ActorSettings, Practice, run
-from brakeline.actors.decision_guard import Outcome
+from brakeline.actors.actor_process import STOP_PRACTICE, ActorSettings, StopPractice, run
+from brakeline.actors.decision_guard import DecisionOutcome
 from brakeline.deploy.vehicle_factory import environment, fleet_world
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.bus import Bus, BusSettings
@@ -84,12 +84,12 @@ def test_a_practised_stop_goes_on_as_it_was_verified_unless_that_does_not_hold()
     driver = SimpleNamespace(robot=GROUND, backup_plan=BackupPlan(GROUND), rng=np.random.default_rng(0))
     driver.backup_plan.accept(np.full((GROUND.horizon, 2), 0.2), "a model", None, True)
     answers = {kind: SimpleNamespace(kind=kind) for kind in ("allowed", "adjusted", "failsafe", "recovering")}
-    asked = {kind: Outcome(pb.Request(), pb.Reply(), answer, "", 1.0) for kind, answer in answers.items()}
-    practice, never = Practice(1.0), Practice(0.0)
+    asked = {kind: DecisionOutcome(pb.Request(), pb.Reply(), answer, "", 1.0) for kind, answer in answers.items()}
+    practice, never = StopPractice(1.0), StopPractice(0.0)
     for one in (practice, never):
         one.instead(driver, np.zeros(2))
     assert [kind for kind, outcome in asked.items() if practice.kept(driver, outcome).answer] == ["allowed"]
-    assert practice.kept(driver, asked["adjusted"]).failure == PRACTISED
+    assert practice.kept(driver, asked["adjusted"]).failure == STOP_PRACTICE
     assert all(never.kept(driver, outcome) is outcome for outcome in asked.values())
     driver.backup_plan.accept(np.full((GROUND.horizon, 2), 0.2), "a model", None, False)
     assert all(practice.kept(driver, outcome) is outcome for outcome in asked.values())

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from brakeline.actors.mavlink.ardupilot_dialect import mavlink
-from brakeline.actors.mavlink.autopilot_commands import Client, CommandRefused, NoAutopilot
-from brakeline.actors.mavlink.frame_log import Frame
-from brakeline.actors.mavlink.lockstep_quadrotor import MavlinkVehicle
+from brakeline.actors.mavlink.autopilot_commands import AutopilotClient, CommandRefused, NoAutopilot
+from brakeline.actors.mavlink.frame_log import CapturedFrame
+from brakeline.actors.mavlink.lockstep_quadrotor import LockstepQuadrotor
 from brakeline.messaging.obstacle import CYLINDER, Obstacle
 from brakeline.sim.arena import Arena, staged_arena
 from brakeline.sim.autopilot.autopilot_rules import SETPOINT_TIMEOUT as TIMEOUT
@@ -40,7 +40,7 @@ def embedded(rules: str, *obstacles: Obstacle) -> Autopilot:
 @pytest.mark.parametrize("rules", RULES)
 def test_in_lockstep_it_takes_control_before_time_begins(rules: str) -> None:
     autopilot = embedded(rules)
-    vehicle = MavlinkVehicle(autopilot, QUADROTOR)
+    vehicle = LockstepQuadrotor(autopilot, QUADROTOR)
     assert autopilot.pilot.time == 0.0
     assert autopilot.pilot.mode is Mode.OFFBOARD
     assert vehicle.standing().clearance > 9.0
@@ -49,7 +49,7 @@ def test_in_lockstep_it_takes_control_before_time_begins(rules: str) -> None:
 @pytest.mark.parametrize("rules, name, value", [("px4", "COM_OBL_RC_ACT", 4), ("ardupilot", "LAND_SPEED", 50)])
 def test_a_whole_number_is_set_as_each_autopilot_wants_it(rules: str, name: str, value: int) -> None:
     autopilot = embedded(rules)
-    vehicle = MavlinkVehicle(autopilot, QUADROTOR)
+    vehicle = LockstepQuadrotor(autopilot, QUADROTOR)
     assert vehicle._client.set_parameter(name, value, vehicle._wait)
     assert autopilot.rules.parameters[name] == value
     assert not vehicle._client.set_parameter(name, 1e6, vehicle._wait), "out of its range"
@@ -61,7 +61,7 @@ def test_over_bytes_it_is_the_vehicle_that_it_is_without_them(rules: str) -> Non
     """Same seed, same inputs: the same flight, but for the rounding of float32, and of ArduPilot's milligravities."""
     rounding = np.array(6 * [2e-3] + 3 * [{"px4": 2e-3, "ardupilot": 0.02}[rules]])
     bare, flown = quadrotor(scale=0.0), Autopilot(quadrotor(scale=0.0), rules, parameters=AT_ONCE[rules], quiet=True)
-    vehicle = MavlinkVehicle(flown, QUADROTOR)
+    vehicle = LockstepQuadrotor(flown, QUADROTOR)
     rng = np.random.default_rng(1)
     for _ in range(40):
         input = rng.uniform(-5.0, 5.0, 3)
@@ -75,7 +75,7 @@ def test_over_bytes_it_is_the_vehicle_that_it_is_without_them(rules: str) -> Non
 
 
 def test_what_is_measured_by_telemetry_stays_within_its_bound() -> None:
-    vehicle, rng = MavlinkVehicle(embedded("px4"), QUADROTOR), np.random.default_rng(2)
+    vehicle, rng = LockstepQuadrotor(embedded("px4"), QUADROTOR), np.random.default_rng(2)
     worst = np.zeros(9)
     for _ in range(400):
         before = vehicle.measured[:3]
@@ -88,7 +88,7 @@ def test_what_is_measured_by_telemetry_stays_within_its_bound() -> None:
 
 def test_it_never_meets_its_own_timeout() -> None:
     autopilot = embedded("px4")
-    vehicle = MavlinkVehicle(autopilot, QUADROTOR)
+    vehicle = LockstepQuadrotor(autopilot, QUADROTOR)
     for _ in range(50):
         vehicle.step(np.array([2.0, 0.0, 0.0]))
     assert autopilot.pilot.mode is Mode.OFFBOARD
@@ -97,18 +97,18 @@ def test_it_never_meets_its_own_timeout() -> None:
 
 
 def test_collisions_come_from_the_simulator() -> None:
-    vehicle = MavlinkVehicle(embedded("px4", Obstacle(CYLINDER, (3.0, 0.0, 10.0), (0.5, 10.0))), QUADROTOR)
+    vehicle = LockstepQuadrotor(embedded("px4", Obstacle(CYLINDER, (3.0, 0.0, 10.0), (0.5, 10.0))), QUADROTOR)
     assert any(vehicle.step(np.array([3.0, 0.0, 0.0])).collision for _ in range(12))
 
 
 def test_bad_inputs_are_refused() -> None:
     with pytest.raises(BadInput):
-        MavlinkVehicle(embedded("px4"), QUADROTOR).step(np.array([np.nan, 0.0, 0.0]))
+        LockstepQuadrotor(embedded("px4"), QUADROTOR).step(np.array([np.nan, 0.0, 0.0]))
 
 
 def test_every_frame_goes_through_the_tap_and_can_be_read_again() -> None:
-    frames: list[Frame] = []
-    vehicle = MavlinkVehicle(embedded("px4"), QUADROTOR, frames.append)
+    frames: list[CapturedFrame] = []
+    vehicle = LockstepQuadrotor(embedded("px4"), QUADROTOR, frames.append)
     frames.clear()
     vehicle.step(np.array([0.5, 0.0, 0.0]))
     names = [(frame.outgoing, frame.name) for frame in frames]
@@ -122,27 +122,27 @@ def test_every_frame_goes_through_the_tap_and_can_be_read_again() -> None:
 
 def test_the_clients_edge_agrees_with_the_autopilots() -> None:
     sent: list[bytes] = []
-    client = Client(sent.append)
+    client = AutopilotClient(sent.append)
     client.setpoint(np.array([1.0, 2.0, 3.0]))
     message = mavlink.MAVLink(None).parse_buffer(sent[0])[0]
     assert (message.vx, message.vy, message.vz) == (2.0, 1.0, -3.0)
     assert message.type_mask == 0x0DC7 and message.coordinate_frame == mavlink.MAV_FRAME_LOCAL_NED
 
     autopilot = embedded("ardupilot")
-    vehicle = MavlinkVehicle(autopilot, QUADROTOR)
+    vehicle = LockstepQuadrotor(autopilot, QUADROTOR)
     for _ in range(10):
         vehicle.step(np.array([3.0, -2.0, 1.0]))  # tilted, and accelerating
     assert vehicle.measured[6:] == pytest.approx(vehicle.true[6:], abs=0.3)
 
 
 def test_nobody_there_and_refusals_are_errors() -> None:
-    client = Client(lambda _: None)
+    client = AutopilotClient(lambda _: None)
     with pytest.raises(NoAutopilot):
         client.identify(lambda condition, _: condition())
     with pytest.raises(CommandRefused, match="no answer"):
         client.arm(lambda condition, _: condition())
     autopilot = Autopilot(quadrotor(floor=0.02), "ardupilot")
-    client = Client(autopilot.receive)
+    client = AutopilotClient(autopilot.receive)
 
     def wait(condition, seconds):  # type: ignore[no-untyped-def]
         autopilot.advance(0.1)

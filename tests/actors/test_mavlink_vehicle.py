@@ -10,8 +10,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from brakeline.actors.mavlink.flight_timing import Offset
-from brakeline.actors.mavlink.frame_log import Frame
+from brakeline.actors.mavlink.flight_timing import ClockOffset
+from brakeline.actors.mavlink.frame_log import CapturedFrame
 from brakeline.actors.mavlink.ground_truth import UdpGroundTruth
 from brakeline.actors.mavlink.mavlink_vehicle import MavlinkVehicle
 from brakeline.actors.mavlink.telemetry import ATTITUDE
@@ -28,13 +28,13 @@ from tests.robots import QUADROTOR
 
 GAP = 0.25  # s between two setpoints, at most
 
-Live = tuple[MavlinkVehicle, Autopilot, list[Frame]]
+Live = tuple[MavlinkVehicle, Autopilot, list[CapturedFrame]]
 
 
 @pytest.fixture(params=RULES)
 def live(request: pytest.FixtureRequest) -> Iterator[Live]:
     """A vehicle, its autopilot in a thread, on the floor at first, and the frames between them."""
-    link, stop, frames = open_link("udpin:127.0.0.1:0"), threading.Event(), list[Frame]()
+    link, stop, frames = open_link("udpin:127.0.0.1:0"), threading.Event(), list[CapturedFrame]()
     truth_port = free_udp_port()
     autopilot = Autopilot(quadrotor(floor=0.02), request.param, parameters={TIMEOUT[request.param]: 1.0})
     channel = autopilot_server.Truth("127.0.0.1", truth_port)
@@ -58,7 +58,7 @@ def live(request: pytest.FixtureRequest) -> Iterator[Live]:
             end.close()
 
 
-def setpoints(frames: list[Frame]) -> list[tuple[float, float, float]]:
+def setpoints(frames: list[CapturedFrame]) -> list[tuple[float, float, float]]:
     """What was sent [m/s], ENU, repetitions left out."""
     sent = [f.message for f in frames if f.name.endswith("SET_POSITION_TARGET_LOCAL_NED")]
     inputs = [(round(m.vy, 3), round(m.vx, 3), round(-m.vz, 3)) for m in sent]
@@ -180,7 +180,7 @@ def test_the_autopilot_brakes_when_the_link_dies(live: Live) -> None:
 
 
 def test_the_offset_of_two_clocks_follows_them() -> None:
-    offset = Offset()
+    offset = ClockOffset()
     for k in range(1000):
         offset.note(0.02 * k + 0.001 * (k % 7), 0.02 * k)
     assert offset.value == pytest.approx(0.0, abs=1e-4)

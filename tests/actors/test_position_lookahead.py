@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from brakeline.actors.mavlink.ardupilot_dialect import mavlink
-from brakeline.actors.mavlink.autopilot_commands import Client, MavlinkError
+from brakeline.actors.mavlink.autopilot_commands import AutopilotClient, MavlinkError
 from brakeline.actors.mavlink.position_lookahead import LATENCY, PARAMETERS, AxisLookahead, PositionLookahead
 from brakeline.actors.mavlink.telemetry import MOTION
 
@@ -73,7 +73,7 @@ class Vehicle:
 
 def test_who_does_not_know_where_it_is_is_told_velocities_and_then_places() -> None:
     vehicle = Vehicle()
-    client = Client(vehicle)
+    client = AutopilotClient(vehicle)
     client.lookahead = PositionLookahead.of("ardupilot", VALUES["ardupilot"])
     client.setpoint(np.array([1.0, 0.0, 0.0]))
     client.message_counts[MOTION] += 1
@@ -89,7 +89,7 @@ def test_who_does_not_know_where_it_is_is_told_velocities_and_then_places() -> N
 
 @pytest.mark.parametrize("kind", PARAMETERS)
 def test_only_who_tells_its_controller_is_led(kind: str) -> None:
-    client = Client(lambda data: None)
+    client = AutopilotClient(lambda data: None)
     wait = lambda condition, seconds: condition()  # noqa: E731
     client.kind = kind
     with pytest.raises(MavlinkError, match=f"it has no {', '.join(PARAMETERS[kind])}: it can only be told velocities"):

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from brakeline.actors.mavlink.ardupilot_dialect import mavlink
-from brakeline.actors.mavlink.autopilot_commands import Client, NotTold, message_id
+from brakeline.actors.mavlink.autopilot_commands import AutopilotClient, TelemetryMissing, message_id
 from brakeline.actors.mavlink.autopilot_limits import AUTOPILOT_LIMITS, demand, limits_below_demand
 from brakeline.actors.mavlink.telemetry import (
     ATTITUDE,
@@ -20,7 +20,7 @@ from brakeline.actors.mavlink.telemetry import (
     MOTION,
     SOURCES,
     TRUTH,
-    Place,
+    GeoPosition,
     missing,
     mode_name,
     turned,
@@ -85,8 +85,8 @@ def test_every_message_says_the_same_in_its_own_units_and_frame(what: str, name:
     elif what == ATTITUDE:
         assert told == pytest.approx(quaternion(), abs=1e-6)
     elif what == TRUTH:
-        north = Place(told.latitude + 9000, told.longitude, told.altitude, told.metres).since(told)
-        east = Place(told.latitude, told.longitude + 9000, told.altitude, told.metres).since(told)
+        north = GeoPosition(told.latitude + 9000, told.longitude, told.altitude, told.metres).since(told)
+        east = GeoPosition(told.latitude, told.longitude + 9000, told.altitude, told.metres).since(told)
         assert north == pytest.approx([0.0, 100.0, 0.0], abs=0.3), "an Earth's quarter is 10,000 km"
         assert east == pytest.approx([100.0 * math.cos(math.radians(47.4)), 0.0, 0.0], abs=0.3)
         assert told.altitude in (None, 488.5)
@@ -120,7 +120,7 @@ class Pretender:
 
     def __init__(self, kind: str, grants: dict[str, float], parameters: dict[str, float] | None = None) -> None:
         self.grants, self.parameters, self.now = grants, parameters or {}, 0.0
-        self.client, self.switched_off = Client(self.receive), list[str]()
+        self.client, self.switched_off = AutopilotClient(self.receive), list[str]()
         self._out = bytearray()
         self._mav = mavlink.MAVLink(self, srcSystem=1, srcComponent=1)
         self._asked: dict[str, float] = {}
@@ -160,7 +160,7 @@ class Pretender:
 
 
 def test_it_tells_when_it_is_outside_of_its_geofence() -> None:
-    client, mav = Client(lambda _: None), mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
+    client, mav = AutopilotClient(lambda _: None), mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
     for breach, side in ((1, 2), (1, 3), (1, 0), (0, 3)):
         client.feed(mavlink.MAVLink_fence_status_message(breach, 1, side, 1000).pack(mav))
         expected = {2: "greatest altitude", 3: "boundary", 0: "geofence"}[side] if breach else ""
@@ -177,7 +177,7 @@ def test_it_tells_when_it_is_outside_of_its_geofence() -> None:
 )
 def test_what_is_no_number_was_not_told(said: Any) -> None:
     """It counted as fresh, and a flight by scan ended in an exception."""
-    client, mav = Client(lambda _: None), mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
+    client, mav = AutopilotClient(lambda _: None), mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
     client.feed(mavlink.MAVLink_heartbeat_message(2, KINDS["px4"], 128, 0, 4, 3).pack(mav))
     before = dict(client.message_counts)
     client.feed(said.pack(mav))
@@ -209,7 +209,7 @@ def test_what_is_refused_is_replaced_as_arducopter_needs_it() -> None:
 
 def test_raw_units_are_believed_only_where_they_are_known() -> None:
     there = Pretender("px4", {"RAW_IMU": 50.0})
-    with pytest.raises(NotTold, match="HIGHRES_IMU is refused"):
+    with pytest.raises(TelemetryMissing, match="HIGHRES_IMU is refused"):
         there.client.choose(FORCE, 0.02, there.wait)
 
 
@@ -217,7 +217,7 @@ def test_the_faster_of_two_slow_ones_is_taken_and_one_too_slow_to_fly_is_none() 
     there = Pretender("px4", {"ATTITUDE_QUATERNION": 4.0, "ATTITUDE": 20.0})
     assert there.client.choose(ATTITUDE, 0.02, there.wait).startswith("attitude from ATTITUDE at 2")
     there = Pretender("px4", {"ATTITUDE_QUATERNION": 4.0})
-    with pytest.raises(NotTold, match="comes at 4 Hz"):
+    with pytest.raises(TelemetryMissing, match="comes at 4 Hz"):
         there.client.choose(ATTITUDE, 0.02, there.wait)
 
 

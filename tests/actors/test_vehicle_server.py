@@ -20,7 +20,7 @@ import pytest
 from brakeline.actors.actor_settings import FlightSettings
 from brakeline.actors.mavlink import vehicle_client
 from brakeline.actors.mavlink.autopilot_commands import MavlinkError
-from brakeline.actors.mavlink.frame_log import decoded
+from brakeline.actors.mavlink.frame_log import decode_frame
 from brakeline.actors.mavlink.mavlink_vehicle import ControlPeriod
 from brakeline.actors.mavlink.vehicle_client import VehicleClient
 from brakeline.actors.mavlink.vehicle_messages import FlightRequest, period_message
@@ -83,7 +83,7 @@ def standing() -> Period:
 
 def setpoints(frames: list[pb.MavlinkFrame]) -> list[Any]:
     """The setpoints among the frames, in their order."""
-    sent = [decoded(frame.raw, True) for frame in frames if frame.outgoing]
+    sent = [decode_frame(frame.raw, True) for frame in frames if frame.outgoing]
     return [f.message for f in sent if f is not None and f.message.get_type() == "SET_POSITION_TARGET_LOCAL_NED"]
 
 

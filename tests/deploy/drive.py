@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
-from brakeline.actors.decision_guard import consult
-from brakeline.actors.episode_runner import EpisodeRunner, Identity
+from brakeline.actors.decision_guard import request_decisions
+from brakeline.actors.episode_runner import ActorIdentity, EpisodeRunner
 from brakeline.deploy.data.model_store import model_for
 from brakeline.deploy.experiments.evaluate import in_process
 from brakeline.deploy.vehicle_factory import environment
@@ -33,7 +33,7 @@ def drive(
     """Drive and record; `change` may falsify what is recorded of an exchange. Returns the model set's version."""
     model = model_for(GROUND, ModelConfig())
     ask = in_process(model)
-    driver = EpisodeRunner(GROUND, environment(GROUND, "dense", 7), Identity(actor, 0, 0), penalty=1.0)
+    driver = EpisodeRunner(GROUND, environment(GROUND, "dense", 7), ActorIdentity(actor, 0, 0), penalty=1.0)
     attachments = {attachment("ground", model.version): model.encode()} if attach else None
     segment = open_segment(log, {"run": {"method": "ddpc"}}, attachments)
     numbers: dict[str, Iterator[int]] = {}
@@ -51,7 +51,7 @@ def drive(
             put(EPISODE, driver.begin(episode))
             episode += 1
         proposal = np.asarray(policy(driver.observation, driver.info), dtype=float)
-        outcome = consult(ask, [driver.request(proposal)], GROUND)[0]
+        outcome = request_decisions(ask, [driver.request(proposal)], GROUND)[0]
         exchange = outcome.exchange(driver.info["time"])
         if change is not None:
             change(exchange)

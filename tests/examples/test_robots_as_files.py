@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from brakeline.actors.episode_runner import EpisodeRunner, Identity
+from brakeline.actors.episode_runner import ActorIdentity, EpisodeRunner
 from brakeline.deploy.cli import main
 from brakeline.deploy.data import collect, data_paths, model_store, simulated_recording
 from brakeline.deploy.data.certification import certified
@@ -187,7 +187,7 @@ def test_nothing_is_touched_in_adversarial_episodes(kind: RobotWithTask, model: 
 def _collisions(kind: RobotWithTask, question: object) -> tuple[int, int]:
     """Collisions and steps outside of the predicted sets, in some periods of two adversarial episodes."""
     env = environment(kind, "default", FRESH)
-    driver = EpisodeRunner(kind, env, Identity("test", 0, 0), filtered=question is not None)
+    driver = EpisodeRunner(kind, env, ActorIdentity("test", 0, 0), filtered=question is not None)
     policy = scripted("adversary", kind, np.random.default_rng(0))
     touched = left = 0
     for number in range(2):

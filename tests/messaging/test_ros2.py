@@ -15,7 +15,7 @@ from rosbags.typesys.stores import Stores, get_typestore
 
 from brakeline.messaging.bus import Malformed, Unreachable
 from brakeline.messaging.free_ports import free_endpoint
-from brakeline.messaging.ros2 import LATCHED, SENSOR, BadName, Entity, Node, Qos, RosSettings
+from brakeline.messaging.ros2 import LATCHED, SENSOR, BadRosName, GraphEntity, Qos, RosNode, RosSettings
 from brakeline.messaging.ros2.cdr_messages import (
     Clock,
     DiagnosticArray,
@@ -73,14 +73,16 @@ def test_names_tokens_and_attachments_are_those_of_another_implementation(tmp_pa
     said = subprocess.run([sys.executable, "-c", text], env={"HOME": str(tmp_path)}, capture_output=True, check=True)
     theirs = json.loads(said.stdout)
     where = (7, "abc123", 0)
-    assert Entity(*where, 0, NODE, "/robot1", "brakeline").token == theirs["node"]
+    assert GraphEntity(*where, 0, NODE, "/robot1", "brakeline").token == theirs["node"]
     ours = [
-        Entity(*where, 3, kind, "/robot1", "brakeline", "/robot1/cmd_vel", "geometry_msgs/msg/Twist", HASH, qos.token())
+        GraphEntity(
+            *where, 3, kind, "/robot1", "brakeline", "/robot1/cmd_vel", "geometry_msgs/msg/Twist", HASH, qos.token()
+        )
         for kind in (PUBLISHER, SUBSCRIPTION)
         for qos in (Qos(), SENSOR, LATCHED)
     ]
     assert [entity.token for entity in ours] == theirs["ends"]
-    assert [Entity.parse(token) for token in theirs["ends"]] == ours
+    assert [GraphEntity.parse(token) for token in theirs["ends"]] == ours
     assert topic_key(7, "/robot1/cmd_vel", "geometry_msgs/msg/Twist", HASH) == theirs["key"]
     assert Attachment(5, 123456789, bytes(range(16))).encode().hex() == theirs["attachment"]
 
@@ -134,14 +136,14 @@ def test_names_are_resolved_as_ros_does():
     assert full_name("~/tube", "/robot1", "brakeline") == "/robot1/brakeline/tube"
     assert ros_type("geometry_msgs::msg::dds_::Twist_") == "geometry_msgs/msg/Twist"
     for wrong in ("", "a b", "1scan", "a//b", "scan*", "$", "a%b"):
-        with pytest.raises(BadName):
+        with pytest.raises(BadRosName):
             full_name(wrong)
 
 
 @pytest.mark.parametrize("token", ["", "a/b", "@ros2_lv/0/z/0/0/NN/%/%", "@ros2_lv/x/z/0/0/NN/%/%/n", "@ros2_lv" * 9])
 def test_what_is_no_token_is_said(token):
-    with pytest.raises(BadName):
-        Entity.parse(token)
+    with pytest.raises(BadRosName):
+        GraphEntity.parse(token)
 
 
 @given(st.floats(-3.1, 3.1), st.floats(0.0, 2e9))
@@ -163,7 +165,7 @@ def nodes():
 
     def make(name, domain=0, namespace="/"):
         place = {"connect": (endpoint,)} if made else {"listen": (endpoint,)}
-        made.append(Node(RosSettings(**place, domain=domain, namespace=namespace), name))
+        made.append(RosNode(RosSettings(**place, domain=domain, namespace=namespace), name))
         return made[-1]
 
     yield make
@@ -237,11 +239,11 @@ def test_what_is_no_message_is_lost_alone(nodes, caplog):
 def test_no_router_is_said_with_what_to_do():
     begun = time.monotonic()
     with pytest.raises(Unreachable, match="rmw_zenohd"):
-        Node(RosSettings(connect=(free_endpoint(),), patience=0.5), "alone")
+        RosNode(RosSettings(connect=(free_endpoint(),), patience=0.5), "alone")
     assert time.monotonic() - begun < 20.0
 
 
 def test_an_endpoint_that_is_taken_is_said(nodes):
     taken = nodes("first").settings.listen
     with pytest.raises(Unreachable, match="cannot listen"):
-        Node(RosSettings(listen=taken), "second")
+        RosNode(RosSettings(listen=taken), "second")

@@ -16,7 +16,7 @@ import pytest
 from pymavlink import mavutil
 
 from benchmarks.timing import stalls
-from brakeline.actors.mavlink.frame_log import decoded
+from brakeline.actors.mavlink.frame_log import decode_frame
 from brakeline.deploy import cli
 from brakeline.deploy.run.processes import CONFIG
 from brakeline.deploy.run.run_config import load
@@ -72,7 +72,7 @@ def sent(records: list[Record]) -> Iterator[tuple[float, Any]]:
     for record in records:
         if record.topic == "frames":
             for frame in record.message.frames:
-                found = decoded(frame.raw, frame.outgoing)
+                found = decode_frame(frame.raw, frame.outgoing)
                 if frame.outgoing and found is not None:
                     yield frame.wall_time * 1e-9, found.message
 
@@ -182,7 +182,7 @@ def _takeovers(records: list[Record]) -> list[dict[str, Any]]:
     found: dict[int, dict[str, Any]] = {life: {} for life in lives}
     for batch in batches:
         for frame in batch.frames:
-            if not frame.outgoing and (known := decoded(frame.raw, frame.outgoing)) is not None:
+            if not frame.outgoing and (known := decode_frame(frame.raw, frame.outgoing)) is not None:
                 found[batch.header.run].setdefault(known.message.get_type(), known.message)
     return list(found.values())[1:]
 

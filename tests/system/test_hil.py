@@ -18,8 +18,8 @@ import psutil
 import pytest
 
 from brakeline.actors.mavlink.ardupilot_dialect import mavlink
-from brakeline.actors.mavlink.autopilot_commands import Client
-from brakeline.actors.mavlink.frame_log import Frame
+from brakeline.actors.mavlink.autopilot_commands import AutopilotClient
+from brakeline.actors.mavlink.frame_log import CapturedFrame
 from brakeline.actors.mavlink.px4_lockstep import FIELD, QUIET, Px4Flight, Px4Vehicle
 from brakeline.deploy.run.autopilot_run import PAD, open_field
 from brakeline.messaging.obstacle import CYLINDER, Obstacle
@@ -46,7 +46,7 @@ class Flight:
 
     def __init__(self, hil: Hil, link: socket.socket, port: int) -> None:
         self.hil, self.link = hil, link
-        self.client = Client(lambda data: link.sendto(data, ("127.0.0.1", port)), tap=self.hear)
+        self.client = AutopilotClient(lambda data: link.sendto(data, ("127.0.0.1", port)), tap=self.hear)
         self.begins: np.ndarray | None = None  # its local frame, as it says itself, m, ENU
         self.setpoint = np.zeros(3)
         self.count = 0
@@ -74,7 +74,7 @@ class Flight:
             self.run(0.05)
         return condition()
 
-    def hear(self, frame: Frame) -> None:
+    def hear(self, frame: CapturedFrame) -> None:
         message = frame.message
         if message.get_type() == "GPS_GLOBAL_ORIGIN":
             north, east = 1e-7 * message.latitude - ned_frames.LATITUDE, 1e-7 * message.longitude - ned_frames.LONGITUDE

@@ -16,7 +16,7 @@ import pytest
 from benchmarks.timing import stalls
 from brakeline.actors.mavlink.ardupilot_dialect import mavlink
 from brakeline.actors.mavlink.autopilot_commands import message_id
-from brakeline.actors.mavlink.frame_log import Frame
+from brakeline.actors.mavlink.frame_log import CapturedFrame
 from brakeline.actors.mavlink.mavlink_decoder import OFFBOARD
 from brakeline.actors.mavlink.mavlink_vehicle import MavlinkVehicle
 from brakeline.messaging.byte_links import open_link
@@ -44,7 +44,7 @@ def way(before: Any, after: Any) -> np.ndarray:
 @pytest.mark.parametrize("kind", KINDS)
 def test_it_is_found_out_flown_and_given_back(kind: str, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.INFO)
-    frames: list[Frame] = []
+    frames: list[CapturedFrame] = []
     with autopilot(kind, tmp_path) as (url, system):
         vehicle = MavlinkVehicle(open_link(url), QUADROTOR, system, height=5.0, tap=frames.append, raise_limits=True)
         try:

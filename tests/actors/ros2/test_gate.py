@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from brakeline.actors.ros2.command_gate import BLIND, LATE, NO_ANSWER, ROOM, Gate, grown
-from brakeline.actors.ros2.ros2_process import Ros2Settings, Unfit, driven
-from brakeline.actors.ros2.ros_inputs import Command
+from brakeline.actors.ros2.command_gate import BLIND, LATE, NO_ANSWER, ROOM, CommandGate, inflated
+from brakeline.actors.ros2.ros2_process import Ros2Settings, UnsupportedRobot, driven
+from brakeline.actors.ros2.ros_inputs import RawCommand
 from brakeline.actors.ros2.ros_views import diagnostics, markers
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.bus import NoReply
@@ -41,11 +41,11 @@ def refuse(requests):
 
 
 def command(speed, turn=0.0, at=0.0, number=1):
-    return Command(np.array([speed, turn]), at, number)
+    return RawCommand(np.array([speed, turn]), at, number)
 
 
 def test_a_command_goes_out_one_period_after_it_was_asked_about():
-    gate = Gate(ROBOT, allow)
+    gate = CommandGate(ROBOT, allow)
     assert gate.begin(0.0).tolist() == [0.0, 0.0] and gate.kind == BLIND
     gate.decide(STATE, (), command(0.2, at=0.1), 0.0, 0)
     assert gate.begin(0.2).tolist() == [0.2, 0.0] and gate.kind == "allowed" and gate.reason == ""
@@ -53,7 +53,7 @@ def test_a_command_goes_out_one_period_after_it_was_asked_about():
 
 
 def test_without_an_answer_it_brakes_along_the_plan():
-    gate = Gate(ROBOT, allow)
+    gate = CommandGate(ROBOT, allow)
     gate.decide(STATE, (), command(0.25), 0.0, 0)
     gate.begin(0.2)
     gate._ask = refuse
@@ -70,14 +70,14 @@ def test_without_an_answer_it_brakes_along_the_plan():
     [(False, "", LATE, "after its period"), (True, "no scan yet", BLIND, "no scan yet")],
 )
 def test_an_answer_that_cannot_count_is_not_executed(in_time, why, kind, reason):
-    gate = Gate(ROBOT, allow)
+    gate = CommandGate(ROBOT, allow)
     gate.decide(STATE, (), command(0.25), 0.0, 0)
     assert gate.begin(0.2, in_time, why).tolist() == [0.0, 0.0]
     assert gate.kind == kind and reason in gate.reason and gate.tally.kinds[kind] == 1
 
 
 def test_a_command_that_is_not_finite_is_a_failsafe():
-    gate = Gate(ROBOT, allow)
+    gate = CommandGate(ROBOT, allow)
     gate.decide(STATE, (), command(0.2), 0.0, 0)
     assert gate.begin(0.2).tolist() == [0.2, 0.0]
     gate.decide(STATE, (), command(float("nan"), number=2), 0.2, 1)
@@ -85,7 +85,7 @@ def test_a_command_that_is_not_finite_is_a_failsafe():
 
 
 def test_without_a_command_it_is_asked_to_stand():
-    gate = Gate(ROBOT, allow)
+    gate = CommandGate(ROBOT, allow)
     gate.decide(STATE, (), None, 0.0, 0)
     assert gate.begin(0.2).tolist() == [0.0, 0.0] and gate.reason == "no command"
     assert gate.tally.commands == 0
@@ -93,7 +93,7 @@ def test_without_a_command_it_is_asked_to_stand():
 
 def test_only_what_a_twist_can_drive_is_taken():
     assert driven("ground") == driven("ground-late") == ROBOT
-    with pytest.raises(Unfit, match="quadrotor"):
+    with pytest.raises(UnsupportedRobot, match="quadrotor"):
         driven("quadrotor")
     assert Ros2Settings().lead < ROBOT.period
 
@@ -136,7 +136,7 @@ DISC = (Obstacle("cylinder", (0.5, 0.0), (0.1,)),)
 
 def test_with_room_around_what_stands_there_one_question_is_enough():
     wary = Wary(near=1.0)
-    gate = Gate(ROBOT, wary)
+    gate = CommandGate(ROBOT, wary)
     gate.decide(STATE, DISC, command(0.2, 0.1), 0.0, 0)
     (asked,) = wary.asked
     assert asked.obstacles[0].size[0] == pytest.approx(0.1 + ROOM)
@@ -145,14 +145,14 @@ def test_with_room_around_what_stands_there_one_question_is_enough():
 def test_where_only_the_room_is_missing_it_may_leave_and_turn_but_not_come_nearer():
     for leads, speed in ((0.1, 0.0), (-0.1, 0.2)):
         wary = Wary(near=0.1 + 0.5 * ROOM, leads=leads)
-        gate = Gate(ROBOT, wary)
+        gate = CommandGate(ROBOT, wary)
         gate.decide(STATE, DISC, command(0.2, 0.1), 0.0, 0)
         assert gate.begin(0.2).tolist() == pytest.approx([speed, 0.1]) and gate.kind == "allowed"
         assert wary.asked[-1].obstacles[0].size[0] == pytest.approx(0.1)
 
 
 def test_where_nothing_is_verified_it_brakes():
-    gate = Gate(ROBOT, Wary(near=0.01))
+    gate = CommandGate(ROBOT, Wary(near=0.01))
     gate.decide(STATE, DISC, command(0.2), 0.0, 0)
     gate.begin(0.2)
     assert gate.kind == "failsafe"
@@ -161,5 +161,5 @@ def test_where_nothing_is_verified_it_brakes():
 def test_room_is_around_all_of_an_obstacle():
     box = Obstacle("box", (1.0, 0.0), (0.2, 0.4), 0.3)
     rim = Shapes.of([box], 2).distance(np.array([[1.0, 0.6]]))
-    assert Shapes.of([grown(box, 0.05)], 2).distance(np.array([[1.0, 0.6]])) <= rim - 0.05 + 1e-9
-    assert grown(DISC[0], 0.05).size == (pytest.approx(0.15),)
+    assert Shapes.of([inflated(box, 0.05)], 2).distance(np.array([[1.0, 0.6]])) <= rim - 0.05 + 1e-9
+    assert inflated(DISC[0], 0.05).size == (pytest.approx(0.15),)

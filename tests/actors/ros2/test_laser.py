@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from brakeline.actors.ros2.laser_obstacles import BadScan, Errors, _joined, obstacles, read
-from brakeline.actors.ros2.sensor_frames import Place
+from brakeline.actors.ros2.laser_obstacles import BadScan, HitErrors, _joined, obstacles, read
+from brakeline.actors.ros2.sensor_frames import PlanarPose
 from brakeline.messaging.obstacle import Shapes
 from brakeline.messaging.ray_directions import Rays
 from brakeline.messaging.ros2.cdr_messages import LaserScan, header
@@ -18,8 +18,8 @@ from brakeline.sim.lidar import Lidar
 from tests.robots import GROUND
 
 BEAMS = 360
-MOUNT = Place(-0.032, 0.0, 0.0)
-ERRORS = Errors.of(GROUND, 0.02)
+MOUNT = PlanarPose(-0.032, 0.0, 0.0)
+ERRORS = HitErrors.of(GROUND, 0.02)
 NEAR = 0.6  # m: closer than this there is no gap between two hits on one wall that the body fits through
 EDGE = 0.15  # m: neighbouring beams that differ by more are on both sides of an edge
 
@@ -83,7 +83,7 @@ def test_what_is_seen_in_random_rooms_is_inside_whatever_the_errors():
 def test_a_room_is_few_obstacles_and_its_middle_is_free():
     angles = 2.0 * math.pi * np.arange(BEAMS) / BEAMS
     square = 0.8 / np.maximum(np.abs(np.cos(angles)), np.abs(np.sin(angles)))
-    found = seen(scan_of(square), mount=Place())
+    found = seen(scan_of(square), mount=PlanarPose())
     assert 4 <= len(found) <= 12
     assert Shapes.of(found, dim=2).distance(np.zeros((1, 2))).min() > 0.7
 
@@ -142,7 +142,7 @@ def test_beams_are_placed_where_the_robot_was_at_their_time():
     beams = read(scan_of(ranges, time_increment=0.2 / BEAMS))
     poses = np.zeros((BEAMS, 3))
     poses[:, 0] = 0.25 * (beams.times - 10.0)  # driving at 0.25 m/s
-    found = obstacles(beams, poses, Place(), GROUND, ERRORS, poses[-1, :2])
+    found = obstacles(beams, poses, PlanarPose(), GROUND, ERRORS, poses[-1, :2])
     assert sorted(o.position[0] for o in found) == pytest.approx([-0.475, 0.5])
 
 

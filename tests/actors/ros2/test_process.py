@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from brakeline.actors.ros2.command_gate import LATE
-from brakeline.actors.ros2.ros2_process import Ros2Settings, Steering
-from brakeline.actors.ros2.ros_inputs import Command, Freshness, Sensing
+from brakeline.actors.ros2.ros2_process import FilterNode, Ros2Settings
+from brakeline.actors.ros2.ros_inputs import AgeLimits, RawCommand, SensorSettings
 from brakeline.messaging.free_ports import free_endpoint
-from brakeline.messaging.ros2 import LATCHED, SENSOR, Node, RosSettings
+from brakeline.messaging.ros2 import LATCHED, SENSOR, RosNode, RosSettings
 from brakeline.messaging.ros2.cdr_messages import (
     Clock,
     DiagnosticArray,
@@ -31,7 +31,7 @@ from tests.actors.ros2.test_senses import odometry, transform
 from tests.waiting import until
 
 # Wide, for a busy machine: what stops is told by its absence alone.
-FRESH = Freshness(odometry=1.0, scan=1.5, command=1.0)
+FRESH = AgeLimits(odometry=1.0, scan=1.5, command=1.0)
 
 
 class Robot:
@@ -93,16 +93,16 @@ class Robot:
 @contextmanager
 def steered(simulated=False, stamped=False, ask=allow):
     endpoint, stop = free_endpoint(), threading.Event()
-    with Node(RosSettings(listen=(endpoint,), namespace="/r"), "robot") as node:
+    with RosNode(RosSettings(listen=(endpoint,), namespace="/r"), "robot") as node:
         robot = Robot(node, simulated, stamped)
         settings = Ros2Settings(
             ros=RosSettings(connect=(endpoint,), namespace="/r"),
             sim_time=simulated,
             stamped=stamped,
-            sensing=Sensing(),
+            sensing=SensorSettings(),
             fresh=FRESH,
         )
-        steering = Steering(settings, ask, stop)
+        steering = FilterNode(settings, ask, stop)
         thread = threading.Thread(target=steering.run)
         thread.start()
         try:
@@ -164,10 +164,10 @@ class Stalling:
 
 def test_an_answer_for_a_moment_long_gone_does_not_count():
     stop = threading.Event()
-    steering = Steering(Ros2Settings(ros=RosSettings(listen=(free_endpoint(),))), allow, stop)
+    steering = FilterNode(Ros2Settings(ros=RosSettings(listen=(free_endpoint(),))), allow, stop)
     try:
         gate, clock = steering.gate, Stalling()
-        full = lambda number: Command(np.array([0.25, 0.0]), clock.time, number)  # noqa: E731
+        full = lambda number: RawCommand(np.array([0.25, 0.0]), clock.time, number)  # noqa: E731
         steering.clock = clock
         steering._decide = lambda began, number: gate.decide(np.zeros(5), (), full(number), began, number)
         due = 100.0

@@ -5,10 +5,10 @@ import math
 import numpy as np
 import pytest
 
-from brakeline.actors.ros2.odometry import KEPT, Track
-from brakeline.actors.ros2.ros_clock import Date, Simulated
-from brakeline.actors.ros2.ros_inputs import Blind, Freshness, Senses, Sensing
-from brakeline.actors.ros2.sensor_frames import Frames, Place
+from brakeline.actors.ros2.odometry import KEPT, OdometryHistory
+from brakeline.actors.ros2.ros_clock import SimulatedClock, SystemClock
+from brakeline.actors.ros2.ros_inputs import AgeLimits, InputMissing, RosInputs, SensorSettings
+from brakeline.actors.ros2.sensor_frames import PlanarPose, TransformTree
 from brakeline.messaging.ros2.cdr_messages import (
     Clock,
     Odometry,
@@ -48,7 +48,7 @@ def transform(parent, child, x=0.0, y=0.0, rotation=None, at=0.0):
 
 
 def test_a_track_gives_states_between_and_a_little_after():
-    track = Track()
+    track = OdometryHistory()
     for i in range(11):
         assert track.add(0.1 * i, 0.02 * i, 0.0, 0.0, 0.2, 0.0)
     assert track.state(0.55) == pytest.approx([0.11, 0.0, 0.0, 0.2, 0.0])
@@ -57,7 +57,7 @@ def test_a_track_gives_states_between_and_a_little_after():
 
 
 def test_a_track_carries_on_along_the_arc_and_turns_through_pi():
-    track = Track()
+    track = OdometryHistory()
     track.add(0.0, 0.0, 0.0, 3.1, 0.2, 0.5)
     track.add(0.1, 0.0, 0.0, -3.13, 0.2, 0.5)
     assert track.state(0.05)[2] == pytest.approx(-3.1566 + 2.0 * math.pi, abs=1e-3)
@@ -65,7 +65,7 @@ def test_a_track_carries_on_along_the_arc_and_turns_through_pi():
 
 
 def test_a_track_keeps_its_length_and_begins_anew_when_time_goes_back():
-    track = Track()
+    track = OdometryHistory()
     for i in range(1000):
         track.add(0.01 * i, 0.0, 0.0, 0.0, 0.0, 0.0)
     assert len(track) <= KEPT / 0.01 + 2
@@ -74,7 +74,7 @@ def test_a_track_keeps_its_length_and_begins_anew_when_time_goes_back():
 
 
 def test_speeds_come_from_poses_where_there_are_none():
-    track = Track()
+    track = OdometryHistory()
     for i in range(50):
         angle = 0.4 * 0.02 * i
         track.add_pose(0.02 * i, 0.5 * math.sin(angle), 0.5 * (1.0 - math.cos(angle)), angle)
@@ -82,12 +82,12 @@ def test_speeds_come_from_poses_where_there_are_none():
 
 
 def test_of_what_was_between_two_odometries_far_apart_nothing_is_known():
-    track = Track(gap=0.15)
+    track = OdometryHistory(gap=0.15)
     for at in (0.0, 0.1, 1.1, 1.2):
         track.add(at, 0.2 * at, 0.0, 0.0, 0.2, 0.0)
     assert track.state(0.05) is not None and track.state(1.15) is not None
     assert track.state(0.6) is None and track.at(np.array([0.05, 0.6])) is None
-    poses = Track(gap=0.15)
+    poses = OdometryHistory(gap=0.15)
     for at in (0.0, 0.05, 0.1, 0.15, 1.15, 1.2, 1.25, 1.3):
         poses.add_pose(at, 0.2 * at, 0.0, 0.0)
     assert poses.state(0.05) is None, "of one pose no speed is known"
@@ -96,7 +96,7 @@ def test_of_what_was_between_two_odometries_far_apart_nothing_is_known():
 
 
 def test_frames_are_followed_up_and_down():
-    frames = Frames()
+    frames = TransformTree()
     frames.add(transform("base_footprint", "base_link", 0.0, 0.1, quaternion(0.5 * math.pi)))
     frames.add(transform("/base_link", "base_scan", 0.2))
     place = frames.place("base_scan", "base_footprint")
@@ -107,7 +107,7 @@ def test_frames_are_followed_up_and_down():
 
 
 def test_a_sensor_that_hangs_upside_down_or_a_loop_of_frames_has_no_place():
-    frames = Frames()
+    frames = TransformTree()
     frames.add(transform("base", "scan", rotation=Quaternion(x=1.0, y=0.0, z=0.0, w=0.0)))
     assert frames.place("scan", "base") is None
     frames.add(transform("a", "b"))
@@ -118,7 +118,7 @@ def test_a_sensor_that_hangs_upside_down_or_a_loop_of_frames_has_no_place():
 @pytest.fixture
 def senses():
     """With odometry, a scan and a command of t = 10 s."""
-    made = Senses(ROBOT, Sensing(mount=Place()), Freshness())
+    made = RosInputs(ROBOT, SensorSettings(mount=PlanarPose()), AgeLimits())
     for i in range(101):
         made.hear_odometry(odometry(9.0 + 0.01 * i, x=0.001 * i))
     made.hear_scan(scan_of(np.full(BEAMS, math.inf)))
@@ -137,12 +137,12 @@ def test_what_is_fresh_is_decided_on(senses):
     [(10.2, "odometry is 0.20 s old"), (5000.0, "compare the clocks"), (9.9, "odometry is 0.10 s in the future")],
 )
 def test_odometry_of_another_time_is_none(senses, now, said):
-    with pytest.raises(Blind, match=said):
+    with pytest.raises(InputMissing, match=said):
         senses.state(9.95, now)
 
 
 def test_a_scan_of_another_time_is_none(senses):
-    with pytest.raises(Blind, match=r"the scan is 0\.70 s old"):
+    with pytest.raises(InputMissing, match=r"the scan is 0\.70 s old"):
         senses.obstacles(np.zeros(2), 10.7)
 
 
@@ -155,26 +155,26 @@ def test_a_command_counts_for_a_while(senses):
 
 
 def test_what_never_came_is_named():
-    bare = Senses(ROBOT, Sensing(), Freshness())
-    with pytest.raises(Blind, match="no odometry yet"):
+    bare = RosInputs(ROBOT, SensorSettings(), AgeLimits())
+    with pytest.raises(InputMissing, match="no odometry yet"):
         bare.state(0.0, 0.0)
-    with pytest.raises(Blind, match="no scan yet"):
+    with pytest.raises(InputMissing, match="no scan yet"):
         bare.obstacles(np.zeros(2), 0.0)
     bare.hear_scan(scan_of(np.full(BEAMS, 1.0)))
-    with pytest.raises(Blind, match="no odometry of when the scan was made"):
+    with pytest.raises(InputMissing, match="no odometry of when the scan was made"):
         bare.obstacles(np.zeros(2), 10.1)
     bare.hear_odometry(odometry(10.0))
-    with pytest.raises(Blind, match="from 'base_footprint' to 'base_scan'"):
+    with pytest.raises(InputMissing, match="from 'base_footprint' to 'base_scan'"):
         bare.obstacles(np.zeros(2), 10.1)
     bare.hear_fixed_transforms(TFMessage(transforms=[transform("base_footprint", "base_scan", -0.03)]))
     assert bare.obstacles(np.zeros(2), 10.1)
     bare.hear_scan(scan_of(np.full(BEAMS, 1.0), angle_increment=0.0))
-    with pytest.raises(Blind, match="no scan that makes sense"):
+    with pytest.raises(InputMissing, match="no scan that makes sense"):
         bare.obstacles(np.zeros(2), 10.1)
 
 
 def test_tf_stands_for_odometry():
-    made = Senses(ROBOT, Sensing(base_frame="base"), Freshness())
+    made = RosInputs(ROBOT, SensorSettings(base_frame="base"), AgeLimits())
     for i in range(30):
         made.hear_transforms(
             TFMessage(
@@ -188,13 +188,13 @@ def test_tf_stands_for_odometry():
 
 
 def test_a_clock_that_was_set_forgets_and_says_by_how_much(monkeypatch):
-    simulated = Simulated()
+    simulated = SimulatedClock()
     for told in (100.0, 99.9, 101.0):
         simulated.hear(Clock(clock=time_of(told)))
     assert simulated.now() == 101.0 and simulated.jumped() == 0.0
     simulated.hear(Clock(clock=time_of(5.0)))
     assert simulated.now() == 5.0 and simulated.jumped() == pytest.approx(-96.0) and simulated.jumped() == 0.0
-    date = Date()
+    date = SystemClock()
     before = date.now()
     real = date._offset
     date._offset = real - 7.0

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from brakeline.actors.actor_process import Change
+from brakeline.actors.actor_process import PhysicsChange
 from brakeline.deploy.commands.fly import Fly
 from brakeline.deploy.commands.train import Train
 from brakeline.deploy.policy_loading import policy_named
@@ -25,7 +25,7 @@ CHANGED = RunConfig(
     model_config=ModelConfig("set-membership", "recursion"),
     arena="dense",
     deadline=0.25,
-    change=Change(after=500, payload_kg=1.0),
+    change=PhysicsChange(after=500, payload_kg=1.0),
     conditions=Conditions(NoiseLevels(scale=2.0), 0.5, 0.8),
     learner=LearnerConfig(td3=TD3Config(hidden=(8, 16, 4)), capacity=99),
 )
@@ -55,7 +55,7 @@ def test_what_is_unknown_or_damaged_is_refused_with_the_files_name(tmp_path: Pat
     with pytest.raises(ValueError, match="is no run's configuration"):
         load(path)
     with pytest.raises(ValueError, match="Change has no when"):
-        decode(Change, {"when": 3})
+        decode(PhysicsChange, {"when": 3})
 
 
 @pytest.mark.parametrize("wrong", [{"actors": 0}, {"steps": 0}, {"replicas": 0}, {"robots_per_actor": 0}])

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from brakeline.actors.episode_runner import EpisodeRunner, Identity
+from brakeline.actors.episode_runner import ActorIdentity, EpisodeRunner
 from brakeline.deploy.cli import main
 from brakeline.deploy.data.excitation_plan import Excited
 from brakeline.deploy.experiments.evaluate import episode
@@ -65,7 +65,7 @@ def test_a_region_without_room_to_stop_is_refused():
 def test_printed_inputs_are_a_policy_of_any_actor(tmp_path):
     path = tmp_path / "inputs.csv"
     path.write_text("time,run,command speed,command turn rate\n0,0,0.1,0\n0.2,0,0.2,0.1\n0,1,0.05,-0.2\n")
-    driver = EpisodeRunner(GROUND, environment(GROUND, "open", 0), Identity("test", 0, 0), filtered=False)
+    driver = EpisodeRunner(GROUND, environment(GROUND, "open", 0), ActorIdentity("test", 0, 0), filtered=False)
     policy = policy_named(str(path), GROUND, 0)
     driven = [[list(step.action) for step in islice(episode(driver, policy, None, n), 3)] for n in (0, 1)]
     assert np.allclose(driven[0], [(0.1, 0), (0.2, 0.1), (0, 0)])

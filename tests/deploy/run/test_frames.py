@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 
-from brakeline.actors.mavlink.frame_recorder import Tape
-from brakeline.actors.mavlink.lockstep_quadrotor import MavlinkVehicle
+from brakeline.actors.mavlink.frame_recorder import FrameRecorder
+from brakeline.actors.mavlink.lockstep_quadrotor import LockstepQuadrotor
 from brakeline.deploy.run.mavlink_json import ENCODING, as_json, both
 from brakeline.logs.minari_export import ExportError
 from brakeline.logs.reader import read
@@ -39,8 +39,8 @@ def taped(periods: int) -> Bus:
     """What a vehicle in memory says in its first periods."""
     arena = staged_arena(start=(0.0, 0.0, 50.0), goal=(9.0, 9.0, 50.0), half_width=100.0, height=100.0)
     bus = Bus()
-    tape = Tape(bus, "quadrotor", "actor-0")
-    vehicle = MavlinkVehicle(Autopilot(Quadrotor(arena, np.random.default_rng(0)), quiet=True), QUADROTOR, tape.take)
+    tape = FrameRecorder(bus, "quadrotor", "actor-0")
+    vehicle = LockstepQuadrotor(Autopilot(Quadrotor(arena, np.random.default_rng(0)), quiet=True), QUADROTOR, tape.take)
     for _ in range(periods):
         vehicle.step(np.array([0.5, 0.25, 0.0]))
         tape.publish()
