@@ -43,7 +43,7 @@ from brakeline.messaging.task import RobotWithTask, robot_with_task
 from brakeline.safety.filter.backup_plan import Array, BackupPlan
 from brakeline.safety.service.client import ask, request_message
 from brakeline.sim.arena import Arena
-from brakeline.sim.arena_generator import tour
+from brakeline.sim.arena_generator import goal_sequence
 from brakeline.sim.navigation_env import NavigationEnv
 from brakeline.sim.sim_conditions import Conditions
 from brakeline.sim.vehicle import Period
@@ -135,9 +135,9 @@ class RealTimeVehicle:
         for _ in range(self.current_period.number - expected):
             self.skipped += 1
             self._skip()
-        return self.standing()
+        return self.initial_period()
 
-    def standing(self) -> Period:
+    def initial_period(self) -> Period:
         """The report about the period that ended last."""
         return replace(self.current_period.report, true=self.current_period.report.measured)
 
@@ -289,7 +289,7 @@ def run(
     robot = robot_with_task(settings.robot)
     if settings.method == "none" or not robot.late:
         raise FilterRequired("in real time a robot flies behind the filter, with plans that reckon with the delay")
-    stages = tour(arena, GOALS, np.random.default_rng(settings.seed), robot)
+    stages = goal_sequence(arena, GOALS, np.random.default_rng(settings.seed), robot)
     if propose is not None:
         policy = prepared(propose, stages, settings.seed)
         propose = lambda _: policy  # noqa: E731

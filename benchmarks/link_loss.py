@@ -21,7 +21,7 @@ from brakeline.safety.model.model_set import ModelConfig
 from brakeline.sim.arena import Arena
 from brakeline.sim.autopilot.autopilot_rules import SETPOINT_TIMEOUT
 from brakeline.sim.autopilot.endpoint import TICK, Autopilot
-from brakeline.sim.delayed_vehicle import LateVehicle
+from brakeline.sim.delayed_vehicle import DelayedVehicle
 from brakeline.sim.navigation_env import NavigationEnv
 from brakeline.sim.quadrotor import Quadrotor
 from brakeline.sim.scripted_policies import scripted
@@ -76,7 +76,7 @@ class Loss:
         endpoint = self._endpoint
         client = AutopilotClient(endpoint.receive)
         client.setpoint(input)
-        endpoint.vehicle.watch()
+        endpoint.vehicle.begin_period()
         endpoint.advance(ROBOT.period - TICK)
         client.setpoint(input)
         endpoint.advance(TICK)
@@ -90,7 +90,7 @@ class Loss:
     def _vehicle(self, arena: Arena, rng: np.random.Generator) -> Vehicle:
         parameters = {SETPOINT_TIMEOUT[RULES]: self._timeout}
         self._endpoint = Autopilot(Quadrotor(arena, rng), RULES, parameters=parameters, quiet=True)
-        return LateVehicle(LockstepQuadrotor(self._endpoint, ROBOT.in_lockstep()), ROBOT)
+        return DelayedVehicle(LockstepQuadrotor(self._endpoint, ROBOT.in_lockstep()), ROBOT)
 
 
 def run() -> Figures:

@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from brakeline.messaging.task import RobotWithTask
-from brakeline.sim.arena import Arena, closing, room_bounds
+from brakeline.sim.arena import Arena, room_boundary, room_bounds
 from brakeline.sim.arena_generator import arena_kind
-from brakeline.sim.delayed_vehicle import late
+from brakeline.sim.delayed_vehicle import delayed
 from brakeline.sim.navigation_env import NavigationEnv
 from brakeline.sim.sim_conditions import Conditions
 from brakeline.sim.vehicle import MakeVehicle, Vehicle
@@ -32,7 +32,7 @@ def factory(robot: RobotWithTask, conditions: Conditions, tap: FrameTap | None =
         UnknownTask: there is none.
     """
     if robot.late:
-        return late(factory(robot.in_lockstep(), conditions, tap), robot)
+        return delayed(factory(robot.in_lockstep(), conditions, tap), robot)
     task = robot.task
     make: MakeVehicle = task.code(task.simulator)(conditions, tap)
     return make
@@ -69,7 +69,7 @@ def vehicle_in_yard(robot: RobotWithTask, rng: np.random.Generator, conditions: 
     height = None if robot.position_dim == 2 else 2.0 * yard
     start = (0.0, 0.0, float(rng.uniform(-np.pi, np.pi)) if height is None else yard)
     goal = (0.5 * yard, 0.0) if height is None else (0.5 * yard, 0.0, yard)
-    arena = Arena("yard", closing(yard, height), start, goal, 0.25, 10**9, room_bounds(yard, height))
+    arena = Arena("yard", room_boundary(yard, height), start, goal, 0.25, 10**9, room_bounds(yard, height))
     return _maker(robot, conditions)(arena, rng)
 
 

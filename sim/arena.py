@@ -9,7 +9,7 @@ from typing import Any
 
 from brakeline.messaging.obstacle import BOX, WALL, Obstacle, Shapes
 from brakeline.sim.grid_planner import ClearanceMap
-from brakeline.sim.traffic import Crowd, Others
+from brakeline.sim.traffic import Crowd, OtherRobots
 
 SLAB = 2.0  # m, thickness of floors and ceilings
 
@@ -28,7 +28,7 @@ class Arena:
     goal_radius: float
     step_limit: int  # periods until the episode is cut off
     bounds: tuple[tuple[float, float], ...]  # lowest and highest coordinate inside the room, for each of the d axes
-    crowd: Crowd | Others | None = field(default=None, compare=False)  # what moves in it
+    crowd: Crowd | OtherRobots | None = field(default=None, compare=False)  # what moves in it
 
     @property
     def dim(self) -> int:
@@ -43,7 +43,7 @@ class Arena:
         return ClearanceMap(self.obstacles, self.bounds)
 
 
-def alike(arena: Arena, **changes: Any) -> Arena:
+def same_room(arena: Arena, **changes: Any) -> Arena:
     """The same room with another start, goal or crowd; what was made of its obstacles is kept: it costs a period."""
     other = replace(arena, **changes)
     vars(other).update(shapes=arena.shapes, clearance_map=arena.clearance_map)
@@ -56,7 +56,7 @@ def room_bounds(half_width: float, height: float | None) -> tuple[tuple[float, f
     return plan if height is None else (*plan, (0.0, height))
 
 
-def closing(half_width: float, height: float | None) -> tuple[Obstacle, ...]:
+def room_boundary(half_width: float, height: float | None) -> tuple[Obstacle, ...]:
     """What closes that room: four walls whose yaw points into it; in space also a floor and a ceiling.
 
     Floor and ceiling are boxes whose upper and lower face is the surface: a wall's half-space has a yaw only.
@@ -83,6 +83,6 @@ def staged_arena(
 
     In the plane, unless there is a height: then `start`, `goal` and the obstacles have three coordinates.
     """
-    obstacles = (*obstacles, *closing(half_width, height))
+    obstacles = (*obstacles, *room_boundary(half_width, height))
     radius = 0.25 if height is None else 1.0
     return Arena("staged", obstacles, start, goal, radius, 300, room_bounds(half_width, height))

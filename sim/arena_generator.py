@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from brakeline.messaging.obstacle import BOX, CYLINDER, SPHERE, WALL, Obstacle, Shapes
 from brakeline.messaging.robot import Robot
 from brakeline.messaging.task import ArenaKind, MoverKind, RobotWithTask
-from brakeline.sim.arena import Arena, alike, closing, room_bounds
+from brakeline.sim.arena import Arena, room_boundary, room_bounds, same_room
 from brakeline.sim.traffic import Crowd
 
 Array = NDArray[np.float64]
@@ -98,7 +98,7 @@ def draw_fleet(name: str, rng: np.random.Generator, robot: RobotWithTask, size: 
             continue
         headings = rng.uniform(-math.pi, math.pi, size)
         return tuple(
-            alike(first, start=(*start, float(heading)), goal=goal)
+            same_room(first, start=(*start, float(heading)), goal=goal)
             for start, goal, heading in zip(starts, goals, headings, strict=True)
         )
     raise NoArena(f"no arena {name!r} with ways for {size} robots in {ATTEMPTS} draws: ask for fewer")
@@ -138,7 +138,7 @@ def _with_movers(arena: Arena, kind: MoverKind, rng: np.random.Generator) -> Are
     return replace(arena, crowd=Crowd(kind, places, arena.shapes, int(rng.integers(2**31))))
 
 
-def tour(arena: Arena, goals: int, rng: np.random.Generator, robot: RobotWithTask) -> tuple[Arena, ...]:
+def goal_sequence(arena: Arena, goals: int, rng: np.random.Generator, robot: RobotWithTask) -> tuple[Arena, ...]:
     """The same arena with one goal after another, for a robot that is not put back: each start is the goal before.
 
     Raises:
@@ -155,7 +155,7 @@ def tour(arena: Arena, goals: int, rng: np.random.Generator, robot: RobotWithTas
         far = np.linalg.norm(points - start, axis=1) >= kind.goal_distance
         for goal in (tuple(point) for point in points[free & far].tolist()):
             if arena.clearance_map.connected(start, goal, robot.footprint + kind.path_clearance):
-                stages.append(alike(arena, start=start, goal=goal))
+                stages.append(same_room(arena, start=start, goal=goal))
                 start = goal
                 break
     raise NoArena(f"no {goals} goals that a way leads to in {arena.name!r}")
@@ -163,7 +163,7 @@ def tour(arena: Arena, goals: int, rng: np.random.Generator, robot: RobotWithTas
 
 def _place(kind: ArenaKind, rng: np.random.Generator, robot: Robot) -> tuple[Obstacle, ...] | None:
     """Obstacles at least a gap apart in plan, what closes the room last; None: fewer than the least found room."""
-    walls = closing(kind.half_width, None)
+    walls = room_boundary(kind.half_width, None)
     placed: list[Obstacle] = []
     least = 2.0 * robot.footprint + kind.gap
     for shape, (few, many) in ((BOX, kind.boxes), (CYLINDER, kind.cylinders), (SPHERE, kind.spheres)):
@@ -176,7 +176,7 @@ def _place(kind: ArenaKind, rng: np.random.Generator, robot: Robot) -> tuple[Obs
                 return None
     if kind.height is not None:
         placed = [_lift(obstacle, kind, kind.height, rng) for obstacle in placed]
-    return (*placed, *closing(kind.half_width, kind.height))
+    return (*placed, *room_boundary(kind.half_width, kind.height))
 
 
 def _draw_obstacle(shape: str, kind: ArenaKind, least: float, rng: np.random.Generator) -> Obstacle:

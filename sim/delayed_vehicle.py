@@ -12,7 +12,7 @@ from brakeline.sim.vehicle import BadInput, MakeVehicle, Period, Vehicle
 Array = NDArray[np.float64]
 
 
-class LateVehicle:
+class DelayedVehicle:
     """A vehicle that carries out each input one period after it was given; at first, zero.
 
     `input` is the one in force, which `step` carries out while its argument waits for its turn.
@@ -46,19 +46,19 @@ class LateVehicle:
         self.input = np.clip(np.clip(wanted, robot.low(), robot.high()), self.input - slew, self.input + slew)
         return period
 
-    def standing(self) -> Period:
+    def initial_period(self) -> Period:
         """The present state as a period in which nothing happened."""
-        return self._vehicle.standing()
+        return self._vehicle.initial_period()
 
     def alter(self, **changes: float) -> None:
         """As the vehicle's own."""
         self._vehicle.alter(**changes)
 
 
-def late(make: MakeVehicle, robot: Robot) -> MakeVehicle:
+def delayed(make: MakeVehicle, robot: Robot) -> MakeVehicle:
     """Makes the same vehicles for a robot in real time."""
 
-    def make_late(arena: Arena, rng: np.random.Generator) -> LateVehicle:
-        return LateVehicle(make(arena, rng), robot)
+    def make_late(arena: Arena, rng: np.random.Generator) -> DelayedVehicle:
+        return DelayedVehicle(make(arena, rng), robot)
 
     return make_late

@@ -17,7 +17,7 @@ STILL: Vector = (0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True)
-class Body:
+class Airframe:
     """What the controller knows of the airframe (sim/quadrotor.xml)."""
 
     mass: float = 1.2  # kg
@@ -56,7 +56,7 @@ class Gains:
     jump: float = 0.82  # m/s
 
 
-class Mean:
+class MovingAverage:
     """The mean of the last samples: `value`; what it gains from a sample to the next follows from `push`'s answer."""
 
     __slots__ = ("_samples", "_share", "_sum", "value")
@@ -97,8 +97,11 @@ class VelocityAxis:
     def __init__(self, gains: Gains, period: float, lag: float) -> None:
         """period: s between two updates; lag: s until a commanded acceleration is there."""
         self._gains, self._period = gains, period
-        self._ramped, self._rounded = Mean(round(gains.ramp / period)), Mean(round(gains.round / period))
-        self._eased, self._jerk = Mean(round(gains.ease / period)), Mean(round(gains.ease / period))
+        self._ramped, self._rounded = (
+            MovingAverage(round(gains.ramp / period)),
+            MovingAverage(round(gains.round / period)),
+        )
+        self._eased, self._jerk = MovingAverage(round(gains.ease / period)), MovingAverage(round(gains.ease / period))
         self._late = deque([0.0] * max(round(lag / period), 1))
         self.integral = 0.0
         self.reset(0.0)
@@ -147,9 +150,11 @@ class FlightController:
     setpoint: (x, y, z) m/s; yaw: rad from east, the heading to keep; yaw_rate: rad/s at which it turns on.
     """
 
-    def __init__(self, period: float, outer_every: int, gains: Gains | None = None, body: Body | None = None) -> None:
+    def __init__(
+        self, period: float, outer_every: int, gains: Gains | None = None, body: Airframe | None = None
+    ) -> None:
         """period: s between two updates; outer_every: updates of attitude and rates for one of the velocity loop."""
-        self.gains, self.body = gains or Gains(), body or Body()
+        self.gains, self.body = gains or Gains(), body or Airframe()
         self._period, self._outer_every = period, outer_every
         outer = period * outer_every
         g = self.gains

@@ -12,14 +12,14 @@ from brakeline.sim.arena import Arena
 from brakeline.sim.ground_estimator import Estimator, NoiseLevels, wrap
 from brakeline.sim.ground_robot import GROUND, SAMPLES, WHEEL_RADIUS, GroundRobot
 from brakeline.sim.lidar import Lidar
-from brakeline.sim.vehicle import executed
+from brakeline.sim.vehicle import clip_input
 
 Array = NDArray[np.float64]
 
-SAMPLE = GROUND.period / SAMPLES  # s
+SAMPLE_TIME = GROUND.period / SAMPLES  # s
 
 
-class RunningEstimator(Estimator):
+class RealtimeEstimator(Estimator):
     """The same estimator, asked at every sample: between two pose fixes it tells its dead reckoning."""
 
     def begin(self) -> None:
@@ -47,7 +47,7 @@ class RunningEstimator(Estimator):
         return np.array([x, y, wrap(heading), ways / self._sample_time, rates])
 
 
-class DrivenGround(GroundRobot):
+class RealtimeGroundRobot(GroundRobot):
     """A ground robot in one arena. An input counts from the next sample on, and until another one comes.
 
     collisions: how often it began to touch something; closest: m, the least distance from its disc to an obstacle so
@@ -63,8 +63,8 @@ class DrivenGround(GroundRobot):
         floor_friction: float = 1.0,
     ) -> None:
         super().__init__(arena, rng, noise, payload_kg, floor_friction)
-        self.estimator: RunningEstimator = RunningEstimator(
-            noise or NoiseLevels(), rng, self._true_pose(), self._wheels(), WHEEL_RADIUS, SAMPLE
+        self.estimator: RealtimeEstimator = RealtimeEstimator(
+            noise or NoiseLevels(), rng, self._true_pose(), self._wheels(), WHEEL_RADIUS, SAMPLE_TIME
         )
         self.estimator.begin()
         self.collisions, self._touches = 0, False
@@ -77,11 +77,11 @@ class DrivenGround(GroundRobot):
         Raises:
             BadInput: when the input is not two finite numbers.
         """
-        self.input = executed(GROUND, input, self.input)
+        self.input = clip_input(GROUND, input, self.input)
         self._set_wheels(self.input)
 
     def advance(self) -> None:
-        """To the next sample, `SAMPLE` s on."""
+        """To the next sample, `SAMPLE_TIME` s on."""
         before = self._true_pose()
         touches = self._run_sample(bool(self.input.any()))
         self.collisions += touches and not self._touches
@@ -89,11 +89,11 @@ class DrivenGround(GroundRobot):
         pose = self._true_pose()
         self.driven += math.dist(before[:2], pose[:2])
         self.true = self._true_state()
-        self.measured = self.estimator.feel(self._wheels(), wrap(pose[2] - before[2]) / SAMPLE, pose)
+        self.measured = self.estimator.feel(self._wheels(), wrap(pose[2] - before[2]) / SAMPLE_TIME, pose)
         self.closest = min(self.closest, float(self._clearance(pose[:2])))
 
 
-class TurningLidar:
+class SpinningLidar:
     """A lidar that looks round once in so many samples, beam after beam: what it tells is of different times.
 
     With the sensor's own errors; a beam that hits nothing reports inf, one that hits too near -inf (REP 117).

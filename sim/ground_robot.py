@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from brakeline.messaging.robot import robot_named
 from brakeline.sim.arena import Arena
 from brakeline.sim.ground_estimator import Estimator, NoiseLevels
-from brakeline.sim.mujoco_obstacles import Moving, standing
+from brakeline.sim.mujoco_obstacles import MoverBodies, compile_ground_model
 from brakeline.sim.sim_conditions import Conditions
-from brakeline.sim.vehicle import MakeVehicle, Period, executed
+from brakeline.sim.vehicle import MakeVehicle, Period, clip_input
 
 Array = NDArray[np.float64]
 
@@ -29,7 +29,7 @@ STANDING = 0.02  # m/s; no faster, and at no input, it stands
 PAYLOAD_GYRATION = 0.05  # m, radius of gyration of what is loaded
 
 
-class Turtle:
+class TurtleBot:
     """One TurtleBot3 of a world, whoever moves the world on.
 
     true, measured: states (x [m], y [m], heading [rad], speed [m/s], turn rate [rad/s]) of the axle's midpoint;
@@ -58,7 +58,7 @@ class Turtle:
         Raises:
             BadInput: when the input is not two finite numbers.
         """
-        self.input = executed(GROUND, input, self.input)
+        self.input = clip_input(GROUND, input, self.input)
 
     def begin(self, input: Array) -> None:
         """A period with this input begins."""
@@ -93,7 +93,7 @@ class Turtle:
             contact_robot,
         )
 
-    def standing(self) -> Period:
+    def initial_period(self) -> Period:
         """The present state as a period in which nothing happened: what there is to say before the first step."""
         clearance = float(self._clearance(self.true[:2]))
         return Period(self.measured, self.true, False, clearance, clearance, np.zeros((SAMPLES, 2)), 0.0)
@@ -124,7 +124,7 @@ class Turtle:
         return np.array([x, y, heading, speed, self._qvel[5]])
 
 
-class GroundRobot(Turtle):
+class GroundRobot(TurtleBot):
     """One TurtleBot3 in one arena of its own."""
 
     def __init__(
@@ -135,14 +135,14 @@ class GroundRobot(Turtle):
         payload_kg: float = 0.0,
         floor_friction: float = 1.0,
     ) -> None:
-        self._model = standing(MODEL, arena, WHEEL_RADIUS)
+        self._model = compile_ground_model(MODEL, arena, WHEEL_RADIUS)
         self._data = mujoco.MjData(self._model)
         super().__init__(arena, self._data)
         base = self._model.body("base").id
         self._base = base
         self._bare_mass = float(self._model.body_mass[base])
         self._bare_inertia = self._model.body_inertia[base].copy()
-        self._moving = Moving(self._model, self._data, arena.crowd)
+        self._moving = MoverBodies(self._model, self._data, arena.crowd)
         self._time = -GROUND.period  # s; the episode's first is 0
         self._wheel_geoms = [self._model.geom(name).id for name in ("left wheel", "right wheel")]
         self._physics_steps = round(GROUND.period / SAMPLES / self._model.opt.timestep)

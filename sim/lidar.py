@@ -10,7 +10,7 @@ from brakeline.messaging.obstacle import rotate
 from brakeline.messaging.ray_directions import Rays
 from brakeline.sim.arena import Arena
 from brakeline.sim.ground_estimator import cut_normal
-from brakeline.sim.mujoco_obstacles import HEIGHT, Moving, map_model
+from brakeline.sim.mujoco_obstacles import HEIGHT, MoverBodies, map_model
 
 Array = NDArray[np.float64]
 
@@ -30,7 +30,7 @@ class Lidar:
         self._beams = beams
         self._height = 0.5 * HEIGHT if arena.dim == 2 else None
         self._model, self._data = map_model(arena)
-        self._moving = Moving(self._model, self._data, arena.crowd)
+        self._moving = MoverBodies(self._model, self._data, arena.crowd)
         self._hit, self._ranges = np.empty(len(beams), np.int32), np.empty(len(beams))
 
     def at(self, time: float) -> None:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from brakeline.messaging.obstacle import BOX, CYLINDER, SPHERE, Obstacle
 from brakeline.sim.arena import Arena
-from brakeline.sim.traffic import Crowd, Others
+from brakeline.sim.traffic import Crowd, OtherRobots
 
 HEIGHT = 0.4  # m, of every obstacle of an arena in the plane: taller than the robot
 THICKNESS = 0.2  # m, of walls
@@ -20,7 +20,7 @@ DEEP = 10.0  # m: so far in would a mover have to be that steps over whoever sta
 Geom = tuple[mujoco.mjtGeom, tuple[float, float, float], tuple[float, float, float]]
 
 
-def standing(model: str, arena: Arena, height: float) -> mujoco.MjModel:
+def compile_ground_model(model: str, arena: Arena, height: float) -> mujoco.MjModel:
     """Compile a robot in the plane (MJCF with a body `base`) and an arena, the robot standing at the start, its base at
     that height [m]."""
     spec = mujoco.MjSpec.from_string(model)
@@ -52,7 +52,7 @@ def add_obstacles(spec: mujoco.MjSpec, arena: Arena) -> None:
         )
 
 
-def add_movers(spec: mujoco.MjSpec, crowd: Crowd | Others | None) -> None:
+def add_movers(spec: mujoco.MjSpec, crowd: Crowd | OtherRobots | None) -> None:
     """Add what moves as bodies that nothing pushes, `mover 0`, `mover 1`, …; `Movers` puts them in their places."""
     for i, mover in enumerate(() if crowd is None else crowd.obstacles(0.0)):
         flat = len(mover.position) == 2
@@ -70,14 +70,14 @@ def add_movers(spec: mujoco.MjSpec, crowd: Crowd | Others | None) -> None:
         )
 
 
-class Moving:
+class MoverBodies:
     """The movers of a compiled model, and how a robot met them.
 
     contacts: since `begin` one began while the robot moved, while it stood. Under somebody who steps over it, it must
     not begin to move either.
     """
 
-    def __init__(self, model: mujoco.MjModel, data: mujoco.MjData, crowd: Crowd | Others | None) -> None:
+    def __init__(self, model: mujoco.MjModel, data: mujoco.MjData, crowd: Crowd | OtherRobots | None) -> None:
         self._data, self._crowd = data, crowd
         self._pushes = crowd is None or crowd.pushes
         self._meeting = False  # one is touched now

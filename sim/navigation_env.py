@@ -17,10 +17,10 @@ from brakeline.messaging.task import Reward, RobotWithTask
 from brakeline.sim.arena import Arena
 from brakeline.sim.arena_generator import draw_arena
 from brakeline.sim.ground_estimator import wrap
-from brakeline.sim.observations import LIDAR_NOISE, Senses
-from brakeline.sim.range_sensors import Perception, scanner_of
+from brakeline.sim.observations import LIDAR_NOISE, ObservationModel
+from brakeline.sim.range_sensors import Perception, make_scanner
 from brakeline.sim.sim_conditions import Conditions
-from brakeline.sim.traffic import Crowd, Watch
+from brakeline.sim.traffic import Crowd, CrowdSensor
 from brakeline.sim.vehicle import MakeVehicle, Period, Vehicle
 
 Array = NDArray[np.float64]
@@ -123,16 +123,18 @@ class NavigationEnv(gymnasium.Env[Observation, Any]):
         self._vehicle = self._make_vehicle(self._arena, rng)
         if self._changes:
             self._vehicle.alter(**self._changes)
-        self._senses: Senses = self._make_senses(self.robot, self._arena, rng, self._lidar_noise)
+        self._senses: ObservationModel = self._make_senses(self.robot, self._arena, rng, self._lidar_noise)
         self._scanner = None
         if self._perception.kind == "scan":
-            self._scanner = scanner_of(self.robot, self._arena, rng, self._lidar_noise, self._perception)
+            self._scanner = make_scanner(self.robot, self._arena, rng, self._lidar_noise, self._perception)
         crowd = self._arena.crowd
         self._pushed = crowd is not None and crowd.pushes  # by whoever runs into it
-        self._watch = Watch(crowd, rng) if isinstance(crowd, Crowd) else None  # other robots promise where they will be
+        self._watch = (
+            CrowdSensor(crowd, rng) if isinstance(crowd, Crowd) else None
+        )  # other robots promise where they will be
         self._steps = 0
         self._distance = self._goal_distance(self._vehicle.true)
-        return self._observe(), self._info(self._vehicle.standing())
+        return self._observe(), self._info(self._vehicle.initial_period())
 
     def step(self, action: Array) -> tuple[Observation, float, bool, bool, Info]:
         return self.after(self.vehicle.step(action))

@@ -12,14 +12,14 @@ from numpy.typing import NDArray
 from brakeline.messaging.task import RobotWithTask
 from brakeline.sim.arena import Arena
 from brakeline.sim.lidar import Lidar
-from brakeline.sim.traffic import Crowd, Others, Watch
+from brakeline.sim.traffic import Crowd, CrowdSensor, OtherRobots
 
 Array = NDArray[np.float64]
 
 LIDAR_NOISE = 0.01  # m, sigma of a range
 
 
-class Senses(Protocol):
+class ObservationModel(Protocol):
     """One robot's observations in one episode."""
 
     def observe(self, true: Array, measured: Array, input: Array, time: float = 0.0) -> Array:
@@ -49,7 +49,7 @@ class TurnMemory:
         self.value += (1.0 - math.exp(-period / self.TIME)) * (turn_rate - self.value)
 
 
-class GroundSenses:
+class GroundObservation:
     """18 beams ahead; the goal by distance and bearing."""
 
     MOUNT = -0.032  # m, the lidar's place along the robot's x axis from the axle's midpoint
@@ -82,7 +82,7 @@ class GroundSenses:
         return np.concatenate((self._lidar.ranges(mount, true[2]) / self._lidar.max_range, own))
 
 
-class TrackingSenses(GroundSenses):
+class TrackingObservation(GroundObservation):
     """The same, and the `MOST` nearest of what moves: people as a tracker has them, robots as they say themselves.
 
     A track with p its place and v its velocity in the robot's frame, d = |p|, is six coordinates, all zero beyond
@@ -103,7 +103,7 @@ class TrackingSenses(GroundSenses):
     def __init__(self, robot: RobotWithTask, arena: Arena, rng: np.random.Generator, lidar_noise: float) -> None:
         super().__init__(robot, arena, rng, lidar_noise)
         self._crowd = arena.crowd
-        self._watch = Watch(arena.crowd, rng) if isinstance(arena.crowd, Crowd) else None
+        self._watch = CrowdSensor(arena.crowd, rng) if isinstance(arena.crowd, Crowd) else None
 
     def observe(self, true: Array, measured: Array, input: Array, time: float = 0.0) -> Array:
         places, paces = self._seen(time)
@@ -115,7 +115,7 @@ class TrackingSenses(GroundSenses):
             seen = [(o.position, o.motion.velocity) for o in self._watch.look(time) if o.motion is not None]
             places, paces = np.array(seen, dtype=float).reshape(-1, 2, 2).swapaxes(0, 1)
             return places, paces
-        return self._crowd.told() if isinstance(self._crowd, Others) else (np.zeros((0, 2)), np.zeros((0, 2)))
+        return self._crowd.told() if isinstance(self._crowd, OtherRobots) else (np.zeros((0, 2)), np.zeros((0, 2)))
 
     def tracks(self, measured: Array, places: Array, paces: Array) -> Array:
         """The coordinates of what is at these places (k, 2) with these velocities, seen from a measured state."""
@@ -138,7 +138,7 @@ class TrackingSenses(GroundSenses):
         return told.ravel()
 
 
-class PlanarSenses:
+class PlanarObservation:
     """Of any robot with a heading: beams at its position; the goal by distance and bearing; all that is no pose, and
     the last input, each as a share of the most there can be of it."""
 
@@ -164,7 +164,7 @@ class PlanarSenses:
         return np.concatenate((self._lidar.ranges(true[:2], float(true[2])) / self._lidar.max_range, own))
 
 
-class AirSenses:
+class QuadrotorObservation:
     """180 beams all round from a lidar that is kept level; the goal by its offset.
 
     The offset o is observed as o / (|o| + `NEAR`): its direction stays exact however far the goal is, and near the

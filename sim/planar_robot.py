@@ -12,8 +12,8 @@ from brakeline.messaging.obstacle import rotate
 from brakeline.messaging.robot import Robot
 from brakeline.sim.arena import Arena
 from brakeline.sim.ground_estimator import NoiseLevels, cut_normal, wrap
-from brakeline.sim.mujoco_obstacles import Moving, standing
-from brakeline.sim.vehicle import Period, executed
+from brakeline.sim.mujoco_obstacles import MoverBodies, compile_ground_model
+from brakeline.sim.vehicle import Period, clip_input
 
 Array = NDArray[np.float64]
 
@@ -36,9 +36,9 @@ class PlanarRobot:
     ) -> None:
         """model: MJCF; height [m]: of the base's origin above the floor; noise: its `scale` counts."""
         self.robot, self.arena = robot, arena
-        self.model = standing(model, arena, height)
+        self.model = compile_ground_model(model, arena, height)
         self.data = mujoco.MjData(self.model)
-        self._moving = Moving(self.model, self.data, arena.crowd)
+        self._moving = MoverBodies(self.model, self.data, arena.crowd)
         self._time = -robot.period  # s; the episode's first is 0
         self._steps = round(robot.period / SAMPLES / self.model.opt.timestep)
         self._bound = np.asarray(robot.measurement_bound)
@@ -72,7 +72,7 @@ class PlanarRobot:
             BadInput: when it is not as many finite numbers as the robot has inputs.
         """
         robot = self.robot
-        self.input = executed(robot, input, self.input)
+        self.input = clip_input(robot, input, self.input)
         before = self.true
         poses, collision = self._run()
         self.true = self._state()
@@ -91,7 +91,7 @@ class PlanarRobot:
             *self._moving.contacts,
         )
 
-    def standing(self) -> Period:
+    def initial_period(self) -> Period:
         """The present state as a period in which nothing happened: what there is to say before the first step."""
         clearance = float(self._clearance(self.true[:3]))
         return Period(self.measured, self.true, False, clearance, clearance, np.zeros((SAMPLES, 2)), 0.0)

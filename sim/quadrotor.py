@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 
 from brakeline.messaging.robot import robot_named
 from brakeline.sim.arena import Arena
-from brakeline.sim.flight_controller import GRAVITY, Body, FlightController, Gains, Vector
+from brakeline.sim.flight_controller import GRAVITY, Airframe, FlightController, Gains, Vector
 from brakeline.sim.flight_estimator import Estimate, FlightEstimator, QuadrotorNoise, rotate
-from brakeline.sim.mujoco_obstacles import Moving, add_movers, add_obstacles
-from brakeline.sim.vehicle import Period, executed
-from brakeline.sim.wind import Air, Wind
+from brakeline.sim.mujoco_obstacles import MoverBodies, add_movers, add_obstacles
+from brakeline.sim.vehicle import Period, clip_input
+from brakeline.sim.wind import Wind, WindProcess
 
 Array = NDArray[np.float64]
 
@@ -52,13 +52,13 @@ class Quadrotor:
         self._data = mujoco.MjData(self._model)
         self.timestep: float = self._model.opt.timestep
         self._ticks = round(QUADROTOR.period / SAMPLES / self.timestep)  # in a sample
-        self._body = Body()
+        self._body = Airframe()
         self.controller = FlightController(self.timestep, OUTER_EVERY, gains, self._body)
         steps = round(QUADROTOR.period / self.timestep / OUTER_EVERY)
         self._estimator = FlightEstimator(noise or QuadrotorNoise(), rng, steps)
         self._rng, self._wind = rng, wind or Wind()
-        self._air = None if self._wind.calm else Air(self._wind, rng, self.timestep)
-        self._moving = Moving(self._model, self._data, arena.crowd)
+        self._air = None if self._wind.calm else WindProcess(self._wind, rng, self.timestep)
+        self._moving = MoverBodies(self._model, self._data, arena.crowd)
         self._time = 0.0  # s
         self._floor_geom = -1 if floor is None else self._model.geom("floor").id
         self.flying = floor is None  # the controller has the rotors; else they stand or idle
@@ -81,31 +81,31 @@ class Quadrotor:
         Raises:
             BadInput: when the input is not three finite numbers.
         """
-        self.input = slewed(input, self.input)
+        self.input = clip_input(QUADROTOR, input, self.input)
         x, y, z = self.input.tolist()
         self.controller.setpoint = (x, y, z)
-        self.watch()
+        self.begin_period()
         start, seen = self.measured[:3], np.empty((SAMPLES, 3))
         for i in range(SAMPLES):
             self.fly(self._ticks)
-            seen[i] = self.seen()[0]
+            seen[i] = self.position_and_velocity()[0]
         self.measured = self.estimated_state(self.estimate())
-        return self.watched(self.measured, seen - start)
+        return self.end_period(self.measured, seen - start)
 
-    def watch(self) -> None:
+    def begin_period(self) -> None:
         """A period begins: note from now on what is touched, and where it has been."""
         self.collided = False
         self._moving.begin()
         self._track.clear()
 
-    def watched(self, measured: Array, path: Array) -> Period:
+    def end_period(self, measured: Array, path: Array) -> Period:
         """The period since `watch`, as it was; measured (9,) and path (S, 3) are what others made of it."""
         self.true = self.state()
         distances = self.clearance(np.array(self._track))
         closest, clearance = float(distances.min()), float(distances[-1])
         return Period(measured, self.true, self.collided, closest, clearance, path, 0.0, *self._moving.contacts)
 
-    def standing(self) -> Period:
+    def initial_period(self) -> Period:
         """The present state as a period in which nothing happened: what there is to say before the first step."""
         clearance = float(self.clearance(self.true[:3]))
         return Period(self.measured, self.true, False, clearance, clearance, np.zeros((SAMPLES, 3)), 0.0)
@@ -124,7 +124,7 @@ class Quadrotor:
                 mujoco.mj_setConst(self._model, mujoco.MjData(self._model))
             elif name in ("wind_speed", "gust"):
                 self._wind = replace(self._wind, **{"speed" if name == "wind_speed" else name: value})
-                self._air = None if self._wind.calm else Air(self._wind, self._rng, self.timestep)
+                self._air = None if self._wind.calm else WindProcess(self._wind, self._rng, self.timestep)
             else:
                 raise ValueError(f"a quadrotor has no {name}; it has: payload_kg, wind_speed, gust")
 
@@ -168,18 +168,18 @@ class Quadrotor:
         self.flying = False
         self._data.ctrl[:] = 0.0
 
-    def spin(self, thrusts: tuple[float, ...]) -> None:
+    def set_thrusts(self, thrusts: tuple[float, ...]) -> None:
         """Another controller has the rotors: thrusts [N] in the order of the model's, until told otherwise."""
         self.flying = False
         self._data.ctrl[:] = thrusts  # clipped to what a rotor can give
 
-    def launch(self) -> None:
+    def start_rotors(self) -> None:
         """The controller takes the rotors, holding the heading as it is."""
         w, x, y, z = self._data.qpos[3:7].tolist()
         self.controller.reset(math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z)))
         self.flying = True
 
-    def resume(self, other: Quadrotor) -> None:
+    def copy_motion(self, other: Quadrotor) -> None:
         """Go on as another one flies, but from here: its attitude, speeds and rotors."""
         mine, theirs = self._data, other._data
         mine.qpos[3:], mine.qvel[:] = theirs.qpos[3:], theirs.qvel
@@ -187,7 +187,7 @@ class Quadrotor:
         self.flying, self._acceleration = other.flying, other._acceleration
         mujoco.mj_forward(self._model, mine)
 
-    def seen(self) -> tuple[Vector, Vector]:
+    def position_and_velocity(self) -> tuple[Vector, Vector]:
         """Position [m] and velocity [m/s] as estimated now: the cheap part of `estimate`, with the same errors."""
         x, y, z = self._data.qpos[:3].tolist()
         vx, vy, vz = self._data.qvel[:3].tolist()
@@ -200,7 +200,7 @@ class Quadrotor:
         vx, vy, vz, p, q, r = self._data.qvel.tolist()
         return self._estimator.read((px, py, pz), (vx, vy, vz), (qw, qx, qy, qz), (p, q, r), self._acceleration)
 
-    def truth(self) -> Estimate:
+    def true_reading(self) -> Estimate:
         """What sensors without any error would say now."""
         px, py, pz, qw, qx, qy, qz = self._data.qpos.tolist()
         vx, vy, vz, p, q, r = self._data.qvel.tolist()
@@ -257,15 +257,6 @@ class Quadrotor:
         self.on_floor = bool((first == floor).any())
         if not self._moving.pushed:
             self.collided = self.collided or bool((first != floor).any())
-
-
-def slewed(input: Array, before: Array) -> Array:
-    """The setpoint (3,) [m/s] that is executed after `before`: within the quadrotor's bounds and slew.
-
-    Raises:
-        BadInput: when the input is not three finite numbers.
-    """
-    return executed(QUADROTOR, input, before)
 
 
 def _build(arena: Arena, floor: float | None) -> mujoco.MjModel:

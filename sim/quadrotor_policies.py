@@ -35,7 +35,7 @@ def way_to_nearest(info: dict[str, Any]) -> Array:
     return np.asarray(ways[np.argmin(np.einsum("ni,ni->n", ways, ways))])
 
 
-class GreedyPilot:
+class QuadrotorGreedyPolicy:
     """Full speed straight at the goal, whatever stands there."""
 
     def __init__(self, robot: Robot, rng: np.random.Generator) -> None:
@@ -45,7 +45,7 @@ class GreedyPilot:
         return full_speed(self._robot, np.asarray(info["goal"]) - info["state"][:3])
 
 
-class HostilePilot:
+class QuadrotorAdversary:
     """Full speed straight at the nearest obstacle, floor and ceiling and what moves included."""
 
     def __init__(self, robot: Robot, rng: np.random.Generator) -> None:
@@ -55,7 +55,7 @@ class HostilePilot:
         return full_speed(self._robot, way_to_nearest(info))
 
 
-class StopModel:
+class StopPrediction:
     """Where a setpoint and the stop after it lead: the vehicle's velocity follows setpoints with a first-order lag.
 
     The setpoint u holds for a period, then falls to zero as the robot's plans do. Positions are linear in the velocity
@@ -91,7 +91,7 @@ class StopModel:
         return np.asarray(coasting + self.from_setpoint[:, None] * setpoints[:, None])
 
 
-class MapPilot:
+class QuadrotorRoutePolicy:
     """Knows the map: of the setpoints within reach takes the one whose stop leads farthest along the routes to the
     goal.
 
@@ -111,7 +111,7 @@ class MapPilot:
 
     def __init__(self, robot: Robot, rng: np.random.Generator) -> None:
         self._robot = robot
-        self._stops = StopModel(robot)
+        self._stops = StopPrediction(robot)
         self._prepared: dict[int, tuple[Arena, Routes]] = {}
         self._changes = np.array(list(product(self.SHARES, repeat=robot.action_dim))) * robot.action_slew
         self._arena: Arena | None = None
@@ -155,7 +155,7 @@ class MapPilot:
         return np.asarray(self._grid.between(self._grid.clearance, places) - self._robot.footprint)
 
 
-class CarefulPilot(MapPilot):
+class QuadrotorCarefulPolicy(QuadrotorRoutePolicy):
     """The same, that keeps a wide berth: by scans, obstacles seem larger, and nobody knows what a corner hides."""
 
     COMFORT = 3.0

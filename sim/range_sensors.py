@@ -17,8 +17,8 @@ from brakeline.messaging.robot import Robot
 from brakeline.messaging.scan import Scan
 from brakeline.sim.arena import Arena
 from brakeline.sim.lidar import Lidar
-from brakeline.sim.sim_conditions import Faults as Faults
 from brakeline.sim.sim_conditions import Perception as Perception
+from brakeline.sim.sim_conditions import SensorFaults as SensorFaults
 from brakeline.sim.traffic import Crowd
 
 Array = NDArray[np.float64]
@@ -160,7 +160,7 @@ def _tilt(rng: np.random.Generator, most: float) -> Array:
     return np.asarray(np.eye(3) + math.sin(angle) * cross + (1.0 - math.cos(angle)) * cross @ cross)
 
 
-def scanner_of(
+def make_scanner(
     robot: Robot, arena: Arena, rng: np.random.Generator, noise: float, perception: Perception
 ) -> FanScanner | DomeScanner:
     """The sensor of a robot in the plane, or in space. Raises ValueError: it can have none."""

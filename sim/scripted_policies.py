@@ -18,8 +18,8 @@ from brakeline.messaging.task import RobotWithTask
 from brakeline.sim.arena import Arena
 from brakeline.sim.grid_planner import Routes
 from brakeline.sim.ground_estimator import wrap
-from brakeline.sim.passing import Passing
 from brakeline.sim.quadrotor_policies import way_to_nearest
+from brakeline.sim.reciprocal_avoidance import ReciprocalAvoidance
 
 Array = NDArray[np.float64]
 Policy = Callable[[NDArray[np.float32], dict[str, Any]], Array]  # (observation, info) -> action in physical units
@@ -53,7 +53,7 @@ def bounded(robot: Robot, speed: float, turn_rate: float) -> Array:
     return np.asarray(np.clip((speed, turn_rate), robot.low(), robot.high()))
 
 
-class RandomInputs:
+class RandomPolicy:
     """Inputs drawn evenly from the bounds, each held for 1 to `LONGEST` periods."""
 
     LONGEST = 10
@@ -70,7 +70,7 @@ class RandomInputs:
         return self._input
 
 
-class Greedy:
+class GroundGreedyPolicy:
     """Full speed, turning towards the goal on the way, whatever stands there."""
 
     def __init__(self, robot: Robot, rng: np.random.Generator) -> None:
@@ -81,7 +81,7 @@ class Greedy:
         return bounded(self._robot, self._robot.high()[0], wanted)
 
 
-class Adversary:
+class GroundAdversary:
     """Turns to the nearest obstacle on the spot, be it one that moves or a robot, then drives at it at full speed."""
 
     AIMED = 0.5  # rad; a larger bearing is turned off first, else it could circle the obstacle for ever
@@ -96,12 +96,12 @@ class Adversary:
         return bounded(self._robot, speed, angle / self._robot.period)
 
 
-class MapDriver:
+class GroundRoutePolicy:
     """Knows the map: follows the best way of `Routes` by pure pursuit of a point ahead that can be driven at straight.
 
     The larger the bearing of that point, the slower it drives; a point far to the side is turned to on the spot.
     Leaving the way needs no new search: `Routes` has one from every cell. Where other robots drive, it gets past them
-    as `Passing` says.
+    as `ReciprocalAvoidance` says.
     """
 
     COMFORT = 0.25  # m beside the footprint: more clearance than this is worth no detour
@@ -118,7 +118,7 @@ class MapDriver:
     def __call__(self, observation: NDArray[np.float32], info: dict[str, Any]) -> Array:
         if info["arena"] is not self._arena:
             self._arena = info["arena"]
-            self._passing = Passing(self._robot, info["arena"].clearance_map, self._rng)
+            self._passing = ReciprocalAvoidance(self._robot, info["arena"].clearance_map, self._rng)
             self._routes = Routes(
                 info["arena"].clearance_map, info["goal"], self._robot.footprint, self._robot.footprint + self.COMFORT
             )
@@ -147,7 +147,7 @@ class MapDriver:
         return bounded(self._robot, speed, self.GAIN * angle)
 
 
-class CarefulDriver(MapDriver):
+class GroundCarefulPolicy(GroundRoutePolicy):
     """The same, that keeps a wide berth: where whatever is seen may move, what is near lets nobody pass."""
 
     COMFORT = 0.6

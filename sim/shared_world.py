@@ -9,13 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brakeline.messaging.task import RobotWithTask
-from brakeline.sim.arena import Arena, alike
+from brakeline.sim.arena import Arena, same_room
 from brakeline.sim.arena_generator import arena_kind, draw_fleet
-from brakeline.sim.ground_robot import GROUND, MODEL, PAYLOAD_GYRATION, SAMPLES, WHEEL_RADIUS, Turtle
+from brakeline.sim.ground_robot import GROUND, MODEL, PAYLOAD_GYRATION, SAMPLES, WHEEL_RADIUS, TurtleBot
 from brakeline.sim.mujoco_obstacles import add_obstacles
 from brakeline.sim.navigation_env import Info, NavigationEnv, Observation
 from brakeline.sim.sim_conditions import Conditions
-from brakeline.sim.traffic import Others
+from brakeline.sim.traffic import OtherRobots
 from brakeline.sim.vehicle import Period
 
 Array = NDArray[np.float64]
@@ -44,7 +44,7 @@ def check_fleet(robot: RobotWithTask, arena: str, size: int, conditions: Conditi
         raise NoFleet("a fleet drives by the map: a scan shows other robots as walls")
 
 
-class FleetRobot(Turtle):
+class FleetRobot(TurtleBot):
     """One of a world; only the world can move time on."""
 
     def step(self, input: Array) -> Period:
@@ -165,7 +165,7 @@ class _Member(NavigationEnv):
                 states = fleet.others(i)
                 return states[:, :2], states[:, 3:4] * np.column_stack([np.cos(states[:, 2]), np.sin(states[:, 2])])
 
-            return alike(there[i].arena, crowd=Others(now, robot.footprint, told))
+            return same_room(there[i].arena, crowd=OtherRobots(now, robot.footprint, told))
 
         def make(arena: Arena, rng: np.random.Generator) -> FleetRobot:
             return fleet.world.robots[i]

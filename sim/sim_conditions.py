@@ -60,7 +60,7 @@ class Wind:
 
 
 @dataclass(frozen=True)
-class Faults:
+class SensorFaults:
     """What ails the beams. Shares are of beams, anew each scan."""
 
     dropped: float = 0.0  # share that says nothing
@@ -81,13 +81,13 @@ class Perception:
     """Where free space comes from: `map`, the arena's obstacles as they are, or `scan`, what the sensor shows."""
 
     kind: str = "map"
-    faults: Faults = Faults()
+    faults: SensorFaults = SensorFaults()
     tracks: bool = False  # among things that move: how fast they may speed up is known, and so they are followed
 
     def __post_init__(self) -> None:
         if self.kind not in ("map", "scan"):
             raise ValueError(f"free space comes from a map or from scans, not from {self.kind!r}")
-        if self.faults != Faults() and self.kind != "scan":
+        if self.faults != SensorFaults() and self.kind != "scan":
             raise ValueError(
                 "dropped, false, ghost, blind and late beams are a scan's: ask for it, too (--perception scan)"
             )

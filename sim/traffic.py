@@ -98,7 +98,7 @@ class Crowd:
         return np.asarray((clear >= self.kind.radius + between + AIR).all(axis=1))
 
 
-class Others:
+class OtherRobots:
     """The other robots of a world, where a lidar sees them: as discs about where they are now."""
 
     pushes = True
@@ -121,7 +121,7 @@ class Others:
         return tuple(Obstacle(CYLINDER, tuple(place), (self._radius,)) for place in self.at(time)[0].tolist())
 
 
-class Watch:
+class CrowdSensor:
     """What a robot's sensors tell of a crowd: places and velocities with errors, each beside the one before."""
 
     def __init__(self, crowd: Crowd, rng: np.random.Generator) -> None:

@@ -19,7 +19,7 @@ class BadInput(ValueError):
     """An input that is not a finite vector of the robot's length."""
 
 
-def executed(robot: Robot, input: Array, before: Array) -> Array:
+def clip_input(robot: Robot, input: Array, before: Array) -> Array:
     """What is executed of an input (m,) after `before`: within the robot's bounds and slew.
 
     Raises:
@@ -70,7 +70,7 @@ class Vehicle(Protocol):
             BadInput: when the input is not m finite numbers.
         """
 
-    def standing(self) -> Period:
+    def initial_period(self) -> Period:
         """The present state as a period in which nothing happened: what there is to say before the first step."""
 
     def alter(self, **changes: float) -> None:

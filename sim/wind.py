@@ -11,7 +11,7 @@ from brakeline.sim.sim_conditions import Wind as Wind
 GUST_CUT = 3.0  # sigma at which a gust is cut off
 
 
-class Air:
+class WindProcess:
     """The wind's course: `velocity` (x, y, z) now, m/s."""
 
     CHUNK = 256  # draws at once: one number alone costs as much as many

@@ -12,7 +12,7 @@ from brakeline.actors.mavlink.frame_log import FrameTap
 from brakeline.actors.mavlink.telemetry import ATTITUDE, FORCE, MOTION, SOURCES, Array
 from brakeline.messaging.robot import Robot
 from brakeline.sim.quadrotor import SAMPLES, Quadrotor
-from brakeline.sim.vehicle import Period, executed
+from brakeline.sim.vehicle import Period, clip_input
 
 
 class Endpoint(Protocol):
@@ -51,20 +51,20 @@ class LockstepQuadrotor:
         Raises:
             BadInput: when the input is not three finite numbers.
         """
-        self.input = executed(self._robot, input, self.input)
+        self.input = clip_input(self._robot, input, self.input)
         client, endpoint, start = self._client, self._endpoint, self.measured[:3]
         client.path.clear()
         client.setpoint(self.input)
-        endpoint.vehicle.watch()
+        endpoint.vehicle.begin_period()
         endpoint.advance(self._robot.period)
         client.feed(endpoint.take())
         self.measured = self._measured()
         path = np.array([position for _, position in client.path]) - start
-        period = endpoint.vehicle.watched(self.measured, path)
+        period = endpoint.vehicle.end_period(self.measured, path)
         self.true = period.true
         return period
 
-    def standing(self) -> Period:
+    def initial_period(self) -> Period:
         """The present state as a period in which nothing happened: what there is to say before the first step."""
         clearance = float(self._endpoint.vehicle.clearance(self.true[:3]))
         return Period(self.measured, self.true, False, clearance, clearance, np.zeros((SAMPLES, 3)), 0.0)

@@ -21,7 +21,7 @@ from brakeline.messaging.byte_links import Link
 from brakeline.messaging.rejected_messages import Tolerance
 from brakeline.messaging.robot import Robot
 from brakeline.sim.quadrotor import SAMPLES
-from brakeline.sim.vehicle import Period, executed
+from brakeline.sim.vehicle import Period, clip_input
 
 log = logging.getLogger("brakeline.flight")
 
@@ -141,7 +141,7 @@ class MavlinkVehicle:
         Raises:
             BadInput: an input is not three finite numbers.
         """
-        rows = [executed(self._robot, row, row) for row in np.asarray(plan, float)]
+        rows = [clip_input(self._robot, row, row) for row in np.asarray(plan, float)]
         with self._changed:
             in_time = self.current_period.number < number
             if in_time:
@@ -245,7 +245,7 @@ class MavlinkVehicle:
     def _begin(self, now: float) -> None:
         """Begin a period: send its input first, then report on the period before."""
         following = self._plan.pop(0) if self._plan else np.zeros(self._robot.action_dim)
-        self._velocity = executed(self._robot, following, self.current_period.input)
+        self._velocity = clip_input(self._robot, following, self.current_period.input)
         self._send_setpoint(now)
         self._keep_time(now - self._due)
         start, state = self.current_period.report.measured[:3], self._state(now)

@@ -17,14 +17,14 @@ from numpy.typing import NDArray
 from brakeline.actors.mavlink.autopilot_commands import AutopilotClient, MavlinkError
 from brakeline.actors.mavlink.frame_log import CapturedFrame, FrameTap
 from brakeline.messaging.robot import Robot
-from brakeline.sim.arena import Arena, closing, room_bounds
+from brakeline.sim.arena import Arena, room_boundary, room_bounds
 from brakeline.sim.autopilot.common_dialect import mavlink
-from brakeline.sim.autopilot.hil_link import AutopilotGone, Hil
-from brakeline.sim.autopilot.hil_sensors import SensorNoise, Sensors
-from brakeline.sim.autopilot.px4_process import Px4
+from brakeline.sim.autopilot.hil_link import AutopilotGone, HilLink
+from brakeline.sim.autopilot.hil_sensors import HilSensors, SensorNoise
+from brakeline.sim.autopilot.px4_process import Px4Process
 from brakeline.sim.flight_estimator import QuadrotorNoise
 from brakeline.sim.quadrotor import SAMPLES, Quadrotor
-from brakeline.sim.vehicle import Period, executed
+from brakeline.sim.vehicle import Period, clip_input
 
 Array = NDArray[np.float64]
 
@@ -42,7 +42,13 @@ STANDING, LEVEL = 0.1, 0.1  # m/s, rad: slower and more upright than that, it ho
 FAR = 500.0  # m to whatever closes the field
 QUIET = QuadrotorNoise(scale=0.0)  # the estimator is PX4's
 FIELD = Arena(
-    "field", closing(FAR, 2.0 * FAR), (0.0, 0.0, FAR), (0.5 * FAR, 0.0, FAR), 1.0, 10**9, room_bounds(FAR, 2.0 * FAR)
+    "field",
+    room_boundary(FAR, 2.0 * FAR),
+    (0.0, 0.0, FAR),
+    (0.5 * FAR, 0.0, FAR),
+    1.0,
+    10**9,
+    room_bounds(FAR, 2.0 * FAR),
 )
 
 
@@ -57,7 +63,7 @@ class Px4Flight:
     ) -> None:
         """folder, parameters: see Px4; tap: is called with every MAVLink frame between it and its companion."""
         self._folder, self._noise, self._parameters, self._tap = folder, noise, parameters, tap
-        self._px4: Px4 | None = None
+        self._px4: Px4Process | None = None
         self._count = 0
         self._told = dict.fromkeys(INTERVALS, 0.0)  # s, time of the newest message of a kind
         self.setpoint = np.zeros(3)
@@ -127,7 +133,7 @@ class Px4Flight:
         link.bind(("127.0.0.1", 0))
         link.setblocking(False)
         try:
-            self._px4 = px4 = Px4(self._folder, link.getsockname()[1], self._parameters)
+            self._px4 = px4 = Px4Process(self._folder, link.getsockname()[1], self._parameters)
         except BaseException:
             link.close()
             raise
@@ -135,7 +141,7 @@ class Px4Flight:
         self.starts += 1
         rng = np.random.default_rng(self.starts)
         vehicle = Quadrotor(FIELD, rng, QUIET, floor=FAR)
-        self.hil = Hil(px4.connection, vehicle, Sensors(self._noise, rng, vehicle.timestep))
+        self.hil = HilLink(px4.connection, vehicle, HilSensors(self._noise, rng, vehicle.timestep))
         self.client = AutopilotClient(lambda data: link.sendto(data, ("127.0.0.1", px4.local)), tap=self._hear)
         self._told = dict.fromkeys(INTERVALS, 0.0)
         self.tell(np.zeros(3))
@@ -159,15 +165,19 @@ class Px4Flight:
         return self.wait(self._hovers, STANDS_IN)
 
     def _hovers(self) -> bool:
-        truth = self.hil.vehicle.truth()
+        truth = self.hil.vehicle.true_reading()
         tilt = 2.0 * math.hypot(truth.attitude[1], truth.attitude[2])
         return math.hypot(*truth.velocity) < STANDING and tilt < LEVEL
 
     def _become(self, vehicle: Quadrotor) -> None:
         """It goes on as this vehicle, from this one's place: for PX4 nothing has changed."""
         hil = self.hil
-        (x, y, z), (a, b, c), (p, q, r) = hil.shift, hil.vehicle.truth().position, vehicle.truth().position
-        vehicle.resume(hil.vehicle)
+        (x, y, z), (a, b, c), (p, q, r) = (
+            hil.shift,
+            hil.vehicle.true_reading().position,
+            vehicle.true_reading().position,
+        )
+        vehicle.copy_motion(hil.vehicle)
         hil.vehicle, hil.shift = vehicle, (x + a - p, y + b - q, z + c - r)
 
     def _hear(self, frame: CapturedFrame) -> None:
@@ -184,7 +194,7 @@ class Px4Flight:
                 self.client.feed(self._link.recv(65536))
 
 
-def _shut(px4: Px4, link: socket.socket) -> None:
+def _shut(px4: Px4Process, link: socket.socket) -> None:
     px4.close()
     link.close()
 
@@ -214,10 +224,10 @@ class Px4Vehicle:
         Raises:
             BadInput: when the input is not three finite numbers; AutopilotGone.
         """
-        self.input = executed(self._robot, input, self.input)
+        self.input = clip_input(self._robot, input, self.input)
         flight, client, start, begin = self._flight, self._flight.client, self.measured[:3], self._flight.hil.time
         client.path.clear()
-        self._vehicle.watch()
+        self._vehicle.begin_period()
         flight.tell(self.input)
         flight.advance(self._robot.period)
         flight.settle()
@@ -226,11 +236,11 @@ class Px4Vehicle:
         places = np.array([start, *(where + self._offset for _, where in client.path), self.measured[:3]])
         samples = begin + self._robot.period * np.arange(1, SAMPLES + 1) / SAMPLES
         path = np.column_stack([np.interp(samples, times, places[:, axis]) for axis in range(3)])
-        period = self._vehicle.watched(self.measured, path - start)
+        period = self._vehicle.end_period(self.measured, path - start)
         self.true = period.true
         return period
 
-    def standing(self) -> Period:
+    def initial_period(self) -> Period:
         """The present state as a period in which nothing happened: what there is to say before the first step."""
         clearance = float(self._vehicle.clearance(self.true[:3]))
         return Period(self.measured, self.true, False, clearance, clearance, np.zeros((SAMPLES, 3)), 0.0)

@@ -18,7 +18,7 @@ from rich.console import Console
 from brakeline.actors.actor_settings import FlightSettings
 from brakeline.logs.console_tables import PLAIN, Stacking
 from brakeline.safety.model.model_config import ModelConfig
-from brakeline.sim.sim_conditions import Conditions, Faults, NoiseLevels, Perception, QuadrotorNoise, Wind
+from brakeline.sim.sim_conditions import Conditions, NoiseLevels, Perception, QuadrotorNoise, SensorFaults, Wind
 
 if TYPE_CHECKING:
     from brakeline.deploy.run.run_config import RunConfig
@@ -96,7 +96,7 @@ class Physics:
             Wind(self.wind, gust=self.gust),
             Perception(
                 self.perception,
-                Faults(self.dropped, self.false_far, self.ghosts, math.radians(self.blind), self.late),
+                SensorFaults(self.dropped, self.false_far, self.ghosts, math.radians(self.blind), self.late),
                 self.tracks,
             ),
         )

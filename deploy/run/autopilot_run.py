@@ -14,9 +14,9 @@ from brakeline.messaging.byte_links import open_link
 from brakeline.messaging.process_clock import WallClock
 from brakeline.messaging.stop_signals import heeded
 from brakeline.messaging.task import robot_with_task
-from brakeline.sim.arena import Arena, closing, room_bounds
+from brakeline.sim.arena import Arena, room_boundary, room_bounds
 from brakeline.sim.autopilot.autopilot_rules import SETPOINT_TIMEOUT
-from brakeline.sim.autopilot.autopilot_server import Tally, Truth, serve
+from brakeline.sim.autopilot.autopilot_server import ServerStats, TruthSender, serve
 from brakeline.sim.autopilot.endpoint import Autopilot
 from brakeline.sim.autopilot.parameters import AT_ONCE
 from brakeline.sim.flight_estimator import QuadrotorNoise
@@ -43,14 +43,14 @@ class AutopilotSettings:
     at_once: bool = False  # it follows setpoints at once, as the vehicle that was recorded; else as it is delivered
 
 
-def fly(settings: AutopilotSettings, begun: Callable[[Arena], Any] = lambda arena: None) -> Tally:
+def fly(settings: AutopilotSettings, begun: Callable[[Arena], Any] = lambda arena: None) -> ServerStats:
     """Serve the vehicles until asked to end; `begun` is called when the link is open."""
     arena = flight_arena(settings.arena, settings.seed) if settings.arena else open_field()
     link = open_link(settings.url)
     truth = None
     if settings.truth:
         host, _, port = settings.truth.rpartition(":")
-        truth = Truth(host or "127.0.0.1", int(port))
+        truth = TruthSender(host or "127.0.0.1", int(port))
     autopilots = [vehicle(settings, arena, system) for system in range(1, settings.vehicles + 1)]
     clock = WallClock()
     begun(arena)
@@ -77,5 +77,11 @@ def vehicle(settings: AutopilotSettings, arena: Arena, system: int) -> Autopilot
 def open_field() -> Arena:
     """Nothing but walls far away; the origin is where to start."""
     return Arena(
-        "open field", closing(FIELD, FIELD), (0.0, 0.0, 5.0), (10.0, 0.0, 5.0), 1.0, 10**9, room_bounds(FIELD, FIELD)
+        "open field",
+        room_boundary(FIELD, FIELD),
+        (0.0, 0.0, 5.0),
+        (10.0, 0.0, 5.0),
+        1.0,
+        10**9,
+        room_bounds(FIELD, FIELD),
     )

@@ -19,7 +19,7 @@ from brakeline.deploy.experiments.trials import TrialLog, one_step, thinking
 from brakeline.deploy.vehicle_factory import YARD, factory
 from brakeline.messaging.task import RobotWithTask
 from brakeline.messaging.topics import EPISODE, STEP
-from brakeline.sim.arena import Arena, closing, room_bounds
+from brakeline.sim.arena import Arena, room_boundary, room_bounds
 from brakeline.sim.navigation_env import NavigationEnv
 from brakeline.sim.sim_conditions import Conditions
 
@@ -85,6 +85,6 @@ def _yard(keep: Keep) -> Callable[[str, np.random.Generator, RobotWithTask], Are
         height = None if robot.position_dim == 2 else 2.0 * half
         up = (0.0,) if height is None else (half,)
         goal = (0.9 * half, 0.9 * half, *(() if height is None else up))
-        return Arena("yard", closing(half, height), (*middle, *up), goal, 0.25, 10**9, room_bounds(half, height))
+        return Arena("yard", room_boundary(half, height), (*middle, *up), goal, 0.25, 10**9, room_bounds(half, height))
 
     return draw

@@ -16,10 +16,10 @@ from brakeline.deploy.run.autopilot_run import PAD, open_field
 from brakeline.messaging.process_clock import Clock, WallClock
 from brakeline.messaging.stop_signals import heeded
 from brakeline.sim.arena import Arena
-from brakeline.sim.autopilot.autopilot_server import PATIENCE, TRUTH_RATE, Truth
-from brakeline.sim.autopilot.hil_link import AutopilotGone, Hil
-from brakeline.sim.autopilot.hil_sensors import SensorNoise, Sensors
-from brakeline.sim.autopilot.px4_process import Px4
+from brakeline.sim.autopilot.autopilot_server import PATIENCE, TRUTH_RATE, TruthSender
+from brakeline.sim.autopilot.hil_link import AutopilotGone, HilLink
+from brakeline.sim.autopilot.hil_sensors import HilSensors, SensorNoise
+from brakeline.sim.autopilot.px4_process import Px4Process
 from brakeline.sim.flight_estimator import QuadrotorNoise
 from brakeline.sim.quadrotor import Quadrotor
 from brakeline.sim.wind import Wind
@@ -67,7 +67,7 @@ def fly(settings: HilSettings, begun: Callable[[Quadrotor], Any] = lambda vehicl
     """
     port = _port(settings.url)
     arena = flight_arena(settings.arena, settings.seed) if settings.arena else open_field()
-    px4 = Px4(settings.folder, port, settings.parameters)
+    px4 = Px4Process(settings.folder, port, settings.parameters)
     truth = _truth(settings.truth)
     try:
         with heeded(threading.Event(), patient=True) as stop:
@@ -82,13 +82,13 @@ def fly(settings: HilSettings, begun: Callable[[Quadrotor], Any] = lambda vehicl
 
 def _served(
     settings: HilSettings,
-    px4: Px4,
+    px4: Px4Process,
     arena: Arena,
-    truth: Truth | None,
+    truth: TruthSender | None,
     stop: threading.Event,
     begun: Callable[[Quadrotor], Any],
 ) -> Flown:
-    hil = Hil(px4.connection, *_vehicle(settings, arena))
+    hil = HilLink(px4.connection, *_vehicle(settings, arena))
     while not hil.answering and not stop.is_set():
         hil.tick()
     begun(hil.vehicle)
@@ -96,7 +96,9 @@ def _served(
     return serve(hil, WallClock(), settings.speed, lambda: stop.is_set() or hil.time >= over, truth)
 
 
-def serve(hil: Hil, clock: Clock, speed: float, stop: Callable[[], bool], truth: Truth | None = None) -> Flown:
+def serve(
+    hil: HilLink, clock: Clock, speed: float, stop: Callable[[], bool], truth: TruthSender | None = None
+) -> Flown:
     """Step by step until told to stop, no faster than `speed` times the clock's time; 0: as fast as it goes."""
     flown, step = Flown(), hil.vehicle.timestep
     begin, since = clock.now(), hil.time
@@ -121,11 +123,11 @@ def serve(hil: Hil, clock: Clock, speed: float, stop: Callable[[], bool], truth:
     return flown
 
 
-def _vehicle(settings: HilSettings, arena: Arena) -> tuple[Quadrotor, Sensors]:
+def _vehicle(settings: HilSettings, arena: Arena) -> tuple[Quadrotor, HilSensors]:
     """On the floor below the arena's start; its estimator is PX4's, so ours errs in nothing."""
     rng = np.random.default_rng((settings.seed, 1))
     vehicle = Quadrotor(arena, rng, QuadrotorNoise(scale=0.0), settings.wind, floor=PAD)
-    return vehicle, Sensors(settings.noise, rng, vehicle.timestep)
+    return vehicle, HilSensors(settings.noise, rng, vehicle.timestep)
 
 
 def _port(url: str) -> int:
@@ -135,8 +137,8 @@ def _port(url: str) -> int:
     return int(port)
 
 
-def _truth(address: str) -> Truth | None:
+def _truth(address: str) -> TruthSender | None:
     if not address:
         return None
     host, _, port = address.rpartition(":")
-    return Truth(host or HERE[0], int(port))
+    return TruthSender(host or HERE[0], int(port))

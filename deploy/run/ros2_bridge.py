@@ -36,7 +36,7 @@ from brakeline.messaging.ros2.cdr_messages import (
 )
 from brakeline.messaging.task import robot_with_task
 from brakeline.sim.arena_generator import draw_arena
-from brakeline.sim.ground_realtime import SAMPLE, DrivenGround, TurningLidar
+from brakeline.sim.ground_realtime import SAMPLE_TIME, RealtimeGroundRobot, SpinningLidar
 from brakeline.sim.ground_robot import SAMPLES
 from brakeline.sim.sim_conditions import Conditions
 
@@ -87,8 +87,8 @@ class Bridge:
         rng = np.random.default_rng((settings.seed, 11))
         arena = draw_arena(settings.arena, np.random.default_rng(settings.seed), robot_with_task("ground"))
         c = settings.conditions
-        self.robot = DrivenGround(arena, rng, c.noise, c.payload_kg, c.floor_friction)
-        self._lidar = TurningLidar(arena, rng, c.lidar_noise(flies=False))
+        self.robot = RealtimeGroundRobot(arena, rng, c.noise, c.payload_kg, c.floor_friction)
+        self._lidar = SpinningLidar(arena, rng, c.lidar_noise(flies=False))
         self._begun = 1.0 if settings.sim_time else time.time()  # its time at the first sample
         self._samples = 0
         self._heard = threading.Condition()
@@ -110,13 +110,13 @@ class Bridge:
     @property
     def now(self) -> float:
         """Its time [s]."""
-        return self._begun + self._samples * SAMPLE
+        return self._begun + self._samples * SAMPLE_TIME
 
     def run(self, stop: threading.Event) -> None:
         """Until asked to stop, or its time is over."""
         settings = self.settings
         if not settings.sim_time:
-            self._begun = time.time() - self._samples * SAMPLE
+            self._begun = time.time() - self._samples * SAMPLE_TIME
         anchor, since = time.monotonic(), self.now
         while not stop.is_set() and not 0.0 < settings.seconds <= self.outcome.seconds:
             self._sample()
@@ -130,7 +130,7 @@ class Bridge:
                     self.outcome.slips += not settings.lockstep
                     anchor, since = time.monotonic(), self.now
                     if not settings.sim_time:
-                        self._begun = time.time() - self._samples * SAMPLE
+                        self._begun = time.time() - self._samples * SAMPLE_TIME
                         since = self.now
 
     def close(self) -> None:
@@ -151,7 +151,7 @@ class Bridge:
         robot.advance()
         self._samples += 1
         self._tell()
-        self.outcome.seconds = self._samples * SAMPLE
+        self.outcome.seconds = self._samples * SAMPLE_TIME
         self.outcome.collisions, self.outcome.closest = robot.collisions, robot.closest
         self.outcome.driven = robot.driven
 
@@ -175,9 +175,9 @@ class Bridge:
 
     def _scan(self, ranges: Array) -> LaserScan:
         """Beams are told evenly in time; each was cast at its sample's end, so at most half a sample from that."""
-        lidar, turn = self._lidar, SAMPLES * SAMPLE
+        lidar, turn = self._lidar, SAMPLES * SAMPLE_TIME
         return LaserScan(
-            header=header(self.now - turn + 0.5 * SAMPLE, LASER),
+            header=header(self.now - turn + 0.5 * SAMPLE_TIME, LASER),
             angle_min=0.0,
             angle_max=lidar.gap * (len(ranges) - 1),
             angle_increment=lidar.gap,

@@ -93,7 +93,7 @@ class Adversary:
         return _towards(self._robot, bearing(info["state"], position + ways[np.argmin(np.linalg.norm(ways, axis=1))]))
 
 
-class MapDriver(scripted_policies.MapDriver):
+class MapDriver(scripted_policies.GroundRoutePolicy):
     """Along the best way on the map, forwards or backwards."""
 
     def _pursue(self, angle: float) -> Array:

@@ -78,7 +78,7 @@ class Adversary:
         return _towards(self._robot, angle, float(self._rng.choice([-1.0, 0.0, 1.0]) * self._robot.high()[2]))
 
 
-class MapDriver(scripted_policies.MapDriver):
+class MapDriver(scripted_policies.GroundRoutePolicy):
     """Along the best way on the map, at half speed, without turning."""
 
     def _pursue(self, angle: float) -> Array:

@@ -10,7 +10,15 @@ from typing import Any, Protocol
 
 from brakeline.sim.autopilot import ned_frames
 from brakeline.sim.autopilot.common_dialect import mavlink
-from brakeline.sim.autopilot.flight_modes import Landed, Limits, Mode, Pilot, Refused, Setpoint, Unknown
+from brakeline.sim.autopilot.flight_modes import (
+    CommandRefused,
+    FlightLimits,
+    FlightStateMachine,
+    LandedState,
+    Mode,
+    Setpoint,
+    UnknownMode,
+)
 from brakeline.sim.autopilot.parameters import ARDUPILOT, PX4, Parameters
 from brakeline.sim.flight_controller import STILL, Vector
 
@@ -42,23 +50,23 @@ class Rules(Protocol):
     lacks: frozenset[int]  # messages that it does not know
     groups: dict[int, tuple[int, ...]]  # messages of each group of REQUEST_DATA_STREAM
 
-    def limits(self) -> Limits:
+    def limits(self) -> FlightLimits:
         """From the parameters as they are."""
 
     def command_mode(self, main: int, sub: int) -> int:
         """The custom mode that param2 and param3 of DO_SET_MODE name."""
 
-    def custom_mode(self, pilot: Pilot) -> int:
+    def custom_mode(self, pilot: FlightStateMachine) -> int:
         """For HEARTBEAT."""
 
-    def change(self, pilot: Pilot, custom_mode: int) -> None: ...
+    def change(self, pilot: FlightStateMachine, custom_mode: int) -> None: ...
 
-    def arm(self, pilot: Pilot) -> None: ...
+    def arm(self, pilot: FlightStateMachine) -> None: ...
 
-    def take_off(self, pilot: Pilot, altitude: float) -> None:
+    def take_off(self, pilot: FlightStateMachine, altitude: float) -> None:
         """altitude: param7 of NAV_TAKEOFF."""
 
-    def setpoint(self, pilot: Pilot, target: Target, heading: float) -> None:
+    def setpoint(self, pilot: FlightStateMachine, target: Target, heading: float) -> None:
         """SET_POSITION_TARGET_LOCAL_NED; heading: of the vehicle, rad from north."""
 
 
@@ -90,9 +98,9 @@ class Px4:
         self.lacks: frozenset[int] = frozenset()
         self.groups: dict[int, tuple[int, ...]] = {}  # it takes no REQUEST_DATA_STREAM
 
-    def limits(self) -> Limits:
+    def limits(self) -> FlightLimits:
         p = self.parameters
-        return Limits(
+        return FlightLimits(
             setpoint_timeout=p["COM_OF_LOSS_T"],
             on_loss=PX4_ON_LOSS.get(round(p["COM_OBL_RC_ACT"]), Mode.POSITION),
             lifts=True,
@@ -108,48 +116,48 @@ class Px4:
     def command_mode(self, main: int, sub: int) -> int:
         return main << 16 | sub << 24
 
-    def custom_mode(self, pilot: Pilot) -> int:
+    def custom_mode(self, pilot: FlightStateMachine) -> int:
         main, sub = next(key for key, mode in PX4_MODES.items() if mode is pilot.mode)
         return main << 16 | sub << 24
 
-    def change(self, pilot: Pilot, custom_mode: int) -> None:
+    def change(self, pilot: FlightStateMachine, custom_mode: int) -> None:
         main, sub = custom_mode >> 16 & 0xFF, custom_mode >> 24 & 0xFF
         mode = PX4_MODES.get((main, sub if main == 4 else 0))
         if main > PX4_LAST:
             return  # accepted, and nothing happens
         if mode in (None, Mode.POSITION):
-            raise Refused(f"mode {main}.{sub} is not available: no sticks, no mission")
+            raise CommandRefused(f"mode {main}.{sub} is not available: no sticks, no mission")
         if mode is Mode.OFFBOARD and pilot.armed and not pilot.streaming:
-            raise Refused("offboard: no offboard signal")
+            raise CommandRefused("offboard: no offboard signal")
         if mode is Mode.TAKEOFF:
             self.take_off(pilot, math.nan)
         else:
             pilot.change(mode)
 
-    def arm(self, pilot: Pilot) -> None:
+    def arm(self, pilot: FlightStateMachine) -> None:
         if pilot.mode is Mode.LAND:
-            raise Refused("Arming denied: not in this mode")
+            raise CommandRefused("Arming denied: not in this mode")
         if pilot.mode is Mode.OFFBOARD and not pilot.streaming:
-            raise Refused("Arming denied: no offboard signal")
+            raise CommandRefused("Arming denied: no offboard signal")
         pilot.arm()
 
-    def take_off(self, pilot: Pilot, altitude: float) -> None:
+    def take_off(self, pilot: FlightStateMachine, altitude: float) -> None:
         above_home = pilot.home[2] + self.parameters["MIS_TAKEOFF_ALT"]
         pilot.change(Mode.TAKEOFF)
         pilot.take_off(altitude - ned_frames.ALTITUDE if math.isfinite(altitude) else above_home)
 
-    def setpoint(self, pilot: Pilot, target: Target, heading: float) -> None:
+    def setpoint(self, pilot: FlightStateMachine, target: Target, heading: float) -> None:
         mask, frame = target.type_mask, target.coordinate_frame
         what = "SET_POSITION_TARGET_LOCAL_NED"
         if frame not in self.FRAMES:
-            raise Refused(f"{what} coordinate frame {frame} unsupported")
+            raise CommandRefused(f"{what} coordinate frame {frame} unsupported")
         if mask & FORCE and mask & ACCELERATION != ACCELERATION:
-            raise Refused(f"{what} force not supported")
+            raise CommandRefused(f"{what} force not supported")
         if mask & POSITION != POSITION or mask & ACCELERATION != ACCELERATION or mask & VELOCITY:
-            raise Refused(f"{what} invalid: all of the velocity, no more")
+            raise CommandRefused(f"{what} invalid: all of the velocity, no more")
         velocity = (target.vx, target.vy, target.vz)
         if not all(map(math.isfinite, velocity)):
-            raise Refused(f"{what} invalid: not finite")
+            raise CommandRefused(f"{what} invalid: not finite")
         pilot.hear(_setpoint(target, frame == mavlink.MAV_FRAME_BODY_NED, heading, relative=False))
 
 
@@ -178,9 +186,9 @@ class ArduCopter:
         }
         self.groups[m.MAV_DATA_STREAM_ALL] = tuple(kind for kinds in self.groups.values() for kind in kinds)
 
-    def limits(self) -> Limits:
+    def limits(self) -> FlightLimits:
         p = self.parameters
-        return Limits(
+        return FlightLimits(
             setpoint_timeout=p["GUID_TIMEOUT"],
             on_loss=Mode.OFFBOARD,
             lifts=False,
@@ -198,36 +206,36 @@ class ArduCopter:
     def command_mode(self, main: int, sub: int) -> int:
         return main
 
-    def custom_mode(self, pilot: Pilot) -> int:
+    def custom_mode(self, pilot: FlightStateMachine) -> int:
         return next(number for number, mode in COPTER_MODES.items() if mode is pilot.mode)
 
-    def change(self, pilot: Pilot, custom_mode: int) -> None:
+    def change(self, pilot: FlightStateMachine, custom_mode: int) -> None:
         mode = COPTER_MODES.get(custom_mode)
         if custom_mode not in range(COPTER_LAST + 1):
-            raise Unknown(f"No such mode {custom_mode}")
+            raise UnknownMode(f"No such mode {custom_mode}")
         if mode is None:
-            raise Refused(f"Mode change to {custom_mode} failed: no sticks, no mission")
-        if mode is Mode.MANUAL and pilot.landed is not Landed.ON_GROUND:
-            raise Refused("Mode change to STABILIZE failed: no sticks")
+            raise CommandRefused(f"Mode change to {custom_mode} failed: no sticks, no mission")
+        if mode is Mode.MANUAL and pilot.landed is not LandedState.ON_GROUND:
+            raise CommandRefused("Mode change to STABILIZE failed: no sticks")
         pilot.change(mode)
 
-    def arm(self, pilot: Pilot) -> None:
+    def arm(self, pilot: FlightStateMachine) -> None:
         if pilot.mode in (Mode.LAND, Mode.BRAKE):
-            raise Refused(f"Arm: {pilot.mode.value} mode not armable")
+            raise CommandRefused(f"Arm: {pilot.mode.value} mode not armable")
         pilot.arm()
 
-    def take_off(self, pilot: Pilot, altitude: float) -> None:
+    def take_off(self, pilot: FlightStateMachine, altitude: float) -> None:
         if pilot.mode is not Mode.OFFBOARD:
-            raise Refused("Takeoff: not in guided")
+            raise CommandRefused("Takeoff: not in guided")
         if not pilot.armed:
-            raise Refused("Takeoff: not armed")
-        if pilot.landed is not Landed.ON_GROUND:
-            raise Refused("Takeoff: in the air")
+            raise CommandRefused("Takeoff: not armed")
+        if pilot.landed is not LandedState.ON_GROUND:
+            raise CommandRefused("Takeoff: in the air")
         if not altitude > 0.0:
-            raise Refused("Takeoff: no altitude")
+            raise CommandRefused("Takeoff: no altitude")
         pilot.take_off(pilot.home[2] + altitude)
 
-    def setpoint(self, pilot: Pilot, target: Target, heading: float) -> None:
+    def setpoint(self, pilot: FlightStateMachine, target: Target, heading: float) -> None:
         if pilot.mode is not Mode.OFFBOARD:
             return
         mask, frame = target.type_mask, target.coordinate_frame
@@ -239,7 +247,7 @@ class ArduCopter:
             return  # and flies on until no other has come for long
         if not sane:
             pilot.hear(Setpoint(STILL))
-        elif pilot.landed is not Landed.ON_GROUND:
+        elif pilot.landed is not LandedState.ON_GROUND:
             pilot.hear(_setpoint(target, frame in self.BODY, heading, relative=True))
 
 

@@ -26,7 +26,7 @@ TRUTH_RATE = 25.0  # Hz
 PATIENCE = 0.25  # s that it may be late before it gives up catching up
 
 
-class Truth:
+class TruthSender:
     """Sends what the vehicles really do to one UDP address."""
 
     def __init__(self, host: str, port: int) -> None:
@@ -54,7 +54,7 @@ class Truth:
 
 
 @dataclass
-class Tally:
+class ServerStats:
     """How a server has fared."""
 
     ticks: int = 0
@@ -67,10 +67,14 @@ class Tally:
 
 
 def serve(
-    autopilots: Sequence[Autopilot], link: Link, clock: Clock, stop: Callable[[], bool], truth: Truth | None = None
-) -> Tally:
+    autopilots: Sequence[Autopilot],
+    link: Link,
+    clock: Clock,
+    stop: Callable[[], bool],
+    truth: TruthSender | None = None,
+) -> ServerStats:
     """Run autopilots in the clock's time until told to stop; all hear all that comes over the link."""
-    tally = Tally()
+    tally = ServerStats()
     touches = [0] * len(autopilots)
     every = round(1.0 / TRUTH_RATE / TICK)
     due = clock.now()

@@ -10,9 +10,9 @@ from typing import Any
 from brakeline.sim.autopilot import ned_frames
 from brakeline.sim.autopilot.autopilot_rules import RULES
 from brakeline.sim.autopilot.common_dialect import mavlink
-from brakeline.sim.autopilot.flight_modes import Mode, Pilot, Refused, Unknown
+from brakeline.sim.autopilot.flight_modes import CommandRefused, FlightStateMachine, Mode, UnknownMode
 from brakeline.sim.autopilot.parameters import BadParameter
-from brakeline.sim.autopilot.telemetry_sender import BUILDERS, Reports, Schedule
+from brakeline.sim.autopilot.telemetry_sender import BUILDERS, StreamSchedule, TelemetryBuilder
 from brakeline.sim.lidar import Lidar
 from brakeline.sim.quadrotor import Quadrotor
 
@@ -70,13 +70,13 @@ class Autopilot:
         self.vehicle, self.rules = vehicle, RULES[rules]()
         for name, value in (parameters or {}).items():
             self.rules.parameters.set(name, value)
-        self.pilot = Pilot(vehicle, self.rules.limits(), self.rules.boots_in)
-        self.reports = Reports(self.pilot, lidar)
+        self.pilot = FlightStateMachine(vehicle, self.rules.limits(), self.rules.boots_in)
+        self.reports = TelemetryBuilder(self.pilot, lidar)
         self._ticks = round(TICK / vehicle.timestep)
         self._outbox = Outbox()
         self.mav = mavlink.MAVLink(self._outbox, srcSystem=system, srcComponent=mavlink.MAV_COMP_ID_AUTOPILOT1)
         self.mav.robust_parsing = True
-        self.schedule = Schedule(TICK)
+        self.schedule = StreamSchedule(TICK)
         self.schedule.set(HEARTBEAT, 1.0, 0.0)
         for kind, rate in () if quiet else self.rules.rates.items():
             self.schedule.set(kind, 1.0 / rate, 0.0)
@@ -152,7 +152,7 @@ class Autopilot:
     def _on_setpoint(self, message: mavlink.MAVLink_set_position_target_local_ned_message) -> None:
         try:
             self.rules.setpoint(self.pilot, message, self._heading())
-        except Refused as refusal:
+        except CommandRefused as refusal:
             self.say(str(refusal), mavlink.MAV_SEVERITY_CRITICAL)
 
     def _on_command_long(self, message: mavlink.MAVLink_command_long_message) -> None:
@@ -170,8 +170,8 @@ class Autopilot:
         action = ACTIONS.get(command.number)
         try:
             result = mavlink.MAV_RESULT_UNSUPPORTED if action is None else action(self, command)
-        except Refused as refusal:
-            unknown = isinstance(refusal, Unknown)
+        except CommandRefused as refusal:
+            unknown = isinstance(refusal, UnknownMode)
             result = mavlink.MAV_RESULT_UNSUPPORTED if unknown else self.rules.refusal
             self.say(str(refusal))
         self.mav.command_ack_send(command.number, result, 0, 0, message.get_srcSystem(), message.get_srcComponent())
@@ -181,7 +181,7 @@ class Autopilot:
         try:
             if message.base_mode & mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED:
                 self.rules.change(self.pilot, message.custom_mode)
-        except Refused as refusal:
+        except CommandRefused as refusal:
             self.say(str(refusal))
 
     def _on_data_stream(self, message: mavlink.MAVLink_request_data_stream_message) -> None:

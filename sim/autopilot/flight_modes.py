@@ -17,11 +17,11 @@ READY_AFTER = 1.0  # s from switching on until the estimate is good enough to ar
 EDGE = 1e-6  # s, rounding of times
 
 
-class Refused(Exception):
+class CommandRefused(Exception):
     """The vehicle does not do that now, and why."""
 
 
-class Unknown(Refused):
+class UnknownMode(CommandRefused):
     """There is no such thing at all."""
 
 
@@ -35,7 +35,7 @@ class Mode(Enum):
     OFFBOARD = "offboard"
 
 
-class Landed(Enum):
+class LandedState(Enum):
     ON_GROUND = "on the ground"
     TAKING_OFF = "taking off"
     IN_AIR = "in the air"
@@ -43,7 +43,7 @@ class Landed(Enum):
 
 
 @dataclass(frozen=True)
-class Limits:
+class FlightLimits:
     """What the vehicle's parameters say."""
 
     setpoint_timeout: float  # s
@@ -69,17 +69,17 @@ class Setpoint:
     yaw_rate: float | None = None
 
 
-class Pilot:
+class FlightStateMachine:
     """One vehicle's modes. `time` is seconds since it was switched on; all methods but `tick` act at that moment."""
 
-    def __init__(self, vehicle: Quadrotor, limits: Limits, mode: Mode) -> None:
+    def __init__(self, vehicle: Quadrotor, limits: FlightLimits, mode: Mode) -> None:
         """It starts as the vehicle does: armed and holding in the air, or in `mode` on the ground."""
         self.vehicle, self.limits = vehicle, limits
         self.time = 0.0
         self.armed = vehicle.flying
-        self.landed = Landed.IN_AIR if vehicle.flying else Landed.ON_GROUND
+        self.landed = LandedState.IN_AIR if vehicle.flying else LandedState.ON_GROUND
         self.mode = Mode.HOLD if vehicle.flying else mode
-        self.home = vehicle.seen()[0]
+        self.home = vehicle.position_and_velocity()[0]
         self.setpoint = Setpoint(STILL)
         self.last_setpoint: float | None = None  # s, when one was heard
         self.news: list[str] = []  # for the ground station
@@ -101,17 +101,17 @@ class Pilot:
         if self.armed:
             return
         if self.time < READY_AFTER:
-            raise Refused("the estimate is not ready")
+            raise CommandRefused("the estimate is not ready")
         self.armed, self._since = True, self.time
-        self.home = self.vehicle.seen()[0]
+        self.home = self.vehicle.position_and_velocity()[0]
         self.news.append("Armed")
         if self.mode is Mode.TAKEOFF:  # asked for before
-            self._leave_floor(Landed.TAKING_OFF)
+            self._leave_floor(LandedState.TAKING_OFF)
 
     def disarm(self, force: bool = False) -> None:
         """Raises Refused in the air, unless forced."""
-        if self.landed is not Landed.ON_GROUND and not force:
-            raise Refused("not landed")
+        if self.landed is not LandedState.ON_GROUND and not force:
+            raise CommandRefused("not landed")
         if self.armed:
             self.news.append("Disarmed")
         self.armed = False
@@ -123,19 +123,19 @@ class Pilot:
         """To a mode. What may precede which is the rules' business."""
         if mode is not self.mode:
             self.setpoint = Setpoint(STILL)
-            if self.landed in (Landed.LANDING, Landed.TAKING_OFF):
-                self.landed = Landed.IN_AIR
+            if self.landed in (LandedState.LANDING, LandedState.TAKING_OFF):
+                self.landed = LandedState.IN_AIR
         if mode is Mode.LAND and self.mode is not Mode.LAND:
             self._before_landing = self.mode
         self.mode, self._interrupted = mode, False
-        if mode is Mode.LAND and self.landed is Landed.IN_AIR:
-            self.landed = Landed.LANDING
+        if mode is Mode.LAND and self.landed is LandedState.IN_AIR:
+            self.landed = LandedState.LANDING
 
     def take_off(self, height: float) -> None:
         """Climb to a height [m, in the world] and hold it."""
         self._height = height
-        if self.armed and self.landed is Landed.ON_GROUND:
-            self._leave_floor(Landed.TAKING_OFF)
+        if self.armed and self.landed is LandedState.ON_GROUND:
+            self._leave_floor(LandedState.TAKING_OFF)
 
     def hear(self, setpoint: Setpoint) -> None:
         """A setpoint came, to be flown if the mode is offboard, or was until there were none."""
@@ -146,8 +146,8 @@ class Pilot:
         if self.mode is not Mode.OFFBOARD:
             return
         self.setpoint = setpoint
-        if self.landed is Landed.TAKING_OFF:
-            self.landed = Landed.IN_AIR
+        if self.landed is LandedState.TAKING_OFF:
+            self.landed = LandedState.IN_AIR
 
     def tick(self, seconds: float) -> None:
         """That much time has passed: see what has become of it, and steer the vehicle's controller."""
@@ -156,7 +156,7 @@ class Pilot:
             return
         if self.mode is Mode.OFFBOARD and not self.streaming:
             self._lose_setpoints()
-        if self.landed is Landed.ON_GROUND:
+        if self.landed is LandedState.ON_GROUND:
             self._rest()
         elif not (self.vehicle.on_floor and self._wants_down()):
             self._since = self.time
@@ -167,15 +167,15 @@ class Pilot:
     def steer(self, seconds: float = 0.0) -> None:
         """Give the controller what the mode asks for now, to be followed for so long."""
         controller, wanted = self.vehicle.controller, self.setpoint
-        if self.mode is Mode.OFFBOARD and self.landed is not Landed.TAKING_OFF:
+        if self.mode is Mode.OFFBOARD and self.landed is not LandedState.TAKING_OFF:
             self._flown = controller.setpoint = self._following(self._limited(wanted.velocity), seconds)
             controller.yaw_rate = wanted.yaw_rate or 0.0
             if wanted.yaw is not None:
                 controller.yaw_goal = wanted.yaw
             return
-        self._flown, controller.yaw_rate = self.vehicle.seen()[1], 0.0
-        if self.landed is Landed.TAKING_OFF:
-            left = self._height - self.vehicle.seen()[0][2]
+        self._flown, controller.yaw_rate = self.vehicle.position_and_velocity()[1], 0.0
+        if self.landed is LandedState.TAKING_OFF:
+            left = self._height - self.vehicle.position_and_velocity()[0][2]
             controller.setpoint = (0.0, 0.0, min(max(left, 0.3), CLIMB))
             if left < REACHED:
                 self._arrive()
@@ -211,13 +211,13 @@ class Pilot:
             self.change(self.limits.on_loss)
             self._interrupted = self.limits.on_loss is not Mode.LAND
 
-    def _leave_floor(self, landed: Landed) -> None:
-        self.vehicle.launch()
+    def _leave_floor(self, landed: LandedState) -> None:
+        self.vehicle.start_rotors()
         self.landed = landed
 
     def _arrive(self) -> None:
         """The height of a takeoff is reached."""
-        self.landed = Landed.IN_AIR
+        self.landed = LandedState.IN_AIR
         self.vehicle.controller.setpoint = STILL
         if self.mode is Mode.TAKEOFF:
             self.mode = Mode.HOLD
@@ -226,7 +226,7 @@ class Pilot:
         """Armed on the floor, since `_since`."""
         rested = self.time - self._since
         if self.mode is Mode.OFFBOARD and self.limits.lifts and self.setpoint.velocity[2] > UPWARD:
-            self._leave_floor(Landed.IN_AIR)
+            self._leave_floor(LandedState.IN_AIR)
         elif rested > (self.limits.disarm_landed if self.mode is Mode.LAND else self.limits.disarm_unused):
             self.disarm()
 
@@ -235,6 +235,6 @@ class Pilot:
 
     def _land(self) -> None:
         """It has come down."""
-        self.landed, self._since = Landed.ON_GROUND, self.time
+        self.landed, self._since = LandedState.ON_GROUND, self.time
         self.vehicle.cut_rotors()
         self.news.append("Landing detected")

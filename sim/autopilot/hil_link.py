@@ -11,7 +11,7 @@ import socket
 import time
 
 from brakeline.sim.autopilot.common_dialect import mavlink
-from brakeline.sim.autopilot.hil_sensors import Sensors
+from brakeline.sim.autopilot.hil_sensors import HilSensors
 from brakeline.sim.flight_controller import Vector
 from brakeline.sim.quadrotor import Quadrotor
 
@@ -26,14 +26,14 @@ class AutopilotGone(RuntimeError):
     """The autopilot does not answer any more, or cannot be run in lockstep."""
 
 
-class Hil:
+class HilLink:
     """The simulator's end of one autopilot. vehicle: may be exchanged for another one between two ticks.
 
     shift: m, ENU: where the autopilot believes to be when the vehicle is at its arena's origin. An arena that is
     exchanged for the next one is, for the autopilot, another corner of one large field.
     """
 
-    def __init__(self, connection: socket.socket, vehicle: Quadrotor, sensors: Sensors) -> None:
+    def __init__(self, connection: socket.socket, vehicle: Quadrotor, sensors: HilSensors) -> None:
         self.vehicle, self.shift = vehicle, (0.0, 0.0, 0.0)
         self.armed = False  # it lets the rotors turn
         self.unanswered = 0  # steps on which no answer came in time
@@ -61,7 +61,7 @@ class Hil:
         """
         vehicle = self.vehicle
         self._now += self._step
-        truth, (dx, dy, dz) = vehicle.truth(), self.shift
+        truth, (dx, dy, dz) = vehicle.true_reading(), self.shift
         x, y, z = truth.position
         where: Vector = (x + dx, y + dy, z + dz)
         packets = [message.pack(self._packer) for message in self._sensors.read(truth, where, self._now)]
@@ -102,7 +102,7 @@ class Hil:
         self.answering = True
         self._heard = message.time_usec
         self.armed = bool(message.mode & ARMED)
-        self.vehicle.spin(tuple(self._most * min(max(c, 0.0), 1.0) for c in message.controls[:ROTORS]))
+        self.vehicle.set_thrusts(tuple(self._most * min(max(c, 0.0), 1.0) for c in message.controls[:ROTORS]))
 
     def _miss(self) -> None:
         if not self.answering:

@@ -48,7 +48,7 @@ class SensorNoise:
 
 
 @dataclass(frozen=True)
-class Rates:
+class SensorRates:
     """How often a sensor reads, Hz; the IMU at every physics step."""
 
     magnetometer: float = 50.0
@@ -56,12 +56,14 @@ class Rates:
     gps: float = 10.0
 
 
-class Sensors:
+class HilSensors:
     """One vehicle's sensors. Everything comes from its generator, so a run can be had again."""
 
-    def __init__(self, noise: SensorNoise, rng: np.random.Generator, period: float, rates: Rates | None = None) -> None:
+    def __init__(
+        self, noise: SensorNoise, rng: np.random.Generator, period: float, rates: SensorRates | None = None
+    ) -> None:
         """period: s between two readings of the IMU."""
-        rates = rates or Rates()
+        rates = rates or SensorRates()
         self.noise, self._rng = noise, rng
         self._every = [round(1.0 / rate / period) for rate in (rates.magnetometer, rates.barometer, rates.gps)]
         n = noise

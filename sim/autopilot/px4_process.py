@@ -13,7 +13,7 @@ import time
 from pathlib import Path
 
 from brakeline.messaging.free_ports import free_udp_port
-from brakeline.sim.flight_controller import GRAVITY, Body
+from brakeline.sim.flight_controller import GRAVITY, Airframe
 
 AIRFRAME = "none_iris"  # the one of PX4's own that expects its simulator at a TCP port
 FIRST_PORT = 4560  # of the simulator of instance 0; PX4's scripts add the instance
@@ -24,7 +24,7 @@ TRACES = ("px4-sock-{}", "px4_lock-{}")  # files of an instance in the folder fo
 STARTS_IN = 30.0  # s until it must have connected
 ALIAS = re.compile(r"^alias (\w+)='px4-", re.MULTILINE)
 
-BODY = Body()
+BODY = Airframe()
 ARM, TORQUE = BODY.arm, BODY.rotor_torque
 
 # What PX4 must know of the vehicle in sim/quadrotor.xml, and of a companion that sends velocities
@@ -51,7 +51,7 @@ class Px4Error(RuntimeError):
     """There is no PX4 in that folder, or it did not start."""
 
 
-class Px4:
+class Px4Process:
     """A running PX4. It sends MAVLink to `127.0.0.1:remote` from `local`, and waits for sensors on `connection`."""
 
     def __init__(self, folder: Path, remote: int, parameters: dict[str, float] | None = None) -> None:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from brakeline.sim.autopilot import ned_frames
 from brakeline.sim.autopilot.common_dialect import mavlink
-from brakeline.sim.autopilot.flight_modes import Landed, Pilot
+from brakeline.sim.autopilot.flight_modes import FlightStateMachine, LandedState
 from brakeline.sim.flight_estimator import Estimate
 from brakeline.sim.lidar import Lidar
 
@@ -31,10 +31,10 @@ VOLTAGE, CHARGE = 16.2, 100  # V, %: the battery is no part of the simulation
 MILLIGRAVITY = 9.80665e-3  # m/s²
 NO_COVARIANCE = [math.nan, *[0.0] * 20]
 LANDED = {
-    Landed.ON_GROUND: mavlink.MAV_LANDED_STATE_ON_GROUND,
-    Landed.TAKING_OFF: mavlink.MAV_LANDED_STATE_TAKEOFF,
-    Landed.IN_AIR: mavlink.MAV_LANDED_STATE_IN_AIR,
-    Landed.LANDING: mavlink.MAV_LANDED_STATE_LANDING,
+    LandedState.ON_GROUND: mavlink.MAV_LANDED_STATE_ON_GROUND,
+    LandedState.TAKING_OFF: mavlink.MAV_LANDED_STATE_TAKEOFF,
+    LandedState.IN_AIR: mavlink.MAV_LANDED_STATE_IN_AIR,
+    LandedState.LANDING: mavlink.MAV_LANDED_STATE_LANDING,
 }
 Message = Any  # pymavlink is untyped
 
@@ -55,10 +55,10 @@ def obstacle_bins(ranges: NDArray[np.float64], directions: NDArray[np.float64], 
     return [int(value) for value in np.where(bins == UNKNOWN, between, bins)]
 
 
-class Reports:
+class TelemetryBuilder:
     """Builds messages about one vehicle; `BUILDERS` has them by message id."""
 
-    def __init__(self, pilot: Pilot, lidar: Lidar | None) -> None:
+    def __init__(self, pilot: FlightStateMachine, lidar: Lidar | None) -> None:
         self._pilot, self._lidar = pilot, lidar
         self._estimate: tuple[float, Estimate] | None = None  # the time it is of
 
@@ -105,13 +105,13 @@ class Reports:
         return mavlink.MAVLink_attitude_quaternion_message(self.milliseconds, *q, *rates)
 
     def local_position_ned(self) -> Message:
-        position, velocity = self._pilot.vehicle.seen()
+        position, velocity = self._pilot.vehicle.position_and_velocity()
         return mavlink.MAVLink_local_position_ned_message(
             self.milliseconds, *ned_frames.world(position), *ned_frames.world(velocity)
         )
 
     def global_position_int(self) -> Message:
-        position, velocity = self._pilot.vehicle.seen()
+        position, velocity = self._pilot.vehicle.position_and_velocity()
         latitude, longitude, altitude = ned_frames.globe(position)
         vx, vy, vz = (round(100.0 * v) for v in ned_frames.world(velocity))
         heading = math.degrees(ned_frames.yaw(ned_frames.heading(self.estimate.attitude))) % 360.0
@@ -122,7 +122,7 @@ class Reports:
         )  # fmt: skip
 
     def gps_raw_int(self) -> Message:
-        position, velocity = self._pilot.vehicle.seen()
+        position, velocity = self._pilot.vehicle.position_and_velocity()
         latitude, longitude, altitude = ned_frames.globe(position)
         speed = round(100.0 * math.hypot(velocity[0], velocity[1]))
         return mavlink.MAVLink_gps_raw_int_message(
@@ -145,7 +145,7 @@ class Reports:
 
     def odometry(self) -> Message:
         """Position in NED, velocity along the body's axes, as PX4 sends them."""
-        position, velocity = self._pilot.vehicle.seen()
+        position, velocity = self._pilot.vehicle.position_and_velocity()
         q = ned_frames.attitude(self.estimate.attitude)
         along = ned_frames.into_body(q, ned_frames.world(velocity))
         return mavlink.MAVLink_odometry_message(
@@ -154,7 +154,7 @@ class Reports:
         )  # fmt: skip
 
     def vfr_hud(self) -> Message:
-        position, velocity = self._pilot.vehicle.seen()
+        position, velocity = self._pilot.vehicle.position_and_velocity()
         heading = round(math.degrees(ned_frames.yaw(ned_frames.heading(self.estimate.attitude)))) % 360
         speed = math.hypot(velocity[0], velocity[1])
         throttle = 50 if self._pilot.vehicle.flying else 0
@@ -190,22 +190,22 @@ class Reports:
         return mavlink.MAVLink_autopilot_version_message(capabilities, 1 << 24, 0, 0, 0, none, none, none, 0, 0, 1)
 
 
-BUILDERS: dict[int, Callable[[Reports], Message | None]] = {
-    mavlink.MAVLINK_MSG_ID_SYS_STATUS: Reports.sys_status,
-    mavlink.MAVLINK_MSG_ID_BATTERY_STATUS: Reports.battery_status,
-    mavlink.MAVLINK_MSG_ID_EXTENDED_SYS_STATE: Reports.extended_sys_state,
-    mavlink.MAVLINK_MSG_ID_ATTITUDE: Reports.attitude,
-    mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION: Reports.attitude_quaternion,
-    mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED: Reports.local_position_ned,
-    mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT: Reports.global_position_int,
-    mavlink.MAVLINK_MSG_ID_GPS_RAW_INT: Reports.gps_raw_int,
-    mavlink.MAVLINK_MSG_ID_HIGHRES_IMU: Reports.highres_imu,
-    mavlink.MAVLINK_MSG_ID_SCALED_IMU: Reports.scaled_imu,
-    mavlink.MAVLINK_MSG_ID_ODOMETRY: Reports.odometry,
-    mavlink.MAVLINK_MSG_ID_VFR_HUD: Reports.vfr_hud,
-    mavlink.MAVLINK_MSG_ID_HOME_POSITION: Reports.home_position,
-    mavlink.MAVLINK_MSG_ID_OBSTACLE_DISTANCE: Reports.obstacle_distance,
-    mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION: Reports.autopilot_version,
+BUILDERS: dict[int, Callable[[TelemetryBuilder], Message | None]] = {
+    mavlink.MAVLINK_MSG_ID_SYS_STATUS: TelemetryBuilder.sys_status,
+    mavlink.MAVLINK_MSG_ID_BATTERY_STATUS: TelemetryBuilder.battery_status,
+    mavlink.MAVLINK_MSG_ID_EXTENDED_SYS_STATE: TelemetryBuilder.extended_sys_state,
+    mavlink.MAVLINK_MSG_ID_ATTITUDE: TelemetryBuilder.attitude,
+    mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION: TelemetryBuilder.attitude_quaternion,
+    mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED: TelemetryBuilder.local_position_ned,
+    mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT: TelemetryBuilder.global_position_int,
+    mavlink.MAVLINK_MSG_ID_GPS_RAW_INT: TelemetryBuilder.gps_raw_int,
+    mavlink.MAVLINK_MSG_ID_HIGHRES_IMU: TelemetryBuilder.highres_imu,
+    mavlink.MAVLINK_MSG_ID_SCALED_IMU: TelemetryBuilder.scaled_imu,
+    mavlink.MAVLINK_MSG_ID_ODOMETRY: TelemetryBuilder.odometry,
+    mavlink.MAVLINK_MSG_ID_VFR_HUD: TelemetryBuilder.vfr_hud,
+    mavlink.MAVLINK_MSG_ID_HOME_POSITION: TelemetryBuilder.home_position,
+    mavlink.MAVLINK_MSG_ID_OBSTACLE_DISTANCE: TelemetryBuilder.obstacle_distance,
+    mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION: TelemetryBuilder.autopilot_version,
 }
 
 
@@ -215,7 +215,7 @@ class Stream:
     due: float  # s, when it is to be sent next
 
 
-class Schedule:
+class StreamSchedule:
     """Which messages are due. Times are multiples of the autopilot's tick, but for rounding: half a tick is allowed."""
 
     def __init__(self, tick: float) -> None:

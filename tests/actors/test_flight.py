@@ -11,7 +11,7 @@ from brakeline.deploy.experiments.evaluate import in_process
 from brakeline.messaging.obstacle import Obstacle
 from brakeline.safety.model.model_config import ModelConfig
 from brakeline.sim.arena import Arena, staged_arena
-from brakeline.sim.delayed_vehicle import late
+from brakeline.sim.delayed_vehicle import delayed
 from brakeline.sim.navigation_env import NavigationEnv
 from brakeline.sim.quadrotor import Quadrotor
 from tests.accepting import BOUND
@@ -46,7 +46,7 @@ def test_in_real_time_a_way_out_is_gone_on_with_period_after_period() -> None:
     """Not every other one: a real vehicle does not answer to velocities that last for a period."""
     robot = QUADROTOR.in_real_time()
     question = in_process(model_for(robot, ModelConfig(), BOUND), BOUND)
-    make = late(Quadrotor, robot)
+    make = delayed(Quadrotor, robot)
     env = NavigationEnv(
         robot, "default", make, draw=lambda *_: staged_arena(start=(0.0, 0.0, 3.0), goal=(-4.0, -4.0, 3.0), height=6.0)
     )

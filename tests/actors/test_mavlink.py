@@ -43,7 +43,7 @@ def test_in_lockstep_it_takes_control_before_time_begins(rules: str) -> None:
     vehicle = LockstepQuadrotor(autopilot, QUADROTOR)
     assert autopilot.pilot.time == 0.0
     assert autopilot.pilot.mode is Mode.OFFBOARD
-    assert vehicle.standing().clearance > 9.0
+    assert vehicle.initial_period().clearance > 9.0
 
 
 @pytest.mark.parametrize("rules, name, value", [("px4", "COM_OBL_RC_ACT", 4), ("ardupilot", "LAND_SPEED", 50)])

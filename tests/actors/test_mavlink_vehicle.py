@@ -37,7 +37,7 @@ def live(request: pytest.FixtureRequest) -> Iterator[Live]:
     link, stop, frames = open_link("udpin:127.0.0.1:0"), threading.Event(), list[CapturedFrame]()
     truth_port = free_udp_port()
     autopilot = Autopilot(quadrotor(floor=0.02), request.param, parameters={TIMEOUT[request.param]: 1.0})
-    channel = autopilot_server.Truth("127.0.0.1", truth_port)
+    channel = autopilot_server.TruthSender("127.0.0.1", truth_port)
     thread = threading.Thread(
         target=autopilot_server.serve, args=([autopilot], link, WallClock(), stop.is_set, channel)
     )

@@ -8,7 +8,7 @@ import pytest
 from benchmarks import perception_cost
 from brakeline.deploy.experiments.evaluate import Evaluation, episode, prepared
 from brakeline.logs.episode_stats import KINDS
-from brakeline.sim.sim_conditions import Conditions, Faults, Perception
+from brakeline.sim.sim_conditions import Conditions, Perception, SensorFaults
 from tests.accepting import BOUND
 from tests.robots import QUADROTOR
 
@@ -24,7 +24,11 @@ def test_a_scan_weighs_kilobytes_and_a_map_hundreds_of_bytes(data_folder, monkey
     assert all(row["answer p50 ms"] > 0.0 and row["reply p50 B"] > 200 for row in figures.values())
 
 
-FAULTS = {"whole": Faults(), "ailing": Faults(dropped=0.1, ghosts=0.01, late=1), "blind": Faults(blind=1.0)}
+FAULTS = {
+    "whole": SensorFaults(),
+    "ailing": SensorFaults(dropped=0.1, ghosts=0.01, late=1),
+    "blind": SensorFaults(blind=1.0),
+}
 
 
 @pytest.mark.parametrize("faults", FAULTS)

@@ -157,7 +157,7 @@ def test_clearance_is_measured_from_the_discs_that_hold_the_body(heading: float,
     made = robot("car").task.code(robot("car").task.simulator)(Conditions(NoiseLevels(scale=0.0)), None)
     wall = Obstacle(BOX, (0.0, 0.35), (4.0, 0.1))
     vehicle = made(staged_arena(wall, start=(0.0, 0.0, heading)), np.random.default_rng(0))
-    for period in (vehicle.standing(), vehicle.step(np.zeros(2))):
+    for period in (vehicle.initial_period(), vehicle.step(np.zeros(2))):
         assert period.closest == pytest.approx(0.3 - nose - 0.155, abs=1e-3)
         assert period.clearance == pytest.approx(period.closest, abs=1e-3) and not period.collision
 

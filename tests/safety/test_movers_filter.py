@@ -13,14 +13,14 @@ from brakeline.safety.filter.filter import Filter
 from brakeline.safety.filter.request import ADJUSTED, ALLOWED, FAILSAFE, BadRequest
 from brakeline.safety.service.client import obstacle_messages
 from brakeline.safety.service.wire import obstacles_of
-from brakeline.sim.arena import closing
-from brakeline.sim.traffic import Crowd, MoverKind, Watch
+from brakeline.sim.arena import room_boundary
+from brakeline.sim.traffic import Crowd, CrowdSensor, MoverKind
 from tests.robots import GROUND
 from tests.safety.asked import request, same
 from tests.safety.unicycle import Unicycle
 
 KIND = MoverKind(count=(6, 6), radius=0.2, speed=1.0, acceleration=1.0, keep=0.5)
-ROOM = closing(1.5, None)
+ROOM = room_boundary(1.5, None)
 PLACES = np.array([[1.0, 0.0], [-1.0, 0.5], [0.0, 1.0], [0.5, -1.0], [-0.9, -0.9], [1.0, 1.0]])
 STANDING = 0.02  # m/s
 DT = GROUND.period / 10
@@ -130,7 +130,7 @@ def contacts(ready, policy, seed, sees=True, steps=300):
     """(touched while moving, touched while standing), judged by the discs at every substep."""
     crowd = Crowd(KIND, PLACES, Shapes.of(ROOM, 2), seed)
     rng = np.random.default_rng(seed)
-    robot, watch, kept = Unicycle((0.0, 0.0, 0.0), rng), Watch(crowd, rng), BackupPlan(GROUND)
+    robot, watch, kept = Unicycle((0.0, 0.0, 0.0), rng), CrowdSensor(crowd, rng), BackupPlan(GROUND)
     moving = standing = 0
     touching = False
     for k in range(steps):

@@ -42,7 +42,7 @@ class PointMass:
         closest, clearance = surfaces.min() - QUADROTOR.footprint, surfaces[-1] - QUADROTOR.footprint
         return Period(self.measured, self.true, bool(surfaces.min() < BODY), closest, clearance, path - start, 0.0)
 
-    def standing(self) -> Period:
+    def initial_period(self) -> Period:
         clearance = float(self.arena.shapes.distance(self.true[:3]).min()) - QUADROTOR.footprint
         return Period(self.measured, self.true, False, clearance, clearance, np.zeros((SAMPLES, 3)), 0.0)
 

@@ -11,7 +11,7 @@ from brakeline.messaging.obstacle import Obstacle
 from brakeline.sim.arena import Arena, staged_arena
 from brakeline.sim.autopilot.common_dialect import mavlink
 from brakeline.sim.autopilot.endpoint import Autopilot
-from brakeline.sim.autopilot.flight_modes import Landed
+from brakeline.sim.autopilot.flight_modes import LandedState
 from brakeline.sim.flight_estimator import QuadrotorNoise
 from brakeline.sim.quadrotor import Quadrotor
 
@@ -92,4 +92,4 @@ class Station:
             assert self.command(ARM, 1) == ACCEPTED
             assert self.command(TAKEOFF, *[0.0] * 6, 3.0) == ACCEPTED
             self.wait(6.0)
-        assert self.pilot.landed is Landed.IN_AIR
+        assert self.pilot.landed is LandedState.IN_AIR

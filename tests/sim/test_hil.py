@@ -15,9 +15,9 @@ import pytest
 from brakeline.sim.arena import Arena, staged_arena
 from brakeline.sim.autopilot import ned_frames
 from brakeline.sim.autopilot.common_dialect import mavlink
-from brakeline.sim.autopilot.hil_link import AutopilotGone, Hil
-from brakeline.sim.autopilot.hil_sensors import DECLINATION, INCLINATION, SensorNoise, Sensors
-from brakeline.sim.autopilot.px4_process import Px4, Px4Error
+from brakeline.sim.autopilot.hil_link import AutopilotGone, HilLink
+from brakeline.sim.autopilot.hil_sensors import DECLINATION, INCLINATION, HilSensors, SensorNoise
+from brakeline.sim.autopilot.px4_process import Px4Error, Px4Process
 from brakeline.sim.flight_controller import GRAVITY
 from brakeline.sim.flight_estimator import Estimate, QuadrotorNoise
 from brakeline.sim.quadrotor import Quadrotor
@@ -30,7 +30,7 @@ def field() -> Arena:
 
 
 def told(truth: Estimate, scale: float = 0.0, readings: int = 1) -> list[Any]:
-    sensors = Sensors(SensorNoise(scale=scale), np.random.default_rng(0), 0.005)
+    sensors = HilSensors(SensorNoise(scale=scale), np.random.default_rng(0), 0.005)
     return [m for i in range(readings) for m in sensors.read(truth, truth.position, 5000 * (i + 1))]
 
 
@@ -71,12 +71,12 @@ def test_errors_are_as_large_as_is_said_and_come_from_the_seed() -> None:
 
 
 @contextmanager
-def stand_in(share: float = HOVER, lockstep: int = 1, answers: float = math.inf) -> Iterator[tuple[Hil, list[int]]]:
+def stand_in(share: float = HOVER, lockstep: int = 1, answers: float = math.inf) -> Iterator[tuple[HilLink, list[int]]]:
     """A simulator's end, and the times that an autopilot at its other end has heard; that one answers every IMU reading
     with the same share of full thrust, so many times."""
     ours, theirs = socket.socketpair()
     vehicle = Quadrotor(field(), np.random.default_rng(0), QuadrotorNoise(scale=0.0))
-    hil = Hil(ours, vehicle, Sensors(SensorNoise(), np.random.default_rng(0), vehicle.timestep))
+    hil = HilLink(ours, vehicle, HilSensors(SensorNoise(), np.random.default_rng(0), vehicle.timestep))
     heard: list[int] = []
 
     def answer() -> None:
@@ -125,4 +125,4 @@ def test_an_autopilot_without_lockstep_or_without_answers_is_an_error(monkeypatc
 
 def test_a_folder_without_px4_is_said_to_hold_none(tmp_path: Any) -> None:
     with pytest.raises(Px4Error, match="holds no PX4"):
-        Px4(tmp_path, 14540)
+        Px4Process(tmp_path, 14540)

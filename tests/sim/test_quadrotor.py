@@ -12,7 +12,7 @@ from brakeline.sim.flight_controller import FlightController, VelocityAxis
 from brakeline.sim.flight_estimator import QuadrotorNoise
 from brakeline.sim.quadrotor import MODEL, SAMPLES, Quadrotor
 from brakeline.sim.vehicle import BadInput
-from brakeline.sim.wind import Air, Wind
+from brakeline.sim.wind import Wind, WindProcess
 from tests.robots import QUADROTOR
 
 QUIET = QuadrotorNoise(scale=0.0)
@@ -35,8 +35,8 @@ def quadrotor(seed: int = 0, noise: QuadrotorNoise = QUIET, wind: Wind | None = 
 def test_it_starts_hovering_at_the_start() -> None:
     vehicle = quadrotor()
     assert np.abs(vehicle.true - [0, 0, 500, *[0] * 6]).max() < 1e-3
-    assert not vehicle.standing().collision
-    assert vehicle.standing().clearance == pytest.approx(500.0 - QUADROTOR.footprint, abs=1e-3)
+    assert not vehicle.initial_period().collision
+    assert vehicle.initial_period().clearance == pytest.approx(500.0 - QUADROTOR.footprint, abs=1e-3)
 
 
 @pytest.mark.parametrize("setpoint", [(5, 5, 5), (-5, 5, -5), (5, -5, 0), (0, 0, 5)])
@@ -147,7 +147,7 @@ def test_wind_is_leant_against() -> None:
 
 
 def test_gusts_have_their_spread_and_their_cut() -> None:
-    air = Air(Wind(speed=2.0, direction=0.0, gust=1.5, correlation=0.5), np.random.default_rng(0), 0.05)
+    air = WindProcess(Wind(speed=2.0, direction=0.0, gust=1.5, correlation=0.5), np.random.default_rng(0), 0.05)
     course = []
     for _ in range(20000):
         air.advance()

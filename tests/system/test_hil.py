@@ -25,9 +25,9 @@ from brakeline.deploy.run.autopilot_run import PAD, open_field
 from brakeline.messaging.obstacle import CYLINDER, Obstacle
 from brakeline.messaging.task import robot_with_task
 from brakeline.sim.autopilot import ned_frames
-from brakeline.sim.autopilot.hil_link import Hil
-from brakeline.sim.autopilot.hil_sensors import SensorNoise, Sensors
-from brakeline.sim.autopilot.px4_process import Px4
+from brakeline.sim.autopilot.hil_link import HilLink
+from brakeline.sim.autopilot.hil_sensors import HilSensors, SensorNoise
+from brakeline.sim.autopilot.px4_process import Px4Process
 from brakeline.sim.quadrotor import Quadrotor
 from tests.system.runs import BRAKELINE
 from tests.waiting import until
@@ -44,7 +44,7 @@ pytestmark = pytest.mark.skipif(not (PX4 / "etc").is_dir(), reason="no PX4: neit
 class Flight:
     """A client that flies PX4 over UDP; time passes only in `run`."""
 
-    def __init__(self, hil: Hil, link: socket.socket, port: int) -> None:
+    def __init__(self, hil: HilLink, link: socket.socket, port: int) -> None:
         self.hil, self.link = hil, link
         self.client = AutopilotClient(lambda data: link.sendto(data, ("127.0.0.1", port)), tap=self.hear)
         self.begins: np.ndarray | None = None  # its local frame, as it says itself, m, ENU
@@ -106,13 +106,13 @@ def flight() -> Iterator[Flight]:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as link:
         link.bind(("127.0.0.1", 0))
         link.setblocking(False)
-        px4 = Px4(PX4, link.getsockname()[1])
+        px4 = Px4Process(PX4, link.getsockname()[1])
         try:
             field = open_field()
             arena = replace(field, obstacles=(POST, *field.obstacles))
             rng = np.random.default_rng(0)
             vehicle = Quadrotor(arena, rng, QUIET, floor=PAD)
-            hil = Hil(px4.connection, vehicle, Sensors(SensorNoise(), rng, vehicle.timestep))
+            hil = HilLink(px4.connection, vehicle, HilSensors(SensorNoise(), rng, vehicle.timestep))
             yield Flight(hil, link, px4.local)
         finally:
             px4.close()

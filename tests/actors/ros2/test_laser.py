@@ -13,7 +13,7 @@ from brakeline.messaging.obstacle import Shapes
 from brakeline.messaging.ray_directions import Rays
 from brakeline.messaging.ros2.cdr_messages import LaserScan, header
 from brakeline.sim.arena_generator import draw_arena
-from brakeline.sim.ground_realtime import TurningLidar
+from brakeline.sim.ground_realtime import SpinningLidar
 from brakeline.sim.lidar import Lidar
 from tests.robots import GROUND
 
@@ -56,7 +56,7 @@ def test_what_is_seen_in_random_rooms_is_inside_whatever_the_errors():
     while looked < 40:
         arena = draw_arena("dense", rng, GROUND)
         close = Lidar(arena, dense)
-        lidar = TurningLidar(arena, rng, 0.0, nearest=0.0)
+        lidar = SpinningLidar(arena, rng, 0.0, nearest=0.0)
         for _ in range(30):
             place = rng.uniform(-2.3, 2.3, 2)
             clear = float(arena.shapes.distance(place).min()) - GROUND.footprint

@@ -11,8 +11,8 @@ from brakeline.actors.mavlink.mavlink_vehicle import ControlPeriod
 from brakeline.deploy.data.first_flight import LEVELS, Box, Maiden, homeward, stretch
 from brakeline.safety.model.dataset import Dataset
 from brakeline.safety.model.windows import PLAN, windows
-from brakeline.sim.quadrotor import SAMPLES, slewed
-from brakeline.sim.vehicle import Period
+from brakeline.sim.quadrotor import SAMPLES
+from brakeline.sim.vehicle import Period, clip_input
 from tests.robots import QUADROTOR
 
 LATE = QUADROTOR.in_real_time()
@@ -31,7 +31,7 @@ class Sluggish:
         self.current_period = ControlPeriod(0, np.zeros(3), self._report(np.zeros((SAMPLES, 3))))
 
     def commit(self, plan: np.ndarray, number: int) -> bool:
-        self.plan = [slewed(row, row) for row in plan]
+        self.plan = [clip_input(QUADROTOR, row, row) for row in plan]
         return True
 
     def wait(self, number: int) -> ControlPeriod:
@@ -51,7 +51,9 @@ class Sluggish:
         self.fastest = max(self.fastest, float(np.abs(self.velocity).max()))
         following = self.plan.pop(0) if self.plan else np.zeros(3)
         self.current_period = ControlPeriod(
-            self.current_period.number + 1, slewed(following, self.current_period.input), self._report(np.array(path))
+            self.current_period.number + 1,
+            clip_input(QUADROTOR, following, self.current_period.input),
+            self._report(np.array(path)),
         )
 
     def _report(self, path: np.ndarray) -> Period:

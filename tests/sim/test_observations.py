@@ -7,9 +7,9 @@ from brakeline.messaging.obstacle import CYLINDER, Obstacle
 from brakeline.messaging.policy_weights import MLP, BadWeights, decode
 from brakeline.messaging.robot import FOLDER, robot_named
 from brakeline.messaging.task import MoverKind, RobotWithTask, UnknownTask, address, read, robot_with_task
-from brakeline.sim.arena import alike, staged_arena
+from brakeline.sim.arena import same_room, staged_arena
 from brakeline.sim.lidar import Lidar
-from brakeline.sim.observations import AirSenses, GroundSenses, TrackingSenses, TurnMemory
+from brakeline.sim.observations import GroundObservation, QuadrotorObservation, TrackingObservation, TurnMemory
 from brakeline.sim.shared_world import FleetEnv
 from brakeline.sim.traffic import Crowd
 from tests.robots import GROUND, QUADROTOR
@@ -21,7 +21,7 @@ def test_the_ground_robots_observation_is_in_the_documented_order() -> None:
     arena = staged_arena(Obstacle(CYLINDER, (1.0, 0.5), (0.3,)), goal=(-1.0, 2.0))
     true, measured = np.array([0.0, 0.0, 0.5, 0.1, 0.2]), np.array([0.01, -0.01, 0.51, 0.11, 0.19])
     input = np.array([0.2, -0.3])
-    senses = GroundSenses(GROUND, arena, RNG, 0.0)
+    senses = GroundObservation(GROUND, arena, RNG, 0.0)
     observation = senses.observe(true, measured, input)
     named = dict(zip(GROUND.task.observed, observation.tolist(), strict=True))
     offset = np.array(arena.goal) - measured[:2]
@@ -45,7 +45,7 @@ def test_the_quadrotors_observation_is_in_the_documented_order() -> None:
     true = np.array([0.0, 0.0, 4.0, 1.0, 2.0, -2.0, 0.1, 0.2, 0.3])
     measured = true + 0.02
     input = np.array([1.0, -3.0, 5.0])
-    senses = AirSenses(QUADROTOR, arena, RNG, 0.0)
+    senses = QuadrotorObservation(QUADROTOR, arena, RNG, 0.0)
     observation = senses.observe(true, measured, input)
     assert len(observation) == QUADROTOR.task.observation_dim == 189
     named = dict(zip(QUADROTOR.task.observed, observation.tolist(), strict=True))
@@ -70,7 +70,7 @@ TRACKS = read(FOLDER / "ground+tracks.task.toml")
 
 
 def test_tracks_say_where_something_is_and_where_it_passes() -> None:
-    senses = TrackingSenses(GROUND, staged_arena(), RNG, 0.0)
+    senses = TrackingObservation(GROUND, staged_arena(), RNG, 0.0)
     facing_up = np.array([1.0, 1.0, 0.5 * np.pi, 0.0, 0.0])
     # 2 m ahead and 0.3 m to the left, coming straight back at 1 m/s; one that stands 1 m to the right; one too far off
     places, paces = np.array([[0.7, 3.0], [2.0, 1.0], [1.0, -4.0]]), np.array([[0.0, -1.0], [0.0, 0.0], [0.0, 1.0]])
@@ -95,10 +95,10 @@ def test_what_follows_the_rays_is_the_usual_tasks_and_then_tracks() -> None:
     usual = GROUND.task
     assert TRACKS.observed[: usual.observation_dim] == usual.observed and TRACKS.arenas == usual.arenas
     kind = MoverKind((1, 1), 0.2, 1.2, 1.0, 1.0)
-    arena = alike(staged_arena(), crowd=Crowd(kind, np.array([[2.0, 0.0]]), staged_arena().shapes, 0))
+    arena = same_room(staged_arena(), crowd=Crowd(kind, np.array([[2.0, 0.0]]), staged_arena().shapes, 0))
     state, input = np.zeros(5), np.zeros(2)
-    told = TrackingSenses(GROUND, arena, np.random.default_rng(0), 0.0).observe(state, state, input, 0.0)
-    seen = GroundSenses(GROUND, arena, np.random.default_rng(0), 0.0).observe(state, state, input, 0.0)
+    told = TrackingObservation(GROUND, arena, np.random.default_rng(0), 0.0).observe(state, state, input, 0.0)
+    seen = GroundObservation(GROUND, arena, np.random.default_rng(0), 0.0).observe(state, state, input, 0.0)
     assert np.array_equal(told[: len(seen)], seen) and len(told) == TRACKS.observation_dim
     assert told[len(seen)] == pytest.approx(1.0 - 2.0 / 3.5, abs=0.02) and not told[len(seen) + 6 :].any()
 

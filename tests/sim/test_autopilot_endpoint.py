@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from brakeline.sim.autopilot.common_dialect import mavlink
-from brakeline.sim.autopilot.flight_modes import Landed, Mode
+from brakeline.sim.autopilot.flight_modes import LandedState, Mode
 from tests.sim.station import (
     ACCEPTED,
     ARM,
@@ -48,9 +48,9 @@ def test_it_takes_off_lands_and_disarms(flying: Station) -> None:
     assert flying.command(ARM, 0) == flying.autopilot.rules.refusal  # not in the air
     assert flying.command(LAND) == ACCEPTED
     flying.wait(1.0)
-    assert flying.pilot.landed is Landed.LANDING
+    assert flying.pilot.landed is LandedState.LANDING
     flying.wait(10.0)
-    assert flying.pilot.landed is Landed.ON_GROUND and not flying.pilot.armed
+    assert flying.pilot.landed is LandedState.ON_GROUND and not flying.pilot.armed
     assert not flying.autopilot.vehicle.collided
     assert "Landing detected" in flying.texts()
 

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from brakeline.sim.arena import staged_arena
-from brakeline.sim.arena_generator import arena_kind, draw_arena, tour
-from brakeline.sim.delayed_vehicle import late
+from brakeline.sim.arena_generator import arena_kind, draw_arena, goal_sequence
+from brakeline.sim.delayed_vehicle import delayed
 from brakeline.sim.quadrotor import Quadrotor
-from brakeline.sim.quadrotor_policies import MapPilot
+from brakeline.sim.quadrotor_policies import QuadrotorRoutePolicy
 from brakeline.sim.vehicle import BadInput
 from tests.robots import GROUND, QUADROTOR
 
@@ -17,16 +17,16 @@ ROBOT = QUADROTOR.in_real_time()
 def test_each_input_is_carried_out_a_period_after_it_was_given() -> None:
     arena = staged_arena(start=(0.0, 0.0, 50.0), goal=(9.0, 9.0, 50.0), half_width=100.0, height=100.0)
     at_once = Quadrotor(arena, np.random.default_rng(3))
-    delayed = late(Quadrotor, ROBOT)(arena, np.random.default_rng(3))
+    late_vehicle = delayed(Quadrotor, ROBOT)(arena, np.random.default_rng(3))
     inputs = [*np.random.default_rng(4).uniform(-5.0, 5.0, (10, 3))]
     for executed, given in zip([np.zeros(3), *inputs[:-1]], inputs, strict=True):
-        period, expected = delayed.step(given), at_once.step(executed)
+        period, expected = late_vehicle.step(given), at_once.step(executed)
         assert period.true == pytest.approx(expected.true, abs=1e-12)
         assert period.measured == pytest.approx(expected.measured, abs=1e-12)
-        assert (np.abs(delayed.input - at_once.input) <= 0.8 + 1e-12).all(), "within the slew"
-        assert (np.abs(delayed.input - given) <= np.abs(at_once.input - given) + 1e-12).all(), "on the way to it"
+        assert (np.abs(late_vehicle.input - at_once.input) <= 0.8 + 1e-12).all(), "within the slew"
+        assert (np.abs(late_vehicle.input - given) <= np.abs(at_once.input - given) + 1e-12).all(), "on the way to it"
     with pytest.raises(BadInput):
-        delayed.step(np.array([np.nan, 0.0, 0.0]))
+        late_vehicle.step(np.array([np.nan, 0.0, 0.0]))
 
 
 def test_a_late_robot_has_the_same_body_senses_and_arenas() -> None:
@@ -37,7 +37,7 @@ def test_a_late_robot_has_the_same_body_senses_and_arenas() -> None:
 @pytest.mark.parametrize("robot", [GROUND, ROBOT], ids=lambda robot: robot.name)
 def test_a_tour_leads_from_goal_to_goal(robot) -> None:  # type: ignore[no-untyped-def]
     arena, kind = draw_arena("default", np.random.default_rng(5), robot), arena_kind(robot, "default")
-    stages = tour(arena, 6, np.random.default_rng(6), robot)
+    stages = goal_sequence(arena, 6, np.random.default_rng(6), robot)
     start = arena.start[: arena.dim]
     for stage in stages:
         assert stage.start == start and stage.obstacles == arena.obstacles
@@ -52,6 +52,6 @@ def test_a_pilot_that_is_prepared_proposes_the_same() -> None:
     arena = draw_arena("default", np.random.default_rng(7), QUADROTOR)
     state = np.array([*arena.start, *np.zeros(6)])
     info = {"arena": arena, "goal": arena.goal, "state": state, "input_in_force": np.zeros(3)}
-    pilot, ready = (MapPilot(ROBOT, np.random.default_rng(0)) for _ in range(2))
+    pilot, ready = (QuadrotorRoutePolicy(ROBOT, np.random.default_rng(0)) for _ in range(2))
     ready.prepare(arena)
     assert (pilot(np.zeros(0, np.float32), info) == ready(np.zeros(0, np.float32), info)).all()

@@ -9,7 +9,7 @@ from brakeline.messaging.obstacle import BOX, CYLINDER, Obstacle
 from brakeline.sim.arena import Arena, staged_arena
 from brakeline.sim.navigation_env import NavigationEnv
 from brakeline.sim.quadrotor import Quadrotor
-from brakeline.sim.quadrotor_policies import CarefulPilot, MapPilot, StopModel, full_speed
+from brakeline.sim.quadrotor_policies import QuadrotorCarefulPolicy, QuadrotorRoutePolicy, StopPrediction, full_speed
 from brakeline.sim.scripted_policies import scripted
 from tests.robots import QUADROTOR
 from tests.sim.kinematic import PointMass
@@ -90,7 +90,7 @@ def test_predicted_stops_are_those_of_the_quadrotor() -> None:
     top = np.array([5.0, -5.0, 2.0])
     for k in range(12):
         vehicle.step(np.clip(0.8 * k, -np.abs(top), np.abs(top)) * np.sign(top))
-    predicted = StopModel(QUADROTOR)(vehicle.true[:3], vehicle.true[3:6], top[None])[0]
+    predicted = StopPrediction(QUADROTOR)(vehicle.true[:3], vehicle.true[3:6], top[None])[0]
     flown = []
     for fraction in QUADROTOR.schedule()[::3, 0]:
         vehicle.step(top * fraction)
@@ -108,11 +108,11 @@ def staged_info(
 def test_it_brakes_in_time_for_what_it_cannot_pass_at_speed() -> None:
     wall = Obstacle(BOX, (0.0, 0.0, 4.5), (1.0, 30.0, 9.0))  # a metre is left above it
     arena = staged_arena(wall, start=(-12.0, 0.0, 2.0), goal=(12.0, 0.0, 2.0), half_width=15.0, height=12.0)
-    pilot = MapPilot(QUADROTOR, np.random.default_rng(0))
+    pilot = QuadrotorRoutePolicy(QUADROTOR, np.random.default_rng(0))
     assert pilot(BLIND, staged_info(arena, (-12.0, 0.0, 2.0), (4.0, 0.0, 0.0)))[0] > 4.0
     assert pilot(BLIND, staged_info(arena, (-5.0, 0.0, 2.0), (5.0, 0.0, 0.0)))[0] < 5.0
     vehicle = PointMass(arena, np.random.default_rng(0))
-    pilot = MapPilot(QUADROTOR, np.random.default_rng(0))
+    pilot = QuadrotorRoutePolicy(QUADROTOR, np.random.default_rng(0))
     for k in range(80):
         info = {"arena": arena, "goal": arena.goal, "state": vehicle.measured, "input_in_force": vehicle.input}
         assert not vehicle.step(pilot(BLIND, info | {"time": 0.2 * k})).collision
@@ -124,11 +124,13 @@ def test_it_brakes_in_time_for_what_it_cannot_pass_at_speed() -> None:
 def test_it_gets_out_of_a_place_without_room() -> None:
     pillar = Obstacle(CYLINDER, (0.0, 0.0, 5.0), (1.0, 10.0))
     arena = staged_arena(pillar, start=(-1.4, 0.0, 5.0), goal=(8.0, 0.0, 5.0), half_width=10.0, height=10.0)
-    first = MapPilot(QUADROTOR, np.random.default_rng(0))(BLIND, staged_info(arena, (-1.4, 0.0, 5.0), (0.0, 0.0, 0.0)))
+    first = QuadrotorRoutePolicy(QUADROTOR, np.random.default_rng(0))(
+        BLIND, staged_info(arena, (-1.4, 0.0, 5.0), (0.0, 0.0, 0.0))
+    )
     assert first[0] < 0.0
 
 
-def nearest_to(pillar: Obstacle, pilot: type[MapPilot]) -> float:
+def nearest_to(pillar: Obstacle, pilot: type[QuadrotorRoutePolicy]) -> float:
     """How near to it the pilot gets on its way past, m."""
     arena = staged_arena(pillar, start=(-10.0, 0.0, 5.0), goal=(10.0, 0.0, 5.0), half_width=15.0, height=10.0)
     vehicle, fly, least = PointMass(arena, np.random.default_rng(0)), pilot(QUADROTOR, np.random.default_rng(0)), np.inf
@@ -143,7 +145,7 @@ def nearest_to(pillar: Obstacle, pilot: type[MapPilot]) -> float:
 
 def test_with_care_it_keeps_a_wide_berth() -> None:
     pillar = Obstacle(CYLINDER, (0.0, 0.5, 5.0), (1.0, 10.0))
-    assert nearest_to(pillar, CarefulPilot) > nearest_to(pillar, MapPilot) + 0.5
+    assert nearest_to(pillar, QuadrotorCarefulPolicy) > nearest_to(pillar, QuadrotorRoutePolicy) + 0.5
 
 
 def test_with_care_it_arrives_among_many_obstacles_too() -> None:

@@ -7,17 +7,21 @@ import pytest
 
 from brakeline.messaging.obstacle import Obstacle, Shapes
 from brakeline.messaging.ray_directions import Rays
-from brakeline.sim.arena import closing, staged_arena
+from brakeline.sim.arena import room_boundary, staged_arena
 from brakeline.sim.arena_generator import draw_arena
 from brakeline.sim.ground_robot import GroundRobot
 from brakeline.sim.lidar import Lidar
 from brakeline.sim.navigation_env import NavigationEnv
 from brakeline.sim.quadrotor import Quadrotor
-from brakeline.sim.traffic import Crowd, MoverKind, Watch
+from brakeline.sim.traffic import Crowd, CrowdSensor, MoverKind
 from tests.robots import GROUND
 
 KIND = MoverKind(count=(4, 4), radius=0.2, speed=1.2, acceleration=1.0, keep=1.0)
-ROOM = (*closing(2.0, None), Obstacle("box", (0.5, 0.5), (0.6, 0.4), 0.4), Obstacle("cylinder", (-1.0, -0.5), (0.3,)))
+ROOM = (
+    *room_boundary(2.0, None),
+    Obstacle("box", (0.5, 0.5), (0.6, 0.4), 0.4),
+    Obstacle("cylinder", (-1.0, -0.5), (0.3,)),
+)
 PLACES = np.array([[-1.0, 1.0], [1.2, -1.0], [0.0, -1.5], [-1.5, 0.3]])
 TIMES = np.arange(0.0, 60.0, 0.01)
 
@@ -55,7 +59,7 @@ def test_where_they_are_does_not_depend_on_who_asks_when():
 
 def test_what_is_told_of_them_holds():
     crowd = Crowd(KIND, PLACES, Shapes.of(ROOM, 2), seed=9)
-    watch = Watch(crowd, np.random.default_rng(0))
+    watch = CrowdSensor(crowd, np.random.default_rng(0))
     for k in range(200):
         time = 0.2 * k
         seen = watch.look(time)

@@ -32,7 +32,7 @@ ASIDE = (0.4, 1.0)  # m
 TRIES = 12
 
 
-class Passing:
+class ReciprocalAvoidance:
     """Of one robot in one episode."""
 
     def __init__(self, robot: Robot, grid: ClearanceMap, rng: np.random.Generator) -> None:
@@ -66,9 +66,9 @@ class Passing:
         speed, berth = self._robot.high()[0], 2.0 * self._robot.footprint + BERTH
         away = others[:, :2] - position  # (k, 2)
         theirs = others[:, 3:4] * np.column_stack([np.cos(others[:, 2]), np.sin(others[:, 2])])
-        closing = speed * unit[:, None] - theirs  # (C, k, 2)
-        square = np.maximum(np.einsum("cki,cki->ck", closing, closing), 1e-9)
-        along = np.einsum("cki,ki->ck", closing, away)
+        room_boundary = speed * unit[:, None] - theirs  # (C, k, 2)
+        square = np.maximum(np.einsum("cki,cki->ck", room_boundary, room_boundary), 1e-9)
+        along = np.einsum("cki,ki->ck", room_boundary, away)
         gap = np.einsum("ki,ki->k", away, away) - berth**2
         inside = along**2 - square * gap  # discriminant of |away - closing t| = berth
         first = (along - np.sqrt(np.maximum(inside, 0.0))) / square

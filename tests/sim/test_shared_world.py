@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from brakeline.sim.arena import alike, staged_arena
+from brakeline.sim.arena import same_room, staged_arena
 from brakeline.sim.arena_generator import draw_fleet
 from brakeline.sim.ground_robot import GroundRobot
 from brakeline.sim.scripted_policies import scripted
@@ -20,7 +20,7 @@ STAND = np.zeros(2)
 def world(*starts):
     arena = staged_arena()
     rngs = [np.random.default_rng(i) for i in range(len(starts))]
-    return GroundWorld([alike(arena, start=start) for start in starts], rngs, Conditions())
+    return GroundWorld([same_room(arena, start=start) for start in starts], rngs, Conditions())
 
 
 def test_robots_touch_each_other_and_that_is_no_collision():
