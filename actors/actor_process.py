@@ -25,7 +25,7 @@ from brakeline.messaging.task import RobotWithTask, robot_with_task
 from brakeline.messaging.topics import EPISODE, EXCHANGE, FRAMES, STEP
 from brakeline.safety.filter.backup_plan import Array
 from brakeline.safety.filter.request import ALLOWED
-from brakeline.safety.service.client import ask
+from brakeline.safety.service.client import query_service
 
 if TYPE_CHECKING:
     from brakeline.actors.mavlink.frame_log import FrameTap
@@ -308,7 +308,7 @@ def run(
         process.announce()
         question: Ask | None = None
         if settings.method != "none":
-            question = lambda requests: ask(process.bus, requests, settings.deadline)  # noqa: E731
+            question = lambda requests: query_service(process.bus, requests, settings.deadline)  # noqa: E731
         if all(rider.join(stop) for rider in riders):
             while not stop() and one_period(riders, question, tally, stop):
                 pass

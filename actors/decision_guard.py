@@ -10,8 +10,8 @@ from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.bus import BusError
 from brakeline.messaging.robot import Robot
 from brakeline.safety.filter.backup_plan import Array, BackupPlan
-from brakeline.safety.service.asker import Answer, accept
-from brakeline.safety.service.client import SafetyError, read
+from brakeline.safety.service.client import SafetyError, read_reply
+from brakeline.safety.service.filter_client import Answer, accept
 
 Ask = Callable[[Sequence[pb.Request]], list[pb.Reply]]  # raises BusError when there is no answer
 
@@ -52,7 +52,7 @@ def _outcome(
     answer = None
     if reply is not None:
         try:
-            answer = read(reply, request, robot)
+            answer = read_reply(reply, request, robot)
         except SafetyError as error:
             failure = str(error)
     return DecisionOutcome(request, reply, answer, failure, elapsed)

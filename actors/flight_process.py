@@ -41,7 +41,7 @@ from brakeline.messaging.process_runtime import Process
 from brakeline.messaging.robot import Robot
 from brakeline.messaging.task import RobotWithTask, robot_with_task
 from brakeline.safety.filter.backup_plan import Array, BackupPlan
-from brakeline.safety.service.client import ask, request_message
+from brakeline.safety.service.client import query_service, request_message
 from brakeline.sim.arena import Arena
 from brakeline.sim.arena_generator import goal_sequence
 from brakeline.sim.navigation_env import NavigationEnv
@@ -299,7 +299,7 @@ def run(
         rider = FlightRunner(process, settings, stages, propose, outbox, conditions or Conditions())
         process.refresh = lambda: process.figures.update(tally.figures(time.monotonic() - started) | rider.figures())
         process.announce()
-        question = partial(ask, process.bus, deadline=settings.deadline)
+        question = partial(query_service, process.bus, deadline=settings.deadline)
         if not (rider.join(stop) and answered(question, robot, stages[0], settings.method == "ddpc", stop)):
             return False
         request = FlightRequest(flight, robot, arena.obstacles)

@@ -35,9 +35,9 @@ from brakeline.messaging.bus.certificate_authority import Authority
 from brakeline.messaging.free_ports import free_endpoint
 from brakeline.messaging.robot import robot_named
 from brakeline.messaging.topics import DECIDE
-from brakeline.safety.service.client import ask
+from brakeline.safety.service.client import query_service
 from brakeline.safety.service.plan_token import PlanAuthenticator, write_key
-from brakeline.safety.service.server import Counts, Models, answerer
+from brakeline.safety.service.server import ModelRegistry, ServiceCounts, batch_handler
 
 REPLICAS = (1, 2, 4)
 ASKERS = (50, 200, 1000)
@@ -60,11 +60,11 @@ class CrowdResult:
 
 
 def _serve(settings: BusSettings, name: str, ready: Event, stop: Event) -> None:
-    models = Models()
+    models = ModelRegistry()
     models.install(situations.model())
     assert settings.keys is not None
     with Bus(settings, name) as bus:
-        bus.serve(DECIDE, answerer(models, Counts(), PlanAuthenticator.of(settings.keys)))
+        bus.serve(DECIDE, batch_handler(models, ServiceCounts(), PlanAuthenticator.of(settings.keys)))
         ready.set()
         stop.wait()
 
@@ -100,7 +100,7 @@ def _crowd(settings: BusSettings, questions: list[bytes], askers: int, out: Conn
                 time.sleep(max(0.0, at - time.monotonic()))
                 before = time.perf_counter()
                 try:
-                    ask(bus, [requests[(number + int(at * RATE)) % len(requests)]], DEADLINE)
+                    query_service(bus, [requests[(number + int(at * RATE)) % len(requests)]], DEADLINE)
                 except BusError as error:
                     with lock:
                         counts["late" if isinstance(error, Late) else "unanswered"] += 1
@@ -193,9 +193,9 @@ def run() -> Figures:
             authority.issue(f"safety-{i}")
         authority.issue("client")
         write_key(keys)
-        notary, asked = PlanAuthenticator.of(keys), situations.messages("trained")
+        authenticator, asked = PlanAuthenticator.of(keys), situations.messages("trained")
         for question in asked:
-            question.plan_token = notary.plan_token(question, robot_named(question.robot))
+            question.plan_token = authenticator.plan_token(question, robot_named(question.robot))
         questions = [question.SerializeToString() for question in asked]
         for replicas in REPLICAS:
             endpoints, services, routers = stack.enter_context(cells(replicas, keys))

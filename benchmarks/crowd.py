@@ -37,7 +37,7 @@ from brakeline.messaging.bus.bus_settings import open_session
 from brakeline.messaging.bus.certificate_authority import Authority
 from brakeline.messaging.robot import robot_named
 from brakeline.messaging.topics import DECIDE, STEP
-from brakeline.safety.service.client import ask
+from brakeline.safety.service.client import query_service
 from brakeline.safety.service.plan_token import PlanAuthenticator, write_key
 
 RATE = 50.0  # Hz of the asker
@@ -149,7 +149,7 @@ def _ask(settings: BusSettings, questions: list[pb.Request]) -> dict[str, float]
             time.sleep(max(0.0, begun + number / RATE - time.monotonic()))
             before = time.perf_counter()
             try:
-                ask(bus, [questions[number % len(questions)]], DEADLINE)
+                query_service(bus, [questions[number % len(questions)]], DEADLINE)
             except Late:
                 late += 1
             except BusError:
@@ -175,9 +175,9 @@ def run(rate: int = JUNK) -> Figures:
         for one in ("router-0", "safety-0", "client", "actor-0", "recorder"):
             authority.issue(one)
         write_key(keys)
-        notary, questions = PlanAuthenticator.of(keys), situations.messages("trained")
+        authenticator, questions = PlanAuthenticator.of(keys), situations.messages("trained")
         for question in questions:
-            question.plan_token = notary.plan_token(question, robot_named(question.robot))
+            question.plan_token = authenticator.plan_token(question, robot_named(question.robot))
         with cells(1, keys) as (endpoints, services, routers):
             settings = BusSettings(connect=tuple(endpoints), keys=keys)
             alone = _ask(settings, questions)

@@ -30,7 +30,7 @@ from brakeline.messaging.topics import LEARNER, RECORDED
 from brakeline.safety.methods import DDPC, load
 from brakeline.safety.model.model_config import ModelConfig
 from brakeline.safety.service.plan_token import write_key
-from brakeline.safety.service.signature import Signer, write_signer
+from brakeline.safety.service.signature import ModelSigner, write_signer
 
 PORT = 7447
 CLOCKS = {2: -7.0, 3: 5.0, 4: -3.0}  # h ahead of the others
@@ -197,7 +197,7 @@ class Fleet:
             authority.issue(name, hosts)
         write_signer(keys)
         write_key(keys)
-        signer = Signer.load(keys)
+        signer = ModelSigner.load(keys)
         for name in self.robots:
             robot = robot_with_task(name)
             method_for(robot, DDPC, ModelConfig())

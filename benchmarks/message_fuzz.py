@@ -52,8 +52,8 @@ from brakeline.safety.filter.backup_plan import BackupPlan
 from brakeline.safety.filter.request import BadRequest
 from brakeline.safety.methods import decode
 from brakeline.safety.model.model_set import BadModel
-from brakeline.safety.service.client import read, request_message
-from brakeline.safety.service.server import Counts, Models, answerer
+from brakeline.safety.service.client import read_reply, request_message
+from brakeline.safety.service.server import ModelRegistry, ServiceCounts, batch_handler
 
 LOOK = 25_000  # messages between two looks at what the processes say and show
 SETTLED = 0.3  # of the messages: by then tables are as full as they get
@@ -183,8 +183,8 @@ def actor(robot: RobotWithTask) -> Party:
 
 def safety() -> Party:
     """Questions and models; what is refused goes back to who asked."""
-    models, tolerance = Models(), Tolerance()
-    answer = answerer(models, Counts())
+    models, tolerance = ModelRegistry(), Tolerance()
+    answer = batch_handler(models, ServiceCounts())
 
     def take(sample: Sample) -> None:
         try:
@@ -207,7 +207,7 @@ def asker(robot: RobotWithTask, mill: Mill) -> Party:
         message = pb.Reply(robot=robot.name)
         mill.fill(message, mill.random.choice(message.DESCRIPTOR.fields))
         try:
-            read(message, request, robot)
+            read_reply(message, request, robot)
         except BusError:
             return
 

@@ -25,20 +25,20 @@ from brakeline.messaging.bus.certificate_authority import Authority
 from brakeline.messaging.free_ports import free_endpoint
 from brakeline.messaging.robot import robot_named
 from brakeline.messaging.topics import DECIDE
-from brakeline.safety.service.client import ask
+from brakeline.safety.service.client import query_service
 from brakeline.safety.service.plan_token import PlanAuthenticator, write_key
-from brakeline.safety.service.server import Counts, Models, answerer
+from brakeline.safety.service.server import ModelRegistry, ServiceCounts, batch_handler
 
 QUESTIONS = 500
 PLAIN, KEYS, SOCKET = "TCP", "with keys", "Unix socket"
 
 
 def _serve(settings: BusSettings, ready: Event, stop: Event) -> None:
-    models = Models()
+    models = ModelRegistry()
     models.install(situations.model())
-    notary = None if settings.keys is None else PlanAuthenticator.of(settings.keys)
+    authenticator = None if settings.keys is None else PlanAuthenticator.of(settings.keys)
     with Bus(settings, "safety") as bus:
-        bus.serve(DECIDE, answerer(models, Counts(), notary))
+        bus.serve(DECIDE, batch_handler(models, ServiceCounts(), authenticator))
         ready.set()
         stop.wait()
 
@@ -78,14 +78,14 @@ def _measure(listen: bool, questions: list[pb.Request]) -> Figures:
         for process in ("safety", "router", "client"):
             authority.issue(process)
         write_key(folder)
-        notary = PlanAuthenticator.of(folder)
+        authenticator = PlanAuthenticator.of(folder)
         buses = {how: stack.enter_context(_client(how, listen, folder)) for how in seconds}
         for i, question in enumerate(questions):
-            question.plan_token = notary.plan_token(question, robot_named(question.robot))
+            question.plan_token = authenticator.plan_token(question, robot_named(question.robot))
             hows = list(seconds)
             for how in hows[i % 3 :] + hows[: i % 3]:
                 before = perf_counter()
-                ask(buses[how], [question], 1.0)
+                query_service(buses[how], [question], 1.0)
                 seconds[how].append(perf_counter() - before)
     warm = {how: np.array(times[WARM_UP:]) for how, times in seconds.items()}
     more = {how: {"p50 more ms": 1e3 * float(np.median(times - warm[PLAIN]))} for how, times in warm.items()}

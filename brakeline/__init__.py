@@ -33,8 +33,8 @@ if TYPE_CHECKING:
     from brakeline.safety.model.model_set import BadModel, ModelConfig, ModelSet
     from brakeline.safety.model.validation import ValidationReport, state
     from brakeline.safety.perception.image_memory import filled, memory_of
-    from brakeline.safety.service.asker import Answer, Asker
     from brakeline.safety.service.client import SafetyClient, SafetyError
+    from brakeline.safety.service.filter_client import Answer, FilterClient
     from brakeline.safety.service.fleet_client import FleetClient
     from brakeline.safety.service.in_process import InProcess
 
@@ -48,7 +48,7 @@ PLACES = {
     "brakeline.messaging.obstacle": ("BadShape", "Obstacle", "Shapes"),
     "brakeline.messaging.task": ("RobotWithTask", "Task", "robot_with_task"),
     "brakeline.safety.model.error_bounds": ("ErrorBoundError",),
-    "brakeline.safety.service.asker": ("Answer", "Asker"),
+    "brakeline.safety.service.filter_client": ("Answer", "FilterClient"),
     "brakeline.safety.service.client": ("SafetyClient", "SafetyError"),
     "brakeline.safety.filter.backup_plan": ("BackupPlan", "Prediction"),
     "brakeline.safety.model.dataset": ("BadData", "Dataset", "Trajectory"),
@@ -66,7 +66,6 @@ _PLACE_OF = {name: module for module, names in PLACES.items() for name in names}
 
 __all__ = [
     "Answer",
-    "Asker",
     "BackupPlan",
     "BadData",
     "BadDescription",
@@ -81,6 +80,7 @@ __all__ = [
     "Disc",
     "ErrorBoundError",
     "Filter",
+    "FilterClient",
     "FleetClient",
     "InProcess",
     "Late",

@@ -10,7 +10,7 @@ from brakeline.logs.decision_explanation import bound_in, explain, fell_back, fi
 from brakeline.logs.episode_stats import KINDS, Figures
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.robot import Robot
-from brakeline.safety.perception.displayed_map import promised, surroundings
+from brakeline.safety.perception.displayed_map import map_for_display, reserved_boxes
 
 MOST_TUBES = 40  # of a picture
 CORNERS, HITS = 48, 90  # of the outline of free space, and beams that hit, in a picture of a step
@@ -188,11 +188,11 @@ def _told(exchange: pb.Exchange, beside: Iterable[pb.Exchange], robot: Robot | N
     if robot is None:
         return {}
     try:
-        around = surroundings(robot, exchange.request, CORNERS).flat(HITS)
+        around = map_for_display(robot, exchange.request, CORNERS).flat(HITS)
     except ValueError:  # it tells of what can't be: it was refused
         return {}
     d = robot.position_dim
-    boxes = [box for other in beside for box in promised(robot, other)]
+    boxes = [box for other in beside for box in reserved_boxes(robot, other)]
     reservations = [_rounded((*box[:2], *(box[d : d + 2] + box[-1]))) for box in boxes]
     return {name: told for name, told in (around | {"promises": reservations}).items() if told}
 

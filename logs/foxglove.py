@@ -26,7 +26,7 @@ from brakeline.messaging.bus import Sample
 from brakeline.messaging.robot import Robot, UnknownRobot
 from brakeline.messaging.task import RobotWithTask
 from brakeline.messaging.topics import EPISODE, EXCHANGE, LOG, STEP
-from brakeline.safety.perception.displayed_map import promised
+from brakeline.safety.perception.displayed_map import reserved_boxes
 
 log = logging.getLogger("brakeline.foxglove")
 
@@ -170,7 +170,7 @@ class Pictures:
             return []
         others = set(exchange.request.fleet) - {exchange.request.actor}
         told = [(a.robot, a.last) for a in self._actors.values() if a.name in others and a.last is not None]
-        return [promised(robot, last) for robot, last in told]
+        return [reserved_boxes(robot, last) for robot, last in told]
 
     def _log_line(self, key: str, decode: Decode, time: int) -> list[Entry]:
         return [_stored(f"{ROOT}/log", foxglove_scene.log_line(decode(), time), time)]

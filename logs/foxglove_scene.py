@@ -35,7 +35,7 @@ from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.obstacle import BOX, CYLINDER, SPHERE, WALL
 from brakeline.messaging.ray_directions import Rays
 from brakeline.messaging.robot import Robot
-from brakeline.safety.perception.displayed_map import DisplayedMap, surroundings
+from brakeline.safety.perception.displayed_map import DisplayedMap, map_for_display
 
 WORLD = "world"
 HEIGHT = 0.4  # m, of what is drawn of a plane's obstacles
@@ -180,7 +180,7 @@ def decision(
             said = f"{WORDS[kind]}: {about.said}"
             _explained(entity, exchange.request.state[:d], about, robot.footprint)
     if exchange is not None:
-        _told(entity, surroundings(robot, exchange.request), reservations)
+        _told(entity, map_for_display(robot, exchange.request), reservations)
     if kind in WORDS:
         word = fell_back() if step.fallback else said or WORDS[kind]
         above = HEIGHT + 3.0 * robot.footprint

@@ -581,7 +581,7 @@ class Decision(_message.Message):
     SOLVER_FIELD_NUMBER: _builtins.int
     ITERATIONS_FIELD_NUMBER: _builtins.int
     PLAN_TOKENS_FIELD_NUMBER: _builtins.int
-    UNVOUCHED_FIELD_NUMBER: _builtins.int
+    TOKEN_REJECTED_FIELD_NUMBER: _builtins.int
     RESERVATION_FIELD_NUMBER: _builtins.int
     BROKEN_FIELD_NUMBER: _builtins.int
     STOPPED_FIELD_NUMBER: _builtins.int
@@ -613,8 +613,8 @@ class Decision(_message.Message):
     solver: _builtins.str
     """status of the last QP; empty: none was solved"""
     iterations: _builtins.int
-    unvouched: _builtins.bool
-    """it was not believed that the request's model verified its plan"""
+    token_rejected: _builtins.bool
+    """the plan token in the request does not match its plan: the plan counts as unverified"""
     broken: _builtins.int
     """obstacles seen outside of what their bounds allowed since they were seen before"""
     for_clearance: _builtins.bool
@@ -679,7 +679,7 @@ class Decision(_message.Message):
         solver: _builtins.str = ...,
         iterations: _builtins.int = ...,
         plan_tokens: _abc.Iterable[_builtins.bytes] | None = ...,
-        unvouched: _builtins.bool = ...,
+        token_rejected: _builtins.bool = ...,
         reservation: Global___Reservation | None = ...,
         broken: _builtins.int = ...,
         stopped: Global___Stopped | None = ...,
@@ -688,7 +688,7 @@ class Decision(_message.Message):
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _typing.Literal["_bound", b"_bound", "_for_clearance", b"_for_clearance", "bound", b"bound", "for_clearance", b"for_clearance", "reservation", b"reservation", "stopped", b"stopped"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["_bound", b"_bound", "_for_clearance", b"_for_clearance", "at_least", b"at_least", "bound", b"bound", "broken", b"broken", "compared", b"compared", "contained", b"contained", "for_clearance", b"for_clearance", "iterations", b"iterations", "kind", b"kind", "margin", b"margin", "model", b"model", "plan", b"plan", "plan_tokens", b"plan_tokens", "predicted_center", b"predicted_center", "predicted_half_width", b"predicted_half_width", "predicted_heading", b"predicted_heading", "queue_ms", b"queue_ms", "reason", b"reason", "reservation", b"reservation", "solve_ms", b"solve_ms", "solver", b"solver", "stopped", b"stopped", "time_ms", b"time_ms", "tube_center", b"tube_center", "tube_half_width", b"tube_half_width", "unvouched", b"unvouched", "verified", b"verified", "verify_ms", b"verify_ms"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["_bound", b"_bound", "_for_clearance", b"_for_clearance", "at_least", b"at_least", "bound", b"bound", "broken", b"broken", "compared", b"compared", "contained", b"contained", "for_clearance", b"for_clearance", "iterations", b"iterations", "kind", b"kind", "margin", b"margin", "model", b"model", "plan", b"plan", "plan_tokens", b"plan_tokens", "predicted_center", b"predicted_center", "predicted_half_width", b"predicted_half_width", "predicted_heading", b"predicted_heading", "queue_ms", b"queue_ms", "reason", b"reason", "reservation", b"reservation", "solve_ms", b"solve_ms", "solver", b"solver", "stopped", b"stopped", "time_ms", b"time_ms", "token_rejected", b"token_rejected", "tube_center", b"tube_center", "tube_half_width", b"tube_half_width", "verified", b"verified", "verify_ms", b"verify_ms"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     _WhichOneofReturnType__bound: _TypeAlias = _typing.Literal["bound"]  # noqa: Y015
     _WhichOneofArgType__bound: _TypeAlias = _typing.Literal["_bound", b"_bound"]  # noqa: Y015

@@ -37,7 +37,7 @@ FIGURES: dict[str, Shown] = {
     "compared": Shown("brakeline_predictions", "States that could be compared with a prediction", COUNT),
     "violations": Shown("brakeline_prediction_violations", "States outside of what was predicted", COUNT),
     "unverified": Shown("brakeline_unverified_decisions", "Decisions without a verified plan", COUNT),
-    "unvouched": Shown("brakeline_unvouched_requests", "Requests whose plan nobody vouched for", COUNT),
+    "token_rejected": Shown("brakeline_unvouched_requests", "Requests with a plan token that does not match", COUNT),
     "not_finite": Shown("brakeline_not_finite_proposals", "Proposed actions with NaN or infinity", COUNT),
     "decide_ms": Shown("brakeline_decide_seconds", "Mean time of a decision", factor=1e-3),
     "busy": Shown("brakeline_busy", "Share of the last second that a safety service was answering"),

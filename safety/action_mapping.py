@@ -22,7 +22,7 @@ class Mismatch(ValueError):
 
 
 @dataclass(frozen=True)
-class Actions:
+class ActionMapping:
     """action_to_control: an action of the environment as the robot's input (m,); control_to_action: the way back.
     Both also of many at once, (k, m), where a vector environment is to be wrapped."""
 
@@ -30,19 +30,19 @@ class Actions:
     control_to_action: Callable[[Array], Any]
 
 
-SAME = Actions(lambda action: action, lambda control: control)
+SAME = ActionMapping(lambda action: action, lambda control: control)
 
 
-def normalised(robot: Robot) -> Actions:
+def normalised(robot: Robot) -> ActionMapping:
     """Actions in [-1, 1], as RL libraries like them: -1 is each input's lowest value, 1 its highest."""
     low, width = robot.low(), robot.high() - robot.low()
-    return Actions(
+    return ActionMapping(
         lambda action: low + 0.5 * width * (np.clip(np.asarray(action, float), -1.0, 1.0) + 1.0),
         lambda control: np.clip(2.0 * (control - low) / width - 1.0, -1.0, 1.0),
     )
 
 
-def actions_of(space: gymnasium.Space[Any], robot: Robot, given: Actions | None) -> Actions:
+def mapping_for_space(space: gymnasium.Space[Any], robot: Robot, given: ActionMapping | None) -> ActionMapping:
     """Those given, or none needed: the space is that of the robot's inputs.
 
     Raises:
@@ -65,7 +65,7 @@ def actions_of(space: gymnasium.Space[Any], robot: Robot, given: Actions | None)
     return SAME
 
 
-def cast(action: Any, space: gymnasium.Space[Any]) -> Any:
+def cast_action(action: Any, space: gymnasium.Space[Any]) -> Any:
     """The action in the type that the environment takes."""
     if isinstance(space, gymnasium.spaces.Box):
         return np.asarray(action, dtype=space.dtype).reshape(space.shape)

@@ -19,12 +19,12 @@ from numpy.typing import NDArray
 
 from brakeline.messaging.bus import BusError
 from brakeline.messaging.sensor_messages import Sensed
-from brakeline.safety.action_mapping import Actions, actions_of, cast
+from brakeline.safety.action_mapping import ActionMapping, cast_action, mapping_for_space
 from brakeline.safety.environment_views import OBSTACLES, STATE, View
 from brakeline.safety.filter.backup_plan import correction_penalty
 from brakeline.safety.perception.image_memory import filled, memory_of
-from brakeline.safety.service.asker import Answer, Asker
-from brakeline.safety.service.in_process import InProcess, sendable
+from brakeline.safety.service.filter_client import Answer, FilterClient
+from brakeline.safety.service.in_process import InProcess, request_observation
 
 if TYPE_CHECKING:
     from brakeline.safety.methods import Method
@@ -47,12 +47,12 @@ class SafetyWrapper(gymnasium.Wrapper[Any, Any, Any, Any]):
     def __init__(
         self,
         env: gymnasium.Env[Any, Any],
-        filter: Method | Asker,
+        filter: Method | FilterClient,
         penalty: float = 0.0,
         *,
         state: View = STATE,
         obstacles: View = OBSTACLES,
-        actions: Actions | None = None,
+        actions: ActionMapping | None = None,
         accept_bound: float | None = None,
     ) -> None:
         """
@@ -71,10 +71,10 @@ class SafetyWrapper(gymnasium.Wrapper[Any, Any, Any, Any]):
             TooLoose: the model set's statement is looser than that.
         """
         super().__init__(env)
-        self.asker = filter if isinstance(filter, Asker) else InProcess(filter, accept_bound)
+        self.asker = filter if isinstance(filter, FilterClient) else InProcess(filter, accept_bound)
         self.penalty, self.backup_plan = penalty, self.asker.backup_plan
         self._state, self._obstacles = state, obstacles
-        self._actions = actions_of(env.action_space, self.asker.robot, actions)
+        self._actions = mapping_for_space(env.action_space, self.asker.robot, actions)
         self._now: tuple[Any, dict[str, Any]] | None = None
         self._memory = memory_of(self.asker.robot)
         self._scan: Sensed | None = None
@@ -104,7 +104,7 @@ class SafetyWrapper(gymnasium.Wrapper[Any, Any, Any, Any]):
         wanted = np.asarray(self._actions.action_to_control(action), dtype=float)
         answer, reason = self._decide(wanted)
         executed = self.backup_plan.next_input
-        made = cast(self._actions.control_to_action(executed), self.env.action_space)
+        made = cast_action(self._actions.control_to_action(executed), self.env.action_space)
         observation, reward, terminated, truncated, info = self.env.step(made)
         cost = correction_penalty(self.asker.robot, wanted, before, executed, self.penalty)
         told = diagnostics(answer, reason) | {"proposed": wanted, "executed": executed}
@@ -118,7 +118,7 @@ class SafetyWrapper(gymnasium.Wrapper[Any, Any, Any, Any]):
         assert self._now is not None
         seen = self._now[0], self._now[1]
         state, near = self._state(self.env, *seen), self._obstacles(self.env, *seen)
-        observation, known_free = sendable(seen[0]), near is not None
+        observation, known_free = request_observation(seen[0]), near is not None
         try:
             answer = self.asker.decide(
                 state, wanted, near, scan=self._scan, observation=observation, known_free=known_free

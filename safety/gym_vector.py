@@ -11,12 +11,12 @@ from gymnasium.vector import AutoresetMode, VectorEnv, VectorWrapper
 from numpy.typing import NDArray
 
 from brakeline.messaging.sensor_messages import Sensed
-from brakeline.safety.action_mapping import Actions, Mismatch, actions_of
+from brakeline.safety.action_mapping import ActionMapping, Mismatch, mapping_for_space
 from brakeline.safety.environment_views import OBSTACLES, STATE, View
 from brakeline.safety.filter.backup_plan import BackupPlan, correction_penalty
 from brakeline.safety.gym import diagnostics
 from brakeline.safety.perception.image_memory import filled, memory_of
-from brakeline.safety.service.in_process import InProcess, sendable
+from brakeline.safety.service.in_process import InProcess, request_observation
 
 if TYPE_CHECKING:
     from brakeline.safety.methods import Method
@@ -40,7 +40,7 @@ class VectorSafetyWrapper(VectorWrapper):
         *,
         state: View = STATE,
         obstacles: View = OBSTACLES,
-        actions: Actions | None = None,
+        actions: ActionMapping | None = None,
         accept_bound: float | None = None,
     ) -> None:
         """
@@ -52,7 +52,7 @@ class VectorSafetyWrapper(VectorWrapper):
         self.asker, self.penalty = InProcess(filter, accept_bound), penalty
         self.backup_plans = [BackupPlan(filter.robot) for _ in range(env.num_envs)]
         self._state, self._obstacles = state, obstacles
-        self._actions = actions_of(env.single_action_space, filter.robot, actions)
+        self._actions = mapping_for_space(env.single_action_space, filter.robot, actions)
         self._mode = AutoresetMode(env.metadata.get("autoreset_mode", AutoresetMode.NEXT_STEP))
         self._ended = np.zeros(env.num_envs, dtype=bool)
         self._now: tuple[Any, dict[str, Any]] | None = None
@@ -86,7 +86,9 @@ class VectorSafetyWrapper(VectorWrapper):
             [wanted[i] for i in deciding],
             [near[i] for i in deciding],
             scans=[self._scans[i] for i in deciding],
-            observations=[sendable(seen[0][i] if isinstance(seen[0], np.ndarray) else None) for i in deciding],
+            observations=[
+                request_observation(seen[0][i] if isinstance(seen[0], np.ndarray) else None) for i in deciding
+            ],
             known_free=[near[i] is not None for i in deciding],
         )
         executed = np.array([kept.next_input for kept in self.backup_plans])
@@ -120,12 +122,14 @@ class VectorSafetyWrapper(VectorWrapper):
 
     def _remember(self, infos: dict[str, Any]) -> None:
         """The scans, if there are any, with what was seen free before."""
-        each = [{"scan": scan} for scan in infos["scan"]] if "scan" in infos else [{}] * self.num_envs
+        by_environment = [{"scan": scan} for scan in infos["scan"]] if "scan" in infos else [{}] * self.num_envs
         period = self.asker.robot.period
-        self._scans = [filled(memory, info, period) for memory, info in zip(self._memories, each, strict=True)]
+        self._scans = [
+            filled(memory, info, period) for memory, info in zip(self._memories, by_environment, strict=True)
+        ]
 
 
-def each(view: Callable[[Any, Any, dict[str, Any]], Any]) -> View:
+def view_each_environment(view: Callable[[Any, Any, dict[str, Any]], Any]) -> View:
     """A vector's view from that of one environment, for `SyncVectorEnv`: asks each with its own observation and what
     `infos` has of it."""
 

@@ -23,7 +23,7 @@ from brakeline.messaging.byte_links import BadLink
 from brakeline.messaging.obstacle import FARTHEST, Obstacle
 from brakeline.messaging.robot import Robot
 from brakeline.messaging.robot_description import robot_of
-from brakeline.safety.service.wire import numbers, obstacles_of
+from brakeline.safety.service.wire import array_of, obstacles_of
 from brakeline.sim.quadrotor import QUADROTOR, SAMPLES
 from brakeline.sim.vehicle import BadInput, Period
 
@@ -107,7 +107,7 @@ def plan_of(message: pb.PlanCommit, robot: Robot, current: int) -> Array:
         raise BadMessage(f"a plan has {most}, not {len(message.plan)} numbers")
     if message.period > current + robot.horizon:
         raise BadMessage(f"a plan for period {message.period} in period {current}: too far ahead")
-    return numbers(message.plan).reshape(rows, robot.action_dim)
+    return array_of(message.plan).reshape(rows, robot.action_dim)
 
 
 def period_message(period: ControlPeriod) -> pb.ControlPeriod:
@@ -177,7 +177,7 @@ def _vector(name: str, field: Collection[float], size: int) -> Array:
     """Return a repeated field as an array of finite numbers."""
     if len(field) != size:
         raise BadMessage(f"{name}: {len(field)} numbers, not {size}")
-    vector = numbers(field)
+    vector = array_of(field)
     if not np.isfinite(vector).all():
         raise BadMessage(f"{name}: not finite: {vector.tolist()}")
     return vector

@@ -39,7 +39,7 @@ from brakeline.safety.model.error_bounds import KINDS, RESIDUAL
 from brakeline.safety.model.model_set import MODES, ModelConfig, ModelSet
 from brakeline.safety.model.stated_bound import accepted_bound, refusal
 from brakeline.safety.model.validation import CONFIDENCE, EPISODE, HOUR, ValidationReport
-from brakeline.safety.service.signature import KEY, Signer, seal_of
+from brakeline.safety.service.signature import KEY, ModelSigner, seal_of
 
 DIVERGES = 100.0  # m, of a stop's half-width: wider than any arena
 
@@ -244,7 +244,7 @@ class Certify:
         path, keys = model_path(model.robot, model.model_config), self.endpoints.keys or default_keys()
         seal_of(path).unlink(missing_ok=True)
         if keys is not None and (keys / KEY).exists():
-            Signer.load(keys).sign(model, data).save(path)
+            ModelSigner.load(keys).sign(model, data).save(path)
         else:
             model.save(path)
 
@@ -269,7 +269,7 @@ class Certify:
         with Bus(settings, "certify") as bus:
             message = pb.Model(robot=model.robot.name, version=model.version, file=model.encode())
             if settings.keys is not None:
-                signed = Signer.load(settings.keys).sign(model, data)
+                signed = ModelSigner.load(settings.keys).sign(model, data)
                 message.file, message.claim, message.signature = signed.file, signed.claim, signed.signature
             bus.publisher(MODEL, robot=model.robot.name).put(message)
         errors.print(f"published {model.model_config.certificate} {model.version} for {model.robot.name}")

@@ -15,7 +15,7 @@ from brakeline.messaging.bus.identity import SERVERS, role_of
 from brakeline.safety.methods import load
 from brakeline.safety.service.plan_token import KEY as VOUCHERS
 from brakeline.safety.service.plan_token import write_key
-from brakeline.safety.service.signature import ANY, SIGNERS, Signer, seal_of, write_signer
+from brakeline.safety.service.signature import ANY, SIGNERS, ModelSigner, seal_of, write_signer
 from brakeline.safety.service.signature import KEY as SIGNER
 
 
@@ -40,7 +40,7 @@ class KeysCommand:
 
     def run(self) -> int:
         if self.sign:
-            signer = Signer.load(self.folder)
+            signer = ModelSigner.load(self.folder)
             for path in self.sign:
                 signer.sign(load(path)).save(path)
                 console.print(f"{seal_of(path)}", markup=False)

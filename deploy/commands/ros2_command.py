@@ -23,7 +23,7 @@ from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.bus import Bus, BusSettings
 from brakeline.messaging.ros2 import ROUTER, RosSettings
 from brakeline.messaging.stop_signals import heeded
-from brakeline.safety.service.client import ask
+from brakeline.safety.service.client import query_service
 
 
 @dataclass(frozen=True)
@@ -113,7 +113,7 @@ class Ros2:
         deadline = 0.3 * settings.lead  # there may be three questions
 
         def question(requests: Sequence[pb.Request]) -> list[pb.Reply]:
-            return ask(bus, requests, deadline)
+            return query_service(bus, requests, deadline)
 
         keys = self.keys or default_keys()
         with Bus(BusSettings(connect=self.connect, keys=keys), self.client if keys else self.name) as bus:

@@ -18,7 +18,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from brakeline.deploy.data.excitation import MOST_HELD, excitation
 from brakeline.messaging.robot import Robot
-from brakeline.safety.action_mapping import Actions, actions_of, cast
+from brakeline.safety.action_mapping import ActionMapping, cast_action, mapping_for_space
 from brakeline.safety.environment_views import STATE, View
 from brakeline.safety.model.dataset import BadData, Dataset, Trajectory
 from brakeline.safety.model.windows import displacement
@@ -38,7 +38,7 @@ def collect(
     seed: int = 0,
     held: int = MOST_HELD,
     state: View = STATE,
-    actions: Actions | None = None,
+    actions: ActionMapping | None = None,
     disturbed: Callable[[Any, Any, dict[str, Any]], bool] = lambda env, observation, info: False,
     chord_deviation: float | None = None,
     options: dict[str, Any] | None = None,
@@ -62,7 +62,7 @@ def collect(
         Mismatch: no state is to be had, or the action space is not that of the robot's inputs; BadData: what was
         recorded is no data set, or every episode ends at once.
     """
-    between = actions_of(env.action_space, robot, actions)
+    between = mapping_for_space(env.action_space, robot, actions)
     columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
     trajectories: list[Trajectory] = []
     fruitless = number = 0
@@ -108,7 +108,7 @@ def _episode(
     seed: int | None,
     most: int,
     options: dict[str, Any] | None,
-    between: Actions,
+    between: ActionMapping,
     state: View,
     disturbed: Callable[[Any, Any, dict[str, Any]], bool],
 ) -> Iterator[Trajectory]:
@@ -118,7 +118,7 @@ def _episode(
     u, before = next(inputs), None
     record = _Record(robot, measured, before)
     for _ in range(most):
-        made = cast(between.control_to_action(u), env.action_space)
+        made = cast_action(between.control_to_action(u), env.action_space)
         observation, _, terminated, truncated, info = env.step(made)
         if terminated:
             break

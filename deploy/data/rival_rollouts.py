@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from brakeline.deploy.vehicle_factory import environment
 from brakeline.messaging.task import RobotWithTask
 from brakeline.safety.filter.braking import brake
-from brakeline.safety.rivals.sailr import normalised
+from brakeline.safety.rivals.sailr import normalised_input
 from brakeline.safety.rivals.secas import Constraints
 from brakeline.sim.scripted_policies import Policy, scripted
 
@@ -124,7 +124,7 @@ def costs(
     def take(action: Array) -> None:
         seen = drive.observation
         drive.step(action)
-        pair = np.concatenate([seen, normalised(robot, np.asarray(drive.info["input_in_force"]))])
+        pair = np.concatenate([seen, normalised_input(robot, np.asarray(drive.info["input_in_force"]))])
         driven.append((pair, (1.0 - gamma) * cost(), drive.observation, bool(drive.info["collision"])))
         each()
 

@@ -21,7 +21,7 @@ from brakeline.messaging.task import RobotWithTask
 from brakeline.safety.methods import DDPC, Model
 from brakeline.safety.model.model_config import check_reservations
 from brakeline.safety.model.model_set import ModelConfig
-from brakeline.safety.service.server import Counts, Models, answerer
+from brakeline.safety.service.server import ModelRegistry, ServiceCounts, batch_handler
 from brakeline.sim.scripted_policies import Policy
 from brakeline.sim.shared_world import FleetEnv
 from brakeline.sim.sim_conditions import Conditions
@@ -50,9 +50,9 @@ def in_process(model: Model, accept_bound: float | None = None) -> Ask:
     Raises:
         TooLoose: the model set's statement is looser than the robot's limit, or than `accept_bound`.
     """
-    models = Models(accept_bound=accept_bound)
+    models = ModelRegistry(accept_bound=accept_bound)
     models.install(model)
-    answer = answerer(models, Counts())
+    answer = batch_handler(models, ServiceCounts())
 
     def ask(requests: Sequence[pb.Request]) -> list[pb.Reply]:
         payload = pb.RequestBatch(requests=requests).SerializeToString()

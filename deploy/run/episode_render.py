@@ -27,7 +27,7 @@ from brakeline.logs.episode_stats import KINDS as DECISIONS
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.obstacle import BOX, WALL, Obstacle
 from brakeline.messaging.robot import Robot
-from brakeline.safety.perception.displayed_map import DisplayedMap, surroundings
+from brakeline.safety.perception.displayed_map import DisplayedMap, map_for_display
 from brakeline.sim.scripted_policies import Policy
 
 Array = NDArray[np.float64]
@@ -93,7 +93,7 @@ def record(driver: EpisodeRunner, policy: Policy, question: Ask | None, number: 
         kind = KINDS.get(step.decision, "no filter")
         why = explain(driver.robot, asked, decision) if len(center) else None
         boxes = center - half, center + half, center
-        around = surroundings(driver.robot, asked)
+        around = map_for_display(driver.robot, asked)
         frames.append(Frame(before[:d], heading, kind, *boxes, decision.margin, why, around))
     touched = step.contact_moving or step.contact_standing
     end = "goal" if step.goal else "collision" if step.collision else "run into" if touched else "out of time"

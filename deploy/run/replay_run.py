@@ -28,11 +28,11 @@ from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.robot import Robot
 from brakeline.safety.filter.backup_plan import UNVERIFIED
 from brakeline.safety.methods import Method, decode, load, ready
-from brakeline.safety.service.server import Counts, Models, answerer
+from brakeline.safety.service.server import ModelRegistry, ServiceCounts, batch_handler
 
 TIMES = ("time_ms", "solve_ms", "verify_ms", "queue_ms")
 # What a service says to itself, with a key that no log holds; and what explains a decision, and changes none.
-WORDS = ("plan_tokens", "unvouched", "stopped", "bound")
+WORDS = ("plan_tokens", "token_rejected", "stopped", "bound")
 # How the solver came by an answer: its way may hang on the last bits where its answer does not.
 WORK = ("solver", "iterations")
 ROUNDING = 1e-12  # of a number (of 1, if the number is smaller) by which two decisions may differ and still be equal
@@ -202,8 +202,8 @@ def replay(paths: Paths, instead: Instead | None = None, each: Callable[[], Any]
         NoLog, NotALog: there is none; ReplayError, BadModel: a model that was in use cannot be had.
     """
     log = open_log(paths)
-    archive, models, result = Archive(log), Models(), Comparison()
-    answer = answerer(models, Counts())
+    archive, models, result = Archive(log), ModelRegistry(), Comparison()
+    answer = batch_handler(models, ServiceCounts())
     waiting: Waiting = {}
     for record in log:
         if record.topic == "model":
@@ -211,7 +211,7 @@ def replay(paths: Paths, instead: Instead | None = None, each: Callable[[], Any]
         if record.topic != "exchange":
             continue
         request, logged = record.message.request, record.message.reply
-        if logged.decision.unvouched:  # by the log's own word; else what the request says is believed
+        if logged.decision.token_rejected:  # by the log's own word; else what the request says is believed
             request.model = UNVERIFIED
         if _from_before_known_free(request, logged):
             request.known_free = True
@@ -259,7 +259,7 @@ def _question(waiting: Waiting, request: pb.Request, logged: pb.Reply) -> list[t
     return [group[name] for name in request.fleet]
 
 
-def _put_to_use(models: Models, request: pb.Request, method: Method) -> None:
+def _put_to_use(models: ModelRegistry, request: pb.Request, method: Method) -> None:
     """As the service was when it decided: the version before may have been used before this log began."""
     models.filters[request.robot] = method
     models.known |= {method.version, request.model}

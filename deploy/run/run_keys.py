@@ -15,7 +15,7 @@ from brakeline.safety.methods import load
 from brakeline.safety.model.model_set import BadModel
 from brakeline.safety.service.plan_token import write_key
 from brakeline.safety.service.server import archive_path
-from brakeline.safety.service.signature import KEY, Signer, Trust, seal_of, write_signer
+from brakeline.safety.service.signature import KEY, ModelSigner, TrustedSigners, seal_of, write_signer
 
 log = logging.getLogger("brakeline.launcher")
 
@@ -41,7 +41,7 @@ def seal_models(config: RunConfig, folder: Path, keys: Path) -> None:
     """
     if not (keys / KEY).exists():
         return
-    signer = Signer.load(keys)
+    signer = ModelSigner.load(keys)
     for name in config.robots if config.filtered else ():
         model = load(method_path(robot_maybe_with_task(name), config.method, config.model_config))
         archived = archive_path(folder, model.robot.name, model.version)
@@ -49,7 +49,7 @@ def seal_models(config: RunConfig, folder: Path, keys: Path) -> None:
             signer.sign(model).save(archived)
 
 
-def newest_model(folder: Path, robot: str, trust: Trust | None) -> Path | None:
+def newest_model(folder: Path, robot: str, trust: TrustedSigners | None) -> Path | None:
     """The version that a service of this run used last: a restarted one goes on with it.
 
     trust: with keys, whoever may have signed it; others' versions are passed over.

@@ -50,12 +50,12 @@ def _safety(place: ProcessSpec, folder: Path, config: RunConfig, bus: BusSetting
     from brakeline.deploy.data.data_paths import method_path
     from brakeline.deploy.run.run_keys import KEYS, newest_model
     from brakeline.safety.service.server import SafetySettings, main
-    from brakeline.safety.service.signature import Trust
+    from brakeline.safety.service.signature import TrustedSigners
 
     robots = [robot_maybe_with_task(robot) for robot in config.robots]
     limits = {robot.name: robot.accept_bound for robot in robots}
     models = tuple(method_path(robot, config.method, config.model_config) for robot in robots)
-    trust = None if bus.keys is None else Trust.load(bus.keys)
+    trust = None if bus.keys is None else TrustedSigners.load(bus.keys)
     newest = (newest_model(folder, robot.name, trust) or path for robot, path in zip(robots, models, strict=True))
     accepted = config.accept_bound
     main(SafetySettings(bus, tuple(newest), folder, place.name, limits, accepted, secrets=folder / KEYS))

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from brakeline.messaging.obstacle import WALL, Obstacle
 from brakeline.messaging.robot import robot_named
-from brakeline.safety.action_mapping import Actions
+from brakeline.safety.action_mapping import ActionMapping
 
 Array = NDArray[np.float64]
 
@@ -72,10 +72,10 @@ class Adapter(ABC):
             if o.kind == WALL or math.dist(o.position, (x, y)) - o.size[0] - max(o.margin, 0.0) <= sight
         ]
 
-    def actions(self) -> Actions:
+    def actions(self) -> ActionMapping:
         """An action is the input itself, clipped."""
         low, high = self.robot.low(), self.robot.high()
-        return Actions(lambda action: np.clip(np.asarray(action, float), low, high), lambda control: control)
+        return ActionMapping(lambda action: np.clip(np.asarray(action, float), low, high), lambda control: control)
 
     def at(self, env: Any, target: Any) -> Array:
         """The action that drives at a point, forwards."""

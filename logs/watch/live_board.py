@@ -20,7 +20,7 @@ from brakeline.messaging.bus import Sample
 from brakeline.messaging.obstacle import WALL
 from brakeline.messaging.rejected_messages import headline
 from brakeline.messaging.robot import Robot
-from brakeline.safety.perception.displayed_map import promised, surroundings
+from brakeline.safety.perception.displayed_map import map_for_display, reserved_boxes
 
 LINES = 8  # of warnings
 EPISODES = 300  # whose rewards are drawn
@@ -87,9 +87,9 @@ class Card:
             raise ValueError(f"a tube of {len(centers)} and {len(halves)} numbers")
         self.tube = [[*centers[i : i + 2], *halves[i : i + 2]] for i in range(0, len(centers), d)]
         self.margin, self.at_least = decision.margin, decision.at_least
-        self.around = surroundings(self.robot, exchange.request).flat()
+        self.around = map_for_display(self.robot, exchange.request).flat()
         self.fleet = list(exchange.request.fleet)
-        boxes = promised(self.robot, exchange)
+        boxes = reserved_boxes(self.robot, exchange)
         self.reservation = [[*box[:2].tolist(), *(box[d : d + 2] + box[-1]).tolist()] for box in boxes]
         self._explain(exchange.request, decision)
 

@@ -65,7 +65,7 @@ class BackupPlan:
         self.seen: Array = np.zeros(self.robot.state_dim)  # the last measured state: of feedback, a stop is made of it
         self._compare = False  # was it measured where the prediction speaks of it?
         self._still = self.robot.horizon  # periods of a stop's inputs
-        self._vouchers: tuple[bytes, ...] = ()  # of this period and those to come; the last stays
+        self._plan_tokens: tuple[bytes, ...] = ()  # of this period and those to come; the last stays
 
     @property
     def next_input(self) -> Array:
@@ -75,7 +75,7 @@ class BackupPlan:
     @property
     def plan_token(self) -> bytes:
         """For the next request; empty: the service gave none."""
-        return self._vouchers[0] if self._vouchers else b""
+        return self._plan_tokens[0] if self._plan_tokens else b""
 
     def measured(self, state: Array) -> None:
         """At a period's beginning, before a question about it; one that is no state (n,) counts as none."""
@@ -93,7 +93,7 @@ class BackupPlan:
     ) -> Array:
         """A decision's plan becomes the committed one; returns the input to execute next."""
         self.reservation = reservation
-        self._vouchers = (b"", *plan_tokens)
+        self._plan_tokens = (b"", *plan_tokens)
         self.plan, self.model = plan, model if verified else UNVERIFIED
         self.predicted = predicted if predicted is not None and len(predicted.center) else None
         return self._advance()
@@ -108,7 +108,7 @@ class BackupPlan:
         """No decision came: the committed plan's next input. Nobody else saw whether the state that was measured is in
         its predicted set; where it is not, what was verified of the plan does not hold any more."""
         if not self.holds:
-            self.model, self._vouchers = UNVERIFIED, ()
+            self.model, self._plan_tokens = UNVERIFIED, ()
         self.predicted = None
         if self.robot.feedback:
             self.plan[0] = self.robot.braked(self.plan[0], self.seen, self.input_in_force)
@@ -118,7 +118,7 @@ class BackupPlan:
         robot = self.robot
         self._compare = False
         now: Array = self.plan[0].copy()
-        self._vouchers = self._vouchers[1:] or self._vouchers
+        self._plan_tokens = self._plan_tokens[1:] or self._plan_tokens
         self.reservation = None if self.reservation is None else self.reservation.later()
         rests = robot.keeps_still(now, self.seen, self.input_in_force)
         last = np.where(robot.stopping, 0.0, self.plan[-1])

@@ -13,7 +13,7 @@ from brakeline.messaging.robot import Robot
 from brakeline.safety.filter.moving_halfspaces import swept_half_spaces
 from brakeline.safety.filter.reservation import Promises
 from brakeline.safety.perception.occluded_regions import OccludedRegions
-from brakeline.safety.perception.scan_free_space import Cells
+from brakeline.safety.perception.scan_free_space import OccupiedCells
 from brakeline.safety.perception.scan_free_space import half_spaces as unseen_half_spaces
 
 Array = NDArray[np.float64]
@@ -45,7 +45,7 @@ class Around:
 
     near: Shapes
     moving: Movers | None
-    unseen: Cells | OccludedRegions | None
+    unseen: OccupiedCells | OccludedRegions | None
     promised: Promises | None = None  # these come last, once for the whole body
 
     @property
@@ -124,5 +124,5 @@ def _moving_or_unseen(which: int, robot: Robot, around: Around, start: Array, en
             mover = around.moving.take(one)
             return f"moving {mover.shapes.kind(0)}", *swept_half_spaces(mover, start, ends, 0.0, exact, robot.period)
         one -= len(around.moving)
-    assert isinstance(around.unseen, Cells)
+    assert isinstance(around.unseen, OccupiedCells)
     return UNSEEN, *unseen_half_spaces(around.unseen.take(one), start, ends, 0.0, exact, robot.period)

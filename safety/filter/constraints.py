@@ -76,7 +76,7 @@ class LocalMap:
     near: Shapes
     beyond: float
     moving: Movers | None = None  # that may meet the tube
-    unseen: seen.Cells | shades.OccludedRegions | None = None  # what a scan does not show to be free
+    unseen: seen.OccupiedCells | shades.OccludedRegions | None = None  # what a scan does not show to be free
     promised: Promises | None = None  # to other robots
 
     @property
@@ -89,7 +89,7 @@ class LocalMap:
     def away(self) -> Array | None:
         """A direction (d,), world, off what is nearest to the start; None: nothing is of which that can be told."""
         ways = [way_from(self.near, self.start)[None]] if len(self.near) else []
-        if isinstance(self.unseen, seen.Cells):
+        if isinstance(self.unseen, seen.OccupiedCells):
             ways.append(self.start - self.unseen.corners.reshape(-1, len(self.start)))
         each = np.concatenate(ways or [np.zeros((0, len(self.start)))])
         return each[np.argmin(np.einsum("nd,nd->n", each, each))] if len(each) else None
@@ -214,9 +214,9 @@ class TubeConstraints:
         if promised is not None:
             beyond, counts = self._parted(promised.nearest(start), beyond)
             promised = promised.take(counts) if counts.any() else None
-        unseen: seen.Cells | shades.OccludedRegions | None = None
+        unseen: seen.OccupiedCells | shades.OccludedRegions | None = None
         if isinstance(request.scan, RangeImage):
-            unseen = shades.shadows(request.scan, self._room(z_0, inputs, start, turn), self.body, start)
+            unseen = shades.occluded_regions(request.scan, self._room(z_0, inputs, start, turn), self.body, start)
         elif request.scan is not None:
             unseen = self._unseen(request.scan, start)
         return LocalMap(start, heading, turn, near, beyond, moving, unseen, promised)
@@ -236,20 +236,20 @@ class TubeConstraints:
         turn[0, 0], turn[0, 1], turn[1, 0], turn[1, 1] = cos, -sin, sin, cos
         return turn
 
-    def _room(self, z_0: Array, inputs: tuple[Array, Array], start: Array, turn: Array) -> shades.Room:
+    def _room(self, z_0: Array, inputs: tuple[Array, Array], start: Array, turn: Array) -> shades.PlanBoxes:
         """Boxes, world, in which every plan's discs stay with their middles after z_0; and some more."""
         z = np.concatenate([z_0, inputs[0]])
-        return shades.Room(
+        return shades.PlanBoxes(
             halfspace_kernels.filled_by_plans(*self._filled, z, inputs[1], self._beside, start, turn),
             self.robot.horizon * self.robot.period,
         )
 
-    def _unseen(self, scan: Scan, start: Array) -> seen.Cells | None:
+    def _unseen(self, scan: Scan, start: Array) -> seen.OccupiedCells | None:
         """What is not known to be free within reach, or may come there before a plan ends."""
         within = self.reach + scan.speed * (scan.age + self.robot.horizon * self.robot.period)
         within += float(np.linalg.norm(scan.sensor()[0] - start)) + scan.sensor_error
-        cells = seen.cells(scan, within + scan.heading_error * within)
-        return cells if len(cells) else None
+        occupied_cells = seen.occupied_cells(scan, within + scan.heading_error * within)
+        return occupied_cells if len(occupied_cells) else None
 
     def sets(self, start: Array, turn: Array, z: Array) -> tuple[Array, Array]:
         """Where the true positions at the periods' ends lie, world: centers and half-widths (N, d)."""
@@ -300,7 +300,7 @@ class TubeConstraints:
             if scene.unseen is not None:
                 of = shades if isinstance(scene.unseen, shades.OccludedRegions) else seen
                 beside.append(of.half_spaces(scene.unseen, start, ends, disc.radius, measured, self.robot.period))
-                if isinstance(scene.unseen, seen.Cells) and scene.unseen.speed > 0.0:
+                if isinstance(scene.unseen, seen.OccupiedCells) and scene.unseen.speed > 0.0:
                     self._let_pass(beside[-1][1])
             normals, offsets = beside[0] if len(beside) == 1 else map(np.concatenate, zip(*beside, strict=True))
             found.append(Planes(start, ends, normals, offsets, disc.radius, measured))

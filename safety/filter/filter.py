@@ -43,7 +43,7 @@ from brakeline.safety.filter.reservation import Reservation
 from brakeline.safety.model.model_set import ModelSet
 from brakeline.safety.model.stated_bound import stated_bound
 from brakeline.safety.model.turning_in_place import widened
-from brakeline.safety.perception.scan_free_space import shows
+from brakeline.safety.perception.scan_free_space import shows_free
 
 Array = NDArray[np.float64]
 
@@ -300,7 +300,7 @@ class Filter:
         on_a_way = request.model == UNVERIFIED and bool(going.any() and (np.abs(going) <= slow).all())
         if not (request.still(robot) or on_a_way):
             return None
-        if isinstance(request.scan, Scan) and not shows(request.scan, scene.start):  # no way out of there is known
+        if isinstance(request.scan, Scan) and not shows_free(request.scan, scene.start):  # no way out of there is known
             return None
         before = z_0[-m:]
         stand = self.inputs.regressors(z_0, self.inputs.stop(request.state, before))

@@ -17,7 +17,7 @@ from brakeline.messaging.range_image import RangeImage, directions
 from brakeline.messaging.robot import Robot
 from brakeline.messaging.scan import Scan
 from brakeline.messaging.sensor_messages import sensed_of
-from brakeline.safety.perception.image_coverage import seen_free
+from brakeline.safety.perception.image_coverage import patch_free_ranges
 from brakeline.safety.perception.scan_coverage import gaps
 
 Array = NDArray[np.float64]
@@ -55,7 +55,7 @@ class DisplayedMap:
         }
 
 
-def surroundings(robot: Robot, request: pb.Request, corners: int = OUTLINE) -> DisplayedMap:
+def map_for_display(robot: Robot, request: pb.Request, corners: int = OUTLINE) -> DisplayedMap:
     """What the request tells; corners: of the outline, about.
 
     Raises BadShape, BadScan: the request tells of none that are.
@@ -147,7 +147,7 @@ def _image_hits(image: RangeImage) -> Array:
 def level_outline(image: RangeImage, most: int = OUTLINE) -> Array:
     """Corners (c, 3) of a part of what the image shows to be free at the sensor's height: the least F of each group of
     columns, in the ring nearest to level."""
-    grid, free = seen_free(image)
+    grid, free = patch_free_ranges(image)
     elevations = grid.elevations
     ring = int(np.abs(elevations).argmin())
     columns = free.shape[1]
@@ -158,7 +158,7 @@ def level_outline(image: RangeImage, most: int = OUTLINE) -> Array:
     return np.asarray(image.sensor() + reach[:, None] * ways @ image.turn.T)
 
 
-def promised(robot: Robot, exchange: pb.Exchange) -> Array:
+def reserved_boxes(robot: Robot, exchange: pb.Exchange) -> Array:
     """What a robot of a fleet promises the others from this question on, boxes (N, 2d+1): center, half-widths, and the
     radius about them; (0, 2d+1): nothing."""
     decision = exchange.reply.decision

@@ -34,7 +34,7 @@ CORNER = math.sqrt(0.75)  # of a cube's edge: from its corner to its middle
 
 
 @dataclass(frozen=True)
-class Cover:
+class SphereCover:
     """Of beams that no direction is farther from than so much: kappa, and `within` [rad] of a direction in a patch
     are the beams that say how far the patch is free."""
 
@@ -42,11 +42,11 @@ class Cover:
     within: float
 
     @staticmethod
-    def of(farthest: float, patch: float) -> Cover:
+    def of(farthest: float, patch: float) -> SphereCover:
         """farthest [rad]: of any direction from a beam; patch [rad]: of a direction in a patch from its beam."""
         sine = math.sin(farthest)
         kappa = 2.0 * sine / (1.0 - math.sqrt(3.0) * sine)
-        return Cover(kappa, patch + math.asin(min(CORNER * kappa, 1.0)) + farthest)
+        return SphereCover(kappa, patch + math.asin(min(CORNER * kappa, 1.0)) + farthest)
 
     @property
     def share(self) -> float:
@@ -72,9 +72,9 @@ def _free_of_single() -> Callable[..., tuple[Single, Single]]:
     return free_of_single
 
 
-def seen_free(image: RangeImage) -> tuple[Grid, Single]:
+def patch_free_ranges(image: RangeImage) -> tuple[BeamGrid, Single]:
     """The grid, from pole to pole, and F (E', A) [m] of each beam's patch."""
-    width, grid = image.least_width, Grid.of(*image.ranges.shape, image.low, image.high)
+    width, grid = image.least_width, BeamGrid.of(*image.ranges.shape, image.low, image.high)
     ranges, scale = np.ascontiguousarray(image.ranges), grid.single.scale(width)
     errors = image.far, image.range_error
     returns, free = _free_of_single()(ranges, *grid.rings, *errors, *grid.windows, *scale, image.doubt)
@@ -98,20 +98,20 @@ def meshes(of: np.ufunc, values: NDArray[Any]) -> NDArray[Any]:
 
 
 @dataclass(frozen=True)
-class Window:
+class GridWindow:
     """So many rings above and below a beam, and so many columns (E,) beside it by its ring."""
 
     rows: int
     beside: NDArray[np.int64]
 
     @staticmethod
-    def of(columns: int, elevations: Array, step: float, within: float) -> Window:
+    def of(columns: int, elevations: Array, step: float, within: float) -> GridWindow:
         """A box about all beams within so many rad of each on the sphere."""
         half = np.full(len(elevations), math.pi)  # a cap with a pole in it is all about
         level = np.abs(elevations) + within < 0.5 * math.pi
         half[level] = np.arcsin(np.minimum(math.sin(within) / np.cos(elevations[level]), 1.0))
         beside = np.minimum(np.ceil(half * columns / math.tau - 1e-9), columns).astype(np.int64)
-        return Window(math.ceil(within / step - 1e-9), beside)
+        return GridWindow(math.ceil(within / step - 1e-9), beside)
 
     def least(self, values: Single) -> Single:
         """The least (E, A) of each beam's window in a grid (E, A)."""
@@ -121,7 +121,7 @@ class Window:
 
 
 @dataclass(frozen=True, eq=False)
-class Grid:
+class BeamGrid:
     """What is known of a grid before any range: elevations (E',) [rad] from pole to pole, of which so many rings below
     and above are not seen, columns, and how far no direction is from the nearest beam [rad]; what single beams say and
     where they are, and balls twice as wide."""
@@ -131,10 +131,10 @@ class Grid:
     half_diagonal: float
     below: int
     above: int
-    single: Cover
-    beams: Window
-    double: Cover
-    balls: Window
+    single: SphereCover
+    beams: GridWindow
+    double: SphereCover
+    balls: GridWindow
 
     @cached_property
     def rings(self) -> tuple[int, int]:
@@ -148,11 +148,14 @@ class Grid:
 
     @staticmethod
     @lru_cache(maxsize=64)
-    def of(rings: int, columns: int, low: float, high: float) -> Grid:
+    def of(rings: int, columns: int, low: float, high: float) -> BeamGrid:
         step = (high - low) / (rings - 1)
         patch = 0.5 * math.hypot(step, math.tau / columns)
         above, below = (max(math.ceil((0.5 * math.pi - end) / step - 0.5 - 1e-9), 0) for end in (high, -low))
         elevations = np.clip(low + step * np.arange(-below, rings + above), -0.5 * math.pi, 0.5 * math.pi)
-        single, double = Cover.of(patch, patch), Cover.of(max(2.0 * patch, 1.5 * step), patch)  # the latter at a pole
-        beams, balls = (Window.of(columns, elevations, step, cover.within) for cover in (single, double))
-        return Grid(elevations, columns, patch, below, above, single, beams, double, balls)
+        single, double = (
+            SphereCover.of(patch, patch),
+            SphereCover.of(max(2.0 * patch, 1.5 * step), patch),
+        )  # the latter at a pole
+        beams, balls = (GridWindow.of(columns, elevations, step, cover.within) for cover in (single, double))
+        return BeamGrid(elevations, columns, patch, below, above, single, beams, double, balls)

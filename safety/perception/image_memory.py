@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from brakeline.messaging.range_image import RangeImage, directions
 from brakeline.messaging.robot import Robot
 from brakeline.messaging.scan import Scan
-from brakeline.safety.perception.image_coverage import Single, Window, meshes, seen_free
-from brakeline.safety.perception.visibility_memory import FanMemory, Memory
+from brakeline.safety.perception.image_coverage import GridWindow, Single, meshes, patch_free_ranges
+from brakeline.safety.perception.visibility_memory import FanMemory, VisibilityMemory
 
 Array = NDArray[np.float64]
 
@@ -36,14 +36,14 @@ class _Seen:
     def free(self) -> tuple[float, Single]:
         """The lowest ring's elevation [rad], and the free ranges (len(ASIDE), E, A) of all directions within so much of
         each patch."""
-        grid, free = seen_free(self.image)
+        grid, free = patch_free_ranges(self.image)
         about, elevations = 2.0 * grid.half_diagonal, grid.elevations
         columns, step = grid.columns, self.image.step[0]
-        levels = [Window.of(columns, elevations, step, aside + about).least(free) for aside in ASIDE]
+        levels = [GridWindow.of(columns, elevations, step, aside + about).least(free) for aside in ASIDE]
         return float(elevations[0]), np.stack(levels)
 
 
-class ImageMemory(Memory[RangeImage]):
+class ImageMemory(VisibilityMemory[RangeImage]):
     """Of an image all about."""
 
     START = 0.7  # what flies needs more to get going

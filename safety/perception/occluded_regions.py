@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from brakeline.messaging.obstacle import FARTHEST
 from brakeline.messaging.range_image import RangeImage, directions
 from brakeline.safety.filter.halfspaces import TOUCHING
-from brakeline.safety.perception.image_coverage import Grid, seen_free
+from brakeline.safety.perception.image_coverage import BeamGrid, patch_free_ranges
 
 Array = NDArray[np.float64]
 Single = NDArray[np.float32]
@@ -31,7 +31,7 @@ FACES = np.vstack([np.eye(3), -np.eye(3)])  # of the room
 
 
 @dataclass(frozen=True)
-class Room:
+class PlanBoxes:
     """Boxes, world, that no plan is outside of at the periods' ends, now the first of them, until so many s from now:
     their lowest and highest corners (2, N+1, 3), or of one for all (2, 1, 3)."""
 
@@ -47,7 +47,7 @@ class OccludedRegions:
 
     lines: Single
     origin: Array
-    room: Room
+    room: PlanBoxes
     speed: float
     age: float
 
@@ -67,10 +67,10 @@ def _compiled() -> tuple[Callable[..., Single], Callable[..., tuple[Array, Array
     return behind, about_way
 
 
-def shadows(image: RangeImage, room: Room, body: float, origin: Array) -> OccludedRegions:
+def occluded_regions(image: RangeImage, room: PlanBoxes, body: float, origin: Array) -> OccludedRegions:
     """All that is not known to be free and that a body of that radius [m], with its middle in the room, may touch; from
     an origin (3,) in the room."""
-    grid, free = seen_free(image)
+    grid, free = patch_free_ranges(image)
     beside = body + image.speed * (image.age + room.last)
     about = grid.half_diagonal + image.angle_error + ASIDE
     pose = image.attitude, image.at, image.mount
@@ -80,7 +80,7 @@ def shadows(image: RangeImage, room: Room, body: float, origin: Array) -> Occlud
 
 
 @lru_cache(maxsize=16)
-def _patches(grid: Grid) -> tuple[NDArray[np.int64], Single]:
+def _patches(grid: BeamGrid) -> tuple[NDArray[np.int64], Single]:
     """How many columns make a patch in each ring (E,), more than one near the poles, and their middles (3, n), as
     exactly as `ASIDE`."""
     elevations, columns = grid.elevations, grid.columns

@@ -28,7 +28,7 @@ WIDEST = math.radians(15.0)  # a wider gap is cut into several of the same F, so
 
 
 @dataclass(frozen=True)
-class Cells:
+class OccupiedCells:
     """n convex cells: corners (n, V, 2), world [m], repeated where there are fewer; error (n, V) m, how far each may be
     off; ways (n, 4): where what they hold has gone since, `age` s ago, as `Followed` says; speed [m/s]: the fastest."""
 
@@ -41,29 +41,31 @@ class Cells:
     def __len__(self) -> int:
         return len(self.corners)
 
-    def take(self, index: NDArray[np.intp]) -> Cells:
+    def take(self, index: NDArray[np.intp]) -> OccupiedCells:
         """The chosen ones."""
-        return Cells(self.corners[index], self.error[index], self.ways[index], self.speed, self.age)
+        return OccupiedCells(self.corners[index], self.error[index], self.ways[index], self.speed, self.age)
 
-    def beside(self, others: Cells) -> Cells:
+    def beside(self, others: OccupiedCells) -> OccupiedCells:
         """These and those, of one scan."""
         widest = max(self.corners.shape[1], others.corners.shape[1])
         parts = []
-        for cells in (self, others):
-            slots = np.minimum(np.arange(widest), max(cells.corners.shape[1] - 1, 0))  # the last one repeated
-            parts.append((cells.corners[:, slots], cells.error[:, slots], cells.ways))
+        for occupied_cells in (self, others):
+            slots = np.minimum(np.arange(widest), max(occupied_cells.corners.shape[1] - 1, 0))  # the last one repeated
+            parts.append((occupied_cells.corners[:, slots], occupied_cells.error[:, slots], occupied_cells.ways))
         joined = [np.concatenate(pair) for pair in zip(*parts, strict=True)]
-        return Cells(joined[0], joined[1], joined[2], self.speed, self.age)
+        return OccupiedCells(joined[0], joined[1], joined[2], self.speed, self.age)
 
 
-def cells(scan: Scan, within: float) -> Cells:
+def occupied_cells(scan: Scan, within: float) -> OccupiedCells:
     """All that is not known to be free within so many m of the sensor, and where somebody may come out of it."""
     found = gaps_and_ways(scan)
     known = _cells(scan, within, *found)
     return known if scan.followed is None else known.beside(_edges(scan, within, *found))
 
 
-def _cells(scan: Scan, within: float, angles: Array, width: Array, free: Array, way: NDArray[np.uint8]) -> Cells:
+def _cells(
+    scan: Scan, within: float, angles: Array, width: Array, free: Array, way: NDArray[np.uint8]
+) -> OccupiedCells:
     parts = np.maximum(np.ceil(width / WIDEST).astype(int), 1)
     if (parts > 1).any():
         each = np.repeat(np.arange(len(angles)), parts)
@@ -72,7 +74,7 @@ def _cells(scan: Scan, within: float, angles: Array, width: Array, free: Array, 
         angles, free, way = angles[each] + number * width, free[each], way[each]
     near = free < within
     if not near.any():
-        return Cells(np.zeros((0, 1, 2)), np.zeros((0, 1)), np.zeros((0, 4)), scan.speed, scan.age)
+        return OccupiedCells(np.zeros((0, 1, 2)), np.zeros((0, 1)), np.zeros((0, 4)), scan.speed, scan.age)
     begins = np.append(True, ~near[:-1] | (np.abs(np.diff(free)) > JUMP) | (way[1:] != way[:-1]))
     run = np.cumsum(begins) - 1
     along = angles - angles[begins][run]
@@ -94,7 +96,7 @@ def _cells(scan: Scan, within: float, angles: Array, width: Array, free: Array, 
     )  # an empty slot repeats the cell's first gap
     filled[cell, slot] = np.arange(len(cell))
     corners, error = points[filled].reshape(len(start), -1, 2), error[filled].reshape(len(start), -1)
-    return Cells(corners, error, ways_of(scan)[way[start]], scan.speed, scan.age)
+    return OccupiedCells(corners, error, ways_of(scan)[way[start]], scan.speed, scan.age)
 
 
 def ways_of(scan: Scan) -> Array:
@@ -103,7 +105,9 @@ def ways_of(scan: Scan) -> Array:
     return anywhere if scan.followed is None else np.concatenate([anywhere, scan.followed.ways])
 
 
-def _edges(scan: Scan, within: float, angles: Array, width: Array, free: Array, way: NDArray[np.uint8]) -> Cells:
+def _edges(
+    scan: Scan, within: float, angles: Array, width: Array, free: Array, way: NDArray[np.uint8]
+) -> OccupiedCells:
     """Where what is hidden behind something followed may come out: beside it, as fast as anything may (`hidden.py`)."""
     outlets = occlusion_exits.outlets(angles, width, free, scan.least_radius)
     chosen = (way[outlets.before] > 0) & (outlets.near < within)
@@ -112,10 +116,10 @@ def _edges(scan: Scan, within: float, angles: Array, width: Array, free: Array, 
     reach = np.column_stack([outlets.near, outlets.far])[chosen]
     corners = at + reach[..., None] * np.column_stack([np.cos(side), np.sin(side)])[:, None]
     error = scan.position_error + scan.heading_error * (reach + math.hypot(*scan.mount))
-    return Cells(corners, error, np.tile(ways_of(scan)[0], (len(reach), 1)), scan.speed, scan.age)
+    return OccupiedCells(corners, error, np.tile(ways_of(scan)[0], (len(reach), 1)), scan.speed, scan.age)
 
 
-def shows(scan: Scan, place: Array) -> bool:
+def shows_free(scan: Scan, place: Array) -> bool:
     """Is a place (2,), world, among what the scan shows to be free, or on its edge?"""
     at, heading = scan.sensor()
     east, north = place - at
@@ -125,7 +129,7 @@ def shows(scan: Scan, place: Array) -> bool:
 
 
 def half_spaces(
-    near: Cells, start: Array, nominal: Array, keep_off: float, measured: Array, period: float
+    near: OccupiedCells, start: Array, nominal: Array, keep_off: float, measured: Array, period: float
 ) -> tuple[Array, Array]:
     """As `freespace.half_spaces`. A normal points to a cell's closest corner; its level is the least over all corners,
     so that the whole hull is beyond it, whatever the normal."""

@@ -52,7 +52,7 @@ class _Seen:
     groups: list[NDArray[np.intp]]
 
 
-class Follower:
+class ScanTracker:
     """Of one robot in one world that is not put back."""
 
     def __init__(self) -> None:

@@ -20,7 +20,7 @@ from brakeline.messaging.range_image import RangeImage
 from brakeline.messaging.scan import Scan
 from brakeline.safety.perception.occlusion_exits import least_of
 from brakeline.safety.perception.scan_free_space import gaps
-from brakeline.safety.perception.scan_tracking import Follower
+from brakeline.safety.perception.scan_tracking import ScanTracker
 
 Array = NDArray[np.float64]
 
@@ -34,7 +34,7 @@ CELLS = 360  # of a turn
 S = TypeVar("S", Scan, RangeImage)
 
 
-class Memory(ABC, Generic[S]):
+class VisibilityMemory(ABC, Generic[S]):
     """Of one robot in one world that is not put back. Positions are the measured ones, with their errors."""
 
     START = 0.1  # m beside the body, where it is put down
@@ -129,7 +129,7 @@ class _Seen:
     least: list[Array]
 
 
-class FanMemory(Memory[Scan]):
+class FanMemory(VisibilityMemory[Scan]):
     """Of a fan in the plane."""
 
     nothing = Scan(np.zeros(0), np.zeros(0), (0.0, 0.0, 0.0))
@@ -137,7 +137,7 @@ class FanMemory(Memory[Scan]):
     def reset(self) -> None:
         super().reset()
         self._seen: deque[_Seen] = deque(maxlen=KEPT)
-        self._follower = Follower()
+        self._follower = ScanTracker()
 
     def later(self, elapsed: float) -> None:
         super().later(elapsed)

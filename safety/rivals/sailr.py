@@ -30,7 +30,7 @@ from brakeline.safety.rivals.pretrained import Pretrained
 Array = NDArray[np.float64]
 
 
-def normalised(robot: Robot, action: Array) -> Array:
+def normalised_input(robot: Robot, action: Array) -> Array:
     """Inputs (..., m) in units of half their range about its middle: what Q is a function of."""
     low, high = robot.low(), robot.high()
     return np.asarray((2.0 * action - low - high) / (high - low))
@@ -56,7 +56,7 @@ class Sailr:
 
     def advantage(self, observation: NDArray[np.float32], action: Array) -> float:
         """max Q(s, a) − min V(s), in [-1, 1]: how much more costly the action is than the backup."""
-        worst = self.q(np.concatenate([observation, normalised(self.robot, action)])).max()
+        worst = self.q(np.concatenate([observation, normalised_input(self.robot, action)])).max()
         best = self.v(observation).min()
         return _sigmoid(float(worst)) - _sigmoid(float(best))
 

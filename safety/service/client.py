@@ -26,7 +26,7 @@ from brakeline.messaging.sensor_messages import Sensed, add_sensed
 from brakeline.messaging.topics import DECIDE
 from brakeline.safety.filter.backup_plan import BackupPlan
 from brakeline.safety.filter.request import BadRequest
-from brakeline.safety.service.asker import Answer, accept, known_free_in, observation_in, obstacles_in, scan_in
+from brakeline.safety.service.filter_client import Answer, accept, known_free_in, observation_in, obstacles_in, scan_in
 from brakeline.safety.service.request_digest import digest
 from brakeline.safety.service.wire import decision_of, reservation_message, reservation_of
 
@@ -114,7 +114,7 @@ def request_message(
     return message
 
 
-def read(reply: pb.Reply, request: pb.Request, robot: Robot) -> Answer:
+def read_reply(reply: pb.Reply, request: pb.Request, robot: Robot) -> Answer:
     """The decision in a reply to a request.
 
     Raises:
@@ -149,7 +149,9 @@ def read(reply: pb.Reply, request: pb.Request, robot: Robot) -> Answer:
     except BadRequest as error:
         raise _bad_reply(error.field, str(error)) from error
     plan_tokens = tuple(decision.plan_tokens)
-    return Answer.of(found, robot, queue_ms=decision.queue_ms, unvouched=decision.unvouched, plan_tokens=plan_tokens)
+    return Answer.of(
+        found, robot, queue_ms=decision.queue_ms, token_rejected=decision.token_rejected, plan_tokens=plan_tokens
+    )
 
 
 def _follows(plan: Array, request: pb.Request, robot: Robot) -> bool:
@@ -180,7 +182,7 @@ def bus_at(connect: str | Sequence[str], keys: Path | str | None, name: str) -> 
     return Bus(BusSettings(connect=endpoints, keys=None if keys is None else Path(keys)), name)
 
 
-class BusAsker:
+class BusClient:
     """A bus to ask about robots of one kind, closed with it if it is its own."""
 
     def __init__(self, bus: Bus, robot: Robot | str, deadline: float) -> None:
@@ -199,7 +201,7 @@ class BusAsker:
         self.close()
 
 
-class SafetyClient(BusAsker):
+class SafetyClient(BusClient):
     """Asks the safety service about one robot, and keeps its committed plan.
 
     Not for several threads at once; a program with several robots has a client (or a `BackupPlan`) for each, and a
@@ -246,7 +248,7 @@ class SafetyClient(BusAsker):
         step: int = 0,
         time: float = 0.0,
     ) -> Answer:
-        """Ask for the decision on an action and commit to its plan, as `Asker` says: then execute `answer.action`.
+        """Ask for the decision on an action and commit to its plan; then execute `answer.action`.
 
         Args:
             actor: your name, the same in every question; episode, step, time [s]: for the service's log.
@@ -268,7 +270,7 @@ class SafetyClient(BusAsker):
             step=step,
             time=time,
         )
-        answer = read(ask(self.bus, [request], self.deadline)[0], request, self.robot)
+        answer = read_reply(query_service(self.bus, [request], self.deadline)[0], request, self.robot)
         accept(self.backup_plan, answer)
         return answer
 
@@ -281,7 +283,7 @@ class SafetyClient(BusAsker):
         self.backup_plan.reset()
 
 
-def ask(bus: Bus, requests: Sequence[pb.Request], deadline: float) -> list[pb.Reply]:
+def query_service(bus: Bus, requests: Sequence[pb.Request], deadline: float) -> list[pb.Reply]:
     """The replies to requests about robots of one kind, in their order.
 
     Raises:

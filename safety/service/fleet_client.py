@@ -18,11 +18,19 @@ from brakeline.messaging.obstacle import Obstacle
 from brakeline.messaging.robot import Robot
 from brakeline.messaging.sensor_messages import Sensed
 from brakeline.safety.filter.backup_plan import BackupPlan
-from brakeline.safety.service.asker import Answer, accept
-from brakeline.safety.service.client import DEADLINE, Array, BusAsker, ask, bus_at, read, request_message
+from brakeline.safety.service.client import (
+    DEADLINE,
+    Array,
+    BusClient,
+    bus_at,
+    query_service,
+    read_reply,
+    request_message,
+)
+from brakeline.safety.service.filter_client import Answer, accept
 
 
-class FleetClient(BusAsker):
+class FleetClient(BusClient):
     """Asks about all robots of a world, and keeps each one's committed plan and promise (docs/fleets.md).
 
     Time passes for all of them or for none: each period is one `decide`, or one `fallback` where that raised. They
@@ -81,8 +89,8 @@ class FleetClient(BusAsker):
             plans may rest on that one's: execute `fallback()` instead, all of it.
         """
         nothing: list[None] = [None] * len(self.names)
-        surroundings = nothing if obstacles is None else obstacles, nothing if scans is None else scans
-        asked = zip(self.names, self.backup_plans, states, actions, *surroundings, strict=True)
+        map_for_display = nothing if obstacles is None else obstacles, nothing if scans is None else scans
+        asked = zip(self.names, self.backup_plans, states, actions, *map_for_display, strict=True)
         requests = [
             request_message(
                 kept,
@@ -98,8 +106,8 @@ class FleetClient(BusAsker):
             )
             for name, kept, state, action, near, scan in asked
         ]
-        replies = zip(ask(self.bus, requests, self.deadline), requests, strict=True)
-        answers = [read(reply, request, self.robot) for reply, request in replies]
+        replies = zip(query_service(self.bus, requests, self.deadline), requests, strict=True)
+        answers = [read_reply(reply, request, self.robot) for reply, request in replies]
         for kept, answer in zip(self.backup_plans, answers, strict=True):
             accept(kept, answer)
         self._step += 1

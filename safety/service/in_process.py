@@ -19,7 +19,7 @@ from brakeline.messaging.robot import Robot
 from brakeline.messaging.sensor_messages import Sensed
 from brakeline.safety.filter.backup_plan import BackupPlan
 from brakeline.safety.filter.request import MOST_OBSERVED, Request
-from brakeline.safety.service.asker import Answer, accept, known_free_in, observation_in, obstacles_in, scan_in
+from brakeline.safety.service.filter_client import Answer, accept, known_free_in, observation_in, obstacles_in, scan_in
 
 if TYPE_CHECKING:
     from brakeline.safety.methods import Method
@@ -57,7 +57,7 @@ class InProcess:
         observation: ArrayLike | None = None,
         known_free: bool = False,
     ) -> Answer:
-        """Decide on an action and commit to its plan, as `Asker` says: then execute `answer.action`.
+        """Decide on an action and commit to its plan, as `FilterClient` says: then execute `answer.action`.
 
         Raises:
             BadRequest, BadShape: a value is missing, not finite, of the wrong size or type; `field` names it.
@@ -127,7 +127,7 @@ class InProcess:
         )
 
 
-def sendable(observation: object) -> NDArray[np.float32]:
+def request_observation(observation: object) -> NDArray[np.float32]:
     """Return the observation as a request holds it: a list of finite numbers, or an empty one.
 
     Only the rivals read observations. Another environment may observe an image or a dict: a request holds none of it.

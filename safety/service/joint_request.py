@@ -24,7 +24,7 @@ class AskedApart(BadRequest):
 
 
 @dataclass
-class Together:
+class FleetReservations:
     """The robots of one world in a batch: what each promises at this moment, by its actor's name."""
 
     names: tuple[str, ...]
@@ -35,7 +35,7 @@ class Together:
         return Promises.to([reservation for other, reservation in self.reservations.items() if other != name])
 
 
-def check_together(requests: Sequence[pb.Request]) -> None:
+def check_fleet(requests: Sequence[pb.Request]) -> None:
     """For one world's requests of a batch.
 
     Raises:
@@ -58,7 +58,7 @@ def check_together(requests: Sequence[pb.Request]) -> None:
         raise AskedApart("the robots of a fleet are of one kind, and asked about at the same step")
 
 
-def worlds(requests: Sequence[pb.Request]) -> list[list[int]]:
+def group_by_fleet(requests: Sequence[pb.Request]) -> list[list[int]]:
     """The requests of a batch in the order in which they are decided, those of one world together.
 
     Robots of a world take turns: who is first moves on with the period's number, so that nobody is last for ever.
@@ -74,7 +74,7 @@ def worlds(requests: Sequence[pb.Request]) -> list[list[int]]:
     return alone + list(shared.values())
 
 
-def joint_request(requests: Sequence[pb.Request], standing: Callable[[pb.Request], Reservation]) -> Together:
+def joint_request(requests: Sequence[pb.Request], standing: Callable[[pb.Request], Reservation]) -> FleetReservations:
     """What the robots of one world are committed to before any of them is decided.
 
     standing: of a robot that has promised nothing yet; raises BadRequest unless it stands.
@@ -82,8 +82,8 @@ def joint_request(requests: Sequence[pb.Request], standing: Callable[[pb.Request
     Raises:
         AskedApart: not all of them are there. BadRequest: a promise is none.
     """
-    check_together(requests)
-    found = Together(tuple(request.actor for request in requests))
+    check_fleet(requests)
+    found = FleetReservations(tuple(request.actor for request in requests))
     for request in requests:
         found.reservations[request.actor] = standing(request)
     return found

@@ -80,7 +80,7 @@ class PlanAuthenticator:
             for k in range(1, max(2, 1 + at_end) + 1)
         ]
 
-    def vouches(self, request: pb.Request, robot: Robot) -> bool:
+    def is_authentic(self, request: pb.Request, robot: Robot) -> bool:
         """Is it true what a request says of its plan: that a model verified it? It may also say nothing of the kind."""
         if request.model in ("", UNVERIFIED):
             return True

@@ -22,11 +22,11 @@ from brakeline.safety.filter.reservation import Reservation
 from brakeline.safety.methods import Method, Model, load, ready
 from brakeline.safety.model.model_set import BadModel
 from brakeline.safety.model.stated_bound import check_bound
-from brakeline.safety.service.joint_request import Together, joint_request, worlds
+from brakeline.safety.service.joint_request import FleetReservations, group_by_fleet, joint_request
 from brakeline.safety.service.plan_token import PlanAuthenticator
 from brakeline.safety.service.request_digest import digest
-from brakeline.safety.service.signature import Signed, Trust, Untrusted
-from brakeline.safety.service.wire import batch_of, error_of, message_of, request_of, reservation_of
+from brakeline.safety.service.signature import SignedModel, TrustedSigners, Untrusted
+from brakeline.safety.service.wire import batch_of, decision_reply, error_reply, request_of, reservation_of
 
 log = logging.getLogger("brakeline.safety")
 
@@ -36,7 +36,7 @@ class NoModel(BadRequest):
 
 
 @dataclass
-class Models:
+class ModelRegistry:
     """The method in use for each robot, and every version there has been, with an archive folder if given.
 
     limits: the largest stated bound that is used without a question, by the robot's name; without it the limit in the
@@ -50,7 +50,7 @@ class Models:
     known: set[str] = field(default_factory=set)
     _lock: Lock = field(default_factory=Lock)
 
-    def install(self, model: Model, signed: Signed | None = None) -> None:
+    def install(self, model: Model, signed: SignedModel | None = None) -> None:
         """Put a model to use; requests in hand finish with the one before. signed: as it came, to be archived so.
 
         Raises:
@@ -72,7 +72,7 @@ class Models:
         if self.archive is not None:
             (signed or model).save(archive_path(self.archive, model.robot.name, method.version))
 
-    def filter_for(self, request: pb.Request) -> Method:
+    def method_for(self, request: pb.Request) -> Method:
         """Raises UnknownRobot, NoModel or StaleModel."""
         method = self.filters.get(request.robot)
         if method is None:
@@ -100,13 +100,13 @@ def archive_path(archive: Path, robot: str, version: str) -> Path:
 
 
 @dataclass
-class Counts:
+class ServiceCounts:
     decisions: int = 0
     errors: int = 0
     violations: int = 0
     compared: int = 0
     unverified: int = 0
-    unvouched: int = 0
+    token_rejected: int = 0
     not_finite: int = 0  # decisions on proposals with NaN or infinity
     decide_ms: float = 0.0
     answering: float = 0.0  # s
@@ -119,25 +119,27 @@ class Counts:
             "compared": self.compared,
             "violations": self.violations,
             "unverified": self.unverified,
-            "unvouched": self.unvouched,
+            "token_rejected": self.token_rejected,
             "not_finite": self.not_finite,
             "decide_ms": mean,
         }
 
 
-def answerer(models: Models, counts: Counts, notary: PlanAuthenticator | None = None) -> Callable[[bytes], bytes]:
+def batch_handler(
+    models: ModelRegistry, counts: ServiceCounts, authenticator: PlanAuthenticator | None = None
+) -> Callable[[bytes], bytes]:
     """The service's core: bytes of a RequestBatch to bytes of a ReplyBatch. Raises BadRequest for no batch at all.
 
     notary: who knows which plans were verified; without one (in process, and when a log is replayed) what requests say
     of theirs is believed.
     """
 
-    def one(message: pb.Request, received: int, shared: Together | None = None) -> pb.Reply:
+    def one(message: pb.Request, received: int, shared: FleetReservations | None = None) -> pb.Reply:
         try:
-            chosen = models.filter_for(message)
-            believed = notary is None or notary.vouches(message, chosen.robot)
+            chosen = models.method_for(message)
+            believed = authenticator is None or authenticator.is_authentic(message, chosen.robot)
             if not believed:
-                counts.unvouched += 1
+                counts.token_rejected += 1
                 message.model = UNVERIFIED
             if shared is None:
                 request = request_of(message, chosen.robot)
@@ -148,11 +150,11 @@ def answerer(models: Models, counts: Counts, notary: PlanAuthenticator | None = 
             decision = chosen.decide(request)
         except (BadRequest, UnknownRobot) as error:
             counts.errors += 1
-            return error_of(error)
+            return error_reply(error)
         except Exception as error:  # whatever it is, the robot brakes on an error reply, and the service goes on
             counts.errors += 1
             log.exception("decide failed for %s", message.actor or message.robot)
-            return error_of(error)
+            return error_reply(error)
         counts.decisions += 1
         counts.decide_ms += decision.time_ms
         counts.compared += decision.compared
@@ -163,15 +165,15 @@ def answerer(models: Models, counts: Counts, notary: PlanAuthenticator | None = 
             log.warning("%s, step %d: outside the predicted set", message.actor or message.robot, message.step)
         if shared is not None and decision.reservation is not None:
             shared.reservations[message.actor] = decision.reservation
-        reply = message_of(decision, queue_ms)
-        reply.robot, reply.decision.unvouched = chosen.robot.name, not believed
-        if notary is not None and decision.verified:
-            reply.decision.plan_tokens.extend(notary.plan_tokens(message, reply.decision, chosen.robot))
+        reply = decision_reply(decision, queue_ms)
+        reply.robot, reply.decision.token_rejected = chosen.robot.name, not believed
+        if authenticator is not None and decision.verified:
+            reply.decision.plan_tokens.extend(authenticator.plan_tokens(message, reply.decision, chosen.robot))
         return reply
 
     def committed(message: pb.Request) -> Reservation:
         """What a fleet's robot has promised; one that stands and has not: to go on standing."""
-        method = models.filter_for(message)
+        method = models.method_for(message)
         if not isinstance(method, Filter):
             raise BadRequest("fleet", "only our own filter makes promises: the rivals predict nothing")
         robot = method.robot
@@ -189,14 +191,14 @@ def answerer(models: Models, counts: Counts, notary: PlanAuthenticator | None = 
         received = perf_counter_ns()
         batch = batch_of(payload)
         replies: list[pb.Reply] = [pb.Reply()] * len(batch.requests)
-        for world in worlds(batch.requests):
+        for world in group_by_fleet(batch.requests):
             members = [batch.requests[i] for i in world]
             try:
                 shared = joint_request(members, committed) if members[0].fleet else None
             except (BadRequest, UnknownRobot) as error:
                 counts.errors += len(members)
                 for i in world:
-                    replies[i] = error_of(error)
+                    replies[i] = error_reply(error)
                 continue
             for i, request in zip(world, members, strict=True):
                 replies[i] = one(request, received, shared)
@@ -213,7 +215,7 @@ class SafetySettings:
     models: tuple[Path, ...]  # model files, one a robot; each says which method it is of
     archive: Path | None = None  # where versions that come over the bus are kept
     name: str = "safety"
-    limits: Mapping[str, float] = field(default_factory=dict)  # as those of `Models`
+    limits: Mapping[str, float] = field(default_factory=dict)  # as those of `ModelRegistry`
     accept_bound: float | None = None
     secrets: Path | None = None  # folder with the key of vouchers, where the bus has no keys
 
@@ -227,22 +229,22 @@ def main(settings: SafetySettings) -> None:
     import brakeline.safety.filter.kernels.halfspace_kernels  # noqa: F401  # compiled, which takes seconds the first time: before it is seen to live
 
     keys = settings.bus.keys
-    models, counts = Models(settings.archive, settings.limits, settings.accept_bound), Counts()
+    models, counts = ModelRegistry(settings.archive, settings.limits, settings.accept_bound), ServiceCounts()
     with Process(settings.bus, settings.name) as process:
-        trust = Trust.load(keys) if keys is not None else None
-        notary = PlanAuthenticator.of(keys or settings.secrets)
+        trust = TrustedSigners.load(keys) if keys is not None else None
+        authenticator = PlanAuthenticator.of(keys or settings.secrets)
         for path in settings.models:
             if trust is None:
                 models.install(load(path))
             else:
-                models.install(trust.load_model(path), Signed.load(path))
+                models.install(trust.load_model(path), SignedModel.load(path))
 
         def replace(sample: Sample) -> None:
             try:
                 said = sample.message()
                 if trust is None:
                     raise Untrusted("models are taken over the bus by a service with keys only: who signed it?")
-                signed = Signed(said.file, said.claim, said.signature)
+                signed = SignedModel(said.file, said.claim, said.signature)
                 models.install(trust.open(signed, said.robot), signed)
             except (BadModel, BusError) as error:
                 log.error("a model was refused: %s", error)
@@ -261,7 +263,7 @@ def main(settings: SafetySettings) -> None:
 
         process.refresh = refresh
         process.bus.subscribe(MODEL, replace)
-        process.bus.serve(DECIDE, answerer(models, counts, notary))
+        process.bus.serve(DECIDE, batch_handler(models, counts, authenticator))
         process.announce()
         log.info("ready")
         process.stop.wait()

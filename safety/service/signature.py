@@ -43,7 +43,7 @@ class Untrusted(BadModel):
 
 
 @dataclass(frozen=True)
-class Signed:
+class SignedModel:
     """A model's file, the claim about it (JSON) and the claim's signature."""
 
     file: bytes
@@ -72,7 +72,7 @@ def seal_of(path: Path) -> Path:
     return path.with_suffix(".seal")
 
 
-class Signer:
+class ModelSigner:
     """Whoever certifies."""
 
     def __init__(self, key: Ed25519PrivateKey) -> None:
@@ -92,7 +92,7 @@ class Signer:
             raise Untrusted(f"{folder / KEY}: not an Ed25519 key")
         return cls(key)
 
-    def sign(self, model: Model, data: Dataset | None = None) -> Signed:
+    def sign(self, model: Model, data: Dataset | None = None) -> SignedModel:
         """A model with a claim about it; data: those that it was made from, else its own word is taken for its domain.
 
         Raises:
@@ -111,11 +111,11 @@ class Signer:
             "domain": None if domain is None else domain.tolist(),
         }
         words = json.dumps(claim, sort_keys=True).encode()
-        return Signed(file, words, self._key.sign(CONTEXT + words))
+        return SignedModel(file, words, self._key.sign(CONTEXT + words))
 
 
 @dataclass(frozen=True)
-class Trust:
+class TrustedSigners:
     """Whose models are taken: public keys, each with the robots that it may speak about."""
 
     signers: tuple[tuple[Ed25519PublicKey, tuple[str, ...]], ...] = ()
@@ -137,7 +137,7 @@ class Trust:
                 raise Untrusted(f"{path}: no signer's public key: {error!r}") from error
         return cls(tuple(found))
 
-    def open(self, signed: Signed, robot: str | None = None) -> Model:
+    def open(self, signed: SignedModel, robot: str | None = None) -> Model:
         """The model in a signed file; robot: what it is said to be for, by where it was published.
 
         Raises:
@@ -166,11 +166,11 @@ class Trust:
     def load_model(self, path: Path) -> Model:
         """The model in a file with a seal beside it. Raises as `open`, naming the file."""
         try:
-            return self.open(Signed.load(path))
+            return self.open(SignedModel.load(path))
         except Untrusted as error:
             raise Untrusted(f"{path}: {error}") from error
 
-    def _signer_of(self, signed: Signed) -> tuple[str, ...]:
+    def _signer_of(self, signed: SignedModel) -> tuple[str, ...]:
         """The robots that whoever signed it may speak about."""
         for key, robots in self.signers:
             try:
@@ -198,7 +198,7 @@ def write_signer(folder: Path, name: str = "certify", robots: tuple[str, ...] = 
     write_whole(folder / SIGNERS / f"{name}.json", json.dumps(said, indent=2).encode())
 
 
-def _claim(signed: Signed) -> dict[str, Any]:
+def _claim(signed: SignedModel) -> dict[str, Any]:
     """What was signed. Raises Untrusted."""
     try:
         claim = json.loads(signed.claim)

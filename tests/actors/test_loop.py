@@ -16,7 +16,7 @@ from brakeline.messaging.bus import Bus, BusSettings
 from brakeline.messaging.topics import DECIDE, EXCHANGE, STEP
 from brakeline.safety.filter.backup_plan import BackupPlan
 from brakeline.safety.model.model_set import ModelConfig
-from brakeline.safety.service.server import Counts, Models, answerer
+from brakeline.safety.service.server import ModelRegistry, ServiceCounts, batch_handler
 from tests.actors.teacher import Teacher
 from tests.robots import GROUND
 from tests.waiting import until
@@ -30,9 +30,9 @@ class Service:
     def __init__(self, bus: Bus, data_folder) -> None:
         from brakeline.deploy.data.model_store import model_for
 
-        models = Models()
+        models = ModelRegistry()
         models.install(model_for(GROUND, ModelConfig()))
-        self._answer = answerer(models, Counts())
+        self._answer = batch_handler(models, ServiceCounts())
         self.batches: list[list[str]] = []
         self.proposals: list[list[float]] = []  # of the first robot
         self.failing = self.fails_when_moving = False

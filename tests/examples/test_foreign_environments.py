@@ -19,7 +19,7 @@ from brakeline.messaging.robot import robot_named
 from brakeline.messaging.topics import DECIDE
 from brakeline.safety.model.dataset import Dataset
 from brakeline.safety.model.model_set import ModelConfig
-from brakeline.safety.service.server import Counts, Models, answerer
+from brakeline.safety.service.server import ModelRegistry, ServiceCounts, batch_handler
 from examples.foreign import table, train
 from examples.foreign.run import missing
 from examples.foreign.trained import Trained, scale
@@ -63,12 +63,12 @@ def test_driving_at_hazards_costs_nothing_behind_a_filter_of_own_data(tmp_path, 
     python = python_of(folder)
     record, lines = tmp_path / f"{robot}.safetensors", tmp_path / "lines.jsonl"
     told(python, "collect.py", robot, str(record), str(periods))
-    models = Models(accept_bound=BOUND)
+    models = ModelRegistry(accept_bound=BOUND)
     models.install(certified(Dataset.load(record), ModelConfig())[0])
     endpoint = free_endpoint()
     words = [robot, "adversarial", "--seeds", "0", "1", "--steps", "300"]
     with Bus(BusSettings(listen=(endpoint,)), "safety") as bus:
-        bus.serve(DECIDE, answerer(models, Counts()))
+        bus.serve(DECIDE, batch_handler(models, ServiceCounts()))
         said = told(python, "run.py", *words, "--connect", endpoint, "--out", str(lines))
     figures = json.loads(said)
     assert figures["cost"] == 0.0 and figures["steps"] == 300

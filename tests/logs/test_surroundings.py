@@ -19,7 +19,7 @@ from brakeline.messaging.obstacle_motion import Motion
 from brakeline.messaging.range_image import RangeImage
 from brakeline.messaging.scan import Scan
 from brakeline.messaging.sensor_messages import add_sensed, scan_message
-from brakeline.safety.perception.displayed_map import surroundings
+from brakeline.safety.perception.displayed_map import map_for_display
 from brakeline.safety.service.client import obstacle_messages
 from tests.browser import CHROMIUM, Page
 from tests.logs.mixed import Writer
@@ -60,7 +60,7 @@ def test_foxgloves_scene_has_it(say: Say) -> None:
     free, hits = shown.lines[1:]
     assert max(np.hypot(p.x - 2.0, p.y) for p in free.points) <= 2.0 and len(hits.points) == 2 * 360
     discs = [round(0.5 * cylinder.size.x, 3) for cylinder in shown.cylinders]
-    swept = surroundings(GROUND, told("b").request).swept[0, :, 2].round(3).tolist()
+    swept = map_for_display(GROUND, told("b").request).swept[0, :, 2].round(3).tolist()
     assert 0.2 in discs and set(swept) <= set(discs)
     boxes = [
         (c.pose.position.x, round(c.size.x, 6), round(c.size.y, 6))

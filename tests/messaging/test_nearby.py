@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from brakeline.messaging.range_image import directions
 from brakeline.safety import compilation
-from brakeline.safety.perception.image_coverage import Window
+from brakeline.safety.perception.image_coverage import GridWindow
 from brakeline.safety.perception.kernels.proximity_kernels import farthest_of_meshes, forget_ghosts, least_of
 
 
@@ -51,7 +51,7 @@ def test_nothing_within_so_much_on_the_sphere_is_left_out(seed, within):
     ways = directions(elevations, columns).reshape(-1, 3)
     near = ways @ ways.T >= math.cos(within) + 1e-9
     least = np.where(near, values.ravel(), np.inf).min(axis=1).reshape(rings, columns)
-    window = Window.of(columns, elevations, elevations[1] - elevations[0], within)
+    window = GridWindow.of(columns, elevations, elevations[1] - elevations[0], within)
     assert (window.least(values) <= least).all()
 
 

@@ -105,7 +105,7 @@ def test_of_replicas_behind_linked_routers_one_works_and_another_when_it_is_slow
     heard: dict[str, int] = {"a": 0, "b": 0}
     slow: set[str] = set()
 
-    def answerer(name: str) -> Callable[[bytes], bytes]:
+    def batch_handler(name: str) -> Callable[[bytes], bytes]:
         def answer(payload: bytes) -> bytes:
             heard[name] += 1
             if name in slow:
@@ -122,7 +122,7 @@ def test_of_replicas_behind_linked_routers_one_works_and_another_when_it_is_slow
             name: stack.enter_context(Bus(BusSettings(connect=(at,)), f"safety-{name}")) for name, at in there.items()
         }
         for name, bus in services.items():
-            bus.serve(DECIDE, answerer(name))
+            bus.serve(DECIDE, batch_handler(name))
         asker = stack.enter_context(Bus(BusSettings(connect=(other,)), "actor-0"))
         until(lambda: answers(asker) is not None and min(heard.values()) > 0)
         before = sum(heard.values())

@@ -13,8 +13,8 @@ from brakeline.messaging.obstacle import Obstacle, Shapes
 from brakeline.messaging.range_image import RangeImage, directions
 from brakeline.messaging.scan import BadScan, Scan
 from brakeline.messaging.sensor_messages import add_sensed, image_of, sensed_of
-from brakeline.safety.perception.displayed_map import surroundings
-from brakeline.safety.perception.image_coverage import Cover, Grid, seen_free
+from brakeline.safety.perception.displayed_map import map_for_display
+from brakeline.safety.perception.image_coverage import BeamGrid, SphereCover, patch_free_ranges
 from tests.messaging.test_shapes import sample
 from tests.robots import QUADROTOR
 
@@ -67,7 +67,7 @@ def solid(obstacles, rng, within=FAR):
 
 def free_towards(image, points):
     """F of the patches that points (n, 3) about the sensor lie in, and how far they are."""
-    grid, free = seen_free(image)
+    grid, free = patch_free_ranges(image)
     elevations = grid.elevations
     far = np.linalg.norm(points, axis=1)
     rings = np.abs(np.arcsin(points[:, 2] / far)[:, None] - elevations).argmin(axis=1)
@@ -94,7 +94,7 @@ def test_much_of_what_is_free_is_said_to_be(dropped, least):
         obstacles = hall(rng)
         image = taken(rng, obstacles)
         image.ranges[rng.random(image.ranges.shape) < dropped] = 0.0
-        shares.append(seen_free(image)[1].mean() / image.ranges.mean())
+        shares.append(patch_free_ranges(image)[1].mean() / image.ranges.mean())
     assert np.median(shares) > least
 
 
@@ -121,29 +121,29 @@ def test_a_lone_ghost_is_none_and_a_thing_as_narrow_as_things_may_be_is_no_ghost
     )
     haunted = replace(clear, ranges=clear.ranges.copy())
     haunted.ranges[20, 30] = haunted.ranges[22, 40] = 1.0
-    assert seen_free(haunted)[1].min() > 1.9
+    assert patch_free_ranges(haunted)[1].min() > 1.9
     rng = np.random.default_rng(0)
     for turn in np.linspace(0.0, math.radians(4.0), 5):  # wherever the beams fall on it
         post = [Obstacle("box", (3.0 * math.cos(turn), 3.0 * math.sin(turn), 0.0), (WIDTH,) * 3, turn + 0.25 * math.pi)]
-        assert seen_free(taken(rng, post))[1][RINGS // 2, :2].max() < 3.0
+        assert patch_free_ranges(taken(rng, post))[1][RINGS // 2, :2].max() < 3.0
 
 
 def test_what_is_not_seen_is_not_free():
     ranges = np.full((RINGS, COLUMNS), FAR)
     blind = RangeImage(0.0 * ranges, (0.0, 0.0, 0.0), low=-EDGE, high=EDGE)
-    assert (seen_free(blind)[1] == 0.0).all()
+    assert (patch_free_ranges(blind)[1] == 0.0).all()
     belt = RangeImage(ranges[:15], (0.0, 0.0, 0.0), low=-0.5, high=0.5, far=FAR)
-    grid, free = seen_free(belt)
+    grid, free = patch_free_ranges(belt)
     elevations = grid.elevations
     assert (free[np.abs(elevations) > 0.5] == 0.0).all() and free[len(elevations) // 2].min() > 1.0
     assert abs(elevations[0]) <= 0.5 * math.pi and elevations[0] < -0.5 * math.pi + belt.step[0]
 
 
 def test_the_closer_beams_are_the_more_they_show():
-    wide, close = (Cover.of(half, half) for half in (0.05, 0.025))
+    wide, close = (SphereCover.of(half, half) for half in (0.05, 0.025))
     far = [cover.free(np.full((1, 1), 5.0, np.float32), 1.0) for cover in (close, wide)]
     assert close.within < wide.within and far[0] > far[1]
-    assert Grid.of(RINGS, COLUMNS, -EDGE, EDGE).half_diagonal == pytest.approx(
+    assert BeamGrid.of(RINGS, COLUMNS, -EDGE, EDGE).half_diagonal == pytest.approx(
         0.5 * math.hypot(math.radians(4.0), math.radians(4.0))
     )
 
@@ -153,7 +153,7 @@ def test_no_direction_is_farther_from_a_beam_than_half_a_meshes_diagonal():
     ways = rng.normal(size=(3000, 3))
     ways /= np.linalg.norm(ways, axis=1, keepdims=True)
     nearest = np.arccos(np.clip((ways @ GRID.reshape(-1, 3).T).max(axis=1), -1.0, 1.0))
-    assert nearest.max() <= Grid.of(RINGS, COLUMNS, -EDGE, EDGE).half_diagonal + 1e-6
+    assert nearest.max() <= BeamGrid.of(RINGS, COLUMNS, -EDGE, EDGE).half_diagonal + 1e-6
 
 
 def test_an_image_crosses_the_wire_and_its_ranges_never_grow():
@@ -228,7 +228,7 @@ def test_what_is_drawn_as_free_is_free_and_hits_lie_on_surfaces():
     obstacles = hall(rng, 7)
     message = pb.Request()
     add_sensed(message, taken(rng, obstacles))
-    about, shapes = surroundings(QUADROTOR, message, corners=60), Shapes.of(obstacles, 3)
+    about, shapes = map_for_display(QUADROTOR, message, corners=60), Shapes.of(obstacles, 3)
     assert len(about.hits) > 500 and np.abs(shapes.distance(about.hits).min(axis=0)).max() < 0.01
     corners = about.free
     k, share = rng.integers(len(corners), size=2000), np.sqrt(rng.random((2000, 1)))

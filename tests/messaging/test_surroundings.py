@@ -11,7 +11,7 @@ from brakeline.messaging.obstacle import BOX, CYLINDER, Obstacle
 from brakeline.messaging.obstacle_motion import Motion
 from brakeline.messaging.scan import Followed
 from brakeline.messaging.sensor_messages import scan_message, scan_of
-from brakeline.safety.perception.displayed_map import promised, surroundings
+from brakeline.safety.perception.displayed_map import map_for_display, reserved_boxes
 from brakeline.safety.service.client import obstacle_messages
 from brakeline.sim.arena import staged_arena
 from brakeline.sim.range_sensors import FanScanner
@@ -36,7 +36,7 @@ def scanned(seed: int) -> tuple[pb.Request, object]:
 @pytest.mark.parametrize("seed", range(5))
 def test_what_is_drawn_as_free_is_free_and_hits_lie_on_surfaces(seed: int) -> None:
     request, arena = scanned(seed)
-    about = surroundings(GROUND, request, corners=60)
+    about = map_for_display(GROUND, request, corners=60)
     assert 20 < len(about.free) <= 60 and len(about.hits) > 100
     assert np.abs(arena.shapes.distance(about.hits).min(axis=0)).max() < 1e-5
     corners, sensor = about.free, np.array([-0.032 * math.cos(0.7), -0.032 * math.sin(0.7)])
@@ -49,7 +49,7 @@ def test_what_is_drawn_as_free_is_free_and_hits_lie_on_surfaces(seed: int) -> No
 
 
 def test_without_a_scan_there_is_none_of_it() -> None:
-    about = surroundings(GROUND, pb.Request(state=[0.0] * 5))
+    about = map_for_display(GROUND, pb.Request(state=[0.0] * 5))
     assert all(told == [] for told in about.flat().values())
 
 
@@ -57,7 +57,7 @@ def test_discs_hold_wherever_a_mover_may_be() -> None:
     motion = Motion((0.5, -0.2), 0.03, 0.05, acceleration=1.0, age=0.1)
     crate = Obstacle(BOX, (1.0, 0.5), (0.4, 0.3), yaw=0.4, motion=motion)
     request = pb.Request(obstacles=obstacle_messages([crate, Obstacle(CYLINDER, (0.0, 1.0), (0.2,))]))
-    about = surroundings(GROUND, request)
+    about = map_for_display(GROUND, request)
     assert about.movers.shape == (1, 3) and about.swept.shape == (1, GROUND.horizon, 3)
     assert about.movers[0] == pytest.approx((1.0, 0.5, math.hypot(0.2, 0.15)))
     rng = np.random.default_rng(0)
@@ -74,22 +74,22 @@ def test_discs_hold_wherever_a_mover_may_be() -> None:
 def test_a_flat_view_of_what_flies_has_the_radius_last() -> None:
     plane = Obstacle("sphere", (1.0, 2.0, 3.0), (0.5,), motion=Motion((0.0, 1.0, 0.0), 0.1, speed=1.0))
     request = pb.Request(obstacles=obstacle_messages([plane]))
-    assert surroundings(QUADROTOR, request).flat()["movers"] == [[1.0, 2.0, 0.5]]
+    assert map_for_display(QUADROTOR, request).flat()["movers"] == [[1.0, 2.0, 0.5]]
 
 
 def test_a_promise_is_the_new_one_or_what_is_left_of_the_old() -> None:
     old, new = (pb.Reservation(center=[x, 0.0], half_width=[0.1, 0.2], radius=[0.15]) for x in (1.0, 2.0))
     asked = pb.Exchange(request=pb.Request(reservation=old))
-    assert promised(GROUND, asked).tolist() == [[1.0, 0.0, 0.1, 0.2, 0.15]]
+    assert reserved_boxes(GROUND, asked).tolist() == [[1.0, 0.0, 0.1, 0.2, 0.15]]
     asked.reply.decision.reservation.CopyFrom(new)
-    assert promised(GROUND, asked)[0, 0] == 2.0
+    assert reserved_boxes(GROUND, asked)[0, 0] == 2.0
     asked.reply.decision.reservation.radius.append(1.0)
-    assert len(promised(GROUND, asked)) == 0, "that is none"
+    assert len(reserved_boxes(GROUND, asked)) == 0, "that is none"
 
 
 def test_what_a_scan_was_followed_to_move_is_drawn_where_it_may_go() -> None:
     request, _ = scanned(0)
-    plain = surroundings(GROUND, request)
+    plain = map_for_display(GROUND, request)
     scan = scan_of(request.scan)
     near = int(np.argmin(scan.ranges))
     which = np.zeros(len(scan.ranges), np.uint8)
@@ -97,7 +97,7 @@ def test_what_a_scan_was_followed_to_move_is_drawn_where_it_may_go() -> None:
     which[:20] = 2  # stands
     ways = np.array([[0.5, 0.0, 0.3, 1.0], [0.0, 0.0, 0.4, 1.0]])
     request.scan.CopyFrom(scan_message(replace(scan, followed=Followed(which, ways))))
-    about = surroundings(GROUND, request)
+    about = map_for_display(GROUND, request)
     assert len(plain.movers) == 0 and about.movers.shape == (1, 3) and about.swept.shape == (1, GROUND.horizon, 3)
     assert np.linalg.norm(plain.hits - about.movers[0, :2], axis=1).min() < 0.05
     ends = about.swept[0]

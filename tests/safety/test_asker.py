@@ -14,10 +14,10 @@ from brakeline.messaging.scan import Scan
 from brakeline.safety.filter.backup_plan import BackupPlan, Prediction
 from brakeline.safety.filter.filter import Filter
 from brakeline.safety.filter.request import BadRequest, check_for_filter
-from brakeline.safety.service.asker import Answer, Asker, accept
-from brakeline.safety.service.client import SafetyClient, SafetyError, read, request_message
+from brakeline.safety.service.client import SafetyClient, SafetyError, read_reply, request_message
+from brakeline.safety.service.filter_client import Answer, FilterClient, accept
 from brakeline.safety.service.in_process import InProcess
-from brakeline.safety.service.server import Counts, Models, answerer
+from brakeline.safety.service.server import ModelRegistry, ServiceCounts, batch_handler
 from tests.robots import GROUND
 from tests.safety.asked import cylinder, request
 
@@ -38,14 +38,18 @@ class Wire:
     """The client's part and the service's core, without a bus."""
 
     def __init__(self, model):
-        models = Models(accept_bound=1.0)
+        models = ModelRegistry(accept_bound=1.0)
         models.install(model)
-        self.ask, self.robot, self.backup_plan = answerer(models, Counts()), model.robot, BackupPlan(model.robot)
+        self.ask, self.robot, self.backup_plan = (
+            batch_handler(models, ServiceCounts()),
+            model.robot,
+            BackupPlan(model.robot),
+        )
 
     def decide(self, state, action, obstacles=None, **more):
         asked = request_message(self.backup_plan, state, action, obstacles, **more)
         batch = pb.ReplyBatch.FromString(self.ask(pb.RequestBatch(requests=[asked]).SerializeToString()))
-        answer = read(batch.replies[0], asked, self.robot)
+        answer = read_reply(batch.replies[0], asked, self.robot)
         accept(self.backup_plan, answer)
         return answer
 
@@ -102,11 +106,11 @@ def asker(request, model):
 
 
 def test_every_asker_is_one(asker, model):
-    assert isinstance(asker, Asker) and not isinstance(Filter(model), Asker)
+    assert isinstance(asker, FilterClient) and not isinstance(Filter(model), FilterClient)
 
 
 def test_both_sign_alike():
-    wanted = list(signature(Asker.decide).parameters.values())
+    wanted = list(signature(FilterClient.decide).parameters.values())
     for kind in (SafetyClient, InProcess):
         own = list(signature(kind.decide).parameters.values())
         assert [(p.name, p.kind, p.default) for p in own[: len(wanted)]] == [
@@ -185,5 +189,5 @@ def test_a_tube_that_is_none_of_this_robots_is_no_answer(model):
         (reply,) = pb.ReplyBatch.FromString(asked.ask(payload)).replies
         change(reply.decision)
         with pytest.raises(SafetyError, match="tube") as caught:
-            read(reply, question, GROUND)
+            read_reply(reply, question, GROUND)
         assert caught.value.field == "tube_center"

@@ -13,7 +13,7 @@ from brakeline.safety.filter.qp_solver import INFEASIBLE
 from brakeline.safety.filter.request import ADJUSTED, ALLOWED, FAILSAFE, MOST_OBSERVED, NOT_FINITE, BadRequest
 from brakeline.safety.model.error_bounds import KINDS, ErrorBound
 from brakeline.safety.model.model_set import ModelConfig, ModelSet
-from brakeline.safety.service.wire import message_of
+from brakeline.safety.service.wire import decision_reply
 from tests.robots import GROUND, QUADROTOR
 from tests.safety.asked import cylinder, fits, random_request, request, same
 from tests.safety.unicycle import FIX, Unicycle
@@ -128,7 +128,7 @@ def test_a_verified_proposal_is_allowed_or_replaced_for_clearance_and_the_decisi
         counts[key] = counts.get(key, 0) + 1
         if decision.for_clearance:
             assert decision.stopped.room >= 0.0
-            assert message_of(decision, 0.0).decision.for_clearance
+            assert decision_reply(decision, 0.0).decision.for_clearance
     assert counts[ADJUSTED, True, True] > 10 < counts[ADJUSTED, False, False], counts
     assert {key for key in counts if key[2]} <= {(ALLOWED, False, True), (ADJUSTED, True, True)}, counts
     assert {key for key in counts if not key[2]} <= {(ADJUSTED, False, False), (FAILSAFE, False, False)}, counts

@@ -9,13 +9,13 @@ from hypothesis import strategies as st
 from brakeline.deploy.data.environment_episodes import collect
 from brakeline.messaging.obstacle import Obstacle
 from brakeline.messaging.scan import OLDEST, Scan
-from brakeline.safety.action_mapping import Actions, Mismatch, actions_of, normalised
+from brakeline.safety.action_mapping import ActionMapping, Mismatch, mapping_for_space, normalised
 from brakeline.safety.environment_views import STATE
 from brakeline.safety.filter.backup_plan import BackupPlan
 from brakeline.safety.filter.filter import Filter
 from brakeline.safety.filter.request import BadRequest
 from brakeline.safety.gym import UNANSWERED, SafetyWrapper
-from brakeline.safety.gym_vector import VectorSafetyWrapper, each
+from brakeline.safety.gym_vector import VectorSafetyWrapper, view_each_environment
 from brakeline.safety.model.dataset import BadData
 from brakeline.safety.model.fitting import make
 from brakeline.safety.model.model_set import ModelConfig, ModelSet
@@ -68,9 +68,9 @@ def test_normalised_actions_are_never_taken_for_metres_a_second(ready):
 @pytest.mark.parametrize("space", [gymnasium.spaces.Discrete(4), gymnasium.spaces.Box(-1.0, 1.0, (3,))])
 def test_an_action_space_of_another_kind_is_refused_unless_mapped(space):
     with pytest.raises(Mismatch, match="action_to_control"):
-        actions_of(space, CAR, None)
-    mapped = Actions(lambda action: action, lambda control: control)
-    assert actions_of(space, CAR, mapped) is mapped
+        mapping_for_space(space, CAR, None)
+    mapped = ActionMapping(lambda action: action, lambda control: control)
+    assert mapping_for_space(space, CAR, mapped) is mapped
 
 
 def test_what_is_missing_is_said_by_name(ready):
@@ -136,7 +136,7 @@ def test_a_vector_decides_as_its_environments_do_alone(ready, mode):
     count, policy = 3, np.random.default_rng(5)
     make_one = lambda: Toy(CAR, discs(), steps=12)  # noqa: E731
     vector = gymnasium.vector.SyncVectorEnv([make_one] * count, autoreset_mode=mode)
-    views = {"state": seen, "obstacles": each(near), "actions": normalised(CAR)}
+    views = {"state": seen, "obstacles": view_each_environment(near), "actions": normalised(CAR)}
     many = VectorSafetyWrapper(vector, ready, 0.5, accept_bound=1.0, **views)
     observations, _ = many.reset(seed=[0, 1, 2])
     alone = [BackupPlan(CAR) for _ in range(count)]

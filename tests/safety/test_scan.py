@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from brakeline.messaging.obstacle import Obstacle, Shapes
 from brakeline.messaging.scan import BadScan, Scan
-from brakeline.safety.perception.scan_free_space import cells, gaps, half_spaces
+from brakeline.safety.perception.scan_free_space import gaps, half_spaces, occupied_cells
 from tests.messaging.test_shapes import sample
 
 FAR, WIDTH = 3.5, 0.1
@@ -77,7 +77,7 @@ def test_every_point_within_is_beyond_some_half_space(seed, drop):
     turn = measured[2] + rng.uniform(-0.02, 0.02)  # of the robot's frame in the world, truly
     moved = Scan(scan.ranges, FAN, tuple(measured), far=FAR, range_error=0.01, position_error=0.02, heading_error=0.02)
     within = 1.0
-    near = cells(moved, within)
+    near = occupied_cells(moved, within)
     start = measured[:2]
     nominal = start + np.cumsum(rng.uniform(-0.1, 0.1, (3, 2)), axis=0)
     normals, offsets = half_spaces(near, start, nominal, 0.0, np.zeros(2), 0.2)
@@ -92,7 +92,7 @@ def test_every_point_within_is_beyond_some_half_space(seed, drop):
 
 def test_a_wall_is_a_handful_of_cells_and_leaves_its_room():
     wall = [Obstacle("wall", (0.5, 0.0), yaw=math.pi)]
-    near = cells(taken(np.random.default_rng(0), wall), 1.0)
+    near = occupied_cells(taken(np.random.default_rng(0), wall), 1.0)
     assert 5 <= len(near) <= 14
     normals, offsets = half_spaces(near, np.zeros(2), np.array([[0.1, 0.0]] * 3), 0.0, np.zeros(2), 0.2)
     assert offsets.max(axis=1).min() > 0.48
@@ -101,11 +101,11 @@ def test_a_wall_is_a_handful_of_cells_and_leaves_its_room():
 
 def test_what_was_not_seen_is_not_free():
     blind = Scan(np.zeros(360), FAN, (0.0, 0.0, 0.0))
-    assert (gaps(blind)[2] == 0.0).all() and len(cells(blind, 1.0)) > 0
+    assert (gaps(blind)[2] == 0.0).all() and len(occupied_cells(blind, 1.0)) > 0
     none = Scan(np.zeros(0), np.zeros(0), (0.0, 0.0, 0.0))
     ahead = np.where(np.abs(FAN) < math.pi / 6, 0.0, FAR)
     for scan in (blind, none, Scan(ahead, FAN, (0.0, 0.0, 0.0))):
-        _, offsets = half_spaces(cells(scan, 1.0), np.zeros(2), np.array([[0.05, 0.0]]), 0.1, np.zeros(2), 0.2)
+        _, offsets = half_spaces(occupied_cells(scan, 1.0), np.zeros(2), np.array([[0.05, 0.0]]), 0.1, np.zeros(2), 0.2)
         assert offsets.min() < 0.0
 
 
@@ -162,7 +162,7 @@ def test_a_lone_ghost_is_none_and_a_thing_as_narrow_as_things_may_be_is_no_ghost
 
 def test_what_may_move_takes_room_with_time():
     wall = [Obstacle("wall", (0.5, 0.0), yaw=math.pi)]
-    still, moving = (cells(taken(np.random.default_rng(0), wall, speed=s, age=0.1), 1.0) for s in (0.0, 1.6))
+    still, moving = (occupied_cells(taken(np.random.default_rng(0), wall, speed=s, age=0.1), 1.0) for s in (0.0, 1.6))
     at = (np.zeros(2), np.zeros((3, 2)), 0.0, np.zeros(2), 0.2)
     lost = half_spaces(still, *at)[1] - half_spaces(moving, *at)[1]
     assert np.allclose(lost, 1.6 * (0.1 + 0.2 * np.arange(1, 4)))

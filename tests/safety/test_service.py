@@ -12,8 +12,8 @@ from brakeline.messaging.topics import DECIDE
 from brakeline.safety.filter.backup_plan import UNVERIFIED, BackupPlan
 from brakeline.safety.filter.request import NOT_FINITE, BadRequest
 from brakeline.safety.model.model_set import ModelSet
-from brakeline.safety.service.client import SafetyClient, SafetyError, ask, read, request_message
-from brakeline.safety.service.server import Counts, Models, answerer
+from brakeline.safety.service.client import SafetyClient, SafetyError, query_service, read_reply, request_message
+from brakeline.safety.service.server import ModelRegistry, ServiceCounts, batch_handler
 from brakeline.safety.service.wire import LARGEST, request_of
 from tests.messaging.conftest import endpoint, join  # noqa: F401 - fixtures
 from tests.robots import GROUND, QUADROTOR
@@ -31,10 +31,10 @@ class Service:
     """The core, called with bytes."""
 
     def __init__(self, *models: ModelSet, archive=None):
-        self.models, self.counts = Models(archive, accept_bound=1.0), Counts()
+        self.models, self.counts = ModelRegistry(archive, accept_bound=1.0), ServiceCounts()
         for model in models:
             self.models.install(model)
-        self.answer = answerer(self.models, self.counts)
+        self.answer = batch_handler(self.models, self.counts)
 
     def replies(self, *requests):
         payload = pb.RequestBatch(requests=requests).SerializeToString()
@@ -55,7 +55,7 @@ def test_a_batch_is_answered_in_its_order(service, model):
     replies = service.replies(*(good(step=i) for i in range(5)), good(time=2.0))
     assert len(replies) == 6
     for reply in replies:
-        answer = read(reply, good(), GROUND)
+        answer = read_reply(reply, good(), GROUND)
         assert answer.kind in ("allowed", "adjusted")
         assert answer.model == model.version
         assert answer.verified
@@ -67,7 +67,7 @@ def test_a_batch_is_answered_in_its_order(service, model):
 def test_the_wire_changes_no_decision(service, ready):
     message = good()
     direct = ready.decide(request_of(message, GROUND))
-    answer = read(service.replies(message)[0], message, GROUND)
+    answer = read_reply(service.replies(message)[0], message, GROUND)
     assert np.array_equal(answer.plan, direct.plan)
     assert answer.kind == direct.kind
     assert answer.margin == direct.margin
@@ -133,7 +133,7 @@ def test_bad_requests_get_an_error_that_names_the_field(service, field, message)
     assert error.type in ("BadRequest", "StaleModel", "UnknownRobot")
     assert error.message
     assert service.counts.errors == 1
-    assert read(service.replies(good())[0], good(), GROUND).verified
+    assert read_reply(service.replies(good())[0], good(), GROUND).verified
 
 
 def test_a_bad_request_spoils_no_other_of_its_batch(service):
@@ -148,7 +148,7 @@ def test_what_is_no_batch_is_refused_and_the_service_goes_on(service):
         with pytest.raises(BadRequest) as caught:
             service.answer(payload)
         assert caught.value.field in ("payload", "requests")
-        assert read(service.replies(good())[0], good(), GROUND).verified
+        assert read_reply(service.replies(good())[0], good(), GROUND).verified
 
 
 def test_random_damage_never_gets_an_unchecked_decision(service):
@@ -164,7 +164,7 @@ def test_random_damage_never_gets_an_unchecked_decision(service):
             continue
         for reply in replies:
             if reply.WhichOneof("result") == "decision":
-                read(reply, good(), GROUND)
+                read_reply(reply, good(), GROUND)
             else:
                 assert reply.error.type in ("BadRequest", "StaleModel", "UnknownRobot")
 
@@ -184,7 +184,7 @@ def test_an_unexpected_failure_is_an_error_reply(service, monkeypatch, caplog):
     assert error.type == "ArithmeticError"
     assert "decide failed for actor-0" in caplog.text
     monkeypatch.undo()
-    assert read(service.replies(good())[0], good(), GROUND)
+    assert read_reply(service.replies(good())[0], good(), GROUND)
 
 
 def test_a_model_is_replaced_while_the_service_runs(model, models, tmp_path):
@@ -194,33 +194,33 @@ def test_a_model_is_replaced_while_the_service_runs(model, models, tmp_path):
     moving.ClearField("obstacles")
     moving.known_free = True
     moving.model, moving.input_in_force[0], moving.plan[0] = model.version, 0.2, 0.1
-    assert read(service.replies(moving)[0], moving, GROUND).model == model.version
+    assert read_reply(service.replies(moving)[0], moving, GROUND).model == model.version
     service.models.install(newer)
-    answer = read(service.replies(moving)[0], moving, GROUND)
+    answer = read_reply(service.replies(moving)[0], moving, GROUND)
     assert answer.model == newer.version
     assert answer.verified
     moving.model = UNVERIFIED
-    assert read(service.replies(moving)[0], moving, GROUND).model == newer.version
+    assert read_reply(service.replies(moving)[0], moving, GROUND).model == newer.version
     stale = good()
     stale.model = models["matrix-zonotope", "direct"].version
     assert service.error(stale).type == "StaleModel"
     # another replica that shares the archive knows what this one has used
     other = Service(newer, archive=tmp_path)
-    assert read(other.replies(moving)[0], moving, GROUND)
+    assert read_reply(other.replies(moving)[0], moving, GROUND)
     moving.model = model.version
-    assert read(other.replies(moving)[0], moving, GROUND)
+    assert read_reply(other.replies(moving)[0], moving, GROUND)
 
 
 def test_violations_and_what_could_not_be_verified_are_counted(service, caplog):
     message = good()
     message.predicted_center.extend([9.0] * 5)
     message.predicted_half_width.extend([0.1] * 5)
-    answer = read(service.replies(message)[0], message, GROUND)
+    answer = read_reply(service.replies(message)[0], message, GROUND)
     assert answer.compared
     assert not answer.contained
     assert "outside the predicted set" in caplog.text
     message.obstacles.append(pb.Obstacle(kind="cylinder", position=[0.2, 0.0], size=[0.1]))
-    assert not read(service.replies(message)[0], message, GROUND).verified
+    assert not read_reply(service.replies(message)[0], message, GROUND).verified
     figures = service.counts.figures()
     assert (figures["violations"], figures["compared"], figures["unverified"]) == (2, 2, 1)
 
@@ -246,10 +246,10 @@ def test_the_client_believes_no_bad_reply(service):
         damaged.CopyFrom(reply)
         change(damaged.decision)
         with pytest.raises(SafetyError) as caught:
-            read(damaged, good(), GROUND)
+            read_reply(damaged, good(), GROUND)
         assert caught.value.field == field
     with pytest.raises(SafetyError):
-        read(pb.Reply(), good(), GROUND)
+        read_reply(pb.Reply(), good(), GROUND)
 
 
 class FakeBus:
@@ -263,7 +263,7 @@ class FakeBus:
 def test_replies_that_are_none_are_typed_errors():
     for answer in (b"\xff\xff", pb.ReplyBatch().SerializeToString(), b""):
         with pytest.raises(SafetyError, match="BadReply"):
-            ask(FakeBus(answer), [good()], 0.1)
+            query_service(FakeBus(answer), [good()], 0.1)
 
 
 def test_a_recorded_reply_is_no_answer_at_another_place(service):
@@ -275,11 +275,11 @@ def test_a_recorded_reply_is_no_answer_at_another_place(service):
             recorded.append(service.answer(payload))
             return recorded[-1]
 
-    assert read(ask(Recording(b""), [good()], 0.1)[0], good(), GROUND).verified
+    assert read_reply(query_service(Recording(b""), [good()], 0.1)[0], good(), GROUND).verified
     elsewhere = request_message(BackupPlan(GROUND), np.ones(5) * 0.1, [0.2, 0.1], [AHEAD])
     for question in (good(), elsewhere):
         with pytest.raises(SafetyError) as caught:
-            ask(FakeBus(recorded[0]), [question], 0.1)
+            query_service(FakeBus(recorded[0]), [question], 0.1)
         assert caught.value.field == "request"
 
 
@@ -296,15 +296,15 @@ def test_a_plan_that_no_actuator_could_follow_is_not_believed():
 
     plan = np.zeros((QUADROTOR.horizon, QUADROTOR.action_dim))
     plan[:3, 0] = 0.7, 0.7, 0.1
-    assert read(reply(plan), question, QUADROTOR).action[0] == 0.7
+    assert read_reply(reply(plan), question, QUADROTOR).action[0] == 0.7
     for row, value in ((0, 0.9), (1, 1.6), (2, -0.2)):
         broken = plan.copy()
         broken[row, 0] = value
         with pytest.raises(SafetyError, match="does not follow") as caught:
-            read(reply(broken), question, QUADROTOR)
+            read_reply(reply(broken), question, QUADROTOR)
         assert caught.value.field == "plan"
     with pytest.raises(SafetyError) as caught:
-        read(reply(plan, robot="ground"), question, QUADROTOR)
+        read_reply(reply(plan, robot="ground"), question, QUADROTOR)
     assert caught.value.field == "robot"
 
 

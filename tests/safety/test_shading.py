@@ -11,10 +11,16 @@ from hypothesis import strategies as st
 
 from brakeline.messaging.obstacle import FARTHEST
 from brakeline.messaging.range_image import RangeImage
-from brakeline.safety.perception.image_coverage import seen_free
+from brakeline.safety.perception.image_coverage import patch_free_ranges
 from brakeline.safety.perception.kernels.occlusion_kernels import rooms, supporting
 from brakeline.safety.perception.kernels.shadow_kernels import complete, nearest_of_patches, rounding
-from brakeline.safety.perception.occluded_regions import OccludedRegions, Room, _patches, half_spaces, shadows
+from brakeline.safety.perception.occluded_regions import (
+    OccludedRegions,
+    PlanBoxes,
+    _patches,
+    half_spaces,
+    occluded_regions,
+)
 from tests.messaging.test_range_images import COLUMNS, EDGE, RINGS
 from tests.safety.test_shadows import NOTHING, room
 
@@ -36,9 +42,9 @@ def test_a_shadow_holds_all_of_its_patch_that_comes_into_the_room_whatever_the_e
     """Also by a sensor that is not where the robot may be: what an old image shows."""
     rng, image = np.random.default_rng(seed), scattered(seed, at)
     origin = np.array([0.5, 0.3, -0.2])
-    lines = shadows(image, room(2.0, 1.0), 0.2, origin).lines.astype(float)
+    lines = occluded_regions(image, room(2.0, 1.0), 0.2, origin).lines.astype(float)
     lines[:3] += origin[:, None]
-    grid, free = seen_free(image)
+    grid, free = patch_free_ranges(image)
     together, middles = _patches(grid)
     middles = middles.T
     free = np.concatenate(
@@ -128,7 +134,7 @@ def lines_of(*lines):
 
 def left(lines, ends, boxes, point):
     """What the half-spaces that are not the room's faces leave to a body of 0.2 m at a point, in every period (N,)."""
-    seen = OccludedRegions(from_(lines, NOTHING), NOTHING, Room(boxes, 0.1 * len(ends)), 0.0, 0.0)
+    seen = OccludedRegions(from_(lines, NOTHING), NOTHING, PlanBoxes(boxes, 0.1 * len(ends)), 0.0, 0.0)
     normals, offsets = half_spaces(seen, NOTHING, ends[1:].copy(), 0.2, NOTHING, 0.1)
     return (offsets - normals @ point)[:-6].min(axis=0, initial=np.inf)
 
@@ -179,7 +185,7 @@ def test_shadows_that_single_precision_can_not_tell_leave_nothing_free(row, valu
     ends, boxes = along_x(0.1, [0.5] * 4)
     lines = lines_of((3.0, 0, 0, 1, 0, 0, 1, 0.1, 0.1), (-3.0, 0, 0, -1, 0, 0, 1, 0.1, 0.1))
     lines[row, 1] = value
-    seen = OccludedRegions(from_(lines, NOTHING), NOTHING, Room(boxes, 0.4), 0.0, 0.0)
+    seen = OccludedRegions(from_(lines, NOTHING), NOTHING, PlanBoxes(boxes, 0.4), 0.0, 0.0)
     assert np.isneginf(half_spaces(seen, NOTHING, ends[1:].copy(), 0.2, NOTHING, 0.1)[1]).all()
 
 
@@ -205,7 +211,7 @@ def test_no_body_in_a_periods_boxes_touches_a_shadow_whatever_the_way(seed):
     bodies = lines[:3, which].T + (share * lines[6, which])[:, None] * ways[which] + off
     in_either = [((bodies >= boxes[0, e]) & (bodies <= boxes[1, e])).all(axis=1) for e in (k, k + 1)]
     origin = rng.normal(size=3)
-    seen = OccludedRegions(from_(lines, origin), origin, Room(boxes, 0.1 * N), *moves)
+    seen = OccludedRegions(from_(lines, origin), origin, PlanBoxes(boxes, 0.1 * N), *moves)
     normals, offsets = half_spaces(seen, NOTHING, ends[1:].copy(), keep_off, NOTHING, 0.1)
     slack = (offsets[:, k] - np.einsum("hmd,md->hm", normals[:, k], bodies)).min(axis=0)
     assert slack[in_either[0] | in_either[1]].max(initial=-np.inf) <= 1e-6
@@ -213,7 +219,7 @@ def test_no_body_in_a_periods_boxes_touches_a_shadow_whatever_the_way(seed):
 
 @pytest.mark.parametrize("period", [0, 2])
 def test_a_way_that_is_no_number_frees_nothing_from_there_on(period):
-    near = shadows(scattered(0), room(2.0, 1.0), 0.0, NOTHING)
+    near = occluded_regions(scattered(0), room(2.0, 1.0), 0.0, NOTHING)
     nominal = np.tile(np.arange(1.0, 5.0)[:, None] * 0.7, 3)
     sound = half_spaces(near, np.zeros(3), 0.1 * nominal, 0.0, np.zeros(3), 0.2)[1]
     assert np.isfinite(sound).all()

@@ -10,9 +10,16 @@ from hypothesis import strategies as st
 
 from brakeline.messaging.obstacle import Obstacle
 from brakeline.messaging.range_image import RangeImage, directions
-from brakeline.safety.perception.image_coverage import seen_free
+from brakeline.safety.perception.image_coverage import patch_free_ranges
 from brakeline.safety.perception.image_memory import AWAY, ImageMemory, _Seen
-from brakeline.safety.perception.occluded_regions import FACES, PLANES, Room, _patches, half_spaces, shadows
+from brakeline.safety.perception.occluded_regions import (
+    FACES,
+    PLANES,
+    PlanBoxes,
+    _patches,
+    half_spaces,
+    occluded_regions,
+)
 from tests.messaging.test_range_images import (
     COLUMNS,
     EDGE,
@@ -31,7 +38,7 @@ BODY, NOTHING = 0.2, np.zeros(3)
 
 
 def room(size=2.0, last=2.4):
-    return Room(np.array([-size, size])[:, None, None].repeat(3, axis=2), last)
+    return PlanBoxes(np.array([-size, size])[:, None, None].repeat(3, axis=2), last)
 
 
 def clear(**more):
@@ -53,7 +60,7 @@ def bounded(seed, dropped):
         [[math.cos(turn), math.sin(turn), 0.0], [-math.sin(turn), math.cos(turn), 0.0], [0, 0, 1]]
     )
     nominal = np.cumsum(rng.uniform(-0.3, 0.3, (6, 3)), axis=0)
-    normals, offsets = half_spaces(shadows(image, room(), BODY, NOTHING), NOTHING, nominal, 0.0, NOTHING, 0.2)
+    normals, offsets = half_spaces(occluded_regions(image, room(), BODY, NOTHING), NOTHING, nominal, 0.0, NOTHING, 0.2)
     return normals, offsets, points[(np.abs(points) < 2.0 + BODY / math.sqrt(3.0)).all(axis=1)]
 
 
@@ -83,7 +90,7 @@ def test_of_every_period_all_that_may_be_touched_in_its_boxes_is_beyond_some_hal
     ways = np.vstack([NOTHING, nominal]) + rng.uniform(-0.5, 0.5, (7, 3)) * size
     boxes = np.stack([ways - size, ways + size])
     normals, offsets = half_spaces(
-        shadows(image, Room(boxes, 2.4), BODY, NOTHING), NOTHING, nominal, BODY, NOTHING, 0.2
+        occluded_regions(image, PlanBoxes(boxes, 2.4), BODY, NOTHING), NOTHING, nominal, BODY, NOTHING, 0.2
     )
     if np.isneginf(offsets).all():
         return
@@ -97,7 +104,7 @@ def test_of_every_period_all_that_may_be_touched_in_its_boxes_is_beyond_some_hal
 def test_a_box_that_is_no_number_leaves_nothing_free(end):
     boxes = room().boxes.repeat(3, axis=1)
     boxes[1, end, 1] = np.nan
-    seen = replace(shadows(clear(), room(), BODY, NOTHING), room=Room(boxes, 2.4))
+    seen = replace(occluded_regions(clear(), room(), BODY, NOTHING), room=PlanBoxes(boxes, 2.4))
     assert np.isneginf(half_spaces(seen, NOTHING, np.zeros((2, 3)), BODY, NOTHING, 0.2)[1]).all()
 
 
@@ -113,7 +120,7 @@ def test_whatever_is_not_shown_to_be_free_is_beyond_some_half_space(seed, monkey
     rng = np.random.default_rng(seed)
     image = clear(ranges=np.repeat(np.repeat(rng.uniform(1.5, 6.0, (RINGS // 5, COLUMNS // 5)), 5, 0), 5, 1))
     nominal = np.cumsum(rng.uniform(-0.1, 0.1, (3, 3)), axis=0)
-    normals, offsets = half_spaces(shadows(image, room(), BODY, NOTHING), NOTHING, nominal, 0.0, NOTHING, 0.2)
+    normals, offsets = half_spaces(occluded_regions(image, room(), BODY, NOTHING), NOTHING, nominal, 0.0, NOTHING, 0.2)
     points = rng.uniform(-2.0, 2.0, (20_000, 3))
     free, far = free_towards(image, points)
     hidden = points[far >= free]
@@ -126,7 +133,7 @@ def test_the_body_is_kept_off_and_what_may_move_takes_room_with_time():
     wall = [Obstacle("box", (2.0, 0.0, 0.0), (2.0, 20.0, 20.0))]
     rng = np.random.default_rng(0)
     nominal = np.zeros((3, 3))
-    still, moving = (shadows(taken(rng, wall, speed=s, age=0.1), room(), BODY, NOTHING) for s in (0.0, 0.5))
+    still, moving = (occluded_regions(taken(rng, wall, speed=s, age=0.1), room(), BODY, NOTHING) for s in (0.0, 0.5))
     ahead = half_spaces(still, NOTHING, nominal, 0.0, NOTHING, 0.2)[1][0]
     assert 0.8 < ahead[0] <= 1.0
     kept = half_spaces(still, NOTHING, nominal, BODY, np.full(3, 0.01), 0.2)[1][0]
@@ -148,7 +155,7 @@ def test_a_sensor_on_a_mast_swings_aside_when_its_attitude_is_wrong():
     known = {"far": FAR, "range_error": 0.0, "angle_error": error, "least_width": 50.0}
     image = RangeImage(ranges, (0.0, 0.0, 0.0), low=-edge, high=edge, mount=mount, **known)
     nominal = np.linspace(0.0, 1.0, 9)[1:, None] * np.asarray(mount)
-    seen = shadows(image, room(4.0, 1.0), 0.0, NOTHING)
+    seen = occluded_regions(image, room(4.0, 1.0), 0.0, NOTHING)
     normals, offsets = half_spaces(seen, NOTHING, nominal, 0.0, NOTHING, 0.2)
     assert np.isfinite(offsets).all()
     across = np.linspace(-0.3, 0.3, 31)
@@ -160,7 +167,7 @@ def test_a_sensor_on_a_mast_swings_aside_when_its_attitude_is_wrong():
 @pytest.mark.parametrize("low", [-EDGE, -0.5 * math.pi, -0.9])
 def test_no_direction_is_farther_from_its_patch_than_half_a_meshes_diagonal(low):
     image = RangeImage(np.ones((RINGS, COLUMNS)), (0.0, 0.0, 0.0), low=low, high=-low)
-    grid, _ = seen_free(image)
+    grid, _ = patch_free_ranges(image)
     middles = _patches(grid)[1].T
     ways = np.random.default_rng(0).normal(size=(3000, 3))
     ways /= np.linalg.norm(ways, axis=1, keepdims=True)
@@ -170,20 +177,22 @@ def test_no_direction_is_farther_from_its_patch_than_half_a_meshes_diagonal(low)
 
 def test_where_nothing_is_there_is_only_the_rooms_box():
     normals, offsets = half_spaces(
-        shadows(clear(), room(), BODY, NOTHING), NOTHING, np.zeros((2, 3)), BODY, NOTHING, 0.2
+        occluded_regions(clear(), room(), BODY, NOTHING), NOTHING, np.zeros((2, 3)), BODY, NOTHING, 0.2
     )
     assert np.array_equal(normals[:, 0], FACES) and (offsets == 2.0).all()
 
 
 @pytest.mark.parametrize("image", [clear(ranges=np.zeros((RINGS, COLUMNS))), clear(range_error=FAR)])
 def test_nothing_seen_is_nothing_free(image):
-    _, offsets = half_spaces(shadows(image, room(), BODY, NOTHING), NOTHING, np.full((2, 3), 0.1), BODY, NOTHING, 0.2)
+    _, offsets = half_spaces(
+        occluded_regions(image, room(), BODY, NOTHING), NOTHING, np.full((2, 3), 0.1), BODY, NOTHING, 0.2
+    )
     assert (offsets.min(axis=0) < 0.0).all()
 
 
 def test_a_way_through_a_shadow_keeps_the_half_spaces_from_before_it():
     wall = [Obstacle("box", (2.0, 0.0, 0.0), (2.0, 20.0, 20.0))]
-    seen = shadows(taken(np.random.default_rng(0), wall), room(4.0), BODY, NOTHING)
+    seen = occluded_regions(taken(np.random.default_rng(0), wall), room(4.0), BODY, NOTHING)
     nominal = np.array([[0.5, 0.0, 0.0], [1.5, 0.0, 0.0], [2.5, 0.0, 0.0]])
     normals, offsets = half_spaces(seen, NOTHING, nominal, 0.0, NOTHING, 0.2)
     assert (normals[:, 1:] == normals[:, :1]).all() and (offsets[:, 1:] == offsets[:, :1]).all()

@@ -21,9 +21,9 @@ from brakeline.safety.model.model_set import BadModel, ModelSet
 from brakeline.safety.service.server import SafetySettings, archive_path, main
 from brakeline.safety.service.signature import (
     CONTEXT,
-    Signed,
-    Signer,
-    Trust,
+    ModelSigner,
+    SignedModel,
+    TrustedSigners,
     Untrusted,
     recorded_domain,
     seal_of,
@@ -46,17 +46,17 @@ def shrunken(model: ModelSet) -> ModelSet:
 
 
 def test_what_was_signed_is_taken(model: ModelSet, keys: Path, tmp_path: Path) -> None:
-    signed = Signer.load(keys).sign(model)
-    assert Trust.load(keys).open(signed, "ground").version == model.version
+    signed = ModelSigner.load(keys).sign(model)
+    assert TrustedSigners.load(keys).open(signed, "ground").version == model.version
     path = tmp_path / "model.safetensors"
     signed.save(path)
-    assert Trust.load(keys).load_model(path).version == model.version
-    assert Signed.load(path) == signed
+    assert TrustedSigners.load(keys).load_model(path).version == model.version
+    assert SignedModel.load(path) == signed
     assert (keys / "signer.key").stat().st_mode & 0o077 == 0
 
 
 def test_a_hash_that_one_computes_oneself_proves_nothing(model: ModelSet, keys: Path) -> None:
-    signed, trust = Signer.load(keys).sign(model), Trust.load(keys)
+    signed, trust = ModelSigner.load(keys).sign(model), TrustedSigners.load(keys)
     evil = shrunken(model)
     assert ModelSet.decode(evil.encode()).version == evil.version, "its own hash is right: yesterday it was taken"
     with pytest.raises(Untrusted, match="not the one that was signed"):
@@ -65,57 +65,57 @@ def test_a_hash_that_one_computes_oneself_proves_nothing(model: ModelSet, keys: 
     with pytest.raises(Untrusted, match="nobody who is trusted"):
         trust.open(replace(signed, file=evil.encode(), claim=json.dumps(claim).encode()), "ground")
     with pytest.raises(Untrusted, match="nobody who is trusted"):
-        trust.open(Signed(evil.encode(), b"", b""), "ground")
+        trust.open(SignedModel(evil.encode(), b"", b""), "ground")
     write_signer(keys.parent / "rogue")
     with pytest.raises(Untrusted, match="nobody who is trusted"):
-        trust.open(Signer.load(keys.parent / "rogue").sign(evil), "ground")
-    assert Trust().signers == ()
+        trust.open(ModelSigner.load(keys.parent / "rogue").sign(evil), "ground")
+    assert TrustedSigners().signers == ()
     with pytest.raises(Untrusted):
-        Trust().open(signed, "ground")
+        TrustedSigners().open(signed, "ground")
 
 
 def test_it_is_of_the_robot_that_topic_and_key_say(model: ModelSet, tmp_path: Path) -> None:
     write_signer(tmp_path / "any")
-    signed = Signer.load(tmp_path / "any").sign(model)
+    signed = ModelSigner.load(tmp_path / "any").sign(model)
     with pytest.raises(Untrusted, match="published as one of quadrotor"):
-        Trust.load(tmp_path / "any").open(signed, "quadrotor")
+        TrustedSigners.load(tmp_path / "any").open(signed, "quadrotor")
     write_signer(tmp_path / "other", robots=("quadrotor",))
     with pytest.raises(Untrusted, match="may not speak about ground"):
-        Trust.load(tmp_path / "other").open(Signer.load(tmp_path / "other").sign(model), "ground")
+        TrustedSigners.load(tmp_path / "other").open(ModelSigner.load(tmp_path / "other").sign(model), "ground")
 
 
 @pytest.mark.parametrize("field", ["robot", "layout", "version", "domain"])
 def test_the_claim_is_what_the_file_is(model: ModelSet, keys: Path, field: str) -> None:
     """Even where the right key signed something else: the file has to agree with every word."""
-    signed = Signer.load(keys).sign(model)
+    signed = ModelSigner.load(keys).sign(model)
     claim = json.loads(signed.claim) | {field: "quadrotor" if field != "domain" else (0.5 * model.domain).tolist()}
     words = json.dumps(claim, sort_keys=True).encode()
     key = load_pem_private_key((keys / "signer.key").read_bytes(), None)
     other = replace(signed, claim=words, signature=key.sign(CONTEXT + words))
     with pytest.raises(Untrusted):
-        Trust.load(keys).open(other)
-    assert Trust.load(keys).open(replace(signed, signature=key.sign(CONTEXT + signed.claim)))
+        TrustedSigners.load(keys).open(other)
+    assert TrustedSigners.load(keys).open(replace(signed, signature=key.sign(CONTEXT + signed.claim)))
 
 
 def test_nobody_signs_for_more_than_was_recorded(model: ModelSet, data, keys: Path) -> None:
-    signer, recorded = Signer.load(keys), recorded_domain(data)
+    signer, recorded = ModelSigner.load(keys), recorded_domain(data)
     assert (model.domain[0] >= recorded[0]).all() and (model.domain[1] <= recorded[1]).all()
-    assert Trust.load(keys).open(signer.sign(model, data))
+    assert TrustedSigners.load(keys).open(signer.sign(model, data))
     wider = replace(model, domain=np.stack([recorded[0], recorded[1] + 0.1]))
     with pytest.raises(Untrusted, match="wider"):
         signer.sign(wider, data)
-    nothing = Signer.load(keys).sign(model)
+    nothing = ModelSigner.load(keys).sign(model)
     claim = json.loads(nothing.claim) | {"domain": None}
     words = json.dumps(claim).encode()
     key = load_pem_private_key((keys / "signer.key").read_bytes(), None)
     with pytest.raises(BadModel):
-        Trust.load(keys).open(Signed(nothing.file, words, key.sign(CONTEXT + words)))
+        TrustedSigners.load(keys).open(SignedModel(nothing.file, words, key.sign(CONTEXT + words)))
 
 
 def test_a_restart_goes_on_with_the_newest_that_somebody_signed(model: ModelSet, keys: Path, tmp_path: Path) -> None:
-    trust, evil = Trust.load(keys), shrunken(model)
+    trust, evil = TrustedSigners.load(keys), shrunken(model)
     good, bad = (archive_path(tmp_path, "ground", m.version) for m in (model, evil))
-    Signer.load(keys).sign(model).save(good)
+    ModelSigner.load(keys).sign(model).save(good)
     time.sleep(0.01)
     evil.save(bad)
     assert newest_model(tmp_path, "ground", None) == bad, "without keys the newest is taken"
@@ -142,7 +142,7 @@ def test_a_service_takes_over_the_bus_only_what_is_signed(
     keys, archive = keyring(tmp_path / "keys"), tmp_path / "archive"
     write_signer(keys)
     path, newer, evil = tmp_path / "model.safetensors", models["set-membership", "direct"], shrunken(model)
-    Signer.load(keys).sign(model).save(path)
+    ModelSigner.load(keys).sign(model).save(path)
     endpoint, notes = free_endpoint("tls"), dict[str, str]()
     settings = BusSettings(connect=(endpoint,), keys=keys)
     with Bus(BusSettings(listen=(endpoint,), keys=keys), "launcher") as router:
@@ -155,9 +155,9 @@ def test_a_service_takes_over_the_bus_only_what_is_signed(
                 publisher = certify.publisher(MODEL, robot="ground")
                 rest = {"robot": "ground", "version": evil.version}
                 publisher.put(pb.Model(file=evil.encode(), **rest))
-                signed = Signer.load(keys).sign(model)
+                signed = ModelSigner.load(keys).sign(model)
                 publisher.put(pb.Model(file=evil.encode(), claim=signed.claim, signature=signed.signature, **rest))
-                signed = Signer.load(keys).sign(newer)
+                signed = ModelSigner.load(keys).sign(newer)
                 said = {"claim": signed.claim, "signature": signed.signature}
                 publisher.put(pb.Model(robot="ground", version=newer.version, file=signed.file, **said))
                 until(lambda: notes.get("model ground") == newer.version)
@@ -166,7 +166,7 @@ def test_a_service_takes_over_the_bus_only_what_is_signed(
             service.wait(20.0)
     kept = {path.stem for path in archive_path(archive, "ground", "*").parent.glob("*.safetensors")}
     assert kept == {model.version, newer.version}, "what was refused is not in the archive either"
-    assert newest_model(archive, "ground", Trust.load(keys)) == archive_path(archive, "ground", newer.version)
+    assert newest_model(archive, "ground", TrustedSigners.load(keys)) == archive_path(archive, "ground", newer.version)
 
 
 def test_with_keys_a_file_that_the_user_names_is_signed_too(model: ModelSet, tmp_path: Path) -> None:

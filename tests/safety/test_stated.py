@@ -24,8 +24,8 @@ from brakeline.safety.model.stated_bound import (
     stated_bound,
 )
 from brakeline.safety.service.in_process import InProcess
-from brakeline.safety.service.server import Counts, Models, answerer
-from brakeline.safety.service.wire import decision_of, message_of
+from brakeline.safety.service.server import ModelRegistry, ServiceCounts, batch_handler
+from brakeline.safety.service.wire import decision_of, decision_reply
 from tests.robots import GROUND
 from tests.safety.rivals.test_sailr import known as rival
 
@@ -99,13 +99,13 @@ def test_whoever_puts_a_model_set_to_use_in_process_refuses_a_loose_one(model, t
     loose.save(tmp_path / "model.safetensors")
     for use in (
         lambda **how: InProcess(Filter(loose), **how),
-        lambda **how: Models(**how).install(loose),
-        lambda **how: Models(limits={"ground": 0.2}, **how).install(loose),
+        lambda **how: ModelRegistry(**how).install(loose),
+        lambda **how: ModelRegistry(limits={"ground": 0.2}, **how).install(loose),
     ):
         with pytest.raises(TooLoose, match=r"accept-bound 0\.27"):
             use()
         use(accept_bound=0.27)
-    Models(limits={"ground": 0.3}).install(loose)
+    ModelRegistry(limits={"ground": 0.3}).install(loose)
     for wrap, env in (
         (SafetyWrapper, Nothing()),
         (VectorSafetyWrapper, gymnasium.vector.SyncVectorEnv([Nothing])),
@@ -126,7 +126,7 @@ class Nothing(gymnasium.Env):
 
 
 def test_a_service_goes_on_with_its_model_set_when_a_loose_one_is_refused(model):
-    models = Models()
+    models = ModelRegistry()
     models.install(said(model, TIGHT))
     in_use = models.filters["ground"]
     with pytest.raises(TooLoose):
@@ -140,10 +140,10 @@ def test_a_rival_states_nothing_and_is_not_asked_to():
 
 def test_every_decision_carries_the_bound_there_and_back(model):
     for about, bound in ((TIGHT, 0.0042), ({}, 1.0), ({"bound_plan": "nan"}, 1.0)):
-        models = Models(accept_bound=1.0)
+        models = ModelRegistry(accept_bound=1.0)
         models.install(said(model, about))
         batch = pb.RequestBatch(requests=[message()]).SerializeToString()
-        reply = pb.ReplyBatch.FromString(answerer(models, Counts())(batch)).replies[0]
+        reply = pb.ReplyBatch.FromString(batch_handler(models, ServiceCounts())(batch)).replies[0]
         assert bound_in(reply.decision) == bound
         assert decision_of(reply.decision, GROUND).bound == bound
 
@@ -152,7 +152,7 @@ def test_a_decision_of_an_old_log_or_of_a_rival_has_none(model):
     state = np.zeros(5)
     plan = np.zeros((GROUND.horizon, 2))
     decision = Filter(model).decide(Request(state, np.zeros(2), np.zeros(2), plan, Shapes.of([], 2), known_free=True))
-    old = message_of(dataclasses.replace(decision, bound=None), 0.0).decision
+    old = decision_reply(dataclasses.replace(decision, bound=None), 0.0).decision
     assert not old.HasField("bound") and decision_of(old, GROUND).bound is None
     old.bound = math.nan
     assert decision_of(old, GROUND).bound == 1.0, "what is no share says nothing"

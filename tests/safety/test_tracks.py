@@ -16,8 +16,8 @@ from brakeline.safety.filter.request import ALLOWED
 from brakeline.safety.perception import occlusion_exits, scan_tracking
 from brakeline.safety.perception import scan_free_space as seen
 from brakeline.safety.perception.scan_coverage import gaps_and_ways
-from brakeline.safety.perception.scan_free_space import Cells, cells
-from brakeline.safety.perception.scan_tracking import Follower
+from brakeline.safety.perception.scan_free_space import OccupiedCells, occupied_cells
+from brakeline.safety.perception.scan_tracking import ScanTracker
 from brakeline.safety.perception.visibility_memory import FanMemory
 from tests.robots import GROUND
 from tests.safety.asked import request
@@ -108,7 +108,7 @@ def outside(rng, kind, scans=9, count=24):
         way = np.array([at(now + t) for t in np.arange(0.0, AHEAD[-1] + 0.01, 0.05)])
         if (walls.distance(way).min(axis=0) < SIZE).any() or np.linalg.norm(way - place, axis=1).min() < SIZE + 0.1:
             continue  # it would go through something
-        near = cells(scan, 2.0) if kind is comes_out else seen._cells(scan, 2.0, *gaps_and_ways(scan))
+        near = occupied_cells(scan, 2.0) if kind is comes_out else seen._cells(scan, 2.0, *gaps_and_ways(scan))
         for t in AHEAD:
             points = at(now + t) + around
             points = points[np.linalg.norm(points - place, axis=1) < 1.2]
@@ -117,7 +117,7 @@ def outside(rng, kind, scans=9, count=24):
     return looked, worst
 
 
-def away(points, near: Cells, t):
+def away(points, near: OccupiedCells, t):
     """How far [m] each point is from all that may be occupied t s after the scan."""
     least = np.full(len(points), math.inf)
     for corners, error, (cx, cy, v, a) in zip(near.corners, near.error, near.ways, strict=True):
@@ -176,7 +176,7 @@ def test_a_mutant_does_not(monkeypatch, kind, name, mutant):
 @pytest.mark.parametrize(("missing", "doubt", "followed"), [(0, 0, True), (1, 0, False), (0, 1, False)])
 def test_nobody_is_followed_across_a_missing_scan_or_by_doubtful_beams(missing, doubt, followed):
     """Then the only place near by may be somebody else's."""
-    rng, follower, now = np.random.default_rng(0), Follower(), 0.0
+    rng, follower, now = np.random.default_rng(0), ScanTracker(), 0.0
     for k in range(5):
         scan = taken([*ROOM, disc(np.array([1.0, -0.5 + 0.8 * now]))], np.zeros(2), rng, doubt=doubt)
         said = follower.follow(scan).followed
@@ -223,7 +223,7 @@ def test_what_is_new_may_go_anywhere_and_what_nothing_bounds_is_not_followed():
     assert not new.followed.which[np.abs(FAN) < 0.1].any() and new.followed.which[np.abs(FAN) > 0.5].any()
     scan = taken(ROOM, np.zeros(2), np.random.default_rng(0))
     for unknown in (replace(scan, acceleration=0.0), replace(scan, speed=0.0)):
-        assert scan_tracking.Follower().follow(unknown) is unknown
+        assert scan_tracking.ScanTracker().follow(unknown) is unknown
 
 
 def test_where_a_scan_does_not_come_what_was_followed_is_older():

@@ -10,10 +10,10 @@ from brakeline.messaging.obstacle import Obstacle
 from brakeline.messaging.robot import Robot
 from brakeline.safety.filter.backup_plan import UNVERIFIED, BackupPlan
 from brakeline.safety.model.model_set import ModelSet
-from brakeline.safety.service.asker import Answer, accept
-from brakeline.safety.service.client import read, request_message
+from brakeline.safety.service.client import read_reply, request_message
+from brakeline.safety.service.filter_client import Answer, accept
 from brakeline.safety.service.plan_token import SIZE, BadKey, PlanAuthenticator, write_key
-from brakeline.safety.service.server import Counts, Models, answerer
+from brakeline.safety.service.server import ModelRegistry, ServiceCounts, batch_handler
 from brakeline.safety.service.wire import decision_of
 from tests.robots import GROUND, QUADROTOR
 
@@ -24,9 +24,9 @@ LATE = QUADROTOR.in_real_time()
 
 class Service:
     def __init__(self, model: ModelSet, key: bytes = KEY) -> None:
-        self.counts, models = Counts(), Models(accept_bound=1.0)
+        self.counts, models = ServiceCounts(), ModelRegistry(accept_bound=1.0)
         models.install(model)
-        self._answer = answerer(models, self.counts, PlanAuthenticator(key))
+        self._answer = batch_handler(models, self.counts, PlanAuthenticator(key))
 
     def __call__(self, request: pb.Request) -> pb.Reply:
         payload = pb.RequestBatch(requests=[request]).SerializeToString()
@@ -37,7 +37,7 @@ def driving(service: Service) -> tuple[BackupPlan, pb.Request]:
     """A robot that drives, and its next honest question, before a wall that has come up."""
     backup_plan = BackupPlan(GROUND)
     request = request_message(backup_plan, np.zeros(5), [0.25, 0.1], known_free=True, actor="actor-0")
-    accept(backup_plan, read(service(request), request, GROUND))
+    accept(backup_plan, read_reply(service(request), request, GROUND))
     state = np.array(backup_plan.predicted.center)
     return backup_plan, request_message(backup_plan, state, [0.25, 0.0], [WALL], actor="actor-0")
 
@@ -47,8 +47,8 @@ def test_an_honest_question_is_believed(model: ModelSet) -> None:
     _, request = driving(service)
     assert len(request.plan_token) == SIZE
     decision = service(request).decision
-    assert (decision.kind, decision.verified, decision.unvouched) == (pb.FAILSAFE, True, False)
-    assert service.counts.unvouched == 0
+    assert (decision.kind, decision.verified, decision.token_rejected) == (pb.FAILSAFE, True, False)
+    assert service.counts.token_rejected == 0
 
 
 FORGERIES = {
@@ -76,13 +76,13 @@ def test_what_no_service_verified_does_not_count_as_verified(model: ModelSet, ch
         else:
             setattr(request, name, value)
     decision = service(request).decision
-    assert (decision.kind, decision.verified, decision.unvouched) == (pb.FAILSAFE, False, True)
+    assert (decision.kind, decision.verified, decision.token_rejected) == (pb.FAILSAFE, False, True)
     assert not decision.plan_tokens, "and nobody vouches for what was not verified"
-    assert service.counts.unvouched == 1
-    trusting = Models(accept_bound=1.0)
+    assert service.counts.token_rejected == 1
+    trusting = ModelRegistry(accept_bound=1.0)
     trusting.install(model)
     payload = pb.RequestBatch(requests=[request]).SerializeToString()
-    believed = pb.ReplyBatch.FromString(answerer(trusting, Counts())(payload)).replies[0].decision
+    believed = pb.ReplyBatch.FromString(batch_handler(trusting, ServiceCounts())(payload)).replies[0].decision
     assert believed.verified, "without a key it would have counted"
 
 
@@ -96,7 +96,7 @@ def test_replicas_share_the_key_and_others_do_not(model: ModelSet) -> None:
 def test_standing_still_needs_nobodys_word(model: ModelSet) -> None:
     request = request_message(BackupPlan(GROUND), np.zeros(5), [0.0, 0.0], [WALL], actor="actor-0")
     decision = Service(model)(request).decision
-    assert decision.verified and not decision.unvouched
+    assert decision.verified and not decision.token_rejected
 
 
 def plan_of(robot: Robot, rng: np.random.Generator) -> np.ndarray:
@@ -109,7 +109,7 @@ def plan_of(robot: Robot, rng: np.random.Generator) -> np.ndarray:
 @pytest.mark.parametrize("robot", [GROUND, QUADROTOR, LATE], ids=lambda robot: robot.name)
 def test_each_period_has_its_voucher_until_the_robot_stands(robot: Robot) -> None:
     """Law: without a better answer the commitment goes on, and every request on the way is vouched for."""
-    notary, rng = PlanAuthenticator(KEY), np.random.default_rng(0)
+    authenticator, rng = PlanAuthenticator(KEY), np.random.default_rng(0)
     for _ in range(50):
         backup_plan, plan = BackupPlan(robot), plan_of(robot, rng)
         request = pb.Request(robot=robot.name, actor="a")
@@ -117,7 +117,7 @@ def test_each_period_has_its_voucher_until_the_robot_stands(robot: Robot) -> Non
         decision.kind = pb.ALLOWED
         decision.predicted_center.extend(rng.normal(size=robot.state_dim).tolist())
         decision.predicted_half_width.extend(rng.random(robot.state_dim).tolist())
-        decision.plan_tokens.extend(notary.plan_tokens(request, decision, robot))
+        decision.plan_tokens.extend(authenticator.plan_tokens(request, decision, robot))
         wire = pb.Decision.FromString(decision.SerializeToString())
         accept(backup_plan, Answer.of(decision_of(wire, robot), robot, plan_tokens=tuple(wire.plan_tokens)))
         for _ in range(robot.horizon + 2):
@@ -125,7 +125,7 @@ def test_each_period_has_its_voucher_until_the_robot_stands(robot: Robot) -> Non
             state = np.zeros(robot.state_dim) if predicted is None else predicted.center
             asked = request_message(backup_plan, state, plan[0], known_free=True, actor="a")
             asked = pb.Request.FromString(asked.SerializeToString())
-            assert notary.vouches(asked, robot)
+            assert authenticator.is_authentic(asked, robot)
             moving = bool(np.any(backup_plan.plan) or np.any(backup_plan.input_in_force))
             assert bool(asked.model) == moving and len(asked.plan_token) == SIZE
             backup_plan.fallback()
@@ -136,7 +136,7 @@ def test_a_plan_that_nobody_verified_gets_no_voucher_and_needs_none(model: Model
     _, request = driving(service)
     request.model, request.plan_token = UNVERIFIED, b""
     decision = service(request).decision
-    assert not decision.verified and not decision.unvouched and not decision.plan_tokens
+    assert not decision.verified and not decision.token_rejected and not decision.plan_tokens
 
 
 def test_the_key_is_kept_where_the_keys_are(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""How near shadows are, and the half-spaces that keep off all of them, compiled (`shadows.py`).
+"""How near shadows are, and the half-spaces that keep off all of them, compiled (`occluded_regions.py`).
 
 Shadows are told as lines: `casting.py` says what those are.
 """
@@ -206,7 +206,7 @@ def supporting(
     """Half-spaces until every shadow that is within reach (G,) is beyond one of them, about each of the chords
     (G, 2, 3): normals (G, k, 3) and levels (G, k) for as many as any chord needs; those that one does not need are at
     `farthest`, and where `most` are not enough the last is at -inf. room (G, n) [m]: from the chords to the shadows,
-    not negative; give: as `shadows.GIVE`; rounded [m]: by how much single precision may be off."""
+    not negative; give: as `occluded_regions.GIVE`; rounded [m]: by how much single precision may be off."""
     normals, levels, needed = np.zeros((len(chords), most, 3)), np.full((len(chords), most), farthest), 0
     n = lines.shape[1]
     room, kept, index = room.copy(), np.empty((9, n), np.float32), np.empty(n, np.int64)
@@ -346,7 +346,7 @@ def about_way(
 ) -> tuple[Array, Array]:
     """The half-spaces of all periods about a nominal way (N, 3), world, from a start (3,), in boxes (2, N+1 or 1, 3),
     as `about_periods` has them, of shadows from an origin (3,). moved [m]: how far what is seen may have moved until
-    now, and moves in a period; limits: `shadows.SHARED`, `TOUCHING`, `GIVE`, `FARTHEST`."""
+    now, and moves in a period; limits: `occluded_regions.SHARED`, `TOUCHING`, `GIVE`, `FARTHEST`."""
     shared, touching, give, farthest = limits
     ends, within = _from(origin, start, nominal, boxes)
     grown, first = moved[0] + moved[1] * np.arange(1.0, len(ends)), np.zeros(1, np.int64)

@@ -1,4 +1,4 @@
-"""Which shadows the patches of a range image cast into where a robot may be, compiled (`shadows.py`).
+"""Which shadows the patches of a range image cast into where a robot may be, compiled (`occluded_regions.py`).
 
 Shadows are told as `lines` (11, n), contiguous, in single precision, from some place: their near ends x, y, z, the
 unit vectors along them x, y, z, their length, how wide they are about their near ends and their far ones, m; and what

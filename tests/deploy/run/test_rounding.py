@@ -17,7 +17,7 @@ from brakeline.logs.reader import open_log
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.safety.filter.filter import Filter
 from brakeline.safety.model.model_set import ModelConfig
-from brakeline.safety.service.wire import message_of, request_of
+from brakeline.safety.service.wire import decision_reply, request_of
 from tests.robots import GROUND
 
 LINE = 64  # bytes: the widest vector that a processor loads at once
@@ -86,7 +86,7 @@ def test_wherever_arrays_lie_in_memory_no_decision_differs(log: Path, offset: in
         one, other = (request_of(record.message.request, GROUND) for _ in range(2))
         for name in ("state", "action", "input_in_force", "plan"):
             object.__setattr__(other, name, moved(getattr(other, name), offset))
-        reply, again = message_of(ready.decide(one), 0.0), message_of(elsewhere.decide(other), 0.0)
+        reply, again = decision_reply(ready.decide(one), 0.0), decision_reply(elsewhere.decide(other), 0.0)
         kinds.add(pb.Kind.Name(reply.decision.kind))
         found = differences(reply, again, GROUND.action_dim)
         assert all(difference.rounding for difference in found.values()), found

@@ -16,9 +16,9 @@ from brakeline.safety.filter.request import NOT_FINITE, BadRequest, Request
 from brakeline.safety.model.model_set import BadModel
 from brakeline.safety.rivals.pretrained import Pretrained
 from brakeline.safety.rivals.secas import Constraints, Secas, closed_form, quadratic
-from brakeline.safety.service.asker import accept
-from brakeline.safety.service.client import read, request_message
-from brakeline.safety.service.server import Counts, Models, answerer
+from brakeline.safety.service.client import read_reply, request_message
+from brakeline.safety.service.filter_client import accept
+from brakeline.safety.service.server import ModelRegistry, ServiceCounts, batch_handler
 from tests.robots import GROUND, QUADROTOR
 
 WIDE = np.full(3, 10.0)
@@ -209,15 +209,15 @@ def test_a_model_without_rays_has_those_of_the_robots_usual_task():
 
 
 def test_the_service_answers_with_it_and_the_asker_brakes_when_it_falls_silent():
-    models = Models()
+    models = ModelRegistry()
     models.install(known())
-    answer, backup_plan = answerer(models, Counts()), BackupPlan(GROUND)
+    answer, backup_plan = batch_handler(models, ServiceCounts()), BackupPlan(GROUND)
     for _ in range(2):  # the second request carries a plan that nobody vouches for
         message = request_message(
             backup_plan, np.zeros(5), [0.25, 0.3], known_free=True, observation=seen(0.25).tolist()
         )
         payload = pb.RequestBatch(requests=[message]).SerializeToString()
-        reply = read(pb.ReplyBatch.FromString(answer(payload)).replies[0], message, GROUND)
+        reply = read_reply(pb.ReplyBatch.FromString(answer(payload)).replies[0], message, GROUND)
         executed = accept(backup_plan, reply)
         assert reply.kind == "adjusted" and executed == pytest.approx((0.25 * 0.05 / 0.06, 0.3), abs=1e-5)
         assert backup_plan.model == UNVERIFIED and backup_plan.predicted is None

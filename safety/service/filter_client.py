@@ -33,13 +33,13 @@ class Answer(Decision):
         action: (m,) the input to execute next. This is the plan's first row. For a late robot it is the second row,
             because the first row is in force already.
         queue_ms: time from the service's receipt of the question to the decision; 0 in process.
-        unvouched: the service did not believe that the request's model verified its plan.
-        vouchers: for the next requests, in their order; empty in process.
+        token_rejected: the request's plan token did not match its plan, so the service treated the plan as unverified.
+        plan_tokens: the plan tokens of the next requests, in order; empty in process.
     """
 
     action: Array
     queue_ms: float = 0.0
-    unvouched: bool = False
+    token_rejected: bool = False
     plan_tokens: tuple[bytes, ...] = ()
 
     @staticmethod
@@ -49,7 +49,7 @@ class Answer(Decision):
 
 
 @runtime_checkable
-class Asker(Protocol):
+class FilterClient(Protocol):
     """Asks for decisions about one robot, and keeps its committed plan between two questions."""
 
     @property
