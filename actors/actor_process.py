@@ -85,7 +85,7 @@ class StopPractice:
         if not self.running:
             return proposal
         self._left -= 1
-        return np.asarray(driver.backup_plan.plan[driver.robot.given])
+        return np.asarray(driver.backup_plan.plan[driver.robot.committed_steps])
 
     def kept(self, driver: EpisodeRunner, outcome: DecisionOutcome) -> DecisionOutcome:
         """A stop that was begun goes on as it was verified, also where the filter would do something else by now: it
@@ -251,7 +251,7 @@ def cycle_together(
             rider.proposer.begin(rider.driver.rng)
     if not all(rider.ready(stop) for rider in riders if rider.driver.running):
         return False
-    proposals = [rider.propose() if rider.driver.running else rider.driver.robot.at_zero() for rider in riders]
+    proposals = [rider.propose() if rider.driver.running else rider.driver.robot.zero_input() for rider in riders]
     outcomes: list[DecisionOutcome | None] = [None] * len(riders)
     if question is not None:
         outcomes = joint_outcomes(request_decisions(question, fleet.requests(proposals), riders[0].driver.robot))

@@ -68,4 +68,4 @@ def next_input(backup_plan: BackupPlan, outcome: DecisionOutcome) -> Array:
 def at_rest(backup_plan: BackupPlan) -> bool:
     """Is the robot standing, and committed to that? Then it can wait for the service for as long as it takes."""
     robot = backup_plan.robot
-    return bool(robot.rests(backup_plan.input_in_force) and robot.rests(backup_plan.plan).all())
+    return bool(robot.is_stop_input(backup_plan.input_in_force) and robot.is_stop_input(backup_plan.plan).all())

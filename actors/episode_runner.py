@@ -141,7 +141,7 @@ class EpisodeRunner:
         counts as standing still."""
         self._number = self.step
         if outcome is None:
-            proposal = proposal if np.isfinite(proposal).all() else self.robot.at_zero()
+            proposal = proposal if np.isfinite(proposal).all() else self.robot.zero_input()
             return np.asarray(np.clip(proposal, self.robot.low(), self.robot.high()))
         return next_input(self.backup_plan, outcome)
 

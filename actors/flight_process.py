@@ -190,7 +190,7 @@ class FlightRunner(ActorRunner):
             what = "not needed"
         elif answer is None:
             what = "none"
-        elif self.flight.vehicle.commit(answer.plan[self.driver.robot.given :], period.number + 1):
+        elif self.flight.vehicle.commit(answer.plan[self.driver.robot.committed_steps :], period.number + 1):
             what = "in time"
         else:
             what, outcome = "late", replace(outcome, answer=None, failure="Late: its period had begun")
@@ -303,7 +303,7 @@ def run(
         if not (rider.join(stop) and answered(question, robot, stages[0], settings.method == "ddpc", stop)):
             return False
         request = FlightRequest(flight, robot, arena.obstacles)
-        vehicle = VehicleClient(request, rider.tape.keep, process.bus.tolerance, stop)
+        vehicle = VehicleClient(request, rider.tape.keep, process.bus.rejected, stop)
         try:
             rider.take(vehicle)
             while not stop() and cycle([rider], question, tally, stop):

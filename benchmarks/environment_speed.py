@@ -9,7 +9,7 @@ import numpy as np
 
 from benchmarks.timing import Figures, timed
 from brakeline.deploy.vehicle_factory import environment
-from brakeline.messaging.robot import shipped
+from brakeline.messaging.robot import shipped_robots
 from brakeline.messaging.task import RobotWithTask, robot_with_task
 from brakeline.sim.arena import Arena
 from brakeline.sim.lidar import Lidar
@@ -20,7 +20,7 @@ STEPS = 3000
 
 def run() -> Figures:
     figures: Figures = {}
-    for robot in map(robot_with_task, shipped()):
+    for robot in map(robot_with_task, shipped_robots()):
         figures[f"{robot.name}: environment, lidar included"], arena = _steps(robot)
         figures |= _lidars(robot, arena)
     return figures

@@ -45,7 +45,7 @@ from brakeline.logs.watch.live_board import Board
 from brakeline.logs.watch.live_page_server import encode
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.bus import BusError, BusSettings, Sample
-from brakeline.messaging.rejected_messages import Tolerance
+from brakeline.messaging.rejected_messages import RejectedMessages
 from brakeline.messaging.task import RobotWithTask, robot_with_task
 from brakeline.messaging.topics import DECIDE, FLOW, JOIN, MODEL, RECORDED, TOPICS, WEIGHTS, Topic
 from brakeline.safety.filter.backup_plan import BackupPlan
@@ -66,7 +66,7 @@ class Wire:
     run = 1
 
     def __init__(self) -> None:
-        self.tolerance = Tolerance()
+        self.rejected = RejectedMessages()
         self.handlers: dict[str, Callable[[Sample], None]] = {}
 
     def publisher(self, topic: Topic, **names: str) -> Any:
@@ -85,7 +85,7 @@ class Party:
     topics: tuple[Topic, ...]
     take: Callable[[Sample], None]
     look: Callable[[], object]
-    tolerance: Tolerance = field(default_factory=Tolerance)
+    rejected: RejectedMessages = field(default_factory=RejectedMessages)
     close: Callable[[], object] = lambda: None
     names: frozenset[str] = frozenset()
     messages: int = 0
@@ -109,35 +109,35 @@ def launcher(folder: Path) -> Party:
         one._inbox.append(sample)
         one._drain()
 
-    return Party(RECORDED, take, lambda: (line(one.metrics.figures()), one.figures()), one._tolerance)
+    return Party(RECORDED, take, lambda: (line(one.metrics.figures()), one.figures()), one._rejected)
 
 
 def recorder(folder: Path) -> Party:
     """Into a file that is begun anew all the time, so that the disk does not fill up."""
-    path, tolerance, inbox = folder / "fuzz.mcap", Tolerance(), Inbox()
+    path, rejected, inbox = folder / "fuzz.mcap", RejectedMessages(), Inbox()
 
     def open_one(run: Path, metadata: Metadata) -> Segment:
         path.unlink(missing_ok=True)
         return Segment(path, path.open("wb", buffering=0), metadata)
 
     derive = both(Pictures().of_sample, as_json)
-    recording = Recording(path, {}, inbox, open_one, derive, Rotation(mib=16.0), tolerance)
+    recording = Recording(path, {}, inbox, open_one, derive, Rotation(mib=16.0), rejected)
 
     def take(sample: Sample) -> None:
         inbox.put(sample)
         if inbox.bytes > 2**16:
             recording.save()
 
-    return Party(RECORDED, take, recording.save, tolerance, recording.finish)
+    return Party(RECORDED, take, recording.save, rejected, recording.finish)
 
 
 def watch() -> Party:
-    board, tolerance = Board(), Tolerance()
+    board, rejected = Board(), RejectedMessages()
 
     def take(sample: Sample) -> None:
-        _show(deque([sample]), board, None, tolerance)
+        _show(deque([sample]), board, None, rejected)
 
-    return Party(RECORDED, take, lambda: encode(board.view()), tolerance)
+    return Party(RECORDED, take, lambda: encode(board.view()), rejected)
 
 
 def learning(robot: RobotWithTask, folder: Path) -> Party:
@@ -157,7 +157,7 @@ def learning(robot: RobotWithTask, folder: Path) -> Party:
                 return
             learner.join(join).SerializeToString()
         else:
-            with wire.tolerance.over(sample.key):
+            with wire.rejected.skip_on_error(sample.key):
                 wire.handlers[sample.topic.name](sample)
             loop._take_steps()
 
@@ -167,7 +167,7 @@ def learning(robot: RobotWithTask, folder: Path) -> Party:
         loop._say_flow()
         loop._say_metrics()
 
-    return Party(topics, take, look, wire.tolerance)
+    return Party(topics, take, look, wire.rejected)
 
 
 def actor(robot: RobotWithTask) -> Party:
@@ -175,15 +175,15 @@ def actor(robot: RobotWithTask) -> Party:
     student = LearnerClient(wire, robot, "actor-0")
 
     def take(sample: Sample) -> None:
-        with wire.tolerance.over(sample.key):
+        with wire.rejected.skip_on_error(sample.key):
             wire.handlers[sample.topic.name](sample)
 
-    return Party((WEIGHTS, FLOW), take, lambda: (student.welcome, student.done), wire.tolerance)
+    return Party((WEIGHTS, FLOW), take, lambda: (student.welcome, student.done), wire.rejected)
 
 
 def safety() -> Party:
     """Questions and models; what is refused goes back to who asked."""
-    models, tolerance = ModelRegistry(), Tolerance()
+    models, rejected = ModelRegistry(), RejectedMessages()
     answer = batch_handler(models, ServiceCounts())
 
     def take(sample: Sample) -> None:
@@ -191,12 +191,12 @@ def safety() -> Party:
             if sample.topic is DECIDE:
                 answer(sample.payload)
             else:
-                with tolerance.over(sample.key):
+                with rejected.skip_on_error(sample.key):
                     models.install(decode(sample.message().file))
         except (BadRequest, BadModel):
             return
 
-    return Party((DECIDE, MODEL), take, lambda: models.filters, tolerance)
+    return Party((DECIDE, MODEL), take, lambda: models.filters, rejected)
 
 
 def asker(robot: RobotWithTask, mill: Mill) -> Party:
@@ -265,7 +265,7 @@ def fuzz(messages: int, seed: int = 0) -> Figures:
             party.try_(party.close)
         everybody["analyse"] = reader(folder)
     rows: Figures = {
-        name: {"messages": party.messages, "passed over": party.tolerance.count, "crashes": party.crashes.total()}
+        name: {"messages": party.messages, "passed over": party.rejected.count, "crashes": party.crashes.total()}
         for name, party in everybody.items()
     }
     rows["all"] = {
@@ -291,7 +291,7 @@ def reader(folder: Path) -> Party:
         analysis = Analysis("fuzz", log, Look(pictures=True), "")
         render(analysis.figures(), {"fuzz": (analysis.figures(), analysis.pictures())})
         party.messages = sum(segment.messages for segment in log.segments)
-        party.tolerance.count = log.malformed
+        party.rejected.count = log.malformed
 
     party.try_(look)
     return party

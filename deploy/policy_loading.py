@@ -77,6 +77,6 @@ def replayed(path: Path, robot: RobotWithTask) -> Policy:
     def policy(observation: NDArray[np.float32], info: dict[str, Any]) -> NDArray[np.float64]:
         if info["time"] == 0.0:
             left[:] = list(next(runs, np.zeros((0, len(names)))))
-        return left.pop(0) if left else np.where(robot.stopping, 0.0, info["input_in_force"])
+        return left.pop(0) if left else np.where(robot.zero_at_rest, 0.0, info["input_in_force"])
 
     return policy

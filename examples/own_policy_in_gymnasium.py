@@ -6,7 +6,7 @@ import numpy as np
 from brakeline.deploy.data.certification import certified
 from brakeline.deploy.data.environment_episodes import collect
 from brakeline.messaging.obstacle import Obstacle
-from brakeline.messaging.robot_description import robot_of
+from brakeline.messaging.robot_description import robot_from_description
 from brakeline.safety.action_mapping import normalised
 from brakeline.safety.filter.filter import Filter
 from brakeline.safety.gym import SafetyWrapper
@@ -33,7 +33,7 @@ def speed(**more):
     return {"unit": "m/s"} | more
 
 
-robot = robot_of(
+robot = robot_from_description(
     {
         "name": "cart",
         "period": 0.1,

@@ -19,7 +19,7 @@ import numpy as np
 import safetensors
 import safetensors.numpy
 
-from brakeline.learner.checkpoint_state import State
+from brakeline.learner.checkpoint_state import PartState
 
 FORMAT = 1
 CHECKPOINT = "checkpoint"  # the folder of a run's checkpoints
@@ -64,7 +64,7 @@ def exists(root: Path) -> bool:
     return (root / LATEST).exists()
 
 
-def save(root: Path, parts: dict[str, State], about: dict[str, Any]) -> Path:
+def save(root: Path, parts: dict[str, PartState], about: dict[str, Any]) -> Path:
     """Write `parts` as the latest checkpoint; `about` is what identifies the run (robot, configuration, …).
 
     Raises:
@@ -92,7 +92,7 @@ def save(root: Path, parts: dict[str, State], about: dict[str, Any]) -> Path:
     return place
 
 
-def load(root: Path, names: tuple[str, ...]) -> tuple[dict[str, State], dict[str, Any]]:
+def load(root: Path, names: tuple[str, ...]) -> tuple[dict[str, PartState], dict[str, Any]]:
     """The latest checkpoint's parts, each of `names` among them, and what was said about it.
 
     Raises:
@@ -131,7 +131,7 @@ def latest(root: Path) -> Path:
     return root / name
 
 
-def _write(folder: Path, parts: dict[str, State], about: dict[str, Any]) -> None:
+def _write(folder: Path, parts: dict[str, PartState], about: dict[str, Any]) -> None:
     listed = {}
     for name, state in parts.items():
         path = folder / f"{name}.safetensors"
@@ -156,13 +156,13 @@ def _manifest(place: Path) -> dict[str, Any]:
     return manifest
 
 
-def _read(place: Path, name: str, entry: dict[str, Any]) -> State:
+def _read(place: Path, name: str, entry: dict[str, Any]) -> PartState:
     path = place / f"{name}.safetensors"
     if not path.exists():
         raise MissingPart(name, place)
     if _hash(path) != entry["sha256"]:
         raise DamagedPart(name, place, "its hash is not the manifest's")
-    return State(safetensors.numpy.load_file(path), entry["values"])
+    return PartState(safetensors.numpy.load_file(path), entry["values"])
 
 
 def _hash(path: Path) -> str:

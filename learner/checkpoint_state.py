@@ -14,7 +14,7 @@ class BadState(ValueError):
 
 
 @dataclass(frozen=True)
-class State:
+class PartState:
     """Arrays (they rest as safetensors) and plain values (they rest as JSON)."""
 
     tensors: dict[str, NDArray[Any]]

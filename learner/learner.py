@@ -17,15 +17,15 @@ from typing import Any, Protocol
 import numpy as np
 
 from brakeline.learner import checkpoint
-from brakeline.learner.checkpoint_state import State
+from brakeline.learner.checkpoint_state import PartState
 from brakeline.learner.learner_config import LearnerConfig
-from brakeline.learner.n_step import Windows
-from brakeline.learner.rate_limiter import Limiter
-from brakeline.learner.replay import Batch, Replay
-from brakeline.learner.step_ledger import Ledger
-from brakeline.learner.symmetry import Images
+from brakeline.learner.n_step import NStepWindows
+from brakeline.learner.rate_limiter import RateLimiter
+from brakeline.learner.replay import Batch, ReplayBuffer
+from brakeline.learner.step_ledger import StepLedger
+from brakeline.learner.symmetry import SymmetryAugmentation
 from brakeline.learner.td3 import TD3
-from brakeline.learner.transition_reader import LATEST, BadStep, Intake
+from brakeline.learner.transition_reader import LATEST, BadStep, StepReader
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging import policy_weights as policy
 from brakeline.messaging.task import RobotWithTask
@@ -35,8 +35,8 @@ AHEAD = 1000  # steps beyond its permission that an actor may be: it had it from
 
 
 class Part(Protocol):
-    def state(self) -> State: ...
-    def restore(self, state: State) -> None: ...
+    def state(self) -> PartState: ...
+    def restore(self, state: PartState) -> None: ...
 
 
 class Learner:
@@ -50,17 +50,17 @@ class Learner:
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         """`incarnation` tells actors of a restart: they join again when it changes."""
-        self._intake = Intake(robot)
+        self._intake = StepReader(robot)
         td3, dims = config.td3, (robot.task.observation_dim, robot.action_dim)
         self.robot, self.config, self.incarnation = robot, config, incarnation
         networks, draws = np.random.SeedSequence(config.seed).spawn(2)
         self._td3 = TD3(*dims, td3, seed=int(networks.generate_state(1)[0]))
         self._draws = np.random.default_rng(draws)
-        self._replay, self._batch = Replay(config.capacity, *dims), Batch(td3.batch, *dims)
-        self._images = Images(robot, td3.batch) if td3.symmetric else None
-        self._windows, self._ledger = Windows(td3.n_step, td3.gamma, td3.stored), Ledger()
+        self._replay, self._batch = ReplayBuffer(config.capacity, *dims), Batch(td3.batch, *dims)
+        self._images = SymmetryAugmentation(robot, td3.batch) if td3.symmetric else None
+        self._windows, self._ledger = NStepWindows(td3.n_step, td3.gamma, td3.stored), StepLedger()
         ahead = 0.0 if config.lockstep else config.ahead
-        self._limiter = Limiter(td3.updates_per_step * td3.batch, td3.batch, td3.warmup, ahead)
+        self._limiter = RateLimiter(td3.updates_per_step * td3.batch, td3.batch, td3.warmup, ahead)
         self._limits: dict[str, int] = {}
         self._episode_ended = True  # by the last step taken in
         self._saved_at = 0  # steps
@@ -308,7 +308,7 @@ class Learner:
             if names:
                 raise checkpoint.OtherRun(", ".join(names), root)
 
-    def _run_state(self) -> State:
+    def _run_state(self) -> PartState:
         values = {
             "draws": self._draws.bit_generator.state,
             "version": self._version,
@@ -316,9 +316,9 @@ class Learner:
             "episode_ended": self._episode_ended,
             "saved_at": self._saved_at,
         }
-        return State({}, values)
+        return PartState({}, values)
 
-    def _restore_run(self, state: State) -> None:
+    def _restore_run(self, state: PartState) -> None:
         self._draws.bit_generator.state = state.value("draws")
         self._version, self._published_updates = state.integer("version"), state.integer("published_updates")
         self._episode_ended, self._saved_at = bool(state.value("episode_ended")), state.integer("saved_at")

@@ -20,7 +20,7 @@ from brakeline.learner.learner import Learner
 from brakeline.learner.learner_config import LearnerConfig
 from brakeline.learner.transition_reader import BadStep
 from brakeline.messaging import brakeline_pb2 as pb
-from brakeline.messaging.atomic_files import write_whole
+from brakeline.messaging.atomic_files import write_atomically
 from brakeline.messaging.bus import BusSettings, Sample
 from brakeline.messaging.process_runtime import Process
 from brakeline.messaging.task import robot_with_task
@@ -153,7 +153,7 @@ class LearnerLoop:
         while self._steps:
             sample = self._steps.popleft()
             taken += 1
-            with self._process.bus.tolerance.over(sample.key):
+            with self._process.bus.rejected.skip_on_error(sample.key):
                 step = sample.message()
                 if sample.key.rpartition("/")[2] != step.actor:
                     raise BadStep("actor", f"{step.actor!r} published at {sample.key}")
@@ -198,7 +198,7 @@ class LearnerLoop:
     def _write_policy(self) -> None:
         path = self._settings.out / POLICY
         try:
-            write_whole(path, self._learner.weights().file)
+            write_atomically(path, self._learner.weights().file)
         except OSError as error:
             log.error("the policy was not written: %s", error)
 

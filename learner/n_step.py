@@ -21,14 +21,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from brakeline.learner.checkpoint_state import State
+from brakeline.learner.checkpoint_state import PartState
 from brakeline.learner.learner_config import Stored
 from brakeline.learner.replay import Transition, Vector
 
 VECTORS = ("observation", "action", "proposed", "next_observation")
 
 
-class Move(NamedTuple):
+class ActorStep(NamedTuple):
     """One step of one episode of an actor."""
 
     episode: int
@@ -44,15 +44,15 @@ class Move(NamedTuple):
     cut: bool = False  # for the learner the episode ends here; the reward less the penalty is the lowest there is
 
 
-class Windows:
+class NStepWindows:
     """Open windows of every actor: at most n − 1 consecutive moves each."""
 
     def __init__(self, n: int, gamma: float, stored: Stored = "executed") -> None:
         self.n, self.gamma, self.stored = n, gamma, stored
-        self._open: dict[str, deque[Move]] = {}
+        self._open: dict[str, deque[ActorStep]] = {}
         self._last: dict[str, tuple[int, int]] = {}  # newest (episode, step) of an actor
 
-    def push(self, actor: str, move: Move) -> list[Transition]:
+    def push(self, actor: str, move: ActorStep) -> list[Transition]:
         """The transitions that this move completes, oldest first. Moves are not repeated (`learner/step_ledger.py`)."""
         here, last = (move.episode, move.step), self._last.get(actor, (-1, -1))
         if here < last:  # a straggler: its neighbours are closed, it stands for itself
@@ -70,14 +70,14 @@ class Windows:
             moves.popleft()
         return done
 
-    def _drain(self, moves: deque[Move]) -> list[Transition]:
+    def _drain(self, moves: deque[ActorStep]) -> list[Transition]:
         done: list[Transition] = []
         while moves:
             done += self._close(moves)
             moves.popleft()
         return done
 
-    def _close(self, moves: deque[Move] | list[Move]) -> list[Transition]:
+    def _close(self, moves: deque[ActorStep] | list[ActorStep]) -> list[Transition]:
         first, last = moves[0], moves[-1]
         reward = 0.0
         for move in reversed(moves):
@@ -92,7 +92,7 @@ class Windows:
             Transition(first.observation, first.proposed, reward, discount, last.next_observation),
         ]
 
-    def _cut(self, move: Move) -> list[Transition]:
+    def _cut(self, move: ActorStep) -> list[Transition]:
         seen, after = move.observation, move.next_observation
         done = [Transition(seen, move.proposed, move.reward - move.penalty, 0.0, after)]
         if self.stored == "both" and not np.array_equal(move.action, move.proposed):
@@ -100,7 +100,7 @@ class Windows:
             done.insert(0, Transition(seen, move.action, move.reward, discount, after))
         return done
 
-    def state(self) -> State:
+    def state(self) -> PartState:
         """The open windows too: with several actors a checkpoint cuts through the episodes of all but one."""
         actors = sorted(self._last)
         moves = [(number, move) for number, actor in enumerate(actors) for move in self._open[actor]]
@@ -111,9 +111,9 @@ class Windows:
         for name in VECTORS:
             rows = [getattr(move, name) for _, move in moves]
             tensors[name] = np.array(rows, np.float32) if rows else np.zeros((0, 0), np.float32)
-        return State(tensors, {"actors": actors, "last": [list(self._last[actor]) for actor in actors]})
+        return PartState(tensors, {"actors": actors, "last": [list(self._last[actor]) for actor in actors]})
 
-    def restore(self, state: State) -> None:
+    def restore(self, state: PartState) -> None:
         actors: list[str] = state.value("actors")
         self._last = {actor: (last[0], last[1]) for actor, last in zip(actors, state.value("last"), strict=True)}
         self._open = {actor: deque() for actor in actors}
@@ -123,5 +123,5 @@ class Windows:
         for (number, episode, step), (reward, penalty), *parts in zip(place, rewards, *vectors, strict=True):
             observation, action, proposed, after = parts
             places, values = (int(episode), int(step)), (float(reward), float(penalty))
-            move = Move(*places, observation, action, proposed, *values, after, False, False)
+            move = ActorStep(*places, observation, action, proposed, *values, after, False, False)
             self._open[actors[number]].append(move)

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 
-from brakeline.learner.checkpoint_state import State
+from brakeline.learner.checkpoint_state import PartState
 
 
-class Limiter:
+class RateLimiter:
     """Keeps learning and acting in step:
 
         error = (inserts − warmup) · samples_per_insert − samples,    0 ≤ error < ceiling  (below 0 in the warm-up)
@@ -49,8 +49,8 @@ class Limiter:
     def sample(self) -> None:
         self.samples += self.batch
 
-    def state(self) -> State:
-        return State({}, {"inserts": self.inserts, "samples": self.samples})
+    def state(self) -> PartState:
+        return PartState({}, {"inserts": self.inserts, "samples": self.samples})
 
-    def restore(self, state: State) -> None:
+    def restore(self, state: PartState) -> None:
         self.inserts, self.samples = state.integer("inserts"), state.integer("samples")

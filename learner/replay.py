@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from brakeline.learner.checkpoint_state import BadState, State
+from brakeline.learner.checkpoint_state import BadState, PartState
 
 Vector = NDArray[np.float32]
 
@@ -24,7 +24,7 @@ class Transition(NamedTuple):
 
 
 class Batch:
-    """Transitions drawn together, as torch and NumPy see the same memory; refilled by every `Replay.sample`.
+    """Transitions drawn together, as torch and NumPy see the same memory; refilled by every `ReplayBuffer.sample`.
 
     Shapes: observation, next_observation (1, batch, obs), action (1, batch, act), reward, discount (1, batch, 1).
     """
@@ -40,7 +40,7 @@ class Batch:
         return len(self.arrays[0])
 
 
-class Replay:
+class ReplayBuffer:
     """The last `capacity` transitions, drawn uniformly with replacement."""
 
     NAMES = ("observation", "action", "reward", "discount", "next_observation")
@@ -67,12 +67,12 @@ class Replay:
         for array, out in zip(self._arrays, batch.arrays, strict=True):
             np.take(array, rows, axis=0, out=out, mode="clip")  # "raise", the default, would copy the whole of `out`
 
-    def state(self) -> State:
+    def state(self) -> PartState:
         """The filled rows as they lie, so that the same draw finds the same rows again."""
         tensors = {name: array[: self.size] for name, array in zip(self.NAMES, self._arrays, strict=True)}
-        return State(tensors, {"capacity": self.capacity, "next": self._next})
+        return PartState(tensors, {"capacity": self.capacity, "next": self._next})
 
-    def restore(self, state: State) -> None:
+    def restore(self, state: PartState) -> None:
         if state.integer("capacity") != self.capacity:
             raise BadState(f"capacity: {state.integer('capacity')} where {self.capacity} belongs")
         size = len(state.tensor("reward", (None, 1), "float32"))

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from brakeline.learner.adam import Adam
 from brakeline.learner.networks import Network
-from brakeline.learner.symmetry import Images
+from brakeline.learner.symmetry import SymmetryAugmentation
 from brakeline.messaging.perceptrons import Perceptrons
 from brakeline.messaging.task import RobotWithTask
 
@@ -24,7 +24,7 @@ Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Fit:
+class FitConfig:
     """How networks are fitted."""
 
     hidden: tuple[int, ...]
@@ -45,7 +45,9 @@ class TooFew(ValueError):
 Gradient = Callable[[Tensor, NDArray[np.intp]], Tensor]  # outputs (count, batch, out) and their rows -> dL/doutputs
 
 
-def fit_linear(observation: Array, action: Array, change: Array, how: Fit, seed: int) -> tuple[Perceptrons, Array]:
+def fit_linear(
+    observation: Array, action: Array, change: Array, how: FitConfig, seed: int
+) -> tuple[Perceptrons, Array]:
     """Networks g_i with change_i ≈ g_i(observation)ᵀ action, one for each column of `change` (N, K).
 
     Returns them and, on held-out samples, each one's root mean squared error and that of predicting no change, (2, K).
@@ -65,7 +67,9 @@ def fit_linear(observation: Array, action: Array, change: Array, how: Fit, seed:
     return networks, np.sqrt(np.stack([((predicted - rest) ** 2).mean(0), (rest**2).mean(0)]))
 
 
-def fit_cost(robot: RobotWithTask, x: Array, cost: Array, count: int, how: Fit, seed: int) -> tuple[Perceptrons, float]:
+def fit_cost(
+    robot: RobotWithTask, x: Array, cost: Array, count: int, how: FitConfig, seed: int
+) -> tuple[Perceptrons, float]:
     """`count` networks whose sigmoid is the cost (N,) in [0, 1] of inputs x (N, i), observations or pairs of
     observation and action; they differ by their start. They learn from images too (`learner/symmetry.py`).
 
@@ -79,13 +83,18 @@ def fit_cost(robot: RobotWithTask, x: Array, cost: Array, count: int, how: Fit, 
     def gradient(outputs: Tensor, rows: NDArray[np.intp]) -> Tensor:
         return (torch.sigmoid(outputs) - costs[rows][:, None]) / len(rows)
 
-    networks, apart = _fit(inputs, (count, 1), gradient, how, seed, Images(robot, how.batch))
+    networks, apart = _fit(inputs, (count, 1), gradient, how, seed, SymmetryAugmentation(robot, how.batch))
     predicted = np.array([1.0 / (1.0 + np.exp(-networks(inputs[t].numpy()).astype(float))) for t in apart])
     return networks, float(np.abs(predicted.mean((1, 2)) - cost[apart]).mean())
 
 
 def _fit(
-    inputs: Tensor, shape: tuple[int, int], gradient: Gradient, how: Fit, seed: int, images: Images | None = None
+    inputs: Tensor,
+    shape: tuple[int, int],
+    gradient: Gradient,
+    how: FitConfig,
+    seed: int,
+    images: SymmetryAugmentation | None = None,
 ) -> tuple[Perceptrons, NDArray[np.intp]]:
     """`shape[0]` networks with `shape[1]` outputs, and the rows that were held out."""
     torch.set_num_threads(1)
@@ -109,7 +118,7 @@ def _fit(
     return Perceptrons(layers), apart
 
 
-def _batches(rows: NDArray[np.intp], how: Fit, rng: np.random.Generator) -> Iterator[NDArray[np.intp]]:
+def _batches(rows: NDArray[np.intp], how: FitConfig, rng: np.random.Generator) -> Iterator[NDArray[np.intp]]:
     """Whole batches of every epoch, each in an order of its own."""
     for _ in range(how.epochs):
         order = rng.permutation(rows)

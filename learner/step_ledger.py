@@ -12,11 +12,11 @@ from typing import Any
 
 import numpy as np
 
-from brakeline.learner.checkpoint_state import BadState, State
+from brakeline.learner.checkpoint_state import BadState, PartState
 
 
 @dataclass
-class Place:
+class ActorProgress:
     """How far one actor is."""
 
     last_index: int = 0
@@ -43,11 +43,11 @@ def mark(ranges: list[list[int]], step: int) -> bool:
     return True
 
 
-class Ledger:
+class StepLedger:
     """Every step that was ever taken in; a thousand steps of an unbroken episode cost one range."""
 
     def __init__(self) -> None:
-        self.places: dict[str, Place] = {}
+        self.places: dict[str, ActorProgress] = {}
         self.received = 0  # distinct steps
         self.expected = 0  # steps that actors say they have published
         self.duplicates = 0
@@ -59,7 +59,7 @@ class Ledger:
 
     def record(self, actor: str, episode: int, step: int, index: int) -> bool:
         """False: a duplicate, not to be learned from again."""
-        place = self.places.setdefault(actor, Place(last_index=index - 1))
+        place = self.places.setdefault(actor, ActorProgress(last_index=index - 1))
         if not mark(place.seen.setdefault(episode, []), step):
             self.duplicates += 1
             return False
@@ -74,7 +74,7 @@ class Ledger:
 
     def join(self, actor: str, index: int, episode: int) -> int:
         """An actor that has published `index` steps and would begin `episode` next; returns where it shall go on."""
-        place = self.places.setdefault(actor, Place(last_index=index))
+        place = self.places.setdefault(actor, ActorProgress(last_index=index))
         place.next_episode = max(place.next_episode, episode)
         if index < place.last_index:  # it was started anew
             place.last_index, place.fresh_from = index, place.next_episode
@@ -83,7 +83,7 @@ class Ledger:
             place.last_index = index
         return place.next_episode
 
-    def state(self) -> State:
+    def state(self) -> PartState:
         actors = sorted(self.places)
         rows = [
             (number, episode, first, last)
@@ -97,12 +97,12 @@ class Ledger:
             "expected": self.expected,
             "duplicates": self.duplicates,
         }
-        return State({"seen": np.array(rows, np.int64).reshape(len(rows), 4)}, values)
+        return PartState({"seen": np.array(rows, np.int64).reshape(len(rows), 4)}, values)
 
-    def restore(self, state: State) -> None:
+    def restore(self, state: PartState) -> None:
         actors: dict[str, tuple[int, int, int]] = state.value("actors")
         names = sorted(actors)
-        self.places = {name: Place(*actors[name]) for name in names}
+        self.places = {name: ActorProgress(*actors[name]) for name in names}
         for number, episode, first, last in state.tensor("seen", (None, 4), "int64").tolist():
             if not 0 <= number < len(names):
                 raise BadState(f"seen: actor {number} of {len(names)}")

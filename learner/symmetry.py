@@ -16,16 +16,18 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
-from brakeline.learner.replay import Batch, Replay
+from brakeline.learner.replay import Batch, ReplayBuffer
 from brakeline.messaging.task import RobotWithTask
 
 Indices = NDArray[np.intp]
 Matrix = NDArray[np.float64]
 
-OBSERVATION, ACTION, NEXT_OBSERVATION = (Replay.NAMES.index(n) for n in ("observation", "action", "next_observation"))
+OBSERVATION, ACTION, NEXT_OBSERVATION = (
+    ReplayBuffer.NAMES.index(n) for n in ("observation", "action", "next_observation")
+)
 
 
-def turns_of(robot: RobotWithTask) -> list[Matrix]:
+def symmetry_matrices(robot: RobotWithTask) -> list[Matrix]:
     """The R (d, d) under which a robot and its world stay the same, the identity first."""
     d = robot.position_dim
     if robot.task.symmetry == "none":
@@ -35,7 +37,7 @@ def turns_of(robot: RobotWithTask) -> list[Matrix]:
     return [flip @ axes for axes in (np.eye(d), swap) for flip in flips]
 
 
-def image_of(robot: RobotWithTask, turn: Matrix) -> tuple[Indices, Matrix, Indices, Matrix]:
+def symmetry_maps(robot: RobotWithTask, turn: Matrix) -> tuple[Indices, Matrix, Indices, Matrix]:
     """Where each coordinate of an observation's image comes from, with which sign; the same of an action's.
 
     Raises:
@@ -56,18 +58,18 @@ def image_of(robot: RobotWithTask, turn: Matrix) -> tuple[Indices, Matrix, Indic
     return np.concatenate([rays, after]), observed, axes, signs
 
 
-class Images:
-    """Replaces rows by their images: row k by that under number k of `turns_of`, modulo their count.
+class SymmetryAugmentation:
+    """Replaces rows by their images: row k by that under number k of `symmetry_matrices`, modulo their count.
 
     Rows are drawn at random, so which image of a transition is seen is as random.
     """
 
     def __init__(self, robot: RobotWithTask, batch: int) -> None:
-        turns = turns_of(robot)
+        turns = symmetry_matrices(robot)
         if len(turns) == 1:
             self._sources: dict[int, tuple[Indices, NDArray[np.float32]]] = {}
             return
-        images = [image_of(robot, turn) for turn in turns]
+        images = [symmetry_maps(robot, turn) for turn in turns]
         which = np.arange(batch) % len(turns)
         observation, observed, action, acted = (np.array([image[part] for image in images])[which] for part in range(4))
         pair = np.hstack([observation, observation.shape[1] + action])

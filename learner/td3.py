@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from brakeline.learner.adam import Adam
-from brakeline.learner.checkpoint_state import State
+from brakeline.learner.checkpoint_state import PartState
 from brakeline.learner.learner_config import TD3Config
 from brakeline.learner.networks import Network
 from brakeline.learner.replay import Batch
@@ -119,13 +119,13 @@ class TD3:
             "critic_square": self.critic_adam.square,
         }
 
-    def state(self) -> State:
+    def state(self) -> PartState:
         tensors = {name: tensor.numpy() for name, tensor in self._tensors().items()}
         tensors["generator"] = self._generator.get_state().numpy()
         counts = {"updates": self.updates, "actor_adam": self.actor_adam.count, "critic_adam": self.critic_adam.count}
-        return State(tensors, counts)
+        return PartState(tensors, counts)
 
-    def restore(self, state: State) -> None:
+    def restore(self, state: PartState) -> None:
         for name, tensor in self._tensors().items():
             tensor.copy_(torch.from_numpy(state.tensor(name, tuple(tensor.shape), "float32").copy()))
         generator = state.tensor("generator", tuple(self._generator.get_state().shape), "uint8")

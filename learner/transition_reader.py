@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from brakeline.learner.n_step import Move
+from brakeline.learner.n_step import ActorStep
 from brakeline.learner.replay import Vector
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.task import RobotWithTask
@@ -28,7 +28,7 @@ class BadStep(ValueError):
         self.field = field
 
 
-class Intake:
+class StepReader:
     """Reads the steps of one kind of robot. The reward learned is `reward − penalty`."""
 
     def __init__(self, robot: RobotWithTask) -> None:
@@ -36,7 +36,7 @@ class Intake:
         self.most_reward = AT_ONCE * sum(map(abs, astuple(robot.task.reward)))
         self._centre, self._half = (robot.high() + robot.low()) / 2.0, (robot.high() - robot.low()) / 2.0
 
-    def move(self, step: pb.Step) -> Move:
+    def move(self, step: pb.Step) -> ActorStep:
         """
         Raises:
             BadStep: it cannot be learned from.
@@ -56,7 +56,9 @@ class Intake:
         observation = self._observed("observation", step.observation)
         after = self._observed("next_observation", step.next_observation)
         values = action, proposed, step.reward, step.penalty
-        return Move(step.episode, step.step, observation, *values, after, step.terminated, step.truncated, step.cut)
+        return ActorStep(
+            step.episode, step.step, observation, *values, after, step.terminated, step.truncated, step.cut
+        )
 
     def _normalised(self, name: str, values: Any, most: float) -> Vector:
         """An action in [-1, 1]: what is out of bounds, by not too much, would have been clipped."""

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.robot import Robot
-from brakeline.messaging.stated_share import UNSTATED, checked, percent, trust
+from brakeline.messaging.stated_share import UNSTATED, describe_verification, percent, valid_bound
 
 Array = NDArray[np.float64]
 
@@ -49,13 +49,15 @@ def explain(robot: Robot, request: pb.Request, decision: pb.Decision) -> Explana
         arrow(robot, heading, executed),
         np.array(decision.stopped.at),
         np.array(decision.stopped.normal),
-        "" if decision.kind in (pb.FAILSAFE, pb.RECOVERING) else trust(decision.verified, bound_in(decision)),
+        ""
+        if decision.kind in (pb.FAILSAFE, pb.RECOVERING)
+        else describe_verification(decision.verified, bound_in(decision)),
     )
 
 
 def bound_in(decision: pb.Decision) -> float | None:
     """The model set's statement, where the decision has it."""
-    return checked(decision.bound) if decision.HasField("bound") else None
+    return valid_bound(decision.bound) if decision.HasField("bound") else None
 
 
 def fits(robot: Robot, request: pb.Request, decision: pb.Decision) -> bool:

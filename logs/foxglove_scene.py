@@ -33,7 +33,7 @@ from google.protobuf.timestamp_pb2 import Timestamp
 from brakeline.logs.decision_explanation import Explanation, explain, fell_back, fits
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.obstacle import BOX, CYLINDER, SPHERE, WALL
-from brakeline.messaging.ray_directions import Rays
+from brakeline.messaging.ray_directions import LidarRays
 from brakeline.messaging.robot import Robot
 from brakeline.safety.perception.displayed_map import DisplayedMap, map_for_display
 
@@ -144,8 +144,8 @@ def _body(robot: Robot, actor: str, time: int) -> SceneEntity:
         )
         body.cylinders.append(drum)
     if robot.position_dim == 2:
-        nose = _pose((0.5 * robot.front, 0.0, tall))
-        body.cubes.append(CubePrimitive(pose=nose, size=_vector(robot.front, 2.0 * FLAT, FLAT), color=NOSE))
+        nose = _pose((0.5 * robot.front_extent, 0.0, tall))
+        body.cubes.append(CubePrimitive(pose=nose, size=_vector(robot.front_extent, 2.0 * FLAT, FLAT), color=NOSE))
     body.texts.append(_text(actor, (0.0, 0.0, HEIGHT + robot.footprint), _color(60, 60, 60)))
     return body
 
@@ -276,7 +276,7 @@ def frames(robot: Robot, actor: str, site: tuple[float, float], state: Sequence[
     return FrameTransforms(transforms=[place, body])
 
 
-def lidar(rays: Rays, actor: str, observation: Sequence[float], time: int) -> LaserScan | PointCloud:
+def lidar(rays: LidarRays, actor: str, observation: Sequence[float], time: int) -> LaserScan | PointCloud:
     """The rays of an observation: a scan in the plane; in space a cloud of the points that were hit."""
     ranges = np.asarray(observation[: len(rays.directions)], float) * rays.range
     frame, at = body_frame(actor), stamp(time)

@@ -17,7 +17,7 @@ from brakeline.logs.mcap_container import Series
 from brakeline.logs.metrics import Metrics, closed_loop, together
 from brakeline.logs.process_timeline import Timeline
 from brakeline.logs.reader import Log, Paths, by_run, find
-from brakeline.messaging.rejected_messages import Tolerance
+from brakeline.messaging.rejected_messages import RejectedMessages
 from brakeline.messaging.topics import EPISODE, EXCHANGE, HEALTH, LEARNER, LOG, STEP
 
 SETUP = ("method", "certificate", "policy", "arena", "perception", "seed")
@@ -46,7 +46,7 @@ class Analysis:
         self.timeline = Timeline()
         self._drawn: dict[Series, tuple[Places, EpisodeSampler, Source]] = {}
         self._kept: dict[Series, deque[Any]] = {}
-        self._tolerance = Tolerance()
+        self._rejected = RejectedMessages()
         self._take(log)
         for gallery in self.galleries.values():
             gallery.close()
@@ -97,7 +97,7 @@ class Analysis:
                     taker(series, message)
             except Exception as error:  # one message is one message: the log goes on
                 log.malformed += 1
-                self._tolerance.note(series.key, error)
+                self._rejected.reject(series.key, error)
 
     def _draw(self, series: Series, step: Any) -> None:
         known = self._drawn.get(series)

@@ -6,8 +6,8 @@ import json
 import logging
 from collections.abc import Iterable, Mapping
 
-from brakeline.messaging.robot import LATE, Robot, UnknownRobot, shipped, unless_shipped
-from brakeline.messaging.robot_description import robot_of
+from brakeline.messaging.robot import REAL_TIME_SUFFIX, Robot, UnknownRobot, refuse_shipped_name, shipped_robots
+from brakeline.messaging.robot_description import robot_from_description
 from brakeline.messaging.task import robot_with_task
 
 log = logging.getLogger("brakeline.logs")
@@ -23,11 +23,11 @@ class Robots:
         """Add the robots that a log's metadata describe; warn of a description that cannot be read, and go on."""
         for name, text in descriptions.items():
             try:
-                robot = unless_shipped(robot_of(json.loads(text), f"the log's {name}"))
+                robot = refuse_shipped_name(robot_from_description(json.loads(text), f"the log's {name}"))
             except ValueError as error:
                 log.warning("%s", error)
                 continue
-            if robot.name not in shipped():
+            if robot.name not in shipped_robots():
                 self._robots.setdefault(robot.name, robot)
 
     def named(self, name: str) -> Robot | None:
@@ -37,9 +37,9 @@ class Robots:
         return self._robots.get(name)
 
     def _found(self, name: str) -> Robot | None:
-        base = name.removesuffix(LATE)
+        base = name.removesuffix(REAL_TIME_SUFFIX)
         robot = self._robots.get(base)
-        if robot is None and base in shipped():
+        if robot is None and base in shipped_robots():
             robot = robot_with_task(base)
         if robot is None or base == name:
             return robot

@@ -19,7 +19,7 @@ from brakeline.logs.segment import Attachments, Entry, Metadata, Segment, open_s
 from brakeline.logs.segment_rotation import Rotation as Rotation
 from brakeline.messaging.bus import BusSettings, Sample
 from brakeline.messaging.process_runtime import Process
-from brakeline.messaging.rejected_messages import Tolerance
+from brakeline.messaging.rejected_messages import RejectedMessages
 from brakeline.messaging.topics import RECORDED
 
 log = logging.getLogger("brakeline.recorder")
@@ -92,7 +92,7 @@ class Recording:
         open_one: Open = open_segment,
         derive: Derive | None = None,
         rotation: Rotation | None = None,
-        tolerance: Tolerance | None = None,
+        rejected: RejectedMessages | None = None,
     ) -> None:
         self.recorded: Counter[str] = Counter()  # messages in the files, per key
         self.failure = ""  # why nothing can be written at present
@@ -100,7 +100,7 @@ class Recording:
         self._run, self._metadata, self._inbox, self._open = run, metadata, inbox, open_one
         self._derive = derive or (lambda sample: ())
         self._rotation = rotation or Rotation()
-        self._tolerance = tolerance or Tolerance()
+        self._rejected = rejected or RejectedMessages()
         self._segment: Segment | None = None
         self._begun_at = 0.0
         self._retry_at = 0.0
@@ -120,7 +120,7 @@ class Recording:
             while waiting > 0 and (portion := self._inbox.portion()):
                 left_out = segment.save([item for sample in portion for item in self._entries(sample)])
                 if left_out:
-                    self._tolerance.note(portion[-1].key, ValueError(f"{left_out} messages of one channel too many"))
+                    self._rejected.reject(portion[-1].key, ValueError(f"{left_out} messages of one channel too many"))
                 waiting -= sum(weight(sample) for sample in portion)
                 self._inbox.forget(portion)
                 self.recorded.update(sample.key for sample in portion)
@@ -147,7 +147,7 @@ class Recording:
                 return [entry(sample)]
             return [entry(sample), *self._derive(sample)]
         except Exception as error:  # its bytes are kept all the same
-            self._tolerance.note(sample.key, error)
+            self._rejected.reject(sample.key, error)
             return [as_it_came(sample)]
 
     def _leave_out(self) -> None:
@@ -222,7 +222,7 @@ def record(
     """
     inbox = Inbox()
     opened = partial(open_segment, attachments=attachments)
-    recording = Recording(run, metadata, inbox, opened, derive, rotation, process.bus.tolerance)
+    recording = Recording(run, metadata, inbox, opened, derive, rotation, process.bus.rejected)
 
     def refresh() -> None:
         process.figures.update(

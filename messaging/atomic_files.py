@@ -7,7 +7,7 @@ import secrets
 from pathlib import Path
 
 
-def write_whole(path: Path, payload: bytes) -> None:
+def write_atomically(path: Path, payload: bytes) -> None:
     """Write a file, and its folders, so that whoever reads it meanwhile finds the old one or the new one; of several
     who write at once the last one's stays.
 
@@ -19,7 +19,7 @@ def write_whole(path: Path, payload: bytes) -> None:
 
 
 def write_secret(path: Path, payload: bytes) -> None:
-    """As `write_whole`, in a file that only its owner can read, from its first byte on."""
+    """As `write_atomically`, in a file that only its owner can read, from its first byte on."""
     path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
     _replace(path, payload, 0o600)
 

@@ -71,7 +71,7 @@ class State:
     published: Mapping[str, int]  # by key
 
 
-class Exposition:
+class MetricsServer:
     """Serves until `close`, in threads of its own."""
 
     def __init__(self, where: str, state: Callable[[], State]) -> None:

@@ -15,7 +15,7 @@ Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Movers:
+class MovingObstacles:
     """n obstacles with a motion: shapes as measured; drift (n, d) c [m/s]; growth (n, 3), r(t) = growth·(1, t, t²);
     age (n,) s since they were measured; kept (n,): not seen outside what the sighting before allows."""
 
@@ -29,7 +29,7 @@ class Movers:
         return len(self.age)
 
     @staticmethod
-    def of(obstacles: Sequence[Obstacle], dim: int) -> Movers:
+    def of(obstacles: Sequence[Obstacle], dim: int) -> MovingObstacles:
         """Raises BadShape when one has another dimension; each has a motion."""
         n = len(obstacles)
         motions = [obstacle.motion for obstacle in obstacles if obstacle.motion is not None]
@@ -37,7 +37,7 @@ class Movers:
             (m.velocity_error, 0.5 * (m.acceleration or 0.0)) if m.speed is None else (m.speed, 0.0) for m in motions
         ]
         growth = [(m.position_error, *pull) for m, pull in zip(motions, pulls, strict=True)]
-        return Movers(
+        return MovingObstacles(
             Shapes.of(obstacles, dim),
             np.array([m.drift() for m in motions], dtype=float).reshape(n, dim),
             np.array(growth, dtype=float).reshape(n, 3),
@@ -45,9 +45,11 @@ class Movers:
             np.array([m.kept(o.position) for m, o in zip(motions, obstacles, strict=True)], dtype=bool),
         )
 
-    def take(self, index: NDArray[np.intp] | NDArray[np.bool_]) -> Movers:
+    def take(self, index: NDArray[np.intp] | NDArray[np.bool_]) -> MovingObstacles:
         """The chosen ones."""
-        return Movers(self.shapes.take(index), self.drift[index], self.growth[index], self.age[index], self.kept[index])
+        return MovingObstacles(
+            self.shapes.take(index), self.drift[index], self.growth[index], self.age[index], self.kept[index]
+        )
 
     @cached_property
     def all_kept(self) -> bool:
@@ -70,9 +72,9 @@ class Movers:
         return np.asarray(self.shapes.distance(point) - self.shapes.margin - way)
 
 
-def parted(obstacles: Sequence[Obstacle], dim: int) -> tuple[Shapes, Movers | None]:
+def split_moving(obstacles: Sequence[Obstacle], dim: int) -> tuple[Shapes, MovingObstacles | None]:
     """What stands still, and what moves (None: nothing). Raises BadShape."""
     moving = [obstacle for obstacle in obstacles if obstacle.motion is not None]
     if not moving:
         return Shapes.of(obstacles, dim), None
-    return Shapes.of([o for o in obstacles if o.motion is None], dim), Movers.of(moving, dim)
+    return Shapes.of([o for o in obstacles if o.motion is None], dim), MovingObstacles.of(moving, dim)

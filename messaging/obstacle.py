@@ -47,7 +47,7 @@ class Obstacle:
     sphere: (radius,); wall: () — a plane through `position` whose free side is the direction `yaw` points to.
     yaw: rad about the vertical (box and wall). margin: m that are kept beside the body's own radius; negative where the
     body may reach over it, down to minus its radius where only the regressed position counts.
-    motion: how it moves; None: it stands still (`Shapes` takes every obstacle for standing: see `movers.parted`).
+    motion: how it moves; None: it stands still (`Shapes` takes every obstacle for standing: see `movers.split_moving`).
     """
 
     kind: str

@@ -18,7 +18,7 @@ import safetensors
 import safetensors.numpy
 from numpy.typing import NDArray
 
-from brakeline.messaging.robot import LATE, Array, shipped
+from brakeline.messaging.robot import REAL_TIME_SUFFIX, Array, shipped_robots
 from brakeline.messaging.task import RobotWithTask, robot_with_task
 
 Matrix = NDArray[np.float32]
@@ -148,7 +148,9 @@ def _robot(about: Any, robot: RobotWithTask | None) -> RobotWithTask:
     if not isinstance(about, dict) or not isinstance(about.get("robot"), str):
         raise BadWeights("robot: missing")
     if robot is None:
-        if about["robot"].removesuffix(LATE) not in shipped():  # the name is from outside: no path is read
+        if (
+            about["robot"].removesuffix(REAL_TIME_SUFFIX) not in shipped_robots()
+        ):  # the name is from outside: no path is read
             raise BadWeights(f"robot: unknown, {about['robot']!r}")
         robot = robot_with_task(about["robot"])
     if about["robot"] != robot.name:

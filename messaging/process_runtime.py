@@ -18,8 +18,8 @@ from typing import Self
 
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.bus import Bus, BusError, BusSettings, Publisher
-from brakeline.messaging.metrics_endpoint import Exposition, State
-from brakeline.messaging.stop_signals import heeded
+from brakeline.messaging.metrics_endpoint import MetricsServer, State
+from brakeline.messaging.stop_signals import stop_on_signals
 from brakeline.messaging.topics import HEALTH, LOG
 
 log = logging.getLogger("brakeline.process")
@@ -53,18 +53,18 @@ class Process:
         self.refresh: Callable[[], None] | None = None
         self._stderr, self._reserved = stderr, reserved
         self._handlers: list[logging.Handler] = []
-        self._signals = heeded(self.stop)
+        self._signals = stop_on_signals(self.stop)
         self._ended = False
         self._due = threading.Event()
         self._announced = False
         self._beat_at = time.monotonic()
-        self._exposition: Exposition | None = None
+        self._exposition: MetricsServer | None = None
 
     def __enter__(self) -> Self:
         self.bus = Bus(self.settings, self.source)
         try:
             if self.settings.metrics:
-                self._exposition = Exposition(self.settings.metrics, self._state)
+                self._exposition = MetricsServer(self.settings.metrics, self._state)
         except (ValueError, OSError):
             self.bus.close()
             raise
@@ -126,7 +126,7 @@ class Process:
             live=time.monotonic() - self._beat_at < SILENT,
             ready=self._announced and connected and not self.stop.is_set(),
             connected=connected,
-            figures=dict(self.figures) | {"passed over": self.bus.tolerance.count},
+            figures=dict(self.figures) | {"passed over": self.bus.rejected.count},
             published=self.bus.published(),
         )
 
@@ -140,7 +140,7 @@ class Process:
                 process=self.source,
                 pid=os.getpid(),
                 published=published,
-                figures=dict(self.figures) | {"passed over": self.bus.tolerance.count},
+                figures=dict(self.figures) | {"passed over": self.bus.rejected.count},
                 notes=dict(self.notes),
                 last=last,
             )

@@ -15,24 +15,24 @@ Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Rays:
+class LidarRays:
     """directions (rays, d): unit vectors in the robot's frame; range [m]: what is observed as 1."""
 
     directions: Array
     range: float
 
 
-def fan(count: int, degrees: float, range: float) -> Rays:
+def planar_rays(count: int, degrees: float, range: float) -> LidarRays:
     """Evenly over so many degrees about straight ahead, right to left."""
     spread = math.radians(degrees)
     angles = np.linspace(-0.5 * spread, 0.5 * spread, count)
-    return Rays(np.stack([np.cos(angles), np.sin(angles)], axis=1), range)
+    return LidarRays(np.stack([np.cos(angles), np.sin(angles)], axis=1), range)
 
 
-def sphere(azimuths: int, elevations: int, degrees: float, range: float) -> Rays:
+def spherical_rays(azimuths: int, elevations: int, degrees: float, range: float) -> LidarRays:
     """Azimuths evenly over 360° from straight ahead, at each of them the elevations from low to high over `degrees`."""
     spread = math.radians(degrees)
     around = 2.0 * math.pi * np.arange(azimuths) / azimuths
     up = np.linspace(-0.5 * spread, 0.5 * spread, elevations)
     a, e = (grid.ravel() for grid in np.meshgrid(around, up, indexing="ij"))
-    return Rays(np.stack([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)], axis=1), range)
+    return LidarRays(np.stack([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)], axis=1), range)

@@ -1,5 +1,5 @@
 """One message is one message: what can't be handled is counted, named in the log once a second at the most, and passed
-over. Every process has one `Tolerance`, its bus's; the count is in its Health."""
+over. Every process has one `RejectedMessages`, its bus's; the count is in its Health."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ SPACING = 1.0  # s between two lines: a line may come back over the bus to the h
 LONGEST = 300  # characters of a line
 
 
-class Tolerance:
+class RejectedMessages:
     """Counts what was passed over, in any thread."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
@@ -23,14 +23,14 @@ class Tolerance:
         self._clock, self._said_at, self._lock = clock, -1e9, threading.Lock()
 
     @contextmanager
-    def over(self, what: str) -> Iterator[None]:
+    def skip_on_error(self, what: str) -> Iterator[None]:
         """Pass over `what` if the block raises."""
         try:
             yield
         except Exception as error:
-            self.note(what, error)
+            self.reject(what, error)
 
-    def note(self, what: str, error: Exception, level: int = logging.ERROR) -> None:
+    def reject(self, what: str, error: Exception, level: int = logging.ERROR) -> None:
         """`what` could not be handled, for this reason; below an error's level it is named without its place."""
         with self._lock:
             self.count += 1

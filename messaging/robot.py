@@ -20,14 +20,20 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-ROUNDING = 1e-9  # of an input
+INPUT_ROUNDING = 1e-9  # of an input
 
-LATE = "-late"  # ends the name of a robot in real time
-WITH = "+"  # stands between a robot's name and that of another task than its usual one (`brakeline.messaging.task`)
+REAL_TIME_SUFFIX = "-late"  # ends the name of a robot in real time
+TASK_SEPARATOR = (
+    "+"  # stands between a robot's name and that of another task than its usual one (`brakeline.messaging.task`)
+)
 RAMP, HOLD, FEEDBACK = "ramp", "hold", "feedback"
-FOLLOWED = 1e-6  # of an input's range: two inputs this close are the same (they were rounded to single precision)
-ACCEPTED = 0.01  # largest stated share of plans outside their tubes that a robot is driven behind without a question
-FOLDER = Path(__file__).parents[1] / "robots"
+INPUT_TOLERANCE = (
+    1e-6  # of an input's range: two inputs this close are the same (they were rounded to single precision)
+)
+DEFAULT_ACCEPT_BOUND = (
+    0.01  # largest stated share of plans outside their tubes that a robot is driven behind without a question
+)
+ROBOTS_FOLDER = Path(__file__).parents[1] / "robots"
 
 
 class UnknownRobot(ValueError):
@@ -93,12 +99,12 @@ class Robot:
     late: bool = False  # an answer counts from the next period on: a plan's first input is the one in force meanwhile
     # The largest share of plans outside their tubes, as a model set states it, that is used without a question. It says
     # nothing about the robot's vectors: robots that differ in nothing else are equal, and have one layout.
-    accept_bound: float = field(default=ACCEPTED, compare=False)
+    accept_bound: float = field(default=DEFAULT_ACCEPT_BOUND, compare=False)
 
     @property
     def kind(self) -> str:
         """Its name but for the time it lives in: robots of one kind have the same body, senses, arenas and policies."""
-        return self.name.removesuffix(LATE)
+        return self.name.removesuffix(REAL_TIME_SUFFIX)
 
     @property
     def state_dim(self) -> int:
@@ -114,7 +120,7 @@ class Robot:
         return len(self.regressor) + self.action_dim
 
     @property
-    def given(self) -> int:
+    def committed_steps(self) -> int:
         """So many of a plan's free inputs are no longer free when the question is asked."""
         return int(self.late)
 
@@ -126,7 +132,9 @@ class Robot:
         """
         if self.feedback:
             raise UnknownRobot(f"{self.name} stops by feedback: it has no real-time mode")
-        return replace(self, name=self.name + LATE, late=True, horizon=self.horizon + 1, free_steps=self.free_steps + 1)
+        return replace(
+            self, name=self.name + REAL_TIME_SUFFIX, late=True, horizon=self.horizon + 1, free_steps=self.free_steps + 1
+        )
 
     def in_lockstep(self) -> Self:
         """The same robot where the world waits."""
@@ -140,17 +148,17 @@ class Robot:
         return max(disc.arm + disc.radius for disc in self.body)
 
     @cached_property
-    def front(self) -> float:
+    def front_extent(self) -> float:
         """m from the position straight ahead to where the discs of the body end."""
         ends = [d.at[0] + math.sqrt(d.radius**2 - d.at[1] ** 2) for d in self.body if abs(d.at[1]) <= d.radius]
         return max(ends, default=self.footprint)
 
     @property
-    def speeds(self) -> list[int]:
+    def speed_indices(self) -> list[int]:
         """The state coordinates that come to the inputs, in the order of those that any comes to."""
         return [index for index in self.follows if index >= 0]
 
-    def driving(self, inputs: Array) -> Array:
+    def state_at_inputs(self, inputs: Array) -> Array:
         """The state (n,), at the origin, of a robot that has come to these inputs (m,)."""
         state = np.zeros(self.state_dim)
         for index, value in zip(self.follows, inputs, strict=True):
@@ -167,27 +175,27 @@ class Robot:
     @cached_property
     def bounds(self) -> tuple[Array, Array]:
         """(m,), (m,): what no input may be beyond, rounding allowed."""
-        return self.low() - ROUNDING, self.high() + ROUNDING
+        return self.low() - INPUT_ROUNDING, self.high() + INPUT_ROUNDING
 
     @cached_property
-    def stopping(self) -> NDArray[np.bool_]:
+    def zero_at_rest(self) -> NDArray[np.bool_]:
         """(m,) which inputs are zero when it stands: all but those that are held."""
         return np.array([rule != HOLD for rule in self.stop])
 
     @cached_property
-    def by_state(self) -> NDArray[np.bool_]:
+    def stops_by_feedback(self) -> NDArray[np.bool_]:
         """(m,) which inputs stop by feedback."""
         return np.array([rule == FEEDBACK for rule in self.stop])
 
-    def at_zero(self) -> Array:
+    def zero_input(self) -> Array:
         """The input (m,) nearest to none: that of a robot that has not been given any."""
         return np.asarray(np.clip(0.0, self.low(), self.high()))
 
-    def rests(self, inputs: Array) -> NDArray[np.bool_]:
+    def is_stop_input(self, inputs: Array) -> NDArray[np.bool_]:
         """Are these inputs (..., m) those of a stop?"""
-        return np.asarray((np.abs(inputs) < 1e-9)[..., self.stopping].all(-1))
+        return np.asarray((np.abs(inputs) < 1e-9)[..., self.zero_at_rest].all(-1))
 
-    def fractions(self) -> Array:
+    def stop_profile(self) -> Array:
         """What the rules leave of the last chosen input, j periods after it: (horizon, m), ones for j = 0."""
         left = np.ones((self.horizon, self.action_dim))
         for j in range(1, self.horizon):
@@ -200,48 +208,49 @@ class Robot:
                     left[j, i] = float(rule[min(j, len(rule)) - 1])
         return left
 
-    def schedule(self) -> Array:
+    def plan_matrix(self) -> Array:
         """S with `plan = S @ free`, plan (horizon·m) and free (free_steps·m) stacked step by step. Shape (N·m, F·m).
 
         What `feedback` adds to it is not known before.
         """
-        m, F, left = self.action_dim, self.free_steps, self.fractions()
+        m, F, left = self.action_dim, self.free_steps, self.stop_profile()
         S = np.zeros((self.horizon * m, F * m))
         for k in range(self.horizon):
             for i in range(m):
                 S[k * m + i, min(k, F - 1) * m + i] = 1.0 if k < F else left[k - F + 1, i]
         return S
 
-    def braked(self, planned: Array, state: Array, before: Array) -> Array:
+    def stop_by_feedback(self, planned: Array, state: Array, before: Array) -> Array:
         """A plan's rows while it brakes (..., m), with what `feedback` makes of the measured state (..., n), in bounds
         and slew after the input `before` (..., m)."""
         if not self.feedback:
             return planned
-        wanted = np.where(self.by_state, state @ np.asarray(self.feedback).T, planned)
+        wanted = np.where(self.stops_by_feedback, state @ np.asarray(self.feedback).T, planned)
         slew = np.asarray(self.action_slew)
         low, high = np.maximum(self.low(), before - slew), np.minimum(self.high(), before + slew)
         return np.asarray(np.clip(wanted, low, high))
 
-    def stands(self, state: Array) -> bool:
+    def is_standing(self, state: Array) -> bool:
         """Is no measured speed more than counts as stopped?"""
         return bool((np.abs(state[list(self.regressor)]) <= self.stopped).all())
 
-    def keeps_still(self, inputs: Array, state: Array, before: Array) -> bool:
+    def is_stopping(self, inputs: Array, state: Array, before: Array) -> bool:
         """Are these the inputs (m,) of a stop, given in that measured state (n,) after the input `before` (m,)?"""
         if not self.feedback:
-            return bool(self.rests(inputs))
-        near = FOLLOWED * (self.high() - self.low())
-        off = np.abs(inputs - self.braked(np.where(self.stopping, 0.0, inputs), state, before))
-        return self.stands(state) and bool((off <= near).all())
+            return bool(self.is_stop_input(inputs))
+        near = INPUT_TOLERANCE * (self.high() - self.low())
+        off = np.abs(inputs - self.stop_by_feedback(np.where(self.zero_at_rest, 0.0, inputs), state, before))
+        return self.is_standing(state) and bool((off <= near).all())
 
-    def may_stand(self, inputs: Array) -> bool:
+    def may_be_standing(self, inputs: Array) -> bool:
         """May a robot that stands have been given these inputs (m,)? By feedback it is given what its residual speed
         makes of it."""
         if not self.feedback:
-            return bool(self.rests(inputs))
+            return bool(self.is_stop_input(inputs))
         gains = np.abs(np.asarray(self.feedback))[:, list(self.regressor)]
-        most = np.where(self.by_state, gains.sum(1) * self.stopped, 0.0) + FOLLOWED * (self.high() - self.low())
-        return bool((np.abs(inputs) <= most)[self.stopping].all())
+        most = INPUT_TOLERANCE * (self.high() - self.low())
+        most += np.where(self.stops_by_feedback, gains.sum(1) * self.stopped, 0.0)
+        return bool((np.abs(inputs) <= most)[self.zero_at_rest].all())
 
     @cached_property
     def description(self) -> dict[str, Any]:
@@ -257,7 +266,7 @@ class Robot:
         words = json.dumps([shared, self.late])  # the order of names is part of it
         return hashlib.sha256(words.encode()).hexdigest()[:16]
 
-    def understands(self, layout: object) -> bool:
+    def accepts_layout(self, layout: object) -> bool:
         """Is it this robot's layout, or the one it had before robots were files?"""
         return layout == self.layout() or layout == FORMER_LAYOUTS.get(self.name)
 
@@ -271,43 +280,44 @@ FORMER_LAYOUTS = {
 }
 
 
-def shipped() -> tuple[str, ...]:
+def shipped_robots() -> tuple[str, ...]:
     """The names of the robots that come with the program."""
-    return tuple(sorted(path.stem for path in FOLDER.glob("*.toml") if "." not in path.stem))
+    return tuple(sorted(path.stem for path in ROBOTS_FOLDER.glob("*.toml") if "." not in path.stem))
 
 
 def robot_named(name: str) -> Robot:
     """Read the robot of a name or at a path.
 
     Args:
-        name: of a robot that comes with the program, or the path of a description (.toml). `LATE` at its end: the same
-            robot in real time. A task's name after the robot's (`ground+tracks`) makes no other robot of it.
+        name: the name of a shipped robot, or the path of a description (.toml). With the suffix `-late`, the robot is
+            returned in real time. A task's name after the robot's (`ground+tracks`) does not change the robot.
 
     Raises:
         UnknownRobot: with the names there are, or every mistake in the file.
     """
     from brakeline.messaging.robot_description import read
 
-    base = name.removesuffix(LATE)
+    base = name.removesuffix(REAL_TIME_SUFFIX)
     if base.endswith(".toml"):
-        robot = unless_shipped(read(Path(base)))
+        robot = refuse_shipped_name(read(Path(base)))
     else:
-        base = base.partition(WITH)[0]
-        if base not in shipped():
+        base = base.partition(TASK_SEPARATOR)[0]
+        if base not in shipped_robots():
             raise UnknownRobot(
-                f"no robot is called {name!r}; there are: {', '.join(shipped())}, or the path of a description (.toml)"
+                f"no robot is called {name!r}; choose one of {', '.join(shipped_robots())}, or give the path of a "
+                "description (.toml)"
             )
-        robot = read(FOLDER / f"{base}.toml")
-    return robot.in_real_time() if name.endswith(LATE) else robot
+        robot = read(ROBOTS_FOLDER / f"{base}.toml")
+    return robot.in_real_time() if name.endswith(REAL_TIME_SUFFIX) else robot
 
 
-def unless_shipped(robot: Robot) -> Robot:
+def refuse_shipped_name(robot: Robot) -> Robot:
     """Return the robot, unless it takes the name of a robot that comes with the program and differs from it.
 
     Raises:
         UnknownRobot: it does.
     """
     name = robot.in_lockstep().name
-    if name in shipped() and robot.description != robot_named(name).description:
+    if name in shipped_robots() and robot.description != robot_named(name).description:
         raise UnknownRobot(f"{name} is the name of a robot that comes with the program: choose another")
     return robot

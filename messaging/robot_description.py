@@ -17,7 +17,17 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
 
-from brakeline.messaging.robot import ACCEPTED, FEEDBACK, HOLD, LATE, RAMP, Disc, Limit, Robot, UnknownRobot
+from brakeline.messaging.robot import (
+    DEFAULT_ACCEPT_BOUND,
+    FEEDBACK,
+    HOLD,
+    RAMP,
+    REAL_TIME_SUFFIX,
+    Disc,
+    Limit,
+    Robot,
+    UnknownRobot,
+)
 
 NAME = re.compile(r"[A-Za-z0-9_.]+(-[A-Za-z0-9_.]+)*")
 LONGEST = 64  # characters of a name
@@ -99,7 +109,7 @@ class Description(_Strict):
     stopped: Positive | None = None
     # The largest share of plans outside their tubes, as a model set states it, that is used without a question. It is
     # below 1, which is what a model set without a statement counts as.
-    accept_bound: Annotated[float, Field(gt=0.0, lt=1.0, allow_inf_nan=False)] = ACCEPTED
+    accept_bound: Annotated[float, Field(gt=0.0, lt=1.0, allow_inf_nan=False)] = DEFAULT_ACCEPT_BOUND
 
 
 def read(path: Path) -> Robot:
@@ -119,12 +129,12 @@ def read(path: Path) -> Robot:
 def _robot_in(text: str, source: str) -> Robot:
     """The robot in a file of this content: the file is read each time, and checked once."""
     try:
-        return robot_of(tomllib.loads(text), source)
+        return robot_from_description(tomllib.loads(text), source)
     except tomllib.TOMLDecodeError as error:
         raise BadDescription(source, [("", f"not TOML: {error}")]) from error
 
 
-def robot_of(values: Any, source: str = "this") -> Robot:
+def robot_from_description(values: Any, source: str = "this") -> Robot:
     """The robot that a description, as nested dicts, says.
 
     Raises:
@@ -182,7 +192,7 @@ def _rule(said: str | list[float] | dict[str, float]) -> str | tuple[float, ...]
 
 
 def describe(robot: Robot) -> dict[str, Any]:
-    """The description of a robot: `robot_of` makes the same robot of it."""
+    """The description of a robot: `robot_from_description` makes the same robot of it."""
 
     def plain(label: str) -> tuple[str, str]:
         name, _, unit = label.rpartition(" [")
@@ -226,7 +236,7 @@ def describe(robot: Robot) -> dict[str, Any]:
         "limit": limits,
     }
     said |= {"stopped": robot.stopped} if math.isfinite(robot.stopped) else {}
-    return said | ({"accept_bound": robot.accept_bound} if robot.accept_bound != ACCEPTED else {})
+    return said | ({"accept_bound": robot.accept_bound} if robot.accept_bound != DEFAULT_ACCEPT_BOUND else {})
 
 
 def _weights(names: list[str], by_name: dict[str, float]) -> tuple[float, ...]:
@@ -265,8 +275,10 @@ def _allowed(place: list[str]) -> list[str]:
 def _inconsistent(said: Description) -> list[tuple[str, str]]:
     """What no field alone can tell."""
     found: list[tuple[str, str]] = []
-    if not NAME.fullmatch(said.name) or said.name.endswith(LATE):
-        found.append(("name", f"letters, digits, '_', '.' and '-', not ending in {LATE!r}; not {said.name!r}"))
+    if not NAME.fullmatch(said.name) or said.name.endswith(REAL_TIME_SUFFIX):
+        found.append(
+            ("name", f"letters, digits, '_', '.' and '-', not ending in {REAL_TIME_SUFFIX!r}; not {said.name!r}")
+        )
     found += _bad_state(said)
     for name, one in said.input.items():
         found += [(f"input.{name}.{field}", text) for field, text in _bad_input(said, name, one)]

@@ -35,7 +35,7 @@ def check_unit(ranges: object) -> None:
 
 
 @dataclass(frozen=True, eq=False)
-class Followed:
+class BeamTracks:
     """What earlier scans say of where whatever was hit goes (`safety/perception/scan_tracking.py`).
 
     which (R,): of each beam, the row of `ways` that what it hit keeps to, from 1 on; 0: none, it may go anywhere at the
@@ -43,17 +43,19 @@ class Followed:
     seconds after the scan it has gone by the velocity times t, give or take error·t + acceleration·t²/2.
     """
 
-    which: NDArray[np.uint8]
-    ways: Array
+    track_index: NDArray[np.uint8]
+    motions: Array
 
     def wrong(self, beams: int) -> str:
         """What is wrong with it, of a scan of so many beams; empty: nothing."""
-        if self.which.shape != (beams,) or self.which.dtype != np.uint8:
-            return "of each beam one byte says what it hit"
-        if self.ways.ndim != 2 or self.ways.shape[1] != 4 or int(self.which.max(initial=0)) > len(self.ways):
-            return "what is followed keeps to ways of four numbers, and to no other"
-        if not (np.abs(self.ways) <= FASTEST).all() or (self.ways[:, 2:] < 0.0).any():  # NaN fails too
-            return f"ways are numbers up to {FASTEST:g}, their errors and accelerations not negative"
+        if self.track_index.shape != (beams,) or self.track_index.dtype != np.uint8:
+            return "a scan's tracks need one byte for each beam"
+        if self.motions.ndim != 2 or self.motions.shape[1] != 4:
+            return "a track's motion has four numbers"
+        if int(self.track_index.max(initial=0)) > len(self.motions):
+            return "a beam's track index is larger than the number of tracks"
+        if not (np.abs(self.motions) <= FASTEST).all() or (self.motions[:, 2:] < 0.0).any():  # NaN fails too
+            return f"the numbers of a track's motion must be within {FASTEST:g}, and its last two not negative"
         return ""
 
 
@@ -82,7 +84,7 @@ class Scan:
     age: float = 0.0  # s since it was taken
     acceleration: float = 0.0  # m/s²: no more than that whatever moves speeds up or slows down; 0: not known
     least_radius: float = 0.0  # m: whatever moves is at least as large
-    followed: Followed | None = None
+    tracks: BeamTracks | None = None
 
     def __post_init__(self) -> None:
         check_unit(self.ranges)
@@ -113,7 +115,7 @@ class Scan:
         object.__setattr__(self, "doubt", int(self.doubt))
         if not (math.isfinite(self.least_width) and self.least_width > 0.0):
             raise BadScan("a scan's least width must be positive")
-        if self.followed is not None and (wrong := self.followed.wrong(n)):
+        if self.tracks is not None and (wrong := self.tracks.wrong(n)):
             raise BadScan(wrong)
 
     @property

@@ -6,15 +6,15 @@ import numpy as np
 
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.range_image import RangeImage
-from brakeline.messaging.scan import BadScan, Followed, Scan
+from brakeline.messaging.scan import BadScan, BeamTracks, Scan
 
-Sensed = Scan | RangeImage
+RangeMeasurement = Scan | RangeImage
 
 MILLI = 1e-3  # m: of what an image's ranges are multiples, rounded down
 MOST = 65_535  # of them
 
 
-def add_sensed(request: pb.Request, sensed: Sensed | None) -> None:
+def set_measurement(request: pb.Request, sensed: RangeMeasurement | None) -> None:
     """Put it into a request."""
     if isinstance(sensed, Scan):
         request.scan.CopyFrom(scan_message(sensed))
@@ -22,7 +22,7 @@ def add_sensed(request: pb.Request, sensed: Sensed | None) -> None:
         request.image.CopyFrom(image_message(sensed))
 
 
-def sensed_of(request: pb.Request) -> Sensed | None:
+def measurement_in(request: pb.Request) -> RangeMeasurement | None:
     """What a request holds. Raises BadScan: it is none, or two."""
     scan, image = request.HasField("scan"), request.HasField("image")
     if scan and image:
@@ -48,8 +48,8 @@ def scan_message(scan: Scan) -> pb.Scan:
         age=scan.age,
         acceleration=scan.acceleration,
         least_radius=scan.least_radius,
-        which=b"" if scan.followed is None else scan.followed.which.tobytes(),
-        ways=[] if scan.followed is None else scan.followed.ways.ravel().tolist(),
+        which=b"" if scan.tracks is None else scan.tracks.track_index.tobytes(),
+        ways=[] if scan.tracks is None else scan.tracks.motions.ravel().tolist(),
     )
 
 
@@ -59,9 +59,9 @@ def scan_of(m: pb.Scan) -> Scan:
         raise BadScan("a scan's pose has 3 coordinates, its mount 2")
     if len(m.ways) % 4:
         raise BadScan("a scan's ways have four numbers each")
-    followed = None
+    tracks = None
     if m.which:
-        followed = Followed(np.frombuffer(m.which, np.uint8), np.array(m.ways, dtype=float).reshape(-1, 4))
+        tracks = BeamTracks(np.frombuffer(m.which, np.uint8), np.array(m.ways, dtype=float).reshape(-1, 4))
     x, y, heading = m.pose
     return Scan(
         np.fromiter(m.ranges, np.float64, len(m.ranges)),  # `np.array` takes five times as long
@@ -78,7 +78,7 @@ def scan_of(m: pb.Scan) -> Scan:
         age=m.age,
         acceleration=m.acceleration,
         least_radius=m.least_radius,
-        followed=followed,
+        tracks=tracks,
     )
 
 

@@ -9,7 +9,7 @@ UNSTATED = 1.0  # what a statement that is missing or can't be read counts as
 DIGITS = 2  # of a bound that is shown
 
 
-def checked(bound: float) -> float:
+def valid_bound(bound: float) -> float:
     """A bound that came from outside: `UNSTATED` if it is no share. NaN is none."""
     return bound if 0.0 <= bound <= 1.0 else UNSTATED
 
@@ -26,13 +26,13 @@ def percent(bound: float) -> str:
     return f"{100.0 * rounded_up(bound):g} %"
 
 
-def trust(verified: bool, bound: float | None) -> str:
+def describe_verification(verified: bool, bound: float | None) -> str:
     """What a decision's `verified` is worth, e.g. "verified; at most 1.1 % of such plans leave their tube, at 99 %
     confidence". bound: None where none was recorded."""
     if not verified:
         return "not verified"
     if bound is None:
         return "verified; no bound was recorded"
-    if checked(bound) == UNSTATED:
+    if valid_bound(bound) == UNSTATED:
         return "verified by a model set that states no bound"
     return f"verified; at most {percent(bound)} of such plans leave their tube, at {100.0 * CONFIDENCE:g} % confidence"

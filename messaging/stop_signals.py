@@ -15,7 +15,7 @@ NUMBERS = (signal.SIGINT, signal.SIGTERM)
 
 
 @contextmanager
-def heeded(stop: threading.Event, patient: bool = False) -> Iterator[threading.Event]:
+def stop_on_signals(stop: threading.Event, patient: bool = False) -> Iterator[threading.Event]:
     """Within the block SIGINT and SIGTERM set `stop`; a second one, later, ends the process at once with status
     128 + its number, unless `patient`. Does nothing but in the main thread.
 

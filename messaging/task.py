@@ -23,8 +23,15 @@ from typing import Any, Literal
 
 from pydantic import ConfigDict, TypeAdapter, ValidationError
 
-from brakeline.messaging.ray_directions import Rays, fan, sphere
-from brakeline.messaging.robot import FOLDER, FORMER_LAYOUTS, LATE, WITH, Robot, robot_named
+from brakeline.messaging.ray_directions import LidarRays, planar_rays, spherical_rays
+from brakeline.messaging.robot import (
+    FORMER_LAYOUTS,
+    REAL_TIME_SUFFIX,
+    ROBOTS_FOLDER,
+    TASK_SEPARATOR,
+    Robot,
+    robot_named,
+)
 
 _STRICT = ConfigDict(extra="forbid")
 
@@ -127,12 +134,12 @@ class Task:
     name: str = ""  # of its file; empty: it has none
 
     @cached_property
-    def rays(self) -> Rays:
+    def rays(self) -> LidarRays:
         """Where the observation's rays point; none without a lidar."""
         seen = self.lidar or Lidar(1.0, 0.0)
         if seen.azimuths:
-            return sphere(seen.azimuths, seen.elevations, seen.degrees, seen.range)
-        return fan(seen.fan, seen.degrees, seen.range)
+            return spherical_rays(seen.azimuths, seen.elevations, seen.degrees, seen.range)
+        return planar_rays(seen.fan, seen.degrees, seen.range)
 
     @cached_property
     def observed(self) -> tuple[str, ...]:
@@ -240,21 +247,23 @@ def task_path(name: str) -> Path:
     Raises:
         UnknownRobot; UnknownTask: there is no such file.
     """
-    if name.removesuffix(LATE).endswith(".toml"):
+    if name.removesuffix(REAL_TIME_SUFFIX).endswith(".toml"):
         path = _task_beside(name)
     else:
-        path = FOLDER / f"{name.removesuffix(LATE)}.task.toml"
+        path = ROBOTS_FOLDER / f"{name.removesuffix(REAL_TIME_SUFFIX)}.task.toml"
     if path.is_file():
         return path
     kind = robot_named(name).kind
-    if WITH in name and not name.removesuffix(LATE).endswith(".toml"):
-        there = sorted(p.name.removesuffix(".task.toml") for p in FOLDER.glob(f"{kind}{WITH}*.task.toml"))
+    if TASK_SEPARATOR in name and not name.removesuffix(REAL_TIME_SUFFIX).endswith(".toml"):
+        there = sorted(
+            p.name.removesuffix(".task.toml") for p in ROBOTS_FOLDER.glob(f"{kind}{TASK_SEPARATOR}*.task.toml")
+        )
         raise UnknownTask(f"there is no {name}; of {kind} there are, besides itself: {', '.join(there)}")
     raise UnknownTask(f"{kind} has no task: what it observes, is paid, and drives in (expected: {path})")
 
 
 def _task_beside(path: str) -> Path:
-    return Path(path.removesuffix(LATE)).with_suffix(".task.toml")
+    return Path(path.removesuffix(REAL_TIME_SUFFIX)).with_suffix(".task.toml")
 
 
 def address(name: str) -> str:
@@ -263,7 +272,7 @@ def address(name: str) -> str:
     Raises:
         UnknownRobot; UnknownTask: there is no such robot, or no such task of it.
     """
-    base = name.removesuffix(LATE)
+    base = name.removesuffix(REAL_TIME_SUFFIX)
     if base.endswith(".toml"):
         return str(Path(base).resolve()) + name[len(base) :]
     task_path(name)
@@ -272,7 +281,7 @@ def address(name: str) -> str:
 
 def address_in_real_time(name: str) -> str:
     """Return the address of the same robot in real time."""
-    return address(name.removesuffix(LATE)) + LATE
+    return address(name.removesuffix(REAL_TIME_SUFFIX)) + REAL_TIME_SUFFIX
 
 
 def read(path: Path) -> Task:

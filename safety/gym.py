@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brakeline.messaging.bus import BusError
-from brakeline.messaging.sensor_messages import Sensed
+from brakeline.messaging.sensor_messages import RangeMeasurement
 from brakeline.safety.action_mapping import ActionMapping, cast_action, mapping_for_space
 from brakeline.safety.environment_views import OBSTACLES, STATE, View
 from brakeline.safety.filter.backup_plan import correction_penalty
@@ -77,7 +77,7 @@ class SafetyWrapper(gymnasium.Wrapper[Any, Any, Any, Any]):
         self._actions = mapping_for_space(env.action_space, self.asker.robot, actions)
         self._now: tuple[Any, dict[str, Any]] | None = None
         self._memory = memory_of(self.asker.robot)
-        self._scan: Sensed | None = None
+        self._scan: RangeMeasurement | None = None
 
     @classmethod
     def load(cls, env: gymnasium.Env[Any, Any], model: Path | str, penalty: float = 0.0, **how: Any) -> Self:

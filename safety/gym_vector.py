@@ -10,7 +10,7 @@ import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv, VectorWrapper
 from numpy.typing import NDArray
 
-from brakeline.messaging.sensor_messages import Sensed
+from brakeline.messaging.sensor_messages import RangeMeasurement
 from brakeline.safety.action_mapping import ActionMapping, Mismatch, mapping_for_space
 from brakeline.safety.environment_views import OBSTACLES, STATE, View
 from brakeline.safety.filter.backup_plan import BackupPlan, correction_penalty
@@ -57,7 +57,7 @@ class VectorSafetyWrapper(VectorWrapper):
         self._ended = np.zeros(env.num_envs, dtype=bool)
         self._now: tuple[Any, dict[str, Any]] | None = None
         self._memories = [memory_of(filter.robot) for _ in range(env.num_envs)]
-        self._scans: list[Sensed | None] = [None] * env.num_envs
+        self._scans: list[RangeMeasurement | None] = [None] * env.num_envs
 
     def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         self._now = self.env.reset(seed=seed, options=options)
@@ -92,7 +92,7 @@ class VectorSafetyWrapper(VectorWrapper):
             known_free=[near[i] is not None for i in deciding],
         )
         executed = np.array([kept.next_input for kept in self.backup_plans])
-        executed[resets] = robot.at_zero()
+        executed[resets] = robot.zero_input()
         space = self.env.action_space
         made = np.asarray(self._actions.control_to_action(executed), dtype=space.dtype).reshape(space.shape)
         observations, rewards, terminated, truncated, infos = self.env.step(made)

@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from brakeline.messaging.ray_directions import Rays
+from brakeline.messaging.ray_directions import LidarRays
 from brakeline.sim.arena import Arena
 from brakeline.sim.ground_estimator import Estimator, NoiseLevels, wrap
 from brakeline.sim.ground_robot import GROUND, SAMPLES, WHEEL_RADIUS, GroundRobot
@@ -114,7 +114,9 @@ class SpinningLidar:
         self.gap = 2.0 * math.pi / beams
         angles = self.gap * np.arange(beams)
         directions = np.stack([np.cos(angles), np.sin(angles)], axis=1)
-        self._sectors = [Lidar(arena, Rays(part, farthest), noise, rng) for part in np.array_split(directions, SAMPLES)]
+        self._sectors = [
+            Lidar(arena, LidarRays(part, farthest), noise, rng) for part in np.array_split(directions, SAMPLES)
+        ]
         self._seen: list[Array] = []
 
     def look(self, true: Array) -> Array | None:

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brakeline.messaging.obstacle import rotate
-from brakeline.messaging.ray_directions import Rays
+from brakeline.messaging.ray_directions import LidarRays
 from brakeline.sim.arena import Arena
 from brakeline.sim.ground_estimator import cut_normal
 from brakeline.sim.mujoco_obstacles import HEIGHT, MoverBodies, map_model
@@ -19,7 +19,9 @@ class Lidar:
     """One lidar in one arena. What it sees are the obstacles of the arena's map, and what moves there; robots are not
     among them."""
 
-    def __init__(self, arena: Arena, rays: Rays, noise: float = 0.0, rng: np.random.Generator | None = None) -> None:
+    def __init__(
+        self, arena: Arena, rays: LidarRays, noise: float = 0.0, rng: np.random.Generator | None = None
+    ) -> None:
         """rays: of the arena's dimension, in the frame of the robot's heading; noise: m, sigma of a range.
 
         The noise is normal, cut off at 2 sigma, anew each range; it needs `rng`.

@@ -53,7 +53,7 @@ def add_obstacles(spec: mujoco.MjSpec, arena: Arena) -> None:
 
 
 def add_movers(spec: mujoco.MjSpec, crowd: Crowd | OtherRobots | None) -> None:
-    """Add what moves as bodies that nothing pushes, `mover 0`, `mover 1`, …; `Movers` puts them in their places."""
+    """Add each moving obstacle as a body without contact forces, named `mover 0`, `mover 1`, …"""
     for i, mover in enumerate(() if crowd is None else crowd.obstacles(0.0)):
         flat = len(mover.position) == 2
         z = 0.5 * HEIGHT if flat else mover.position[2]

@@ -11,7 +11,7 @@ import numpy as np
 from gymnasium.spaces import Box
 from numpy.typing import NDArray
 
-from brakeline.messaging.moving_obstacles import Movers
+from brakeline.messaging.moving_obstacles import MovingObstacles
 from brakeline.messaging.obstacle import Obstacle
 from brakeline.messaging.task import Reward, RobotWithTask
 from brakeline.sim.arena import Arena
@@ -180,7 +180,7 @@ class NavigationEnv(gymnasium.Env[Observation, Any]):
             return []
         seen = self._watch.look(self._steps * self.robot.period)
         within = self.robot.horizon * self.robot.period
-        nearest = Movers.of(seen, self.robot.position_dim).least_distance(position, within)
+        nearest = MovingObstacles.of(seen, self.robot.position_dim).least_distance(position, within)
         return [seen[i] for i in np.flatnonzero(nearest <= self.robot.sight)]
 
     def _info(self, period: Period) -> Info:

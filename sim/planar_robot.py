@@ -116,7 +116,7 @@ class PlanarRobot:
         poses = np.empty((SAMPLES, 3))
         self._moving.begin()
         collision = False
-        rests = bool(self.robot.rests(self.input))
+        rests = bool(self.robot.is_stop_input(self.input))
         for i in range(SAMPLES):
             for _ in range(self._steps):
                 moving = not rests or math.hypot(*data.qvel[:2].tolist()) > STANDING

@@ -69,7 +69,9 @@ class StopPrediction:
         self._period = robot.period
         fine = 20  # steps of the integration a point
         step = robot.period / (self.POINTS * fine)
-        fractions = robot.schedule()[robot.given * robot.action_dim :: robot.action_dim, -robot.action_dim]  # of u
+        fractions = robot.plan_matrix()[
+            robot.committed_steps * robot.action_dim :: robot.action_dim, -robot.action_dim
+        ]  # of u
         velocity, way = np.array([1.0, 0.0]), np.zeros(2)  # the shares of v and of u in them
         ways: list[Array] = []
         for fraction in np.repeat(fractions, self.POINTS * fine):

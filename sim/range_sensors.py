@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brakeline.messaging.range_image import RangeImage, directions
-from brakeline.messaging.ray_directions import Rays
+from brakeline.messaging.ray_directions import LidarRays
 from brakeline.messaging.robot import Robot
 from brakeline.messaging.scan import Scan
 from brakeline.sim.arena import Arena
@@ -34,7 +34,7 @@ class Scanner(ABC, Generic[S]):
         self,
         robot: Robot,
         arena: Arena,
-        rays: Rays,
+        rays: LidarRays,
         near: float,
         rng: np.random.Generator,
         noise: float,
@@ -93,7 +93,7 @@ class FanScanner(Scanner[Scan]):
         if robot.heading is None:
             raise ValueError(f"{robot.name} has no heading for a fan of beams: its free space comes from the map")
         self._angles = np.linspace(-math.pi, math.pi, self.BEAMS, endpoint=False)
-        rays = Rays(np.stack([np.cos(self._angles), np.sin(self._angles)], axis=1), self.FAR)
+        rays = LidarRays(np.stack([np.cos(self._angles), np.sin(self._angles)], axis=1), self.FAR)
         super().__init__(robot, arena, rays, self.NEAR, rng, noise, perception)
         self._heading, self._heading_error = robot.heading, robot.measurement_bound[robot.heading]
 
@@ -132,7 +132,7 @@ class DomeScanner(Scanner[RangeImage]):
         beams = directions(np.linspace(self.LOW, -self.LOW, self.RINGS), self.COLUMNS)
         if perception.tracks:
             raise ValueError("in space nothing is followed from scan to scan: leave out --tracks")
-        super().__init__(robot, arena, Rays(beams.reshape(-1, 3), self.FAR), self.NEAR, rng, noise, perception)
+        super().__init__(robot, arena, LidarRays(beams.reshape(-1, 3), self.FAR), self.NEAR, rng, noise, perception)
 
     def _taken(self, true: Array, measured: Array) -> RangeImage:
         ranges = self._ailing(self._lidar.ranges(true[:3], _tilt(self._rng, self.TILT)))

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from brakeline.actors.mavlink.telemetry import Array, GeoPosition
-from brakeline.messaging.rejected_messages import Tolerance
+from brakeline.messaging.rejected_messages import RejectedMessages
 from brakeline.sim.quadrotor import QUADROTOR
 
 FARTHEST = 1e5  # m, m/s, ...: no vehicle is farther away, or faster
@@ -33,7 +33,7 @@ class UdpGroundTruth:
         clearance: m from the body to the nearest obstacle; inf if the simulator sends none.
     """
 
-    def __init__(self, port: int, system: int, tolerance: Tolerance | None = None) -> None:
+    def __init__(self, port: int, system: int, rejected: RejectedMessages | None = None) -> None:
         """Listen on a UDP port of the loopback interface, for the vehicle of this MAVLink system id.
 
         Raises:
@@ -42,7 +42,7 @@ class UdpGroundTruth:
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.bind(("127.0.0.1", port))
         self._socket.setblocking(False)
-        self._system, self._tolerance = system, tolerance or Tolerance()
+        self._system, self._rejected = system, rejected or RejectedMessages()
         self.state: Array | None = None
         self.collisions = 0
         self.clearance = math.inf
@@ -54,7 +54,7 @@ class UdpGroundTruth:
                 data = self._socket.recv(4096)
             except BlockingIOError:
                 return
-            with self._tolerance.over("truth"):
+            with self._rejected.skip_on_error("truth"):
                 self._take(json.loads(data))
 
     def close(self) -> None:

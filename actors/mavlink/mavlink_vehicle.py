@@ -18,7 +18,7 @@ from brakeline.actors.mavlink.ground_truth import MavlinkGroundTruth, UdpGroundT
 from brakeline.actors.mavlink.takeoff import TELEMETRY, Takeoff
 from brakeline.actors.mavlink.telemetry import IN_FLIGHT, TRUTH, Array
 from brakeline.messaging.byte_links import Link
-from brakeline.messaging.rejected_messages import Tolerance
+from brakeline.messaging.rejected_messages import RejectedMessages
 from brakeline.messaging.robot import Robot
 from brakeline.sim.quadrotor import SAMPLES
 from brakeline.sim.vehicle import Period, clip_input
@@ -75,7 +75,7 @@ class MavlinkVehicle:
         origin: tuple[float, float, float] = (0.0, 0.0, 0.0),
         truth: UdpGroundTruth | None = None,
         tap: FrameTap | None = None,
-        tolerance: Tolerance | None = None,
+        rejected: RejectedMessages | None = None,
         stop: Callable[[], bool] = lambda: False,
         raise_limits: bool = False,
         mavlink_truth: MavlinkGroundTruth | None = None,
@@ -91,7 +91,7 @@ class MavlinkVehicle:
             origin: the start of the autopilot's local frame in our world frame, m.
             truth: the ground truth that our own simulator sends over UDP.
             tap: called with each MAVLink frame.
-            tolerance: counts messages that cannot be handled.
+            rejected: counts messages that cannot be handled.
             stop: once it returns true, nothing here waits any more.
             raise_limits: set each autopilot parameter that is below the robot's bounds.
             mavlink_truth: the ground truth of the autopilot's own simulator; without effect if `truth` is given.
@@ -105,7 +105,7 @@ class MavlinkVehicle:
         self._link, self._truth = link, truth
         self._mavlink_truth = mavlink_truth if truth is None else None
         self._client = AutopilotClient(link.send, system, tap, lambda text: log.info("it says: %s", text))
-        self._origin, self._tolerance = np.asarray(origin), tolerance or Tolerance()
+        self._origin, self._rejected = np.asarray(origin), rejected or RejectedMessages()
         self.timing = FlightTiming()
         self._plan: list[Array] = []  # the inputs after the one in force
         self._sent_at = self._heartbeat_at = self._synced_at = -math.inf
@@ -331,7 +331,7 @@ class MavlinkVehicle:
         """Read all messages that have arrived, and send all that is due."""
         client = self._client
         before = len(client.path), client.time
-        with self._tolerance.over("mavlink"):
+        with self._rejected.skip_on_error("mavlink"):
             client.feed(self._link.receive())
         for what, count in client.message_counts.items():
             if self._counted.get(what) != count:

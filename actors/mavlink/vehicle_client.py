@@ -27,7 +27,7 @@ from brakeline.actors.mavlink.vehicle_messages import (
 )
 from brakeline.actors.mavlink.vehicle_socket import BadMessage, MessageSocket, connect
 from brakeline.messaging import brakeline_pb2 as pb
-from brakeline.messaging.rejected_messages import Tolerance
+from brakeline.messaging.rejected_messages import RejectedMessages
 from brakeline.sim.vehicle import BadInput
 
 log = logging.getLogger("brakeline.flight")
@@ -48,7 +48,7 @@ class VehicleClient:
         self,
         request: FlightRequest,
         tap: Callable[[pb.MavlinkFrame], None],
-        tolerance: Tolerance,
+        rejected: RejectedMessages,
         stop: Callable[[], bool],
     ) -> None:
         """Connect to the vehicle's server, or start one, and wait until the vehicle flies.
@@ -56,7 +56,7 @@ class VehicleClient:
         Args:
             request: the vehicle to fly.
             tap: called with each MAVLink frame.
-            tolerance: counts messages that cannot be handled, the server's too.
+            rejected: counts messages that cannot be handled, the server's too.
             stop: once it returns true, the client does not wait any more.
 
         Raises:
@@ -64,7 +64,7 @@ class VehicleClient:
                 flies it, or if `stop` returned true.
             BadMessage: the request is not valid, or too large.
         """
-        self._tap, self._tolerance, self._passed_over = tap, tolerance, 0
+        self._tap, self._rejected, self._passed_over = tap, rejected, 0
         self._robot = request.robot
         self._changed = threading.Condition()
         self._lines: SimpleQueue[pb.LogLine] = SimpleQueue()
@@ -215,10 +215,10 @@ class VehicleClient:
                 try:
                     message = self._socket.receive(pb.VehicleMessage)
                 except BadMessage as error:
-                    self._tolerance.note("vehicle server", error)
+                    self._rejected.reject("vehicle server", error)
                     continue
                 self._heard, self._heard_at = True, time.monotonic()
-                with self._tolerance.over("vehicle server"):
+                with self._rejected.skip_on_error("vehicle server"):
                     self._handle(message)
         except (EOFError, OSError):
             self._fail(MavlinkError(ENDED) if self._heard else HandoverRefused(ENDED))
@@ -248,7 +248,7 @@ class VehicleClient:
     def _take(self, update: pb.VehicleUpdate) -> None:
         for frame in update.frames:
             self._tap(frame)
-        self._tolerance.count += max(0, update.passed_over - self._passed_over)
+        self._rejected.count += max(0, update.passed_over - self._passed_over)
         self._passed_over = update.passed_over
         self._figures = dict(update.figures) or self._figures
         period = period_of(update.period, self._robot)

@@ -22,7 +22,7 @@ from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.byte_links import BadLink
 from brakeline.messaging.obstacle import FARTHEST, Obstacle
 from brakeline.messaging.robot import Robot
-from brakeline.messaging.robot_description import robot_of
+from brakeline.messaging.robot_description import robot_from_description
 from brakeline.safety.service.wire import array_of, obstacles_of
 from brakeline.sim.quadrotor import QUADROTOR, SAMPLES
 from brakeline.sim.vehicle import BadInput, Period
@@ -72,7 +72,7 @@ def request_message(request: FlightRequest) -> pb.FlightRequest:
 def request_of(message: pb.FlightRequest) -> FlightRequest:
     """Return the flight request in a message."""
     try:
-        robot = robot_of(json.loads(message.robot))
+        robot = robot_from_description(json.loads(message.robot))
         robot = robot.in_real_time() if message.late else robot
         obstacles = tuple(obstacles_of(message.obstacles, robot.position_dim))
     except (ValueError, RecursionError) as error:

@@ -43,8 +43,8 @@ from brakeline.actors.mavlink.vehicle_socket import BadMessage, MessageSocket, l
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.byte_links import open_link
 from brakeline.messaging.obstacle import Shapes
-from brakeline.messaging.rejected_messages import Tolerance
-from brakeline.messaging.stop_signals import heeded
+from brakeline.messaging.rejected_messages import RejectedMessages
+from brakeline.messaging.stop_signals import stop_on_signals
 from brakeline.sim.vehicle import BadInput
 
 log = logging.getLogger("brakeline.flight")
@@ -147,7 +147,7 @@ class VehicleServer:
         self._robot, flight = request.robot, request.flight
         self._frames: deque[pb.MavlinkFrame] = deque(maxlen=MOST_FRAMES)
         self._updating = threading.Lock()
-        self._tolerance = Tolerance()
+        self._rejected = RejectedMessages()
         footprint, shapes = self._robot.footprint, Shapes.of(request.obstacles, self._robot.position_dim)
         self._vehicle = MavlinkVehicle(
             open_link(flight.url),
@@ -155,9 +155,9 @@ class VehicleServer:
             flight.system,
             flight.height,
             flight.origin,
-            UdpGroundTruth(flight.truth, flight.system, self._tolerance) if flight.truth else None,
+            UdpGroundTruth(flight.truth, flight.system, self._rejected) if flight.truth else None,
             self._store_frame,
-            self._tolerance,
+            self._rejected,
             lambda: stop.is_set() or actor.poll(),
             flight.raise_limits,
             MavlinkGroundTruth(lambda position: float(shapes.distance(position).min()) - footprint),
@@ -184,7 +184,7 @@ class VehicleServer:
                     continue
                 command = actor.receive(pb.VehicleCommand)
             except BadMessage as error:
-                self._tolerance.note("vehicle command", error)
+                self._rejected.reject("vehicle command", error)
                 continue
             except (EOFError, OSError):
                 return False
@@ -236,7 +236,7 @@ class VehicleServer:
             plan = plan_of(command.commit, self._robot, self._vehicle.current_period.number)
             in_time = self._vehicle.commit(plan, command.commit.period)
         except (BadMessage, BadInput) as error:
-            self._tolerance.note("vehicle command", error)
+            self._rejected.reject("vehicle command", error)
             return pb.CommitReply(number=command.number, error=error_message(error))
         return pb.CommitReply(number=command.number, in_time=in_time)
 
@@ -263,7 +263,7 @@ class VehicleServer:
             update = pb.VehicleUpdate(
                 period=period_message(period),
                 frames=frames[start : start + FRAMES_PER_UPDATE],
-                passed_over=self._tolerance.count,
+                passed_over=self._rejected.count,
                 figures=vehicle.timing.figures() | vehicle.judged() if figures else {},
             )
             self._outbox.put(pb.VehicleMessage(update=update))
@@ -316,7 +316,7 @@ def main() -> int:
     root.setLevel(logging.INFO)
     root.addHandler(ActorLog(outbox))
     try:
-        with heeded(stop, patient=True), listening(url, system) as listener:
+        with stop_on_signals(stop, patient=True), listening(url, system) as listener:
             return _serve_actors(listener, url, system, outbox, stop)
     except Exception as error:
         if outbox.actor is None:

@@ -133,7 +133,7 @@ class FilterNode:
 
     def figures(self) -> dict[str, float]:
         """What became of the periods and messages so far."""
-        return self.gate.tally.figures() | {"passed over": self.node.tolerance.count}
+        return self.gate.tally.figures() | {"passed over": self.node.rejected.count}
 
     def _first(self) -> float:
         """When the first period begins: at a multiple of its length, as all do."""

@@ -17,8 +17,8 @@ from brakeline.messaging.obstacle import KINDS, Obstacle
 from brakeline.messaging.range_image import RangeImage
 from brakeline.messaging.robot import robot_named
 from brakeline.messaging.scan import BadScan, Scan
-from brakeline.messaging.sensor_messages import Sensed
-from brakeline.messaging.stated_share import trust
+from brakeline.messaging.sensor_messages import RangeMeasurement
+from brakeline.messaging.stated_share import describe_verification
 from brakeline.messaging.topics import HEALTH, LEARNER
 from brakeline.safety.service.client import SafetyClient
 
@@ -40,7 +40,7 @@ def obstacle_of(words: tuple[str, ...], dim: int) -> Obstacle:
     return Obstacle(kind, tuple(values[:dim]), tuple(values[dim : dim + sizes]), yaw)
 
 
-def sensed_in(path: Path, dim: int) -> Sensed:
+def sensed_in(path: Path, dim: int) -> RangeMeasurement:
     """What a file says was seen: a JSON object with the fields of a `Scan`, in the air (dim 3) of a `RangeImage`.
 
     Raises:
@@ -104,7 +104,7 @@ class Query:
             return 0
         why = " for clearance: the proposal is verified too," if answer.for_clearance else ""
         console.print(f"[bold]{answer.kind}[/]{why} {escape(answer.reason)}")
-        console.print(trust(answer.verified, answer.bound), markup=False)
+        console.print(describe_verification(answer.verified, answer.bound), markup=False)
         shown = Stacking(**PLAIN)
         for column in ("period", *robot.action, "center [m]", "± [m]"):
             shown.add_column(column)

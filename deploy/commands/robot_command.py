@@ -12,7 +12,7 @@ from rich.markup import escape
 from brakeline.deploy.commands.common_options import console, errors, say_json
 from brakeline.deploy.data.description_plot import picture, summary
 from brakeline.logs.console_tables import PLAIN, Stacking
-from brakeline.messaging.robot import FOLDER, robot_named
+from brakeline.messaging.robot import ROBOTS_FOLDER, robot_named
 from brakeline.messaging.robot_description import NAME, BadDescription
 from brakeline.messaging.task import RobotWithTask, robot_maybe_with_task
 
@@ -38,7 +38,7 @@ class RobotCommand:
             raise ValueError(f"{self.file}: a description is a file NAME.toml, NAME of letters, digits, '_' and '-'")
         if path.exists():
             raise ValueError(f"{path} exists: `brakeline robot check {path}`")
-        template = (FOLDER / "template.txt").read_text().replace('"NAME"', f'"{path.stem}"')
+        template = (ROBOTS_FOLDER / "template.txt").read_text().replace('"NAME"', f'"{path.stem}"')
         notes: tuple[str, ...] = ()
         if self.from_ is not None:
             template, notes = _from_log(self.from_, template, path.stem)

@@ -22,7 +22,7 @@ from brakeline.logs.bag_writer import Bag
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.bus import Bus, BusSettings
 from brakeline.messaging.ros2 import ROUTER, RosSettings
-from brakeline.messaging.stop_signals import heeded
+from brakeline.messaging.stop_signals import stop_on_signals
 from brakeline.safety.service.client import query_service
 
 
@@ -95,7 +95,7 @@ class Ros2:
             seconds=self.seconds,
         )
         log_to_stderr(self.name)
-        with self._question(settings) as question, self._tap() as tap, heeded(threading.Event()) as stop:
+        with self._question(settings) as question, self._tap() as tap, stop_on_signals(threading.Event()) as stop:
             figures = run(settings, question, stop, tap)
         if self.json:
             say_json(figures)
@@ -178,7 +178,7 @@ class BridgeSim:
             stack.callback(bridge.close)
             if not self.json:
                 errors.print(f"ground on {', '.join(self.router or self.listen)}, {self.arena}; ^C ends it")
-            bridge.run(stack.enter_context(heeded(threading.Event())))
+            bridge.run(stack.enter_context(stop_on_signals(threading.Event())))
         figures = bridge.outcome.figures()
         if self.json:
             say_json(figures)

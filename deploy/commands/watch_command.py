@@ -14,8 +14,8 @@ from brakeline.logs.watch.foxglove_server import ORIGINS, Live
 from brakeline.logs.watch.live_board import Board
 from brakeline.logs.watch.live_page_server import Server
 from brakeline.messaging.bus import Bus, Sample
-from brakeline.messaging.rejected_messages import Tolerance
-from brakeline.messaging.stop_signals import heeded
+from brakeline.messaging.rejected_messages import RejectedMessages
+from brakeline.messaging.stop_signals import stop_on_signals
 from brakeline.messaging.topics import RECORDED
 
 TURN = 0.05  # s between two looks into the inbox
@@ -44,12 +44,12 @@ class Watch:
             server = stack.enter_context(Server(board.view, self.host, self.port))
             if self.foxglove_port >= 0:
                 live = stack.enter_context(Live(self.host, self.foxglove_port, origins=self.origins))
-            stop = stack.enter_context(heeded(threading.Event()))
+            stop = stack.enter_context(stop_on_signals(threading.Event()))
             for topic in RECORDED:
                 bus.subscribe(topic, inbox.append)
             self._say(server.url, live.url if live is not None else None)
             while not stop.wait(TURN):
-                _show(inbox, board, live, bus.tolerance)
+                _show(inbox, board, live, bus.rejected)
         return 0
 
     def _say(self, page: str, foxglove: str | None) -> None:
@@ -62,11 +62,11 @@ class Watch:
         console.print("[dim]^C ends the watching; the run goes on[/]")
 
 
-def _show(inbox: deque[Sample], board: Board, live: Live | None, tolerance: Tolerance) -> None:
+def _show(inbox: deque[Sample], board: Board, live: Live | None, rejected: RejectedMessages) -> None:
     """What has come since the last look."""
     for _ in range(len(inbox)):
         sample = inbox.popleft()
-        with tolerance.over(sample.key):
+        with rejected.skip_on_error(sample.key):
             board.take(sample)
             if live is not None:
                 live.take(sample)

@@ -79,7 +79,7 @@ def coverage(data: Dataset) -> Coverage:
     braked = [
         _seen(name, robot.action[i], robot.action_low[i], robot.action_high[i], begun[:, i])
         for i, name in enumerate(inputs)
-        if robot.stopping[i] and len(begun)
+        if robot.zero_at_rest[i] and len(begun)
     ]
     missing = _stops_missing(robot, stops, rested)
     missing += [text for one in seen[: len(inputs)] for text in _never(one)]
@@ -100,7 +100,7 @@ def _begun(data: Dataset) -> Array:
     for t in data.trajectories:
         before = np.zeros(robot.action_dim) if t.before is None else t.before
         inputs = np.vstack([before, t.inputs])
-        rests = robot.rests(inputs)
+        rests = robot.is_stop_input(inputs)
         for i in np.flatnonzero(rests[1:] & ~rests[:-1]):
             last = inputs[max(i + 1 - max(robot.brake_steps, 1), 0) : i + 1]
             found.append(last[np.abs(last).argmax(0), np.arange(robot.action_dim)])
@@ -111,7 +111,7 @@ def _stops_missing(robot: Robot, stops: int, rested: int) -> list[str]:
     if stops >= FEWEST_STOPS:
         return []
     seconds = (rested + 2) * robot.period
-    zero = " and ".join(name for name, is_zero in zip(columns_of(robot)[1], robot.stopping, strict=True) if is_zero)
+    zero = " and ".join(name for name, is_zero in zip(columns_of(robot)[1], robot.zero_at_rest, strict=True) if is_zero)
     return [
         f"{'no stops' if not stops else f'only {stops} stops'}, at least {FEWEST_STOPS} are needed: from every speed "
         f"give zero {zero} and let the robot stand for {seconds:.1f} s or more, {2 * FEWEST_STOPS} times or more"

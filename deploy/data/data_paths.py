@@ -11,7 +11,7 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-from brakeline.messaging.robot import WITH, Robot
+from brakeline.messaging.robot import TASK_SEPARATOR, Robot
 from brakeline.messaging.task import RobotWithTask
 from brakeline.safety.model.model_config import DDPC, ModelConfig
 
@@ -33,5 +33,5 @@ def method_path(robot: Robot, method: str, model_config: ModelConfig) -> Path:
     """Of the model that the safety service needs for a method."""
     if method == DDPC:
         return model_path(robot, model_config)
-    other = robot.task.name.partition(WITH)[2] if isinstance(robot, RobotWithTask) else ""
-    return data_root() / robot.name / f"{method}{WITH if other else ''}{other}.safetensors"
+    other = robot.task.name.partition(TASK_SEPARATOR)[2] if isinstance(robot, RobotWithTask) else ""
+    return data_root() / robot.name / f"{method}{TASK_SEPARATOR if other else ''}{other}.safetensors"

@@ -16,7 +16,7 @@ Array = NDArray[np.float64]
 def profile(robot: Robot) -> Array:
     """The inputs (N, m) of the plan that begins at every input's bound of larger size."""
     largest = np.where(np.abs(robot.low()) > np.abs(robot.high()), robot.low(), robot.high())
-    return np.asarray(robot.schedule() @ np.tile(largest, robot.free_steps)).reshape(robot.horizon, -1)
+    return np.asarray(robot.plan_matrix() @ np.tile(largest, robot.free_steps)).reshape(robot.horizon, -1)
 
 
 def way(robot: Robot) -> float:

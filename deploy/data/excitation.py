@@ -47,7 +47,7 @@ def excitation(
     none, unless given.
     """
     before = np.zeros(robot.action_dim) if before is None else before
-    schedule = robot.schedule()
+    schedule = robot.plan_matrix()
     across = (robot.high() - robot.low()) / np.asarray(robot.action_slew)  # periods from bound to bound
     longest_lead = held + math.ceil(across.max())
     state: Array | None = None
@@ -69,7 +69,7 @@ def excitation(
         for k, planned in enumerate((schedule @ np.concatenate(free)).reshape(robot.horizon, -1)):
             before = planned if k < robot.free_steps else _braked(robot, planned, state, before)
             state = yield before
-        standing = np.where(robot.stopping, 0.0, before)
+        standing = np.where(robot.zero_at_rest, 0.0, before)
         longest = LONG_STOP if rng.random() < LONG_STOPS else SHORT_STOP
         for _ in range(rng.integers(longest + 1)):
             before = _braked(robot, standing, state, before)
@@ -82,4 +82,4 @@ def _braked(robot: Robot, planned: Array, state: Array | None, before: Array) ->
         return planned
     if state is None:
         raise ValueError(f"{robot.name} stops by feedback: send the measured state after each period")
-    return robot.braked(planned, state, before)
+    return robot.stop_by_feedback(planned, state, before)

@@ -49,7 +49,7 @@ def rows(robot: Robot, keep: Keep, minutes: float, seed: int) -> Iterator[Row]:
         pose = np.array([*(low + high) / 2.0, 0.0])
         done: list[Array] = []
         while len(done) < length:
-            before = done[-1] if done else robot.at_zero()
+            before = done[-1] if done else robot.zero_input()
             inputs, pose = _stretch(robot, rng, motion, pose, low, high, before)
             done += inputs
         yield from (Row(k * robot.period, run, u) for k, u in enumerate(done))
@@ -96,7 +96,7 @@ class Excited:
         beyond = np.maximum(self._low + self._to_stop - state[:2], state[:2] - self._high + self._to_stop)
         out, last = float(beyond.max()), self._out
         self._out = out
-        if out > max(last, 0.0) and not self._robot.rests(before):
+        if out > max(last, 0.0) and not self._robot.is_stop_input(before):
             self._left = list(braking_plan(self._robot, before)[1:])
         if not self._left:
             heading = 0.0 if self._robot.heading is None else state[self._robot.heading]
@@ -133,7 +133,7 @@ def _to_rest(robot: Robot, rng: np.random.Generator, before: Array) -> list[Arra
     inputs = list(itertools.islice(drawn, LEAD))
     for u in drawn:
         inputs.append(u)
-        if robot.rests(inputs[-1]) and robot.rests(inputs[-2]):
+        if robot.is_stop_input(inputs[-1]) and robot.is_stop_input(inputs[-2]):
             return inputs
     raise AssertionError("excitation has no end")
 

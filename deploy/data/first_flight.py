@@ -81,7 +81,7 @@ def stretch(robot: Robot, share: float, before: Array, rng: np.random.Generator)
             inputs.append(towards(robot, inputs[-1], target))
     chosen = towards(robot, inputs[-1], share * random_target(robot, rng))
     waiting = replace(robot.in_lockstep(), free_steps=1)
-    inputs += list((waiting.schedule() @ chosen).reshape(waiting.horizon, -1))
+    inputs += list((waiting.plan_matrix() @ chosen).reshape(waiting.horizon, -1))
     standing = rng.integers(3) if rng.random() < 0.9 else 12
     return inputs[1:] + [np.zeros(robot.action_dim)] * int(standing)
 

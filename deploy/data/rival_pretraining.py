@@ -10,7 +10,7 @@ from dataclasses import asdict, dataclass, field
 import numpy as np
 
 from brakeline.deploy.data.rival_rollouts import costs, transitions
-from brakeline.learner.rival_networks import Fit, fit_cost, fit_linear
+from brakeline.learner.rival_networks import FitConfig, fit_cost, fit_linear
 from brakeline.messaging.perceptrons import Perceptrons
 from brakeline.messaging.task import RobotWithTask
 from brakeline.safety.rivals.pretrained import Pretrained
@@ -27,7 +27,7 @@ class SecasRecipe:
     samples: int = 40_000
     arena: str = "default"
     seed: int = 20_261
-    fit: Fit = field(default_factory=lambda: Fit(hidden=(64, 64)))
+    fit: FitConfig = field(default_factory=lambda: FitConfig(hidden=(64, 64)))
     margin: float = 0.1  # m beside the footprint: the bound C, tuned
 
 
@@ -38,7 +38,7 @@ class SailrRecipe:
     samples: int = 80_000
     arena: str = "default"
     seed: int = 20_262
-    fit: Fit = field(default_factory=lambda: Fit(hidden=(256, 256, 256), epochs=10))
+    fit: FitConfig = field(default_factory=lambda: FitConfig(hidden=(256, 256, 256), epochs=10))
     gamma: float = 0.99
     smoothing: float = 0.5  # m of clearance
     threshold: float = 0.08  # η, tuned

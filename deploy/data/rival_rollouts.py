@@ -167,5 +167,5 @@ def _braking(robot: RobotWithTask, before: Array) -> Iterator[Array]:
     standing = 0
     while standing < STAND:
         before = brake(robot, before)
-        standing += bool(robot.rests(before))
+        standing += bool(robot.is_stop_input(before))
         yield before

@@ -15,7 +15,7 @@ import numpy as np
 
 from brakeline.logs.reader import read
 from brakeline.messaging import brakeline_pb2 as pb
-from brakeline.messaging.robot import FOLLOWED, Robot
+from brakeline.messaging.robot import INPUT_TOLERANCE, Robot
 from brakeline.safety.model.dataset import BadData, Dataset, Trajectory
 
 FEWEST_STEPS = 5  # of a trajectory that is worth keeping
@@ -62,7 +62,7 @@ def _trajectory(run: list[pb.Step], robot: Robot) -> Trajectory:
 
     In real time a step's action is what it decided for the period after it: it takes one step more to know that input.
     """
-    given = robot.given
+    given = robot.committed_steps
     first, rest = run[given], run[1 + given :]
     actions = _within(np.array([s.action for s in run], dtype=float), robot)
     paths = np.array([s.path for s in rest], dtype=float).reshape(len(rest), -1, robot.position_dim)
@@ -78,5 +78,5 @@ def _trajectory(run: list[pb.Step], robot: Robot) -> Trajectory:
 def _within(inputs: np.ndarray, robot: Robot) -> np.ndarray:
     """Inputs (T, m), those at a bound exactly there: a step's were rounded to single precision."""
     inside = np.clip(inputs, robot.low(), robot.high())
-    rounded = np.abs(inputs - inside) <= FOLLOWED * (robot.high() - robot.low())
+    rounded = np.abs(inputs - inside) <= INPUT_TOLERANCE * (robot.high() - robot.low())
     return np.where(rounded, inside, inputs)

@@ -97,7 +97,7 @@ def round_of(
         proposals = [
             np.asarray(policy(driver.observation, driver.info), dtype=float)
             if driver.running
-            else driver.robot.at_zero()
+            else driver.robot.zero_input()
             for driver, policy in zip(fleet.drivers, policies, strict=True)
         ]
         outcomes: list[DecisionOutcome | None] = [None] * len(proposals)

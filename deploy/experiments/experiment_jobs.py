@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from brakeline.deploy.interpreter import spawning
-from brakeline.messaging.atomic_files import write_whole
+from brakeline.messaging.atomic_files import write_atomically
 
 LONGEST_LINE = 500  # characters of a job's progress
 
@@ -60,7 +60,7 @@ def read(results: Path, job: Job) -> dict[str, Any] | None:
 def write(results: Path, job: Job, result: dict[str, Any]) -> Path:
     """At once, and whole."""
     path = result_path(results, job)
-    write_whole(path, (json.dumps(result, separators=(",", ":")) + "\n").encode())
+    write_atomically(path, (json.dumps(result, separators=(",", ":")) + "\n").encode())
     return path
 
 

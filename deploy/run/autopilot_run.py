@@ -12,7 +12,7 @@ import numpy as np
 from brakeline.deploy.quadrotor_vehicles import flight_arena
 from brakeline.messaging.byte_links import open_link
 from brakeline.messaging.process_clock import WallClock
-from brakeline.messaging.stop_signals import heeded
+from brakeline.messaging.stop_signals import stop_on_signals
 from brakeline.messaging.task import robot_with_task
 from brakeline.sim.arena import Arena, room_boundary, room_bounds
 from brakeline.sim.autopilot.autopilot_rules import SETPOINT_TIMEOUT
@@ -55,7 +55,7 @@ def fly(settings: AutopilotSettings, begun: Callable[[Arena], Any] = lambda aren
     clock = WallClock()
     begun(arena)
     try:
-        with heeded(threading.Event(), patient=True) as stop:
+        with stop_on_signals(threading.Event(), patient=True) as stop:
             return serve(autopilots, link, clock, lambda: stop.is_set() or 0.0 < settings.seconds <= clock.now(), truth)
     finally:
         link.close()

@@ -311,7 +311,7 @@ class _Stage:
             circle = Circle(middle, disc.radius, facecolor=COLOURS[kind], edgecolor="black", alpha=alpha, zorder=7)
             drawn.append(self.axes.add_patch(circle))
         if self.robot.heading is not None:
-            nose = position[:2] + self.robot.front * turn[:, 0]
+            nose = position[:2] + self.robot.front_extent * turn[:, 0]
             line = np.stack([position[:2], nose])
             drawn += self.axes.plot(line[:, 0], line[:, 1], color="white", linewidth=1.5, alpha=alpha, zorder=8)
         return drawn

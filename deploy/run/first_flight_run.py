@@ -14,7 +14,7 @@ from brakeline.actors.mavlink.vehicle_socket import listening
 from brakeline.deploy.data.first_flight import Box, Found, Maiden
 from brakeline.messaging.byte_links import open_link
 from brakeline.messaging.robot import Robot
-from brakeline.messaging.stop_signals import heeded
+from brakeline.messaging.stop_signals import stop_on_signals
 
 LANDING = 120.0  # s that a landing may take
 
@@ -39,7 +39,7 @@ def fly(robot: Robot, settings: MaidenSettings) -> Found:
     """
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s", datefmt="%H:%M:%S")
     with (
-        heeded(threading.Event(), patient=True) as stop,  # a second one must not leave it in the air
+        stop_on_signals(threading.Event(), patient=True) as stop,  # a second one must not leave it in the air
         listening(settings.url, settings.system),  # so that no actor of this machine takes it
     ):
         return _flown(robot, settings, stop)

@@ -21,7 +21,7 @@ from brakeline.logs.recorded_robots import Robots
 from brakeline.logs.watch.run_totals import told, totals
 from brakeline.messaging.bus import BusError, BusSettings, Sample
 from brakeline.messaging.process_runtime import Process
-from brakeline.messaging.rejected_messages import Tolerance, headline
+from brakeline.messaging.rejected_messages import RejectedMessages, headline
 from brakeline.messaging.robot import robot_named
 from brakeline.messaging.task import robot_maybe_with_task
 from brakeline.messaging.topics import RECORDED
@@ -61,7 +61,7 @@ class Launcher:
         self.metrics = Metrics(robots=Robots(robot_named(name) for name in config.robots))
         self.lines: deque[str] = deque(maxlen=200)
         self._inbox: deque[Sample] = deque()
-        self._tolerance = Tolerance()  # the bus's, once there is one
+        self._rejected = RejectedMessages()  # the bus's, once there is one
 
     def run(self, show: Callable[[View], Any] = lambda view: None) -> dict[str, Any]:
         """Until the learners are done or SIGINT or SIGTERM; returns the figures, also saved in the run's folder.
@@ -73,7 +73,7 @@ class Launcher:
         view = View(self.config, self.folder, self.metrics, self.children, self.lines)
         failure: LaunchError | None = None
         with Process(self.bus, "launcher", stderr=False, reserved=True) as process:
-            self._tolerance = process.bus.tolerance
+            self._rejected = process.bus.rejected
             self._claim_folder()
             for topic in RECORDED:
                 process.bus.subscribe(topic, self._inbox.append)
@@ -204,7 +204,7 @@ class Launcher:
     def _drain(self) -> None:
         while self._inbox:
             sample = self._inbox.popleft()
-            with self._tolerance.over(sample.key):
+            with self._rejected.skip_on_error(sample.key):
                 message = sample.message()
                 self.metrics.add(sample.key, message)
                 if sample.topic.name == "health":

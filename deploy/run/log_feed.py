@@ -14,8 +14,8 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 
 from brakeline.actors.learner_client import LearnerClient
-from brakeline.learner.step_ledger import Ledger
-from brakeline.learner.transition_reader import BadStep, Intake
+from brakeline.learner.step_ledger import StepLedger
+from brakeline.learner.transition_reader import BadStep, StepReader
 from brakeline.logs.reader import by_run, find, open_log
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.bus import BusSettings, Publisher
@@ -50,9 +50,9 @@ class Steps:
     counts: Counter[str] = field(default_factory=Counter)
 
     def __iter__(self) -> Iterator[pb.Step]:
-        intake = Intake(self.robot)
+        intake = StepReader(self.robot)
         for number, files in enumerate(by_run(find(self.logs)).values(), 1):
-            seen = Ledger()
+            seen = StepLedger()
             for record in open_log(files):
                 if record.topic != "step" or record.message.robot != self.robot.name:
                     continue

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from brakeline.deploy.run.run_config import RunConfig
-from brakeline.messaging.atomic_files import write_whole
+from brakeline.messaging.atomic_files import write_atomically
 from brakeline.messaging.bus import BusSettings
 from brakeline.messaging.robot import robot_named
 
@@ -54,7 +54,7 @@ def say_where(folder: Path, bus: BusSettings) -> None:
     """Write down where the run's router is; `client_of` reads it."""
     keys = bus.keys and str(bus.keys.absolute())
     said = {"endpoint": bus.listen[0], "pid": os.getpid(), "keys": keys, "metrics": bus.metrics}
-    write_whole(folder / ENDPOINT, json.dumps(said).encode())
+    write_atomically(folder / ENDPOINT, json.dumps(said).encode())
 
 
 def client_of(folder: Path) -> BusSettings:

@@ -14,7 +14,7 @@ import numpy as np
 from brakeline.deploy.quadrotor_vehicles import flight_arena
 from brakeline.deploy.run.autopilot_run import PAD, open_field
 from brakeline.messaging.process_clock import Clock, WallClock
-from brakeline.messaging.stop_signals import heeded
+from brakeline.messaging.stop_signals import stop_on_signals
 from brakeline.sim.arena import Arena
 from brakeline.sim.autopilot.autopilot_server import PATIENCE, TRUTH_RATE, TruthSender
 from brakeline.sim.autopilot.hil_link import AutopilotGone, HilLink
@@ -70,7 +70,7 @@ def fly(settings: HilSettings, begun: Callable[[Quadrotor], Any] = lambda vehicl
     px4 = Px4Process(settings.folder, port, settings.parameters)
     truth = _truth(settings.truth)
     try:
-        with heeded(threading.Event(), patient=True) as stop:
+        with stop_on_signals(threading.Event(), patient=True) as stop:
             return _served(settings, px4, arena, truth, stop, begun)
     except AutopilotGone as error:
         raise AutopilotGone(f"{error}; PX4's last words:\n{px4.last_words()}") from error

@@ -21,8 +21,8 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).parents[2]))
 
 from brakeline.learner.learner_config import TD3Config
-from brakeline.learner.n_step import Move, Windows
-from brakeline.learner.replay import Batch, Replay
+from brakeline.learner.n_step import ActorStep, NStepWindows
+from brakeline.learner.replay import Batch, ReplayBuffer
 from brakeline.learner.td3 import TD3
 from brakeline.safety.action_mapping import normalised
 from brakeline.safety.service.client import SafetyClient
@@ -47,8 +47,8 @@ class LearnedPolicy:
         self.robot, self.rng = robot, np.random.default_rng(seed)
         self.between = normalised(robot)
         self.td3 = TD3(*dims, config, seed)
-        self.windows = Windows(config.n_step, config.gamma, config.stored)
-        self.replay, self.batch = Replay(2 * steps, *dims), Batch(config.batch, *dims)
+        self.windows = NStepWindows(config.n_step, config.gamma, config.stored)
+        self.replay, self.batch = ReplayBuffer(2 * steps, *dims), Batch(config.batch, *dims)
         self.policy: Trained | None = None
         self._held, self._left = np.zeros(robot.action_dim), 0
 
@@ -62,7 +62,7 @@ class LearnedPolicy:
         self._left -= 1
         return self._held.astype(np.float32)
 
-    def learn(self, move: Move) -> None:
+    def learn(self, move: ActorStep) -> None:
         """Takes a step in, and makes an update as soon as there is enough to learn from."""
         for transition in self.windows.push(self.robot.name, move):
             self.replay.insert(transition)
@@ -89,7 +89,7 @@ def episode(env: Any, pupil: LearnedPolicy, number: int) -> Tally:
         tally.add(reward, info)
         step, ended = step + 1, terminated or truncated
         told = reward, info["penalty"], after, terminated, truncated
-        pupil.learn(Move(number, step, observation, executed, wanted, *told))
+        pupil.learn(ActorStep(number, step, observation, executed, wanted, *told))
         observation = after
     return tally
 

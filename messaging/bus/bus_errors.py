@@ -55,7 +55,7 @@ class Refused(BusError):
 
 
 @contextmanager
-def typed(what: str) -> Iterator[None]:
+def as_bus_error(what: str) -> Iterator[None]:
     """Zenoh's errors as the bus's."""
     try:
         yield

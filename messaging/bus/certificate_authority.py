@@ -22,7 +22,7 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat, load_pem_private_key
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
-from brakeline.messaging.atomic_files import write_secret, write_whole
+from brakeline.messaging.atomic_files import write_atomically, write_secret
 from brakeline.messaging.bus.bus_errors import BadKeys
 from brakeline.messaging.bus.identity import SERVERS, certificate_file, key_file, role_of
 
@@ -76,10 +76,10 @@ class Authority:
             builder = builder.add_extension(x509.SubjectAlternativeName([_general(h) for h in reached]), critical=False)
         certificate = builder.sign(self._key, hashes.SHA256())
         write_secret(key_file(self.folder, name), _pem(key))
-        write_whole(certificate_file(self.folder, name), certificate.public_bytes(Encoding.PEM))
+        write_atomically(certificate_file(self.folder, name), certificate.public_bytes(Encoding.PEM))
         listed = self.folder / "names"
         names = listed.read_text().split() if listed.exists() else []
-        write_whole(listed, "".join(f"{n}\n" for n in dict.fromkeys((*names, name))).encode())
+        write_atomically(listed, "".join(f"{n}\n" for n in dict.fromkeys((*names, name))).encode())
 
     def _founded(self) -> tuple[ec.EllipticCurvePrivateKey, x509.Certificate]:
         """A new authority, written down."""
@@ -95,7 +95,7 @@ class Authority:
             .sign(key, hashes.SHA256())
         )
         write_secret(self.folder / "ca.key", _pem(key))
-        write_whole(self.folder / "ca.pem", certificate.public_bytes(Encoding.PEM))
+        write_atomically(self.folder / "ca.pem", certificate.public_bytes(Encoding.PEM))
         return key, certificate
 
     def _begun(

@@ -11,7 +11,7 @@ EACH = 8  # questions of one asker that wait; a newer one takes the place of the
 MOST = 1024  # askers whose questions wait
 
 
-class Turns(Generic[T]):
+class FairQueue(Generic[T]):
     """Questions that wait, by who asked. Not for several threads at once."""
 
     def __init__(self) -> None:

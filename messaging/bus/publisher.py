@@ -9,7 +9,7 @@ import zenoh
 from google.protobuf.message import Message
 
 from brakeline.messaging import brakeline_pb2 as pb
-from brakeline.messaging.bus.bus_errors import typed
+from brakeline.messaging.bus.bus_errors import as_bus_error
 from brakeline.messaging.topics import Topic
 
 
@@ -41,6 +41,6 @@ class Publisher:
                 header: pb.Header = message.header  # type: ignore[attr-defined]
                 header.sequence, header.source, header.run = self.count + 1, self._source, self._run
                 header.wall_time = time.time_ns()
-            with typed(f"cannot publish at {self.key}"):
+            with as_bus_error(f"cannot publish at {self.key}"):
                 self._sender.put(message.SerializeToString())
             self.count += 1

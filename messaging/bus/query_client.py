@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import zenoh
 
 from brakeline.messaging import brakeline_pb2 as pb
-from brakeline.messaging.bus.bus_errors import Late, NoReply, Refused, typed
+from brakeline.messaging.bus.bus_errors import Late, NoReply, Refused, as_bus_error
 from brakeline.messaging.bus.topic_keys import own_key
 
 RENEWED = 30.0  # s after which all are asked again: there may be more of them by now, or one that is less busy
@@ -30,7 +30,7 @@ class _Chosen:
         return time.monotonic() - self.since
 
 
-class Asker:
+class QueryClient:
     """A session's questions. With Zenoh's own choice (BEST_MATCHING) each goes to a replica of every linked router."""
 
     def __init__(self, session: zenoh.Session) -> None:
@@ -55,7 +55,7 @@ class Asker:
         """Of whom a question reaches `at` (the shared key or one's own); who answered to all is chosen."""
         refusal: Refused | None = None
         late, begun = False, time.monotonic()
-        with typed(f"cannot ask {key}"):
+        with as_bus_error(f"cannot ask {key}"):
             querier = self._querier(at, timeout)
             source = zenoh.SourceInfo(querier.id, 0)  # whose turn it is
             for reply in querier.get(payload=payload, attachment=f"{timeout:.6g}", source_info=source):

@@ -14,22 +14,22 @@ import zenoh
 
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.bus.bus_errors import Busy, Expired
-from brakeline.messaging.bus.fair_queue import Turns
-from brakeline.messaging.bus.subscription import Receiving
-from brakeline.messaging.rejected_messages import Tolerance
+from brakeline.messaging.bus.fair_queue import FairQueue
+from brakeline.messaging.bus.subscription import ReceiverThreads
+from brakeline.messaging.rejected_messages import RejectedMessages
 
 LONGEST = 10.0  # s that a question waits which does not say for how long it is of use
 
 
 @dataclass(frozen=True)
-class Question:
+class PendingQuery:
     """A query, and until when (time.monotonic) an answer is of use."""
 
     query: zenoh.Query
     until: float
 
 
-class Service(Receiving):
+class QueryServer(ReceiverThreads):
     """Two threads take the questions of a receiver in turn: one notes when they come in while the other answers, and
     whoever takes one in when nobody answers does it itself, for to wake another costs a tenth of a millisecond. Who
     asks at another receiver waits for its turn like the others.
@@ -39,9 +39,9 @@ class Service(Receiving):
     """
 
     def __init__(
-        self, name: str, receivers: Sequence[Any], handler: Callable[[bytes], bytes], tolerance: Tolerance
+        self, name: str, receivers: Sequence[Any], handler: Callable[[bytes], bytes], rejected: RejectedMessages
     ) -> None:
-        self._handler, self._tolerance, self._turns = handler, tolerance, Turns[Question]()
+        self._handler, self._rejected, self._turns = handler, rejected, FairQueue[PendingQuery]()
         self._state = threading.Lock()
         self._answering = False
         runs = []
@@ -59,12 +59,12 @@ class Service(Receiving):
                 return
             answering = self._admit(query)
             while answering and (question := self._next()) is not None:
-                with self._tolerance.over(self._name):
+                with self._rejected.skip_on_error(self._name):
                     self._answer(question)
 
     def _admit(self, query: zenoh.Query) -> bool:
         """Let a question wait for its turn; True: nobody answers now."""
-        question = Question(query, time.monotonic() + _patience(query))
+        question = PendingQuery(query, time.monotonic() + _patience(query))
         with self._state:
             left_out = self._turns.add(_asker(query), question)
             idle, self._answering = not self._answering, True
@@ -73,13 +73,13 @@ class Service(Receiving):
                 self._pass_over(one, Busy("too many questions wait"))
         return idle
 
-    def _next(self) -> Question | None:
+    def _next(self) -> PendingQuery | None:
         """The question whose turn it is; None: there is none, and nobody answers any more."""
         with self._state:
             self._answering = len(self._turns) > 0
             return self._turns.next() if self._answering else None
 
-    def _answer(self, question: Question) -> None:
+    def _answer(self, question: PendingQuery) -> None:
         """Answer one query; without an answer of some kind the service would look dead."""
         with question.query as query:
             if time.monotonic() > question.until:
@@ -95,7 +95,7 @@ class Service(Receiving):
     def _pass_over(self, query: zenoh.Query, reason: Busy | Expired) -> None:
         """That the machine does not keep up is nobody's mistake."""
         _refuse(query, reason)
-        self._tolerance.note(self._name, reason, logging.WARNING)
+        self._rejected.reject(self._name, reason, logging.WARNING)
 
 
 def _refuse(query: zenoh.Query, error: Exception) -> None:

@@ -20,12 +20,12 @@ from zenoh.handlers import FifoChannel, RingChannel
 from brakeline.messaging.bus.access_control import ALIVE
 from brakeline.messaging.bus.bus_settings import BusSettings, open_session
 from brakeline.messaging.bus.publisher import Publisher
-from brakeline.messaging.bus.query_client import Asker
-from brakeline.messaging.bus.query_server import Service
-from brakeline.messaging.bus.subscription import Listener, Receiving, Sample, Subscription
+from brakeline.messaging.bus.query_client import QueryClient
+from brakeline.messaging.bus.query_server import QueryServer
+from brakeline.messaging.bus.subscription import Listener, ReceiverThreads, Sample, Subscription
 from brakeline.messaging.bus.topic_keys import exact_key, key_of, own_key
 from brakeline.messaging.message_checks import NAME
-from brakeline.messaging.rejected_messages import Tolerance
+from brakeline.messaging.rejected_messages import RejectedMessages
 from brakeline.messaging.topics import Delivery, Topic
 
 log = logging.getLogger("brakeline.bus")
@@ -38,7 +38,7 @@ RING = 64
 class Bus:
     """A process's place on the bus, under the name `source`; it is alive to others until `close`.
 
-    What its handlers can't handle is passed over, and counted in `tolerance`.
+    What its handlers can't handle is passed over, and counted in `rejected`.
 
     Raises:
         Unreachable: no router answered within `patience`, or an endpoint cannot be listened on.
@@ -52,14 +52,14 @@ class Bus:
         self.settings = settings
         self.source = source
         self.run = secrets.randbits(63)
-        self.tolerance = Tolerance()
+        self.rejected = RejectedMessages()
         self._lock = threading.Lock()
         self._publishers: dict[str, Publisher] = {}
-        self._subscriptions: list[Receiving] = []
+        self._subscriptions: list[ReceiverThreads] = []
         self._telemetry = open_session(settings, source)
         # A router is one session; the two links of each client end in it separately.
         self._queries = self._telemetry if settings.listen else open_session(settings, source)
-        self._asker = Asker(self._queries)
+        self._asker = QueryClient(self._queries)
         self._token = self._telemetry.liveliness().declare_token(self._full(ALIVE.format(source=source)))
 
     def __enter__(self) -> Self:
@@ -120,11 +120,11 @@ class Bus:
         channel: Any = FifoChannel(FIFO) if topic.delivery is Delivery.BLOCK else RingChannel(RING)
         key = key_of(topic, names)
         receiver: Any = self._telemetry.declare_subscriber(self._full(key), channel)
-        listener = Listener(topic, key, receiver, self.settings.prefix, handler, self.tolerance)
+        listener = Listener(topic, key, receiver, self.settings.prefix, handler, self.rejected)
         self._keep(listener)
         return listener
 
-    def serve(self, topic: Topic, handler: Callable[[bytes], bytes], **names: str) -> Service:
+    def serve(self, topic: Topic, handler: Callable[[bytes], bytes], **names: str) -> QueryServer:
         """Answer the questions of `topic`, one at a time and every asker's in turn, in a thread of its own.
 
         What the handler raises goes back to who asked as `Refused` (with the exception's `field`, if it has one) and is
@@ -137,7 +137,7 @@ class Bus:
             self._queries.declare_queryable(at, FifoChannel(FIFO), complete=True)
             for at in (own_key(shared, self._queries.zid()), shared)
         ]
-        service = Service(key, receivers, handler, self.tolerance)
+        service = QueryServer(key, receivers, handler, self.rejected)
         self._keep(service)
         return service
 
@@ -168,14 +168,14 @@ class Bus:
         def take(sample: zenoh.Sample) -> None:
             handler(str(sample.key_expr).rsplit("/", 1)[1], sample.kind == zenoh.SampleKind.PUT)
 
-        watching = Subscription("alive/*", receiver, take, self.tolerance)
+        watching = Subscription("alive/*", receiver, take, self.rejected)
         self._keep(watching)
         return watching
 
     def _full(self, key: str) -> str:
         return f"{self.settings.prefix}/{key}"
 
-    def _keep(self, receiving: Receiving) -> None:
+    def _keep(self, receiving: ReceiverThreads) -> None:
         with self._lock:
             self._subscriptions.append(receiving)
 

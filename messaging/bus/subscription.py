@@ -12,10 +12,10 @@ from typing import Any
 import zenoh
 from google.protobuf.message import DecodeError
 
-from brakeline.messaging.bus.bus_errors import Malformed, typed
+from brakeline.messaging.bus.bus_errors import Malformed, as_bus_error
 from brakeline.messaging.bus.topic_keys import names_of
 from brakeline.messaging.message_checks import NAME, Implausible, check
-from brakeline.messaging.rejected_messages import Tolerance
+from brakeline.messaging.rejected_messages import RejectedMessages
 from brakeline.messaging.topics import Topic
 
 MOST_KEYS = 2048  # that one subscription listens to; samples of further ones are passed over
@@ -55,7 +55,7 @@ def _said(message: Any, field: str) -> list[str]:
     return said if field == "robot" else [*said, str(message.header.source)]
 
 
-class Receiving:
+class ReceiverThreads:
     """Threads that take from receivers until `close`."""
 
     def __init__(self, name: str, receivers: Sequence[Any], runs: Sequence[Callable[[], None]]) -> None:
@@ -67,7 +67,7 @@ class Receiving:
 
     def close(self) -> None:
         """Stop receiving, and wait for what is in hand for a moment."""
-        with typed(f"closing {self._name}"):
+        with as_bus_error(f"closing {self._name}"):
             for receiver in self._receivers:
                 receiver.undeclare()
         self.join(1.0)
@@ -78,16 +78,16 @@ class Receiving:
                 thread.join(timeout)
 
 
-class Subscription(Receiving):
+class Subscription(ReceiverThreads):
     """A thread that hands samples to a handler, one by one, until `close`."""
 
-    def __init__(self, name: str, receiver: Any, work: Callable[[Any], None], tolerance: Tolerance) -> None:
-        self._samples, self._work, self._tolerance = receiver.handler, work, tolerance
+    def __init__(self, name: str, receiver: Any, work: Callable[[Any], None], rejected: RejectedMessages) -> None:
+        self._samples, self._work, self._rejected = receiver.handler, work, rejected
         super().__init__(name, [receiver], [self._run])
 
     def _run(self) -> None:
         for item in self._samples:
-            with self._tolerance.over(self._name):
+            with self._rejected.skip_on_error(self._name):
                 self._work(item)
 
 
@@ -101,11 +101,11 @@ class Listener(Subscription):
         receiver: Any,
         prefix: str,
         handler: Callable[[Sample], None],
-        tolerance: Tolerance,
+        rejected: RejectedMessages,
     ) -> None:
         self._topic, self._cut, self._handler = topic, len(prefix) + 1, handler
         self._heard: dict[str, float] = {}  # per key: when (time.monotonic) the latest sample came
-        super().__init__(key, receiver, self._take, tolerance)
+        super().__init__(key, receiver, self._take, rejected)
 
     def stale(self) -> frozenset[str]:
         """Keys that were heard of, but for three periods of the topic's rate no more."""

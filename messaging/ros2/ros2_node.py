@@ -27,9 +27,9 @@ from zenoh.ext import (
 )
 from zenoh.handlers import RingChannel
 
-from brakeline.messaging.bus.bus_errors import Malformed, Unreachable, typed
+from brakeline.messaging.bus.bus_errors import Malformed, Unreachable, as_bus_error
 from brakeline.messaging.bus.subscription import Subscription
-from brakeline.messaging.rejected_messages import Tolerance
+from brakeline.messaging.rejected_messages import RejectedMessages
 from brakeline.messaging.ros2.cdr_messages import decode, digest_of, encode, type_of
 from brakeline.messaging.ros2.rmw_attachment import Attachment, gid_of
 from brakeline.messaging.ros2.rmw_names import (
@@ -114,7 +114,7 @@ class RosPublisher(Generic[M]):
         if not isinstance(message, self._kind):
             raise TypeError(f"{self.entity.topic} carries {type_of(self._kind)}, not {type(message).__name__}")
         payload, now = encode(message), time.time_ns()
-        with self._lock, typed(f"cannot publish on {self.entity.topic}"):
+        with self._lock, as_bus_error(f"cannot publish on {self.entity.topic}"):
             self.count += 1
             attachment = Attachment(self.count, now, self._gid).encode()
             self._sender.put(payload, attachment=attachment)
@@ -125,7 +125,7 @@ class RosPublisher(Generic[M]):
 class RosNode:
     """A node of that name; it is in the graph until `close`.
 
-    What its handlers can't handle is passed over, and counted in `tolerance`.
+    What its handlers can't handle is passed over, and counted in `rejected`.
 
     Raises:
         Unreachable: no router answered within `patience`, or an endpoint cannot be listened on.
@@ -135,7 +135,7 @@ class RosNode:
     def __init__(self, settings: RosSettings, name: str, tap: MessageTap | None = None) -> None:
         self.settings, self.name = settings, name
         full_name(f"/{name}")  # is it one?
-        self.tolerance = Tolerance()
+        self.rejected = RejectedMessages()
         self._tap = tap
         self._lock = threading.Lock()
         self._tokens: list[Any] = []
@@ -228,7 +228,7 @@ class RosNode:
                 self._tap(entity.topic, kind, payload, time.time_ns(), qos)
             handler(decode(kind, payload))
 
-        subscription = Subscription(entity.topic, receiver, take, self.tolerance)
+        subscription = Subscription(entity.topic, receiver, take, self.rejected)
         self._subscriptions.append(subscription)
         self._declare(entity)
         return subscription

@@ -57,7 +57,7 @@ class BackupPlan:
 
     def reset(self) -> None:
         """At an episode's start: standing still."""
-        self.input_in_force: Array = self.robot.at_zero()
+        self.input_in_force: Array = self.robot.zero_input()
         self.plan: Array = np.tile(self.input_in_force, (self.robot.horizon, 1))
         self.model = ""
         self.predicted: Prediction | None = None
@@ -111,7 +111,7 @@ class BackupPlan:
             self.model, self._plan_tokens = UNVERIFIED, ()
         self.predicted = None
         if self.robot.feedback:
-            self.plan[0] = self.robot.braked(self.plan[0], self.seen, self.input_in_force)
+            self.plan[0] = self.robot.stop_by_feedback(self.plan[0], self.seen, self.input_in_force)
         return self._advance()
 
     def _advance(self) -> Array:
@@ -120,13 +120,13 @@ class BackupPlan:
         now: Array = self.plan[0].copy()
         self._plan_tokens = self._plan_tokens[1:] or self._plan_tokens
         self.reservation = None if self.reservation is None else self.reservation.later()
-        rests = robot.keeps_still(now, self.seen, self.input_in_force)
-        last = np.where(robot.stopping, 0.0, self.plan[-1])
+        rests = robot.is_stopping(now, self.seen, self.input_in_force)
+        last = np.where(robot.zero_at_rest, 0.0, self.plan[-1])
         self.plan = np.vstack([self.plan[1:], last[None]])
         self.input_in_force = now
         self._still = self._still + 1 if rests else 0
         stopped = self.model != UNVERIFIED or self._still >= robot.horizon
-        if stopped and rests and robot.rests(self.plan).all():
+        if stopped and rests and robot.is_stop_input(self.plan).all():
             self.model = ""  # standing still needs nobody's word
         return self.next_input
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from brakeline.messaging.moving_obstacles import Movers
+from brakeline.messaging.moving_obstacles import MovingObstacles
 from brakeline.messaging.obstacle import Shapes
 from brakeline.messaging.robot import Robot
 from brakeline.safety.filter.moving_halfspaces import swept_half_spaces
@@ -44,7 +44,7 @@ class Around:
     """What half-spaces are about, in the order of their rows, one disc of the body after the other."""
 
     near: Shapes
-    moving: Movers | None
+    moving: MovingObstacles | None
     unseen: OccupiedCells | OccludedRegions | None
     promised: Promises | None = None  # these come last, once for the whole body
 

@@ -18,7 +18,7 @@ from brakeline.safety.filter.request import FAILSAFE, Decision, Request
 def brake(robot: Robot, before: Array) -> Array:
     """μ: the input (m,) that follows the input `before` (m,) while braking."""
     slew = np.asarray(robot.action_slew)
-    return np.where(robot.stopping, before - np.clip(before, -slew, slew), before)
+    return np.where(robot.zero_at_rest, before - np.clip(before, -slew, slew), before)
 
 
 def within(robot: Robot, wanted: Array, before: Array) -> Array:

@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from brakeline.messaging.moving_obstacles import Movers
+from brakeline.messaging.moving_obstacles import MovingObstacles
 from brakeline.messaging.obstacle import FARTHEST, Shapes
 from brakeline.messaging.range_image import RangeImage
 from brakeline.messaging.robot import Robot
@@ -75,7 +75,7 @@ class LocalMap:
     turn: Array
     near: Shapes
     beyond: float
-    moving: Movers | None = None  # that may meet the tube
+    moving: MovingObstacles | None = None  # that may meet the tube
     unseen: seen.OccupiedCells | shades.OccludedRegions | None = None  # what a scan does not show to be free
     promised: Promises | None = None  # to other robots
 
@@ -106,7 +106,7 @@ def turning_extent(robot: Robot, tube: Tube) -> float:
     Without it a robot may stop so close to an obstacle that no motion can be verified from there, for good.
     """
     in_place = np.where([not moves for moves in robot.translates], robot.high(), 0.0)
-    state = robot.driving(in_place)
+    state = robot.state_at_inputs(in_place)
     z = np.concatenate([state[list(robot.regressor)], in_place, np.tile(in_place, robot.free_steps)])
     sizes = tube.magnitudes(z)
     L, d = tube.generators, robot.position_dim
@@ -137,7 +137,7 @@ class TubeConstraints:
             shades.prepare()
         self.robot, self.tube, self.stands = robot, tube, model.moving
         self.discs = _discs(robot, tube)
-        free = len(robot.action_slew) * (robot.free_steps - robot.given)
+        free = len(robot.action_slew) * (robot.free_steps - robot.committed_steps)
         self._spans = np.abs(tube.directions)
         whole = np.ascontiguousarray
         W_free, moved = whole(np.abs(tube.W[:, -free:])), whole(np.abs(tube.position[..., -free:]))
@@ -170,8 +170,8 @@ class TubeConstraints:
     def _stays(self) -> bool:
         """Is it, once it stands, where it stands? Who hovers by an estimate may go on drifting: then standing for a
         plan's length adds more to where it may be than a measurement's error, and than a tenth of its body."""
-        nothing = self.robot.at_zero()
-        state = self.robot.driving(nothing)[list(self.robot.regressor)]
+        nothing = self.robot.zero_input()
+        state = self.robot.state_at_inputs(nothing)[list(self.robot.regressor)]
         z = np.concatenate([state, np.tile(nothing, 1 + self.robot.free_steps)])
         half = np.abs(self.tube.directions) @ self.tube.magnitudes(z)[: self.tube.generators]
         size = np.linalg.norm(half, axis=1)

@@ -107,14 +107,14 @@ class Filter:
         self.ordinary = Ordinary(robot)
         self.standing = np.array([not moves for moves in robot.translates])
         driven = np.tile(robot.translates, robot.free_steps)
-        self.first_free = robot.regressor_dim + robot.given * robot.action_dim  # of regressors
+        self.first_free = robot.regressor_dim + robot.committed_steps * robot.action_dim  # of regressors
         self.translating = np.concatenate([np.zeros(robot.regressor_dim), driven])
         self.regressor = np.array(robot.regressor, dtype=np.intp)
         self.clearance_margin, self.reach = self.around.clearance_margin, self.around.reach  # m
 
     def half_width(self, speed: Array) -> float:
         """[m] of the full stop's set, largest axis, from driving at inputs `speed` (m,) with that input once more."""
-        state = self.robot.driving(speed)
+        state = self.robot.state_at_inputs(speed)
         z = np.concatenate([state[self.regressor], speed, np.tile(speed, self.robot.free_steps)])
         return float(self._around(z).tube.half_widths(z)[-1].max())
 
@@ -146,7 +146,7 @@ class Filter:
         if not request.finite:
             blind = NOT_FINITE
             request = replace(request, action=request.input_in_force)  # it is not looked at
-        given = request.plan[: self.robot.given].ravel()
+        given = request.plan[: self.robot.committed_steps].ravel()
         z_0 = np.concatenate([request.state[self.regressor], request.input_in_force, given])
         proposal = self.inputs.limited(request.action, z_0[-self.robot.action_dim :])
         scene = self.around.scene(request, z_0, self.builder.reachable(z_0[-self.robot.action_dim :]))
@@ -274,8 +274,8 @@ class Filter:
         before = z_0[-self.robot.action_dim :]
         tail = request.plan
         if self.robot.feedback:  # what the tail's inputs are follows from the measured state, this period's at once
-            tail = np.vstack([self.robot.braked(tail[:1], request.state, before), tail[1:]])
-        chosen = tail[self.robot.given : self.robot.free_steps].ravel()
+            tail = np.vstack([self.robot.stop_by_feedback(tail[:1], request.state, before), tail[1:]])
+        chosen = tail[self.robot.committed_steps : self.robot.free_steps].ravel()
         as_committed = np.concatenate([z_0, chosen])
         if attempt.contained and vouched:
             around = self._around(as_committed)
@@ -296,7 +296,7 @@ class Filter:
         verified to end nearer."""
         robot, m = self.robot, self.robot.action_dim
         slow = np.where(robot.translates, SLOW + 0.05, 1.0) * np.maximum(self.inputs.high, -self.inputs.low)
-        going = np.vstack([request.input_in_force, request.plan[: robot.given]])
+        going = np.vstack([request.input_in_force, request.plan[: robot.committed_steps]])
         on_a_way = request.model == UNVERIFIED and bool(going.any() and (np.abs(going) <= slow).all())
         if not (request.still(robot) or on_a_way):
             return None
@@ -318,7 +318,7 @@ class Filter:
             return None
         standing = rows.support(self.tube, stand) - rows.bound
         # What is carried out late is taken back late: no faster then than it gets within a period.
-        most = np.asarray(robot.action_slew) if robot.given else np.full(m, np.inf)
+        most = np.asarray(robot.action_slew) if robot.committed_steps else np.full(m, np.inf)
         inputs = np.array([self.inputs.limited(np.clip(u, -most, most), before) for u in slow_inputs(robot)])
         plans = [self.inputs.regressors(z_0, action) for action in inputs]
         # Each as sure of where it goes as standing is: who knows little of its own motion would else be led to where

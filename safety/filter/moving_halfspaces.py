@@ -15,14 +15,14 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from brakeline.messaging.moving_obstacles import Movers
+from brakeline.messaging.moving_obstacles import MovingObstacles
 from brakeline.safety.filter.halfspaces import TOUCHING
 
 Array = NDArray[np.float64]
 
 
 def swept_half_spaces(
-    near: Movers, start: Array, nominal: Array, keep_off: float, measured: Array, period: float
+    near: MovingObstacles, start: Array, nominal: Array, keep_off: float, measured: Array, period: float
 ) -> tuple[Array, Array]:
     """As `freespace.half_spaces`, for what moves; period: s, between two of the nominal positions."""
     n, (N, d) = len(near), nominal.shape

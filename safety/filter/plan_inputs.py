@@ -42,9 +42,9 @@ class Inputs:
     def __init__(self, robot: Robot) -> None:
         self.robot = robot
         self.low, self.high, self.slew = robot.low(), robot.high(), np.asarray(robot.action_slew, dtype=float)
-        self.schedule = robot.schedule()
-        self.nothing = robot.at_zero()
-        self.braking = np.ascontiguousarray(robot.fractions()[: robot.free_steps - robot.given])
+        self.schedule = robot.plan_matrix()
+        self.nothing = robot.zero_input()
+        self.braking = np.ascontiguousarray(robot.stop_profile()[: robot.free_steps - robot.committed_steps])
 
     def limited(self, wanted: Array, before: Array) -> Array:
         """The input (m,) closest to the wanted one within bounds and slew."""
@@ -59,8 +59,8 @@ class Inputs:
 
     def stop(self, state: Array, before: Array) -> Array:
         """The strongest braking's next input: to zero, held, or what the feedback makes of the state."""
-        wanted = np.where(self.robot.stopping, self.nothing, before)
-        return self.limited(self.robot.braked(wanted, state, before), before)
+        wanted = np.where(self.robot.zero_at_rest, self.nothing, before)
+        return self.limited(self.robot.stop_by_feedback(wanted, state, before), before)
 
     def regressors(self, z_0: Array, action: Array) -> Array:
         """z of an action followed by braking."""

@@ -87,7 +87,7 @@ class Builder:
     def __init__(self, robot: Robot, tube: Tube) -> None:
         self.robot = robot
         self.tube = tube
-        m, steps = robot.action_dim, robot.free_steps - robot.given
+        m, steps = robot.action_dim, robot.free_steps - robot.committed_steps
         free = steps * m
         self.known = tube.position.shape[2] - free  # length of z_0
         self.free = free

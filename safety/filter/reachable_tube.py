@@ -124,7 +124,7 @@ def recursion_of(robot: Robot, plans: bool = True) -> Recursion:
     """y = (position, heading, speeds ...), all relative to the frame of now; z ends in a plan's chosen inputs, or in
     all of its inputs, one by one."""
     reg = list(robot.regressor)
-    S = robot.schedule() if plans else np.eye(robot.horizon * robot.action_dim)
+    S = robot.plan_matrix() if plans else np.eye(robot.horizon * robot.action_dim)
     nz = robot.regressor_dim + S.shape[1]
     first = np.zeros((robot.state_dim, nz))
     first[reg, np.arange(len(reg))] = 1.0

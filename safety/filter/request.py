@@ -9,12 +9,12 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from brakeline.messaging.moving_obstacles import Movers
+from brakeline.messaging.moving_obstacles import MovingObstacles
 from brakeline.messaging.obstacle import FARTHEST, Shapes
 from brakeline.messaging.range_image import RangeImage
 from brakeline.messaging.robot import Robot
 from brakeline.messaging.scan import Scan
-from brakeline.messaging.sensor_messages import Sensed
+from brakeline.messaging.sensor_messages import RangeMeasurement
 from brakeline.safety.filter.backup_plan import Prediction
 from brakeline.safety.filter.blocking_constraint import Stopped
 from brakeline.safety.filter.reservation import Promises, Reservation
@@ -29,7 +29,7 @@ NOTHING_KNOWN = (
     "nothing is known of the space around the robot: give obstacles, or a scan, or say known_free if a map says that "
     "all space within reach is free"
 )
-STOPPED = 0.9e-9  # of an input: surely one of a stop (`Robot.rests`)
+STOPPED = 0.9e-9  # of an input: surely one of a stop (`Robot.is_stop_input`)
 
 Named: TypeAlias = dict[str, tuple[NDArray[np.floating[Any]], tuple[int, ...]]]  # arrays, and the shapes they must have
 
@@ -63,8 +63,8 @@ class Request:
     obstacles: Shapes
     model: str = ""
     predicted: Prediction | None = None
-    movers: Movers | None = None
-    scan: Sensed | None = None
+    movers: MovingObstacles | None = None
+    scan: RangeMeasurement | None = None
     reservation: Reservation | None = None
     promised: Promises | None = None
     observation: NDArray[np.float32] = field(default_factory=lambda: np.zeros(0, np.float32))
@@ -82,8 +82,10 @@ class Request:
 
     def still(self, robot: Robot) -> bool:
         """Is the robot said to stand, and to be committed to that? Needs no model's word."""
-        committed = not self.model and bool(robot.rests(self.plan).all()) and robot.may_stand(self.input_in_force)
-        return committed and robot.stands(self.state)
+        committed = (
+            not self.model and bool(robot.is_stop_input(self.plan).all()) and robot.may_be_standing(self.input_in_force)
+        )
+        return committed and robot.is_standing(self.state)
 
 
 @dataclass(frozen=True)
@@ -138,7 +140,7 @@ def check_for_filter(robot: Robot, request: Request) -> None:
         further["predicted_half_width"] = predicted.half_width, (robot.state_dim,)
     _check_motion(robot, request, further)
     _within_bounds(robot, "plan", request.plan)
-    if not robot.rests(request.plan[-1]):
+    if not robot.is_stop_input(request.plan[-1]):
         raise BadRequest("plan", "the committed plan does not end in a stop")
     check_surroundings(robot, request)
     if predicted is not None:
@@ -174,7 +176,7 @@ class Ordinary:
         n, m, most = robot.state_dim, robot.action_dim, np.finfo(float).max
         self.sizes = n, m, (robot.horizon, m)
         low, high = (np.tile(bound, (robot.horizon, 1)) for bound in robot.bounds)
-        low[-1, robot.stopping], high[-1, robot.stopping] = -STOPPED, STOPPED
+        low[-1, robot.zero_at_rest], high[-1, robot.zero_at_rest] = -STOPPED, STOPPED
         fixed = [np.full(n, FARTHEST), np.full(m, most)]
         self.low = np.concatenate([*(-part for part in fixed), robot.bounds[0], low.ravel()])
         self.high = np.concatenate([*fixed, robot.bounds[1], high.ravel()])

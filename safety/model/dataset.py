@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from brakeline.messaging.atomic_files import write_whole
-from brakeline.messaging.robot import Robot, UnknownRobot, robot_named, unless_shipped
-from brakeline.messaging.robot_description import robot_of
+from brakeline.messaging.atomic_files import write_atomically
+from brakeline.messaging.robot import Robot, UnknownRobot, refuse_shipped_name, robot_named
+from brakeline.messaging.robot_description import robot_from_description
 from brakeline.safety.model.tensor_file import pack, unpack
 
 Array = NDArray[np.float64]
@@ -104,7 +104,7 @@ class Dataset:
         about: dict[str, Any] = {"robot": robot.name, "layout": robot.layout(), "about": self.about}
         about["bulge"] = self.chord_deviation
         about["description"] = json.dumps(robot.description)  # a text: the order of its names counts
-        write_whole(Path(path), pack(tensors, ENTRY, about))
+        write_atomically(Path(path), pack(tensors, ENTRY, about))
 
     @staticmethod
     def load(path: Path | str) -> Dataset:
@@ -124,12 +124,16 @@ class Dataset:
         try:
             name = str(about["robot"])
             described = about.get("description")
-            robot = robot_named(name) if described is None else unless_shipped(robot_of(json.loads(described), name))
+            robot = (
+                robot_named(name)
+                if described is None
+                else refuse_shipped_name(robot_from_description(json.loads(described), name))
+            )
         except (UnknownRobot, ValueError, TypeError) as error:
             raise BadData(f"{path}: {error}") from error
         if robot.name != name:
             raise BadData(f"{path} is of robot {name!r}, its description of {robot.name!r}")
-        if not robot.understands(about.get("layout")):
+        if not robot.accepts_layout(about.get("layout")):
             raise BadData(f"{path} was recorded for another layout of {robot.name}: record it again")
         lengths = tensors.pop("lengths")
         tensors = {name: np.atleast_1d(tensor).astype(float) for name, tensor in tensors.items()}

@@ -12,9 +12,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from brakeline.messaging.atomic_files import write_whole
-from brakeline.messaging.robot import FORMER_LAYOUTS, LATE, Robot, UnknownRobot, robot_named, unless_shipped
-from brakeline.messaging.robot_description import robot_of
+from brakeline.messaging.atomic_files import write_atomically
+from brakeline.messaging.robot import (
+    FORMER_LAYOUTS,
+    REAL_TIME_SUFFIX,
+    Robot,
+    UnknownRobot,
+    refuse_shipped_name,
+    robot_named,
+)
+from brakeline.messaging.robot_description import robot_from_description
 from brakeline.safety.filter.reachable_tube import Tube, recursion_of, stack_direct, stack_recursive
 from brakeline.safety.model.error_bounds import ErrorBound
 from brakeline.safety.model.model_config import DIRECT as DIRECT
@@ -173,7 +180,7 @@ class ModelSet:
         return pack(self._tensors(), ENTRY, about)
 
     def save(self, path: Path | str) -> None:
-        write_whole(Path(path), self.encode())
+        write_atomically(Path(path), self.encode())
 
     @staticmethod
     def decode(payload: bytes) -> ModelSet:
@@ -190,7 +197,7 @@ class ModelSet:
             stands = int(about.get("stands", 0))
         except (KeyError, TypeError, ValueError, UnknownRobot) as error:
             raise BadModel(f"no model set: {error!r}") from error
-        if not robot.understands(about.get("layout")):
+        if not robot.accepts_layout(about.get("layout")):
             raise BadModel(f"the model set is for another layout of {robot.name}: make it again from data")
         layout = "" if about["layout"] == robot.layout() else str(about["layout"])
         if not all(t.dtype == np.float64 and np.isfinite(t).all() for t in tensors.values()):
@@ -217,7 +224,7 @@ class ModelSet:
         """Raises BadModel, naming the file."""
         try:
             model = ModelSet.decode(Path(path).read_bytes())
-            unless_shipped(model.robot)
+            refuse_shipped_name(model.robot)
             return model
         except OSError as error:
             raise BadModel(f"{path}: {error}") from error
@@ -236,8 +243,8 @@ def robot_in(about: dict[str, Any]) -> Robot:
         if about.get("layout") != FORMER_LAYOUTS.get(name):
             raise UnknownRobot(f"{name}: neither a description nor the layout of a robot known before there were any")
         return robot_named(name)
-    robot = robot_of(json.loads(about["description"]), "the model set's robot")
-    robot = robot.in_real_time() if name.endswith(LATE) else robot
+    robot = robot_from_description(json.loads(about["description"]), "the model set's robot")
+    robot = robot.in_real_time() if name.endswith(REAL_TIME_SUFFIX) else robot
     if robot.name != name:
         raise UnknownRobot(f"the model set is of {name!r}, its description of {robot.name!r}")
     return robot

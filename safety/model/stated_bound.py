@@ -11,7 +11,7 @@ import math
 from collections.abc import Mapping
 
 from brakeline.messaging.robot import Robot
-from brakeline.messaging.stated_share import CONFIDENCE, UNSTATED, checked, percent, rounded_up
+from brakeline.messaging.stated_share import CONFIDENCE, UNSTATED, percent, rounded_up, valid_bound
 from brakeline.safety.model.model_set import BadModel, ModelSet
 
 
@@ -21,7 +21,7 @@ def stated_bound(about: Mapping[str, str]) -> float:
         bound = float(about["bound_plan"])
     except (KeyError, TypeError, ValueError):
         return UNSTATED
-    return checked(bound)
+    return valid_bound(bound)
 
 
 def accepted_bound(robot: Robot, accept_bound: float | None = None) -> float:

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from brakeline.messaging.robot import FOLLOWED, Robot
+from brakeline.messaging.robot import INPUT_TOLERANCE, Robot
 from brakeline.safety.model.error_bounds import ErrorBound
 
 Array = NDArray[np.float64]
@@ -81,6 +81,6 @@ def standing_limits(robot: Robot) -> Array | None:
     for i, index in enumerate(robot.follows):
         if index >= 0:
             slow[index] = max(slow[index], STANDING * width[i])
-    most = np.concatenate([slow[list(robot.regressor)], FOLLOWED * width, FOLLOWED * width])
+    most = np.concatenate([slow[list(robot.regressor)], INPUT_TOLERANCE * width, INPUT_TOLERANCE * width])
     most[turning(robot)] = np.inf
     return np.stack([-most, most])

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brakeline.messaging.obstacle import rotate
-from brakeline.messaging.robot import FOLLOWED, Robot
+from brakeline.messaging.robot import INPUT_TOLERANCE, Robot
 from brakeline.safety.model.dataset import BadData, Dataset, Trajectory
 from brakeline.safety.model.model_config import FREE as FREE
 from brakeline.safety.model.model_config import PLAN as PLAN
@@ -76,7 +76,7 @@ def windows(data: Dataset, k: int, kind: str = PLAN) -> Windows:
 def specialised(robot: Robot) -> Array:
     """T with `z' = T z`: the regressors of a free window (all inputs of a plan) from those of a plan window."""
     known = robot.regressor_dim
-    S = robot.schedule()
+    S = robot.plan_matrix()
     T = np.zeros((known + len(S), known + S.shape[1]))
     T[:known, :known] = np.eye(known)
     T[known:, known:] = S
@@ -89,14 +89,14 @@ def _plans_of(robot: Robot, t: Trajectory, k: int) -> tuple[NDArray[np.intp], Ar
     count = max(len(t.inputs) - k + 1, 0)
     padded = np.vstack([t.inputs, np.zeros((free, m))])  # the free inputs beyond k play no part
     chosen = np.hstack([padded[j : j + count] for j in range(free)])
-    planned = chosen @ robot.schedule()[: k * m].T
+    planned = chosen @ robot.plan_matrix()[: k * m].T
     actual = np.hstack([t.inputs[j : j + count] for j in range(k)]).reshape(count, k * m)
     if robot.feedback:
         made = _braked(robot, t)
         for j in range(1, k):
             row = slice(j * m, (j + 1) * m)
-            planned[:, row] = np.where(robot.by_state, made[j : j + count], planned[:, row])
-        near = np.tile(FOLLOWED * (robot.high() - robot.low()), k)
+            planned[:, row] = np.where(robot.stops_by_feedback, made[j : j + count], planned[:, row])
+        near = np.tile(INPUT_TOLERANCE * (robot.high() - robot.low()), k)
     else:
         near = np.full(k * m, 1e-9)
     start = np.flatnonzero((np.abs(planned - actual) < near).all(1))
@@ -142,15 +142,15 @@ _found: WeakKeyDictionary[Trajectory, tuple[Robot, Array, Array]] = WeakKeyDicti
 def _braked(robot: Robot, t: Trajectory) -> Array:
     """What the stop rules make of each state when every input is on its way to zero: (T, m)."""
     earlier = np.zeros((1, robot.action_dim)) if t.before is None else t.before[None]
-    return robot.braked(np.zeros_like(t.inputs), t.states[:-1], np.vstack([earlier, t.inputs[:-1]]))
+    return robot.stop_by_feedback(np.zeros_like(t.inputs), t.states[:-1], np.vstack([earlier, t.inputs[:-1]]))
 
 
 def resting(robot: Robot, t: Trajectory) -> NDArray[np.bool_]:
     """In which periods are the inputs those of a stop? (T,)"""
     if not robot.feedback:
-        return robot.rests(t.inputs)
-    near = FOLLOWED * (robot.high() - robot.low())
-    return np.asarray((np.abs(t.inputs - _braked(robot, t)) < near)[:, robot.stopping].all(1))
+        return robot.is_stop_input(t.inputs)
+    near = INPUT_TOLERANCE * (robot.high() - robot.low())
+    return np.asarray((np.abs(t.inputs - _braked(robot, t)) < near)[:, robot.zero_at_rest].all(1))
 
 
 def outputs(robot: Robot, y: Array) -> Array:
@@ -194,7 +194,7 @@ def _rest_travel(robot: Robot, t: Trajectory) -> Array:
 
 def standing_at_the_end(robot: Robot) -> int:
     """So many of a plan's last inputs are those of a stop: one at least."""
-    left = robot.fractions()[:, robot.stopping]
+    left = robot.stop_profile()[:, robot.zero_at_rest]
     moving = np.flatnonzero(np.abs(left).max(1, initial=0.0) > 0.0)
     return max(robot.horizon - robot.free_steps - int(moving[-1]), 1)
 

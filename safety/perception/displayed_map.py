@@ -10,13 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brakeline.messaging import brakeline_pb2 as pb
-from brakeline.messaging.moving_obstacles import Movers
+from brakeline.messaging.moving_obstacles import MovingObstacles
 from brakeline.messaging.obstacle import Obstacle
 from brakeline.messaging.obstacle_motion import Motion, Sighting
 from brakeline.messaging.range_image import RangeImage, directions
 from brakeline.messaging.robot import Robot
 from brakeline.messaging.scan import Scan
-from brakeline.messaging.sensor_messages import sensed_of
+from brakeline.messaging.sensor_messages import measurement_in
 from brakeline.safety.perception.image_coverage import patch_free_ranges
 from brakeline.safety.perception.scan_coverage import gaps
 
@@ -61,13 +61,13 @@ def map_for_display(robot: Robot, request: pb.Request, corners: int = OUTLINE) -
     Raises BadShape, BadScan: the request tells of none that are.
     """
     hits = free = np.zeros((0, robot.position_dim))
-    sensed = sensed_of(request)
+    sensed = measurement_in(request)
     if isinstance(sensed, Scan):
         hits, free = _hits(sensed), outline(sensed, corners)
     elif sensed is not None:
         hits, free = _image_hits(sensed), level_outline(sensed, corners)
-    followed = _followed(robot, sensed) if isinstance(sensed, Scan) and sensed.followed is not None else None
-    moving = Movers.of([_obstacle(o) for o in request.obstacles if o.HasField("motion")], robot.position_dim)
+    followed = _followed(robot, sensed) if isinstance(sensed, Scan) and sensed.tracks is not None else None
+    moving = MovingObstacles.of([_obstacle(o) for o in request.obstacles if o.HasField("motion")], robot.position_dim)
     shapes, ends = moving.shapes, robot.period * np.arange(1.0, robot.horizon + 1.0)
     across: Array = shapes.rho + np.sqrt((shapes.half**2).sum(axis=1))
     swept = shapes.center[:, None] + moving.moved(ends), (across[:, None] + moving.radius(ends))[..., None]
@@ -79,13 +79,13 @@ def map_for_display(robot: Robot, request: pb.Request, corners: int = OUTLINE) -
 
 def _followed(robot: Robot, scan: Scan) -> tuple[Array, Array]:
     """Of what a scan was followed to move: the discs about what was hit of it (k, 3), and those swept (k, N, 3)."""
-    assert scan.followed is not None
+    assert scan.tracks is not None
     points = np.zeros((len(scan.ranges), 2))
     points[scan.known & (scan.ranges < scan.far)] = _hits(scan)
     t = scan.age + robot.period * np.arange(1.0, robot.horizon + 1.0)
     discs, swept = [np.zeros((0, 3))], [np.zeros((0, len(t), 3))]
-    for row, (cx, cy, error, acceleration) in enumerate(scan.followed.ways, start=1):
-        hit = points[scan.followed.which == row]
+    for row, (cx, cy, error, acceleration) in enumerate(scan.tracks.motions, start=1):
+        hit = points[scan.tracks.track_index == row]
         if not len(hit) or not (cx or cy):
             continue
         middle = hit.mean(axis=0)

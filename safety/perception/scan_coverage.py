@@ -48,9 +48,9 @@ def gaps_and_ways(scan: Scan) -> tuple[Array, Array, Array, NDArray[np.uint8]]:
     doubt = min(scan.doubt, len(ranges))
     least = _least(ranges, range(-doubt, doubt + 2))
     free = _free(least, np.maximum(*_spans(width, doubt)), scan.least_width)
-    if scan.followed is None:
+    if scan.tracks is None:
         return angles, width, free, np.zeros(len(free), np.uint8)
-    return angles, width, free, _ways(scan.followed.which[beams], ranges, width, doubt)
+    return angles, width, free, _ways(scan.tracks.track_index[beams], ranges, width, doubt)
 
 
 def _ways(which: NDArray[np.uint8], ranges: Array, width: Array, doubt: int) -> NDArray[np.uint8]:

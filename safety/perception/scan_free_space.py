@@ -30,7 +30,7 @@ WIDEST = math.radians(15.0)  # a wider gap is cut into several of the same F, so
 @dataclass(frozen=True)
 class OccupiedCells:
     """n convex cells: corners (n, V, 2), world [m], repeated where there are fewer; error (n, V) m, how far each may be
-    off; ways (n, 4): where what they hold has gone since, `age` s ago, as `Followed` says; speed [m/s]: the fastest."""
+    off; ways (n, 4): the motion since, `age` s ago, see `BeamTracks`; speed [m/s]: the fastest."""
 
     corners: Array
     error: Array
@@ -60,7 +60,7 @@ def occupied_cells(scan: Scan, within: float) -> OccupiedCells:
     """All that is not known to be free within so many m of the sensor, and where somebody may come out of it."""
     found = gaps_and_ways(scan)
     known = _cells(scan, within, *found)
-    return known if scan.followed is None else known.beside(_edges(scan, within, *found))
+    return known if scan.tracks is None else known.beside(_edges(scan, within, *found))
 
 
 def _cells(
@@ -102,7 +102,7 @@ def _cells(
 def ways_of(scan: Scan) -> Array:
     """(K+1, 4): the ways of what was hit, the first of them that of whatever may go anywhere."""
     anywhere = np.array([[0.0, 0.0, scan.speed, 0.0]])
-    return anywhere if scan.followed is None else np.concatenate([anywhere, scan.followed.ways])
+    return anywhere if scan.tracks is None else np.concatenate([anywhere, scan.tracks.motions])
 
 
 def _edges(

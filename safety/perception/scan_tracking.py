@@ -20,7 +20,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from brakeline.messaging.scan import Followed, Scan
+from brakeline.messaging.scan import BeamTracks, Scan
 
 Array = NDArray[np.float64]
 
@@ -81,7 +81,7 @@ class ScanTracker:
             ways.append((0.0, 0.0, min(_speed(MOVED, age, scan) for age, _ in before), scan.acceleration))
             which[seen.beams[still]] = len(ways)
         self._before.append((scan.age, seen))
-        return replace(scan, followed=Followed(which, np.array(ways, dtype=float).reshape(-1, 4)))
+        return replace(scan, tracks=BeamTracks(which, np.array(ways, dtype=float).reshape(-1, 4)))
 
     def _moving(
         self, scan: Scan, seen: _Seen, before: list[tuple[float, _Seen]]

@@ -148,9 +148,9 @@ class FanMemory(VisibilityMemory[Scan]):
         filled = super().fill(scan, elapsed)
         if scan is None:
             return filled
-        followed = self._follower.follow(scan).followed
+        followed = self._follower.follow(scan).tracks
         if followed is not None:
-            self._last = filled = replace(filled, followed=followed)
+            self._last = filled = replace(filled, tracks=followed)
         return filled
 
     def _own(self, scan: Scan) -> Scan:

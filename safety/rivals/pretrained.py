@@ -15,9 +15,9 @@ from typing import Any
 
 import numpy as np
 
-from brakeline.messaging.atomic_files import write_whole
+from brakeline.messaging.atomic_files import write_atomically
 from brakeline.messaging.perceptrons import BadPerceptrons, Perceptrons
-from brakeline.messaging.ray_directions import Rays
+from brakeline.messaging.ray_directions import LidarRays
 from brakeline.messaging.robot import Robot, UnknownRobot, robot_named
 from brakeline.safety.model.model_set import BadModel, robot_in
 from brakeline.safety.model.tensor_file import pack, unpack
@@ -39,7 +39,7 @@ class Pretrained:
     networks: Mapping[str, Perceptrons]
     settings: Mapping[str, float]
     about: dict[str, str] = field(default_factory=dict)
-    rays: Rays | None = None
+    rays: LidarRays | None = None
 
     @property
     def version(self) -> str:
@@ -70,7 +70,7 @@ class Pretrained:
         return pack(self._tensors(), ENTRY, about)
 
     def save(self, path: Path) -> None:
-        write_whole(path, self.encode())
+        write_atomically(path, self.encode())
 
     @staticmethod
     def decode(payload: bytes) -> Pretrained:
@@ -87,7 +87,7 @@ class Pretrained:
             model = Pretrained(robot, str(about["method"]), networks, settings, dict(about["about"]), rays)
         except (KeyError, TypeError, ValueError, UnknownRobot, BadPerceptrons) as error:
             raise BadModel(f"no pretrained model: {error!r}") from error
-        if not robot.understands(about.get("layout")):
+        if not robot.accepts_layout(about.get("layout")):
             raise BadModel(f"the model is for another layout of {robot.name}: pretrain it again")
         if not np.isfinite(list(settings.values())).all():
             raise BadModel("the model's settings hold NaN or infinity")
@@ -96,7 +96,7 @@ class Pretrained:
         return model
 
 
-def _rays(tensors: Mapping[str, Any], about: Mapping[str, Any]) -> Rays | None:
+def _rays(tensors: Mapping[str, Any], about: Mapping[str, Any]) -> LidarRays | None:
     """Return the rays that the file holds, or None. Raises ValueError if they are not unit vectors with a range."""
     if RAYS not in tensors:
         return None
@@ -104,4 +104,4 @@ def _rays(tensors: Mapping[str, Any], about: Mapping[str, Any]) -> Rays | None:
     unit = directions.ndim == 2 and directions.dtype == np.float64 and len(directions) > 0
     if not unit or not np.allclose(np.linalg.norm(directions, axis=1), 1.0) or not 0.0 < reach < np.inf:
         raise ValueError("the rays are not unit vectors with a finite range")
-    return Rays(directions, reach)
+    return LidarRays(directions, reach)

@@ -18,8 +18,8 @@ from time import perf_counter_ns
 import numpy as np
 from numpy.typing import NDArray
 
-from brakeline.messaging.ray_directions import Rays
-from brakeline.messaging.robot import Robot, shipped
+from brakeline.messaging.ray_directions import LidarRays
+from brakeline.messaging.robot import Robot, shipped_robots
 from brakeline.messaging.task import robot_with_task
 from brakeline.safety.filter.backup_plan import NO_PREDICTION
 from brakeline.safety.filter.braking import braked, braking_plan, within
@@ -50,7 +50,7 @@ class Constraints:
     nothing about the input, and would drown what is near in the fit.
     """
 
-    def __init__(self, robot: Robot, rays: Rays) -> None:
+    def __init__(self, robot: Robot, rays: LidarRays) -> None:
         self.robot, self.directions, self.range = robot, rays.directions, rays.range
         self.stopping = robot.period * (0.5 * robot.brake_steps + LAG)  # s
         fastest = float(np.linalg.norm(np.where(robot.translates, robot.high(), 0.0)))
@@ -63,7 +63,7 @@ class Constraints:
 
     def __call__(self, observation: NDArray[np.floating], state: Array) -> Array:
         """Of an observation and the measured state with it."""
-        speeds = state[self.robot.speeds]
+        speeds = state[self.robot.speed_indices]
         velocity = speeds if self.robot.heading is None else np.eye(self.directions.shape[1])[0] * speeds[0]
         ranges = np.minimum(np.asarray(observation[: len(self.directions)], float) * self.range, self.near)
         way = self.stopping * np.maximum(self.directions @ velocity, 0.0) - ranges
@@ -110,9 +110,9 @@ def quadratic(r: Array, G: Array, d: Array, low: Array, high: Array) -> tuple[Ar
     return a, solution.status, solution.iterations
 
 
-def _usual_rays(robot: Robot) -> Rays:
+def _usual_rays(robot: Robot) -> LidarRays:
     """Return the rays of a robot's usual task: older files do not hold the rays. Raises BadModel if there is none."""
-    if robot.kind not in shipped():
+    if robot.kind not in shipped_robots():
         raise BadModel(f"the model of {robot.name} does not hold the lidar's rays: pretrain it again")
     return robot_with_task(robot.kind).task.rays
 

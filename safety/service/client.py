@@ -22,7 +22,7 @@ from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.bus import Bus, BusError, BusSettings
 from brakeline.messaging.obstacle import Obstacle
 from brakeline.messaging.robot import FEEDBACK, Robot, robot_named
-from brakeline.messaging.sensor_messages import Sensed, add_sensed
+from brakeline.messaging.sensor_messages import RangeMeasurement, set_measurement
 from brakeline.messaging.topics import DECIDE
 from brakeline.safety.filter.backup_plan import BackupPlan
 from brakeline.safety.filter.request import BadRequest
@@ -76,7 +76,7 @@ def request_message(
     action: ArrayLike,
     obstacles: Iterable[Obstacle] | None = None,
     *,
-    scan: Sensed | None = None,
+    scan: RangeMeasurement | None = None,
     observation: ArrayLike | None = None,
     known_free: bool = False,
     actor: str = "",
@@ -104,7 +104,7 @@ def request_message(
         time=time,
         fleet=fleet,
     )
-    add_sensed(message, scan_in(scan))
+    set_measurement(message, scan_in(scan))
     if backup_plan.predicted is not None:
         message.predicted_center.extend(backup_plan.predicted.center.tolist())
         message.predicted_half_width.extend(backup_plan.predicted.half_width.tolist())
@@ -132,7 +132,7 @@ def read_reply(reply: pb.Reply, request: pb.Request, robot: Robot) -> Answer:
     plan = plan.reshape(robot.horizon, robot.action_dim)
     if not ((plan >= robot.low() - 1e-9) & (plan <= robot.high() + 1e-9)).all():  # NaN fails too
         raise _bad_reply("plan", "an input out of bounds")
-    if not robot.rests(plan[-1]):
+    if not robot.is_stop_input(plan[-1]):
         raise _bad_reply("plan", "a plan that does not end in a stop")
     if not _follows(plan, request, robot):
         raise _bad_reply("plan", "a plan that does not follow the input in force")
@@ -240,7 +240,7 @@ class SafetyClient(BusClient):
         action: ArrayLike,
         obstacles: Iterable[Obstacle] | None = None,
         *,
-        scan: Sensed | None = None,
+        scan: RangeMeasurement | None = None,
         observation: ArrayLike | None = None,
         known_free: bool = False,
         actor: str = "",

@@ -18,7 +18,7 @@ from brakeline.messaging.obstacle import Obstacle
 from brakeline.messaging.range_image import RangeImage
 from brakeline.messaging.robot import Robot
 from brakeline.messaging.scan import Scan
-from brakeline.messaging.sensor_messages import Sensed
+from brakeline.messaging.sensor_messages import RangeMeasurement
 from brakeline.safety.filter.backup_plan import BackupPlan
 from brakeline.safety.filter.request import BadRequest, Decision
 
@@ -45,7 +45,7 @@ class Answer(Decision):
     @staticmethod
     def of(decision: Decision, robot: Robot, **more: Any) -> Answer:
         """The answer that holds this decision; more: the attributes that a decision has not."""
-        return Answer(**vars(decision), action=decision.plan[robot.given].copy(), **more)
+        return Answer(**vars(decision), action=decision.plan[robot.committed_steps].copy(), **more)
 
 
 @runtime_checkable
@@ -64,7 +64,7 @@ class FilterClient(Protocol):
         action: ArrayLike,
         obstacles: Iterable[Obstacle] | None = None,
         *,
-        scan: Sensed | None = None,
+        scan: RangeMeasurement | None = None,
         observation: ArrayLike | None = None,
         known_free: bool = False,
     ) -> Answer:
@@ -110,7 +110,7 @@ def obstacles_in(given: Iterable[Obstacle] | None) -> list[Obstacle]:
     return found
 
 
-def scan_in(given: Sensed | None) -> Sensed | None:
+def scan_in(given: RangeMeasurement | None) -> RangeMeasurement | None:
     """Return the scan that a program gave. Raises BadRequest: it gave something else."""
     if given is not None and not isinstance(given, Scan | RangeImage):
         raise BadRequest("scan", f"scan is a {type(given).__name__}: give a Scan, in space a RangeImage")

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 from brakeline.messaging.bus import Bus
 from brakeline.messaging.obstacle import Obstacle
 from brakeline.messaging.robot import Robot
-from brakeline.messaging.sensor_messages import Sensed
+from brakeline.messaging.sensor_messages import RangeMeasurement
 from brakeline.safety.filter.backup_plan import BackupPlan
 from brakeline.safety.service.client import (
     DEADLINE,
@@ -71,7 +71,7 @@ class FleetClient(BusClient):
         actions: Sequence[ArrayLike],
         obstacles: Sequence[Iterable[Obstacle] | None] | None = None,
         *,
-        scans: Sequence[Sensed | None] | None = None,
+        scans: Sequence[RangeMeasurement | None] | None = None,
         known_free: bool = False,
     ) -> list[Answer]:
         """The decisions; their plans are committed to, so execute every `answer.action`.

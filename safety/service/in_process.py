@@ -13,10 +13,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from brakeline.messaging.moving_obstacles import parted
+from brakeline.messaging.moving_obstacles import split_moving
 from brakeline.messaging.obstacle import Obstacle
 from brakeline.messaging.robot import Robot
-from brakeline.messaging.sensor_messages import Sensed
+from brakeline.messaging.sensor_messages import RangeMeasurement
 from brakeline.safety.filter.backup_plan import BackupPlan
 from brakeline.safety.filter.request import MOST_OBSERVED, Request
 from brakeline.safety.service.filter_client import Answer, accept, known_free_in, observation_in, obstacles_in, scan_in
@@ -53,7 +53,7 @@ class InProcess:
         action: ArrayLike,
         obstacles: Iterable[Obstacle] | None = None,
         *,
-        scan: Sensed | None = None,
+        scan: RangeMeasurement | None = None,
         observation: ArrayLike | None = None,
         known_free: bool = False,
     ) -> Answer:
@@ -79,7 +79,7 @@ class InProcess:
         actions: Sequence[ArrayLike],
         obstacles: Sequence[Iterable[Obstacle] | None],
         *,
-        scans: Sequence[Sensed | None],
+        scans: Sequence[RangeMeasurement | None],
         observations: Sequence[ArrayLike | None],
         known_free: Sequence[bool],
     ) -> list[Answer]:
@@ -105,13 +105,13 @@ class InProcess:
         state: ArrayLike,
         action: ArrayLike,
         obstacles: Iterable[Obstacle] | None,
-        scan: Sensed | None,
+        scan: RangeMeasurement | None,
         observation: ArrayLike | None,
         known_free: bool,
     ) -> Request:
         measured = np.asarray(state, dtype=float)
         kept.measured(measured)
-        standing, moving = parted(obstacles_in(obstacles), self.robot.position_dim)
+        standing, moving = split_moving(obstacles_in(obstacles), self.robot.position_dim)
         return Request(
             state=measured,
             action=np.asarray(action, dtype=float),

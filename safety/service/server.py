@@ -13,7 +13,7 @@ from time import perf_counter_ns
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.bus import BusError, BusSettings, Sample
 from brakeline.messaging.process_runtime import Process
-from brakeline.messaging.robot import LATE, UnknownRobot, shipped, unless_shipped
+from brakeline.messaging.robot import REAL_TIME_SUFFIX, UnknownRobot, refuse_shipped_name, shipped_robots
 from brakeline.messaging.topics import DECIDE, MODEL
 from brakeline.safety.filter.backup_plan import UNVERIFIED
 from brakeline.safety.filter.filter import Filter
@@ -62,7 +62,7 @@ class ModelRegistry:
         check_bound(model, dataclasses.replace(robot, accept_bound=limit), self.accept_bound)
         method = ready(model)
         try:
-            unless_shipped(model.robot)
+            refuse_shipped_name(model.robot)
         except UnknownRobot as error:
             raise BadModel(str(error)) from error
         with self._lock:
@@ -76,7 +76,7 @@ class ModelRegistry:
         """Raises UnknownRobot, NoModel or StaleModel."""
         method = self.filters.get(request.robot)
         if method is None:
-            if request.robot.removesuffix(LATE) not in shipped():
+            if request.robot.removesuffix(REAL_TIME_SUFFIX) not in shipped_robots():
                 raise UnknownRobot(f"no robot is called {request.robot!r:.80} here")
             have = ", ".join(self.filters) or "none"
             raise NoModel("robot", f"no model of {request.robot} is loaded (loaded: {have})")

@@ -27,7 +27,7 @@ from cryptography.hazmat.primitives.serialization import (
     load_pem_private_key,
 )
 
-from brakeline.messaging.atomic_files import write_secret, write_whole
+from brakeline.messaging.atomic_files import write_atomically, write_secret
 from brakeline.safety.methods import Model, decode
 from brakeline.safety.model.dataset import Dataset
 from brakeline.safety.model.model_set import Array, BadModel, ModelSet
@@ -53,8 +53,8 @@ class SignedModel:
     def save(self, path: Path) -> None:
         """The file, with its seal beside it; the seal first, so that there is never a model without one."""
         said = {"claim": self.claim.decode(), "signature": self.signature.hex()}
-        write_whole(seal_of(path), json.dumps(said, indent=2).encode())
-        write_whole(path, self.file)
+        write_atomically(seal_of(path), json.dumps(said, indent=2).encode())
+        write_atomically(path, self.file)
 
     @classmethod
     def load(cls, path: Path) -> Self:
@@ -195,7 +195,7 @@ def write_signer(folder: Path, name: str = "certify", robots: tuple[str, ...] = 
     public = key.public_key().public_bytes(Encoding.Raw, PublicFormat.Raw)
     write_secret(folder / KEY, key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption()))
     said = {"key": public.hex(), "robots": list(robots)}
-    write_whole(folder / SIGNERS / f"{name}.json", json.dumps(said, indent=2).encode())
+    write_atomically(folder / SIGNERS / f"{name}.json", json.dumps(said, indent=2).encode())
 
 
 def _claim(signed: SignedModel) -> dict[str, Any]:

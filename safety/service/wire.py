@@ -10,12 +10,12 @@ from google.protobuf.message import DecodeError
 from numpy.typing import NDArray
 
 from brakeline.messaging import brakeline_pb2 as pb
-from brakeline.messaging.moving_obstacles import parted
+from brakeline.messaging.moving_obstacles import split_moving
 from brakeline.messaging.obstacle import FARTHEST, BadShape, Obstacle
 from brakeline.messaging.robot import Robot
 from brakeline.messaging.scan import BadScan
-from brakeline.messaging.sensor_messages import Sensed, sensed_of
-from brakeline.messaging.stated_share import checked
+from brakeline.messaging.sensor_messages import RangeMeasurement, measurement_in
+from brakeline.messaging.stated_share import valid_bound
 from brakeline.safety.filter.backup_plan import Prediction
 from brakeline.safety.filter.blocking_constraint import Stopped
 from brakeline.safety.filter.request import ADJUSTED, ALLOWED, FAILSAFE, RECOVERING, BadRequest, Decision, Request
@@ -92,7 +92,7 @@ def request_of(
     if plan.size != robot.horizon * robot.action_dim:
         wanted = f"{robot.horizon} x {robot.action_dim}"
         raise BadRequest("plan", f"plan has {plan.size} numbers, a {robot.name} robot's has {wanted}")
-    obstacles, movers = parted(obstacles_of(message.obstacles, robot.position_dim), robot.position_dim)
+    obstacles, movers = split_moving(obstacles_of(message.obstacles, robot.position_dim), robot.position_dim)
     return Request(
         state=array_of(message.state),
         action=array_of(message.action),
@@ -129,10 +129,10 @@ def obstacles_of(messages: Sequence[pb.Obstacle], dim: int) -> list[Obstacle]:
     return obstacles
 
 
-def seen(message: pb.Request) -> Sensed | None:
+def seen(message: pb.Request) -> RangeMeasurement | None:
     """Raises BadRequest: it is none."""
     try:
-        return sensed_of(message)
+        return measurement_in(message)
     except BadScan as error:
         raise BadRequest("scan", str(error)) from error
 
@@ -228,7 +228,7 @@ def decision_of(m: pb.Decision, robot: Robot) -> Decision:
         stopped=stopped,
         reservation=reservation_of(m.reservation, robot) if m.HasField("reservation") else None,
         for_clearance=m.for_clearance if m.HasField("for_clearance") else None,
-        bound=checked(m.bound) if m.HasField("bound") else None,
+        bound=valid_bound(m.bound) if m.HasField("bound") else None,
     )
 
 

@@ -7,7 +7,7 @@ from brakeline.actors.decision_guard import request_decisions
 from brakeline.actors.episode_runner import ActorIdentity, EpisodeRunner
 from brakeline.deploy.experiments.evaluate import in_process
 from brakeline.deploy.vehicle_factory import environment
-from brakeline.learner.transition_reader import Intake
+from brakeline.learner.transition_reader import StepReader
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.bus import NoReply
 from brakeline.safety.filter.request import NOT_FINITE
@@ -89,7 +89,7 @@ def test_a_proposal_that_is_not_finite_is_a_failsafe_and_a_step_to_learn_from(as
     assert (outcome.answer.kind, outcome.answer.reason) == ("failsafe", NOT_FINITE)
     step = robot.execute(np.array(wrong), outcome)
     assert step.decision == pb.FAILSAFE and step.proposed == step.action == [0.0, 0.0]
-    Intake(GROUND).move(step)
+    StepReader(GROUND).move(step)
 
 
 def test_without_a_filter_a_proposal_that_is_not_finite_is_standing_still():

@@ -10,7 +10,7 @@ import pytest
 from brakeline.actors.mavlink.autopilot_commands import AutopilotClient
 from brakeline.actors.mavlink.ground_truth import MOST_DATAGRAMS, UdpGroundTruth
 from brakeline.messaging.free_ports import free_udp_port
-from brakeline.messaging.rejected_messages import Tolerance
+from brakeline.messaging.rejected_messages import RejectedMessages
 
 STATE = [1.0, 2.0, 3.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]
 TOLD = {"system": 1, "time": 1.0, "state": STATE, "collisions": 2, "clearance": 0.5}
@@ -20,8 +20,8 @@ class Said:
     """A truth channel and who sends to it."""
 
     def __init__(self) -> None:
-        self.tolerance, self.port = Tolerance(), free_udp_port()
-        self.truth = UdpGroundTruth(self.port, 1, self.tolerance)
+        self.rejected, self.port = RejectedMessages(), free_udp_port()
+        self.truth = UdpGroundTruth(self.port, 1, self.rejected)
         self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
 
     def __call__(self, data: object) -> None:
@@ -50,7 +50,7 @@ def test_what_no_simulator_tells_is_passed_over(say: Said, data: object) -> None
     say(data)
     say(TOLD)
     say.truth.poll()
-    assert say.tolerance.count == 1
+    assert say.rejected.count == 1
     assert say.truth.state is not None and say.truth.state.tolist() == STATE
     assert (say.truth.collisions, say.truth.clearance) == (2, 0.5)
 

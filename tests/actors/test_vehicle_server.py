@@ -37,7 +37,7 @@ from brakeline.actors.mavlink.vehicle_socket import (
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.byte_links import open_link
 from brakeline.messaging.process_clock import WallClock
-from brakeline.messaging.rejected_messages import Tolerance
+from brakeline.messaging.rejected_messages import RejectedMessages
 from brakeline.sim.arena import staged_arena
 from brakeline.sim.autopilot import autopilot_server as server
 from brakeline.sim.autopilot.endpoint import Autopilot
@@ -70,7 +70,7 @@ def flown() -> Iterator[tuple[str, Autopilot]]:
 def actor(url: str, frames: list[pb.MavlinkFrame] | None = None, height: float = 2.0) -> Iterator[VehicleClient]:
     request = FlightRequest(FlightSettings(url, height=height), QUADROTOR, ARENA.obstacles)
     tap: Callable[[pb.MavlinkFrame], None] = (frames if frames is not None else []).append
-    vehicle = VehicleClient(request, tap, Tolerance(), lambda: False)
+    vehicle = VehicleClient(request, tap, RejectedMessages(), lambda: False)
     try:
         yield vehicle
     finally:
@@ -182,7 +182,7 @@ def test_a_robot_of_ones_own_file_is_flown(flown: tuple[str, Autopilot]) -> None
     """The server gets the description itself: it knows no name but those that come with the program."""
     robot = replace(QUADROTOR, name="mine").in_real_time()
     request = FlightRequest(FlightSettings(flown[0], height=2.0), robot, ())
-    vehicle = VehicleClient(request, lambda _: None, Tolerance(), lambda: False)
+    vehicle = VehicleClient(request, lambda _: None, RejectedMessages(), lambda: False)
     try:
         assert vehicle.wait(vehicle.current_period.number + 2).report.measured.shape == (9,)
     finally:
@@ -192,9 +192,9 @@ def test_a_robot_of_ones_own_file_is_flown(flown: tuple[str, Autopilot]) -> None
 def test_what_is_no_command_is_lost_and_the_flight_goes_on(
     flown: tuple[str, Autopilot], caplog: pytest.LogCaptureFixture
 ) -> None:
-    tolerance, horizon, url = Tolerance(), QUADROTOR.horizon, flown[0]
+    rejected, horizon, url = RejectedMessages(), QUADROTOR.horizon, flown[0]
     request = FlightRequest(FlightSettings(url, height=2.0), QUADROTOR, ARENA.obstacles)
-    vehicle = VehicleClient(request, lambda _: None, tolerance, lambda: False)
+    vehicle = VehicleClient(request, lambda _: None, rejected, lambda: False)
     with contextlib.closing(vehicle), caplog.at_level("INFO", "brakeline"):
         raw = vehicle._socket._socket
         for junk in (b"\xff", b"\x80\x04\x95\x00.", b"x" * LARGEST, b"x" * (LARGEST + 1)):
@@ -217,7 +217,7 @@ def test_what_is_no_command_is_lost_and_the_flight_goes_on(
         after = vehicle.wait(vehicle.current_period.number + 3)
         assert not after.input.any() and not after.lost, "nothing of it was flown"
         assert vehicle.commit(np.full((1, 3), 0.3), after.number + 2), "a plan that is valid still is"
-        until(lambda: tolerance.count >= 11, "the server's count")
+        until(lambda: rejected.count >= 11, "the server's count")
     lines = [record.message for record in caplog.records if "passed over" in record.message]
     assert lines and "vehicle command" in lines[0], "the actor's log says so"
 
@@ -252,7 +252,7 @@ def test_what_is_no_flight_request_is_answered_and_the_next_actor_is_served(flow
 
 def test_an_update_that_is_not_valid_is_lost_and_the_next_one_counts() -> None:
     """A server that sends nonsense, and then falls silent: the actor gets an error and does not hang."""
-    url, tolerance = f"udpout:127.0.0.1:{os.getpid()}", Tolerance()
+    url, rejected = f"udpout:127.0.0.1:{os.getpid()}", RejectedMessages()
     good = period_message(ControlPeriod(3, np.zeros(3), standing()))
     bad = [pb.ControlPeriod(), pb.ControlPeriod.FromString(good.SerializeToString())]
     bad[1].measured[4] = np.nan
@@ -275,8 +275,8 @@ def test_an_update_that_is_not_valid_is_lost_and_the_next_one_counts() -> None:
         thread = threading.Thread(target=serve, args=(listener,))
         thread.start()
         request = FlightRequest(FlightSettings(url), QUADROTOR, ())
-        vehicle = VehicleClient(request, lambda _: None, tolerance, lambda: False)
-        assert vehicle.current_period.number == 3 and tolerance.count == 4
+        vehicle = VehicleClient(request, lambda _: None, rejected, lambda: False)
+        assert vehicle.current_period.number == 3 and rejected.count == 4
         assert not vehicle.commit(np.zeros((1, 3)), 5), "no reply: as if it came too late"
         with pytest.raises(MavlinkError, match="period 4 does not begin"):
             vehicle.wait(4)

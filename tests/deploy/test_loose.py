@@ -6,7 +6,7 @@ import pytest
 
 from brakeline.deploy.cli import main
 from brakeline.deploy.data import simulated_recording
-from brakeline.messaging.robot import FOLDER
+from brakeline.messaging.robot import ROBOTS_FOLDER
 from brakeline.messaging.robot_description import read
 from brakeline.safety.model.model_set import ModelSet
 from tests.robots import GROUND
@@ -90,7 +90,7 @@ def test_a_set_without_a_readable_statement_is_refused(bound, few, capsys):
 
 
 def test_a_description_may_have_a_limit_of_its_own(tmp_path):
-    text = (FOLDER / "ground.toml").read_text()
+    text = (ROBOTS_FOLDER / "ground.toml").read_text()
     mine = tmp_path / "mine.toml"
     mine.write_text(text.replace('name = "ground"', 'name = "mine"\naccept_bound = 0.05'))
     robot = read(mine)

@@ -165,7 +165,7 @@ def test_clearance_is_measured_from_the_discs_that_hold_the_body(heading: float,
 def test_recorded_inputs_keep_the_steering_at_a_stop() -> None:
     car = robot("car")
     (part,) = collect.record(car, 1, 3, Conditions())
-    stands = car.rests(part.inputs)
+    stands = car.is_stop_input(part.inputs)
     assert stands.any() and (np.abs(np.diff(part.inputs[:, 1])) <= 0.3 + 1e-9).all()
     assert np.abs(part.inputs[stands, 1]).max() > 0.05
 

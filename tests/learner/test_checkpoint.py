@@ -6,14 +6,17 @@ import numpy as np
 import pytest
 
 from brakeline.learner import checkpoint
-from brakeline.learner.checkpoint_state import BadState, State
+from brakeline.learner.checkpoint_state import BadState, PartState
 
 NAMES = ("big", "small")
 
 
-def parts(number: int) -> dict[str, State]:
+def parts(number: int) -> dict[str, PartState]:
     big = np.full((1000, 50), number, np.float32)
-    return {"big": State({"rows": big[:, ::2]}, {}), "small": State({}, {"number": number, "huge": 2**100 + number})}
+    return {
+        "big": PartState({"rows": big[:, ::2]}, {}),
+        "small": PartState({}, {"number": number, "huge": 2**100 + number}),
+    }
 
 
 def number_in(root: Path) -> int:
@@ -113,7 +116,7 @@ def test_killed_at_any_point_a_whole_one_is_there(tmp_path, monkeypatch, killed_
 
 
 def test_state_says_what_does_not_fit():
-    state = State({"rows": np.zeros((2, 3), np.float32)}, {"count": 2, "flag": True})
+    state = PartState({"rows": np.zeros((2, 3), np.float32)}, {"count": 2, "flag": True})
     assert state.tensor("rows", (None, 3), "float32") is state.tensors["rows"]
     for name, shape, kind in (("rows", (2, 4), "float32"), ("rows", (6,), "float32"), ("rows", (2, 3), "float64")):
         with pytest.raises(BadState, match="rows"):

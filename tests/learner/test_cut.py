@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from brakeline.learner.n_step import Move, Windows
-from brakeline.learner.transition_reader import Intake
+from brakeline.learner.n_step import ActorStep, NStepWindows
+from brakeline.learner.transition_reader import StepReader
 from brakeline.messaging import brakeline_pb2 as pb
 from tests.robots import GROUND
 
@@ -12,14 +12,14 @@ GAMMA = 0.9
 LOWEST = -100.0
 
 
-def move(step: int, cut: bool = False, terminated: bool = False) -> Move:
+def move(step: int, cut: bool = False, terminated: bool = False) -> ActorStep:
     here, after = np.array([step], np.float32), np.array([step + 1], np.float32)
     action, proposed = np.array([0.0 if cut else 0.5], np.float32), np.array([0.5], np.float32)
-    return Move(0, step, here, action, proposed, 1.0, 1.0 - LOWEST if cut else 0.0, after, terminated, False, cut)
+    return ActorStep(0, step, here, action, proposed, 1.0, 1.0 - LOWEST if cut else 0.0, after, terminated, False, cut)
 
 
 def learned(stored: str, n: int = 3, cut_at: int = 2, steps: int = 5, **more) -> list[tuple]:
-    windows = Windows(n, GAMMA, stored)
+    windows = NStepWindows(n, GAMMA, stored)
     found = [t for k in range(steps) for t in windows.push("a", move(k, k == cut_at, **(more if k == cut_at else {})))]
     return [
         (
@@ -60,6 +60,6 @@ def test_the_intake_reads_it_from_the_wire():
     step = pb.Step(robot="ground", actor="a", index=1, observation=vector, next_observation=vector)
     step.action.extend([0.0, 0.0])
     step.proposed.extend([0.1, 0.0])
-    assert not Intake(GROUND).move(step).cut
+    assert not StepReader(GROUND).move(step).cut
     step.cut = True
-    assert Intake(GROUND).move(step).cut
+    assert StepReader(GROUND).move(step).cut

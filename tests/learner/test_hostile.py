@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from brakeline.learner.learner import AHEAD, MOST_ACTORS, Learner
-from brakeline.learner.transition_reader import MOST_OBSERVED, BadStep, Intake
+from brakeline.learner.transition_reader import MOST_OBSERVED, BadStep, StepReader
 from brakeline.messaging import brakeline_pb2 as pb
 from tests.learner.test_core import step
 from tests.learner.toy import CONFIG, TOY
@@ -31,7 +31,7 @@ def test_steps_of_an_actor_that_never_joined_are_refused_and_counted(learner: Le
 @pytest.mark.parametrize(
     ("fields", "field"),
     [
-        *(({"reward": value}, "reward") for value in (1e6, -1e6, Intake(TOY).most_reward * 1.01, np.inf, np.nan)),
+        *(({"reward": value}, "reward") for value in (1e6, -1e6, StepReader(TOY).most_reward * 1.01, np.inf, np.nan)),
         *(({"penalty": value}, "reward") for value in (1e6, -0.1, np.inf, np.nan)),
         *(({"observation": [value, 0.0]}, "observation") for value in (MOST_OBSERVED * 1.01, -1e30, np.nan)),
         *(({"next_observation": [0.0, value]}, "next_observation") for value in (1e30, -np.inf)),

@@ -2,14 +2,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from brakeline.learner.rate_limiter import Limiter
+from brakeline.learner.rate_limiter import RateLimiter
 
 RATIOS = st.sampled_from([0.5, 1.0, 4.0, 8.0, 16.0, 64.0])
 
 
 @given(st.lists(st.booleans(), max_size=300), RATIOS, st.integers(0, 20), st.sampled_from([0.0, 1.0, 5.0]))
 def test_error_stays_in_its_band_and_someone_may_always_move(wishes, ratio, warmup, ahead):
-    limiter = Limiter(ratio, batch=8, warmup=warmup, ahead=ahead)
+    limiter = RateLimiter(ratio, batch=8, warmup=warmup, ahead=ahead)
     for wants_insert in wishes:
         assert limiter.may_insert() or limiter.may_sample()
         if wants_insert and limiter.may_insert():
@@ -23,7 +23,7 @@ def test_error_stays_in_its_band_and_someone_may_always_move(wishes, ratio, warm
 
 @given(st.lists(st.booleans(), max_size=100), RATIOS, st.integers(0, 20), st.sampled_from([0.0, 1.0, 5.0]))
 def test_room_is_the_number_of_inserts_allowed_in_a_row(wishes, ratio, warmup, ahead):
-    limiter = Limiter(ratio, batch=8, warmup=warmup, ahead=ahead)
+    limiter = RateLimiter(ratio, batch=8, warmup=warmup, ahead=ahead)
     for wants_insert in wishes:
         if wants_insert and limiter.may_insert():
             limiter.insert()
@@ -38,7 +38,7 @@ def test_room_is_the_number_of_inserts_allowed_in_a_row(wishes, ratio, warmup, a
 
 @pytest.mark.parametrize("updates_per_step", [0.25, 0.5, 1.0, 2.0, 3.0])
 def test_lockstep_alternates_and_owes_nothing_for_the_warmup(updates_per_step):
-    limiter = Limiter(updates_per_step * 8, batch=8, warmup=10)
+    limiter = RateLimiter(updates_per_step * 8, batch=8, warmup=10)
     for step in range(1, 101):
         assert limiter.may_insert() and not limiter.may_sample()
         limiter.insert()
@@ -49,7 +49,7 @@ def test_lockstep_alternates_and_owes_nothing_for_the_warmup(updates_per_step):
 
 
 def test_state_round_trip():
-    one, other = Limiter(4.0, 8, 3), Limiter(4.0, 8, 3)
+    one, other = RateLimiter(4.0, 8, 3), RateLimiter(4.0, 8, 3)
     for _ in range(7):
         one.insert()
     one.sample()

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from brakeline.learner.rival_networks import Fit, TooFew, fit_cost, fit_linear
+from brakeline.learner.rival_networks import FitConfig, TooFew, fit_cost, fit_linear
 from tests.robots import GROUND
 
-HOW = Fit(hidden=(32, 32), rate=3e-3, batch=64, epochs=25)
+HOW = FitConfig(hidden=(32, 32), rate=3e-3, batch=64, epochs=25)
 
 
 def drawn(count=4000):
@@ -37,7 +37,7 @@ def test_costs_are_probabilities():
 
 def test_the_seed_decides_alone():
     seen, action, _ = drawn(500)
-    short = Fit(hidden=(8,), batch=64, epochs=2)
+    short = FitConfig(hidden=(8,), batch=64, epochs=2)
     fits = [fit_linear(seen, action, seen[:, :1], short, seed)[0].tensors("g") for seed in (1, 1, 2)]
     assert all(np.array_equal(fits[0][name], fits[1][name]) for name in fits[0])
     assert not all(np.array_equal(fits[0][name], fits[2][name]) for name in fits[0])
@@ -48,4 +48,4 @@ def test_too_few_samples_and_senseless_numbers_are_refused():
         fit_cost(GROUND, np.zeros((10, 2)), np.zeros(10), 1, HOW, 0)
     for wrong in ({"batch": 0}, {"epochs": 0}, {"hidden": ()}, {"held_out": 0.0}):
         with pytest.raises(ValueError, match="1 or more"):
-            Fit(**({"hidden": (4,)} | wrong))
+            FitConfig(**({"hidden": (4,)} | wrong))

@@ -7,17 +7,17 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from brakeline.learner.checkpoint_state import BadState, State
-from brakeline.learner.n_step import Move, Windows
-from brakeline.learner.replay import Batch, Replay, Transition
-from brakeline.learner.step_ledger import Ledger, mark
+from brakeline.learner.checkpoint_state import BadState, PartState
+from brakeline.learner.n_step import ActorStep, NStepWindows
+from brakeline.learner.replay import Batch, ReplayBuffer, Transition
+from brakeline.learner.step_ledger import StepLedger, mark
 
 GAMMA = 0.9
 
 
-def move(episode: int, step: int, reward: float, terminated: bool = False, truncated: bool = False) -> Move:
+def move(episode: int, step: int, reward: float, terminated: bool = False, truncated: bool = False) -> ActorStep:
     name = np.array([episode, step], np.float32)  # a vector that says which step it is of
-    return Move(
+    return ActorStep(
         episode, step, name, name, name, reward, 0.0, name + np.array([0, 1], np.float32), terminated, truncated
     )
 
@@ -50,7 +50,7 @@ def episodes(draw):
 @given(episodes())
 def test_ledger_counts_duplicates_and_gaps(drawn):
     moves, copies = drawn
-    ledger = Ledger()
+    ledger = StepLedger()
     assert ledger.join("a", 0, 0) == 0
     news = 0
     for index, (m, times) in enumerate(zip(moves, copies, strict=True), start=1):
@@ -68,7 +68,7 @@ def test_ledger_forgives_disorder(drawn, random):
     moves, _ = drawn
     steps = [(m.episode, m.step, index) for index, m in enumerate(moves, start=1)]
     random.shuffle(steps)
-    ledger = Ledger()
+    ledger = StepLedger()
     ledger.join("a", 0, 0)
     assert all(ledger.record("a", *step) for step in steps)
     assert (ledger.missing, ledger.duplicates) == (0, 0)
@@ -76,11 +76,11 @@ def test_ledger_forgives_disorder(drawn, random):
 
 
 def test_ledger_over_restarts():
-    ledger = Ledger()
+    ledger = StepLedger()
     ledger.join("a", 0, 0)
     for step in range(5):
         ledger.record("a", 0, step, step + 1)
-    again = Ledger()
+    again = StepLedger()
     again.restore(ledger.state())
     assert again.join("a", 8, 2) == 2  # the actor lived on: 3 steps went past a dead learner
     assert again.missing == 3
@@ -91,7 +91,7 @@ def test_ledger_over_restarts():
     assert (ledger.missing, ledger.places["a"].last_index) == (0, 1)
 
 
-def expected_transitions(arrived: list[Move], n: int) -> list[Transition]:
+def expected_transitions(arrived: list[ActorStep], n: int) -> list[Transition]:
     """By definition: from every step as far as n, its episode and the unbroken sequence reach."""
     by_name = {(m.episode, m.step): m for m in arrived}
     found = []
@@ -119,11 +119,11 @@ def comparable(transitions: list[Transition]) -> list[tuple]:
 @given(episodes(), st.integers(1, 4), st.booleans())
 def test_windows_against_their_definition(drawn, n, checkpointed):
     moves, copies = drawn
-    windows, got = Windows(n, GAMMA), []
+    windows, got = NStepWindows(n, GAMMA), []
     arrived = [m for m, times in zip(moves, copies, strict=True) if times]
     for m in arrived:
         if checkpointed:
-            state, windows = windows.state(), Windows(n, GAMMA)
+            state, windows = windows.state(), NStepWindows(n, GAMMA)
             windows.restore(state)
         got += windows.push("a", m)
     got += windows.push("a", move(99, 0, 0.0, terminated=True))[
@@ -136,7 +136,7 @@ def test_truncation_is_not_termination():
     for n in (1, 3):
         ends = {}
         for kind in ("terminated", "truncated"):
-            windows = Windows(n, GAMMA)
+            windows = NStepWindows(n, GAMMA)
             steps = [move(0, 0, 1.0), move(0, 1, 1.0, **{kind: True})]
             ends[kind] = [t.discount for m in steps for t in windows.push("a", m)]
         assert ends["truncated"] == pytest.approx([GAMMA ** min(n, 2), GAMMA])
@@ -144,7 +144,7 @@ def test_truncation_is_not_termination():
 
 
 def test_actors_do_not_mix():
-    windows = Windows(2, GAMMA)
+    windows = NStepWindows(2, GAMMA)
     assert windows.push("a", move(0, 0, 1.0)) == []
     assert windows.push("b", move(0, 1, 9.0)) == []
     (transition,) = windows.push("a", move(0, 1, 1.0))
@@ -152,7 +152,7 @@ def test_actors_do_not_mix():
 
 
 def test_a_straggler_stands_for_itself():
-    windows = Windows(3, GAMMA)
+    windows = NStepWindows(3, GAMMA)
     windows.push("a", move(0, 0, 1.0))
     (cut,) = windows.push("a", move(0, 2, 3.0))
     (late,) = windows.push("a", move(0, 1, 2.0))
@@ -168,7 +168,7 @@ def transition(number: float) -> Transition:
 
 @given(st.integers(1, 12), st.integers(1, 40))
 def test_replay_holds_the_newest(capacity, count):
-    replay, batch = Replay(capacity, 3, 1), Batch(256, 3, 1)
+    replay, batch = ReplayBuffer(capacity, 3, 1), Batch(256, 3, 1)
     for number in range(count):
         replay.insert(transition(number))
     replay.sample(np.random.default_rng(0), batch)
@@ -182,7 +182,7 @@ def test_replay_holds_the_newest(capacity, count):
 
 @given(st.integers(1, 12), st.integers(1, 40))
 def test_restored_replay_draws_and_goes_on_alike(capacity, count):
-    one, other = Replay(capacity, 3, 1), Replay(capacity, 3, 1)
+    one, other = ReplayBuffer(capacity, 3, 1), ReplayBuffer(capacity, 3, 1)
     for number in range(count):
         one.insert(transition(number))
     other.restore(one.state())
@@ -195,27 +195,27 @@ def test_restored_replay_draws_and_goes_on_alike(capacity, count):
 
 
 def test_replay_refuses_what_does_not_fit():
-    replay = Replay(4, 3, 1)
+    replay = ReplayBuffer(4, 3, 1)
     replay.insert(transition(1.0))
     state = replay.state()
     with pytest.raises(BadState, match="capacity"):
-        Replay(5, 3, 1).restore(state)
+        ReplayBuffer(5, 3, 1).restore(state)
     with pytest.raises(BadState, match="observation"):
-        Replay(4, 2, 1).restore(state)
+        ReplayBuffer(4, 2, 1).restore(state)
     with pytest.raises(BadState, match="action: missing"):
         tensors = {name: array for name, array in state.tensors.items() if name != "action"}
-        Replay(4, 3, 1).restore(State(tensors, state.values))
+        ReplayBuffer(4, 3, 1).restore(PartState(tensors, state.values))
     with pytest.raises(BadState, match="next"):
-        Replay(4, 3, 1).restore(State(state.tensors, state.values | {"next": 3}))
+        ReplayBuffer(4, 3, 1).restore(PartState(state.tensors, state.values | {"next": 3}))
     with pytest.raises(ValueError, match="nothing"):
-        Replay(4, 3, 1).sample(np.random.default_rng(0), Batch(2, 3, 1))
+        ReplayBuffer(4, 3, 1).sample(np.random.default_rng(0), Batch(2, 3, 1))
 
 
 def test_a_corrected_step_is_two_lessons():
     """What was executed would have cost nothing; what was proposed cost the penalty; later penalties are on both."""
     ends = [np.array([v], np.float32) for v in (0.0, 1.0)]
-    moves = [Move(0, i, ends[0], ends[0], ends[1], 1.0, 0.25, ends[1], False, i == 1) for i in range(2)]
-    windows = Windows(2, 0.5, "both")
+    moves = [ActorStep(0, i, ends[0], ends[0], ends[1], 1.0, 0.25, ends[1], False, i == 1) for i in range(2)]
+    windows = NStepWindows(2, 0.5, "both")
     first = windows.push("a", moves[0]) + windows.push("a", moves[1])
     assert [(t.action[0], t.reward) for t in first] == [
         (0.0, 1.0 + 0.5 * 0.75),
@@ -223,5 +223,5 @@ def test_a_corrected_step_is_two_lessons():
         (0.0, 1.0),
         (1.0, 0.75),
     ]
-    single = Windows(1, 0.5, "executed").push("a", moves[0])
+    single = NStepWindows(1, 0.5, "executed").push("a", moves[0])
     assert [(t.action[0], t.reward) for t in single] == [(0.0, 0.75)]

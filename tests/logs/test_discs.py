@@ -32,7 +32,10 @@ def test_a_film_has_them_at_the_heading() -> None:
     drawn = _Stage(film, Figure().subplots())._body(AT, HEADING, "allowed")
     middles = np.array([circle.center for circle in drawn[:2]])
     assert np.allclose(middles, [(1.0, 2.11), (1.0, 1.89)]) and [c.radius for c in drawn[:2]] == [0.155, 0.155]
-    assert np.allclose(drawn[2].get_xydata()[1], (1.0, 2.0 + CAR.front)) and pytest.approx(0.265) == CAR.front
+    assert (
+        np.allclose(drawn[2].get_xydata()[1], (1.0, 2.0 + CAR.front_extent))
+        and pytest.approx(0.265) == CAR.front_extent
+    )
 
 
 def test_pages_are_told_of_all_of_them() -> None:

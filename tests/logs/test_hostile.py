@@ -24,7 +24,7 @@ from brakeline.logs.watch.live_board import Board
 from brakeline.logs.watch.live_page_server import encode
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.bus import Sample
-from brakeline.messaging.rejected_messages import Tolerance
+from brakeline.messaging.rejected_messages import RejectedMessages
 from brakeline.messaging.topics import EPISODE, EXCHANGE, FRAMES, LOG, STEP, Topic
 
 Say = Callable[..., Sample]
@@ -44,9 +44,9 @@ HOSTILE = [
 ]
 
 
-def record(path: Path, samples: list[Sample], tolerance: Tolerance | None = None) -> Recording:
+def record(path: Path, samples: list[Sample], rejected: RejectedMessages | None = None) -> Recording:
     inbox = Inbox()
-    recording = Recording(path, {}, inbox, derive=Pictures().of_sample, tolerance=tolerance)
+    recording = Recording(path, {}, inbox, derive=Pictures().of_sample, rejected=rejected)
     for one in samples:
         inbox.put(one)
     recording.finish()
@@ -65,11 +65,11 @@ def test_the_recorder_keeps_what_it_cannot_date_and_goes_on(hostile: Sample, say
 
 
 def test_66000_keys_do_not_end_a_recording(tmp_path: Path) -> None:
-    tolerance = Tolerance()
+    rejected = RejectedMessages()
     samples = [sample(LOG, pb.LogLine(text="x"), source=f"a{number}") for number in range(66_000)]
-    record(tmp_path / "run.mcap", samples, tolerance)
+    record(tmp_path / "run.mcap", samples, rejected)
     assert sum(1 for _ in open_log(tmp_path).rows()) == MOST_CHANNELS - 1  # and Foxglove's
-    assert tolerance.count > 0
+    assert rejected.count > 0
 
 
 @pytest.mark.parametrize(("received", "published"), [(-1, 0), (0, -1), (2**64, 0), (0, 2**64)])
@@ -93,9 +93,9 @@ MALFORMED = [
 
 @pytest.mark.parametrize("malformed", MALFORMED, ids=lambda one: one.key)
 def test_watch_passes_over_what_it_cannot_show(malformed: Sample, say: Say) -> None:
-    board, tolerance = Board(), Tolerance()
+    board, rejected = Board(), RejectedMessages()
     step = pb.Step(robot="ground", actor="b", state=[1.0, 0.0, 0.0, 0.0, 0.0])
-    _show(deque([malformed, say("step/ground/b", step)]), board, None, tolerance)
+    _show(deque([malformed, say("step/ground/b", step)]), board, None, rejected)
     shown = {robot["actor"]: robot for robot in json.loads(encode(board.view()))["robots"]}
     assert shown["b"]["pose"] == [1.0, 0.0, 0.0]
 

@@ -18,7 +18,7 @@ from brakeline.messaging.obstacle import CYLINDER, Obstacle
 from brakeline.messaging.obstacle_motion import Motion
 from brakeline.messaging.range_image import RangeImage
 from brakeline.messaging.scan import Scan
-from brakeline.messaging.sensor_messages import add_sensed, scan_message
+from brakeline.messaging.sensor_messages import scan_message, set_measurement
 from brakeline.safety.perception.displayed_map import map_for_display
 from brakeline.safety.service.client import obstacle_messages
 from tests.browser import CHROMIUM, Page
@@ -76,7 +76,7 @@ def test_of_a_range_image_so_few_hits_are_drawn_that_a_recorder_keeps_up(say: Sa
     ranges = np.full((90, 180), 5.0)
     edge = 0.5 * np.pi * (1.0 - 1.0 / 90)
     exchange = pb.Exchange(request=pb.Request(robot="quadrotor", actor="q", state=[0.0] * 9, action=[0.0] * 3))
-    add_sensed(exchange.request, RangeImage(ranges, (1.0, 0.0, 2.0), low=-edge, high=edge))
+    set_measurement(exchange.request, RangeImage(ranges, (1.0, 0.0, 2.0), low=-edge, high=edge))
     exchange.reply.decision.kind = pb.ADJUSTED
     drawn = foxglove_scene.decision(QUADROTOR, pb.Step(actor="q", state=[0.0] * 9, decision=pb.ADJUSTED), exchange, 0)
     (hits,) = (line for line in drawn.entities[0].lines if line.type == line.LINE_LIST)

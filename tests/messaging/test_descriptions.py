@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from brakeline.messaging.robot import FOLDER, Robot, UnknownRobot, robot_named, unless_shipped
-from brakeline.messaging.robot_description import UNITS, BadDescription, describe, read, robot_of
+from brakeline.messaging.robot import ROBOTS_FOLDER, Robot, UnknownRobot, refuse_shipped_name, robot_named
+from brakeline.messaging.robot_description import UNITS, BadDescription, describe, read, robot_from_description
 from brakeline.messaging.task import UnknownTask, needs_task, robot_maybe_with_task, robot_with_task
 from brakeline.messaging.task import read as read_task
 from tests.robots import GROUND, QUADROTOR, ROBOTS
@@ -52,22 +52,22 @@ def changed(*path_and_value):
 
 @pytest.mark.parametrize("robot", [robot_named(name) for name in ROBOTS], ids=ROBOTS)
 def test_a_description_makes_the_same_robot_again(robot):
-    assert robot_of(json.loads(json.dumps(robot.description))) == robot
+    assert robot_from_description(json.loads(json.dumps(robot.description))) == robot
     assert robot.in_real_time().in_lockstep() == robot
-    assert read(FOLDER / f"{robot.name}.toml") == robot
+    assert read(ROBOTS_FOLDER / f"{robot.name}.toml") == robot
 
 
 def test_what_a_description_says_is_what_the_robot_has():
-    car = robot_of(CAR)
+    car = robot_from_description(CAR)
     assert car.state == ("x [m]", "y [m]", "heading [rad]", "speed [m/s]", "steering [rad]")
     assert (car.position_dim, car.heading, car.regressor, car.follows) == (2, 2, (3, 4), (3, 4))
-    assert car.stop == ("ramp", "hold") and list(car.stopping) == [True, False]
+    assert car.stop == ("ramp", "hold") and list(car.zero_at_rest) == [True, False]
     assert car.footprint == pytest.approx(0.4)
-    plan = (car.schedule() @ [1.0, 0.3]).reshape(8, 2)
+    plan = (car.plan_matrix() @ [1.0, 0.3]).reshape(8, 2)
     assert plan[:, 0] == pytest.approx([1.0, 0.8, 0.6, 0.4, 0.2, 0.0, 0.0, 0.0])
     assert plan[:, 1] == pytest.approx(0.3), "a car keeps its steering while it brakes"
-    assert car.rests(plan[-1]) and not car.rests(plan[3])
-    assert robot_of(describe(car)) == car
+    assert car.is_stop_input(plan[-1]) and not car.is_stop_input(plan[3])
+    assert robot_from_description(describe(car)) == car
 
 
 @pytest.mark.parametrize(
@@ -112,7 +112,7 @@ def test_what_a_description_says_is_what_the_robot_has():
 )
 def test_a_mistake_is_told_by_its_field(said, field, word):
     with pytest.raises(BadDescription) as caught:
-        robot_of(said, "my.toml")
+        robot_from_description(said, "my.toml")
     told = [text for place, text in caught.value.problems if place == field or place.startswith(f"{field}.")]
     assert any(word in text for text in told), caught.value.problems
     assert field in str(caught.value) and "my.toml" in str(caught.value)
@@ -123,7 +123,7 @@ def test_all_mistakes_are_told_at_once():
     said["state"]["x"]["unit"] = 3
     del said["plan"]
     with pytest.raises(BadDescription) as caught:
-        robot_of(said)
+        robot_from_description(said)
     assert {"period", "state.x.unit", "plan"} <= {field for field, _ in caught.value.problems}
 
 
@@ -144,20 +144,20 @@ PLACES = [
 def test_whatever_stands_in_a_field_makes_a_sound_robot_or_is_told(place, value):
     said = changed(*place, value)
     try:
-        robot = robot_of(said)
+        robot = robot_from_description(said)
     except BadDescription as error:
         assert error.problems
         return
-    assert robot_of(describe(robot)) == robot
-    assert np.isfinite(robot.schedule()).all() and robot.rests(
-        (robot.schedule() @ np.tile(robot.high(), 1)).reshape(robot.horizon, -1)[-1]
+    assert robot_from_description(describe(robot)) == robot
+    assert np.isfinite(robot.plan_matrix()).all() and robot.is_stop_input(
+        (robot.plan_matrix() @ np.tile(robot.high(), 1)).reshape(robot.horizon, -1)[-1]
     )
     assert robot.horizon >= robot.free_steps + robot.brake_steps and robot.footprint > 0.0
     assert all(label.endswith("]") and label[label.rindex("[") + 1 : -1] in UNITS for label in robot.state)
 
 
 def test_a_file_is_found_by_its_path_and_never_by_its_name(tmp_path):
-    text = (FOLDER / "ground.toml").read_text().replace('name = "ground"', 'name = "minted"')
+    text = (ROBOTS_FOLDER / "ground.toml").read_text().replace('name = "ground"', 'name = "minted"')
     (tmp_path / "my.toml").write_text(text)
     robot = robot_named(str(tmp_path / "my.toml"))
     assert robot.name == "minted" and robot == replace(robot_named("ground"), name="minted")
@@ -182,13 +182,13 @@ def test_nobody_takes_the_name_of_a_robot_that_comes_with_the_program():
     said = copy.deepcopy(GROUND.description)
     said["sight"] = 0.1
     with pytest.raises(UnknownRobot, match="choose another"):
-        unless_shipped(robot_of(said))
-    assert unless_shipped(GROUND) is GROUND
+        refuse_shipped_name(robot_from_description(said))
+    assert refuse_shipped_name(GROUND) is GROUND
     assert robot_named("ground").description == GROUND.description
 
 
 def test_a_task_says_what_is_wrong_in_it(tmp_path):
-    text = (FOLDER / "ground.task.toml").read_text()
+    text = (ROBOTS_FOLDER / "ground.task.toml").read_text()
     (tmp_path / "a.task.toml").write_text(text.replace("half_width = 2.5", 'half_width = "wide"'))
     with pytest.raises(UnknownTask, match=r"arenas\.default\.half_width"):
         read_task(tmp_path / "a.task.toml")
@@ -205,10 +205,10 @@ def test_a_robot_that_stops_by_feedback_brakes_by_what_is_measured():
     said = changed("input", "speed", "stop", {"speed": -1.0})
     said["stopped"] = 0.05
     del said["input"]["speed"]["slew"]
-    robot: Robot = robot_of(said)
+    robot: Robot = robot_from_description(said)
     state = np.array([9.0, 9.0, 1.0, 0.3, 0.1])
-    assert robot.braked(np.array([0.0, 0.2]), state, np.zeros(2)) == pytest.approx([-0.3, 0.2])
-    assert robot.braked(np.zeros(2), np.array([0, 0, 0, 9.0, 0]), np.zeros(2))[0] == -0.5, "within bounds"
-    assert not robot.stands(state) and robot.stands(np.array([9.0, 9.0, 1.0, 0.04, 0.0]))
+    assert robot.stop_by_feedback(np.array([0.0, 0.2]), state, np.zeros(2)) == pytest.approx([-0.3, 0.2])
+    assert robot.stop_by_feedback(np.zeros(2), np.array([0, 0, 0, 9.0, 0]), np.zeros(2))[0] == -0.5, "within bounds"
+    assert not robot.is_standing(state) and robot.is_standing(np.array([9.0, 9.0, 1.0, 0.04, 0.0]))
     with pytest.raises(UnknownRobot, match="no real-time mode"):
         robot.in_real_time()

@@ -11,7 +11,7 @@ from prometheus_client.parser import text_string_to_metric_families
 
 from brakeline.messaging.bus import BusSettings
 from brakeline.messaging.free_ports import free_endpoint
-from brakeline.messaging.metrics_endpoint import FIGURES, Exposition, State
+from brakeline.messaging.metrics_endpoint import FIGURES, MetricsServer, State
 from brakeline.messaging.process_runtime import Process
 from brakeline.messaging.topics import LOG
 from tests.waiting import until
@@ -51,7 +51,7 @@ def exposed():
     started = []
 
     def serve(state):
-        started.append(Exposition("0", lambda: state))
+        started.append(MetricsServer("0", lambda: state))
         return started[-1].port
 
     yield serve
@@ -91,9 +91,9 @@ def test_who_is_stuck_does_not_live_and_who_is_cut_off_is_not_ready(exposed):
 
 def test_where_nothing_can_be_served_is_said(exposed):
     with pytest.raises(ValueError, match="HOST:PORT"):
-        Exposition("nonsense", everything)
+        MetricsServer("nonsense", everything)
     with pytest.raises(OSError, match="in use"):
-        Exposition(str(exposed(everything())), everything)
+        MetricsServer(str(exposed(everything())), everything)
 
 
 @pytest.mark.parametrize("path", ["grafana/brakeline.json", "kubernetes/autoscaler.yaml"])

@@ -12,7 +12,7 @@ from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.obstacle import Obstacle, Shapes
 from brakeline.messaging.range_image import RangeImage, directions
 from brakeline.messaging.scan import BadScan, Scan
-from brakeline.messaging.sensor_messages import add_sensed, image_of, sensed_of
+from brakeline.messaging.sensor_messages import image_of, measurement_in, set_measurement
 from brakeline.safety.perception.displayed_map import map_for_display
 from brakeline.safety.perception.image_coverage import BeamGrid, SphereCover, patch_free_ranges
 from tests.messaging.test_shapes import sample
@@ -165,8 +165,8 @@ def test_an_image_crosses_the_wire_and_its_ranges_never_grow():
         **{"doubt": 1, "speed": 1.6, "age": 0.2},
     )
     message = pb.Request()
-    add_sensed(message, sent)
-    got = sensed_of(pb.Request.FromString(message.SerializeToString()))
+    set_measurement(message, sent)
+    got = measurement_in(pb.Request.FromString(message.SerializeToString()))
     assert isinstance(got, RangeImage) and message.ByteSize() < 2 * ranges.size + 200
     assert (got.ranges <= sent.ranges + 1e-6).all() and np.abs(got.ranges - sent.ranges).max() <= 0.001
     assert np.array_equal(got.known, sent.known)
@@ -178,11 +178,11 @@ def test_an_image_crosses_the_wire_and_its_ranges_never_grow():
 
 def test_two_at_once_and_half_a_beam_are_refused():
     message = pb.Request()
-    add_sensed(message, Scan(np.ones(4), np.arange(4.0), (0.0, 0.0, 0.0)))
-    assert isinstance(sensed_of(message), Scan) and sensed_of(pb.Request()) is None
-    add_sensed(message, RangeImage(np.ones((RINGS, COLUMNS)), (0.0, 0.0, 0.0)))
+    set_measurement(message, Scan(np.ones(4), np.arange(4.0), (0.0, 0.0, 0.0)))
+    assert isinstance(measurement_in(message), Scan) and measurement_in(pb.Request()) is None
+    set_measurement(message, RangeImage(np.ones((RINGS, COLUMNS)), (0.0, 0.0, 0.0)))
     with pytest.raises(BadScan, match="not both"):
-        sensed_of(message)
+        measurement_in(message)
     message.image.ranges += b"0"
     with pytest.raises(BadScan, match="two bytes"):
         image_of(message.image)
@@ -227,7 +227,7 @@ def test_what_is_drawn_as_free_is_free_and_hits_lie_on_surfaces():
     rng = np.random.default_rng(3)
     obstacles = hall(rng, 7)
     message = pb.Request()
-    add_sensed(message, taken(rng, obstacles))
+    set_measurement(message, taken(rng, obstacles))
     about, shapes = map_for_display(QUADROTOR, message, corners=60), Shapes.of(obstacles, 3)
     assert len(about.hits) > 500 and np.abs(shapes.distance(about.hits).min(axis=0)).max() < 0.01
     corners = about.free

@@ -25,7 +25,7 @@ def test_every_robot_is_consistent(robot):
 
 @pytest.mark.parametrize("robot", ROBOTS.values(), ids=ROBOTS)
 def test_every_plan_ends_in_a_stop(robot):
-    schedule = robot.schedule()
+    schedule = robot.plan_matrix()
     assert schedule.shape == (robot.horizon * robot.action_dim, robot.free_steps * robot.action_dim)
     free = np.tile(robot.high(), robot.free_steps)
     plan = (schedule @ free).reshape(robot.horizon, -1)
@@ -35,7 +35,7 @@ def test_every_plan_ends_in_a_stop(robot):
 
 def test_a_ramp_goes_down_step_by_step():
     robot = replace(GROUND, horizon=6, free_steps=2, brake_steps=4)
-    plan = (robot.schedule() @ [0.1, 0.2, 0.2, 0.4]).reshape(6, 2)
+    plan = (robot.plan_matrix() @ [0.1, 0.2, 0.2, 0.4]).reshape(6, 2)
     assert np.allclose(plan[:, 0], [0.1, 0.2, 0.15, 0.1, 0.05, 0.0])
     assert np.allclose(plan[:, 1], [0.2, 0.4, 0.3, 0.2, 0.1, 0.0])
 

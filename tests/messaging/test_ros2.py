@@ -228,7 +228,7 @@ def test_what_is_no_message_is_lost_alone(nodes, caplog):
 
     def broken():
         raw.put(b"\x00\x01\x00\x00rubbish")
-        return node.tolerance.count
+        return node.rejected.count
 
     until(broken, "the rubbish", 20.0)
     publisher.put(twist(1.0, 0.0))

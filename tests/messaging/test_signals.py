@@ -5,15 +5,15 @@ import subprocess
 import sys
 import threading
 
-from brakeline.messaging.stop_signals import heeded
+from brakeline.messaging.stop_signals import stop_on_signals
 
 WAITS = """
 import signal
 import threading
-from brakeline.messaging.stop_signals import heeded
+from brakeline.messaging.stop_signals import stop_on_signals
 signal.signal(signal.SIGTERM, signal.SIG_IGN)  # the rest of a volley comes when it is through
 print("born", flush=True)
-with heeded(threading.Event()) as stop:
+with stop_on_signals(threading.Event()) as stop:
     print("ready", flush=True)
     {wait}
 print("ended", flush=True)
@@ -51,7 +51,7 @@ def test_a_signal_that_another_thread_was_handed() -> None:
 
 def test_what_was_there_before_is_there_again() -> None:
     before = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
-    with heeded(threading.Event()) as stop:
+    with stop_on_signals(threading.Event()) as stop:
         signal.raise_signal(signal.SIGINT)
         assert stop.wait(10.0)
     assert [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)] == before
@@ -61,7 +61,7 @@ def test_not_in_the_main_thread_nothing_is_changed() -> None:
     before, seen = signal.getsignal(signal.SIGTERM), []
 
     def elsewhere() -> None:
-        with heeded(threading.Event()):
+        with stop_on_signals(threading.Event()):
             seen.append(signal.getsignal(signal.SIGTERM))
 
     thread = threading.Thread(target=elsewhere)

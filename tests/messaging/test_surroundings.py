@@ -9,7 +9,7 @@ import pytest
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.obstacle import BOX, CYLINDER, Obstacle
 from brakeline.messaging.obstacle_motion import Motion
-from brakeline.messaging.scan import Followed
+from brakeline.messaging.scan import BeamTracks
 from brakeline.messaging.sensor_messages import scan_message, scan_of
 from brakeline.safety.perception.displayed_map import map_for_display, reserved_boxes
 from brakeline.safety.service.client import obstacle_messages
@@ -96,7 +96,7 @@ def test_what_a_scan_was_followed_to_move_is_drawn_where_it_may_go() -> None:
     which[near - 2 : near + 3] = 1
     which[:20] = 2  # stands
     ways = np.array([[0.5, 0.0, 0.3, 1.0], [0.0, 0.0, 0.4, 1.0]])
-    request.scan.CopyFrom(scan_message(replace(scan, followed=Followed(which, ways))))
+    request.scan.CopyFrom(scan_message(replace(scan, tracks=BeamTracks(which, ways))))
     about = map_for_display(GROUND, request)
     assert len(plain.movers) == 0 and about.movers.shape == (1, 3) and about.swept.shape == (1, GROUND.horizon, 3)
     assert np.linalg.norm(plain.hits - about.movers[0, :2], axis=1).min() < 0.05

@@ -8,18 +8,18 @@ import pytest
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.bus import Malformed, Sample
 from brakeline.messaging.message_checks import MOST_NUMBERS, MOST_OBSTACLES
-from brakeline.messaging.rejected_messages import LONGEST, Tolerance, headline
+from brakeline.messaging.rejected_messages import LONGEST, RejectedMessages, headline
 from brakeline.messaging.topics import EPISODE, EXCHANGE, HEALTH, LOG, STEP, Topic
 
 
 def test_what_fails_is_counted_and_named_once_a_second(caplog: pytest.LogCaptureFixture) -> None:
     now = [0.0]
-    tolerance = Tolerance(clock=lambda: now[0])
+    rejected = RejectedMessages(clock=lambda: now[0])
     for moment in (0.0, 0.5, 0.9, 1.1, 1.2):
         now[0] = moment
-        with tolerance.over(f"step/at {moment}"):
+        with rejected.skip_on_error(f"step/at {moment}"):
             raise ValueError("seven")
-    assert tolerance.count == 5
+    assert rejected.count == 5
     assert [record.getMessage() for record in caplog.records] == [
         "passed over (1 so far): step/at 0.0: ValueError: seven",
         "passed over (4 so far): step/at 1.1: ValueError: seven",
@@ -29,13 +29,13 @@ def test_what_fails_is_counted_and_named_once_a_second(caplog: pytest.LogCapture
 def test_what_was_not_expected_is_named_with_its_place_and_an_interrupt_goes_through(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
-    tolerance = Tolerance()
-    with tolerance.over("a"):
+    rejected = RejectedMessages()
+    with rejected.skip_on_error("a"):
         raise ZeroDivisionError
     assert caplog.records[0].exc_info is not None and caplog.records[0].levelno == logging.ERROR
-    with pytest.raises(KeyboardInterrupt), tolerance.over("b"):
+    with pytest.raises(KeyboardInterrupt), rejected.skip_on_error("b"):
         raise KeyboardInterrupt
-    assert tolerance.count == 1
+    assert rejected.count == 1
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ import pytest
 
 from brakeline.messaging.bus import BusError, query_server
 from brakeline.messaging.bus import fair_queue as module
-from brakeline.messaging.bus.fair_queue import EACH, T, Turns
+from brakeline.messaging.bus.fair_queue import EACH, FairQueue, T
 from brakeline.messaging.bus.query_client import PATIENT
 from brakeline.messaging.topics import DECIDE
 from tests.messaging.test_bus import Join
@@ -18,7 +18,7 @@ from tests.waiting import PATIENCE, until
 
 
 def test_each_askers_questions_are_answered_in_turn() -> None:
-    turns = Turns[str]()
+    turns = FairQueue[str]()
     for question in ("a1", "a2", "a3", "b1", "c1", "c2"):
         assert turns.add(question[0], question) is None
     assert len(turns) == 6
@@ -29,7 +29,7 @@ def test_each_askers_questions_are_answered_in_turn() -> None:
 
 
 def test_of_too_many_the_oldest_of_the_same_asker_goes(monkeypatch: pytest.MonkeyPatch) -> None:
-    turns = Turns[int]()
+    turns = FairQueue[int]()
     gone = [turns.add("a", number) for number in range(EACH + 3)]
     assert gone == [None] * EACH + [0, 1, 2]
     monkeypatch.setattr(module, "MOST", 1)
@@ -69,7 +69,7 @@ def test_a_question_for_which_nobody_waits_is_dropped_with_a_warning(
     """A machine that stalls is no error of the service: it is said in a line, and counted."""
     came_in: list[Any] = []
 
-    class Noted(Turns[T]):
+    class Noted(FairQueue[T]):
         def add(self, who: str, question: T) -> T | None:
             came_in.append(question)
             return super().add(who, question)
@@ -100,6 +100,6 @@ def test_a_question_for_which_nobody_waits_is_dropped_with_a_warning(
     slow.join()
     until(lambda: actor.ask(DECIDE, b"after", timeout=10.0, robot="ground") == b"after")
     assert b"dead" not in answered and {b"slow", b"after"} <= {*answered}
-    assert router.tolerance.count == 1
+    assert router.rejected.count == 1
     said = [record for record in caplog.records if "Expired" in record.getMessage()]
     assert [(record.levelno, record.exc_info) for record in said] == [(logging.WARNING, None)]

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from brakeline.messaging import brakeline_pb2 as pb
-from brakeline.messaging.moving_obstacles import Movers
+from brakeline.messaging.moving_obstacles import MovingObstacles
 from brakeline.messaging.obstacle import Obstacle
 from brakeline.messaging.obstacle_motion import Motion
 from brakeline.messaging.scan import Scan
@@ -177,7 +177,9 @@ def test_the_quick_check_and_the_whole_one_both_ask_what_is_known(ready, predict
         with pytest.raises(BadRequest) as caught:
             check(silent)
         assert caught.value.field == "obstacles"
-    walker = Movers.of([Obstacle("cylinder", (0.9, 0.0), (0.2,), motion=Motion((0.0, 0.0), 0.05, speed=0.5))], 2)
+    walker = MovingObstacles.of(
+        [Obstacle("cylinder", (0.9, 0.0), (0.2,), motion=Motion((0.0, 0.0), 0.05, speed=0.5))], 2
+    )
     assert ready.decide(replace(silent, movers=walker)).kind in ("allowed", "adjusted", "failsafe")
 
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from brakeline.messaging.moving_obstacles import Movers
+from brakeline.messaging.moving_obstacles import MovingObstacles
 from brakeline.messaging.obstacle import Obstacle
 from brakeline.messaging.obstacle_motion import Motion
 from brakeline.messaging.robot import Limit
@@ -58,7 +58,7 @@ def test_a_wall_a_box_a_mover_and_a_limit_have_their_names(ready):
     assert by(obstacles=[Obstacle("wall", (0.16, 0.0), (), np.pi), cylinder(-1.0, 0.0)]) == "wall"
     assert by(obstacles=[cylinder(-1.0, 0.0), Obstacle("box", (0.3, 0.0), (0.3, 0.3))]) == "box"
     walker = Obstacle("cylinder", (0.45, 0.0), (0.1,), motion=Motion((0.0, 0.0), 0.0, 0.0, speed=0.5))
-    assert by(movers=Movers.of([walker], 2), obstacles=[cylinder(-1.0, 0.0)]) == "moving cylinder"
+    assert by(movers=MovingObstacles.of([walker], 2), obstacles=[cylinder(-1.0, 0.0)]) == "moving cylinder"
     slow = replace(ready.robot, limits=(Limit("walking pace", (0.0, 0.0, 0.0, 1.0, 0.0), 0.1),))
     limited = Filter(replace(ready.model, robot=slow))
     assert by(limited, state=(0, 0, 0, 0.05, 0)) == "walking pace"

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from brakeline.deploy.data.excitation import excitation
-from brakeline.messaging.robot_description import robot_of
+from brakeline.messaging.robot_description import robot_from_description
 from brakeline.safety.model.dataset import BadData, Dataset, Trajectory
 from brakeline.safety.model.error_bounds import KINDS, RESIDUAL
 from brakeline.safety.model.fitting import make
@@ -14,7 +14,7 @@ from brakeline.safety.model.model_set import MODES, ModelConfig
 from brakeline.safety.model.validation import state
 from brakeline.safety.model.windows import FREE, PLAN, specialised, windows
 
-ROBOT = robot_of(
+ROBOT = robot_from_description(
     {
         "name": "lagging-puck",
         "period": 0.2,
@@ -96,7 +96,7 @@ def test_of_a_linear_robot_both_are_the_same_predictor(planned, mode):
 @pytest.mark.parametrize("which", ALL, ids="-".join)
 def test_tubes_from_free_driving_hold_plans_that_were_never_driven(which):
     model = make(free_data(3), ModelConfig(*which, windows=FREE))
-    tube, S = model.tube(), ROBOT.schedule()
+    tube, S = model.tube(), ROBOT.plan_matrix()
     rng = np.random.default_rng(4)
     outside = 0
     for _ in range(300):

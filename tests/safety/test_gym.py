@@ -234,7 +234,9 @@ def test_a_scan_that_does_not_come_is_not_a_world_without_obstacles(ready):
     for _ in range(round(OLDEST / CAR.period) + CAR.horizon):
         *_, after = env.step(np.array([1.0, 0.0]))
     told = after["diagnostics"]
-    assert told["kind"] == "failsafe" and "s old" in told["reason"] and CAR.rests(told["executed"]), "nor is an old one"
+    assert told["kind"] == "failsafe" and "s old" in told["reason"] and CAR.is_stop_input(told["executed"]), (
+        "nor is an old one"
+    )
 
 
 @pytest.mark.parametrize("many", [False, True])
@@ -275,7 +277,7 @@ def test_collecting_gives_up_where_every_episode_ends_at_once():
 def test_a_stop_by_feedback_follows_the_measured_state():
     data = collect(Toy(PUCK), PUCK, 300, held=8, state=seen, actions=normalised(PUCK), shown=False)
     t = data.trajectories[0]
-    braked = PUCK.braked(np.zeros_like(t.inputs), t.states[:-1], np.vstack([np.zeros((1, 2)), t.inputs[:-1]]))
+    braked = PUCK.stop_by_feedback(np.zeros_like(t.inputs), t.states[:-1], np.vstack([np.zeros((1, 2)), t.inputs[:-1]]))
     follows = (np.abs(t.inputs - braked) < 1e-9).all(1)
     assert 0.3 < follows.mean() < 0.95
 
@@ -286,7 +288,7 @@ def test_a_puck_keeps_still_only_by_its_feedback(residual, push):
     kept = BackupPlan(PUCK)
     kept.seen = state
     plan = np.zeros((PUCK.horizon, 2))
-    plan[0] = PUCK.braked(plan[0], state, plan[0])
+    plan[0] = PUCK.stop_by_feedback(plan[0], state, plan[0])
     moving = plan.copy()
     moving[0, 1] = push
     kept.accept(plan, "v", None, True)

@@ -7,7 +7,7 @@ import pytest
 
 from brakeline.messaging.obstacle import Shapes, rotate
 from brakeline.messaging.robot import Disc
-from brakeline.messaging.robot_description import robot_of
+from brakeline.messaging.robot_description import robot_from_description
 from brakeline.safety.filter.backup_plan import BackupPlan
 from brakeline.safety.filter.filter import Filter
 from brakeline.safety.filter.request import ADJUSTED, ALLOWED, FAILSAFE, Request
@@ -23,7 +23,7 @@ from tests.safety.test_closed_loop import ROOM
 from tests.safety.unicycle import Unicycle
 from tests.safety.unicycle import record as record_ground
 
-ROBOT = robot_of(
+ROBOT = robot_from_description(
     {
         "name": "quick-turner",
         "period": 0.2,

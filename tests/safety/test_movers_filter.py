@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from brakeline.messaging.moving_obstacles import Movers, parted
+from brakeline.messaging.moving_obstacles import MovingObstacles, split_moving
 from brakeline.messaging.obstacle import Obstacle, Shapes
 from brakeline.messaging.obstacle_motion import Motion, Sighting
 from brakeline.safety.filter.backup_plan import BackupPlan
@@ -32,7 +32,7 @@ def walker(x, y=0.0, velocity=(0.0, 0.0), **more):
 
 
 def ask(obstacles, **more):
-    still, movers = parted(obstacles, 2)
+    still, movers = split_moving(obstacles, 2)
     return request(obstacles=still, movers=movers, **more)
 
 
@@ -94,12 +94,14 @@ def test_a_request_without_movers_is_decided_as_ever(ready):
     for _ in range(20):
         near = Shapes.of([Obstacle("cylinder", tuple(rng.uniform(0.2, 0.6, 2)), (0.1,))], 2)
         plain = request(action=rng.uniform(GROUND.low(), GROUND.high()), obstacles=near)
-        far = Movers.of([walker(50.0)], 2)
+        far = MovingObstacles.of([walker(50.0)], 2)
         assert same(ready.decide(plain), ready.decide(replace(plain, movers=far)))
 
 
 def test_movers_of_another_dimension_are_refused(ready):
-    wrong = Movers.of([Obstacle("sphere", (1.0, 0.0, 0.0), (0.2,), motion=Motion((0.0,) * 3, 0.0, speed=1.0))], 3)
+    wrong = MovingObstacles.of(
+        [Obstacle("sphere", (1.0, 0.0, 0.0), (0.2,), motion=Motion((0.0,) * 3, 0.0, speed=1.0))], 3
+    )
     with pytest.raises(BadRequest) as error:
         ready.decide(request(movers=wrong))
     assert error.value.field == "obstacles"
@@ -136,7 +138,7 @@ def contacts(ready, policy, seed, sees=True, steps=300):
     for k in range(steps):
         state = robot.measure()
         seen = watch.look(k * GROUND.period)
-        still, movers = parted([*ROOM, *(seen if sees else ())], 2)
+        still, movers = split_moving([*ROOM, *(seen if sees else ())], 2)
         places = np.array([o.position for o in seen]) - state[:2]
         nearest = places[np.argmin(np.linalg.norm(places, axis=1))]
         bearing = (np.arctan2(nearest[1], nearest[0]) - state[2] + np.pi) % (2 * np.pi) - np.pi
@@ -186,7 +188,7 @@ def test_who_does_not_see_them_does(ready):
 
 def test_a_filter_that_takes_them_for_standing_touches_them(model, monkeypatch):
     """The mutant: as if nothing moved after it was measured."""
-    monkeypatch.setattr(Movers, "moved", lambda self, times: np.zeros((len(self), len(times), 2)))
-    monkeypatch.setattr(Movers, "radius", lambda self, times: np.zeros((len(self), len(times))))
+    monkeypatch.setattr(MovingObstacles, "moved", lambda self, times: np.zeros((len(self), len(times), 2)))
+    monkeypatch.setattr(MovingObstacles, "radius", lambda self, times: np.zeros((len(self), len(times))))
     blind = Filter(model)
     assert sum(contacts(blind, policy, seed)[0] for policy in (wild, pushing) for seed in range(2)) > 0

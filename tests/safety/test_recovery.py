@@ -9,7 +9,7 @@ import pytest
 from brakeline.deploy.data.environment_episodes import collect
 from brakeline.messaging.obstacle import Obstacle, Shapes
 from brakeline.messaging.robot import Disc
-from brakeline.messaging.robot_description import robot_of
+from brakeline.messaging.robot_description import robot_from_description
 from brakeline.messaging.scan import Scan
 from brakeline.safety.action_mapping import normalised
 from brakeline.safety.filter.backup_plan import BackupPlan
@@ -193,7 +193,7 @@ def ranges_to(pillar, radius, pose):
     return np.where((along > 0.0) & (half > 0.0), along - np.sqrt(np.maximum(half, 0.0)), 3.5)
 
 
-HOVERER = robot_of(
+HOVERER = robot_from_description(
     {
         "name": "toy-hoverer",
         "period": 0.2,

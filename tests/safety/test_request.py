@@ -24,7 +24,7 @@ def usual(robot, seed, predicted):
     rng = np.random.default_rng(seed)
     low, high = robot.low(), robot.high()
     plan = rng.uniform(low, high, (robot.horizon, robot.action_dim))
-    plan[-1, robot.stopping] = 0.0
+    plan[-1, robot.zero_at_rest] = 0.0
     n = robot.state_dim
     sets = Prediction(rng.normal(size=n), rng.random(n), 0.3) if predicted else None
     return Request(

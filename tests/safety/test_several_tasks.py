@@ -10,7 +10,7 @@ from brakeline.deploy.data.data_paths import method_path
 from brakeline.deploy.vehicle_factory import environment
 from brakeline.messaging.perceptrons import Perceptrons
 from brakeline.messaging.policy_weights import MLP, BadWeights, decode
-from brakeline.messaging.robot import FOLDER, UnknownRobot, robot_named
+from brakeline.messaging.robot import ROBOTS_FOLDER, UnknownRobot, robot_named
 from brakeline.messaging.task import RobotWithTask, robot_with_task
 from brakeline.safety.filter.filter import Filter
 from brakeline.safety.filter.request import BadRequest
@@ -84,9 +84,9 @@ def test_two_policies_are_read_each_by_its_own_task():
 
 
 def test_a_robot_of_ones_own_is_read_from_the_models_file_and_from_nowhere_else(tmp_path: Path):
-    text = (FOLDER / "ground.toml").read_text().replace('name = "ground"', 'name = "minted"')
+    text = (ROBOTS_FOLDER / "ground.toml").read_text().replace('name = "ground"', 'name = "minted"')
     (tmp_path / "my.toml").write_text(text)
-    (tmp_path / "my.task.toml").write_text((FOLDER / "ground.task.toml").read_text())
+    (tmp_path / "my.task.toml").write_text((ROBOTS_FOLDER / "ground.task.toml").read_text())
     payload = sailr(robot_with_task(str(tmp_path / "my.toml"))).encode()
     (tmp_path / "my.toml").unlink()
     with pytest.raises(UnknownRobot):

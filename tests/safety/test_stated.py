@@ -10,7 +10,7 @@ import pytest
 from brakeline.logs.decision_explanation import bound_in, explain
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.obstacle import Shapes
-from brakeline.messaging.stated_share import percent, rounded_up, trust
+from brakeline.messaging.stated_share import describe_verification, percent, rounded_up
 from brakeline.safety.filter.filter import Filter
 from brakeline.safety.filter.request import Request
 from brakeline.safety.gym import SafetyWrapper
@@ -159,9 +159,12 @@ def test_a_decision_of_an_old_log_or_of_a_rival_has_none(model):
 
 
 def test_verified_is_said_with_what_it_is_worth(model):
-    assert trust(True, 0.0113) == "verified; at most 1.2 % of such plans leave their tube, at 99 % confidence"
-    assert trust(False, 0.001) == "not verified"
-    assert "no bound" in trust(True, None) and "states no bound" in trust(True, 1.0)
+    assert (
+        describe_verification(True, 0.0113)
+        == "verified; at most 1.2 % of such plans leave their tube, at 99 % confidence"
+    )
+    assert describe_verification(False, 0.001) == "not verified"
+    assert "no bound" in describe_verification(True, None) and "states no bound" in describe_verification(True, 1.0)
     request = message()
     decision = pb.Decision(kind=pb.ALLOWED, verified=True, plan=[0.0] * 6, bound=0.26)
     assert "at most 26 %" in explain(GROUND, request, decision).trust

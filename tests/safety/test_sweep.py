@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from brakeline.messaging.moving_obstacles import Movers, parted
+from brakeline.messaging.moving_obstacles import MovingObstacles, split_moving
 from brakeline.messaging.obstacle import BadShape, Obstacle, Shapes
 from brakeline.messaging.obstacle_motion import Motion, Sighting
 from brakeline.safety.filter.halfspaces import half_spaces
@@ -71,7 +71,7 @@ def test_what_keeps_its_bounds_stays_on_the_far_side(data, seed):
     rng = np.random.default_rng(seed)
     start, nominal = rng.uniform(-4, 4, d), rng.uniform(-4, 4, (PERIODS, d))
     measured = rng.uniform(0, 0.05, d)
-    near = Movers.of([moving(obstacle, motion)], d)
+    near = MovingObstacles.of([moving(obstacle, motion)], d)
     normals, offsets = swept_half_spaces(near, start, nominal, BODY, measured, PERIOD)
     solid = sample(obstacle, rng, 300)
     times = PERIOD * np.linspace(0, PERIODS, 6 * PERIODS + 1)
@@ -94,7 +94,7 @@ def test_one_that_has_no_way_to_go_is_one_that_stands(obstacle, seed):
     d = len(obstacle.position)
     ways = np.cumsum(rng.uniform(-0.5, 0.5, (PERIODS + 1, d)), axis=0)
     start, nominal = ways[0], ways[1:]
-    near = Movers.of([moving(obstacle, Motion((0.0,) * d, 0.0, speed=0.0))], d)
+    near = MovingObstacles.of([moving(obstacle, Motion((0.0,) * d, 0.0, speed=0.0))], d)
     normals, offsets = swept_half_spaces(near, start, nominal, BODY, np.zeros(d), PERIOD)
     still, stops = half_spaces(Shapes.of([obstacle], d), start, nominal, BODY, np.zeros(d))
     for k in range(PERIODS):
@@ -106,7 +106,7 @@ def test_one_that_has_no_way_to_go_is_one_that_stands(obstacle, seed):
 
 def test_a_walker_that_comes_is_given_way_to():
     motion = Motion((-1.0, 0.0), 0.03, 0.05, acceleration=1.0)
-    near = Movers.of([Obstacle("cylinder", (1.0, 0.0), (0.2,), motion=motion)], 2)
+    near = MovingObstacles.of([Obstacle("cylinder", (1.0, 0.0), (0.2,), motion=motion)], 2)
     nominal = np.array([[0.05, 0.0], [0.06, 0.0], [0.06, 0.0]])
     normals, offsets = swept_half_spaces(near, np.zeros(2), nominal, 0.1, np.zeros(2), 0.2)
     assert np.allclose(normals[0], [1.0, 0.0])
@@ -122,7 +122,7 @@ def test_many_movers_take_room_for_each_not_for_each_pair():
         for at in rng.uniform(-2.0, 2.0, (count, 2))
     ]
     nominal = np.array([[0.05, 0.0], [0.1, 0.0], [0.1, 0.0]])
-    _, movers = parted(near, 2)
+    _, movers = split_moving(near, 2)
     tracemalloc.start()
     normals, offsets = swept_half_spaces(movers, np.zeros(2), nominal, BODY, np.zeros(2), PERIOD)
     most = tracemalloc.get_traced_memory()[1]
@@ -134,7 +134,7 @@ def test_many_movers_take_room_for_each_not_for_each_pair():
 
 
 def test_no_number_is_never_free():
-    near = Movers.of([Obstacle("sphere", (1.0, 0.0), (0.3,), motion=Motion((0.0, 0.0), 0.0, speed=1.0))], 2)
+    near = MovingObstacles.of([Obstacle("sphere", (1.0, 0.0), (0.3,), motion=Motion((0.0, 0.0), 0.0, speed=1.0))], 2)
     near.drift[:] = np.nan
     _, offsets = swept_half_spaces(near, np.zeros(2), np.zeros((2, 2)), BODY, np.zeros(2), PERIOD)
     assert not (offsets > -np.inf).any()
@@ -195,6 +195,6 @@ def test_a_motion_that_is_none_is_refused(motion):
 def test_what_moves_is_told_from_what_stands():
     still = Obstacle("sphere", (1.0, 0.0), (0.3,))
     mover = moving(still, Motion((1.0, 0.0), 0.0, speed=1.0))
-    shapes, movers = parted([still, mover, still], 2)
+    shapes, movers = split_moving([still, mover, still], 2)
     assert len(shapes) == 2 and movers is not None and len(movers) == 1
-    assert parted([still], 2)[1] is None
+    assert split_moving([still], 2)[1] is None

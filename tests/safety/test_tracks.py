@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from scipy.spatial import ConvexHull
 
 from brakeline.messaging.obstacle import Obstacle, Shapes
-from brakeline.messaging.scan import BadScan, Followed, Scan
+from brakeline.messaging.scan import BadScan, BeamTracks, Scan
 from brakeline.messaging.sensor_messages import scan_message, scan_of
 from brakeline.safety.filter.request import ALLOWED
 from brakeline.safety.perception import occlusion_exits, scan_tracking
@@ -179,11 +179,11 @@ def test_nobody_is_followed_across_a_missing_scan_or_by_doubtful_beams(missing, 
     rng, follower, now = np.random.default_rng(0), ScanTracker(), 0.0
     for k in range(5):
         scan = taken([*ROOM, disc(np.array([1.0, -0.5 + 0.8 * now]))], np.zeros(2), rng, doubt=doubt)
-        said = follower.follow(scan).followed
+        said = follower.follow(scan).tracks
         passed = DT * (1 + missing * (k == 3))
         now += passed
         follower.later(passed)
-    assert bool((np.abs(said.ways[:, :2]).max(axis=1) > 0.4).any()) is followed
+    assert bool((np.abs(said.motions[:, :2]).max(axis=1) > 0.4).any()) is followed
 
 
 def followed(world, scans=4, seed=0):
@@ -198,7 +198,7 @@ def test_what_stood_is_told_from_what_moved_and_how_fast():
     pillar = Obstacle("cylinder", (0.8, 0.0), (0.15,))
     velocity = np.array([0.5, -0.3])
     scan = followed(lambda t: [*ROOM, pillar, disc(np.array([-1.0, 0.6]) + t * velocity)])
-    which, ways = scan.followed.which, scan.followed.ways
+    which, ways = scan.tracks.track_index, scan.tracks.motions
     hit = np.abs(scan.ranges * np.cos(FAN) - 0.8) < 0.16
     hit &= np.abs(scan.ranges * np.sin(FAN)) < 0.1
     (stood,) = set(which[hit])
@@ -215,12 +215,12 @@ def test_who_may_have_been_one_of_two_is_not_followed():
     world = [lambda t, leg=leg: Obstacle("cylinder", tuple(leg + t * velocity), (0.06,)) for leg in legs]
     for some, count in ((world, 1), (world[:1], 1), (world[1:], 1)):
         scan = followed(lambda t, some=some: [*ROOM, *(one(t) for one in some)])
-        assert np.count_nonzero(scan.followed.ways[:, 0]) == count
+        assert np.count_nonzero(scan.tracks.motions[:, 0]) == count
 
 
 def test_what_is_new_may_go_anywhere_and_what_nothing_bounds_is_not_followed():
     new = followed(lambda t: [*ROOM, *([disc((0.8, 0.0))] if t > 2.5 * DT else [])])
-    assert not new.followed.which[np.abs(FAN) < 0.1].any() and new.followed.which[np.abs(FAN) > 0.5].any()
+    assert not new.tracks.track_index[np.abs(FAN) < 0.1].any() and new.tracks.track_index[np.abs(FAN) > 0.5].any()
     scan = taken(ROOM, np.zeros(2), np.random.default_rng(0))
     for unknown in (replace(scan, acceleration=0.0), replace(scan, speed=0.0)):
         assert scan_tracking.ScanTracker().follow(unknown) is unknown
@@ -231,9 +231,9 @@ def test_where_a_scan_does_not_come_what_was_followed_is_older():
     for _ in range(4):
         last = memory.fill(taken(ROOM, np.zeros(2), rng), DT)
     missed = memory.fill(None, DT)
-    assert missed.age == pytest.approx(DT) and missed.followed is last.followed
+    assert missed.age == pytest.approx(DT) and missed.tracks is last.tracks
     memory.reset()
-    assert not memory.fill(taken(ROOM, np.zeros(2), rng), DT).followed.which.any()
+    assert not memory.fill(taken(ROOM, np.zeros(2), rng), DT).tracks.track_index.any()
 
 
 def test_who_hides_needs_room():
@@ -254,7 +254,7 @@ def test_by_what_stood_it_drives_and_where_somebody_may_come_out_it_does_not(rea
     wall = Obstacle("wall", (0.0, -0.55), yaw=math.pi / 2)
     scan = followed(lambda t: [*ROOM, wall])
     assert ready.decide(request(scan=scan)).kind == ALLOWED
-    assert ready.decide(request(scan=replace(scan, followed=None))).kind != ALLOWED
+    assert ready.decide(request(scan=replace(scan, tracks=None))).kind != ALLOWED
     scan = followed(lambda t: [*ROOM, disc((0.45, 0.6))])
     assert ready.decide(request(scan=scan)).kind != ALLOWED
     monkeypatch.setattr(seen, "_edges", none)
@@ -264,8 +264,8 @@ def test_by_what_stood_it_drives_and_where_somebody_may_come_out_it_does_not(rea
 def test_what_was_followed_crosses_the_wire():
     scan = followed(lambda t: [*ROOM, disc((-1.0 + 0.5 * t, 0.6))])
     got = scan_of(scan_message(scan))
-    assert np.array_equal(got.followed.which, scan.followed.which)
-    assert np.array_equal(got.followed.ways, scan.followed.ways)
+    assert np.array_equal(got.tracks.track_index, scan.tracks.track_index)
+    assert np.array_equal(got.tracks.motions, scan.tracks.motions)
     assert (got.acceleration, got.least_radius) == (PUSH, SIZE)
 
 
@@ -283,7 +283,7 @@ def test_what_was_followed_crosses_the_wire():
 )
 def test_what_nobody_can_have_followed_is_refused(which, ways):
     with pytest.raises(BadScan):
-        Scan(np.ones(360), FAN, (0.0, 0.0, 0.0), followed=Followed(which, ways))
+        Scan(np.ones(360), FAN, (0.0, 0.0, 0.0), tracks=BeamTracks(which, ways))
     message = scan_message(Scan(np.ones(360), FAN, (0.0, 0.0, 0.0)))
     message.which, message.ways[:] = which.astype(np.uint8).tobytes(), ways.ravel().tolist()
     if which.dtype == np.uint8:

@@ -8,14 +8,14 @@ import gymnasium
 import numpy as np
 
 from brakeline.messaging.obstacle import Obstacle
-from brakeline.messaging.robot_description import robot_of
+from brakeline.messaging.robot_description import robot_from_description
 
 SUBSTEPS = 20
 
 
 def car(name, stop=("ramp", "hold"), body=(((0.0, 0.0), 0.1),), limit=()):
     """Speed and curvature are given; the speed follows with a lag, the curvature at once."""
-    return robot_of(
+    return robot_from_description(
         {
             "name": name,
             "period": 0.1,
@@ -39,7 +39,7 @@ def car(name, stop=("ramp", "hold"), body=(((0.0, 0.0), 0.1),), limit=()):
 
 def puck(name, limit=()):
     """A mass with drag on a plane; a force is given, and it stops by the force that its velocity asks for."""
-    return robot_of(
+    return robot_from_description(
         {
             "name": name,
             "period": 0.1,

@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from brakeline.messaging.obstacle import BOX, CYLINDER, SPHERE, WALL, Obstacle, rotate
-from brakeline.messaging.ray_directions import Rays
+from brakeline.messaging.ray_directions import LidarRays
 from brakeline.sim.arena import Arena, staged_arena
 from brakeline.sim.arena_generator import draw_arena
 from brakeline.sim.lidar import Lidar
@@ -18,7 +18,7 @@ PLANE, SPACE = GROUND.task.rays, QUADROTOR.task.rays
 SAMPLES = 60  # along a beam
 
 
-def agree(arena: Arena, rays: Rays, origin: np.ndarray, heading: float) -> None:
+def agree(arena: Arena, rays: LidarRays, origin: np.ndarray, heading: float) -> None:
     """Each beam ends on a surface or at the full range, and is free up to there."""
     ranges = Lidar(arena, rays).cast(origin, heading)
     directions = rotate(rays.directions, heading)

@@ -5,7 +5,7 @@ import pytest
 
 from brakeline.messaging.obstacle import CYLINDER, Obstacle
 from brakeline.messaging.policy_weights import MLP, BadWeights, decode
-from brakeline.messaging.robot import FOLDER, robot_named
+from brakeline.messaging.robot import ROBOTS_FOLDER, robot_named
 from brakeline.messaging.task import MoverKind, RobotWithTask, UnknownTask, address, read, robot_with_task
 from brakeline.sim.arena import same_room, staged_arena
 from brakeline.sim.lidar import Lidar
@@ -66,7 +66,7 @@ def test_turn_memory_forgets_within_seconds() -> None:
     assert memory.value == pytest.approx(0.5 * (1.0 - np.exp(-1.0)))
 
 
-TRACKS = read(FOLDER / "ground+tracks.task.toml")
+TRACKS = read(ROBOTS_FOLDER / "ground+tracks.task.toml")
 
 
 def test_tracks_say_where_something_is_and_where_it_passes() -> None:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from brakeline.messaging.obstacle import Obstacle, Shapes
-from brakeline.messaging.ray_directions import Rays
+from brakeline.messaging.ray_directions import LidarRays
 from brakeline.sim.arena import room_boundary, staged_arena
 from brakeline.sim.arena_generator import draw_arena
 from brakeline.sim.ground_robot import GroundRobot
@@ -120,7 +120,7 @@ def test_the_same_in_the_air():
 
 def test_a_lidar_sees_them_where_they_are():
     crowd = Straight(1.0, -0.5)
-    lidar = Lidar(replace(staged_arena(), crowd=crowd), Rays(np.array([[1.0, 0.0], [0.0, 1.0]]), 10.0))
+    lidar = Lidar(replace(staged_arena(), crowd=crowd), LidarRays(np.array([[1.0, 0.0], [0.0, 1.0]]), 10.0))
     for time, there in ((0.0, 0.8), (1.0, 0.3)):
         lidar.at(time)
         assert lidar.cast(np.zeros(2)) == pytest.approx([there, 5.0])

@@ -8,7 +8,7 @@ import pytest
 
 from brakeline.deploy.data import data_paths
 from brakeline.messaging.free_ports import free_endpoint
-from brakeline.messaging.moving_obstacles import parted
+from brakeline.messaging.moving_obstacles import split_moving
 from brakeline.messaging.obstacle import Obstacle
 from brakeline.safety.filter.backup_plan import BackupPlan
 from brakeline.safety.filter.filter import Filter
@@ -80,7 +80,7 @@ def episode(ready, seed):
         if np.linalg.norm(at) > radius + body + 0.3:
             discs.append((at, radius))
     centers, radii = np.array([at for at, _ in discs]), np.array([radius for _, radius in discs])
-    shapes, _ = parted([Obstacle("cylinder", tuple(at), (radius,)) for at, radius in discs], 2)
+    shapes, _ = split_moving([Obstacle("cylinder", tuple(at), (radius,)) for at, radius in discs], 2)
     plant, kept = Porter(rng, (0.0, 0.0, rng.uniform(-3, 3))), BackupPlan(robot)
     least, outside, way = np.inf, 0, 0.0
     for _ in range(STEPS):

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from brakeline.actors.ros2.laser_obstacles import BadScan, HitErrors, _joined, obstacles, read
 from brakeline.actors.ros2.sensor_frames import PlanarPose
 from brakeline.messaging.obstacle import Shapes
-from brakeline.messaging.ray_directions import Rays
+from brakeline.messaging.ray_directions import LidarRays
 from brakeline.messaging.ros2.cdr_messages import LaserScan, header
 from brakeline.sim.arena_generator import draw_arena
 from brakeline.sim.ground_realtime import SpinningLidar
@@ -52,7 +52,7 @@ def test_what_is_seen_in_random_rooms_is_inside_whatever_the_errors():
     """Dense true beams beside a scan whose ranges, and the pose it is seen from, are as wrong as they may be."""
     rng, looked = np.random.default_rng(0), 0
     angles = np.linspace(0.0, 2.0 * math.pi, 3600, endpoint=False)
-    dense = Rays(np.stack([np.cos(angles), np.sin(angles)], axis=1), 3.5)
+    dense = LidarRays(np.stack([np.cos(angles), np.sin(angles)], axis=1), 3.5)
     while looked < 40:
         arena = draw_arena("dense", rng, GROUND)
         close = Lidar(arena, dense)

@@ -10,7 +10,7 @@ from brakeline.deploy.cli import main
 from brakeline.deploy.data.importer import bring, tables_of
 from brakeline.deploy.data.resample import resample
 from brakeline.deploy.data.sources.source_table import NoSource, Table
-from brakeline.messaging.robot_description import robot_of
+from brakeline.messaging.robot_description import robot_from_description
 from brakeline.safety.model.dataset import Dataset
 from brakeline.safety.model.windows import _off_chord
 from tests.deploy.data.bags import write_bag, write_bin, write_parquet, write_tlog, write_ulg
@@ -74,7 +74,7 @@ def test_a_flight_in_ned_is_read_in_enu(tmp_path, write, ending):
     u = np.repeat(rng.uniform(-1, 1, (500, 2)), 4, 0)  # each for a period
     position = np.cumsum(np.vstack([np.zeros(2), 0.05 * u[:-1]]), 0)
     seen = np.hstack([position, u, u])
-    robot = robot_of(PUCK)
+    robot = robot_from_description(PUCK)
     data = bring([write(tmp_path / f"a.{ending}", time, seen)], robot).data
     csv = write_csv(tmp_path / "a.csv", time, seen, ("x", "y", "vx", "vy", "ux", "uy"))
     same(bring([csv], robot).data, data, 1e-4)

@@ -12,7 +12,7 @@ from brakeline.deploy.cli import main
 from brakeline.deploy.data.importer import bring, tables_of
 from brakeline.deploy.data.schema_inference import told
 from brakeline.deploy.data.sources.source_table import NoSource, Table
-from brakeline.messaging.robot import FOLDER as ROBOTS
+from brakeline.messaging.robot import ROBOTS_FOLDER as ROBOTS
 from brakeline.messaging.robot import robot_named
 from tests.deploy.data.bags import write_bag
 from tests.deploy.data.porter import COLUMNS, drive, write_csv

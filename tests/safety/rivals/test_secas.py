@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.obstacle import Shapes
 from brakeline.messaging.perceptrons import Perceptrons
-from brakeline.messaging.ray_directions import fan
+from brakeline.messaging.ray_directions import planar_rays
 from brakeline.safety.filter.backup_plan import UNVERIFIED, BackupPlan
 from brakeline.safety.filter.request import NOT_FINITE, BadRequest, Request
 from brakeline.safety.model.model_set import BadModel
@@ -193,7 +193,7 @@ def test_a_model_of_another_shape_or_method_is_refused():
         replace(good, method="sailr"),
         replace(good, settings={}),
         replace(good, networks={}),
-        replace(good, rays=fan(30, 180.0, 3.5)),
+        replace(good, rays=planar_rays(30, 180.0, 3.5)),
     ):
         with pytest.raises(BadModel):
             Secas(wrong)
