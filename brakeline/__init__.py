@@ -124,7 +124,14 @@ def __getattr__(name: str) -> Any:
             return "0+unknown"
     if name not in _PLACE_OF:
         raise AttributeError(f"brakeline has no {name!r}; it has: {', '.join(__all__)}")
-    return getattr(importlib.import_module(_PLACE_OF[name]), name)
+    try:
+        return getattr(importlib.import_module(_PLACE_OF[name]), name)
+    except ModuleNotFoundError as error:
+        from brakeline.extras import missing_extra
+
+        if (missing := missing_extra(error)) is not None:
+            raise missing from error
+        raise
 
 
 def __dir__() -> list[str]:

@@ -18,6 +18,8 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from brakeline.extras import missing_extra
+
 
 @dataclass(frozen=True)
 class Command:
@@ -225,6 +227,11 @@ def main(arguments: list[str] | None = None) -> int:
     except BrokenPipeError:  # who read the output has seen enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
+    except ModuleNotFoundError as error:
+        if (missing := missing_extra(error)) is None:
+            raise
+        errors.print(f"[red]brakeline {name}:[/] {escape(str(missing))}", soft_wrap=True)
+        return 1
     except Exception as error:
         if not isinstance(error, expected()):
             raise
