@@ -16,9 +16,8 @@ from brakeline.deploy.data.data_paths import data_root, method_path
 from brakeline.deploy.data.model_store import method_for
 from brakeline.deploy.policy_loading import policy_named
 from brakeline.deploy.run.run_config import RunConfig
-from brakeline.deploy.vehicle_factory import environment, fleet_world
 from brakeline.learner.learner_config import LearnerConfig
-from brakeline.logs.recorder import Rotation
+from brakeline.logs.segment_rotation import Rotation
 from brakeline.messaging.task import address, address_in_real_time, robot_maybe_with_task, robot_with_task
 from brakeline.safety.model.model_config import check_reservations
 
@@ -131,6 +130,8 @@ class Actor:
             arena = flight_arena(self.arena, self.seed)
             flight.run(settings, self.flight.settings(self.url, arena), arena, propose, about)
         else:
+            from brakeline.deploy.vehicle_factory import environment, fleet_world
+
             worlds = partial(fleet_world, conditions=about)
             run(settings, partial(environment, conditions=about), propose, worlds)
         return 0
