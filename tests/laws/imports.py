@@ -22,7 +22,7 @@ PARTS: dict[str, tuple[str, ...]] = {
             "safety.filter.request",
             "safety.perception.image_memory",
         ),
-        *("safety.service.asker", "safety.service.client", "safety.service.wire"),
+        *("safety.service.filter_client", "safety.service.client", "safety.service.wire"),
     ),
     "learner": ("messaging", "errors"),
     # The viewers draw the map that the filter was shown.
