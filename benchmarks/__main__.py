@@ -22,18 +22,12 @@ from rich.console import Console
 from benchmarks import (
     askers,
     autopilot_conformance,
-    chaos,
     costs,
-    crowd,
     decide,
-    disturbances,
     environment_speed,
     flights,
     learning_speed,
-    link_faults,
-    link_loss,
     log_reading,
-    message_fuzz,
     perception_cost,
     reachability,
     recording_cost,
@@ -42,6 +36,8 @@ from benchmarks import (
 )
 from benchmarks.timing import Figures, Words
 from brakeline.logs.console_tables import Stacking
+from tests.faults import chaos, crowd, disturbances, link_faults, link_loss
+from tests.fuzz import message_fuzz
 
 
 @dataclass(frozen=True)

@@ -14,9 +14,9 @@ from pathlib import Path
 
 import psutil
 
-from benchmarks.five_hosts import PATIENCE, TURN, Fleet
-from benchmarks.network_hosts import Hosts
 from benchmarks.timing import Figures
+from tests.faults.five_hosts import PATIENCE, TURN, Fleet
+from tests.faults.network_hosts import Hosts
 
 WARM_UP = 300  # steps, of which 200 at random
 MEASURED = 500

@@ -7,11 +7,11 @@ from contextlib import suppress
 
 import pytest
 
-from benchmarks.five_hosts import MOVED, Fleet
-from benchmarks.network_hosts import Hosts, NoHosts
 from brakeline.learner.checkpoint import exists
 from brakeline.learner.learner_config import LearnerConfig
 from brakeline.logs.reader import read
+from tests.faults.five_hosts import MOVED, Fleet
+from tests.faults.network_hosts import Hosts, NoHosts
 from tests.waiting import until
 
 DELAY = 0.005  # s each way, and up to as much again, between the robot and the routers

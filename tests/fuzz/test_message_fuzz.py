@@ -6,9 +6,9 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from benchmarks.message_fuzz import Party, fuzz, parties
-from benchmarks.message_fuzzer import Mill
 from brakeline.messaging.topics import TOPICS
+from tests.fuzz.message_fuzz import Party, fuzz, parties
+from tests.fuzz.message_fuzzer import Mill
 
 
 def test_no_message_ends_a_process_and_a_report_of_them_can_be_read() -> None:

@@ -19,10 +19,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from random import Random
 
-from benchmarks.five_hosts import CLOCKS, LEARNERS, MOVED, TURN, Fleet
-from benchmarks.network_hosts import Hosts
 from benchmarks.timing import Figures
 from brakeline.logs.reader import Record, open_log
+from tests.faults.five_hosts import CLOCKS, LEARNERS, MOVED, TURN, Fleet
+from tests.faults.network_hosts import Hosts
 
 ROBOTS = ("ground", "quadrotor")
 CUT = (0.3, 6.0)  # s that a cable is out

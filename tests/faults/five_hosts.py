@@ -18,7 +18,6 @@ from pathlib import Path
 from types import TracebackType
 from typing import Self
 
-from benchmarks.network_hosts import Hosts
 from brakeline.deploy.data.data_paths import method_path
 from brakeline.deploy.data.model_store import method_for
 from brakeline.deploy.interpreter import PYTHON
@@ -31,6 +30,7 @@ from brakeline.safety.methods import DDPC, load
 from brakeline.safety.model.model_config import ModelConfig
 from brakeline.safety.service.plan_token import write_key
 from brakeline.safety.service.signature import ModelSigner, write_signer
+from tests.faults.network_hosts import Hosts
 
 PORT = 7447
 CLOCKS = {2: -7.0, 3: 5.0, 4: -3.0}  # h ahead of the others
@@ -108,7 +108,7 @@ class Fleet:
             words = [
                 *PYTHON,
                 "-m",
-                "benchmarks.cable_delay",
+                "tests.faults.cable_delay",
                 *ports,
                 "--delay",
                 str(self.delay),

@@ -24,7 +24,6 @@ from typing import Any
 import psutil
 from google.protobuf.message import DecodeError
 
-from benchmarks.message_fuzzer import Mill
 from benchmarks.timing import Figures
 from brakeline.actors.learner_client import LearnerClient
 from brakeline.deploy.commands.watch_command import _show
@@ -54,6 +53,7 @@ from brakeline.safety.methods import decode
 from brakeline.safety.model.model_set import BadModel
 from brakeline.safety.service.client import read_reply, request_message
 from brakeline.safety.service.server import ModelRegistry, ServiceCounts, batch_handler
+from tests.fuzz.message_fuzzer import Mill
 
 LOOK = 25_000  # messages between two looks at what the processes say and show
 SETTLED = 0.3  # of the messages: by then tables are as full as they get

@@ -1,6 +1,6 @@
 """PROCESS: a long cable: passes a TCP port on to another host, each byte later than it came (kernels without netem).
 
-python -m benchmarks.cable_delay 0.0.0.0:7447=10.0.0.1:7447 --delay 0.02 --jitter 0.01
+python -m tests.faults.cable_delay 0.0.0.0:7447=10.0.0.1:7447 --delay 0.02 --jitter 0.01
 """
 
 from __future__ import annotations
@@ -91,5 +91,5 @@ async def serve(given: Delay) -> None:
 
 if __name__ == "__main__":
     with contextlib.suppress(KeyboardInterrupt):
-        asyncio.run(serve(tyro.cli(Delay, prog="python -m benchmarks.cable_delay", description=__doc__)))
+        asyncio.run(serve(tyro.cli(Delay, prog="python -m tests.faults.cable_delay", description=__doc__)))
     sys.exit(130)

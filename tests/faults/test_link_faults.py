@@ -10,9 +10,9 @@ import pytest
 
 from benchmarks import flights
 from benchmarks.flights import Failed, Flights, flown
-from benchmarks.link_faults import Outcomes, Relay, Steps
 from brakeline.messaging.byte_links import Tcp, Udp, open_link
 from brakeline.messaging.free_ports import free_udp_port
+from tests.faults.link_faults import Outcomes, Relay, Steps
 from tests.waiting import until
 
 
