@@ -35,7 +35,7 @@ from benchmarks import (
     solvers,
 )
 from benchmarks.timing import Figures, Words
-from brakeline.logs.console_tables import Stacking
+from brakeline.logs.console_tables import StackingTable
 from tests.faults import chaos, crowd, disturbances, link_faults, link_loss
 from tests.fuzz import message_fuzz
 
@@ -112,7 +112,7 @@ def _cell(value: float | str) -> str:
 
 
 def show(console: Console, name: str, figures: Figures | Words) -> None:
-    table = Stacking(title=name)
+    table = StackingTable(title=name)
     table.add_column("what")
     columns = sorted({key for row in figures.values() for key in row}, key=str)
     for column in columns:

@@ -21,7 +21,7 @@ from mcap_protobuf.decoder import DecoderFactory
 
 from benchmarks.timing import Figures
 from brakeline.deploy.interpreter import PYTHON
-from brakeline.logs.log_analysis import Look, analysed
+from brakeline.logs.log_analysis import AnalysisOptions, analyse_runs
 from brakeline.logs.segment import Entry, open_segment
 from brakeline.messaging import brakeline_pb2 as pb
 
@@ -99,7 +99,7 @@ def measured(what: str, path: Path) -> dict[str, float]:
 
 
 def ours(path: Path, pictures: bool) -> int:
-    figures = analysed(path, Look(pictures)).figures()
+    figures = analyse_runs(path, AnalysisOptions(pictures)).figures()
     return int(sum(segment["messages"] for segment in figures["segments"]))
 
 

@@ -25,7 +25,7 @@ PERIOD = 1.0  # s: a process that is killed loses what came since
 FOREVER = QosTime(sec=9223372036, nsec=854775807)
 
 
-class Bag:
+class BagWriter:
     """Records into a folder that is not there yet; a `brakeline.messaging.ros2.Tap`.
 
     Raises:

@@ -13,7 +13,7 @@ PLAIN: dict[str, Any] = {"box": None, "padding": (0, 2, 0, 0)}
 UNLIMITED = 10_000  # columns
 
 
-class Stacking(Table):
+class StackingTable(Table):
     """A table that is never cut: too wide for the terminal, every row becomes a block of `column: cell` lines.
 
     Into a file it goes as wide as it is, unless $COLUMNS says how wide the reader is.

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from brakeline.logs.episode_stats import KINDS, Figures
-from brakeline.logs.quantiles import BATCH, Histogram, merged, spread, summary
+from brakeline.logs.quantiles import BATCH, QuantileSketch, merged, spread, summary
 from brakeline.messaging import brakeline_pb2 as pb
 
 # Parts of the time from an actor's question to its answer.
@@ -34,20 +34,20 @@ WIDTH = 9
 NOTHING = math.nan  # in a row, where there was no program or no tube
 
 
-def _latency() -> dict[int, dict[str, Histogram]]:
-    return {kind: {part: Histogram() for part in PARTS} for kind in KINDS}
+def _latency() -> dict[int, dict[str, QuantileSketch]]:
+    return {kind: {part: QuantileSketch() for part in PARTS} for kind in KINDS}
 
 
 @dataclass
-class Decisions:
+class DecisionStats:
     """The figures of one actor's exchanges."""
 
-    round_trip_ms: Histogram = field(default_factory=Histogram)
-    latency: dict[int, dict[str, Histogram]] = field(default_factory=_latency)
-    iterations: Histogram = field(default_factory=Histogram)  # of decisions for which a program was solved
+    round_trip_ms: QuantileSketch = field(default_factory=QuantileSketch)
+    latency: dict[int, dict[str, QuantileSketch]] = field(default_factory=_latency)
+    iterations: QuantileSketch = field(default_factory=QuantileSketch)  # of decisions for which a program was solved
     statuses: Counter[str] = field(default_factory=Counter)  # of these, how the last one ended
-    half_width: Histogram = field(default_factory=Histogram)  # m: the largest in a tube
-    margin: Histogram = field(default_factory=Histogram)  # m: of a tube to the free space's edge
+    half_width: QuantileSketch = field(default_factory=QuantileSketch)  # m: the largest in a tube
+    margin: QuantileSketch = field(default_factory=QuantileSketch)  # m: of a tube to the free space's edge
     unverified: int = 0  # failsafes whose plan could not be verified
     not_finite: int = 0  # decisions on proposals with NaN or infinity
     failures: Counter[str] = field(default_factory=Counter)  # exchanges without a decision, by reason
@@ -120,10 +120,10 @@ def count(words: Counter[str], word: str) -> None:
     words[word if word in words or len(words) < MOST_WORDS else OTHER] += 1
 
 
-def joined(parts: Iterable[Decisions]) -> Decisions:
+def joined(parts: Iterable[DecisionStats]) -> DecisionStats:
     """All exchanges of the parts; the sums are the same whenever the parts come in the same order."""
     parts = [_settled(part) for part in parts]
-    return Decisions(
+    return DecisionStats(
         round_trip_ms=merged(part.round_trip_ms for part in parts),
         latency={kind: {name: merged(part.latency[kind][name] for part in parts) for name in PARTS} for kind in KINDS},
         iterations=merged(part.iterations for part in parts),
@@ -136,7 +136,7 @@ def joined(parts: Iterable[Decisions]) -> Decisions:
     )
 
 
-def _settled(part: Decisions) -> Decisions:
+def _settled(part: DecisionStats) -> DecisionStats:
     """A copy with no rows waiting: looking at figures does not change when rows are sorted, and so no sum."""
     copy = deepcopy(part)
     copy._sort()

@@ -26,7 +26,7 @@ MOST_QUESTIONS = 600  # the latest of an actor, in memory
 
 
 @dataclass
-class Held:
+class EpisodeRecord:
     """An episode of one actor, as far as it was seen."""
 
     label: str  # of its run; empty if there is only one
@@ -76,11 +76,11 @@ class Held:
         return "timeout" if last.truncated else "unfinished"
 
 
-class Source:
+class ActorBuffer:
     """What of one actor is in memory: its running episode and its latest questions."""
 
     def __init__(self) -> None:
-        self.running: Held | None = None
+        self.running: EpisodeRecord | None = None
         self.about: deque[pb.Episode] = deque(maxlen=2)
         self.exchanges: deque[pb.Exchange] = deque(maxlen=MOST_QUESTIONS)
 
@@ -99,8 +99,8 @@ class EpisodeSampler:
         self.label = ""
         self.wanted, self.actor = wanted, actor
         self.found: list[Figures] = []  # the wanted ones, with all their steps
-        self.last: Held | None = None
-        self._sources: dict[str, Source] = {}
+        self.last: EpisodeRecord | None = None
+        self._sources: dict[str, ActorBuffer] = {}
         self._nearest: list[tuple[float, int, Figures]] = []  # heaps: the least worth keeping comes first
         self._braked: list[tuple[float, int, Figures]] = []
         self._collisions: list[Figures] = []
@@ -108,22 +108,22 @@ class EpisodeSampler:
         self._stride = 1
         self._count = 0
 
-    def source(self, name: str) -> Source:
+    def source(self, name: str) -> ActorBuffer:
         """What is in memory of the actor of that name; new if there is none."""
         name = self.label + name
         source = self._sources.get(name)
         if source is None:
-            source = self._sources[name] = Source()
+            source = self._sources[name] = ActorBuffer()
         return source
 
-    def step(self, source: Source, step: pb.Step) -> None:
+    def step(self, source: ActorBuffer, step: pb.Step) -> None:
         """Take a step of the actor. An episode is looked at when the next begins: questions may come after steps."""
         held = source.running
         number = step.episode
         if held is None or held.number != number or step.step == 0:
             if held is not None:
                 self._ended(source, held)
-            held = source.running = Held(self.label, number, source.episode(number))
+            held = source.running = EpisodeRecord(self.label, number, source.episode(number))
         held.take(step)
 
     def close(self) -> None:
@@ -143,7 +143,7 @@ class EpisodeSampler:
         kept = {item["order"]: item for item in every}
         return {"near": [item["order"] for item in near], "episodes": [kept[order] for order in sorted(kept)]}
 
-    def _ended(self, source: Source, held: Held) -> None:
+    def _ended(self, source: ActorBuffer, held: EpisodeRecord) -> None:
         """Keep the episode if it is worth it. Its picture is made only then."""
         order, self._count = self._count, self._count + 1
         held.questions, held.others = source.exchanges, self._others(source, held)
@@ -162,17 +162,19 @@ class EpisodeSampler:
         if held.number == self.wanted and self.actor in (None, held.actor):
             self.found.append(self._picture(held, order) | {"rows": list(rows(held, self.robot))})
 
-    def _others(self, source: Source, held: Held) -> list[pb.Exchange]:
+    def _others(self, source: ActorBuffer, held: EpisodeRecord) -> list[pb.Exchange]:
         """What the other robots of its world asked and were answered; alone: nothing."""
         own = next((e.request for e in source.exchanges if e.request.episode == held.number), None)
         names = [] if own is None else [self.label + name for name in own.fleet if name != own.actor]
         return [e for name in names if name in self._sources for e in self._sources[name].exchanges]
 
-    def _push(self, heap: list[tuple[float, int, Figures]], worth: float, most: int, held: Held, order: int) -> None:
+    def _push(
+        self, heap: list[tuple[float, int, Figures]], worth: float, most: int, held: EpisodeRecord, order: int
+    ) -> None:
         if len(heap) < most:
             heapq.heappush(heap, (worth, -order, self._picture(held, order)))
         elif worth > heap[0][0]:
             heapq.heapreplace(heap, (worth, -order, self._picture(held, order)))
 
-    def _picture(self, held: Held, order: int) -> Figures:
+    def _picture(self, held: EpisodeRecord, order: int) -> Figures:
         return {"order": order, **picture(held, self.robot)}

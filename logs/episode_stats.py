@@ -1,7 +1,7 @@
 """What came of a robot's steps: the figures that `evaluate` and `analyse` share.
 
-`evaluate`, without a bus, fills a `Tally` itself; `Metrics` keeps one for each actor. They are joined in the order that
-is given, so that the same steps give the same figures to the last bit.
+`evaluate` fills an `EpisodeStats` without a bus; `Metrics` has one for each actor. Parts are merged in the given order,
+so that the same steps give the same figures to the last bit.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from brakeline.logs.proportion_intervals import Clustered, clopper_pearson, poisson
-from brakeline.logs.quantiles import Histogram, spread, summary
+from brakeline.logs.proportion_intervals import ClusteredProportion, clopper_pearson, poisson
+from brakeline.logs.quantiles import QuantileSketch, spread, summary
 from brakeline.messaging import brakeline_pb2 as pb
 
 Figures = dict[str, Any]  # what JSON can hold
@@ -35,7 +35,7 @@ _RECOVERING = int(pb.RECOVERING)
 
 
 @dataclass
-class Tally:
+class EpisodeStats:
     """The figures of one actor's steps."""
 
     robot: str = ""
@@ -60,11 +60,13 @@ class Tally:
     violations: int = 0  # of these, not contained
     speed: float = 0.0  # m/s, summed
     max_speed: float = 0.0  # m/s
-    clearance: Histogram = field(default_factory=Histogram)  # m, from the footprint to the nearest obstacle
+    clearance: QuantileSketch = field(default_factory=QuantileSketch)  # m, from the footprint to the nearest obstacle
     returns: array[float] = field(default_factory=lambda: array("d"))  # per finished episode, without the penalty
-    decision_ms: dict[int, Histogram] = field(default_factory=lambda: {kind: Histogram() for kind in KINDS})
-    propose_ms: Histogram = field(default_factory=Histogram)
-    shares: Clustered = field(default_factory=Clustered)  # interventions in the steps of each finished episode
+    decision_ms: dict[int, QuantileSketch] = field(default_factory=lambda: {kind: QuantileSketch() for kind in KINDS})
+    propose_ms: QuantileSketch = field(default_factory=QuantileSketch)
+    shares: ClusteredProportion = field(
+        default_factory=ClusteredProportion
+    )  # interventions in the steps of each finished episode
     _episode: int | None = None
     _return: float = 0.0
     _collided: bool = False
@@ -138,7 +140,7 @@ class Tally:
         self._episode = None
 
 
-def closed_loop(tallies: Iterable[Tally]) -> Figures:
+def closed_loop(tallies: Iterable[EpisodeStats]) -> Figures:
     """The figures that `evaluate` and `analyse` share, over the steps of these actors."""
     tallies = list(tallies)
 
@@ -180,10 +182,10 @@ def closed_loop(tallies: Iterable[Tally]) -> Figures:
     return figures | {"intervals": intervals(figures, tallies)}
 
 
-def intervals(figures: Figures, tallies: Iterable[Tally]) -> dict[str, list[float] | None]:
+def intervals(figures: Figures, tallies: Iterable[EpisodeStats]) -> dict[str, list[float] | None]:
     """95 % intervals of the rates: per episode for its ends, per step for the others (interventions: by episodes)."""
     episodes, contained = figures["episodes"], figures["containment"]
-    shares = Clustered()
+    shares = ClusteredProportion()
     for tally in tallies:
         shares.join(tally.shares)
     ends = {name: figures[name] for name in ("goals", "collisions", *CONTACTS, "timeouts") if name != RUN_INTO}

@@ -19,7 +19,7 @@ from google.protobuf.message import Message
 
 from brakeline.logs import foxglove_scene
 from brakeline.logs.reader import Record
-from brakeline.logs.recorded_robots import Robots
+from brakeline.logs.recorded_robots import RecordedRobots
 from brakeline.logs.segment import Entry
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.bus import Sample
@@ -38,7 +38,7 @@ Decode = Callable[[], Any]
 
 
 @dataclass
-class Sites:
+class ArenaLayout:
     """Where the arenas stand in the world: a row for each robot kind, an arena for each actor, as they come."""
 
     _rows: dict[str, tuple[float, float, list[str]]] = field(default_factory=dict)  # y, edge, actors
@@ -68,16 +68,16 @@ class _Actor:
     drawn: float = -math.inf  # s
 
 
-class Pictures:
+class FoxgloveConverter:
     """Turns messages into Foxglove's, one by one. Whatever is wrong with one, there is only no picture of it."""
 
-    def __init__(self, rate: float = RATE, robots: Robots | None = None) -> None:
+    def __init__(self, rate: float = RATE, robots: RecordedRobots | None = None) -> None:
         """rate: steps drawn per second and actor, by the time when they came; infinite: every one. robots: those that
         the messages name; the rays of a robot without a task are not drawn."""
-        self._robots = robots or Robots()
+        self._robots = robots or RecordedRobots()
         self.failures = 0
         self._spacing = 1.0 / rate
-        self._sites = Sites()
+        self._sites = ArenaLayout()
         self._actors: dict[str, _Actor] = {}
         self._takers: dict[str, Callable[[str, Decode, int], list[Entry]]] = {
             EPISODE.name: self._episode,
@@ -86,11 +86,11 @@ class Pictures:
             LOG.name: self._log_line,
         }
 
-    def of_sample(self, sample: Sample) -> list[Entry]:
+    def from_sample(self, sample: Sample) -> list[Entry]:
         """As the recorder and `brakeline watch` receive it."""
         return self._take(sample.topic.name, sample.key, sample.message, sample.received)
 
-    def of_record(self, record: Record) -> list[Entry]:
+    def from_record(self, record: Record) -> list[Entry]:
         """As it stands in a log."""
         return self._take(record.topic, record.key, lambda: record.message, record.log_time)
 

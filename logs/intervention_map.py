@@ -13,7 +13,7 @@ MOST_CELLS = 6400
 _ADJUSTED, _FAILSAFE = int(pb.ADJUSTED), int(pb.FAILSAFE)
 
 
-class Places:
+class InterventionMap:
     """Counts of steps by the cell of the plane in which they ended. Too many cells become fewer, twice as wide."""
 
     def __init__(self) -> None:

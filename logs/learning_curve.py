@@ -11,7 +11,7 @@ from collections import deque
 from dataclasses import dataclass, fields
 
 from brakeline.logs.episode_stats import Figures
-from brakeline.logs.quantiles import Histogram, summary
+from brakeline.logs.quantiles import QuantileSketch, summary
 from brakeline.messaging import brakeline_pb2 as pb
 
 MOST_BINS = 200
@@ -53,13 +53,13 @@ class Episode:
     collision: bool = False
 
 
-class Training:
+class LearningCurve:
     """Takes the steps of one robot kind in the order in which they came in."""
 
     def __init__(self) -> None:
         self.width = FIRST_WIDTH
         self.bins: list[Bin] = [Bin()]
-        self.staleness = Histogram()  # versions that a step's weights were behind the newest that was known
+        self.staleness = QuantileSketch()  # versions that a step's weights were behind the newest that was known
         self.last: deque[Episode] = deque(maxlen=LAST)
         self._running: dict[str, Episode] = {}
         self._learned: list[tuple[float, ...]] = []  # a point each, as CURVES names them

@@ -9,13 +9,13 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from brakeline.logs.episode_sampler import EpisodeSampler, Source
+from brakeline.logs.episode_sampler import ActorBuffer, EpisodeSampler
 from brakeline.logs.episode_stats import Figures
-from brakeline.logs.intervention_map import Places
-from brakeline.logs.learning_curve import Training
-from brakeline.logs.mcap_container import Series
+from brakeline.logs.intervention_map import InterventionMap
+from brakeline.logs.learning_curve import LearningCurve
+from brakeline.logs.mcap_container import LogChannel
 from brakeline.logs.metrics import Metrics, closed_loop, together
-from brakeline.logs.process_timeline import Timeline
+from brakeline.logs.process_timeline import ProcessTimeline
 from brakeline.logs.reader import Log, Paths, by_run, find
 from brakeline.messaging.rejected_messages import RejectedMessages
 from brakeline.messaging.topics import EPISODE, EXCHANGE, HEALTH, LEARNER, LOG, STEP
@@ -24,7 +24,7 @@ SETUP = ("method", "certificate", "policy", "arena", "perception", "seed")
 
 
 @dataclass
-class Look:
+class AnalysisOptions:
     """What is wanted besides the figures."""
 
     pictures: bool = False  # what the report draws
@@ -32,20 +32,20 @@ class Look:
     actor: str | None = None  # ... of this actor; None: of all
 
 
-class Analysis:
+class RunAnalysis:
     """Takes the log of one run; `figures` and `pictures` are what it comes to."""
 
-    def __init__(self, label: str, log: Log, look: Look | None = None, prefix: str = "") -> None:
+    def __init__(self, label: str, log: Log, look: AnalysisOptions | None = None, prefix: str = "") -> None:
         """`prefix` goes before the names of actors in episodes: it tells runs apart."""
         self.label, self.log, self.prefix = label, log, prefix
-        self.look = look or Look()
+        self.look = look or AnalysisOptions()
         self.metrics = Metrics(robots=log.robots)
-        self.training: dict[str, Training] = {}  # by robot kind
-        self.places: dict[str, Places] = {}
+        self.training: dict[str, LearningCurve] = {}  # by robot kind
+        self.places: dict[str, InterventionMap] = {}
         self.galleries: dict[str, EpisodeSampler] = {}
-        self.timeline = Timeline()
-        self._drawn: dict[Series, tuple[Places, EpisodeSampler, Source]] = {}
-        self._kept: dict[Series, deque[Any]] = {}
+        self.timeline = ProcessTimeline()
+        self._drawn: dict[LogChannel, tuple[InterventionMap, EpisodeSampler, ActorBuffer]] = {}
+        self._kept: dict[LogChannel, deque[Any]] = {}
         self._rejected = RejectedMessages()
         self._take(log)
         for gallery in self.galleries.values():
@@ -55,7 +55,7 @@ class Analysis:
 
     def figures(self) -> Figures:
         """All figures of the run."""
-        return Analyses([self]).figures()
+        return LogAnalysis([self]).figures()
 
     def pictures(self) -> Figures:
         """What the report draws besides the figures."""
@@ -73,11 +73,11 @@ class Analysis:
         """The one loop over all messages; what is seldom has a function of its own."""
         add, look = self.metrics.add, self.look
         drawn = look.pictures or look.episode is not None
-        takers: dict[str, Callable[[Series, Any], None]] = {
+        takers: dict[str, Callable[[LogChannel, Any], None]] = {
             LEARNER.name: self._learner,
             **({HEALTH.name: self._health, LOG.name: self._line} if drawn else {}),
         }
-        trained: dict[str, Training] = {}
+        trained: dict[str, LearningCurve] = {}
         for series, message, _, _ in log.decoded():
             try:
                 if not add(series.key, message):
@@ -86,7 +86,7 @@ class Analysis:
                 if topic == STEP.name:
                     training = trained.get(series.key)
                     if training is None:
-                        training = trained[series.key] = self.training.setdefault(message.robot, Training())
+                        training = trained[series.key] = self.training.setdefault(message.robot, LearningCurve())
                     training.step(message)
                     if drawn:
                         self._draw(series, message)
@@ -99,11 +99,11 @@ class Analysis:
                 log.malformed += 1
                 self._rejected.reject(series.key, error)
 
-    def _draw(self, series: Series, step: Any) -> None:
+    def _draw(self, series: LogChannel, step: Any) -> None:
         known = self._drawn.get(series)
         if known is None:
             robot, _, name = series.place.partition("/")
-            places = self.places.setdefault(robot, Places())
+            places = self.places.setdefault(robot, InterventionMap())
             gallery = self._gallery(robot)
             known = self._drawn[series] = places, gallery, gallery.source(name)
         places, gallery, source = known
@@ -112,7 +112,7 @@ class Analysis:
         gallery.step(source, step)
         self.timeline.step(step.header.wall_time)
 
-    def _keep(self, series: Series, message: Any) -> None:
+    def _keep(self, series: LogChannel, message: Any) -> None:
         kept = self._kept.get(series)
         if kept is None:
             robot, _, name = series.place.partition("/")
@@ -129,13 +129,13 @@ class Analysis:
             gallery.label = self.prefix
         return gallery
 
-    def _learner(self, _: Series, message: Any) -> None:
-        self.training.setdefault(message.robot, Training()).learner(message)
+    def _learner(self, _: LogChannel, message: Any) -> None:
+        self.training.setdefault(message.robot, LearningCurve()).learner(message)
 
-    def _health(self, _: Series, message: Any) -> None:
+    def _health(self, _: LogChannel, message: Any) -> None:
         self.timeline.health(message.process, message)
 
-    def _line(self, _: Series, message: Any) -> None:
+    def _line(self, _: LogChannel, message: Any) -> None:
         self.timeline.line(message.process, message)
 
     def about(self) -> Figures:
@@ -166,10 +166,10 @@ def perception_in(conditions: Mapping[str, str]) -> str:
     return f"{kind} with tracks" if conditions.get("tracks") == "True" else kind
 
 
-class Analyses:
+class LogAnalysis:
     """Several runs beside each other: counts are summed up, curves and processes stay each run's own."""
 
-    def __init__(self, parts: Sequence[Analysis]) -> None:
+    def __init__(self, parts: Sequence[RunAnalysis]) -> None:
         self.parts = parts
 
     def figures(self) -> Figures:
@@ -209,7 +209,7 @@ class Analyses:
         return {"episode": wanted, "episode_detail": [episode for gallery in galleries for episode in gallery.found]}
 
 
-def analysed(paths: Paths, look: Look | None = None) -> Analyses:
+def analyse_runs(paths: Paths, look: AnalysisOptions | None = None) -> LogAnalysis:
     """Everything about the logs at `paths`, run by run.
 
     Raises:
@@ -218,8 +218,8 @@ def analysed(paths: Paths, look: Look | None = None) -> Analyses:
     """
     runs = by_run(find(paths))
     several = len(runs) > 1
-    return Analyses(
-        [Analysis(label, Log(files), look, f"{label}/" if several else "") for label, files in runs.items()]
+    return LogAnalysis(
+        [RunAnalysis(label, Log(files), look, f"{label}/" if several else "") for label, files in runs.items()]
     )
 
 

@@ -10,7 +10,7 @@ from typing import Any, TextIO
 
 from google.protobuf.message import DecodeError
 
-from brakeline.logs.foxglove import Pictures
+from brakeline.logs.foxglove import FoxgloveConverter
 from brakeline.logs.minari_export import ExportError, nothing_of
 from brakeline.logs.reader import TYPES, Log, Paths, Record, open_log
 from brakeline.logs.segment import Entry, Segment, open_segment
@@ -82,14 +82,14 @@ def to_foxglove(paths: Paths, out: Path, rate: float = math.inf) -> int:
     if out.exists():
         raise ExportError(f"{out} is there already")
     log = open_log(paths)
-    pictures = Pictures(rate, log.robots)
+    pictures = FoxgloveConverter(rate, log.robots)
     segment: Segment | None = None
     count = 0
     batch: list[Entry] = []
     for stored, record in _stored(log):
         if segment is None:  # by now the metadata are known
             segment = open_segment(out, {k: v for k, v in log.metadata.items() if k != "brakeline"}, log.attachments)
-        batch += [stored, *pictures.of_record(record)]
+        batch += [stored, *pictures.from_record(record)]
         if len(batch) >= BATCH:
             segment.save(batch)
             count, batch = count + len(batch), []

@@ -15,7 +15,7 @@ from typing import IO, Any
 import mcap.writer
 from mcap.records import Attachment, Metadata
 
-from brakeline.logs.mcap_container import Damage, NotMcap, Series, records
+from brakeline.logs.mcap_container import DamagedBytes, LogChannel, NotMcap, records
 from brakeline.logs.reader import LogError, NotALog
 from brakeline.logs.segment import CHUNK, being_written
 
@@ -89,9 +89,9 @@ def recover(path: Path, out: Path | None = None) -> Recovery:
 def _copy(source: IO[bytes], size: int, sink: IO[bytes], found: Recovery) -> None:
     writer: Any = mcap.writer.Writer(sink, chunk_size=CHUNK)
     writer.start(profile="", library="brakeline recover")
-    numbers: dict[Series, int] = {}
+    numbers: dict[LogChannel, int] = {}
     schemas: dict[tuple[str, bytes], int] = {}
-    for item in records(source, size, lambda key, schema: Series(key, key, None)):
+    for item in records(source, size, lambda key, schema: LogChannel(key, key, None)):
         if type(item) is tuple:
             series, log_time, publish_time, payload = item
             if series not in numbers:
@@ -99,7 +99,7 @@ def _copy(source: IO[bytes], size: int, sink: IO[bytes], found: Recovery) -> Non
             writer.add_message(numbers[series], log_time, payload, publish_time, series.sequence)
             found.messages += 1
             found.last = max(found.last, log_time)
-        elif isinstance(item, Damage):
+        elif isinstance(item, DamagedBytes):
             found.lost += item.lost
             found.cuts.append(str(item))
         elif isinstance(item, Metadata):
@@ -109,7 +109,7 @@ def _copy(source: IO[bytes], size: int, sink: IO[bytes], found: Recovery) -> Non
     writer.finish()
 
 
-def _register(writer: Any, series: Series, schemas: dict[tuple[str, bytes], int]) -> int:
+def _register(writer: Any, series: LogChannel, schemas: dict[tuple[str, bytes], int]) -> int:
     """The number of a channel in the new file, and of its schema."""
     schema, channel = series.schema, series.channel
     assert channel is not None, "the container fills it in"

@@ -37,7 +37,7 @@ class NotMcap(Exception):
 
 
 @dataclass(frozen=True)
-class Damage:
+class DamagedBytes:
     """Bytes that cannot be read."""
 
     at: int  # where they begin
@@ -53,7 +53,7 @@ class Damage:
 
 
 @dataclass(slots=True, eq=False)
-class Series:
+class LogChannel:
     """A channel: the messages published at one key."""
 
     topic: str
@@ -71,14 +71,14 @@ class Series:
 
 
 Row = tuple[Any, int, int, bytes]  # Series, log_time, publish_time [ns], payload
-Item = Row | Metadata | Attachment | Damage
+Item = Row | Metadata | Attachment | DamagedBytes
 
 
 class _Tables:
     """The schemas and channels that were read so far."""
 
-    def __init__(self, make: Callable[[str, str], Series]) -> None:
-        self.make, self.schemas, self.series = make, dict[int, Schema](), dict[int, Series]()
+    def __init__(self, make: Callable[[str, str], LogChannel]) -> None:
+        self.make, self.schemas, self.series = make, dict[int, Schema](), dict[int, LogChannel]()
 
     def learn(self, opcode: int, content: bytes) -> None:
         stream = ReadDataStream(BytesIO(content))
@@ -94,7 +94,7 @@ class _Tables:
                 self.series[channel.id] = series
 
 
-def records(file: IO[bytes], size: int, make: Callable[[str, str], Series]) -> Iterator[Item]:
+def records(file: IO[bytes], size: int, make: Callable[[str, str], LogChannel]) -> Iterator[Item]:
     """Messages, metadata and attachments of a file of `size` bytes, and what of it is damaged, in order.
 
     `make` gives the series for a channel's topic and the name of its schema.
@@ -113,7 +113,7 @@ def records(file: IO[bytes], size: int, make: Callable[[str, str], Series]) -> I
         end = good + _HEAD.size + length
         if not opcode or end > size:
             reason = "a record is cut off" if good < size else "the recorder was killed, or is still at work"
-            yield Damage(good, size - good, reason, at_end=True)
+            yield DamagedBytes(good, size - good, reason, at_end=True)
             return
         content = file.read(length)
         try:
@@ -121,12 +121,12 @@ def records(file: IO[bytes], size: int, make: Callable[[str, str], Series]) -> I
                 yield from _unpacked(_uncompressed(content), tables)
             elif opcode == Opcode.FOOTER:
                 if file.read(len(MAGIC)) != MAGIC:
-                    yield Damage(end, size - end, "its last bytes are cut off", at_end=True)
+                    yield DamagedBytes(end, size - end, "its last bytes are cut off", at_end=True)
                 return
             else:
                 yield from _plain(opcode, content, tables)
         except BROKEN as error:
-            yield Damage(good, end - good, str(error) or type(error).__name__, at_end=False)
+            yield DamagedBytes(good, end - good, str(error) or type(error).__name__, at_end=False)
         good = end
 
 
@@ -190,6 +190,6 @@ def _unpacked(data: bytes, tables: _Tables) -> Iterator[Row]:
         at = after
 
 
-def attachment(robot: str, version: str) -> str:
+def model_attachment_name(robot: str, version: str) -> str:
     """The name in a log of a model set."""
     return f"model/{robot}/{version}.safetensors"

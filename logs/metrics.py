@@ -16,18 +16,18 @@ from typing import Any, TypeVar
 from google.protobuf.message import Message
 
 from brakeline.logs import tube_stats
-from brakeline.logs.decision_stats import Decisions, joined
-from brakeline.logs.episode_stats import KINDS, Figures, Tally, closed_loop
-from brakeline.logs.quantiles import Histogram, spread
-from brakeline.logs.recorded_robots import Robots
-from brakeline.logs.tube_stats import Plans
+from brakeline.logs.decision_stats import DecisionStats, joined
+from brakeline.logs.episode_stats import KINDS, EpisodeStats, Figures, closed_loop
+from brakeline.logs.quantiles import QuantileSketch, spread
+from brakeline.logs.recorded_robots import RecordedRobots
+from brakeline.logs.tube_stats import TubeStats
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.topics import HEALTH, RECORDED, STEP, Topic
 
 K = TypeVar("K")
 V = TypeVar("V")
 
-__all__ = ["KINDS", "Figures", "Metrics", "Tally", "closed_loop", "spread"]
+__all__ = ["KINDS", "EpisodeStats", "Figures", "Metrics", "closed_loop", "spread"]
 
 MOST_STREAMS = 20_000  # what would be one more is nobody's
 MOST_NAMES = 4_000  # of actors, learners, processes; an actor's histograms take 10 kB and more
@@ -40,7 +40,7 @@ class Crowded(ValueError):
 
 
 @dataclass(slots=True)
-class Stream:
+class PublisherStream:
     """One publisher's messages at one key: the gaps in their numbers are losses."""
 
     received: int = 0
@@ -78,12 +78,12 @@ class Metrics:
     came is missing. robots: those that the messages name.
     """
 
-    def __init__(self, topics: Iterable[Topic] = RECORDED, robots: Robots | None = None) -> None:
-        self._robots = robots or Robots()
-        self.actors: dict[str, Tally] = {}
-        self.decisions: dict[str, Decisions] = {}  # by actor
-        self.plans: dict[str, Plans] = {}  # by actor
-        self.streams: dict[tuple[str, int], Stream] = {}  # by key and start of the process
+    def __init__(self, topics: Iterable[Topic] = RECORDED, robots: RecordedRobots | None = None) -> None:
+        self._robots = robots or RecordedRobots()
+        self.actors: dict[str, EpisodeStats] = {}
+        self.decisions: dict[str, DecisionStats] = {}  # by actor
+        self.plans: dict[str, TubeStats] = {}  # by actor
+        self.streams: dict[tuple[str, int], PublisherStream] = {}  # by key and start of the process
         self.learners: dict[str, pb.LearnerMetrics] = {}  # the latest, by robot
         self.processes: dict[str, ProcessFigures] = {}
         self.log_lines: Counter[str] = Counter()  # by level
@@ -104,7 +104,7 @@ class Metrics:
         """
         header: pb.Header = message.header
         sequence, place = header.sequence, (key, header.run)
-        stream = self.streams.get(place) or _entered(self.streams, place, Stream)
+        stream = self.streams.get(place) or _entered(self.streams, place, PublisherStream)
         if sequence and sequence <= stream.last:
             stream.duplicates += 1
             return False
@@ -136,7 +136,7 @@ class Metrics:
         streams = {place: stream for place, stream in self.streams.items() if place[0].startswith(root)}
         return covered(self.spans(streams).values())
 
-    def latency(self) -> dict[str, dict[str, Histogram]]:
+    def latency(self) -> dict[str, dict[str, QuantileSketch]]:
         """By kind of decision and part of the time, in ms."""
         every = joined([self.decisions[name] for name in sorted(self.decisions)])
         return {KINDS[kind]: parts for kind, parts in every.latency.items()}
@@ -153,7 +153,7 @@ class Metrics:
         return totals
 
     @staticmethod
-    def spans(streams: dict[tuple[str, int], Stream]) -> dict[int, tuple[int, int]]:
+    def spans(streams: dict[tuple[str, int], PublisherStream]) -> dict[int, tuple[int, int]]:
         """When each start of a process was first and last heard of, in ns."""
         spans: dict[int, tuple[int, int]] = {}
         for (_, run), stream in streams.items():
@@ -184,19 +184,19 @@ class Metrics:
             "notes": process.notes,
         }
 
-    def _stream(self, key: str, run: int) -> Stream:
-        return _entered(self.streams, (key, run), Stream)
+    def _stream(self, key: str, run: int) -> PublisherStream:
+        return _entered(self.streams, (key, run), PublisherStream)
 
     def _step(self, step: pb.Step) -> None:
         name = step.actor
-        tally = self.actors.get(name) or _entered(self.actors, name, Tally)
+        tally = self.actors.get(name) or _entered(self.actors, name, EpisodeStats)
         tally.step(step)
 
     def _exchange(self, exchange: pb.Exchange) -> None:
         name = exchange.request.actor
-        decisions = self.decisions.get(name) or _entered(self.decisions, name, Decisions)
+        decisions = self.decisions.get(name) or _entered(self.decisions, name, DecisionStats)
         decisions.exchange(exchange)
-        (self.plans.get(name) or _entered(self.plans, name, partial(Plans, self._robots))).exchange(exchange)
+        (self.plans.get(name) or _entered(self.plans, name, partial(TubeStats, self._robots))).exchange(exchange)
 
     def _learner(self, metrics: pb.LearnerMetrics) -> None:
         name = metrics.robot
@@ -229,7 +229,7 @@ class Metrics:
 def _entered(table: dict[K, V], name: K, make: Callable[[], V]) -> V:
     """What the table has under the name, made anew if it is the first time. Raises Crowded."""
     if name not in table:
-        most = MOST_STREAMS if make is Stream else MOST_NAMES
+        most = MOST_STREAMS if make is PublisherStream else MOST_NAMES
         if len(table) >= most:
             raise Crowded(f"{name} is one more than {most}")
         table[name] = make()

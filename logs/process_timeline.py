@@ -27,7 +27,7 @@ class Life:
     restart: bool = False  # it was started again, not merely heard of again
 
 
-class Timeline:
+class ProcessTimeline:
     """Takes what says how processes fare; steps only as times."""
 
     def __init__(self) -> None:

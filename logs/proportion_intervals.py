@@ -37,7 +37,7 @@ def poisson(count: int, of: int) -> Interval | None:
     return low / of, float(gammaincinv(count + 1, 1.0 - tail)) / of
 
 
-class Clustered:
+class ClusteredProportion:
     """The interval of a share of steps, when the steps of one episode resemble each other.
 
     With x_e of n_e steps in episode e, r = Σx / Σn has about the variance E/(E-1) Σ(x_e - r n_e)² / (Σn)²: that of a
@@ -57,7 +57,7 @@ class Clustered:
         self.xn += hits * trials
         self.nn += trials * trials
 
-    def join(self, other: Clustered) -> None:
+    def join(self, other: ClusteredProportion) -> None:
         """Take all episodes of another."""
         for name in ("clusters", "hits", "trials", "xx", "xn", "nn"):
             setattr(self, name, getattr(self, name) + getattr(other, name))

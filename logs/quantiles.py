@@ -1,7 +1,7 @@
 """Figures of a stream of numbers in bounded memory: count, mean, deviation, extremes, percentiles to half a percent.
 
-A `Histogram` has bins whose edges grow by `RATIO`: a percentile is the middle of the bin that holds the value of that
-rank, so it is wrong by at most `RESOLUTION` of itself, whatever the distribution and however long the stream.
+A `QuantileSketch` has bins whose edges grow by `RATIO`. A percentile is the middle of the bin that holds the value of
+that rank, so it is wrong by at most `RESOLUTION` of itself, whatever the distribution and however long the stream.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ def _middle(place: int) -> float:
 
 
 @dataclass
-class Histogram:
+class QuantileSketch:
     """At most some 3,000 bins for values over twelve decades; those that are no numbers, or as good as infinite, are
     only counted apart.
 
@@ -55,7 +55,7 @@ class Histogram:
         if len(waiting) >= BATCH:
             self._sort()
 
-    def settled(self) -> Histogram:
+    def settled(self) -> QuantileSketch:
         """A copy with nothing waiting."""
         copy = replace(self, bins=self.bins.copy(), waiting=self.waiting[:])
         copy._sort()
@@ -122,14 +122,14 @@ class Histogram:
         return [(edge(bar), edge(bar + 1), counts.get(bar, 0)) for bar in range(min(counts), max(counts) + 1)]
 
 
-def merged(parts: Iterable[Histogram]) -> Histogram:
+def merged(parts: Iterable[QuantileSketch]) -> QuantileSketch:
     """All values of the parts. The sums come out the same whenever the parts come in the same order."""
     parts = [part.settled() for part in parts]
     bins: dict[int, int] = {}
     for part in parts:
         for place, count in part.bins.items():
             bins[place] = bins.get(place, 0) + count
-    return Histogram(
+    return QuantileSketch(
         count=sum(part.count for part in parts),
         total=math.fsum(part.total for part in parts),
         squares=math.fsum(part.squares for part in parts),
@@ -140,7 +140,7 @@ def merged(parts: Iterable[Histogram]) -> Histogram:
     )
 
 
-def spread(*parts: Histogram) -> dict[str, float] | None:
+def spread(*parts: QuantileSketch) -> dict[str, float] | None:
     """Mean, standard deviation, median and 99th percentile of the values; None if there is none."""
     values = merged(parts)
     if not values.count:
@@ -148,7 +148,7 @@ def spread(*parts: Histogram) -> dict[str, float] | None:
     return {"mean": values.mean, "std": values.std, "p50": values.percentile(50), "p99": values.percentile(99)}
 
 
-def summary(*parts: Histogram) -> dict[str, float] | None:
+def summary(*parts: QuantileSketch) -> dict[str, float] | None:
     """As `spread`, with how many values there are, the extremes and the 90th percentile."""
     values = merged(parts)
     if not values.count:

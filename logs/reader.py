@@ -16,8 +16,8 @@ from typing import Any, NamedTuple
 from google.protobuf.message import DecodeError, Message
 from mcap.records import Attachment, Metadata
 
-from brakeline.logs.mcap_container import Damage, NotMcap, Row, Series, records
-from brakeline.logs.recorded_robots import Robots
+from brakeline.logs.mcap_container import DamagedBytes, LogChannel, NotMcap, Row, records
+from brakeline.logs.recorded_robots import RecordedRobots
 from brakeline.logs.segment import being_written, name_of, number_of
 from brakeline.messaging.message_checks import Implausible, check
 from brakeline.messaging.topics import TOPICS
@@ -51,7 +51,7 @@ class Record(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Cut:
+class DamagedFile:
     """A file that is not as it should be: the recorder was killed, its disk was full, or bytes were changed."""
 
     path: Path
@@ -67,7 +67,7 @@ class Cut:
 
 
 @dataclass(frozen=True)
-class Absent:
+class MissingSegment:
     """A segment that must have been there: later ones are."""
 
     path: Path
@@ -103,16 +103,16 @@ class Log:
     paths: tuple[Path, ...]
     metadata: dict[str, dict[str, str]] = field(default_factory=dict)  # the latest of each name
     attachments: dict[str, bytes] = field(default_factory=dict)  # likewise: the model sets of the run's start
-    cuts: list[Cut | Absent] = field(default_factory=list)
+    cuts: list[DamagedFile | MissingSegment] = field(default_factory=list)
     malformed: int = 0  # messages that are not of their type, or say what nobody can handle
     segments: list[Segment] = field(default_factory=list)
-    robots: Robots = field(default_factory=Robots)
+    robots: RecordedRobots = field(default_factory=RecordedRobots)
 
     def __iter__(self) -> Iterator[Record]:
         for series, message, log_time, publish_time in self.decoded():
             yield Record(series.topic, series.key, message, log_time, publish_time)
 
-    def decoded(self) -> Iterator[tuple[Series, Any, int, int]]:
+    def decoded(self) -> Iterator[tuple[LogChannel, Any, int, int]]:
         """As iterating, with plain tuples (channel, message, log_time, publish_time): faster."""
         for series, log_time, publish_time, payload in self.rows():
             try:
@@ -140,7 +140,7 @@ class Log:
                         about.took(item[1])
                         if item[0].known:  # others may have added channels of their own
                             yield item
-                    elif isinstance(item, Damage):
+                    elif isinstance(item, DamagedBytes):
                         self._note(about, item)
                     elif isinstance(item, Metadata):
                         self.metadata[item.name] = dict(item.metadata)
@@ -151,14 +151,14 @@ class Log:
         except NotMcap as error:
             raise NotALog(f"{path} is not an MCAP file: {error}") from error
 
-    def _note(self, about: Segment, damage: Damage) -> None:
+    def _note(self, about: Segment, damage: DamagedBytes) -> None:
         reason = "it is being recorded" if about.recording and damage.at_end else damage.reason
-        self.cuts.append(Cut(about.path, damage.lost, reason, None if damage.at_end else damage.at))
+        self.cuts.append(DamagedFile(about.path, damage.lost, reason, None if damage.at_end else damage.at))
 
     @staticmethod
-    def _series(key: str, schema: str) -> Series:
+    def _series(key: str, schema: str) -> LogChannel:
         kind, root = TYPES.get(schema), key.split("/", 1)[0]
-        return Series(NAMES.get(root, root), key, None if kind is None else kind.FromString)
+        return LogChannel(NAMES.get(root, root), key, None if kind is None else kind.FromString)
 
 
 def find(paths: Paths) -> tuple[Path, ...]:
@@ -198,14 +198,14 @@ def by_run(paths: Sequence[Path]) -> dict[str, tuple[Path, ...]]:
     return runs
 
 
-def absent(paths: Sequence[Path]) -> list[Cut | Absent]:
+def absent(paths: Sequence[Path]) -> list[DamagedFile | MissingSegment]:
     """The segments that are missing between those at `paths`: numbers that were left out."""
-    found: list[Cut | Absent] = []
+    found: list[DamagedFile | MissingSegment] = []
     for (folder, name), files in groupby(paths, key=lambda path: (path.parent, number_of(path)[0])):
         numbers = [number_of(path)[1] for path in files]
         if len(numbers) > 1:
             gone = sorted(set(range(numbers[-1])) - set(numbers))
-            found += [Absent(folder / name_of(f"{name}.mcap", number)) for number in gone]
+            found += [MissingSegment(folder / name_of(f"{name}.mcap", number)) for number in gone]
     return found
 
 

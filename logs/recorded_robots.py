@@ -13,7 +13,7 @@ from brakeline.messaging.task import robot_with_task
 log = logging.getLogger("brakeline.logs")
 
 
-class Robots:
+class RecordedRobots:
     """Robots by name: those that the log describes, and those that come with the program, with their usual tasks."""
 
     def __init__(self, robots: Iterable[Robot] = ()) -> None:

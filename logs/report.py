@@ -8,9 +8,9 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from brakeline.logs.console_tables import PLAIN, Stacking
+from brakeline.logs.console_tables import PLAIN, StackingTable
 from brakeline.logs.episode_stats import CONTACTS
-from brakeline.logs.log_analysis import SETUP, analysed
+from brakeline.logs.log_analysis import SETUP, analyse_runs
 from brakeline.logs.metrics import Figures
 from brakeline.logs.reader import Paths
 from brakeline.logs.tube_stats import stated
@@ -19,14 +19,14 @@ BLOCKS = "▁▂▃▄▅▆▇█"
 
 
 def analyse(paths: Paths) -> Figures:
-    """The figures of the logs at `paths`: those of `Metrics` and of `Training`, how each run was set up (from the
+    """The figures of the logs at `paths`: those of `Metrics` and of `LearningCurve`, how each run was set up (from the
     metadata in its log; None where it does not tell, or where runs differ), and what of the logs is damaged.
 
     Raises:
         NoLog: there is none.
         NotALog: a file is something else.
     """
-    return analysed(paths).figures()
+    return analyse_runs(paths).figures()
 
 
 def show(figures: Figures, verbose: bool = False) -> RenderableType:
@@ -61,7 +61,7 @@ def show_episode(episode: Figures) -> RenderableType:
         f"{episode['actor']}, episode {episode['episode']} ({episode['arena'] or 'its beginning is in no file'}): "
         f"{episode['outcome']} after {episode['steps']} steps, reward {episode['reward']:.2f}{closest}"
     )
-    table = Stacking(
+    table = StackingTable(
         "step", "x, y [m]", "proposed", "executed", "decision", "ms", "margin [m]", "clear [m]", "why", **PLAIN
     )
     for row in episode["rows"]:
@@ -84,7 +84,7 @@ def _vector(values: list[float]) -> str:
 
 
 def _summary(figures: Figures) -> Table:
-    table = Stacking(show_header=False, **PLAIN)
+    table = StackingTable(show_header=False, **PLAIN)
     episodes, steps = figures["episodes"], figures["steps"]
     within = figures.get("intervals") or {}
     setup = [f"{name} {figures[name]}" for name in SETUP if figures.get(name) is not None]
@@ -170,7 +170,7 @@ def _runs(runs: dict[str, Figures]) -> Table:
         "interventions",
         "reward",
     )
-    table = Stacking("run", *columns, **PLAIN)
+    table = StackingTable("run", *columns, **PLAIN)
     for label, run in runs.items():
         setup = [
             "-" if run[name] is None else str(run[name]) for name in ("method", "certificate", "perception", "seed")
@@ -184,7 +184,7 @@ def _runs(runs: dict[str, Figures]) -> Table:
 
 
 def _decisions(times: Figures) -> Table:
-    table = Stacking("decision [ms]", "mean", "std", "p50", "p99", **PLAIN)
+    table = StackingTable("decision [ms]", "mean", "std", "p50", "p99", **PLAIN)
     for kind in ("all", "allowed", "adjusted", "failsafe", "recovering"):
         row = times if kind == "all" else times[kind]
         if row is not None:
@@ -195,7 +195,7 @@ def _decisions(times: Figures) -> Table:
 def _latency(latency: Figures) -> Table:
     """Where the time of a decision goes, by its kind."""
     columns = ("mean", "std", "p50", "p90", "p99", "max")
-    table = Stacking("decision [ms]", "part", *columns, **PLAIN)
+    table = StackingTable("decision [ms]", "part", *columns, **PLAIN)
     for kind, parts in latency.items():
         for part, row in parts.items():
             if row is not None:
@@ -207,7 +207,7 @@ def _latency(latency: Figures) -> Table:
 def _training(robot: str, training: Figures) -> Table:
     """Rates over the training, as rows of characters."""
     bins = _coarse(training["bins"], 60)
-    table = Stacking(f"{robot} over training", "first", "last", "", **PLAIN)
+    table = StackingTable(f"{robot} over training", "first", "last", "", **PLAIN)
     for label, name in (("interventions", "interventions"), ("goals", "goals"), ("reward", "reward")):
         values = [row[name] for row in bins if row[name] is not None]
         if values:
@@ -245,7 +245,7 @@ def _sparkline(values: list[float]) -> str:
 
 
 def _processes(processes: Figures) -> Table:
-    table = Stacking("process", "starts", "lived, s", "messages/s", "silences", "ended", **PLAIN)
+    table = StackingTable("process", "starts", "lived, s", "messages/s", "silences", "ended", **PLAIN)
     for name, process in processes.items():
         rate = _optional("{:.1f}", process["messages_per_s"])
         longest = process["longest_silence"]
@@ -256,7 +256,7 @@ def _processes(processes: Figures) -> Table:
 
 
 def _topics(topics: dict[str, dict[str, int]]) -> Table:
-    table = Stacking("topic", "messages", "missing", "duplicates", **PLAIN)
+    table = StackingTable("topic", "messages", "missing", "duplicates", **PLAIN)
     for key, counts in topics.items():
         table.add_row(key, *(str(counts[name]) for name in ("messages", "missing", "duplicates")))
     return table
@@ -264,7 +264,7 @@ def _topics(topics: dict[str, dict[str, int]]) -> Table:
 
 def _metadata(metadata: Figures) -> Table:
     """What the log says of its run; the configuration is long, and left to --json and --html."""
-    table = Stacking("metadata", "", **PLAIN)
+    table = StackingTable("metadata", "", **PLAIN)
     for name, values in metadata.items():
         if name != "configuration" and isinstance(values, dict):
             table.add_row(name, Text(", ".join(f"{key} {value}" for key, value in values.items())))

@@ -87,7 +87,7 @@ def being_written(path: Path) -> bool:
     return False
 
 
-class Spool:
+class BufferedFile:
     """A file whose bytes wait in memory until `flush` writes all of them, or none.
 
     A disk that is full thus leaves the file as it was after the last flush.
@@ -142,7 +142,7 @@ class Segment:
             OSError: there is no space for it.
         """
         self.path = path
-        self._spool = Spool(file)
+        self._spool = BufferedFile(file)
         output: Any = self._spool  # of a file it needs `write`, `tell` and `flush`
         self._writer: Any = mcap.writer.Writer(output, chunk_size=CHUNK)
         self._schemas: dict[str, int] = {}
@@ -168,7 +168,7 @@ class Segment:
         Returns how many were left out, being of channels that are too many for a file.
 
         Raises:
-            OSError: as `Spool.flush`; no entry is in the file, which must then be abandoned.
+            OSError: as `BufferedFile.flush`; no entry is in the file, which must then be abandoned.
         """
         left_out = 0
         for entry in entries:

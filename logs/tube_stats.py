@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from brakeline.logs.decision_explanation import bound_in
 from brakeline.logs.episode_stats import Figures
-from brakeline.logs.recorded_robots import Robots
+from brakeline.logs.recorded_robots import RecordedRobots
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.stated_share import UNSTATED, percent
 
@@ -26,13 +26,13 @@ _OWN = (int(pb.ALLOWED), int(pb.ADJUSTED))
 
 
 @dataclass
-class Plans:
+class TubeStats:
     """Of one actor. flown: verified plans that it went on along for more than their first period, for nothing newer was
     verified; outside: of these, in which it was measured outside of the plan's tube, at any period's end; excess: the
     largest share of a tube's half-width that any position came to; bound: the largest share of them outside that the
     model sets stated which verified them, None: not all say."""
 
-    robots: Robots = field(default_factory=Robots)
+    robots: RecordedRobots = field(default_factory=RecordedRobots)
     flown: int = 0
     outside: int = 0
     excess: float = 0.0
@@ -106,7 +106,7 @@ def _tube_of(exchange: pb.Exchange) -> tuple[Array, Array] | None:
     return centers.reshape(periods, -1), half.reshape(periods, -1)
 
 
-def figures(parts: Iterable[Plans]) -> Figures:
+def figures(parts: Iterable[TubeStats]) -> Figures:
     """Of all actors."""
     parts = [part for part in parts if part.flown]
     stated = [part.bound for part in parts]

@@ -12,7 +12,7 @@ import tyro
 
 from brakeline.deploy.commands.common_options import console, errors, say_json
 from brakeline.deploy.progress import under_way
-from brakeline.logs.log_analysis import Look, analysed
+from brakeline.logs.log_analysis import AnalysisOptions, analyse_runs
 from brakeline.logs.log_recovery import recover
 from brakeline.logs.reader import find
 from brakeline.logs.report import show, show_episode
@@ -40,7 +40,7 @@ class Analyse:
         if self.json and self.csv:
             raise ValueError("--json or --csv: one of them")
         with under_way("reading " + ", ".join(map(str, self.logs))):
-            analysis = analysed(list(self.logs), Look(self.html is not None, self.episode, self.actor))
+            analysis = analyse_runs(list(self.logs), AnalysisOptions(self.html is not None, self.episode, self.actor))
         figures = analysis.figures()
         if self.episode is not None and not figures["episode_detail"]:
             whose = f" of {self.actor}" if self.actor else ""

@@ -29,7 +29,7 @@ from brakeline.deploy.data.run_dataset import Recorded, from_log
 from brakeline.deploy.data.simulated_recording import SEED, data_for, recorded
 from brakeline.deploy.data.supported_modes import Unsupported, supported
 from brakeline.deploy.progress import under_way
-from brakeline.logs.console_tables import Stacking
+from brakeline.logs.console_tables import StackingTable
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.bus import Bus
 from brakeline.messaging.task import robot_maybe_with_task
@@ -286,8 +286,8 @@ def widened(statement: ValidationReport) -> str:
     )
 
 
-def table(rows: list[tuple[ValidationReport, str]]) -> Stacking:
-    shown = Stacking(title="what held-out plans say (bounds at 99 % confidence)")
+def table(rows: list[tuple[ValidationReport, str]]) -> StackingTable:
+    shown = StackingTable(title="what held-out plans say (bounds at 99 % confidence)")
     for column in (
         *("certificate", "mode", "driving", "samples", "rank", "condition", "plans", "violations"),
         *(

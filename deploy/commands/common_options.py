@@ -16,7 +16,7 @@ import tyro
 from rich.console import Console
 
 from brakeline.actors.actor_settings import FlightSettings
-from brakeline.logs.console_tables import PLAIN, Stacking
+from brakeline.logs.console_tables import PLAIN, StackingTable
 from brakeline.safety.model.model_config import ModelConfig
 from brakeline.sim.sim_conditions import Conditions, NoiseLevels, Perception, QuadrotorNoise, SensorFaults, Wind
 
@@ -221,9 +221,9 @@ errors = Console(stderr=True, highlight=False, soft_wrap=True)
 Robot = Annotated[str, tyro.conf.Positional]
 
 
-def conditions(about: dict[str, str]) -> Stacking:
+def conditions(about: dict[str, str]) -> StackingTable:
     """How data were recorded, a line each."""
-    shown = Stacking(show_header=False, **PLAIN)
+    shown = StackingTable(show_header=False, **PLAIN)
     for name, value in about.items():
         shown.add_row(name.replace("_", " "), value)
     return shown

@@ -17,7 +17,7 @@ from brakeline.deploy.commands.common_options import (
 )
 from brakeline.deploy.experiments.evaluate import Evaluation, evaluate, prepared
 from brakeline.deploy.progress import under_way
-from brakeline.logs.metrics import Tally
+from brakeline.logs.metrics import EpisodeStats
 from brakeline.logs.report import show
 from brakeline.messaging.task import RobotWithTask, robot_with_task
 
@@ -73,7 +73,7 @@ class Evaluate:
             self._draw(robot, what, self.render)
         with under_way("driving episodes", self.episodes) as advance:
 
-            def each(tally: Tally) -> None:
+            def each(tally: EpisodeStats) -> None:
                 told = f"goals {tally.goals}, collisions {tally.collisions}, interventions {tally.interventions}"
                 advance(what=told)
 

@@ -18,7 +18,7 @@ from brakeline.deploy.data.data_paths import record_path
 from brakeline.deploy.data.resample import HOLD
 from brakeline.deploy.data.sources.quantity_names import columns_of
 from brakeline.deploy.progress import under_way
-from brakeline.logs.console_tables import PLAIN, Stacking
+from brakeline.logs.console_tables import PLAIN, StackingTable
 from brakeline.messaging.robot import robot_named
 from brakeline.messaging.task import RobotWithTask, robot_with_task
 
@@ -68,8 +68,8 @@ class Import:
         return 0
 
 
-def covered(told: Coverage) -> Stacking:
-    shown = Stacking(**PLAIN)
+def covered(told: Coverage) -> StackingTable:
+    shown = StackingTable(**PLAIN)
     for column in ("", "least", "most", "bounds", "covered"):
         shown.add_column(column, justify="left" if not column else "right")
     for one in told.seen:

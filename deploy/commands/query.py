@@ -11,7 +11,7 @@ from typing import Any
 from rich.markup import escape
 
 from brakeline.deploy.commands.common_options import Endpoints, Flags, Robot, console, say_json
-from brakeline.logs.console_tables import PLAIN, Stacking
+from brakeline.logs.console_tables import PLAIN, StackingTable
 from brakeline.messaging.bus import Bus, Sample
 from brakeline.messaging.obstacle import KINDS, Obstacle
 from brakeline.messaging.range_image import RangeImage
@@ -105,7 +105,7 @@ class Query:
         why = " for clearance: the proposal is verified too," if answer.for_clearance else ""
         console.print(f"[bold]{answer.kind}[/]{why} {escape(answer.reason)}")
         console.print(describe_verification(answer.verified, answer.bound), markup=False)
-        shown = Stacking(**PLAIN)
+        shown = StackingTable(**PLAIN)
         for column in ("period", *robot.action, "center [m]", "± [m]"):
             shown.add_column(column)
         for k, (u, c, h) in enumerate(
@@ -150,7 +150,7 @@ class Status:
         if self.json:
             say_json({"alive": alive, "processes": processes, "learners": learners})
             return 0
-        table = Stacking(**PLAIN)
+        table = StackingTable(**PLAIN)
         for column in ("process", "state", "what it says"):
             table.add_column(column)
         for name in sorted({*alive, *processes}):

@@ -17,7 +17,7 @@ from brakeline.deploy.data.certification import certified
 from brakeline.deploy.data.model_store import model_for
 from brakeline.deploy.progress import under_way
 from brakeline.deploy.run.replay_run import ROUNDING, Instead, replay
-from brakeline.logs.console_tables import PLAIN, Stacking
+from brakeline.logs.console_tables import PLAIN, StackingTable
 from brakeline.logs.log_length import count
 from brakeline.messaging.robot import Robot
 from brakeline.messaging.topics import EXCHANGE
@@ -113,15 +113,15 @@ def show(figures: dict[str, Any]) -> None:
     if not figures["different"]:
         return
     console.print(f"the robot is told the same in {share(figures['same_input'], compared)}")
-    kinds = Stacking("decided", "now", "requests", **PLAIN)
+    kinds = StackingTable("decided", "now", "requests", **PLAIN)
     for logged, row in figures["kinds"].items():
         for now, number in row.items():
             kinds.add_row(logged, now, str(number))
-    fields = Stacking("field", "differs in", "by at most", **PLAIN)
+    fields = StackingTable("field", "differs in", "by at most", **PLAIN)
     for name, about in figures["fields"].items():
         fields.add_row(name, str(about["count"]), size(about["largest"]))
     columns = ("largest differences", "decided", "now", "input", "margin")
-    examples = Stacking(*columns, **PLAIN)
+    examples = StackingTable(*columns, **PLAIN)
     for one in figures["examples"]:
         place = f"{one['actor']} episode {one['episode']} step {one['step']}"
         found = (size(one["differences"].get(name, 0.0)) for name in ("input", "margin"))

@@ -11,7 +11,7 @@ from rich.markup import escape
 
 from brakeline.deploy.commands.common_options import console, errors, say_json
 from brakeline.deploy.data.description_plot import picture, summary
-from brakeline.logs.console_tables import PLAIN, Stacking
+from brakeline.logs.console_tables import PLAIN, StackingTable
 from brakeline.messaging.robot import ROBOTS_FOLDER, robot_named
 from brakeline.messaging.robot_description import NAME, BadDescription
 from brakeline.messaging.task import RobotWithTask, robot_maybe_with_task
@@ -80,7 +80,7 @@ class RobotCommand:
         if self.json:
             say_json(found)
             return 0
-        table = Stacking(show_header=False, **PLAIN)
+        table = StackingTable(show_header=False, **PLAIN)
         for label, one in found.pop("inputs").items():
             table.add_row(escape(f"input {label}"), f"{one['low']:g} to {one['high']:g}, stop: {one['stop']}")
         for name, value in found.items():

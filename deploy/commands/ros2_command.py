@@ -18,7 +18,7 @@ from brakeline.deploy.commands.common_options import Flags, Physics, Robot, Serv
 from brakeline.deploy.data.model_store import model_for
 from brakeline.deploy.experiments.evaluate import in_process
 from brakeline.deploy.run.ros2_bridge import Bridge, BridgeSettings
-from brakeline.logs.bag_writer import Bag
+from brakeline.logs.bag_writer import BagWriter
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.bus import Bus, BusSettings
 from brakeline.messaging.ros2 import ROUTER, RosSettings
@@ -120,11 +120,11 @@ class Ros2:
             yield question
 
     @contextlib.contextmanager
-    def _tap(self) -> Iterator[Bag | None]:
+    def _tap(self) -> Iterator[BagWriter | None]:
         if self.bag is None:
             yield None
         else:
-            with Bag(self.bag) as bag:
+            with BagWriter(self.bag) as bag:
                 yield bag
 
 
@@ -173,7 +173,7 @@ class BridgeSim:
         )
         log_to_stderr("bridge-sim")
         with contextlib.ExitStack() as stack:
-            bag = stack.enter_context(Bag(self.bag)) if self.bag is not None else None
+            bag = stack.enter_context(BagWriter(self.bag)) if self.bag is not None else None
             bridge = Bridge(settings, bag)
             stack.callback(bridge.close)
             if not self.json:

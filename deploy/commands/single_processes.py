@@ -150,9 +150,9 @@ class Recorder:
     def run(self) -> int:
         from brakeline.deploy.run.mavlink_json import as_json, both
         from brakeline.logs import recorder
-        from brakeline.logs.foxglove import Pictures
+        from brakeline.logs.foxglove import FoxgloveConverter
 
         about = {"versions": {"brakeline": version("brakeline")}}
-        derive = both(Pictures(self.pictures).of_sample, as_json) if self.pictures > 0.0 else as_json
+        derive = both(FoxgloveConverter(self.pictures).from_sample, as_json) if self.pictures > 0.0 else as_json
         recorder.main(self.endpoints.bus(), self.log, about, self.name, derive=derive, rotation=self.rotation)
         return 0

@@ -10,9 +10,9 @@ from contextlib import ExitStack
 from dataclasses import dataclass, field
 
 from brakeline.deploy.commands.common_options import Endpoints, Flags, console
-from brakeline.logs.watch.foxglove_server import ORIGINS, Live
-from brakeline.logs.watch.live_board import Board
-from brakeline.logs.watch.live_page_server import Server
+from brakeline.logs.watch.dashboard import Dashboard
+from brakeline.logs.watch.foxglove_server import ORIGINS, FoxgloveServer
+from brakeline.logs.watch.live_page_server import LivePageServer
 from brakeline.messaging.bus import Bus, Sample
 from brakeline.messaging.rejected_messages import RejectedMessages
 from brakeline.messaging.stop_signals import stop_on_signals
@@ -38,12 +38,12 @@ class Watch:
 
     def run(self) -> int:
         inbox: deque[Sample] = deque(maxlen=INBOX)
-        board, live = Board(), None
+        board, live = Dashboard(), None
         with ExitStack() as stack:
             bus = stack.enter_context(Bus(self.endpoints.bus(), f"viewer.watch-{time.time_ns() % 10**6}"))
-            server = stack.enter_context(Server(board.view, self.host, self.port))
+            server = stack.enter_context(LivePageServer(board.view, self.host, self.port))
             if self.foxglove_port >= 0:
-                live = stack.enter_context(Live(self.host, self.foxglove_port, origins=self.origins))
+                live = stack.enter_context(FoxgloveServer(self.host, self.foxglove_port, origins=self.origins))
             stop = stack.enter_context(stop_on_signals(threading.Event()))
             for topic in RECORDED:
                 bus.subscribe(topic, inbox.append)
@@ -62,7 +62,7 @@ class Watch:
         console.print("[dim]^C ends the watching; the run goes on[/]")
 
 
-def _show(inbox: deque[Sample], board: Board, live: Live | None, rejected: RejectedMessages) -> None:
+def _show(inbox: deque[Sample], board: Dashboard, live: FoxgloveServer | None, rejected: RejectedMessages) -> None:
     """What has come since the last look."""
     for _ in range(len(inbox)):
         sample = inbox.popleft()

@@ -15,7 +15,7 @@ from brakeline.deploy.data.model_store import method_for
 from brakeline.deploy.policy_loading import policy_named
 from brakeline.deploy.vehicle_factory import environment, fleet_world
 from brakeline.logs.log_analysis import perception_in
-from brakeline.logs.metrics import Tally, closed_loop
+from brakeline.logs.metrics import EpisodeStats, closed_loop
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.task import RobotWithTask
 from brakeline.safety.methods import DDPC, Model
@@ -124,14 +124,14 @@ def prepared_fleet(robot: RobotWithTask, what: Evaluation) -> tuple[RobotGroup, 
 
 
 def evaluate(
-    robot: RobotWithTask, what: Evaluation, each: Callable[[Tally], Any] = lambda tally: None
+    robot: RobotWithTask, what: Evaluation, each: Callable[[EpisodeStats], Any] = lambda tally: None
 ) -> dict[str, Any]:
     """The shared figures of `what.episodes` episodes (of a fleet: of at least so many, each robot's counted); `each` is
     called after every one."""
     if what.fleet:
         return _together(robot, what, each) | _about(what)
     driver, policy, question = prepared(robot, what)
-    tally = Tally()
+    tally = EpisodeStats()
     for number in range(what.episodes):
         for step in episode(driver, policy, question, number):
             tally.step(step)
@@ -139,10 +139,10 @@ def evaluate(
     return closed_loop([tally]) | _about(what)
 
 
-def _together(robot: RobotWithTask, what: Evaluation, each: Callable[[Tally], Any]) -> dict[str, Any]:
+def _together(robot: RobotWithTask, what: Evaluation, each: Callable[[EpisodeStats], Any]) -> dict[str, Any]:
     """A fleet's figures: of all, by kind and by robot as `analyse` has them, and of its worlds."""
     fleet, world, policies, question = prepared_fleet(robot, what)
-    tallies = {driver.identity.actor: Tally() for driver in fleet.drivers}
+    tallies = {driver.identity.actor: EpisodeStats() for driver in fleet.drivers}
     rounds, periods = -(-what.episodes // what.fleet), 0
     for number in range(rounds):
         for steps in round_of(fleet, policies, question, number):

@@ -17,8 +17,8 @@ from brakeline.deploy.run.run_keys import KEYS, seal_models
 from brakeline.deploy.run.run_view import View
 from brakeline.deploy.run.supervisor import LaunchError, SupervisedProcess, last_line
 from brakeline.logs.metrics import Metrics
-from brakeline.logs.recorded_robots import Robots
-from brakeline.logs.watch.run_totals import told, totals
+from brakeline.logs.recorded_robots import RecordedRobots
+from brakeline.logs.watch.run_totals import run_totals, totals_to_health
 from brakeline.messaging.bus import BusError, BusSettings, Sample
 from brakeline.messaging.process_runtime import Process
 from brakeline.messaging.rejected_messages import RejectedMessages, headline
@@ -58,7 +58,7 @@ class Launcher:
         """bus: where it listens, and the keys of all processes, if they have any."""
         self.config, self.folder, self.bus = config, folder, bus
         self.children = [SupervisedProcess(place, folder) for place in places(config)]
-        self.metrics = Metrics(robots=Robots(robot_named(name) for name in config.robots))
+        self.metrics = Metrics(robots=RecordedRobots(robot_named(name) for name in config.robots))
         self.lines: deque[str] = deque(maxlen=200)
         self._inbox: deque[Sample] = deque()
         self._rejected = RejectedMessages()  # the bus's, once there is one
@@ -110,7 +110,7 @@ class Launcher:
         """Of the whole run, with each sign of life: who watches may have come in its middle."""
         config = self.config
         process.figures.update({f"restarts {child.place.name}": child.restarts for child in self.children})
-        process.figures.update(told(totals(self.metrics)))
+        process.figures.update(totals_to_health(run_totals(self.metrics)))
         process.notes.update(
             {
                 "run": self.folder.name,
@@ -210,7 +210,7 @@ class Launcher:
                 if sample.topic.name == "health":
                     for child in self.children:
                         if child.place.name == message.process:
-                            child.heard(message.pid)
+                            child.totals_from_health(message.pid)
                 if sample.topic.name == "log" and message.level in ("WARNING", "ERROR"):
                     self.lines.append(f"{message.process}: {headline(message.text)}")
 

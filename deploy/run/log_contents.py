@@ -8,7 +8,7 @@ from pathlib import Path
 
 from brakeline.deploy.data.data_paths import method_path
 from brakeline.deploy.run.run_config import RunConfig, encode
-from brakeline.logs.mcap_container import attachment
+from brakeline.logs.mcap_container import model_attachment_name
 from brakeline.messaging.robot import robot_named
 from brakeline.messaging.task import robot_maybe_with_task
 from brakeline.safety.methods import DDPC, load
@@ -48,8 +48,8 @@ def attachments(config: RunConfig, folder: Path) -> dict[str, bytes]:
     models = (
         load(method_path(robot_maybe_with_task(robot), config.method, config.model_config)) for robot in config.robots
     )
-    files = {attachment(model.robot.name, model.version): model.encode() for model in models}
+    files = {model_attachment_name(model.robot.name, model.version): model.encode() for model in models}
     for robot in (robot_named(name).name for name in config.robots):
         archived = (folder / robot / "models").glob("*.safetensors")
-        files |= {attachment(robot, path.stem): path.read_bytes() for path in archived}
+        files |= {model_attachment_name(robot, path.stem): path.read_bytes() for path in archived}
     return files

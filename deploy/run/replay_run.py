@@ -22,7 +22,7 @@ from google.protobuf.message import Message
 
 from brakeline.deploy.data.data_paths import data_root
 from brakeline.logs.episode_stats import KINDS
-from brakeline.logs.mcap_container import attachment
+from brakeline.logs.mcap_container import model_attachment_name
 from brakeline.logs.reader import Log, Paths, open_log
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.robot import Robot
@@ -69,7 +69,7 @@ class Archive:
         return self.methods[version]
 
     def _model(self, robot: str, version: str) -> Any:
-        attached = self.log.attachments.get(attachment(robot, version))
+        attached = self.log.attachments.get(model_attachment_name(robot, version))
         if attached is not None:
             return decode(attached)
         for root in (*dict.fromkeys(path.parent for path in self.log.paths), data_root()):

@@ -36,11 +36,11 @@ def _recorder(place: ProcessSpec, folder: Path, config: RunConfig, bus: BusSetti
     from brakeline.deploy.run.log_contents import attachments, metadata
     from brakeline.deploy.run.mavlink_json import as_json, both
     from brakeline.logs import recorder
-    from brakeline.logs.foxglove import Pictures
-    from brakeline.logs.recorded_robots import Robots
+    from brakeline.logs.foxglove import FoxgloveConverter
+    from brakeline.logs.recorded_robots import RecordedRobots
 
-    robots = Robots(robot_maybe_with_task(name) for name in config.robots)
-    derive = both(Pictures(config.pictures, robots).of_sample, as_json) if config.pictures > 0.0 else as_json
+    robots = RecordedRobots(robot_maybe_with_task(name) for name in config.robots)
+    derive = both(FoxgloveConverter(config.pictures, robots).from_sample, as_json) if config.pictures > 0.0 else as_json
     about, files = metadata(config), attachments(config, folder)
     recorder.main(bus, folder / LOG, about, place.name, files, derive, config.rotation)
     return False

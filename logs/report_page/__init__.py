@@ -41,8 +41,7 @@ RATES = (  # name, of what, in words
 
 
 def render(figures: Figures, runs: Mapping[str, tuple[Figures, Figures]]) -> str:
-    """The page about runs, as `Analyses` gives them: what they share, their curves over each other, and each by itself
-    with its figures and pictures."""
+    """Render the HTML page of the runs of a `LogAnalysis`: what they share, their curves, and each run by itself."""
     environment = Environment(
         loader=FunctionLoader(_text), autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )

@@ -14,7 +14,7 @@ from ipaddress import ip_address
 from urllib.parse import urlsplit
 
 
-def refusal(headers: Message, host: str, port: int, origins: Collection[str] = ()) -> str:
+def rejection_reason(headers: Message, host: str, port: int, origins: Collection[str] = ()) -> str:
     """Why a request with these headers is refused; empty: it is not.
 
     It is for `host`:`port` (or an address, or localhost), and comes from a page from there, from one of `origins`, or

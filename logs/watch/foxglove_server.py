@@ -13,17 +13,17 @@ from foxglove.websocket import ServerListener
 from google.protobuf.message import Message
 from mcap_protobuf.schema import build_file_descriptor_set
 
-from brakeline.logs.foxglove import ROOT, Pictures
+from brakeline.logs.foxglove import ROOT, FoxgloveConverter
 from brakeline.logs.recorder import entry
 from brakeline.logs.segment import Entry
-from brakeline.logs.watch.websocket_gate import Gate, hidden_host
+from brakeline.logs.watch.websocket_gate import WebSocketGate, hidden_host
 from brakeline.messaging.bus import Sample
 
 RATE = 20.0  # pictures a second and robot
 ORIGINS = ("https://app.foxglove.dev",)  # Foxglove in a browser
 
 
-class Live:
+class FoxgloveServer:
     """A Foxglove server at `url`, from `with` to the end of the block. `take` is for one thread.
 
     Raises:
@@ -35,7 +35,7 @@ class Live:
     ) -> None:
         """`port` 0: a free one; origins: of the pages that may connect; programs that are no browser always may."""
         self.host, self.port, self._origins = host, port, origins
-        self._pictures = Pictures(rate)
+        self._pictures = FoxgloveConverter(rate)
         self._context = foxglove.Context()
         self._channels: dict[str, foxglove.Channel] = {}
         self._schemas: dict[str, foxglove.Schema] = {}
@@ -49,7 +49,7 @@ class Live:
             name="brakeline", host=hidden, port=0, context=self._context, server_listener=listener
         )
         try:
-            self._gate = Gate(self.host, self.port, (hidden, self._server.port), self._origins)
+            self._gate = WebSocketGate(self.host, self.port, (hidden, self._server.port), self._origins)
         except OSError:
             self._server.stop()
             raise
@@ -64,7 +64,7 @@ class Live:
     def take(self, sample: Sample) -> None:
         """Publish a message and what is drawn of it."""
         self._publish(entry(sample))
-        for picture in self._pictures.of_sample(sample):
+        for picture in self._pictures.from_sample(sample):
             if picture.key.startswith(f"{ROOT}/arena/"):
                 self._arenas[picture.key] = picture
             self._publish(picture)

@@ -17,7 +17,7 @@ from importlib.resources import files
 from types import TracebackType
 from typing import Any, Self
 
-from brakeline.logs.watch.allowed_hosts import refusal
+from brakeline.logs.watch.allowed_hosts import rejection_reason
 
 RATE = 10.0  # Hz of events
 PATIENCE = 10.0  # s for a request, and for a reader that does not read
@@ -37,7 +37,7 @@ HEADERS = {
 View = Callable[[], dict[str, Any]]
 
 
-class Server:
+class LivePageServer:
     """The page at `url`, from `with` to the end of the block.
 
     Raises:
@@ -74,7 +74,7 @@ class _Handler(BaseHTTPRequestHandler):
     def do_GET(self) -> None:
         path = self.path.split("?", 1)[0]
         try:
-            if why := refusal(self.headers, self._host, self.connection.getsockname()[1]):
+            if why := rejection_reason(self.headers, self._host, self.connection.getsockname()[1]):
                 self._send(403, "text/plain; charset=utf-8", f"{why}\n".encode(errors="replace"))
             elif path == "/events":
                 self._events()

@@ -15,7 +15,7 @@ COUNTS = ("steps", "episodes", "goals", "collisions", "interventions", "failsafe
 Totals = dict[str, dict[str, float]]  # by robot kind and name
 
 
-def totals(metrics: Metrics) -> Totals:
+def run_totals(metrics: Metrics) -> Totals:
     """What metrics have counted so far. They may be added to meanwhile."""
     found: Totals = {}
     for tally in metrics.actors.copy().values():
@@ -29,13 +29,13 @@ def totals(metrics: Metrics) -> Totals:
     return found
 
 
-def told(found: Totals) -> dict[str, float]:
+def totals_to_health(found: Totals) -> dict[str, float]:
     """As a Health's figures."""
     return {f"{robot} {name}": value for robot, counts in found.items() for name, value in counts.items()}
 
 
-def heard(figures: Mapping[str, float]) -> Totals:
-    """What `told` said, among other figures; a kind of which a count is missing or odd is left out."""
+def totals_from_health(figures: Mapping[str, float]) -> Totals:
+    """What `totals_to_health` said, among other figures; a kind of which a count is missing or odd is left out."""
     found: Totals = {}
     for key, value in figures.items():
         robot, _, name = key.partition(" ")

@@ -13,7 +13,7 @@ import threading
 from collections.abc import Collection
 from email.parser import BytesHeaderParser
 
-from brakeline.logs.watch.allowed_hosts import refusal
+from brakeline.logs.watch.allowed_hosts import rejection_reason
 
 HEAD = 2**14  # bytes of a handshake, at most
 PATIENCE = 5.0  # s for it
@@ -26,7 +26,7 @@ def hidden_host() -> str:
     return f"127.{secrets.randbelow(254) + 1}.{secrets.randbelow(256)}.{secrets.randbelow(254) + 1}"
 
 
-class Gate:
+class WebSocketGate:
     """Listens at `host`:`port` (0: a free one), until `close`, for the server behind.
 
     Raises:
@@ -65,7 +65,7 @@ class Gate:
             with visitor, contextlib.suppress(OSError):
                 head = _handshake(visitor)
                 said, _, headers = head.partition(b"\r\n")
-                why = refusal(BytesHeaderParser().parsebytes(headers), self._host, self.port, self._origins)
+                why = rejection_reason(BytesHeaderParser().parsebytes(headers), self._host, self.port, self._origins)
                 if why or not said.startswith(b"GET "):
                     text = f"{why or 'only a websocket is here'}\n".encode(errors="replace")
                     visitor.sendall(b"HTTP/1.1 403 Forbidden\r\nConnection: close\r\nContent-Type: text/plain\r\n")

@@ -7,7 +7,7 @@ from brakeline.actors.decision_guard import request_decisions
 from brakeline.actors.episode_runner import ActorIdentity, EpisodeRunner
 from brakeline.deploy.experiments.evaluate import in_process
 from brakeline.deploy.vehicle_factory import environment
-from brakeline.logs.episode_stats import Tally
+from brakeline.logs.episode_stats import EpisodeStats
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.bus import NoReply
 from tests.robots import GROUND
@@ -35,7 +35,7 @@ def test_an_intervention_is_a_terminal_step_for_the_learner_alone(driver):
     assert cut.reward - cut.penalty == pytest.approx(GROUND.task.reward.cut) and cut.reward > -5
     assert not cut.terminated and not cut.goal and not cut.collision, "nothing ended in the environment"
     assert cut.truncated and not driver.running, "the robot's episode was called off"
-    seen = Tally()
+    seen = EpisodeStats()
     for taken in (allowed, cut):
         seen.step(taken)
     assert (seen.timeouts, seen.collisions, seen.goals, len(seen.returns)) == (0, 0, 0, 1)

@@ -14,7 +14,7 @@ from brakeline.actors.episode_runner import ActorIdentity, EpisodeRunner
 from brakeline.deploy.data.model_store import model_for
 from brakeline.deploy.experiments.evaluate import in_process
 from brakeline.deploy.vehicle_factory import environment
-from brakeline.logs.mcap_container import attachment
+from brakeline.logs.mcap_container import model_attachment_name
 from brakeline.logs.recorder import entry
 from brakeline.logs.segment import open_segment
 from brakeline.messaging import brakeline_pb2 as pb
@@ -34,7 +34,7 @@ def drive(
     model = model_for(GROUND, ModelConfig())
     ask = in_process(model)
     driver = EpisodeRunner(GROUND, environment(GROUND, "dense", 7), ActorIdentity(actor, 0, 0), penalty=1.0)
-    attachments = {attachment("ground", model.version): model.encode()} if attach else None
+    attachments = {model_attachment_name("ground", model.version): model.encode()} if attach else None
     segment = open_segment(log, {"run": {"method": "ddpc"}}, attachments)
     numbers: dict[str, Iterator[int]] = {}
 

@@ -34,13 +34,13 @@ from brakeline.deploy.run.run_config import RunConfig
 from brakeline.learner.learner import Learner
 from brakeline.learner.learner_config import LearnerConfig
 from brakeline.learner.learner_process import LearnerLoop, LearnerSettings
-from brakeline.logs.foxglove import Pictures
-from brakeline.logs.log_analysis import Analysis, Look
+from brakeline.logs.foxglove import FoxgloveConverter
+from brakeline.logs.log_analysis import AnalysisOptions, RunAnalysis
 from brakeline.logs.reader import Log
 from brakeline.logs.recorder import Inbox, Recording, Rotation
 from brakeline.logs.report_page import render
 from brakeline.logs.segment import Metadata, Segment
-from brakeline.logs.watch.live_board import Board
+from brakeline.logs.watch.dashboard import Dashboard
 from brakeline.logs.watch.live_page_server import encode
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.bus import BusError, BusSettings, Sample
@@ -120,7 +120,7 @@ def recorder(folder: Path) -> Party:
         path.unlink(missing_ok=True)
         return Segment(path, path.open("wb", buffering=0), metadata)
 
-    derive = both(Pictures().of_sample, as_json)
+    derive = both(FoxgloveConverter().from_sample, as_json)
     recording = Recording(path, {}, inbox, open_one, derive, Rotation(mib=16.0), rejected)
 
     def take(sample: Sample) -> None:
@@ -132,7 +132,7 @@ def recorder(folder: Path) -> Party:
 
 
 def watch() -> Party:
-    board, rejected = Board(), RejectedMessages()
+    board, rejected = Dashboard(), RejectedMessages()
 
     def take(sample: Sample) -> None:
         _show(deque([sample]), board, None, rejected)
@@ -288,7 +288,7 @@ def reader(folder: Path) -> Party:
 
     def look() -> None:
         log = Log((folder / "fuzz.mcap",))
-        analysis = Analysis("fuzz", log, Look(pictures=True), "")
+        analysis = RunAnalysis("fuzz", log, AnalysisOptions(pictures=True), "")
         render(analysis.figures(), {"fuzz": (analysis.figures(), analysis.pictures())})
         party.messages = sum(segment.messages for segment in log.segments)
         party.rejected.count = log.malformed

@@ -8,14 +8,14 @@ from typing import Any
 
 import pytest
 
-from brakeline.logs.log_analysis import Look, analysed
+from brakeline.logs.log_analysis import AnalysisOptions, analyse_runs
 from brakeline.logs.report_page import render
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.bus import Sample
 from brakeline.messaging.bus.topic_keys import names_of
 from brakeline.messaging.topics import TOPICS
 from tests.browser import Page, drawn
-from tests.logs.mixed import mixed
+from tests.logs.sample_log import mixed
 
 Say = Callable[..., Sample]
 
@@ -42,7 +42,7 @@ def report(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, An
     """The page of a log, and the figures that `analyse --json` gives for it."""
     folder = tmp_path_factory.mktemp("page")
     log = mixed(folder / "<b>mixed")
-    analysis = analysed(log, Look(pictures=True))
+    analysis = analyse_runs(log, AnalysisOptions(pictures=True))
     path = folder / "report.html"
     path.write_text(render(analysis.figures(), analysis.each()), encoding="utf-8")
     return path, json.loads(json.dumps(analysis.figures()))

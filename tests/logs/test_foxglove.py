@@ -19,7 +19,7 @@ from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 
 import brakeline.logs
 from brakeline.logs import foxglove_scene
-from brakeline.logs.foxglove import Pictures, Sites
+from brakeline.logs.foxglove import ArenaLayout, FoxgloveConverter
 from brakeline.logs.recorder import Inbox, Recording
 from brakeline.logs.segment import Entry
 from brakeline.messaging import brakeline_pb2 as pb
@@ -59,11 +59,11 @@ class Studio:
     """Draws messages as they are said, and decodes what was drawn."""
 
     def __init__(self, say: Say, rate: float = math.inf) -> None:
-        self.say, self.pictures = say, Pictures(rate)
+        self.say, self.pictures = say, FoxgloveConverter(rate)
         self.entries: list[Entry] = []
 
     def __call__(self, key: str, message: Any) -> dict[str, Any]:
-        new = self.pictures.of_sample(self.say(key, message))
+        new = self.pictures.from_sample(self.say(key, message))
         self.entries += new
         return {entry.key: entry.type.FromString(entry.payload) for entry in new}
 
@@ -154,15 +154,15 @@ def test_calm_steps_are_thinned_out_and_interventions_are_not(say: Say) -> None:
 
 def test_what_is_drawn_has_the_time_of_receipt_and_is_no_loss_in_the_numbers(studio: Studio, say: Say) -> None:
     sample = say("episode/ground/actor-0", episode())
-    for entry in studio.pictures.of_sample(sample):
+    for entry in studio.pictures.from_sample(sample):
         assert entry.log_time == entry.publish_time == sample.received and entry.sequence == 0
-    arena = SceneUpdate.FromString(studio.pictures.of_sample(sample)[0].payload)
+    arena = SceneUpdate.FromString(studio.pictures.from_sample(sample)[0].payload)
     at = arena.entities[0].timestamp
     assert at.seconds * 10**9 + at.nanos == sample.received
 
 
 def test_arenas_of_several_actors_do_not_overlap() -> None:
-    sites = Sites()
+    sites = ArenaLayout()
     squares = [(sites.of("ground", f"a{i}", 10.0), 10.0) for i in range(3)]
     squares += [(sites.of("quadrotor", f"q{i}", 40.0), 40.0) for i in range(2)]
     for i, ((x, y), edge) in enumerate(squares):
@@ -212,21 +212,21 @@ def test_log_lines_are_foxgloves(studio: Studio) -> None:
 
 
 def test_a_message_that_cannot_be_drawn_costs_its_picture_only(say: Say, caplog: pytest.LogCaptureFixture) -> None:
-    pictures = Pictures()
-    pictures.of_sample(say("episode/ground/actor-0", episode()))
+    pictures = FoxgloveConverter()
+    pictures.from_sample(say("episode/ground/actor-0", episode()))
     bad = [
         Sample(STEP, "step/ground/actor-0", b"\xff\xff", 1),
         say("episode/submarine/actor-1", episode("actor-1", "submarine")),
         say("step/ground/actor-0", step(0, pb.UNKNOWN, state=(1.0,))),
     ]
-    assert [pictures.of_sample(sample) for sample in bad] == [[], [], []]
+    assert [pictures.from_sample(sample) for sample in bad] == [[], [], []]
     assert pictures.failures == 3 and len(caplog.records) == 1
-    assert pictures.of_sample(say("step/ground/actor-0", step(1, pb.UNKNOWN)))
+    assert pictures.from_sample(say("step/ground/actor-0", step(1, pb.UNKNOWN)))
 
 
 def test_a_recording_has_the_pictures_beside_the_messages(say: Say, tmp_path: Path) -> None:
     inbox = Inbox()
-    recording = Recording(tmp_path / "run.mcap", {}, inbox, derive=Pictures(math.inf).of_sample)
+    recording = Recording(tmp_path / "run.mcap", {}, inbox, derive=FoxgloveConverter(math.inf).from_sample)
     messages = [("episode", episode()), ("exchange", exchange(0)), ("step", step(0))]
     for topic, message in messages:
         inbox.put(say(f"{topic}/ground/actor-0", message))

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from brakeline.logs.decision_stats import Decisions, joined
-from brakeline.logs.learning_curve import Training
-from brakeline.logs.metrics import Metrics, Tally, closed_loop, spread
+from brakeline.logs.decision_stats import DecisionStats, joined
+from brakeline.logs.learning_curve import LearningCurve
+from brakeline.logs.metrics import EpisodeStats, Metrics, closed_loop, spread
 from brakeline.logs.recorder import entry
 from brakeline.logs.report import analyse, for_clearance, show
 from brakeline.logs.run_plots import draw
@@ -49,7 +49,7 @@ def some_steps() -> list[pb.Step]:
 
 
 def test_steps_are_counted() -> None:
-    tally = Tally()
+    tally = EpisodeStats()
     for step in some_steps():
         tally.step(step)
     figures = closed_loop([tally])
@@ -74,7 +74,7 @@ def test_steps_adjusted_for_clearance_are_counted_where_every_adjusted_step_says
     steps = episode(0, [pb.ADJUSTED, pb.ADJUSTED, pb.ADJUSTED, pb.ALLOWED], terminated=True)
     for step, said in zip(steps, (True, True, False), strict=False):
         step.for_clearance = said
-    new, old = Tally(), Tally()
+    new, old = EpisodeStats(), EpisodeStats()
     for step in steps:
         new.step(step)
     figures = closed_loop([new])
@@ -89,7 +89,7 @@ def test_steps_adjusted_for_clearance_are_counted_where_every_adjusted_step_says
 
 
 def test_a_collision_counts_once_an_episode() -> None:
-    tally = Tally()
+    tally = EpisodeStats()
     for number in range(2):
         for step in episode(number, [0, 0, 0]):
             step.collision = True
@@ -101,7 +101,7 @@ def test_without_steps_and_without_a_filter_there_are_no_numbers() -> None:
     figures = closed_loop([])
     assert figures["steps"] == figures["episodes"] == 0
     assert [figures[name] for name in ("mean_speed", "max_speed", "mean_reward", "decision_ms")] == [None] * 4
-    tally = Tally()
+    tally = EpisodeStats()
     tally.step(pb.Step(speed=0.1))
     assert closed_loop([tally])["decision_ms"] is None
     assert spread() is None
@@ -211,7 +211,7 @@ def test_an_empty_run_can_be_shown() -> None:
 
 
 def test_learning_curves_are_drawn(tmp_path: Path, say: Say) -> None:
-    training = Training()
+    training = LearningCurve()
     for step in some_steps() * 20:
         training.step(step)
     draw({"ground": training.figures()}, tmp_path / "pictures" / "curve.png")
@@ -220,7 +220,7 @@ def test_learning_curves_are_drawn(tmp_path: Path, say: Say) -> None:
 
 
 def test_times_that_are_none_warn_nobody() -> None:
-    decisions = Decisions()
+    decisions = DecisionStats()
     said = pb.Decision(kind=pb.ALLOWED, queue_ms=math.inf, time_ms=math.inf)
     decisions.exchange(pb.Exchange(round_trip_ms=math.inf, reply=pb.Reply(decision=said)))
     assert joined([decisions]).figures()["latency_ms"]["allowed"]["network"] is None

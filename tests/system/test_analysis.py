@@ -5,7 +5,7 @@ import json
 from pathlib import Path
 
 from brakeline.logs.reader import find
-from tests.logs.mixed import agree, counted, decoded
+from tests.logs.sample_log import agree, counted, decoded
 from tests.system.runs import Run, brakeline
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from brakeline.deploy.experiments.evaluate import Evaluation, evaluate
-from brakeline.logs.episode_stats import Tally
+from brakeline.logs.episode_stats import EpisodeStats
 from tests.robots import GROUND
 from tests.system.runs import brakeline
 
@@ -20,7 +20,7 @@ def returns(policy: str, episodes: int = EPISODES) -> np.ndarray[Any, np.dtype[n
     """The rewards of fresh episodes through the filter."""
     found: list[float] = []
 
-    def each(tally: Tally) -> None:
+    def each(tally: EpisodeStats) -> None:
         found.append(tally.returns[-1])
 
     evaluate(GROUND, Evaluation(policy=policy, episodes=episodes), each)

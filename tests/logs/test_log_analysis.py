@@ -11,15 +11,15 @@ import pytest
 from rich.console import Console
 
 from brakeline.logs.episode_sampler import SPREAD
-from brakeline.logs.intervention_map import MOST_CELLS, Places
-from brakeline.logs.learning_curve import MOST_BINS, Training
-from brakeline.logs.log_analysis import Look, analysed
+from brakeline.logs.intervention_map import MOST_CELLS, InterventionMap
+from brakeline.logs.learning_curve import MOST_BINS, LearningCurve
+from brakeline.logs.log_analysis import AnalysisOptions, analyse_runs
 from brakeline.logs.process_timeline import MOST_BINS as MOST_TIMES
-from brakeline.logs.process_timeline import Timeline
+from brakeline.logs.process_timeline import ProcessTimeline
 from brakeline.logs.reader import by_run, find, open_log
 from brakeline.logs.report import analyse, show, show_episode
 from brakeline.messaging import brakeline_pb2 as pb
-from tests.logs.mixed import ABOUT, BEGIN, SECOND, Writer, agree, counted, decoded, mixed, once
+from tests.logs.sample_log import ABOUT, BEGIN, SECOND, Writer, agree, counted, decoded, mixed, once
 
 
 @pytest.fixture(scope="module")
@@ -138,7 +138,7 @@ def test_what_is_missing_is_said(tmp_path: Path) -> None:
 
 
 def test_an_episode_in_detail_is_what_was_recorded(log: Path) -> None:
-    figures = analysed(log, Look(episode=3, actor="actor-1")).figures()
+    figures = analyse_runs(log, AnalysisOptions(episode=3, actor="actor-1")).figures()
     (detail,) = figures["episode_detail"]
     messages = once(decoded(find(log)))
     steps = [m for key, m in messages if key == "step/ground/actor-1" and m.episode == 3]
@@ -152,11 +152,11 @@ def test_an_episode_in_detail_is_what_was_recorded(log: Path) -> None:
     console = Console(record=True, width=200)
     console.print(show_episode(detail))
     assert "actor-1, episode 3" in console.export_text()
-    assert len(analysed(log, Look(episode=3)).figures()["episode_detail"]) == 3, "of every actor"
+    assert len(analyse_runs(log, AnalysisOptions(episode=3)).figures()["episode_detail"]) == 3, "of every actor"
 
 
 def test_the_nearest_misses_are_the_nearest(log: Path) -> None:
-    pictures = analysed(log, Look(pictures=True)).each()["mixed"][1]
+    pictures = analyse_runs(log, AnalysisOptions(pictures=True)).each()["mixed"][1]
     closest: dict[tuple[str, int, int], float] = {}
     for key, step in once(decoded(find(log))):
         if key.startswith("step/ground"):
@@ -202,7 +202,7 @@ def test_memory_does_not_grow_with_the_log(tmp_path: Path) -> None:
                 writer.write(tmp_path / name / "run.mcap")
         writer.write(tmp_path / name / "run.mcap")
         tracemalloc.start()
-        analysis = analysed(tmp_path / name, Look(pictures=True))
+        analysis = analyse_runs(tmp_path / name, AnalysisOptions(pictures=True))
         held.append(tracemalloc.get_traced_memory()[1])
         tracemalloc.stop()
         _, pictures = analysis.each()[name]
@@ -211,7 +211,7 @@ def test_memory_does_not_grow_with_the_log(tmp_path: Path) -> None:
 
 
 def test_bins_become_wider_instead_of_more() -> None:
-    training, places, timeline = Training(), Places(), Timeline()
+    training, places, timeline = LearningCurve(), InterventionMap(), ProcessTimeline()
     for k in range(40_000):
         step = pb.Step(
             actor="a", episode=k // 100, step=k % 100, decision=pb.ADJUSTED, terminated=k % 100 == 99, goal=True
@@ -230,7 +230,7 @@ def test_bins_become_wider_instead_of_more() -> None:
 
 
 def test_lives_of_a_process_that_fell_silent_and_was_started_again() -> None:
-    timeline = Timeline()
+    timeline = ProcessTimeline()
     for run, seconds in ((1, (0, 1, 2, 9, 10)), (2, (12, 13))):
         for second in seconds:
             health = pb.Health(process="a", last=second == 13)

@@ -25,7 +25,7 @@ from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.bus import Bus, BusSettings, Sample
 from brakeline.messaging.free_ports import free_endpoint
 from brakeline.messaging.topics import HEALTH, STEP
-from tests.logs.mixed import ABOUT, Writer
+from tests.logs.sample_log import ABOUT, Writer
 from tests.waiting import until
 
 Say = Callable[..., Sample]

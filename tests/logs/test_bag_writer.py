@@ -9,13 +9,13 @@ from mcap.stream_reader import StreamReader
 from rosbags.highlevel import AnyReader
 
 from brakeline.logs import bag_writer as bags
-from brakeline.logs.bag_writer import Bag
+from brakeline.logs.bag_writer import BagWriter
 from brakeline.messaging.ros2 import SENSOR, Qos
 from brakeline.messaging.ros2.cdr_messages import Clock, Twist, encode, time_of, twist
 
 
 def test_a_bag_holds_every_message_with_its_type_and_qos(tmp_path):
-    with Bag(tmp_path / "bag") as bag:
+    with BagWriter(tmp_path / "bag") as bag:
         for i in range(20):
             bag("/cmd_vel", Twist, encode(twist(float(i), 0.0)), 1000 + i, Qos())
         bag("/clock", Clock, encode(Clock(clock=time_of(3.0))), 2000, SENSOR)
@@ -29,7 +29,7 @@ def test_a_bag_holds_every_message_with_its_type_and_qos(tmp_path):
 
 def test_what_came_a_second_before_a_kill_is_in_the_file(tmp_path, monkeypatch):
     monkeypatch.setattr(bags, "PERIOD", 0.01)
-    bag = Bag(tmp_path / "bag")
+    bag = BagWriter(tmp_path / "bag")
     for i in range(30):
         bag("/cmd_vel", Twist, encode(twist(float(i), 0.0)), i, Qos())
         time.sleep(0.002)
@@ -46,7 +46,7 @@ def test_what_came_a_second_before_a_kill_is_in_the_file(tmp_path, monkeypatch):
 
 def test_a_folder_that_is_there_is_left_alone(tmp_path):
     with pytest.raises(FileExistsError, match="exists already"):
-        Bag(tmp_path)
+        BagWriter(tmp_path)
 
 
 def test_a_full_disk_is_said_once_and_the_rest_goes_on(tmp_path, monkeypatch, caplog):
@@ -54,7 +54,7 @@ def test_a_full_disk_is_said_once_and_the_rest_goes_on(tmp_path, monkeypatch, ca
         raise OSError("no space left")
 
     monkeypatch.setattr(bags, "PERIOD", 0.0)
-    bag = Bag(tmp_path / "bag")
+    bag = BagWriter(tmp_path / "bag")
     flush = bag._flush
     monkeypatch.setattr(bag, "_flush", full)
     for i in range(5):

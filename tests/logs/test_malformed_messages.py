@@ -14,13 +14,13 @@ import pytest
 import zstandard
 
 from brakeline.deploy.commands.watch_command import _show
-from brakeline.logs.foxglove import Pictures
-from brakeline.logs.log_analysis import Look, analysed
+from brakeline.logs.foxglove import FoxgloveConverter
+from brakeline.logs.log_analysis import AnalysisOptions, analyse_runs
 from brakeline.logs.log_recovery import recover
 from brakeline.logs.reader import open_log
 from brakeline.logs.recorder import Inbox, Recording
 from brakeline.logs.segment import MOST_CHANNELS, Entry
-from brakeline.logs.watch.live_board import Board
+from brakeline.logs.watch.dashboard import Dashboard
 from brakeline.logs.watch.live_page_server import encode
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.bus import Sample
@@ -46,7 +46,7 @@ HOSTILE = [
 
 def record(path: Path, samples: list[Sample], rejected: RejectedMessages | None = None) -> Recording:
     inbox = Inbox()
-    recording = Recording(path, {}, inbox, derive=Pictures().of_sample, rejected=rejected)
+    recording = Recording(path, {}, inbox, derive=FoxgloveConverter().from_sample, rejected=rejected)
     for one in samples:
         inbox.put(one)
     recording.finish()
@@ -93,7 +93,7 @@ MALFORMED = [
 
 @pytest.mark.parametrize("malformed", MALFORMED, ids=lambda one: one.key)
 def test_watch_passes_over_what_it_cannot_show(malformed: Sample, say: Say) -> None:
-    board, rejected = Board(), RejectedMessages()
+    board, rejected = Dashboard(), RejectedMessages()
     step = pb.Step(robot="ground", actor="b", state=[1.0, 0.0, 0.0, 0.0, 0.0])
     _show(deque([malformed, say("step/ground/b", step)]), board, None, rejected)
     shown = {robot["actor"]: robot for robot in json.loads(encode(board.view()))["robots"]}
@@ -104,7 +104,7 @@ def test_an_analysis_counts_what_it_cannot_handle_and_goes_on(say: Say, tmp_path
     step = pb.Step(robot="ground", actor="b", state=[1.0, 0.0, 0.0, 0.0, 0.0], truncated=True)
     infinite = pb.Step(robot="ground", actor="a", state=[math.inf] * 5)
     record(tmp_path / "run.mcap", [*HOSTILE, *MALFORMED, sample(STEP, infinite), say("step/ground/b", step)])
-    found = analysed(tmp_path, Look(pictures=True))
+    found = analyse_runs(tmp_path, AnalysisOptions(pictures=True))
     figures = found.figures()
     assert figures["actors"]["b"]["episodes"] == 1 and figures["malformed"] >= 5
     found.each()

@@ -7,9 +7,9 @@ from typing import Any
 import pytest
 
 from brakeline.logs.metrics import Metrics
-from brakeline.logs.watch.live_board import Board
-from brakeline.logs.watch.live_page_server import Server
-from brakeline.logs.watch.run_totals import heard, told, totals
+from brakeline.logs.watch.dashboard import Dashboard
+from brakeline.logs.watch.live_page_server import LivePageServer
+from brakeline.logs.watch.run_totals import run_totals, totals_from_health, totals_to_health
 from brakeline.messaging import brakeline_pb2 as pb
 from tests.browser import CHROMIUM, Page
 from tests.logs.conftest import Say
@@ -27,9 +27,9 @@ def health(name: str, last: bool = False, **told: Any) -> pb.Health:
 
 
 @pytest.fixture
-def mixed(say: Say) -> Board:
+def mixed(say: Say) -> Dashboard:
     """A board in the middle of a run with two robot kinds, of which each ends an episode while it is watched."""
-    board = Board()
+    board = Dashboard()
     for number in range(3):
         board.take(say("step/ground/a", step("ground", "a", number, 10.0, number == 2)))
         board.take(say("step/quadrotor/b", step("quadrotor", "b", number, -1.0, number == 2)))
@@ -37,16 +37,16 @@ def mixed(say: Say) -> Board:
     return board
 
 
-def launched(say: Say, board: Board, last: bool = False, outcome: str = "") -> None:
+def launched(say: Say, board: Dashboard, last: bool = False, outcome: str = "") -> None:
     """What the launcher says: ten times as many steps as were watched."""
     notes = {"run": "crossing", "method": "ddpc", "arena": "dense", "seed": "3", "steps": "600"}
     counts = {"steps": 30.0, "episodes": 10.0, "goals": 9.0, "collisions": 0.0, "interventions": 3.0, "failsafes": 1.0}
-    figures = told({"ground": counts | {"reward": 290.0}, "quadrotor": counts | {"reward": -30.0}})
+    figures = totals_to_health({"ground": counts | {"reward": 290.0}, "quadrotor": counts | {"reward": -30.0}})
     notes |= {"outcome": outcome} if outcome else {}
     board.take(say("health/launcher", health("launcher", last, figures=figures, notes=notes)))
 
 
-def test_rewards_of_different_robots_are_not_mixed(mixed: Board) -> None:
+def test_rewards_of_different_robots_are_not_mixed(mixed: Dashboard) -> None:
     shown = mixed.view()
     assert {robot: counts["mean_reward"] for robot, counts in shown["totals"].items()} == {
         "ground": 30.0,
@@ -55,7 +55,7 @@ def test_rewards_of_different_robots_are_not_mixed(mixed: Board) -> None:
     assert shown["returns"] == {"ground": [30.0], "quadrotor": [-3.0]}
 
 
-def test_counts_are_of_the_whole_run_or_it_is_said_that_they_are_not(say: Say, mixed: Board) -> None:
+def test_counts_are_of_the_whole_run_or_it_is_said_that_they_are_not(say: Say, mixed: Dashboard) -> None:
     shown = mixed.view()
     assert shown["since"] is not None and shown["totals"]["ground"]["steps"] == 3
     launched(say, mixed)
@@ -66,7 +66,7 @@ def test_counts_are_of_the_whole_run_or_it_is_said_that_they_are_not(say: Say, m
     assert shown["run"] == {"run": "crossing", "method": "ddpc", "arena": "dense", "seed": "3", "steps": "600"}
 
 
-def test_a_run_that_ended_in_order_is_not_a_run_that_died(say: Say, mixed: Board) -> None:
+def test_a_run_that_ended_in_order_is_not_a_run_that_died(say: Say, mixed: Dashboard) -> None:
     launched(say, mixed)
     assert mixed.view()["processes"] == {"launcher": "alive", "learner": "alive"}
     mixed.take(say("health/learner", health("learner", last=True)))
@@ -78,7 +78,7 @@ def test_a_run_that_ended_in_order_is_not_a_run_that_died(say: Say, mixed: Board
     assert shown["processes"] == {"launcher": "ended", "learner": "ended"}
 
 
-def test_who_said_no_goodbye_is_silent(say: Say, mixed: Board) -> None:
+def test_who_said_no_goodbye_is_silent(say: Say, mixed: Dashboard) -> None:
     launched(say, mixed)
     mixed._heard -= 1000.0
     shown = mixed.view()
@@ -89,7 +89,7 @@ def test_what_a_launcher_tells_is_what_it_counted() -> None:
     metrics = Metrics()
     for number in range(4):
         metrics.add("step/ground/a", step("ground", "a", number, 2.5, number == 3))
-    counted = totals(metrics)
+    counted = run_totals(metrics)
     assert counted["ground"]["reward"] == 10.0 and counted["ground"]["goals"] == 1
     odd = {
         "restarts actor-0": 1.0,
@@ -98,20 +98,20 @@ def test_what_a_launcher_tells_is_what_it_counted() -> None:
         "air reward": float("nan"),
         "passed over": 0.0,
     }
-    assert heard(told(counted) | odd) == counted
+    assert totals_from_health(totals_to_health(counted) | odd) == counted
 
 
 @pytest.fixture
-def page(mixed: Board, tmp_path: Path) -> Iterator[Page]:
+def page(mixed: Dashboard, tmp_path: Path) -> Iterator[Page]:
     if CHROMIUM is None:
         pytest.skip("there is no Chromium: the live page was not looked at")
-    with Server(mixed.view) as server, Page(tmp_path / "profile", 390, 844) as page:
+    with LivePageServer(mixed.view) as server, Page(tmp_path / "profile", 390, 844) as page:
         page.open(server.url)
         page.until("document.body.dataset.drawn > 0")
         yield page
 
 
-def test_the_page_says_so(say: Say, mixed: Board, page: Page) -> None:
+def test_the_page_says_so(say: Say, mixed: Dashboard, page: Page) -> None:
     tiles = "[...document.querySelectorAll('#figures .group')].map(g => g.dataset.robot + ': ' + g.textContent)"
     page.until(f"{tiles}.length === 2")
     assert "that were watched" in page.value("document.getElementById('scope').textContent")

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from brakeline.deploy.run.episode_render import Film, Frame, _Stage
 from brakeline.logs import foxglove_scene
 from brakeline.logs.episode_view import discs
-from brakeline.logs.watch.live_board import Card
+from brakeline.logs.watch.dashboard import RobotPanel
 from brakeline.messaging.robot import robot_named
 from brakeline.sim.arena import staged_arena
 from tests.browser import CHROMIUM, Page
@@ -40,7 +40,7 @@ def test_a_film_has_them_at_the_heading() -> None:
 
 def test_pages_are_told_of_all_of_them() -> None:
     assert discs(CAR) == [[0.11, 0.0, 0.155], [-0.11, 0.0, 0.155]] and discs(GROUND) == [[0.0, 0.0, GROUND.footprint]]
-    assert Card(CAR, "actor-0").view()["discs"] == discs(CAR)
+    assert RobotPanel(CAR, "actor-0").view()["discs"] == discs(CAR)
 
 
 def test_a_report_draws_them_at_the_heading(tmp_path: Path) -> None:

@@ -10,18 +10,18 @@ import pytest
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
-from brakeline.logs.watch.foxglove_server import Live
-from brakeline.logs.watch.live_board import Board
-from brakeline.logs.watch.live_page_server import Server
+from brakeline.logs.watch.dashboard import Dashboard
+from brakeline.logs.watch.foxglove_server import FoxgloveServer
+from brakeline.logs.watch.live_page_server import LivePageServer
 
 
 @pytest.fixture
-def server() -> Iterator[Server]:
-    with Server(Board().view) as server:
+def server() -> Iterator[LivePageServer]:
+    with LivePageServer(Dashboard().view) as server:
         yield server
 
 
-def asked(server: Server, path: str, **headers: str) -> tuple[int, bytes]:
+def asked(server: LivePageServer, path: str, **headers: str) -> tuple[int, bytes]:
     """Status and body; `Host` is the server's unless given; an empty one is left out."""
     port = int(server.url.rsplit(":", 1)[1].strip("/"))
     connection = http.client.HTTPConnection("127.0.0.1", port, timeout=10.0)
@@ -38,7 +38,7 @@ def asked(server: Server, path: str, **headers: str) -> tuple[int, bytes]:
 
 
 @pytest.mark.parametrize("host", ["127.0.0.1:{port}", "localhost:{port}", "[::1]:{port}", "192.168.1.7:{port}"])
-def test_our_own_page_is_answered(server: Server, host: str) -> None:
+def test_our_own_page_is_answered(server: LivePageServer, host: str) -> None:
     status, body = asked(server, "/view.json", Host=host, Origin=f"http://{host}")
     assert status == 200 and json.loads(body)["robots"] == []
 
@@ -53,19 +53,19 @@ def test_our_own_page_is_answered(server: Server, host: str) -> None:
     ],
     ids=str,
 )
-def test_a_strangers_page_is_not(server: Server, path: str, headers: dict[str, str]) -> None:
+def test_a_strangers_page_is_not(server: LivePageServer, path: str, headers: dict[str, str]) -> None:
     status, body = asked(server, path, **headers)
     assert status == 403 and b"robots" not in body
 
 
 @pytest.fixture
-def live() -> Iterator[Live]:
-    with Live() as live:
+def live() -> Iterator[FoxgloveServer]:
+    with FoxgloveServer() as live:
         yield live
 
 
 @pytest.mark.parametrize("origin", [None, "https://app.foxglove.dev"])
-def test_foxglove_is_let_in(live: Live, origin: str | None) -> None:
+def test_foxglove_is_let_in(live: FoxgloveServer, origin: str | None) -> None:
     with connect(live.url, subprotocols=["foxglove.sdk.v1"], origin=origin) as visit:  # type: ignore[arg-type, list-item]
         assert json.loads(visit.recv(timeout=10.0))["op"] == "serverInfo"
 
@@ -74,7 +74,7 @@ def test_foxglove_is_let_in(live: Live, origin: str | None) -> None:
     "headers",
     [{"Origin": "https://evil"}, {"Origin": "null"}, {"Host": "evil"}, {"Origin": "https://app.foxglove.dev.evil"}],
 )
-def test_a_strangers_page_hears_nothing_of_what_foxglove_is_told(live: Live, headers: dict[str, str]) -> None:
+def test_a_strangers_page_hears_nothing_of_what_foxglove_is_told(live: FoxgloveServer, headers: dict[str, str]) -> None:
     url = live.url.replace("127.0.0.1", headers.get("Host", "127.0.0.1"))
     there = socket.create_connection(("127.0.0.1", live.port))
     with there, pytest.raises(InvalidStatus) as refused:
@@ -89,7 +89,7 @@ def listening() -> set[tuple[str, int]]:
 
 def test_the_server_behind_the_gate_is_where_no_page_looks() -> None:
     before = listening()  # also a server that was told to stop, and has not yet
-    with Live() as live:
+    with FoxgloveServer() as live:
         new = listening() - before
     assert ("127.0.0.1", live.port) in new
     ((ip, _),) = new - {("127.0.0.1", live.port)}

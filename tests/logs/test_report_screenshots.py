@@ -2,7 +2,8 @@
 
 Of each section a small picture is kept, averaged so much that a browser's next version changes little, and what is
 gone, doubled or in another colour changes much. They are of one font, which has to be there. After a
-change that is meant: `BRAKELINE_PICTURES=write pytest tests/logs/test_pictures.py`, and look at what it wrote.
+change that is meant, run `BRAKELINE_PICTURES=write pytest tests/logs/test_report_screenshots.py`
+and look at what it wrote.
 """
 
 import base64

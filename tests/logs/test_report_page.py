@@ -11,10 +11,10 @@ from typing import Any
 import pytest
 
 from brakeline.deploy.cli import main
-from brakeline.logs.log_analysis import Look, analysed
+from brakeline.logs.log_analysis import AnalysisOptions, analyse_runs
 from brakeline.logs.report_page import embedded, names, number, percent, render
 from tests.browser import CHROMIUM, Page, drawn
-from tests.logs.mixed import ABOUT, mixed
+from tests.logs.sample_log import ABOUT, mixed
 
 TRICKS = "</script><script>alert(1)</script><!-- \u2028"
 
@@ -65,7 +65,7 @@ def test_the_tables_say_what_json_says_without_a_script(report: tuple[Path, dict
 
 
 def test_it_says_in_words_how_sure_a_model_set_is(tmp_path: Path) -> None:
-    analysis = analysed(mixed(tmp_path / "run"), Look(pictures=True))
+    analysis = analyse_runs(mixed(tmp_path / "run"), AnalysisOptions(pictures=True))
     [(label, (figures, pictures))] = analysis.each().items()
 
     def said(**more: str) -> str:
@@ -186,7 +186,7 @@ def compared(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[dict[
         patch.setitem(ABOUT, "run", ABOUT["run"] | {"method": "none", "certificate": ""})
         logs.append(mixed(folder / "c", 3, 10, later=5e4))
     assert main(["analyse", *map(str, logs), "--html", str(folder / "page.html"), "--json"]) == 0
-    return folder / "page.html", [json.loads(json.dumps(analysed(log).figures())) for log in logs]
+    return folder / "page.html", [json.loads(json.dumps(analyse_runs(log).figures())) for log in logs]
 
 
 @pytest.fixture(scope="module")
@@ -328,7 +328,7 @@ HOSTILE = '"><img src=x onerror="document.title=\'owned\'"></title></text><scrip
 def hostile(folder: Path) -> Path:
     """A page of figures in which every text that a log can choose is a script."""
 
-    analysis = analysed(mixed(folder / "log"), Look(pictures=True))
+    analysis = analyse_runs(mixed(folder / "log"), AnalysisOptions(pictures=True))
     figures, pictures = json.loads(json.dumps(analysis.each()["log"]))
     figures["processes"] |= {HOSTILE: next(iter(figures["processes"].values()))}
     figures["topics"] |= {HOSTILE: {"messages": 1, "missing": 1, "duplicates": 1}}

@@ -10,7 +10,7 @@ from rich.console import Console
 
 from brakeline.logs.metrics import Metrics, closed_loop
 from brakeline.logs.report import show
-from brakeline.logs.tube_stats import Plans, figures, stated
+from brakeline.logs.tube_stats import TubeStats, figures, stated
 from brakeline.messaging import brakeline_pb2 as pb
 
 N = 4  # periods of a plan
@@ -33,7 +33,7 @@ def asked(step, kind, x=0.0, given=0, own=0.0, verified=True, episode=0, run=1):
 
 
 def of(*exchanges):
-    plans = Plans()
+    plans = TubeStats()
     for exchange in exchanges:
         plans.exchange(exchange)
     return plans
@@ -99,7 +99,7 @@ def test_a_position_that_is_no_number_is_outside():
 @given(st.data())
 def test_whatever_somebody_sends_is_no_error(data):
     numbers = st.lists(st.floats(width=32), max_size=6)
-    plans = Plans()
+    plans = TubeStats()
     for step in range(4):
         exchange = asked(step, data.draw(st.sampled_from([pb.ALLOWED, pb.FAILSAFE, pb.RECOVERING, pb.UNKNOWN])))
         for field in (exchange.request.state, exchange.request.action, exchange.request.plan):

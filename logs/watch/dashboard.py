@@ -12,9 +12,9 @@ from brakeline.logs.decision_explanation import explain, fits
 from brakeline.logs.episode_view import discs
 from brakeline.logs.foxglove_scene import half_width
 from brakeline.logs.metrics import SILENT, Crowded, Metrics
-from brakeline.logs.recorded_robots import Robots
+from brakeline.logs.recorded_robots import RecordedRobots
 from brakeline.logs.tube_stats import stated
-from brakeline.logs.watch.run_totals import heard, totals
+from brakeline.logs.watch.run_totals import run_totals, totals_from_health
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.bus import Sample
 from brakeline.messaging.obstacle import WALL
@@ -33,7 +33,7 @@ SETUP = ("run", "method", "arena", "seed", "steps")  # its notes about it
 
 
 @dataclass
-class Card:
+class RobotPanel:
     """One robot, in its running episode. Positions are x and y in m, in the arena's frame."""
 
     robot: Robot
@@ -134,13 +134,13 @@ class Card:
         return about | lists | {"robot": self.robot.name, "footprint": self.robot.footprint, "discs": discs(self.robot)}
 
 
-class Board:
+class Dashboard:
     """Takes samples in one thread; others ask for its `view`."""
 
     def __init__(self) -> None:
-        self._robots = Robots()
+        self._robots = RecordedRobots()
         self.metrics = Metrics(robots=self._robots)
-        self._cards: dict[str, Card] = {}
+        self._cards: dict[str, RobotPanel] = {}
         self._lines: deque[str] = deque(maxlen=LINES)
         self._returns: dict[str, deque[float]] = {}  # by robot kind
         self._begun = self._heard = time.monotonic()
@@ -174,7 +174,7 @@ class Board:
             robot = self._robots.named(message.robot)
             if robot is None:
                 return
-            card = Card(robot, message.actor)
+            card = RobotPanel(robot, message.actor)
             if len(self._cards) == MOST_CARDS:
                 raise Crowded(f"{message.actor} is one robot more than the {MOST_CARDS} that are shown")
             self._cards[message.actor] = card
@@ -207,8 +207,8 @@ class Board:
         }
         times = figures.get("decision_ms") or {}
         launcher = self.metrics.processes.get(LAUNCHER)
-        whole = heard(launcher.figures) if launcher is not None else {}
-        counted = whole or totals(self.metrics)
+        whole = totals_from_health(launcher.figures) if launcher is not None else {}
+        counted = whole or run_totals(self.metrics)
         return {
             "run": self._run(),
             # Counts of the whole run, or only of what was seen here.

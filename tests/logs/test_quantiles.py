@@ -10,14 +10,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import binomtest, chi2
 
-from brakeline.logs.proportion_intervals import Clustered, clopper_pearson, poisson
-from brakeline.logs.quantiles import BATCH, RESOLUTION, Histogram, merged, spread, summary
+from brakeline.logs.proportion_intervals import ClusteredProportion, clopper_pearson, poisson
+from brakeline.logs.quantiles import BATCH, RESOLUTION, QuantileSketch, merged, spread, summary
 
 VALUES = st.lists(st.floats(-1e6, 1e6).filter(lambda x: x == 0.0 or abs(x) > 1e-6), min_size=1, max_size=300)
 
 
-def filled(values: list[float]) -> Histogram:
-    histogram = Histogram()
+def filled(values: list[float]) -> QuantileSketch:
+    histogram = QuantileSketch()
     for value in values:
         histogram.add(value)
     return histogram
@@ -50,7 +50,7 @@ def test_moments(values: list[float]) -> None:
 def test_looking_changes_nothing() -> None:
     chance = random.Random(1)
     values = [chance.lognormvariate(0.0, 2.0) for _ in range(3 * BATCH)]
-    one, two = Histogram(), Histogram()
+    one, two = QuantileSketch(), QuantileSketch()
     for place, value in enumerate(values):
         one.add(value)
         two.add(value)
@@ -62,9 +62,9 @@ def test_looking_changes_nothing() -> None:
 def test_what_is_no_number_is_counted_apart() -> None:
     found = merged([filled([1.0, math.inf, -math.inf, math.nan, 0.0])])
     assert (found.count, found.strange, found.low, found.high) == (2, 3, 0.0, 1.0)
-    assert summary(Histogram()) is None and spread() is None
+    assert summary(QuantileSketch()) is None and spread() is None
     with pytest.raises(ValueError, match="nothing was measured"):
-        Histogram().percentile(50)
+        QuantileSketch().percentile(50)
 
 
 def test_bars_hold_all_positive_values_where_they_are() -> None:
@@ -95,8 +95,8 @@ def test_what_may_happen_several_times_in_a_trial_has_garwoods_interval(count: i
 
 
 def test_no_trial_no_interval() -> None:
-    assert clopper_pearson(0, 0) is None and poisson(0, 0) is None and Clustered().interval() is None
-    alone = Clustered()
+    assert clopper_pearson(0, 0) is None and poisson(0, 0) is None and ClusteredProportion().interval() is None
+    alone = ClusteredProportion()
     alone.add(3, 10)
     assert alone.interval() is None
 
@@ -106,7 +106,7 @@ def test_intervals_by_episodes_cover_where_intervals_by_steps_do_not() -> None:
     chance = np.random.default_rng(0)
     covered = naive = 0
     for _ in range(300):
-        whole, hits = Clustered(), 0
+        whole, hits = ClusteredProportion(), 0
         for rate in chance.beta(0.5, 2.0, size=80):
             count = int(chance.binomial(50, rate))
             hits += count

@@ -8,11 +8,11 @@ from PIL import Image
 
 from brakeline.logs import foxglove_scene
 from brakeline.logs.episode_sampler import EpisodeSampler
-from brakeline.logs.foxglove import Pictures
-from brakeline.logs.log_analysis import Look, analysed
+from brakeline.logs.foxglove import FoxgloveConverter
+from brakeline.logs.log_analysis import AnalysisOptions, analyse_runs
 from brakeline.logs.report_page import render
-from brakeline.logs.watch.live_board import Board
-from brakeline.logs.watch.live_page_server import Server
+from brakeline.logs.watch.dashboard import Dashboard
+from brakeline.logs.watch.live_page_server import LivePageServer
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.obstacle import CYLINDER, Obstacle
 from brakeline.messaging.obstacle_motion import Motion
@@ -22,7 +22,7 @@ from brakeline.messaging.sensor_messages import scan_message, set_measurement
 from brakeline.safety.perception.displayed_map import map_for_display
 from brakeline.safety.service.client import obstacle_messages
 from tests.browser import CHROMIUM, Page
-from tests.logs.mixed import Writer
+from tests.logs.sample_log import Writer
 from tests.logs.test_foxglove import Say, Studio, episode, step
 from tests.robots import GROUND, QUADROTOR
 
@@ -86,16 +86,16 @@ def test_of_a_range_image_so_few_hits_are_drawn_that_a_recorder_keeps_up(say: Sa
 
 
 def test_a_scan_that_is_none_costs_its_picture_only(say: Say) -> None:
-    pictures = Pictures(float("inf"))
+    pictures = FoxgloveConverter(float("inf"))
     broken = told("a")
     broken.request.scan.pose.append(1.0)
     for key, message in (("episode", episode("a")), ("exchange", broken), ("step", step(0, pb.RECOVERING, "a"))):
-        pictures.of_sample(say(f"{key}/ground/a", message))
+        pictures.from_sample(say(f"{key}/ground/a", message))
     assert pictures.failures == 1
 
 
 def test_the_live_page_is_told(say: Say) -> None:
-    board = Board()
+    board = Dashboard()
     for actor, x in (("a", 0.0), ("b", 2.0)):
         board.take(say(f"episode/ground/{actor}", episode(actor)))
         board.take(say(f"exchange/ground/{actor}", told(actor, x=x)))
@@ -129,7 +129,7 @@ def drawn(page: Page, name: str) -> int:
 
 @pytest.mark.skipif(CHROMIUM is None, reason="there is no Chromium: the pages were not looked at")
 def test_browsers_draw_it(say: Say, tmp_path: Path) -> None:
-    writer, board = Writer(losses=0.0), Board()
+    writer, board = Writer(losses=0.0), Dashboard()
     for actor in ("a", "b"):
         writer.put(f"episode/ground/{actor}", episode(actor))
         board.take(say(f"episode/ground/{actor}", episode(actor)))
@@ -139,10 +139,10 @@ def test_browsers_draw_it(say: Say, tmp_path: Path) -> None:
             for topic, message in (("exchange", told(actor, k, x)), ("step", after)):
                 writer.put(f"{topic}/ground/{actor}", message)
                 board.take(say(f"{topic}/ground/{actor}", message))
-    analysis = analysed(writer.write(tmp_path / "run.mcap"), Look(pictures=True))
+    analysis = analyse_runs(writer.write(tmp_path / "run.mcap"), AnalysisOptions(pictures=True))
     path = tmp_path / "report.html"
     path.write_text(render(analysis.figures(), analysis.each()), encoding="utf-8")
-    with Server(board.view) as server, Page(tmp_path / "profile") as page:
+    with LivePageServer(board.view) as server, Page(tmp_path / "profile") as page:
         page.open(path.as_uri())
         page.until("document.documentElement.dataset.drawn === 'yes'")
         shown = {name: drawn(page, name) for name in ("free", "hit", "mover", "swept", "promise")}

@@ -5,13 +5,13 @@ import io
 import pytest
 from rich.console import Console
 
-from brakeline.logs.console_tables import Stacking
+from brakeline.logs.console_tables import StackingTable
 
 CELLS = [f"the cell of column {i}, which is not short" for i in range(6)]
 
 
 def printed(**console):
-    table = Stacking(*(f"column {i}" for i in range(6)), title="a title")
+    table = StackingTable(*(f"column {i}" for i in range(6)), title="a title")
     table.add_row(*CELLS)
     file = io.StringIO()
     Console(file=file, **console).print(table)
