@@ -210,7 +210,7 @@ class Launcher:
                 if sample.topic.name == "health":
                     for child in self.children:
                         if child.place.name == message.process:
-                            child.totals_from_health(message.pid)
+                            child.heard(message.pid)
                 if sample.topic.name == "log" and message.level in ("WARNING", "ERROR"):
                     self.lines.append(f"{message.process}: {headline(message.text)}")
 
