@@ -13,6 +13,7 @@ log can be replayed.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from pathlib import Path
 from time import perf_counter_ns
 
 import numpy as np
@@ -41,7 +42,7 @@ from brakeline.safety.filter.request import (
 )
 from brakeline.safety.filter.reservation import Reservation
 from brakeline.safety.model.model_set import ModelSet
-from brakeline.safety.model.stated_bound import stated_bound
+from brakeline.safety.model.stated_bound import check_bound, stated_bound
 from brakeline.safety.model.turning_in_place import widened
 from brakeline.safety.perception.scan_free_space import shows_free
 
@@ -111,6 +112,26 @@ class Filter:
         self.translating = np.concatenate([np.zeros(robot.regressor_dim), driven])
         self.regressor = np.array(robot.regressor, dtype=np.intp)
         self.clearance_margin, self.reach = self.around.clearance_margin, self.around.reach  # m
+
+    @classmethod
+    def load(cls, source: Path | str, *, accept_bound: float | None = None) -> Filter:
+        """Return a filter with the model set in a file, or with the one that comes with a shipped robot.
+
+        Args:
+            source: the path of a model set, or the name of a shipped robot (`"ground"`, `"quadrotor"`).
+            accept_bound: the largest stated share of plans outside their tubes that you accept; by default the limit
+                in the robot's description.
+
+        Raises:
+            BadModel: the file holds no model set, or no shipped robot has that name.
+            TooLoose: the model set states a larger share than is accepted.
+
+        >>> Filter.load("ground").robot.name
+        'ground'
+        """
+        model = ModelSet.load(source)
+        check_bound(model, model.robot, accept_bound)
+        return cls(model)
 
     def half_width(self, speed: Array) -> float:
         """[m] of the full stop's set, largest axis, from driving at inputs `speed` (m,) with that input once more."""

@@ -36,6 +36,7 @@ from brakeline.safety.model.windows import specialised
 Array = NDArray[np.float64]
 
 ENTRY = "model_set"
+SHIPPED = Path(__file__).parents[2] / "robots"  # model sets lie beside the descriptions of their robots
 TENSORS = ("C", "W", "M", "kappa", "w", "generators")
 IN_PLACE, BOX = "in_place.step", "in_place.box"  # optional
 
@@ -220,16 +221,41 @@ class ModelSet:
         return model
 
     @staticmethod
-    def load(path: Path | str) -> ModelSet:
-        """Raises BadModel, naming the file."""
+    def load(source: Path | str) -> ModelSet:
+        """Return the model set in a file, or the one that comes with a shipped robot.
+
+        Args:
+            source: the path of a model set, or the name of a shipped robot (`"ground"`, `"quadrotor"`).
+
+        Raises:
+            BadModel: the file holds no model set, or no shipped robot has that name. The message names the source.
+
+        >>> ModelSet.load("ground")
+        ModelSet('ground', residual, direct, version '65e60d68390b', at most 0.42% of plans outside)
+        """
+        path = Path(source)
+        if isinstance(source, str) and not path.suffix and not path.exists():
+            path = SHIPPED / f"{source}.model.safetensors"
+            if not path.is_file():
+                names = ", ".join(sorted(p.name.partition(".")[0] for p in SHIPPED.glob("*.model.safetensors")))
+                raise BadModel(f"no model set comes with {source!r}; there are: {names}, or give the path of a file")
         try:
-            model = ModelSet.decode(Path(path).read_bytes())
+            model = ModelSet.decode(path.read_bytes())
             refuse_shipped_name(model.robot)
             return model
         except OSError as error:
             raise BadModel(f"{path}: {error}") from error
         except (BadModel, UnknownRobot) as error:
             raise BadModel(f"{path}: {error}") from error
+
+    def __repr__(self) -> str:
+        """Return one line that tells model sets apart; arrays are left out."""
+        try:
+            stated = f"at most {float(self.about['bound_plan']):.2%} of plans outside"
+        except (KeyError, ValueError):
+            stated = "no bound stated"
+        kind = f"{self.model_config.certificate}, {self.model_config.mode}"
+        return f"ModelSet({self.robot.name!r}, {kind}, version {self.version!r}, {stated})"
 
 
 def robot_in(about: dict[str, Any]) -> Robot:

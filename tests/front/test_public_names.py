@@ -120,7 +120,13 @@ def test_a_wheel_has_everything(wheel):
         path.relative_to(wheel / "brakeline").as_posix() for path in (wheel / "brakeline").rglob("*") if path.is_file()
     }
     for needed in (
-        *("py.typed", "robots/ground.toml", "robots/quadrotor.task.toml", "robots/template.txt"),
+        *(
+            "py.typed",
+            "robots/ground.toml",
+            "robots/quadrotor.task.toml",
+            "robots/template.txt",
+            "robots/ground.model.safetensors",
+        ),
         *(
             "policies/ground/trained.safetensors",
             "sim/ground.xml",
@@ -142,3 +148,16 @@ def test_the_trained_policies_are_found_outside_the_checkout(wheel):
         "policy_named('trained-by-scan', robot_with_task('ground'), 0); import brakeline; print(brakeline.__file__)"
     )
     assert Path(outside(wheel, code)).is_relative_to(wheel)
+
+
+def test_the_shipped_model_sets_filter_outside_the_checkout(wheel):
+    """A fresh machine with nothing but the package decides, and refuses what hits a wall."""
+    code = (
+        "from brakeline import Filter, InProcess, Obstacle; import numpy as np; "
+        "kinds = []; "
+        "ask = lambda robot, state, action, near: InProcess(Filter.load(robot)).decide(state, action, near).kind; "
+        "kinds.append(ask('ground', np.zeros(5), [0.2, 0.0], [Obstacle('cylinder', (2.0, 0.0), (0.1,))])); "
+        "kinds.append(ask('ground', np.zeros(5), [0.2, 0.0], [Obstacle('cylinder', (0.23, 0.0), (0.1,))])); "
+        "kinds.append(Filter.load('quadrotor').robot.name); print(kinds)"
+    )
+    assert outside(wheel, code) in (f"['allowed', '{kind}', 'quadrotor']" for kind in ("adjusted", "failsafe"))
