@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+import sysconfig
 import zipfile
 from pathlib import Path
 
@@ -88,14 +89,15 @@ def test_a_users_own_modules_do_not_shadow_ours(install, crowded, request):
     """From such a folder our package imports its own parts, and the user's imports find the user's modules."""
     site = request.getfixturevalue(install)
     code = (
-        f"import site; site.addsitedir({str(site)!r}); from brakeline import Filter, SafetyClient, robot_named; "
+        f"import site, sys; sys.path.append({sysconfig.get_path('purelib')!r}); site.addsitedir({str(site)!r}); "
+        "from brakeline import Filter, SafetyClient, robot_named; "
         "robot_named('ground'); import messaging, safety, sim; assert messaging.MINE and safety.MINE and sim.MINE; "
         "import brakeline.messaging.robot as ours; print(ours.__file__)"
     )
     clean = {name: value for name, value in os.environ.items() if name not in ("PYTHONPATH", "PYTHONSAFEPATH")}
-    # -I would also ignore the working directory, which is what this test is about.
+    # -S: an editable install of the checkout that runs these tests must not be found. The packages that it needs are.
     found = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, check=False, cwd=crowded, env=clean
+        [sys.executable, "-S", "-c", code], capture_output=True, text=True, check=False, cwd=crowded, env=clean
     )
     assert found.returncode == 0, found.stderr
     assert Path(found.stdout.strip()).is_relative_to(site if install == "wheel" else ROOT)
