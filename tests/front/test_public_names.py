@@ -89,13 +89,13 @@ def test_a_users_own_modules_do_not_shadow_ours(install, crowded, request):
     """From such a folder our package imports its own parts, and the user's imports find the user's modules."""
     site = request.getfixturevalue(install)
     code = (
-        f"import site, sys; sys.path.append({sysconfig.get_path('purelib')!r}); site.addsitedir({str(site)!r}); "
+        f"import site; site.addsitedir({str(site)!r}); site.addsitedir({sysconfig.get_path('purelib')!r}); "
         "from brakeline import Filter, SafetyClient, robot_named; "
         "robot_named('ground'); import messaging, safety, sim; assert messaging.MINE and safety.MINE and sim.MINE; "
         "import brakeline.messaging.robot as ours; print(ours.__file__)"
     )
     clean = {name: value for name, value in os.environ.items() if name not in ("PYTHONPATH", "PYTHONSAFEPATH")}
-    # -S: an editable install of the checkout that runs these tests must not be found. The packages that it needs are.
+    # -S: first the install under test, then the packages that it needs.
     found = subprocess.run(
         [sys.executable, "-S", "-c", code], capture_output=True, text=True, check=False, cwd=crowded, env=clean
     )
