@@ -10,10 +10,11 @@ from numpy.typing import NDArray
 
 from brakeline.actors.decision_guard import DecisionOutcome, at_rest, next_input
 from brakeline.messaging import brakeline_pb2 as pb
+from brakeline.messaging.obstacle_messages import obstacle_messages
 from brakeline.messaging.task import RobotWithTask
 from brakeline.safety.filter.backup_plan import Array, BackupPlan, Prediction, correction_penalty
 from brakeline.safety.perception.image_memory import filled, memory_of
-from brakeline.safety.service.client import obstacle_messages, request_message
+from brakeline.safety.service.client import request_message
 from brakeline.safety.service.wire import KINDS
 
 StepResult = tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]  # of a step

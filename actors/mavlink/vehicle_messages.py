@@ -21,6 +21,7 @@ from brakeline.actors.mavlink.vehicle_socket import BadMessage
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.byte_links import BadLink
 from brakeline.messaging.obstacle import FARTHEST, Obstacle
+from brakeline.messaging.obstacle_messages import obstacle_messages
 from brakeline.messaging.robot import Robot
 from brakeline.messaging.robot_description import robot_from_description
 from brakeline.safety.service.wire import array_of, obstacles_of
@@ -50,10 +51,6 @@ class FlightRequest:
 
 def request_message(request: FlightRequest) -> pb.FlightRequest:
     """Return the message of a flight request."""
-    from brakeline.safety.service.client import (
-        obstacle_messages,  # it imports the bus, which the vehicle server does not need
-    )
-
     flight, robot = request.flight, request.robot
     return pb.FlightRequest(
         url=flight.url,

@@ -1,5 +1,8 @@
-"""What the filter was told of a robot's surroundings, for whoever draws them: what a scan hit and showed to be free,
-what moves and may come to where, and what robots of a fleet promise each other."""
+"""A robot's local map as its request describes it, for programs that draw it.
+
+It holds what a scan hit and showed to be free, where moving obstacles may come, and the space that robots of a fleet
+reserve.
+"""
 
 from __future__ import annotations
 
@@ -11,8 +14,7 @@ from numpy.typing import NDArray
 
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.moving_obstacles import MovingObstacles
-from brakeline.messaging.obstacle import Obstacle
-from brakeline.messaging.obstacle_motion import Motion, Sighting
+from brakeline.messaging.obstacle_messages import obstacle_of
 from brakeline.messaging.range_image import RangeImage, directions
 from brakeline.messaging.robot import Robot
 from brakeline.messaging.scan import Scan
@@ -22,18 +24,20 @@ from brakeline.safety.perception.scan_coverage import gaps
 
 Array = NDArray[np.float64]
 
-OUTLINE = 120  # corners of what is drawn of free space, about
-SLICE = 0.5  # m above and below the sensor: what was hit within is drawn from above
+OUTLINE = 120  # corners of a drawn outline, about
+SLICE = 0.5  # m: hits this far above or below the sensor are drawn from above
 
 
 @dataclass(frozen=True)
 class DisplayedMap:
-    """Of one question, in the world's frame, m.
+    """The local map of one request, in the world's frame.
 
-    hits (k, d): where beams ended; free (c, d): the outline of what they showed to be free, as the filter takes it (in
-    space: at the sensor's height); both empty without a scan. movers (n, d+1): of each that moves its place as measured
-    and the radius of a disc (ball) that holds it; swept (n, N, d+1): one for the end of every period of a plan, which
-    holds wherever it may be then.
+    Attributes:
+        hits: (k, d) ends of the beams that hit something [m]; empty without a scan.
+        free: (c, d) outline of the space that the scan showed to be free [m], as the filter takes it. In space, it is
+            the outline at the sensor's height. Empty without a scan.
+        movers: (n, d+1) measured center, and radius of a disc or ball around each moving obstacle [m].
+        swept: (n, N, d+1) the same at the end of each period of a plan, with room for wherever the obstacle may be.
     """
 
     hits: Array
@@ -42,7 +46,10 @@ class DisplayedMap:
     swept: Array
 
     def flat(self, hits: int = OUTLINE) -> dict[str, list[Any]]:
-        """From above, as JSON can hold it: points x, y and discs x, y, radius, in mm; so many hits at the most."""
+        """Return the map from above as values for JSON: points (x, y) and discs (x, y, radius), rounded to 1 mm.
+
+        hits: largest number of hits.
+        """
         level = self.hits
         if level.shape[1] == 3 and len(self.free):
             level = level[np.abs(level[:, 2] - self.free[0, 2]) <= SLICE]
@@ -56,77 +63,57 @@ class DisplayedMap:
 
 
 def map_for_display(robot: Robot, request: pb.Request, corners: int = OUTLINE) -> DisplayedMap:
-    """What the request tells; corners: of the outline, about.
+    """Return the map that a request describes; corners: of the outline, about.
 
-    Raises BadShape, BadScan: the request tells of none that are.
+    Raises:
+        BadShape, BadScan: the request holds an obstacle or a scan that is not valid.
     """
     hits = free = np.zeros((0, robot.position_dim))
     sensed = measurement_in(request)
     if isinstance(sensed, Scan):
-        hits, free = _hits(sensed), outline(sensed, corners)
+        hits, free = _scan_hits(sensed), _scan_outline(sensed, corners)
     elif sensed is not None:
-        hits, free = _image_hits(sensed), level_outline(sensed, corners)
-    followed = _followed(robot, sensed) if isinstance(sensed, Scan) and sensed.tracks is not None else None
-    moving = MovingObstacles.of([_obstacle(o) for o in request.obstacles if o.HasField("motion")], robot.position_dim)
-    shapes, ends = moving.shapes, robot.period * np.arange(1.0, robot.horizon + 1.0)
-    across: Array = shapes.rho + np.sqrt((shapes.half**2).sum(axis=1))
-    swept = shapes.center[:, None] + moving.moved(ends), (across[:, None] + moving.radius(ends))[..., None]
-    movers, sweeps = np.column_stack([shapes.center, across]), np.concatenate(swept, axis=2)
-    if followed is not None:
-        movers, sweeps = np.concatenate([movers, followed[0]]), np.concatenate([sweeps, followed[1]])
-    return DisplayedMap(hits, free, movers, sweeps)
+        hits, free = _image_hits(sensed), _image_outline(sensed, corners)
+    moving = [obstacle_of(o, robot.position_dim) for o in request.obstacles if o.HasField("motion")]
+    obstacles = MovingObstacles.of(moving, robot.position_dim)
+    shapes, ends = obstacles.shapes, robot.period * np.arange(1.0, robot.horizon + 1.0)
+    radius: Array = shapes.rho + np.sqrt((shapes.half**2).sum(axis=1))
+    centers, radii = shapes.center[:, None] + obstacles.moved(ends), radius[:, None] + obstacles.radius(ends)
+    movers, swept = np.column_stack([shapes.center, radius]), np.concatenate([centers, radii[..., None]], axis=2)
+    if isinstance(sensed, Scan) and sensed.tracks is not None:
+        tracked = _tracked(sensed, sensed.age + ends)
+        movers, swept = np.concatenate([movers, tracked[0]]), np.concatenate([swept, tracked[1]])
+    return DisplayedMap(hits, free, movers, swept)
 
 
-def _followed(robot: Robot, scan: Scan) -> tuple[Array, Array]:
-    """Of what a scan was followed to move: the discs about what was hit of it (k, 3), and those swept (k, N, 3)."""
+def _tracked(scan: Scan, times: Array) -> tuple[Array, Array]:
+    """Return a disc around the hits of each tracked surface (k, 3), and that disc at times (N,) [s] after the scan."""
     assert scan.tracks is not None
     points = np.zeros((len(scan.ranges), 2))
-    points[scan.known & (scan.ranges < scan.far)] = _hits(scan)
-    t = scan.age + robot.period * np.arange(1.0, robot.horizon + 1.0)
-    discs, swept = [np.zeros((0, 3))], [np.zeros((0, len(t), 3))]
-    for row, (cx, cy, error, acceleration) in enumerate(scan.tracks.motions, start=1):
-        hit = points[scan.tracks.track_index == row]
-        if not len(hit) or not (cx or cy):
+    points[scan.known & (scan.ranges < scan.far)] = _scan_hits(scan)
+    discs, swept = [np.zeros((0, 3))], [np.zeros((0, len(times), 3))]
+    for number, (vx, vy, error, acceleration) in enumerate(scan.tracks.motions, start=1):
+        hits = points[scan.tracks.track_index == number]
+        if not len(hits) or not (vx or vy):
             continue
-        middle = hit.mean(axis=0)
-        about = float(np.linalg.norm(hit - middle, axis=1).max())
-        discs.append(np.array([[*middle, about]]))
-        grown = about + error * t + 0.5 * acceleration * t * t
-        swept.append(np.column_stack([middle + t[:, None] * (cx, cy), grown])[None])
+        center = hits.mean(axis=0)
+        radius = float(np.linalg.norm(hits - center, axis=1).max())
+        discs.append(np.array([[*center, radius]]))
+        radii = radius + error * times + 0.5 * acceleration * times * times
+        swept.append(np.column_stack([center + times[:, None] * (vx, vy), radii])[None])
     return np.concatenate(discs), np.concatenate(swept)
 
 
-def _obstacle(o: pb.Obstacle) -> Obstacle:
-    return Obstacle(o.kind, tuple(o.position), tuple(o.size), o.yaw, o.margin, motion_of(o.motion))
-
-
-def motion_of(m: pb.Motion) -> Motion:
-    """What an obstacle's message says of how it moves."""
-    before = None
-    if m.before_position or m.before_velocity:
-        before = Sighting(tuple(m.before_position), tuple(m.before_velocity), m.since)
-    return Motion(
-        tuple(m.velocity),
-        m.position_error,
-        m.velocity_error,
-        acceleration=m.acceleration if m.HasField("acceleration") else None,
-        speed=m.speed if m.HasField("speed") else None,
-        age=m.age,
-        before=before,
-    )
-
-
-def _hits(scan: Scan) -> Array:
-    """(k, 2)"""
+def _scan_hits(scan: Scan) -> Array:
+    """Return the ends (k, 2) of the beams that hit something."""
     at, heading = scan.sensor()
     hit = scan.known & (scan.ranges < scan.far)
     angles = heading + scan.angles[hit]
     return np.asarray(at + scan.ranges[hit, None] * np.column_stack([np.cos(angles), np.sin(angles)]))
 
 
-def outline(scan: Scan, most: int = OUTLINE) -> Array:
-    """Corners (c, 2) of a part of what the scan shows to be free, all round the sensor: neighbouring gaps in groups,
-    each up to the least F of its group."""
+def _scan_outline(scan: Scan, most: int) -> Array:
+    """Return corners (c, 2) of free space: neighbouring gaps in groups, each up to the least F of its group."""
     at, heading = scan.sensor()
     angles, width, free = gaps(scan)
     first = np.arange(0, len(free), max(1, 2 * len(free) // most))
@@ -137,19 +124,17 @@ def outline(scan: Scan, most: int = OUTLINE) -> Array:
 
 
 def _image_hits(image: RangeImage) -> Array:
-    """(k, 3)"""
+    """Return the ends (k, 3) of the beams that hit something."""
     elevations = image.low + image.step[0] * np.arange(len(image.ranges))
     hit = image.known & (image.ranges < image.far)
     ways = directions(elevations, image.ranges.shape[1])[hit]
     return np.asarray(image.sensor() + image.ranges[hit, None] * ways @ image.turn.T)
 
 
-def level_outline(image: RangeImage, most: int = OUTLINE) -> Array:
-    """Corners (c, 3) of a part of what the image shows to be free at the sensor's height: the least F of each group of
-    columns, in the ring nearest to level."""
+def _image_outline(image: RangeImage, most: int) -> Array:
+    """Return corners (c, 3) of free space at the sensor's height: least F by groups of columns in the level ring."""
     grid, free = patch_free_ranges(image)
-    elevations = grid.elevations
-    ring = int(np.abs(elevations).argmin())
+    ring = int(np.abs(grid.elevations).argmin())
     columns = free.shape[1]
     first = np.arange(0, columns, max(1, 2 * columns // most))
     reach = np.repeat(np.minimum.reduceat(free[ring], first), 2)
@@ -159,8 +144,11 @@ def level_outline(image: RangeImage, most: int = OUTLINE) -> Array:
 
 
 def reserved_boxes(robot: Robot, exchange: pb.Exchange) -> Array:
-    """What a robot of a fleet promises the others from this question on, boxes (N, 2d+1): center, half-widths, and the
-    radius about them; (0, 2d+1): nothing."""
+    """Return the boxes (N, 2d+1) that a robot of a fleet reserves after an exchange with the service.
+
+    A row holds the center (d,), the half-widths (d,) and the radius around the box [m]. Without a reservation there are
+    no rows.
+    """
     decision = exchange.reply.decision
     reservation = decision.reservation if decision.HasField("reservation") else exchange.request.reservation
     d = robot.position_dim

@@ -1,16 +1,19 @@
-"""How far a range image shows each patch about a beam to be free.
+"""How far a range image shows each patch of directions to be free (docs/method.md §10).
 
-Take a point p of an obstacle, d from the sensor. A cube of any edge w up to the least width W has its corner there and
-lies in the obstacle, and so does the ball in the cube, of radius w/2, with its middle at most s = √¾ w from p. If no
-direction is farther than δ from a beam, one of them hits that ball as soon as sin δ <= (w/2) / (d + s), and returns
-from d + s at the most. The smallest such edge is w = κ d with κ = 2 sin δ / (1 - √3 sin δ). So a patch is free up to
+Take a point of an obstacle at distance d from the sensor. By assumption it is the corner of a cube that lies in the
+obstacle, for any edge w up to the least width W. The cube's inner ball of radius w/2 has its center at most s = √¾ w
+from the point. If no direction is farther than δ from a beam, some beam hits that ball as soon as
+sin δ ≤ (w/2) / (d + s), and returns a range of at most d + s. The smallest such edge is w = κ d with
+κ = 2 sin δ / (1 - √3 sin δ). So a patch is free up to
 
-    F = min( ρ / (1 + √¾ κ),  W / κ )
+    F = min( ρ / (1 + √¾ κ),  W / κ ),
 
-with ρ the least range of all beams within `asin(√¾ κ) + δ` of any direction in it. Patches are as wide as beams are
-apart, so δ is half the diagonal of the grid's meshes. A ball twice as wide covers all four beams of some mesh: that is
-what counts where single beams say nothing, or are doubted. Where a mesh has too few that say something, nothing is
-known. And a beam that returns from where no mesh about it returns as a whole, where one would have to, is a ghost.
+with ρ the least range of all beams within asin(√¾ κ) + δ of any direction in the patch. Patches are as wide as beams
+are apart, so δ is half the diagonal of a mesh (the cell between four neighbouring beams).
+
+If a beam is unknown or single beams are doubted, a ball twice as wide counts: it covers all four beams of some mesh. A
+mesh with too few known beams shows nothing to be free. A *ghost* is a return that is nearer than an obstacle can be, by
+the meshes around it; it counts as unknown.
 """
 
 from __future__ import annotations
@@ -18,7 +21,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cache, cached_property, lru_cache
+from functools import cache, lru_cache
 from typing import Any
 
 import numpy as np
@@ -29,133 +32,139 @@ from brakeline.messaging.range_image import RangeImage
 Array = NDArray[np.float64]
 Single = NDArray[np.float32]
 
-SINGLE = 1e-6  # of a range: more than a few operations in single precision are off by
-CORNER = math.sqrt(0.75)  # of a cube's edge: from its corner to its middle
+SINGLE = 1e-6  # relative error of a few operations in single precision, at most
+CORNER = math.sqrt(0.75)  # from a cube's corner to its center, per metre of edge
 
 
 @dataclass(frozen=True)
 class SphereCover:
-    """Of beams that no direction is farther from than so much: kappa, and `within` [rad] of a direction in a patch
-    are the beams that say how far the patch is free."""
+    """Beams that no direction on the sphere is farther from than an angle δ.
+
+    Attributes:
+        kappa: κ, the edge of the cube that a beam cannot miss, per metre of distance.
+        within: angle [rad] around a patch's beam within which the beams bound the patch's free range.
+    """
 
     kappa: float
     within: float
 
     @staticmethod
-    def of(farthest: float, patch: float) -> SphereCover:
-        """farthest [rad]: of any direction from a beam; patch [rad]: of a direction in a patch from its beam."""
-        sine = math.sin(farthest)
+    def of(delta: float, patch: float) -> SphereCover:
+        """Make a cover. delta [rad]: from any direction to a beam; patch [rad]: from a patch's edge to its beam."""
+        sine = math.sin(delta)
         kappa = 2.0 * sine / (1.0 - math.sqrt(3.0) * sine)
-        return SphereCover(kappa, patch + math.asin(min(CORNER * kappa, 1.0)) + farthest)
+        return SphereCover(kappa, patch + math.asin(min(CORNER * kappa, 1.0)) + delta)
 
     @property
     def share(self) -> float:
-        """Of the range that what covers a point returns from: from where it can be hit at the nearest."""
+        """The distance of a point per metre of the range that its cube returns, at least."""
         return 1.0 / (1.0 + CORNER * self.kappa)
 
+    def scale(self, least_width: float) -> tuple[float, float]:
+        """Return F per metre of the least range, and the largest F [m]."""
+        return (1.0 - SINGLE) * self.share, (1.0 - SINGLE) * least_width / self.kappa
+
     def free(self, least: Single, least_width: float) -> Single:
-        """F [m] by the least ranges [m], which it overwrites."""
+        """Return F [m] for the least ranges [m], which it overwrites."""
         from brakeline.safety.perception.kernels.proximity_kernels import scale_to  # compiled
 
         scale_to(least, *self.scale(least_width))
         return least
 
-    def scale(self, least_width: float) -> tuple[float, float]:
-        """What F is of the least range, and how much [m] at the most."""
-        return (1.0 - SINGLE) * self.share, (1.0 - SINGLE) * least_width / self.kappa
-
 
 @cache
-def _free_of_single() -> Callable[..., tuple[Single, Single]]:
-    from brakeline.safety.perception.kernels.proximity_kernels import free_of_single  # compiled
+def _single_beam_ranges() -> Callable[..., tuple[Single, Single]]:
+    from brakeline.safety.perception.kernels.proximity_kernels import single_beam_ranges  # compiled
 
-    return free_of_single
+    return single_beam_ranges
 
 
 def patch_free_ranges(image: RangeImage) -> tuple[BeamGrid, Single]:
-    """The grid, from pole to pole, and F (E', A) [m] of each beam's patch."""
+    """Return the grid from pole to pole, and the free range F (E', A) [m] of each beam's patch."""
     width, grid = image.least_width, BeamGrid.of(*image.ranges.shape, image.low, image.high)
-    ranges, scale = np.ascontiguousarray(image.ranges), grid.single.scale(width)
-    errors = image.far, image.range_error
-    returns, free = _free_of_single()(ranges, *grid.rings, *errors, *grid.windows, *scale, image.doubt)
+    ranges, sensor = np.ascontiguousarray(image.ranges), (float(image.far), float(image.range_error), image.doubt)
+    mesh_window = grid.double.share, grid.mesh_window.rows, grid.mesh_window.beside
+    beam_window = grid.beam_window.rows, grid.beam_window.beside
+    returns, free = _single_beam_ranges()(
+        ranges, grid.added, sensor, mesh_window, beam_window, grid.single.scale(width)
+    )
     if free.size:
         return grid, free
-    known, nothing = returns >= 0.0, np.float32(0.0)
-    enough = meshes(np.add, known.astype(np.int8)) > image.doubt
-    # Who says nothing does not say that something is near, either.
-    silent = np.where(known, returns, np.float32(np.inf))
-    free = grid.double.free(grid.balls.least(np.where(enough, silent, nothing)), width)
+    known, zero = returns >= 0.0, np.float32(0.0)
+    enough = by_mesh(np.add, known.astype(np.int8)) > image.doubt
+    known_or_far = np.where(known, returns, np.float32(np.inf))  # an unknown beam does not say that something is near
+    free = grid.double.free(grid.mesh_window.minimum(np.where(enough, known_or_far, zero)), width)
     if not image.doubt:
-        free = np.maximum(free, grid.single.free(grid.beams.least(np.maximum(returns, nothing)), width))
+        free = np.maximum(free, grid.single.free(grid.beam_window.minimum(np.maximum(returns, zero)), width))
     return grid, free
 
 
-def meshes(of: np.ufunc, values: NDArray[Any]) -> NDArray[Any]:
-    """Of each beam and its neighbours to the left, above and above to the left (E, A); of the last ring, of two."""
-    found = of(values, np.roll(values, -1, axis=1))
-    found[:-1] = of(found[:-1], found[1:])
-    return np.asarray(found)
+def by_mesh(of: np.ufunc, values: NDArray[Any]) -> NDArray[Any]:
+    """Combine the values (E, A) of each beam, its left neighbour and the two above them; in the last ring, of two."""
+    meshes = of(values, np.roll(values, -1, axis=1))
+    meshes[:-1] = of(meshes[:-1], meshes[1:])
+    return np.asarray(meshes)
 
 
 @dataclass(frozen=True)
 class GridWindow:
-    """So many rings above and below a beam, and so many columns (E,) beside it by its ring."""
+    """Neighbours of each beam in a grid.
+
+    Attributes:
+        rows: rings above and below the beam.
+        beside: (E,) columns to the left and to the right of the beam, by its ring.
+    """
 
     rows: int
     beside: NDArray[np.int64]
 
     @staticmethod
     def of(columns: int, elevations: Array, step: float, within: float) -> GridWindow:
-        """A box about all beams within so many rad of each on the sphere."""
-        half = np.full(len(elevations), math.pi)  # a cap with a pole in it is all about
+        """Return a window that holds all beams within an angle [rad] on the sphere; step [rad]: between rings."""
+        half = np.full(len(elevations), math.pi)  # a cap around a pole has all azimuths
         level = np.abs(elevations) + within < 0.5 * math.pi
         half[level] = np.arcsin(np.minimum(math.sin(within) / np.cos(elevations[level]), 1.0))
         beside = np.minimum(np.ceil(half * columns / math.tau - 1e-9), columns).astype(np.int64)
         return GridWindow(math.ceil(within / step - 1e-9), beside)
 
-    def least(self, values: Single) -> Single:
-        """The least (E, A) of each beam's window in a grid (E, A)."""
-        from brakeline.safety.perception.kernels.proximity_kernels import least_of  # compiled
+    def minimum(self, values: Single) -> Single:
+        """Return the minimum (E, A) of each beam's window in a grid (E, A)."""
+        from brakeline.safety.perception.kernels.proximity_kernels import window_minimum  # compiled
 
-        return least_of(np.ascontiguousarray(values, np.float32), self.rows, self.beside)
+        return window_minimum(np.ascontiguousarray(values, np.float32), self.rows, self.beside)
 
 
 @dataclass(frozen=True, eq=False)
 class BeamGrid:
-    """What is known of a grid before any range: elevations (E',) [rad] from pole to pole, of which so many rings below
-    and above are not seen, columns, and how far no direction is from the nearest beam [rad]; what single beams say and
-    where they are, and balls twice as wide."""
+    """The geometry of a grid of beams, which its ranges do not change.
+
+    Attributes:
+        elevations: (E',) [rad] from pole to pole.
+        columns: A.
+        half_diagonal: largest angle [rad] from any direction to the nearest beam.
+        added: the numbers of rings (below, above) that the sensor does not see.
+        single, beam_window: the cover by single beams, and the beams that bound a patch's free range.
+        double, mesh_window: the same for meshes.
+    """
 
     elevations: Array
     columns: int
     half_diagonal: float
-    below: int
-    above: int
+    added: tuple[int, int]
     single: SphereCover
-    beams: GridWindow
+    beam_window: GridWindow
     double: SphereCover
-    balls: GridWindow
-
-    @cached_property
-    def rings(self) -> tuple[int, int]:
-        """That are not seen, below and above."""
-        return self.below, self.above
-
-    @cached_property
-    def windows(self) -> tuple[float, int, NDArray[np.int64], int, NDArray[np.int64]]:
-        """Of balls twice as wide: of a mesh's range the share that they return from; theirs and single beams'."""
-        return self.double.share, self.balls.rows, self.balls.beside, self.beams.rows, self.beams.beside
+    mesh_window: GridWindow
 
     @staticmethod
     @lru_cache(maxsize=64)
     def of(rings: int, columns: int, low: float, high: float) -> BeamGrid:
+        """Return the geometry of a grid whose rings lie between two elevations [rad]."""
         step = (high - low) / (rings - 1)
         patch = 0.5 * math.hypot(step, math.tau / columns)
-        above, below = (max(math.ceil((0.5 * math.pi - end) / step - 0.5 - 1e-9), 0) for end in (high, -low))
+        below, above = (max(math.ceil((0.5 * math.pi - end) / step - 0.5 - 1e-9), 0) for end in (-low, high))
         elevations = np.clip(low + step * np.arange(-below, rings + above), -0.5 * math.pi, 0.5 * math.pi)
-        single, double = (
-            SphereCover.of(patch, patch),
-            SphereCover.of(max(2.0 * patch, 1.5 * step), patch),
-        )  # the latter at a pole
-        beams, balls = (GridWindow.of(columns, elevations, step, cover.within) for cover in (single, double))
-        return BeamGrid(elevations, columns, patch, below, above, single, beams, double, balls)
+        single = SphereCover.of(patch, patch)
+        double = SphereCover.of(max(2.0 * patch, 1.5 * step), patch)  # 1.5 steps: at a pole
+        beams, meshes = (GridWindow.of(columns, elevations, step, cover.within) for cover in (single, double))
+        return BeamGrid(elevations, columns, patch, (below, above), single, beams, double, meshes)

@@ -1,4 +1,4 @@
-"""What a sensor with beams all about saw free before (`safety/perception/visibility_memory.py`)."""
+"""Memory of free space for a sensor with beams in all directions (`visibility_memory.py`)."""
 
 from __future__ import annotations
 
@@ -15,104 +15,110 @@ from numpy.typing import NDArray
 from brakeline.messaging.range_image import RangeImage, directions
 from brakeline.messaging.robot import Robot
 from brakeline.messaging.scan import Scan
-from brakeline.safety.perception.image_coverage import GridWindow, Single, meshes, patch_free_ranges
+from brakeline.safety.perception.image_coverage import GridWindow, Single, by_mesh, patch_free_ranges
 from brakeline.safety.perception.visibility_memory import FanMemory, VisibilityMemory
 
 Array = NDArray[np.float64]
 
-KEPT = 4  # images
-APART = 0.5  # m between two that are kept
-# Along a beam, m.
-AWAY = np.concatenate([np.arange(0.05, 1.0, 0.05), np.arange(1.0, 3.0, 0.25), np.arange(3.0, 8.0, 0.5)])
-STEPS = np.diff(AWAY, prepend=0.0)
-ASIDE = tuple(math.radians(angle) for angle in (2.0, 5.0, 10.0, 20.0, 40.0))  # that drift may be seen under
+CAPACITY = 4  # images
+SPACING = 0.5  # m: smallest motion between two stored images
+# m: the tested points along a beam.
+DISTANCES = np.concatenate([np.arange(0.05, 1.0, 0.05), np.arange(1.0, 3.0, 0.25), np.arange(3.0, 8.0, 0.5)])
+STEPS = np.diff(DISTANCES, prepend=0.0)
+DRIFT_ANGLES = tuple(math.radians(angle) for angle in (2.0, 5.0, 10.0, 20.0, 40.0))  # under which drift may appear
 
 
 @dataclass(frozen=True, eq=False)
-class _Seen:
+class _StoredImage:
     image: RangeImage
 
     @cached_property
     def free(self) -> tuple[float, Single]:
-        """The lowest ring's elevation [rad], and the free ranges (len(ASIDE), E, A) of all directions within so much of
-        each patch."""
+        """The lowest ring's elevation [rad], and free ranges (len(DRIFT_ANGLES), E, A) [m]: entry k is the least free
+        range of all directions within `DRIFT_ANGLES[k]` of a patch."""
         grid, free = patch_free_ranges(self.image)
-        about, elevations = 2.0 * grid.half_diagonal, grid.elevations
-        columns, step = grid.columns, self.image.step[0]
-        levels = [GridWindow.of(columns, elevations, step, aside + about).least(free) for aside in ASIDE]
-        return float(elevations[0]), np.stack(levels)
+        patch, step = 2.0 * grid.half_diagonal, self.image.step[0]
+        windows = [GridWindow.of(grid.columns, grid.elevations, step, angle + patch) for angle in DRIFT_ANGLES]
+        return float(grid.elevations[0]), np.stack([window.minimum(free) for window in windows])
 
 
 class ImageMemory(VisibilityMemory[RangeImage]):
-    """Of an image all about."""
+    """Memory of a sensor with beams in all directions."""
 
-    START = 0.7  # what flies needs more to get going
+    START = 0.7  # a flying robot needs more room to get going
     nothing = RangeImage(np.zeros((16, 32)), (0.0, 0.0, 0.0))
 
     def __init__(self, footprint: float) -> None:
-        import brakeline.safety.perception.kernels.proximity_kernels  # noqa: F401  # compiled now, and not when the first image is to be answered in time
+        import brakeline.safety.perception.kernels.proximity_kernels  # noqa: F401  # compiles now, not at the first image
 
         super().__init__(footprint)
 
     def reset(self) -> None:
         super().reset()
-        self._seen: deque[_Seen] = deque(maxlen=KEPT)
+        self._stored: deque[_StoredImage] = deque(maxlen=CAPACITY)
 
-    def _own(self, scan: RangeImage) -> RangeImage:
+    def _copied(self, scan: RangeImage) -> RangeImage:
         return replace(scan, ranges=scan.ranges.copy())
 
-    def _wanted(self, scan: RangeImage) -> NDArray[np.bool_]:
-        """Those that none of a mesh speaks for: single ones cost little."""
-        none = ~meshes(np.logical_or, scan.known)
+    def _beams_to_fill(self, scan: RangeImage) -> NDArray[np.bool_]:
+        """Return the unknown beams next to a mesh without any known beam. Single unknown beams cost little."""
+        none = ~by_mesh(np.logical_or, scan.known)
         none |= np.roll(none, 1, axis=1)
         none[1:] |= none[:-1].copy()
         return np.asarray(none & ~scan.known)
 
-    def _keep(self, scan: RangeImage) -> None:
-        if self._seen and math.dist(self._seen[-1].image.at, scan.at) < APART:
+    def _store(self, scan: RangeImage) -> None:
+        if self._stored and math.dist(self._stored[-1].image.at, scan.at) < SPACING:
             return
-        if len(self._seen) == KEPT:
-            self._before.pop(0)
-        self._seen.append(_Seen(scan))
-        self._before.append(scan.age)
+        if len(self._stored) == CAPACITY:
+            self._ages.pop(0)
+        self._stored.append(_StoredImage(scan))
+        self._ages.append(scan.age)
 
-    def _along(self, scan: RangeImage, beams: NDArray[np.bool_]) -> Array:
+    def _free_along(self, scan: RangeImage, beams: NDArray[np.bool_]) -> Array:
         elevations = scan.low + scan.step[0] * np.arange(len(scan.ranges))
         ways = directions(elevations, scan.ranges.shape[1])[beams] @ scan.turn.T
-        points = scan.sensor() + AWAY[:, None, None] * ways  # (S, B, 3)
-        free = self._at_start(points, scan, STEPS[:, None])
-        for seen, age in zip(self._seen, self._before, strict=True):
-            free |= self._in(seen, age, points, scan)
-        steps = np.where(free.all(axis=0), len(AWAY), free.argmin(axis=0))
-        return np.concatenate([[0.0], AWAY])[steps]
+        points = scan.sensor() + DISTANCES[:, None, None] * ways  # (S, B, 3)
+        free = self._near_start(points, scan, STEPS[:, None])
+        for stored, age in zip(self._stored, self._ages, strict=True):
+            free |= self._shown_free(stored, age, points, scan)
+        steps = np.where(free.all(axis=0), len(DISTANCES), free.argmin(axis=0))
+        return np.concatenate([[0.0], DISTANCES])[steps]
 
-    def _in(self, seen: _Seen, age: float, points: Array, scan: RangeImage) -> NDArray[np.bool_]:
-        """Was it seen free, with all that is within the errors since?"""
-        away = (points - seen.image.sensor()) @ seen.image.turn
+    def _shown_free(self, stored: _StoredImage, age: float, points: Array, scan: RangeImage) -> NDArray[np.bool_]:
+        """Return which points a stored image shows to be free, with everything within the errors around them."""
+        image = stored.image
+        away = (points - image.sensor()) @ image.turn
         far = np.sqrt(np.einsum("sbd,sbd->sb", away, away))
-        drift = seen.image.sensor_error + scan.position_error + scan.speed * age + STEPS[:, None]
+        drift = image.sensor_error + scan.position_error + scan.speed * age + STEPS[:, None]
         reach = np.linalg.norm(points - np.asarray(scan.at), axis=-1)
-        drift = drift + seen.image.angle_error * far + scan.angle_error * reach
+        drift = drift + image.angle_error * far + scan.angle_error * reach
         aside = np.arcsin(np.minimum(drift / np.maximum(far, 1e-9), 1.0))
-        level = np.searchsorted(np.array(ASIDE), aside)
-        lowest, free = seen.free
+        level = np.searchsorted(np.array(DRIFT_ANGLES), aside)
+        lowest, free = stored.free
         _, rings, columns = free.shape
-        up = np.arcsin(np.clip(away[..., 2] / np.maximum(far, 1e-9), -1.0, 1.0))
-        ring = np.clip(np.rint((up - lowest) / seen.image.step[0]).astype(int), 0, rings - 1)
+        elevation = np.arcsin(np.clip(away[..., 2] / np.maximum(far, 1e-9), -1.0, 1.0))
+        ring = np.clip(np.rint((elevation - lowest) / image.step[0]).astype(int), 0, rings - 1)
         column = np.rint(np.arctan2(away[..., 1], away[..., 0]) * (columns / math.tau)).astype(int) % columns
-        least = free[np.minimum(level, len(ASIDE) - 1), ring, column]
-        return np.asarray((far + drift < least) & (level < len(ASIDE)))
+        least = free[np.minimum(level, len(DRIFT_ANGLES) - 1), ring, column]
+        return np.asarray((far + drift < least) & (level < len(DRIFT_ANGLES)))
 
 
 def memory_of(robot: Robot) -> FanMemory | ImageMemory:
-    """What a robot's asker remembers of what its sensor saw."""
+    """Return an empty memory for a robot's sensor."""
     return FanMemory(robot.footprint) if robot.position_dim == 2 else ImageMemory(robot.footprint)
 
 
 def filled(memory: FanMemory | ImageMemory, info: Mapping[str, Any], elapsed: float) -> Scan | RangeImage | None:
-    """The scan in an environment's `info`, with what is remembered; one that the memory is not of, as it is.
+    """Return `info["scan"]` of an environment, with unknown beams filled in from memory.
 
-    A scan that is None did not come: the last one counts, so much older. None: the environment never had a `scan`.
+    Args:
+        memory: of the robot. A scan of the other kind is returned unchanged.
+        info: an environment's. A `scan` of None means that none came: the last one counts, and ages.
+        elapsed: time since the last call [s].
+
+    Returns:
+        The scan, or None if the environment never had a `scan`.
     """
     if "scan" not in info and memory.unused:
         return None

@@ -1,9 +1,8 @@
-"""Free space from a range image: what it does not show to be free lies in shadows of patches (docs/method.md §10).
+"""Free space from a range image: everything that the image does not show to be free is a shadow (docs/method.md §10).
 
-The shadow of a patch is what is in it beyond F (`safety/perception/image_coverage.py`). Thousands of them are kept
-off by a few
-half-spaces a period: the one that supports the nearest shadow, then, of all that are not beyond it, the one that
-supports the nearest of these, until none is left.
+The shadow of a patch is all of it beyond its free range F (`image_coverage.py`). A few half-spaces for each period keep
+the plan off thousands of shadows. The first supports the nearest shadow. The next supports the nearest shadow that is
+not beyond the first, and so on until every shadow is beyond one.
 """
 
 from __future__ import annotations
@@ -15,25 +14,26 @@ from functools import cache, lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from brakeline.messaging.obstacle import FARTHEST
 from brakeline.messaging.range_image import RangeImage, directions
-from brakeline.safety.filter.halfspaces import TOUCHING
 from brakeline.safety.perception.image_coverage import BeamGrid, patch_free_ranges
 
 Array = NDArray[np.float64]
 Single = NDArray[np.float32]
 
-PLANES = 32  # of a period at most: what needs more has no free space there
-GIVE = 0.05  # of the room to a shadow, that is given up for fewer half-spaces; twice as much after every eight
-SHARED = 0.6  # m of the nominal way, about, along which periods share half-spaces
-ASIDE = 1e-6  # rad: more than a direction in single precision is beside its patch's middle
-FACES = np.vstack([np.eye(3), -np.eye(3)])  # of the room
+PLANES = 32  # half-spaces of a period at most; a period that needs more has no free space
+GIVE = 0.05  # share of the gap to a shadow that is given up for fewer half-spaces; it doubles after every eight
+DIRECTION_ERROR = 1e-6  # rad: largest error of a direction in single precision
+FACES = np.vstack([np.eye(3), -np.eye(3)])  # normals of a box
 
 
 @dataclass(frozen=True)
 class PlanBoxes:
-    """Boxes, world, that no plan is outside of at the periods' ends, now the first of them, until so many s from now:
-    their lowest and highest corners (2, N+1, 3), or of one for all (2, 1, 3)."""
+    """Boxes that hold every plan's position at the ends of the periods, in the world's frame.
+
+    Attributes:
+        boxes: (2, N+1, 3) lowest and highest corners [m], the first for now; or (2, 1, 3), one box for all ends.
+        last: time of the last end [s from now].
+    """
 
     boxes: Array
     last: float
@@ -41,11 +41,17 @@ class PlanBoxes:
 
 @dataclass(frozen=True)
 class OccludedRegions:
-    """n of them, as `lines` (11, n) from their near ends to their far ones, from an origin (3,), world: `casting.py`
-    says what a line is, and the hull of balls about both ends holds the shadow. room: all that come into it. speed
-    [m/s]: whatever they hold may move as fast since `age` s ago."""
+    """The n shadows of a range image that come into the boxes of a plan.
 
-    lines: Single
+    Attributes:
+        capsules: (ROWS, n) hulls of the shadows, relative to the origin (`kernels/shadow_kernels.py`).
+        origin: (3,) [m], world.
+        room: the boxes.
+        speed: largest speed of anything in a shadow [m/s].
+        age: time since the image was taken [s].
+    """
+
+    capsules: Single
     origin: Array
     room: PlanBoxes
     speed: float
@@ -53,53 +59,66 @@ class OccludedRegions:
 
 
 def prepare() -> None:
-    """Compile what reads range images, or load it: before the first one is to be answered in time."""
+    """Compile or load the kernels that read range images, so that the first image is answered in time."""
     import brakeline.safety.perception.kernels.proximity_kernels  # noqa: F401
 
-    _compiled()
+    _kernels()
 
 
-@cache  # importing anew what there is takes a fiftieth of a decision
-def _compiled() -> tuple[Callable[..., Single], Callable[..., tuple[Array, Array]]]:
-    from brakeline.safety.perception.kernels.occlusion_kernels import about_way
-    from brakeline.safety.perception.kernels.shadow_kernels import behind
+@cache  # an import statement at each call would cost a fiftieth of a decision
+def _kernels() -> tuple[Callable[..., Single], Callable[..., tuple[Array, Array]]]:
+    from brakeline.safety.perception.kernels.occlusion_kernels import path_planes
+    from brakeline.safety.perception.kernels.shadow_kernels import shadow_capsules
 
-    return behind, about_way
+    return shadow_capsules, path_planes
 
 
 def occluded_regions(image: RangeImage, room: PlanBoxes, body: float, origin: Array) -> OccludedRegions:
-    """All that is not known to be free and that a body of that radius [m], with its middle in the room, may touch; from
-    an origin (3,) in the room."""
+    """Return the shadows that a body may touch in the boxes.
+
+    Args:
+        image: what the sensor measured.
+        room: boxes of the body's positions.
+        body: the body's radius [m].
+        origin: (3,) a point in the boxes [m], world.
+    """
+    shadow_capsules, _ = _kernels()
     grid, free = patch_free_ranges(image)
-    beside = body + image.speed * (image.age + room.last)
-    about = grid.half_diagonal + image.angle_error + ASIDE
+    reach = body + image.speed * (image.age + room.last)
+    angle = grid.half_diagonal + image.angle_error + DIRECTION_ERROR
     pose = image.attitude, image.at, image.mount
-    behind, _ = _compiled()
-    lines = behind(free, *_patches(grid), *pose, room.boxes, beside, about, image.sensor_error, origin)
-    return OccludedRegions(lines, origin, room, image.speed, image.age)
+    capsules = shadow_capsules(free, _patches(grid), pose, room.boxes, (reach, angle, image.sensor_error), origin)
+    return OccludedRegions(capsules, origin, room, image.speed, image.age)
 
 
 @lru_cache(maxsize=16)
 def _patches(grid: BeamGrid) -> tuple[NDArray[np.int64], Single]:
-    """How many columns make a patch in each ring (E,), more than one near the poles, and their middles (3, n), as
-    exactly as `ASIDE`."""
+    """Return the columns per patch of each ring (E,), more than one near the poles, and the patches' middles (3, n).
+
+    The middles are unit vectors in the sensor's frame, within `DIRECTION_ERROR`.
+    """
     elevations, columns = grid.elevations, grid.columns
     half = 0.5 * float(np.diff(elevations).max())  # the outermost rings may have been moved to the poles
-    together = (1.0 / np.cos(np.maximum(np.abs(elevations) - half, 0.0))).astype(np.int64)
+    columns_per_patch = (1.0 / np.cos(np.maximum(np.abs(elevations) - half, 0.0))).astype(np.int64)
     middles = []
-    for elevation, each in zip(elevations, together, strict=True):
-        begin = np.arange(0, columns, each)
-        middle = 0.5 * (begin + np.minimum(begin + each, columns) - 1)
+    for elevation, width in zip(elevations, columns_per_patch, strict=True):
+        begin = np.arange(0, columns, width)
+        middle = 0.5 * (begin + np.minimum(begin + width, columns) - 1)
         middles.append(directions(np.array([elevation]), columns, middle)[0])
-    return together, np.ascontiguousarray(np.concatenate(middles).T, np.float32)
+    return columns_per_patch, np.ascontiguousarray(np.concatenate(middles).T, np.float32)
 
 
 def half_spaces(
     near: OccludedRegions, start: Array, nominal: Array, keep_off: float, measured: Array, period: float
 ) -> tuple[Array, Array]:
-    """As `freespace.half_spaces`: as many as any period needs, up to `PLANES`, and the room's faces. Those that a
-    period does not need hold everywhere."""
-    boxes, moved = near.room.boxes, (near.speed * near.age, near.speed * period)  # m: until now, and in a period
-    way, limits = np.ascontiguousarray(nominal), (SHARED, TOUCHING, GIVE, FARTHEST)
-    _, about_way = _compiled()
-    return about_way(near.lines, near.origin, start, way, boxes, moved, keep_off, measured, PLANES, limits)
+    """Return half-spaces like `halfspaces.half_spaces`: up to `PLANES` for each period, and the boxes' faces.
+
+    A half-space that a period does not need holds everywhere. period: duration of a period [s].
+    """
+    _, path_planes = _kernels()
+    plan = start, np.ascontiguousarray(nominal), near.room.boxes
+    motion = near.speed * near.age, near.speed * period
+    planes: tuple[Array, Array] = path_planes(
+        near.capsules, near.origin, plan, motion, (keep_off, measured), (PLANES, GIVE)
+    )
+    return planes

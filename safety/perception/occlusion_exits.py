@@ -1,13 +1,15 @@
-"""Where somebody whom a sensor does not see may come out from behind something that it does.
+"""Where something hidden from a scan may come out from behind what the scan sees (docs/method.md §10).
 
-Behind a near surface a shadow begins. Whoever is in it passes the line at its edge, from the near surface to what is
-seen beyond, before any part of him is where the sensor sees: all that may come is within speed times time of that line.
+A shadow begins behind a near surface. Whatever is in the shadow must cross the line along its edge before the sensor
+sees any part of it. The line goes from the near surface to what the sensor sees beyond. So everything that may come out
+is within speed times time of that line.
 
-And who is at least as large as a disc of radius R needs room to hide. Let D be how far the nearest such disc, hidden
-all over, is from the line's near end. A point of the line, r from that end, is no nearer to it than D - r, so what
-comes by that point is no farther than who goes from the line's point at D straight off: the line counts from D on.
+Something at least as large as a disc of radius R needs room to hide. Let D be the distance from the line's near end to
+the nearest fully hidden disc. A point of the line at r from that end is no nearer to the disc than D - r. So whatever
+passes that point is no farther than something that starts at D on the line and goes straight on. So the line counts
+from D on.
 
-What stands before the hidden one is taken to stay until it has come out.
+The surface that hides something is assumed to stay until it has come out.
 """
 
 from __future__ import annotations
@@ -20,72 +22,77 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-PARTS = 360  # of a turn
-PART = 2.0 * math.pi / PARTS  # rad
-BESIDE = 30  # parts to either side of a disc's middle that it is looked for in
-SLIT = 0.1  # m: nobody gets through what is narrower, and hardly into it
+SECTORS = 360  # of a turn
+SECTOR = 2.0 * math.pi / SECTORS  # rad
+DISC_SECTORS = 30  # to either side of a disc's center that may hide it
+SLIT = 0.1  # m: a smaller step between two ranges lets nothing through
 
 
 @dataclass(frozen=True)
-class Outlets:
-    """Edges (e,) of shadows: before, the gap of what is near there; angle [rad] in the sensor's frame; near, far [m],
-    from the sensor to where somebody may pass."""
+class OcclusionExits:
+    """Edges of shadows where something may come out.
+
+    Attributes:
+        before: (e,) number of the gap with the near surface.
+        angle: (e,) [rad] in the sensor's frame.
+        near, far: (e,) [m] from the sensor to the first and last point where something may pass.
+    """
 
     before: NDArray[np.intp]
     angle: Array
     near: Array
     far: Array
 
-    def take(self, index: NDArray[np.bool_]) -> Outlets:
-        """The chosen ones."""
-        return Outlets(self.before[index], self.angle[index], self.near[index], self.far[index])
+    def take(self, index: NDArray[np.bool_]) -> OcclusionExits:
+        """Return the chosen edges."""
+        return OcclusionExits(self.before[index], self.angle[index], self.near[index], self.far[index])
 
 
-def outlets(angles: Array, width: Array, free: Array, radius: float) -> Outlets:
-    """Of gaps as `brakeline.safety.perception.scan_coverage.gaps` has them; radius [m]: of the smallest that may
-    hide, 0: of any size."""
+def occlusion_exits(angles: Array, width: Array, free: Array, radius: float) -> OcclusionExits:
+    """Return the exits between gaps (`scan_coverage.gaps`); radius [m]: of the smallest thing that may hide."""
     after = np.roll(free, -1)
     edge = np.flatnonzero(np.abs(after - free) > SLIT)
     nearer = free[edge] < after[edge]
     before = np.where(nearer, edge, (edge + 1) % len(free))
     near, far = np.minimum(free[edge], after[edge]), np.maximum(free[edge], after[edge])
-    found = Outlets(before, angles[edge] + width[edge], near, far)
+    exits = OcclusionExits(before, angles[edge] + width[edge], near, far)
     if radius <= 0.0 or not len(edge):
-        return found
-    found = Outlets(before, found.angle, near + _room(found, _hiding(angles, width, free, radius), radius), far)
-    return found.take(found.near < found.far)
+        return exits
+    nearest = _nearest_hidden(exits, _hiding_distance(angles, width, free, radius), radius)
+    exits = OcclusionExits(before, exits.angle, near + nearest, far)
+    return exits.take(exits.near < exits.far)
 
 
-def _hiding(angles: Array, width: Array, free: Array, radius: float) -> Array:
-    """How far [m] from the sensor the middle of a disc of which nothing is seen is at least, in each part of a turn."""
-    least = least_of(angles, width, free, PARTS)
-    away = np.arange(-BESIDE, BESIDE + 1)
-    off = (np.abs(away) + 0.5) * PART  # at most, from the middle to the beam in the middle of that part
-    beside = least[(np.arange(PARTS)[:, None] + away) % PARTS]
+def _hiding_distance(angles: Array, width: Array, free: Array, radius: float) -> Array:
+    """Return the least distance [m] from the sensor to the center of a fully hidden disc, in each sector."""
+    least = minimum_by_sector(angles, width, free, SECTORS)
+    away = np.arange(-DISC_SECTORS, DISC_SECTORS + 1)
+    off = (np.abs(away) + 0.5) * SECTOR  # largest angle from the center to the middle beam of that sector
+    beside = least[(np.arange(SECTORS)[:, None] + away) % SECTORS]
     across = beside * np.sin(off)
     within = np.sqrt(np.maximum(radius * radius - across * across, 0.0))
-    there = np.where(across <= radius, beside * np.cos(off) + within, radius / np.sin(off))
-    return np.asarray(there.max(axis=1))
+    distance = np.where(across <= radius, beside * np.cos(off) + within, radius / np.sin(off))
+    return np.asarray(distance.max(axis=1))
 
 
-def _room(edges: Outlets, hiding: Array, radius: float) -> Array:
-    """How far [m] all that hides is from each edge's near end, at least: (e,)."""
-    middles = PART * (np.arange(PARTS) + 0.5)
-    aside = np.abs(np.mod(middles - edges.angle[:, None] + math.pi, 2.0 * math.pi) - math.pi)
-    aside = np.maximum(aside - 0.5 * PART, 0.0)
-    near = edges.near[:, None]
+def _nearest_hidden(exits: OcclusionExits, hiding: Array, radius: float) -> Array:
+    """Return D (e,) [m] of each edge, from the hiding distances of the sectors [m]."""
+    middles = SECTOR * (np.arange(SECTORS) + 0.5)
+    aside = np.abs(np.mod(middles - exits.angle[:, None] + math.pi, 2.0 * math.pi) - math.pi)
+    aside = np.maximum(aside - 0.5 * SECTOR, 0.0)
+    near = exits.near[:, None]
     reach = np.maximum(hiding, near * np.cos(aside))
     square = reach * reach + near * near - 2.0 * reach * near * np.cos(aside)
     return np.asarray(np.maximum(np.sqrt(np.maximum(square, 0.0)).min(axis=1) - radius, 0.0))
 
 
-def least_of(angles: Array, width: Array, free: Array, parts: int) -> Array:
-    """The least free range (parts,) of the gaps that meet each of so many equal parts of a turn, from angle 0 on."""
-    least = np.full(parts, np.inf)
-    per = parts / (2.0 * math.pi)
+def minimum_by_sector(angles: Array, width: Array, free: Array, sectors: int) -> Array:
+    """Return the least free range (sectors,) [m] of the gaps that meet each sector of a turn, from angle 0 on."""
+    least = np.full(sectors, np.inf)
+    per = sectors / (2.0 * math.pi)
     first = np.floor(angles * per - 1e-9).astype(int)
     last = np.floor((angles + width) * per + 1e-9).astype(int)
     for step in range(int((last - first).max()) + 1):
         within = first + step <= last
-        np.minimum.at(least, (first[within] + step) % parts, free[within])
+        np.minimum.at(least, (first[within] + step) % sectors, free[within])
     return least

@@ -1,15 +1,17 @@
 """How far a scan shows each gap between two beams to be free (docs/method.md §10).
 
-Between two neighbouring beams Δ < 45° apart, free up to ρ from the sensor, everything nearer than
+Take two neighbouring beams that are Δ < 45° apart, both free up to ρ from the sensor. Everything in their gap that is
+nearer than
 
     F = min( ρ / (cos Δ + sin Δ tan(45° + Δ)),  W cos(45° + Δ) / sin Δ )
 
-is free: from a point at d two edges of length W at right angles start, one of them at 45° or less to the beams' normal.
-The gap there is at most d sin Δ wide; if that edge is long enough to leave it, it meets a beam at most at
-d (cos Δ + sin Δ tan(45° + Δ)) from the sensor, where that is free if d < F.
-Where that many beams in a row may be false, the edge must reach the next one: Δ is as much wider.
-So a dropped beam costs little near by (2 m for W = 0.1 m), and a blind sector everything. A beam that returns from
-where, by its neighbours, nothing can be is a ghost, and says nothing.
+is free. By assumption, two edges of length W at right angles start at each point of an obstacle's surface, and one of
+them is within 45° of the beams' normal. At distance d the gap is at most d sin Δ wide. If the edge is long enough to
+leave the gap, it meets a beam at most d (cos Δ + sin Δ tan(45° + Δ)) from the sensor, where the beam is free if d < F.
+
+If `doubt` beams in a row may be false, the edge must reach the next beam, and Δ is wider by as many gaps. So a dropped
+beam costs little nearby (2 m for W = 0.1 m), and a blind sector everything. A *ghost* is a return from where, by the
+neighbouring beams, nothing can be. It counts as unknown.
 """
 
 from __future__ import annotations
@@ -23,53 +25,57 @@ from brakeline.messaging.scan import Scan
 
 Array = NDArray[np.float64]
 
-WIDE = math.radians(3.0)  # of a gap in which nothing is taken for what is on both sides of it
-NEARER = 0.15  # m between what two beams hit, if it is not one surface
-STEEPEST = math.radians(89.0)  # 45° and a gap: beyond it an edge may lie along the beams
+WIDE = math.radians(3.0)  # a wider gap may hide something else than the surfaces on both sides of it
+SURFACE_STEP = 0.15  # m between two ranges: a larger step is between two surfaces
+STEEPEST = math.radians(89.0)  # of 45° + Δ: beyond it, an edge may lie along the beams
 
 
 def gaps(scan: Scan) -> tuple[Array, Array, Array]:
-    """Of each gap between two beams that say something: its first angle, its width [rad], and F [m] of the measured
-    ranges, less their error. In the sensor's frame; all round."""
-    return gaps_and_ways(scan)[:3]
+    """Return the first angle [rad], the width [rad] and F [m] of each gap between two known beams, around the turn.
+
+    Angles are in the sensor's frame. F is for the measured ranges minus their error.
+    """
+    return gaps_and_motions(scan)[:3]
 
 
-def gaps_and_ways(scan: Scan) -> tuple[Array, Array, Array, NDArray[np.uint8]]:
-    """The same, and which of the ways that a scan was followed by bounds what is behind F there; 0: none."""
+def gaps_and_motions(scan: Scan) -> tuple[Array, Array, Array, NDArray[np.uint8]]:
+    """Return `gaps(scan)`, and the motion of the surface behind each gap: its number in `BeamTracks.motions`, or 0."""
     beams = np.flatnonzero(scan.known)
     angles = scan.angles[beams]
     ranges = np.maximum(np.minimum(scan.ranges[beams], scan.far) - scan.range_error, 0.0)
     if len(angles) > 2 * scan.doubt + 2:
-        single = ~_lone(angles, ranges, scan)
-        beams, angles, ranges = beams[single], angles[single], ranges[single]
+        real = ~_ghosts(angles, ranges, scan)
+        beams, angles, ranges = beams[real], angles[real], ranges[real]
     if not len(angles):
         return np.array([-math.pi]), np.array([2.0 * math.pi]), np.zeros(1), np.zeros(1, np.uint8)
     width = np.diff(angles, append=angles[0] + 2.0 * math.pi)
     doubt = min(scan.doubt, len(ranges))
-    least = _least(ranges, range(-doubt, doubt + 2))
-    free = _free(least, np.maximum(*_spans(width, doubt)), scan.least_width)
+    least = _neighbour_minimum(ranges, range(-doubt, doubt + 2))
+    free = _free_range(least, np.maximum(*_spans(width, doubt)), scan.least_width)
     if scan.tracks is None:
         return angles, width, free, np.zeros(len(free), np.uint8)
-    return angles, width, free, _ways(scan.tracks.track_index[beams], ranges, width, doubt)
+    return angles, width, free, _gap_motions(scan.tracks.track_index[beams], ranges, width, doubt)
 
 
-def _ways(which: NDArray[np.uint8], ranges: Array, width: Array, doubt: int) -> NDArray[np.uint8]:
-    """Of each gap the way of the beams about it, if they have the same; where one of two hit something nearer, that
-    one's. A wide gap has none: there may be something else in it."""
+def _gap_motions(which: NDArray[np.uint8], ranges: Array, width: Array, doubt: int) -> NDArray[np.uint8]:
+    """Return the motion of each gap, from those of its beams (R,).
+
+    It is the beams' common motion, or that of the nearer surface. A wide gap has none: it may hide something else.
+    """
     same = np.ones(len(which), dtype=bool)
     for k in range(-doubt, doubt + 2):
         same &= np.roll(which, -k) == which
     after = np.roll(ranges, -1)
     if not doubt:
         nearer = np.where(ranges < after, which, np.roll(which, -1))
-        which = np.where(np.abs(after - ranges) > NEARER, nearer, np.where(same, which, 0))
+        which = np.where(np.abs(after - ranges) > SURFACE_STEP, nearer, np.where(same, which, 0))
     else:
         which = np.where(same, which, 0)
     return np.where(width > WIDE, 0, which).astype(np.uint8)
 
 
 def _spans(width: Array, doubt: int) -> tuple[Array, Array]:
-    """Of each gap [rad], with so many more before it, and after it, all round."""
+    """Return the angles [rad] from each gap over `doubt` more gaps before it, and after it."""
     before, after = width.copy(), width.copy()
     for k in range(1, doubt + 1):
         before += np.roll(width, k)
@@ -77,18 +83,18 @@ def _spans(width: Array, doubt: int) -> tuple[Array, Array]:
     return before, after
 
 
-def _least(ranges: Array, places: range) -> Array:
-    """The least of each beam's neighbours that are so many places on, all round."""
-    before, count = max(0, -places[0]), len(ranges)
-    turned = np.take(ranges, np.arange(-before, count + max(0, places[-1])), mode="wrap")
-    least = turned[before + places[0] :][:count].copy()
-    for k in places[1:]:
-        np.minimum(least, turned[before + k :][:count], out=least)
+def _neighbour_minimum(ranges: Array, offsets: range) -> Array:
+    """Return the least range of each beam's neighbours at the offsets, around the turn."""
+    before, count = max(0, -offsets[0]), len(ranges)
+    wrapped = np.take(ranges, np.arange(-before, count + max(0, offsets[-1])), mode="wrap")
+    least = wrapped[before + offsets[0] :][:count].copy()
+    for k in offsets[1:]:
+        np.minimum(least, wrapped[before + k :][:count], out=least)
     return least
 
 
-def _free(least: Array, width: Array, least_width: float) -> Array:
-    """F [m] of gaps of that width [rad] between beams that are free up to `least`."""
+def _free_range(least: Array, width: Array, least_width: float) -> Array:
+    """Return F [m] of gaps of a width [rad] between beams that are free up to `least` [m]."""
     steep = np.minimum(0.25 * math.pi + width, STEEPEST)
     free = np.minimum(
         least / (np.cos(width) + np.sin(width) * np.tan(steep)), least_width * np.cos(steep) / np.sin(width)
@@ -96,11 +102,11 @@ def _free(least: Array, width: Array, least_width: float) -> Array:
     return np.where(steep < STEEPEST, free, 0.0)
 
 
-def _lone(angles: Array, ranges: Array, scan: Scan) -> NDArray[np.bool_]:
-    """Beams that return from where, by their neighbours and the least width, nothing can be: ghosts."""
+def _ghosts(angles: Array, ranges: Array, scan: Scan) -> NDArray[np.bool_]:
+    """Return which beams are ghosts."""
     gap = np.diff(angles, append=angles[0] + 2.0 * math.pi)
     before, after = _spans(gap, scan.doubt)
     width = np.maximum(np.roll(gap, 1) + after, np.roll(before, 1) + gap)
     far = scan.doubt + 1
-    beside = np.minimum(_least(ranges, range(-far, 0)), _least(ranges, range(1, far + 1)))
-    return np.asarray(ranges + 2.0 * scan.range_error < _free(beside, width, scan.least_width))
+    beside = np.minimum(_neighbour_minimum(ranges, range(-far, 0)), _neighbour_minimum(ranges, range(1, far + 1)))
+    return np.asarray(ranges + 2.0 * scan.range_error < _free_range(beside, width, scan.least_width))

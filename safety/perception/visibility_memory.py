@@ -1,8 +1,8 @@
-"""What a robot's sensor saw free before: fills in the beams of a scan that say nothing (docs/method.md §10).
+"""Memory of free space: fills in the beams of a scan that measured nothing (docs/method.md §10).
 
-The asker keeps it: the service keeps nothing about a robot. A world that moves (`Scan.speed`) takes back with time what
-was seen. Where the robot was put there is room: `START` m about its body; without that it could never move away from a
-blind sector, for it would touch it already.
+The client keeps the memory, because the service keeps nothing about a robot. In a world that moves (`Scan.speed`), free
+space in the memory shrinks with time. A ring of `START` m around the body counts as free at the start: without it, a
+robot with a blind sector could never move, because its body would touch occupied space.
 """
 
 from __future__ import annotations
@@ -18,197 +18,205 @@ from numpy.typing import NDArray
 
 from brakeline.messaging.range_image import RangeImage
 from brakeline.messaging.scan import Scan
-from brakeline.safety.perception.occlusion_exits import least_of
-from brakeline.safety.perception.scan_free_space import gaps
+from brakeline.safety.perception.occlusion_exits import minimum_by_sector
+from brakeline.safety.perception.scan_coverage import gaps
 from brakeline.safety.perception.scan_tracking import ScanTracker
 
 Array = NDArray[np.float64]
 
-KEPT = 12  # scans
-APART = 0.04  # m or, by a quarter of it, rad, between two that are kept
-LOOK = 1.0  # m along a beam that memory is asked about
-STEP = 0.01  # m between the places at which it is
-CELLS = 360  # of a turn
+CAPACITY = 12  # scans
+SPACING = 0.04  # m, or a quarter of it in rad: smallest motion between two stored scans
+REACH = 1.0  # m along a beam that the memory is asked about
+STEP = 0.01  # m between the tested points of a beam
+SECTORS = 360  # of a turn
 
 
 S = TypeVar("S", Scan, RangeImage)
 
 
 class VisibilityMemory(ABC, Generic[S]):
-    """Of one robot in one world that is not put back. Positions are the measured ones, with their errors."""
+    """The free space that one robot's sensor has shown in one episode.
 
-    START = 0.1  # m beside the body, where it is put down
-    nothing: S  # a scan that shows nothing to be free
+    Poses are measured ones, with their errors. The bounds hold as long as the world is not reset.
+
+    Attributes:
+        START: width [m] of the ring around the body that counts as free at the start.
+        nothing: a scan that shows nothing to be free.
+    """
+
+    START = 0.1
+    nothing: S
 
     def __init__(self, footprint: float) -> None:
-        """footprint: radius of the body's disc or ball, m."""
-        self._room = footprint + self.START
+        """Begin an episode. footprint: radius of the body's disc or ball [m]."""
+        self._start_radius = footprint + self.START
         self.reset()
 
     def reset(self) -> None:
-        """It is put down somewhere else."""
+        """Forget everything: an episode begins."""
         self._begun = False
-        self._put: S | None = None
-        self._last: S | None = None  # as it was given out
-        self._waited = 0.0  # s since then
-        self._age = 0.0  # s since it was put down
-        self._before: list[float] = []  # s since each that is kept was taken
+        self._first: S | None = None
+        self._last: S | None = None  # as returned
+        self._since_last = 0.0  # s
+        self._since_start = 0.0  # s
+        self._ages: list[float] = []  # s, of the stored scans
 
     def later(self, elapsed: float) -> None:
-        """So many s go by."""
-        self._waited += elapsed
-        self._age += elapsed
-        self._before = [age + elapsed for age in self._before]
+        """Let time pass [s]."""
+        self._since_last += elapsed
+        self._since_start += elapsed
+        self._ages = [age + elapsed for age in self._ages]
 
     @property
     def unused(self) -> bool:
-        """Has no scan been given to it?"""
+        """Whether no scan has come yet."""
         return self._last is None
 
     def fill(self, scan: S | None, elapsed: float) -> S:
-        """The scan, with what is remembered in the place of beams that say nothing; elapsed: s since the last one.
+        """Return the scan with unknown beams filled in from memory.
 
-        None: none came. Then the last one goes on to be what is known, so much older; before the first nothing is.
+        Args:
+            scan: the new scan. None if none came: the last one stays valid and ages, and before the first one nothing
+                is free.
+            elapsed: time since the last call [s].
         """
         if self._begun:
             self.later(elapsed)
         self._begun = True
         if scan is None:
-            return self.nothing if self._last is None else replace(self._last, age=self._last.age + self._waited)
-        scan = self._own(scan)
-        if self._put is None:
-            self._put = scan
-        unknown = self._wanted(scan)
+            return self.nothing if self._last is None else replace(self._last, age=self._last.age + self._since_last)
+        scan = self._copied(scan)
+        if self._first is None:
+            self._first = scan
+        unknown = self._beams_to_fill(scan)
         filled = scan
         if unknown.any():
             ranges = np.array(scan.ranges)
-            # What is remembered has its errors off already; whoever reads a scan takes them off every beam.
-            known = self._along(scan, unknown)
-            ranges[unknown] = np.where(known > 0.0, np.minimum(known + scan.range_error, scan.far), 0.0)
+            # `_free_along` subtracts the errors already, and every reader of a scan subtracts the range error again.
+            free = self._free_along(scan, unknown)
+            ranges[unknown] = np.where(free > 0.0, np.minimum(free + scan.range_error, scan.far), 0.0)
             filled = replace(scan, ranges=ranges)
-        self._keep(scan)
-        self._last, self._waited = filled, 0.0
+        self._store(scan)
+        self._last, self._since_last = filled, 0.0
         return filled
 
     @abstractmethod
-    def _own(self, scan: S) -> S:
-        """With arrays of its own: whoever asks may fill his again."""
+    def _copied(self, scan: S) -> S:
+        """Return the scan with copies of its arrays, which the caller may overwrite."""
 
     @abstractmethod
-    def _wanted(self, scan: S) -> NDArray[np.bool_]:
-        """The beams to be filled in, as `ranges`."""
+    def _beams_to_fill(self, scan: S) -> NDArray[np.bool_]:
+        """Return the mask of the beams to fill in, shaped like `ranges`."""
 
     @abstractmethod
-    def _along(self, scan: S, beams: NDArray[np.bool_]) -> Array:
-        """How far these beams (B,) are known to be free, m; 0: not at all."""
+    def _free_along(self, scan: S, beams: NDArray[np.bool_]) -> Array:
+        """Return how far [m] the masked beams (B,) are known to be free."""
 
     @abstractmethod
-    def _keep(self, scan: S) -> None:
-        """Remember it, if it was taken from somewhere else than the last one that is kept."""
+    def _store(self, scan: S) -> None:
+        """Store the scan, unless the sensor has hardly moved since the last stored one."""
 
-    def _at_start(self, points: Array, scan: S, step: Array | float) -> NDArray[np.bool_]:
-        """In the room that it was put down in? step [m]: from each of the points (..., d) to the next."""
-        assert self._put is not None
-        moved = scan is not self._put
-        drift = 2.0 * scan.position_error * moved + scan.speed * self._age + step
-        return np.asarray(np.linalg.norm(points - _place(self._put), axis=-1) <= self._room - drift)
+    def _near_start(self, points: Array, scan: S, step: Array | float) -> NDArray[np.bool_]:
+        """Return which points (..., d) are in the ring that is free at the start; step [m]: between two points."""
+        assert self._first is not None
+        moved = scan is not self._first
+        drift = 2.0 * scan.position_error * moved + scan.speed * self._since_start + step
+        return np.asarray(np.linalg.norm(points - _position(self._first), axis=-1) <= self._start_radius - drift)
 
 
-def _place(scan: Scan | RangeImage) -> Array:
-    """(d,): the robot's measured position when it was taken."""
+def _position(scan: Scan | RangeImage) -> Array:
+    """Return the robot's measured position (d,) [m]."""
     return np.asarray(scan.pose[:2] if isinstance(scan, Scan) else scan.at)
 
 
 @dataclass(frozen=True)
-class _Seen:
-    """A scan as the free range of every direction: least[k] (CELLS,) over 2^k of them from each on."""
+class _StoredScan:
+    """A scan as free ranges by direction.
+
+    Attributes:
+        at, heading: pose of the sensor.
+        minima: (levels, SECTORS) minima[k, i] is the least free range [m] of the 2^k sectors from sector i on.
+    """
 
     scan: Scan
     at: Array
     heading: float
-    least: list[Array]
+    minima: Array
 
 
 class FanMemory(VisibilityMemory[Scan]):
-    """Of a fan in the plane."""
+    """Memory of a sensor whose beams fan out in the plane."""
 
     nothing = Scan(np.zeros(0), np.zeros(0), (0.0, 0.0, 0.0))
 
     def reset(self) -> None:
         super().reset()
-        self._seen: deque[_Seen] = deque(maxlen=KEPT)
-        self._follower = ScanTracker()
+        self._stored: deque[_StoredScan] = deque(maxlen=CAPACITY)
+        self._tracker = ScanTracker()
 
     def later(self, elapsed: float) -> None:
         super().later(elapsed)
-        self._follower.later(elapsed)
+        self._tracker.later(elapsed)
 
     def fill(self, scan: Scan | None, elapsed: float) -> Scan:
-        """The same; where it is known how things speed up, what earlier scans say of where they go comes with it."""
+        """Fill in the scan, and add the motions that `ScanTracker` knows."""
         filled = super().fill(scan, elapsed)
         if scan is None:
             return filled
-        followed = self._follower.follow(scan).tracks
-        if followed is not None:
-            self._last = filled = replace(filled, tracks=followed)
+        tracks = self._tracker.follow(scan).tracks
+        if tracks is not None:
+            self._last = filled = replace(filled, tracks=tracks)
         return filled
 
-    def _own(self, scan: Scan) -> Scan:
+    def _copied(self, scan: Scan) -> Scan:
         return replace(scan, ranges=scan.ranges.copy(), angles=scan.angles.copy())
 
-    def _wanted(self, scan: Scan) -> NDArray[np.bool_]:
+    def _beams_to_fill(self, scan: Scan) -> NDArray[np.bool_]:
         return ~scan.known
 
-    def _keep(self, scan: Scan) -> None:
-        if self._seen:
-            last = self._seen[-1].scan.pose
+    def _store(self, scan: Scan) -> None:
+        if self._stored:
+            last = self._stored[-1].scan.pose
             moved = math.dist(last[:2], scan.pose[:2]) + 0.25 * abs(math.remainder(scan.pose[2] - last[2], math.tau))
-            if moved < APART:
+            if moved < SPACING:
                 return
-        if len(self._seen) == KEPT:
-            self._before.pop(0)
-        at, heading = scan.sensor()
-        self._seen.append(_Seen(scan, at, heading, _levels(_least(scan))))
-        self._before.append(scan.age)
+        if len(self._stored) == CAPACITY:
+            self._ages.pop(0)
+        self._stored.append(_StoredScan(scan, *scan.sensor(), _range_minima(minimum_by_sector(*gaps(scan), SECTORS))))
+        self._ages.append(scan.age)
 
-    def _along(self, scan: Scan, beams: NDArray[np.bool_]) -> Array:
+    def _free_along(self, scan: Scan, beams: NDArray[np.bool_]) -> Array:
         at, heading = scan.sensor()
-        away = STEP * np.arange(1, round(LOOK / STEP) + 1)
+        away = STEP * np.arange(1, round(REACH / STEP) + 1)
         turned = heading + scan.angles[beams]
         points = at + away[:, None, None] * np.stack([np.cos(turned), np.sin(turned)], axis=1)  # (S, B, 2)
-        free = self._at_start(points, scan, STEP)
-        for seen, age in zip(self._seen, self._before, strict=True):
-            free |= self._in(seen, age, points, scan)
+        free = self._near_start(points, scan, STEP)
+        for stored, age in zip(self._stored, self._ages, strict=True):
+            free |= self._shown_free(stored, age, points, scan)
         return STEP * np.where(free.all(axis=0), len(away), free.argmin(axis=0))
 
-    def _in(self, seen: _Seen, age: float, points: Array, scan: Scan) -> NDArray[np.bool_]:
-        """Was it seen free, with all that is within the errors since?"""
-        away = points - seen.at
+    def _shown_free(self, stored: _StoredScan, age: float, points: Array, scan: Scan) -> NDArray[np.bool_]:
+        """Return which points a stored scan shows to be free, with everything within the errors around them."""
+        away = points - stored.at
         far = np.sqrt(np.einsum("sbd,sbd->sb", away, away))
-        drift = seen.scan.sensor_error + scan.position_error + scan.speed * age + STEP
-        reach = np.linalg.norm(points - _place(scan), axis=-1)
-        drift = drift + seen.scan.heading_error * far + scan.heading_error * reach
+        drift = stored.scan.sensor_error + scan.position_error + scan.speed * age + STEP
+        reach = np.linalg.norm(points - _position(scan), axis=-1)
+        drift = drift + stored.scan.heading_error * far + scan.heading_error * reach
         aside = np.arcsin(np.minimum(drift / np.maximum(far, 1e-9), 1.0))
-        angle = np.arctan2(away[..., 1], away[..., 0]) - seen.heading
-        first = np.floor((angle - aside) * (CELLS / math.tau)).astype(int)
-        last = np.floor((angle + aside) * (CELLS / math.tau)).astype(int)
-        count = np.where(drift >= far, CELLS, np.minimum(last - first + 1, CELLS))
+        angle = np.arctan2(away[..., 1], away[..., 0]) - stored.heading
+        first = np.floor((angle - aside) * (SECTORS / math.tau)).astype(int)
+        last = np.floor((angle + aside) * (SECTORS / math.tau)).astype(int)
+        count = np.where(drift >= far, SECTORS, np.minimum(last - first + 1, SECTORS))
         level = np.floor(np.log2(count)).astype(int)
-        table = np.stack(seen.least)
-        low = table[level, first % CELLS]
-        high = table[level, (first + count - (1 << level)) % CELLS]
+        low = stored.minima[level, first % SECTORS]
+        high = stored.minima[level, (first + count - (1 << level)) % SECTORS]
         return np.asarray(far + drift < np.minimum(low, high))
 
 
-def _least(scan: Scan) -> Array:
-    """The least free range (CELLS,) of the gaps that meet each of so many equal parts of a turn, from heading 0 on."""
-    return least_of(*gaps(scan), CELLS)
-
-
-def _levels(least: Array) -> list[Array]:
-    """least[k][i]: the least of 2^k values from i on, round the turn."""
-    found = [least]
-    while 1 << len(found) <= CELLS:
-        half = 1 << (len(found) - 1)
-        found.append(np.minimum(found[-1], np.roll(found[-1], -half)))
-    return found
+def _range_minima(least: Array) -> Array:
+    """Return a sparse table (levels, SECTORS): row k holds the minimum of 2^k values from each on, around the turn."""
+    rows = [least]
+    while 1 << len(rows) <= SECTORS:
+        half = 1 << (len(rows) - 1)
+        rows.append(np.minimum(rows[-1], np.roll(rows[-1], -half)))
+    return np.stack(rows)

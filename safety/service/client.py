@@ -21,6 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.bus import Bus, BusError, BusSettings
 from brakeline.messaging.obstacle import Obstacle
+from brakeline.messaging.obstacle_messages import obstacle_messages
 from brakeline.messaging.robot import FEEDBACK, Robot, robot_named
 from brakeline.messaging.sensor_messages import RangeMeasurement, set_measurement
 from brakeline.messaging.topics import DECIDE
@@ -43,31 +44,6 @@ class SafetyError(BusError):
     def __init__(self, error: pb.Error) -> None:
         super().__init__(f"{error.type}: {error.message}")
         self.type, self.field = error.type, error.field
-
-
-def obstacle_messages(obstacles: Iterable[Obstacle]) -> list[pb.Obstacle]:
-    return [
-        pb.Obstacle(kind=o.kind, position=o.position, size=o.size, yaw=o.yaw, margin=o.margin, motion=_motion(o))
-        for o in obstacles
-    ]
-
-
-def _motion(obstacle: Obstacle) -> pb.Motion | None:
-    if (motion := obstacle.motion) is None:
-        return None
-    message = pb.Motion(
-        velocity=motion.velocity,
-        position_error=motion.position_error,
-        velocity_error=motion.velocity_error,
-        acceleration=motion.acceleration,
-        speed=motion.speed,
-        age=motion.age,
-    )
-    if motion.before is not None:
-        message.before_position.extend(motion.before.position)
-        message.before_velocity.extend(motion.before.velocity)
-        message.since = motion.before.since
-    return message
 
 
 def request_message(

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.moving_obstacles import split_moving
 from brakeline.messaging.obstacle import FARTHEST, BadShape, Obstacle
+from brakeline.messaging.obstacle_messages import obstacle_of
 from brakeline.messaging.robot import Robot
 from brakeline.messaging.scan import BadScan
 from brakeline.messaging.sensor_messages import RangeMeasurement, measurement_in
@@ -20,7 +21,6 @@ from brakeline.safety.filter.backup_plan import Prediction
 from brakeline.safety.filter.blocking_constraint import Stopped
 from brakeline.safety.filter.request import ADJUSTED, ALLOWED, FAILSAFE, RECOVERING, BadRequest, Decision, Request
 from brakeline.safety.filter.reservation import Promises, Reservation
-from brakeline.safety.perception import displayed_map
 
 KINDS = {ALLOWED: pb.ALLOWED, ADJUSTED: pb.ADJUSTED, FAILSAFE: pb.FAILSAFE, RECOVERING: pb.RECOVERING}
 NAMES = {number: name for name, number in KINDS.items()}
@@ -120,10 +120,7 @@ def obstacles_of(messages: Sequence[pb.Obstacle], dim: int) -> list[Obstacle]:
     obstacles = []
     for i, o in enumerate(messages):
         try:
-            if len(o.position) != dim:
-                raise BadShape("position", f"{len(o.position)} coordinates; this robot's obstacles have {dim}")
-            motion = displayed_map.motion_of(o.motion) if o.HasField("motion") else None
-            obstacles.append(Obstacle(o.kind, tuple(o.position), tuple(o.size), o.yaw, o.margin, motion))
+            obstacles.append(obstacle_of(o, dim))
         except BadShape as error:
             raise BadRequest(f"obstacles[{i}].{error.field}", str(error)) from error
     return obstacles

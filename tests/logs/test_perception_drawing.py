@@ -15,12 +15,12 @@ from brakeline.logs.watch.dashboard import Dashboard
 from brakeline.logs.watch.live_page_server import LivePageServer
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.obstacle import CYLINDER, Obstacle
+from brakeline.messaging.obstacle_messages import obstacle_messages
 from brakeline.messaging.obstacle_motion import Motion
 from brakeline.messaging.range_image import RangeImage
 from brakeline.messaging.scan import Scan
 from brakeline.messaging.sensor_messages import scan_message, set_measurement
 from brakeline.safety.perception.displayed_map import map_for_display
-from brakeline.safety.service.client import obstacle_messages
 from tests.browser import CHROMIUM, Page
 from tests.logs.sample_log import Writer
 from tests.logs.test_foxglove import Say, Studio, episode, step

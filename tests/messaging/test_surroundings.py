@@ -8,11 +8,11 @@ import pytest
 
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.obstacle import BOX, CYLINDER, Obstacle
+from brakeline.messaging.obstacle_messages import obstacle_messages
 from brakeline.messaging.obstacle_motion import Motion
 from brakeline.messaging.scan import BeamTracks
 from brakeline.messaging.sensor_messages import scan_message, scan_of
 from brakeline.safety.perception.displayed_map import map_for_display, reserved_boxes
-from brakeline.safety.service.client import obstacle_messages
 from brakeline.sim.arena import staged_arena
 from brakeline.sim.range_sensors import FanScanner
 from brakeline.sim.sim_conditions import Perception

@@ -18,7 +18,7 @@ from brakeline.safety.service.client import request_message
 from brakeline.safety.service.wire import batch_of, request_of
 from tests.robots import GROUND, QUADROTOR
 from tests.safety.asked import request
-from tests.safety.test_scan import FAN, FAR, WIDTH, cast
+from tests.safety.test_scan_free_space import FAN, FAR, WIDTH, cast
 from tests.safety.unicycle import FIX, Unicycle
 
 ROOM = [

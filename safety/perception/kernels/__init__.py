@@ -1,1 +1,1 @@
-"""Compiled loops of perception; each has a plain NumPy twin in the tests."""
+"""Compiled loops of perception. `tests/safety/perception_twins.py` has a plain NumPy twin of each."""

@@ -13,15 +13,15 @@ from brakeline.messaging.obstacle import Obstacle, Shapes
 from brakeline.messaging.scan import BadScan, BeamTracks, Scan
 from brakeline.messaging.sensor_messages import scan_message, scan_of
 from brakeline.safety.filter.request import ALLOWED
-from brakeline.safety.perception import occlusion_exits, scan_tracking
-from brakeline.safety.perception import scan_free_space as seen
-from brakeline.safety.perception.scan_coverage import gaps_and_ways
+from brakeline.safety.perception import scan_free_space, scan_tracking
+from brakeline.safety.perception.occlusion_exits import occlusion_exits
+from brakeline.safety.perception.scan_coverage import gaps_and_motions
 from brakeline.safety.perception.scan_free_space import OccupiedCells, occupied_cells
 from brakeline.safety.perception.scan_tracking import ScanTracker
 from brakeline.safety.perception.visibility_memory import FanMemory
 from tests.robots import GROUND
 from tests.safety.asked import request
-from tests.safety.test_scan import FAN, FAR, WIDTH, cast
+from tests.safety.test_scan_free_space import FAN, FAR, WIDTH, cast
 
 SPEED, PUSH, SIZE = 1.2, 1.0, 0.2  # m/s, m/s², m
 DT = GROUND.period
@@ -108,7 +108,11 @@ def outside(rng, kind, scans=9, count=24):
         way = np.array([at(now + t) for t in np.arange(0.0, AHEAD[-1] + 0.01, 0.05)])
         if (walls.distance(way).min(axis=0) < SIZE).any() or np.linalg.norm(way - place, axis=1).min() < SIZE + 0.1:
             continue  # it would go through something
-        near = occupied_cells(scan, 2.0) if kind is comes_out else seen._cells(scan, 2.0, *gaps_and_ways(scan))
+        near = (
+            occupied_cells(scan, 2.0)
+            if kind is comes_out
+            else scan_free_space._unseen_cells(scan, 2.0, *gaps_and_motions(scan))
+        )
         for t in AHEAD:
             points = at(now + t) + around
             points = points[np.linalg.norm(points - place, axis=1) < 1.2]
@@ -120,7 +124,7 @@ def outside(rng, kind, scans=9, count=24):
 def away(points, near: OccupiedCells, t):
     """How far [m] each point is from all that may be occupied t s after the scan."""
     least = np.full(len(points), math.inf)
-    for corners, error, (cx, cy, v, a) in zip(near.corners, near.error, near.ways, strict=True):
+    for corners, error, (cx, cy, v, a) in zip(near.corners, near.error, near.motions, strict=True):
         least = np.minimum(least, off(points - t * np.array([cx, cy]), corners) - error.max() - v * t - 0.5 * a * t * t)
     return least
 
@@ -147,26 +151,29 @@ def test_who_keeps_the_bounds_is_where_he_may_be(seed, kind):
     assert worst <= 1e-6
 
 
-def standing(scan, ways=seen.ways_of):
+def standing(scan, motions=scan_free_space.possible_motions):
     """The mutant: what stood goes on standing."""
-    return np.where((ways(scan)[:, :2] == 0.0).all(axis=1)[:, None] & (ways(scan)[:, 3:] > 0.0), 0.0, ways(scan))
+    return np.where(
+        (motions(scan)[:, :2] == 0.0).all(axis=1)[:, None] & (motions(scan)[:, 3:] > 0.0), 0.0, motions(scan)
+    )
 
 
-def exact(scan, ways=seen.ways_of):
+def exact(scan, motions=scan_free_space.possible_motions):
     """The mutant: velocities are as they were measured, for good."""
-    return np.where(ways(scan)[:, 3:] > 0.0, ways(scan) * [1.0, 1.0, 0.0, 0.0], ways(scan))
+    return np.where(motions(scan)[:, 3:] > 0.0, motions(scan) * [1.0, 1.0, 0.0, 0.0], motions(scan))
 
 
-def none(scan, *rest, edges=seen._edges):
+def none(scan, *rest, exits=scan_free_space._exit_cells):
     """The mutant: nothing comes out."""
-    return edges(scan, *rest).take(np.zeros(0, dtype=int))
+    return exits(scan, *rest).take(np.zeros(0, dtype=int))
 
 
 @pytest.mark.parametrize(
-    ("kind", "name", "mutant"), [(starts, "ways_of", standing), (turns, "ways_of", exact), (comes_out, "_edges", none)]
+    ("kind", "name", "mutant"),
+    [(starts, "possible_motions", standing), (turns, "possible_motions", exact), (comes_out, "_exit_cells", none)],
 )
 def test_a_mutant_does_not(monkeypatch, kind, name, mutant):
-    monkeypatch.setattr(seen, name, mutant)
+    monkeypatch.setattr(scan_free_space, name, mutant)
     assert max(outside(np.random.default_rng(seed), kind)[1] for seed in range(25)) > 0.02
 
 
@@ -243,11 +250,11 @@ def test_who_hides_needs_room():
     width = np.full(360, math.radians(1.0))
     for half, least, most in ((0.2, 1.0, 1.1), (0.1, 1.3, 1.8)):  # the smallest disc is 1.0 and 2.0 m off
         shadow = np.where(np.abs(angles + 0.5 * width) < math.asin(half), 1.0, free)
-        near = occlusion_exits.outlets(angles, width, shadow, SIZE).near
+        near = occlusion_exits(angles, width, shadow, SIZE).near
         assert len(near) == 2 and (least < near).all() and (near < most).all()
-        assert (occlusion_exits.outlets(angles, width, shadow, 0.0).near == 1.0).all()
+        assert (occlusion_exits(angles, width, shadow, 0.0).near == 1.0).all()
     narrow = np.where(np.abs(angles + 0.5 * width) < math.asin(0.05), 1.0, free)
-    assert occlusion_exits.outlets(angles, width, narrow, SIZE).near.min() > 2.0  # only beyond sight is room: 4 m off
+    assert occlusion_exits(angles, width, narrow, SIZE).near.min() > 2.0  # only beyond sight is room: 4 m off
 
 
 def test_by_what_stood_it_drives_and_where_somebody_may_come_out_it_does_not(ready, monkeypatch):
@@ -257,7 +264,7 @@ def test_by_what_stood_it_drives_and_where_somebody_may_come_out_it_does_not(rea
     assert ready.decide(request(scan=replace(scan, tracks=None))).kind != ALLOWED
     scan = followed(lambda t: [*ROOM, disc((0.45, 0.6))])
     assert ready.decide(request(scan=scan)).kind != ALLOWED
-    monkeypatch.setattr(seen, "_edges", none)
+    monkeypatch.setattr(scan_free_space, "_exit_cells", none)
     assert ready.decide(request(scan=scan)).kind == ALLOWED
 
 

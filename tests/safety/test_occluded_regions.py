@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 
 from brakeline.messaging.obstacle import Obstacle
 from brakeline.messaging.range_image import RangeImage, directions
-from brakeline.safety.perception.image_coverage import patch_free_ranges
-from brakeline.safety.perception.image_memory import AWAY, ImageMemory, _Seen
+from brakeline.safety.perception.image_coverage import GridWindow, patch_free_ranges
+from brakeline.safety.perception.image_memory import DISTANCES, ImageMemory, _StoredImage
 from brakeline.safety.perception.occluded_regions import (
     FACES,
     PLANES,
@@ -34,7 +34,7 @@ from tests.messaging.test_range_images import (
     taken,
 )
 
-BODY, NOTHING = 0.2, np.zeros(3)
+BODY, ORIGIN = 0.2, np.zeros(3)
 
 
 def room(size=2.0, last=2.4):
@@ -60,7 +60,7 @@ def bounded(seed, dropped):
         [[math.cos(turn), math.sin(turn), 0.0], [-math.sin(turn), math.cos(turn), 0.0], [0, 0, 1]]
     )
     nominal = np.cumsum(rng.uniform(-0.3, 0.3, (6, 3)), axis=0)
-    normals, offsets = half_spaces(occluded_regions(image, room(), BODY, NOTHING), NOTHING, nominal, 0.0, NOTHING, 0.2)
+    normals, offsets = half_spaces(occluded_regions(image, room(), BODY, ORIGIN), ORIGIN, nominal, 0.0, ORIGIN, 0.2)
     return normals, offsets, points[(np.abs(points) < 2.0 + BODY / math.sqrt(3.0)).all(axis=1)]
 
 
@@ -87,10 +87,10 @@ def test_of_every_period_all_that_may_be_touched_in_its_boxes_is_beyond_some_hal
     image, points = taken(rng, obstacles, 0.02), solid(obstacles, rng)
     nominal = np.cumsum(rng.uniform(-0.3, 0.3, (6, 3)), axis=0)
     size = np.linspace(0.05, 1.0, 7)[:, None]
-    ways = np.vstack([NOTHING, nominal]) + rng.uniform(-0.5, 0.5, (7, 3)) * size
+    ways = np.vstack([ORIGIN, nominal]) + rng.uniform(-0.5, 0.5, (7, 3)) * size
     boxes = np.stack([ways - size, ways + size])
     normals, offsets = half_spaces(
-        occluded_regions(image, PlanBoxes(boxes, 2.4), BODY, NOTHING), NOTHING, nominal, BODY, NOTHING, 0.2
+        occluded_regions(image, PlanBoxes(boxes, 2.4), BODY, ORIGIN), ORIGIN, nominal, BODY, ORIGIN, 0.2
     )
     if np.isneginf(offsets).all():
         return
@@ -104,8 +104,8 @@ def test_of_every_period_all_that_may_be_touched_in_its_boxes_is_beyond_some_hal
 def test_a_box_that_is_no_number_leaves_nothing_free(end):
     boxes = room().boxes.repeat(3, axis=1)
     boxes[1, end, 1] = np.nan
-    seen = replace(occluded_regions(clear(), room(), BODY, NOTHING), room=PlanBoxes(boxes, 2.4))
-    assert np.isneginf(half_spaces(seen, NOTHING, np.zeros((2, 3)), BODY, NOTHING, 0.2)[1]).all()
+    seen = replace(occluded_regions(clear(), room(), BODY, ORIGIN), room=PlanBoxes(boxes, 2.4))
+    assert np.isneginf(half_spaces(seen, ORIGIN, np.zeros((2, 3)), BODY, ORIGIN, 0.2)[1]).all()
 
 
 def test_from_a_whole_sensor_the_start_is_rarely_said_to_be_occupied():
@@ -120,7 +120,7 @@ def test_whatever_is_not_shown_to_be_free_is_beyond_some_half_space(seed, monkey
     rng = np.random.default_rng(seed)
     image = clear(ranges=np.repeat(np.repeat(rng.uniform(1.5, 6.0, (RINGS // 5, COLUMNS // 5)), 5, 0), 5, 1))
     nominal = np.cumsum(rng.uniform(-0.1, 0.1, (3, 3)), axis=0)
-    normals, offsets = half_spaces(occluded_regions(image, room(), BODY, NOTHING), NOTHING, nominal, 0.0, NOTHING, 0.2)
+    normals, offsets = half_spaces(occluded_regions(image, room(), BODY, ORIGIN), ORIGIN, nominal, 0.0, ORIGIN, 0.2)
     points = rng.uniform(-2.0, 2.0, (20_000, 3))
     free, far = free_towards(image, points)
     hidden = points[far >= free]
@@ -133,12 +133,12 @@ def test_the_body_is_kept_off_and_what_may_move_takes_room_with_time():
     wall = [Obstacle("box", (2.0, 0.0, 0.0), (2.0, 20.0, 20.0))]
     rng = np.random.default_rng(0)
     nominal = np.zeros((3, 3))
-    still, moving = (occluded_regions(taken(rng, wall, speed=s, age=0.1), room(), BODY, NOTHING) for s in (0.0, 0.5))
-    ahead = half_spaces(still, NOTHING, nominal, 0.0, NOTHING, 0.2)[1][0]
+    still, moving = (occluded_regions(taken(rng, wall, speed=s, age=0.1), room(), BODY, ORIGIN) for s in (0.0, 0.5))
+    ahead = half_spaces(still, ORIGIN, nominal, 0.0, ORIGIN, 0.2)[1][0]
     assert 0.8 < ahead[0] <= 1.0
-    kept = half_spaces(still, NOTHING, nominal, BODY, np.full(3, 0.01), 0.2)[1][0]
+    kept = half_spaces(still, ORIGIN, nominal, BODY, np.full(3, 0.01), 0.2)[1][0]
     assert (ahead - kept >= BODY + 0.01 - 0.02).all()
-    lost = ahead - half_spaces(moving, NOTHING, nominal, 0.0, NOTHING, 0.2)[1][0]
+    lost = ahead - half_spaces(moving, ORIGIN, nominal, 0.0, ORIGIN, 0.2)[1][0]
     assert np.allclose(lost, 0.5 * (0.1 + 0.2 * np.arange(1, 4)), atol=0.02)
 
 
@@ -155,8 +155,8 @@ def test_a_sensor_on_a_mast_swings_aside_when_its_attitude_is_wrong():
     known = {"far": FAR, "range_error": 0.0, "angle_error": error, "least_width": 50.0}
     image = RangeImage(ranges, (0.0, 0.0, 0.0), low=-edge, high=edge, mount=mount, **known)
     nominal = np.linspace(0.0, 1.0, 9)[1:, None] * np.asarray(mount)
-    seen = occluded_regions(image, room(4.0, 1.0), 0.0, NOTHING)
-    normals, offsets = half_spaces(seen, NOTHING, nominal, 0.0, NOTHING, 0.2)
+    seen = occluded_regions(image, room(4.0, 1.0), 0.0, ORIGIN)
+    normals, offsets = half_spaces(seen, ORIGIN, nominal, 0.0, ORIGIN, 0.2)
     assert np.isfinite(offsets).all()
     across = np.linspace(-0.3, 0.3, 31)
     wall = np.array([[ahead, y, mount[2] + z] for y in across for z in across])
@@ -177,7 +177,7 @@ def test_no_direction_is_farther_from_its_patch_than_half_a_meshes_diagonal(low)
 
 def test_where_nothing_is_there_is_only_the_rooms_box():
     normals, offsets = half_spaces(
-        occluded_regions(clear(), room(), BODY, NOTHING), NOTHING, np.zeros((2, 3)), BODY, NOTHING, 0.2
+        occluded_regions(clear(), room(), BODY, ORIGIN), ORIGIN, np.zeros((2, 3)), BODY, ORIGIN, 0.2
     )
     assert np.array_equal(normals[:, 0], FACES) and (offsets == 2.0).all()
 
@@ -185,18 +185,31 @@ def test_where_nothing_is_there_is_only_the_rooms_box():
 @pytest.mark.parametrize("image", [clear(ranges=np.zeros((RINGS, COLUMNS))), clear(range_error=FAR)])
 def test_nothing_seen_is_nothing_free(image):
     _, offsets = half_spaces(
-        occluded_regions(image, room(), BODY, NOTHING), NOTHING, np.full((2, 3), 0.1), BODY, NOTHING, 0.2
+        occluded_regions(image, room(), BODY, ORIGIN), ORIGIN, np.full((2, 3), 0.1), BODY, ORIGIN, 0.2
     )
     assert (offsets.min(axis=0) < 0.0).all()
 
 
 def test_a_way_through_a_shadow_keeps_the_half_spaces_from_before_it():
     wall = [Obstacle("box", (2.0, 0.0, 0.0), (2.0, 20.0, 20.0))]
-    seen = occluded_regions(taken(np.random.default_rng(0), wall), room(4.0), BODY, NOTHING)
+    seen = occluded_regions(taken(np.random.default_rng(0), wall), room(4.0), BODY, ORIGIN)
     nominal = np.array([[0.5, 0.0, 0.0], [1.5, 0.0, 0.0], [2.5, 0.0, 0.0]])
-    normals, offsets = half_spaces(seen, NOTHING, nominal, 0.0, NOTHING, 0.2)
+    normals, offsets = half_spaces(seen, ORIGIN, nominal, 0.0, ORIGIN, 0.2)
     assert (normals[:, 1:] == normals[:, :1]).all() and (offsets[:, 1:] == offsets[:, :1]).all()
     assert (nominal[1] @ normals[:, 1].T > offsets[:, 1]).any()
+
+
+@settings(max_examples=12)
+@given(st.integers(0, 100_000), st.floats(0.02, 1.2))
+def test_a_window_holds_all_beams_within_its_angle(seed, within):
+    rings, columns = 12, 24
+    elevations = np.linspace(-0.5 * math.pi, 0.5 * math.pi, rings)
+    values = np.random.default_rng(seed).random((rings, columns), np.float32)
+    ways = directions(elevations, columns).reshape(-1, 3)
+    near = ways @ ways.T >= math.cos(within) + 1e-9
+    least = np.where(near, values.ravel(), np.inf).min(axis=1).reshape(rings, columns)
+    window = GridWindow.of(columns, elevations, elevations[1] - elevations[0], within)
+    assert (window.minimum(values) <= least).all()
 
 
 # --- what is remembered ----------------------------------------------------------------------------------------------
@@ -251,7 +264,7 @@ def test_a_world_that_moves_takes_it_back():
 @pytest.mark.parametrize(("error", "free"), [(0.0, True), (0.03, False)])
 def test_a_wrong_attitude_displaces_what_is_far_from_the_sensor_now_however_near_it_was_before(error, free):
     """A point 0.4 m from where an image was taken that shows 0.6 m to be free, 3.6 m from where the sensor is now."""
-    before = _Seen(clear(ranges=np.full((RINGS, COLUMNS), 0.6)))
+    before = _StoredImage(clear(ranges=np.full((RINGS, COLUMNS), 0.6)))
     now = replace(clear(angle_error=error), at=(4.0, 0.0, 0.0))
-    points = np.full((len(AWAY), 1, 3), [0.4, 0.0, 0.0])
-    assert ImageMemory(BODY)._in(before, 0.0, points, now)[0, 0] == free
+    points = np.full((len(DISTANCES), 1, 3), [0.4, 0.0, 0.0])
+    assert ImageMemory(BODY)._shown_free(before, 0.0, points, now)[0, 0] == free

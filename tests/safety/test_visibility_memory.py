@@ -14,7 +14,7 @@ from brakeline.messaging.scan import Scan
 from brakeline.safety.perception.image_memory import ImageMemory
 from brakeline.safety.perception.scan_free_space import gaps
 from brakeline.safety.perception.visibility_memory import FanMemory
-from tests.safety.test_scan import FAN, FAR, WIDTH, cast, scene
+from tests.safety.test_scan_free_space import FAN, FAR, WIDTH, cast, scene
 
 BODY, BLIND = 0.02, math.radians(30.0)  # rad on either side of straight behind
 
