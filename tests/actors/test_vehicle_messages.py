@@ -30,6 +30,7 @@ from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.byte_links import BadLink
 from brakeline.messaging.obstacle import Obstacle
 from brakeline.messaging.obstacle_motion import Motion
+from brakeline.messaging.robot import robot_named
 from brakeline.sim.quadrotor import SAMPLES
 from brakeline.sim.vehicle import BadInput, Period
 from tests.robots import GROUND, QUADROTOR
@@ -42,7 +43,7 @@ MAP = (
 REQUEST = FlightRequest(FlightSettings("udpin:0.0.0.0:14540", 7, 9000, 2.5, (1.0, -2.0, 0.1), True, True), LATE, MAP)
 
 
-@pytest.mark.parametrize("robot", [QUADROTOR, LATE])
+@pytest.mark.parametrize("robot", [robot_named("quadrotor"), robot_named("quadrotor-late")])
 def test_a_flight_request_comes_out_as_it_went_in(robot):
     request = FlightRequest(REQUEST.flight, robot, MAP)
     data = request_message(request).SerializeToString()

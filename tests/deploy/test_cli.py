@@ -287,7 +287,8 @@ def test_of_works_within_each_other_the_innermost_is_told(monkeypatch, capsys):
     with progress.under_way("driving", 3), progress.under_way("recording"):
         time.sleep(0.1)
     told = capsys.readouterr().err
-    assert "recording" in told and "driving" not in told
+    before, innermost, after = told.partition("recording")
+    assert innermost and "driving" not in after
     with progress.under_way("driving", 3), progress.under_way("recording"):
         pass
     with progress.under_way("driving", 3):

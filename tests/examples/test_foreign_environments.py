@@ -52,7 +52,7 @@ def told(python, script, *words):
 def test_who_asks_and_records_needs_no_solver_and_no_simulator():
     """Their virtual environments have neither."""
     missing = "import sys; sys.modules |= dict.fromkeys(('proxsuite', 'scipy', 'torch', 'mcap'))"
-    needed = "import brakeline.safety.service.client, safety.gym, deploy.data.episodes"
+    needed = "import brakeline.safety.service.client, brakeline.safety.gym, brakeline.deploy.data.environment_episodes"
     subprocess.run([sys.executable, "-c", f"{missing}; {needed}"], check=True, cwd=EXAMPLES.parent)
 
 

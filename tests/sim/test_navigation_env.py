@@ -71,7 +71,7 @@ def episode(env: NavigationEnv, policy: str, options: dict[str, Any], steps: int
 
 
 def test_ours_is_imported() -> None:
-    assert Path(brakeline.sim.__file__).parent == Path(__file__).parents[2] / "sim"
+    assert Path(brakeline.sim.__file__).resolve().parent == Path(__file__).parents[2] / "sim"
 
 
 @pytest.mark.filterwarnings("ignore:.*symmetric and normalized space.*")  # actions are physical: speed is not negative

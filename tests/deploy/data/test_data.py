@@ -26,9 +26,9 @@ from tests.waiting import PATIENCE
 MAKE = """
 from brakeline.deploy.data import model_store, simulated_recording
 from brakeline.messaging.task import robot_with_task
-from brakeline.safety.model.model_config import Recipe
+from brakeline.safety.model.model_config import ModelConfig
 simulated_recording.recorded(robot_with_task("ground"), trajectories=12)
-model_store.model_for(robot_with_task("ground"), Recipe(), 0.3)
+model_store.model_for(robot_with_task("ground"), ModelConfig(), 0.3)
 """
 
 
