@@ -287,7 +287,7 @@ def test_of_works_within_each_other_the_innermost_is_told(monkeypatch, capsys):
     with progress.under_way("driving", 3), progress.under_way("recording"):
         time.sleep(0.1)
     told = capsys.readouterr().err
-    before, innermost, after = told.partition("recording")
+    _, innermost, after = told.partition("recording")
     assert innermost and "driving" not in after
     with progress.under_way("driving", 3), progress.under_way("recording"):
         pass
