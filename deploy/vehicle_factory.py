@@ -1,6 +1,7 @@
-"""A task's vehicles and environments, made.
+"""Make the vehicles and environments of a task.
 
-What makes a vehicle is imported when one is made: without an autopilot, a ground robot's process starts sooner.
+The module imports a simulator only when it makes a vehicle: the process of a ground robot starts sooner without an
+autopilot.
 """
 
 from __future__ import annotations
@@ -22,14 +23,18 @@ if TYPE_CHECKING:
     from brakeline.actors.mavlink.frame_log import FrameTap
     from brakeline.sim.shared_world import FleetEnv
 
-YARD = {2: 50.0, 3: 500.0}  # m to the walls of the place where data are recorded: farther than a trajectory can go
+# m, distance of the walls of an empty arena in the plane and in space: no recorded trajectory gets that far
+EMPTY_ARENA_SIZE = {2: 50.0, 3: 500.0}
 
 
 def factory(robot: RobotWithTask, conditions: Conditions, tap: FrameTap | None = None) -> MakeVehicle:
-    """What makes a vehicle of that kind under these conditions; tap: see `environment`.
+    """Return the function that makes vehicles of this robot under these conditions.
+
+    Args:
+        tap: is called with each MAVLink frame of a robot that has any.
 
     Raises:
-        UnknownTask: there is none.
+        UnknownTask: the robot has no simulator.
     """
     if robot.late:
         return delayed(factory(robot.in_lockstep(), conditions, tap), robot)
@@ -41,39 +46,54 @@ def factory(robot: RobotWithTask, conditions: Conditions, tap: FrameTap | None =
 def environment(
     robot: RobotWithTask, arena: str, seed: int, conditions: Conditions | None = None, *, tap: FrameTap | None = None
 ) -> NavigationEnv:
-    """A Gymnasium environment; `seed` sets its episodes apart from those of another seed; tap: is called with every
-    MAVLink frame of a robot that has any.
+    """Return the Gymnasium environment of a robot in an arena.
+
+    Args:
+        seed: separates its episodes from those of another seed.
+        conditions: differences from the recorded robot; None: none.
+        tap: is called with each MAVLink frame of a robot that has any.
 
     Raises:
-        UnknownTask: the robot has none; UnknownArena: no such arena for it.
+        UnknownTask: the robot has no simulator.
+        UnknownArena: the robot has no such arena.
     """
-    c = conditions or Conditions()
-    make = factory(robot, c, tap)
+    conditions = conditions or Conditions()
+    make = factory(robot, conditions, tap)
     arena_kind(robot, arena)
-    noise = c.lidar_noise(robot.position_dim == 3)
-    return NavigationEnv(robot, arena, make, noise, seed_key=seed, perception=c.perception)
+    noise = conditions.lidar_noise(robot.position_dim == 3)
+    return NavigationEnv(robot, arena, make, noise, seed_key=seed, perception=conditions.perception)
 
 
 def fleet_world(
     robot: RobotWithTask, arena: str, size: int, seed: int, conditions: Conditions | None = None
 ) -> FleetEnv:
-    """A world of several robots: see there."""
+    """Return a world that `size` robots share."""
     from brakeline.sim.shared_world import FleetEnv
 
     return FleetEnv(robot, arena, size, seed, conditions)
 
 
-def vehicle_in_yard(robot: RobotWithTask, rng: np.random.Generator, conditions: Conditions) -> Vehicle:
-    """The bare vehicle with nothing near it, heading at random."""
-    yard = YARD[robot.position_dim]
-    height = None if robot.position_dim == 2 else 2.0 * yard
-    start = (0.0, 0.0, float(rng.uniform(-np.pi, np.pi)) if height is None else yard)
-    goal = (0.5 * yard, 0.0) if height is None else (0.5 * yard, 0.0, yard)
-    arena = Arena("yard", room_boundary(yard, height), start, goal, 0.25, 10**9, room_bounds(yard, height))
-    return _maker(robot, conditions)(arena, rng)
+def empty_arena(robot: RobotWithTask, position: tuple[float, float] = (0.0, 0.0), heading: float = 0.0) -> Arena:
+    """Return an arena with walls far away and nothing else, its goal out of reach.
+
+    Args:
+        position: start in the plane [m]; in space at half the height of the arena.
+        heading: of the start, in the plane [rad].
+    """
+    size = EMPTY_ARENA_SIZE[robot.position_dim]
+    height = None if robot.position_dim == 2 else 2.0 * size
+    start = (*position, heading if height is None else size)
+    goal = (0.9 * size, 0.9 * size, *(() if height is None else (size,)))
+    return Arena("yard", room_boundary(size, height), start, goal, 0.25, 10**9, room_bounds(size, height))
+
+
+def vehicle_in_empty_arena(robot: RobotWithTask, rng: np.random.Generator, conditions: Conditions) -> Vehicle:
+    """Return a vehicle with nothing near it; in the plane with a random heading."""
+    heading = float(rng.uniform(-np.pi, np.pi)) if robot.position_dim == 2 else 0.0
+    return _maker(robot, conditions)(empty_arena(robot, heading=heading), rng)
 
 
 @lru_cache(maxsize=1)
 def _maker(robot: RobotWithTask, conditions: Conditions) -> MakeVehicle:
-    """The same for one trajectory after the other: what starts a real autopilot starts it once."""
+    """Return the same maker for each trajectory of a recording: a real autopilot then starts only once."""
     return factory(robot, conditions)

@@ -1,6 +1,6 @@
-"""Options and small things that several commands share.
+"""Define the options and the output helpers that several commands share.
 
-Nothing heavy is imported before it is used: `--help` and a typing mistake are answered at once.
+This module imports nothing heavy, so that `--help` and a mistyped option are answered at once.
 """
 
 from __future__ import annotations
@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 import math
 import os
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
@@ -25,128 +25,155 @@ if TYPE_CHECKING:
     from brakeline.messaging.bus import BusSettings
     from brakeline.sim.arena import Arena
 
+LATEST = Path("runs/latest")
+
+T = TypeVar("T")
+Unprefixed = Annotated[T, tyro.conf.OmitArgPrefixes]
 Certificate = Literal["residual", "set-membership", "matrix-zonotope"]
 Mode = Literal["direct", "recursion"]
 Method = Literal["ddpc", "secas", "sailr", "none"]
-T = TypeVar("T")
-Flags = Annotated[T, tyro.conf.OmitArgPrefixes]
 
-LATEST = Path("runs/latest")
+Robot = Annotated[
+    str, tyro.conf.Positional, tyro.conf.arg(help="Name of a robot, or path of a robot description (.toml).")
+]
+Logs = Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(help="Log files (.mcap) or run folders.")]
+Seed = Annotated[int, tyro.conf.arg(help="Seed of all random draws. The same seed gives the same result.")]
+ArenaName = Annotated[
+    str,
+    tyro.conf.arg(
+        help="Name of the arena. Ground robot: default, open, dense, few-walkers, walkers, many-walkers or crossing. "
+        "Quadrotor: default, dense, tall or traffic. Another robot: one of its task file."
+    ),
+]
+RunFolder = Annotated[
+    Path | None, tyro.conf.arg(help="Folder of the run. Defaults to runs/DATE-TIME.", metavar="FOLDER")
+]
+AcceptBound = Annotated[
+    float | None,
+    tyro.conf.arg(
+        help="Use a model set only if its stated bound is at most this share of plans outside their tubes (0.26 means "
+        "26 %). Defaults to `accept_bound` of the robot description, or 0.01 if the description has none."
+    ),
+]
+Pictures = Annotated[
+    float,
+    tyro.conf.arg(
+        help="Pictures a second and robot that the recorder draws into the log for Foxglove, besides one of each "
+        "intervention. 0 draws none at all."
+    ),
+]
+Json = Annotated[bool, tyro.conf.arg(help="Print the result as one JSON object on stdout.")]
+VehicleUrl = "udpin:HOST:PORT, udpout:HOST:PORT or tcp:HOST:PORT"
+
+# The terminal breaks long lines (soft wrap); lines into a pipe stay whole.
+console = Console(highlight=False, soft_wrap=True)
+errors = Console(stderr=True, highlight=False, soft_wrap=True)
 
 
 @dataclass(frozen=True)
-class Filtering:
-    """Which filter stands before the policy."""
+class FilterOptions:
+    """The filter that checks what the policy proposes."""
 
     method: Method = "ddpc"
-    """ddpc: ours; secas, sailr: the rivals; none: no filter."""
+    """Filter method: ddpc (this project's own), secas or sailr (the rivals), or none for no filter."""
     certificate: Certificate = "residual"
-    """What the model set trusts in the data (docs/certificates.md)."""
+    """Error bound of the model set (see docs/certificates.md)."""
     mode: Mode = "direct"
-    """A predictor for each step of the plan, or the paper's recursion."""
+    """Prediction mode: direct uses one predictor for each step of the plan, recursion repeats the paper's one-step
+    model."""
 
     def model_config(self) -> ModelConfig:
+        """Return the configuration of the model set that the options select."""
         return ModelConfig(self.certificate, self.mode)
 
 
 @dataclass(frozen=True)
-class Serving(Filtering):
-    """Which filter is put to use, and how loose its statement may be."""
+class ServiceOptions(FilterOptions):
+    """The filter that checks what the policy proposes, and how loose its model set may be."""
 
-    accept_bound: float | None = None
-    """Use model sets that state at most this share of plans outside their tubes (0.26: 26 %). Without it the limit of
-    the robot's description counts: `accept_bound`, 0.01 unless the description has one."""
+    accept_bound: AcceptBound = None
 
 
 @dataclass(frozen=True)
-class Physics:
-    """What may differ between the robot that was recorded and the one that drives."""
+class PhysicsOptions:
+    """Differences between the simulated robot and the robot that was recorded."""
 
     payload: float = 0.0
-    """kg on top of the robot."""
+    """Mass on top of the robot [kg]."""
     friction: float = 1.0
     """Friction coefficient of the wheels on the floor."""
     noise: float = 1.0
     """Factor on all sensor errors."""
     wind: float = 0.0
-    """m/s on average, on the quadrotor, from a side that is drawn anew each episode."""
+    """Mean wind speed on the quadrotor [m/s]. Its direction is drawn anew for each episode."""
     gust: float = 0.0
-    """m/s, standard deviation of the wind on each axis."""
+    """Standard deviation of the wind on each axis [m/s]."""
     perception: Literal["map", "scan"] = "map"
-    """Where free space comes from: the arena's map, or what a sensor shows (360 beams; in the air 90 rings of 180)."""
+    """Source of free space: the arena's map, or the scan of a sensor (360 beams on the ground, 90 rings of 180 beams in
+    the air)."""
     dropped: float = 0.0
-    """Share of the scan's beams that say nothing."""
+    """Share of the beams of a scan that return nothing."""
     false_far: float = 0.0
-    """Share of the scan's beams that see through what is there."""
+    """Share of the beams of a scan that pass through an obstacle."""
     ghosts: float = 0.0
-    """Share of the scan's beams that return from where nothing is."""
+    """Share of the beams of a scan that return from a point where nothing is."""
     blind: float = 0.0
-    """Degrees about straight behind that the sensor does not see."""
+    """Width of the sector behind the robot that the sensor does not see [deg]."""
     late: int = 0
-    """Periods until a scan is there."""
+    """Delay of a scan [control periods]."""
     tracks: bool = False
-    """By scans, among things that move: follow what is seen from scan to scan, to know how fast it may go on."""
+    """With --perception scan: track moving obstacles from scan to scan, so that their speed is known."""
 
     def conditions(self) -> Conditions:
+        """Return the simulator's conditions for these options. Raises ValueError if the options contradict."""
+        faults = SensorFaults(self.dropped, self.false_far, self.ghosts, math.radians(self.blind), self.late)
         return Conditions(
             NoiseLevels(scale=self.noise),
             self.payload,
             self.friction,
             QuadrotorNoise(scale=self.noise),
             Wind(self.wind, gust=self.gust),
-            Perception(
-                self.perception,
-                SensorFaults(self.dropped, self.false_far, self.ghosts, math.radians(self.blind), self.late),
-                self.tracks,
-            ),
+            Perception(self.perception, faults, self.tracks),
         )
 
 
 @dataclass(frozen=True)
-class Flight:
-    """The autopilot behind a link, and where it is."""
+class FlightOptions(FlightSettings):
+    """The vehicle behind a MAVLink link, and its place in the arena."""
 
-    system: int = 1
-    """MAVLink system id of the vehicle."""
-    truth: int = 0
-    """UDP port at which a simulator on this machine tells of collisions (`brakeline autopilot --truth`); 0: none."""
-    height: float = 3.0
-    """m above the ground that it climbs to first, unless it flies already. Nothing is filtered on this way."""
-    origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """m: where in the arena the autopilot's local frame begins."""
+    url: Annotated[str, tyro.conf.Suppress] = ""
     at_start: bool = False
-    """Its local frame begins on the floor below the arena's start: a simulator on its home position."""
-    raise_limits: bool = False
-    """Set those of its parameters that hold it below what the filter may ask for: speeds, accelerations, tilt."""
-    lead: bool = False
-    """Tell it places to go to in place of velocities: when setpoints stop it stays at the last one, where an ArduCopter
-    without GUID_TIMEOUT flies on for 3 s. It flies otherwise then: `collect` and `fly` both with it."""
+    """Place the origin of the autopilot's local frame on the floor below the arena's start, where a simulated vehicle
+    has its home position. Overrides --origin."""
 
     def settings(self, url: str, arena: Arena) -> FlightSettings:
-        """For the flight in an arena."""
-        x, y, *_ = arena.start
-        origin = (x, y, 0.0) if self.at_start else self.origin
-        return FlightSettings(url, self.system, self.truth, self.height, origin, self.raise_limits, self.lead)
+        """Return the settings of a flight over the link `url` in an arena."""
+        values = {item.name: getattr(self, item.name) for item in fields(FlightSettings)} | {"url": url}
+        if self.at_start:
+            values["origin"] = (*arena.start[:2], 0.0)
+        return FlightSettings(**values)
 
 
 @dataclass(frozen=True)
-class Endpoints:
-    """Where the bus is, as Zenoh writes it: tls/HOST:PORT with keys, tcp/HOST:PORT without."""
+class BusOptions:
+    """The message bus. Write endpoints as Zenoh does: tls/HOST:PORT with keys, tcp/HOST:PORT without."""
 
     connect: tuple[str, ...] = ()
-    """Routers to connect to; without any: that of the newest run here."""
+    """Routers to connect to. Defaults to the router of the newest run on this machine."""
     listen: tuple[str, ...] = ()
-    """Be the router at these endpoints."""
-
+    """Act as the router at these endpoints."""
     keys: Path | None = None
-    """Folder with this process's keys (`brakeline keys` makes them); default: $BRAKELINE_KEYS, else none."""
+    """Folder with the keys of this process, as `brakeline keys` makes them. Defaults to $BRAKELINE_KEYS, else to no
+    keys."""
     insecure: bool = False
-    """Listen beyond this machine without keys. Whoever reaches the bus can command the robots; every Health says so."""
+    """Listen beyond this machine without keys. Everyone who reaches the bus can then command the robots, and each
+    Health message warns of it."""
     metrics: str = ""
-    """PORT of this machine, or HOST:PORT, for /metrics (Prometheus), /live and /ready; without one: nowhere."""
+    """PORT of this machine, or HOST:PORT, at which the process serves /metrics (Prometheus), /live and /ready. Without
+    it the process serves none."""
 
     def bus(self) -> BusSettings:
-        """Raises ValueError when there is neither an endpoint nor a run."""
+        """Return the bus settings. Raises ValueError if there is neither an endpoint nor a run on this machine."""
         from brakeline.messaging.bus import BusSettings
 
         if self.connect or self.listen:
@@ -158,22 +185,23 @@ class Endpoints:
 
 
 @dataclass(frozen=True)
-class Meeting:
-    """Where the processes of a run meet, and how they know each other."""
+class RunBusOptions:
+    """The message bus of a run, and the keys of its processes."""
 
     listen: str | None = None
-    """The router's endpoint; default: a free port of this machine."""
+    """Endpoint of the run's router. Defaults to a free port of this machine."""
     keys: Path | None = None
-    """Folder with keys of all processes (`brakeline keys`); default: $BRAKELINE_KEYS, else the run's own."""
+    """Folder with the keys of all processes, as `brakeline keys` makes them. Defaults to $BRAKELINE_KEYS, else to keys
+    of the run's own."""
     secured: bool = True
-    """Make keys of the run's own where none are given; without, whoever reaches the bus can command the robots."""
+    """Make keys for the run if you give none. With --no-secured everyone who reaches the bus can command the robots."""
     insecure: bool = False
-    """Let --listen be beyond this machine without keys. Every Health says so."""
+    """Allow --listen beyond this machine without keys. Each Health message then warns of it."""
     metrics: str = ""
-    """PORT of this machine, or HOST:PORT, for the launcher's /metrics; its processes have the ports after it."""
+    """PORT of this machine, or HOST:PORT, at which the launcher serves /metrics. Its processes use the next ports."""
 
     def settings(self, config: RunConfig, folder: Path) -> BusSettings:
-        """The launcher's place on the bus."""
+        """Return the bus settings of the launcher. Makes the run's own keys if the run needs any."""
         from brakeline.deploy.run.run_keys import own_keys
         from brakeline.messaging.bus import BusSettings
         from brakeline.messaging.free_ports import free_endpoint
@@ -184,13 +212,13 @@ class Meeting:
 
 
 def default_keys() -> Path | None:
-    """`$BRAKELINE_KEYS`, if it is set."""
+    """Return the folder in `$BRAKELINE_KEYS`, or None if the variable is not set."""
     folder = os.environ.get("BRAKELINE_KEYS")
     return Path(folder) if folder else None
 
 
 def bus_of(run: Path) -> BusSettings:
-    """How a client gets on the bus of a run on this machine. Raises ValueError with what to do."""
+    """Return the settings with which a client joins the bus of a run on this machine. Raises ValueError."""
     from brakeline.deploy.run.processes import client_of
 
     try:
@@ -199,8 +227,8 @@ def bus_of(run: Path) -> BusSettings:
         raise ValueError(f"no run at {run}: give --connect tls/HOST:PORT, or start `brakeline train`") from error
 
 
-def say_json(figures: dict[str, Any]) -> None:
-    """One JSON object on stdout; what is not finite becomes null."""
+def print_json(figures: dict[str, Any]) -> None:
+    """Print one JSON object on stdout. Numbers that are not finite become null."""
     print(json.dumps(_finite(figures)))
 
 
@@ -209,21 +237,22 @@ def _finite(value: Any) -> Any:
         return {key: _finite(inner) for key, inner in value.items()}
     if isinstance(value, list | tuple):
         return [_finite(inner) for inner in value]
-    if isinstance(value, float) and not abs(value) < float("inf"):
+    if isinstance(value, float) and not math.isfinite(value):
         return None
     return value
 
 
-# Soft wrap: lines are the terminal's to break, and a pipe's not to be broken.
-console = Console(highlight=False, soft_wrap=True)
-errors = Console(stderr=True, highlight=False, soft_wrap=True)
+def print_counts(figures: dict[str, float], as_json: bool) -> None:
+    """Print named numbers: as JSON on stdout, or in one line on stderr."""
+    if as_json:
+        print_json(figures)
+    else:
+        errors.print(", ".join(f"{name} {value:g}" for name, value in figures.items()))
 
-Robot = Annotated[str, tyro.conf.Positional]
 
-
-def conditions(about: dict[str, str]) -> StackingTable:
-    """How data were recorded, a line each."""
-    shown = StackingTable(show_header=False, **PLAIN)
-    for name, value in about.items():
-        shown.add_row(name.replace("_", " "), value)
-    return shown
+def conditions_table(conditions: dict[str, str]) -> StackingTable:
+    """Return a table with one line for each recording condition."""
+    table = StackingTable(show_header=False, **PLAIN)
+    for name, value in conditions.items():
+        table.add_row(name.replace("_", " "), value)
+    return table

@@ -1,4 +1,4 @@
-"""`brakeline evaluate`."""
+"""Implement `brakeline evaluate`: evaluate a policy behind the filter, in this process."""
 
 from __future__ import annotations
 
@@ -6,14 +6,17 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from brakeline.deploy.commands.common_options import (
-    Flags,
-    Physics,
+    ArenaName,
+    Json,
+    PhysicsOptions,
     Robot,
-    Serving,
-    conditions,
+    Seed,
+    ServiceOptions,
+    Unprefixed,
+    conditions_table,
     console,
     errors,
-    say_json,
+    print_json,
 )
 from brakeline.deploy.experiments.evaluate import Evaluation, evaluate, prepared
 from brakeline.deploy.progress import under_way
@@ -23,40 +26,44 @@ from brakeline.messaging.task import RobotWithTask, robot_with_task
 
 
 @dataclass(frozen=True)
-class Evaluate:
+class EvaluateCommand:
+    """The options of `brakeline evaluate`."""
+
     robot: Robot = "ground"
     policy: str = "astar"
-    """A policy file, inputs (.csv, as `excite` prints them), or trained | trained-by-scan (those in policies/) |
-    untrained | random | greedy | adversary | astar | careful (astar with a wide berth)."""
-    filtering: Flags[Serving] = field(default_factory=Serving)
-    physics: Flags[Physics] = field(default_factory=Physics)
-    arena: str = "default"
-    """On the ground default | open | dense | few-walkers | walkers | many-walkers | crossing, in the air default |
-    dense | tall | traffic; else those of the robot's task."""
+    """Policy to evaluate: trained, trained-by-scan (both stored in policies/), untrained, random, greedy, adversary,
+    astar, careful (astar far from obstacles), a weights file, or a CSV file of inputs as `brakeline excite` prints
+    them."""
+    filtering: Unprefixed[ServiceOptions] = field(default_factory=ServiceOptions)
+    physics: Unprefixed[PhysicsOptions] = field(default_factory=PhysicsOptions)
+    arena: ArenaName = "default"
     episodes: int = 100
-    """Of a fleet: of all its robots, in whole worlds."""
+    """Episodes to drive. A fleet counts those of all its robots, and completes each world."""
     fleet: int = 0
-    """So many robots in one world; 0: each is alone."""
-    seed: int = 0
+    """Robots that share one world and avoid each other. 0 evaluates one robot alone."""
+    seed: Seed = 0
     render: Path | None = None
-    """Also draw an episode from above, with tube and plan, into this file (.png, .gif, .mp4)."""
+    """Also draw an episode from above, with tube and plan, into this file (.png, .gif or .mp4)."""
     episode: int = 0
-    """Which one to draw."""
+    """With --render: number of the episode to draw."""
     beside: bool = False
-    """Draw the same episode without the filter beside it."""
+    """With --render: draw the same episode without the filter beside it."""
     verbose: bool = False
-    """Say also the conditions: sensors' errors, wind, load."""
-    json: bool = False
+    """Show also the conditions: sensor errors, wind, payload."""
+    json: Json = False
 
     def run(self) -> int:
+        """Drive the episodes and print the figures. Returns the exit status."""
+        if self.beside and self.render is None:
+            raise ValueError("--beside draws an episode: give --render FILE too")
         if self.render is not None:
             from brakeline.deploy.run.episode_render import check_ending
 
             check_ending(self.render)
-        if self.beside and self.render is None:
-            raise ValueError("--beside draws: give --render FILE too")
+            if self.fleet:
+                raise ValueError("--render can't draw a fleet: leave out --render or --fleet")
         robot = robot_with_task(self.robot)
-        what = Evaluation(
+        evaluation = Evaluation(
             policy=self.policy,
             method=self.filtering.method,
             model_config=self.filtering.model_config(),
@@ -67,33 +74,31 @@ class Evaluate:
             conditions=self.physics.conditions(),
             fleet=self.fleet,
         )
-        if self.render is not None and self.fleet:
-            raise ValueError("a fleet is not drawn: leave out --render")
         if self.render is not None:
-            self._draw(robot, what, self.render)
+            self._draw(robot, evaluation, self.render)
         with under_way("driving episodes", self.episodes) as advance:
 
-            def each(tally: EpisodeStats) -> None:
-                told = f"goals {tally.goals}, collisions {tally.collisions}, interventions {tally.interventions}"
-                advance(what=told)
+            def show_progress(tally: EpisodeStats) -> None:
+                counts = f"goals {tally.goals}, collisions {tally.collisions}, interventions {tally.interventions}"
+                advance(what=counts)
 
-            figures = evaluate(robot, what, each)
+            figures = evaluate(robot, evaluation, show_progress)
         if self.json:
-            say_json(figures)
+            print_json(figures)
         else:
             console.print(show(figures))
             if self.verbose:
-                console.print(conditions(figures["conditions"]))
+                console.print(conditions_table(figures["conditions"]))
         return 0
 
-    def _draw(self, robot: RobotWithTask, what: Evaluation, path: Path) -> None:
+    def _draw(self, robot: RobotWithTask, evaluation: Evaluation, path: Path) -> None:
         from brakeline.deploy.run.episode_render import record, save
 
         films = []
-        for method in (what.method, "none") if self.beside else (what.method,):
-            driver, policy, question = prepared(robot, replace(what, method=method))
-            film = record(driver, policy, question, self.episode)
+        for method in (evaluation.method, "none") if self.beside else (evaluation.method,):
+            driver, policy, ask = prepared(robot, replace(evaluation, method=method))
+            film = record(driver, policy, ask, self.episode)
             films.append(film)
-            how = f"method {method}, {film.end} after {len(film.frames) * robot.period:.1f} s"
-            errors.print(f"{path}: episode {self.episode}, {how}")
+            outcome = f"{film.end} after {len(film.frames) * robot.period:.1f} s"
+            errors.print(f"{path}: episode {self.episode}, method {method}, {outcome}")
         save(films, path)

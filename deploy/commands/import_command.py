@@ -1,123 +1,83 @@
-"""`brakeline import` and `brakeline excite`: data of a robot that somebody drives."""
+"""Implement `brakeline import`: make a data set from logs of any robot."""
 
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import tyro
 from rich.markup import escape
 
-from brakeline.deploy.commands.common_options import Robot, console, errors, say_json
-from brakeline.deploy.data import excitation_plan, importer
+from brakeline.deploy.commands.common_options import Json, console, errors, print_json
+from brakeline.deploy.data import importer
 from brakeline.deploy.data.build_lock import alone
 from brakeline.deploy.data.coverage import Coverage, coverage
 from brakeline.deploy.data.coverage_plot import draw
 from brakeline.deploy.data.data_paths import record_path
 from brakeline.deploy.data.resample import HOLD
-from brakeline.deploy.data.sources.quantity_names import columns_of
-from brakeline.deploy.progress import under_way
 from brakeline.logs.console_tables import PLAIN, StackingTable
 from brakeline.messaging.robot import robot_named
-from brakeline.messaging.task import RobotWithTask, robot_with_task
 
 
 @dataclass(frozen=True)
-class Import:
+class ImportCommand:
+    """The options of `brakeline import`."""
+
     sources: Annotated[tuple[Path, ...], tyro.conf.Positional]
-    """CSV, Parquet, ROS 2 bags, ArduPilot's .bin and .tlog, PX4's .ulg, logs of runs (docs/data.md)."""
+    """Logs to import: CSV, Parquet, ROS 2 bags, .bin and .tlog of ArduPilot, .ulg of PX4, own runs (docs/data.md)."""
     robot: str = "ground"
-    """Name, or path of a description (.toml)."""
+    """Robot that was logged: a name, or the path of a description (.toml)."""
     out: Path | None = None
-    """File; default: the data set in use (data/ROBOT/record.safetensors), replaced."""
+    """File of the data set. Defaults to data/ROBOT/record.safetensors, the data set in use, which it replaces."""
     map: tuple[str, ...] = ()
-    """NAME=TABLE/FIELD: where a coordinate or input is, if not where it usually is."""
+    """Places of coordinates and inputs in the log, each as NAME=TABLE/FIELD, if they are not at their usual places."""
     delay: float = 0.0
-    """s by which inputs are stamped too early; the report says how much later than its inputs the robot moves."""
+    """Time by which the inputs are stamped too early [s]. The report says how much later than its inputs the robot
+    moves."""
     hold: float = HOLD
-    """s that an input counts for after its last message."""
+    """Time after its last message for which an input counts [s]."""
     picture: Path | None = None
-    """PNG of what was driven."""
-    json: bool = False
+    """Draw what was driven into this image (.png)."""
+    json: Json = False
 
     def run(self) -> int:
+        """Import the logs. Returns the exit status; 1 if the data can't give a model set."""
         robot = robot_named(self.robot)
-        made = importer.bring(self.sources, robot, self.map, self.delay, self.hold)
-        told = coverage(made.data)
+        imported = importer.bring(self.sources, robot, self.map, self.delay, self.hold)
+        covered = coverage(imported.data)
         path = self.out or record_path(robot)
         if self.picture is not None:
-            draw(made.data, told, self.picture)
-        if not told.refused:
+            draw(imported.data, covered, self.picture)
+        if not covered.refused:
             with alone(path.parent):
-                made.data.save(path)
-        figures = {"path": None if told.refused else str(path), "digest": made.data.digest()}
+                imported.data.save(path)
         if self.json:
-            say_json(figures | {"report": asdict(made.report), "coverage": asdict(told), "refused": told.refused})
-            return int(bool(told.refused))
-        for note in made.report.notes:
+            figures: dict[str, Any] = {"path": None if covered.refused else str(path), "digest": imported.data.digest()}
+            figures |= {"report": asdict(imported.report), "coverage": asdict(covered), "refused": covered.refused}
+            print_json(figures)
+            return int(bool(covered.refused))
+        for note in imported.report.notes:
             console.print(note, markup=False)
-        console.print(covered(told))
-        for text in told.missing:
+        console.print(coverage_table(covered))
+        for text in covered.missing:
             console.print(f"[yellow]missing:[/] {escape(text)}")
-        if told.refused:
-            errors.print(f"[red]refused:[/] no model set can be made of this: {escape(told.refused)}")
+        if covered.refused:
+            errors.print(f"[red]refused:[/] no model set can be made of this: {escape(covered.refused)}")
             return 1
-        console.print(f"{path}: {made.data.periods} periods in {made.report.trajectories} trajectories", markup=False)
-        console.print(f"next: brakeline certify {path} --use", markup=False)
+        counts = f"{imported.data.periods} periods in {imported.report.trajectories} trajectories"
+        console.print(f"{path}: {counts}\nnext: brakeline certify {path} --use", markup=False)
         return 0
 
 
-def covered(told: Coverage) -> StackingTable:
-    shown = StackingTable(**PLAIN)
+def coverage_table(covered: Coverage) -> StackingTable:
+    """Return a table of the ranges that the data cover."""
+    table = StackingTable(**PLAIN)
     for column in ("", "least", "most", "bounds", "covered"):
-        shown.add_column(column, justify="left" if not column else "right")
-    for one in told.seen:
+        table.add_column(column, justify="left" if not column else "right")
+    for one in covered.seen:
         bounds = f"{one.low:g} to {one.high:g} {one.unit}"
-        shown.add_row(one.name, f"{one.least:.3g}", f"{one.most:.3g}", bounds, f"{one.share:.0%}")
-    shown.add_row("stops", str(told.stops))
-    shown.add_row("windows", f"{told.plans} of plans", f"{told.windows} free")
-    return shown
-
-
-@dataclass(frozen=True)
-class Excite:
-    robot: Robot = "ground"
-    keep: tuple[float, float, float, float] = (-2.0, -2.0, 2.0, 2.0)
-    """x and y, least and most [m], that the robot stays within; each run begins in the middle, along x."""
-    minutes: float = 10.0
-    seed: int = 0
-    drive: Path | None = None
-    """Drive them in the robot's simulator instead of printing them, and record that into this log (.mcap); it keeps to
-    the region by where the robot is measured to be."""
-    json: bool = False
-    """With --drive: one JSON object on stdout."""
-
-    def run(self) -> int:
-        robot = robot_named(self.robot)
-        if self.drive is not None:
-            return self._drive(robot_with_task(self.robot), self.drive)
-        print(",".join(("time", "run", *columns_of(robot)[1])))
-        for row in excitation_plan.rows(robot, self.keep, self.minutes, self.seed):
-            print(",".join((f"{row.time:.9g}", str(row.run), *(f"{value:.6g}" for value in row.input))))
-        return 0
-
-    def _drive(self, robot: RobotWithTask, path: Path) -> int:
-        from brakeline.deploy.run.excitation_run import drive
-
-        with under_way(f"driving {robot.name}", round(60.0 * self.minutes / robot.period)) as advance:
-            done = 0
-
-            def each(periods: int) -> None:
-                nonlocal done
-                advance(periods - done)
-                done = periods
-
-            driven = drive(robot, self.keep, self.minutes, self.seed, path, each=each)
-        if self.json:
-            say_json(asdict(driven))
-            return 0
-        edge = f"{-driven.outside:.2f} m inside the region" if driven.outside <= 0.0 else f"{driven.outside:.2f} m OUT"
-        console.print(f"{path}: {driven.periods} periods in {driven.runs} runs; the body came to {edge}", markup=False)
-        console.print(f"next: brakeline import LOG {path} --robot {self.robot}", markup=False)
-        return 0
+        table.add_row(one.name, f"{one.least:.3g}", f"{one.most:.3g}", bounds, f"{one.share:.0%}")
+    table.add_row("stops", str(covered.stops))
+    table.add_row("windows", f"{covered.plans} of plans", f"{covered.windows} free")
+    return table

@@ -1,37 +1,84 @@
-"""`brakeline replay`."""
+"""Implement `brakeline replay`: decide each logged request again, and compare."""
 
 from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
-import tyro
-
-from brakeline.deploy.commands.common_options import LATEST, Certificate, Mode, console, say_json
+from brakeline.deploy.commands.common_options import LATEST, Certificate, Json, Logs, Mode, console, print_json
 from brakeline.deploy.data.certification import certified
 from brakeline.deploy.data.model_store import model_for
 from brakeline.deploy.progress import under_way
-from brakeline.deploy.run.replay_run import ROUNDING, Instead, replay
+from brakeline.deploy.run.replay_run import ROUNDING, Replacement, replay
 from brakeline.logs.console_tables import PLAIN, StackingTable
 from brakeline.logs.log_length import count
 from brakeline.messaging.robot import Robot
 from brakeline.messaging.topics import EXCHANGE
 from brakeline.safety.filter.filter import Filter
 from brakeline.safety.model.dataset import Dataset
-from brakeline.safety.model.model_set import ModelConfig, ModelSet
+from brakeline.safety.model.model_set import ModelConfig
 
-ANY_BOUND = 1.0  # no robot is driven: what would have been decided is asked, however loose the statement
-DIFFERENT = 1  # exit status: decisions differ by more than rounding though nothing was asked to be different
+ANY_BOUND = 1.0  # the replay drives no robot, so it accepts a model set with any stated bound
+DIFFERENT = 1  # exit status: decisions differ by more than rounding although you replaced nothing
+
+
+@dataclass(frozen=True)
+class ReplayCommand:
+    """The options of `brakeline replay`."""
+
+    logs: Logs = (LATEST,)
+    certificate: Certificate | None = None
+    """Decide with this error bound instead, fitted to the data set in use or to --data."""
+    mode: Mode = "direct"
+    """With --certificate or --data: prediction mode."""
+    data: Path | None = None
+    """Decide with a model set of this data set (a file that `brakeline collect` wrote) instead."""
+    margin: float | None = None
+    """Decide with this clearance margin [m] instead of the one of the model set."""
+    json: Json = False
+
+    def run(self) -> int:
+        """Replay the logs and print the comparison. Returns the exit status: 0, or DIFFERENT."""
+        values = {"certificate": self.certificate, "data": self.data and str(self.data), "margin": self.margin}
+        changes = {name: value for name, value in values.items() if value is not None}
+        if self.certificate or self.data:
+            changes["mode"] = self.mode
+        replacement = self._replacement() if changes else None
+        total = count(list(self.logs), EXCHANGE)
+        # The warnings of the filter were about the robots of that time.
+        with under_way("deciding each request again", total) as advance, errors_only("brakeline.safety"):
+            result = replay(list(self.logs), replacement, advance)
+        figures = result.figures() | {"log": [str(path) for path in self.logs], "instead": changes}
+        if self.json:
+            print_json(figures)
+        else:
+            print_comparison(figures)
+        return DIFFERENT if replacement is None and result.different else 0
+
+    def _replacement(self) -> Replacement:
+        """Return the function that gives, for a robot, the filter to ask instead of the one that was in use."""
+        config = ModelConfig(self.certificate or "residual", self.mode)
+        fitted = None if self.data is None else certified(Dataset.load(self.data), config)[0]
+
+        @cache
+        def filter_for(robot: Robot) -> Filter:
+            replacement = Filter(fitted or model_for(robot, config, ANY_BOUND), self.margin)
+            if replacement.robot.name != robot.name:
+                raise ValueError(f"{self.data} has data of {replacement.robot.name}, but the log is of {robot.name}")
+            return replacement
+
+        return filter_for
 
 
 @contextmanager
-def quiet(name: str) -> Iterator[None]:
-    """Nothing but errors from that logger."""
+def errors_only(name: str) -> Iterator[None]:
+    """Let a logger pass errors alone until the block ends."""
     logger = logging.getLogger(name)
     before = logger.level
     logger.setLevel(logging.ERROR)
@@ -41,98 +88,40 @@ def quiet(name: str) -> Iterator[None]:
         logger.setLevel(before)
 
 
-@dataclass(frozen=True)
-class Replay:
-    logs: Annotated[tuple[Path, ...], tyro.conf.Positional] = (LATEST,)
-    """Log files, or run folders."""
-    certificate: Certificate | None = None
-    """What would have been decided with this certificate (of the data set in use, or of --data)?"""
-    mode: Mode = "direct"
-    """Of --certificate or --data."""
-    data: Path | None = None
-    """What would have been decided with a model set from this data set (a file that `collect` wrote)?"""
-    margin: float | None = None
-    """What would have been decided with this clearance margin, m, instead of the model set's own?"""
-    json: bool = False
-
-    def run(self) -> int:
-        instead = self._instead()
-        total = count(list(self.logs), EXCHANGE)
-        with (
-            under_way("asking every question again", total) as advance,
-            quiet("brakeline.safety"),  # its warnings were about the robots of then
-        ):
-            result = replay(list(self.logs), instead, advance)
-        figures = result.figures() | {"log": [str(path) for path in self.logs], "instead": self._words()}
-        if self.json:
-            say_json(figures)
-        else:
-            show(figures)
-        return DIFFERENT if instead is None and result.different else 0
-
-    def _words(self) -> dict[str, Any]:
-        """What was asked to be different."""
-        given = {"certificate": self.certificate, "data": self.data and str(self.data), "margin": self.margin}
-        chosen = {name: value for name, value in given.items() if value is not None}
-        return chosen | ({"mode": self.mode} if self.certificate or self.data else {})
-
-    def _instead(self) -> Instead | None:
-        """The filter to be asked in place of the one that was in use, made once for each robot; None: the same."""
-        if self.certificate is None and self.data is None and self.margin is None:
-            return None
-        model_config = ModelConfig(self.certificate or "residual", self.mode)
-        filters: dict[str, Filter] = {}
-        make: Callable[[Robot], ModelSet]
-        if self.data is not None:
-            model, _ = certified(Dataset.load(self.data), model_config)
-            make = lambda robot: model  # noqa: E731
-        else:
-            make = lambda robot: model_for(robot, model_config, ANY_BOUND)  # noqa: E731
-
-        def chosen(robot: Robot) -> Filter:
-            name = robot.name
-            if name not in filters:
-                filters[name] = Filter(make(robot), self.margin)
-                if filters[name].robot.name != name:
-                    raise ValueError(f"{self.data} is of {filters[name].robot.name}, and the log of {name}")
-            return filters[name]
-
-        return chosen
-
-
-def show(figures: dict[str, Any]) -> None:
-    """The figures of a replay, on stdout."""
+def print_comparison(figures: dict[str, Any]) -> None:
+    """Print the figures of a replay on stdout."""
     compared = figures["requests"] - figures["unanswered"]
-    asked = ", ".join(f"{name} {value}" for name, value in figures["instead"].items())
-    question = f"asked again with {asked}" if asked else "asked again"
-    console.print(f"{question}: {compared} requests; {figures['unanswered']} had no answer")
+    changes = ", ".join(f"{name} {value}" for name, value in figures["instead"].items())
+    heading = f"decided again with {changes}" if changes else "decided again"
+    console.print(f"{heading}: {compared} requests; {figures['unanswered']} had no answer")
     console.print(f"identical in every bit: {share(figures['identical'], compared)}")
     largest = f"; at most {figures['rounding']:.1g}" if figures["equal"] else ""
     console.print(f"same kind, numbers equal to within {ROUNDING:g}: {share(figures['equal'], compared)}{largest}")
     console.print(f"different: {figures['different']}")
     if not figures["different"]:
         return
-    console.print(f"the robot is told the same in {share(figures['same_input'], compared)}")
+    console.print(f"the robot gets the same input in {share(figures['same_input'], compared)}")
     kinds = StackingTable("decided", "now", "requests", **PLAIN)
     for logged, row in figures["kinds"].items():
         for now, number in row.items():
             kinds.add_row(logged, now, str(number))
     fields = StackingTable("field", "differs in", "by at most", **PLAIN)
-    for name, about in figures["fields"].items():
-        fields.add_row(name, str(about["count"]), size(about["largest"]))
-    columns = ("largest differences", "decided", "now", "input", "margin")
-    examples = StackingTable(*columns, **PLAIN)
+    for name, field in figures["fields"].items():
+        fields.add_row(name, str(field["count"]), size(field["largest"]))
+    examples = StackingTable("largest differences", "decided", "now", "input", "margin", **PLAIN)
     for one in figures["examples"]:
-        place = f"{one['actor']} episode {one['episode']} step {one['step']}"
-        found = (size(one["differences"].get(name, 0.0)) for name in ("input", "margin"))
-        examples.add_row(place, one["logged"], one["now"], *found)
+        step = f"{one['actor']} episode {one['episode']} step {one['step']}"
+        sizes = (size(one["differences"].get(name, 0.0)) for name in ("input", "margin"))
+        examples.add_row(step, one["logged"], one["now"], *sizes)
     for table in (kinds, fields, examples):
         console.print(table)
 
 
-def share(count: int, of: int) -> str:
-    return f"{count} ({count / of:.2%})" if of else str(count)
+def share(count: int, total: int) -> str:
+    """Return a count, with its share of the total."""
+    return f"{count} ({count / total:.2%})" if total else str(count)
 
 
 def size(value: float) -> str:
+    """Return a difference as text. Empty if it is not finite: the values are no numbers."""
     return f"{value:.3g}" if math.isfinite(value) else ""

@@ -1,4 +1,4 @@
-"""`brakeline robot`: a robot's description: a new one, a check, a picture."""
+"""Implement `brakeline robot`: write, check or show the description of a robot."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 import tyro
 from rich.markup import escape
 
-from brakeline.deploy.commands.common_options import console, errors, say_json
+from brakeline.deploy.commands.common_options import Json, console, errors, print_json
 from brakeline.deploy.data.description_plot import picture, summary
 from brakeline.logs.console_tables import PLAIN, StackingTable
 from brakeline.messaging.robot import ROBOTS_FOLDER, robot_named
@@ -19,17 +19,21 @@ from brakeline.messaging.task import RobotWithTask, robot_maybe_with_task
 
 @dataclass(frozen=True)
 class RobotCommand:
+    """The options of `brakeline robot`."""
+
     action: Annotated[Literal["new", "check", "show"], tyro.conf.Positional]
-    """new: write a commented description; check: tell every mistake; show: what it amounts to."""
+    """new writes a description with comments, check lists all mistakes in one, show prints what follows from it."""
     file: Annotated[str, tyro.conf.Positional]
-    """The description (.toml), or the name of a robot that comes with the program."""
+    """The description (.toml). With check and show also the name of a robot that comes with the program."""
     from_: Annotated[Path | None, tyro.conf.arg(name="from")] = None
-    """With new: fill in what this log tells (CSV, Parquet, ROS 2 bags, autopilots' logs; that of a run tells all)."""
+    """With new: infer values from this log (CSV, Parquet, ROS 2 bags, logs of autopilots). The log of a run contains
+    the whole description."""
     picture: Path | None = None
-    """Draw the body and the stop into this image."""
-    json: bool = False
+    """With show: draw the body and the stop into this image."""
+    json: Json = False
 
     def run(self) -> int:
+        """Do the action. Returns the exit status; 1 if the description has mistakes."""
         return {"new": self._new, "check": self._check, "show": self._show}[self.action]()
 
     def _new(self) -> int:
@@ -37,14 +41,14 @@ class RobotCommand:
         if path.suffix != ".toml" or not NAME.fullmatch(path.stem):
             raise ValueError(f"{self.file}: a description is a file NAME.toml, NAME of letters, digits, '_' and '-'")
         if path.exists():
-            raise ValueError(f"{path} exists: `brakeline robot check {path}`")
-        template = (ROBOTS_FOLDER / "template.txt").read_text().replace('"NAME"', f'"{path.stem}"')
+            raise ValueError(f"{path} exists: check it with `brakeline robot check {path}`, or choose another name")
+        text = (ROBOTS_FOLDER / "template.txt").read_text().replace('"NAME"', f'"{path.stem}"')
         notes: tuple[str, ...] = ()
         if self.from_ is not None:
-            template, notes = _from_log(self.from_, template, path.stem)
-        path.write_text(template)
+            text, notes = _from_log(self.from_, text, path.stem)
+        path.write_text(text)
         if self.json:
-            say_json({"file": str(path), "notes": list(notes)})
+            print_json({"file": str(path), "notes": list(notes)})
             return 0
         for note in notes:
             console.print(note, markup=False)
@@ -56,50 +60,49 @@ class RobotCommand:
             robot = robot_named(self.file)
         except BadDescription as error:
             if self.json:
-                say_json({"file": self.file, "problems": [list(problem) for problem in error.problems]})
+                print_json({"file": self.file, "problems": [list(problem) for problem in error.problems]})
             else:
                 errors.print(str(error), markup=False)
             return 1
-        found = summary(robot)
+        remarks = summary(robot)["remarks"]
         if self.json:
-            say_json({"file": self.file, "problems": [], "remarks": found["remarks"]})
+            print_json({"file": self.file, "problems": [], "remarks": remarks})
             return 0
         console.print(f"{robot.name}: {len(robot.state)} coordinates, {len(robot.action)} inputs, no mistake")
-        for remark in found["remarks"]:
-            console.print(f"  {remark}", markup=False)
-        console.print(f"  {_task(self.file)}", markup=False)
+        for line in (*remarks, _task_text(self.file)):
+            console.print(f"  {line}", markup=False)
         console.print(f"next: `brakeline import LOG --robot {self.file}`, or `brakeline collect {self.file}`")
         return 0
 
     def _show(self) -> int:
         robot = robot_named(self.file)
-        found = summary(robot)
+        values = summary(robot)
         if self.picture is not None:
             picture(robot, self.picture)
-            found["picture"] = str(self.picture)
+            values["picture"] = str(self.picture)
         if self.json:
-            say_json(found)
+            print_json(values)
             return 0
         table = StackingTable(show_header=False, **PLAIN)
-        for label, one in found.pop("inputs").items():
+        for label, one in values.pop("inputs").items():
             table.add_row(escape(f"input {label}"), f"{one['low']:g} to {one['high']:g}, stop: {one['stop']}")
-        for name, value in found.items():
-            shown = "\n".join(value) if isinstance(value, list) else f"{value:g}" if isinstance(value, float) else value
-            table.add_row(name.replace("_", " "), escape(str(shown)))
+        for name, value in values.items():
+            text = "\n".join(value) if isinstance(value, list) else f"{value:g}" if isinstance(value, float) else value
+            table.add_row(name.replace("_", " "), escape(str(text)))
         console.print(table)
         return 0
 
 
-def _task(name: str) -> str:
+def _task_text(name: str) -> str:
     robot = robot_maybe_with_task(name)
     if not isinstance(robot, RobotWithTask):
-        return "no task beside it: enough to certify and to filter; to train, write NAME.task.toml (docs/your_robot.md)"
+        return "no task file beside it: you can certify and filter; to train, write NAME.task.toml (docs/your_robot.md)"
     task = robot.task
     return f"its task: {task.observation_dim} observed values, arenas {', '.join(task.arenas)}"
 
 
 def _from_log(source: Path, template: str, name: str) -> tuple[str, tuple[str, ...]]:
-    """A description's text, and what the log could not tell of it. Raises NoSource, LogError."""
+    """Return the text of a description, and notes on what the log does not show. Raises NoSource, LogError."""
     from brakeline.deploy.data.description_template import draft
     from brakeline.deploy.data.embedded_description import carried
     from brakeline.deploy.data.importer import own_log, tables_of
@@ -107,5 +110,5 @@ def _from_log(source: Path, template: str, name: str) -> tuple[str, tuple[str, .
 
     if own_log(source):
         return carried(source, name), ()
-    found = told(tables_of(source))
-    return draft(template, found, source.name), found.notes
+    schema = told(tables_of(source))
+    return draft(template, schema, source.name), schema.notes

@@ -1,4 +1,4 @@
-"""`brakeline watch`."""
+"""Implement `brakeline watch`: show a running system on a web page and in Foxglove."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from collections import deque
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 
-from brakeline.deploy.commands.common_options import Endpoints, Flags, console
+from brakeline.deploy.commands.common_options import BusOptions, Unprefixed, console
 from brakeline.logs.watch.dashboard import Dashboard
 from brakeline.logs.watch.foxglove_server import ORIGINS, FoxgloveServer
 from brakeline.logs.watch.live_page_server import LivePageServer
@@ -18,26 +18,29 @@ from brakeline.messaging.rejected_messages import RejectedMessages
 from brakeline.messaging.stop_signals import stop_on_signals
 from brakeline.messaging.topics import RECORDED
 
-TURN = 0.05  # s between two looks into the inbox
-INBOX = 20_000  # samples: beyond them the oldest are not shown, and nobody has to wait
+REFRESH_PERIOD = 0.05  # s
+INBOX_SIZE = 20_000  # samples; the oldest of more are not shown, so that no publisher has to wait
 
 
 @dataclass(frozen=True)
-class Watch:
-    endpoints: Flags[Endpoints] = field(default_factory=Endpoints)
+class WatchCommand:
+    """The options of `brakeline watch`."""
+
+    endpoints: Unprefixed[BusOptions] = field(default_factory=BusOptions)
     host: str = "127.0.0.1"
-    """Who may look: this machine alone, unless an address of it that others reach is given."""
+    """Address to serve at. Only this machine can watch, unless you give an address that others reach."""
     port: int = 8787
-    """Of the web page; 0: any."""
+    """Port of the web page. 0 takes any free port."""
     foxglove_port: int = 8765
-    """Of the server that Foxglove connects to; 0: any; -1: none."""
+    """Port of the server that Foxglove connects to. 0 takes any free port; -1 starts no server."""
     origins: tuple[str, ...] = ORIGINS
-    """Of the web pages that may connect there besides programs, e.g. https://app.foxglove.dev."""
+    """Web pages that may connect to the Foxglove server besides programs, such as https://app.foxglove.dev."""
     json: bool = False
-    """Print where to look as one JSON object on stdout."""
+    """Print the addresses as one JSON object on stdout."""
 
     def run(self) -> int:
-        inbox: deque[Sample] = deque(maxlen=INBOX)
+        """Serve the live views until SIGINT or SIGTERM. Returns the exit status."""
+        inbox: deque[Sample] = deque(maxlen=INBOX_SIZE)
         board, live = Dashboard(), None
         with ExitStack() as stack:
             bus = stack.enter_context(Bus(self.endpoints.bus(), f"viewer.watch-{time.time_ns() % 10**6}"))
@@ -47,23 +50,25 @@ class Watch:
             stop = stack.enter_context(stop_on_signals(threading.Event()))
             for topic in RECORDED:
                 bus.subscribe(topic, inbox.append)
-            self._say(server.url, live.url if live is not None else None)
-            while not stop.wait(TURN):
-                _show(inbox, board, live, bus.rejected)
+            self._print_addresses(server.url, live.url if live is not None else None)
+            while not stop.wait(REFRESH_PERIOD):
+                show_received(inbox, board, live, bus.rejected)
         return 0
 
-    def _say(self, page: str, foxglove: str | None) -> None:
+    def _print_addresses(self, page: str, foxglove: str | None) -> None:
         if self.json:
             print(json.dumps({"page": page, "foxglove": foxglove}), flush=True)
             return
         console.print(f"page:     {page}", markup=False)
         if foxglove is not None:
             console.print(f"Foxglove: {foxglove} (layout: logs/brakeline.foxglove-layout.json)", markup=False)
-        console.print("[dim]^C ends the watching; the run goes on[/]")
+        console.print("[dim]^C ends only this command; the run continues[/]")
 
 
-def _show(inbox: deque[Sample], board: Dashboard, live: FoxgloveServer | None, rejected: RejectedMessages) -> None:
-    """What has come since the last look."""
+def show_received(
+    inbox: deque[Sample], board: Dashboard, live: FoxgloveServer | None, rejected: RejectedMessages
+) -> None:
+    """Empty the inbox into the web page and the Foxglove server. Skip messages that can't be shown."""
     for _ in range(len(inbox)):
         sample = inbox.popleft()
         with rejected.skip_on_error(sample.key):

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from brakeline.deploy.data.excitation import excitation
-from brakeline.deploy.vehicle_factory import vehicle_in_yard
+from brakeline.deploy.vehicle_factory import vehicle_in_empty_arena
 from brakeline.messaging.robot import Robot
 from brakeline.messaging.task import RobotWithTask
 from brakeline.safety.model.dataset import Dataset, Trajectory
@@ -24,7 +24,7 @@ def record(
     """Drive trajectories from number `first` on, each from standing still, with its own generator: (seed, number)."""
     for number in range(first, trajectories):
         rng = np.random.default_rng((seed, number))
-        vehicle = vehicle_in_yard(robot, rng, conditions)
+        vehicle = vehicle_in_empty_arena(robot, rng, conditions)
         states, inputs, paths, turned = [vehicle.measured], [], [], []
         for u in itertools.islice(excitation(robot, rng), PERIODS):
             period = vehicle.step(u)

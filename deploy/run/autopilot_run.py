@@ -1,4 +1,4 @@
-"""Quadrotors behind MAVLink, in real time, at one end of a link."""
+"""Simulate quadrotors behind MAVLink in real time, at one end of a link."""
 
 from __future__ import annotations
 
@@ -24,36 +24,35 @@ from brakeline.sim.lidar import Lidar
 from brakeline.sim.quadrotor import Quadrotor
 from brakeline.sim.wind import Wind
 
-FIELD = 1000.0  # m to the walls of the open field
-PAD = 0.02  # m, height of the plane to stand on above an arena's own floor, which is an obstacle
+FIELD_SIZE = 1000.0  # m from the origin to the walls of the open field
+PAD = 0.02  # m, height of the ground above the arena's own floor, which is an obstacle
 
 
 @dataclass(frozen=True)
 class AutopilotSettings:
+    """Settings of the simulated vehicles and their autopilots."""
+
     url: str
-    rules: str = "px4"  # whose modes, refusals and parameters: px4 or ardupilot
-    vehicles: int = 1  # by system id 1, 2, ...; they pass through each other
-    arena: str = ""  # of the quadrotor, drawn with the seed; without one: an open field
+    rules: str = "px4"  # modes, refusals and parameters: px4 or ardupilot
+    vehicles: int = 1  # with system ids 1, 2, ...; they pass through each other
+    arena: str = ""  # of the quadrotor, drawn with the seed; empty: an open field
     seed: int = 0
-    airborne: bool = False  # start hovering at the arena's start, armed, instead of on the ground below it
-    setpoint_timeout: float | None = None  # s without a setpoint until it brakes; None: as the rules' parameter has it
+    airborne: bool = False  # start armed and hovering at the arena's start, instead of on the ground below it
+    setpoint_timeout: float | None = None  # s without a setpoint after which it brakes; None: the rules' parameter
     wind: Wind = field(default_factory=Wind)
-    truth: str = "127.0.0.1:14600"  # where states and collisions go, as JSON in UDP datagrams; empty: nowhere
-    seconds: float = 0.0  # until it ends; 0: on SIGINT or SIGTERM
-    at_once: bool = False  # it follows setpoints at once, as the vehicle that was recorded; else as it is delivered
+    truth: str = "127.0.0.1:14600"  # HOST:PORT that gets states and collisions, as JSON in UDP; empty: none
+    seconds: float = 0.0  # duration; 0: until SIGINT or SIGTERM
+    at_once: bool = False  # follow setpoints at once, as the recorded vehicle does; else with the delivered limits
 
 
-def fly(settings: AutopilotSettings, begun: Callable[[Arena], Any] = lambda arena: None) -> ServerStats:
-    """Serve the vehicles until asked to end; `begun` is called when the link is open."""
-    arena = flight_arena(settings.arena, settings.seed) if settings.arena else open_field()
+def fly(settings: AutopilotSettings, on_start: Callable[[Arena], Any] = lambda arena: None) -> ServerStats:
+    """Serve the vehicles until the duration ends, SIGINT or SIGTERM. Calls `on_start` when the link is open."""
+    arena = arena_or_field(settings.arena, settings.seed)
     link = open_link(settings.url)
-    truth = None
-    if settings.truth:
-        host, _, port = settings.truth.rpartition(":")
-        truth = TruthSender(host or "127.0.0.1", int(port))
+    truth = open_truth(settings.truth)
     autopilots = [vehicle(settings, arena, system) for system in range(1, settings.vehicles + 1)]
     clock = WallClock()
-    begun(arena)
+    on_start(arena)
     try:
         with stop_on_signals(threading.Event(), patient=True) as stop:
             return serve(autopilots, link, clock, lambda: stop.is_set() or 0.0 < settings.seconds <= clock.now(), truth)
@@ -62,7 +61,7 @@ def fly(settings: AutopilotSettings, begun: Callable[[Arena], Any] = lambda aren
 
 
 def vehicle(settings: AutopilotSettings, arena: Arena, system: int) -> Autopilot:
-    """The endpoint of one vehicle."""
+    """Return the MAVLink endpoint of one vehicle."""
     rng = np.random.default_rng((settings.seed, system))
     noise = QuadrotorNoise()
     quadrotor = Quadrotor(arena, rng, noise, settings.wind, floor=None if settings.airborne else PAD)
@@ -74,14 +73,18 @@ def vehicle(settings: AutopilotSettings, arena: Arena, system: int) -> Autopilot
     return Autopilot(quadrotor, settings.rules, system, parameters, lidar)
 
 
+def arena_or_field(name: str, seed: int) -> Arena:
+    """Return the arena with this name, drawn with the seed; an open field for an empty name."""
+    return flight_arena(name, seed) if name else open_field()
+
+
 def open_field() -> Arena:
-    """Nothing but walls far away; the origin is where to start."""
-    return Arena(
-        "open field",
-        room_boundary(FIELD, FIELD),
-        (0.0, 0.0, 5.0),
-        (10.0, 0.0, 5.0),
-        1.0,
-        10**9,
-        room_bounds(FIELD, FIELD),
-    )
+    """Return an arena with nothing in it but walls far away, and the start at its middle."""
+    walls, bounds = room_boundary(FIELD_SIZE, FIELD_SIZE), room_bounds(FIELD_SIZE, FIELD_SIZE)
+    return Arena("open field", walls, (0.0, 0.0, 5.0), (10.0, 0.0, 5.0), 1.0, 10**9, bounds)
+
+
+def open_truth(address: str) -> TruthSender | None:
+    """Return the sender of true states to HOST:PORT; None for an empty address."""
+    host, _, port = address.rpartition(":")
+    return TruthSender(host or "127.0.0.1", int(port)) if address else None

@@ -1,4 +1,4 @@
-"""A vehicle's first flight, from the link to the landing."""
+"""Fly a vehicle for the first time, from the link to the landing, to record its first data set."""
 
 from __future__ import annotations
 
@@ -6,69 +6,83 @@ import logging
 import threading
 import time
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from brakeline.actors.mavlink.mavlink_vehicle import MavlinkVehicle
-from brakeline.actors.mavlink.vehicle_socket import listening
-from brakeline.deploy.data.first_flight import Box, Found, Maiden
 from brakeline.messaging.byte_links import open_link
 from brakeline.messaging.robot import Robot
 from brakeline.messaging.stop_signals import stop_on_signals
 
-LANDING = 120.0  # s that a landing may take
+if TYPE_CHECKING:
+    from brakeline.deploy.data.first_flight import Found
+
+LANDING_TIMEOUT = 120.0  # s
 
 
 @dataclass(frozen=True)
-class MaidenSettings:
-    url: str
-    system: int = 1
+class FirstFlightSettings:
+    """The first flight of a vehicle. These are options of `brakeline collect --url`."""
+
     minutes: float = 15.0
-    height: float = 30.0  # m
-    room: float = 80.0  # m, the side of the square
-    seed: int = 0
+    """Duration of the flight [min], without takeoff and landing."""
+    height: float = 30.0
+    """Height that the vehicle climbs to [m]. It stays between a third and five thirds of it."""
+    room: float = 80.0
+    """Side of the square that the vehicle stays in [m]."""
+    system: int = 1
+    """MAVLink system id of the vehicle."""
     raise_limits: bool = False
+    """Raise the parameters of the vehicle that limit it below its description: speeds, accelerations, tilt."""
     lead: bool = False
+    """Send position targets instead of velocities. When setpoints stop, the vehicle then stays at the last target; an
+    ArduCopter without GUID_TIMEOUT would fly on for 3 s. The vehicle flies differently then: use the option with both
+    `collect` and `fly`."""
 
 
-def fly(robot: Robot, settings: MaidenSettings) -> Found:
-    """Take off, fly, land. SIGINT or SIGTERM: land at once; what was flown counts.
+def fly(robot: Robot, url: str, seed: int, settings: FirstFlightSettings) -> Found:
+    """Take off, fly, land, and return the recorded data and the model set of it.
+
+    SIGINT or SIGTERM land the vehicle at once; the data until then count.
+
+    Args:
+        robot: the description in real time.
+        url: the MAVLink link.
 
     Raises:
-        BadLink, MavlinkError: with what to do; BadData: nothing was flown.
+        BadLink, MavlinkError: the vehicle can't be flown; the message says what to do.
+        BadData: nothing was recorded.
     """
+    from brakeline.actors.mavlink.mavlink_vehicle import MavlinkVehicle
+    from brakeline.actors.mavlink.vehicle_socket import listening
+    from brakeline.deploy.data.first_flight import Box, Maiden
+
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s", datefmt="%H:%M:%S")
     with (
-        stop_on_signals(threading.Event(), patient=True) as stop,  # a second one must not leave it in the air
-        listening(settings.url, settings.system),  # so that no actor of this machine takes it
+        stop_on_signals(
+            threading.Event(), patient=True
+        ) as stop,  # a second signal must not leave the vehicle in the air
+        listening(url, settings.system),  # so that no actor of this machine takes the vehicle
     ):
-        return _flown(robot, settings, stop)
-
-
-def _flown(robot: Robot, settings: MaidenSettings, stop: threading.Event) -> Found:
-    vehicle = MavlinkVehicle(
-        open_link(settings.url),
-        robot,
-        settings.system,
-        settings.height,
-        stop=stop.is_set,
-        raise_limits=settings.raise_limits,
-        lead=settings.lead,
-    )
-    try:
-        middle = vehicle.current_period.report.measured[:3]
-        box = Box(middle, np.array([0.5 * settings.room, 0.5 * settings.room, settings.height * 2.0 / 3.0]))
-        about = {"autopilot": "; ".join(vehicle.notes), "url": settings.url}
-        found = Maiden(vehicle, robot, box, settings.seed, stop.is_set).fly(settings.minutes, about)
-        vehicle.wait(vehicle.current_period.number + robot.horizon)
-        vehicle.land()
-        _await_landing(vehicle)
-    finally:
-        vehicle.close()
-    return found
-
-
-def _await_landing(vehicle: MavlinkVehicle) -> None:
-    deadline = time.monotonic() + LANDING
-    while vehicle.armed and time.monotonic() < deadline:
-        vehicle.listen(1.0)
+        vehicle = MavlinkVehicle(
+            open_link(url),
+            robot,
+            settings.system,
+            settings.height,
+            stop=stop.is_set,
+            raise_limits=settings.raise_limits,
+            lead=settings.lead,
+        )
+        try:
+            middle = vehicle.current_period.report.measured[:3]
+            box = Box(middle, np.array([0.5 * settings.room, 0.5 * settings.room, settings.height * 2.0 / 3.0]))
+            metadata = {"autopilot": "; ".join(vehicle.notes), "url": url}
+            flight = Maiden(vehicle, robot, box, seed, stop.is_set).fly(settings.minutes, metadata)
+            vehicle.wait(vehicle.current_period.number + robot.horizon)
+            vehicle.land()
+            deadline = time.monotonic() + LANDING_TIMEOUT
+            while vehicle.armed and time.monotonic() < deadline:
+                vehicle.listen(1.0)
+        finally:
+            vehicle.close()
+    return flight

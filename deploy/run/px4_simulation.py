@@ -1,5 +1,7 @@
-"""A real PX4 with our physics, in real time or as fast as both can: flight code, estimator and failsafes are its own;
-vehicle, sensors and arena are ours."""
+"""Simulate the physics for a real PX4, in real time or as fast as both can.
+
+Flight code, estimator and failsafes are PX4's own. This program simulates vehicle, sensors and arena.
+"""
 
 from __future__ import annotations
 
@@ -11,8 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from brakeline.deploy.quadrotor_vehicles import flight_arena
-from brakeline.deploy.run.autopilot_run import PAD, open_field
+from brakeline.deploy.run.autopilot_run import PAD, arena_or_field, open_truth
 from brakeline.messaging.process_clock import Clock, WallClock
 from brakeline.messaging.stop_signals import stop_on_signals
 from brakeline.sim.arena import Arena
@@ -24,32 +25,32 @@ from brakeline.sim.flight_estimator import QuadrotorNoise
 from brakeline.sim.quadrotor import Quadrotor
 from brakeline.sim.wind import Wind
 
-HERE = ("127.0.0.1", "localhost")
-
 
 @dataclass(frozen=True)
 class HilSettings:
-    folder: Path  # of PX4
-    url: str = "udpout:127.0.0.1:14540"  # where it sends MAVLink
-    arena: str = ""  # of the quadrotor, drawn with the seed; without one: an open field
+    """Settings of PX4 and of the simulated physics (hardware in the loop)."""
+
+    folder: Path  # of a PX4 that was built for SITL
+    url: str = "udpout:127.0.0.1:14540"  # where PX4 sends MAVLink
+    arena: str = ""  # of the quadrotor, drawn with the seed; empty: an open field
     seed: int = 0
     noise: SensorNoise = field(default_factory=SensorNoise)
     wind: Wind = field(default_factory=Wind)
     parameters: dict[str, float] = field(default_factory=dict)  # of PX4
-    truth: str = "127.0.0.1:14600"  # where states and collisions go, as JSON in UDP datagrams; empty: nowhere
-    speed: float = 1.0  # times real time; 0: as fast as it goes
-    seconds: float = 0.0  # of simulated time until it ends; 0: on SIGINT or SIGTERM
+    truth: str = "127.0.0.1:14600"  # HOST:PORT that gets states and collisions, as JSON in UDP; empty: none
+    speed: float = 1.0  # multiple of real time; 0: as fast as possible
+    seconds: float = 0.0  # simulated duration; 0: until SIGINT or SIGTERM
 
 
 @dataclass
-class Flown:
-    """How it went. Times in s, from PX4's first answer on."""
+class FlightResult:
+    """Figures of a flight, from PX4's first answer on."""
 
-    simulated: float = 0.0
-    real: float = 0.0
+    simulated: float = 0.0  # s
+    real: float = 0.0  # s
     speed: float = 0.0  # simulated seconds in a real one
     unanswered: int = 0  # physics steps at which PX4 did not answer in time
-    slips: int = 0  # times it gave up catching up with real time
+    slips: int = 0  # times that the simulation gave up catching up with real time
     collisions: int = 0  # touches of an obstacle
 
     def __str__(self) -> str:
@@ -59,72 +60,73 @@ class Flown:
         )
 
 
-def fly(settings: HilSettings, begun: Callable[[Quadrotor], Any] = lambda vehicle: None) -> Flown:
-    """Start PX4 and let it fly until asked to end; `begun` is called when it has answered for the first time.
+def fly(settings: HilSettings, on_start: Callable[[Quadrotor], Any] = lambda vehicle: None) -> FlightResult:
+    """Start PX4 and let it fly until the duration ends, SIGINT or SIGTERM.
+
+    Args:
+        on_start: is called when PX4 has answered for the first time.
 
     Raises:
-        Px4Error: it is not there or does not start; AutopilotGone: it went silent; ValueError: the URL is none of here.
+        Px4Error: PX4 is not in the folder or does not start.
+        AutopilotGone: PX4 fell silent.
+        ValueError: the URL is not on this machine.
     """
     port = _port(settings.url)
-    arena = flight_arena(settings.arena, settings.seed) if settings.arena else open_field()
+    arena = arena_or_field(settings.arena, settings.seed)
     px4 = Px4Process(settings.folder, port, settings.parameters)
-    truth = _truth(settings.truth)
+    truth = open_truth(settings.truth)
     try:
         with stop_on_signals(threading.Event(), patient=True) as stop:
-            return _served(settings, px4, arena, truth, stop, begun)
+            hil = HilLink(px4.connection, *_vehicle(settings, arena))
+            while not hil.answering and not stop.is_set():
+                hil.tick()
+            on_start(hil.vehicle)
+            end = settings.seconds or float("inf")
+            return serve(hil, WallClock(), settings.speed, lambda: stop.is_set() or hil.time >= end, truth)
     except AutopilotGone as error:
-        raise AutopilotGone(f"{error}; PX4's last words:\n{px4.last_words()}") from error
+        raise AutopilotGone(f"{error}; PX4's last output:\n{px4.last_words()}") from error
     finally:
         px4.close()
         if truth is not None:
             truth.close()
 
 
-def _served(
-    settings: HilSettings,
-    px4: Px4Process,
-    arena: Arena,
-    truth: TruthSender | None,
-    stop: threading.Event,
-    begun: Callable[[Quadrotor], Any],
-) -> Flown:
-    hil = HilLink(px4.connection, *_vehicle(settings, arena))
-    while not hil.answering and not stop.is_set():
-        hil.tick()
-    begun(hil.vehicle)
-    over = settings.seconds or float("inf")
-    return serve(hil, WallClock(), settings.speed, lambda: stop.is_set() or hil.time >= over, truth)
-
-
 def serve(
     hil: HilLink, clock: Clock, speed: float, stop: Callable[[], bool], truth: TruthSender | None = None
-) -> Flown:
-    """Step by step until told to stop, no faster than `speed` times the clock's time; 0: as fast as it goes."""
-    flown, step = Flown(), hil.vehicle.timestep
-    begin, since = clock.now(), hil.time
-    due, every, count, touching = begin, round(1.0 / TRUTH_RATE / step), 0, False
+) -> FlightResult:
+    """Simulate step by step until `stop` returns True.
+
+    Args:
+        speed: highest multiple of the clock's time; 0: as fast as possible.
+    """
+    result, step = FlightResult(), hil.vehicle.timestep
+    start, simulated_start = clock.now(), hil.time
+    due, steps_per_report, count, touching = start, round(1.0 / TRUTH_RATE / step), 0, False
     while not stop():
         hil.vehicle.collided = False
         hil.tick()
-        begun = hil.vehicle.collided and not touching
+        touched = hil.vehicle.collided and not touching
         touching = hil.vehicle.collided
-        flown.collisions += begun
-        if truth is not None and (begun or count % every == 0):
-            truth.send(1, hil.time, hil.vehicle, flown.collisions)
+        result.collisions += touched
+        if truth is not None and (touched or count % steps_per_report == 0):
+            truth.send(1, hil.time, hil.vehicle, result.collisions)
         count += 1
         if speed:
             due += step / speed
             clock.sleep_until(due)
             if clock.now() - due > PATIENCE:
-                flown.slips += 1
+                result.slips += 1
                 due = clock.now()
-    flown.simulated, flown.real = hil.time - since, clock.now() - begin
-    flown.speed, flown.unanswered = flown.simulated / max(flown.real, 1e-9), hil.unanswered
-    return flown
+    result.simulated, result.real = hil.time - simulated_start, clock.now() - start
+    result.speed, result.unanswered = result.simulated / max(result.real, 1e-9), hil.unanswered
+    return result
 
 
 def _vehicle(settings: HilSettings, arena: Arena) -> tuple[Quadrotor, HilSensors]:
-    """On the floor below the arena's start; its estimator is PX4's, so ours errs in nothing."""
+    """Return the vehicle on the floor below the arena's start, and its sensors.
+
+    The vehicle's own estimator has no errors, for PX4 estimates.
+    """
     rng = np.random.default_rng((settings.seed, 1))
     vehicle = Quadrotor(arena, rng, QuadrotorNoise(scale=0.0), settings.wind, floor=PAD)
     return vehicle, HilSensors(settings.noise, rng, vehicle.timestep)
@@ -132,13 +134,6 @@ def _vehicle(settings: HilSettings, arena: Arena) -> tuple[Quadrotor, HilSensors
 
 def _port(url: str) -> int:
     kind, host, port = [*url.split(":"), "", ""][:3]
-    if kind != "udpout" or host not in HERE or not port.isdigit():
+    if kind != "udpout" or host not in ("127.0.0.1", "localhost") or not port.isdigit():
         raise ValueError(f"PX4 sends to a port of this machine: udpout:127.0.0.1:PORT, not {url!r}")
     return int(port)
-
-
-def _truth(address: str) -> TruthSender | None:
-    if not address:
-        return None
-    host, _, port = address.rpartition(":")
-    return TruthSender(host or HERE[0], int(port))

@@ -40,7 +40,7 @@ EXAMPLES = 20  # decisions that are told in full: those with the largest differe
 NAMES = {pb.UNKNOWN: "error", **KINDS}
 
 Waiting = dict[tuple[tuple[str, ...], int, int], dict[str, tuple[pb.Request, pb.Reply]]]  # fleets not yet whole
-Instead = Callable[[Robot], Method]  # what is asked about a robot in place of what was in use
+Replacement = Callable[[Robot], Method]  # what is asked about a robot in place of what was in use
 
 
 class ReplayError(ValueError):
@@ -193,7 +193,7 @@ def _difference(one: Any, other: Any) -> Difference:
     return Difference(float(off.max(initial=0.0)), bool((off <= ROUNDING * np.maximum(np.abs(first), 1.0)).all()))
 
 
-def replay(paths: Paths, instead: Instead | None = None, each: Callable[[], Any] = lambda: None) -> Comparison:
+def replay(paths: Paths, instead: Replacement | None = None, each: Callable[[], Any] = lambda: None) -> Comparison:
     """Ask every question of the log at `paths` again; `each` is called after every one.
 
     With `instead`, the plans that were committed to count as verified by what is asked now.

@@ -1,14 +1,14 @@
-"""Named whole-system configurations, and a run's one resolved configuration as it is saved and read back."""
+"""Define the configuration of a run, the named experiments, and how a configuration is saved and loaded."""
 
 from __future__ import annotations
 
 import dataclasses
 import json
-import types
-import typing
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, ClassVar, TypeVar
+
+import tyro
 
 from brakeline.actors.actor_settings import FlightSettings, PhysicsChange
 from brakeline.learner.learner_config import LearnerConfig, TD3Config
@@ -18,48 +18,80 @@ from brakeline.safety.model.model_config import ModelConfig
 from brakeline.sim.sim_conditions import Conditions
 
 METHODS = (*FILTERS, "none")
+FORMER_NAMES = {"recipe": "model_config"}  # names that fields have in older files
+
+T = TypeVar("T")
+Internal = Annotated[T, tyro.conf.Suppress]  # a field that commands set from other options, or by themselves
 
 
 @dataclass(frozen=True)
-class Embedded:
+class AutopilotConfig:
     """The simulated autopilot of a flight in real time."""
 
     rules: str = "px4"
-    setpoint_timeout: float = 0.2  # s without a setpoint until it brakes
+    setpoint_timeout: float = 0.2  # s without a setpoint after which the autopilot brakes
 
 
 @dataclass(frozen=True)
 class RunConfig:
-    """Everything that a run depends on, besides the machine."""
+    """Everything that a run depends on, besides the machine. `brakeline train` makes its options from these fields.
 
-    robots: tuple[str, ...] = ("ground",)
-    method: str = "ddpc"
-    model_config: ModelConfig = field(default_factory=ModelConfig)
-    accept_bound: float | None = None  # the largest stated bound that is accepted; None: each robot's own limit
+    Raises ValueError if the values contradict each other.
+    """
+
+    __pydantic_config__: ClassVar[dict[str, str]] = {"extra": "forbid"}  # for this and all nested dataclasses
+
+    robots: Annotated[tuple[str, ...], tyro.conf.Positional] = ("ground",)
+    """Robots to train: names, or paths of robot descriptions (.toml). Each has a learner and actors of its own; all
+    share the safety service."""
+    method: Internal[str] = "ddpc"
+    model_config: Internal[ModelConfig] = field(default_factory=ModelConfig)
+    accept_bound: Internal[float | None] = None  # largest accepted stated bound; None: the limit of each description
     arena: str = "default"
-    actors: int = 2  # processes a robot kind
-    robots_per_actor: int = 1  # robots in a process; they share a question to the safety service
-    fleet: int = 0  # as many, if they share a world too
-    steps: int = 100_000  # a robot kind
+    """Name of the arena."""
+    actors: int = 2
+    """Actor processes for each robot kind. With --from-logs it may be 0."""
+    robots_per_actor: int = 1
+    """Robots in each actor process. They share one request to the safety service."""
+    fleet: int = 0
+    """Robots in each actor process that share one world and avoid each other. 0 gives each robot a world of its own."""
+    steps: int = 100_000
+    """Training steps for each robot kind."""
     seed: int = 0
-    penalty: float = 1.0  # for a correction by the whole range of an input
-    deadline: float = 0.1  # s for an answer of the safety service
-    deterministic: bool = False  # one actor, lockstep, no deadlines
-    from_logs: tuple[str, ...] = ()  # files or folders whose steps are learned from first; with no actor: only these
-    replicas: int = 1  # of the safety service
-    record: bool = True  # a log; without one nothing can be analysed or replayed
-    rotation: Rotation = field(default_factory=Rotation)  # of the log's files
-    pictures: float = 10.0  # a second and robot, drawn for Foxglove in the log; 0: none
-    practice: float = 0.0  # share of steps at which a robot starts to follow its committed plan to the stop
-    change: PhysicsChange = field(default_factory=PhysicsChange)  # of the robots, in mid-run
-    conditions: Conditions = field(default_factory=Conditions)
-    policy: str = ""  # a file or a name, as `evaluate` takes it; empty: one is learned
-    flights: tuple[
-        FlightSettings, ...
-    ] = ()  # in real time behind links, an actor each; none: simulated as fast as it goes
-    autopilot: Embedded | None = None  # that the run starts itself, at the other end of each link
-    mavlink: bool = False  # every frame of quadrotors in memory into the log; those of a flight always are
+    """Seed of all random draws of the run."""
+    penalty: float = 1.0
+    """Penalty subtracted from the learned reward for a correction by the whole range of an input."""
+    deadline: float = 0.1
+    """Time that an actor waits for an answer of the safety service [s]. Then the robot brakes along its backup plan."""
+    deterministic: bool = False
+    """Run one actor in lockstep without deadlines: the same seed gives the same weights, bit for bit."""
+    from_logs: tuple[str, ...] = ()
+    """Logs (files or run folders) whose steps the learner takes before any robot starts. With --actors 0 it learns from
+    them alone; with --resume they replace a lost checkpoint."""
+    replicas: int = 1
+    """Safety service processes. A robot goes on if one of several fails."""
+    record: bool = True
+    """Record a log. Without a log you can't analyse, replay or certify the run."""
+    rotation: Rotation = field(default_factory=Rotation)
+    """Sizes at which the recorder begins the next file of the log."""
+    pictures: float = 10.0
+    """Pictures a second and robot that the recorder draws into the log for Foxglove, besides one of each intervention.
+    0 draws none at all."""
+    practice: float = 0.0
+    """Share of the steps at which a robot starts to follow its backup plan to the stop, so that the log has the stops
+    that `brakeline certify LOG` needs."""
+    change: PhysicsChange = field(default_factory=PhysicsChange)
+    """A change of the robots or the floor in the middle of the run, such as --change.after 5000 --change.payload-kg 1.
+    """
+    conditions: Internal[Conditions] = field(default_factory=Conditions)
+    policy: Internal[str] = ""  # a name or a file, as `evaluate` takes it; empty: the run learns a policy
+    flights: Internal[tuple[FlightSettings, ...]] = ()  # links to vehicles in real time, one for each actor
+    autopilot: Internal[AutopilotConfig | None] = None  # that the run starts at the other end of each link
+    mavlink: bool = False
+    """Log each MAVLink frame of simulated quadrotors, as bytes and as JSON. This about doubles the size of the log.
+    Flights in real time always log them."""
     learner: LearnerConfig = field(default_factory=lambda: LearnerConfig(checkpoint_every=2500))
+    """The learner and its algorithm (TD3)."""
 
     def __post_init__(self) -> None:
         if self.method not in METHODS:
@@ -72,26 +104,29 @@ class RunConfig:
             raise ValueError(
                 "actors (unless there are logs to learn from), robots per actor, replicas, steps: 1 or more"
             )
+        one_robot = self.robots_per_actor == 1 and len(self.robots) == 1
         if self.deterministic and self.from_logs:
-            raise ValueError("a deterministic run learns from its own actor, not from logs")
-        if self.deterministic and (self.actors != 1 or self.robots_per_actor != 1 or len(self.robots) != 1):
+            raise ValueError("a deterministic run learns from its own actor, not from logs: leave out --from-logs")
+        if self.deterministic and not (self.actors == 1 and one_robot):
             raise ValueError("a deterministic run has one actor with one robot: --actors 1")
-        if self.flights and (self.actors != len(self.flights) or self.robots_per_actor != 1 or len(self.robots) != 1):
-            raise ValueError("flights in real time have one actor each, with one robot of one kind")
+        if self.flights and not (self.actors == len(self.flights) and one_robot):
+            raise ValueError("each flight in real time has one actor with one robot, all of one kind")
 
     @property
     def filtered(self) -> bool:
-        """Is anybody asked before a robot acts? Offline there is no robot."""
+        """Whether robots act, and a filter checks their actions. Learning from logs alone moves no robot."""
         return self.method != "none" and self.actors > 0
 
     def learning(self) -> LearnerConfig:
-        """The learner's part, with what it shares with the others."""
+        """Return the learner's configuration, with the seed, steps and lockstep of the run."""
         return replace(self.learner, seed=self.seed, steps=self.steps, lockstep=self.deterministic)
 
 
 def _check_arenas(robots: tuple[str, ...], arena: str) -> None:
-    """Raises ValueError: a robot or its arena does not exist. Other than the defaults', which need no look: what
-    `train --help` reads has no simulator to wait for."""
+    """Check that the robots and their arena exist. Raises ValueError.
+
+    The caller skips the default robot and arena, so that `train --help` does not import the simulator.
+    """
     from brakeline.messaging.task import robot_with_task
     from brakeline.sim.arena_generator import arena_kind
 
@@ -103,7 +138,7 @@ def _check_arenas(robots: tuple[str, ...], arena: str) -> None:
 
 
 def _check_fleets(config: RunConfig) -> None:
-    """Raises NoFleet."""
+    """Check that the robots can share a world. Raises NoFleet."""
     from brakeline.messaging.task import robot_with_task
     from brakeline.sim.shared_world import check_fleet
 
@@ -114,7 +149,7 @@ def _check_fleets(config: RunConfig) -> None:
 EXPERIMENTS: dict[str, RunConfig] = {
     "default": RunConfig(),
     "demo": RunConfig(steps=24_000),
-    # Minutes of nothing: whole runs in the tests, with networks too small to learn much.
+    # For tests of whole runs: ends within minutes, with networks that are too small to learn much.
     "debug": RunConfig(
         steps=1_200,
         learner=LearnerConfig(
@@ -124,48 +159,31 @@ EXPERIMENTS: dict[str, RunConfig] = {
 }
 
 
-# Names that fields had in older files.
-FORMER = {"recipe": "model_config"}
-
-
-def encode(config: Any) -> str:
-    """JSON of a configuration."""
+def encode(config: RunConfig) -> str:
+    """Return a configuration as JSON."""
     return json.dumps(dataclasses.asdict(config), indent=2)
 
 
-def decode(kind: type[Any], values: Any) -> Any:
-    """The configuration (a dataclass, nested ones included) that `encode` wrote.
+def decode(text: str) -> RunConfig:
+    """Return the configuration that `encode` wrote, now or in an older version.
 
-    Raises:
-        ValueError: a field is unknown: the file is another version's.
+    Raises ValueError if the text is no JSON, a field is unknown or a value is not allowed.
     """
-    if not isinstance(values, dict):
-        raise ValueError(f"{kind.__name__} is an object of named values, not {values!r}")
-    hints = typing.get_type_hints(kind)
-    values = {FORMER.get(name, name): value for name, value in values.items()}
-    unknown = values.keys() - {f.name for f in dataclasses.fields(kind)}
-    if unknown:
-        raise ValueError(f"{kind.__name__} has no {', '.join(sorted(unknown))}: written by another version?")
-    return kind(**{name: _value(hints[name], value) for name, value in values.items()})
+    from pydantic import TypeAdapter, ValidationError  # here, so that `--help` does not wait for it
 
-
-def _value(hint: Any, value: Any) -> Any:
-    if value is None:
-        return None
-    if typing.get_origin(hint) in (typing.Union, types.UnionType):
-        hint = next(part for part in typing.get_args(hint) if part is not type(None))
-    if dataclasses.is_dataclass(hint):
-        return decode(typing.cast(type[Any], hint), value)
-    if typing.get_origin(hint) is tuple:
-        (part, *_) = typing.get_args(hint)
-        return tuple(decode(part, each) if isinstance(each, dict) else each for each in value)
-    return Path(value) if hint is Path else value
+    values: Any = json.loads(text)
+    if isinstance(values, dict):
+        values = {FORMER_NAMES.get(name, name): value for name, value in values.items()}
+    try:
+        return TypeAdapter(RunConfig).validate_python(values)
+    except ValidationError as error:
+        problems = (f"{'.'.join(map(str, problem['loc']))}: {problem['msg']}" for problem in error.errors())
+        raise ValueError("; ".join(problem.removeprefix(": ") for problem in problems)) from error
 
 
 def load(path: Path) -> RunConfig:
-    """Raises ValueError, naming the file, when it is no run's configuration."""
+    """Load the configuration of a run from a file. Raises ValueError, which names the file."""
     try:
-        config: RunConfig = decode(RunConfig, json.loads(path.read_text()))
-    except (OSError, ValueError, TypeError, KeyError) as error:
+        return decode(path.read_text())
+    except (OSError, ValueError) as error:
         raise ValueError(f"{path} is no run's configuration: {error}") from error
-    return config

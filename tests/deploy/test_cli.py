@@ -13,9 +13,9 @@ import pytest
 from rich.console import Console
 
 from brakeline.deploy import progress
-from brakeline.deploy.cli import COMMANDS, find, main
-from brakeline.deploy.commands.certify import table
-from brakeline.deploy.commands.query import obstacle_of, sensed_in
+from brakeline.deploy.cli import COMMANDS, command_class, main
+from brakeline.deploy.commands.certify_command import validation_table
+from brakeline.deploy.commands.query_command import load_scan, parse_obstacle
 from brakeline.logs.report import analyse
 from brakeline.logs.segment import open_segment
 from brakeline.messaging.obstacle import Obstacle
@@ -81,7 +81,7 @@ def test_help_shows_the_example_and_ends_with_0(command, name):
 @pytest.mark.parametrize("name", COMMANDS)
 def test_every_example_is_understood(name, monkeypatch):
     understood = []
-    monkeypatch.setattr(find(name), "run", lambda self: understood.append(self) or 0)
+    monkeypatch.setattr(command_class(name), "run", lambda self: understood.append(self) or 0)
     assert main(shlex.split(COMMANDS[name].example)[1:]) == 0 and understood
 
 
@@ -149,12 +149,12 @@ def test_a_run_that_could_not_listen_can_be_started_again(command, data_folder, 
 
 
 def test_obstacles_are_read_as_words():
-    assert obstacle_of(("cylinder", "0.4", "0", "0.1"), 2) == Obstacle("cylinder", (0.4, 0.0), (0.1,))
-    assert obstacle_of(("box", "1", "2", "0.3", "0.4", "0.5"), 2) == Obstacle("box", (1.0, 2.0), (0.3, 0.4), 0.5)
-    assert obstacle_of(("wall", "1", "0", "3.14"), 2) == Obstacle("wall", (1.0, 0.0), (), 3.14)
+    assert parse_obstacle(("cylinder", "0.4", "0", "0.1"), 2) == Obstacle("cylinder", (0.4, 0.0), (0.1,))
+    assert parse_obstacle(("box", "1", "2", "0.3", "0.4", "0.5"), 2) == Obstacle("box", (1.0, 2.0), (0.3, 0.4), 0.5)
+    assert parse_obstacle(("wall", "1", "0", "3.14"), 2) == Obstacle("wall", (1.0, 0.0), (), 3.14)
     for wrong in ((), ("pond", "1", "2"), ("cylinder", "1", "2"), ("box", "1", "2", "x", "4")):
         with pytest.raises(ValueError, match="an obstacle is"):
-            obstacle_of(wrong, 2)
+            parse_obstacle(wrong, 2)
 
 
 def test_collect_is_reproducible_by_its_seed(figures, tmp_path):
@@ -238,7 +238,9 @@ def said(**figures):
 def test_certificates_are_told_whole_at_any_width(columns):
     file = io.StringIO()
     console = Console(file=file, width=columns, force_terminal=True, color_system=None, soft_wrap=True)
-    console.print(table([(said(), "plan"), (said(half_width_full=float("nan"), certificate="residual"), "free")]))
+    console.print(
+        validation_table([(said(), "plan"), (said(half_width_full=float("nan"), certificate="residual"), "free")])
+    )
     shown = file.getvalue()
     assert "…" not in shown and max(map(len, shown.splitlines())) <= columns
     for word in (
@@ -344,7 +346,7 @@ def test_a_configuration_may_say_every_method_that_can_be_served():
 def test_a_scan_is_read_from_a_file(tmp_path):
     def read(dim, text):
         (tmp_path / "seen.json").write_text(text)
-        return sensed_in(tmp_path / "seen.json", dim)
+        return load_scan(tmp_path / "seen.json", dim)
 
     scan = read(2, '{"ranges": [1, null, 0], "angles": [0, 0.1, 0.2], "pose": [1, 2, 0], "doubt": 1}')
     assert isinstance(scan, Scan) and scan.known.tolist() == [True, False, False] and (scan.doubt, scan.far) == (1, 3.5)

@@ -26,7 +26,7 @@ from google.protobuf.message import DecodeError
 
 from benchmarks.timing import Figures
 from brakeline.actors.learner_client import LearnerClient
-from brakeline.deploy.commands.watch_command import _show
+from brakeline.deploy.commands.watch_command import show_received
 from brakeline.deploy.run.display import line
 from brakeline.deploy.run.launcher import Launcher
 from brakeline.deploy.run.mavlink_json import as_json, both
@@ -135,7 +135,7 @@ def watch() -> Party:
     board, rejected = Dashboard(), RejectedMessages()
 
     def take(sample: Sample) -> None:
-        _show(deque([sample]), board, None, rejected)
+        show_received(deque([sample]), board, None, rejected)
 
     return Party(RECORDED, take, lambda: encode(board.view()), rejected)
 

@@ -13,7 +13,7 @@ import lz4.frame
 import pytest
 import zstandard
 
-from brakeline.deploy.commands.watch_command import _show
+from brakeline.deploy.commands.watch_command import show_received
 from brakeline.logs.foxglove import FoxgloveConverter
 from brakeline.logs.log_analysis import AnalysisOptions, analyse_runs
 from brakeline.logs.log_recovery import recover
@@ -95,7 +95,7 @@ MALFORMED = [
 def test_watch_passes_over_what_it_cannot_show(malformed: Sample, say: Say) -> None:
     board, rejected = Dashboard(), RejectedMessages()
     step = pb.Step(robot="ground", actor="b", state=[1.0, 0.0, 0.0, 0.0, 0.0])
-    _show(deque([malformed, say("step/ground/b", step)]), board, None, rejected)
+    show_received(deque([malformed, say("step/ground/b", step)]), board, None, rejected)
     shown = {robot["actor"]: robot for robot in json.loads(encode(board.view()))["robots"]}
     assert shown["b"]["pose"] == [1.0, 0.0, 0.0]
 

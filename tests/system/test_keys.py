@@ -3,7 +3,7 @@
 import os
 
 from brakeline.actors.ros2.ros2_process import Ros2Settings
-from brakeline.deploy.commands.ros2_command import Ros2
+from brakeline.deploy.commands.ros2_command import Ros2Command
 from brakeline.deploy.data.data_paths import method_path
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.bus import Bus, BusSettings
@@ -38,7 +38,7 @@ def test_a_service_with_the_keys_that_were_handed_out_to_it(start, data_folder, 
         assert answer.returncode == 0 and '"decision": "allowed"' in answer.stdout, answer.stderr
         stranger = brakeline("query", "ground", "--connect", endpoint, "--keys", parts / "actor-0")
         assert stranger.returncode == 1 and "no keys of client" in stranger.stderr
-        node = Ros2(connect=(endpoint,), keys=parts / "client")
+        node = Ros2Command(connect=(endpoint,), keys=parts / "client")
         with node._question(Ros2Settings("ground", lead=30.0)) as question:
             (reply,) = question([pb.Request(robot="ground")])
         assert reply.error.field == "plan", "a ROS robot's questions are heard, and this one was empty"

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from brakeline.actors.actor_process import PhysicsChange
-from brakeline.deploy.commands.fly import Fly
-from brakeline.deploy.commands.train import Train
+from brakeline.deploy.commands.fly_command import FlyCommand
+from brakeline.deploy.commands.train_command import TrainCommand
 from brakeline.deploy.policy_loading import policy_named
 from brakeline.deploy.run.processes import places
 from brakeline.deploy.run.run_config import EXPERIMENTS, RunConfig, decode, encode, load
@@ -41,8 +41,10 @@ def test_what_is_unknown_or_damaged_is_refused_with_the_files_name(tmp_path: Pat
     path = tmp_path / "config.json"
     values = json.loads(encode(RunConfig()))
     for damage, said in (
-        (values | {"colour": "red"}, "RunConfig has no colour"),
-        (values | {"learner": values["learner"] | {"depth": 3}}, "LearnerConfig has no depth"),
+        (values | {"colour": "red"}, "colour: Unexpected keyword"),
+        (values | {"learner": values["learner"] | {"depth": 3}}, "learner.depth: Unexpected keyword"),
+        (values | {"change": {"when": 3}}, "change.when: Unexpected keyword"),
+        (values | {"actors": "many"}, "actors: Input should be a valid integer"),
         (values | {"arena": "ballroom"}, "no arena is called 'ballroom'"),
         (values | {"method": "prayer"}, "no method is called 'prayer'"),
         ([1, 2], "is no run's configuration"),
@@ -54,8 +56,6 @@ def test_what_is_unknown_or_damaged_is_refused_with_the_files_name(tmp_path: Pat
     path.write_text("{")
     with pytest.raises(ValueError, match="is no run's configuration"):
         load(path)
-    with pytest.raises(ValueError, match="Change has no when"):
-        decode(PhysicsChange, {"when": 3})
 
 
 @pytest.mark.parametrize("wrong", [{"actors": 0}, {"steps": 0}, {"replicas": 0}, {"robots_per_actor": 0}])
@@ -85,17 +85,17 @@ def test_the_processes_of_a_run() -> None:
 
 def test_an_experiment_is_where_the_options_start(tmp_path: Path) -> None:
     debug = EXPERIMENTS["debug"]
-    assert Train.defaults(["ground", "--experiment", "debug"]).config() == debug
-    assert Train.defaults(["ground", "--experiment=debug"]).config() == debug
-    assert Train.defaults(["ground"]).config() == EXPERIMENTS["default"]
+    assert TrainCommand.defaults(["ground", "--experiment", "debug"]).config() == debug
+    assert TrainCommand.defaults(["ground", "--experiment=debug"]).config() == debug
+    assert TrainCommand.defaults(["ground"]).config() == EXPERIMENTS["default"]
     with pytest.raises(ValueError, match=r"no experiment is called 'debag'; there are: default, demo, debug"):
-        Train.defaults(["--experiment", "debag"])
+        TrainCommand.defaults(["--experiment", "debag"])
 
 
 def test_a_resumed_run_keeps_its_configuration_but_for_the_steps(tmp_path: Path) -> None:
     (tmp_path / "config.json").write_text(encode(CHANGED))
-    assert Train(resume=tmp_path, arena="open").config() == CHANGED
-    assert Train(resume=tmp_path, steps=5).config() == replace(CHANGED, steps=5)
+    assert TrainCommand(resume=tmp_path, arena="open").config() == CHANGED
+    assert TrainCommand(resume=tmp_path, steps=5).config() == replace(CHANGED, steps=5)
 
 
 def test_what_no_world_is_made_for_is_refused_before_anything_starts() -> None:
@@ -110,7 +110,7 @@ def test_what_no_world_is_made_for_is_refused_before_anything_starts() -> None:
         with pytest.raises(ValueError, match=said):
             RunConfig(**wrong)
     config = RunConfig(robots=("ground+tracks",), arena="walkers")
-    assert decode(RunConfig, json.loads(encode(config))) == config
+    assert decode(encode(config)) == config
     (place,) = (place for place in places(config) if place.kind == "learner")
     assert robot_with_task(place.robot).task.observation_dim == 50, "its process has the task"
     stored = policy_named("trained", robot_with_task(place.robot), 0)
@@ -120,5 +120,5 @@ def test_what_no_world_is_made_for_is_refused_before_anything_starts() -> None:
 def test_each_process_of_a_flight_can_read_the_robot_by_itself() -> None:
     """A robot of somebody's own has no name that another process knows."""
     path = Path(__file__).parents[3] / "examples" / "px4" / "quadrotor_px4.toml"
-    (place,) = (place for place in places(Fly(robot=str(path)).config()) if place.kind == "actor")
+    (place,) = (place for place in places(FlyCommand(robot=str(path)).config()) if place.kind == "actor")
     assert robot_with_task(place.robot).name == "quadrotor-px4-late"

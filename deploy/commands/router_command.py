@@ -1,19 +1,22 @@
-"""`brakeline router`: what the processes of several machines meet at."""
+"""Implement `brakeline router`: run a router of the bus."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from brakeline.deploy.commands.common_options import Endpoints, Flags
+from brakeline.deploy.commands.common_options import BusOptions, Unprefixed
 
 
 @dataclass(frozen=True)
-class Router:
-    endpoints: Flags[Endpoints] = field(default_factory=Endpoints)
+class RouterCommand:
+    """The options of `brakeline router`."""
+
+    endpoints: Unprefixed[BusOptions] = field(default_factory=BusOptions)
     name: str = "router"
-    """On the bus; each router has its own."""
+    """Name of the router on the bus. Each router needs its own."""
 
     def run(self) -> int:
+        """Route messages until SIGINT or SIGTERM. Returns the exit status."""
         from brakeline.messaging.process_runtime import Process
 
         settings = self.endpoints.bus()

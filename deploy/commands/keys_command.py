@@ -1,4 +1,4 @@
-"""`brakeline keys`."""
+"""Implement `brakeline keys`: make keys and certificates for the processes of several machines."""
 
 from __future__ import annotations
 
@@ -13,37 +13,42 @@ from brakeline.messaging.atomic_files import write_secret
 from brakeline.messaging.bus.certificate_authority import DAYS, Authority
 from brakeline.messaging.bus.identity import SERVERS, role_of
 from brakeline.safety.methods import load
-from brakeline.safety.service.plan_token import KEY as VOUCHERS
+from brakeline.safety.service.plan_token import KEY as PLAN_TOKEN_KEY
 from brakeline.safety.service.plan_token import write_key
 from brakeline.safety.service.signature import ANY, SIGNERS, ModelSigner, seal_of, write_signer
-from brakeline.safety.service.signature import KEY as SIGNER
+from brakeline.safety.service.signature import KEY as SIGNING_KEY
 
 
 @dataclass(frozen=True)
 class KeysCommand:
+    """The options of `brakeline keys`."""
+
     folder: Annotated[Path, tyro.conf.Positional] = Path("keys")
-    """Where the keys are, or are to be."""
+    """Folder of the keys. The command makes it if it does not exist."""
     names: Annotated[tuple[str, ...], tyro.conf.Positional] = ()
-    """Processes to issue certificates to, anew if they have one; each begins with its role, such as actor-7."""
+    """Processes to issue certificates to. Each name begins with its role, such as actor-7. A process that has a
+    certificate gets a new one."""
     host: tuple[str, ...] = ()
-    """Names and addresses at which the others reach those that may be routers, besides this machine's."""
+    """Names and addresses, besides this machine's, at which others reach the processes that may be routers."""
     days: int = DAYS
-    """That the certificates are valid."""
+    """Days for which the certificates are valid."""
     signer: bool = True
-    """Make a key to sign models with, if there is none: it belongs to whoever certifies, offline."""
+    """Make a key that signs models, if there is none. Keep it offline, with the person who certifies models."""
     robots: tuple[str, ...] = (ANY,)
-    """Robots that a new signer may speak about; *: all."""
+    """Robots whose models a new signer may sign; * stands for all."""
     sign: tuple[Path, ...] = ()
-    """Model files to sign as they are; `brakeline certify --use --keys FOLDER` signs with the data at hand."""
+    """Model files to sign as they are. `brakeline certify --use --keys FOLDER` signs with the data set at hand."""
     hand_out: Path | None = None
-    """Copy what each of the names needs, and no more, to a folder of its name in here: to be carried to its machine."""
+    """Copy the files that each named process needs, and no others, to a folder of its name in this folder. Carry that
+    folder to the machine of the process."""
 
     def run(self) -> int:
+        """Sign the models, or else make the keys. Returns the exit status."""
         if self.sign:
             signer = ModelSigner.load(self.folder)
             for path in self.sign:
                 signer.sign(load(path)).save(path)
-                console.print(f"{seal_of(path)}", markup=False)
+                console.print(str(seal_of(path)), markup=False)
             return 0
         authority = Authority(self.folder, self.days)
         for name in self.names:
@@ -59,15 +64,15 @@ class KeysCommand:
 
 
 def hand_out(keys: Path, name: str, to: Path) -> None:
-    """Copy the files that a process of that name needs."""
+    """Copy the files that a process of this name needs to the folder `to`."""
     role = role_of(name)
     files = ["ca.pem", f"{name}.pem", f"{name}.key"]
     if role in SERVERS:
         files.append("names")
     if role == "safety":
-        files += [VOUCHERS, *(str(path.relative_to(keys)) for path in (keys / SIGNERS).glob("*.json"))]
+        files += [PLAN_TOKEN_KEY, *(str(path.relative_to(keys)) for path in (keys / SIGNERS).glob("*.json"))]
     if role == "certify":
-        files.append(SIGNER)
+        files.append(SIGNING_KEY)
     for file in files:
         write_secret(to / file, (keys / file).read_bytes())
     console.print(f"{to}: {', '.join(files)}", markup=False)

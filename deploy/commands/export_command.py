@@ -1,49 +1,51 @@
-"""`brakeline export`."""
+"""Implement `brakeline export`: write a log in the formats of other programs."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
-import tyro
-
-from brakeline.deploy.commands.common_options import LATEST, console, say_json
+from brakeline.deploy.commands.common_options import LATEST, Json, Logs, console, print_json
 from brakeline.deploy.progress import under_way
 from brakeline.messaging.task import robot_with_task
 
 
 @dataclass(frozen=True)
-class Export:
-    logs: Annotated[tuple[Path, ...], tyro.conf.Positional] = (LATEST,)
-    """Log files, or run folders."""
+class ExportCommand:
+    """The options of `brakeline export`."""
+
+    logs: Logs = (LATEST,)
     csv: Path | None = None
-    """Every step as a line of this file."""
+    """Write each step as a line of this CSV file."""
     minari: str | None = None
-    """The episodes as a local Minari data set of this name, e.g. brakeline/ground-v0."""
+    """Write the episodes as a local Minari data set with this name, such as brakeline/ground-v0."""
     foxglove: Path | None = None
-    """An MCAP file with a picture of every step; the log itself has pictures of some."""
+    """Write an MCAP file with a picture of each step. The log itself has pictures of some steps."""
     tlog: Path | None = None
-    """Every MAVLink frame, as ground stations and pymavlink read it."""
+    """Write each MAVLink frame to this file, which ground stations and pymavlink can read."""
     robot: str = "ground"
-    """Whose steps --csv and --minari take: a name, or the path of a description (.toml)."""
-    json: bool = False
+    """With --csv and --minari: robot whose steps to export: a name, or the path of a description (.toml)."""
+    json: Json = False
 
     def run(self) -> int:
-        wanted = {"csv": self._csv, "minari": self._minari, "foxglove": self._foxglove, "tlog": self._tlog}
-        asked = [name for name in wanted if getattr(self, name) is not None]
-        if not asked:
-            raise ValueError(f"export to what? Give {', '.join(f'--{name}' for name in wanted)}, or several of them")
+        """Write the files. Returns the exit status."""
+        writers = {"csv": self._csv, "minari": self._minari, "foxglove": self._foxglove, "tlog": self._tlog}
+        formats = [name for name in writers if getattr(self, name) is not None]
+        if not formats:
+            raise ValueError(
+                f"no format to export to: give one or more of {', '.join(f'--{name}' for name in writers)}"
+            )
         figures: dict[str, Any] = {}
-        for name in asked:
+        for name in formats:
             with under_way(f"writing {getattr(self, name)}"):
-                figures[name] = wanted[name]()
+                figures[name] = writers[name]()
         if self.json:
-            say_json(figures)
+            print_json(figures)
         else:
-            for about in figures.values():
-                counts = ", ".join(f"{count} {what}" for what, count in about.items() if what != "path")
-                console.print(f"{about['path']}: {counts}", markup=False)
+            for written in figures.values():
+                counts = ", ".join(f"{count} {unit}" for unit, count in written.items() if unit != "path")
+                console.print(f"{written['path']}: {counts}", markup=False)
         return 0
 
     def _csv(self) -> dict[str, Any]:
@@ -57,7 +59,7 @@ class Export:
             with self.csv.open("w", newline="") as file:
                 return {"path": str(self.csv), "steps": to_csv(list(self.logs), robot, file)}
         except ExportError:
-            if self.csv.is_file():  # with a headline alone; a pipe stays
+            if self.csv.is_file():  # it has a header alone; a pipe has no file to delete
                 self.csv.unlink()
             raise
 

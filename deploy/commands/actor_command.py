@@ -1,0 +1,97 @@
+"""Implement `brakeline actor`: run one actor process alone."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass, field
+from functools import partial
+
+from brakeline.deploy.commands.common_options import (
+    ArenaName,
+    BusOptions,
+    FilterOptions,
+    FlightOptions,
+    PhysicsOptions,
+    Robot,
+    Seed,
+    Unprefixed,
+)
+from brakeline.deploy.policy_loading import policy_named
+from brakeline.deploy.run.run_config import RunConfig
+from brakeline.messaging.task import address, address_in_real_time, robot_with_task
+from brakeline.safety.model.model_config import check_reservations
+
+
+@dataclass(frozen=True)
+class ActorCommand:
+    """The options of `brakeline actor`."""
+
+    robot: Robot = "ground"
+    endpoints: Unprefixed[BusOptions] = field(default_factory=BusOptions)
+    filtering: Unprefixed[FilterOptions] = field(default_factory=FilterOptions)
+    physics: Unprefixed[PhysicsOptions] = field(default_factory=PhysicsOptions)
+    name: str = f"actor-{os.uname().nodename.split('.')[0]}"
+    """Name of the actor on the bus. Each actor of a run needs its own."""
+    number: int = 0
+    """Number of the first robot of this process in the run. Robots with the same number and seed see the same
+    episodes."""
+    robots: int = 1
+    """Robots in this process. They share one request to the safety service."""
+    fleet: int = 0
+    """Robots in this process that share one world and avoid each other. 0 gives each robot a world of its own."""
+    seed: Seed = 0
+    arena: ArenaName = "default"
+    penalty: float = RunConfig.penalty
+    """Penalty subtracted from the learned reward for a correction by the whole range of an input."""
+    deadline: float = RunConfig.deadline
+    """Time that the actor waits for an answer of the safety service [s]. Then the robot brakes along its backup plan.
+    """
+    policy: str = ""
+    """Policy to follow: trained, untrained, random, greedy, adversary, astar, careful, a weights file, or a CSV file of
+    inputs as `brakeline excite` prints them. Defaults to the weights that a learner publishes."""
+    steps: int = 0
+    """With --policy: number of steps. 0 runs until you press ^C."""
+    mavlink: bool = False
+    """Log each MAVLink frame of simulated quadrotors too. With --url the actor always logs them."""
+    url: str = ""
+    """Link to a vehicle to fly in real time: udpin:HOST:PORT, udpout:HOST:PORT or tcp:HOST:PORT. The map is the arena
+    drawn with the seed. The safety service must serve quadrotor-late."""
+    flight: Unprefixed[FlightOptions] = field(default_factory=FlightOptions)
+
+    def run(self) -> int:
+        """Act until the last step, SIGINT or SIGTERM. Returns the exit status."""
+        from brakeline.actors.actor_process import ActorSettings, run
+
+        robot_address = address_in_real_time(self.robot) if self.url else address(self.robot)
+        robot = robot_with_task(robot_address)
+        if self.fleet:
+            check_reservations(self.filtering.method)
+        settings = ActorSettings(
+            bus=self.endpoints.bus(),
+            robot=robot_address,
+            name=self.name,
+            number=self.number,
+            robots=self.fleet or self.robots,
+            fleet=self.fleet > 0,
+            seed=self.seed,
+            arena=self.arena,
+            method=self.filtering.method,
+            penalty=self.penalty,
+            deadline=self.deadline,
+            mavlink=self.mavlink,
+            steps=self.steps,
+        )
+        propose = partial(policy_named, self.policy, robot) if self.policy else None
+        conditions = self.physics.conditions()
+        if self.url:
+            from brakeline.actors import flight_process as flight
+            from brakeline.deploy.quadrotor_vehicles import flight_arena
+
+            arena = flight_arena(self.arena, self.seed)
+            flight.run(settings, self.flight.settings(self.url, arena), arena, propose, conditions)
+        else:
+            from brakeline.deploy.vehicle_factory import environment, fleet_world
+
+            worlds = partial(fleet_world, conditions=conditions)
+            run(settings, partial(environment, conditions=conditions), propose, worlds)
+        return 0

@@ -1,0 +1,114 @@
+"""Implement `brakeline autopilot`: simulate quadrotors behind MAVLink in real time.
+
+With `--px4` the autopilot is a real PX4, and this program simulates only the physics.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Literal
+
+from brakeline.deploy.commands.common_options import Json, Seed, errors, print_json
+from brakeline.deploy.run import autopilot_run, px4_simulation
+from brakeline.sim.arena import Arena
+from brakeline.sim.autopilot.autopilot_rules import SETPOINT_TIMEOUT
+from brakeline.sim.autopilot.autopilot_server import ServerStats
+from brakeline.sim.autopilot.hil_sensors import SensorNoise
+from brakeline.sim.quadrotor import Quadrotor
+from brakeline.sim.wind import Wind
+
+
+@dataclass(frozen=True)
+class AutopilotCommand:
+    """The options of `brakeline autopilot`."""
+
+    url: str = "udpout:127.0.0.1:14540"
+    """Link to serve MAVLink on: udpout:HOST:PORT, udpin:HOST:PORT or tcpin:HOST:PORT. PX4's simulator sends to UDP port
+    14540; ArduPilot's listens on TCP port 5760."""
+    rules: Literal["px4", "ardupilot"] = "px4"
+    """Rules of the autopilot: its modes, refusals and parameters."""
+    vehicles: int = 1
+    """Number of vehicles, with system ids 1, 2, … They pass through each other."""
+    arena: str = ""
+    """Arena of the quadrotor, drawn with the seed. Defaults to an open field."""
+    seed: Seed = 0
+    airborne: bool = False
+    """Start armed and hovering at the arena's start, instead of on the ground below it."""
+    setpoint_timeout: float | None = None
+    """Time without a setpoint after which the autopilot brakes [s]. Defaults to the parameter of --rules: 1 s for px4,
+    3 s for ardupilot."""
+    wind: float = 0.0
+    """Mean wind speed [m/s]. Its direction is drawn with the seed."""
+    gust: float = 0.0
+    """Standard deviation of the wind on each axis [m/s]."""
+    truth: str = "127.0.0.1:14600"
+    """HOST:PORT to send true states and collisions to, as JSON in UDP datagrams. Empty sends none."""
+    seconds: float = 0.0
+    """Duration [s]. 0 runs until you press ^C."""
+    px4: Path | None = None
+    """Folder of a PX4 that you built for SITL. It flies the simulated vehicle in lockstep, with its own rules and
+    estimator."""
+    speed: float = 1.0
+    """With --px4: speed as a multiple of real time. 0 runs as fast as possible."""
+    sensors: float = SensorNoise.scale
+    """With --px4: factor on the errors of IMU, magnetometer, barometer and GPS."""
+    gps: float = SensorNoise.gps_position
+    """With --px4: standard deviation of the GPS position on each axis [m]."""
+    parameters: dict[str, float] = field(default_factory=dict)
+    """With --px4: parameters to set, as NAME VALUE NAME VALUE ..."""
+    json: Json = False
+
+    def run(self) -> int:
+        """Fly until the duration ends, SIGINT or SIGTERM. Returns the exit status."""
+        result = self._fly_simulated() if self.px4 is None else self._fly_px4(self.px4)
+        if self.json:
+            print_json(asdict(result))
+        else:
+            errors.print(str(result))
+        return 0
+
+    def _fly_px4(self, folder: Path) -> px4_simulation.FlightResult:
+        if self.vehicles != 1 or self.airborne or self.rules != "px4":
+            raise ValueError(
+                "a real PX4 flies one vehicle, by its own rules, and starts on the ground: leave out the option"
+            )
+        timeout = {} if self.setpoint_timeout is None else {SETPOINT_TIMEOUT["px4"]: self.setpoint_timeout}
+        settings = px4_simulation.HilSettings(
+            folder,
+            self.url,
+            self.arena,
+            self.seed,
+            SensorNoise(scale=self.sensors, gps_position=self.gps),
+            Wind(self.wind, gust=self.gust),
+            timeout | self.parameters,
+            self.truth,
+            self.speed,
+            self.seconds,
+        )
+        return px4_simulation.fly(settings, self._print_px4_start)
+
+    def _fly_simulated(self) -> ServerStats:
+        settings = autopilot_run.AutopilotSettings(
+            self.url,
+            self.rules,
+            self.vehicles,
+            self.arena,
+            self.seed,
+            self.airborne,
+            self.setpoint_timeout,
+            Wind(self.wind, gust=self.gust),
+            self.truth,
+            self.seconds,
+        )
+        return autopilot_run.fly(settings, self._print_start)
+
+    def _print_start(self, arena: Arena) -> None:
+        if not self.json:
+            errors.print(f"{self.rules} on {self.url}, {self.vehicles} vehicle(s), {arena.name}; ^C ends it")
+
+    def _print_px4_start(self, vehicle: Quadrotor) -> None:
+        if not self.json:
+            x, y, z = vehicle.true[:3]
+            origin = f"its local frame begins at {x:.2f} {y:.2f} {z:.2f}"
+            errors.print(f"PX4 on {self.url}, {vehicle.arena.name}; {origin}; ^C ends it")

@@ -1,0 +1,77 @@
+"""Implement `brakeline bridge-sim`: simulate a ground robot as a ROS 2 robot."""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from brakeline.deploy.commands.common_options import (
+    ArenaName,
+    Json,
+    PhysicsOptions,
+    Seed,
+    Unprefixed,
+    errors,
+    print_counts,
+)
+from brakeline.deploy.commands.ros2_command import GraphOptions, log_to_stderr, open_bag
+from brakeline.deploy.run.ros2_bridge import Bridge, BridgeSettings
+from brakeline.messaging.ros2 import RosSettings
+from brakeline.messaging.stop_signals import stop_on_signals
+
+
+@dataclass(frozen=True)
+class BridgeSimCommand:
+    """The options of `brakeline bridge-sim`."""
+
+    listen: tuple[str, ...] = ("tcp/127.0.0.1:7447",)
+    """Act as the Zenoh router at these endpoints."""
+    router: tuple[str, ...] = ()
+    """Connect to a running router of rmw_zenoh at these endpoints instead."""
+    graph: Unprefixed[GraphOptions] = field(default_factory=GraphOptions)
+    arena: ArenaName = "default"
+    seed: Seed = 0
+    sim_time: bool = False
+    """Publish simulated time on /clock, instead of using the time of this machine."""
+    factor: float = 1.0
+    """With --sim-time: highest speed, as a multiple of real time. 0 runs as fast as possible."""
+    lockstep: bool = False
+    """With --sim-time: wait in each control period for its command, so that no command is late on a busy machine."""
+    timeout: float = BridgeSettings.timeout
+    """Time without a command after which the base stops [s]."""
+    stamped: bool = False
+    """Expect TwistStamped commands."""
+    physics: Unprefixed[PhysicsOptions] = field(default_factory=PhysicsOptions)
+    bag: Path | None = None
+    """Record all received and sent messages as a ROS 2 bag in this folder, which must not exist."""
+    seconds: float = 0.0
+    """Duration by the clock of the robot [s]. 0 runs until you press ^C."""
+    json: Json = False
+
+    def run(self) -> int:
+        """Simulate until the duration ends, SIGINT or SIGTERM. Returns the exit status."""
+        if not self.sim_time and (self.lockstep or self.factor != 1.0):
+            raise ValueError("--factor and --lockstep need simulated time: give --sim-time too")
+        settings = BridgeSettings(
+            ros=RosSettings(self.router, () if self.router else self.listen, self.graph.domain, self.graph.namespace),
+            arena=self.arena,
+            seed=self.seed,
+            sim_time=self.sim_time,
+            factor=self.factor,
+            lockstep=self.lockstep,
+            timeout=self.timeout,
+            stamped=self.stamped,
+            seconds=self.seconds,
+            conditions=self.physics.conditions(),
+        )
+        log_to_stderr("bridge-sim")
+        with contextlib.ExitStack() as stack:
+            bridge = Bridge(settings, stack.enter_context(open_bag(self.bag)))
+            stack.callback(bridge.close)
+            if not self.json:
+                errors.print(f"ground on {', '.join(self.router or self.listen)}, {self.arena}; ^C ends it")
+            bridge.run(stack.enter_context(stop_on_signals(threading.Event())))
+        print_counts(bridge.outcome.figures(), self.json)
+        return 0

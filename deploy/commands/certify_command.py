@@ -1,0 +1,234 @@
+"""Implement `brakeline certify`: validate model sets on held-out data, and put them to use or publish them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from itertools import product
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import tyro
+from rich.markup import escape
+
+from brakeline.deploy.commands.common_options import (
+    AcceptBound,
+    BusOptions,
+    Json,
+    Mode,
+    Unprefixed,
+    conditions_table,
+    console,
+    default_keys,
+    errors,
+    print_json,
+)
+from brakeline.deploy.data.coverage import more_to_drive
+from brakeline.deploy.data.data_paths import model_path, record_path
+from brakeline.deploy.data.run_dataset import Recorded, from_log
+from brakeline.deploy.data.simulated_recording import data_for
+from brakeline.deploy.data.supported_modes import Unsupported, supported
+from brakeline.deploy.progress import under_way
+from brakeline.logs.console_tables import StackingTable
+from brakeline.messaging import brakeline_pb2 as pb
+from brakeline.messaging.bus import Bus
+from brakeline.messaging.task import robot_maybe_with_task
+from brakeline.messaging.topics import MODEL
+from brakeline.safety.model.dataset import Dataset
+from brakeline.safety.model.error_bounds import KINDS, RESIDUAL
+from brakeline.safety.model.model_set import MODES, ModelConfig, ModelSet
+from brakeline.safety.model.stated_bound import accepted_bound, refusal
+from brakeline.safety.model.validation import CONFIDENCE, EPISODE, HOUR, ValidationReport
+from brakeline.safety.service.signature import KEY, ModelSigner, seal_of
+
+DIVERGENT = 100.0  # m, half-width of a stop that is wider than any arena
+
+
+@dataclass(frozen=True)
+class CertifyCommand:
+    """The options of `brakeline certify`."""
+
+    data: Annotated[Path | None, tyro.conf.Positional] = None
+    """A data set, or a log (file or run folder), of which the last steps count. Defaults to the data set in use of
+    --robot."""
+    certificates: tuple[str, ...] = KINDS
+    """Error bounds to validate (see docs/certificates.md)."""
+    mode: Mode | None = None
+    """Prediction mode to validate. Defaults to both."""
+    windows: Literal["plan", "free", "auto"] = "auto"
+    """Driving to fit and validate on: plan for plans as the filter makes them, free for any, auto for any if there are
+    too few plans."""
+    few: bool = False
+    """Accept minutes of driving instead of hours: 60 windows of each length suffice, and each envelope is scaled by 1.5
+    instead of 1.15, as after `collect --url`."""
+    until_held: bool = False
+    """Widen each envelope until no held-out plan leaves its set, and no further."""
+    robot: str = "ground"
+    """Robot whose data set in use to take, or, of a log, whose steps to take."""
+    last: int = 20_000
+    """Number of last steps of a log to take."""
+    use: bool = False
+    """Write the model sets to where the other commands load them from."""
+    accept_bound: AcceptBound = None
+    publish: bool = False
+    """Replace the model set of running safety services by the first of --certificates, in direct mode unless you give
+    --mode."""
+    endpoints: Unprefixed[BusOptions] = field(default_factory=BusOptions)
+    verbose: bool = False
+    """Show also the conditions of the recording: sensor errors, wind, payload."""
+    json: Json = False
+
+    def run(self) -> int:
+        """Validate the model sets. Returns the exit status; 1 if none is supported, or one may not be used."""
+        path, source = self._load()
+        data, robot = source.data, source.data.robot
+        accepted_bound(robot, self.accept_bound)
+        models: list[tuple[ModelSet, ValidationReport]] = []
+        results: dict[str, Any] = {}
+        notes: list[str] = []
+        refused = False
+        modes = (self.mode,) if self.mode else MODES
+        with under_way("certifying", len(self.certificates) * len(modes)) as advance:
+            for kind, mode in product(self.certificates, modes):
+                advance(0, f"certifying {kind}, {mode}")
+                config = ModelConfig(kind, mode)
+                try:
+                    config = config.of_minutes() if self.few else config
+                    model, report, unsupported = supported(data, config, self.windows, self.until_held)
+                except Unsupported as error:
+                    results.setdefault(kind, {})[mode] = {"refused": str(error)}
+                    errors.print(f"[red]{kind}, {mode}: refused:[/] {escape(str(error))}")
+                    if not self.few:
+                        errors.print("give --few to certify minutes of driving", markup=False)
+                    continue
+                finally:
+                    advance()
+                models.append((model, report))
+                notes += [f"not supported: {windows} windows: {reason}" for windows, reason in unsupported.items()]
+                figures = report.figures() | {"windows_of": model.model_config.windows, "not_of": unsupported}
+                refusal_text = refusal(robot, model.about, self.accept_bound) if self.use or self.publish else ""
+                if refusal_text:
+                    refused = True
+                    figures["not_used"] = refusal_text
+                    errors.print(f"[red]{kind}, {mode}: not put to use:[/] {escape(refusal_text)}")
+                elif self.use:
+                    self._save(model, data)
+                results.setdefault(kind, {})[mode] = figures
+        if self.json:
+            # The figures of a certificate are those of the direct mode; those of each mode stand beside them.
+            flat = {kind: row.get("direct", next(iter(row.values()))) | row for kind, row in results.items()}
+            print_json(flat | {"source": str(path), "periods": data.periods, "note": source.note})
+        else:
+            self._print(models, notes, path, source)
+        if self.publish and models and not refusal(robot, models[0][0].about, self.accept_bound):
+            self._publish(models[0][0], data)
+        return 1 if refused or not models else 0
+
+    def _print(
+        self, models: list[tuple[ModelSet, ValidationReport]], notes: list[str], path: Path, source: Recorded
+    ) -> None:
+        reports = [report for _, report in models]
+        console.print(validation_table([(report, model.model_config.windows) for model, report in models]))
+        lines = [bounds_in_words(reports[0], source.data.robot.period)] if reports else []
+        lines += dict.fromkeys((*notes, *filter(None, map(widening, reports))))
+        lines += [f"missing: {text}" for text in more_to_drive(reports[0], source.data)] if reports else []
+        for line in (*lines, f"{path}: {source.note}"):
+            console.print(line, markup=False)
+        if self.verbose:
+            console.print(conditions_table(source.data.about))
+
+    def _save(self, model: ModelSet, data: Dataset) -> None:
+        """Write a model set to where the other commands load it from; signed, if there is a key to sign with."""
+        path, keys = model_path(model.robot, model.model_config), self.endpoints.keys or default_keys()
+        seal_of(path).unlink(missing_ok=True)
+        if keys is not None and (keys / KEY).exists():
+            ModelSigner.load(keys).sign(model, data).save(path)
+        else:
+            model.save(path)
+
+    def _load(self) -> tuple[Path, Recorded]:
+        """Return the source and its data. Raises ValueError if a named data set does not exist."""
+        robot = robot_maybe_with_task(self.robot)
+        if self.data is None:
+            path, data = record_path(robot.in_lockstep()), data_for(robot)
+        elif self.data.suffix == ".safetensors":
+            if not self.data.exists():  # a mistyped name must not start a recording
+                raise ValueError(f"no data set at {self.data}: `brakeline collect {self.robot} --out FILE` records one")
+            path, data = self.data, Dataset.load(self.data)
+            if robot.kind == data.robot.kind:  # today's description sets the limit, not the one that was recorded
+                data = replace(data, robot=replace(data.robot, accept_bound=robot.accept_bound))
+        else:
+            return self.data, from_log(self.data, robot, self.last)
+        return path, Recorded(data, f"{data.periods} recorded periods of {data.robot.name}")
+
+    def _publish(self, model: ModelSet, data: Dataset) -> None:
+        settings = self.endpoints.bus()
+        with Bus(settings, "certify") as bus:
+            message = pb.Model(robot=model.robot.name, version=model.version, file=model.encode())
+            if settings.keys is not None:
+                signed = ModelSigner.load(settings.keys).sign(model, data)
+                message.file, message.claim, message.signature = signed.file, signed.claim, signed.signature
+            bus.publisher(MODEL, robot=model.robot.name).put(message)
+        errors.print(f"published {model.model_config.certificate} {model.version} for {model.robot.name}")
+
+
+def widening(report: ValidationReport) -> str:
+    """Say that envelopes are wider than usual, and why. Empty if they are not."""
+    usual = ModelConfig().inflation
+    if report.inflation <= usual * 1.001 or report.inflation == ModelConfig().of_minutes().inflation:
+        return ""
+    return (
+        f"{report.certificate}, {report.mode}: every envelope is widened by {report.inflation:.3g}, not by "
+        f"{usual:g}, so that no more than {report.violations} of {report.windows} held-out plans leave their sets"
+    )
+
+
+def validation_table(rows: list[tuple[ValidationReport, str]]) -> StackingTable:
+    """Return a table of validation reports, each with the kind of its windows."""
+    table = StackingTable(title="validation on held-out plans (bounds at 99 % confidence)")
+    for column in ("certificate", "mode", "driving"):
+        table.add_column(column)
+    for column in (
+        *("samples", "rank", "condition", "plans", "violations", "≤ per step", "≤ per plan", "≤ per episode"),
+        *("outside an hour", "stop from rest", "from full speed", "clearance margin"),
+    ):
+        table.add_column(column, justify="right")
+    for s, windows in rows:
+        table.add_row(
+            s.certificate,
+            s.mode + ("" if s.certificate != RESIDUAL or s.mode != "direct" else " *"),
+            windows,
+            *(str(s.samples), str(s.rank), f"{s.condition:.0f}", str(s.windows), str(s.violations)),
+            *(f"{s.bound_step:.3%}", f"{s.bound_plan:.3%}", f"{s.bound_episode:.1%}", f"≤ {s.outside_hour:.0f} steps"),
+            *(width(value) for value in (s.half_width_rest, s.half_width_full, s.clearance_margin)),
+        )
+    table.caption = "* the default; half-widths of a full stop, largest axis"
+    return table
+
+
+def bounds_in_words(s: ValidationReport, period: float) -> str:
+    """Return the bounds of a validation report as sentences. period: control period [s]."""
+    lines = [
+        f"{s.certificate}, {s.mode}, in words, at {CONFIDENCE:.0%} confidence, from {s.windows} held-out plans:",
+        f"  a step: at most {s.bound_step:.2%} of steps leave their predicted set ({s.step_violations} did)",
+        f"  a plan, driven to its stop: at most {s.bound_plan:.2%} of plans leave their tube ({s.violations} did)",
+        f"  an episode of {EPISODE} steps ({EPISODE * period:.0f} s): at most {s.outside_episode:.2g} steps outside on "
+        f"average; at least one in up to {s.bound_episode:.0%} of episodes, if steps are independent",
+        f"  an hour of driving ({round(HOUR / period):,} steps): at most {s.outside_hour:.3g} steps outside on average",
+    ]
+    if s.in_place_windows:
+        lines.append(
+            f"  a turn on the spot: at most {s.bound_in_place:.2%} of {s.in_place_windows} such plans leave their tube "
+            f"({s.in_place_violations} did)"
+        )
+    lines += [
+        "A step outside is no collision by itself, but the filter has verified nothing about where the robot then is.",
+        "The bounds hold for driving like the recorded driving; more held-out plans make them tighter.",
+    ]
+    return "\n".join(lines)
+
+
+def width(metres: float) -> str:
+    """Return the half-width of a tube as text. A recursion that diverges ends in numbers without meaning."""
+    if not metres < DIVERGENT:
+        return "diverges"
+    return f"{1e3 * metres:.1f} mm" if metres < 1.0 else f"{metres:.1f} m"

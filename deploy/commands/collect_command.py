@@ -1,0 +1,96 @@
+"""Implement `brakeline collect`: record the data set that the filter learns a robot from."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from rich.markup import escape
+
+from brakeline.deploy.commands.certify_command import bounds_in_words, validation_table
+from brakeline.deploy.commands.common_options import (
+    AcceptBound,
+    Json,
+    PhysicsOptions,
+    Robot,
+    Seed,
+    Unprefixed,
+    console,
+    errors,
+    print_json,
+)
+from brakeline.deploy.data.build_lock import alone
+from brakeline.deploy.data.data_paths import model_path, record_path
+from brakeline.deploy.data.simulated_recording import SEED, recorded
+from brakeline.deploy.run.first_flight_run import FirstFlightSettings, fly
+from brakeline.messaging.task import robot_maybe_with_task
+from brakeline.safety.model.stated_bound import accepted_bound, refusal
+
+
+@dataclass(frozen=True)
+class CollectCommand:
+    """The options of `brakeline collect`."""
+
+    robot: Robot = "ground"
+    trajectories: int | None = None
+    """Trajectories to record, each of 300 control periods. Defaults to as many as the plans of the robot need."""
+    seed: Seed = SEED
+    physics: Unprefixed[PhysicsOptions] = field(default_factory=PhysicsOptions)
+    out: Path | None = None
+    """File of the data set. Defaults to data/ROBOT/record.safetensors, the data set in use, which it replaces."""
+    url: str = ""
+    """Link to a vehicle for its first flight: udpin:HOST:PORT, udpout:HOST:PORT or tcp:HOST:PORT. The vehicle takes
+    off, flies random targets in a box, slowly at first, and lands. No filter checks this flight: clear the box."""
+    first: Unprefixed[FirstFlightSettings] = field(default_factory=FirstFlightSettings)
+    accept_bound: AcceptBound = None
+    json: Json = False
+
+    def run(self) -> int:
+        """Record the data set. Returns the exit status; 1 if a first flight gave no model set to use."""
+        if self.url:
+            return self._first_flight()
+        robot = robot_maybe_with_task(self.robot)
+        path = self.out or record_path(robot)
+        data = recorded(robot, path, self.trajectories, self.seed, self.physics.conditions(), again=True)
+        figures = {"path": str(path), "trajectories": len(data.trajectories), "periods": data.periods}
+        if self.json:
+            print_json(figures | {"digest": data.digest(), "about": data.about})
+        else:
+            console.print(f"{path}: {data.periods} periods in {len(data.trajectories)} trajectories, {data.digest()}")
+            console.print(f"next: brakeline certify {path}")
+        return 0
+
+    def _first_flight(self) -> int:
+        robot = robot_maybe_with_task(self.robot)
+        if robot.position_dim != 3:
+            raise ValueError(f"a {robot.kind} robot does not fly: leave out --url")
+        accepted_bound(robot, self.accept_bound)
+        path = self.out or record_path(robot).with_name("flown.safetensors")
+        flight = fly(robot.in_lockstep().in_real_time(), self.url, self.seed, self.first)
+        with alone(path.parent):
+            flight.data.save(path)
+        minutes, model, report = flight.seconds / 60.0, flight.model, flight.statement
+        figures: dict[str, Any] = {"path": str(path), "periods": flight.data.periods, "minutes": minutes}
+        figures |= {"level": flight.level, "missing": flight.missing}
+        text: list[Any] = [f"{path}: {flight.data.periods} periods in {minutes:.1f} min of flight"]
+        if model is not None and report is not None:
+            windows = model.model_config.windows
+            figures |= {"windows_of": windows} | report.figures()
+            text += [validation_table([(report, windows)]), bounds_in_words(report, robot.period)]
+            refused = refusal(robot, model.about, self.accept_bound)
+            if refused:
+                figures["not_used"] = refused
+                errors.print(f"[red]not put to use:[/] {escape(refused)}")
+                errors.print(f"to validate it again: brakeline certify {path} --robot {robot.name} --few", markup=False)
+            else:
+                used = model_path(model.robot, model.model_config)
+                model.save(used)
+                figures["model"] = str(used)
+                text.append(f"{used}: in use from now on")
+        if self.json:
+            print_json(figures)
+        else:
+            for part in (*text, *(f"missing: {line}" for line in flight.missing)):
+                console.print(part, markup=False)
+        return 0 if "model" in figures else 1

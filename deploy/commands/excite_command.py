@@ -1,0 +1,54 @@
+"""Implement `brakeline excite`: print or drive the inputs that excite a robot best within a region."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from brakeline.deploy.commands.common_options import Json, Robot, Seed, console, print_json
+from brakeline.deploy.data import excitation_plan
+from brakeline.deploy.data.sources.quantity_names import columns_of
+from brakeline.deploy.progress import under_way
+from brakeline.messaging.robot import robot_named
+from brakeline.messaging.task import RobotWithTask, robot_with_task
+
+
+@dataclass(frozen=True)
+class ExciteCommand:
+    """The options of `brakeline excite`."""
+
+    robot: Robot = "ground"
+    keep: tuple[float, float, float, float] = (-2.0, -2.0, 2.0, 2.0)
+    """Region that the robot stays in: least x, least y, greatest x, greatest y [m]. Each run starts in its middle,
+    along x."""
+    minutes: float = 10.0
+    """Duration of the driving [min]."""
+    seed: Seed = 0
+    drive: Path | None = None
+    """Drive the inputs in the robot's simulator instead of printing them, and record this log (.mcap). The measured
+    position then keeps the robot in the region."""
+    json: Json = False
+    """With --drive: print the result as one JSON object on stdout."""
+
+    def run(self) -> int:
+        """Print or drive the inputs. Returns the exit status."""
+        if self.drive is not None:
+            return self._drive(robot_with_task(self.robot), self.drive)
+        robot = robot_named(self.robot)
+        print(",".join(("time", "run", *columns_of(robot)[1])))
+        for row in excitation_plan.rows(robot, self.keep, self.minutes, self.seed):
+            print(",".join((f"{row.time:.9g}", str(row.run), *(f"{value:.6g}" for value in row.input))))
+        return 0
+
+    def _drive(self, robot: RobotWithTask, path: Path) -> int:
+        from brakeline.deploy.run.excitation_run import drive
+
+        with under_way(f"driving {robot.name}", round(60.0 * self.minutes / robot.period)) as advance:
+            driven = drive(robot, self.keep, self.minutes, self.seed, path, advance=advance)
+        if self.json:
+            print_json(asdict(driven))
+            return 0
+        edge = f"{-driven.outside:.2f} m inside the region" if driven.outside <= 0.0 else f"{driven.outside:.2f} m OUT"
+        console.print(f"{path}: {driven.periods} periods in {driven.runs} runs; the body came to {edge}", markup=False)
+        console.print(f"next: brakeline import LOG {path} --robot {self.robot}", markup=False)
+        return 0

@@ -1,0 +1,156 @@
+"""Implement `brakeline fly`: fly quadrotors in real time, with all processes on this machine."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import Annotated, Any, Literal
+
+import tyro
+
+from brakeline.actors.flight_process import FlightSettings
+from brakeline.deploy.commands.common_options import (
+    ArenaName,
+    FlightOptions,
+    Json,
+    PhysicsOptions,
+    Pictures,
+    RunBusOptions,
+    RunFolder,
+    Seed,
+    ServiceOptions,
+    Unprefixed,
+    console,
+    errors,
+    print_json,
+)
+from brakeline.deploy.commands.train_command import STOPPED, dated_folder
+from brakeline.deploy.quadrotor_vehicles import flight_arena
+from brakeline.deploy.run.display import Display, summary
+from brakeline.deploy.run.launcher import Launcher, prepare
+from brakeline.deploy.run.run_config import AutopilotConfig, RunConfig
+from brakeline.messaging.free_ports import free_udp_port
+from brakeline.messaging.robot import robot_named
+from brakeline.messaging.task import address_in_real_time
+
+LEARN = "learn"  # value of --policy
+TIMING_PREFIXES = ("periods ", "lateness", "worst", "link", "true", "estimate")  # of an actor's figures
+
+
+@dataclass(frozen=True)
+class FlyCommand:
+    """The options of `brakeline fly`."""
+
+    robot: Annotated[str, tyro.conf.Positional] = "quadrotor"
+    """Robot that flies: a name, or the path of a robot description (.toml)."""
+    minutes: float = 10.0
+    """Duration of the flight [min]."""
+    policy: str = "astar"
+    """Policy to fly: trained, untrained, random, greedy, adversary, astar, careful, a weights file, or learn to learn
+    from the flight."""
+    url: tuple[str, ...] = ()
+    """Links to vehicles: udpin:HOST:PORT, udpout:HOST:PORT or tcp:HOST:PORT. Each vehicle flies alone on its own map,
+    and all share one safety service. Without a link the command simulates the vehicles."""
+    systems: tuple[int, ...] = ()
+    """MAVLink system ids of the vehicles, one for each link. Defaults to --system for all."""
+    vehicles: int = 1
+    """Number of simulated vehicles."""
+    flight: Unprefixed[FlightOptions] = field(default_factory=FlightOptions)
+    rules: Literal["px4", "ardupilot"] = "px4"
+    """Rules of the simulated autopilot: its modes, refusals and parameters."""
+    setpoint_timeout: float = AutopilotConfig.setpoint_timeout
+    """Time without a setpoint after which the simulated autopilot brakes [s]."""
+    arena: ArenaName = "default"
+    seed: Seed = 0
+    filtering: Unprefixed[ServiceOptions] = field(default_factory=ServiceOptions)
+    physics: Unprefixed[PhysicsOptions] = field(default_factory=PhysicsOptions)
+    practice: float = 0.0
+    """Share of the steps at which a vehicle starts to follow its backup plan to the stop, so that the log has the stops
+    that `brakeline certify LOG` needs."""
+    deadline: float = 0.12
+    """Time that an actor waits for an answer of the safety service [s]. The answer applies from the next control period
+    (0.2 s) on."""
+    pictures: Pictures = RunConfig.pictures
+    out: RunFolder = None
+    meeting: Unprefixed[RunBusOptions] = field(default_factory=RunBusOptions)
+    json: Json = False
+
+    def run(self) -> int:
+        """Fly. Returns the exit status."""
+        config, folder = self.config(), self.out or dated_folder()
+        prepare(config, folder, resume=False)
+        with Display(errors if self.json else console, config.steps * len(config.flights)) as display:
+            figures = Launcher(config, folder, self.meeting.settings(config, folder)).run(display)
+        actors = [f"actor-{i}" for i in range(len(config.flights))]
+        figures["flight"] = flight_figures(figures, actors[0])
+        if len(actors) > 1:
+            figures["flights"] = {actor: timing_figures(figures, actor) for actor in actors}
+        if self.json:
+            print_json(figures)
+        else:
+            summary(console, figures)
+            for prefix, values in [("", figures["flight"]), *figures.get("flights", {}).items()]:
+                for name, value in values.items():
+                    console.print(f"{prefix}: {name}: {value}".removeprefix(": "), markup=False)
+        return 0 if figures["finished"] else STOPPED
+
+    def config(self) -> RunConfig:
+        """Return the run's configuration. Raises ValueError if options contradict or the robot does not fly."""
+        robot = robot_named(self.robot)
+        if robot.position_dim != 3:
+            raise ValueError(f"a {robot.kind} robot does not fly: name a robot with three position coordinates")
+        robot = robot if robot.late else robot.in_real_time()
+        flights = self._flights()
+        return RunConfig(
+            robots=(address_in_real_time(self.robot),),
+            method=self.filtering.method,
+            model_config=self.filtering.model_config(),
+            accept_bound=self.filtering.accept_bound,
+            arena=self.arena,
+            actors=len(flights),
+            steps=max(1, round(60.0 * self.minutes / robot.period)),
+            seed=self.seed,
+            deadline=self.deadline,
+            practice=self.practice,
+            pictures=self.pictures,
+            conditions=self.physics.conditions(),
+            policy="" if self.policy == LEARN else self.policy,
+            flights=flights,
+            autopilot=None if self.url else AutopilotConfig(self.rules, self.setpoint_timeout),
+        )
+
+    def _flights(self) -> tuple[FlightSettings, ...]:
+        if not self.url:
+            ports = [(free_udp_port(), free_udp_port()) for _ in range(self.vehicles)]
+            return tuple(FlightSettings(f"udpin:127.0.0.1:{port}", truth=truth) for port, truth in ports)
+        if self.vehicles != 1:
+            raise ValueError("--vehicles counts simulated vehicles: give one --url for each other vehicle instead")
+        systems = self.systems or (self.flight.system,) * len(self.url)
+        if len(systems) != len(self.url):
+            raise ValueError(f"{len(self.url)} links and {len(systems)} system ids: give one id for each --url")
+        arena = flight_arena(self.arena, self.seed)
+        pairs = zip(self.url, systems, strict=True)
+        return tuple(replace(self.flight.settings(url, arena), system=system) for url, system in pairs)
+
+
+def timing_figures(figures: dict[str, Any], actor: str) -> dict[str, Any]:
+    """Select an actor's figures of real time, and of the ground truth, from the figures of a finished run."""
+    values = figures["processes"].get(actor, {}).get("figures", {})
+    names = ("periods", "answers in time", "answers in time share", "answers late", "answers none", "answers lost")
+    more = {name: value for name, value in values.items() if name.startswith(TIMING_PREFIXES)}
+    return {name: values.get(name) for name in names} | more
+
+
+def flight_figures(figures: dict[str, Any], actor: str) -> dict[str, Any]:
+    """Return the timing figures of an actor, and the outcome of the whole run."""
+    return {
+        **timing_figures(figures, actor),
+        "collisions": figures["collisions"],
+        "goals": figures["goals"],
+        "decision_ms": _percentiles(figures["decision_ms"]),
+        "round_trip_ms": _percentiles(figures["round_trip_ms"]),
+        "left the predicted set": figures["containment"]["violations"],
+    }
+
+
+def _percentiles(times: dict[str, Any] | None) -> dict[str, float] | None:
+    return None if times is None else {name: times[name] for name in ("p50", "p99")}

@@ -1,0 +1,41 @@
+"""Implement `brakeline learner`: run a learner alone."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+from brakeline.deploy.commands.common_options import BusOptions, Robot, Seed, Unprefixed
+from brakeline.deploy.run.run_config import RunConfig
+from brakeline.learner.learner_config import LearnerConfig
+from brakeline.messaging.task import address
+
+
+@dataclass(frozen=True)
+class LearnerCommand:
+    """The options of `brakeline learner`."""
+
+    robot: Robot = "ground"
+    endpoints: Unprefixed[BusOptions] = field(default_factory=BusOptions)
+    out: Path = Path("runs/learner")
+    """Folder of the checkpoint and the policy."""
+    resume: bool = False
+    """Resume from the checkpoint in the folder. It is an error if there is none."""
+    resume_if_any: bool = False
+    """Resume from the checkpoint in the folder if there is one. Use it if a supervisor restarts the process."""
+    name: str = "learner"
+    """Name of the learner on the bus."""
+    seed: Seed = 0
+    steps: int = 100_000
+    """Training steps."""
+    learner: LearnerConfig = field(default_factory=lambda: RunConfig().learner)
+
+    def run(self) -> int:
+        """Learn until the last step, SIGINT or SIGTERM. Returns the exit status."""
+        from brakeline.learner.checkpoint import CHECKPOINT, exists
+        from brakeline.learner.learner_process import LearnerSettings, main
+
+        resume = self.resume or (self.resume_if_any and exists(self.out / CHECKPOINT))
+        config = replace(self.learner, seed=self.seed, steps=self.steps)
+        main(LearnerSettings(self.endpoints.bus(), address(self.robot), self.out, resume, self.name, config))
+        return 0

@@ -1,0 +1,67 @@
+"""Implement `brakeline pretrain`: drive and fit what a rival method must know of a robot."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Annotated, Literal
+
+import tyro
+
+from brakeline.deploy.commands.common_options import Json, Robot, console, errors, print_json
+from brakeline.deploy.data.data_paths import method_path
+from brakeline.deploy.data.model_store import pretrained
+from brakeline.deploy.data.rival_pretraining import recipe_for
+from brakeline.deploy.experiments.rival_tuning import Tried, best, try_all, values_for
+from brakeline.messaging.task import RobotWithTask, robot_with_task
+from brakeline.safety.model.model_set import ModelConfig
+from brakeline.safety.rivals.pretrained import Pretrained
+
+
+@dataclass(frozen=True)
+class PretrainCommand:
+    """The options of `brakeline pretrain`."""
+
+    method: Annotated[Literal["secas", "sailr"], tyro.conf.Positional]
+    """The rival method."""
+    robot: Robot = "ground"
+    samples: int | None = None
+    """Steps to drive. Defaults to the number that the comparison uses."""
+    seed: int | None = None
+    """Seed of the driving. Defaults to the one that the comparison uses."""
+    tune: bool = False
+    """Try values of the method's threshold in closed loop, and name the best. This stores nothing."""
+    episodes: int = 60
+    """With --tune: episodes for each policy and value."""
+    json: Json = False
+
+    def run(self) -> int:
+        """Pretrain or tune the method. Returns the exit status."""
+        robot = robot_with_task(self.robot)
+        recipe = recipe_for(self.method, robot)
+        changed = {name: value for name in ("samples", "seed") if (value := getattr(self, name)) is not None}
+        model = pretrained(robot, self.method, replace(recipe, **changed), again=not self.tune)
+        if self.tune:
+            return self._tune(model, robot)
+        path = method_path(robot, self.method, ModelConfig())
+        if self.json:
+            print_json({"path": str(path), "version": model.version, "settings": dict(model.settings)} | model.about)
+        else:
+            console.print(f"{path}: {model.version}")
+        return 0
+
+    def _tune(self, model: Pretrained, robot: RobotWithTask) -> int:
+        rows = try_all(model, robot, values_for(model, robot), self.episodes, self._print_row)
+        chosen = best(rows)
+        if self.json:
+            print_json({"tried": [row.figures() for row in rows], "best": chosen.value})
+        else:
+            console.print(
+                f"best: {chosen.value:g}, which has the fewest collisions of the values at which A* loses no goal"
+            )
+        return 0
+
+    def _print_row(self, row: Tried) -> None:
+        (errors if self.json else console).print(
+            f"{row.value:g}: A* {row.oracle_goals} goals of {row.episodes}, {row.oracle_interventions:.1%} "
+            f"interventions; greedy {row.greedy_goals} goals, {row.greedy_collisions} collisions"
+        )

@@ -1,0 +1,131 @@
+"""Implement `brakeline query`: ask a running safety service for one decision."""
+
+from __future__ import annotations
+
+import json
+import time
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+from typing import Any
+
+from rich.markup import escape
+
+from brakeline.deploy.commands.common_options import BusOptions, Json, Robot, Unprefixed, console, print_json
+from brakeline.logs.console_tables import PLAIN, StackingTable
+from brakeline.messaging.bus import Bus
+from brakeline.messaging.obstacle import KINDS, Obstacle
+from brakeline.messaging.range_image import RangeImage
+from brakeline.messaging.robot import robot_named
+from brakeline.messaging.scan import BadScan, Scan
+from brakeline.messaging.sensor_messages import RangeMeasurement
+from brakeline.messaging.stated_share import describe_verification
+from brakeline.safety.service.client import SafetyClient
+
+OBSTACLE_FORM = "an obstacle is: cylinder X Y RADIUS | box X Y LENGTH WIDTH [YAW] | wall X Y YAW"
+
+
+@dataclass(frozen=True)
+class QueryCommand:
+    """The options of `brakeline query`."""
+
+    robot: Robot = "ground"
+    endpoints: Unprefixed[BusOptions] = field(default_factory=BusOptions)
+    state: tuple[float, ...] = ()
+    """Measured state, in the order of the robot description. Defaults to rest at the origin."""
+    action: tuple[float, ...] = ()
+    """Proposed action, in the order of the robot description. Defaults to the highest inputs."""
+    obstacle: str = ""
+    """Obstacles, separated by commas, such as "cylinder 0.4 0 0.1, wall 1 0 3.14"."""
+    scan: Path | None = None
+    """JSON file with a scan, {"ranges": [...], "angles": [...], "pose": [0, 0, 0], ...}: the fields of Scan, or in the
+    air of RangeImage (see docs/perception.md). Space that the scan does not show to be free counts as occupied."""
+    known_free: bool = False
+    """Declare that all space outside the obstacles is free. Give it if you give neither --obstacle nor --scan."""
+    timeout: float = 1.0
+    """Time to wait for the answer [s]."""
+    json: Json = False
+
+    def run(self) -> int:
+        """Ask, and print the decision. Returns the exit status."""
+        robot = robot_named(self.robot)
+        parts = (part.split() for part in self.obstacle.split(",") if part.strip())
+        obstacles = [parse_obstacle(tuple(words), robot.position_dim) for words in parts]
+        state = self.state or (0.0,) * robot.state_dim
+        action = self.action or robot.action_high
+        scan = None if self.scan is None else load_scan(self.scan, robot.position_dim)
+        with Bus(self.endpoints.bus(), f"client.query-{time.time_ns() % 10**6}") as bus:
+            client = SafetyClient(bus, robot, self.timeout)
+            answer = client.decide(state, action, obstacles, scan=scan, known_free=self.known_free)
+        figures: dict[str, Any] = {
+            "decision": answer.kind,
+            "for_clearance": answer.for_clearance,
+            "plan": answer.plan.tolist(),
+            "tube": {"center": answer.tube_center.tolist(), "half_width": answer.tube_half_width.tolist()},
+            "margin": answer.margin,
+            "at_least": answer.at_least,
+            "time_ms": answer.time_ms,
+            "model": answer.model,
+            "reason": answer.reason,
+            "verified": answer.verified,
+            "bound": answer.bound,
+        }
+        if self.json:
+            print_json(figures)
+            return 0
+        clearance = " for clearance: the proposal is verified too," if answer.for_clearance else ""
+        console.print(f"[bold]{answer.kind}[/]{clearance} {escape(answer.reason)}")
+        console.print(describe_verification(answer.verified, answer.bound), markup=False)
+        table = StackingTable("period", *robot.action, "center [m]", "± [m]", **PLAIN)
+        rows = zip(figures["plan"], figures["tube"]["center"], figures["tube"]["half_width"], strict=True)
+        for k, (inputs, center, half_width) in enumerate(rows):
+            table.add_row(str(k), *(f"{value:.4f}" for value in inputs), _numbers(center), _numbers(half_width))
+        console.print(table)
+        margin = f"{'> ' if answer.at_least else ''}{answer.margin:.4f} m"
+        console.print(f"margin {margin}, {answer.time_ms:.2f} ms in decide, model {answer.model}")
+        return 0
+
+
+def parse_obstacle(words: tuple[str, ...], dim: int) -> Obstacle:
+    """Parse an obstacle: kind, position, sizes, and the yaw of a box or wall if one number is left.
+
+    Args:
+        words: kind and numbers.
+        dim: number of position coordinates, 2 or 3.
+
+    Raises:
+        ValueError: the words are no obstacle; the message says how to write one.
+    """
+    kind = words[0] if words else ""
+    if kind not in KINDS:
+        raise ValueError(f"{kind!r}: {OBSTACLE_FORM}")
+    sizes = {"box": dim, "cylinder": dim - 1, "sphere": 1, "wall": 0}[kind]
+    try:
+        values = [float(number) for number in words[1:]]
+    except ValueError:
+        values = []
+    if len(values) not in (dim + sizes, dim + sizes + 1):
+        raise ValueError(f"{' '.join(words)}: {OBSTACLE_FORM}")
+    yaw = values[dim + sizes] if len(values) > dim + sizes else 0.0
+    return Obstacle(kind, tuple(values[:dim]), tuple(values[dim : dim + sizes]), yaw)
+
+
+def load_scan(path: Path, dim: int) -> RangeMeasurement:
+    """Load a scan from a JSON file: the fields of a `Scan` on the ground (dim 2), of a `RangeImage` in the air (dim 3).
+
+    Raises:
+        BadScan: the file holds no such scan.
+        OSError: the file can't be read.
+    """
+    kind = Scan if dim == 2 else RangeImage
+    names = [field.name for field in fields(kind) if field.name != "followed"]
+    try:
+        values = json.loads(path.read_text())
+        if not isinstance(values, dict) or not values.keys() <= set(names):
+            raise BadScan(f"{path}: not a {kind.__name__}, which is a JSON object of {', '.join(names)}")
+        return kind(**values)
+    except (TypeError, ValueError) as error:  # no JSON, a field is missing, or a value is no number
+        raise error if isinstance(error, BadScan) else BadScan(f"{path}: not a {kind.__name__}: {error}") from error
+
+
+def _numbers(values: list[float]) -> str:
+    return ", ".join(f"{value:.4f}" for value in values)

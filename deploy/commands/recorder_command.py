@@ -1,0 +1,38 @@
+"""Implement `brakeline recorder`: run a recorder alone."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from importlib.metadata import version
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from brakeline.deploy.commands.common_options import BusOptions, Pictures, Unprefixed
+from brakeline.deploy.run.run_config import RunConfig
+from brakeline.logs.segment_rotation import Rotation
+
+
+@dataclass(frozen=True)
+class RecorderCommand:
+    """The options of `brakeline recorder`."""
+
+    log: Annotated[Path, tyro.conf.Positional] = Path("runs/run.mcap")
+    """Log file to write (.mcap). If the file exists, the recorder writes the next one of the same log."""
+    endpoints: Unprefixed[BusOptions] = field(default_factory=BusOptions)
+    name: str = "recorder"
+    """Name of the recorder on the bus."""
+    pictures: Pictures = RunConfig.pictures
+    rotation: Rotation = field(default_factory=Rotation)
+
+    def run(self) -> int:
+        """Record until SIGINT or SIGTERM. Returns the exit status."""
+        from brakeline.deploy.run.mavlink_json import as_json, both
+        from brakeline.logs import recorder
+        from brakeline.logs.foxglove import FoxgloveConverter
+
+        metadata = {"versions": {"brakeline": version("brakeline")}}
+        derive = both(FoxgloveConverter(self.pictures).from_sample, as_json) if self.pictures > 0.0 else as_json
+        recorder.main(self.endpoints.bus(), self.log, metadata, self.name, derive=derive, rotation=self.rotation)
+        return 0

@@ -1,0 +1,46 @@
+"""Implement `brakeline recover`: repair damaged logs."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from brakeline.deploy.commands.common_options import Json, console, print_json
+from brakeline.deploy.progress import under_way
+from brakeline.logs.log_recovery import recover
+from brakeline.logs.reader import find
+
+
+@dataclass(frozen=True)
+class RecoverCommand:
+    """The options of `brakeline recover`."""
+
+    logs: Annotated[tuple[Path, ...], tyro.conf.Positional]
+    """Log files (.mcap) or run folders. A repaired file takes the place of the damaged one, which stays beside it as
+    *.mcap.damaged."""
+    out: Path | None = None
+    """Write the repaired log (of one file) here, and leave the damaged one as it is."""
+    json: Json = False
+
+    def run(self) -> int:
+        """Repair the logs. Returns the exit status."""
+        paths = find(list(self.logs))
+        if self.out is not None and len(paths) > 1:
+            raise ValueError(f"--out takes one file, but the logs have {len(paths)}: name one file")
+        recovered = []
+        for path in paths:
+            with under_way(f"reading {path}"):
+                recovered.append(recover(path, self.out))
+            if not self.json:
+                console.print(str(recovered[-1]), markup=False)
+        if self.json:
+            files = [{name: _plain(value) for name, value in asdict(file).items()} for file in recovered]
+            print_json({"files": files})
+        return 0
+
+
+def _plain(value: object) -> object:
+    return str(value) if isinstance(value, Path) else value

@@ -1,0 +1,66 @@
+"""Implement `brakeline status`: show the living processes of a system."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, field
+from typing import Any
+
+from rich.markup import escape
+
+from brakeline.deploy.commands.common_options import BusOptions, Json, Unprefixed, console, print_json
+from brakeline.logs.console_tables import PLAIN, StackingTable
+from brakeline.messaging.bus import Bus, Sample
+from brakeline.messaging.topics import HEALTH, LEARNER
+
+
+@dataclass(frozen=True)
+class StatusCommand:
+    """The options of `brakeline status`."""
+
+    endpoints: Unprefixed[BusOptions] = field(default_factory=BusOptions)
+    wait: float = 1.5
+    """Time to listen [s]. Each living process publishes its health once a second."""
+    json: Json = False
+
+    def run(self) -> int:
+        """Listen, and print the processes. Returns the exit status."""
+        processes: dict[str, Any] = {}
+        learners: dict[str, Any] = {}
+
+        def receive_health(sample: Sample) -> None:
+            health = sample.message()
+            processes[health.process] = {"pid": health.pid, **dict(health.figures), **dict(health.notes)}
+
+        def receive_learner(sample: Sample) -> None:
+            message = sample.message()
+            names = [f.name for f in message.DESCRIPTOR.fields if f.name not in ("header", "robot")]
+            learners[message.robot] = {name: getattr(message, name) for name in names}
+
+        with Bus(self.endpoints.bus(), f"viewer.status-{time.time_ns() % 10**6}") as bus:
+            bus.subscribe(HEALTH, receive_health)
+            bus.subscribe(LEARNER, receive_learner)
+            time.sleep(self.wait)
+            alive = sorted(name for name in bus.living() if name != bus.source)
+        if self.json:
+            print_json({"alive": alive, "processes": processes, "learners": learners})
+            return 0
+        table = StackingTable("process", "state", "figures", **PLAIN)
+        for name in sorted({*alive, *processes}):
+            state = "[green]alive[/]" if name in alive else "[red]gone[/]"
+            table.add_row(name, state, figures_text(processes.get(name, {})))
+        console.print(table)
+        for robot, figures in learners.items():
+            console.print(
+                f"learning {robot}: {figures['steps']} steps, {figures['updates']} updates, "
+                f"{figures['steps_per_s']:.0f} steps/s, {figures['updates_per_s']:.0f} updates/s, "
+                f"critic loss {figures['critic_loss']:.3f}, actor loss {figures['actor_loss']:.3f}, "
+                f"weights {figures['weights_version']}"
+            )
+        return 0
+
+
+def figures_text(values: dict[str, Any]) -> str:
+    """Return the figures and notes of a process that are not zero or empty, without the counts of each channel."""
+    shown = {name: value for name, value in values.items() if value and "/" not in name}
+    return escape(", ".join(f"{k} {v:.4g}" if isinstance(v, float) else f"{k} {v}" for k, v in shown.items()))

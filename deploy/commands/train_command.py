@@ -1,0 +1,135 @@
+"""Implement `brakeline train`: start and supervise all processes of a run on this machine."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, field, fields, replace
+from pathlib import Path
+from typing import Any, ClassVar, Self
+
+from brakeline.deploy.commands.common_options import (
+    Json,
+    PhysicsOptions,
+    RunBusOptions,
+    RunFolder,
+    ServiceOptions,
+    Unprefixed,
+    console,
+    errors,
+    print_json,
+)
+from brakeline.deploy.progress import under_way
+from brakeline.deploy.run.run_config import EXPERIMENTS, RunConfig, load
+
+STOPPED = 130  # exit status: the user stopped the run before its last step
+
+
+@dataclass(frozen=True)
+class TrainCommand(RunConfig):
+    """The options of `brakeline train`: the fields of RunConfig, and what a configuration does not hold."""
+
+    steps: int = 0
+    """Training steps for each robot kind. 0 takes the steps of the experiment, of the resumed run, or of the logs if
+    there is no actor."""
+    filtering: Unprefixed[ServiceOptions] = field(default_factory=ServiceOptions)
+    physics: Unprefixed[PhysicsOptions] = field(default_factory=PhysicsOptions)
+    experiment: str = "default"
+    """Configuration that the other options start from: default, demo or debug."""
+    out: RunFolder = None
+    resume: Path | None = None
+    """Continue the run in this folder, with its own configuration. Only --steps and --from-logs can change."""
+    meeting: Unprefixed[RunBusOptions] = field(default_factory=RunBusOptions)
+    json: Json = False
+
+    # Options that `--help` leaves to `--help-all`.
+    expert: ClassVar[tuple[str, ...]] = (
+        *("physics", "robots_per_actor", "penalty", "deadline", "replicas", "from_logs", "practice", "change"),
+        *("deterministic", "record", "rotation", "pictures", "mavlink", "meeting", "learner"),
+    )
+
+    def __post_init__(self) -> None:
+        """Check nothing yet: `config` builds a RunConfig, which checks its values."""
+
+    @classmethod
+    def defaults(cls, arguments: list[str]) -> Self:
+        """Return the default options: those of the experiment that `arguments` name. Raises ValueError for others."""
+        name = cls.experiment
+        for flag, value in zip(arguments, [*arguments[1:], ""], strict=True):
+            option, equals, attached = flag.partition("=")
+            if option == "--experiment":
+                name = attached if equals else value
+        if name not in EXPERIMENTS:
+            raise ValueError(f"no experiment is called {name!r}; there are: {', '.join(EXPERIMENTS)}")
+        return cls(experiment=name, **_run_values(EXPERIMENTS[name]) | {"steps": 0})
+
+    def config(self) -> RunConfig:
+        """Return the run's configuration. Raises ValueError if options contradict each other."""
+        if self.resume is not None:
+            from brakeline.deploy.run.processes import CONFIG
+
+            resumed = load(self.resume / CONFIG)
+            from_logs = self.from_logs or resumed.from_logs
+            return replace(resumed, steps=self.steps or resumed.steps, from_logs=from_logs)
+        from brakeline.messaging.task import address
+        from brakeline.safety.model.model_config import check_reservations
+
+        if self.fleet:
+            check_reservations(self.filtering.method)
+        values = _run_values(self) | {
+            "robots": tuple(address(name) for name in self.robots),
+            "method": self.filtering.method,
+            "model_config": self.filtering.model_config(),
+            "accept_bound": self.filtering.accept_bound,
+            "conditions": self.physics.conditions(),
+            "actors": 1 if self.deterministic else self.actors,
+            "robots_per_actor": self.fleet or self.robots_per_actor,
+            "steps": self.steps or self._default_steps(),
+        }
+        return RunConfig(**values)
+
+    def _default_steps(self) -> int:
+        """Return the steps in the logs if nothing else teaches the learner, else the experiment's steps."""
+        if not self.from_logs or self.actors:
+            return EXPERIMENTS[self.experiment].steps
+        from brakeline.deploy.run.log_feed import count
+        from brakeline.messaging.task import robot_with_task
+
+        with under_way("counting the steps of the logs"):
+            return max(count(self.from_logs, robot_with_task(name)) for name in self.robots)
+
+    def run(self) -> int:
+        """Run the training. Returns the exit status."""
+        folder = self.resume or self.out or dated_folder()
+        return train(self.config(), folder, self.resume is not None, self.meeting, self.json)
+
+
+def _run_values(config: RunConfig) -> dict[str, Any]:
+    return {item.name: getattr(config, item.name) for item in fields(RunConfig)}
+
+
+def train(config: RunConfig, folder: Path, resume: bool, meeting: RunBusOptions, as_json: bool) -> int:
+    """Run all processes of a configuration, with a display on stdout (with `as_json` on stderr).
+
+    Returns the exit status: 0, or STOPPED if the run was stopped before its last step.
+    """
+    shown = errors if as_json else console
+    summary_line = f"{', '.join(config.robots)}, method {config.method}, arena {config.arena}, {config.steps} steps"
+    with under_way(f"{folder}: {summary_line}"):  # the imports alone take seconds
+        from brakeline.deploy.run.display import Display, summary
+        from brakeline.deploy.run.launcher import Launcher, prepare
+
+    prepare(config, folder, resume)
+    if resume:
+        shown.print(f"resuming {folder} from the learner's last checkpoint; the log continues in a new file")
+    with Display(shown, config.steps * len(config.robots)) as display:
+        figures = Launcher(config, folder, meeting.settings(config, folder)).run(display)
+    if as_json:
+        print_json(figures)
+    else:
+        summary(console, figures)
+    return 0 if figures["finished"] else STOPPED
+
+
+def dated_folder() -> Path:
+    """Return the default folder of a run that starts now."""
+    return Path("runs") / time.strftime("%Y%m%d-%H%M%S")
