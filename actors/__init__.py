@@ -1,1 +1,1 @@
-"""Processes that drive robots: observe, propose, ask the safety service, act, publish."""
+"""Processes that drive robots: they observe, propose, ask the safety service, act and publish."""

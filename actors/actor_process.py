@@ -1,4 +1,8 @@
-"""PROCESS: drives one or several robots: observe, propose, ask safety, act, publish."""
+"""PROCESS: drive one or several robots with the loop of `brakeline.actors.episode_runner`, over the bus.
+
+The process adds to that loop: the learner's permission for each step, one question to the safety service about all
+robots, waiting for a service that does not answer while the robots stand, and publishing.
+"""
 
 from __future__ import annotations
 
@@ -12,12 +16,19 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 
 from brakeline.actors.actor_settings import PhysicsChange as PhysicsChange
-from brakeline.actors.decision_guard import Ask, DecisionOutcome, request_decisions
-from brakeline.actors.episode_runner import EPISODE_STRIDE, ActorIdentity, Environment, EpisodeRunner
-from brakeline.actors.joint_episode import RobotGroup, SharedWorld, joint_outcomes
+from brakeline.actors.decision_guard import Ask, DecisionOutcome
+from brakeline.actors.episode_runner import (
+    EPISODE_STRIDE,
+    ActorIdentity,
+    Environment,
+    EpisodeRunner,
+    RobotGroup,
+    SharedWorld,
+    decide,
+)
 from brakeline.actors.learner_client import LearnerClient
 from brakeline.actors.mavlink.frame_recorder import FrameRecorder, MessageSink
-from brakeline.actors.policies import FixedPolicy, LearnedPolicy, PolicyFactory, Proposer, RealTimePolicy, check
+from brakeline.actors.policies import FixedPolicy, LearnedPolicy, PolicyFactory, Proposer, RealTimePolicy, Stop
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.bus import BusSettings, Publisher
 from brakeline.messaging.process_runtime import Process
@@ -32,74 +43,84 @@ if TYPE_CHECKING:
 
 log = logging.getLogger("brakeline.actor")
 
-PATIENCE = 0.05  # s between questions of a standing robot that got no answer
+RETRY_INTERVAL = 0.05  # s between two questions about robots that stand and got no answer
 
 
 @dataclass(frozen=True)
 class ActorSettings:
+    """Settings of an actor process."""
+
     bus: BusSettings
     robot: str = "ground"
     name: str = "actor-0"
-    number: int = 0  # of the first robot of this process
-    robots: int = 1  # in this process; their requests share a question
-    fleet: bool = False  # they share a world, too
+    number: int = 0  # the number of this process's first robot
+    robots: int = 1  # number of robots in this process; one question is about all of them
+    fleet: bool = False  # whether the robots share a world
     seed: int = 0
     arena: str = "default"
     method: str = "ddpc"
     penalty: float = 1.0
-    deadline: float = 0.1  # s for an answer of the safety service
+    deadline: float = 0.1  # s in which the safety service must answer
     lockstep: bool = False
-    practice: float = 0.0  # share of steps at which a robot starts to follow its committed plan to the stop
+    practice: float = 0.0  # probability at each step that a robot begins to follow its committed plan to the stop
     change: PhysicsChange = field(default_factory=PhysicsChange)
-    mavlink: bool = False  # log every frame of quadrotors in memory; in real time it is always done
-    steps: int = 0  # of each robot with a policy that does not learn; 0: no end
+    mavlink: bool = False  # whether to log every frame of simulated quadrotors; a real-time flight always logs them
+    steps: int = 0  # steps of each robot whose policy does not learn; 0: no end
 
 
 class EnvironmentFactory(Protocol):
-    """Makes a robot's environment; tap: is to be called with every MAVLink frame, if there are any."""
+    """Makes a robot's environment. tap: called with every MAVLink frame, if there are any."""
 
     def __call__(self, robot: RobotWithTask, arena: str, seed: int, *, tap: FrameTap | None = None) -> Environment: ...
 
 
-WorldFactory = Callable[
-    [RobotWithTask, str, int, int], SharedWorld
-]  # of robots of a kind in an arena, so many, from a seed
+WorldFactory = Callable[[RobotWithTask, str, int, int], SharedWorld]  # (robot, arena, number of robots, seed)
 
-STOP_PRACTICE = "Practised: the stop goes on as it was verified"  # instead of an answer
-STANDING = 2  # periods that a practised stop lasts beyond its plan
+STOP_PRACTICE = "Practised: the stop goes on as it was verified"  # the failure of an outcome that was not needed
+STANDSTILL = 2  # periods that a practised stop lasts after its plan
 
 
 class StopPractice:
-    """Now and then the committed plan to its end: safe, for it was verified, and the only way to go on recording what
-    a stop is like (`brakeline certify LOG`)."""
+    """Stops that a robot makes from time to time by following its committed plan to the end.
 
-    def __init__(self, share: float) -> None:
-        self.share, self._left = share, 0
-        self.running = False  # is the last proposal part of a stop?
+    Such a stop is safe, since the plan was verified. It is the only way to go on recording real stops, which
+    `brakeline certify LOG` needs.
 
-    def instead(self, driver: EpisodeRunner, proposal: Array) -> Array:
-        """The committed plan's next input while a stop is practised, else the proposal."""
-        if self._left == 0 and self.share > 0.0 and driver.rng.random() < self.share:
-            self._left = driver.robot.horizon - 1 + STANDING
+    Attributes:
+        running: whether the last proposal was part of a stop.
+    """
+
+    def __init__(self, probability: float) -> None:
+        """probability: of beginning a stop, at each step."""
+        self.probability, self._left = probability, 0
+        self.running = False
+
+    def proposal(self, runner: EpisodeRunner, proposal: Array) -> Array:
+        """Return the committed plan's next input during a stop, otherwise the proposal."""
+        if self._left == 0 and self.probability > 0.0 and runner.rng.random() < self.probability:
+            self._left = runner.robot.horizon - 1 + STANDSTILL
         self.running = self._left > 0
         if not self.running:
             return proposal
         self._left -= 1
-        return np.asarray(driver.backup_plan.plan[driver.robot.committed_steps])
+        return np.asarray(runner.backup_plan.plan[runner.robot.committed_steps])
 
-    def kept(self, driver: EpisodeRunner, outcome: DecisionOutcome) -> DecisionOutcome:
-        """A stop that was begun goes on as it was verified, also where the filter would do something else by now: it
-        keeps more distance than is needed. Not where what was verified does not hold any more."""
+    def outcome(self, runner: EpisodeRunner, outcome: DecisionOutcome) -> DecisionOutcome:
+        """Return the outcome to act on: during a stop, one without an answer, so that the committed plan goes on.
+
+        The filter may prefer another input during a stop, to keep more clearance than the plan needs. Its answer
+        counts only if it allows the plan's input, or if the verification of the plan does not hold any more.
+        """
         answer = outcome.answer
-        if not self.running or answer is None or answer.kind == ALLOWED or not driver.backup_plan.holds:
+        if not self.running or answer is None or answer.kind == ALLOWED or not runner.backup_plan.holds:
             return outcome
         return replace(outcome, answer=None, failure=STOP_PRACTICE)
 
 
 class ActorRunner:
-    """A driver with its link to the learner and its publishers."""
+    """One robot with its proposer and its publishers."""
 
-    waits = True  # standing, for the safety service, instead of letting time pass
+    waits = True  # whether a standing robot waits for the safety service instead of letting time pass
 
     def __init__(
         self,
@@ -108,99 +129,114 @@ class ActorRunner:
         offset: int,
         make: EnvironmentFactory,
         propose: PolicyFactory | None = None,
-        goes_on: bool = False,
+        continuous: bool = False,
         env: Environment | None = None,
     ) -> None:
-        """propose: instead of learning; goes_on: see Driver; env: its place in a world that others share."""
+        """
+        Args:
+            offset: the robot's number in this process.
+            propose: makes the policy; None: the robot learns.
+            continuous: see `EpisodeRunner`.
+            env: the robot's environment in a shared world; None: `make` makes one.
+        """
         robot = robot_with_task(settings.robot)
         actor = settings.name if settings.robots == 1 else f"{settings.name}.{offset}"
         identity = ActorIdentity(actor, settings.number + offset, settings.seed)
         publisher: Callable[..., Publisher] = process.bus.publisher
-        frames = publisher(FRAMES, robot=robot.name, source=actor)
-        self.tape = FrameRecorder(frames, robot.name, actor)
-        tap = self.tape.take if settings.mavlink else None
+        self.frames = FrameRecorder(publisher(FRAMES, robot=robot.name, source=actor), robot.name, actor)
+        tap = self.frames.record if settings.mavlink else None
         env = env or make(robot, settings.arena, settings.seed, tap=tap)
-        filtered, cuts = settings.method != "none", settings.method == "sailr"
-        self.driver = EpisodeRunner(robot, env, identity, settings.penalty, filtered, cuts, goes_on)
+        filtered, ends_on_intervention = settings.method != "none", settings.method == "sailr"
+        self.runner = EpisodeRunner(robot, env, identity, settings.penalty, filtered, ends_on_intervention, continuous)
         if propose is None:
-            student = LearnerClient(process.bus, robot, actor, settings.lockstep)
-            self.proposer: Proposer = RealTimePolicy(student) if goes_on else LearnedPolicy(student)
+            learner = LearnerClient(process.bus, robot, actor, settings.lockstep)
+            self.proposer: Proposer = RealTimePolicy(learner) if continuous else LearnedPolicy(learner)
         else:
             self.proposer = FixedPolicy(propose, settings.seed + identity.number, settings.steps)
         self.next_episode = 0
-        self.waiting = False  # for the safety service, standing
+        self.waiting = False  # whether the robot stands and waits for the safety service
         self.proposal = np.zeros(robot.action_dim)  # the last one
-        self.braking = False  # for want of a decision
+        self.braking = False  # whether the robot brakes because there was no decision
         self.practice, self.change = StopPractice(settings.practice), settings.change
         self.steps: MessageSink = publisher(STEP, robot=robot.name, source=actor)
         self.episodes: MessageSink = publisher(EPISODE, robot=robot.name, source=actor)
         self.exchanges: MessageSink = publisher(EXCHANGE, robot=robot.name, source=actor)
 
-    def join(self, stop: Callable[[], bool]) -> bool:
-        """Wait until there are proposals; False: told to stop."""
-        episode = self.proposer.join(self.driver.index, self.next_episode, stop)
+    def join(self, stop: Stop) -> bool:
+        """Wait until the proposer is ready. Return False if `stop` returned true."""
+        episode = self.proposer.join(self.runner.index, self.next_episode, stop)
         self.next_episode = max(self.next_episode, episode or 0)
         return episode is not None
 
-    def ready(self, stop: Callable[[], bool]) -> bool:
-        """Wait for permission to step, and begin an episode if none is running; False: the end."""
-        if self.driver.index == self.change.after:
-            self.driver.env.alter(**self.change.changes())
-        if not self.proposer.ready(self.driver.index + 1, self.next_episode, stop):
-            return False
-        if not self.driver.running:
-            self.episodes.put(self.driver.begin(self.next_episode))
-            self.next_episode += 1
-            self.proposer.begin(self.driver.rng)
-        return True
+    def may_step(self, stop: Stop) -> bool:
+        """Wait for permission for the next step. Return False at the end of the run."""
+        if self.runner.index == self.change.after:
+            self.runner.env.alter(**self.change.changes())
+        return self.proposer.ready(self.runner.index + 1, self.next_episode, stop)
+
+    def begin(self, episode: pb.Episode) -> None:
+        """Publish an episode that has begun."""
+        self.episodes.put(episode)
+        self.next_episode = episode.episode + 1
+        self.proposer.begin(self.runner.rng)
 
     def propose(self) -> Array:
-        """The proposer's action; now and then a practised stop's.
+        """Return the proposal (m,): the proposer's, or that of a practised stop.
 
-        Who stands and waits goes on proposing the same: how often it has to ask must not move the random generator.
+        A robot that stands and waits keeps its proposal: the number of questions must not advance the generator.
         """
-        driver = self.driver
+        runner = self.runner
+        if not runner.running:
+            return runner.robot.zero_input()
         if not self.waiting:
-            proposal = self.proposer.propose(driver.observation, driver.info)
-            check(proposal, self.proposer.version)
-            self.proposal = self.practice.instead(driver, proposal)
+            proposal = self.proposer.propose(runner.observation, runner.info)
+            if not np.isfinite(proposal).all():
+                log.error("the policy with weights %d proposes %s", self.proposer.version, proposal)
+            self.proposal = self.practice.proposal(runner, proposal)
         return self.proposal
 
     def settle(self, outcome: DecisionOutcome) -> DecisionOutcome:
-        """The last word on an outcome, when it is to be put into action."""
+        """Return the outcome to act on, and publish it."""
+        if not self.runner.fleet_size:  # in a fleet, one robot without an answer would take the others' answers away
+            outcome = self.practice.outcome(self.runner, outcome)
+        outcome = self.commit(outcome)
         if (outcome.answer is None) != self.braking:
             self.braking = outcome.answer is None
             if self.braking and not self.practice.running:
                 log.warning("no decision, braking along the committed plan: %s", outcome.failure)
+        self.exchanges.put(outcome.exchange(self.runner.info["time"]))
         return outcome
 
-    def act(self, proposal: Array, outcome: DecisionOutcome | None) -> pb.Step:
-        if outcome is not None:
-            outcome = self.settle(self.practice.kept(self.driver, outcome))
-            self.exchanges.put(outcome.exchange(self.driver.info["time"]))
-        step = self.driver.execute(proposal, outcome, self.proposer.version)
+    def commit(self, outcome: DecisionOutcome) -> DecisionOutcome:
+        """Return the outcome to act on: here the same; in real time the plan may come too late."""
+        return outcome
+
+    def publish(self, step: pb.Step) -> None:
+        """Publish a step, and the MAVLink frames of its period."""
         self.steps.put(step)
-        self.tape.publish()
-        return step
+        self.frames.publish()
 
 
 @dataclass
 class ActorStats:
+    """Counts of a process, over all its robots."""
+
     steps: int = 0
     fallbacks: int = 0
     waits: int = 0
-    round_trip_ms: float = 0.0  # sum
+    round_trip_ms: float = 0.0  # sum over the steps
     collisions: int = 0
     contacts_robots: int = 0
 
     def count(self, step: pb.Step) -> None:
+        """Add a step."""
         self.steps += 1
         self.fallbacks += step.fallback
         self.collisions += step.collision
         self.contacts_robots += step.contact_robot
 
     def figures(self, seconds: float) -> dict[str, float]:
-        """For Health."""
+        """Return the figures for Health after this many seconds."""
         return {
             "steps": self.steps,
             "steps_per_s": self.steps / max(seconds, 1e-9),
@@ -212,68 +248,63 @@ class ActorStats:
         }
 
 
-def cycle(riders: list[ActorRunner], question: Ask | None, tally: ActorStats, stop: Callable[[], bool]) -> bool:
-    """One period of all robots of the process; False: the end."""
-    for rider in riders:
-        if not rider.ready(stop):
-            return False
-    proposals = [rider.propose() for rider in riders]
-    outcomes: list[DecisionOutcome | None] = [None] * len(riders)
-    if question is not None:
-        requests = [rider.driver.request(p) for rider, p in zip(riders, proposals, strict=True)]
-        outcomes = list(request_decisions(question, requests, riders[0].driver.robot))
-    for rider, proposal, outcome in zip(riders, proposals, outcomes, strict=True):
-        if outcome is not None:
-            tally.round_trip_ms += outcome.round_trip_ms
-            if rider.waits and rider.driver.may_wait(outcome):
-                if not rider.waiting:
-                    log.warning("standing and waiting for the safety service: %s", outcome.failure)
-                rider.waiting = True
-                tally.waits += 1
-                time.sleep(PATIENCE)
-                continue
-            rider.waiting = False
-        tally.count(rider.act(proposal, outcome))
-    return True
+class ActorGroup:
+    """The robots whose time passes together (see `RobotGroup`), with what publishes them."""
 
+    def __init__(self, actors: Sequence[ActorRunner], world: SharedWorld | None = None, reserving: bool = True) -> None:
+        """See `RobotGroup`."""
+        self.actors = list(actors)
+        self.robots = RobotGroup([actor.runner for actor in actors], world, reserving)
 
-def cycle_together(
-    fleet: RobotGroup, riders: list[ActorRunner], question: Ask | None, tally: ActorStats, stop: Callable[[], bool]
-) -> bool:
-    """One period of the robots of one world; False: the end. Time passes for all of them or for none."""
-    if not fleet.running:
-        episode = max(rider.next_episode for rider in riders)
-        if not all(rider.proposer.ready(rider.driver.index + 1, episode, stop) for rider in riders):
-            return False
-        for rider, message in zip(riders, fleet.begin(episode), strict=True):
-            rider.episodes.put(message)
-            rider.next_episode = episode + 1
-            rider.proposer.begin(rider.driver.rng)
-    if not all(rider.ready(stop) for rider in riders if rider.driver.running):
-        return False
-    proposals = [rider.propose() if rider.driver.running else rider.driver.robot.zero_input() for rider in riders]
-    outcomes: list[DecisionOutcome | None] = [None] * len(riders)
-    if question is not None:
-        outcomes = joint_outcomes(request_decisions(question, fleet.requests(proposals), riders[0].driver.robot))
-    told = list(zip(riders, outcomes, strict=True))
-    waits = all(outcome is not None and rider.driver.may_wait(outcome) for rider, outcome in told)
-    for rider in riders:
-        if waits and not rider.waiting:
-            log.warning("%s: standing and waiting for the safety service", rider.driver.identity.actor)
-        rider.waiting = waits
-    if waits:
-        tally.waits += 1
-        time.sleep(PATIENCE)
+    def ready(self, stop: Stop) -> bool:
+        """Wait for permission to step, and begin an episode if none is running. Return False at the end of the run."""
+        driving = [actor for actor in self.actors if actor.runner.running]
+        episode = max(actor.next_episode for actor in self.actors)
+        for actor in driving or self.actors:
+            actor.next_episode = episode
+            if not actor.may_step(stop):
+                return False
+        if not driving:
+            for actor, message in zip(self.actors, self.robots.begin(episode), strict=True):
+                actor.begin(message)
         return True
-    for rider, outcome in told:
-        if outcome is not None:
-            tally.round_trip_ms += outcome.round_trip_ms
-            rider.exchanges.put(rider.settle(outcome).exchange(rider.driver.info["time"]))
-    versions = [rider.proposer.version for rider in riders]
-    for rider, step in zip(riders, fleet.execute(proposals, outcomes, versions), strict=True):
-        if step is not None:
-            rider.steps.put(step)
-            tally.count(step)
+
+    def act(self, proposals: Sequence[Array], outcomes: Sequence[DecisionOutcome | None], stats: ActorStats) -> None:
+        """Act on the outcomes for one period, or wait if there are none and all robots stand."""
+        if self._wait(outcomes):
+            stats.waits += 1
+            time.sleep(RETRY_INTERVAL)
+            return
+        settled = [
+            None if outcome is None else actor.settle(outcome)
+            for actor, outcome in zip(self.actors, outcomes, strict=True)
+        ]
+        stats.round_trip_ms += sum(outcome.round_trip_ms for outcome in settled if outcome is not None)
+        versions = [actor.proposer.version for actor in self.actors]
+        for actor, step in zip(self.actors, self.robots.execute(proposals, settled, versions), strict=True):
+            if step is not None:
+                stats.count(step)
+                actor.publish(step)
+
+    def _wait(self, outcomes: Sequence[DecisionOutcome | None]) -> bool:
+        turns = list(zip(self.actors, outcomes, strict=True))
+        waits = all(outcome and actor.waits and actor.runner.may_wait(outcome) for actor, outcome in turns)
+        for actor, outcome in turns:
+            if waits and outcome and not actor.waiting:
+                name = actor.runner.identity.actor
+                log.warning("%s: standing and waiting for the safety service: %s", name, outcome.failure)
+            actor.waiting = waits
+        return waits
+
+
+def run_period(groups: Sequence[ActorGroup], ask: Ask | None, stats: ActorStats, stop: Stop) -> bool:
+    """Run one period of all robots of the process. Return False at the end of the run."""
+    if not all(group.ready(stop) for group in groups):
+        return False
+    proposals = [[actor.propose() for actor in group.actors] for group in groups]
+    outcomes = decide([group.robots for group in groups], proposals, ask)
+    for group, inputs, answers in zip(groups, proposals, outcomes, strict=True):
+        group.act(inputs, answers, stats)
     return True
 
 
@@ -283,34 +314,44 @@ def run(
     propose: PolicyFactory | None = None,
     make_world: WorldFactory | None = None,
 ) -> bool:
-    """Drive until the learner says the run is done (True), or SIGINT or SIGTERM. propose: a policy instead of learning,
-    for as many steps as the settings say (of a fleet: until one robot has taken them); make_world: of a fleet.
+    """Drive until the run is over (True), or until SIGINT or SIGTERM (False).
+
+    Args:
+        settings: the settings of the process.
+        make: makes the environment of a robot that is alone.
+        propose: makes each robot's policy; None: the robots learn. The run is then over after as many steps as the
+            settings say, in a fleet once one robot has taken them.
+        make_world: makes the world of a fleet.
 
     Raises:
         RefusedByLearner, Unreachable: with what to do.
     """
-    tally = ActorStats()
+    stats = ActorStats()
     with Process(settings.bus, settings.name) as process:
-        stop = process.stop.is_set
-        world = None
-        if settings.fleet and make_world is not None:
-            number = settings.seed * EPISODE_STRIDE + settings.number
-            world = make_world(robot_with_task(settings.robot), settings.arena, settings.robots, number)
-        places: Sequence[Environment | None] = [None] * settings.robots if world is None else world.members
-        riders = [ActorRunner(process, settings, i, make, propose, env=env) for i, env in enumerate(places)]
-        one_period: Callable[[list[ActorRunner], Ask | None, ActorStats, Callable[[], bool]], bool] = cycle
-        if world is not None:
-            fleet = RobotGroup(world, [rider.driver for rider in riders], settings.method != "none")
-            one_period = partial(cycle_together, fleet)
-        started = time.monotonic()
-
-        process.refresh = lambda: process.figures.update(tally.figures(time.monotonic() - started))
+        stop, started = process.stop.is_set, time.monotonic()
+        groups = _groups(process, settings, make, propose, make_world)
+        process.refresh = lambda: process.figures.update(stats.figures(time.monotonic() - started))
         process.announce()
-        question: Ask | None = None
-        if settings.method != "none":
-            question = lambda requests: query_service(process.bus, requests, settings.deadline)  # noqa: E731
-        if all(rider.join(stop) for rider in riders):
-            while not stop() and one_period(riders, question, tally, stop):
+        filtered = settings.method != "none"
+        question: Ask | None = partial(query_service, process.bus, deadline=settings.deadline) if filtered else None
+        if all(actor.join(stop) for group in groups for actor in group.actors):
+            while not stop() and run_period(groups, question, stats, stop):
                 pass
-        log.info("%s: %d steps, %d fallbacks, %d waits", settings.name, tally.steps, tally.fallbacks, tally.waits)
+        log.info("%s: %d steps, %d fallbacks, %d waits", settings.name, stats.steps, stats.fallbacks, stats.waits)
         return not stop()
+
+
+def _groups(
+    process: Process,
+    settings: ActorSettings,
+    make: EnvironmentFactory,
+    propose: PolicyFactory | None,
+    make_world: WorldFactory | None,
+) -> list[ActorGroup]:
+    """Make the robots of a process: a fleet in one world, or robots that are alone."""
+    if not settings.fleet or make_world is None:
+        return [ActorGroup([ActorRunner(process, settings, i, make, propose)]) for i in range(settings.robots)]
+    seed = settings.seed * EPISODE_STRIDE + settings.number
+    world = make_world(robot_with_task(settings.robot), settings.arena, settings.robots, seed)
+    actors = [ActorRunner(process, settings, i, make, propose, env=env) for i, env in enumerate(world.members)]
+    return [ActorGroup(actors, world, settings.method != "none")]

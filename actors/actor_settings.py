@@ -1,4 +1,4 @@
-"""What an actor can be told of its robots. Nothing heavy here: whoever starts a run reads it."""
+"""Settings of an actor. This module imports nothing heavy, since the launcher reads it too."""
 
 from __future__ import annotations
 
@@ -7,31 +7,31 @@ from dataclasses import asdict, dataclass
 
 @dataclass(frozen=True)
 class PhysicsChange:
-    """What becomes of each robot after so many steps: the robot that was recorded is not the one that drives on.
+    """A change of each robot's physics during a run, so that the robot differs from the one in the recorded data.
 
-    What is None stays as it is; a robot kind refuses what it does not have.
+    A value of None changes nothing. A robot kind raises an error for a value that it does not have.
     """
 
-    after: int = -1  # -1: never
+    after: int = -1  # steps until the change; -1: never
     payload_kg: float | None = None
     floor_friction: float | None = None
     wind_speed: float | None = None  # m/s
     gust: float | None = None  # m/s
 
     def changes(self) -> dict[str, float]:
-        """What a vehicle's `alter` takes."""
+        """Return the arguments for a vehicle's `alter`."""
         values = {name: value for name, value in asdict(self).items() if name != "after"}
         return {name: value for name, value in values.items() if value is not None}
 
 
 @dataclass(frozen=True)
 class FlightSettings:
-    """Which autopilot, and where it is."""
+    """The autopilot of a flight, and how to fly it."""
 
     url: str
     system: int = 1  # MAVLink system id
-    truth: int = 0  # UDP port at which a simulator tells collisions; 0: none does
-    height: float = 3.0  # m above the ground that it climbs to, unless it flies already
-    origin: tuple[float, float, float] = (0.0, 0.0, 0.0)  # m: where the autopilot's local frame begins
-    raise_limits: bool = False  # set the parameters that hold the vehicle below what the filter may ask for
-    lead: bool = False  # tell it places to go to in place of velocities
+    truth: int = 0  # UDP port to which a simulator sends the ground truth; 0: none does
+    height: float = 3.0  # m above the ground to climb to, unless the vehicle flies already
+    origin: tuple[float, float, float] = (0.0, 0.0, 0.0)  # m, start of the autopilot's local frame in the world frame
+    raise_limits: bool = False  # raise the autopilot's parameters that are below the robot's bounds
+    lead: bool = False  # send positions ahead of the vehicle instead of velocities

@@ -1,4 +1,4 @@
-"""Asks for decisions with a deadline; without one the robot brakes along the plan that it committed to."""
+"""Ask for decisions with a deadline. Without an answer, the robot brakes along the plan that it committed to."""
 
 from __future__ import annotations
 
@@ -13,12 +13,19 @@ from brakeline.safety.filter.backup_plan import Array, BackupPlan
 from brakeline.safety.service.client import SafetyError, read_reply
 from brakeline.safety.service.filter_client import Answer, accept
 
-Ask = Callable[[Sequence[pb.Request]], list[pb.Reply]]  # raises BusError when there is no answer
+Ask = Callable[[Sequence[pb.Request]], list[pb.Reply]]  # raises BusError if there is no answer
 
 
 @dataclass(frozen=True)
 class DecisionOutcome:
-    """Of one question about one robot: an answer, or why there is none."""
+    """The outcome of one request.
+
+    Attributes:
+        request, reply: the messages; reply is None if none arrived.
+        answer: the valid answer; None: there is none.
+        failure: why there is no answer; empty: there is one.
+        round_trip_ms: the time that the question took.
+    """
 
     request: pb.Request
     reply: pb.Reply | None
@@ -27,6 +34,7 @@ class DecisionOutcome:
     round_trip_ms: float
 
     def exchange(self, time: float) -> pb.Exchange:
+        """Return the message for the log; time: s, of the request."""
         message = pb.Exchange(request=self.request, round_trip_ms=self.round_trip_ms, failure=self.failure)
         message.header.time = time
         if self.reply is not None:
@@ -35,37 +43,34 @@ class DecisionOutcome:
 
 
 def request_decisions(ask: Ask, requests: Sequence[pb.Request], robot: Robot) -> list[DecisionOutcome]:
-    """One question for all robots of a process. Whatever goes wrong, each has an outcome."""
+    """Ask one question about several robots, and return the outcome of each request, whatever goes wrong."""
     before = perf_counter_ns()
     replies: Sequence[pb.Reply | None]
     try:
         replies, failure = ask(requests), ""
     except BusError as error:
         replies, failure = [None] * len(requests), f"{type(error).__name__}: {error}"
-    elapsed = (perf_counter_ns() - before) * 1e-6
-    return [_outcome(request, reply, failure, elapsed, robot) for request, reply in zip(requests, replies, strict=True)]
-
-
-def _outcome(
-    request: pb.Request, reply: pb.Reply | None, failure: str, elapsed: float, robot: Robot
-) -> DecisionOutcome:
-    answer = None
-    if reply is not None:
-        try:
-            answer = read_reply(reply, request, robot)
-        except SafetyError as error:
-            failure = str(error)
-    return DecisionOutcome(request, reply, answer, failure, elapsed)
+    elapsed_ms = (perf_counter_ns() - before) * 1e-6
+    outcomes = []
+    for request, reply in zip(requests, replies, strict=True):
+        answer, why = None, failure
+        if reply is not None:
+            try:
+                answer = read_reply(reply, request, robot)
+            except SafetyError as error:
+                why = str(error)
+        outcomes.append(DecisionOutcome(request, reply, answer, why, elapsed_ms))
+    return outcomes
 
 
 def next_input(backup_plan: BackupPlan, outcome: DecisionOutcome) -> Array:
-    """The input to execute now: the answer's, else the committed plan's."""
+    """Return the input (m,) to execute next: the answer's, or the committed plan's if there is no answer."""
     if outcome.answer is not None:
         return accept(backup_plan, outcome.answer)
     return backup_plan.fallback()
 
 
 def at_rest(backup_plan: BackupPlan) -> bool:
-    """Is the robot standing, and committed to that? Then it can wait for the service for as long as it takes."""
+    """Return whether the robot stands and its committed plan keeps it there: it can wait for the service."""
     robot = backup_plan.robot
     return bool(robot.is_stop_input(backup_plan.input_in_force) and robot.is_stop_input(backup_plan.plan).all())

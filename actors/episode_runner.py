@@ -1,24 +1,32 @@
-"""One robot through its episodes: what it sees, what it asks, what it does, and the step that comes of it."""
+"""The loop of every robot: observe, propose, ask the safety service, act, and record the step.
+
+An `EpisodeRunner` holds one robot between its resets. A `RobotGroup` holds the robots whose time passes together: one
+robot, or a fleet in a shared world. `decide` asks one question about all robots of some groups. `run_episode` is the
+whole loop without a bus; `brakeline.actors.actor_process` is the same loop with a learner and publishers.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import islice
 from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from brakeline.actors.decision_guard import DecisionOutcome, at_rest, next_input
+from brakeline.actors.decision_guard import Ask, DecisionOutcome, at_rest, next_input, request_decisions
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.obstacle_messages import obstacle_messages
 from brakeline.messaging.task import RobotWithTask
-from brakeline.safety.filter.backup_plan import Array, BackupPlan, Prediction, correction_penalty
+from brakeline.safety.filter.backup_plan import Array, BackupPlan, correction_penalty
 from brakeline.safety.perception.image_memory import filled, memory_of
 from brakeline.safety.service.client import request_message
 from brakeline.safety.service.wire import KINDS
+from brakeline.sim.scripted_policies import Policy
 
-StepResult = tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]  # of a step
-EPISODE_STRIDE = 4096  # episodes of different robots of a run never share a seed: seed = episode · stride + number
+StepResult = tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]  # what an environment's `step` returns
+EPISODE_STRIDE = 4096  # robots of one run never share a seed: seed = episode * stride + number of the robot
 
 
 class Environment(Protocol):
@@ -31,27 +39,53 @@ class Environment(Protocol):
     def step(self, action: Array) -> StepResult: ...
 
     def alter(self, **changes: float) -> None:
-        """Change the robot's physics, from now on."""
+        """Change the robot's physics from now on."""
+
+
+class SharedWorld(Protocol):
+    """Several robots in one physics simulation, such as `brakeline.sim.shared_world.FleetEnv`."""
+
+    @property
+    def members(self) -> Sequence[Environment]:
+        """The environment of each robot, for everything but its steps."""
+
+    def draw(self, episode_seed: int) -> None:
+        """Draw a new world; reset every member afterwards."""
+
+    def step(self, inputs: Sequence[Array]) -> list[Any]:
+        """Simulate one period of all robots, and return the `StepResult` of each."""
 
 
 @dataclass(frozen=True)
 class ActorIdentity:
-    """Who drives: its name on the bus, its number in the run, and the run's seed."""
+    """A robot's name on the bus, its number in the run, and the run's seed."""
 
     actor: str
     number: int
     seed: int
 
     def episode_seed(self, episode: int) -> int:
+        """Return the seed of an episode's arena."""
         return episode * EPISODE_STRIDE + self.number
 
     def noise(self, episode: int) -> np.random.Generator:
-        """The generator of an episode's exploration: it follows from the episode alone, so any run can resume."""
+        """Return the generator of an episode's exploration. It depends on the episode only, so every run can resume."""
         return np.random.default_rng((self.seed, self.number, episode))
 
 
 class EpisodeRunner:
-    """Everything about one robot but the bus and the policy."""
+    """One robot in its environment, with its committed plan; it knows neither the bus nor the policy.
+
+    Attributes:
+        backup_plan: the committed plan.
+        observation, info: the latest ones of the environment.
+        running: whether an episode is running.
+        episode, step: number of the episode, and of the current period in it.
+        index: steps recorded so far, over all episodes.
+        rng: the episode's random generator.
+        fleet_size: number of robots in the shared world; 0: the robot is alone.
+        fleet: names of the robots that reserve space for each other; empty: none do.
+    """
 
     def __init__(
         self,
@@ -60,31 +94,35 @@ class EpisodeRunner:
         identity: ActorIdentity,
         penalty: float = 0.0,
         filtered: bool = True,
-        cuts: bool = False,
-        goes_on: bool = False,
+        ends_on_intervention: bool = False,
+        continuous: bool = False,
     ) -> None:
-        """penalty: for a correction by the whole range of an input; cuts: instead of a penalty, an intervention ends
-        the episode, for the learner as a terminal step with the lowest reward, for the robot as one that was called
-        off (SAILR's training; without `cuts` its episodes go on, braked step by step);
-        goes_on: a reset gives another goal to a robot that goes on as it was, and so does its committed plan."""
+        """
+        Args:
+            penalty: the penalty for a correction by the whole range of an input.
+            filtered: whether the safety service decides about the proposals.
+            ends_on_intervention: an intervention ends the episode instead of costing a penalty. For the learner the
+                step is terminal and has the lowest reward; for the robot the episode is called off (SAILR's training).
+            continuous: a reset sets a new goal for a robot that stays where it is, so its committed plan stays too.
+        """
         self.robot, self.env, self.identity, self.penalty, self.filtered = robot, env, identity, penalty, filtered
-        self.cuts, self._goes_on = cuts, goes_on
+        self.ends_on_intervention, self._continuous = ends_on_intervention, continuous
         self.backup_plan = BackupPlan(robot)
         self._memory = memory_of(robot)
-        self.index = 0  # steps so far
+        self.index = 0
         self.running = False
-        self.size = 0  # robots in its world; 0: it is alone
-        self.fleet: tuple[str, ...] = ()  # their actors, if they promise each other something
+        self.fleet_size = 0
+        self.fleet: tuple[str, ...] = ()
 
     def begin(self, episode: int) -> pb.Episode:
-        """Reset to an episode of that number."""
+        """Reset the environment to the episode of this number, and return the message that describes it."""
         seed = self.identity.episode_seed(episode)
         self.observation, self.info = self.env.reset(options={"episode_seed": seed})
-        if not self._goes_on:
+        if not self._continuous:
             self.backup_plan.reset()
             self._memory.reset()
-        self._remember()
-        self.episode, self.step, self._number, self.running = episode, 0, 0, True
+        self._fill_scan()
+        self.episode, self.step, self._decided_step, self.running = episode, 0, 0, True
         self.rng = self.identity.noise(episode)
         arena = self.info["arena"]
         message = pb.Episode(
@@ -102,14 +140,14 @@ class EpisodeRunner:
         return message
 
     def request(self, proposal: Array) -> pb.Request:
-        """The question about a proposal in the present state."""
+        """Return the request about a proposal (m,) in the current state."""
         return request_message(
             self.backup_plan,
             self.info["state"],
             proposal,
             self.info["obstacles"],
             scan=self._scan,
-            known_free=self._scan is None,  # by the map
+            known_free=self._scan is None,  # without a scan the obstacles come from the complete map
             actor=self.identity.actor,
             episode=self.episode,
             step=self.step,
@@ -118,41 +156,43 @@ class EpisodeRunner:
             fleet=self.fleet,
         )
 
-    def skip(self) -> None:
-        """A period went by unseen: the plan went on, and the steps' numbers show a gap."""
-        self.backup_plan.fallback()
-        self._memory.later(self.robot.period)
-        self.step += 1
-
-    def _remember(self) -> None:
-        """Fill in the scan, if there is one, with what was seen free before."""
-        self._scan = filled(self._memory, self.info, self.robot.period)
-
-    def may_wait(self, outcome: DecisionOutcome) -> bool:
-        """No answer, and nothing moves: better to ask again than to let the episode pass."""
-        return outcome.answer is None and at_rest(self.backup_plan)
+    def decide(self, proposal: Array, ask: Ask | None) -> DecisionOutcome | None:
+        """Ask for a decision on a proposal (m,). Return None if there is no filter (`ask` is None)."""
+        return None if ask is None else request_decisions(ask, [self.request(proposal)], self.robot)[0]
 
     def execute(self, proposal: Array, outcome: DecisionOutcome | None, weights_version: int = 0) -> pb.Step:
-        """Do what the outcome says (without a filter: the proposal) for one period."""
+        """Act on an outcome for one period; without an outcome, execute the proposal. Return the recorded step."""
         action = self.command(proposal, outcome)
-        return self.took(proposal, outcome, action, self.env.step(action), weights_version)
+        return self.record(proposal, outcome, action, self.env.step(action), weights_version)
 
     def command(self, proposal: Array, outcome: DecisionOutcome | None) -> Array:
-        """The input of the coming period; the committed plan moves on. Without a filter a proposal with NaN or infinity
-        counts as standing still."""
-        self._number = self.step
+        """Return the input (m,) of the coming period, and advance the committed plan.
+
+        Without an outcome this is the proposal, clipped to bounds; a proposal with NaN or infinity becomes zero.
+        """
+        self._decided_step = self.step
         if outcome is None:
             proposal = proposal if np.isfinite(proposal).all() else self.robot.zero_input()
             return np.asarray(np.clip(proposal, self.robot.low(), self.robot.high()))
         return next_input(self.backup_plan, outcome)
 
-    def stood(self, result: StepResult) -> None:
-        """A period passed in which it had nothing to do: its episode is over, its world is not."""
-        self.observation, _, _, _, self.info = result
-        self._remember()
+    def may_wait(self, outcome: DecisionOutcome) -> bool:
+        """Return whether the robot stands and got no answer: it can then ask again before the episode goes on."""
+        return outcome.answer is None and at_rest(self.backup_plan)
+
+    def skip(self) -> None:
+        """Account for a period that passed without an observation: the committed plan advanced by one input."""
+        self.backup_plan.fallback()
+        self._memory.later(self.robot.period)
         self.step += 1
 
-    def took(
+    def idle(self, result: StepResult) -> None:
+        """Take in a period after the end of this robot's episode, while others in its world are still driving."""
+        self.observation, _, _, _, self.info = result
+        self._fill_scan()
+        self.step += 1
+
+    def record(
         self,
         proposal: Array,
         outcome: DecisionOutcome | None,
@@ -160,40 +200,35 @@ class EpisodeRunner:
         result: StepResult,
         weights_version: int = 0,
     ) -> pb.Step:
-        """The step that came of a command."""
-        before, held = self.observation, self.info["input_in_force"]
+        """Take in the result of a command, and return the step."""
+        before, input_before = self.observation, self.info["input_in_force"]
         self.observation, reward, terminated, truncated, self.info = result
-        self._remember()
+        info = self.info
+        self._fill_scan()
         self.running = not (terminated or truncated)
         if outcome is None:
-            action = self.info["input_in_force"]  # the vehicle kept to its slew
-        step = self._step(before, proposal, action, reward)
-        if self.filtered:
-            step.penalty = correction_penalty(self.robot, proposal, held, action, self.penalty)
-        step.terminated, step.truncated = terminated, truncated
-        step.goal, step.collision = self.info["at_goal"], self.info["collision"]
-        step.contact_moving, step.contact_standing = self.info["contact_moving"], self.info["contact_standing"]
-        step.contact_robot, step.fleet = self.info["contact_robot"], self.size
-        step.weights_version = weights_version
-        if outcome is not None:
-            self._note(step, outcome)
-        return step
-
-    def _step(self, before: NDArray[np.float32], proposal: Array, action: Array, reward: float) -> pb.Step:
-        info = self.info
+            action = info["input_in_force"]  # the vehicle limited the change of its input
         self.index += 1
         step = pb.Step(
             robot=self.robot.name,
             actor=self.identity.actor,
             episode=self.episode,
-            step=self._number,  # periods that pass unseen meanwhile count on
+            step=self._decided_step,  # skipped periods have raised `self.step` meanwhile
             index=self.index,
             observation=before.tolist(),
-            # A learner takes in finite numbers only. The exchange with the safety service has the proposal as it was.
+            # A learner accepts finite numbers only. The exchange with the safety service has the original proposal.
             proposed=(proposal if np.isfinite(proposal).all() else action).tolist(),
             action=action.tolist(),
             next_observation=self.observation.tolist(),
             reward=reward,
+            terminated=terminated,
+            truncated=truncated,
+            goal=info["at_goal"],
+            collision=info["collision"],
+            contact_moving=info["contact_moving"],
+            contact_standing=info["contact_standing"],
+            contact_robot=info["contact_robot"],
+            fleet=self.fleet_size,
             speed=info["speed"],
             clearance=info["clearance"],
             state=info["state"].tolist(),
@@ -201,31 +236,151 @@ class EpisodeRunner:
             outside=info["outside"],
             path=info["subsamples"].ravel().tolist(),
             turned=info["turned"],
+            weights_version=weights_version,
         )
         step.header.time = info["time"]
         self.step += 1
+        if self.filtered:
+            step.penalty = correction_penalty(self.robot, proposal, input_before, action, self.penalty)
+        if outcome is not None:
+            self._record_decision(step, outcome)
         return step
 
-    def _note(self, step: pb.Step, outcome: DecisionOutcome) -> None:
-        """What the filter did about this step, and whether the state after it is where the filter said."""
-        if outcome.answer is None:
+    def _record_decision(self, step: pb.Step, outcome: DecisionOutcome) -> None:
+        """Write into the step the decision, and whether the new state is in the set that the filter predicted."""
+        answer = outcome.answer
+        if answer is None:
             step.fallback = True
             step.decision = pb.FAILSAFE
             return
-        answer = outcome.answer
         step.decision, step.decide_ms, step.broken = KINDS[answer.kind], answer.time_ms, answer.broken
         if answer.for_clearance is not None:
             step.for_clearance = answer.for_clearance
-        if self.cuts:
-            self._cut(step)
-        predicted: Prediction | None = self.backup_plan.predicted
-        if predicted is not None:
+        if self.ends_on_intervention:
+            self._end_on_intervention(step)
+        if self.backup_plan.predicted is not None:
             step.compared = True
-            step.contained = predicted.contains(self.robot, self.info["state"])
+            step.contained = self.backup_plan.predicted.contains(self.robot, self.info["state"])
 
-    def _cut(self, step: pb.Step) -> None:
-        """No penalty, but the end of the episode if there was an intervention. A collision while braking stays one."""
+    def _end_on_intervention(self, step: pb.Step) -> None:
+        """End the episode if there was an intervention, without a penalty. A collision while braking stays one."""
         step.cut = step.decision == pb.FAILSAFE
         step.penalty = max(step.reward - self.robot.task.reward.cut, 0.0) if step.cut else 0.0
         if step.cut and self.running:
             self.running, step.truncated = False, True
+
+    def _fill_scan(self) -> None:
+        """Complete the scan, if there is one, with the space that earlier scans showed to be free."""
+        self._scan = filled(self._memory, self.info, self.robot.period)
+
+
+class RobotGroup:
+    """The robots whose time passes together: one robot alone, or a fleet in a shared world.
+
+    A robot whose episode is over stands until the others' episodes are over. The filter still decides about it, since
+    the others have to know where it is.
+    """
+
+    def __init__(
+        self, runners: Sequence[EpisodeRunner], world: SharedWorld | None = None, reserving: bool = True
+    ) -> None:
+        """
+        Args:
+            runners: the robots; one, unless there is a world.
+            world: the world that they share; None: the robot has an environment of its own.
+            reserving: whether the robots of a world reserve space for each other; without reservations the filter
+                does not know about the other robots.
+        """
+        assert world is not None or len(runners) == 1, "robots without a shared world have groups of their own"
+        self.runners, self.world = list(runners), world
+        names = tuple(runner.identity.actor for runner in runners)
+        for runner in self.runners if world is not None else ():
+            runner.fleet_size, runner.fleet = len(names), names if reserving else ()
+
+    @property
+    def running(self) -> bool:
+        """Whether the episode of any robot is running."""
+        return any(runner.running for runner in self.runners)
+
+    def begin(self, episode: int) -> list[pb.Episode]:
+        """Begin the episode of this number with all robots at their starts."""
+        if self.world is not None:
+            self.world.draw(self.runners[0].identity.episode_seed(episode))
+        return [runner.begin(episode) for runner in self.runners]
+
+    def requests(self, proposals: Sequence[Array]) -> list[pb.Request]:
+        """Return the request about each robot's proposal (m,)."""
+        return [runner.request(proposal) for runner, proposal in zip(self.runners, proposals, strict=True)]
+
+    def execute(
+        self,
+        proposals: Sequence[Array],
+        outcomes: Sequence[DecisionOutcome | None],
+        versions: Sequence[int] | None = None,
+    ) -> list[pb.Step | None]:
+        """Act on the outcomes for one period. Return the step of each robot; None if its episode was over."""
+        versions = versions or [0] * len(self.runners)
+        turns = list(zip(self.runners, proposals, outcomes, versions, strict=True))
+        inputs = [runner.command(proposal, outcome) for runner, proposal, outcome, _ in turns]
+        results: list[StepResult]
+        results = [self.runners[0].env.step(inputs[0])] if self.world is None else self.world.step(inputs)
+        steps: list[pb.Step | None] = []
+        for (runner, proposal, outcome, version), action, result in zip(turns, inputs, results, strict=True):
+            if runner.running:
+                steps.append(runner.record(proposal, outcome, action, result, version))
+            else:
+                runner.idle(result)
+                steps.append(None)
+        return steps
+
+
+def decide(
+    groups: Sequence[RobotGroup], proposals: Sequence[Sequence[Array]], ask: Ask | None
+) -> list[list[DecisionOutcome | None]]:
+    """Ask one question about all robots of the groups.
+
+    Args:
+        groups: groups of robots of one kind.
+        proposals: of each group, the proposal (m,) of each robot.
+        ask: sends the requests; None: there is no filter.
+
+    Returns:
+        Of each group, the outcome of each robot; None where there is no filter.
+    """
+    if ask is None:
+        return [[None] * len(group.runners) for group in groups]
+    requests = [r for group, inputs in zip(groups, proposals, strict=True) for r in group.requests(inputs)]
+    outcomes = iter(request_decisions(ask, requests, groups[0].runners[0].robot))
+    return [joint_outcomes(list(islice(outcomes, len(group.runners)))) for group in groups]
+
+
+def joint_outcomes(outcomes: Sequence[DecisionOutcome]) -> list[DecisionOutcome | None]:
+    """Discard all answers of a group if one is missing: the other robots' new plans may rest on that robot's plan."""
+    missing = next((outcome for outcome in outcomes if outcome.answer is None), None)
+    if missing is None:
+        return list(outcomes)
+    why = f"no answer about {missing.request.actor}, so none about its fleet: {missing.failure}"
+    return [o if o.answer is None else replace(o, answer=None, reply=None, failure=why) for o in outcomes]
+
+
+def run_episode(
+    group: RobotGroup, policies: Sequence[Policy], ask: Ask | None, episode: int
+) -> Iterator[list[pb.Step]]:
+    """Run one episode, and yield the steps of each period.
+
+    Args:
+        group: the robots.
+        policies: the policy of each robot.
+        ask: the safety service; None: there is no filter.
+        episode: its number.
+    """
+    group.begin(episode)
+    while group.running:
+        proposals = [
+            np.asarray(policy(runner.observation, runner.info), dtype=float)
+            if runner.running
+            else runner.robot.zero_input()
+            for runner, policy in zip(group.runners, policies, strict=True)
+        ]
+        (outcomes,) = decide([group], [proposals], ask)
+        yield [step for step in group.execute(proposals, outcomes) if step is not None]

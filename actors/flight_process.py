@@ -1,8 +1,9 @@
-"""PROCESS: flies one quadrotor in real time behind a MAVLink link; the loop is that of every actor.
+"""PROCESS: fly one quadrotor in real time over a MAVLink link, with the loop of every actor.
 
-Period k: its input goes out; then it is observed, proposed and asked, and what the answer says is for period k + 1. An
-answer that comes too late is discarded for the committed plan's next input, which the vehicle's keeper sends by itself:
-a process of its own, which brakes along that plan should this one die (`brakeline.actors.mavlink.vehicle_server`).
+While the input of period k is in force, the actor observes, proposes and asks; the answer is for period k + 1. An
+answer that comes too late does not count, and the vehicle server sends the committed plan's next input by itself. The
+server is a process of its own (`brakeline.actors.mavlink.vehicle_server`), which brakes along that plan if this
+process dies.
 """
 
 from __future__ import annotations
@@ -22,11 +23,12 @@ from google.protobuf.message import Message
 
 from brakeline.actors.actor_process import (
     STOP_PRACTICE,
+    ActorGroup,
     ActorRunner,
     ActorSettings,
     ActorStats,
     EnvironmentFactory,
-    cycle,
+    run_period,
 )
 from brakeline.actors.actor_settings import FlightSettings as FlightSettings
 from brakeline.actors.decision_guard import Ask, DecisionOutcome, request_decisions
@@ -35,12 +37,13 @@ from brakeline.actors.mavlink.frame_recorder import MessageSink
 from brakeline.actors.mavlink.mavlink_vehicle import ControlPeriod
 from brakeline.actors.mavlink.vehicle_client import VehicleClient
 from brakeline.actors.mavlink.vehicle_messages import FlightRequest
-from brakeline.actors.policies import PolicyFactory
+from brakeline.actors.policies import PolicyFactory, Stop
 from brakeline.messaging.bus import BusError
 from brakeline.messaging.process_runtime import Process
 from brakeline.messaging.robot import Robot
 from brakeline.messaging.task import RobotWithTask, robot_with_task
 from brakeline.safety.filter.backup_plan import Array, BackupPlan
+from brakeline.safety.filter.request import ADJUSTED, ALLOWED
 from brakeline.safety.service.client import query_service, request_message
 from brakeline.sim.arena import Arena
 from brakeline.sim.arena_generator import goal_sequence
@@ -50,34 +53,34 @@ from brakeline.sim.vehicle import Period
 
 log = logging.getLogger("brakeline.flight")
 
-GOALS = 12  # after which they come again: what a policy works out about a goal it works out before the flight
-PATIENCE = 0.2  # s between questions to a service that does not answer yet
+GOALS = 12  # of a flight, which then come again: a policy prepares for each of them before the flight
+RETRY_INTERVAL = 0.2  # s between two questions to a service that does not answer yet
 
 
 class FilterRequired(ValueError):
-    """In real time nobody flies without the filter: its plan is what is flown when nothing else comes."""
+    """A real-time flight needs the filter: without an answer the vehicle flies the filter's plan."""
 
 
 class TakeoffNotVerified(ValueError):
-    """Not even hovering can be verified where the flight is to begin."""
+    """The filter cannot verify that the vehicle may hover where the flight begins."""
 
 
 class BackgroundPublisher:
-    """Publishes in a thread of its own: a receiver that does not drain may block it, and not the flight."""
+    """Publishes in a thread of its own, so that a receiver that does not read cannot hold up the flight."""
 
     def __init__(self) -> None:
         self._queue: SimpleQueue[tuple[MessageSink, Message] | None] = SimpleQueue()
-        self._thread = Thread(target=self._run, name="outbox", daemon=True)
+        self._thread = Thread(target=self._run, name="publisher", daemon=True)
         self._thread.start()
 
-    def at(self, publisher: MessageSink) -> Posting:
-        """What publishes there."""
-        return Posting(publisher, self._queue)
+    def wrap(self, publisher: MessageSink) -> MessageSink:
+        """Return a sink that passes its messages to a publisher in the background."""
+        return QueuedSink(publisher, self._queue)
 
-    def close(self, patience: float = 2.0) -> None:
-        """Wait until all is published, but not for ever."""
+    def close(self, timeout: float = 2.0) -> None:
+        """Wait until everything is published, for `timeout` seconds at most."""
         self._queue.put(None)
-        self._thread.join(patience)
+        self._thread.join(timeout)
 
     def _run(self) -> None:
         while (item := self._queue.get()) is not None:
@@ -89,47 +92,51 @@ class BackgroundPublisher:
 
 
 @dataclass(frozen=True)
-class Posting:
-    """A publisher behind an outbox."""
+class QueuedSink:
+    """A publisher behind the queue of a `BackgroundPublisher`."""
 
     publisher: MessageSink
     queue: SimpleQueue[tuple[MessageSink, Message] | None]
 
     def put(self, message: Message) -> None:
-        """Never waits."""
+        """Queue a message; never waits."""
         self.queue.put((self.publisher, message))
 
 
 class RealTimeVehicle:
-    """A live vehicle as the environment sees it: `step` ends with the period; what was committed is carried out.
+    """A flying vehicle as the environment sees it: `step` waits for the end of the period.
 
-    What is true is not known here: the estimate stands for it, also where rays are cast.
+    The true state is unknown here. The estimate takes its place, also for the rays of a virtual scan.
+
+    Attributes:
+        current_period: the latest control period.
+        skipped: number of periods that passed without an observation.
     """
 
     def __init__(self, vehicle: VehicleClient, skip: Callable[[], object]) -> None:
-        """skip: is called for each period that went by unseen."""
+        """skip: called for each period that passed without an observation."""
         self.vehicle, self._skip = vehicle, skip
         self.current_period: ControlPeriod = vehicle.current_period
         self.skipped = 0
 
     @property
     def true(self) -> Array:
-        """(9,) as estimated."""
+        """The estimated state (9,)."""
         return self.current_period.report.measured
 
     measured = true
 
     @property
     def input(self) -> Array:
-        """(3,) m/s, in force."""
+        """The input in force (3,) [m/s]."""
         return self.current_period.input
 
     def catch_up(self) -> None:
-        """Go on from the next period on, whatever the number of the last one."""
+        """Continue with the next period, whatever the number of the last one."""
         self.current_period = self.vehicle.wait(self.vehicle.current_period.number + 1)
 
     def step(self, input: Array) -> Period:
-        """The running period to its end. Raises MavlinkError."""
+        """Wait for the end of the current period; the vehicle flies the committed plan. Raises MavlinkError."""
         expected = self.current_period.number + 1
         self.current_period = self.vehicle.wait(expected)
         for _ in range(self.current_period.number - expected):
@@ -137,17 +144,21 @@ class RealTimeVehicle:
             self._skip()
         return self.initial_period()
 
-    def initial_period(self) -> Period:
-        """The report about the period that ended last."""
+    def standing(self) -> Period:
+        """Return the report about the last period that ended."""
         return replace(self.current_period.report, true=self.current_period.report.measured)
 
     def alter(self, **changes: float) -> None:
-        """Raises ValueError: nobody can, from here."""
+        """Raises ValueError: the physics of a vehicle behind a link cannot change from here."""
         raise ValueError(f"a vehicle behind a link cannot be altered: {', '.join(changes)}")
 
 
 class FlightRunner(ActorRunner):
-    """A rider whose world does not wait."""
+    """The robot of a flight: its world does not wait.
+
+    Attributes:
+        answers: number of answers by what became of them: in time, late, none, lost, or not needed.
+    """
 
     waits = False
 
@@ -157,67 +168,66 @@ class FlightRunner(ActorRunner):
         settings: ActorSettings,
         stages: Sequence[Arena],
         propose: PolicyFactory | None,
-        outbox: BackgroundPublisher,
+        publisher: BackgroundPublisher,
         conditions: Conditions,
     ) -> None:
-        super().__init__(process, settings, 0, self._environment(stages, conditions), propose, goes_on=True)
-        self._flight: RealTimeVehicle | None = None
-        self.answers: Counter[str] = Counter()  # in time | late | none | lost
-        self.steps, self.episodes, self.exchanges = map(outbox.at, (self.steps, self.episodes, self.exchanges))
-        self.tape.publisher = outbox.at(self.tape.publisher)
+        """stages: the arenas of the flight's episodes, one after the other; they differ in the goal."""
+        super().__init__(process, settings, 0, self._environment(stages, conditions), propose, continuous=True)
+        self._vehicle: RealTimeVehicle | None = None
+        self.answers: Counter[str] = Counter()
+        self.steps, self.episodes, self.exchanges = map(publisher.wrap, (self.steps, self.episodes, self.exchanges))
+        self.frames.publisher = publisher.wrap(self.frames.publisher)
 
     @property
-    def flight(self) -> RealTimeVehicle:
-        """Once it has begun."""
-        assert self._flight is not None, "begin the flight first"
-        return self._flight
+    def vehicle(self) -> RealTimeVehicle:
+        """The vehicle, once `take` has been called."""
+        assert self._vehicle is not None, "call `take` first"
+        return self._vehicle
 
     def take(self, vehicle: VehicleClient) -> None:
-        """From here on it flies this one, which hovers. What is slow the first time is done once before."""
-        self._flight = RealTimeVehicle(vehicle, self.driver.skip)
-        observation, info = self.driver.env.reset(options={"episode_seed": 0})
+        """Fly this vehicle, which hovers, from now on. This does everything once that is slow the first time."""
+        self._vehicle = RealTimeVehicle(vehicle, self.runner.skip)
+        observation, info = self.runner.env.reset(options={"episode_seed": 0})
         self.proposer.begin(np.random.default_rng(0))
         self.proposer.propose(observation, info)
         self._stage = -1
-        self._flight.catch_up()
+        self._vehicle.catch_up()
 
-    def settle(self, outcome: DecisionOutcome) -> DecisionOutcome:
-        """Hand the plan over, if it comes in time and what it was made from counts; else there is no answer."""
-        period, answer = self.flight.current_period, outcome.answer
+    def commit(self, outcome: DecisionOutcome) -> DecisionOutcome:
+        """Commit the answer's plan. Return an outcome without an answer if the plan is late, or its state is lost."""
+        period, answer = self.vehicle.current_period, outcome.answer
         if period.lost:
-            what, outcome = "lost", replace(outcome, answer=None, failure=f"Lost: {period.lost}")
+            result, outcome = "lost", replace(outcome, answer=None, failure=f"Lost: {period.lost}")
         elif outcome.failure == STOP_PRACTICE:
-            what = "not needed"
+            result = "not needed"
         elif answer is None:
-            what = "none"
-        elif self.flight.vehicle.commit(answer.plan[self.driver.robot.committed_steps :], period.number + 1):
-            what = "in time"
+            result = "none"
+        elif self.vehicle.vehicle.commit(answer.plan[self.runner.robot.committed_steps :], period.number + 1):
+            result = "in time"
         else:
-            what, outcome = "late", replace(outcome, answer=None, failure="Late: its period had begun")
-        self.answers[what] += 1
-        return super().settle(outcome)
+            result, outcome = "late", replace(outcome, answer=None, failure="Late: its period had begun")
+        self.answers[result] += 1
+        return outcome
 
-    def stop(self) -> None:
-        """Along the committed plan to hovering."""
-        period = self.flight.current_period
-        self.flight.vehicle.wait(period.number + self.driver.robot.horizon)
+    def brake(self) -> None:
+        """Wait until the vehicle has flown its committed plan to the end, and hovers."""
+        self.vehicle.vehicle.wait(self.vehicle.current_period.number + self.runner.robot.horizon)
 
     def figures(self) -> dict[str, float]:
-        """For Health."""
-        if self._flight is None:
+        """Return figures for Health."""
+        if self._vehicle is None:
             return {}
-        asked = max(self.answers.total() - self.answers["not needed"], 1)
+        needed = max(self.answers.total() - self.answers["not needed"], 1)
         return {
-            **{f"answers {what}": self.answers[what] for what in ("in time", "late", "none", "lost")},
-            "answers in time share": self.answers["in time"] / asked,
-            "periods skipped": self._flight.skipped,
-            **self._flight.vehicle.figures(),
+            **{f"answers {result}": self.answers[result] for result in ("in time", "late", "none", "lost")},
+            "answers in time share": self.answers["in time"] / needed,
+            "periods skipped": self._vehicle.skipped,
+            **self._vehicle.vehicle.figures(),
         }
 
     def _environment(self, stages: Sequence[Arena], conditions: Conditions) -> EnvironmentFactory:
-        """Obstacles are virtual: what a scan shows is cast from the estimated pose."""
-        seeing = conditions.perception.kind == "scan"
-        noise = conditions.lidar_noise(flies=True) if seeing else 0.0
+        """Make the environment: obstacles are virtual, and a scan is computed from the estimated pose."""
+        noise = conditions.lidar_noise(flies=True) if conditions.perception.kind == "scan" else 0.0
 
         def draw(name: str, rng: np.random.Generator, robot: RobotWithTask) -> Arena:
             self._stage += 1
@@ -226,14 +236,14 @@ class FlightRunner(ActorRunner):
         self._stage = -1
 
         def make(robot: RobotWithTask, arena: str, seed: int, *, tap: FrameTap | None = None) -> NavigationEnv:
-            vehicle = lambda arena, rng: self.flight  # noqa: E731
+            vehicle = lambda arena, rng: self.vehicle  # noqa: E731
             return NavigationEnv(robot, arena, vehicle, noise, seed, draw=draw, perception=conditions.perception)
 
         return make
 
 
 def prepared(propose: PolicyFactory, stages: Sequence[Arena], seed: int) -> Any:
-    """The policy, with what it must know of the map worked out."""
+    """Return the policy, prepared for each arena if it can prepare."""
     policy = propose(seed)
     if hasattr(policy, "prepare"):
         for stage in stages:
@@ -241,34 +251,39 @@ def prepared(propose: PolicyFactory, stages: Sequence[Arena], seed: int) -> Any:
     return policy
 
 
-def answered(question: Ask, robot: Robot, stage: Arena, filtered: bool, stop: Callable[[], bool]) -> bool:
-    """Wait until the safety service answers about a robot that hovers at the start; False: told to stop.
+def takeoff_verified(question: Ask, robot: Robot, stage: Arena, filtered: bool, stop: Stop) -> bool:
+    """Wait until the safety service decides about hovering at the start. Return False if `stop` returned true.
 
-    filtered: by our own filter, which knows whether it could.
+    Args:
+        question: asks the service.
+        robot: the robot in real time.
+        stage: the first arena.
+        filtered: whether our own filter decides; a rival method does not tell whether it can verify hovering.
+        stop: once it returns true, nothing here waits any more.
 
     Raises:
-        TakeoffNotVerified: hovering there can't be verified, let alone a flight from there.
+        TakeoffNotVerified: the filter cannot verify hovering there.
     """
     start = np.array(stage.start[: robot.position_dim])
     state = np.concatenate([start, np.zeros(robot.state_dim - len(start))])
-    away = stage.shapes.distance(start)
-    seen = [obstacle for obstacle, far in zip(stage.obstacles, away, strict=True) if far <= robot.sight]
-    said = ""
+    distances = stage.shapes.distance(start)
+    near = [obstacle for obstacle, far in zip(stage.obstacles, distances, strict=True) if far <= robot.sight]
+    logged = ""
     while not stop():
-        request = request_message(BackupPlan(robot), state, np.zeros(robot.action_dim), seen, known_free=True)
+        request = request_message(BackupPlan(robot), state, np.zeros(robot.action_dim), near, known_free=True)
         outcome = request_decisions(question, [request], robot)[0]
         if outcome.answer is not None:
-            if filtered and outcome.answer.kind not in ("allowed", "adjusted"):
+            if filtered and outcome.answer.kind not in (ALLOWED, ADJUSTED):
                 raise TakeoffNotVerified(
-                    f"not taking off: hovering at the start, {away.min():.2f} m from the nearest obstacle, can't be "
-                    f"verified ({outcome.answer.reason}). Where this vehicle drifts to is known too badly for "
-                    "that much room: collect more data, or fly where there is more"
+                    f"not taking off: hovering at the start, {distances.min():.2f} m from the nearest obstacle, can't "
+                    f"be verified ({outcome.answer.reason}). The model set's error bound is too large for so little "
+                    "room: collect more data, or fly where there is more room"
                 )
             return True
-        if outcome.failure != said:
+        if outcome.failure != logged:
             log.info("on the ground, waiting for the safety service: %s", outcome.failure)
-            said = outcome.failure
-        time.sleep(PATIENCE)
+            logged = outcome.failure
+        time.sleep(RETRY_INTERVAL)
     return False
 
 
@@ -279,43 +294,53 @@ def run(
     propose: PolicyFactory | None = None,
     conditions: Conditions | None = None,
 ) -> bool:
-    """Fly from goal to goal on the arena's map until the learner's run is done or the policy's steps are taken (True),
-    or SIGINT or SIGTERM; then brake, and leave the vehicle to its autopilot. Of the conditions, perception counts.
+    """Fly from goal to goal on the arena's map until the run is over (True), or until SIGINT or SIGTERM (False).
+
+    The vehicle then brakes, and stays with its autopilot.
+
+    Args:
+        settings: the settings of the process.
+        flight: the autopilot.
+        arena: the map.
+        propose: makes the policy, which flies the settings' number of steps; None: the robot learns until the learner
+            ends the run.
+        conditions: of these only perception counts.
 
     Raises:
         FilterRequired, TakeoffNotVerified, RefusedByLearner, Unreachable, BadLink: with what to do.
-        MavlinkError: no autopilot, it refuses something, or nobody flies it any more.
+        MavlinkError: there is no autopilot, it refuses something, or nobody flies the vehicle any more.
     """
     robot = robot_with_task(settings.robot)
     if settings.method == "none" or not robot.late:
-        raise FilterRequired("in real time a robot flies behind the filter, with plans that reckon with the delay")
+        raise FilterRequired("a real-time flight needs the filter, and a robot whose plans allow for the delay")
     stages = goal_sequence(arena, GOALS, np.random.default_rng(settings.seed), robot)
     if propose is not None:
         policy = prepared(propose, stages, settings.seed)
         propose = lambda _: policy  # noqa: E731
-    tally, outbox = ActorStats(), BackgroundPublisher()
+    stats, publisher = ActorStats(), BackgroundPublisher()
     with Process(settings.bus, settings.name) as process:
         stop, started = process.stop.is_set, time.monotonic()
-        rider = FlightRunner(process, settings, stages, propose, outbox, conditions or Conditions())
-        process.refresh = lambda: process.figures.update(tally.figures(time.monotonic() - started) | rider.figures())
+        actor = FlightRunner(process, settings, stages, propose, publisher, conditions or Conditions())
+        process.refresh = lambda: process.figures.update(stats.figures(time.monotonic() - started) | actor.figures())
         process.announce()
         question = partial(query_service, process.bus, deadline=settings.deadline)
-        if not (rider.join(stop) and answered(question, robot, stages[0], settings.method == "ddpc", stop)):
+        if not (actor.join(stop) and takeoff_verified(question, robot, stages[0], settings.method == "ddpc", stop)):
             return False
         request = FlightRequest(flight, robot, arena.obstacles)
-        vehicle = VehicleClient(request, rider.tape.keep, process.bus.rejected, stop)
+        vehicle = VehicleClient(request, actor.frames.add, process.bus.rejected, stop)
         try:
-            rider.take(vehicle)
-            while not stop() and cycle([rider], question, tally, stop):
+            actor.take(vehicle)
+            group = ActorGroup([actor])
+            while not stop() and run_period([group], question, stats, stop):
                 pass
             done = not stop()
-            rider.stop()
+            actor.brake()
             vehicle.close()
         except BaseException:
             vehicle.leave()
             raise
         finally:
-            rider.tape.publish()
-            outbox.close()
-        log.info("%s: %d periods, %d without an answer in time", settings.name, tally.steps, tally.fallbacks)
+            actor.frames.publish()
+            publisher.close()
+        log.info("%s: %d periods, %d without an answer in time", settings.name, stats.steps, stats.fallbacks)
         return done

@@ -1,4 +1,4 @@
-"""An actor's side of learning: join the learner, hold its newest weights, and go no further ahead than it allows."""
+"""An actor's link to the learner: join it, hold its newest weights, and take no more steps than it permits."""
 
 from __future__ import annotations
 
@@ -17,28 +17,35 @@ from brakeline.messaging.topics import FLOW, JOIN, WEIGHTS
 log = logging.getLogger("brakeline.actor")
 
 JOIN_TIMEOUT = 2.0  # s
-REJOIN_AFTER = 2.0  # s without permission: the learner may have missed our last step
-LEAP = 1000  # versions that weights may be ahead of ours: who is farther behind asks the learner
-MOST_AHEAD = 10_000  # steps that a learner may ever allow at once
-SAY_EVERY = 10.0  # s between log lines while there is no learner
+REJOIN_AFTER = 2.0  # s without permission: the learner may have missed the last step
+MOST_VERSIONS_AHEAD = 1000  # of published weights; an actor that is farther behind joins the learner again
+MOST_STEPS_AHEAD = 10_000  # that a learner may permit at once
+LOG_INTERVAL = 10.0  # s between two log lines while there is no learner
 
 
 class RefusedByLearner(RuntimeError):
-    """The learner does not take this actor: layouts differ, or it has enough."""
+    """The learner does not accept this actor: their layouts differ, or the learner has enough actors."""
 
 
 class LearnerClient:
-    """The link of one actor name to the learner. `policy` is the newest, None before the first join."""
+    """The link of one actor to the learner.
+
+    Attributes:
+        policy: the newest policy; None before the first join.
+        flow: the learner's latest message about permissions.
+        joins: number of successful joins.
+    """
 
     def __init__(self, bus: Bus, robot: RobotWithTask, actor: str, lockstep: bool = False) -> None:
+        """lockstep: whether each step needs the very weights that the learner names."""
         self.bus, self.robot, self.actor, self.lockstep = bus, robot, actor, lockstep
         self.policy: MLP | None = None
         self.flow = pb.Flow()
         self.joins = 0
-        self._joined = 0  # incarnation
-        self._index = 0  # of the latest step that was asked for
-        self._doubtful = False  # somebody said what our learner would not: ask it
-        self._news = threading.Condition()
+        self._incarnation = 0  # of the learner that accepted this actor; 0: none
+        self._index = 0  # of the latest step that this actor waited for
+        self._doubtful = False  # whether a message contradicts our learner, so that we have to join again
+        self._changed = threading.Condition()
         self._subscriptions = (
             bus.subscribe(WEIGHTS, self._on_weights, robot=robot.name),
             bus.subscribe(FLOW, self._on_flow, robot=robot.name),
@@ -46,99 +53,111 @@ class LearnerClient:
 
     @property
     def done(self) -> bool:
+        """Whether the learner has ended the run."""
         return self.flow.done
 
     @property
     def warmup(self) -> bool:
+        """Whether the learner asks for random actions."""
         return self.flow.warmup
 
     @property
-    def welcome(self) -> bool:
-        """The learner that took us in is still the one that there is, and nobody says otherwise."""
-        return self.flow.incarnation == self._joined and not self._doubtful
+    def joined(self) -> bool:
+        """Whether the learner that accepted this actor is still running, and no message contradicts that."""
+        return self.flow.incarnation == self._incarnation and not self._doubtful
 
     def join(self, index: int, episode: int, stop: Callable[[], bool]) -> int | None:
-        """Wait until a learner takes us in; returns the episode to go on with, None if told to stop.
+        """Wait until a learner accepts this actor.
+
+        Args:
+            index: the number of steps so far.
+            episode: the next episode by the actor's own count.
+            stop: once it returns true, the actor does not wait any more.
+
+        Returns:
+            The episode to go on with; None if `stop` returned true.
 
         Raises:
-            RefusedByLearner: it says why.
+            RefusedByLearner: with the learner's reason.
         """
         message = pb.Join(
             robot=self.robot.name, actor=self.actor, layout=self.robot.learning_layout(), index=index, episode=episode
         )
-        say_at = 0.0
+        log_at = 0.0
         while not stop():
             try:
                 payload = self.bus.ask(JOIN, message.SerializeToString(), JOIN_TIMEOUT, robot=self.robot.name)
             except BusError as error:
-                if time.monotonic() >= say_at:
+                if time.monotonic() >= log_at:
                     log.info("%s waits for a learner: %s", self.actor, error)
-                    say_at = time.monotonic() + SAY_EVERY
+                    log_at = time.monotonic() + LOG_INTERVAL
                 time.sleep(0.2)
                 continue
             reply = pb.JoinReply.FromString(payload)
             if reply.error.type:
                 raise RefusedByLearner(f"{reply.error.field}: {reply.error.message}")
-            with self._news:
+            with self._changed:
                 self.flow, self._index, self._doubtful = reply.flow, index, False
-                self._joined = reply.flow.incarnation
-                self._take(reply.weights, joined=True)
+                self._incarnation = reply.flow.incarnation
+                self._take(reply.weights, joining=True)
             self.joins += 1
             return reply.episode
         return None
 
     def wait(self, index: int, episode: int, stop: Callable[[], bool]) -> bool:
-        """Wait for permission to take the step of that index; False: the run is done, or told to stop."""
-        asked, self._index = time.monotonic(), index
+        """Wait for permission for step number `index`. Return False if the run is over or `stop` returned true."""
+        since, self._index = time.monotonic(), index
         while not stop() and not self.flow.done:
-            with self._news:
-                if self._may(index):
+            with self._changed:
+                if self._permitted(index):
                     return True
-                self._news.wait(0.1)
-                rejoin = not self.welcome or time.monotonic() - asked > REJOIN_AFTER
+                self._changed.wait(0.1)
+                rejoin = not self.joined or time.monotonic() - since > REJOIN_AFTER
             if rejoin:
                 self.join(index - 1, episode, stop)
-                asked = time.monotonic()
+                since = time.monotonic()
         return False
 
-    def _may(self, index: int) -> bool:
-        if self.policy is None or self.flow.limit.get(self.actor, 0) < index or self.flow.incarnation != self._joined:
+    def _permitted(self, index: int) -> bool:
+        flow = self.flow
+        if self.policy is None or flow.limit.get(self.actor, 0) < index or flow.incarnation != self._incarnation:
             return False
-        return not self.lockstep or self.policy.version == self.flow.weights_version
+        return not self.lockstep or self.policy.version == flow.weights_version
 
     def _on_flow(self, sample: Sample) -> None:
         flow = sample.message()
-        with self._news:
-            if flow.limit.get(self.actor, 0) > self._index + MOST_AHEAD:
-                raise Implausible(f"{flow.limit[self.actor]} steps allowed, at {self._index}")
-            if flow.incarnation == self._joined or not self._joined or flow.incarnation != self.flow.incarnation:
+        with self._changed:
+            if flow.limit.get(self.actor, 0) > self._index + MOST_STEPS_AHEAD:
+                raise Implausible(f"a learner permits {flow.limit[self.actor]} steps at step {self._index}")
+            ours = not self._incarnation or flow.incarnation == self._incarnation
+            if ours or flow.incarnation != self.flow.incarnation:
                 self.flow = flow
-            self._news.notify_all()
+            self._changed.notify_all()
 
     def _on_weights(self, sample: Sample) -> None:
-        with self._news:
-            self._take(sample.message(), joined=False)
-            self._news.notify_all()
+        with self._changed:
+            self._take(sample.message(), joining=False)
+            self._changed.notify_all()
 
-    def _take(self, message: pb.Weights, joined: bool) -> None:
-        """Weights that are a little newer, or, on joining, whatever the learner has; anything else is refused aloud.
+    def _take(self, message: pb.Weights, joining: bool) -> None:
+        """Take newer weights; when joining, any. Log weights that are not valid, and keep the ones we have.
 
         Raises:
-            Implausible: they do not go on from ours.
+            Implausible: they are too far ahead of ours.
         """
-        if not joined:
+        if not joining:
             if self.policy is None:
-                return  # another's: what to go on from comes with the learner's answer to our joining
-            if message.version > self.policy.version + LEAP:
+                return  # another actor's: ours come with the learner's reply to our join
+            if message.version > self.policy.version + MOST_VERSIONS_AHEAD:
                 self._doubtful = True
-                raise Implausible(f"weights {message.version}, after {self.policy.version}")
+                raise Implausible(f"weights {message.version} after weights {self.policy.version}")
         try:
             policy = decode(message.file, self.robot)
         except BadWeights as error:
-            log.error("weights %d were refused: %s", message.version, error)
+            log.error("weights %d are not valid: %s", message.version, error)
             return
         if policy.version != message.version:
-            log.error("weights %d were refused: they are of version %d", message.version, policy.version)
+            log.error("weights %d are not valid: the file has version %d", message.version, policy.version)
             return
-        if joined or self.policy is None or policy.version > self.policy.version:
+        if joining or self.policy is None or policy.version > self.policy.version:
             self.policy = policy

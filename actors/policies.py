@@ -1,8 +1,10 @@
-"""Who proposes a robot's actions, and says whether it may go on: a learner's pupil, or a policy that is what it is."""
+"""Proposers of a robot's actions: the policy that a learner trains, or a policy that does not change.
+
+A proposer also says whether the robot may go on.
+"""
 
 from __future__ import annotations
 
-import logging
 import threading
 from collections.abc import Callable
 from typing import Any, Protocol
@@ -14,80 +16,81 @@ from brakeline.actors.learner_client import LearnerClient
 from brakeline.safety.filter.backup_plan import Array
 from brakeline.sim.scripted_policies import Policy, scripted
 
-log = logging.getLogger("brakeline.actor")
-
-Stop = Callable[[], bool]
-PolicyFactory = Callable[[int], Policy]  # from a seed
+Stop = Callable[[], bool]  # whether to end
+PolicyFactory = Callable[[int], Policy]  # makes a policy from a seed
 
 
 class Proposer(Protocol):
-    """Where a robot's proposals come from."""
+    """The source of a robot's proposals."""
 
     @property
     def version(self) -> int:
-        """Of the weights that propose; 0: none do."""
+        """The version of the weights that propose; 0: a policy without versions."""
 
     def join(self, index: int, episode: int, stop: Stop) -> int | None:
-        """Before the first step: wait until there are proposals. The episode to begin with; None: told to stop."""
+        """Wait until there are proposals. Return the episode to begin with; None if `stop` returned true.
+
+        index: the number of steps so far; episode: the next one by the actor's own count.
+        """
 
     def ready(self, index: int, episode: int, stop: Stop) -> bool:
-        """Wait until the step of that index may be taken; False: the end."""
+        """Wait for permission for step number `index`. Return False at the end of the run."""
 
     def begin(self, rng: np.random.Generator) -> None:
-        """An episode begins, whose chance is this generator."""
+        """Begin an episode with this random generator."""
 
     def propose(self, observation: NDArray[np.float32], info: dict[str, Any]) -> Array:
-        """A proposal (m,), whatever it may be."""
+        """Return a proposal (m,); the caller checks it."""
 
 
 class LearnedPolicy:
-    """Explores with the newest weights of a learner, and goes no further ahead than it allows."""
+    """Explores with a learner's newest weights, and takes no more steps than the learner permits."""
 
-    def __init__(self, student: LearnerClient) -> None:
-        self.student = student
+    def __init__(self, learner: LearnerClient) -> None:
+        self.learner = learner
 
     @property
     def version(self) -> int:
-        """Of the newest weights."""
-        return 0 if self.student.policy is None else self.student.policy.version
+        """The version of the newest weights; 0: none have arrived."""
+        return 0 if self.learner.policy is None else self.learner.policy.version
 
     def join(self, index: int, episode: int, stop: Stop) -> int | None:
-        """Join the learner. Raises RefusedByLearner."""
-        return self.student.join(index, episode, stop)
+        """Join the learner, see `LearnerClient.join`. Raises RefusedByLearner."""
+        return self.learner.join(index, episode, stop)
 
     def ready(self, index: int, episode: int, stop: Stop) -> bool:
-        """Wait for the learner's permission; False: the run is done, or told to stop."""
-        return self.student.wait(index, episode, stop)
+        """Wait for the learner's permission, see `LearnerClient.wait`."""
+        return self.learner.wait(index, episode, stop)
 
     def begin(self, rng: np.random.Generator) -> None:
-        """An episode begins."""
+        """Begin an episode."""
         self._rng = rng
-        self._random = scripted("random", self.student.robot, rng)
+        self._random = scripted("random", self.learner.robot, rng)
 
     def propose(self, observation: NDArray[np.float32], info: dict[str, Any]) -> Array:
-        """The exploring policy's action, at random during warm-up."""
-        policy = self.student.policy
-        if policy is None or self.student.warmup:
+        """Return the exploring policy's action; during warm-up, a random one."""
+        policy = self.learner.policy
+        if policy is None or self.learner.warmup:
             return self._random(observation, info)
         return np.asarray(policy.explore(observation, self._rng), dtype=float)
 
 
 class RealTimePolicy(LearnedPolicy):
-    """A pupil that cannot stand and wait: it flies on with the weights that it has, and joins again meanwhile."""
+    """A learned policy of a robot that cannot wait: it uses the weights it has while it joins again."""
 
     _joining: threading.Thread | None = None
 
     def ready(self, index: int, episode: int, stop: Stop) -> bool:
-        """False when the run is done. Does not wait."""
-        if not self.student.welcome and (self._joining is None or not self._joining.is_alive()):
+        """Return False at the end of the run. Never waits."""
+        if not self.learner.joined and (self._joining is None or not self._joining.is_alive()):
             arguments = (index - 1, episode, stop)
-            self._joining = threading.Thread(target=self.student.join, args=arguments, name="join", daemon=True)
+            self._joining = threading.Thread(target=self.learner.join, args=arguments, name="join", daemon=True)
             self._joining.start()
-        return not self.student.done
+        return not self.learner.done
 
 
 class FixedPolicy:
-    """A policy that learns nothing; after so many steps it is done (0: never)."""
+    """A policy that does not learn, for a number of steps (0: without end)."""
 
     version = 0
 
@@ -95,22 +98,16 @@ class FixedPolicy:
         self.policy, self._steps = make(seed), steps
 
     def join(self, index: int, episode: int, stop: Stop) -> int | None:
-        """There is nobody to wait for."""
+        """Return the episode: there is no learner to wait for."""
         return episode
 
     def ready(self, index: int, episode: int, stop: Stop) -> bool:
-        """Until its steps are taken."""
+        """Return whether steps are left."""
         return not stop() and not 0 < self._steps < index
 
     def begin(self, rng: np.random.Generator) -> None:
-        """Scripted policies notice by themselves."""
+        """Do nothing: scripted policies notice a new episode by themselves."""
 
     def propose(self, observation: NDArray[np.float32], info: dict[str, Any]) -> Array:
-        """The policy's action."""
+        """Return the policy's action."""
         return np.asarray(self.policy(observation, info), dtype=float)
-
-
-def check(proposal: Array, version: int) -> None:
-    """Log a proposal that holds NaN or infinity: the filter answers it with a failsafe."""
-    if not np.isfinite(proposal).all():
-        log.error("weights %d propose %s", version, proposal)

@@ -37,7 +37,6 @@ def real() -> list[tuple[str, Any]]:
     """Keys and messages of some episodes, driven in process (what it takes is not loaded where memory is measured)."""
     import numpy as np
 
-    from brakeline.actors.decision_guard import request_decisions
     from brakeline.actors.episode_runner import ActorIdentity, EpisodeRunner
     from brakeline.deploy.data.model_store import model_for
     from brakeline.deploy.experiments.evaluate import in_process
@@ -55,7 +54,8 @@ def real() -> list[tuple[str, Any]]:
         found.append(("episode/ground/actor-0", driver.begin(number)))
         while driver.running:
             proposal = np.asarray(policy(driver.observation, driver.info), dtype=float)
-            outcome = request_decisions(ask, [driver.request(proposal)], ground)[0]
+            outcome = driver.decide(proposal, ask)
+            assert outcome is not None
             found.append(("exchange/ground/actor-0", outcome.exchange(driver.info["time"])))
             found.append(("step/ground/actor-0", driver.execute(proposal, outcome)))
         found.append(("health/actor-0", pb.Health(process="actor-0", figures={"steps_per_s": 100.0, "steps": number})))

@@ -17,7 +17,8 @@ import numpy as np
 from benchmarks.decide import SCANS
 from benchmarks.timing import WARM_UP, Figures
 from brakeline.actors.decision_guard import Ask
-from brakeline.deploy.experiments.evaluate import Evaluation, episode, prepared, prepared_fleet, round_of
+from brakeline.actors.episode_runner import run_episode
+from brakeline.deploy.experiments.evaluate import Evaluation, episode, prepared, prepared_fleet
 from brakeline.logs.episode_stats import KINDS
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.task import RobotWithTask, robot_with_task
@@ -72,7 +73,7 @@ def _weighed(robot: RobotWithTask, what: Evaluation, steps: int) -> dict[str, fl
             fleet, _, policies, question = prepared_fleet(robot, asked)
             assert question is not None
             weighed = Weighed(question)
-            taken = (1 for k in range(steps) for _ in round_of(fleet, policies, weighed, k))
+            taken = (1 for k in range(steps) for _ in run_episode(fleet, policies, weighed, k))
         else:
             driver, choose, question = prepared(robot, asked)
             assert question is not None

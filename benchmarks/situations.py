@@ -6,7 +6,6 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from brakeline.actors.decision_guard import request_decisions
 from brakeline.actors.episode_runner import ActorIdentity, EpisodeRunner
 from brakeline.deploy.data.model_store import model_for
 from brakeline.deploy.experiments.evaluate import in_process
@@ -42,8 +41,10 @@ def messages(
         episode += 1
         while driver.running and len(asked) < STEPS:
             proposal = np.asarray(choose(driver.observation, driver.info), dtype=float)
-            asked.append(driver.request(proposal))
-            driver.execute(proposal, request_decisions(question, [asked[-1]], robot)[0])
+            outcome = driver.decide(proposal, question)
+            assert outcome is not None
+            asked.append(outcome.request)
+            driver.execute(proposal, outcome)
     return asked
 
 

@@ -27,8 +27,8 @@ TRAJECTORIES = 55  # the fewest whose held-out plans state the limit of 1 %, lat
 # What flies or drives in real time mostly waits, as do real autopilots; whole runs keep both cores busy. One of each at
 # a time, and what keeps a core busy by itself beside them only from when one of the lanes is through.
 LIVE = (
-    *("tests/actors/test_live.py", "tests/actors/ros2/", "tests/system/test_fly.py", "tests/system/test_mavsdk.py"),
-    *("tests/system/test_hil.py", "tests/system/test_ros2.py"),
+    *("tests/actors/test_mavlink_vehicle.py", "tests/actors/ros2/", "tests/system/test_fly.py"),
+    *("tests/system/test_mavsdk.py", "tests/system/test_hil.py", "tests/system/test_ros2.py"),
 )
 REAL_AUTOPILOTS = ("tests/system/test_real_autopilots.py",)
 WHOLE_RUNS = ("tests/system/",)

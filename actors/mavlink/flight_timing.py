@@ -1,4 +1,4 @@
-"""How a flight keeps real time, and how an autopilot's clock is read by ours."""
+"""How well a flight keeps real time, and the offset between the autopilot's clock and ours."""
 
 from __future__ import annotations
 
@@ -8,31 +8,31 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-KEPT = 10_000  # latest beginnings whose lateness is remembered
+MOST_LATENESSES = 10_000  # the latest ones count
 
 
 @dataclass
 class FlightTiming:
-    """How real time was kept."""
+    """Statistics of the control periods."""
 
     periods: int = 0
-    late: int = 0  # begun more than `LATE` after their time
-    slips: int = 0  # begun so late that the clock was set anew: the one before lasted two periods or more
+    late: int = 0  # periods that began more than `mavlink_vehicle.LATE` after their time
+    slips: int = 0  # periods that began so late that the schedule was moved: the one before lasted two or more
     worst_gap: float = 0.0  # s between two setpoints
     round_trip: float = math.inf  # s to the autopilot and back, the fastest
-    lost: int = 0  # periods whose telemetry, or whose mode, did not count
-    lateness: deque[float] = field(default_factory=lambda: deque(maxlen=KEPT))  # s, of the beginnings of periods
+    lost: int = 0  # periods whose telemetry or mode did not count
+    lateness: deque[float] = field(default_factory=lambda: deque(maxlen=MOST_LATENESSES))  # s, of each period's start
 
     def figures(self) -> dict[str, float]:
-        """For Health, in ms where it says so."""
-        lateness = 1e3 * np.array([*self.lateness] or [0.0])
+        """Return the figures for Health."""
+        lateness_ms = 1e3 * np.array([*self.lateness] or [0.0])
         return {
             "periods": self.periods,
             "periods late": self.late,
             "periods slipped": self.slips,
-            "lateness p50 ms": float(np.percentile(lateness, 50)),
-            "lateness p99 ms": float(np.percentile(lateness, 99)),
-            "lateness worst ms": float(lateness.max()),
+            "lateness p50 ms": float(np.percentile(lateness_ms, 50)),
+            "lateness p99 ms": float(np.percentile(lateness_ms, 99)),
+            "lateness worst ms": float(lateness_ms.max()),
             "worst setpoint gap ms": 1e3 * self.worst_gap,
             "periods without telemetry": self.lost,
             **({"link round trip ms": 1e3 * self.round_trip} if math.isfinite(self.round_trip) else {}),
@@ -40,26 +40,28 @@ class FlightTiming:
 
 
 class ClockOffset:
-    """Our clock less the autopilot's [s], by the messages that came soonest.
+    """Our clock minus the autopilot's [s], from the messages with the least delay.
 
-    It falls at once and rises with the clocks' drift: milliseconds on a busy machine must not move it, for at 7 m/s
-    each is 7 mm. Only when every message of a second is `JUMP` late the other clock has jumped: a simulator slips.
+    The value falls at once, and rises only by the drift between two clocks: on a busy machine messages arrive
+    milliseconds late, and at 7 m/s each millisecond is 7 mm. The autopilot's clock has jumped if every message of one
+    second arrives later by `JUMP`, as when a simulator stalls.
     """
 
-    DRIFT = 1e-4  # s a second, at most, between two clocks
+    DRIFT = 1e-4  # s per second, the largest between two clocks
     JUMP = 0.05  # s
 
     def __init__(self) -> None:
         self.value = math.inf  # before the first message
-        self._noted = self._second = -math.inf  # when the last message came, and when this second began
-        self._soonest = math.inf  # in this second
+        self._noted_at = -math.inf  # s, arrival of the last message
+        self._second_began = -math.inf  # s
+        self._least = math.inf  # s, the least offset in this second
 
     def note(self, now: float, theirs: float) -> None:
-        """A message of their time `theirs` has come."""
-        if now - self._second > 1.0:
-            if self._soonest > self.value + self.JUMP:
-                self.value = self._soonest
-            self._second, self._soonest = now, math.inf
-        late = now - theirs
-        drifted = self.value + self.DRIFT * (now - self._noted) if math.isfinite(self.value) else math.inf
-        self.value, self._noted, self._soonest = min(drifted, late), now, min(self._soonest, late)
+        """Take in a message that arrives at `now` [s, our clock] and was sent at `theirs` [s, the autopilot's]."""
+        if now - self._second_began > 1.0:
+            if self._least > self.value + self.JUMP:
+                self.value = self._least
+            self._second_began, self._least = now, math.inf
+        offset = now - theirs
+        drifted = self.value + self.DRIFT * (now - self._noted_at) if math.isfinite(self.value) else math.inf
+        self.value, self._noted_at, self._least = min(drifted, offset), now, min(self._least, offset)

@@ -1,4 +1,4 @@
-"""MAVLink frames as they were sent or received, for who records or shows them."""
+"""MAVLink frames as they were sent or received, for logs and displays."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from brakeline.actors.mavlink.ardupilot_dialect import mavlink
 
 @dataclass(frozen=True)
 class CapturedFrame:
-    """One MAVLink frame as it was sent or received."""
+    """One MAVLink frame. outgoing: sent to the autopilot; raw: its bytes; message: pymavlink's message."""
 
     outgoing: bool
     raw: bytes
@@ -20,18 +20,18 @@ class CapturedFrame:
 
     @property
     def name(self) -> str:
-        """Such as `mavlink/1/1/HEARTBEAT`: system, component, message."""
+        """System, component and message, such as `mavlink/1/1/HEARTBEAT`."""
         m = self.message
         return f"mavlink/{m.get_srcSystem()}/{m.get_srcComponent()}/{m.get_type()}"
 
     @property
     def fields(self) -> dict[str, Any]:
-        """For JSON: numbers that are not finite become None."""
-        return {key: _plain(value) for key, value in self.message.to_dict().items()}
+        """The fields for JSON, which has no infinity and no NaN: they become None."""
+        return {key: _json_value(value) for key, value in self.message.to_dict().items()}
 
     @property
     def described(self) -> dict[str, Any]:
-        """Header and fields, for JSON."""
+        """Header and fields for JSON."""
         m, fields = self.message, self.fields
         header = {"system_id": m.get_srcSystem(), "component_id": m.get_srcComponent(), "sequence": m.get_seq()}
         return {"header": header, "message": {"type": fields.pop("mavpackettype"), **fields}}
@@ -41,7 +41,7 @@ FrameTap = Callable[[CapturedFrame], None]
 
 
 def decode_frame(raw: bytes, outgoing: bool) -> CapturedFrame | None:
-    """A frame from its bytes; None if they are none."""
+    """Return the frame of some bytes; None if they are not a frame."""
     try:
         message = mavlink.MAVLink(None).decode(bytearray(raw))
     except mavlink.MAVError:
@@ -49,11 +49,11 @@ def decode_frame(raw: bytes, outgoing: bool) -> CapturedFrame | None:
     return CapturedFrame(outgoing, raw, message)
 
 
-def _plain(value: Any) -> Any:
+def _json_value(value: Any) -> Any:
     if isinstance(value, float):
         return value if math.isfinite(value) else None
     if isinstance(value, bytes | bytearray):
         return value.hex()
     if isinstance(value, list | tuple):
-        return [_plain(inner) for inner in value]
+        return [_json_value(item) for item in value]
     return value

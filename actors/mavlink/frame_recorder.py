@@ -1,4 +1,4 @@
-"""MAVLink frames on their way into the log: collected as they come, published once a period."""
+"""Collect MAVLink frames as they come, and publish those of a period as one message."""
 
 from __future__ import annotations
 
@@ -14,33 +14,33 @@ if TYPE_CHECKING:
     from brakeline.actors.mavlink.frame_log import CapturedFrame
 
 
-PART = 1000  # frames in a message, at most
+MOST_FRAMES = 1000  # in a message, whose size is limited
 
 
 class MessageSink(Protocol):
-    """A publisher, or what stands before one."""
+    """A publisher, or something that passes messages on to one."""
 
     def put(self, message: Message) -> None:
-        """Publish it."""
+        """Publish a message."""
 
 
 class FrameRecorder:
-    """Takes frames, in whatever thread, and publishes those of a period as one message."""
+    """Collects the frames of one vehicle from any thread."""
 
     def __init__(self, publisher: MessageSink, robot: str, actor: str) -> None:
         self.publisher, self._robot, self._actor = publisher, robot, actor
         self._frames: deque[pb.MavlinkFrame] = deque()
 
-    def take(self, frame: CapturedFrame) -> None:
-        """A frame that was sent or received now."""
-        self.keep(pb.MavlinkFrame(wall_time=time.time_ns(), outgoing=frame.outgoing, raw=frame.raw))
+    def record(self, frame: CapturedFrame) -> None:
+        """Collect a frame that was sent or received just now."""
+        self.add(pb.MavlinkFrame(wall_time=time.time_ns(), outgoing=frame.outgoing, raw=frame.raw))
 
-    def keep(self, frame: pb.MavlinkFrame) -> None:
-        """Take a frame that another process sent or received."""
+    def add(self, frame: pb.MavlinkFrame) -> None:
+        """Collect a frame that another process sent or received."""
         self._frames.append(frame)
 
     def publish(self) -> None:
-        """Those since the last call, if there are any; in parts, for a message has a largest size."""
+        """Publish the frames since the last call, if there are any."""
         while self._frames:
-            frames = [self._frames.popleft() for _ in range(min(PART, len(self._frames)))]
+            frames = [self._frames.popleft() for _ in range(min(MOST_FRAMES, len(self._frames)))]
             self.publisher.put(pb.MavlinkFrames(robot=self._robot, actor=self._actor, frames=frames))

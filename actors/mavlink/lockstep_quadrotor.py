@@ -1,4 +1,4 @@
-"""A quadrotor behind MAVLink in memory, in lockstep with its simulated autopilot."""
+"""A quadrotor behind MAVLink in memory, in lockstep with a simulated autopilot."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from brakeline.sim.vehicle import Period, clip_input
 
 
 class Endpoint(Protocol):
-    """A simulated autopilot in memory: sim.autopilot.endpoint.Autopilot."""
+    """A simulated autopilot in memory, such as `brakeline.sim.autopilot.endpoint.Autopilot`."""
 
     vehicle: Quadrotor
 
@@ -28,20 +28,24 @@ class Endpoint(Protocol):
 
 
 class LockstepQuadrotor:
-    """A quadrotor flown over the bytes of an embedded autopilot, in lockstep: time passes only in `step`.
+    """A quadrotor flown by a simulated autopilot in this process: time passes only in `step`.
 
-    What is measured comes from telemetry, what is true and what was touched from the simulator. The autopilot starts in
-    the air; setpoints and mode are exchanged before time begins.
+    The measured state comes from telemetry; the true state and the contacts come from the simulator. The autopilot
+    starts in the air, and changes its mode before time begins.
+
+    Attributes:
+        input: the input in force (3,) [m/s].
+        measured, true: the state (9,).
     """
 
     def __init__(self, endpoint: Endpoint, robot: Robot, tap: FrameTap | None = None) -> None:
-        """tap: is called with every MAVLink frame. Raises MavlinkError when the autopilot refuses something."""
+        """tap: called with every MAVLink frame. Raises MavlinkError: the autopilot refuses something."""
         self._endpoint, self._client = endpoint, AutopilotClient(endpoint.receive, tap=tap)
         self._robot, period = robot, robot.period
         self.input = np.zeros(robot.action_dim)
         wait = self._wait
         for what, interval in ((MOTION, period / SAMPLES), (ATTITUDE, period), (FORCE, period)):
-            self._listen(what, interval)
+            self._request(what, interval)
         self._client.follow_setpoints(wait)
         self.true, self.measured = endpoint.vehicle.state(), self._measured()
 
@@ -49,7 +53,7 @@ class LockstepQuadrotor:
         """Fly one period at a velocity setpoint (3,) [m/s], clipped to bounds and slew.
 
         Raises:
-            BadInput: when the input is not three finite numbers.
+            BadInput: the input is not three finite numbers.
         """
         self.input = clip_input(self._robot, input, self.input)
         client, endpoint, start = self._client, self._endpoint, self.measured[:3]
@@ -65,22 +69,22 @@ class LockstepQuadrotor:
         return period
 
     def initial_period(self) -> Period:
-        """The present state as a period in which nothing happened: what there is to say before the first step."""
+        """Return the report before the first step: the current state, as of a period without motion."""
         clearance = float(self._endpoint.vehicle.clearance(self.true[:3]))
         return Period(self.measured, self.true, False, clearance, clearance, np.zeros((SAMPLES, 3)), 0.0)
 
     def alter(self, **changes: float) -> None:
-        """Of the simulated vehicle: see Quadrotor.alter."""
+        """Change the simulated vehicle, see `Quadrotor.alter`."""
         self._endpoint.vehicle.alter(**changes)
 
     def _measured(self) -> Array:
-        """The state (9,) by the latest telemetry."""
+        """Return the state (9,) of the latest telemetry."""
         client = self._client
         assert client.position is not None
         return np.concatenate((client.position, client.velocity, client.acceleration))
 
-    def _listen(self, what: str, interval: float) -> None:
-        """Have the best message that it grants sent every `interval` s, and once now. Raises CommandRefused."""
+    def _request(self, what: str, interval: float) -> None:
+        """Request the best message that the autopilot grants, at an interval [s] and now. Raises CommandRefused."""
         names = [source.message for source in SOURCES[what]]
         for name in names:
             try:
@@ -92,6 +96,6 @@ class LockstepQuadrotor:
                     raise
 
     def _wait(self, condition: Callable[[], bool], _: float) -> bool:
-        """Answers come at once or not at all."""
+        """Read the replies, which are there at once or never."""
         self._client.feed(self._endpoint.take())
         return condition()

@@ -27,7 +27,6 @@ from brakeline.actors.mavlink.telemetry import (
     TRUTH,
     Array,
     GeoPosition,
-    MotionSample,
 )
 
 STATION, COMPONENT = 245, int(mavlink.MAV_COMP_ID_ONBOARD_COMPUTER)  # who we are
@@ -79,7 +78,6 @@ class MavlinkDecoder:
         self.chosen: dict[str, str] = {}  # message by key of SOURCES
         self.received = self.missed = 0
         self._sequence: int | None = None
-        self._came: Counter[str] = Counter()  # messages by name
         self._best: dict[str, int] = {}  # index in SOURCES of the best message so far, until one is chosen
         self._attitude: telemetry.Quaternion = (1.0, 0.0, 0.0, 0.0)  # NED from forward-right-down
         self._forces: deque[telemetry.Triple] = deque([(0.0, 0.0, -GRAVITY)], 1)
@@ -118,7 +116,6 @@ class MavlinkDecoder:
             if self._tap is not None:
                 self._tap(CapturedFrame(False, bytes(message.get_msgbuf()), message))
             name = message.get_type()
-            self._came[name] += 1
             for what, place in SENDERS.get(name, ()):
                 self._take(what, place, message)
             handler = HANDLERS.get(message.get_msgId())
@@ -143,28 +140,22 @@ class MavlinkDecoder:
         chosen = self.chosen.get(what)
         if (chosen or source.message) != source.message or (not chosen and place > self._best.get(what, place)):
             return
-        value = telemetry.told(source, message)
+        value = telemetry.read_source(source, message)
         if value is None:
             return
         self._best[what] = place
         self.message_counts[what] += 1
-        TAKERS[what](self, value)
-
-    def _move(self, motion: MotionSample) -> None:
-        self.time, self.position, self.velocity = motion.time, motion.position, motion.velocity
-        self.path.append((motion.time, motion.position))
-
-    def _turn(self, attitude: telemetry.Quaternion) -> None:
-        self._attitude = attitude
-
-    def _feel(self, force: telemetry.Triple) -> None:
-        self._forces.append(force)
-
-    def _lift(self, airborne: bool) -> None:
-        self.airborne = airborne
-
-    def _locate(self, place: GeoPosition) -> None:
-        self.truth = place
+        if what == MOTION:
+            self.time, self.position, self.velocity = value.time, value.position, value.velocity
+            self.path.append((value.time, value.position))
+        elif what == ATTITUDE:
+            self._attitude = value
+        elif what == FORCE:
+            self._forces.append(value)
+        elif what == LANDED:
+            self.airborne = value
+        elif what == TRUTH:
+            self.truth = value
 
     def _on_heartbeat(self, message: Any) -> None:
         if message.autopilot not in KINDS:
@@ -218,13 +209,6 @@ HANDLERS: dict[int, Callable[[MavlinkDecoder, Any], None]] = {
     mavlink.MAVLINK_MSG_ID_FENCE_STATUS: MavlinkDecoder._on_fence,
     mavlink.MAVLINK_MSG_ID_PARAM_VALUE: MavlinkDecoder._on_parameter,
     mavlink.MAVLINK_MSG_ID_TIMESYNC: MavlinkDecoder._on_time,
-}
-TAKERS: dict[str, Callable[[MavlinkDecoder, Any], None]] = {
-    MOTION: MavlinkDecoder._move,
-    ATTITUDE: MavlinkDecoder._turn,
-    FORCE: MavlinkDecoder._feel,
-    LANDED: MavlinkDecoder._lift,
-    TRUTH: MavlinkDecoder._locate,
 }
 SENDERS: dict[str, list[tuple[str, int]]] = {}  # by message: the quantities in it, each with its index in SOURCES
 for _what, _sources in SOURCES.items():

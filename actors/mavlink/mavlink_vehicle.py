@@ -101,7 +101,7 @@ class MavlinkVehicle:
         Raises:
             MavlinkError: no autopilot answers, it refuses something, or `stop` returned true.
         """
-        self._robot, self._told_to_stop = robot, stop
+        self._robot, self._stop_requested = robot, stop
         self._link, self._truth = link, truth
         self._mavlink_truth = mavlink_truth if truth is None else None
         self._client = AutopilotClient(link.send, system, tap, lambda text: log.info("it says: %s", text))
@@ -175,7 +175,7 @@ class MavlinkVehicle:
     def land(self) -> None:
         """Land, disarm and give up control. Raises MavlinkError."""
         self._stop()
-        self._velocity, self._told_to_stop = None, lambda: False
+        self._velocity, self._stop_requested = None, lambda: False
         self._client.land(self._wait)
 
     @property
@@ -283,14 +283,14 @@ class MavlinkVehicle:
     def _log_loss(self, why: str) -> None:
         """Log a loss when it begins, when its reason changes, and when it ends."""
         self.timing.lost += bool(why)
-        kind, said = why.split(" for ")[0], self._logged_loss
-        if kind != said:
+        kind, before = why.split(" for ")[0], self._logged_loss
+        if kind != before:
             self._logged_loss = kind
             texts = "; ".join(self._client.texts[-2:])
             if why:
                 log.warning("braking: %s%s", why, f"; it says: {texts}" if texts else "")
             else:
-                log.warning("flying again, after: %s", said)
+                log.warning("flying again, after: %s", before)
         battery = self._client.battery
         if battery is not None and battery < LOW_BATTERY and not self._logged_battery:
             self._logged_battery = True
@@ -370,16 +370,16 @@ class MavlinkVehicle:
 
     def _wait(self, condition: Callable[[], bool], seconds: float) -> bool:
         """Exchange messages until the condition holds, before the thread runs. Our own stalls do not count as time."""
-        left, looked = seconds, time.monotonic()
+        left, before = seconds, time.monotonic()
         while not condition():
-            if self._told_to_stop():
-                raise MavlinkError("told to stop before it flew")
+            if self._stop_requested():
+                raise MavlinkError("asked to stop before the vehicle flew")
             if left < 0.0:
                 return False
             self._exchange(time.monotonic())
             time.sleep(POLL)
             now = time.monotonic()
-            left, looked = left - min(now - looked, 10.0 * POLL), now
+            left, before = left - min(now - before, 10.0 * POLL), now
         return True
 
     def _stop(self) -> None:

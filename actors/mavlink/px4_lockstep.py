@@ -1,4 +1,4 @@
-"""A quadrotor behind the real PX4, in lockstep: it stays in the air from episode to episode, and the arenas change."""
+"""A quadrotor behind the real PX4, in lockstep. It stays in the air between episodes, while the arenas change."""
 
 from __future__ import annotations
 
@@ -28,19 +28,20 @@ from brakeline.sim.vehicle import Period, clip_input
 
 Array = NDArray[np.float64]
 
-LISTEN_EVERY, TELL_EVERY = 4, 20  # physics steps between two looks, two setpoints
+RECEIVE_EVERY, SETPOINT_EVERY = 4, 20  # physics steps
 INTERVALS = {
     mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED: 0.01,
     mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION: 0.005,
     mavlink.MAVLINK_MSG_ID_HIGHRES_IMU: 0.005,
-}  # s between two messages of a kind, as often as each is made
-FRESH, LATEST = 0.0125, 0.25  # s; a message that is older is waited for, so long in real time
-READY_IN, UP_IN, STANDS_IN = 90.0, 20.0, 10.0  # s until it knows where it is, has climbed, has come to a stop
-SETTLES_IN = 15.0  # s of hovering until what a takeoff does to its estimate is forgotten
+}  # s between two messages, at the rate at which PX4 makes them
+FRESH = 0.0125  # s of simulated time: `settle` waits for newer messages than that
+SETTLE_TIMEOUT = 0.25  # s of real time
+POSITION_TIMEOUT, CLIMB_TIMEOUT, STOP_TIMEOUT = 90.0, 20.0, 10.0  # s
+SETTLING_TIME = 15.0  # s of hovering, after which the takeoff does not disturb the estimate any more
 HEIGHT, CLIMB = 3.0, 1.5  # m, m/s, of the takeoff
-STANDING, LEVEL = 0.1, 0.1  # m/s, rad: slower and more upright than that, it hovers
-FAR = 500.0  # m to whatever closes the field
-QUIET = QuadrotorNoise(scale=0.0)  # the estimator is PX4's
+STANDING, LEVEL = 0.1, 0.1  # m/s, rad: below both, the vehicle hovers
+FAR = 500.0  # m to the walls of the field
+QUIET = QuadrotorNoise(scale=0.0)  # PX4 has its own estimator
 FIELD = Arena(
     "field",
     room_boundary(FAR, 2.0 * FAR),
@@ -53,32 +54,37 @@ FIELD = Arena(
 
 
 class Px4Flight:
-    """One PX4, started at the first need and again when it cannot go on, as after a crash.
+    """One PX4 process, which starts when it is needed first, and again when it cannot go on, as after a crash.
 
-    `enter` puts another vehicle in the place of the one that flies. For PX4 all arenas are corners of one large field.
+    `enter` puts another simulated vehicle in the place of the one that flies. For PX4 all arenas lie in one large
+    field.
+
+    Attributes:
+        setpoint: the velocity (3,) [m/s] that is sent.
+        starts: number of starts of PX4.
     """
 
     def __init__(
         self, folder: Path, noise: SensorNoise, parameters: dict[str, float] | None = None, tap: FrameTap | None = None
     ) -> None:
-        """folder, parameters: see Px4; tap: is called with every MAVLink frame between it and its companion."""
+        """folder, parameters: see `Px4Process`; tap: called with every MAVLink frame between PX4 and this process."""
         self._folder, self._noise, self._parameters, self._tap = folder, noise, parameters, tap
         self._px4: Px4Process | None = None
         self._count = 0
-        self._told = dict.fromkeys(INTERVALS, 0.0)  # s, time of the newest message of a kind
+        self._times = dict.fromkeys(INTERVALS, 0.0)  # s, of the newest message of each kind
         self.setpoint = np.zeros(3)
-        self.starts = 0  # of PX4
+        self.starts = 0
 
     @property
     def flies(self) -> bool:
-        """PX4 lives and follows setpoints."""
+        """Whether PX4 runs and follows setpoints."""
         return self._px4 is not None and self._px4.alive and self.hil.armed and self.client.offboard
 
     def enter(self, vehicle: Quadrotor) -> None:
-        """Hover at the start of that vehicle's arena, as that vehicle.
+        """Take this vehicle's place, hovering at the start of its arena.
 
         Raises:
-            Px4Error, MavlinkError: PX4 does not start, or does not take off; AutopilotGone: nor does it answer.
+            Px4Error, MavlinkError: PX4 does not start, or does not take off; AutopilotGone: PX4 does not answer.
         """
         try:
             hovers = self.flies and self._stop()
@@ -86,25 +92,25 @@ class Px4Flight:
             hovers = False
         if not hovers:
             self._begin()
-        self._become(vehicle)
+        self._replace(vehicle)
 
-    def tell(self, velocity: Array) -> None:
-        """The setpoint (3,) [m/s] from now on."""
+    def send_setpoint(self, velocity: Array) -> None:
+        """Send this setpoint (3,) [m/s] from now on."""
         self.setpoint, self._count = velocity, 0
 
     def advance(self, seconds: float) -> None:
-        """Let time pass. Raises AutopilotGone."""
+        """Simulate some seconds. Raises AutopilotGone."""
         for _ in range(round(seconds / self.hil.vehicle.timestep)):
-            if self._count % TELL_EVERY == 0:
+            if self._count % SETPOINT_EVERY == 0:
                 self.client.setpoint(self.setpoint)
                 self.client.heartbeat()
             self._count += 1
             self.hil.tick()
-            if self._count % LISTEN_EVERY == 0:
-                self._listen()
+            if self._count % RECEIVE_EVERY == 0:
+                self._receive()
 
     def wait(self, condition: Callable[[], bool], seconds: float) -> bool:
-        """Until it holds, at most so many seconds of simulated time; whether it does."""
+        """Simulate until a condition holds, for some seconds at most. Return whether it holds."""
         end = self.hil.time + seconds
         while not condition():
             if self.hil.time >= end:
@@ -113,15 +119,15 @@ class Px4Flight:
         return True
 
     def settle(self) -> None:
-        """Time stands still, but threads of PX4 may not have said yet what they know."""
-        end = time.monotonic() + LATEST
-        self._listen()
-        while min(self._told.values()) < self.hil.time - FRESH and (left := end - time.monotonic()) > 0.0:
+        """Wait for the newest messages while simulated time stands still: PX4's threads may be behind."""
+        end = time.monotonic() + SETTLE_TIMEOUT
+        self._receive()
+        while min(self._times.values()) < self.hil.time - FRESH and (left := end - time.monotonic()) > 0.0:
             select.select([self._link], [], [], left)
-            self._listen()
+            self._receive()
 
     def close(self) -> None:
-        """Also when nobody refers to it any more, and at the end of the program."""
+        """End PX4. This also happens when the object is collected, and at the end of the program."""
         if self._px4 is not None:
             self._shut()
             self._px4 = None
@@ -142,35 +148,35 @@ class Px4Flight:
         rng = np.random.default_rng(self.starts)
         vehicle = Quadrotor(FIELD, rng, QUIET, floor=FAR)
         self.hil = HilLink(px4.connection, vehicle, HilSensors(self._noise, rng, vehicle.timestep))
-        self.client = AutopilotClient(lambda data: link.sendto(data, ("127.0.0.1", px4.local)), tap=self._hear)
-        self._told = dict.fromkeys(INTERVALS, 0.0)
-        self.tell(np.zeros(3))
+        self.client = AutopilotClient(lambda data: link.sendto(data, ("127.0.0.1", px4.local)), tap=self._on_frame)
+        self._times = dict.fromkeys(INTERVALS, 0.0)
+        self.send_setpoint(np.zeros(3))
         while not self.hil.answering:
             self.hil.tick()
-        if not self.wait(lambda: self.client.position is not None, READY_IN):
-            raise MavlinkError(f"PX4 does not know where it is; its last words:\n{px4.last_words()}")
+        if not self.wait(lambda: self.client.position is not None, POSITION_TIMEOUT):
+            raise MavlinkError(f"PX4 does not know its position; its last output:\n{px4.last_words()}")
         for kind, interval in INTERVALS.items():
             self.client.stream(kind, interval, self.wait)
         self.client.follow_setpoints(self.wait)
         self.client.arm(self.wait)
-        self.tell(np.array([0.0, 0.0, CLIMB]))
-        if not self.wait(lambda: vehicle.state()[2] > FAR + HEIGHT, UP_IN) or not self._stop():
-            raise MavlinkError(f"PX4 does not take off; its last words:\n{px4.last_words()}")
-        self.advance(SETTLES_IN)
+        self.send_setpoint(np.array([0.0, 0.0, CLIMB]))
+        if not self.wait(lambda: vehicle.state()[2] > FAR + HEIGHT, CLIMB_TIMEOUT) or not self._stop():
+            raise MavlinkError(f"PX4 does not take off; its last output:\n{px4.last_words()}")
+        self.advance(SETTLING_TIME)
 
     def _stop(self) -> bool:
-        """Come to a stop where there is nothing to touch; whether it did."""
-        self._become(Quadrotor(FIELD, np.random.default_rng(0), QUIET))
-        self.tell(np.zeros(3))
-        return self.wait(self._hovers, STANDS_IN)
+        """Come to a stop in the empty field. Return whether the vehicle hovers."""
+        self._replace(Quadrotor(FIELD, np.random.default_rng(0), QUIET))
+        self.send_setpoint(np.zeros(3))
+        return self.wait(self._hovers, STOP_TIMEOUT)
 
     def _hovers(self) -> bool:
         truth = self.hil.vehicle.true_reading()
         tilt = 2.0 * math.hypot(truth.attitude[1], truth.attitude[2])
         return math.hypot(*truth.velocity) < STANDING and tilt < LEVEL
 
-    def _become(self, vehicle: Quadrotor) -> None:
-        """It goes on as this vehicle, from this one's place: for PX4 nothing has changed."""
+    def _replace(self, vehicle: Quadrotor) -> None:
+        """Replace the simulated vehicle; shift its position so that nothing changes for PX4."""
         hil = self.hil
         (x, y, z), (a, b, c), (p, q, r) = (
             hil.shift,
@@ -180,15 +186,15 @@ class Px4Flight:
         vehicle.copy_motion(hil.vehicle)
         hil.vehicle, hil.shift = vehicle, (x + a - p, y + b - q, z + c - r)
 
-    def _hear(self, frame: CapturedFrame) -> None:
+    def _on_frame(self, frame: CapturedFrame) -> None:
         message = frame.message
-        if not frame.outgoing and message.get_msgId() in self._told:
+        if not frame.outgoing and message.get_msgId() in self._times:
             micro = getattr(message, "time_usec", None)
-            self._told[message.get_msgId()] = 1e-3 * message.time_boot_ms if micro is None else 1e-6 * micro
+            self._times[message.get_msgId()] = 1e-3 * message.time_boot_ms if micro is None else 1e-6 * micro
         if self._tap is not None:
             self._tap(frame)
 
-    def _listen(self) -> None:
+    def _receive(self) -> None:
         with contextlib.suppress(BlockingIOError):
             while True:
                 self.client.feed(self._link.recv(65536))
@@ -202,16 +208,20 @@ def _shut(px4: Px4Process, link: socket.socket) -> None:
 class Px4Vehicle:
     """A quadrotor flown by PX4 over MAVLink, for one episode: time passes only in `step`.
 
-    What is measured is PX4's estimate, what is true and what was touched is the simulator's. At the start, where it
-    hovers, its local frame is laid onto the arena's, as by somebody who switches it on at a known place.
+    The measured state is PX4's estimate; the true state and the contacts come from the simulator. At the start, where
+    the vehicle hovers, PX4's local frame is aligned with the arena's, as if PX4 were switched on at a known place.
+
+    Attributes:
+        input: the input in force (3,) [m/s].
+        measured, true: the state (9,).
     """
 
     def __init__(self, flight: Px4Flight, vehicle: Quadrotor, robot: Robot) -> None:
-        """Raises what `Px4Flight.enter` does."""
+        """Raises the errors of `Px4Flight.enter`."""
         self._flight, self._vehicle, self._robot = flight, vehicle, robot
         self.input = np.zeros(robot.action_dim)
         flight.enter(vehicle)
-        flight.tell(self.input)
+        flight.send_setpoint(self.input)
         flight.settle()
         self._offset = np.zeros(3)
         self.true = vehicle.state()
@@ -222,13 +232,13 @@ class Px4Vehicle:
         """Fly one period at a velocity setpoint (3,) [m/s], clipped to bounds and slew.
 
         Raises:
-            BadInput: when the input is not three finite numbers; AutopilotGone.
+            BadInput: the input is not three finite numbers; AutopilotGone: PX4 does not answer.
         """
         self.input = clip_input(self._robot, input, self.input)
         flight, client, start, begin = self._flight, self._flight.client, self.measured[:3], self._flight.hil.time
         client.path.clear()
         self._vehicle.begin_period()
-        flight.tell(self.input)
+        flight.send_setpoint(self.input)
         flight.advance(self._robot.period)
         flight.settle()
         self.measured = self._estimate()
@@ -241,16 +251,16 @@ class Px4Vehicle:
         return period
 
     def initial_period(self) -> Period:
-        """The present state as a period in which nothing happened: what there is to say before the first step."""
+        """Return the report before the first step: the current state, as of a period without motion."""
         clearance = float(self._vehicle.clearance(self.true[:3]))
         return Period(self.measured, self.true, False, clearance, clearance, np.zeros((SAMPLES, 3)), 0.0)
 
     def alter(self, **changes: float) -> None:
-        """Of the simulated vehicle: see Quadrotor.alter."""
+        """Change the simulated vehicle, see `Quadrotor.alter`."""
         self._vehicle.alter(**changes)
 
     def _estimate(self) -> Array:
-        """The state (9,) by the latest telemetry, carried on to the present."""
+        """Return the state (9,) of the latest telemetry, extrapolated to the current time."""
         client = self._flight.client
         assert client.position is not None
         age, acceleration = max(self._flight.hil.time - client.time, 0.0), client.acceleration

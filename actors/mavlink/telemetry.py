@@ -1,8 +1,9 @@
-"""What an autopilot can tell about its vehicle, and by which messages: their units and frames end here.
+"""The quantities that a flight needs from an autopilot, and the MAVLink messages that carry them.
 
-Autopilots differ in what they grant, and in what then comes: a list for each thing needed, the best first. What goes
-out is ENU and SI, but for two that only make sense together: an attitude turns forward-right-down into NED, a force is
-felt along forward-right-down.
+Autopilots differ in the messages that they grant, and in those that they then send. `SOURCES` lists for each quantity
+the messages that carry it, the best one first. Units and frames of the messages end here: all values are in ENU and SI
+units, except an attitude, which rotates forward-right-down into NED, and a specific force, which is in
+forward-right-down. `acceleration` combines these two.
 """
 
 from __future__ import annotations
@@ -22,9 +23,9 @@ Triple = tuple[float, float, float]
 GRAVITY = 9.81  # m/s²
 MILLIGRAVITY = 9.80665e-3  # m/s², the unit of some accelerometers
 MOTION, ATTITUDE, FORCE, LANDED = "position and velocity", "attitude", "acceleration", "landed state"
-COPTER_EARTH, PX4_EARTH = 6378100.0, 6371000.0  # m, the radius that each lays its map with
-TRUTH = "truth"  # of a simulator inside the autopilot
-LOCAL, BODY = (1,), (8, 12)  # MAV_FRAME: LOCAL_NED; BODY_NED and BODY_FRD of a velocity
+COPTER_EARTH, PX4_EARTH = 6378100.0, 6371000.0  # m, the radius of the Earth in each simulator
+TRUTH = "truth"  # ground truth of a simulator inside the autopilot
+LOCAL, BODY = (1,), (8, 12)  # MAV_FRAME: LOCAL_NED; for a velocity also BODY_NED and BODY_FRD
 ON_GROUND, UNKNOWN = 1, 0  # MAV_LANDED_STATE
 
 Message = Any  # pymavlink is untyped
@@ -32,7 +33,7 @@ Message = Any  # pymavlink is untyped
 
 @dataclass(frozen=True)
 class MotionSample:
-    """time [s] by the autopilot's clock, position [m] in its local frame, velocity [m/s]; (3,) each, ENU."""
+    """A position (3,) [m] in the autopilot's local frame and a velocity (3,) [m/s], ENU, at a time [s] of its clock."""
 
     time: float
     position: Array
@@ -41,8 +42,13 @@ class MotionSample:
 
 @dataclass(frozen=True)
 class GeoPosition:
-    """Latitude and longitude [1e-7 degrees], altitude [m] if it is told, and how many m of latitude one of these is:
-    each simulator has an Earth of its own."""
+    """A position on the Earth.
+
+    Attributes:
+        latitude, longitude: in units of 1e-7 degrees.
+        altitude: m; None: the message has none.
+        metres: m of latitude in one unit; each simulator has its own radius of the Earth.
+    """
 
     latitude: int
     longitude: int
@@ -50,67 +56,73 @@ class GeoPosition:
     metres: float
 
     def since(self, first: GeoPosition) -> Array:
-        """(3,) m, ENU, from another; a height that is not told is 0."""
-        narrow = math.cos(math.radians(1e-7 * first.latitude))
+        """Return the displacement (3,) [m, ENU] from `first`. Its height is 0 if an altitude is unknown."""
+        cos_latitude = math.cos(math.radians(1e-7 * first.latitude))
         up = 0.0 if self.altitude is None or first.altitude is None else self.altitude - first.altitude
         east, north = self.longitude - first.longitude, self.latitude - first.latitude
-        return np.array([self.metres * narrow * east, self.metres * north, up])
+        return np.array([self.metres * cos_latitude * east, self.metres * north, up])
 
 
 @dataclass(frozen=True)
 class TelemetrySource:
-    """A message that tells something; `read` gives None when it does not this time."""
+    """A message that carries a quantity.
+
+    Attributes:
+        message: its name.
+        read: returns the quantity; None if this message does not contain it.
+        kinds: the autopilots whose message has this meaning.
+    """
 
     message: str
     read: Callable[[Message], Any]
-    kinds: tuple[str, ...] = ("px4", "ardupilot")  # whose it is to be understood so
+    kinds: tuple[str, ...] = ("px4", "ardupilot")
 
 
-def told(source: TelemetrySource, message: Message) -> Any:
-    """What a message says; None: nothing, for what is no number is not told."""
+def read_source(source: TelemetrySource, message: Message) -> Any:
+    """Return the quantity in a message; None if it is missing, or a number in it is not finite."""
     try:
-        said = source.read(message)
-    except (ValueError, OverflowError):  # of an infinite angle there is no sine
+        value = source.read(message)
+    except (ValueError, OverflowError):  # an infinite angle has no sine
         return None
-    if isinstance(said, MotionSample):
-        numbers = math.isfinite(said.time) and bool(np.isfinite([said.position, said.velocity]).all())
+    if isinstance(value, MotionSample):
+        finite = math.isfinite(value.time) and bool(np.isfinite([value.position, value.velocity]).all())
     else:
-        numbers = not isinstance(said, tuple) or all(map(math.isfinite, said))
-    return said if numbers else None
+        finite = not isinstance(value, tuple) or all(map(math.isfinite, value))
+    return value if finite else None
 
 
-def turned(q: Quaternion, vector: Triple) -> Triple:
-    """A vector in the frame that the attitude turns into."""
+def rotate(q: Quaternion, vector: Triple) -> Triple:
+    """Rotate a vector by a quaternion."""
     w, x, y, z = q
     a, b, c = vector
     tx, ty, tz = 2.0 * (y * c - z * b), 2.0 * (z * a - x * c), 2.0 * (x * b - y * a)
     return (a + w * tx + y * tz - z * ty, b + w * ty + z * tx - x * tz, c + w * tz + x * ty - y * tx)
 
 
-def world(ned: Triple) -> Array:
-    """NED to ENU."""
+def enu_of(ned: Triple) -> Array:
+    """Convert a vector from NED to ENU."""
     north, east, down = ned
     return np.array([east, north, -down])
 
 
 def acceleration(attitude: Quaternion, force: Triple) -> Array:
-    """(3,) m/s², ENU: what an accelerometer feels, turned into the world, gravity taken out."""
-    north, east, down = turned(attitude, force)
+    """Return the acceleration (3,) [m/s², ENU] without gravity, from an accelerometer's specific force."""
+    north, east, down = rotate(attitude, force)
     return np.array([east, north, -down - GRAVITY])
 
 
 def _position(m: Message) -> MotionSample:
-    return MotionSample(1e-3 * m.time_boot_ms, world((m.x, m.y, m.z)), world((m.vx, m.vy, m.vz)))
+    return MotionSample(1e-3 * m.time_boot_ms, enu_of((m.x, m.y, m.z)), enu_of((m.vx, m.vy, m.vz)))
 
 
 def _odometry(m: Message) -> MotionSample | None:
-    """Only in the local frame; its velocity may be along the body."""
+    """Read a pose in the local frame; the velocity may be in the body frame."""
     velocity = (m.vx, m.vy, m.vz)
     if m.frame_id not in LOCAL or m.child_frame_id not in LOCAL + BODY:
         return None
     if m.child_frame_id in BODY:
-        velocity = turned(tuple(m.q), velocity)
-    return MotionSample(1e-6 * m.time_usec, world((m.x, m.y, m.z)), world(velocity))
+        velocity = rotate(tuple(m.q), velocity)
+    return MotionSample(1e-6 * m.time_usec, enu_of((m.x, m.y, m.z)), enu_of(velocity))
 
 
 def _quaternion(m: Message) -> Quaternion:
@@ -122,7 +134,7 @@ def _odometry_attitude(m: Message) -> Quaternion | None:
 
 
 def _euler(m: Message) -> Quaternion:
-    """Yaw, then pitch, then roll."""
+    """Convert Euler angles: yaw first, then pitch, then roll."""
     cr, sr = math.cos(0.5 * m.roll), math.sin(0.5 * m.roll)
     cp, sp = math.cos(0.5 * m.pitch), math.sin(0.5 * m.pitch)
     cy, sy = math.cos(0.5 * m.yaw), math.sin(0.5 * m.yaw)
@@ -163,7 +175,9 @@ SOURCES: dict[str, tuple[TelemetrySource, ...]] = {
     FORCE: (
         TelemetrySource("HIGHRES_IMU", _metric),
         TelemetrySource("SCALED_IMU", _milligravities),
-        TelemetrySource("RAW_IMU", _milligravities, ("ardupilot",)),  # raw by the book; there it is what SCALED_IMU has
+        TelemetrySource(
+            "RAW_IMU", _milligravities, ("ardupilot",)
+        ),  # the standard says raw; ArduPilot sends the units of SCALED_IMU
         TelemetrySource("SCALED_IMU2", _milligravities),
     ),
     LANDED: (TelemetrySource("EXTENDED_SYS_STATE", _airborne),),
@@ -173,7 +187,7 @@ SOURCES: dict[str, tuple[TelemetrySource, ...]] = {
         TelemetrySource("HIL_STATE_QUATERNION", _hil_state, ("px4",)),
     ),
 }
-IN_FLIGHT = (MOTION, ATTITUDE, FORCE)  # what is lost when it stops coming
+IN_FLIGHT = (MOTION, ATTITUDE, FORCE)  # telemetry counts as lost if one of these stops
 
 # EKF_STATUS_REPORT (ArduPilot) and ESTIMATOR_STATUS (PX4) have the same flags.
 ESTIMATED = {
@@ -183,17 +197,15 @@ ESTIMATED = {
     "horizontal position": 8 | 16,
     "height": 32,
 }
-CONSTANT_POSITION = 128  # it only assumes that it stands still
+CONSTANT_POSITION = 128  # flag: the estimator only assumes that the vehicle stands still
 ESTIMATORS = ("EKF_STATUS_REPORT", "ESTIMATOR_STATUS")
 
 
 def missing(flags: int) -> list[str]:
-    """What the estimator does not know yet, by its flags."""
-    lacking = [name for name, bits in ESTIMATED.items() if not flags & bits]
-    return lacking + ["anything but that it stands still"] * bool(flags & CONSTANT_POSITION)
+    """Return the names of the quantities that the estimator does not know yet, from its flags."""
+    unknown = [name for name, bits in ESTIMATED.items() if not flags & bits]
+    return unknown + ["anything except that the vehicle stands still"] * bool(flags & CONSTANT_POSITION)
 
-
-# --- modes ----------------------------------------------------------------------------------------------------------
 
 COPTER_MODES = {
     0: "STABILIZE", 1: "ACRO", 2: "ALT_HOLD", 3: "AUTO", 4: "GUIDED", 5: "LOITER", 6: "RTL", 7: "CIRCLE", 9: "LAND",
@@ -205,7 +217,7 @@ PX4_AUTO = {1: "READY", 2: "TAKEOFF", 3: "HOLD", 4: "MISSION", 5: "RETURN", 6: "
 
 
 def mode_name(kind: str, custom: int) -> str:
-    """What people call a HEARTBEAT's custom mode."""
+    """Return the name of the custom mode in a HEARTBEAT."""
     if kind == "ardupilot":
         return COPTER_MODES.get(custom, f"mode {custom}")
     main, sub = custom >> 16 & 0xFF, custom >> 24 & 0xFF

@@ -181,7 +181,7 @@ class VehicleClient:
             while self._current is None:
                 self._check()
                 if stop():
-                    raise MavlinkError("told to stop before it flew")
+                    raise MavlinkError("asked to stop before the vehicle flew")
                 if time.monotonic() - self._heard_at > HANDOVER_TIMEOUT:
                     why = "the vehicle server fell silent" if self._heard else "another process here flies it"
                     raise MavlinkError(why)

@@ -1,1 +1,1 @@
-"""The filter between a ROS 2 robot's raw commands and its base."""
+"""Filter the commands of a ROS 2 robot between its raw commands and its base."""

@@ -1,8 +1,8 @@
-"""One robot's committed plan between its raw commands and its base: what goes out in each period, and why.
+"""Decide in each period which command goes to a ROS 2 robot's base, and keep the committed plan.
 
-The world does not wait: while a period's input is carried out the next one's is decided on, by a model set of the robot
-in real time. `begin` gives the input of the period that begins; `decide`, late in it, asks about the command that is
-the newest then, with the state that was measured at its beginning.
+Time does not wait: while the input of one period is in force, the gate decides about the next one, with a model set of
+the robot in real time. `begin` returns the input of the period that begins. `decide`, late in the period, asks about
+the newest command, with the state that was measured at the period's beginning.
 """
 
 from __future__ import annotations
@@ -25,71 +25,92 @@ from brakeline.safety.service.wire import KINDS
 
 Array = NDArray[np.float64]
 
-ROOM = 0.035  # m: by how much two scans of one thing may differ, roughly
-KEPT = 10_000  # latest delays that are remembered
+SCAN_DIFFERENCE = 0.035  # m by which two scans of one obstacle may differ, about
+MOST_SAMPLES = 10_000  # the latest delays and decision times that count
 NO_ANSWER, LATE, BLIND = "no answer", "late", "blind"
 
 
-def inflated(obstacle: Obstacle, room: float) -> Obstacle:
-    """A box or a disc with that much [m] around it."""
-    more = 2.0 * room if obstacle.kind == BOX else room
-    return replace(obstacle, size=tuple(size + more for size in obstacle.size))
+def inflated(obstacle: Obstacle, margin: float) -> Obstacle:
+    """Return a box or a disc that is larger by a margin [m] on every side."""
+    growth = 2.0 * margin if obstacle.kind == BOX else margin
+    return replace(obstacle, size=tuple(size + growth for size in obstacle.size))
 
 
 @dataclass
 class GateStats:
-    """What became of the periods so far."""
+    """Statistics of the periods so far.
+
+    Attributes:
+        periods: number of periods.
+        kinds: periods by the kind of their decision, or `no answer`, `late`, `blind`.
+        commands: number of commands that the gate decided about.
+        compared, outside: measured states with a prediction, and those outside of the predicted set.
+        slips: periods that began late by a period or more.
+        delays: s from the arrival of a command to the beginning of its period.
+        decide_ms: ms of each decision.
+    """
 
     periods: int = 0
-    kinds: Counter[str] = field(default_factory=Counter)  # as decided; or no answer, late, blind
-    commands: int = 0  # that were decided on
-    compared: int = 0  # measured states with a prediction
-    outside: int = 0  # of them: not in the predicted set
-    slips: int = 0  # periods that began a period late or more
-    delays: deque[float] = field(default_factory=lambda: deque(maxlen=KEPT))  # s from a command's coming to its going
-    decide_ms: deque[float] = field(default_factory=lambda: deque(maxlen=KEPT))
+    kinds: Counter[str] = field(default_factory=Counter)
+    commands: int = 0
+    compared: int = 0
+    outside: int = 0
+    slips: int = 0
+    delays: deque[float] = field(default_factory=lambda: deque(maxlen=MOST_SAMPLES))
+    decide_ms: deque[float] = field(default_factory=lambda: deque(maxlen=MOST_SAMPLES))
 
     def figures(self) -> dict[str, float]:
-        kinds = (*KINDS, NO_ANSWER, LATE, BLIND)
-        delays, decide = 1e3 * np.array([*self.delays] or [0.0]), np.array([*self.decide_ms] or [0.0])
+        """Return the figures for diagnostics and for the end of the run."""
+        delays_ms, decide_ms = 1e3 * np.array([*self.delays] or [0.0]), np.array([*self.decide_ms] or [0.0])
         return {
             "periods": self.periods,
-            **{kind: self.kinds[kind] for kind in kinds},
+            **{kind: self.kinds[kind] for kind in (*KINDS, NO_ANSWER, LATE, BLIND)},
             "commands": self.commands,
             "left the predicted set": self.outside,
             "periods slipped": self.slips,
-            "delay p50 ms": float(np.percentile(delays, 50)),
-            "delay p99 ms": float(np.percentile(delays, 99)),
-            "delay worst ms": float(delays.max()),
-            "decide p50 ms": float(np.percentile(decide, 50)),
-            "decide p99 ms": float(np.percentile(decide, 99)),
+            "delay p50 ms": float(np.percentile(delays_ms, 50)),
+            "delay p99 ms": float(np.percentile(delays_ms, 99)),
+            "delay worst ms": float(delays_ms.max()),
+            "decide p50 ms": float(np.percentile(decide_ms, 50)),
+            "decide p99 ms": float(np.percentile(decide_ms, 99)),
         }
 
 
 class CommandGate:
-    """The committed plan, and who is asked about the next one."""
+    """The committed plan of one robot, and the decision about its next input.
+
+    Attributes:
+        input: the input in force (m,).
+        kind, reason: the decision about it, and why the input is not the command; empty if it is.
+        outcome: the outcome of this period's question; None before `decide`.
+    """
 
     def __init__(self, robot: Robot, ask: Ask, name: str = "ros2") -> None:
-        """robot: in real time (`Robot.late`)."""
-        assert robot.late, "in real time an answer counts from the next period on"
-        self.robot, self.backup_plan, self.tally = robot, BackupPlan(robot), GateStats()
-        self.input = np.zeros(robot.action_dim)  # of the running period
-        self.reason = "not begun"  # why the next input is not the command; empty: it is
-        self.kind = BLIND
-        self.outcome: DecisionOutcome | None = None  # of this period's question
+        """robot: in real time (`Robot.late`); name: of the robot, in the requests."""
+        assert robot.late, "in real time a decision is about the next period"
+        self.robot, self.backup_plan, self.stats = robot, BackupPlan(robot), GateStats()
+        self.input = np.zeros(robot.action_dim)
+        self.kind, self.reason = BLIND, "not begun"
+        self.outcome: DecisionOutcome | None = None
         self._ask, self._name = ask, name
-        self._command: RawCommand | None = None  # that was asked about
-        self._known = 0  # number of the last command whose delay is known
+        self._command: RawCommand | None = None  # the one that the outcome is about
+        self._counted = 0  # number of the last command whose delay has been counted
 
     def decide(
         self, state: Array, obstacles: Sequence[Obstacle], command: RawCommand | None, time: float, step: int
     ) -> None:
-        """Ask about a command (None: to stand) in the state of the period's beginning. obstacles: all that a scan
-        shows; space is known to be free where it shows nothing.
+        """Ask about a command in the state (n,) at the beginning of the period.
 
-        First with `ROOM` around the obstacles: the next scan will show them somewhat nearer or farther, and who stopped
-        where this one just allowed it could not even turn by the next. If nothing is verified there, then without; but
-        then nothing that leads nearer.
+        The gate first inflates the obstacles by `SCAN_DIFFERENCE`, since the next scan may show them that much nearer:
+        a robot that stopped where this scan just allowed it could then not even turn. If nothing can be verified with
+        that margin, the gate asks without it, but accepts no plan that ends nearer to an obstacle.
+
+        Args:
+            state: as measured.
+            obstacles: all obstacles that a scan shows; all other space is free.
+            command: the newest command; None: the robot should stand.
+            time: s, of the state.
+            step: number of the period.
         """
         proposal = np.zeros(self.robot.action_dim) if command is None else command.action
 
@@ -106,30 +127,37 @@ class CommandGate:
             )
             return request_decisions(self._ask, [request], self.robot)[0]
 
-        outcome = ask(proposal, [inflated(obstacle, ROOM) for obstacle in obstacles])
-        if self._stuck(outcome) and obstacles:
+        outcome = ask(proposal, [inflated(obstacle, SCAN_DIFFERENCE) for obstacle in obstacles])
+        if _unverified(outcome) and obstacles:
             outcome = ask(proposal, obstacles)
-            if not self._stuck(outcome) and self._nearer(outcome, state, obstacles):
+            if not _unverified(outcome) and self._approaches(outcome, state, obstacles):
                 outcome = ask(np.where(self.robot.translates, 0.0, proposal), obstacles)
         self.outcome, self._command = outcome, command
 
     def begin(self, now: float, in_time: bool = True, why: str = "") -> Array:
-        """The input (m,) of the period that begins now. in_time: False if the answer came after its beginning; why:
-        there was no question, or no answer can count, and this is the reason."""
-        tally, outcome, command = self.tally, None if why else self.outcome, self._command
+        """Return the input (m,) of the period that begins now [s].
+
+        Args:
+            now: by the robot's clock.
+            in_time: whether the answer arrived before the period began.
+            why: the reason why there was no question, or why no answer counts; empty: there is none.
+        """
+        stats, outcome, command = self.stats, None if why else self.outcome, self._command
         self.outcome = self._command = None
-        tally.periods += 1
+        stats.periods += 1
         if outcome is not None and outcome.answer is not None and in_time:
             answer = outcome.answer
-            tally.compared += answer.compared
-            tally.outside += answer.compared and not answer.contained
-            tally.decide_ms.append(answer.time_ms)
+            stats.compared += answer.compared
+            stats.outside += answer.compared and not answer.contained
+            stats.decide_ms.append(answer.time_ms)
             self.kind, self.reason = answer.kind, answer.reason
             self.input = next_input(self.backup_plan, outcome)
             if command is None:
                 self.reason = self.reason or "no command"
-            else:
-                self._note(command, now)
+            elif command.number != self._counted:
+                self._counted = command.number
+                stats.commands += 1
+                stats.delays.append(now - command.at)
         else:
             if outcome is None:
                 self.kind, self.reason = BLIND, why or "nothing was asked"
@@ -138,23 +166,18 @@ class CommandGate:
             else:
                 self.kind, self.reason = LATE, "the answer came after its period had begun"
             self.input = self.backup_plan.fallback()
-        tally.kinds[self.kind] += 1
+        stats.kinds[self.kind] += 1
         return self.input
 
-    def _stuck(self, outcome: DecisionOutcome) -> bool:
-        """Was there an answer, and was nothing verified?"""
-        return outcome.answer is not None and outcome.answer.kind not in (ALLOWED, ADJUSTED)
-
-    def _nearer(self, outcome: DecisionOutcome, state: Array, obstacles: Sequence[Obstacle]) -> bool:
-        """Does the answer's plan end nearer to what stands around than the robot is now?"""
+    def _approaches(self, outcome: DecisionOutcome, state: Array, obstacles: Sequence[Obstacle]) -> bool:
+        """Return whether the answer's plan ends nearer to the obstacles than the robot is now."""
         assert outcome.answer is not None
         d = self.robot.position_dim
-        ends = np.stack([state[:d], outcome.answer.tube_center[-1]])
-        here, there = Shapes.of(obstacles, d).distance(ends).min(axis=0)
-        return bool(there < here)
+        positions = np.stack([state[:d], outcome.answer.tube_center[-1]])
+        now, end = Shapes.of(obstacles, d).distance(positions).min(axis=0)
+        return bool(end < now)
 
-    def _note(self, command: RawCommand, now: float) -> None:
-        self.tally.commands += command.number != self._known
-        if command.number != self._known:
-            self._known = command.number
-            self.tally.delays.append(now - command.at)
+
+def _unverified(outcome: DecisionOutcome) -> bool:
+    """Return whether there was an answer, but no verified plan."""
+    return outcome.answer is not None and outcome.answer.kind not in (ALLOWED, ADJUSTED)

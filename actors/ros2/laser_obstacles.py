@@ -1,15 +1,15 @@
-"""From a laser scan to obstacles that hold all it may have seen (docs/method.md §10).
+"""Convert a laser scan to obstacles that contain everything the scan may have hit (docs/method.md §10).
 
-A beam that hits at range r becomes a disc of radius `increment r + range error + heading error r + position error`:
-the gap to the next beam, before which an edge may lie anywhere, and how wrong the hit's place may be. Neighbouring hits
-that the body can't pass between are joined to boxes along them, so that a wall is one obstacle and not a hundred. A
-beam without a hit is free up to the sensor's range. One that tells nothing (too near, NaN), and directions that no beam
-looks in, may have something standing right at the body: they count as occupied there, and there is no memory of what
-was seen free before.
+A beam that hits at range r becomes a disc of radius `increment r + range error + heading error r + position error`.
+The first part covers the gap to the next beam, since an edge may be anywhere in it; the others cover the error of the
+hit's position. Neighbouring hits that the body cannot pass between are joined to boxes, so that a wall is one obstacle
+and not a hundred. A beam without a hit is free up to the sensor's range. A beam without information (too near, NaN),
+and a direction without a beam, may have an obstacle right at the body: there the space at the body counts as occupied.
+Earlier scans do not count.
 
-What it assumes: nothing moves, and nothing is narrower than the gap between two beams where it matters (at 360 beams
-7 mm in 0.4 m). What stands behind an edge, within the one gap between the beams on both sides of it, is seen when the
-robot has come round.
+Assumptions: nothing moves, and no obstacle is narrower than the gap between two beams at the distance where it matters
+(7 mm at 0.4 m with 360 beams). The scan shows an obstacle in the one gap behind an edge only after the robot has come
+around that edge.
 """
 
 from __future__ import annotations
@@ -27,18 +27,18 @@ from brakeline.messaging.ros2.cdr_messages import LaserScan, seconds
 
 Array = NDArray[np.float64]
 
-SLACK = 0.2  # m beyond a robot's sight up to which hits are kept: it drives on until the next scan
-STRAIGHT = 0.02  # m: hits that lie so near to a line are on one wall
-MOST = 10_000  # beams
+EXTRA_SIGHT = 0.2  # m: hits count up to the robot's sight plus this, since it drives on until the next scan
+STRAIGHT = 0.02  # m: hits that are nearer to a line belong to one wall
+MOST_BEAMS = 10_000
 
 
 class BadScan(ValueError):
-    """Not a scan that anything can be seen from."""
+    """A scan is not valid."""
 
 
 @dataclass(frozen=True)
 class HitErrors:
-    """Of a hit's place: range [m]; heading [rad] and position [m] of the pose that it was seen from."""
+    """The largest errors of a hit: its range [m], and heading [rad] and position [m] of the robot."""
 
     range: float
     heading: float
@@ -46,7 +46,7 @@ class HitErrors:
 
     @staticmethod
     def of(robot: Robot, range_error: float) -> HitErrors:
-        """With the pose as wrong as the robot's measurements may be."""
+        """Take the errors of the pose from the robot's measurement bound."""
         assert robot.heading is not None
         bound = robot.measurement_bound
         return HitErrors(range_error, bound[robot.heading], math.hypot(*bound[: robot.position_dim]))
@@ -54,26 +54,35 @@ class HitErrors:
 
 @dataclass(frozen=True)
 class LaserBeams:
-    """What a scan says, beam by beam: time [s], angle [rad] in the sensor's frame, range [m] up to which it is free: to
-    a hit, or to where the sensor sees no farther. blind: which say nothing; they have no range."""
+    """The n beams of a scan, with one for each direction that the scan leaves out.
+
+    Attributes:
+        times: (n,) s.
+        angles: (n,) rad, in the sensor's frame.
+        ranges: (n,) m of free space: up to the hit or the sensor's range; NaN for a blind beam.
+        blind: (n,) whether the beam has no information.
+        gap: rad between two neighbours.
+    """
 
     times: Array
     angles: Array
     ranges: Array
     blind: NDArray[np.bool_]
-    gap: float  # rad between neighbours
+    gap: float
 
 
 def read(scan: LaserScan, zero_is_free: bool = False) -> LaserBeams:
-    """zero_is_free: the driver reports 0 where nothing is within range, as some do (by REP 117 it should be inf).
+    """Return the beams of a scan.
+
+    zero_is_free: the driver reports 0 where nothing is within range, as some do (REP 117 demands inf).
 
     Raises:
-        BadScan: angles or ranges make no sense.
+        BadScan: the scan's angles or ranges are not valid.
     """
     ranges = np.asarray(scan.ranges, dtype=float)
     n, gap = len(ranges), float(scan.angle_increment)
     limits = (scan.range_min, scan.range_max, scan.angle_min, gap, scan.time_increment)
-    if not (2 <= n <= MOST and all(map(math.isfinite, limits)) and abs(gap) > 1.0 / MOST):
+    if not (2 <= n <= MOST_BEAMS and all(map(math.isfinite, limits)) and abs(gap) > 1.0 / MOST_BEAMS):
         raise BadScan(f"{n} beams, {gap:g} rad apart")
     if not 0.0 <= scan.range_min < scan.range_max:
         raise BadScan(f"ranges from {scan.range_min:g} m to {scan.range_max:g} m")
@@ -83,80 +92,88 @@ def read(scan: LaserScan, zero_is_free: bool = False) -> LaserBeams:
     free = ranges > scan.range_max
     if zero_is_free:
         free |= ranges == 0.0
-    known = np.where(free, scan.range_max, np.where(hit, ranges, np.nan))
+    lengths = np.where(free, scan.range_max, np.where(hit, ranges, np.nan))
     unseen = _unseen(float(scan.angle_min), gap, n)
-    known = np.concatenate([known, np.full(len(unseen), np.nan)])
-    times = np.concatenate([times, np.full(len(unseen), times[-1])])
-    ways = np.asarray(known, dtype=float)
-    return LaserBeams(np.asarray(times, float), np.concatenate([angles, unseen]), ways, np.isnan(ways), abs(gap))
+    lengths = np.concatenate([lengths, np.full(len(unseen), np.nan)]).astype(float)
+    times = np.concatenate([times, np.full(len(unseen), times[-1])]).astype(float)
+    return LaserBeams(times, np.concatenate([angles, unseen]), lengths, np.isnan(lengths), abs(gap))
 
 
 def _unseen(first: float, gap: float, count: int) -> Array:
-    """Angles, as close as the beams, of the directions that a fan leaves out."""
+    """Return angles [rad] in the directions that a scan leaves out, with the gap of its beams between them."""
     left = 2.0 * math.pi - abs(gap) * count
-    more = math.ceil(left / abs(gap) - 0.5)  # a beam's rounding is no sector
+    more = math.ceil(left / abs(gap) - 0.5)  # less than half a gap is rounding
     return np.asarray(first + gap * (count + np.arange(max(more, 0))))
 
 
 def obstacles(
     beams: LaserBeams, poses: Array, mount: PlanarPose, robot: Robot, errors: HitErrors, around: Array
 ) -> tuple[Obstacle, ...]:
-    """What may stand near `around` (2,) [m], in the frame of the poses (n, 3) that the robot had at the beams' times.
+    """Return all obstacles that may be near a position.
 
-    Where a beam is blind, an obstacle touches the body as it stands at `around`.
+    Args:
+        beams: the n beams of a scan.
+        poses: (n, ≥ 3) x, y [m], heading [rad] of the robot at the beams' times.
+        mount: the sensor's pose on the robot.
+        robot: its footprint and sight count.
+        errors: the largest errors.
+        around: (2,) m, the position, in the frame of the poses. At a blind beam, an obstacle touches the body there.
     """
     cos, sin = np.cos(poses[:, 2]), np.sin(poses[:, 2])
     sensor = poses[:, :2] + np.stack([cos * mount.x - sin * mount.y, sin * mount.x + cos * mount.y], axis=1)
     angles = poses[:, 2] + mount.yaw + beams.angles
-    beside = np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    directions = np.stack([np.cos(angles), np.sin(angles)], axis=1)
     with np.errstate(invalid="ignore"):
-        points = sensor + beams.ranges[:, None] * beside
+        points = sensor + beams.ranges[:, None] * directions
         radii = (beams.gap + errors.heading) * beams.ranges + errors.range + errors.position
-        near = np.linalg.norm(points - around, axis=1) <= robot.sight + SLACK + radii
+        near = np.linalg.norm(points - around, axis=1) <= robot.sight + EXTRA_SIGHT + radii
     chosen = np.flatnonzero(near)
     order = chosen[np.argsort(beams.angles[chosen], kind="stable")]
-    found = _joined(points[order], radii[order], 2.0 * robot.footprint)
-    blind = beside[beams.blind]
+    hits = _joined(points[order], radii[order], 2.0 * robot.footprint)
+    blind = directions[beams.blind]
     size = max(0.5 * beams.gap, 1e-3) * robot.footprint + errors.position
     touching = around + (robot.footprint + size) * blind
-    return (*found, *_joined(touching, np.full(len(touching), size), 2.0 * robot.footprint))
+    return (*hits, *_joined(touching, np.full(len(touching), size), 2.0 * robot.footprint))
 
 
 def _joined(points: Array, radii: Array, body: float) -> list[Obstacle]:
-    """Discs (n,) in the order in which they are met around the sensor, as few obstacles that hold them all."""
+    """Return few obstacles that contain all discs (n,), which are in their order around the sensor.
+
+    points: (n, 2) m, their centers; radii: (n,) m; body: m, the width of the narrowest gap that the body may pass.
+    """
     n = len(points)
     if n == 0:
         return []
-    apart = np.linalg.norm(np.roll(points, -1, axis=0) - points, axis=1) - radii - np.roll(radii, -1)
-    open_after = np.flatnonzero(apart > body)  # the body may fit between these and the next
+    gaps = np.linalg.norm(np.roll(points, -1, axis=0) - points, axis=1) - radii - np.roll(radii, -1)
+    open_after = np.flatnonzero(gaps > body)  # the body may pass between these discs and the next ones
     if not len(open_after):
         closed = np.concatenate([np.arange(n), [0]]) if n > 2 else np.arange(n)
         return _along(points[closed], radii[closed])
     starts = (open_after + 1) % n
-    found = []
+    obstacles = []
     for i, start in enumerate(starts):
         end = open_after[(i + 1) % len(open_after)]
         count = (end - start) % n + 1
         run = (start + np.arange(count)) % n
-        found += _along(points[run], radii[run])
-    return found
+        obstacles += _along(points[run], radii[run])
+    return obstacles
 
 
 def _along(points: Array, radii: Array) -> list[Obstacle]:
-    """A chain of discs as boxes along its straight parts; two parts share the disc where they meet."""
+    """Return boxes along the straight parts of a chain of discs; two parts share the disc where they meet."""
     if len(points) == 1:
         return [Obstacle(CYLINDER, (float(points[0, 0]), float(points[0, 1])), (float(radii[0]),))]
     chord = points[-1] - points[0]
     length = float(np.linalg.norm(chord))
     along = chord / length if length > 1e-9 else np.array([1.0, 0.0])
     across = np.array([-along[1], along[0]])
-    off = (points - points[0]) @ across
-    worst = int(np.argmax(np.abs(off))) if length > 1e-9 else len(points) // 2
-    bent = abs(off[worst]) > STRAIGHT or length <= 1e-9
+    offsets = (points - points[0]) @ across
+    worst = int(np.argmax(np.abs(offsets))) if length > 1e-9 else len(points) // 2
+    bent = abs(offsets[worst]) > STRAIGHT or length <= 1e-9
     if bent and 0 < worst < len(points) - 1:
         return _along(points[: worst + 1], radii[: worst + 1]) + _along(points[worst:], radii[worst:])
-    on = (points - points[0]) @ along
-    low, high = np.array([(on - radii).min(), (off - radii).min()]), np.array([(on + radii).max(), (off + radii).max()])
+    local = np.stack([(points - points[0]) @ along, offsets], axis=1)
+    low, high = (local - radii[:, None]).min(axis=0), (local + radii[:, None]).max(axis=0)
     middle, edges = 0.5 * (low + high), high - low
     center = points[0] + middle[0] * along + middle[1] * across
     yaw = math.atan2(along[1], along[0])

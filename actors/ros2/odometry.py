@@ -1,4 +1,4 @@
-"""Where a robot was lately: its odometry, and its state at any moment that this covers."""
+"""Recent odometry of a robot, and its state at any time that the odometry covers."""
 
 from __future__ import annotations
 
@@ -10,17 +10,24 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-KEPT = 2.0  # s
-AHEAD = 0.1  # s beyond the newest odometry to which it is carried on by its own speeds
-GAP = 0.15  # s between two odometries: of what was in a longer one nothing is known
-STEP = 1e-4  # s: two odometries that are no farther apart are one
-SLOPE = 0.1  # s over which speeds are taken from poses that come without any
+HISTORY = 2.0  # s
+EXTRAPOLATION = 0.1  # s after the newest odometry, for which the last speeds are assumed
+LONGEST_GAP = 0.15  # s between two odometries, between which states are interpolated
+SAME_TIME = 1e-4  # s: odometry that is not newer by more is dropped
+SPEED_WINDOW = 0.1  # s over which speeds are computed from poses without speeds
+TIME, X, Y, HEADING = range(4)  # columns of a row; speed [m/s] and turn rate [rad/s] follow
+
+
+def wrapped(angle: float) -> float:
+    """Return an angle [rad] in [-π, π)."""
+    return (angle + math.pi) % (2.0 * math.pi) - math.pi
 
 
 class OdometryHistory:
     """Odometry by its own time stamps: rows of time [s], x, y [m], heading [rad], speed [m/s], turn rate [rad/s]."""
 
-    def __init__(self, gap: float = GAP) -> None:
+    def __init__(self, gap: float = LONGEST_GAP) -> None:
+        """gap: s, the longest between two odometries."""
         self._rows: deque[tuple[float, ...]] = deque()
         self._gap = gap
 
@@ -29,66 +36,65 @@ class OdometryHistory:
 
     @property
     def newest(self) -> float:
-        """The last one's time [s]; -inf without any."""
-        return self._rows[-1][0] if self._rows else -math.inf
+        """Time of the newest odometry [s]; -inf without any."""
+        return self._rows[-1][TIME] if self._rows else -math.inf
 
     def add(self, time: float, x: float, y: float, heading: float, speed: float, turn_rate: float) -> bool:
-        """False: not taken, for it holds something that is no finite number, or is not newer than the last one. One
-        that is older by more than is kept begins anew: whoever measures was restarted."""
+        """Add an odometry. Return False if it is dropped: a number is not finite, or it is not newer than the last one.
+
+        An odometry that is older by more than `HISTORY` begins a new history: its sender has restarted.
+        """
         return all(map(math.isfinite, (speed, turn_rate))) and self._add(time, x, y, heading, speed, turn_rate)
 
-    def _add(self, time: float, x: float, y: float, heading: float, speed: float, turn_rate: float) -> bool:
-        """Speeds that are no numbers are not known."""
-        if not all(map(math.isfinite, (time, x, y, heading))):
-            return False
-        if time < self.newest - KEPT:
-            self._rows.clear()
-        if time <= self.newest + STEP:
-            return False
-        if self._rows:  # headings go on without jumps
-            before = self._rows[-1][3]
-            heading = before + (heading - before + math.pi) % (2.0 * math.pi) - math.pi
-        self._rows.append((time, x, y, heading, speed, turn_rate))
-        while self._rows[0][0] < time - KEPT:
-            self._rows.popleft()
-        return True
-
     def add_pose(self, time: float, x: float, y: float, heading: float) -> bool:
-        """As `add`, for poses that come without speeds: they are the differences over the last `SLOPE` s, and not known
-        before there are so many."""
-        past = next((row for row in reversed(self._rows) if row[0] <= time - SLOPE), None)
-        if past is None or time < self.newest or time - past[0] > SLOPE + self._gap:
+        """Add a pose without speeds, see `add`. The speeds come from the poses of the last `SPEED_WINDOW` seconds."""
+        past = next((row for row in reversed(self._rows) if row[TIME] <= time - SPEED_WINDOW), None)
+        if past is None or time < self.newest or time - past[TIME] > SPEED_WINDOW + self._gap:
             return self._add(time, x, y, heading, math.nan, math.nan)
-        lasted = time - past[0]
-        turned = (heading - past[3] + math.pi) % (2.0 * math.pi) - math.pi
-        middle = past[3] + 0.5 * turned
-        way = math.cos(middle) * (x - past[1]) + math.sin(middle) * (y - past[2])
-        return self.add(time, x, y, heading, way / lasted, turned / lasted)
+        duration, turn = time - past[TIME], wrapped(heading - past[HEADING])
+        middle = past[HEADING] + 0.5 * turn
+        distance = math.cos(middle) * (x - past[X]) + math.sin(middle) * (y - past[Y])
+        return self.add(time, x, y, heading, distance / duration, turn / duration)
 
     def at(self, times: Array) -> Array | None:
-        """States (n, 5) at times (n,); None: some time is not covered, or in a gap."""
+        """Return the states (n, 5) at some times (n,) [s]; None if one of them is not covered, or in a gap."""
         if not self._rows:
             return None
         rows = np.array(self._rows)
-        if times.min() < rows[0, 0] - STEP or times.max() > rows[-1, 0] + AHEAD:
+        if times.min() < rows[0, TIME] - SAME_TIME or times.max() > rows[-1, TIME] + EXTRAPOLATION:
             return None
-        after = np.searchsorted(rows[:, 0], times)
+        after = np.searchsorted(rows[:, TIME], times)
         between = after[(after > 0) & (after < len(rows))]
-        if (rows[between, 0] - rows[between - 1, 0] > self._gap).any():
+        if (rows[between, TIME] - rows[between - 1, TIME] > self._gap).any():
             return None
-        states = np.stack([np.interp(times, rows[:, 0], rows[:, i]) for i in range(1, 6)], axis=1)
-        ahead = np.maximum(times - rows[-1, 0], 0.0)
-        middle = states[:, 2] + 0.5 * ahead * states[:, 4]
-        states[:, 0] += ahead * states[:, 3] * np.cos(middle)
-        states[:, 1] += ahead * states[:, 3] * np.sin(middle)
-        states[:, 2] += ahead * states[:, 4]
+        x, y, heading, speed, turn_rate = (np.interp(times, rows[:, TIME], rows[:, i]) for i in range(X, 6))
+        ahead = np.maximum(times - rows[-1, TIME], 0.0)
+        middle = heading + 0.5 * ahead * turn_rate
+        x, y = x + ahead * speed * np.cos(middle), y + ahead * speed * np.sin(middle)
+        states = np.stack([x, y, heading + ahead * turn_rate, speed, turn_rate], axis=1)
         return states if np.isfinite(states).all() else None
 
     def state(self, time: float) -> Array | None:
-        """(5,) at one time, the heading in [-π, π)."""
+        """Return the state (5,) at a time [s], with its heading in [-π, π); None, see `at`."""
         states = self.at(np.array([time]))
         if states is None:
             return None
         state = np.asarray(states[0])
-        state[2] = (state[2] + math.pi) % (2.0 * math.pi) - math.pi
+        state[2] = wrapped(state[2])
         return state
+
+    def _add(self, time: float, x: float, y: float, heading: float, speed: float, turn_rate: float) -> bool:
+        """Add an odometry whose speeds may be NaN: unknown."""
+        if not all(map(math.isfinite, (time, x, y, heading))):
+            return False
+        if time < self.newest - HISTORY:
+            self._rows.clear()
+        if time <= self.newest + SAME_TIME:
+            return False
+        if self._rows:  # interpolation needs headings without jumps
+            before = self._rows[-1][HEADING]
+            heading = before + wrapped(heading - before)
+        self._rows.append((time, x, y, heading, speed, turn_rate))
+        while self._rows[0][TIME] < time - HISTORY:
+            self._rows.popleft()
+        return True

@@ -1,9 +1,9 @@
-"""PROCESS: a ROS 2 robot behind the filter: its raw commands in, what may be driven out.
+"""PROCESS: filter the raw commands of a ROS 2 robot, and drive its base by what the filter allows.
 
-Periods follow each other by the robot's clock. In each: its input goes out, and again every `RESEND` s; `lead` before
-its end the newest raw command is asked about; at its end the answer's input follows, or the committed plan's if there
-is none. What is missing or stale is a reason to brake along that plan. If the process dies, the base's own timeout
-brakes.
+Periods follow each other by the robot's clock. At the beginning of a period its input goes out, and again every
+`RESEND` seconds. `lead` seconds before its end, the process asks about the newest raw command. The answer's input, or
+without an answer the committed plan's, is for the next period. If an input of the decision is missing or stale, the
+robot brakes along the committed plan. If this process dies, the base's own timeout brakes.
 """
 
 from __future__ import annotations
@@ -45,17 +45,17 @@ log = logging.getLogger("brakeline.ros2")
 
 RESEND = 0.05  # s after which an input is sent again
 SILENCE = 0.5  # s for which a simulation's clock may stand still
-LATE = 0.02  # s after a period's beginning at which an answer to it is too late
-TELL = 1.0  # s between two diagnostics; a change is told at once
+LATE = 0.02  # s after a period's beginning, from which on an answer is too late
+DIAGNOSTICS_INTERVAL = 1.0  # s between two diagnostics, unless the decision changes
 
 
 class UnsupportedRobot(ValueError):
-    """Not a robot that Twist messages drive."""
+    """A robot cannot be driven by Twist messages."""
 
 
 @dataclass(frozen=True)
 class Topics:
-    """Names, below the namespace unless they begin with a slash."""
+    """Names of topics, below the namespace unless they begin with a slash."""
 
     odometry: str = "odom"
     scan: str = "scan"
@@ -69,23 +69,26 @@ class Topics:
 
 @dataclass(frozen=True)
 class Ros2Settings:
+    """Settings of the process."""
+
     robot: str = "ground"
     ros: RosSettings = field(default_factory=RosSettings)
     name: str = "brakeline"
     topics: Topics = field(default_factory=Topics)
-    stamped: bool = False  # TwistStamped instead of Twist, in and out
-    sim_time: bool = False
-    lead: float = 0.04  # s before a period at which its input is decided on
-    sensing: SensorSettings = field(default_factory=SensorSettings)
-    fresh: AgeLimits = field(default_factory=AgeLimits)
-    seconds: float = 0.0  # by the robot's clock, until it ends; 0: when asked to
+    stamped: bool = False  # whether commands are TwistStamped instead of Twist
+    sim_time: bool = False  # whether the time is on /clock
+    lead: float = 0.04  # s before a period, at which the filter decides about its input
+    sensors: SensorSettings = field(default_factory=SensorSettings)
+    age_limits: AgeLimits = field(default_factory=AgeLimits)
+    seconds: float = 0.0  # s by the robot's clock until the end; 0: until the process is asked to stop
 
 
 def driven(name: str) -> Robot:
-    """The robot of that name in real time.
+    """Return the robot of this name in real time.
 
     Raises:
-        UnknownRobot; UnsupportedRobot: a Twist can't drive it, or odometry can't tell its state.
+        UnknownRobot: there is none.
+        UnsupportedRobot: a Twist cannot drive it, or odometry does not contain its state.
     """
     robot = robot_maybe_with_task(name)
     robot = robot if robot.late else robot.in_real_time()
@@ -95,18 +98,18 @@ def driven(name: str) -> Robot:
 
 
 class FilterNode:
-    """A robot's node, and the loop that keeps its periods."""
+    """The node of one robot, and the loop over its periods."""
 
-    def __init__(
-        self, settings: Ros2Settings, question: Ask, stop: threading.Event, tap: MessageTap | None = None
-    ) -> None:
-        """Raises Unreachable, BadRosName, UnknownRobot, UnsupportedRobot."""
+    def __init__(self, settings: Ros2Settings, ask: Ask, stop: threading.Event, tap: MessageTap | None = None) -> None:
+        """ask: sends requests to the filter; tap: called with every message. Raises Unreachable, BadRosName,
+        UnknownRobot, UnsupportedRobot."""
         self.settings, self.robot, self._stop = settings, driven(settings.robot), stop
-        self.senses = RosInputs(self.robot, settings.sensing, settings.fresh)
-        self.gate = CommandGate(self.robot, question, settings.name)
+        self.inputs = RosInputs(self.robot, settings.sensors, settings.age_limits)
+        self.gate = CommandGate(self.robot, ask, settings.name)
         self.clock: RosClock = SimulatedClock() if settings.sim_time else SystemClock()
-        self._why, self._ending = "not begun", False
-        self._told = (-math.inf, "", "")  # when diagnostics went out, and what they said
+        self._missing = "not begun"  # why there is no decision about the next period; empty: there is one
+        self._ending = False
+        self._diagnosed_at, self._diagnosed = -math.inf, ("", "")  # s; kind and reason of the last diagnostics
         self.node = RosNode(settings.ros, settings.name, tap)
         names = settings.topics
         if settings.stamped:
@@ -115,35 +118,36 @@ class FilterNode:
             self._stamped, self._plain = None, self.node.publisher(names.command, Twist)
         self._markers = self.node.publisher(names.markers, MarkerArray)
         self._diagnostics = self.node.publisher(names.diagnostics, DiagnosticArray)
-        self._listen()
+        self._subscribe()
 
     def run(self) -> None:
-        """Until asked to stop; then along the committed plan to a stop."""
-        due = self._first()
+        """Run until asked to stop; then follow the committed plan to a stop."""
+        due = self._first_period()
         ends = due + self.settings.seconds if self.settings.seconds else math.inf
         while not self._stop.is_set() and due < ends:
             due = self._period(due, self._stop)
-        self._ending, unasked = True, threading.Event()
+        self._ending, never = True, threading.Event()
         while self.gate.backup_plan.plan.any():
-            due = self._period(due, unasked)
+            due = self._period(due, never)
         self._send(np.zeros(self.robot.action_dim))
 
     def close(self) -> None:
+        """Leave the graph."""
         self.node.close()
 
     def figures(self) -> dict[str, float]:
-        """What became of the periods and messages so far."""
-        return self.gate.tally.figures() | {"passed over": self.node.rejected.count}
+        """Return the statistics of periods and messages so far."""
+        return self.gate.stats.figures() | {"passed over": self.node.rejected.count}
 
-    def _first(self) -> float:
-        """When the first period begins: at a multiple of its length, as all do."""
-        while self.clock.now() == 0.0 and not self._stop.is_set():  # a simulation that has not told yet
+    def _first_period(self) -> float:
+        """Return when the first period begins [s]: at a multiple of its length, as all periods do."""
+        while self.clock.now() == 0.0 and not self._stop.is_set():  # a simulation that has not sent its time yet
             self.clock.wait(1e-6, self._stop, SILENCE)
         self.clock.jumped()
         return math.ceil(self.clock.now() / self.robot.period) * self.robot.period
 
     def _period(self, due: float, stop: threading.Event) -> float:
-        """Wait for the period that is due, let it begin, and decide on the one after it. Returns when that is due."""
+        """Wait until `due` [s], begin a period, and decide about the next one. Return when that begins [s]."""
         clock, gate, period = self.clock, self.gate, self.robot.period
         in_time = clock.now() <= due + LATE
         if not clock.wait(due, stop, SILENCE):
@@ -152,40 +156,44 @@ class FilterNode:
             return due
         if jump := clock.jumped():
             log.warning("the clock was set by %.2f s", jump)
-            self.senses.forget()
-            self._why = "the clock was set"
-        if jump or clock.now() > due + period:  # what was decided was for another moment
-            gate.tally.slips += not jump
+            self.inputs.forget()
+            self._missing = "the clock was set"
+        if jump or clock.now() > due + period:  # the decision was for another time
+            gate.stats.slips += not jump
             in_time = False
             due = math.floor(clock.now() / period) * period
-        number = gate.tally.periods
-        self._begin(in_time, self._why)
-        self._why = "" if self._until(due + period - self.settings.lead, stop) else "the clock stands still"
-        if not self._why:
+        number = gate.stats.periods
+        self._begin(in_time, self._missing)
+        decide_at = due + period - self.settings.lead
+        self._missing = "" if self._resend_until(decide_at, stop) else "the clock stands still"
+        if not self._missing:
             self._decide(due, number)
         return due + period
 
     def _begin(self, in_time: bool = True, why: str = "") -> None:
         self._send(self.gate.begin(self.clock.now(), in_time, why))
-        self._tell()
+        self._diagnose()
 
     def _decide(self, began: float, number: int) -> None:
         now = self.clock.now()
         try:
             if self._ending:
                 raise InputMissing("the filter ends")
-            state = self.senses.state(began, now)
-            around: tuple[Obstacle, ...] = self.senses.obstacles(state[:2], now)
+            state = self.inputs.state(began, now)
+            around: tuple[Obstacle, ...] = self.inputs.obstacles(state[:2], now)
         except InputMissing as error:
-            self._why = str(error)
+            self._missing = str(error)
             return
-        self.gate.decide(state, around, self.senses.command(now), began, number)
+        self.gate.decide(state, around, self.inputs.command(now), began, number)
         outcome = self.gate.outcome
         if outcome is not None and outcome.answer is not None:
-            self._markers.put(markers(began, self.senses.frame, outcome.answer, around))
+            self._markers.put(markers(began, self.inputs.frame, outcome.answer, around))
 
-    def _until(self, moment: float, stop: threading.Event) -> bool:
-        """Wait, and meanwhile send the input in force again (not in a simulation: it may wait for the next one)."""
+    def _resend_until(self, moment: float, stop: threading.Event) -> bool:
+        """Wait for a moment [s], and send the input in force again meanwhile. Return False as `RosClock.wait` does.
+
+        In a simulation nothing is sent again: a simulation may wait for the next command.
+        """
         clock = self.clock
         while not self.settings.sim_time and moment - clock.now() > RESEND:
             if not clock.wait(clock.now() + RESEND, stop, SILENCE):
@@ -201,44 +209,40 @@ class FilterNode:
         else:
             self._plain.put(message)
 
-    def _tell(self) -> None:
-        """Diagnostics: each second, and when something changes."""
+    def _diagnose(self) -> None:
+        """Publish diagnostics every second and when the decision changes; log a change of its kind."""
         gate, now = self.gate, self.clock.now()
-        when, *said = self._told
-        if gate.kind != said[0]:
-            lost = gate.kind not in KINDS
-            log.log(logging.WARNING if lost else logging.INFO, "%s: %s", gate.kind, gate.reason)
-        if [gate.kind, gate.reason] == said and now - when < TELL:
+        if gate.kind != self._diagnosed[0]:
+            log.log(logging.INFO if gate.kind in KINDS else logging.WARNING, "%s: %s", gate.kind, gate.reason)
+        if (gate.kind, gate.reason) == self._diagnosed and now - self._diagnosed_at < DIAGNOSTICS_INTERVAL:
             return
-        self._told = (now, gate.kind, gate.reason)
+        self._diagnosed_at, self._diagnosed = now, (gate.kind, gate.reason)
         self._diagnostics.put(
             diagnostics(now, self.settings.name, self.robot.name, gate.kind, gate.reason, self.figures())
         )
 
-    def _listen(self) -> None:
-        names, senses, subscribe = self.settings.topics, self.senses, self.node.subscribe
+    def _subscribe(self) -> None:
+        names, inputs, subscribe = self.settings.topics, self.inputs, self.node.subscribe
         if isinstance(self.clock, SimulatedClock):
-            subscribe("/clock", Clock, self.clock.hear, SENSOR)
-        subscribe(names.fixed_transforms, TFMessage, senses.hear_fixed_transforms, LATCHED)
-        if self.settings.sensing.base_frame:
-            subscribe(names.transforms, TFMessage, senses.hear_transforms)
+            subscribe("/clock", Clock, self.clock.on_clock, SENSOR)
+        subscribe(names.fixed_transforms, TFMessage, inputs.on_fixed_transforms, LATCHED)
+        if self.settings.sensors.base_frame:
+            subscribe(names.transforms, TFMessage, inputs.on_transforms)
         else:
-            subscribe(names.odometry, Odometry, senses.hear_odometry, SENSOR)
-        subscribe(names.scan, LaserScan, senses.hear_scan, SENSOR)
-        hear = lambda message: senses.hear_command(message, self.clock.now())  # noqa: E731
+            subscribe(names.odometry, Odometry, inputs.on_odometry, SENSOR)
+        subscribe(names.scan, LaserScan, inputs.on_scan, SENSOR)
+        on_command = lambda message: inputs.on_command(message, self.clock.now())  # noqa: E731
         if self.settings.stamped:
-            subscribe(names.raw, TwistStamped, hear)
+            subscribe(names.raw, TwistStamped, on_command)
         else:
-            subscribe(names.raw, Twist, hear)
+            subscribe(names.raw, Twist, on_command)
 
 
-def run(
-    settings: Ros2Settings, question: Ask, stop: threading.Event, tap: MessageTap | None = None
-) -> dict[str, float]:
-    """Steer until asked to stop; returns what became of the periods."""
-    steering = FilterNode(settings, question, stop, tap)
+def run(settings: Ros2Settings, ask: Ask, stop: threading.Event, tap: MessageTap | None = None) -> dict[str, float]:
+    """Filter commands until asked to stop. Return the statistics of periods and messages."""
+    node = FilterNode(settings, ask, stop, tap)
     try:
-        steering.run()
+        node.run()
     finally:
-        steering.close()
-    return steering.figures()
+        node.close()
+    return node.figures()

@@ -1,4 +1,4 @@
-"""The time that a ROS graph lives by: this machine's date, or a simulation's on /clock."""
+"""The clock of a ROS graph: the system time, or a simulation's time on /clock."""
 
 from __future__ import annotations
 
@@ -8,76 +8,84 @@ from typing import Protocol
 
 from brakeline.messaging.ros2.cdr_messages import Clock, seconds
 
-JUMP = 0.05  # s: a date that is off by less is left to drift
-SLICE = 0.02  # s between two looks at whether to stop
+JUMP = 0.05  # s: a smaller difference to the system time counts as drift
+POLL = 0.02  # s between two checks whether to stop
 
 
 class RosClock(Protocol):
-    """Seconds since the Unix epoch, or since the simulation's beginning."""
+    """A clock in seconds since the Unix epoch, or since the beginning of the simulation."""
 
-    def now(self) -> float: ...
+    def now(self) -> float:
+        """Return the time [s]."""
 
     def wait(self, moment: float, stop: threading.Event, patience: float) -> bool:
-        """Until `now()` has reached the moment. False: asked to stop, or for `patience` s it stood still."""
+        """Wait for a moment [s]. Return False if `stop` is set, or if the clock stood still for `patience` s."""
 
     def jumped(self) -> float:
-        """By how much it was set since the last call [s]; what was to come is later by as much."""
+        """Return by how many seconds the clock was set since the last call."""
 
 
 class SystemClock:
-    """This machine's. In between it runs evenly: who sets the date must not stop whoever waits."""
+    """This machine's time. It runs evenly between two calls of `jumped`, so that setting the date stops nobody."""
 
     def __init__(self) -> None:
         self._offset = time.time() - time.monotonic()
 
     def now(self) -> float:
+        """Return the time [s]."""
         return time.monotonic() + self._offset
 
     def wait(self, moment: float, stop: threading.Event, patience: float) -> bool:
+        """Wait for a moment [s]. Return False if `stop` is set."""
         return not stop.wait(max(0.0, moment - self.now()))
 
     def jumped(self) -> float:
-        off = time.time() - self.now()
-        if abs(off) < JUMP:
+        """Return by how many seconds the date was set since the last call, and adopt it."""
+        difference = time.time() - self.now()
+        if abs(difference) < JUMP:
             return 0.0
-        self._offset += off
-        return off
+        self._offset += difference
+        return difference
 
 
 class SimulatedClock:
-    """What /clock says."""
+    """The time on /clock."""
 
-    BACK = 1.0  # s: a clock that goes back by more was begun anew
+    RESTART = 1.0  # s: a clock that goes back by more has restarted
 
     def __init__(self) -> None:
         self._now = 0.0
         self._moved = threading.Condition()
         self._jump = 0.0
 
-    def hear(self, message: Clock) -> None:
+    def on_clock(self, message: Clock) -> None:
+        """Handle a message on /clock."""
         with self._moved:
-            told = seconds(message.clock)
-            if told < self._now - self.BACK:
-                self._jump += told - self._now
-                self._now = told
-            self._now = max(self._now, told)
+            stamp = seconds(message.clock)
+            if stamp < self._now - self.RESTART:
+                self._jump += stamp - self._now
+                self._now = stamp
+            self._now = max(self._now, stamp)
             self._moved.notify_all()
 
     def now(self) -> float:
+        """Return the time [s]; 0 before the first message."""
         return self._now
 
     def wait(self, moment: float, stop: threading.Event, patience: float) -> bool:
+        """Wait for a moment [s]. Return False if `stop` is set, or if the clock stood still for `patience` s."""
         with self._moved:
-            seen, since = self._now, time.monotonic()
+            last, since = self._now, time.monotonic()
             while self._now < moment - 1e-9 and not self._jump:
-                self._moved.wait(SLICE)
-                if self._now != seen:
-                    seen, since = self._now, time.monotonic()
+                self._moved.wait(POLL)
+                if self._now != last:
+                    last, since = self._now, time.monotonic()
                 if stop.is_set() or time.monotonic() - since > patience:
                     return False
         return not stop.is_set()
 
     def jumped(self) -> float:
+        """Return by how many seconds the simulation was set back since the last call."""
         with self._moved:
             jump, self._jump = self._jump, 0.0
         return jump

@@ -1,4 +1,4 @@
-"""What a robot's nodes told lately, and whether that is enough to decide on."""
+"""The latest messages of a robot's nodes, and whether they are complete and fresh enough for a decision."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from brakeline.actors.ros2.laser_obstacles import BadScan, HitErrors, LaserBeams, obstacles, read
 from brakeline.actors.ros2.odometry import OdometryHistory
-from brakeline.actors.ros2.sensor_frames import PlanarPose, TransformTree, name_of, place_of
+from brakeline.actors.ros2.sensor_frames import PlanarPose, TransformTree, frame_name, pose_of
 from brakeline.messaging.obstacle import Obstacle
 from brakeline.messaging.rejected_messages import headline
 from brakeline.messaging.robot import Robot
@@ -20,28 +20,36 @@ from brakeline.messaging.ros2.cdr_messages import LaserScan, Odometry, TFMessage
 Array = NDArray[np.float64]
 
 LONGEST_FRAME = 100  # characters of a frame's name
+OTHER_CLOCK = 1e3  # s: a message of this age has the time of another clock
 
 
 class InputMissing(Exception):
-    """Something that a decision needs is missing or stale: the message says what."""
+    """An input of a decision is missing or stale; the message says which."""
 
 
 @dataclass(frozen=True)
 class AgeLimits:
-    """How old [s] what the decision is made on may be; older is as good as missing."""
+    """The greatest age [s] of each input; an older one counts as missing."""
 
     odometry: float = 0.15
-    scan: float = 0.6  # from its first beam: a turn of a slow lidar, and the next one's wait
+    scan: float = 0.6  # from its first beam: one turn of a slow lidar, and the wait for the next scan
     command: float = 0.5
-    ahead: float = 0.05  # that a stamp may lie in the future: clocks differ
+    ahead: float = 0.05  # s by which a stamp may be in the future, since clocks differ
 
 
 @dataclass(frozen=True)
 class SensorSettings:
-    """mount: of the lidar in the robot's frame; None: as the transforms say. odometry_frame, base_frame: of TF, where
-    it stands for odometry; empty base_frame: it does not."""
+    """How to interpret a robot's sensors.
 
-    range_error: float = 0.02  # m, at most
+    Attributes:
+        range_error: m, the largest of the lidar.
+        zero_is_free: the lidar reports 0 where nothing is within its range.
+        mount: the lidar's pose on the robot; None: the transforms contain it.
+        odometry_frame: the frame of the state.
+        base_frame: the robot's frame in the transforms, which then replace the odometry; empty: they do not.
+    """
+
+    range_error: float = 0.02
     zero_is_free: bool = False
     mount: PlanarPose | None = None
     odometry_frame: str = "odom"
@@ -50,7 +58,7 @@ class SensorSettings:
 
 @dataclass(frozen=True)
 class RawCommand:
-    """A raw command (speed [m/s], turn rate [rad/s]), and when it came by the robot's clock."""
+    """A raw command: speed [m/s] and turn rate [rad/s], the time [s] of its arrival by the robot's clock, a number."""
 
     action: Array
     at: float
@@ -58,94 +66,95 @@ class RawCommand:
 
 
 class RosInputs:
-    """The latest of each. The handlers are called by the node's threads, the rest by whoever decides."""
+    """The latest input of each kind. The node's threads call the handlers `on_…`; one other thread calls the rest.
 
-    def __init__(self, robot: Robot, sensing: SensorSettings, fresh: AgeLimits) -> None:
-        self.robot, self.sensing, self.fresh = robot, sensing, fresh
-        self.frame = sensing.odometry_frame  # in which the state is
-        self._errors = HitErrors.of(robot, sensing.range_error)
+    Attributes:
+        frame: the frame of the state.
+    """
+
+    def __init__(self, robot: Robot, settings: SensorSettings, limits: AgeLimits) -> None:
+        self.robot, self.settings, self.limits = robot, settings, limits
+        self.frame = settings.odometry_frame
+        self._errors = HitErrors.of(robot, settings.range_error)
         self._lock = threading.Lock()
-        self._track, self._frames = OdometryHistory(fresh.odometry), TransformTree()
-        self._base = sensing.base_frame
+        self._odometry, self._transforms = OdometryHistory(limits.odometry), TransformTree()
+        self._base = settings.base_frame
         self._scan: tuple[LaserBeams, str] | None = None
         self._bad_scan = ""
         self._command: RawCommand | None = None
         self._commands = 0
 
-    # --- handlers -------------------------------------------------------------------------------------------------
-
-    def hear_odometry(self, message: Odometry) -> None:
+    def on_odometry(self, message: Odometry) -> None:
+        """Handle odometry."""
         pose, twist = message.pose.pose, message.twist.twist
         with self._lock:
             self.frame = headline(message.header.frame_id, LONGEST_FRAME) or self.frame
             self._base = headline(message.child_frame_id, LONGEST_FRAME) or self._base
-            self._track.add(
+            self._odometry.add(
                 seconds(message.header.stamp),
                 *(pose.position.x, pose.position.y, yaw_of(pose.orientation)),
                 *(twist.linear.x, twist.angular.z),
             )
 
-    def hear_transforms(self, message: TFMessage) -> None:
-        """Those that move: the robot's own in the odometry's frame counts."""
+    def on_transforms(self, message: TFMessage) -> None:
+        """Handle moving transforms: that of the robot in the odometry's frame counts."""
+        wanted = frame_name(self.settings.odometry_frame), frame_name(self.settings.base_frame)
         for stamped in message.transforms:
-            if (name_of(stamped.header.frame_id), name_of(stamped.child_frame_id)) == (
-                name_of(self.sensing.odometry_frame),
-                name_of(self.sensing.base_frame),
-            ):
-                place = place_of(stamped.transform)
-                if place is not None:
-                    with self._lock:
-                        self._track.add_pose(seconds(stamped.header.stamp), place.x, place.y, place.yaw)
+            frames = frame_name(stamped.header.frame_id), frame_name(stamped.child_frame_id)
+            if frames == wanted and (pose := pose_of(stamped.transform)) is not None:
+                with self._lock:
+                    self._odometry.add_pose(seconds(stamped.header.stamp), pose.x, pose.y, pose.yaw)
 
-    def hear_fixed_transforms(self, message: TFMessage) -> None:
+    def on_fixed_transforms(self, message: TFMessage) -> None:
+        """Handle fixed transforms."""
         with self._lock:
             for stamped in message.transforms:
-                self._frames.add(stamped)
+                self._transforms.add(stamped)
 
-    def hear_scan(self, message: LaserScan) -> None:
+    def on_scan(self, message: LaserScan) -> None:
+        """Handle a scan; one that is not valid counts as missing until the next valid one."""
         try:
             frame = headline(message.header.frame_id, LONGEST_FRAME)
-            scan, bad = (read(message, self.sensing.zero_is_free), frame), ""
+            scan, bad = (read(message, self.settings.zero_is_free), frame), ""
         except BadScan as error:
             scan, bad = None, str(error)
         with self._lock:
             self._scan, self._bad_scan = scan or self._scan, bad
 
-    def hear_command(self, message: Twist | TwistStamped, now: float) -> None:
+    def on_command(self, message: Twist | TwistStamped, now: float) -> None:
+        """Handle a raw command that arrives now [s]."""
         twist = message.twist if isinstance(message, TwistStamped) else message
         with self._lock:
             self._commands += 1
             self._command = RawCommand(np.array([twist.linear.x, twist.angular.z]), now, self._commands)
 
-    # --- what there is to decide on -----------------------------------------------------------------------------------
-
     def forget(self) -> None:
-        """The clock was set: nothing that came before counts."""
+        """Drop everything with a time stamp, since the clock was set."""
         with self._lock:
-            self._track, self._scan, self._command = OdometryHistory(self.fresh.odometry), None, None
+            self._odometry, self._scan, self._command = OdometryHistory(self.limits.odometry), None, None
 
     def state(self, at: float, now: float) -> Array:
-        """(5,) as measured at that time. Raises InputMissing."""
+        """Return the measured state (5,) at a time [s]. Raises InputMissing."""
         with self._lock:
-            newest, state = self._track.newest, self._track.state(at)
+            newest, state = self._odometry.newest, self._odometry.state(at)
         if newest == -math.inf:
             raise InputMissing("no odometry yet")
-        self._check("odometry", newest, now, self.fresh.odometry)
+        self._check_age("odometry", newest, now, self.limits.odometry)
         if state is None:
             raise InputMissing("no odometry of when the period began")
         return state
 
     def obstacles(self, around: Array, now: float) -> tuple[Obstacle, ...]:
-        """Those that the last scan speaks of near a position (2,), in the odometry's frame. Raises InputMissing."""
+        """Return the last scan's obstacles near a position (2,) [m], in the odometry's frame. Raises InputMissing."""
         with self._lock:
             if self._bad_scan:
-                raise InputMissing(f"no scan that makes sense: {self._bad_scan}")
+                raise InputMissing(f"no valid scan: {self._bad_scan}")
             if self._scan is None:
                 raise InputMissing("no scan yet")
             beams, frame = self._scan
-            self._check("the scan", float(beams.times[0]), now, self.fresh.scan)
-            poses = self._track.at(beams.times)
-            mount = self.sensing.mount or self._frames.place(frame, self._base or frame)
+            self._check_age("the scan", float(beams.times[0]), now, self.limits.scan)
+            poses = self._odometry.at(beams.times)
+            mount = self.settings.mount or self._transforms.pose(frame, self._base or frame)
         if poses is None:
             raise InputMissing("no odometry of when the scan was made")
         if mount is None:
@@ -153,18 +162,18 @@ class RosInputs:
         return obstacles(beams, poses, mount, self.robot, self._errors, around)
 
     def command(self, now: float) -> RawCommand | None:
-        """The last one; None: none lately."""
+        """Return the last command; None if it is older than its age limit."""
         with self._lock:
             command = self._command
-        if command is None or now - command.at > self.fresh.command:
+        if command is None or now - command.at > self.limits.command:
             return None
         return command
 
-    def _check(self, what: str, stamp: float, now: float, limit: float) -> None:
+    def _check_age(self, what: str, stamp: float, now: float, limit: float) -> None:
         age = now - stamp
+        if age > OTHER_CLOCK:
+            raise InputMissing(f"{what} has the time of another clock: compare the clocks")
         if age > limit:
-            raise InputMissing(
-                f"{what} is {age:.2f} s old" if age < 1e3 else f"{what} is of another time: compare the clocks"
-            )
-        if age < -self.fresh.ahead:
+            raise InputMissing(f"{what} is {age:.2f} s old")
+        if age < -self.limits.ahead:
             raise InputMissing(f"{what} is {-age:.2f} s in the future: compare the clocks")

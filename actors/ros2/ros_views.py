@@ -1,4 +1,4 @@
-"""What the filter thinks, as ROS's tools show it: tube, plan and obstacles as markers, the reasons as diagnostics."""
+"""Messages that show the filter in ROS's tools: tube, plan and obstacles as markers, its decisions as diagnostics."""
 
 from __future__ import annotations
 
@@ -31,9 +31,9 @@ from brakeline.safety.service.wire import KINDS
 
 Array = NDArray[np.float64]
 
-HEIGHT = 0.2  # m, of what is drawn of obstacles
-THIN = 0.01  # m, of lines and of the tube's boxes
-KEPT = Duration(sec=1, nanosec=0)  # s that a marker stays when nothing new comes
+OBSTACLE_HEIGHT = 0.2  # m
+THICKNESS = 0.01  # m, of lines and of the tube's boxes
+LIFETIME = Duration(sec=1, nanosec=0)  # of a marker that is not replaced
 OBSTACLE = ColorRGBA(r=0.47, g=0.5, b=0.55, a=0.6)
 COLORS = {
     ALLOWED: (0.2, 0.66, 0.39),
@@ -45,33 +45,33 @@ CUBE, ROUND, LINE = Marker.CUBE, Marker.CYLINDER, Marker.LINE_STRIP
 
 
 def markers(time: float, frame: str, decision: Decision, obstacles: Sequence[Obstacle]) -> MarkerArray:
-    """The tube's boxes, the way through their middles, and what was taken to stand around."""
+    """Return the boxes of the tube, the path through their centers, and the obstacles (time in s)."""
     centers, halves = decision.tube_center, decision.tube_half_width
     red, green, blue = COLORS.get(decision.kind, OTHER)
     tube, plan = ColorRGBA(r=red, g=green, b=blue, a=0.35), ColorRGBA(r=red, g=green, b=blue, a=1.0)
-    drawn = [
-        _marker(time, frame, "tube", i, CUBE, pose(*center), (*(2.0 * half), THIN), tube)
+    shown = [
+        _marker(time, frame, "tube", i, CUBE, pose(*center), (*(2.0 * half), THICKNESS), tube)
         for i, (center, half) in enumerate(zip(centers.tolist(), halves, strict=True))
     ]
-    way = [point(x, y, THIN) for x, y in centers.tolist()]
-    drawn.append(_marker(time, frame, "plan", 0, LINE, pose(0.0, 0.0), (THIN, 0.0, 0.0), plan, way))
+    path = [point(x, y, THICKNESS) for x, y in centers.tolist()]
+    shown.append(_marker(time, frame, "plan", 0, LINE, pose(0.0, 0.0), (THICKNESS, 0.0, 0.0), plan, path))
     for i, obstacle in enumerate(obstacles):
-        drawn.append(_obstacle(time, frame, i, obstacle))
-    return MarkerArray(markers=[_clear(time, frame), *drawn])  # type: ignore[list-item]
+        shown.append(_obstacle(time, frame, i, obstacle))
+    return MarkerArray(markers=[_clear(time, frame), *shown])  # type: ignore[list-item]
 
 
 def _obstacle(time: float, frame: str, number: int, obstacle: Obstacle) -> Marker:
     x, y = obstacle.position
-    place = pose(x, y, obstacle.yaw, 0.5 * HEIGHT)
+    place = pose(x, y, obstacle.yaw, 0.5 * OBSTACLE_HEIGHT)
     if obstacle.kind == BOX:
-        return _marker(time, frame, "obstacles", number, CUBE, place, (*obstacle.size[:2], HEIGHT), OBSTACLE)
+        return _marker(time, frame, "obstacles", number, CUBE, place, (*obstacle.size[:2], OBSTACLE_HEIGHT), OBSTACLE)
     assert obstacle.kind == CYLINDER, "a scan gives boxes and discs"
     width = 2.0 * obstacle.size[0]
-    return _marker(time, frame, "obstacles", number, ROUND, place, (width, width, HEIGHT), OBSTACLE)
+    return _marker(time, frame, "obstacles", number, ROUND, place, (width, width, OBSTACLE_HEIGHT), OBSTACLE)
 
 
 def _clear(time: float, frame: str) -> Marker:
-    """Takes away all that was drawn before."""
+    """Return the marker that deletes all earlier ones."""
     return _marker(time, frame, "", 0, CUBE, pose(0.0, 0.0), (0.0, 0.0, 0.0), OBSTACLE, action=Marker.DELETEALL)
 
 
@@ -98,7 +98,7 @@ def _marker(
         pose=place,
         scale=vector(*map(float, scale)),
         color=color,
-        lifetime=KEPT,
+        lifetime=LIFETIME,
         frame_locked=False,
         points=list(points),
         colors=[],
@@ -115,11 +115,14 @@ def _marker(
 def diagnostics(
     time: float, node: str, robot: str, kind: str, reason: str, figures: Mapping[str, float]
 ) -> DiagnosticArray:
-    """OK: the command went through; WARN: another input or the committed plan did; ERROR: there was nothing to decide
-    on, or nobody to do it, and the robot brakes."""
-    decided = DiagnosticStatus.OK if kind == ALLOWED else DiagnosticStatus.WARN
+    """Return the diagnostics of a decision.
+
+    OK: the command is executed. WARN: another input or the committed plan is. ERROR: there is no decision, since an
+    input of it is missing or the service does not answer, and the robot brakes.
+    """
+    level = DiagnosticStatus.OK if kind == ALLOWED else DiagnosticStatus.WARN
     status = DiagnosticStatus(
-        level=decided if kind in KINDS else DiagnosticStatus.ERROR,
+        level=level if kind in KINDS else DiagnosticStatus.ERROR,
         name=f"{node}: safety filter",
         message=f"{kind}: {reason}" if reason else kind,
         hardware_id=robot,

@@ -97,14 +97,14 @@ class Ros2Command:
             stamped=self.stamped,
             sim_time=self.sim_time,
             lead=self.lead or (SERVICE_LEAD if self.connect else Ros2Settings.lead),
-            sensing=SensorSettings(
+            sensors=SensorSettings(
                 self.range_error,
                 self.zero_is_free,
                 PlanarPose(*self.mount) if self.mount else None,
                 self.odometry_frame,
                 self.base_frame if self.tf else "",
             ),
-            fresh=self.fresh,
+            age_limits=self.fresh,
             seconds=self.seconds,
         )
         log_to_stderr(self.name)

@@ -6,11 +6,8 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-import numpy as np
-
-from brakeline.actors.decision_guard import Ask, DecisionOutcome, request_decisions
-from brakeline.actors.episode_runner import ActorIdentity, EpisodeRunner
-from brakeline.actors.joint_episode import RobotGroup
+from brakeline.actors.decision_guard import Ask
+from brakeline.actors.episode_runner import ActorIdentity, EpisodeRunner, RobotGroup, run_episode
 from brakeline.deploy.data.model_store import method_for
 from brakeline.deploy.policy_loading import policy_named
 from brakeline.deploy.vehicle_factory import environment, fleet_world
@@ -62,14 +59,9 @@ def in_process(model: Model, accept_bound: float | None = None) -> Ask:
 
 
 def episode(driver: EpisodeRunner, policy: Policy, question: Ask | None, number: int) -> Iterator[pb.Step]:
-    """The steps of one episode."""
-    driver.begin(number)
-    while driver.running:
-        proposal = np.asarray(policy(driver.observation, driver.info), dtype=float)
-        outcome = None
-        if question is not None:
-            outcome = request_decisions(question, [driver.request(proposal)], driver.robot)[0]
-        yield driver.execute(proposal, outcome)
+    """Yield the steps of one episode of a robot that is alone."""
+    for (step,) in run_episode(RobotGroup([driver]), [policy], question, number):
+        yield step
 
 
 def prepared(robot: RobotWithTask, what: Evaluation) -> tuple[EpisodeRunner, Policy, Ask | None]:
@@ -88,24 +80,6 @@ def _question(robot: RobotWithTask, what: Evaluation) -> Ask | None:
     return in_process(method_for(robot, what.method, what.model_config, what.accept_bound), what.accept_bound)
 
 
-def round_of(
-    fleet: RobotGroup, policies: Sequence[Policy], question: Ask | None, number: int
-) -> Iterator[list[pb.Step]]:
-    """The steps of one episode of every robot of a world, period by period."""
-    fleet.begin(number)
-    while fleet.running:
-        proposals = [
-            np.asarray(policy(driver.observation, driver.info), dtype=float)
-            if driver.running
-            else driver.robot.zero_input()
-            for driver, policy in zip(fleet.drivers, policies, strict=True)
-        ]
-        outcomes: list[DecisionOutcome | None] = [None] * len(proposals)
-        if question is not None:
-            outcomes = list(request_decisions(question, fleet.requests(proposals), fleet.drivers[0].robot))
-        yield [step for step in fleet.execute(proposals, outcomes) if step is not None]
-
-
 def prepared_fleet(robot: RobotWithTask, what: Evaluation) -> tuple[RobotGroup, FleetEnv, list[Policy], Ask | None]:
     """The same for several robots in one world.
 
@@ -120,7 +94,7 @@ def prepared_fleet(robot: RobotWithTask, what: Evaluation) -> tuple[RobotGroup, 
         EpisodeRunner(robot, member, ActorIdentity(f"evaluate.{i}", i, what.seed), filtered=question is not None)
         for i, member in enumerate(world.members)
     ]
-    return RobotGroup(world, drivers, question is not None), world, policies, question
+    return RobotGroup(drivers, world, question is not None), world, policies, question
 
 
 def evaluate(
@@ -142,10 +116,10 @@ def evaluate(
 def _together(robot: RobotWithTask, what: Evaluation, each: Callable[[EpisodeStats], Any]) -> dict[str, Any]:
     """A fleet's figures: of all, by kind and by robot as `analyse` has them, and of its worlds."""
     fleet, world, policies, question = prepared_fleet(robot, what)
-    tallies = {driver.identity.actor: EpisodeStats() for driver in fleet.drivers}
+    tallies = {driver.identity.actor: EpisodeStats() for driver in fleet.runners}
     rounds, periods = -(-what.episodes // what.fleet), 0
     for number in range(rounds):
-        for steps in round_of(fleet, policies, question, number):
+        for steps in run_episode(fleet, policies, question, number):
             periods += 1
             for step in steps:
                 tallies[step.actor].step(step)

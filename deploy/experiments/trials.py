@@ -16,7 +16,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from brakeline.actors.decision_guard import Ask, request_decisions
+from brakeline.actors.decision_guard import Ask
 from brakeline.actors.episode_runner import EpisodeRunner
 from brakeline.learner.learner import Learner
 from brakeline.logs.segment import Entry, open_segment
@@ -143,11 +143,9 @@ def thinking(policy: Policy) -> Propose:
 def one_step(driver: EpisodeRunner, propose: Propose, question: Ask | None, version: int = 0) -> pb.Step:
     """Propose, ask, act."""
     proposal = propose(driver)
-    outcome = None
-    if question is not None:
-        outcome = request_decisions(question, [driver.request(proposal.action)], driver.robot)[0]
-        if outcome.answer is None:
-            raise RuntimeError(f"no decision: {outcome.failure}")  # in one process that is a defect, never the network
+    outcome = driver.decide(proposal.action, question)
+    if outcome is not None and outcome.answer is None:
+        raise RuntimeError(f"no decision: {outcome.failure}")  # in one process that is a defect, never the network
     step = driver.execute(proposal.action, outcome, version)
     step.propose_ms = proposal.ms
     return step

@@ -23,7 +23,7 @@ from brakeline.sim.autopilot.autopilot_rules import SETPOINT_TIMEOUT as TIMEOUT
 from brakeline.sim.autopilot.endpoint import Autopilot
 from brakeline.sim.autopilot.flight_modes import Mode
 from brakeline.sim.vehicle import BadInput
-from tests.actors.test_mavlink import RULES, quadrotor
+from tests.actors.test_lockstep_quadrotor import RULES, quadrotor
 from tests.robots import QUADROTOR
 
 GAP = 0.25  # s between two setpoints, at most

@@ -92,6 +92,6 @@ def test_only_who_tells_its_controller_is_led(kind: str) -> None:
     client = AutopilotClient(lambda data: None)
     wait = lambda condition, seconds: condition()  # noqa: E731
     client.kind = kind
-    with pytest.raises(MavlinkError, match=f"it has no {', '.join(PARAMETERS[kind])}: it can only be told velocities"):
+    with pytest.raises(MavlinkError, match=f"the autopilot has no {', '.join(PARAMETERS[kind])}: fly it by velocities"):
         client.lead(wait)
     assert client.lookahead is None

@@ -23,7 +23,7 @@ from brakeline.actors.mavlink.telemetry import (
     GeoPosition,
     missing,
     mode_name,
-    turned,
+    rotate,
 )
 from brakeline.sim.autopilot import ned_frames
 from tests.robots import QUADROTOR
@@ -105,11 +105,11 @@ def test_odometry_along_the_body_is_turned_and_of_another_frame_is_nothing() -> 
 
 
 def test_the_turn_agrees_with_the_autopilots_own_edge() -> None:
-    """What is felt along its body, turned by what it says of its attitude, is what the simulator knows."""
+    """What is felt along its body, rotate by what it says of its attitude, is what the simulator knows."""
     body = (0.3, -0.2, 9.0)  # forward-left-up
     own = quaternion()  # taken for ENU from forward-left-up
     there = np.array(ned_frames.rotate(own, body))
-    north, east, down = turned(ned_frames.attitude(own), ned_frames.body(body))
+    north, east, down = rotate(ned_frames.attitude(own), ned_frames.body(body))
     assert [east, north, -down] == pytest.approx(there)
 
 
@@ -188,7 +188,9 @@ def test_what_is_granted_and_never_comes_is_not_relied_on() -> None:
     """PX4 before its heading is known, as it was met."""
     there = Pretender("px4", {"ATTITUDE_QUATERNION": 0.0, "ODOMETRY": 50.0, "HIGHRES_IMU": 50.0})
     line = there.client.choose(ATTITUDE, 0.02, there.wait)
-    assert line.startswith("attitude from ODOMETRY at 5") and "ATTITUDE_QUATERNION is granted, never comes" in line
+    assert (
+        line.startswith("attitude from ODOMETRY at 5") and "ATTITUDE_QUATERNION is granted, but never arrives" in line
+    )
     assert there.switched_off == ["ATTITUDE_QUATERNION"]
     there.client.choose(FORCE, 0.02, there.wait)
     hovering = times(quaternion(), times((0.0, *[0.1, 0.2, 9.80665 * DOWN]), conjugate(quaternion())))
@@ -217,7 +219,7 @@ def test_the_faster_of_two_slow_ones_is_taken_and_one_too_slow_to_fly_is_none() 
     there = Pretender("px4", {"ATTITUDE_QUATERNION": 4.0, "ATTITUDE": 20.0})
     assert there.client.choose(ATTITUDE, 0.02, there.wait).startswith("attitude from ATTITUDE at 2")
     there = Pretender("px4", {"ATTITUDE_QUATERNION": 4.0})
-    with pytest.raises(TelemetryMissing, match="comes at 4 Hz"):
+    with pytest.raises(TelemetryMissing, match="arrives at 4 Hz"):
         there.client.choose(ATTITUDE, 0.02, there.wait)
 
 
@@ -253,7 +255,11 @@ def test_parameters_that_hold_it_below_what_may_be_asked_for() -> None:
 
 def test_what_the_estimator_lacks_has_a_name() -> None:
     assert missing(sum({1, 2, 4, 16, 32})) == [] and missing(sum({1, 2, 4, 8, 32})) == []
-    assert missing(165) == ["horizontal velocity", "horizontal position", "anything but that it stands still"]
+    assert missing(165) == [
+        "horizontal velocity",
+        "horizontal position",
+        "anything except that the vehicle stands still",
+    ]
     assert missing(0) == list(ESTIMATED)
 
 

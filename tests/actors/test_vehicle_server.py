@@ -44,7 +44,7 @@ from brakeline.sim.autopilot.endpoint import Autopilot
 from brakeline.sim.autopilot.flight_modes import Mode
 from brakeline.sim.quadrotor import SAMPLES
 from brakeline.sim.vehicle import BadInput, Period
-from tests.actors.test_mavlink import quadrotor
+from tests.actors.test_lockstep_quadrotor import quadrotor
 from tests.robots import QUADROTOR
 from tests.waiting import until
 

@@ -9,7 +9,6 @@ from pathlib import Path
 
 import numpy as np
 
-from brakeline.actors.decision_guard import request_decisions
 from brakeline.actors.episode_runner import ActorIdentity, EpisodeRunner
 from brakeline.deploy.data.model_store import model_for
 from brakeline.deploy.experiments.evaluate import in_process
@@ -51,7 +50,8 @@ def drive(
             put(EPISODE, driver.begin(episode))
             episode += 1
         proposal = np.asarray(policy(driver.observation, driver.info), dtype=float)
-        outcome = request_decisions(ask, [driver.request(proposal)], GROUND)[0]
+        outcome = driver.decide(proposal, ask)
+        assert outcome is not None
         exchange = outcome.exchange(driver.info["time"])
         if change is not None:
             change(exchange)

@@ -5,7 +5,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from brakeline.actors.decision_guard import request_decisions
 from brakeline.actors.episode_runner import ActorIdentity, EpisodeRunner
 from brakeline.deploy.data.run_dataset import trajectories_of
 from brakeline.deploy.experiments.evaluate import Evaluation, episode, evaluate, prepared
@@ -39,7 +38,7 @@ def test_without_answers_it_brakes_along_the_plan_that_it_was_committed_to(fligh
 
     for step in range(14 + ROBOT.horizon):
         proposal = np.asarray(policy(driver.observation, driver.info))
-        outcome = request_decisions(question if step < 14 else nobody, [driver.request(proposal)], ROBOT)[0]
+        outcome = driver.decide(proposal, question if step < 14 else nobody)
         expected = driver.backup_plan.plan[1].copy()
         taken = driver.execute(proposal, outcome)
         if step >= 14:
@@ -52,9 +51,9 @@ def test_without_answers_it_brakes_along_the_plan_that_it_was_committed_to(fligh
 def test_a_flight_that_goes_on_keeps_its_plan_from_goal_to_goal() -> None:
     driver, _, question = prepared(ROBOT, Evaluation("greedy", accept_bound=BOUND))
     assert question is not None
-    flying = EpisodeRunner(ROBOT, driver.env, ActorIdentity("a", 0, 0), goes_on=True)
+    flying = EpisodeRunner(ROBOT, driver.env, ActorIdentity("a", 0, 0), continuous=True)
     flying.begin(0)
-    outcome = request_decisions(question, [flying.request(np.array([1.0, 0.0, 0.0]))], ROBOT)[0]
+    outcome = flying.decide(np.array([1.0, 0.0, 0.0]), question)
     flying.execute(np.array([1.0, 0.0, 0.0]), outcome)
     plan = flying.backup_plan.plan.copy()
     assert plan.any()

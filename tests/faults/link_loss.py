@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.timing import Figures
-from brakeline.actors.decision_guard import Ask, request_decisions
+from brakeline.actors.decision_guard import Ask
 from brakeline.actors.episode_runner import ActorIdentity, EpisodeRunner
 from brakeline.actors.mavlink.autopilot_commands import AutopilotClient
 from brakeline.actors.mavlink.lockstep_quadrotor import LockstepQuadrotor
@@ -60,13 +60,11 @@ class Loss:
         propose, driver = scripted(policy, ROBOT, rng), EpisodeRunner(ROBOT, self._env, ActorIdentity("actor", 0, 0))
         driver.begin(number)
         for _ in range(int(rng.integers(3, LONGEST))):
-            outcome = request_decisions(
-                self._question, [driver.request(propose(driver.observation, driver.info))], ROBOT
-            )[0]
+            outcome = driver.decide(propose(driver.observation, driver.info), self._question)
             driver.execute(driver.backup_plan.plan[0], outcome)
             if not driver.running:
                 break
-        assert outcome.answer is not None, "nobody kills the filter here"
+        assert outcome is not None and outcome.answer is not None, "nobody kills the filter here"
         center, half = outcome.answer.tube_center, outcome.answer.tube_half_width
         positions = self._die(driver.backup_plan.plan[0])
         return float(excess(positions, center, half).max())

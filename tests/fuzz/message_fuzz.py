@@ -178,7 +178,7 @@ def actor(robot: RobotWithTask) -> Party:
         with wire.rejected.skip_on_error(sample.key):
             wire.handlers[sample.topic.name](sample)
 
-    return Party((WEIGHTS, FLOW), take, lambda: (student.welcome, student.done), wire.rejected)
+    return Party((WEIGHTS, FLOW), take, lambda: (student.joined, student.done), wire.rejected)
 
 
 def safety() -> Party:

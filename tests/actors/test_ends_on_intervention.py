@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from brakeline.actors.decision_guard import request_decisions
 from brakeline.actors.episode_runner import ActorIdentity, EpisodeRunner
 from brakeline.deploy.experiments.evaluate import in_process
 from brakeline.deploy.vehicle_factory import environment
@@ -18,13 +17,14 @@ SLOW, FAST = np.array([0.05, 0.1]), np.array([0.25, 0.1])
 
 @pytest.fixture
 def driver() -> EpisodeRunner:
-    made = EpisodeRunner(GROUND, environment(GROUND, "default", 0), ActorIdentity("a", 0, 0), penalty=5.0, cuts=True)
-    made.begin(0)
-    return made
+    env, identity = environment(GROUND, "default", 0), ActorIdentity("a", 0, 0)
+    runner = EpisodeRunner(GROUND, env, identity, penalty=5.0, ends_on_intervention=True)
+    runner.begin(0)
+    return runner
 
 
 def step(driver: EpisodeRunner, proposal, ask) -> pb.Step:
-    return driver.execute(proposal, request_decisions(ask, [driver.request(proposal)], GROUND)[0])
+    return driver.execute(proposal, driver.decide(proposal, ask))
 
 
 def test_an_intervention_is_a_terminal_step_for_the_learner_alone(driver):
@@ -54,12 +54,12 @@ def test_in_use_the_episode_goes_on_behind_the_rule():
 def test_a_collision_while_braking_is_still_paid_for_as_one(driver):
     taken = pb.Step(reward=-100.0, terminated=True, collision=True, decision=pb.FAILSAFE)
     driver.running = False
-    driver._cut(taken)
+    driver._end_on_intervention(taken)
     assert taken.cut and taken.penalty == 0.0 and taken.terminated and not taken.truncated
 
 
 def test_a_missing_answer_is_no_intervention(driver):
     step(driver, SLOW, in_process(known(threshold=0.3)))
-    lost = request_decisions(lambda requests: (_ for _ in ()).throw(NoReply("gone")), [driver.request(SLOW)], GROUND)[0]
+    lost = driver.decide(SLOW, lambda requests: (_ for _ in ()).throw(NoReply("gone")))
     fallen = driver.execute(SLOW, lost)
     assert fallen.fallback and not fallen.cut and fallen.penalty >= 0.0

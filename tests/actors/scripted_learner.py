@@ -7,7 +7,7 @@ from brakeline.messaging.topics import FLOW, JOIN, WEIGHTS
 from tests.robots import GROUND
 
 
-class Teacher:
+class ScriptedLearner:
     """A learner's bus side: takes every actor of the right layout in, and says what it is told to."""
 
     def __init__(self, bus: Bus) -> None:

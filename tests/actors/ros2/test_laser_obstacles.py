@@ -1,4 +1,4 @@
-"""Laws of what is made of a scan: nothing that a beam may have seen is outside of the obstacles."""
+"""The obstacles of a scan contain everything that a beam may have hit."""
 
 import math
 
@@ -24,8 +24,8 @@ NEAR = 0.6  # m: closer than this there is no gap between two hits on one wall t
 EDGE = 0.15  # m: neighbouring beams that differ by more are on both sides of an edge
 
 
-def scan_of(ways, **more):
-    n = len(ways)
+def scan_of(ranges, **more):
+    n = len(ranges)
     fields = {
         "header": header(10.0, "base_scan"),
         "angle_min": 0.0,
@@ -35,21 +35,21 @@ def scan_of(ways, **more):
         "scan_time": 0.2,
         "range_min": 0.12,
         "range_max": 3.5,
-        "ranges": np.asarray(ways, np.float32),
+        "ranges": np.asarray(ranges, np.float32),
         "intensities": np.zeros(0, np.float32),
     }
     return LaserScan(**fields | more)
 
 
 def seen(scan, pose=(0.0, 0.0, 0.0), mount=MOUNT, **more):
-    """The obstacles of a scan made in one place."""
+    """Return the obstacles of a scan that a robot makes while it stands."""
     beams = read(scan, **more)
     poses = np.tile(pose, (len(beams.times), 1))
     return obstacles(beams, poses, mount, GROUND, ERRORS, np.asarray(pose[:2], float))
 
 
-def test_what_is_seen_in_random_rooms_is_inside_whatever_the_errors():
-    """Dense true beams beside a scan whose ranges, and the pose it is seen from, are as wrong as they may be."""
+def test_obstacles_contain_all_hits_in_random_rooms_with_the_largest_errors():
+    """Compare exact dense beams with a scan whose ranges and pose have the largest errors."""
     rng, looked = np.random.default_rng(0), 0
     angles = np.linspace(0.0, 2.0 * math.pi, 3600, endpoint=False)
     dense = LidarRays(np.stack([np.cos(angles), np.sin(angles)], axis=1), 3.5)
@@ -71,11 +71,12 @@ def test_what_is_seen_in_random_rooms_is_inside_whatever_the_errors():
             wrong = true[:3] + rng.choice([-1.0, 1.0], 3) * GROUND.measurement_bound[:3]
             found = Shapes.of(seen(scan_of(ranges, range_min=0.0), wrong), dim=2)
             sensor = place + MOUNT.x * np.array([math.cos(true[2]), math.sin(true[2])])
-            ways = close.cast(sensor, float(true[2]))
+            true_ranges = close.cast(sensor, float(true[2]))
             turned = true[2] + angles
-            points = sensor + ways[:, None] * np.stack([np.cos(turned), np.sin(turned)], axis=1)
-            beside = np.abs(np.diff(ways[::10], append=ways[0])) < EDGE  # of each beam and the next: on one surface
-            points = points[(ways < NEAR) & np.repeat(beside, 10)]
+            points = sensor + true_ranges[:, None] * np.stack([np.cos(turned), np.sin(turned)], axis=1)
+            jumps = np.abs(np.diff(true_ranges[::10], append=true_ranges[0]))
+            beside = jumps < EDGE  # a beam and the next one hit one surface
+            points = points[(true_ranges < NEAR) & np.repeat(beside, 10)]
             assert len(points) > 0
             assert found.distance(points).min(axis=0).max() <= 1e-9
 
@@ -93,7 +94,7 @@ def test_a_room_is_few_obstacles_and_its_middle_is_free():
     st.floats(1e-3, 0.1),
 )
 @settings(deadline=None)
-def test_joined_discs_are_all_inside_what_they_are_joined_to(points, radius):
+def test_the_boxes_contain_all_discs_that_they_replace(points, radius):
     points = np.array(points)
     radii = radius * np.linspace(1.0, 2.0, len(points))
     shapes = Shapes.of(_joined(points, radii, 0.2), dim=2)
@@ -102,41 +103,41 @@ def test_joined_discs_are_all_inside_what_they_are_joined_to(points, radius):
     assert shapes.distance(rims.reshape(-1, 2)).min(axis=0).max() <= 1e-9
 
 
-def test_between_neighbours_that_the_body_cannot_pass_nothing_is_free():
+def test_a_gap_that_the_body_cannot_pass_is_occupied():
     shapes = Shapes.of(_joined(np.array([[0.5, -0.1], [0.5, 0.1]]), np.full(2, 0.01), 0.21), dim=2)
     assert shapes.distance(np.array([[0.5, 0.0]])).min() == 0.0
     apart = Shapes.of(_joined(np.array([[0.5, -0.2], [0.5, 0.2]]), np.full(2, 0.01), 0.21), dim=2)
     assert apart.distance(np.array([[0.5, 0.0]])).min() > 0.1
 
 
-@pytest.mark.parametrize("dumb", [math.nan, 0.0, 0.05, -math.inf, -1.0])
-def test_a_beam_that_says_nothing_has_something_at_the_body(dumb):
+@pytest.mark.parametrize("blind", [math.nan, 0.0, 0.05, -math.inf, -1.0])
+def test_a_blind_beam_makes_an_obstacle_at_the_body(blind):
     ranges = np.full(BEAMS, math.inf)
     assert seen(scan_of(ranges)) == ()
-    ranges[90] = dumb
+    ranges[90] = blind
     shapes = Shapes.of(seen(scan_of(ranges)), dim=2)
     assert shapes.distance(np.array([[0.0, GROUND.footprint + 0.005]])).min() == 0.0
     assert shapes.distance(np.zeros((1, 2))).min() >= GROUND.footprint - 1e-9
 
 
-def test_zero_is_free_only_if_that_is_said():
+def test_zero_is_free_only_if_the_settings_say_so():
     assert seen(scan_of(np.zeros(BEAMS)), zero_is_free=True) == ()
     assert seen(scan_of(np.zeros(BEAMS))) != ()
 
 
-def test_where_no_beam_looks_is_occupied():
+def test_a_direction_without_a_beam_is_occupied():
     fan = scan_of(np.full(180, math.inf), angle_min=-0.5 * math.pi, angle_increment=math.pi / 179)
     shapes = Shapes.of(seen(fan), dim=2)
     assert shapes.distance(np.array([[-0.12, 0.0]])).min() == 0.0
     assert shapes.distance(np.array([[0.3, 0.0]])).min() > 0.1
 
 
-def test_beyond_what_a_short_sighted_sensor_sees_nothing_is_free():
+def test_space_beyond_a_short_range_sensor_is_occupied():
     shapes = Shapes.of(seen(scan_of(np.full(BEAMS, math.inf), range_max=0.5)), dim=2)
     assert shapes.distance(np.array([[0.47, 0.0]])).min() == 0.0
 
 
-def test_beams_are_placed_where_the_robot_was_at_their_time():
+def test_each_beam_starts_where_the_robot_was_at_its_time():
     ranges = np.full(BEAMS, math.inf)
     ranges[0] = ranges[180] = 0.5
     beams = read(scan_of(ranges, time_increment=0.2 / BEAMS))
@@ -160,6 +161,6 @@ def test_beams_are_placed_where_the_robot_was_at_their_time():
         {"time_increment": math.nan},
     ],
 )
-def test_a_scan_that_makes_no_sense_is_refused(wrong):
+def test_an_invalid_scan_is_refused(wrong):
     with pytest.raises(BadScan):
         read(scan_of(np.full(BEAMS, 1.0), **wrong))

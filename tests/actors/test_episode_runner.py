@@ -36,7 +36,7 @@ def test_the_steps_of_an_episode(ask):
     assert episode.obstacles and len(episode.start) == 5 and episode.goal_radius > 0
     observation = robot.observation
     for number in range(40):
-        outcome = request_decisions(ask, [robot.request(FAST)], GROUND)[0]
+        outcome = robot.decide(FAST, ask)
         step = robot.execute(FAST, outcome, weights_version=3)
         assert (step.episode, step.step, step.index, step.weights_version) == (5, number, number + 1, 3)
         assert np.array_equal(np.float32(step.observation), observation)
@@ -57,14 +57,12 @@ def test_containment_is_of_the_state_after_the_step_and_unknown_after_a_fallback
     robot = driver()
     robot.begin(0)
     for wrong in (False, True):
-        outcome = request_decisions(ask, [robot.request(FAST)], GROUND)[0]
+        outcome = robot.decide(FAST, ask)
         if wrong:  # a prediction that cannot come true
             outcome.answer.predicted.center[0] += 1.0
         step = robot.execute(FAST, outcome)
         assert step.compared and step.contained is not wrong
-    missing = request_decisions(lambda requests: (_ for _ in ()).throw(NoReply("gone")), [robot.request(FAST)], GROUND)[
-        0
-    ]
+    missing = robot.decide(FAST, lambda requests: (_ for _ in ()).throw(NoReply("gone")))
     plan = robot.backup_plan.plan.copy()
     step = robot.execute(FAST, missing)
     assert step.fallback and step.decision == pb.FAILSAFE and not step.compared
@@ -83,8 +81,8 @@ def test_without_a_filter_the_proposal_is_executed_within_bounds():
 def test_a_proposal_that_is_not_finite_is_a_failsafe_and_a_step_to_learn_from(ask, wrong):
     robot = driver(penalty=2.0)
     robot.begin(0)
-    robot.execute(FAST, request_decisions(ask, [robot.request(FAST)], GROUND)[0])
-    outcome = request_decisions(ask, [robot.request(np.array(wrong))], GROUND)[0]
+    robot.execute(FAST, robot.decide(FAST, ask))
+    outcome = robot.decide(np.array(wrong), ask)
     assert np.array_equal(outcome.exchange(0.2).request.action, wrong, equal_nan=True)
     assert (outcome.answer.kind, outcome.answer.reason) == ("failsafe", NOT_FINITE)
     step = robot.execute(np.array(wrong), outcome)

@@ -3,9 +3,8 @@
 import numpy as np
 import pytest
 
-from brakeline.actors.decision_guard import request_decisions
 from brakeline.actors.episode_runner import ActorIdentity, EpisodeRunner
-from brakeline.actors.flight_process import TakeoffNotVerified, answered
+from brakeline.actors.flight_process import TakeoffNotVerified, takeoff_verified
 from brakeline.deploy.data.model_store import model_for
 from brakeline.deploy.experiments.evaluate import in_process
 from brakeline.messaging.obstacle import Obstacle
@@ -35,10 +34,10 @@ def stage(gap: float) -> Arena:
 def test_it_does_not_take_off_where_it_could_not_hover() -> None:
     robot = QUADROTOR.in_real_time()
     question = in_process(model_for(robot, ModelConfig(), BOUND), BOUND)
-    assert answered(question, robot, stage(2.0), True, lambda: False)
+    assert takeoff_verified(question, robot, stage(2.0), True, lambda: False)
     with pytest.raises(TakeoffNotVerified, match=r"0\.\d+ m from the nearest obstacle.*collect more data"):
-        answered(question, robot, stage(0.02), True, lambda: False)
-    assert answered(question, robot, stage(0.02), False, lambda: False), "a rival says nothing of hovering"
+        takeoff_verified(question, robot, stage(0.02), True, lambda: False)
+    assert takeoff_verified(question, robot, stage(0.02), False, lambda: False), "a rival says nothing of hovering"
 
 
 @pytest.mark.usefixtures("flight_folder")
@@ -57,8 +56,8 @@ def test_in_real_time_a_way_out_is_gone_on_with_period_after_period() -> None:
         driver.info["obstacles"] = (
             Obstacle("sphere", (0.5, 0.0, 3.0), (0.6,)),
         )  # a virtual one, which it is inside of
-        outcome = request_decisions(question, [driver.request(np.zeros(3))], robot)[0]
-        assert outcome.answer is not None
+        outcome = driver.decide(np.zeros(3), question)
+        assert outcome is not None and outcome.answer is not None
         kinds.append(outcome.answer.kind)
         driver.execute(np.zeros(3), outcome)
     on_the_way = kinds[: len(kinds) - kinds[::-1].index("recovering")]

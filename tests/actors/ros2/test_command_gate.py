@@ -1,9 +1,9 @@
-"""A period's input: the answer's if it came in time, else the committed plan's; with askers that answer at will."""
+"""The gate sends the answer's input if it came in time, otherwise the committed plan's. The askers are scripted."""
 
 import numpy as np
 import pytest
 
-from brakeline.actors.ros2.command_gate import BLIND, LATE, NO_ANSWER, ROOM, CommandGate, inflated
+from brakeline.actors.ros2.command_gate import BLIND, LATE, NO_ANSWER, SCAN_DIFFERENCE, CommandGate, inflated
 from brakeline.actors.ros2.ros2_process import Ros2Settings, UnsupportedRobot, driven
 from brakeline.actors.ros2.ros_inputs import RawCommand
 from brakeline.actors.ros2.ros_views import diagnostics, markers
@@ -20,7 +20,7 @@ STATE = np.zeros(ROBOT.state_dim)
 
 
 def allow(requests):
-    """Allows every command of finite numbers: in force, the command, half of it, stop."""
+    """Allow every finite command by a plan of the input in force, the command, half of it, and a stop."""
     replies = []
     for request in requests:
         action = np.clip(request.action, ROBOT.low(), ROBOT.high())
@@ -44,15 +44,15 @@ def command(speed, turn=0.0, at=0.0, number=1):
     return RawCommand(np.array([speed, turn]), at, number)
 
 
-def test_a_command_goes_out_one_period_after_it_was_asked_about():
+def test_a_command_is_executed_one_period_after_its_question():
     gate = CommandGate(ROBOT, allow)
     assert gate.begin(0.0).tolist() == [0.0, 0.0] and gate.kind == BLIND
     gate.decide(STATE, (), command(0.2, at=0.1), 0.0, 0)
     assert gate.begin(0.2).tolist() == [0.2, 0.0] and gate.kind == "allowed" and gate.reason == ""
-    assert list(gate.tally.delays) == [pytest.approx(0.1)] and gate.tally.commands == 1
+    assert list(gate.stats.delays) == [pytest.approx(0.1)] and gate.stats.commands == 1
 
 
-def test_without_an_answer_it_brakes_along_the_plan():
+def test_without_an_answer_the_gate_brakes_along_the_plan():
     gate = CommandGate(ROBOT, allow)
     gate.decide(STATE, (), command(0.25), 0.0, 0)
     gate.begin(0.2)
@@ -69,11 +69,11 @@ def test_without_an_answer_it_brakes_along_the_plan():
     ("in_time", "why", "kind", "reason"),
     [(False, "", LATE, "after its period"), (True, "no scan yet", BLIND, "no scan yet")],
 )
-def test_an_answer_that_cannot_count_is_not_executed(in_time, why, kind, reason):
+def test_a_late_answer_or_one_without_inputs_is_not_executed(in_time, why, kind, reason):
     gate = CommandGate(ROBOT, allow)
     gate.decide(STATE, (), command(0.25), 0.0, 0)
     assert gate.begin(0.2, in_time, why).tolist() == [0.0, 0.0]
-    assert gate.kind == kind and reason in gate.reason and gate.tally.kinds[kind] == 1
+    assert gate.kind == kind and reason in gate.reason and gate.stats.kinds[kind] == 1
 
 
 def test_a_command_that_is_not_finite_is_a_failsafe():
@@ -84,81 +84,82 @@ def test_a_command_that_is_not_finite_is_a_failsafe():
     assert gate.begin(0.4).tolist() == [0.0, 0.0] and (gate.kind, gate.reason) == ("failsafe", NOT_FINITE)
 
 
-def test_without_a_command_it_is_asked_to_stand():
+def test_without_a_command_the_proposal_is_to_stand():
     gate = CommandGate(ROBOT, allow)
     gate.decide(STATE, (), None, 0.0, 0)
     assert gate.begin(0.2).tolist() == [0.0, 0.0] and gate.reason == "no command"
-    assert gate.tally.commands == 0
+    assert gate.stats.commands == 0
 
 
-def test_only_what_a_twist_can_drive_is_taken():
+def test_a_robot_that_a_twist_cannot_drive_is_refused():
     assert driven("ground") == driven("ground-late") == ROBOT
     with pytest.raises(UnsupportedRobot, match="quadrotor"):
         driven("quadrotor")
     assert Ros2Settings().lead < ROBOT.period
 
 
-def test_views_are_messages():
+def test_markers_and_diagnostics_survive_encoding():
     decision = allow([pb.Request(action=[0.2, 0.0], input_in_force=[0.0, 0.0], plan=[0.0] * 2 * ROBOT.horizon)])[
         0
     ].decision
-    things = (Obstacle("box", (1.0, 0.0), (0.1, 0.5), 0.3), Obstacle("cylinder", (0.0, 1.0), (0.1,)))
-    drawn = decode(MarkerArray, encode(markers(3.0, "odom", decision_of(decision, ROBOT), things)))
-    groups = [marker.ns for marker in drawn.markers]
+    obstacles = (Obstacle("box", (1.0, 0.0), (0.1, 0.5), 0.3), Obstacle("cylinder", (0.0, 1.0), (0.1,)))
+    shown = decode(MarkerArray, encode(markers(3.0, "odom", decision_of(decision, ROBOT), obstacles)))
+    groups = [marker.ns for marker in shown.markers]
     assert groups.count("tube") == ROBOT.horizon and groups.count("plan") == 1 and groups.count("obstacles") == 2
-    assert {marker.header.frame_id for marker in drawn.markers} == {"odom"}
+    assert {marker.header.frame_id for marker in shown.markers} == {"odom"}
     for kind, level in (("allowed", 0), ("adjusted", 1), ("failsafe", 1), (BLIND, 2), (LATE, 2), (NO_ANSWER, 2)):
-        told = decode(DiagnosticArray, encode(diagnostics(3.0, "brakeline", "ground", kind, "why", {"periods": 3.0})))
-        (status,) = told.status
+        sent = diagnostics(3.0, "brakeline", "ground", kind, "why", {"periods": 3.0})
+        message = decode(DiagnosticArray, encode(sent))
+        (status,) = message.status
         assert (status.level, status.message, status.values[0].key) == (level, f"{kind}: why", "periods")
     assert DiagnosticStatus.ERROR == 2
 
 
-class Wary:
-    """Verifies nothing where obstacles are larger than `near` [m]; its plans lead `leads` m towards them."""
+class CautiousFilter:
+    """Verifies nothing if obstacles are larger than `largest` [m]; its plans end `advance` m nearer to them."""
 
-    def __init__(self, near, leads=0.0):
-        self.near, self.leads, self.asked = near, leads, []
+    def __init__(self, largest, advance=0.0):
+        self.largest, self.advance, self.asked = largest, advance, []
 
     def __call__(self, requests):
         (request,) = requests
         self.asked.append(request)
         (reply,) = allow(requests)
         size = max((obstacle.size[0] for obstacle in request.obstacles), default=0.0)
-        if size > self.near:
+        if size > self.largest:
             reply.decision.kind = pb.FAILSAFE
-        reply.decision.tube_center[-2] = self.leads if request.action[0] else 0.0
+        reply.decision.tube_center[-2] = self.advance if request.action[0] else 0.0
         return [reply]
 
 
 DISC = (Obstacle("cylinder", (0.5, 0.0), (0.1,)),)
 
 
-def test_with_room_around_what_stands_there_one_question_is_enough():
-    wary = Wary(near=1.0)
-    gate = CommandGate(ROBOT, wary)
+def test_if_the_inflated_obstacles_leave_room_the_gate_asks_once():
+    cautious = CautiousFilter(largest=1.0)
+    gate = CommandGate(ROBOT, cautious)
     gate.decide(STATE, DISC, command(0.2, 0.1), 0.0, 0)
-    (asked,) = wary.asked
-    assert asked.obstacles[0].size[0] == pytest.approx(0.1 + ROOM)
+    (asked,) = cautious.asked
+    assert asked.obstacles[0].size[0] == pytest.approx(0.1 + SCAN_DIFFERENCE)
 
 
-def test_where_only_the_room_is_missing_it_may_leave_and_turn_but_not_come_nearer():
-    for leads, speed in ((0.1, 0.0), (-0.1, 0.2)):
-        wary = Wary(near=0.1 + 0.5 * ROOM, leads=leads)
-        gate = CommandGate(ROBOT, wary)
+def test_if_only_the_inflation_forbids_a_plan_the_robot_may_leave_and_turn_but_not_approach():
+    for advance, speed in ((0.1, 0.0), (-0.1, 0.2)):
+        cautious = CautiousFilter(largest=0.1 + 0.5 * SCAN_DIFFERENCE, advance=advance)
+        gate = CommandGate(ROBOT, cautious)
         gate.decide(STATE, DISC, command(0.2, 0.1), 0.0, 0)
         assert gate.begin(0.2).tolist() == pytest.approx([speed, 0.1]) and gate.kind == "allowed"
-        assert wary.asked[-1].obstacles[0].size[0] == pytest.approx(0.1)
+        assert cautious.asked[-1].obstacles[0].size[0] == pytest.approx(0.1)
 
 
-def test_where_nothing_is_verified_it_brakes():
-    gate = CommandGate(ROBOT, Wary(near=0.01))
+def test_without_any_verified_plan_the_robot_brakes():
+    gate = CommandGate(ROBOT, CautiousFilter(largest=0.01))
     gate.decide(STATE, DISC, command(0.2), 0.0, 0)
     gate.begin(0.2)
     assert gate.kind == "failsafe"
 
 
-def test_room_is_around_all_of_an_obstacle():
+def test_an_inflated_obstacle_is_larger_on_every_side():
     box = Obstacle("box", (1.0, 0.0), (0.2, 0.4), 0.3)
     rim = Shapes.of([box], 2).distance(np.array([[1.0, 0.6]]))
     assert Shapes.of([inflated(box, 0.05)], 2).distance(np.array([[1.0, 0.6]])) <= rim - 0.05 + 1e-9

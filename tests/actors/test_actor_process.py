@@ -17,7 +17,7 @@ from brakeline.messaging.topics import DECIDE, EXCHANGE, STEP
 from brakeline.safety.filter.backup_plan import BackupPlan
 from brakeline.safety.model.model_set import ModelConfig
 from brakeline.safety.service.server import ModelRegistry, ServiceCounts, batch_handler
-from tests.actors.teacher import Teacher
+from tests.actors.scripted_learner import ScriptedLearner
 from tests.robots import GROUND
 from tests.waiting import until
 
@@ -57,11 +57,11 @@ def scene(buses, data_folder):
     learner.subscribe(STEP, lambda sample: steps.append(sample.message()))
     learner.subscribe(EXCHANGE, lambda sample: exchanges.append(sample.message()))
     threads: list[threading.Thread] = []
-    teacher = Teacher(learner)
+    scripted = ScriptedLearner(learner)
 
     def start(robots: int, limit: int = STEPS, **settings) -> None:
         names = ["actor-0"] if robots == 1 else [f"actor-0.{i}" for i in range(robots)]
-        teacher.flow.limit.update(dict.fromkeys(names, limit))
+        scripted.flow.limit.update(dict.fromkeys(names, limit))
         bus = BusSettings(connect=learner.settings.listen)
         values = ActorSettings(bus, robots=robots, deadline=2.0, **settings)
         arguments = (values, partial(environment), None, fleet_world)
@@ -69,7 +69,7 @@ def scene(buses, data_folder):
         threads[0].start()
 
     def end() -> None:
-        teacher.say(0, done=True)
+        scripted.say(0, done=True)
         for thread in threads:
             thread.join(20.0)
             assert not thread.is_alive()
@@ -87,12 +87,12 @@ def test_a_practised_stop_goes_on_as_it_was_verified_unless_that_does_not_hold()
     asked = {kind: DecisionOutcome(pb.Request(), pb.Reply(), answer, "", 1.0) for kind, answer in answers.items()}
     practice, never = StopPractice(1.0), StopPractice(0.0)
     for one in (practice, never):
-        one.instead(driver, np.zeros(2))
-    assert [kind for kind, outcome in asked.items() if practice.kept(driver, outcome).answer] == ["allowed"]
-    assert practice.kept(driver, asked["adjusted"]).failure == STOP_PRACTICE
-    assert all(never.kept(driver, outcome) is outcome for outcome in asked.values())
+        one.proposal(driver, np.zeros(2))
+    assert [kind for kind, outcome in asked.items() if practice.outcome(driver, outcome).answer] == ["allowed"]
+    assert practice.outcome(driver, asked["adjusted"]).failure == STOP_PRACTICE
+    assert all(never.outcome(driver, outcome) is outcome for outcome in asked.values())
     driver.backup_plan.accept(np.full((GROUND.horizon, 2), 0.2), "a model", None, False)
-    assert all(practice.kept(driver, outcome) is outcome for outcome in asked.values())
+    assert all(practice.outcome(driver, outcome) is outcome for outcome in asked.values())
 
 
 def test_the_robots_of_a_process_share_a_question(scene):

@@ -1,14 +1,12 @@
 """Robots that share a world: promises stay disjoint whatever comes, and nobody touches anybody."""
 
-from dataclasses import replace
 from itertools import combinations
 
 import numpy as np
 import pytest
 
-from brakeline.actors.decision_guard import DecisionOutcome, request_decisions
-from brakeline.actors.episode_runner import ActorIdentity, EpisodeRunner
-from brakeline.actors.joint_episode import RobotGroup
+from brakeline.actors.decision_guard import request_decisions
+from brakeline.actors.episode_runner import ActorIdentity, EpisodeRunner, RobotGroup, decide
 from brakeline.deploy.data.model_store import model_for
 from brakeline.deploy.experiments.evaluate import in_process
 from brakeline.messaging import brakeline_pb2 as pb
@@ -29,12 +27,12 @@ def ask(data_folder):
     return in_process(model_for(GROUND, ModelConfig()))
 
 
-def fleet_of(size=SIZE, arena="crossing", promising=True):
+def fleet_of(size=SIZE, arena="crossing", reserving=True):
     world = FleetEnv(GROUND, arena, size, 0)
-    drivers = [
+    runners = [
         EpisodeRunner(GROUND, member, ActorIdentity(f"robot.{i}", i, 0)) for i, member in enumerate(world.members)
     ]
-    return RobotGroup(world, drivers, promising)
+    return RobotGroup(runners, world, reserving)
 
 
 def policies(name, size=SIZE, seed=0):
@@ -47,26 +45,26 @@ def gathered(fleet, seed=0):
     arena = fleet.world.world.robots[0].arena
     spots = np.random.default_rng(seed).uniform(-1.5, 1.5, (2000, 2))
     spot = spots[np.argmax(arena.shapes.distance(spots).min(axis=0))]
-    size = len(fleet.drivers)
+    size = len(fleet.runners)
     for i, robot in enumerate(fleet.world.world.robots):
         angle = 2.0 * np.pi * i / size
         robot._qpos[:2] = spot + 0.4 * np.array([np.cos(angle), np.sin(angle)])
         robot.wake(None, np.random.default_rng(i))
-        driver = fleet.drivers[i]
+        driver = fleet.runners[i]
         driver.info = driver.info | {"state": robot.measured, "others": fleet.world.others(i)}
 
 
 def disjoint(fleet):
-    made = [d.backup_plan.reservation for d in fleet.drivers if d.backup_plan.reservation is not None]
+    made = [d.backup_plan.reservation for d in fleet.runners if d.backup_plan.reservation is not None]
     return min((a.apart(b) for a, b in combinations(made, 2)), default=np.inf)
 
 
 def drive(fleet, ask, policy, periods, lost=0.0, seed=0):
     """Least distance of promises (m) and the kinds of decisions; lost: share of questions that get no answer."""
-    rng, proposers, least, kinds = np.random.default_rng(seed), policies(policy, len(fleet.drivers), seed), np.inf, []
+    rng, proposers, least, kinds = np.random.default_rng(seed), policies(policy, len(fleet.runners), seed), np.inf, []
     gone = 0
     for _ in range(periods):
-        proposals = [p(d.observation, d.info) for p, d in zip(proposers, fleet.drivers, strict=True)]
+        proposals = [p(d.observation, d.info) for p, d in zip(proposers, fleet.runners, strict=True)]
         gone = gone - 1 if gone else int(rng.integers(1, 4)) * (rng.random() < lost)
 
         def answer(requests, gone=gone):
@@ -74,11 +72,11 @@ def drive(fleet, ask, policy, periods, lost=0.0, seed=0):
                 raise NoReply("out of order")
             return ask(requests)
 
-        outcomes = request_decisions(answer, fleet.requests(proposals), GROUND)
+        (outcomes,) = decide([fleet], [proposals], answer)
         steps = fleet.execute(proposals, outcomes)
         kinds += [step.decision for step in steps if step is not None]
         least = min(least, disjoint(fleet))
-        for driver in fleet.drivers:
+        for driver in fleet.runners:
             driver.running = True  # beyond goals and timeouts: this is about what is in between
     return least, kinds
 
@@ -94,7 +92,7 @@ def test_nobody_touches_anybody_and_promises_stay_disjoint_though_answers_fail(a
 
 
 def test_without_promises_the_same_robots_touch(ask):
-    fleet = fleet_of(promising=False)
+    fleet = fleet_of(reserving=False)
     gathered(fleet)
     drive(fleet, ask, "adversary", 60)
     assert fleet.world.touches > 0
@@ -114,7 +112,7 @@ def test_when_nobody_answers_all_stop_within_what_they_promised(ask):
     fleet = fleet_of()
     gathered(fleet)
     drive(fleet, ask, "random", 15)
-    promised = [driver.backup_plan.reservation for driver in fleet.drivers]
+    promised = [driver.backup_plan.reservation for driver in fleet.runners]
     silent = request_decisions(
         lambda requests: (_ for _ in ()).throw(NoReply("gone")), fleet.requests([np.zeros(2)] * SIZE), GROUND
     )
@@ -199,20 +197,26 @@ def test_no_answer_about_one_is_no_answer_about_any(ask):
     fleet = fleet_of()
     gathered(fleet)
     drive(fleet, ask, "random", 8)
-    outcomes = request_decisions(ask, fleet.requests([np.array([0.2, 0.1])] * SIZE), GROUND)
-    before = [driver.backup_plan.plan.copy() for driver in fleet.drivers]
-    outcomes[2] = replace(outcomes[2], answer=None, reply=None, failure="garbled")
+
+    def garbled(requests):
+        replies = ask(requests)
+        replies[2] = pb.Reply()
+        return replies
+
+    before = [driver.backup_plan.plan.copy() for driver in fleet.runners]
+    (outcomes,) = decide([fleet], [[np.array([0.2, 0.1])] * SIZE], garbled)
     steps = fleet.execute([np.zeros(2)] * SIZE, outcomes)
+    assert all("no answer about robot.2" in outcomes[i].failure for i in (0, 1, 3))
     assert all(step.fallback for step in steps)
     assert all(np.allclose(step.action, plan[0]) for step, plan in zip(steps, before, strict=True))
-    assert isinstance(outcomes[0], DecisionOutcome) and disjoint(fleet) >= -ROUNDING
+    assert disjoint(fleet) >= -ROUNDING
 
 
 def test_who_is_done_stands_and_is_kept_off(ask):
     fleet = fleet_of(2, arena="open")
     fleet.begin(0)
-    first, second = fleet.drivers
+    first, second = fleet.runners
     first.running = False
-    results = fleet.execute([np.zeros(2)] * 2, request_decisions(ask, fleet.requests([np.zeros(2)] * 2), GROUND))
+    results = fleet.execute([np.zeros(2)] * 2, *decide([fleet], [[np.zeros(2)] * 2], ask))
     assert results[0] is None and results[1].actor == "robot.1" and results[1].fleet == 2
     assert (first.step, second.step) == (1, 1) and first.backup_plan.reservation is not None

@@ -1,4 +1,4 @@
-"""The process among nodes that fall silent: whatever is missing, what goes out is a stop, until it comes again."""
+"""The process among nodes that fall silent: while an input is missing the robot stops; then it drives on."""
 
 import math
 import threading
@@ -25,20 +25,20 @@ from brakeline.messaging.ros2.cdr_messages import (
     time_of,
     twist,
 )
-from tests.actors.ros2.test_gate import allow
-from tests.actors.ros2.test_laser import BEAMS, scan_of
-from tests.actors.ros2.test_senses import odometry, transform
+from tests.actors.ros2.test_command_gate import allow
+from tests.actors.ros2.test_laser_obstacles import BEAMS, scan_of
+from tests.actors.ros2.test_ros_inputs import odometry, transform
 from tests.waiting import until
 
-# Wide, for a busy machine: what stops is told by its absence alone.
-FRESH = AgeLimits(odometry=1.0, scan=1.5, command=1.0)
+# Wide, for a busy machine: only the absence of a message shows that its sender is silent.
+AGE_LIMITS = AgeLimits(odometry=1.0, scan=1.5, command=1.0)
 
 
 class Robot:
-    """Nodes that tell all that is needed, 20 times a second, but for what is in `mute`."""
+    """The nodes of a robot, which publish all inputs 20 times a second except those in `mute`."""
 
     def __init__(self, node, simulated, stamped):
-        self.mute, self.said, self.simulated = set(), [], simulated
+        self.mute, self.speeds, self.simulated = set(), [], simulated
         self.reasons = []
         self._odometry, self._scan = node.publisher("odom", Odometry), node.publisher("scan", LaserScan, SENSOR)
         self._clock = node.publisher("/clock", Clock, SENSOR)
@@ -47,39 +47,39 @@ class Robot:
         node.publisher("/tf_static", TFMessage, LATCHED).put(
             TFMessage(transforms=[transform("base_footprint", "base_scan")])
         )
-        node.subscribe("cmd_vel", kind, lambda m: self.said.append(m.twist.linear.x if stamped else m.linear.x))
+        node.subscribe("cmd_vel", kind, lambda m: self.speeds.append(m.twist.linear.x if stamped else m.linear.x))
         node.subscribe("/diagnostics", DiagnosticArray, lambda m: self.reasons.append(m.status[0].message))
         self.offset = 0.0
-        self._begun, self._told = time.time(), 100.0
+        self._time = 100.0
         self._done = threading.Event()
         self._thread = threading.Thread(target=self._run)
         self._thread.start()
 
     def now(self):
-        return (self._told if self.simulated else time.time()) + self.offset
+        return (self._time if self.simulated else time.time()) + self.offset
 
     def close(self):
         self._done.set()
         self._thread.join()
 
     def drives(self):
-        """Does a command go through from now on?"""
-        del self.said[:]
-        until(lambda: self.said and self.said[-1] == 0.2, f"driving again: {self.reasons[-3:]}", 30.0)
+        """Check that a command is executed from now on."""
+        del self.speeds[:]
+        until(lambda: self.speeds and self.speeds[-1] == 0.2, f"driving again: {self.reasons[-3:]}", 30.0)
 
     def stops(self, because):
-        until(lambda: self.said and self.said[-1] == 0.0, f"a stop: {because}", 30.0)
-        until(lambda: any(because in said for said in self.reasons), f"{because}, not {self.reasons[-3:]}", 30.0)
-        del self.said[:]
-        until(lambda: len(self.said) > 2, "more of what is sent", 30.0)
-        assert set(self.said) == {0.0}
+        until(lambda: self.speeds and self.speeds[-1] == 0.0, f"a stop: {because}", 30.0)
+        until(lambda: any(because in reason for reason in self.reasons), f"{because}, not {self.reasons[-3:]}", 30.0)
+        del self.speeds[:]
+        until(lambda: len(self.speeds) > 2, "more of what is sent", 30.0)
+        assert set(self.speeds) == {0.0}
         del self.reasons[:]
 
     def _run(self):
         while not self._done.wait(0.05):
             if self.simulated and "clock" not in self.mute:
-                self._told += 0.05
-                self._clock.put(Clock(clock=time_of(self._told)))
+                self._time += 0.05
+                self._clock.put(Clock(clock=time_of(self._time)))
             now = self.now()
             if "odometry" not in self.mute:
                 self._odometry.put(odometry(now, speed=0.2))
@@ -99,18 +99,18 @@ def steered(simulated=False, stamped=False, ask=allow):
             ros=RosSettings(connect=(endpoint,), namespace="/r"),
             sim_time=simulated,
             stamped=stamped,
-            sensing=SensorSettings(),
-            fresh=FRESH,
+            sensors=SensorSettings(),
+            age_limits=AGE_LIMITS,
         )
-        steering = FilterNode(settings, ask, stop)
-        thread = threading.Thread(target=steering.run)
+        node_under_test = FilterNode(settings, ask, stop)
+        thread = threading.Thread(target=node_under_test.run)
         thread.start()
         try:
-            yield robot, steering
+            yield robot, node_under_test
         finally:
             stop.set()
             thread.join(20.0)
-            steering.close()
+            node_under_test.close()
             robot.close()
             assert not thread.is_alive()
 
@@ -124,7 +124,7 @@ def steered(simulated=False, stamped=False, ask=allow):
         ("numbers", "holds NaN"),
     ],
 )
-def test_what_falls_silent_stops_the_robot_until_it_speaks(what, because):
+def test_a_missing_input_stops_the_robot_until_it_comes_again(what, because):
     with steered() as (robot, _):
         robot.drives()
         robot.mute.add(what)
@@ -140,13 +140,13 @@ def test_a_clock_that_stands_still_or_goes_back_stops_the_robot():
         robot.stops("the clock stands still")
         robot.mute.clear()
         robot.drives()
-        robot._told = 3.0
-        until(lambda: any("the clock was set" in said for said in robot.reasons), "the clock was set", 30.0)
+        robot._time = 3.0
+        until(lambda: any("the clock was set" in reason for reason in robot.reasons), "the clock was set", 30.0)
         robot.drives()
 
 
 class Stalling:
-    """A clock that waits exactly, and once so many s longer."""
+    """A clock that waits exactly, and once `stall` seconds longer."""
 
     def __init__(self):
         self.time, self.stall = 100.0, 0.0
@@ -162,24 +162,24 @@ class Stalling:
         return 0.0
 
 
-def test_an_answer_for_a_moment_long_gone_does_not_count():
+def test_an_answer_for_a_past_period_does_not_count():
     stop = threading.Event()
-    steering = FilterNode(Ros2Settings(ros=RosSettings(listen=(free_endpoint(),))), allow, stop)
+    node_under_test = FilterNode(Ros2Settings(ros=RosSettings(listen=(free_endpoint(),))), allow, stop)
     try:
-        gate, clock = steering.gate, Stalling()
+        gate, clock = node_under_test.gate, Stalling()
         full = lambda number: RawCommand(np.array([0.25, 0.0]), clock.time, number)  # noqa: E731
-        steering.clock = clock
-        steering._decide = lambda began, number: gate.decide(np.zeros(5), (), full(number), began, number)
+        node_under_test.clock = clock
+        node_under_test._decide = lambda began, number: gate.decide(np.zeros(5), (), full(number), began, number)
         due = 100.0
         for _ in range(3):
-            due = steering._period(due, stop)
+            due = node_under_test._period(due, stop)
         assert gate.kind == "allowed" and gate.input[0] == 0.25
         clock.stall = 1.5
-        due = steering._period(due, stop)
-        assert gate.kind == LATE and gate.tally.slips == 1 and due > clock.now()
+        due = node_under_test._period(due, stop)
+        assert gate.kind == LATE and gate.stats.slips == 1 and due > clock.now()
         assert gate.input[0] < 0.25, "it brakes"
     finally:
-        steering.close()
+        node_under_test.close()
 
 
 def test_clocks_that_differ_stop_the_robot():
@@ -191,8 +191,8 @@ def test_clocks_that_differ_stop_the_robot():
         robot.stops("in the future")
 
 
-def test_it_ends_with_a_stop():
-    with steered() as (robot, steering):
+def test_the_process_ends_with_a_stop():
+    with steered() as (robot, node_under_test):
         robot.drives()
-    assert robot.said[-1] == 0.0 and not steering.gate.backup_plan.plan.any()
-    assert steering.gate.tally.kinds["allowed"] > 0
+    assert robot.speeds[-1] == 0.0 and not node_under_test.gate.backup_plan.plan.any()
+    assert node_under_test.gate.stats.kinds["allowed"] > 0
