@@ -144,7 +144,7 @@ class RealTimeVehicle:
             self._skip()
         return self.initial_period()
 
-    def standing(self) -> Period:
+    def initial_period(self) -> Period:
         """Return the report about the last period that ended."""
         return replace(self.current_period.report, true=self.current_period.report.measured)
 

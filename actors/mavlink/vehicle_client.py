@@ -143,7 +143,7 @@ class VehicleClient:
         self._failure: Exception | None = None
         self._figures: dict[str, float] = {}
         self._replies: SimpleQueue[pb.CommitReply | None] = SimpleQueue()
-        self._heard, self._heard_at = False, time.monotonic()
+        self._received, self._received_at = False, time.monotonic()
         command = pb.VehicleCommand(fly=request_message(request))
         self._socket = self._reach(request.flight, stop)
         try:
@@ -182,8 +182,8 @@ class VehicleClient:
                 self._check()
                 if stop():
                     raise MavlinkError("asked to stop before the vehicle flew")
-                if time.monotonic() - self._heard_at > HANDOVER_TIMEOUT:
-                    why = "the vehicle server fell silent" if self._heard else "another process here flies it"
+                if time.monotonic() - self._received_at > HANDOVER_TIMEOUT:
+                    why = "the vehicle server fell silent" if self._received else "another process here flies it"
                     raise MavlinkError(why)
                 self._changed.wait(POLL)
 
@@ -217,11 +217,11 @@ class VehicleClient:
                 except BadMessage as error:
                     self._rejected.reject("vehicle server", error)
                     continue
-                self._heard, self._heard_at = True, time.monotonic()
+                self._received, self._received_at = True, time.monotonic()
                 with self._rejected.skip_on_error("vehicle server"):
                     self._handle(message)
         except (EOFError, OSError):
-            self._fail(MavlinkError(ENDED) if self._heard else HandoverRefused(ENDED))
+            self._fail(MavlinkError(ENDED) if self._received else HandoverRefused(ENDED))
         except Exception as error:  # any error: a server that nobody listens to does not fly for us
             self._fail(error)
 

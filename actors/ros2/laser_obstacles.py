@@ -94,9 +94,10 @@ def read(scan: LaserScan, zero_is_free: bool = False) -> LaserBeams:
         free |= ranges == 0.0
     lengths = np.where(free, scan.range_max, np.where(hit, ranges, np.nan))
     unseen = _unseen(float(scan.angle_min), gap, n)
-    lengths = np.concatenate([lengths, np.full(len(unseen), np.nan)]).astype(float)
-    times = np.concatenate([times, np.full(len(unseen), times[-1])]).astype(float)
-    return LaserBeams(times, np.concatenate([angles, unseen]), lengths, np.isnan(lengths), abs(gap))
+    lengths = np.concatenate([lengths, np.full(len(unseen), np.nan)])
+    times = np.asarray(np.concatenate([times, np.full(len(unseen), times[-1])]), dtype=float)
+    angles = np.concatenate([angles, unseen])
+    return LaserBeams(times, angles, np.asarray(lengths, dtype=float), np.isnan(lengths), abs(gap))
 
 
 def _unseen(first: float, gap: float, count: int) -> Array:

@@ -1,7 +1,7 @@
-"""Other people's robots: a node in a ROS 2 graph, by rmw_zenoh's conventions, without ROS.
+"""A node in a ROS 2 graph, by the conventions of rmw_zenoh, without ROS.
 
-A room beside the bus, with a session of its own. The bus is ours from end to end: one schema, one table of topics, who
-may say what. Here names, types, QoS and who speaks are the graph's, and none of the bus's rules can hold.
+The node has a Zenoh session of its own, beside the bus. The bus has one schema, one table of topics, and rules about
+its senders. In a ROS graph the names, types, QoS and senders are not ours, so those rules cannot hold here.
 """
 
 from brakeline.messaging.ros2.rmw_names import LATCHED, SENSOR, BadRosName, GraphEntity, Qos

@@ -1,6 +1,6 @@
-"""ROS 2 messages as bytes (CDR) and back, their type hashes and definitions, by `rosbags`; no ROS is needed.
+"""Encode and decode ROS 2 messages (CDR), and return their type hashes and definitions, by `rosbags` and without ROS.
 
-The types are Jazzy's. Those used here have the same hashes in Kilted (a test compares them).
+The types are those of Jazzy. The types that we use have the same hashes in Kilted (a test compares them).
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from brakeline.messaging.bus.bus_errors import Malformed
 
 M = TypeVar("M")
 
-LONGEST = 100_000  # elements of a sequence in a message from outside
+LONGEST = 100_000  # elements of a sequence in a received message
 
 CompressedImage = types.sensor_msgs__msg__CompressedImage
 Clock = types.rosgraph_msgs__msg__Clock
@@ -49,31 +49,32 @@ STORE = Typestore(types, max_sequence_length=LONGEST)
 
 
 def type_of(kind: type) -> str:
-    """`geometry_msgs/msg/Twist`."""
+    """Return the name of a message type, such as `geometry_msgs/msg/Twist`."""
     return str(kind.__msgtype__)  # type: ignore[attr-defined]
 
 
 @cache
 def digest_of(kind: type) -> str:
-    """The type's hash, `RIHS01_…`."""
+    """Return the hash of a message type, `RIHS01_…`."""
     return str(STORE.hash_rihs01(type_of(kind)))
 
 
 @cache
 def definition_of(kind: type) -> str:
-    """The type's definition with all it depends on, as a bag's schema has it."""
+    """Return the definition of a type and of the types that it contains, as a bag's schema needs it."""
     return str(STORE.generate_msgdef(type_of(kind), ros_version=2)[0])
 
 
 def encode(message: Any) -> bytes:
-    """The message in little-endian CDR, with its encapsulation header."""
+    """Encode a message in little-endian CDR, with its encapsulation header."""
     return bytes(STORE.serialize_cdr(message, type_of(type(message)), little_endian=True))
 
 
 def decode(kind: type[M], payload: bytes) -> M:
-    """
+    """Decode a message of one type.
+
     Raises:
-        Malformed: the bytes are no message of that type.
+        Malformed: the bytes are not a message of that type.
     """
     try:
         message = STORE.deserialize_cdr(payload, type_of(kind))
@@ -83,28 +84,29 @@ def decode(kind: type[M], payload: bytes) -> M:
     return message
 
 
-# --- small parts that most messages have ------------------------------------------------------------------------------
-
-
 def time_of(seconds: float) -> Time:
+    """Convert seconds to a ROS time."""
     nanoseconds = round(seconds * 1e9)
     return Time(sec=nanoseconds // 10**9, nanosec=nanoseconds % 10**9)
 
 
 def seconds(time: Time) -> float:
+    """Convert a ROS time to seconds."""
     return float(time.sec + 1e-9 * time.nanosec)
 
 
 def header(at: float, frame: str) -> Header:
+    """Return a header with a time [s] and a frame."""
     return Header(stamp=time_of(at), frame_id=frame)
 
 
 def quaternion(yaw: float) -> Quaternion:
+    """Return a rotation about the vertical axis [rad]."""
     return Quaternion(x=0.0, y=0.0, z=math.sin(0.5 * yaw), w=math.cos(0.5 * yaw))
 
 
 def yaw_of(q: Quaternion) -> float:
-    """rad, about the vertical; NaN if it is no rotation."""
+    """Return the angle about the vertical axis [rad]; NaN if the quaternion is not a rotation."""
     norm = q.x * q.x + q.y * q.y + q.z * q.z + q.w * q.w
     if not 0.9 < norm < 1.1:
         return math.nan
@@ -112,16 +114,20 @@ def yaw_of(q: Quaternion) -> float:
 
 
 def vector(x: float = 0.0, y: float = 0.0, z: float = 0.0) -> Vector3:
+    """Return a vector."""
     return Vector3(x=x, y=y, z=z)
 
 
 def point(x: float, y: float, z: float = 0.0) -> Point:
+    """Return a point."""
     return Point(x=x, y=y, z=z)
 
 
 def pose(x: float, y: float, yaw: float = 0.0, z: float = 0.0) -> Pose:
+    """Return a pose that is level."""
     return Pose(position=point(x, y, z), orientation=quaternion(yaw))
 
 
 def twist(speed: float, turn_rate: float) -> Twist:
+    """Return the command of a speed [m/s] and a turn rate [rad/s]."""
     return Twist(linear=vector(speed), angular=vector(z=turn_rate))

@@ -1,4 +1,4 @@
-"""What rmw_zenoh sends along with each message: its number, when it was sent, and by whom."""
+"""The attachment that rmw_zenoh sends with each message: sequence number, time and sender."""
 
 from __future__ import annotations
 
@@ -14,26 +14,35 @@ GID = 16  # bytes
 
 
 def gid_of(token: str) -> bytes:
-    """A publisher's global id, from its liveliness token: XXH3-128, the low half first, each little-endian."""
+    """Return a publisher's global id: XXH3-128 of its liveliness token, low half first, each half little-endian."""
     return xxhash.xxh3_128_digest(token.encode())[::-1]
 
 
 @dataclass(frozen=True)
 class Attachment:
-    sequence: int  # from 1, of each publisher
-    time: int  # ns since the Unix epoch
+    """The attachment of a message.
+
+    Attributes:
+        sequence: number of the message, from 1 on for each publisher.
+        time: ns since the Unix epoch.
+        gid: the publisher's global id.
+    """
+
+    sequence: int
+    time: int
     gid: bytes
 
     def encode(self) -> bytes:
+        """Encode the attachment."""
         return LAYOUT.pack(self.sequence, self.time, GID, self.gid)
 
     @staticmethod
     def decode(payload: bytes) -> Attachment:
-        """Raises Malformed."""
+        """Decode an attachment. Raises Malformed."""
         try:
             sequence, time, length, gid = LAYOUT.unpack(payload)
         except struct.error as error:
-            raise Malformed(f"no attachment: {error}") from error
+            raise Malformed(f"not an attachment: {error}") from error
         if length != GID:
-            raise Malformed(f"no attachment: a global id of {length} bytes")
+            raise Malformed(f"not an attachment: a global id of {length} bytes")
         return Attachment(sequence, time, gid)

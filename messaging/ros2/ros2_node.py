@@ -1,4 +1,4 @@
-"""A node among other people's ROS 2 nodes, over Zenoh as rmw_zenoh does it, without ROS.
+"""A node in a ROS 2 graph over Zenoh, by the conventions of rmw_zenoh, without ROS.
 
 with Node(RosSettings(), "brakeline") as node:
     node.subscribe("scan", LaserScan, take, SENSOR)
@@ -47,13 +47,13 @@ from brakeline.messaging.ros2.rmw_names import (
 log = logging.getLogger("brakeline.ros2")
 
 M = TypeVar("M")
-ROUTER = "tcp/localhost:7447"  # where rmw_zenoh's router listens, and its nodes look for it
+ROUTER = "tcp/localhost:7447"  # rmw_zenoh's default
 RELIABLE = Qos()
-LARGEST = 2**20  # bytes of a message that is listened to
+LARGEST = 2**20  # bytes of a received message
 
 
 class MessageTap(Protocol):
-    """Is called with every message that a node hears or sends, as bytes: a bag."""
+    """Called with the bytes of every message that a node receives or sends, as a bag needs them."""
 
     def __call__(self, topic: str, kind: type, payload: bytes, at: int, qos: Qos) -> object:
         """at: ns since the Unix epoch."""
@@ -61,20 +61,25 @@ class MessageTap(Protocol):
 
 @dataclass(frozen=True)
 class RosSettings:
-    """Where the ROS graph is. Endpoints are written as Zenoh writes them.
+    """How to reach a ROS graph.
 
-    As rmw_zenoh's nodes: a peer that connects to the router on this machine, and by gossip to the nodes that the router
-    knows. With `listen` it is the router itself. `patience` is how long it waits for a router at the start.
+    The node is a peer like those of rmw_zenoh: it connects to the router, and to the nodes that the router knows.
+
+    Attributes:
+        connect: Zenoh endpoints of the router.
+        listen: Zenoh endpoints on which the node is a router itself; empty: it is not.
+        domain, namespace: of the node.
+        patience: s to wait for a router at the start.
     """
 
     connect: tuple[str, ...] = (ROUTER,)
     listen: tuple[str, ...] = ()
     domain: int = 0
     namespace: str = "/"
-    patience: float = 10.0  # s
+    patience: float = 10.0
 
     def configuration(self) -> zenoh.Config:
-        """Of one session."""
+        """Return the configuration of the Zenoh session."""
         router = bool(self.listen)
         values: dict[str, object] = {
             "mode": "router" if router else "peer",
@@ -87,7 +92,7 @@ class RosSettings:
             "scouting/gossip/enabled": True,
             "timestamping/enabled": True,  # latched topics need it
             "transport/shared_memory/enabled": False,
-            # With the default of 1 ms messages were lost on busy cores.
+            # With the default of 1 ms, busy machines lost messages.
             "transport/link/tx/queue/congestion_control/drop/wait_before_drop": 20_000,
         }
         config = zenoh.Config()
@@ -97,7 +102,7 @@ class RosSettings:
 
 
 class RosPublisher(Generic[M]):
-    """Publishes messages of one type on one topic."""
+    """A publisher of one type on one topic. count: messages sent so far."""
 
     def __init__(self, entity: GraphEntity, kind: type[M], qos: Qos, sender: Any, tap: MessageTap | None) -> None:
         self.entity, self.count = entity, 0
@@ -106,10 +111,10 @@ class RosPublisher(Generic[M]):
         self._lock = threading.Lock()
 
     def put(self, message: M) -> None:
-        """Never waits for a receiver that does not drain: to it the message is lost.
+        """Publish a message. A receiver that reads too slowly loses it, since this method never waits.
 
         Raises:
-            TypeError: not the topic's type; BusError: the node is closed.
+            TypeError: the message has another type than the topic; BusError: the node is closed.
         """
         if not isinstance(message, self._kind):
             raise TypeError(f"{self.entity.topic} carries {type_of(self._kind)}, not {type(message).__name__}")
@@ -123,23 +128,23 @@ class RosPublisher(Generic[M]):
 
 
 class RosNode:
-    """A node of that name; it is in the graph until `close`.
+    """A node in the graph, until `close`.
 
-    What its handlers can't handle is passed over, and counted in `rejected`.
+    A message that its handler cannot handle is skipped, and counted in `rejected`.
 
     Raises:
-        Unreachable: no router answered within `patience`, or an endpoint cannot be listened on.
-        BadRosName: the name or the namespace is none.
+        Unreachable: no router answered within `patience`, or the node cannot listen on an endpoint.
+        BadRosName: the name or the namespace is not valid.
     """
 
     def __init__(self, settings: RosSettings, name: str, tap: MessageTap | None = None) -> None:
         self.settings, self.name = settings, name
-        full_name(f"/{name}")  # is it one?
+        full_name(f"/{name}")  # raises BadRosName
         self.rejected = RejectedMessages()
         self._tap = tap
         self._lock = threading.Lock()
         self._tokens: list[Any] = []
-        self._senders: list[Any] = []  # one that nobody holds would be gone
+        self._senders: list[Any] = []  # Zenoh closes a publisher that nothing refers to
         self._subscriptions: list[Subscription] = []
         try:
             self._session = zenoh.open(settings.configuration())
@@ -160,7 +165,7 @@ class RosNode:
         self.close()
 
     def close(self, timeout: float = 2.0) -> None:
-        """Leave the graph. Returns after `timeout` s even if the network hangs."""
+        """Leave the graph. Return after `timeout` seconds even if the network hangs."""
         closable: Any = self._session
         worker = threading.Thread(target=closable.close, name="ros2 close", daemon=True)
         worker.start()
@@ -172,11 +177,11 @@ class RosNode:
             subscription.join(timeout)
 
     def full_name(self, topic: str) -> str:
-        """The topic's name in the graph. Raises BadRosName."""
+        """Return a topic's name in the graph. Raises BadRosName."""
         return full_name(topic, self.settings.namespace, self.name)
 
     def publisher(self, topic: str, kind: type[M], qos: Qos = RELIABLE) -> RosPublisher[M]:
-        """Raises BadRosName."""
+        """Make a publisher. Raises BadRosName."""
         entity = self._entity(PUBLISHER, self.full_name(topic), kind, qos)
         options: dict[str, Any] = {
             "congestion_control": zenoh.CongestionControl.DROP,
@@ -185,12 +190,12 @@ class RosNode:
         }
         key = topic_key(self.settings.domain, entity.topic, entity.type, entity.digest)
         if qos.latched:
-            beat: Any = partial(MissDetectionConfig, heartbeat=0.5)  # Any: its stubs want both kinds
+            heartbeat: Any = partial(MissDetectionConfig, heartbeat=0.5)  # Any: its stubs want both kinds
             sender: Any = declare_advanced_publisher(
                 self._session,
                 key,
                 cache=CacheConfig(max_samples=qos.depth),
-                sample_miss_detection=beat(),
+                sample_miss_detection=heartbeat(),
                 publisher_detection=True,
                 **options,
             )
@@ -201,9 +206,9 @@ class RosNode:
         return RosPublisher(entity, kind, qos, sender, self._tap)
 
     def subscribe(self, topic: str, kind: type[M], handler: Callable[[M], None], qos: Qos = RELIABLE) -> Subscription:
-        """Call `handler` with every message, in a thread of its own; one that is slow misses the oldest.
+        """Call a handler with every message, in a thread of its own; a slow handler misses the oldest messages.
 
-        What is no message of that type is passed over, as is one at which the handler raises. Raises BadRosName.
+        Invalid messages, and those at which the handler raises an error, are skipped. Raises BadRosName.
         """
         entity = self._entity(SUBSCRIPTION, self.full_name(topic), kind, qos)
         key = topic_key(self.settings.domain, entity.topic, entity.type)
@@ -234,24 +239,24 @@ class RosNode:
         return subscription
 
     def graph(self, timeout: float = 1.0) -> tuple[GraphEntity, ...]:
-        """Every node, publisher and subscription of the domain that is there now, this node's too."""
-        found = []
-        where = f"{SPACE}/{self.settings.domain}/**"
-        replies: Iterable[zenoh.Reply] = self._session.liveliness().get(where, timeout=timeout)
+        """Return all nodes, publishers and subscriptions of the domain, including this node's own."""
+        entities = []
+        tokens = f"{SPACE}/{self.settings.domain}/**"
+        replies: Iterable[zenoh.Reply] = self._session.liveliness().get(tokens, timeout=timeout)
         for reply in replies:
             if reply.ok is not None:
                 try:
-                    found.append(GraphEntity.parse(str(reply.ok.key_expr)))
+                    entities.append(GraphEntity.parse(str(reply.ok.key_expr)))
                 except BadRosName:
-                    continue  # a service's, or one that is none
-        return tuple(found)
+                    continue  # the token of a service, or an invalid one
+        return tuple(entities)
 
     def _entity(self, kind: str, topic: str = "", message: type | None = None, qos: Qos = RELIABLE) -> GraphEntity:
         with self._lock:
-            own = len(self._tokens)
+            id = len(self._tokens)
         of_topic = () if message is None else (topic, type_of(message), digest_of(message), qos.token())
         settings = self.settings
-        return GraphEntity(settings.domain, self._zid, 0, own, kind, settings.namespace, self.name, *of_topic)
+        return GraphEntity(settings.domain, self._zid, 0, id, kind, settings.namespace, self.name, *of_topic)
 
     def _declare(self, entity: GraphEntity) -> None:
         token = self._session.liveliness().declare_token(entity.token)

@@ -1,4 +1,4 @@
-"""Names, tokens and bytes as rmw_zenoh has them, beside an implementation that others wrote; nodes of one graph."""
+"""Compare names, tokens and bytes with another implementation of rmw_zenoh, and connect nodes in one graph."""
 
 import contextlib
 import json
@@ -42,7 +42,7 @@ from tests.waiting import until
 
 KINDS = (Clock, DiagnosticArray, LaserScan, MarkerArray, Odometry, TFMessage, Twist, TwistStamped)
 HASH = "RIHS01_9c45bf16fe0983d80e3cfe750d6835843d265a9a6c46bd2e609fcddde6fb8d2a"
-THEIRS = """
+REFERENCE_SCRIPT = """
 import json
 from zenoh_ros2_sdk.attachment import Attachment
 from zenoh_ros2_sdk.entity import EndpointEntity, EntityKind, NodeEntity
@@ -68,12 +68,12 @@ print(json.dumps({{
 """
 
 
-def test_names_tokens_and_attachments_are_those_of_another_implementation(tmp_path):
-    text = THEIRS.format(hash=HASH)
-    said = subprocess.run([sys.executable, "-c", text], env={"HOME": str(tmp_path)}, capture_output=True, check=True)
-    theirs = json.loads(said.stdout)
+def test_names_tokens_and_attachments_agree_with_another_implementation(tmp_path):
+    text = REFERENCE_SCRIPT.format(hash=HASH)
+    done = subprocess.run([sys.executable, "-c", text], env={"HOME": str(tmp_path)}, capture_output=True, check=True)
+    reference = json.loads(done.stdout)
     where = (7, "abc123", 0)
-    assert GraphEntity(*where, 0, NODE, "/robot1", "brakeline").token == theirs["node"]
+    assert GraphEntity(*where, 0, NODE, "/robot1", "brakeline").token == reference["node"]
     ours = [
         GraphEntity(
             *where, 3, kind, "/robot1", "brakeline", "/robot1/cmd_vel", "geometry_msgs/msg/Twist", HASH, qos.token()
@@ -81,15 +81,15 @@ def test_names_tokens_and_attachments_are_those_of_another_implementation(tmp_pa
         for kind in (PUBLISHER, SUBSCRIPTION)
         for qos in (Qos(), SENSOR, LATCHED)
     ]
-    assert [entity.token for entity in ours] == theirs["ends"]
-    assert [GraphEntity.parse(token) for token in theirs["ends"]] == ours
-    assert topic_key(7, "/robot1/cmd_vel", "geometry_msgs/msg/Twist", HASH) == theirs["key"]
-    assert Attachment(5, 123456789, bytes(range(16))).encode().hex() == theirs["attachment"]
+    assert [entity.token for entity in ours] == reference["ends"]
+    assert [GraphEntity.parse(token) for token in reference["ends"]] == ours
+    assert topic_key(7, "/robot1/cmd_vel", "geometry_msgs/msg/Twist", HASH) == reference["key"]
+    assert Attachment(5, 123456789, bytes(range(16))).encode().hex() == reference["attachment"]
 
 
-def test_hashes_are_those_that_ros_has():
-    known = {Twist: "9c45bf16", TwistStamped: "5f0fcd4f", Odometry: "3cc97dc7", LaserScan: "64c19139"}
-    for kind, begins in known.items():
+def test_type_hashes_agree_with_ros():
+    expected = {Twist: "9c45bf16", TwistStamped: "5f0fcd4f", Odometry: "3cc97dc7", LaserScan: "64c19139"}
+    for kind, begins in expected.items():
         assert digest_of(kind).startswith(f"RIHS01_{begins}")
     kilted = get_typestore(Stores.ROS2_KILTED)
     for kind in KINDS:
@@ -103,56 +103,56 @@ def test_a_twist_is_52_bytes_of_little_endian_cdr():
     assert decode(Twist, payload) == twist(0.25, -0.5)
 
 
-def test_a_global_id_is_the_tokens_hash_low_half_first():
+def test_a_global_id_is_the_hash_of_the_token_low_half_first():
     value = xxhash.xxh3_128_intdigest(b"@ros2_lv/0/a")
     assert gid_of("@ros2_lv/0/a") == (value & (2**64 - 1)).to_bytes(8, "little") + (value >> 64).to_bytes(8, "little")
 
 
-def test_attachments_are_33_bytes_and_nothing_else():
+def test_an_attachment_has_33_bytes():
     whole = Attachment(1, 2, bytes(16)).encode()
     assert len(whole) == 33 and Attachment.decode(whole) == Attachment(1, 2, bytes(16))
-    for wrong in (b"", whole[:-1], whole + b"x", whole[:16] + b"\x0f" + whole[17:]):
+    for invalid in (b"", whole[:-1], whole + b"x", whole[:16] + b"\x0f" + whole[17:]):
         with pytest.raises(Malformed):
-            Attachment.decode(wrong)
+            Attachment.decode(invalid)
 
 
 @given(st.sampled_from(KINDS), st.binary(max_size=200))
-def test_any_bytes_are_a_message_or_malformed(kind, payload):
+def test_arbitrary_bytes_decode_or_are_malformed(kind, payload):
     for whole in (payload, b"\x00\x01\x00\x00" + payload):
         with contextlib.suppress(Malformed):
             assert type_of(type(decode(kind, whole))) == type_of(kind)
 
 
-def test_a_sequence_without_end_is_malformed():
+def test_a_sequence_with_too_many_elements_is_malformed():
     endless = bytearray(encode(TFMessage(transforms=[])))
     endless[4:8] = (2**32 - 1).to_bytes(4, "little")
     with pytest.raises(Malformed):
         decode(TFMessage, bytes(endless))
 
 
-def test_names_are_resolved_as_ros_does():
+def test_topic_names_resolve_as_in_ros():
     assert full_name("scan") == "/scan" and full_name("scan", "/robot1") == "/robot1/scan"
     assert full_name("/tf", "/robot1") == "/tf"
     assert full_name("~/tube", "/robot1", "brakeline") == "/robot1/brakeline/tube"
     assert ros_type("geometry_msgs::msg::dds_::Twist_") == "geometry_msgs/msg/Twist"
-    for wrong in ("", "a b", "1scan", "a//b", "scan*", "$", "a%b"):
+    for invalid in ("", "a b", "1scan", "a//b", "scan*", "$", "a%b"):
         with pytest.raises(BadRosName):
-            full_name(wrong)
+            full_name(invalid)
 
 
 @pytest.mark.parametrize("token", ["", "a/b", "@ros2_lv/0/z/0/0/NN/%/%", "@ros2_lv/x/z/0/0/NN/%/%/n", "@ros2_lv" * 9])
-def test_what_is_no_token_is_said(token):
+def test_an_invalid_token_is_refused(token):
     with pytest.raises(BadRosName):
         GraphEntity.parse(token)
 
 
 @given(st.floats(-3.1, 3.1), st.floats(0.0, 2e9))
-def test_angles_and_times_come_back(yaw, moment):
+def test_angles_and_times_survive_a_conversion(yaw, moment):
     assert yaw_of(quaternion(yaw)) == pytest.approx(yaw, abs=1e-9)
     assert seconds(time_of(moment)) == pytest.approx(moment, abs=1e-6)
 
 
-def test_no_rotation_has_no_yaw():
+def test_a_quaternion_that_is_not_a_rotation_has_no_yaw():
     nothing = quaternion(0.0)
     nothing.w = 0.0
     assert np.isnan(yaw_of(nothing))
@@ -160,7 +160,7 @@ def test_no_rotation_has_no_yaw():
 
 @pytest.fixture
 def nodes():
-    """`nodes("name", namespace="/a")`: nodes of one graph; the first is its router."""
+    """Return a function that makes nodes of one graph; the first one is the router."""
     endpoint, made = free_endpoint(), []
 
     def make(name, domain=0, namespace="/"):
@@ -173,37 +173,37 @@ def nodes():
         node.close()
 
 
-def test_nodes_hear_each_other_in_order_and_by_domain(nodes):
+def test_nodes_of_one_domain_receive_messages_in_order(nodes):
     nodes("router")
     sender, receiver, stranger = nodes("sender"), nodes("receiver"), nodes("stranger", domain=1)
-    heard, astray = [], []
-    receiver.subscribe("cmd_vel", Twist, lambda message: heard.append(message.linear.x), Qos(depth=100))
-    stranger.subscribe("cmd_vel", Twist, astray.append)
+    received, misdirected = [], []
+    receiver.subscribe("cmd_vel", Twist, lambda message: received.append(message.linear.x), Qos(depth=100))
+    stranger.subscribe("cmd_vel", Twist, misdirected.append)
     publisher = sender.publisher("cmd_vel", Twist)
 
-    def greeted():
+    def first_arrived():
         publisher.put(twist(-1.0, 0.0))
-        return heard
+        return received
 
-    until(greeted, "the first message", 20.0)
+    until(first_arrived, "the first message", 20.0)
     for i in range(50):
         publisher.put(twist(float(i), 0.0))
-    until(lambda: heard[-1] == 49.0, "the last message", 20.0)
-    assert [value for value in heard if value >= 0.0] == [float(i) for i in range(50)]
-    assert not astray
+    until(lambda: received[-1] == 49.0, "the last message", 20.0)
+    assert [value for value in received if value >= 0.0] == [float(i) for i in range(50)]
+    assert not misdirected
     with pytest.raises(TypeError, match="Twist"):
         publisher.put(header(0.0, "odom"))
 
 
-def test_what_is_latched_is_there_for_who_comes_later(nodes):
+def test_a_later_subscriber_gets_latched_messages(nodes):
     early = nodes("early")
     early.publisher("/tf_static", TFMessage, LATCHED).put(TFMessage(transforms=[]))
-    heard = []
-    nodes("late").subscribe("/tf_static", TFMessage, heard.append, LATCHED)
-    until(lambda: heard, "the transforms of before", 20.0)
+    received = []
+    nodes("late").subscribe("/tf_static", TFMessage, received.append, LATCHED)
+    until(lambda: received, "the transforms of before", 20.0)
 
 
-def test_the_graph_has_every_end_of_every_node_until_it_is_closed(nodes):
+def test_the_graph_lists_all_entities_of_a_node_until_it_is_closed(nodes):
     watcher, robot = nodes("watcher"), nodes("robot", namespace="/a")
     robot.publisher("odom", Odometry)
     robot.subscribe("cmd_vel", Twist, print, SENSOR)
@@ -219,31 +219,31 @@ def test_the_graph_has_every_end_of_every_node_until_it_is_closed(nodes):
     until(lambda: seen() == {(NODE, "/", "watcher", "", "")}, "the watcher alone", 20.0)
 
 
-def test_what_is_no_message_is_lost_alone(nodes, caplog):
+def test_an_invalid_message_does_not_stop_the_next_one(nodes, caplog):
     router, node = nodes("router"), nodes("node")
-    heard = []
-    node.subscribe("cmd_vel", Twist, lambda message: heard.append(message.linear.x))
+    received = []
+    node.subscribe("cmd_vel", Twist, lambda message: received.append(message.linear.x))
     publisher = router.publisher("cmd_vel", Twist)
     raw = router._session.declare_publisher(topic_key(0, "/cmd_vel", "geometry_msgs/msg/Twist", "any"))
 
-    def broken():
+    def send_invalid():
         raw.put(b"\x00\x01\x00\x00rubbish")
         return node.rejected.count
 
-    until(broken, "the rubbish", 20.0)
+    until(send_invalid, "the invalid message", 20.0)
     publisher.put(twist(1.0, 0.0))
-    until(lambda: heard == [1.0], "a message after it", 20.0)
+    until(lambda: received == [1.0], "a message after it", 20.0)
     assert "/cmd_vel: Malformed: not a geometry_msgs/msg/Twist" in caplog.text
 
 
-def test_no_router_is_said_with_what_to_do():
+def test_without_a_router_the_error_says_what_to_do():
     begun = time.monotonic()
     with pytest.raises(Unreachable, match="rmw_zenohd"):
         RosNode(RosSettings(connect=(free_endpoint(),), patience=0.5), "alone")
     assert time.monotonic() - begun < 20.0
 
 
-def test_an_endpoint_that_is_taken_is_said(nodes):
+def test_a_taken_endpoint_is_an_error(nodes):
     taken = nodes("first").settings.listen
     with pytest.raises(Unreachable, match="cannot listen"):
         RosNode(RosSettings(listen=taken), "second")

@@ -24,8 +24,8 @@ NEAR = 0.6  # m: closer than this there is no gap between two hits on one wall t
 EDGE = 0.15  # m: neighbouring beams that differ by more are on both sides of an edge
 
 
-def scan_of(ranges, **more):
-    n = len(ranges)
+def scan_of(beam_ranges, **more):
+    n = len(beam_ranges)
     fields = {
         "header": header(10.0, "base_scan"),
         "angle_min": 0.0,
@@ -35,7 +35,7 @@ def scan_of(ranges, **more):
         "scan_time": 0.2,
         "range_min": 0.12,
         "range_max": 3.5,
-        "ranges": np.asarray(ranges, np.float32),
+        "ranges": np.asarray(beam_ranges, np.float32),
         "intensities": np.zeros(0, np.float32),
     }
     return LaserScan(**fields | more)

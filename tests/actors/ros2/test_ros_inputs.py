@@ -161,7 +161,7 @@ def test_the_message_names_the_missing_input():
     with pytest.raises(InputMissing, match="no scan yet"):
         bare.obstacles(np.zeros(2), 0.0)
     bare.on_scan(scan_of(np.full(BEAMS, 1.0)))
-    with pytest.raises(InputMissing, match="no odometry of when the scan was inputs"):
+    with pytest.raises(InputMissing, match="no odometry of when the scan was made"):
         bare.obstacles(np.zeros(2), 10.1)
     bare.on_odometry(odometry(10.0))
     with pytest.raises(InputMissing, match="from 'base_footprint' to 'base_scan'"):

@@ -40,7 +40,9 @@ def taped(periods: int) -> Bus:
     arena = staged_arena(start=(0.0, 0.0, 50.0), goal=(9.0, 9.0, 50.0), half_width=100.0, height=100.0)
     bus = Bus()
     tape = FrameRecorder(bus, "quadrotor", "actor-0")
-    vehicle = LockstepQuadrotor(Autopilot(Quadrotor(arena, np.random.default_rng(0)), quiet=True), QUADROTOR, tape.take)
+    vehicle = LockstepQuadrotor(
+        Autopilot(Quadrotor(arena, np.random.default_rng(0)), quiet=True), QUADROTOR, tape.record
+    )
     for _ in range(periods):
         vehicle.step(np.array([0.5, 0.25, 0.0]))
         tape.publish()
