@@ -61,7 +61,7 @@ FRAMES_PER_UPDATE = 300  # of up to 280 bytes: they fit into one message
 MOST_QUEUED = 20  # messages, from which on the actor gets no new updates
 
 
-class Outbox:
+class ActorOutbox:
     """Sends messages to the current actor in its own thread, so that an actor that does not read holds up nobody.
 
     Attributes:
@@ -121,7 +121,7 @@ class Outbox:
 class ActorLog(logging.Handler):
     """Sends each line of the log to the actor, which publishes it."""
 
-    def __init__(self, outbox: Outbox) -> None:
+    def __init__(self, outbox: ActorOutbox) -> None:
         super().__init__()
         self._outbox = outbox
 
@@ -136,7 +136,9 @@ class ActorLog(logging.Handler):
 class VehicleServer:
     """One vehicle, which flies once this object exists."""
 
-    def __init__(self, request: FlightRequest, actor: MessageSocket, outbox: Outbox, stop: threading.Event) -> None:
+    def __init__(
+        self, request: FlightRequest, actor: MessageSocket, outbox: ActorOutbox, stop: threading.Event
+    ) -> None:
         """Take control of the vehicle and take off.
 
         Raises:
@@ -311,7 +313,7 @@ def main() -> int:
         0: an actor closed the flight; 1: the flight failed; 2: no actor took over.
     """
     url, system = sys.argv[1], int(sys.argv[2])
-    outbox, stop = Outbox(), threading.Event()
+    outbox, stop = ActorOutbox(), threading.Event()
     root = logging.getLogger()
     root.setLevel(logging.INFO)
     root.addHandler(ActorLog(outbox))
@@ -327,7 +329,7 @@ def main() -> int:
         outbox.close()
 
 
-def _serve_actors(listener: socket.socket, url: str, system: int, outbox: Outbox, stop: threading.Event) -> int:
+def _serve_actors(listener: socket.socket, url: str, system: int, outbox: ActorOutbox, stop: threading.Event) -> int:
     """Serve one actor after the other. Raises what `VehicleServer` raises."""
     server: VehicleServer | None = None
     try:

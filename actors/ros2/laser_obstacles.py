@@ -95,9 +95,14 @@ def read(scan: LaserScan, zero_is_free: bool = False) -> LaserBeams:
     lengths = np.where(free, scan.range_max, np.where(hit, ranges, np.nan))
     unseen = _unseen(float(scan.angle_min), gap, n)
     lengths = np.concatenate([lengths, np.full(len(unseen), np.nan)])
-    times = np.asarray(np.concatenate([times, np.full(len(unseen), times[-1])]), dtype=float)
-    angles = np.concatenate([angles, unseen])
-    return LaserBeams(times, angles, np.asarray(lengths, dtype=float), np.isnan(lengths), abs(gap))
+    times = np.concatenate([times, np.full(len(unseen), times[-1])])
+    return LaserBeams(
+        np.asarray(times, float),
+        np.concatenate([angles, unseen]),
+        np.asarray(lengths, float),
+        np.isnan(lengths),
+        abs(gap),
+    )
 
 
 def _unseen(first: float, gap: float, count: int) -> Array:

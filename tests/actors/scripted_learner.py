@@ -1,4 +1,4 @@
-"""A learner that the tests play."""
+"""A scripted learner on a real bus."""
 
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.bus import Bus
@@ -8,7 +8,7 @@ from tests.robots import GROUND
 
 
 class ScriptedLearner:
-    """A learner's bus side: takes every actor of the right layout in, and says what it is told to."""
+    """The bus side of a learner: it accepts every actor of the right layout, and publishes what the test says."""
 
     def __init__(self, bus: Bus) -> None:
         self.flow = pb.Flow(robot="ground", incarnation=1)
@@ -21,19 +21,20 @@ class ScriptedLearner:
         join = pb.Join.FromString(payload)
         self.joins.append(join)
         if join.layout != self.layout:
-            return pb.JoinReply(error=pb.Error(type="Refused", field="layout", message="another")).SerializeToString()
+            error = pb.Error(type="Refused", field="layout", message="another layout")
+            return pb.JoinReply(error=error).SerializeToString()
         return pb.JoinReply(weights=self.weights(), flow=self.flow, episode=join.episode + 3).SerializeToString()
 
     def weights(self) -> pb.Weights:
         file = MLP(GROUND, MLP.untrained(GROUND, 0, (8,)).layers, self.version).encode()
         return pb.Weights(robot="ground", version=self.version, file=file)
 
-    def say(self, limit: int, **fields: object) -> None:
+    def publish_flow(self, limit: int, **fields: object) -> None:
         self.flow.limit["actor-0"] = limit
         for name, value in fields.items():
             setattr(self.flow, name, value)
         self._flow.put(self.flow)
 
-    def publish(self, version: int) -> None:
+    def publish_weights(self, version: int) -> None:
         self.version = version
         self._weights.put(self.weights())

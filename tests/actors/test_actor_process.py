@@ -1,4 +1,4 @@
-"""The actor's process on a real bus, with a learner that the tests play and the safety service's own core."""
+"""The actor process on a real bus, with a scripted learner and the real core of the safety service."""
 
 import threading
 import time
@@ -25,7 +25,7 @@ STEPS = 60  # that each robot may take
 
 
 class Service:
-    """Safety in the test's process: it can be away, and says what it was asked."""
+    """A safety service in the test's process, which can fail and records its requests."""
 
     def __init__(self, bus: Bus, data_folder) -> None:
         from brakeline.deploy.data.model_store import model_for
@@ -50,7 +50,7 @@ class Service:
 
 @pytest.fixture
 def scene(buses, data_folder):
-    """`(service, steps, exchanges, start)`: what the actors publish, and how to start their process."""
+    """Return the service, lists of the published steps and exchanges, and a function that starts the actors."""
     learner, _ = buses
     steps: list[pb.Step] = []
     exchanges: list[pb.Exchange] = []
@@ -69,7 +69,7 @@ def scene(buses, data_folder):
         threads[0].start()
 
     def end() -> None:
-        scripted.say(0, done=True)
+        scripted.publish_flow(0, done=True)
         for thread in threads:
             thread.join(20.0)
             assert not thread.is_alive()
@@ -79,8 +79,8 @@ def scene(buses, data_folder):
     end()
 
 
-def test_a_practised_stop_goes_on_as_it_was_verified_unless_that_does_not_hold():
-    """Beside something the filter may prefer another input by now: then no stop would ever be recorded whole."""
+def test_a_practised_stop_follows_its_plan_as_long_as_the_plan_holds():
+    """Near an obstacle the filter may prefer another input; following it would leave no complete stop in the log."""
     driver = SimpleNamespace(robot=GROUND, backup_plan=BackupPlan(GROUND), rng=np.random.default_rng(0))
     driver.backup_plan.accept(np.full((GROUND.horizon, 2), 0.2), "a model", None, True)
     answers = {kind: SimpleNamespace(kind=kind) for kind in ("allowed", "adjusted", "failsafe", "recovering")}
@@ -95,7 +95,7 @@ def test_a_practised_stop_goes_on_as_it_was_verified_unless_that_does_not_hold()
     assert all(practice.outcome(driver, outcome) is outcome for outcome in asked.values())
 
 
-def test_the_robots_of_a_process_share_a_question(scene):
+def test_one_question_is_about_all_robots_of_a_process(scene):
     service, steps, exchanges, start = scene
     start(robots=3, limit=20)
     until(lambda: len(steps) == 3 * 20 and len(exchanges) == 3 * 20)
@@ -106,10 +106,10 @@ def test_the_robots_of_a_process_share_a_question(scene):
         assert [step.index for step in own] == list(range(1, 21))
         assert [step.header.sequence for step in own] == list(range(1, 21))
     starts = {tuple(step.true_state) for step in steps if step.index == 1}
-    assert len(starts) == 3, "each in an arena of its own"
+    assert len(starts) == 3, "each robot has its own arena"
 
 
-def test_without_the_service_it_brakes_along_its_plan_waits_and_goes_on(scene):
+def test_without_the_service_a_robot_brakes_along_its_plan_waits_and_drives_on(scene):
     service, steps, exchanges, start = scene
     start(robots=1, limit=10**6)
 
@@ -117,11 +117,11 @@ def test_without_the_service_it_brakes_along_its_plan_waits_and_goes_on(scene):
     service.fails_when_moving = True
     until(lambda: service.failing)
     quiet = -1
-    while quiet != len(steps):  # it stands, and does not let the episode pass
+    while quiet != len(steps):  # the robot stands, and its episode does not go on
         quiet, asked = len(steps), len(service.proposals)
         time.sleep(1.0)
     again = service.proposals[asked:]
-    assert len(again) > 3 and again == [again[0]] * len(again), "who waits draws no new proposals"
+    assert len(again) > 3 and again == [again[0]] * len(again), "a waiting robot keeps its proposal"
     lost = [step for step in steps if step.fallback]
     assert lost and lost[-1] is steps[-1] and not any(steps[-1].action)
     first = steps.index(lost[0])
@@ -135,7 +135,7 @@ def test_without_the_service_it_brakes_along_its_plan_waits_and_goes_on(scene):
     assert not any(step.collision for step in steps)
 
 
-def test_a_fleet_stops_together_when_the_service_is_gone_and_goes_on_together(scene):
+def test_a_fleet_without_the_service_stops_together_and_drives_on_together(scene):
     service, steps, exchanges, start = scene
     start(robots=3, limit=1000, fleet=True, arena="crossing")
     names = ["actor-0.0", "actor-0.1", "actor-0.2"]
@@ -143,7 +143,7 @@ def test_a_fleet_stops_together_when_the_service_is_gone_and_goes_on_together(sc
     service.fails_when_moving = True
     until(lambda: service.failing)
     quiet = -1
-    while quiet != len(steps):  # time passes for all of them or for none
+    while quiet != len(steps):  # time passes for all robots or for none
         quiet = len(steps)
         time.sleep(1.0)
     last = {name: [step for step in steps if step.actor == name][-1] for name in names}

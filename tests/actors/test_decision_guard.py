@@ -1,4 +1,4 @@
-"""Whatever happens to a question, the robot brakes along the plan that it committed to, stands, and goes on later."""
+"""Whatever happens to a question, the robot brakes along its committed plan, stands, and later drives on."""
 
 import numpy as np
 import pytest
@@ -21,7 +21,7 @@ def decision(plan=PLAN, **fields):
 
 
 def outcome_of(reply):
-    """Of a question that is answered by `reply`, or fails with it."""
+    """Return the outcome of a question whose answer is `reply`, or which fails with it."""
 
     def ask(requests):
         if isinstance(reply, BusError):
@@ -32,7 +32,7 @@ def outcome_of(reply):
 
 
 def committed():
-    """A robot that just executes the first input of PLAN."""
+    """Return the backup plan of a robot that executes the first input of PLAN."""
     backup_plan = BackupPlan(GROUND)
     assert (next_input(backup_plan, outcome_of(decision())) == PLAN[0]).all()
     return backup_plan
@@ -57,17 +57,17 @@ FAILURES = {
 
 
 @pytest.mark.parametrize("failure", FAILURES.values(), ids=FAILURES.keys())
-def test_without_a_decision_the_plan_is_followed_to_standstill_and_beyond(failure):
+def test_without_a_decision_the_robot_follows_its_plan_to_the_end_and_stands(failure):
     backup_plan, executed = committed(), []
     for _ in range(5):
         outcome = outcome_of(failure)
         assert outcome.answer is None and outcome.failure
         executed.append(next_input(backup_plan, outcome))
     assert np.array(executed).tolist() == [[0.1, 0.15], [0, 0], [0, 0], [0, 0], [0, 0]]
-    assert backup_plan.predicted is None, "nobody predicted where it is now"
+    assert backup_plan.predicted is None, "no prediction holds any more"
 
 
-def test_what_failed_is_recorded_with_its_reason_and_the_reply_if_one_came():
+def test_the_exchange_contains_the_failure_and_the_reply():
     assert outcome_of(FAILURES["late"]).exchange(1.0).failure.startswith("Late: no answer within 100 ms")
     refused = outcome_of(FAILURES["error"]).exchange(1.0)
     assert refused.failure == "StaleModel: never in use here"
@@ -77,7 +77,7 @@ def test_what_failed_is_recorded_with_its_reason_and_the_reply_if_one_came():
     assert allowed.round_trip_ms > 0.0
 
 
-def test_it_waits_only_when_it_stands_and_is_committed_to_that():
+def test_a_robot_is_at_rest_only_if_its_input_and_its_plan_are_zero():
     backup_plan = BackupPlan(GROUND)
     assert at_rest(backup_plan)
     next_input(backup_plan, outcome_of(decision()))
@@ -91,7 +91,7 @@ def test_it_waits_only_when_it_stands_and_is_committed_to_that():
     assert not at_rest(backup_plan), "it stands, but has committed to move"
 
 
-def test_it_goes_on_when_the_service_is_back():
+def test_the_robot_drives_on_when_the_service_answers_again():
     backup_plan = committed()
     next_input(backup_plan, outcome_of(FAILURES["late"]))
     again = np.array([[0.25, -0.5], [0.0, 0.0], [0.0, 0.0]])
@@ -100,10 +100,10 @@ def test_it_goes_on_when_the_service_is_back():
     for _ in range(3):
         next_input(backup_plan, outcome_of(FAILURES["late"]))
     request = request_message(backup_plan, np.zeros(5), np.zeros(2), known_free=True)
-    assert request.model == "" and not any(request.plan), "standing still needs nobody's word"
+    assert request.model == "" and not any(request.plan), "standing still needs no verification"
 
 
-def test_a_wrong_reply_about_one_robot_leaves_the_others_theirs():
+def test_an_invalid_reply_about_one_robot_does_not_affect_the_others():
     replies = [decision(), FAILURES["error"], decision()]
     outcomes = request_decisions(lambda requests: replies, [REQUEST] * 3, GROUND)
     assert [outcome.answer is not None for outcome in outcomes] == [True, False, True]

@@ -1,4 +1,4 @@
-"""SAILR's driver: in training an intervention is a terminal step for the learner, and for nobody else."""
+"""SAILR's training: an intervention is a terminal step for the learner only."""
 
 import numpy as np
 import pytest
@@ -35,31 +35,31 @@ def test_an_intervention_is_a_terminal_step_for_the_learner_alone(driver):
     assert cut.reward - cut.penalty == pytest.approx(GROUND.task.reward.cut) and cut.reward > -5
     assert not cut.terminated and not cut.goal and not cut.collision, "nothing ended in the environment"
     assert cut.truncated and not driver.running, "the robot's episode was called off"
-    seen = EpisodeStats()
-    for taken in (allowed, cut):
-        seen.step(taken)
-    assert (seen.timeouts, seen.collisions, seen.goals, len(seen.returns)) == (0, 0, 0, 1)
+    stats = EpisodeStats()
+    for step_taken in (allowed, cut):
+        stats.step(step_taken)
+    assert (stats.timeouts, stats.collisions, stats.goals, len(stats.returns)) == (0, 0, 0, 1)
 
 
-def test_in_use_the_episode_goes_on_behind_the_rule():
+def test_outside_of_training_an_intervention_does_not_end_the_episode():
     driver = EpisodeRunner(GROUND, environment(GROUND, "default", 0), ActorIdentity("a", 0, 0))
     driver.begin(0)
     ask = in_process(known(threshold=0.3))
     for number, proposal in enumerate((FAST, FAST, SLOW)):
-        taken = step(driver, proposal, ask)
-        assert driver.running and not taken.cut and taken.step == number
-        assert (taken.decision == pb.FAILSAFE) == (proposal is FAST)
+        step_taken = step(driver, proposal, ask)
+        assert driver.running and not step_taken.cut and step_taken.step == number
+        assert (step_taken.decision == pb.FAILSAFE) == (proposal is FAST)
 
 
-def test_a_collision_while_braking_is_still_paid_for_as_one(driver):
-    taken = pb.Step(reward=-100.0, terminated=True, collision=True, decision=pb.FAILSAFE)
+def test_a_collision_while_braking_keeps_its_reward(driver):
+    step_taken = pb.Step(reward=-100.0, terminated=True, collision=True, decision=pb.FAILSAFE)
     driver.running = False
-    driver._end_on_intervention(taken)
-    assert taken.cut and taken.penalty == 0.0 and taken.terminated and not taken.truncated
+    driver._end_on_intervention(step_taken)
+    assert step_taken.cut and step_taken.penalty == 0.0 and step_taken.terminated and not step_taken.truncated
 
 
-def test_a_missing_answer_is_no_intervention(driver):
+def test_a_missing_answer_is_not_an_intervention(driver):
     step(driver, SLOW, in_process(known(threshold=0.3)))
     lost = driver.decide(SLOW, lambda requests: (_ for _ in ()).throw(NoReply("gone")))
-    fallen = driver.execute(SLOW, lost)
-    assert fallen.fallback and not fallen.cut and fallen.penalty >= 0.0
+    fallback = driver.execute(SLOW, lost)
+    assert fallback.fallback and not fallback.cut and fallback.penalty >= 0.0

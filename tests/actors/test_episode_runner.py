@@ -1,4 +1,4 @@
-"""One robot through an episode, without a bus."""
+"""One robot through its episodes, without a bus."""
 
 import numpy as np
 import pytest
@@ -18,7 +18,7 @@ from tests.robots import GROUND
 FAST = np.array([0.25, 0.1])
 
 
-def driver(number: int = 0, seed: int = 0, **more) -> EpisodeRunner:
+def make_runner(number: int = 0, seed: int = 0, **more) -> EpisodeRunner:
     return EpisodeRunner(GROUND, environment(GROUND, "default", seed), ActorIdentity("actor-0", number, seed), **more)
 
 
@@ -29,8 +29,8 @@ def ask(data_folder):
     return in_process(model_for(GROUND, ModelConfig()))
 
 
-def test_the_steps_of_an_episode(ask):
-    robot = driver(penalty=2.0)
+def test_a_step_records_the_proposal_the_decision_and_the_result(ask):
+    robot = make_runner(penalty=2.0)
     episode = robot.begin(5)
     assert (episode.episode, episode.actor, episode.arena) == (5, "actor-0", "default")
     assert episode.obstacles and len(episode.start) == 5 and episode.goal_radius > 0
@@ -53,15 +53,15 @@ def test_the_steps_of_an_episode(ask):
             break
 
 
-def test_containment_is_of_the_state_after_the_step_and_unknown_after_a_fallback(ask):
-    robot = driver()
+def test_the_state_after_a_step_is_compared_with_the_prediction_unless_there_was_no_answer(ask):
+    robot = make_runner()
     robot.begin(0)
-    for wrong in (False, True):
+    for falsified in (False, True):
         outcome = robot.decide(FAST, ask)
-        if wrong:  # a prediction that cannot come true
+        if falsified:  # a prediction that cannot come true
             outcome.answer.predicted.center[0] += 1.0
         step = robot.execute(FAST, outcome)
-        assert step.compared and step.contained is not wrong
+        assert step.compared and step.contained is not falsified
     missing = robot.decide(FAST, lambda requests: (_ for _ in ()).throw(NoReply("gone")))
     plan = robot.backup_plan.plan.copy()
     step = robot.execute(FAST, missing)
@@ -69,34 +69,34 @@ def test_containment_is_of_the_state_after_the_step_and_unknown_after_a_fallback
     assert np.allclose(step.action, plan[0])
 
 
-def test_without_a_filter_the_proposal_is_executed_within_bounds():
-    robot = driver(filtered=False)
+def test_without_a_filter_the_proposal_is_clipped_to_bounds():
+    robot = make_runner(filtered=False)
     robot.begin(0)
     step = robot.execute(np.array([9.0, -9.0]), None)
     assert np.allclose(step.action, [0.25, -0.5])
     assert (step.decision, step.penalty, step.compared) == (pb.UNKNOWN, 0.0, False)
 
 
-@pytest.mark.parametrize("wrong", [[np.nan, 0.1], [np.inf, 0.0]])
-def test_a_proposal_that_is_not_finite_is_a_failsafe_and_a_step_to_learn_from(ask, wrong):
-    robot = driver(penalty=2.0)
+@pytest.mark.parametrize("proposal", [[np.nan, 0.1], [np.inf, 0.0]])
+def test_a_proposal_of_nan_is_a_failsafe_and_a_step_that_the_learner_accepts(ask, proposal):
+    robot = make_runner(penalty=2.0)
     robot.begin(0)
     robot.execute(FAST, robot.decide(FAST, ask))
-    outcome = robot.decide(np.array(wrong), ask)
-    assert np.array_equal(outcome.exchange(0.2).request.action, wrong, equal_nan=True)
+    outcome = robot.decide(np.array(proposal), ask)
+    assert np.array_equal(outcome.exchange(0.2).request.action, proposal, equal_nan=True)
     assert (outcome.answer.kind, outcome.answer.reason) == ("failsafe", NOT_FINITE)
-    step = robot.execute(np.array(wrong), outcome)
+    step = robot.execute(np.array(proposal), outcome)
     assert step.decision == pb.FAILSAFE and step.proposed == step.action == [0.0, 0.0]
     StepReader(GROUND).move(step)
 
 
-def test_without_a_filter_a_proposal_that_is_not_finite_is_standing_still():
-    robot = driver(filtered=False)
+def test_without_a_filter_a_proposal_of_nan_becomes_zero():
+    robot = make_runner(filtered=False)
     robot.begin(0)
     assert robot.execute(np.array([np.nan, 0.3]), None).action == [0.0, 0.0]
 
 
-def test_no_two_robots_of_a_run_ever_see_the_same_episode():
+def test_all_robots_of_a_run_have_different_episodes():
     seeds = {
         ActorIdentity(f"actor-{number}", number, 0).episode_seed(episode)
         for number in range(64)
@@ -104,30 +104,29 @@ def test_no_two_robots_of_a_run_ever_see_the_same_episode():
     }
     assert len(seeds) == 64 * 200
     arenas = {
-        driver(number, seed).begin(episode).SerializeToString()
+        make_runner(number, seed).begin(episode).SerializeToString()
         for number in (0, 1)
         for seed in (0, 1)
         for episode in (0, 1)
     }
     assert len(arenas) == 8
-    one, same = driver(1, 7), driver(1, 7)
+    one, same = make_runner(1, 7), make_runner(1, 7)
     assert one.begin(3) == same.begin(3)
     assert one.rng.random() == same.rng.random()
     same.begin(4)
     assert one.rng.random() != same.rng.random()
 
 
-def test_a_step_has_the_number_of_its_question_though_periods_pass_unseen_meanwhile(ask, monkeypatch):
-    robot = driver()
+def test_a_step_has_the_number_of_its_request_even_if_periods_are_skipped(ask, monkeypatch):
+    robot = make_runner()
     robot.begin(0)
     drive = robot.env.step
 
-    def slow(action):  # as `brakeline.actors.flight_process` counts them
-        robot.backup_plan.fallback()
-        robot.step += 1
+    def skip_a_period(action):  # as a flight that observes too late
+        robot.skip()
         return drive(action)
 
     for number in (0, 1, 3):
         asked = robot.request(FAST)
-        monkeypatch.setattr(robot.env, "step", slow if number == 1 else drive)
+        monkeypatch.setattr(robot.env, "step", skip_a_period if number == 1 else drive)
         assert robot.execute(FAST, request_decisions(ask, [asked], GROUND)[0]).step == asked.step == number

@@ -18,7 +18,7 @@ from tests.robots import QUADROTOR
 
 
 def stage(gap: float) -> Arena:
-    """A sphere so far [m] from the vehicle's own, at the start."""
+    """Return an arena with a sphere whose distance from the body is `gap` [m] at the start."""
     radius = 0.4
     away = QUADROTOR.footprint + gap + radius
     return staged_arena(
@@ -31,18 +31,20 @@ def stage(gap: float) -> Arena:
 
 
 @pytest.mark.usefixtures("flight_folder")
-def test_it_does_not_take_off_where_it_could_not_hover() -> None:
+def test_no_takeoff_where_hovering_cannot_be_verified() -> None:
     robot = QUADROTOR.in_real_time()
     question = in_process(model_for(robot, ModelConfig(), BOUND), BOUND)
     assert takeoff_verified(question, robot, stage(2.0), True, lambda: False)
     with pytest.raises(TakeoffNotVerified, match=r"0\.\d+ m from the nearest obstacle.*collect more data"):
         takeoff_verified(question, robot, stage(0.02), True, lambda: False)
-    assert takeoff_verified(question, robot, stage(0.02), False, lambda: False), "a rival says nothing of hovering"
+    assert takeoff_verified(question, robot, stage(0.02), False, lambda: False), (
+        "a rival method does not verify hovering"
+    )
 
 
 @pytest.mark.usefixtures("flight_folder")
-def test_in_real_time_a_way_out_is_gone_on_with_period_after_period() -> None:
-    """Not every other one: a real vehicle does not answer to velocities that last for a period."""
+def test_in_real_time_recovery_continues_period_after_period() -> None:
+    """A recovery in every other period would not move a real vehicle: it does not follow so short a command."""
     robot = QUADROTOR.in_real_time()
     question = in_process(model_for(robot, ModelConfig(), BOUND), BOUND)
     make = delayed(Quadrotor, robot)

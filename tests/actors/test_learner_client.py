@@ -1,4 +1,4 @@
-"""An actor's link to a learner that the tests play."""
+"""An actor's link to a scripted learner."""
 
 import threading
 import time
@@ -25,13 +25,13 @@ def joined(buses: tuple[Bus, Bus], lockstep: bool = False) -> tuple[ScriptedLear
 
 
 def waiting(client: LearnerClient, index: int, stop: Callable[[], bool] = never) -> list[bool]:
-    """The result of `wait`, once there is one."""
+    """Call `wait` in a thread; the list gets its result."""
     results: list[bool] = []
     threading.Thread(target=lambda: results.append(client.wait(index, 7, stop)), daemon=True).start()
     return results
 
 
-def test_it_waits_for_a_learner_joins_it_and_is_told_where_to_go_on(buses: tuple[Bus, Bus]) -> None:
+def test_join_waits_for_a_learner_and_returns_the_episode(buses: tuple[Bus, Bus]) -> None:
     client = LearnerClient(buses[1], GROUND, "actor-0")
     answers: list[int | None] = []
     thread = threading.Thread(target=lambda: answers.append(client.join(12, 4, never)))
@@ -52,21 +52,21 @@ def test_a_stop_ends_the_wait_for_a_learner(buses: tuple[Bus, Bus]) -> None:
     assert client.join(0, 0, stop.is_set) is None
 
 
-def test_another_layout_is_refused(buses: tuple[Bus, Bus]) -> None:
+def test_the_learner_refuses_another_layout(buses: tuple[Bus, Bus]) -> None:
     ScriptedLearner(buses[0]).layout = "that of another version"
     with pytest.raises(RefusedByLearner, match="layout: another"):
         LearnerClient(buses[1], GROUND, "actor-0").join(0, 0, never)
 
 
-def test_it_goes_as_far_as_it_may(buses: tuple[Bus, Bus]) -> None:
+def test_wait_returns_when_the_learner_permits_the_step(buses: tuple[Bus, Bus]) -> None:
     learner, client = joined(buses)
     result = waiting(client, 5)
-    learner.say(4)
+    learner.publish_flow(4)
     time.sleep(0.3)
     assert not result
-    learner.say(5)
+    learner.publish_flow(5)
     until(lambda: result == [True])
-    assert client.wait(3, 7, never), "what was allowed stays so"
+    assert client.wait(3, 7, never), "a permission stays valid"
 
 
 def test_the_end_of_the_run_and_a_stop_end_the_wait(buses: tuple[Bus, Bus]) -> None:
@@ -76,87 +76,87 @@ def test_the_end_of_the_run_and_a_stop_end_the_wait(buses: tuple[Bus, Bus]) -> N
     stop.set()
     until(lambda: result == [False])
     result = waiting(client, 5)
-    learner.say(0, done=True)
+    learner.publish_flow(0, done=True)
     until(lambda: result == [False])
     assert client.done
 
 
-def test_a_new_incarnation_is_joined_and_its_weights_taken_older_or_not(buses: tuple[Bus, Bus]) -> None:
+def test_a_restarted_learner_is_joined_even_if_its_weights_are_older(buses: tuple[Bus, Bus]) -> None:
     learner, client = joined(buses)
-    learner.publish(9)
+    learner.publish_weights(9)
     until(lambda: client.policy is not None and client.policy.version == 9)
     learner.version = 4  # restarted from a checkpoint
-    learner.say(20, incarnation=2)
+    learner.publish_flow(20, incarnation=2)
     assert client.wait(11, 7, never)
     assert client.policy is not None and client.policy.version == 4
     assert (len(learner.joins), learner.joins[-1].index, learner.joins[-1].episode) == (2, 10, 7)
 
 
-def test_without_permission_it_joins_again(buses: tuple[Bus, Bus], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_actor_without_permission_joins_again(buses: tuple[Bus, Bus], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("brakeline.actors.learner_client.REJOIN_AFTER", 0.2)
     learner, client = joined(buses)
     result = waiting(client, 5)
     until(lambda: len(learner.joins) >= 4)
     assert not result
-    learner.say(5)
+    learner.publish_flow(5)
     until(lambda: result == [True])
 
 
-def test_lockstep_waits_for_the_very_version(buses: tuple[Bus, Bus]) -> None:
+def test_lockstep_waits_for_the_exact_version(buses: tuple[Bus, Bus]) -> None:
     learner, client = joined(buses, lockstep=True)
-    learner.say(1, weights_version=2)
+    learner.publish_flow(1, weights_version=2)
     result = waiting(client, 1)
     time.sleep(0.3)
     assert not result
-    learner.publish(2)
+    learner.publish_weights(2)
     until(lambda: result == [True])
-    learner.say(2, weights_version=3)
-    learner.publish(4)
+    learner.publish_flow(2, weights_version=3)
+    learner.publish_weights(4)
     result = waiting(client, 2)
     time.sleep(0.3)
-    assert not result, "newer weights are not the right ones"
+    assert not result, "newer weights are not the right version"
 
 
-def test_damaged_or_older_weights_are_not_taken(buses: tuple[Bus, Bus], caplog: pytest.LogCaptureFixture) -> None:
+def test_damaged_or_older_weights_are_ignored(buses: tuple[Bus, Bus], caplog: pytest.LogCaptureFixture) -> None:
     learner, client = joined(buses)
     learner._weights.put(pb.Weights(robot="ground", version=5, file=b"nonsense"))
-    learner.publish(6)
+    learner.publish_weights(6)
     until(lambda: client.policy is not None and client.policy.version == 6)
-    learner.publish(2)
+    learner.publish_weights(2)
     time.sleep(0.2)
     assert client.policy is not None and client.policy.version == 6
     assert "weights 5 are not valid" in caplog.text
 
 
-def test_weights_that_do_not_go_on_from_ours_are_not_taken_and_the_learner_is_asked(buses: tuple[Bus, Bus]) -> None:
+def test_implausible_weights_are_ignored_and_the_learner_is_joined_again(buses: tuple[Bus, Bus]) -> None:
     learner, client = joined(buses)
-    learner.publish(2**32 - 1)
+    learner.publish_weights(2**32 - 1)
     until(lambda: buses[1].rejected.count == 1)
     assert client.policy is not None and client.policy.version == 1
     learner.version = 7
     result = waiting(client, 5)
     until(lambda: len(learner.joins) == 2)
-    learner.say(5)
+    learner.publish_flow(5)
     until(lambda: result == [True])
     assert client.policy.version == 7
-    learner.publish(8)
+    learner.publish_weights(8)
     until(lambda: client.policy is not None and client.policy.version == 8)
 
 
-def test_a_permission_that_no_learner_gives_is_passed_over(buses: tuple[Bus, Bus]) -> None:
+def test_an_implausible_permission_is_ignored(buses: tuple[Bus, Bus]) -> None:
     learner, client = joined(buses)
-    learner.say(10**9)
+    learner.publish_flow(10**9)
     until(lambda: buses[1].rejected.count == 1)
     result = waiting(client, 5)
     time.sleep(0.3)
     assert not result
-    learner.say(5)
+    learner.publish_flow(5)
     until(lambda: result == [True])
 
 
-def test_nothing_is_taken_before_a_learner_has_taken_it_in(buses: tuple[Bus, Bus]) -> None:
+def test_weights_before_the_first_join_are_ignored(buses: tuple[Bus, Bus]) -> None:
     learner, client = ScriptedLearner(buses[0]), LearnerClient(buses[1], GROUND, "actor-0")
     for version in range(1, 11):
-        learner.publish(version)
+        learner.publish_weights(version)
         time.sleep(0.02)
     assert client.policy is None and buses[1].rejected.count == 0

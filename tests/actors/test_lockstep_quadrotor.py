@@ -1,4 +1,4 @@
-"""The client at its own edge, and the vehicle over it in lockstep, with both rule sets."""
+"""The MAVLink client and the quadrotor in lockstep, with the rules of both autopilots."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def embedded(rules: str, *obstacles: Obstacle) -> Autopilot:
 
 
 @pytest.mark.parametrize("rules", RULES)
-def test_in_lockstep_it_takes_control_before_time_begins(rules: str) -> None:
+def test_the_vehicle_is_under_control_before_time_begins(rules: str) -> None:
     autopilot = embedded(rules)
     vehicle = LockstepQuadrotor(autopilot, QUADROTOR)
     assert autopilot.pilot.time == 0.0
@@ -47,7 +47,7 @@ def test_in_lockstep_it_takes_control_before_time_begins(rules: str) -> None:
 
 
 @pytest.mark.parametrize("rules, name, value", [("px4", "COM_OBL_RC_ACT", 4), ("ardupilot", "LAND_SPEED", 50)])
-def test_a_whole_number_is_set_as_each_autopilot_wants_it(rules: str, name: str, value: int) -> None:
+def test_an_integer_parameter_is_set_in_each_autopilots_encoding(rules: str, name: str, value: int) -> None:
     autopilot = embedded(rules)
     vehicle = LockstepQuadrotor(autopilot, QUADROTOR)
     assert vehicle._client.set_parameter(name, value, vehicle._wait)
@@ -57,8 +57,8 @@ def test_a_whole_number_is_set_as_each_autopilot_wants_it(rules: str, name: str,
 
 
 @pytest.mark.parametrize("rules", RULES)
-def test_over_bytes_it_is_the_vehicle_that_it_is_without_them(rules: str) -> None:
-    """Same seed, same inputs: the same flight, but for the rounding of float32, and of ArduPilot's milligravities."""
+def test_a_flight_over_mavlink_equals_one_without_it(rules: str) -> None:
+    """Same seed and inputs give the same flight, except for rounding to float32 and to ArduPilot's milligravities."""
     rounding = np.array(6 * [2e-3] + 3 * [{"px4": 2e-3, "ardupilot": 0.02}[rules]])
     bare, flown = quadrotor(scale=0.0), Autopilot(quadrotor(scale=0.0), rules, parameters=AT_ONCE[rules], quiet=True)
     vehicle = LockstepQuadrotor(flown, QUADROTOR)
@@ -71,10 +71,10 @@ def test_over_bytes_it_is_the_vehicle_that_it_is_without_them(rules: str) -> Non
         assert (np.abs(period.measured - direct.measured) < rounding).all()
         assert period.subsamples == pytest.approx(direct.subsamples, abs=1e-3)
         assert period.clearance == pytest.approx(direct.clearance, abs=1e-3)
-        assert period.closest <= direct.closest + 1e-3  # looked at more often
+        assert period.closest <= direct.closest + 1e-3  # sampled more often
 
 
-def test_what_is_measured_by_telemetry_stays_within_its_bound() -> None:
+def test_the_error_of_telemetry_stays_within_the_measurement_bound() -> None:
     vehicle, rng = LockstepQuadrotor(embedded("px4"), QUADROTOR), np.random.default_rng(2)
     worst = np.zeros(9)
     for _ in range(400):
@@ -86,13 +86,13 @@ def test_what_is_measured_by_telemetry_stays_within_its_bound() -> None:
     assert (worst < QUADROTOR.measurement_bound).all()
 
 
-def test_it_never_meets_its_own_timeout() -> None:
+def test_periods_are_shorter_than_the_setpoint_timeout() -> None:
     autopilot = embedded("px4")
     vehicle = LockstepQuadrotor(autopilot, QUADROTOR)
     for _ in range(50):
         vehicle.step(np.array([2.0, 0.0, 0.0]))
     assert autopilot.pilot.mode is Mode.OFFBOARD
-    autopilot.advance(0.22)  # nobody steps any more
+    autopilot.advance(0.22)  # without another step
     assert autopilot.pilot.mode is Mode.POSITION
 
 
@@ -101,12 +101,12 @@ def test_collisions_come_from_the_simulator() -> None:
     assert any(vehicle.step(np.array([3.0, 0.0, 0.0])).collision for _ in range(12))
 
 
-def test_bad_inputs_are_refused() -> None:
+def test_an_input_of_nan_is_refused() -> None:
     with pytest.raises(BadInput):
         LockstepQuadrotor(embedded("px4"), QUADROTOR).step(np.array([np.nan, 0.0, 0.0]))
 
 
-def test_every_frame_goes_through_the_tap_and_can_be_read_again() -> None:
+def test_the_tap_gets_every_frame_and_each_can_be_decoded() -> None:
     frames: list[CapturedFrame] = []
     vehicle = LockstepQuadrotor(embedded("px4"), QUADROTOR, frames.append)
     frames.clear()
@@ -114,13 +114,13 @@ def test_every_frame_goes_through_the_tap_and_can_be_read_again() -> None:
     names = [(frame.outgoing, frame.name) for frame in frames]
     assert names.count((True, "mavlink/245/191/SET_POSITION_TARGET_LOCAL_NED")) == 1
     assert names.count((False, "mavlink/1/1/LOCAL_POSITION_NED")) == SAMPLES
-    again = mavlink.MAVLink(None).parse_buffer(b"".join(frame.raw for frame in frames))
-    assert [message.get_type() for message in again] == [frame.message.get_type() for frame in frames]
+    decoded = mavlink.MAVLink(None).parse_buffer(b"".join(frame.raw for frame in frames))
+    assert [message.get_type() for message in decoded] == [frame.message.get_type() for frame in frames]
     sent = next(frame for frame in frames if frame.outgoing)
     assert json.loads(json.dumps(sent.fields))["vy"] == pytest.approx(0.5)  # east
 
 
-def test_the_clients_edge_agrees_with_the_autopilots() -> None:
+def test_client_and_simulated_autopilot_agree_on_frames() -> None:
     sent: list[bytes] = []
     client = AutopilotClient(sent.append)
     client.setpoint(np.array([1.0, 2.0, 3.0]))
@@ -135,7 +135,7 @@ def test_the_clients_edge_agrees_with_the_autopilots() -> None:
     assert vehicle.measured[6:] == pytest.approx(vehicle.true[6:], abs=0.3)
 
 
-def test_nobody_there_and_refusals_are_errors() -> None:
+def test_a_missing_autopilot_and_refusals_are_errors() -> None:
     client = AutopilotClient(lambda _: None)
     with pytest.raises(NoAutopilot):
         client.identify(lambda condition, _: condition())

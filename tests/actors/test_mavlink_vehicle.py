@@ -1,4 +1,4 @@
-"""A vehicle in real time over UDP: the clock goes on, plans are carried out, and what is late does not count."""
+"""A vehicle in real time over UDP: it carries out plans period by period, and late plans do not count."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ from tests.robots import QUADROTOR
 
 GAP = 0.25  # s between two setpoints, at most
 
-Live = tuple[MavlinkVehicle, Autopilot, list[CapturedFrame]]
+Flying = tuple[MavlinkVehicle, Autopilot, list[CapturedFrame]]
 
 
 @pytest.fixture(params=RULES)
-def live(request: pytest.FixtureRequest) -> Iterator[Live]:
-    """A vehicle, its autopilot in a thread, on the floor at first, and the frames between them."""
+def flying(request: pytest.FixtureRequest) -> Iterator[Flying]:
+    """Fly a vehicle from the floor. Yield it, its autopilot in a thread, and the frames between them."""
     link, stop, frames = open_link("udpin:127.0.0.1:0"), threading.Event(), list[CapturedFrame]()
     truth_port = free_udp_port()
     autopilot = Autopilot(quadrotor(floor=0.02), request.param, parameters={TIMEOUT[request.param]: 1.0})
@@ -59,25 +59,25 @@ def live(request: pytest.FixtureRequest) -> Iterator[Live]:
 
 
 def setpoints(frames: list[CapturedFrame]) -> list[tuple[float, float, float]]:
-    """What was sent [m/s], ENU, repetitions left out."""
+    """Return the setpoints [m/s, ENU] without repetitions."""
     sent = [f.message for f in frames if f.name.endswith("SET_POSITION_TARGET_LOCAL_NED")]
     inputs = [(round(m.vy, 3), round(m.vx, 3), round(-m.vz, 3)) for m in sent]
     return [u for u, before in zip(inputs, [None, *inputs[:-1]], strict=True) if u != before]
 
 
-def test_it_takes_off_flies_brakes_and_lands(stalled: Callable[[], float], live: Live) -> None:
-    vehicle, autopilot, _ = live
+def test_a_vehicle_takes_off_flies_brakes_and_lands(stalled: Callable[[], float], flying: Flying) -> None:
+    vehicle, autopilot, _ = flying
     assert autopilot.pilot.armed and autopilot.pilot.mode is Mode.OFFBOARD
     for _ in range(12):
         period = vehicle.step(np.array([2.0, 1.0, 0.0]))
     assert period.measured[3:6] == pytest.approx([2.0, 1.0, 0.0], abs=0.3)
-    late = 3.0 * stalled()  # m flown meanwhile: the truth's word is of a moment before, or of one before a stall
+    late = 3.0 * stalled()  # m flown meanwhile: the ground truth is older, by a stall at most
     assert period.measured[:3] == pytest.approx(period.true[:3], abs=0.3 + late)
     assert period.subsamples[-1] == pytest.approx([0.4, 0.2, 0.0], abs=0.15)
     assert vehicle.timing.worst_gap < GAP + stalled() and not vehicle.current_period.lost and not period.collision
     assert vehicle.current_period.number >= 12
 
-    hovering = vehicle.wait(vehicle.current_period.number + 10)  # nothing follows: it brakes within its slew
+    hovering = vehicle.wait(vehicle.current_period.number + 10)  # without a plan it brakes within its slew
     assert not hovering.input.any()
     assert np.linalg.norm(hovering.report.measured[3:6]) < 0.3
 
@@ -88,20 +88,20 @@ def test_it_takes_off_flies_brakes_and_lands(stalled: Callable[[], float], live:
     assert not autopilot.pilot.armed
 
 
-def test_a_plan_is_carried_out_input_by_input_and_then_it_hovers(live: Live) -> None:
-    vehicle, _, frames = live
+def test_a_plan_is_flown_input_by_input_and_then_the_vehicle_hovers(flying: Flying) -> None:
+    vehicle, _, frames = flying
     frames.clear()
     plan = np.array([[0.5, 0.0, 0.0], [1.0, 0.2, 0.0], [0.6, 0.1, 0.0], [0.0, 0.0, 0.0]])
     number = vehicle.current_period.number + 2
     assert vehicle.commit(plan, number)
     periods = [vehicle.wait(number + k) for k in range(6)]
-    assert [current.number - number for current in periods] == [0, 1, 2, 3, 4, 5], "nobody was late to look"
+    assert [current.number - number for current in periods] == [0, 1, 2, 3, 4, 5], "the test saw every period"
     assert np.array([current.input for current in periods]) == pytest.approx(np.vstack([plan, np.zeros((2, 3))]))
     assert setpoints(frames) == [(0.0, 0.0, 0.0), *(tuple(row) for row in plan)]
 
 
-def test_what_is_carried_out_keeps_to_the_robots_own_slew(live: Live) -> None:
-    vehicle, _, _ = live
+def test_inputs_keep_to_the_robots_slew(flying: Flying) -> None:
+    vehicle, _, _ = flying
     vehicle._robot = replace(QUADROTOR, action_slew=(0.2, 0.2, 0.2))
     number = vehicle.current_period.number + 2
     assert vehicle.commit(np.tile([1.0, 0.0, 0.0], (3, 1)), number)
@@ -109,8 +109,8 @@ def test_what_is_carried_out_keeps_to_the_robots_own_slew(live: Live) -> None:
     assert inputs == pytest.approx([0.2, 0.4, 0.6, 0.4, 0.2])
 
 
-def test_a_plan_that_comes_late_does_not_count_and_a_newer_one_does(live: Live) -> None:
-    vehicle, _, _ = live
+def test_a_late_plan_does_not_count_and_a_newer_one_does(flying: Flying) -> None:
+    vehicle, _, _ = flying
     first, second = np.full((3, 3), 0.3), np.full((3, 3), 0.6)
     number = vehicle.current_period.number + 2
     assert vehicle.commit(first, number)
@@ -123,55 +123,55 @@ def test_a_plan_that_comes_late_does_not_count_and_a_newer_one_does(live: Live) 
         vehicle.commit(np.full((2, 3), np.nan), number + 4)
 
 
-def heard_again(vehicle: MavlinkVehicle) -> bool:
-    """Within some periods, on a machine that may stall."""
+def recovers(vehicle: MavlinkVehicle) -> bool:
+    """Return whether telemetry counts again within some periods, on a machine that may stall."""
     return any(not vehicle.wait(vehicle.current_period.number + 1).lost for _ in range(25))
 
 
-def test_without_telemetry_it_says_so_and_goes_on(live: Live) -> None:
-    vehicle, autopilot, _ = live
+def test_without_telemetry_the_period_is_lost_and_the_plan_goes_on(flying: Flying) -> None:
+    vehicle, autopilot, _ = flying
     assert vehicle.commit(np.full((9, 3), 0.4), vehicle.current_period.number + 2)
     real, autopilot.take = autopilot.take, lambda: real() and b""  # type: ignore[method-assign, func-returns-value]
     current = vehicle.wait(vehicle.current_period.number + 4)
     assert "no telemetry" in current.lost
     assert current.input == pytest.approx([0.4, 0.4, 0.4])
     autopilot.take = real  # type: ignore[method-assign]
-    assert heard_again(vehicle)
+    assert recovers(vehicle)
 
 
-def test_what_stops_coming_alone_is_lost_telemetry_too(live: Live) -> None:
-    vehicle, _, _ = live
+def test_one_missing_quantity_is_lost_telemetry(flying: Flying) -> None:
+    vehicle, _, _ = flying
     chosen = vehicle._client.chosen[ATTITUDE]
-    vehicle._client.chosen[ATTITUDE] = "AHRS2"  # which does not come; the position goes on coming
+    vehicle._client.chosen[ATTITUDE] = "AHRS2"  # which does not arrive, while the position still does
     assert "no telemetry of attitude" in vehicle.wait(vehicle.current_period.number + 3).lost
     vehicle._client.chosen[ATTITUDE] = chosen
-    assert heard_again(vehicle)
+    assert recovers(vehicle)
     assert vehicle.timing.figures()["periods without telemetry"] >= 1
 
 
-def test_outside_of_the_autopilots_geofence_it_brakes(live: Live) -> None:
-    vehicle, _, _ = live
+def test_a_period_outside_of_the_geofence_is_lost(flying: Flying) -> None:
+    vehicle, _, _ = flying
     vehicle._client.outside = "boundary"
     assert "outside of its geofence (boundary)" in vehicle.wait(vehicle.current_period.number + 2).lost
     vehicle._client.outside = ""
-    assert heard_again(vehicle)
+    assert recovers(vehicle)
 
 
-def test_a_pilot_may_take_over(live: Live) -> None:
-    vehicle, autopilot, _ = live
+def test_a_pilot_may_take_over_and_keeps_control(flying: Flying) -> None:
+    vehicle, autopilot, _ = flying
     autopilot.pilot.change(Mode.HOLD)
-    for _ in range(25):  # until a heartbeat comes, on a machine that may stall
+    for _ in range(25):  # until a heartbeat arrives, on a machine that may stall
         if "does not follow" in (current := vehicle.wait(vehicle.current_period.number + 1)).lost:
             break
     assert (
         "does not follow" in current.lost
         and {"px4": "HOLD", "ardupilot": "LOITER"}[vehicle._client.kind] in current.lost
     )
-    assert autopilot.pilot.mode is Mode.HOLD, "who took it keeps it"
+    assert autopilot.pilot.mode is Mode.HOLD, "the pilot keeps control"
 
 
-def test_the_autopilot_brakes_when_the_link_dies(live: Live) -> None:
-    vehicle, autopilot, _ = live
+def test_the_autopilot_brakes_when_the_link_dies(flying: Flying) -> None:
+    vehicle, autopilot, _ = flying
     for _ in range(8):
         vehicle.step(np.array([2.0, 0.0, 0.0]))
     vehicle.close()
@@ -179,16 +179,16 @@ def test_the_autopilot_brakes_when_the_link_dies(live: Live) -> None:
     assert np.linalg.norm(autopilot.vehicle.state()[3:6]) < 0.1
 
 
-def test_the_offset_of_two_clocks_follows_them() -> None:
+def test_the_clock_offset_ignores_late_messages_and_follows_jumps() -> None:
     offset = ClockOffset()
     for k in range(1000):
         offset.note(0.02 * k + 0.001 * (k % 7), 0.02 * k)
     assert offset.value == pytest.approx(0.0, abs=1e-4)
     for k in range(1000, 1040):
-        offset.note(0.02 * k + 0.03, 0.02 * k)  # all of them late, for a while
+        offset.note(0.02 * k + 0.03, 0.02 * k)  # all are late for a while
     assert offset.value == pytest.approx(0.0, abs=1e-3)
     for k in range(1040, 1240):
-        offset.note(0.02 * k, 0.02 * k - 0.5)  # their clock has slipped
+        offset.note(0.02 * k, 0.02 * k - 0.5)  # the autopilot's clock jumped
     assert offset.value == pytest.approx(0.5, abs=1e-3)
     offset.note(25.0, 24.9)
     assert offset.value == pytest.approx(0.1)

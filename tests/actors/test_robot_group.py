@@ -1,4 +1,4 @@
-"""Robots that share a world: promises stay disjoint whatever comes, and nobody touches anybody."""
+"""Robots that share a world: their reservations stay disjoint, and no robot touches another."""
 
 from itertools import combinations
 
@@ -39,8 +39,8 @@ def policies(name, size=SIZE, seed=0):
     return [scripted(name, GROUND, np.random.default_rng(seed + i)) for i in range(size)]
 
 
-def gathered(fleet, seed=0):
-    """Begin, with everybody close to everybody: a ring of 0.5 m about a free place."""
+def begin_close_together(fleet, seed=0):
+    """Begin an episode with all robots on a small circle around a free position."""
     fleet.begin(seed)
     arena = fleet.world.world.robots[0].arena
     spots = np.random.default_rng(seed).uniform(-1.5, 1.5, (2000, 2))
@@ -54,13 +54,14 @@ def gathered(fleet, seed=0):
         driver.info = driver.info | {"state": robot.measured, "others": fleet.world.others(i)}
 
 
-def disjoint(fleet):
-    made = [d.backup_plan.reservation for d in fleet.runners if d.backup_plan.reservation is not None]
-    return min((a.apart(b) for a, b in combinations(made, 2)), default=np.inf)
+def least_distance(fleet):
+    """Return the least distance between two reservations [m]."""
+    reservations = [r.backup_plan.reservation for r in fleet.runners if r.backup_plan.reservation is not None]
+    return min((a.apart(b) for a, b in combinations(reservations, 2)), default=np.inf)
 
 
 def drive(fleet, ask, policy, periods, lost=0.0, seed=0):
-    """Least distance of promises (m) and the kinds of decisions; lost: share of questions that get no answer."""
+    """Return the least distance of reservations [m] and the decisions; lost: probability that answers begin to fail."""
     rng, proposers, least, kinds = np.random.default_rng(seed), policies(policy, len(fleet.runners), seed), np.inf, []
     gone = 0
     for _ in range(periods):
@@ -75,66 +76,66 @@ def drive(fleet, ask, policy, periods, lost=0.0, seed=0):
         (outcomes,) = decide([fleet], [proposals], answer)
         steps = fleet.execute(proposals, outcomes)
         kinds += [step.decision for step in steps if step is not None]
-        least = min(least, disjoint(fleet))
+        least = min(least, least_distance(fleet))
         for driver in fleet.runners:
-            driver.running = True  # beyond goals and timeouts: this is about what is in between
+            driver.running = True  # this test goes on after goals and timeouts
     return least, kinds
 
 
 @pytest.mark.parametrize("policy", ["adversary", "random"])
-def test_nobody_touches_anybody_and_promises_stay_disjoint_though_answers_fail(ask, policy):
+def test_no_robots_touch_and_reservations_stay_disjoint_though_answers_fail(ask, policy):
     fleet = fleet_of()
-    gathered(fleet)
+    begin_close_together(fleet)
     least, kinds = drive(fleet, ask, policy, 100, lost=0.15)
     assert fleet.world.touches == 0
     assert least >= -ROUNDING
     assert {pb.ALLOWED, pb.ADJUSTED, pb.FAILSAFE} <= set(kinds)
 
 
-def test_without_promises_the_same_robots_touch(ask):
+def test_without_reservations_the_same_robots_touch(ask):
     fleet = fleet_of(reserving=False)
-    gathered(fleet)
+    begin_close_together(fleet)
     drive(fleet, ask, "adversary", 60)
     assert fleet.world.touches > 0
 
 
-def test_who_forgets_the_others_promises_touches_them(data_folder, monkeypatch):
-    """The mutant: promises are made, and nobody keeps off them."""
+def test_a_filter_that_ignores_reservations_lets_robots_touch(data_folder, monkeypatch):
+    """A mutant of the filter: robots make reservations, and no plan avoids them."""
     ask = in_process(model_for(GROUND, ModelConfig()))
     monkeypatch.setattr(Promises, "nearest", lambda self, point: np.full(len(self), np.inf))
     fleet = fleet_of()
-    gathered(fleet)
+    begin_close_together(fleet)
     least, _ = drive(fleet, ask, "adversary", 60)
     assert least < -ROUNDING and fleet.world.touches > 0
 
 
-def test_when_nobody_answers_all_stop_within_what_they_promised(ask):
+def test_without_answers_all_robots_stop_within_their_reservations(ask):
     fleet = fleet_of()
-    gathered(fleet)
+    begin_close_together(fleet)
     drive(fleet, ask, "random", 15)
-    promised = [driver.backup_plan.reservation for driver in fleet.runners]
+    reservations = [driver.backup_plan.reservation for driver in fleet.runners]
     silent = request_decisions(
         lambda requests: (_ for _ in ()).throw(NoReply("gone")), fleet.requests([np.zeros(2)] * SIZE), GROUND
     )
     for k in range(6):
         fleet.execute([np.zeros(2)] * SIZE, silent)
-        for reservation, robot in zip(promised, fleet.world.world.robots, strict=True):
+        for reservation, robot in zip(reservations, fleet.world.world.robots, strict=True):
             at = min(k, len(reservation.center) - 1)
             body = reservation.radius[at] - GROUND.footprint
             assert (np.abs(robot.true[:2] - reservation.center[at]) <= reservation.half_width[at] + body).all()
     assert all(abs(robot.true[3]) < 0.01 for robot in fleet.world.world.robots) and fleet.world.touches == 0
 
 
-def test_robots_take_turns(ask):
+def test_the_filter_decides_about_the_robots_in_turn(ask):
     asked = []
     original = Filter.decide
 
-    class Heard(Filter):
+    class RecordingFilter(Filter):
         def decide(self, request):
             asked.append(tuple(request.state[:2]))
             return original(self, request)
 
-    Filter.decide, kept = Heard.decide, Filter.decide
+    Filter.decide = RecordingFilter.decide
     try:
         fleet = fleet_of(3)
         fleet.begin(0)
@@ -146,14 +147,14 @@ def test_robots_take_turns(ask):
             assert asked == states[turn % 3 :] + states[: turn % 3]
             fleet.execute([np.zeros(2)] * 3, request_decisions(ask, requests, GROUND))
     finally:
-        Filter.decide = kept
+        Filter.decide = original
 
 
 def replies(ask, requests):
     return [reply.error.type if reply.HasField("error") else "decided" for reply in ask(requests)]
 
 
-def test_who_is_asked_apart_is_promised_nothing_and_told_why(ask):
+def test_a_fleet_that_is_not_in_one_question_is_refused_with_a_reason(ask):
     fleet = fleet_of()
     fleet.begin(0)
     requests = fleet.requests([np.array([0.2, 0.0])] * SIZE)
@@ -161,7 +162,7 @@ def test_who_is_asked_apart_is_promised_nothing_and_told_why(ask):
     apart = ask(requests[:3])
     assert [reply.error.type for reply in apart] == ["AskedApart"] * 3
     assert "robot.3" in apart[0].error.message and apart[0].error.field == "fleet"
-    # The others of a batch are no worse off for it.
+    # The other robots of the batch still get their decisions.
     alone = pb.Request()
     alone.CopyFrom(requests[3])
     alone.fleet[:] = []
@@ -173,7 +174,7 @@ def test_who_is_asked_apart_is_promised_nothing_and_told_why(ask):
     assert set(replies(ask, late)) == {"AskedApart"}
 
 
-def test_who_moves_and_has_promised_nothing_is_refused(ask):
+def test_a_moving_robot_without_a_reservation_is_refused(ask):
     fleet = fleet_of(2)
     fleet.begin(0)
     requests = fleet.requests([np.array([0.2, 0.0])] * 2)
@@ -192,10 +193,10 @@ def test_who_moves_and_has_promised_nothing_is_refused(ask):
         assert set(replies(ask, [requests[0], bad])) == {"BadRequest"}
 
 
-def test_no_answer_about_one_is_no_answer_about_any(ask):
-    """The others' new plans may rest on a plan that one never heard of."""
+def test_if_one_robot_has_no_answer_none_has(ask):
+    """The other robots' new plans may rest on a plan that this robot does not know."""
     fleet = fleet_of()
-    gathered(fleet)
+    begin_close_together(fleet)
     drive(fleet, ask, "random", 8)
 
     def garbled(requests):
@@ -209,10 +210,10 @@ def test_no_answer_about_one_is_no_answer_about_any(ask):
     assert all("no answer about robot.2" in outcomes[i].failure for i in (0, 1, 3))
     assert all(step.fallback for step in steps)
     assert all(np.allclose(step.action, plan[0]) for step, plan in zip(steps, before, strict=True))
-    assert disjoint(fleet) >= -ROUNDING
+    assert least_distance(fleet) >= -ROUNDING
 
 
-def test_who_is_done_stands_and_is_kept_off(ask):
+def test_a_robot_at_its_goal_stands_and_is_avoided(ask):
     fleet = fleet_of(2, arena="open")
     fleet.begin(0)
     first, second = fleet.runners

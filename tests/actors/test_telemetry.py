@@ -1,4 +1,4 @@
-"""Who can tell what: units and frames of every message, and what is used when an autopilot grants and does not send."""
+"""Units and frames of every message, and the choice of messages that an autopilot grants and sends."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ KINDS = {"px4": mavlink.MAV_AUTOPILOT_PX4, "ardupilot": mavlink.MAV_AUTOPILOT_AR
 
 
 def quaternion() -> tuple[float, float, float, float]:
-    """By the product of three turns, as the book has it: about down, then right, then ahead."""
+    """Return the attitude as a product of three rotations: about down, then right, then forward."""
     half = [(math.cos(angle / 2.0), math.sin(angle / 2.0)) for angle in (ROLL, PITCH, YAW)]
     (cr, sr), (cp, sp), (cy, sy) = half
     yaw, pitch, roll = (cy, 0, 0, sy), (cp, 0, sp, 0), (cr, sr, 0, 0)
@@ -58,7 +58,7 @@ def odometry(frame: int = 1, child: int = 1, velocity: tuple[float, float, float
     )
 
 
-SAID: dict[str, Any] = {
+MESSAGES: dict[str, Any] = {
     "LOCAL_POSITION_NED": mavlink.MAVLink_local_position_ned_message(12_500, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0),
     "ODOMETRY": odometry(),
     "ATTITUDE_QUATERNION": mavlink.MAVLink_attitude_quaternion_message(0, *quaternion(), 0, 0, 0),
@@ -76,27 +76,27 @@ SAID: dict[str, Any] = {
 
 
 @pytest.mark.parametrize(("what", "name"), [(what, s.message) for what in SOURCES for s in SOURCES[what]])
-def test_every_message_says_the_same_in_its_own_units_and_frame(what: str, name: str) -> None:
+def test_every_message_of_a_quantity_gives_the_same_value(what: str, name: str) -> None:
     read = next(source.read for source in SOURCES[what] if source.message == name)
-    told = read(SAID[name])
+    value = read(MESSAGES[name])
     if what == MOTION:
-        assert told.time == pytest.approx(12.5)
-        assert told.position == pytest.approx([2.0, 1.0, -3.0]) and told.velocity == pytest.approx([5.0, 4.0, -6.0])
+        assert value.time == pytest.approx(12.5)
+        assert value.position == pytest.approx([2.0, 1.0, -3.0]) and value.velocity == pytest.approx([5.0, 4.0, -6.0])
     elif what == ATTITUDE:
-        assert told == pytest.approx(quaternion(), abs=1e-6)
+        assert value == pytest.approx(quaternion(), abs=1e-6)
     elif what == TRUTH:
-        north = GeoPosition(told.latitude + 9000, told.longitude, told.altitude, told.metres).since(told)
-        east = GeoPosition(told.latitude, told.longitude + 9000, told.altitude, told.metres).since(told)
+        north = GeoPosition(value.latitude + 9000, value.longitude, value.altitude, value.metres).since(value)
+        east = GeoPosition(value.latitude, value.longitude + 9000, value.altitude, value.metres).since(value)
         assert north == pytest.approx([0.0, 100.0, 0.0], abs=0.3), "an Earth's quarter is 10,000 km"
         assert east == pytest.approx([100.0 * math.cos(math.radians(47.4)), 0.0, 0.0], abs=0.3)
-        assert told.altitude in (None, 488.5)
+        assert value.altitude in (None, 488.5)
     elif what == FORCE:
-        assert told == pytest.approx([0.1, 0.2, 9.80665 * DOWN], abs=0.005)
+        assert value == pytest.approx([0.1, 0.2, 9.80665 * DOWN], abs=0.005)
     else:
-        assert told is True
+        assert value is True
 
 
-def test_odometry_along_the_body_is_turned_and_of_another_frame_is_nothing() -> None:
+def test_body_frame_odometry_is_rotated_and_an_unknown_frame_ignored() -> None:
     read = SOURCES[MOTION][1].read
     ahead = read(odometry(child=12, velocity=(1.0, 0.0, 0.0))).velocity
     level = math.cos(PITCH)
@@ -104,19 +104,20 @@ def test_odometry_along_the_body_is_turned_and_of_another_frame_is_nothing() -> 
     assert read(odometry(frame=20)) is None and SOURCES[ATTITUDE][1].read(odometry(frame=20)) is None
 
 
-def test_the_turn_agrees_with_the_autopilots_own_edge() -> None:
-    """What is felt along its body, rotate by what it says of its attitude, is what the simulator knows."""
+def test_the_rotation_agrees_with_the_simulated_autopilot() -> None:
+    """A vector in the body frame, rotated by the attitude that the autopilot sends, is the simulator's vector."""
     body = (0.3, -0.2, 9.0)  # forward-left-up
     own = quaternion()  # taken for ENU from forward-left-up
-    there = np.array(ned_frames.rotate(own, body))
+    autopilot = np.array(ned_frames.rotate(own, body))
     north, east, down = rotate(ned_frames.attitude(own), ned_frames.body(body))
-    assert [east, north, -down] == pytest.approx(there)
+    assert [east, north, -down] == pytest.approx(autopilot)
 
 
-class Pretender:
-    """An autopilot that answers as it is told to, in a time of its own.
+class ScriptedAutopilot:
+    """An autopilot with scripted replies and a clock of its own.
 
-    grants: messages, and the rate [Hz] at which each then comes; all others are refused."""
+    grants: the rate [Hz] at which each granted message arrives; it refuses all others.
+    """
 
     def __init__(self, kind: str, grants: dict[str, float], parameters: dict[str, float] | None = None) -> None:
         self.grants, self.parameters, self.now = grants, parameters or {}, 0.0
@@ -156,10 +157,10 @@ class Pretender:
             for name, since in self._asked.items():
                 rate = self.grants[name]
                 if rate and int((self.now - since) * rate) > int((self.now - 0.01 - since) * rate):
-                    self._mav.send(SAID[name])
+                    self._mav.send(MESSAGES[name])
 
 
-def test_it_tells_when_it_is_outside_of_its_geofence() -> None:
+def test_a_breach_of_the_geofence_is_decoded() -> None:
     client, mav = AutopilotClient(lambda _: None), mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
     for breach, side in ((1, 2), (1, 3), (1, 0), (0, 3)):
         client.feed(mavlink.MAVLink_fence_status_message(breach, 1, side, 1000).pack(mav))
@@ -168,84 +169,86 @@ def test_it_tells_when_it_is_outside_of_its_geofence() -> None:
 
 
 @pytest.mark.parametrize(
-    "said",
+    "message",
     [
         mavlink.MAVLink_local_position_ned_message(1000, math.nan, 0, 0, 0, 0, 0),
         mavlink.MAVLink_attitude_message(1000, math.inf, 0, 0, 0, 0, 0),
         mavlink.MAVLink_highres_imu_message(0, math.nan, 0, 0, *[0] * 10, 0),
     ],
 )
-def test_what_is_no_number_was_not_told(said: Any) -> None:
-    """It counted as fresh, and a flight by scan ended in an exception."""
+def test_a_message_with_nan_does_not_count_as_fresh(message: Any) -> None:
+    """Such a message once counted as fresh, and ended a flight with a virtual scan in an exception."""
     client, mav = AutopilotClient(lambda _: None), mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
     client.feed(mavlink.MAVLink_heartbeat_message(2, KINDS["px4"], 128, 0, 4, 3).pack(mav))
     before = dict(client.message_counts)
-    client.feed(said.pack(mav))
+    client.feed(message.pack(mav))
     assert dict(client.message_counts) == before
 
 
-def test_what_is_granted_and_never_comes_is_not_relied_on() -> None:
-    """PX4 before its heading is known, as it was met."""
-    there = Pretender("px4", {"ATTITUDE_QUATERNION": 0.0, "ODOMETRY": 50.0, "HIGHRES_IMU": 50.0})
-    line = there.client.choose(ATTITUDE, 0.02, there.wait)
+def test_a_message_that_is_granted_but_never_arrives_is_not_used() -> None:
+    """PX4 does this before it knows its heading."""
+    autopilot = ScriptedAutopilot("px4", {"ATTITUDE_QUATERNION": 0.0, "ODOMETRY": 50.0, "HIGHRES_IMU": 50.0})
+    line = autopilot.client.choose(ATTITUDE, 0.02, autopilot.wait)
     assert (
         line.startswith("attitude from ODOMETRY at 5") and "ATTITUDE_QUATERNION is granted, but never arrives" in line
     )
-    assert there.switched_off == ["ATTITUDE_QUATERNION"]
-    there.client.choose(FORCE, 0.02, there.wait)
+    assert autopilot.switched_off == ["ATTITUDE_QUATERNION"]
+    autopilot.client.choose(FORCE, 0.02, autopilot.wait)
     hovering = times(quaternion(), times((0.0, *[0.1, 0.2, 9.80665 * DOWN]), conjugate(quaternion())))
-    assert there.client.acceleration == pytest.approx([hovering[2], hovering[1], -hovering[3] - 9.81], abs=1e-4)
+    assert autopilot.client.acceleration == pytest.approx([hovering[2], hovering[1], -hovering[3] - 9.81], abs=1e-4)
 
 
 def conjugate(q: Any) -> tuple[float, float, float, float]:
     return (q[0], -q[1], -q[2], -q[3])
 
 
-def test_what_is_refused_is_replaced_as_arducopter_needs_it() -> None:
+def test_a_refused_message_is_replaced_as_arducopter_needs_it() -> None:
     grants = ("ATTITUDE", "RAW_IMU", "EXTENDED_SYS_STATE", "LOCAL_POSITION_NED")
-    there = Pretender("ardupilot", dict.fromkeys(grants, 50.0))
-    lines = [there.client.choose(what, 0.02, there.wait) for what in (ATTITUDE, FORCE, LANDED, MOTION)]
-    assert list(there.client.chosen.values()) == list(grants), lines
-    assert there.client.airborne and there.client.position == pytest.approx([2.0, 1.0, -3.0])
+    autopilot = ScriptedAutopilot("ardupilot", dict.fromkeys(grants, 50.0))
+    lines = [autopilot.client.choose(what, 0.02, autopilot.wait) for what in (ATTITUDE, FORCE, LANDED, MOTION)]
+    assert list(autopilot.client.chosen.values()) == list(grants), lines
+    assert autopilot.client.airborne and autopilot.client.position == pytest.approx([2.0, 1.0, -3.0])
 
 
-def test_raw_units_are_believed_only_where_they_are_known() -> None:
-    there = Pretender("px4", {"RAW_IMU": 50.0})
+def test_raw_imu_is_used_only_for_ardupilot() -> None:
+    autopilot = ScriptedAutopilot("px4", {"RAW_IMU": 50.0})
     with pytest.raises(TelemetryMissing, match="HIGHRES_IMU is refused"):
-        there.client.choose(FORCE, 0.02, there.wait)
+        autopilot.client.choose(FORCE, 0.02, autopilot.wait)
 
 
-def test_the_faster_of_two_slow_ones_is_taken_and_one_too_slow_to_fly_is_none() -> None:
-    there = Pretender("px4", {"ATTITUDE_QUATERNION": 4.0, "ATTITUDE": 20.0})
-    assert there.client.choose(ATTITUDE, 0.02, there.wait).startswith("attitude from ATTITUDE at 2")
-    there = Pretender("px4", {"ATTITUDE_QUATERNION": 4.0})
+def test_the_faster_of_two_slow_messages_is_used_unless_it_is_too_slow_to_fly() -> None:
+    autopilot = ScriptedAutopilot("px4", {"ATTITUDE_QUATERNION": 4.0, "ATTITUDE": 20.0})
+    assert autopilot.client.choose(ATTITUDE, 0.02, autopilot.wait).startswith("attitude from ATTITUDE at 2")
+    autopilot = ScriptedAutopilot("px4", {"ATTITUDE_QUATERNION": 4.0})
     with pytest.raises(TelemetryMissing, match="arrives at 4 Hz"):
-        there.client.choose(ATTITUDE, 0.02, there.wait)
+        autopilot.client.choose(ATTITUDE, 0.02, autopilot.wait)
 
 
-def test_once_chosen_another_message_says_nothing() -> None:
-    there = Pretender("px4", {"ATTITUDE_QUATERNION": 0.0, "ATTITUDE": 50.0})
-    there.client.choose(ATTITUDE, 0.02, there.wait)
-    heard = there.client.message_counts[ATTITUDE]
-    there._mav.send(SAID["ATTITUDE_QUATERNION"])
-    there.wait(lambda: False, 0.0)
-    assert there.client.message_counts[ATTITUDE] == heard
+def test_after_the_choice_other_messages_of_the_quantity_are_ignored() -> None:
+    autopilot = ScriptedAutopilot("px4", {"ATTITUDE_QUATERNION": 0.0, "ATTITUDE": 50.0})
+    autopilot.client.choose(ATTITUDE, 0.02, autopilot.wait)
+    count = autopilot.client.message_counts[ATTITUDE]
+    autopilot._mav.send(MESSAGES["ATTITUDE_QUATERNION"])
+    autopilot.wait(lambda: False, 0.0)
+    assert autopilot.client.message_counts[ATTITUDE] == count
 
 
-def test_frames_that_are_missing_are_counted() -> None:
-    there = Pretender("px4", {})
-    there.wait(lambda: False, 0.0)
+def test_missing_frames_are_counted() -> None:
+    autopilot = ScriptedAutopilot("px4", {})
+    autopilot.wait(lambda: False, 0.0)
     for skipped in (0, 3):
-        there._mav.seq = (there._mav.seq + skipped) % 256
-        there._mav.send(SAID["ATTITUDE"])
-    there.wait(lambda: False, 0.0)
-    assert (there.client.received, there.client.missed) == (3, 3)
+        autopilot._mav.seq = (autopilot._mav.seq + skipped) % 256
+        autopilot._mav.send(MESSAGES["ATTITUDE"])
+    autopilot.wait(lambda: False, 0.0)
+    assert (autopilot.client.received, autopilot.client.missed) == (3, 3)
 
 
-def test_parameters_that_hold_it_below_what_may_be_asked_for() -> None:
-    there = Pretender("ardupilot", {}, {"WPNAV_ACCEL": 100.0, "WPNAV_SPEED": 800.0})
-    there.client.identify(there.wait)
-    values = {c.parameter: there.client.parameter(c.parameter, there.wait) for c in AUTOPILOT_LIMITS["ardupilot"]}
+def test_parameters_below_the_robots_bounds_are_found() -> None:
+    autopilot = ScriptedAutopilot("ardupilot", {}, {"WPNAV_ACCEL": 100.0, "WPNAV_SPEED": 800.0})
+    autopilot.client.identify(autopilot.wait)
+    values = {
+        c.parameter: autopilot.client.parameter(c.parameter, autopilot.wait) for c in AUTOPILOT_LIMITS["ardupilot"]
+    }
     known = {name: value for name, value in values.items() if value is not None}
     assert known == {"WPNAV_ACCEL": 100.0, "WPNAV_SPEED": 800.0}
     assert [limit.parameter for limit, _ in limits_below_demand("ardupilot", known, QUADROTOR)] == ["WPNAV_ACCEL"]
@@ -253,7 +256,7 @@ def test_parameters_that_hold_it_below_what_may_be_asked_for() -> None:
     assert (asked.speed, asked.climb, asked.horizontal_acceleration) == pytest.approx((50**0.5, 5.0, 32**0.5))
 
 
-def test_what_the_estimator_lacks_has_a_name() -> None:
+def test_missing_quantities_of_the_estimator_have_names() -> None:
     assert missing(sum({1, 2, 4, 16, 32})) == [] and missing(sum({1, 2, 4, 8, 32})) == []
     assert missing(165) == [
         "horizontal velocity",
@@ -267,3 +270,10 @@ def test_modes_have_names() -> None:
     assert mode_name("ardupilot", 6) == "RTL" and mode_name("ardupilot", 99) == "mode 99"
     assert mode_name("px4", 6 << 16) == "OFFBOARD" and mode_name("px4", 4 << 16 | 5 << 24) == "RETURN"
     assert message_id("EXTENDED_SYS_STATE") == 245
+
+
+def test_noise_on_a_link_is_skipped() -> None:
+    random, client = np.random.default_rng(0), AutopilotClient(lambda data: None, 1)
+    for _ in range(2000):
+        start = b"\xfd" if random.random() < 0.5 else b""
+        client.feed(start + random.integers(0, 256, int(random.integers(0, 300)), np.uint8).tobytes())

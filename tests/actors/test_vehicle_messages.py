@@ -1,4 +1,4 @@
-"""The messages of an actor and its vehicle server: what goes in comes out, and what is not valid is named."""
+"""The messages of an actor and its vehicle server survive a conversion; invalid ones are refused."""
 
 from __future__ import annotations
 
@@ -44,14 +44,14 @@ REQUEST = FlightRequest(FlightSettings("udpin:0.0.0.0:14540", 7, 9000, 2.5, (1.0
 
 
 @pytest.mark.parametrize("robot", [robot_named("quadrotor"), robot_named("quadrotor-late")])
-def test_a_flight_request_comes_out_as_it_went_in(robot):
+def test_a_flight_request_survives_a_conversion(robot):
     request = FlightRequest(REQUEST.flight, robot, MAP)
     data = request_message(request).SerializeToString()
     assert request_of(pb.FlightRequest.FromString(data)) == request
 
 
 @given(numbers=st.lists(st.floats(-1e6, 1e6), min_size=21 + 3 * SAMPLES, max_size=21 + 3 * SAMPLES), lost=st.text())
-def test_a_control_period_comes_out_as_it_went_in(numbers, lost):
+def test_a_control_period_survives_a_conversion(numbers, lost):
     values = np.array(numbers)
     path = values[21:].reshape(SAMPLES, 3)
     report = Period(values[:9], values[9:18], True, math.inf, -0.25, path, 0.5)
@@ -76,7 +76,7 @@ def test_a_control_period_comes_out_as_it_went_in(numbers, lost):
         lambda m: setattr(m, "turned", math.inf),
     ],
 )
-def test_a_control_period_that_is_not_valid_is_refused(spoil):
+def test_an_invalid_control_period_is_refused(spoil):
     report = Period(np.zeros(9), np.zeros(9), False, 1.0, 1.0, np.zeros((SAMPLES, 3)), 0.0)
     message = period_message(ControlPeriod(1, np.zeros(3), report))
     period_of(message, LATE)
@@ -104,7 +104,7 @@ def test_a_control_period_that_is_not_valid_is_refused(spoil):
         {"obstacles": [pb.Obstacle(kind="sphere", position=[0.0, 0.0, math.nan], size=[1.0])]},
     ],
 )
-def test_a_flight_request_that_is_not_valid_is_refused(change):
+def test_an_invalid_flight_request_is_refused(change):
     message = request_message(REQUEST)
     for name in change:
         message.ClearField(name)
@@ -113,13 +113,13 @@ def test_a_flight_request_that_is_not_valid_is_refused(change):
         request_of(message)
 
 
-def test_only_a_quadrotor_is_flown():
+def test_a_request_for_another_kind_of_robot_is_refused():
     with pytest.raises(BadMessage, match="than a quadrotor"):
         request_of(request_message(FlightRequest(REQUEST.flight, GROUND, ())))
 
 
 @given(st.binary(max_size=300))
-def test_noise_is_refused_or_read_and_nothing_else(data):
+def test_arbitrary_bytes_are_read_or_refused(data):
     for kind, read in (
         (pb.FlightRequest, request_of),
         (pb.ControlPeriod, lambda m: period_of(m, LATE)),
@@ -145,12 +145,12 @@ def test_noise_is_refused_or_read_and_nothing_else(data):
         (KeyError("a"), MavlinkError),
     ],
 )
-def test_an_error_keeps_its_kind(error, kind):
-    again = error_of(error_message(error))
-    assert type(again) is kind and "a" in str(again)
+def test_a_known_error_keeps_its_type(error, kind):
+    received = error_of(error_message(error))
+    assert type(received) is kind and "a" in str(received)
 
 
-def test_an_error_of_any_length_fits_and_one_of_no_known_kind_is_no_class():
+def test_a_long_error_is_cut_and_an_unknown_type_becomes_a_mavlink_error():
     assert len(error_message(ValueError("x" * 10 * LARGEST)).SerializeToString()) < LARGEST
     assert error_message(ValueError("\ud800")).message == "?"
     assert type(error_of(pb.Error(type="SystemExit", message="0"))) is MavlinkError

@@ -1,4 +1,4 @@
-"""A vehicle in a process of its own: an actor flies it, the actor dies, and the socket carries what is no message."""
+"""A vehicle server in its own process: actors fly, die and take over, and the socket carries invalid messages."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from brakeline.actors.mavlink.frame_log import decode_frame
 from brakeline.actors.mavlink.mavlink_vehicle import ControlPeriod
 from brakeline.actors.mavlink.vehicle_client import VehicleClient
 from brakeline.actors.mavlink.vehicle_messages import FlightRequest, period_message
-from brakeline.actors.mavlink.vehicle_server import FRAMES_PER_UPDATE, MOST_QUEUED, Outbox, next_actor
+from brakeline.actors.mavlink.vehicle_server import FRAMES_PER_UPDATE, MOST_QUEUED, ActorOutbox, next_actor
 from brakeline.actors.mavlink.vehicle_socket import (
     LARGEST,
     BadMessage,
@@ -53,7 +53,7 @@ ARENA = staged_arena(start=(0.0, 0.0, 2.0), half_width=20.0, height=10.0)
 
 @pytest.fixture
 def flown() -> Iterator[tuple[str, Autopilot]]:
-    """An autopilot on the floor, in a thread, and where it is."""
+    """Run an autopilot on the floor in a thread. Yield its URL and the autopilot."""
     link, stop = open_link("udpin:127.0.0.1:0"), threading.Event()
     autopilot = Autopilot(quadrotor(floor=0.02), "px4")
     thread = threading.Thread(target=server.serve, args=([autopilot], link, WallClock(), stop.is_set))
@@ -77,17 +77,17 @@ def actor(url: str, frames: list[pb.MavlinkFrame] | None = None, height: float =
         vehicle.close()
 
 
-def standing() -> Period:
+def still_period() -> Period:
     return Period(np.zeros(9), np.zeros(9), False, np.inf, np.inf, np.zeros((SAMPLES, 3)), 0.0)
 
 
 def setpoints(frames: list[pb.MavlinkFrame]) -> list[Any]:
-    """The setpoints among the frames, in their order."""
+    """Return the setpoints among the frames, in their order."""
     sent = [decode_frame(frame.raw, True) for frame in frames if frame.outgoing]
     return [f.message for f in sent if f is not None and f.message.get_type() == "SET_POSITION_TARGET_LOCAL_NED"]
 
 
-def test_what_an_actor_that_dies_committed_is_flown_to_its_end_and_the_next_one_goes_on(
+def test_a_dead_actors_plan_is_flown_to_its_end_and_the_next_actor_takes_over(
     stalled: Callable[[], float], flown: tuple[str, Autopilot]
 ) -> None:
     url, autopilot = flown
@@ -99,26 +99,26 @@ def test_what_an_actor_that_dies_committed_is_flown_to_its_end_and_the_next_one_
             vehicle.commit(np.full((2, 3), np.nan), vehicle.current_period.number + 2)
         number = vehicle.current_period.number + 2
         plan = np.array([[0.8, 0.0, 0.0], [1.5, 0.0, 0.0], [1.5, 0.0, 0.0], [0.8, 0.0, 0.0]])
-        assert vehicle.commit(plan, number) and not vehicle.commit(plan, number - 2), "that one has begun"
+        assert vehicle.commit(plan, number) and not vehicle.commit(plan, number - 2), "that period has begun"
         assert vehicle.wait(number + 1).input == pytest.approx(plan[1])
         vehicle.leave()
         with pytest.raises(MavlinkError, match="ended"):
             vehicle.wait(number + 5)
 
-        heir = stack.enter_context(actor(url, second))
-        period = heir.current_period
+        next_vehicle = stack.enter_context(actor(url, second))
+        period = next_vehicle.current_period
         assert period.number >= number + QUADROTOR.horizon, "the periods went on"
         assert np.linalg.norm(period.report.measured[3:6]) < 0.3 and not period.lost, "it hovers"
         assert period.report.measured[0] > 0.5 and autopilot.pilot.mode is Mode.OFFBOARD, "where the plan ended"
-        heir.wait(heir.current_period.number + 6)
-        assert heir.figures()["periods"] >= number
+        next_vehicle.wait(next_vehicle.current_period.number + 6)
+        assert next_vehicle.figures()["periods"] >= number
     times = np.array([frame.wall_time for frame in first + second]) * 1e-9
-    assert np.diff(times).max() < 0.3 + stalled(), "the next actor gets the frames of the time between"
+    assert np.diff(times).max() < 0.3 + stalled(), "the next actor gets the frames from the time without an actor"
     sent = setpoints(first + second)
-    assert set(np.round([m.vy for m in sent], 3)) == {0.0, 0.8, 1.5}, "nothing else was ever asked of it"
+    assert set(np.round([m.vy for m in sent], 3)) == {0.0, 0.8, 1.5}, "no other setpoints were sent"
 
 
-def test_one_vehicle_has_one_actor_and_a_server_that_ends_with_it(
+def test_a_vehicle_has_one_actor_at_a_time_and_its_server_ends_with_the_flight(
     monkeypatch: pytest.MonkeyPatch, flown: tuple[str, Autopilot]
 ) -> None:
     url, autopilot = flown
@@ -130,13 +130,13 @@ def test_one_vehicle_has_one_actor_and_a_server_that_ends_with_it(
         vehicle.wait(vehicle.current_period.number + 2)
         vehicle.leave()
         with actor(url, height=3.0) as other:
-            assert other.current_period.number < vehicle.current_period.number, "other settings: taken anew"
-    with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as knocking, pytest.raises(ConnectionRefusedError):
-        knocking.connect(address(url, 1))
-    until(lambda: autopilot.pilot.mode is not Mode.OFFBOARD, "the autopilot goes by its own timeout")
+            assert other.current_period.number < vehicle.current_period.number, "it is taken over anew"
+    with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as client_socket, pytest.raises(ConnectionRefusedError):
+        client_socket.connect(address(url, 1))
+    until(lambda: autopilot.pilot.mode is not Mode.OFFBOARD, "the autopilot leaves offboard mode by its own timeout")
 
 
-def test_an_actor_that_closes_in_full_flight_leaves_it_braked(flown: tuple[str, Autopilot]) -> None:
+def test_closing_a_flight_at_speed_brakes_the_vehicle(flown: tuple[str, Autopilot]) -> None:
     url, autopilot = flown
     frames: list[pb.MavlinkFrame] = []
     with actor(url, frames) as vehicle:
@@ -146,40 +146,43 @@ def test_an_actor_that_closes_in_full_flight_leaves_it_braked(flown: tuple[str, 
         assert np.linalg.norm(vehicle.current_period.report.measured[3:6]) > 0.5
     assert np.linalg.norm(autopilot.vehicle.state()[3:6]) < 0.3
     sent = setpoints(frames)
-    assert sent[-1].vy == 0.0, "told to its end"
+    assert sent[-1].vy == 0.0, "the plan was sent to its end"
 
 
-def test_who_is_taken_by_somebody_else_meanwhile_is_taken_control_of_anew(flown: tuple[str, Autopilot]) -> None:
+def test_a_vehicle_that_a_pilot_took_meanwhile_is_taken_over_anew(flown: tuple[str, Autopilot]) -> None:
     url, autopilot = flown
     with actor(url) as vehicle:
         vehicle.leave()
         autopilot.pilot.mode = Mode.HOLD
         time.sleep(0.5)
-        with actor(url) as heir:
-            heir.wait(heir.current_period.number + 5)
-            assert not heir.current_period.lost and autopilot.pilot.mode is Mode.OFFBOARD
+        with actor(url) as next_vehicle:
+            next_vehicle.wait(next_vehicle.current_period.number + 5)
+            assert not next_vehicle.current_period.lost and autopilot.pilot.mode is Mode.OFFBOARD
 
 
-def test_nobody_elses_processes_are_listened_to(monkeypatch: pytest.MonkeyPatch) -> None:
-    with listening("udpin:test", os.getpid()) as door, socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as knocking:
-        knocking.connect(address("udpin:test", os.getpid()))
-        assert same_user(knocking)
+def test_a_process_of_another_user_is_rejected(monkeypatch: pytest.MonkeyPatch) -> None:
+    with (
+        listening("udpin:test", os.getpid()) as listener,
+        socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as client_socket,
+    ):
+        client_socket.connect(address("udpin:test", os.getpid()))
+        assert same_user(client_socket)
         user = os.getuid()
         monkeypatch.setattr("os.getuid", lambda: user + 1)
         stop = threading.Event()
         threading.Timer(0.5, stop.set).start()
         began = time.monotonic()
-        assert next_actor(door, stop, None) is None and time.monotonic() - began > 0.3
-        assert knocking.recv(1) == b"", "it is hung up on"
+        assert next_actor(listener, stop, None) is None and time.monotonic() - began > 0.3
+        assert client_socket.recv(1) == b"", "the server hung up"
 
 
-def test_what_is_said_of_a_link_that_is_none(flown: tuple[str, Autopilot]) -> None:
+def test_an_invalid_link_is_an_error(flown: tuple[str, Autopilot]) -> None:
     with pytest.raises(ValueError, match="a link is"), actor("nonsense:1"):
         pass
 
 
-def test_a_robot_of_ones_own_file_is_flown(flown: tuple[str, Autopilot]) -> None:
-    """The server gets the description itself: it knows no name but those that come with the program."""
+def test_a_robot_with_a_description_of_its_own_can_fly(flown: tuple[str, Autopilot]) -> None:
+    """The request contains the whole description, since the server knows the names of the built-in robots only."""
     robot = replace(QUADROTOR, name="mine").in_real_time()
     request = FlightRequest(FlightSettings(flown[0], height=2.0), robot, ())
     vehicle = VehicleClient(request, lambda _: None, RejectedMessages(), lambda: False)
@@ -189,7 +192,7 @@ def test_a_robot_of_ones_own_file_is_flown(flown: tuple[str, Autopilot]) -> None
         vehicle.close()
 
 
-def test_what_is_no_command_is_lost_and_the_flight_goes_on(
+def test_an_invalid_command_is_skipped_and_the_flight_goes_on(
     flown: tuple[str, Autopilot], caplog: pytest.LogCaptureFixture
 ) -> None:
     rejected, horizon, url = RejectedMessages(), QUADROTOR.horizon, flown[0]
@@ -197,8 +200,8 @@ def test_what_is_no_command_is_lost_and_the_flight_goes_on(
     vehicle = VehicleClient(request, lambda _: None, rejected, lambda: False)
     with contextlib.closing(vehicle), caplog.at_level("INFO", "brakeline"):
         raw = vehicle._socket._socket
-        for junk in (b"\xff", b"\x80\x04\x95\x00.", b"x" * LARGEST, b"x" * (LARGEST + 1)):
-            raw.send(junk)
+        for payload in (b"\xff", b"\x80\x04\x95\x00.", b"x" * LARGEST, b"x" * (LARGEST + 1)):
+            raw.send(payload)
         for command in (pb.VehicleCommand(number=7), pb.VehicleCommand(number=8, fly=pb.FlightRequest(url=url))):
             vehicle._socket.send(command)
         number = vehicle.current_period.number + 2
@@ -211,18 +214,18 @@ def test_what_is_no_command_is_lost_and_the_flight_goes_on(
         for plan in (np.zeros((0, 3)), np.zeros((horizon + 1, 3))):
             with pytest.raises(BadMessage, match="a plan has"):
                 vehicle.commit(plan, number)
-        odd = pb.VehicleCommand(commit=pb.PlanCommit(period=number, plan=[0.0] * 4))
-        reply = vehicle._ask(odd)
+        misshapen = pb.VehicleCommand(commit=pb.PlanCommit(period=number, plan=[0.0] * 4))
+        reply = vehicle._ask(misshapen)
         assert reply is not None and reply.error.type == "BadMessage" and not reply.in_time
         after = vehicle.wait(vehicle.current_period.number + 3)
-        assert not after.input.any() and not after.lost, "nothing of it was flown"
-        assert vehicle.commit(np.full((1, 3), 0.3), after.number + 2), "a plan that is valid still is"
+        assert not after.input.any() and not after.lost, "no invalid plan was flown"
+        assert vehicle.commit(np.full((1, 3), 0.3), after.number + 2), "a valid plan still counts"
         until(lambda: rejected.count >= 11, "the server's count")
     lines = [record.message for record in caplog.records if "passed over" in record.message]
     assert lines and "vehicle command" in lines[0], "the actor's log says so"
 
 
-def test_what_is_no_flight_request_is_answered_and_the_next_actor_is_served(flown: tuple[str, Autopilot]) -> None:
+def test_an_invalid_flight_request_gets_an_error_and_the_next_actor_is_served(flown: tuple[str, Autopilot]) -> None:
     url, _ = flown
     server = subprocess.Popen([sys.executable, "-P", "-m", "brakeline.actors.mavlink.vehicle_server", url, "1"])
     try:
@@ -250,10 +253,10 @@ def test_what_is_no_flight_request_is_answered_and_the_next_actor_is_served(flow
         server.wait()
 
 
-def test_an_update_that_is_not_valid_is_lost_and_the_next_one_counts() -> None:
-    """A server that sends nonsense, and then falls silent: the actor gets an error and does not hang."""
+def test_an_invalid_update_is_skipped_and_the_next_one_counts() -> None:
+    """A server sends invalid messages and then falls silent: the actor gets an error and does not hang."""
     url, rejected = f"udpout:127.0.0.1:{os.getpid()}", RejectedMessages()
-    good = period_message(ControlPeriod(3, np.zeros(3), standing()))
+    good = period_message(ControlPeriod(3, np.zeros(3), still_period()))
     bad = [pb.ControlPeriod(), pb.ControlPeriod.FromString(good.SerializeToString())]
     bad[1].measured[4] = np.nan
 
@@ -277,7 +280,7 @@ def test_an_update_that_is_not_valid_is_lost_and_the_next_one_counts() -> None:
         request = FlightRequest(FlightSettings(url), QUADROTOR, ())
         vehicle = VehicleClient(request, lambda _: None, rejected, lambda: False)
         assert vehicle.current_period.number == 3 and rejected.count == 4
-        assert not vehicle.commit(np.zeros((1, 3)), 5), "no reply: as if it came too late"
+        assert not vehicle.commit(np.zeros((1, 3)), 5), "without a reply the plan counts as late"
         with pytest.raises(MavlinkError, match="period 4 does not begin"):
             vehicle.wait(4)
         silent.set()
@@ -287,10 +290,10 @@ def test_an_update_that_is_not_valid_is_lost_and_the_next_one_counts() -> None:
         thread.join()
 
 
-def test_an_actor_that_does_not_read_holds_up_nobody() -> None:
-    """Its messages wait in the outbox; once it is gone, the next actor gets the frames."""
+def test_an_actor_that_does_not_read_delays_nobody() -> None:
+    """Its messages wait in the outbox; once the actor is gone, the next one gets the frames."""
     near, far = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-    outbox, frames = Outbox(), [pb.MavlinkFrame(wall_time=n, raw=bytes(280)) for n in range(FRAMES_PER_UPDATE)]
+    outbox, frames = ActorOutbox(), [pb.MavlinkFrame(wall_time=n, raw=bytes(280)) for n in range(FRAMES_PER_UPDATE)]
     message = pb.VehicleMessage(update=pb.VehicleUpdate(frames=frames))
     assert message.ByteSize() < LARGEST
     outbox.actor = MessageSocket(near)
