@@ -129,6 +129,7 @@ class ActorRunner:
         offset: int,
         make: EnvironmentFactory,
         propose: PolicyFactory | None = None,
+        *,
         continuous: bool = False,
         env: Environment | None = None,
     ) -> None:
@@ -146,8 +147,15 @@ class ActorRunner:
         self.frames = FrameRecorder(publisher(FRAMES, robot=robot.name, source=actor), robot.name, actor)
         tap = self.frames.record if settings.mavlink else None
         env = env or make(robot, settings.arena, settings.seed, tap=tap)
-        filtered, ends_on_intervention = settings.method != "none", settings.method == "sailr"
-        self.runner = EpisodeRunner(robot, env, identity, settings.penalty, filtered, ends_on_intervention, continuous)
+        self.runner = EpisodeRunner(
+            robot,
+            env,
+            identity,
+            penalty=settings.penalty,
+            filtered=settings.method != "none",
+            ends_on_intervention=settings.method == "sailr",
+            continuous=continuous,
+        )
         if propose is None:
             learner = LearnerClient(process.bus, robot, actor, settings.lockstep)
             self.proposer: Proposer = RealTimePolicy(learner) if continuous else LearnedPolicy(learner)

@@ -92,6 +92,7 @@ class EpisodeRunner:
         robot: RobotWithTask,
         env: Environment,
         identity: ActorIdentity,
+        *,
         penalty: float = 0.0,
         filtered: bool = True,
         ends_on_intervention: bool = False,

@@ -115,12 +115,9 @@ class MavlinkDecoder:
             self._count(message.get_seq())
             if self._tap is not None:
                 self._tap(CapturedFrame(False, bytes(message.get_msgbuf()), message))
-            name = message.get_type()
-            for what, place in SENDERS.get(name, ()):
+            for what, place in SENDERS.get(message.get_type(), ()):
                 self._take(what, place, message)
-            handler = HANDLERS.get(message.get_msgId())
-            if handler is not None:
-                handler(self, message)
+            self._handle(message)
 
     def smooth(self, readings: int) -> None:
         """Average this many readings of the accelerometer from now on."""
@@ -157,59 +154,38 @@ class MavlinkDecoder:
         elif what == TRUTH:
             self.truth = value
 
-    def _on_heartbeat(self, message: Any) -> None:
-        if message.autopilot not in KINDS:
-            return
-        self.kind = KINDS[message.autopilot]
-        self.armed = bool(message.base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED)
-        self.emergency = message.system_status in (mavlink.MAV_STATE_CRITICAL, mavlink.MAV_STATE_EMERGENCY)
-        self.custom_mode = message.custom_mode
-        self.message_counts["mode"] += 1
-
-    def _on_ack(self, message: Any) -> None:
-        if message.result != mavlink.MAV_RESULT_IN_PROGRESS:
-            self._acks[message.command] = message.result
-
-    def _on_text(self, message: Any) -> None:
-        fresh = not self.texts or self.texts[-1] != message.text
-        self.texts.append(message.text)
-        if fresh and self._say is not None:
-            self._say(message.text)
-
-    def _on_estimator(self, message: Any) -> None:
-        self.estimator = message.flags
-
-    def _on_status(self, message: Any) -> None:
-        if 0 <= message.battery_remaining <= FULL:
-            self.battery = float(message.battery_remaining)
-
-    def _on_fence(self, message: Any) -> None:
-        side = SIDES.get(message.breach_type, "") or "geofence"
-        self.outside = side if message.breach_status else ""
-
-    def _on_parameter(self, message: Any) -> None:
-        value = message.param_value
-        if self.kind == "px4" and message.param_type == mavlink.MAV_PARAM_TYPE_INT32:  # its bits, not its value
-            value = struct.unpack("<i", struct.pack("<f", value))[0]
-        self._parameters[message.param_id], self._types[message.param_id] = float(value), message.param_type
-
-    def _on_time(self, message: Any) -> None:
-        if message.tc1 == 0:
-            return  # a request of the autopilot for our clock
-        self.answers.append((message.ts1, message.tc1))
+    def _handle(self, message: Any) -> None:
+        """Take in a message about the autopilot itself."""
+        match message.get_type():
+            case "HEARTBEAT" if message.autopilot in KINDS:
+                self.kind = KINDS[message.autopilot]
+                self.armed = bool(message.base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED)
+                self.emergency = message.system_status in (mavlink.MAV_STATE_CRITICAL, mavlink.MAV_STATE_EMERGENCY)
+                self.custom_mode = message.custom_mode
+                self.message_counts["mode"] += 1
+            case "COMMAND_ACK" if message.result != mavlink.MAV_RESULT_IN_PROGRESS:
+                self._acks[message.command] = message.result
+            case "STATUSTEXT":
+                if self._say is not None and self.texts[-1:] != [message.text]:
+                    self._say(message.text)
+                self.texts.append(message.text)
+            case "EKF_STATUS_REPORT" | "ESTIMATOR_STATUS":
+                self.estimator = message.flags
+            case "SYS_STATUS" if 0 <= message.battery_remaining <= FULL:
+                self.battery = float(message.battery_remaining)
+            case "FENCE_STATUS":
+                side = SIDES.get(message.breach_type, "") or "geofence"
+                self.outside = side if message.breach_status else ""
+            case "PARAM_VALUE":
+                value = message.param_value
+                if self.kind == "px4" and message.param_type == mavlink.MAV_PARAM_TYPE_INT32:  # the integer's bits
+                    value = struct.unpack("<i", struct.pack("<f", value))[0]
+                self._parameters[message.param_id] = float(value)
+                self._types[message.param_id] = message.param_type
+            case "TIMESYNC" if message.tc1 != 0:  # 0: the autopilot asks for our clock
+                self.answers.append((message.ts1, message.tc1))
 
 
-HANDLERS: dict[int, Callable[[MavlinkDecoder, Any], None]] = {
-    mavlink.MAVLINK_MSG_ID_HEARTBEAT: MavlinkDecoder._on_heartbeat,
-    mavlink.MAVLINK_MSG_ID_COMMAND_ACK: MavlinkDecoder._on_ack,
-    mavlink.MAVLINK_MSG_ID_STATUSTEXT: MavlinkDecoder._on_text,
-    mavlink.MAVLINK_MSG_ID_EKF_STATUS_REPORT: MavlinkDecoder._on_estimator,
-    mavlink.MAVLINK_MSG_ID_ESTIMATOR_STATUS: MavlinkDecoder._on_estimator,
-    mavlink.MAVLINK_MSG_ID_SYS_STATUS: MavlinkDecoder._on_status,
-    mavlink.MAVLINK_MSG_ID_FENCE_STATUS: MavlinkDecoder._on_fence,
-    mavlink.MAVLINK_MSG_ID_PARAM_VALUE: MavlinkDecoder._on_parameter,
-    mavlink.MAVLINK_MSG_ID_TIMESYNC: MavlinkDecoder._on_time,
-}
 SENDERS: dict[str, list[tuple[str, int]]] = {}  # by message: the quantities in it, each with its index in SOURCES
 for _what, _sources in SOURCES.items():
     for _place, _source in enumerate(_sources):

@@ -70,6 +70,7 @@ class MavlinkVehicle:
         self,
         link: Link,
         robot: Robot,
+        *,
         system: int = 1,
         height: float = 3.0,
         origin: tuple[float, float, float] = (0.0, 0.0, 0.0),

@@ -154,16 +154,16 @@ class VehicleServer:
         self._vehicle = MavlinkVehicle(
             open_link(flight.url),
             self._robot,
-            flight.system,
-            flight.height,
-            flight.origin,
-            UdpGroundTruth(flight.truth, flight.system, self._rejected) if flight.truth else None,
-            self._store_frame,
-            self._rejected,
-            lambda: stop.is_set() or actor.poll(),
-            flight.raise_limits,
-            MavlinkGroundTruth(lambda position: float(shapes.distance(position).min()) - footprint),
-            flight.lead,
+            system=flight.system,
+            height=flight.height,
+            origin=flight.origin,
+            truth=UdpGroundTruth(flight.truth, flight.system, self._rejected) if flight.truth else None,
+            tap=self._store_frame,
+            rejected=self._rejected,
+            stop=lambda: stop.is_set() or actor.poll(),
+            raise_limits=flight.raise_limits,
+            mavlink_truth=MavlinkGroundTruth(lambda position: float(shapes.distance(position).min()) - footprint),
+            lead=flight.lead,
         )
         threading.Thread(target=self._send_updates, name="updates", daemon=True).start()
 

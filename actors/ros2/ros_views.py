@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from brakeline.messaging.obstacle import BOX, CYLINDER, Obstacle
 from brakeline.messaging.ros2.cdr_messages import (
@@ -19,8 +19,6 @@ from brakeline.messaging.ros2.cdr_messages import (
     Marker,
     MarkerArray,
     MeshFile,
-    Point,
-    Pose,
     header,
     point,
     pose,
@@ -28,8 +26,6 @@ from brakeline.messaging.ros2.cdr_messages import (
 )
 from brakeline.safety.filter.request import ADJUSTED, ALLOWED, FAILSAFE, Decision
 from brakeline.safety.service.wire import KINDS
-
-Array = NDArray[np.float64]
 
 OBSTACLE_HEIGHT = 0.2  # m
 THICKNESS = 0.01  # m, of lines and of the tube's boxes
@@ -41,75 +37,69 @@ COLORS = {
     FAILSAFE: (0.84, 0.19, 0.24),
 }
 OTHER = (0.5, 0.3, 0.7)
-CUBE, ROUND, LINE = Marker.CUBE, Marker.CYLINDER, Marker.LINE_STRIP
+NO_DATA = np.zeros(0, dtype=np.uint8)
+CLEAR = Marker(  # deletes all earlier markers
+    header=header(0.0, ""),
+    ns="",
+    id=0,
+    type=Marker.CUBE,
+    action=Marker.DELETEALL,
+    pose=pose(0.0, 0.0),
+    scale=vector(),
+    color=OBSTACLE,
+    lifetime=LIFETIME,
+    frame_locked=False,
+    points=[],
+    colors=[],
+    texture_resource="",
+    texture=CompressedImage(header=header(0.0, ""), format="", data=NO_DATA),
+    uv_coordinates=[],
+    text="",
+    mesh_resource="",
+    mesh_file=MeshFile(filename="", data=NO_DATA),
+    mesh_use_embedded_materials=False,
+)
 
 
 def markers(time: float, frame: str, decision: Decision, obstacles: Sequence[Obstacle]) -> MarkerArray:
     """Return the boxes of the tube, the path through their centers, and the obstacles (time in s)."""
-    centers, halves = decision.tube_center, decision.tube_half_width
     red, green, blue = COLORS.get(decision.kind, OTHER)
-    tube, plan = ColorRGBA(r=red, g=green, b=blue, a=0.35), ColorRGBA(r=red, g=green, b=blue, a=1.0)
-    shown = [
-        _marker(time, frame, "tube", i, CUBE, pose(*center), (*(2.0 * half), THICKNESS), tube)
-        for i, (center, half) in enumerate(zip(centers.tolist(), halves, strict=True))
+    clear = replace(CLEAR, header=header(time, frame))
+    box = replace(clear, action=Marker.ADD, ns="tube", color=ColorRGBA(r=red, g=green, b=blue, a=0.35))
+    centers, widths = decision.tube_center.tolist(), (2.0 * decision.tube_half_width).tolist()
+    tube = [
+        replace(box, id=i, pose=pose(*center), scale=vector(*width, THICKNESS))
+        for i, (center, width) in enumerate(zip(centers, widths, strict=True))
     ]
-    path = [point(x, y, THICKNESS) for x, y in centers.tolist()]
-    shown.append(_marker(time, frame, "plan", 0, LINE, pose(0.0, 0.0), (THICKNESS, 0.0, 0.0), plan, path))
-    for i, obstacle in enumerate(obstacles):
-        shown.append(_obstacle(time, frame, i, obstacle))
-    return MarkerArray(markers=[_clear(time, frame), *shown])  # type: ignore[list-item]
-
-
-def _obstacle(time: float, frame: str, number: int, obstacle: Obstacle) -> Marker:
-    x, y = obstacle.position
-    place = pose(x, y, obstacle.yaw, 0.5 * OBSTACLE_HEIGHT)
-    if obstacle.kind == BOX:
-        return _marker(time, frame, "obstacles", number, CUBE, place, (*obstacle.size[:2], OBSTACLE_HEIGHT), OBSTACLE)
-    assert obstacle.kind == CYLINDER, "a scan gives boxes and discs"
-    width = 2.0 * obstacle.size[0]
-    return _marker(time, frame, "obstacles", number, ROUND, place, (width, width, OBSTACLE_HEIGHT), OBSTACLE)
-
-
-def _clear(time: float, frame: str) -> Marker:
-    """Return the marker that deletes all earlier ones."""
-    return _marker(time, frame, "", 0, CUBE, pose(0.0, 0.0), (0.0, 0.0, 0.0), OBSTACLE, action=Marker.DELETEALL)
-
-
-def _marker(
-    time: float,
-    frame: str,
-    group: str,
-    number: int,
-    kind: int,
-    place: Pose,
-    scale: tuple[float, ...],
-    color: ColorRGBA,
-    points: Sequence[Point] = (),
-    action: int = Marker.ADD,
-) -> Marker:
-    nothing = np.zeros(0, dtype=np.uint8)
-    image = CompressedImage(header=header(0.0, ""), format="", data=nothing)
-    return Marker(
-        header=header(time, frame),
-        ns=group,
-        id=number,
-        type=kind,
-        action=action,
-        pose=place,
-        scale=vector(*map(float, scale)),
-        color=color,
-        lifetime=LIFETIME,
-        frame_locked=False,
-        points=list(points),
-        colors=[],
-        texture_resource="",
-        texture=image,
-        uv_coordinates=[],
-        text="",
-        mesh_resource="",
-        mesh_file=MeshFile(filename="", data=nothing),
-        mesh_use_embedded_materials=False,
+    plan = replace(
+        box,
+        ns="plan",
+        type=Marker.LINE_STRIP,
+        color=ColorRGBA(r=red, g=green, b=blue, a=1.0),
+        scale=vector(THICKNESS),
+        points=[point(x, y, THICKNESS) for x, y in centers],
     )
+    shapes = [
+        replace(
+            box,
+            ns="obstacles",
+            id=i,
+            type=Marker.CUBE if obstacle.kind == BOX else Marker.CYLINDER,
+            color=OBSTACLE,
+            pose=pose(*obstacle.position[:2], obstacle.yaw, 0.5 * OBSTACLE_HEIGHT),
+            scale=vector(*_widths(obstacle), OBSTACLE_HEIGHT),
+        )
+        for i, obstacle in enumerate(obstacles)
+    ]
+    return MarkerArray(markers=[clear, *tube, plan, *shapes])  # type: ignore[list-item]
+
+
+def _widths(obstacle: Obstacle) -> tuple[float, float]:
+    """Return the widths of a box or a disc [m]."""
+    if obstacle.kind == BOX:
+        return float(obstacle.size[0]), float(obstacle.size[1])
+    assert obstacle.kind == CYLINDER, "a scan gives boxes and discs"
+    return 2.0 * float(obstacle.size[0]), 2.0 * float(obstacle.size[0])
 
 
 def diagnostics(

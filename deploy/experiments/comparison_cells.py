@@ -128,7 +128,7 @@ def _driver(study: Study, trial: Trial, robot: RobotWithTask, seed: int, actor: 
     identity, filtered = ActorIdentity(actor, 0, study.seed), trial.method != NONE
     # at an intervention training calls the episode off; an evaluation goes on, or its goal rate would mean nothing
     cuts = trial.method == SAILR and trial.policy == LEARNING
-    return EpisodeRunner(robot, env, identity, study.penalty, filtered, cuts)
+    return EpisodeRunner(robot, env, identity, penalty=study.penalty, filtered=filtered, ends_on_intervention=cuts)
 
 
 def _question(models: dict[str, Model], method: str) -> Ask | None:

@@ -67,8 +67,8 @@ def fly(robot: Robot, url: str, seed: int, settings: FirstFlightSettings) -> Fou
         vehicle = MavlinkVehicle(
             open_link(url),
             robot,
-            settings.system,
-            settings.height,
+            system=settings.system,
+            height=settings.height,
             stop=stop.is_set,
             raise_limits=settings.raise_limits,
             lead=settings.lead,

@@ -46,7 +46,9 @@ def test_it_is_found_out_flown_and_given_back(kind: str, tmp_path: Path, caplog:
     caplog.set_level(logging.INFO)
     frames: list[CapturedFrame] = []
     with autopilot(kind, tmp_path) as (url, system):
-        vehicle = MavlinkVehicle(open_link(url), QUADROTOR, system, height=5.0, tap=frames.append, raise_limits=True)
+        vehicle = MavlinkVehicle(
+            open_link(url), QUADROTOR, system=system, height=5.0, tap=frames.append, raise_limits=True
+        )
         try:
             client = vehicle._client
             assert client.kind == kind and set(client.chosen.values()) >= USED.get(kind, set()), vehicle.notes
@@ -95,7 +97,7 @@ def test_it_is_found_out_flown_and_given_back(kind: str, tmp_path: Path, caplog:
 def test_an_ardupilot_that_is_led_stays_where_it_was_led_to_when_nothing_more_comes(tmp_path: Path) -> None:
     """Told velocities, a version without GUID_TIMEOUT flies on for 3 s: 12 m."""
     with autopilot("ardupilot", tmp_path) as (url, system):
-        vehicle = MavlinkVehicle(open_link(url), QUADROTOR, system, height=5.0, raise_limits=True, lead=True)
+        vehicle = MavlinkVehicle(open_link(url), QUADROTOR, system=system, height=5.0, raise_limits=True, lead=True)
         try:
             flown = [vehicle.step(np.array([3.0, 0.0, 0.0])) for _ in range(20)][-1].measured
             assert flown[3:6] == pytest.approx([3.0, 0.0, 0.0], abs=0.6)
