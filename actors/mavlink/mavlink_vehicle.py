@@ -55,13 +55,13 @@ class ControlPeriod:
 class MavlinkVehicle:
     """A quadrotor in real time on a link, with any autopilot that speaks MAVLink, simulated or not.
 
-    Periods follow each other by the clock. `commit` hands over a plan: one input for each period that has not begun.
-    The vehicle's thread sends each input at its time, sends it again every `RESEND` seconds, and reads telemetry. The
-    thread carries out a plan that nobody replaces to its end, and then sends zero: hover. If the process dies, the
-    autopilot's own timeout brakes the vehicle. An actor therefore runs the vehicle in a second process, which outlives
-    the actor (`brakeline.actors.mavlink.vehicle_client`). If the vehicle leaves offboard or guided mode (pilot,
-    failsafe, battery,
-    fence), we do not take it back; the periods until it returns by itself are `lost`.
+    Periods follow each other by the clock. `commit` takes a plan: one input for each period that has not begun. The
+    vehicle's thread sends each input at its time, sends it again every `RESEND` seconds, and reads telemetry. It flies
+    a plan to its end unless another plan replaces it, and then sends zero: the vehicle hovers.
+
+    If the process dies, the autopilot's own timeout brakes the vehicle. An actor therefore runs the vehicle in a second
+    process, which outlives the actor (`brakeline.actors.mavlink.vehicle_client`). If the vehicle leaves offboard or
+    guided mode (pilot, failsafe, battery, fence), we do not take it back; periods are `lost` until it returns.
 
     Collisions and clearance come from the ground truth of a simulator, if there is one.
     """
@@ -96,8 +96,7 @@ class MavlinkVehicle:
             stop: once it returns true, nothing here waits any more.
             raise_limits: set each autopilot parameter that is below the robot's bounds.
             mavlink_truth: the ground truth of the autopilot's own simulator; without effect if `truth` is given.
-            lead: send positions ahead of the vehicle instead of velocities
-            (`brakeline.actors.mavlink.position_lookahead`).
+            lead: send positions ahead of the vehicle instead of velocities (`position_lookahead`).
 
         Raises:
             MavlinkError: no autopilot answers, it refuses something, or `stop` returned true.

@@ -122,7 +122,7 @@ class VehicleClient:
         return self._figures
 
     def close(self) -> None:
-        """Let go of the vehicle: its server brakes unless the vehicle hovers, and ends."""
+        """Give up the vehicle: its server brakes unless the vehicle hovers, and ends."""
         with contextlib.suppress(OSError):
             self._socket.send(pb.VehicleCommand(close=True))
         self._listener.join(CLOSE_TIMEOUT)  # until the server's last message

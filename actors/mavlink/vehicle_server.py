@@ -1,14 +1,11 @@
-"""PROCESS: keeps one vehicle in flight for its actor, and outlives the actor.
+"""PROCESS: fly one vehicle for an actor, and outlive the actor.
 
-The process has the link and the clock, and carries out the plans that the actor commits. It does nothing else: no
-policy and no bus can hold it up. If the actor dies, the process flies the committed plan, which was verified, to its
-end. The vehicle then hovers until the next actor takes over. If none comes, the process lets go of the vehicle.
+The process has the link and the clock, and flies the plans that the actor commits. It does nothing else, so that no
+policy and no bus can delay it. If the actor dies, the process flies the committed plan, which was verified, to its
+end. The vehicle then hovers until the next actor takes over. If none comes, the process gives up the vehicle.
 
-The actor's side is `brakeline.actors.mavlink.vehicle_client`; their socket is in
-`brakeline.actors.mavlink.vehicle_socket`, their messages are in
-`brakeline.actors.mavlink.vehicle_messages`. The process drops a message that is not valid, says so in the log, and
-flies on: without a
-valid plan the vehicle brakes.
+The actor's side is `vehicle_client`; their socket is in `vehicle_socket`, their messages are in `vehicle_messages`. The
+process skips an invalid message, logs it, and flies on: without a valid plan the vehicle brakes.
 """
 
 from __future__ import annotations
@@ -221,7 +218,7 @@ class VehicleServer:
         return self._vehicle.current_period.lost
 
     def close(self) -> None:
-        """Brake unless the vehicle hovers, let go of it, and send the last update."""
+        """Brake unless the vehicle hovers, give it up, and send the last update."""
         vehicle = self._vehicle
         try:
             if not (vehicle.idle or self.gone):
@@ -322,7 +319,7 @@ def main() -> int:
             return _serve_actors(listener, url, system, outbox, stop)
     except Exception as error:
         if outbox.actor is None:
-            log.error("the vehicle server lets go of the vehicle: %s", error)
+            log.error("the vehicle server gives up the vehicle: %s", error)
         outbox.put(pb.VehicleMessage(failure=error_message(error)))
         return 1
     finally:
