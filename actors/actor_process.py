@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
-from brakeline.actors.actor_settings import PhysicsChange as PhysicsChange
+from brakeline.actors.actor_settings import PhysicsChange
 from brakeline.actors.decision_guard import Ask, DecisionOutcome
 from brakeline.actors.episode_runner import (
     EPISODE_STRIDE,

@@ -30,7 +30,7 @@ from brakeline.actors.actor_process import (
     EnvironmentFactory,
     run_period,
 )
-from brakeline.actors.actor_settings import FlightSettings as FlightSettings
+from brakeline.actors.actor_settings import FlightSettings
 from brakeline.actors.decision_guard import Ask, DecisionOutcome, request_decisions
 from brakeline.actors.mavlink.frame_log import FrameTap
 from brakeline.actors.mavlink.frame_recorder import MessageSink

@@ -39,6 +39,7 @@ ATTEMPTS = 3  # to take over or to take off
 HANDOVER_TIMEOUT = 45.0  # s for a server whose actor died to bring the vehicle to rest
 POLL = 0.1  # s between two checks whether to go on waiting
 ENDED = "the vehicle server has ended"
+SERVER = "brakeline.actors.mavlink.vehicle_server"
 
 
 class VehicleClient:
@@ -161,14 +162,7 @@ class VehicleClient:
         deadline, process = time.monotonic() + START_TIMEOUT, None
         while (connection := connect(flight.url, flight.system)) is None:
             if process is None:
-                words = [
-                    sys.executable,
-                    "-P",
-                    "-m",
-                    "brakeline.actors.mavlink.vehicle_server",
-                    flight.url,
-                    str(flight.system),
-                ]
+                words = [sys.executable, "-P", "-m", SERVER, flight.url, str(flight.system)]
                 # A session of its own: ^C is for the actor, which then brakes and closes the flight.
                 process = self._process = subprocess.Popen(words, start_new_session=True)
             if process.poll() is not None or time.monotonic() > deadline or stop():

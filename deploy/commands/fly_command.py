@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from brakeline.actors.flight_process import FlightSettings
+from brakeline.actors.actor_settings import FlightSettings
 from brakeline.deploy.commands.common_options import (
     ArenaName,
     FlightOptions,

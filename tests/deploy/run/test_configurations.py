@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from brakeline.actors.actor_process import PhysicsChange
+from brakeline.actors.actor_settings import PhysicsChange
 from brakeline.deploy.commands.fly_command import FlyCommand
 from brakeline.deploy.commands.train_command import TrainCommand
 from brakeline.deploy.policy_loading import policy_named
