@@ -81,18 +81,18 @@ def scene(buses, data_folder):
 
 def test_a_practised_stop_follows_its_plan_as_long_as_the_plan_holds():
     """Near an obstacle the filter may prefer another input; following it would leave no complete stop in the log."""
-    driver = SimpleNamespace(robot=GROUND, backup_plan=BackupPlan(GROUND), rng=np.random.default_rng(0))
-    driver.backup_plan.accept(np.full((GROUND.horizon, 2), 0.2), "a model", None, True)
+    runner = SimpleNamespace(robot=GROUND, backup_plan=BackupPlan(GROUND), rng=np.random.default_rng(0))
+    runner.backup_plan.accept(np.full((GROUND.horizon, 2), 0.2), "a model", None, True)
     answers = {kind: SimpleNamespace(kind=kind) for kind in ("allowed", "adjusted", "failsafe", "recovering")}
     asked = {kind: DecisionOutcome(pb.Request(), pb.Reply(), answer, "", 1.0) for kind, answer in answers.items()}
     practice, never = StopPractice(1.0), StopPractice(0.0)
     for one in (practice, never):
-        one.proposal(driver, np.zeros(2))
-    assert [kind for kind, outcome in asked.items() if practice.outcome(driver, outcome).answer] == ["allowed"]
-    assert practice.outcome(driver, asked["adjusted"]).failure == STOP_PRACTICE
-    assert all(never.outcome(driver, outcome) is outcome for outcome in asked.values())
-    driver.backup_plan.accept(np.full((GROUND.horizon, 2), 0.2), "a model", None, False)
-    assert all(practice.outcome(driver, outcome) is outcome for outcome in asked.values())
+        one.proposal(runner, np.zeros(2))
+    assert [kind for kind, outcome in asked.items() if practice.outcome(runner, outcome).answer] == ["allowed"]
+    assert practice.outcome(runner, asked["adjusted"]).failure == STOP_PRACTICE
+    assert all(never.outcome(runner, outcome) is outcome for outcome in asked.values())
+    runner.backup_plan.accept(np.full((GROUND.horizon, 2), 0.2), "a model", None, False)
+    assert all(practice.outcome(runner, outcome) is outcome for outcome in asked.values())
 
 
 def test_one_question_is_about_all_robots_of_a_process(scene):

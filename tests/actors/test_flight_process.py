@@ -51,16 +51,16 @@ def test_in_real_time_recovery_continues_period_after_period() -> None:
     env = NavigationEnv(
         robot, "default", make, draw=lambda *_: staged_arena(start=(0.0, 0.0, 3.0), goal=(-4.0, -4.0, 3.0), height=6.0)
     )
-    driver = EpisodeRunner(robot, env, ActorIdentity("actor", 0, 0))
-    driver.begin(0)
+    runner = EpisodeRunner(robot, env, ActorIdentity("actor", 0, 0))
+    runner.begin(0)
     kinds = []
     for _ in range(25):
-        driver.info["obstacles"] = (
+        runner.info["obstacles"] = (
             Obstacle("sphere", (0.5, 0.0, 3.0), (0.6,)),
         )  # a virtual one, which it is inside of
-        outcome = driver.decide(np.zeros(3), question)
+        outcome = runner.decide(np.zeros(3), question)
         assert outcome is not None and outcome.answer is not None
         kinds.append(outcome.answer.kind)
-        driver.execute(np.zeros(3), outcome)
+        runner.execute(np.zeros(3), outcome)
     on_the_way = kinds[: len(kinds) - kinds[::-1].index("recovering")]
     assert set(on_the_way) == {"recovering"} and len(on_the_way) >= 2 and kinds[-1] == "allowed", kinds

@@ -50,8 +50,8 @@ def begin_close_together(fleet, seed=0):
         angle = 2.0 * np.pi * i / size
         robot._qpos[:2] = spot + 0.4 * np.array([np.cos(angle), np.sin(angle)])
         robot.wake(None, np.random.default_rng(i))
-        driver = fleet.runners[i]
-        driver.info = driver.info | {"state": robot.measured, "others": fleet.world.others(i)}
+        runner = fleet.runners[i]
+        runner.info = runner.info | {"state": robot.measured, "others": fleet.world.others(i)}
 
 
 def least_distance(fleet):
@@ -77,8 +77,8 @@ def drive(fleet, ask, policy, periods, lost=0.0, seed=0):
         steps = fleet.execute(proposals, outcomes)
         kinds += [step.decision for step in steps if step is not None]
         least = min(least, least_distance(fleet))
-        for driver in fleet.runners:
-            driver.running = True  # this test goes on after goals and timeouts
+        for runner in fleet.runners:
+            runner.running = True  # this test goes on after goals and timeouts
     return least, kinds
 
 
@@ -113,7 +113,7 @@ def test_without_answers_all_robots_stop_within_their_reservations(ask):
     fleet = fleet_of()
     begin_close_together(fleet)
     drive(fleet, ask, "random", 15)
-    reservations = [driver.backup_plan.reservation for driver in fleet.runners]
+    reservations = [runner.backup_plan.reservation for runner in fleet.runners]
     silent = request_decisions(
         lambda requests: (_ for _ in ()).throw(NoReply("gone")), fleet.requests([np.zeros(2)] * SIZE), GROUND
     )
@@ -204,7 +204,7 @@ def test_if_one_robot_has_no_answer_none_has(ask):
         replies[2] = pb.Reply()
         return replies
 
-    before = [driver.backup_plan.plan.copy() for driver in fleet.runners]
+    before = [runner.backup_plan.plan.copy() for runner in fleet.runners]
     (outcomes,) = decide([fleet], [[np.array([0.2, 0.1])] * SIZE], garbled)
     steps = fleet.execute([np.zeros(2)] * SIZE, outcomes)
     assert all("no answer about robot.2" in outcomes[i].failure for i in (0, 1, 3))
