@@ -68,8 +68,8 @@ def markers(time: float, frame: str, decision: Decision, obstacles: Sequence[Obs
     box = replace(clear, action=Marker.ADD, ns="tube", color=ColorRGBA(r=red, g=green, b=blue, a=0.35))
     centers, widths = decision.tube_center.tolist(), (2.0 * decision.tube_half_width).tolist()
     tube = [
-        replace(box, id=i, pose=pose(*center), scale=vector(*width, THICKNESS))
-        for i, (center, width) in enumerate(zip(centers, widths, strict=True))
+        replace(box, id=i, pose=pose(x, y), scale=vector(length, width, THICKNESS))
+        for i, ((x, y), (length, width)) in enumerate(zip(centers, widths, strict=True))
     ]
     plan = replace(
         box,
@@ -86,7 +86,7 @@ def markers(time: float, frame: str, decision: Decision, obstacles: Sequence[Obs
             id=i,
             type=Marker.CUBE if obstacle.kind == BOX else Marker.CYLINDER,
             color=OBSTACLE,
-            pose=pose(*obstacle.position[:2], obstacle.yaw, 0.5 * OBSTACLE_HEIGHT),
+            pose=pose(obstacle.position[0], obstacle.position[1], obstacle.yaw, 0.5 * OBSTACLE_HEIGHT),
             scale=vector(*_widths(obstacle), OBSTACLE_HEIGHT),
         )
         for i, obstacle in enumerate(obstacles)
