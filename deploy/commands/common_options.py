@@ -202,11 +202,11 @@ class RunBusOptions:
 
     def settings(self, config: RunConfig, folder: Path) -> BusSettings:
         """Return the bus settings of the launcher. Makes the run's own keys if the run needs any."""
-        from brakeline.deploy.run.run_keys import own_keys
+        from brakeline.deploy.run.run_keys import make_run_keys
         from brakeline.messaging.bus import BusSettings
         from brakeline.messaging.free_ports import free_endpoint
 
-        keys = self.keys or default_keys() or (own_keys(config, folder) if self.secured else None)
+        keys = self.keys or default_keys() or (make_run_keys(config, folder) if self.secured else None)
         endpoint = self.listen or free_endpoint("tcp" if keys is None else "tls")
         return BusSettings(listen=(endpoint,), keys=keys, insecure=self.insecure, metrics=self.metrics)
 
@@ -219,10 +219,10 @@ def default_keys() -> Path | None:
 
 def bus_of(run: Path) -> BusSettings:
     """Return the settings with which a client joins the bus of a run on this machine. Raises ValueError."""
-    from brakeline.deploy.run.processes import client_of
+    from brakeline.deploy.run.processes import client_settings
 
     try:
-        return client_of(run)
+        return client_settings(run)
     except (OSError, ValueError, KeyError) as error:
         raise ValueError(f"no run at {run}: give --connect tls/HOST:PORT, or start `brakeline train`") from error
 

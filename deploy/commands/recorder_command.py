@@ -28,11 +28,10 @@ class RecorderCommand:
 
     def run(self) -> int:
         """Record until SIGINT or SIGTERM. Returns the exit status."""
-        from brakeline.deploy.run.mavlink_json import as_json, both
+        from brakeline.deploy.run.log_contents import derive_entries
         from brakeline.logs import recorder
-        from brakeline.logs.foxglove import FoxgloveConverter
 
         metadata = {"versions": {"brakeline": version("brakeline")}}
-        derive = both(FoxgloveConverter(self.pictures).from_sample, as_json) if self.pictures > 0.0 else as_json
+        derive = derive_entries(self.pictures)
         recorder.main(self.endpoints.bus(), self.log, metadata, self.name, derive=derive, rotation=self.rotation)
         return 0

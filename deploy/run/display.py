@@ -13,7 +13,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 from rich.text import Text
 
-from brakeline.deploy.run.run_view import View
+from brakeline.deploy.run.run_view import RunView
 from brakeline.logs.report import show
 from brakeline.logs.tube_stats import stated
 
@@ -44,7 +44,7 @@ class Display:
         if self._live is not None:
             self._live.stop()
 
-    def __call__(self, view: View) -> None:
+    def __call__(self, view: RunView) -> None:
         if self._live is None and (now := doing(view)) != self._said:
             self._said = now
             self.console.print(now, markup=False)
@@ -61,12 +61,12 @@ class Display:
             self.console.print(line(figures))
 
 
-def doing(view: View) -> str:
+def doing(view: RunView) -> str:
     """What the run is at: most of its first half minute goes into starting processes."""
     if view.ending:
         return "ending every process in order"
     heard = view.metrics.processes.copy()
-    starting = [child.place.name for child in view.children if child.place.name not in heard and not child.finished]
+    starting = [child.spec.name for child in view.processes if child.spec.name not in heard and not child.finished]
     if starting:
         return f"starting {', '.join(starting)}"
     if not any(tally.steps for tally in view.metrics.actors.copy().values()) and view.config.actors:
@@ -86,7 +86,7 @@ def line(figures: dict[str, Any]) -> str:
     )
 
 
-def live(view: View, figures: dict[str, Any], bar: Progress) -> RenderableType:
+def live(view: RunView, figures: dict[str, Any], bar: Progress) -> RenderableType:
     """The whole picture: progress, the learning, the safety, the processes, the latest warnings."""
     parts: list[RenderableType] = [Text(doing(view), "bold"), bar, _run(figures), _processes(view)]
     if view.lines:
@@ -132,15 +132,15 @@ def _pair(times: dict[str, Any] | None) -> str:
     return "-" if times is None else f"{times['p50']:.2f} / {times['p99']:.2f} ms"
 
 
-def _processes(view: View) -> Table:
+def _processes(view: RunView) -> Table:
     table = Table(box=None, padding=(0, 2, 0, 0))
     for column in ("process", "state", "restarts"):
         table.add_column(column, style="dim" if column != "process" else "")
-    for child in view.children:
+    for child in view.processes:
         state = "[green]runs[/]" if child.alive else "done" if child.finished else "[red]down[/]"
-        if child.place.name not in view.metrics.processes and not child.restarts and not child.finished:
+        if child.spec.name not in view.metrics.processes and not child.restarts and not child.finished:
             state = "[yellow]starts[/]"
-        table.add_row(child.place.name, state, str(child.restarts))
+        table.add_row(child.spec.name, state, str(child.restarts))
     return table
 
 

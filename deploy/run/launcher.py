@@ -1,4 +1,4 @@
-"""Starts the processes of a run on this machine, watches and restarts them, shows what happens, and ends them all."""
+"""Start the processes of a run on this machine, supervise them, and end them in order."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from pathlib import Path
 from typing import Any
 
 from brakeline.deploy.data.model_store import method_for
-from brakeline.deploy.run.processes import CONFIG, LOG, places, say_where
+from brakeline.deploy.run.processes import CONFIG, LOG, process_specs, write_endpoint
 from brakeline.deploy.run.run_config import RunConfig, encode
-from brakeline.deploy.run.run_keys import KEYS, seal_models
-from brakeline.deploy.run.run_view import View
+from brakeline.deploy.run.run_keys import KEYS, sign_models
+from brakeline.deploy.run.run_view import RunView
 from brakeline.deploy.run.supervisor import LaunchError, SupervisedProcess, last_line
 from brakeline.logs.metrics import Metrics
 from brakeline.logs.recorded_robots import RecordedRobots
 from brakeline.logs.watch.run_totals import run_totals, totals_to_health
-from brakeline.messaging.bus import BusError, BusSettings, Sample
+from brakeline.messaging.bus import BusSettings, Sample
 from brakeline.messaging.process_runtime import Process
 from brakeline.messaging.rejected_messages import RejectedMessages, headline
 from brakeline.messaging.robot import robot_named
@@ -29,19 +29,20 @@ from brakeline.safety.service.plan_token import write_key
 
 log = logging.getLogger("brakeline.launcher")
 
-TURN = 0.1  # s
-END_PATIENCE = 10.0  # s from SIGTERM to SIGKILL: a checkpoint may be in progress
-RECORDER_PATIENCE = 30.0  # s until the run starts without a recorder: its disk may be full
-HEARD_OUT = 2.0  # s that is waited for the last message at most
-QUIET = 0.5  # s without a message after which the last one has come
+PERIOD = 0.1  # s between two looks at the processes
+TERMINATION_TIMEOUT = 10.0  # s from SIGTERM to SIGKILL: a process may be writing a checkpoint
+RECORDER_TIMEOUT = 30.0  # s after which the run starts without a recorder, whose disk may be full
+LAST_MESSAGES_TIMEOUT = 2.0  # s, longest wait for the last messages of processes that have ended
+SILENCE = 0.5  # s without a message after which the launcher takes the last message to have arrived
 FIGURES = "figures.json"
 
 
 def prepare(config: RunConfig, folder: Path, resume: bool) -> None:
-    """See that the folder can take the run, and that there are model sets.
+    """Make the run's folder, and the model sets if there are none.
 
     Raises:
-        LaunchError: the folder holds another run; TooLoose: a model set states more than is used without a question.
+        LaunchError: the folder holds another run.
+        TooLoose: the stated bound of a model set is above the accepted one.
     """
     if not resume and (folder / CONFIG).exists():
         raise LaunchError(f"{folder} holds a run already: give --resume {folder}, or another --out")
@@ -55,40 +56,43 @@ class Launcher:
     """A run from its first process to its last."""
 
     def __init__(self, config: RunConfig, folder: Path, bus: BusSettings) -> None:
-        """bus: where it listens, and the keys of all processes, if they have any."""
+        """bus: the endpoint to listen on, and the folder with the keys of all processes, if they have any."""
         self.config, self.folder, self.bus = config, folder, bus
-        self.children = [SupervisedProcess(place, folder) for place in places(config)]
+        self.processes = [SupervisedProcess(spec, folder) for spec in process_specs(config)]
         self.metrics = Metrics(robots=RecordedRobots(robot_named(name) for name in config.robots))
         self.lines: deque[str] = deque(maxlen=200)
         self._inbox: deque[Sample] = deque()
-        self._rejected = RejectedMessages()  # the bus's, once there is one
+        self._rejected = RejectedMessages()  # replaced by that of the bus when the run starts
 
-    def run(self, show: Callable[[View], Any] = lambda view: None) -> dict[str, Any]:
-        """Until the learners are done or SIGINT or SIGTERM; returns the figures, also saved in the run's folder.
+    def run(self, show: Callable[[RunView], Any] = lambda view: None) -> dict[str, Any]:
+        """Run until the learners are done, SIGINT or SIGTERM. Returns the figures, and saves them in the run's folder.
+
+        Args:
+            show: is called several times a second with the state of the run.
 
         Raises:
-            LaunchError: a process fails again and again; the others were ended in order.
-            Unreachable: the endpoint cannot be listened on.
+            LaunchError: a process failed several times in a row; the launcher has ended the others.
+            Unreachable: the launcher can't listen on the endpoint.
         """
-        view = View(self.config, self.folder, self.metrics, self.children, self.lines)
+        view = RunView(self.config, self.folder, self.metrics, self.processes, self.lines)
         failure: LaunchError | None = None
         with Process(self.bus, "launcher", stderr=False, reserved=True) as process:
             self._rejected = process.bus.rejected
             self._claim_folder()
             for topic in RECORDED:
                 process.bus.subscribe(topic, self._inbox.append)
-            process.refresh = lambda: self._tell(process)
+            process.refresh = lambda: self._update_health(process)
             try:
                 if self.config.record:
                     self._start_recorder(process, lambda: show(view))
                 process.announce()
                 while not process.stop.is_set() and not self.finished:
-                    for child in self.children:
+                    for child in self.processes:
                         if not self._must_wait(child):
-                            child.watch()
+                            child.supervise()
                     self._drain()
                     show(view)
-                    process.stop.wait(TURN)
+                    process.stop.wait(PERIOD)
             except LaunchError as error:
                 failure = error
                 log.error("%s", error)
@@ -106,10 +110,10 @@ class Launcher:
             raise failure
         return figures
 
-    def _tell(self, process: Process) -> None:
-        """Of the whole run, with each sign of life: who watches may have come in its middle."""
+    def _update_health(self, process: Process) -> None:
+        """Put the totals of the run into each health message, for viewers that connect in its middle."""
         config = self.config
-        process.figures.update({f"restarts {child.place.name}": child.restarts for child in self.children})
+        process.figures.update({f"restarts {child.spec.name}": child.restarts for child in self.processes})
         process.figures.update(totals_to_health(run_totals(self.metrics)))
         process.notes.update(
             {
@@ -122,7 +126,7 @@ class Launcher:
         )
 
     def figures(self) -> dict[str, Any]:
-        """As `analyse` would give them for the log, with what only the launcher knows."""
+        """Return the figures that `analyse` computes from the log, and those that only the launcher knows."""
         setup = {
             "method": self.config.method,
             "certificate": self.config.model_config.certificate if self.config.method == "ddpc" else None,
@@ -130,7 +134,7 @@ class Launcher:
             "arena": self.config.arena,
             "seed": self.config.seed,
         }
-        restarts = {child.place.name: child.restarts for child in self.children if child.restarts}
+        restarts = {child.spec.name: child.restarts for child in self.processes if child.restarts}
         log_path = str(self.folder / LOG) if self.config.record else None
         paths = {"folder": str(self.folder), "log": log_path, "policies": self.policies()}
         return (
@@ -143,54 +147,56 @@ class Launcher:
 
     @property
     def finished(self) -> bool:
-        """Have all learners done their work (where nobody learns, the robots)? Then nobody needs the others. Offline
-        they may be a few steps short of it when the logs end: what a learner that was interrupted had not saved."""
+        """Whether all learners, or with a fixed policy all actors, have done their work.
+
+        A run from logs alone has also finished when the logs end. Its learner may then lack a few steps, which an
+        interrupted learner had not saved.
+        """
         kinds = ("learner", "feeder", "actor")
-        done = {kind: [c.finished for c in self.children if c.place.kind == kind] for kind in kinds}
+        done = {kind: [c.finished for c in self.processes if c.spec.kind == kind] for kind in kinds}
         if self.config.policy:
             return all(done["actor"])
         return all(done["learner"]) or (self.config.actors == 0 and all(done["feeder"]))
 
     def _must_wait(self, child: SupervisedProcess) -> bool:
-        """Robots start when what the logs hold of their kind was learned from."""
-        feeders = (c for c in self.children if c.place.kind == "feeder" and c.place.robot == child.place.robot)
-        return child.place.kind == "actor" and not all(feeder.finished for feeder in feeders)
+        """Whether a process is an actor whose learner still learns from logs."""
+        feeders = (c for c in self.processes if c.spec.kind == "feeder" and c.spec.robot == child.spec.robot)
+        return child.spec.kind == "actor" and not all(feeder.finished for feeder in feeders)
 
     def _from_logs(self) -> dict[str, Any]:
-        """What was learned from logs, if anything was to be."""
+        """Return the figures of learning from logs; empty for a run without."""
         if not self.config.from_logs:
             return {}
-        fed: Counter[str] = Counter()
-        for child in self.children:
-            process = self.metrics.processes.get(child.place.name)
-            if child.place.kind == "feeder" and process is not None:
-                fed.update({name: int(count) for name, count in process.figures.items()})
-        return {"from_logs": {"logs": list(self.config.from_logs)} | dict(fed)}
+        steps: Counter[str] = Counter()
+        for child in self.processes:
+            process = self.metrics.processes.get(child.spec.name)
+            if child.spec.kind == "feeder" and process is not None:
+                steps.update({name: int(count) for name, count in process.figures.items()})
+        return {"from_logs": {"logs": list(self.config.from_logs)} | dict(steps)}
 
     def policies(self) -> list[str]:
-        """The policy files that were saved."""
+        """Return the saved policy files."""
         return [str(path) for path in sorted(self.folder.glob("learner*/policy.safetensors"))]
 
     def _claim_folder(self) -> None:
-        """Write what the processes read, and that this is the latest run."""
+        """Write the files that the processes read, and make runs/latest point to this run."""
         (self.folder / CONFIG).write_text(encode(self.config))
-        say_where(self.folder, self.bus)
+        write_endpoint(self.folder, self.bus)
         if self.bus.keys is None:
-            write_key(self.folder / KEYS)  # a plan that one service verified is so for the next
+            write_key(self.folder / KEYS)  # so that each service accepts the plans that another one verified
         else:
-            seal_models(self.config, self.folder, self.bus.keys)
+            sign_models(self.config, self.folder, self.bus.keys)
         latest = self.folder.parent / "latest"
         if latest.is_symlink() or not latest.exists():
             latest.unlink(missing_ok=True)
             latest.symlink_to(self.folder.name)
 
     def _start_recorder(self, process: Process, show: Callable[[], Any]) -> None:
-        """The recorder first, and not a word, of the launcher's either, before it listens: no message shall be missing
-        in the log."""
-        recorder = self.children[0]
-        deadline = time.monotonic() + RECORDER_PATIENCE
+        """Start the recorder and wait until it listens, so that the log misses no message, not even the launcher's."""
+        recorder = self.processes[0]
+        deadline = time.monotonic() + RECORDER_TIMEOUT
         while not process.stop.is_set() and time.monotonic() < deadline:
-            recorder.watch()
+            recorder.supervise()
             self._drain()
             show()
             known = self.metrics.processes.get("recorder")
@@ -199,46 +205,47 @@ class Launcher:
             process.stop.wait(0.05)
         else:
             if not process.stop.is_set():
-                log.error("the recorder does not record: %s", last_line(self.folder / "logs" / "recorder.log"))
+                log.error(
+                    "no recorder, so the run starts without a log: %s",
+                    last_line(self.folder / "logs" / "recorder.log"),
+                )
 
     def _drain(self) -> None:
+        """Take in the received messages."""
         while self._inbox:
             sample = self._inbox.popleft()
             with self._rejected.skip_on_error(sample.key):
                 message = sample.message()
                 self.metrics.add(sample.key, message)
                 if sample.topic.name == "health":
-                    for child in self.children:
-                        if child.place.name == message.process:
-                            child.heard(message.pid)
+                    for child in self.processes:
+                        if child.spec.name == message.process:
+                            child.record_sign_of_life(message.pid)
                 if sample.topic.name == "log" and message.level in ("WARNING", "ERROR"):
                     self.lines.append(f"{message.process}: {headline(message.text)}")
 
     def _end(self) -> None:
-        """Actors first, so that none is left without answers; the recorder last, so that all last words are logged."""
-        recorders = [child for child in self.children if child.place.kind == "recorder"]
-        actors = [child for child in self.children if child.place.kind == "actor"]
-        others = [child for child in self.children if child not in (*recorders, *actors)]
+        """End the actors first, so that none lacks answers, and the recorder last, so that it logs all messages."""
+        recorders = [child for child in self.processes if child.spec.kind == "recorder"]
+        actors = [child for child in self.processes if child.spec.kind == "actor"]
+        others = [child for child in self.processes if child not in (*recorders, *actors)]
         for group in filter(None, (actors, others, recorders)):
             for child in group:
                 child.terminate()
-            deadline = time.monotonic() + END_PATIENCE
+            deadline = time.monotonic() + TERMINATION_TIMEOUT
             while any(child.alive for child in group) and time.monotonic() < deadline:
                 self._drain()
                 time.sleep(0.02)
             for child in group:
                 child.end(deadline)
-            self._hear_out()
+            self._await_last_messages()
 
-    def _hear_out(self) -> None:
-        """Wait for the last words of those who have ended; who still lives may go on talking."""
+    def _await_last_messages(self) -> None:
+        """Wait for the last messages of ended processes. Others may go on to publish."""
         now = time.monotonic()
-        quiet, patience = now + QUIET, now + HEARD_OUT
-        while time.monotonic() < min(quiet, patience):
+        silent, deadline = now + SILENCE, now + LAST_MESSAGES_TIMEOUT
+        while time.monotonic() < min(silent, deadline):
             if self._inbox:
-                quiet = time.monotonic() + QUIET
+                silent = time.monotonic() + SILENCE
             self._drain()
             time.sleep(0.02)
-
-
-__all__ = ["BusError", "LaunchError", "Launcher", "View", "prepare"]

@@ -1,4 +1,4 @@
-"""What the log of a run holds besides messages: its configuration, versions, conditions, and the models in use."""
+"""Collect what the log of a run holds besides messages: configuration, versions, conditions, models, pictures."""
 
 from __future__ import annotations
 
@@ -7,16 +7,18 @@ from importlib.metadata import version
 from pathlib import Path
 
 from brakeline.deploy.data.data_paths import method_path
+from brakeline.deploy.run.mavlink_json import Derive, chain_derived, frames_as_json
 from brakeline.deploy.run.run_config import RunConfig, encode
+from brakeline.logs.foxglove import FoxgloveConverter
 from brakeline.logs.mcap_container import model_attachment_name
+from brakeline.logs.recorded_robots import RecordedRobots
 from brakeline.messaging.robot import robot_named
 from brakeline.messaging.task import robot_maybe_with_task
 from brakeline.safety.methods import DDPC, load
 
 
 def metadata(config: RunConfig) -> dict[str, dict[str, str]]:
-    """What the log says of its run, besides the messages."""
-    filtered = config.filtered
+    """Return the metadata of the log: named groups of named texts."""
     run = {
         "method": config.method,
         "policy": config.policy or "learning",
@@ -27,29 +29,41 @@ def metadata(config: RunConfig) -> dict[str, dict[str, str]]:
     if config.method == DDPC:
         run |= {"certificate": config.model_config.certificate, "mode": config.model_config.mode}
     packages = ("brakeline", "mujoco", "proxsuite", "numpy", "torch", "eclipse-zenoh", "mcap")
-    about = {
+    groups = {
         "run": run,
         "configuration": {"json": encode(config)},
         "versions": {name: version(name) for name in packages},
         "conditions": config.conditions.describe(),
     }
     robots = [robot_maybe_with_task(name) for name in config.robots]
-    about["robots"] = {robot.kind: json.dumps(robot.description) for robot in robots}
-    for robot in robots if filtered else ():
+    groups["robots"] = {robot.kind: json.dumps(robot.description) for robot in robots}
+    for robot in robots if config.filtered else ():
         model = load(method_path(robot, config.method, config.model_config))
-        about[f"model {robot.name}"] = {"version": model.version, **model.about}
-    return about
+        groups[f"model {robot.name}"] = {"version": model.version, **model.about}
+    return groups
 
 
 def attachments(config: RunConfig, folder: Path) -> dict[str, bytes]:
-    """The models in use when the log begins, or before (of a run that goes on), so that it alone can be replayed."""
+    """Return the files of all models that the run uses or has used, so that the log alone suffices for a replay."""
     if not config.filtered:
         return {}
-    models = (
-        load(method_path(robot_maybe_with_task(robot), config.method, config.model_config)) for robot in config.robots
-    )
-    files = {model_attachment_name(model.robot.name, model.version): model.encode() for model in models}
-    for robot in (robot_named(name).name for name in config.robots):
+    files = {}
+    for name in config.robots:
+        model = load(method_path(robot_maybe_with_task(name), config.method, config.model_config))
+        files[model_attachment_name(model.robot.name, model.version)] = model.encode()
+        robot = robot_named(name).name
         archived = (folder / robot / "models").glob("*.safetensors")
         files |= {model_attachment_name(robot, path.stem): path.read_bytes() for path in archived}
     return files
+
+
+def derive_entries(pictures: float, robots: RecordedRobots | None = None) -> Derive:
+    """Return the function that adds pictures for Foxglove, and MAVLink frames as JSON, to the log.
+
+    Args:
+        pictures: a second and robot; 0: none.
+        robots: the robots of the run, if they are known before the first message.
+    """
+    if pictures == 0.0:
+        return frames_as_json
+    return chain_derived(FoxgloveConverter(pictures, robots).from_sample, frames_as_json)

@@ -1,8 +1,7 @@
-"""PROCESS: publishes the steps of logs as actors would, each at the pace that the learner allows.
+"""PROCESS: publish the steps of logs as actors would, at the pace that the learner allows.
 
-The replay buffer is thus rebuilt from MCAP: offline, with no robot at all, or before live actors go on. Steps that the
-learner took in before an interruption are not published again: a log's actor, like a live one that comes back, goes on
-with the episode that the learner names.
+The learner thus rebuilds its replay buffer from MCAP: from logs alone, or before robots start. Like an actor that
+reconnects, a replayed actor resumes at the episode that the learner names, so the learner gets no step twice.
 """
 
 from __future__ import annotations
@@ -25,24 +24,26 @@ from brakeline.messaging.topics import LOGGED
 
 log = logging.getLogger("brakeline.feeder")
 
-LAST_UPDATES = 10.0  # s that the learner may take for the updates that are due after the last step
+LAST_UPDATES_TIMEOUT = 10.0  # s for the updates that the learner makes after the last step
 
 
 @dataclass(frozen=True)
 class FeederSettings:
+    """Settings of a feeder process."""
+
     bus: BusSettings
     logs: tuple[str, ...]  # files or folders
     robot: str = "ground"
     name: str = "feeder"
-    alone: bool = False  # no robot goes on after the logs
+    alone: bool = False  # no robot learns after the logs
 
 
 @dataclass
-class Steps:
-    """The steps of a robot kind in logs that a learner can take in, each once, in the order in which they came.
+class LoggedSteps:
+    """The steps of a robot kind in logs that a learner can use, each once, in the order of the log.
 
-    Actors of different runs are told apart: of the first they keep their names, of the n-th theirs end in `.run<n>`.
-    `counts` tells, once iterated: `taken`, `duplicate`, and `unusable` (sizes or values that nobody can learn from).
+    The names of actors of the n-th run, from the second on, end in `.run<n>`. After the iteration `counts` has the
+    numbers of `taken`, `duplicate` and `unusable` steps; an unusable step has wrong sizes or values.
     """
 
     logs: Sequence[str]
@@ -52,7 +53,7 @@ class Steps:
     def __iter__(self) -> Iterator[pb.Step]:
         intake = StepReader(self.robot)
         for number, files in enumerate(by_run(find(self.logs)).values(), 1):
-            seen = StepLedger()
+            ledger = StepLedger()
             for record in open_log(files):
                 if record.topic != "step" or record.message.robot != self.robot.name:
                     continue
@@ -62,7 +63,7 @@ class Steps:
                 except BadStep:
                     self.counts["unusable"] += 1
                     continue
-                if not seen.record(step.actor, step.episode, step.step, step.index):
+                if not ledger.record(step.actor, step.episode, step.step, step.index):
                     self.counts["duplicate"] += 1
                     continue
                 self.counts["taken"] += 1
@@ -72,37 +73,42 @@ class Steps:
 
 
 def count(logs: Sequence[str], robot: RobotWithTask) -> int:
-    """How many steps of a robot kind a learner can take from these logs.
+    """Count the steps of a robot kind that a learner can use from these logs.
 
     Raises:
-        NoLog, NotALog: there is none; ValueError: there are none of this robot.
+        NoLog, NotALog: a path is no log.
+        ValueError: the logs have no steps of this robot.
     """
-    total = sum(1 for _ in Steps(logs, robot))
+    total = sum(1 for _ in LoggedSteps(logs, robot))
     if not total:
-        raise ValueError(f"no steps of {robot.name} in {', '.join(map(str, logs))}: was it recorded?")
+        raise ValueError(
+            f"no steps of {robot.name} in {', '.join(map(str, logs))}: name a log that recorded this robot"
+        )
     return total
 
 
 @dataclass
-class LearnedPolicy:
-    """A logged actor's link to the learner, and its publisher."""
+class ReplayedActor:
+    """An actor of a log: its client of the learner, and its publisher."""
 
-    student: LearnerClient
-    steps: Publisher
-    begin: int  # the episode to go on with
-    index: int = 0
+    client: LearnerClient
+    publisher: Publisher
+    first_episode: int  # to publish
+    index: int = 0  # number of the last published step
 
 
 def feed(process: Process, settings: FeederSettings) -> bool:
-    """Publish until the logs' end or the run's (True), or until told to stop.
+    """Publish the steps until the end of the logs or of the training. Returns False if a signal stopped the process.
 
-    Health figures: `published` steps, and those that were `known` to the learner, `duplicate` or `unusable`.
+    The health figures have the numbers of `published`, `known` (the learner has them already),
+    `duplicate` and `unusable` steps.
 
     Raises:
-        RefusedByLearner, NoLog, NotALog: as they say.
+        RefusedByLearner: the learner does not accept the actors of the log.
+        NoLog, NotALog: a path is no log.
     """
     robot, stop = robot_with_task(settings.robot), process.stop.is_set
-    steps, pupils, figures = Steps(settings.logs, robot), dict[str, LearnedPolicy](), Counter[str]()
+    steps, actors, figures = LoggedSteps(settings.logs, robot), dict[str, ReplayedActor](), Counter[str]()
 
     def refresh() -> None:
         process.figures.update({name: float(figures[name]) for name in ("published", "known")})
@@ -111,47 +117,47 @@ def feed(process: Process, settings: FeederSettings) -> bool:
     process.refresh = refresh
     process.announce()
     for step in steps:
-        if step.actor not in pupils:
-            student = LearnerClient(process.bus, robot, step.actor)
-            begin = student.join(0, step.episode, stop)
-            if begin is None:
+        if step.actor not in actors:
+            client = LearnerClient(process.bus, robot, step.actor)
+            first_episode = client.join(0, step.episode, stop)
+            if first_episode is None:
                 return False
             publisher = process.bus.publisher(LOGGED, robot=robot.name, source=step.actor)
-            # A learner that knows nothing of this actor lets it begin where the log does.
-            pupils[step.actor] = LearnedPolicy(student, publisher, begin)
-        pupil = pupils[step.actor]
-        if step.episode < pupil.begin:
+            # A learner that does not know this actor returns the log's first episode.
+            actors[step.actor] = ReplayedActor(client, publisher, first_episode)
+        actor = actors[step.actor]
+        if step.episode < actor.first_episode:
             figures["known"] += 1
             continue
-        if not pupil.student.wait(pupil.index + 1, step.episode, stop):
+        if not actor.client.wait(actor.index + 1, step.episode, stop):
             break
-        pupil.index += 1
-        _readdress(step, pupil)
-        pupil.steps.put(step)
+        actor.index += 1
+        _renumber(step, actor)
+        actor.publisher.put(step)
         figures["published"] += 1
     log.info("published %d logged steps; the learner knew %d", figures["published"], figures["known"])
     if settings.alone:
-        _await_the_end(pupils, stop)
+        _await_last_updates(actors, stop)
     return not stop()
 
 
-def _readdress(step: pb.Step, pupil: LearnedPolicy) -> None:
-    """The number among this actor's steps, and the weights' version, are the present learner's to count."""
-    moment = step.header.time
+def _renumber(step: pb.Step, actor: ReplayedActor) -> None:
+    """Number the step, and name the version of the weights, as the present learner counts them."""
+    time_of_step = step.header.time
     step.ClearField("header")
-    step.header.time = moment
-    step.index = pupil.index
-    step.weights_version = 0 if pupil.student.policy is None else pupil.student.policy.version
+    step.header.time = time_of_step
+    step.index = actor.index
+    step.weights_version = 0 if actor.client.policy is None else actor.client.policy.version
 
 
-def _await_the_end(pupils: dict[str, LearnedPolicy], stop: Callable[[], bool]) -> None:
-    """Leave the learner the time to make its last updates."""
-    deadline = time.monotonic() + LAST_UPDATES
-    while time.monotonic() < deadline and not stop() and not any(p.student.done for p in pupils.values()):
+def _await_last_updates(actors: dict[str, ReplayedActor], stop: Callable[[], bool]) -> None:
+    """Give the learner time for its last updates."""
+    deadline = time.monotonic() + LAST_UPDATES_TIMEOUT
+    while time.monotonic() < deadline and not stop() and not any(p.client.done for p in actors.values()):
         time.sleep(0.05)
 
 
 def main(settings: FeederSettings) -> bool:
-    """The feeder's process; True: its work is done."""
+    """Run a feeder process. Returns whether its work is done."""
     with Process(settings.bus, settings.name) as process:
         return feed(process, settings)

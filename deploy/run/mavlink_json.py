@@ -1,4 +1,4 @@
-"""MAVLink frames in the log as JSON beside the bytes: `mavlink/SYSTEM/COMPONENT/MESSAGE`, as other recorders write it.
+"""Write MAVLink frames into the log as JSON, too, as other recorders do: channel `mavlink/SYSTEM/COMPONENT/MESSAGE`.
 
 {"header": {"system_id": 1, "component_id": 1, "sequence": 7}, "message": {"type": "HEARTBEAT", …}}
 """
@@ -20,11 +20,12 @@ ENCODING = "application/json;mavlink"
 Derive = Callable[[Sample], Iterable[Entry]]
 
 
-def as_json(sample: Sample) -> list[Entry]:
-    """An entry for each frame of a FRAMES message, dated when it was sent or received; nothing for other messages.
+def frames_as_json(sample: Sample) -> list[Entry]:
+    """Return a log entry for each frame of a FRAMES message, with the time of the frame. Other messages give none.
 
     Raises:
-        Malformed: it can't be understood; ValueError: a frame's time can't be stored.
+        Malformed: the message can't be decoded.
+        ValueError: the time of a frame can't be stored.
     """
     if sample.topic is not FRAMES:
         return []
@@ -37,6 +38,6 @@ def as_json(sample: Sample) -> list[Entry]:
     return entries
 
 
-def both(*derived: Derive) -> Derive:
-    """What several make of a sample, one after the other."""
+def chain_derived(*derived: Derive) -> Derive:
+    """Return a function that joins the entries of several functions."""
     return lambda sample: [entry for derive in derived for entry in derive(sample)]

@@ -1,4 +1,4 @@
-"""THE table of a run's processes, and the files of its folder that they share."""
+"""Define THE table of a run's processes, and the files in the run's folder that they share."""
 
 from __future__ import annotations
 
@@ -13,22 +13,22 @@ from brakeline.messaging.bus import BusSettings
 from brakeline.messaging.robot import robot_named
 
 CONFIG, ENDPOINT, LOG = "config.json", "endpoint", "run.mcap"
-UNFINISHED = 75  # exit status: asked to end before its work was done
+UNFINISHED = 75  # exit status of a process that was asked to end before its work was done
 
 
 @dataclass(frozen=True)
 class ProcessSpec:
-    """A process's name, and how it is called on in a run."""
+    """A process of a run."""
 
     name: str
-    kind: str  # a key of KINDS
-    robot: str = ""  # its name or path, as the configuration has it
-    number: int = 0
-    nice: int = 0  # the robot's safety comes before learning
+    kind: str  # key of `run_process.MAIN_FUNCTIONS`
+    robot: str = ""  # name or path of the robot, as in the configuration
+    number: int = 0  # of an actor's first robot, or of an autopilot
+    nice: int = 0  # the safety of robots comes before learning
 
 
-def places(config: RunConfig) -> list[ProcessSpec]:
-    """THE table of a run's processes, in the order in which they start."""
+def process_specs(config: RunConfig) -> list[ProcessSpec]:
+    """Return THE table of a run's processes, in the order in which they start."""
     table = [ProcessSpec("recorder", "recorder", nice=5 if config.flights else 0)] if config.record else []
     if config.filtered:
         table += [ProcessSpec(f"safety-{i}", "safety") for i in range(config.replicas)]
@@ -50,30 +50,33 @@ def places(config: RunConfig) -> list[ProcessSpec]:
     return table
 
 
-def say_where(folder: Path, bus: BusSettings) -> None:
-    """Write down where the run's router is; `client_of` reads it."""
+def write_endpoint(folder: Path, bus: BusSettings) -> None:
+    """Write the endpoint of the run's router to the run's folder, where `client_settings` reads it."""
     keys = bus.keys and str(bus.keys.absolute())
-    said = {"endpoint": bus.listen[0], "pid": os.getpid(), "keys": keys, "metrics": bus.metrics}
-    write_atomically(folder / ENDPOINT, json.dumps(said).encode())
+    values = {"endpoint": bus.listen[0], "pid": os.getpid(), "keys": keys, "metrics": bus.metrics}
+    write_atomically(folder / ENDPOINT, json.dumps(values).encode())
 
 
-def client_of(folder: Path) -> BusSettings:
-    """How a client gets on the bus of the run in a folder.
+def client_settings(folder: Path) -> BusSettings:
+    """Return the settings with which a client joins the bus of the run in a folder.
 
     Raises:
-        OSError, ValueError, KeyError: there is no run.
+        OSError, ValueError, KeyError: the folder has no run.
     """
-    said = json.loads((folder / ENDPOINT).read_text())
-    keys = said.get("keys")
-    return BusSettings(connect=(said["endpoint"],), keys=Path(keys) if keys else None)
+    values = json.loads((folder / ENDPOINT).read_text())
+    keys = values.get("keys")
+    return BusSettings(connect=(values["endpoint"],), keys=Path(keys) if keys else None)
 
 
-def metrics_of(folder: Path, number: int) -> str:
-    """Where the process of that row in the table serves its metrics: behind the launcher; empty: nowhere."""
+def metrics_address(folder: Path, number: int) -> str:
+    """Return PORT or HOST:PORT at which the process in row `number` of the table serves metrics; empty for none.
+
+    The launcher has the first port, its processes have the next ones.
+    """
     host, colon, port = json.loads((folder / ENDPOINT).read_text()).get("metrics", "").rpartition(":")
     return f"{host}{colon}{int(port) + 1 + number}" if port else ""
 
 
-def launcher_of(folder: Path) -> int:
-    """Its process id. Raises as `client_of`."""
+def launcher_pid(folder: Path) -> int:
+    """Return the process id of the run's launcher. Raises as `client_settings`."""
     return int(json.loads((folder / ENDPOINT).read_text())["pid"])

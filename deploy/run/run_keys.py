@@ -1,5 +1,4 @@
-"""The keys of a run that makes its own, for one machine and one user, in the run's folder; and the models that it
-starts with, signed."""
+"""Make the keys of a run on one machine, in the run's folder, and sign the models that the run starts with."""
 
 from __future__ import annotations
 
@@ -7,7 +6,7 @@ import logging
 from pathlib import Path
 
 from brakeline.deploy.data.data_paths import method_path
-from brakeline.deploy.run.processes import places
+from brakeline.deploy.run.processes import process_specs
 from brakeline.deploy.run.run_config import RunConfig
 from brakeline.messaging.bus.certificate_authority import Authority
 from brakeline.messaging.task import robot_maybe_with_task
@@ -19,25 +18,25 @@ from brakeline.safety.service.signature import KEY, ModelSigner, TrustedSigners,
 
 log = logging.getLogger("brakeline.launcher")
 
-KEYS = "keys"  # under the run's folder
-OTHERS = ("launcher", "viewer", "client", "certify")  # who may join in, besides the run's processes
+KEYS = "keys"  # folder in the run's folder
+OTHER_ROLES = ("launcher", "viewer", "client", "certify")  # that may join the bus, besides the run's processes
 
 
-def own_keys(config: RunConfig, folder: Path) -> Path:
-    """The folder of the run's keys, made if there is none; a run that goes on has the same: they signed its models."""
+def make_run_keys(config: RunConfig, folder: Path) -> Path:
+    """Return the folder of the run's keys. Makes the keys, unless a resumed run has them already."""
     keys = folder / KEYS
     authority = Authority(keys)
-    for name in (*OTHERS, *(place.name for place in places(config) if place.kind != "autopilot")):
+    for name in (*OTHER_ROLES, *(spec.name for spec in process_specs(config) if spec.kind != "autopilot")):
         authority.issue(name)
     write_signer(keys)
     write_key(keys)
     return keys
 
 
-def seal_models(config: RunConfig, folder: Path, keys: Path) -> None:
-    """Whoever can certify signs the models that the run is to start with, in the run's archive.
+def sign_models(config: RunConfig, folder: Path, keys: Path) -> None:
+    """Sign the models that the run starts with, and save them in the run's archive.
 
-    Where the key to sign with is elsewhere, the models have to bring their seals along.
+    If the signing key is elsewhere, this does nothing: the models must have signatures already.
     """
     if not (keys / KEY).exists():
         return
@@ -50,9 +49,13 @@ def seal_models(config: RunConfig, folder: Path, keys: Path) -> None:
 
 
 def newest_model(folder: Path, robot: str, trust: TrustedSigners | None) -> Path | None:
-    """The version that a service of this run used last: a restarted one goes on with it.
+    """Return the model that a service of this run used last, so that a restarted service uses it again.
 
-    trust: with keys, whoever may have signed it; others' versions are passed over.
+    Args:
+        trust: the accepted signers, on a bus with keys. The function skips models that others signed.
+
+    Returns:
+        The file; None if there is none.
     """
     versions = archive_path(folder, robot, "*")
     newest = sorted(versions.parent.glob(versions.name), key=lambda path: path.stat().st_mtime_ns, reverse=True)
@@ -61,7 +64,7 @@ def newest_model(folder: Path, robot: str, trust: TrustedSigners | None) -> Path
             if trust is not None:
                 trust.load_model(path)
         except BadModel as error:
-            log.warning("not used: %s", error)
+            log.warning("model not used: %s", error)
             continue
         return path
     return None

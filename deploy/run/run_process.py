@@ -1,7 +1,7 @@
-"""One process of a launched run: `python -m brakeline.deploy.run.run_process RUN_FOLDER PROCESS`.
+"""Run one process of a launched run: `python -m brakeline.deploy.run.run_process RUN_FOLDER PROCESS`.
 
-Everything it needs is in the run's resolved configuration, so that all processes of a run agree. Each process can also
-be started alone, with `brakeline safety | learner | actor | recorder`.
+The process takes its settings from the run's saved configuration, so that all processes of a run agree. You can also
+start each process alone, with `brakeline safety`, `learner`, `actor` or `recorder`.
 """
 
 from __future__ import annotations
@@ -20,33 +20,31 @@ from brakeline.deploy.run.processes import (
     LOG,
     UNFINISHED,
     ProcessSpec,
-    client_of,
-    launcher_of,
-    metrics_of,
-    places,
+    client_settings,
+    launcher_pid,
+    metrics_address,
+    process_specs,
 )
 from brakeline.deploy.run.run_config import RunConfig, load
 from brakeline.messaging.bus import BusError, BusSettings
 from brakeline.messaging.task import robot_maybe_with_task, robot_with_task
 
-PARENT_DIED = 1  # prctl: PR_SET_PDEATHSIG
+PR_SET_PDEATHSIG = 1  # of prctl: the signal that a process gets when its parent dies
 
 
-def _recorder(place: ProcessSpec, folder: Path, config: RunConfig, bus: BusSettings) -> bool:
-    from brakeline.deploy.run.log_contents import attachments, metadata
-    from brakeline.deploy.run.mavlink_json import as_json, both
+def _recorder(spec: ProcessSpec, folder: Path, config: RunConfig, bus: BusSettings) -> bool:
+    from brakeline.deploy.run.log_contents import attachments, derive_entries, metadata
     from brakeline.logs import recorder
-    from brakeline.logs.foxglove import FoxgloveConverter
     from brakeline.logs.recorded_robots import RecordedRobots
 
     robots = RecordedRobots(robot_maybe_with_task(name) for name in config.robots)
-    derive = both(FoxgloveConverter(config.pictures, robots).from_sample, as_json) if config.pictures > 0.0 else as_json
-    about, files = metadata(config), attachments(config, folder)
-    recorder.main(bus, folder / LOG, about, place.name, files, derive, config.rotation)
+    derive = derive_entries(config.pictures, robots)
+    files = attachments(config, folder)
+    recorder.main(bus, folder / LOG, metadata(config), spec.name, files, derive, config.rotation)
     return False
 
 
-def _safety(place: ProcessSpec, folder: Path, config: RunConfig, bus: BusSettings) -> bool:
+def _safety(spec: ProcessSpec, folder: Path, config: RunConfig, bus: BusSettings) -> bool:
     from brakeline.deploy.data.data_paths import method_path
     from brakeline.deploy.run.run_keys import KEYS, newest_model
     from brakeline.safety.service.server import SafetySettings, main
@@ -58,31 +56,31 @@ def _safety(place: ProcessSpec, folder: Path, config: RunConfig, bus: BusSetting
     trust = None if bus.keys is None else TrustedSigners.load(bus.keys)
     newest = (newest_model(folder, robot.name, trust) or path for robot, path in zip(robots, models, strict=True))
     accepted = config.accept_bound
-    main(SafetySettings(bus, tuple(newest), folder, place.name, limits, accepted, secrets=folder / KEYS))
+    main(SafetySettings(bus, tuple(newest), folder, spec.name, limits, accepted, secrets=folder / KEYS))
     return False
 
 
-def _learner(place: ProcessSpec, folder: Path, config: RunConfig, bus: BusSettings) -> bool:
+def _learner(spec: ProcessSpec, folder: Path, config: RunConfig, bus: BusSettings) -> bool:
     from brakeline.learner.checkpoint import CHECKPOINT, exists, latest
 
-    out = folder / place.name
+    out = folder / spec.name
     if resume := exists(out / CHECKPOINT):
-        latest(out / CHECKPOINT)  # what is not there is said before torch is loaded, which takes seconds
+        latest(out / CHECKPOINT)  # fails for a damaged checkpoint before the import of torch, which takes seconds
     from brakeline.learner.learner_process import LearnerSettings, main
 
-    return main(LearnerSettings(bus, place.robot, out, resume, place.name, config.learning()))
+    return main(LearnerSettings(bus, spec.robot, out, resume, spec.name, config.learning()))
 
 
-def _actor(place: ProcessSpec, folder: Path, config: RunConfig, bus: BusSettings) -> bool:
+def _actor(spec: ProcessSpec, folder: Path, config: RunConfig, bus: BusSettings) -> bool:
     from brakeline.actors.actor_process import ActorSettings, run
     from brakeline.deploy.policy_loading import policy_named
     from brakeline.deploy.vehicle_factory import environment, fleet_world
 
     settings = ActorSettings(
         bus=bus,
-        robot=place.robot,
-        name=place.name,
-        number=place.number,
+        robot=spec.robot,
+        name=spec.name,
+        number=spec.number,
         robots=config.robots_per_actor,
         fleet=config.fleet > 0,
         seed=config.seed,
@@ -96,23 +94,23 @@ def _actor(place: ProcessSpec, folder: Path, config: RunConfig, bus: BusSettings
         mavlink=config.mavlink,
         steps=config.steps,
     )
-    propose = partial(policy_named, config.policy, robot_with_task(place.robot)) if config.policy else None
+    propose = partial(policy_named, config.policy, robot_with_task(spec.robot)) if config.policy else None
     if config.flights:
         from brakeline.actors import flight_process as flight
         from brakeline.deploy.quadrotor_vehicles import flight_arena
 
-        arena = flight_arena(config.arena, config.seed, robot_with_task(place.robot))
-        return flight.run(settings, config.flights[place.number], arena, propose, config.conditions)
+        arena = flight_arena(config.arena, config.seed, robot_with_task(spec.robot))
+        return flight.run(settings, config.flights[spec.number], arena, propose, config.conditions)
     worlds = partial(fleet_world, conditions=config.conditions)
     return run(settings, partial(environment, conditions=config.conditions), propose, worlds)
 
 
-def _autopilot(place: ProcessSpec, folder: Path, config: RunConfig, bus: BusSettings) -> bool:
+def _autopilot(spec: ProcessSpec, folder: Path, config: RunConfig, bus: BusSettings) -> bool:
     from brakeline.deploy.run.autopilot_run import AutopilotSettings, fly
 
     assert config.autopilot is not None
-    flight = config.flights[place.number]
-    tally = fly(
+    flight = config.flights[spec.number]
+    stats = fly(
         AutopilotSettings(
             url=flight.url.replace("udpin:0.0.0.0", "udpout:127.0.0.1").replace("udpin", "udpout"),
             rules=config.autopilot.rules,
@@ -125,18 +123,19 @@ def _autopilot(place: ProcessSpec, folder: Path, config: RunConfig, bus: BusSett
             truth=f"127.0.0.1:{flight.truth}",
         )
     )
-    print(tally, file=sys.stderr)  # into its log
+    print(stats, file=sys.stderr)
     return False
 
 
-def _feeder(place: ProcessSpec, folder: Path, config: RunConfig, bus: BusSettings) -> bool:
+def _feeder(spec: ProcessSpec, folder: Path, config: RunConfig, bus: BusSettings) -> bool:
     from brakeline.deploy.run.log_feed import FeederSettings, main
 
-    return main(FeederSettings(bus, config.from_logs, place.robot, place.name, config.actors == 0))
+    return main(FeederSettings(bus, config.from_logs, spec.robot, spec.name, config.actors == 0))
 
 
-# Each runs until its work is done (True) or it is asked to end; a recorder's and a safety service's never is.
-KINDS: dict[str, Callable[[ProcessSpec, Path, RunConfig, BusSettings], bool]] = {
+# Each function returns True when its work is done, False when a signal ended it. The work of a recorder and of a safety
+# service is never done.
+MAIN_FUNCTIONS: dict[str, Callable[[ProcessSpec, Path, RunConfig, BusSettings], bool]] = {
     "recorder": _recorder,
     "safety": _safety,
     "learner": _learner,
@@ -147,19 +146,19 @@ KINDS: dict[str, Callable[[ProcessSpec, Path, RunConfig, BusSettings], bool]] = 
 
 
 def main() -> int:
-    """Run the process named on the command line; it ends with its launcher. 0: its work is done."""
+    """Run the process that the command line names, until its work is done or its launcher ends. Returns the status."""
     folder, name = Path(sys.argv[1]), sys.argv[2]
-    ctypes.CDLL(None).prctl(PARENT_DIED, signal.SIGTERM)
+    ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGTERM)
     signal.signal(signal.SIGINT, signal.SIG_DFL)
-    if os.getppid() != launcher_of(folder):  # it died before we could ask to be told
+    if os.getppid() != launcher_pid(folder):  # the launcher died before the prctl call
         return UNFINISHED
     config = load(folder / CONFIG)
-    number, place = next(row for row in enumerate(places(config)) if row[1].name == name)
-    if place.nice:
-        os.nice(place.nice)
+    number, spec = next(row for row in enumerate(process_specs(config)) if row[1].name == name)
+    if spec.nice:
+        os.nice(spec.nice)
     try:
-        bus = replace(client_of(folder), metrics=metrics_of(folder, number))
-        done = KINDS[place.kind](place, folder, config, bus)
+        bus = replace(client_settings(folder), metrics=metrics_address(folder, number))
+        done = MAIN_FUNCTIONS[spec.kind](spec, folder, config, bus)
     except BusError as error:
         print(f"{name}: {type(error).__name__}: {error}", file=sys.stderr)
         return 1

@@ -1,4 +1,4 @@
-"""What a display needs to know of a run in progress."""
+"""Define what a display shows of a running run."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from brakeline.logs.metrics import Metrics
 
 
 @dataclass
-class View:
-    """What a display needs to know of a run in progress."""
+class RunView:
+    """The state of a running run that a display shows."""
 
     config: RunConfig
     folder: Path
     metrics: Metrics
-    children: list[SupervisedProcess]
-    lines: deque[str]
-    ending: bool = False
+    processes: list[SupervisedProcess]
+    lines: deque[str]  # latest warnings
+    ending: bool = False  # the launcher ends the processes

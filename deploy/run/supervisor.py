@@ -1,4 +1,4 @@
-"""A process of a run through its restarts."""
+"""Start a process of a run, and restart it when it fails."""
 
 from __future__ import annotations
 
@@ -15,113 +15,118 @@ from brakeline.deploy.run.processes import UNFINISHED, ProcessSpec
 
 log = logging.getLogger("brakeline.launcher")
 
-FIRST_BACKOFF, LONGEST_BACKOFF = 0.5, 10.0  # s before a restart, doubled each time ...
-HEALTHY_AFTER = 20.0  # s from its first sign of life on after which the next backoff is the first one again
-SPEAKS_AFTER = 60.0  # s from its start: a busy machine takes long to import what it needs, and not everybody speaks
-MOST_FAILURES = 5  # in a row, none of them healthy: then it is no accident
+FIRST_BACKOFF, LONGEST_BACKOFF = 0.5, 10.0  # s from a failure to the restart; doubles with each failure in a row
+HEALTHY_AFTER = 20.0  # s after its first sign of life at which a process counts as healthy
+START_ALLOWANCE = 60.0  # s from the start of a process that gives no sign of life: imports are slow on a busy machine
+MOST_FAILURES = 5  # in a row, none of them after a healthy time, before the run ends
 
 
 class LaunchError(RuntimeError):
-    """A run cannot be started; the message says what to do."""
+    """A run can't start or go on. The message says what to do."""
 
 
 @dataclass
 class SupervisedProcess:
-    """A process of the run, through its restarts."""
+    """A process of a run, with its restarts."""
 
-    place: ProcessSpec
+    spec: ProcessSpec
     folder: Path
     restarts: int = 0
-    failures: int = 0  # in a row
+    failures: int = 0  # in a row, none of them after a healthy time
     popen: subprocess.Popen[bytes] | None = None
-    started: float = 0.0
-    spoke: float | None = None  # when its first sign of life was heard
-    due: float = 0.0  # when to start it (again)
-    finished: bool = False  # it ended with 0: its work is done
+    started: float = 0.0  # monotonic time [s], as the next two
+    first_sign_of_life: float | None = None
+    next_start: float = 0.0
+    finished: bool = False  # it ended with status 0: its work is done
 
     def start(self) -> None:
+        """Start the process. Its output goes to logs/NAME.log in the run's folder."""
         logs = self.folder / "logs"
         logs.mkdir(exist_ok=True)
         environment = os.environ | {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
-        environment["MUJOCO_GL"] = "disable"  # nobody draws by it, and asking for a display is a process of its own
-        with (logs / f"{self.place.name}.log").open("ab") as errors:
+        environment["MUJOCO_GL"] = "disable"  # MuJoCo draws nothing; looking for a display would start another process
+        with (logs / f"{self.spec.name}.log").open("ab") as errors:
             self.popen = subprocess.Popen(
-                [*PYTHON, "-m", "brakeline.deploy.run.run_process", str(self.folder), self.place.name],
+                [*PYTHON, "-m", "brakeline.deploy.run.run_process", str(self.folder), self.spec.name],
                 stdin=subprocess.DEVNULL,
                 stdout=errors,
                 stderr=errors,
                 env=environment,
-                start_new_session=True,  # ^C goes to the launcher alone, which ends them in order
+                start_new_session=True,  # ^C reaches only the launcher, which ends the processes in order
             )
-        self.started, self.spoke = time.monotonic(), None
+        self.started, self.first_sign_of_life = time.monotonic(), None
 
     @property
     def alive(self) -> bool:
+        """Whether the process runs."""
         return self.popen is not None and self.popen.poll() is None
 
-    def heard(self, pid: int) -> None:
-        """A process of this name gave a sign of life."""
-        if self.popen is not None and self.popen.pid == pid and self.spoke is None:
-            self.spoke = time.monotonic()
+    def record_sign_of_life(self, pid: int) -> None:
+        """Note a health message of the process with this id and this name."""
+        if self.popen is not None and self.popen.pid == pid and self.first_sign_of_life is None:
+            self.first_sign_of_life = time.monotonic()
 
-    def watch(self) -> None:
-        """Start it if that is due; see how it ended if it did.
+    def supervise(self) -> None:
+        """Start the process if it is time, and schedule a restart if it has failed.
 
         Raises:
-            LaunchError: it fails again and again.
+            LaunchError: it failed MOST_FAILURES times in a row.
         """
         now = time.monotonic()
         if self.finished or self.alive:
             return
         if self.popen is None:
-            if now >= self.due:
+            if now >= self.next_start:
                 self.start()
             return
-        code, lived = self.popen.returncode, now - self.started
+        code, lifetime = self.popen.returncode, now - self.started
         self.popen = None
         if code == 0:
             self.finished = True
             return
-        since = self.started + SPEAKS_AFTER if self.spoke is None else self.spoke
-        self.failures = 1 if now - since > HEALTHY_AFTER else self.failures + 1
-        how = ended(code, lived)
-        log_file = self.folder / "logs" / f"{self.place.name}.log"
-        words = f"its last words: {last_line(log_file) or 'none'}"
+        first_sign = self.first_sign_of_life
+        ready = self.started + START_ALLOWANCE if first_sign is None else first_sign
+        self.failures = 1 if now - ready > HEALTHY_AFTER else self.failures + 1
+        ending = describe_end(code, lifetime)
+        log_file = self.folder / "logs" / f"{self.spec.name}.log"
+        output = f"its last output: {last_line(log_file) or 'none'}"
         if self.failures == MOST_FAILURES:
             raise LaunchError(
-                f"{self.place.name} {how}, the {MOST_FAILURES}th time in a row; {words}; more in {log_file}"
+                f"{self.spec.name} {ending}, the {MOST_FAILURES}th time in a row; {output}; see {log_file}"
             )
         backoff = min(FIRST_BACKOFF * 2.0 ** (self.failures - 1), LONGEST_BACKOFF)
-        self.due = now + backoff
+        self.next_start = now + backoff
         self.restarts += 1
-        log.error("%s %s; starting it again in %.1f s (%s)", self.place.name, how, backoff, words)
+        log.error("%s %s; starting it again in %.1f s (%s)", self.spec.name, ending, backoff, output)
 
     def terminate(self) -> None:
+        """Ask the process to end."""
         if self.popen is not None and self.alive:
             self.popen.terminate()
 
     def end(self, deadline: float) -> None:
-        """Wait until the deadline, then kill."""
+        """Wait for the end of the process until the deadline (monotonic time [s]), then kill it."""
         if self.popen is None:
             return
         try:
             self.popen.wait(max(0.0, deadline - time.monotonic()))
         except subprocess.TimeoutExpired:
-            log.error("%s did not end; killing it", self.place.name)
+            log.error("%s did not end; killing it", self.spec.name)
             self.popen.kill()
             self.popen.wait()
 
 
-def ended(code: int, lived: float) -> str:
-    """How a process ended that should not have."""
+def describe_end(code: int, lifetime: float) -> str:
+    """Say how a process ended too early. code: exit status; lifetime [s]."""
     if code < 0:
-        return f"was killed by {signal.Signals(-code).name} after {lived:.1f} s"
+        return f"was killed by {signal.Signals(-code).name} after {lifetime:.1f} s"
     if code == UNFINISHED:
-        return f"was asked to end after {lived:.1f} s, not by the launcher"
-    return f"ended with {code} after {lived:.1f} s"
+        return f"was asked to end after {lifetime:.1f} s, not by the launcher"
+    return f"ended with {code} after {lifetime:.1f} s"
 
 
 def last_line(path: Path) -> str:
+    """Return the last line of a text file; empty if there is none."""
     try:
         lines = path.read_text(errors="replace").strip().splitlines()
     except OSError:

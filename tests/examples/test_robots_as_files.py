@@ -16,7 +16,7 @@ from brakeline.deploy.data import collect, data_paths, model_store, simulated_re
 from brakeline.deploy.data.certification import certified
 from brakeline.deploy.experiments.evaluate import FRESH, episode, in_process
 from brakeline.deploy.policy_loading import policy_named
-from brakeline.deploy.run.processes import places
+from brakeline.deploy.run.processes import process_specs
 from brakeline.deploy.run.run_config import RunConfig
 from brakeline.deploy.vehicle_factory import environment
 from brakeline.messaging.obstacle import BOX, Obstacle
@@ -233,7 +233,7 @@ def test_what_was_not_recorded_here_is_never_recorded_over(
 
 def test_a_run_names_its_processes_by_the_robot_and_not_by_its_path() -> None:
     config = RunConfig(robots=tuple(address(str(EXAMPLES / name / f"{name}.toml")) for name in NAMES))
-    names = {place.name for place in places(config) if place.kind == "learner"}
+    names = {place.name for place in process_specs(config) if place.kind == "learner"}
     assert names == {"learner-car", "learner-omni"}
 
 

@@ -29,7 +29,7 @@ from brakeline.actors.learner_client import LearnerClient
 from brakeline.deploy.commands.watch_command import show_received
 from brakeline.deploy.run.display import line
 from brakeline.deploy.run.launcher import Launcher
-from brakeline.deploy.run.mavlink_json import as_json, both
+from brakeline.deploy.run.mavlink_json import chain_derived, frames_as_json
 from brakeline.deploy.run.run_config import RunConfig
 from brakeline.learner.learner import Learner
 from brakeline.learner.learner_config import LearnerConfig
@@ -120,7 +120,7 @@ def recorder(folder: Path) -> Party:
         path.unlink(missing_ok=True)
         return Segment(path, path.open("wb", buffering=0), metadata)
 
-    derive = both(FoxgloveConverter().from_sample, as_json)
+    derive = chain_derived(FoxgloveConverter().from_sample, frames_as_json)
     recording = Recording(path, {}, inbox, open_one, derive, Rotation(mib=16.0), rejected)
 
     def take(sample: Sample) -> None:

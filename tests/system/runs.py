@@ -12,7 +12,7 @@ from typing import Any, Self
 import psutil
 
 from brakeline.deploy.interpreter import PYTHON
-from brakeline.deploy.run.processes import client_of, launcher_of
+from brakeline.deploy.run.processes import client_settings, launcher_pid
 from brakeline.logs.metrics import Metrics
 from brakeline.messaging.bus import Bus, BusSettings, Sample
 from brakeline.messaging.topics import RECORDED
@@ -74,7 +74,7 @@ class Run:
 
         def settings() -> BusSettings | None:
             try:
-                return client_of(self.folder) if launcher_of(self.folder) == self.popen.pid else None
+                return client_settings(self.folder) if launcher_pid(self.folder) == self.popen.pid else None
             except (OSError, ValueError):
                 assert self.popen.poll() is None, self.errors.read_text()
                 return None
@@ -91,7 +91,7 @@ class Run:
     @property
     def there(self) -> tuple[object, ...]:
         """Options of a command that joins in."""
-        (endpoint,) = client_of(self.folder).connect
+        (endpoint,) = client_settings(self.folder).connect
         return "--connect", endpoint, "--keys", self.folder / "keys"
 
     def steps(self) -> int:

@@ -11,7 +11,7 @@ from brakeline.actors.actor_settings import PhysicsChange
 from brakeline.deploy.commands.fly_command import FlyCommand
 from brakeline.deploy.commands.train_command import TrainCommand
 from brakeline.deploy.policy_loading import policy_named
-from brakeline.deploy.run.processes import places
+from brakeline.deploy.run.processes import process_specs
 from brakeline.deploy.run.run_config import EXPERIMENTS, RunConfig, decode, encode, load
 from brakeline.learner.learner_config import LearnerConfig, TD3Config
 from brakeline.messaging.task import robot_with_task
@@ -76,11 +76,15 @@ def test_the_learner_shares_the_runs_seed_and_steps() -> None:
 
 
 def test_the_processes_of_a_run() -> None:
-    names = [place.name for place in places(RunConfig(actors=2, replicas=2))]
+    names = [spec.name for spec in process_specs(RunConfig(actors=2, replicas=2))]
     assert names == ["recorder", "safety-0", "safety-1", "learner", "actor-0", "actor-1"]
-    assert [place.name for place in places(RunConfig(actors=1, method="none"))] == ["recorder", "learner", "actor-0"]
-    several = places(RunConfig(actors=3, robots_per_actor=4))
-    assert [place.number for place in several if place.kind == "actor"] == [0, 4, 8], "no robot's number comes twice"
+    assert [spec.name for spec in process_specs(RunConfig(actors=1, method="none"))] == [
+        "recorder",
+        "learner",
+        "actor-0",
+    ]
+    several = process_specs(RunConfig(actors=3, robots_per_actor=4))
+    assert [spec.number for spec in several if spec.kind == "actor"] == [0, 4, 8], "no robot's number comes twice"
 
 
 def test_an_experiment_is_where_the_options_start(tmp_path: Path) -> None:
@@ -111,14 +115,14 @@ def test_what_no_world_is_made_for_is_refused_before_anything_starts() -> None:
             RunConfig(**wrong)
     config = RunConfig(robots=("ground+tracks",), arena="walkers")
     assert decode(encode(config)) == config
-    (place,) = (place for place in places(config) if place.kind == "learner")
-    assert robot_with_task(place.robot).task.observation_dim == 50, "its process has the task"
-    stored = policy_named("trained", robot_with_task(place.robot), 0)
+    (spec,) = (spec for spec in process_specs(config) if spec.kind == "learner")
+    assert robot_with_task(spec.robot).task.observation_dim == 50, "its process has the task"
+    stored = policy_named("trained", robot_with_task(spec.robot), 0)
     assert stored(np.zeros(50, np.float32), {}).shape == (2,), "of its own observation, in a folder of its own"
 
 
 def test_each_process_of_a_flight_can_read_the_robot_by_itself() -> None:
     """A robot of somebody's own has no name that another process knows."""
     path = Path(__file__).parents[3] / "examples" / "px4" / "quadrotor_px4.toml"
-    (place,) = (place for place in places(FlyCommand(robot=str(path)).config()) if place.kind == "actor")
-    assert robot_with_task(place.robot).name == "quadrotor-px4-late"
+    (spec,) = (spec for spec in process_specs(FlyCommand(robot=str(path)).config()) if spec.kind == "actor")
+    assert robot_with_task(spec.robot).name == "quadrotor-px4-late"

@@ -10,9 +10,9 @@ from rich.progress import Progress
 
 from brakeline.deploy.commands import common_options
 from brakeline.deploy.run.display import Display, doing, line, live, summary
-from brakeline.deploy.run.processes import places
+from brakeline.deploy.run.processes import process_specs
 from brakeline.deploy.run.run_config import RunConfig
-from brakeline.deploy.run.run_view import View
+from brakeline.deploy.run.run_view import RunView
 from brakeline.deploy.run.supervisor import SupervisedProcess
 from brakeline.logs.metrics import Metrics
 from brakeline.messaging import brakeline_pb2 as pb
@@ -26,7 +26,7 @@ def step(number: int) -> pb.Step:
 
 
 @pytest.fixture
-def view() -> View:
+def view() -> RunView:
     """Of a run with figures as wide as they get."""
     metrics = Metrics()
     for number in range(1000):
@@ -37,12 +37,12 @@ def view() -> View:
     metrics.add("exchange/ground/actor-0", exchange)
     folder = Path("/a/folder/with [brackets] in its name")
     lines = deque(["safety-0: [red]no[/] markup " + "and very long " * 20])
-    children = [SupervisedProcess(place, folder) for place in places(RunConfig(replicas=2))]
-    return View(RunConfig(), folder, metrics, children, lines)
+    processes = [SupervisedProcess(spec, folder) for spec in process_specs(RunConfig(replicas=2))]
+    return RunView(RunConfig(), folder, metrics, processes, lines)
 
 
 @pytest.mark.parametrize("width", [80, 100, 120])
-def test_the_live_picture_fits_the_terminal(view: View, width: int) -> None:
+def test_the_live_picture_fits_the_terminal(view: RunView, width: int) -> None:
     console = Console(file=io.StringIO(), force_terminal=True, width=width, color_system=None)
     console.print(live(view, view.metrics.figures(), Progress()))
     shown = console.file.getvalue()  # type: ignore[attr-defined]
@@ -62,7 +62,7 @@ def test_the_live_picture_fits_the_terminal(view: View, width: int) -> None:
         assert name in shown, "no value is broken"
 
 
-def test_without_a_terminal_it_says_a_line_now_and_then(view: View, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_a_terminal_it_says_a_line_now_and_then(view: RunView, monkeypatch: pytest.MonkeyPatch) -> None:
     console = Console(file=io.StringIO(), soft_wrap=True)
     with Display(console, 1000) as display:
         for _ in range(100):
@@ -78,7 +78,7 @@ def test_without_a_terminal_it_says_a_line_now_and_then(view: View, monkeypatch:
     assert rows[1:] == [line(view.metrics.figures()), "ending every process in order"]
 
 
-def test_the_summary_has_the_paths_whole(view: View) -> None:
+def test_the_summary_has_the_paths_whole(view: RunView) -> None:
     console = Console(file=io.StringIO(), soft_wrap=common_options.console.soft_wrap)
     folder = "/very/long" * 12
     paths = {"folder": folder, "log": f"{folder}/run.mcap", "policies": [f"{folder}/policy.safetensors"]}
@@ -90,14 +90,14 @@ def test_the_summary_has_the_paths_whole(view: View) -> None:
     assert f"next:   brakeline analyse {folder} --html report.html" in rows, "and what comes next"
 
 
-def test_what_a_run_is_at_is_said_from_the_first_second(view: View) -> None:
-    young = View(view.config, view.folder, Metrics(), view.children, deque())
+def test_what_a_run_is_at_is_said_from_the_first_second(view: RunView) -> None:
+    young = RunView(view.config, view.folder, Metrics(), view.processes, deque())
     console = Console(file=io.StringIO(), force_terminal=True, width=80, color_system=None)
     console.print(live(young, young.metrics.figures(), Progress()))
     shown = console.file.getvalue()  # type: ignore[attr-defined]
-    assert "starting recorder, safety-0" in shown and shown.count(" starts ") == len(view.children)
-    for number, child in enumerate(view.children):
-        name = child.place.name
+    assert "starting recorder, safety-0" in shown and shown.count(" starts ") == len(view.processes)
+    for number, child in enumerate(view.processes):
+        name = child.spec.name
         young.metrics.add(f"health/{name}", pb.Health(header=pb.Header(sequence=1, run=number + 1), process=name))
     assert doing(young) == "waiting for the first step"
     young.metrics.add("step/ground/actor-0", step(0))

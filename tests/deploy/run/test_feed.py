@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from brakeline.deploy.run.log_feed import Steps, count
-from brakeline.deploy.run.processes import places
+from brakeline.deploy.run.log_feed import LoggedSteps, count
+from brakeline.deploy.run.processes import process_specs
 from brakeline.deploy.run.run_config import EXPERIMENTS, RunConfig
 from brakeline.logs.segment import Entry, open_segment
 from brakeline.messaging import brakeline_pb2 as pb
@@ -28,13 +28,13 @@ def step(number: int, actor: str = "a", episode: int = 0, **more: object) -> pb.
     return pb.Step(**(fields | about | more))
 
 
-def names(steps: Steps) -> list[tuple[str, int, int]]:
+def names(steps: LoggedSteps) -> list[tuple[str, int, int]]:
     return [(one.actor, one.episode, one.step) for one in steps]
 
 
 def test_each_step_once_in_its_order(tmp_path: Path) -> None:
     record(tmp_path / "run.mcap", step(0), step(1), step(1), step(0, "b"), step(3), step(2))
-    steps = Steps([str(tmp_path)], GROUND)
+    steps = LoggedSteps([str(tmp_path)], GROUND)
     assert names(steps) == [("a", 0, 0), ("a", 0, 1), ("b", 0, 0), ("a", 0, 3), ("a", 0, 2)]
     assert steps.counts == {"taken": 5, "duplicate": 1}
 
@@ -42,7 +42,7 @@ def test_each_step_once_in_its_order(tmp_path: Path) -> None:
 def test_what_nobody_can_learn_from_is_counted_and_left_out(tmp_path: Path) -> None:
     bad = [step(1, observation=[0.5]), step(2, reward=float("nan")), step(3, action=[float("inf"), 0.0])]
     record(tmp_path / "run.mcap", step(0), *bad, step(4))
-    steps = Steps([str(tmp_path)], GROUND)
+    steps = LoggedSteps([str(tmp_path)], GROUND)
     assert names(steps) == [("a", 0, 0), ("a", 0, 4)]
     assert steps.counts == {"taken": 2, "unusable": 2}  # the reader has passed over the reward that is no number
 
@@ -52,7 +52,7 @@ def test_actors_of_other_runs_are_others_and_those_of_other_segments_the_same(tm
         (tmp_path / folder).mkdir()
         record(tmp_path / folder / "run.mcap", step(0), step(1))
     record(tmp_path / "one" / "run_0001.mcap", step(1), step(2))
-    steps = Steps([str(tmp_path / "one"), str(tmp_path / "two")], GROUND)
+    steps = LoggedSteps([str(tmp_path / "one"), str(tmp_path / "two")], GROUND)
     assert names(steps) == [("a", 0, 0), ("a", 0, 1), ("a", 0, 2), ("a.run2", 0, 0), ("a.run2", 0, 1)]
     assert count([str(tmp_path / "one"), str(tmp_path / "two")], GROUND) == 5
     with pytest.raises(ValueError, match="no steps of quadrotor"):
@@ -63,16 +63,16 @@ def test_a_truncated_log_feeds_what_is_left_of_it(log: Path, tmp_path: Path) -> 
     whole = log.read_bytes()
     (tmp_path / "cut.mcap").write_bytes(whole[: len(whole) * 2 // 3])
     shutil.copy(log, tmp_path / "whole.mcap")
-    left = names(Steps([str(tmp_path / "cut.mcap")], GROUND))
-    assert left and left == names(Steps([str(tmp_path / "whole.mcap")], GROUND))[: len(left)]
+    left = names(LoggedSteps([str(tmp_path / "cut.mcap")], GROUND))
+    assert left and left == names(LoggedSteps([str(tmp_path / "whole.mcap")], GROUND))[: len(left)]
 
 
 def test_an_offline_run_has_no_robots_and_a_warm_start_has_both() -> None:
     offline = RunConfig(from_logs=("runs/a",), actors=0)
-    assert [place.name for place in places(offline)] == ["recorder", "learner", "feeder"]
+    assert [spec.name for spec in process_specs(offline)] == ["recorder", "learner", "feeder"]
     warm = RunConfig(from_logs=("runs/a",), actors=1)
-    assert [place.name for place in places(warm)] == ["recorder", "safety-0", "learner", "feeder", "actor-0"]
-    assert "feeder" not in [place.name for place in places(EXPERIMENTS["default"])]
+    assert [spec.name for spec in process_specs(warm)] == ["recorder", "safety-0", "learner", "feeder", "actor-0"]
+    assert "feeder" not in [spec.name for spec in process_specs(EXPERIMENTS["default"])]
     with pytest.raises(ValueError, match="actors"):
         RunConfig(actors=0)
     with pytest.raises(ValueError, match="deterministic"):

@@ -9,7 +9,7 @@ from mcap.reader import make_reader
 
 from brakeline.actors.mavlink.frame_recorder import FrameRecorder
 from brakeline.actors.mavlink.lockstep_quadrotor import LockstepQuadrotor
-from brakeline.deploy.run.mavlink_json import ENCODING, as_json, both
+from brakeline.deploy.run.mavlink_json import ENCODING, chain_derived, frames_as_json
 from brakeline.logs.minari_export import ExportError
 from brakeline.logs.reader import read
 from brakeline.logs.recorder import Inbox, Recording
@@ -51,7 +51,7 @@ def taped(periods: int) -> Bus:
 
 def test_a_recorder_stores_bytes_and_json(tmp_path: Path) -> None:
     bus = taped(3)
-    recording = Recording(tmp_path / "run.mcap", {}, bus.inbox, derive=both(lambda sample: [], as_json))
+    recording = Recording(tmp_path / "run.mcap", {}, bus.inbox, derive=chain_derived(lambda sample: [], frames_as_json))
     recording.save()
     recording.finish()
 
@@ -85,8 +85,8 @@ def test_a_log_without_frames_says_how_to_have_some(log: Path, tmp_path: Path) -
 
 def test_what_is_no_frame_is_left_out() -> None:
     line = Sample(LOG, "log/a", pb.LogLine(text="x").SerializeToString(), 1)
-    assert as_json(line) == []
+    assert frames_as_json(line) == []
     garbage = pb.MavlinkFrames(frames=[pb.MavlinkFrame(wall_time=1, raw=b"\xfd\x00no frame")])
-    assert as_json(Sample(FRAMES, "frames/a/b", garbage.SerializeToString(), 1)) == []
+    assert frames_as_json(Sample(FRAMES, "frames/a/b", garbage.SerializeToString(), 1)) == []
     with pytest.raises(Malformed):
-        as_json(Sample(FRAMES, "frames/a/b", b"\xff\xff", 1))
+        frames_as_json(Sample(FRAMES, "frames/a/b", b"\xff\xff", 1))

@@ -2,7 +2,7 @@
 
 import pytest
 
-from brakeline.deploy.run.processes import client_of, metrics_of, say_where
+from brakeline.deploy.run.processes import client_settings, metrics_address, write_endpoint
 from brakeline.messaging.bus import BusSettings
 
 
@@ -10,6 +10,6 @@ from brakeline.messaging.bus import BusSettings
     ("launcher", "third"), [("9100", "9103"), ("0.0.0.0:9100", "0.0.0.0:9103"), ("", "")], ids=["here", "there", "none"]
 )
 def test_processes_have_the_ports_behind_their_launchers(launcher, third, tmp_path):
-    say_where(tmp_path, BusSettings(listen=("tcp/127.0.0.1:7447",), metrics=launcher))
-    assert metrics_of(tmp_path, 2) == third
-    assert client_of(tmp_path).metrics == "", "who looks on does not take a port"
+    write_endpoint(tmp_path, BusSettings(listen=("tcp/127.0.0.1:7447",), metrics=launcher))
+    assert metrics_address(tmp_path, 2) == third
+    assert client_settings(tmp_path).metrics == "", "who looks on does not take a port"

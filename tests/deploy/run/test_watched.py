@@ -8,7 +8,13 @@ import pytest
 
 from brakeline.deploy.run import supervisor
 from brakeline.deploy.run.processes import ProcessSpec
-from brakeline.deploy.run.supervisor import HEALTHY_AFTER, MOST_FAILURES, SPEAKS_AFTER, LaunchError, SupervisedProcess
+from brakeline.deploy.run.supervisor import (
+    HEALTHY_AFTER,
+    MOST_FAILURES,
+    START_ALLOWANCE,
+    LaunchError,
+    SupervisedProcess,
+)
 
 
 @pytest.fixture
@@ -25,20 +31,20 @@ class Failing(SupervisedProcess):
     def start(self) -> None:
         self.popen = subprocess.Popen([sys.executable, "-c", "raise SystemExit(1)"])
         self.popen.wait()
-        self.started, self.spoke = supervisor.time.monotonic(), None
+        self.started, self.first_sign_of_life = supervisor.time.monotonic(), None
 
 
 def lives(child: SupervisedProcess, clock: list[float], until_it_speaks: float | None, after: float) -> None:
     """One life: how long until its first sign of life, None: it gives none; and how long after that."""
-    clock[0] = max(clock[0], child.due)
-    child.watch()
+    clock[0] = max(clock[0], child.next_start)
+    child.supervise()
     assert child.popen is not None
     clock[0] += until_it_speaks or 0.0
-    child.heard(child.popen.pid + 1)  # the one before it: too late to count
+    child.record_sign_of_life(child.popen.pid + 1)  # the one before it: too late to count
     if until_it_speaks is not None:
-        child.heard(child.popen.pid)
+        child.record_sign_of_life(child.popen.pid)
     clock[0] += after
-    child.watch()
+    child.supervise()
 
 
 @pytest.mark.parametrize("speaks", [0.5, 200.0])
@@ -52,7 +58,9 @@ def test_however_slowly_it_starts_the_fifth_failure_in_a_row_ends_the_run(
         lives(child, clock, speaks, 2.0)
 
 
-@pytest.mark.parametrize(("speaks", "after"), [(5.0, HEALTHY_AFTER + 1.0), (None, SPEAKS_AFTER + HEALTHY_AFTER + 1.0)])
+@pytest.mark.parametrize(
+    ("speaks", "after"), [(5.0, HEALTHY_AFTER + 1.0), (None, START_ALLOWANCE + HEALTHY_AFTER + 1.0)]
+)
 def test_who_was_healthy_before_may_fail_as_often_as_it_likes(
     speaks: float | None, after: float, clock: list[float], tmp_path: Path
 ) -> None:
