@@ -18,7 +18,7 @@ from benchmarks.decide import SCANS
 from benchmarks.timing import WARM_UP, Figures
 from brakeline.actors.decision_guard import Ask
 from brakeline.actors.episode_runner import run_episode
-from brakeline.deploy.experiments.evaluate import Evaluation, episode, prepared, prepared_fleet
+from brakeline.deploy.experiments.evaluate import Evaluation, episode, prepare_evaluation, prepare_fleet
 from brakeline.logs.episode_stats import KINDS
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.task import RobotWithTask, robot_with_task
@@ -70,12 +70,12 @@ def _weighed(robot: RobotWithTask, what: Evaluation, steps: int) -> dict[str, fl
     for policy in POLICIES:
         asked = Evaluation(policy, arena=what.arena, conditions=what.conditions, fleet=what.fleet)
         if what.fleet:
-            fleet, _, policies, question = prepared_fleet(robot, asked)
+            fleet, _, policies, question = prepare_fleet(robot, asked)
             assert question is not None
             weighed = Weighed(question)
             taken = (1 for k in range(steps) for _ in run_episode(fleet, policies, weighed, k))
         else:
-            driver, choose, question = prepared(robot, asked)
+            driver, choose, question = prepare_evaluation(robot, asked)
             assert question is not None
             weighed = Weighed(question)
             taken = (1 for k in range(steps) for _ in episode(driver, choose, weighed, k))

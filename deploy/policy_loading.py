@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from brakeline.deploy.data.sources.quantity_names import columns_of
+from brakeline.deploy.data.sources.quantity_names import column_names
 from brakeline.deploy.data.sources.source_table import NoSource
 from brakeline.messaging.policy_weights import MLP, BadWeights
 from brakeline.messaging.task import RobotWithTask
@@ -67,7 +67,7 @@ def replayed(path: Path, robot: RobotWithTask) -> Policy:
     from brakeline.deploy.data.sources.column_files import read_csv  # pyarrow with it, which no other policy needs
 
     (table,) = read_csv(path)
-    names = columns_of(robot)[1]
+    names = column_names(robot)[1]
     if missing := [name for name in names if name not in table.columns]:
         raise NoSource(f"{path}: no column {', '.join(missing)}; there are: {', '.join(table.columns)}")
     inputs = np.stack([table.columns[name] for name in names], axis=1)

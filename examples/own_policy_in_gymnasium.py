@@ -3,7 +3,7 @@
 import gymnasium
 import numpy as np
 
-from brakeline.deploy.data.certification import certified
+from brakeline.deploy.data.certification import certify
 from brakeline.deploy.data.environment_episodes import collect
 from brakeline.messaging.obstacle import Obstacle
 from brakeline.messaging.robot_description import robot_from_description
@@ -47,7 +47,7 @@ robot = robot_from_description(
 )
 how = {"state": lambda env, seen, info: seen, "actions": normalised(robot)}
 data = collect(Cart(), robot, 25_000, **how)  # so many that held-out plans state a bound within the robot's limit
-model, statement = certified(data, ModelConfig())
+model, statement = certify(data, ModelConfig())
 env = SafetyWrapper(Cart(), Filter(model), obstacles=lambda *_: [Obstacle("wall", (1.0, 0.0), yaw=np.pi)], **how)
 
 observation, _ = env.reset()

@@ -83,7 +83,7 @@ def data_folder(shared_folder: Path) -> Iterator[Path]:
     folder = shared_folder / "recorded"
     folder.mkdir(exist_ok=True)
     os.environ["BRAKELINE_DATA"] = str(folder)
-    simulated_recording.recorded(GROUND, trajectories=TRAJECTORIES)
+    simulated_recording.load_or_record(GROUND, trajectories=TRAJECTORIES)
     model_store.model_for(GROUND, ModelConfig())
     yield folder
     if before is None:
@@ -95,7 +95,7 @@ def data_folder(shared_folder: Path) -> Iterator[Path]:
 @pytest.fixture(scope="session")
 def flight_folder(data_folder: Path) -> Path:
     """The same, with a data set of the quadrotor, and its models in lockstep and in real time."""
-    simulated_recording.recorded(QUADROTOR, trajectories=FLIGHTS)
+    simulated_recording.load_or_record(QUADROTOR, trajectories=FLIGHTS)
     for robot in (QUADROTOR, QUADROTOR.in_real_time()):
         model_store.model_for(robot, ModelConfig(), BOUND)
     return data_folder

@@ -22,11 +22,11 @@ from brakeline.deploy.commands.common_options import (
     errors,
     print_json,
 )
-from brakeline.deploy.data.coverage import more_to_drive
+from brakeline.deploy.data.coverage import recording_advice
 from brakeline.deploy.data.data_paths import model_path, record_path
 from brakeline.deploy.data.run_dataset import Recorded, from_log
 from brakeline.deploy.data.simulated_recording import data_for
-from brakeline.deploy.data.supported_modes import Unsupported, supported
+from brakeline.deploy.data.supported_modes import Unsupported, certify_supported
 from brakeline.deploy.progress import under_way
 from brakeline.logs.console_tables import StackingTable
 from brakeline.messaging import brakeline_pb2 as pb
@@ -93,7 +93,7 @@ class CertifyCommand:
                 config = ModelConfig(kind, mode)
                 try:
                     config = config.of_minutes() if self.few else config
-                    model, report, unsupported = supported(data, config, self.windows, self.until_held)
+                    model, report, unsupported = certify_supported(data, config, self.windows, self.until_held)
                 except Unsupported as error:
                     results.setdefault(kind, {})[mode] = {"refused": str(error)}
                     errors.print(f"[red]{kind}, {mode}: refused:[/] {escape(str(error))}")
@@ -130,7 +130,7 @@ class CertifyCommand:
         console.print(validation_table([(report, model.model_config.windows) for model, report in models]))
         lines = [bounds_in_words(reports[0], source.data.robot.period)] if reports else []
         lines += dict.fromkeys((*notes, *filter(None, map(widening, reports))))
-        lines += [f"missing: {text}" for text in more_to_drive(reports[0], source.data)] if reports else []
+        lines += [f"missing: {text}" for text in recording_advice(reports[0], source.data)] if reports else []
         for line in (*lines, f"{path}: {source.note}"):
             console.print(line, markup=False)
         if self.verbose:

@@ -20,9 +20,9 @@ from brakeline.deploy.commands.common_options import (
     errors,
     print_json,
 )
-from brakeline.deploy.data.build_lock import alone
+from brakeline.deploy.data.build_lock import folder_lock
 from brakeline.deploy.data.data_paths import model_path, record_path
-from brakeline.deploy.data.simulated_recording import SEED, recorded
+from brakeline.deploy.data.simulated_recording import SEED, load_or_record
 from brakeline.deploy.run.first_flight_run import FirstFlightSettings, fly
 from brakeline.messaging.task import robot_maybe_with_task
 from brakeline.safety.model.stated_bound import accepted_bound, refusal
@@ -52,7 +52,7 @@ class CollectCommand:
             return self._first_flight()
         robot = robot_maybe_with_task(self.robot)
         path = self.out or record_path(robot)
-        data = recorded(robot, path, self.trajectories, self.seed, self.physics.conditions(), again=True)
+        data = load_or_record(robot, path, self.trajectories, self.seed, self.physics.conditions(), again=True)
         figures = {"path": str(path), "trajectories": len(data.trajectories), "periods": data.periods}
         if self.json:
             print_json(figures | {"digest": data.digest(), "about": data.about})
@@ -68,7 +68,7 @@ class CollectCommand:
         accepted_bound(robot, self.accept_bound)
         path = self.out or record_path(robot).with_name("flown.safetensors")
         flight = fly(robot.in_lockstep().in_real_time(), self.url, self.seed, self.first)
-        with alone(path.parent):
+        with folder_lock(path.parent):
             flight.data.save(path)
         minutes, model, report = flight.seconds / 60.0, flight.model, flight.statement
         figures: dict[str, Any] = {"path": str(path), "periods": flight.data.periods, "minutes": minutes}

@@ -18,7 +18,7 @@ from brakeline.deploy.commands.common_options import (
     errors,
     print_json,
 )
-from brakeline.deploy.experiments.evaluate import Evaluation, evaluate, prepared
+from brakeline.deploy.experiments.evaluate import Evaluation, evaluate, prepare_evaluation
 from brakeline.deploy.progress import under_way
 from brakeline.logs.metrics import EpisodeStats
 from brakeline.logs.report import show
@@ -96,7 +96,7 @@ class EvaluateCommand:
 
         films = []
         for method in (evaluation.method, "none") if self.beside else (evaluation.method,):
-            driver, policy, ask = prepared(robot, replace(evaluation, method=method))
+            driver, policy, ask = prepare_evaluation(robot, replace(evaluation, method=method))
             film = record(driver, policy, ask, self.episode)
             films.append(film)
             outcome = f"{film.end} after {len(film.frames) * robot.period:.1f} s"

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from brakeline.deploy.commands.common_options import Json, Robot, Seed, console, print_json
 from brakeline.deploy.data import excitation_plan
-from brakeline.deploy.data.sources.quantity_names import columns_of
+from brakeline.deploy.data.sources.quantity_names import column_names
 from brakeline.deploy.progress import under_way
 from brakeline.messaging.robot import robot_named
 from brakeline.messaging.task import RobotWithTask, robot_with_task
@@ -35,8 +35,8 @@ class ExciteCommand:
         if self.drive is not None:
             return self._drive(robot_with_task(self.robot), self.drive)
         robot = robot_named(self.robot)
-        print(",".join(("time", "run", *columns_of(robot)[1])))
-        for row in excitation_plan.rows(robot, self.keep, self.minutes, self.seed):
+        print(",".join(("time", "run", *column_names(robot)[1])))
+        for row in excitation_plan.excitation_rows(robot, self.keep, self.minutes, self.seed):
             print(",".join((f"{row.time:.9g}", str(row.run), *(f"{value:.6g}" for value in row.input))))
         return 0
 

@@ -11,9 +11,9 @@ from rich.markup import escape
 
 from brakeline.deploy.commands.common_options import Json, console, errors, print_json
 from brakeline.deploy.data import importer
-from brakeline.deploy.data.build_lock import alone
+from brakeline.deploy.data.build_lock import folder_lock
 from brakeline.deploy.data.coverage import Coverage, coverage
-from brakeline.deploy.data.coverage_plot import draw
+from brakeline.deploy.data.coverage_plot import draw_coverage
 from brakeline.deploy.data.data_paths import record_path
 from brakeline.deploy.data.resample import HOLD
 from brakeline.logs.console_tables import PLAIN, StackingTable
@@ -44,13 +44,13 @@ class ImportCommand:
     def run(self) -> int:
         """Import the logs. Returns the exit status; 1 if the data can't give a model set."""
         robot = robot_named(self.robot)
-        imported = importer.bring(self.sources, robot, self.map, self.delay, self.hold)
+        imported = importer.import_sources(self.sources, robot, self.map, self.delay, self.hold)
         covered = coverage(imported.data)
         path = self.out or record_path(robot)
         if self.picture is not None:
-            draw(imported.data, covered, self.picture)
+            draw_coverage(imported.data, covered, self.picture)
         if not covered.refused:
-            with alone(path.parent):
+            with folder_lock(path.parent):
                 imported.data.save(path)
         if self.json:
             figures: dict[str, Any] = {"path": None if covered.refused else str(path), "digest": imported.data.digest()}

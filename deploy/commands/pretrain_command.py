@@ -11,7 +11,7 @@ from brakeline.deploy.commands.common_options import Json, Robot, console, error
 from brakeline.deploy.data.data_paths import method_path
 from brakeline.deploy.data.model_store import pretrained
 from brakeline.deploy.data.rival_pretraining import recipe_for
-from brakeline.deploy.experiments.rival_tuning import Tried, best, try_all, values_for
+from brakeline.deploy.experiments.rival_tuning import ThresholdTrial, best_threshold, tune_threshold, values_for
 from brakeline.messaging.task import RobotWithTask, robot_with_task
 from brakeline.safety.model.model_set import ModelConfig
 from brakeline.safety.rivals.pretrained import Pretrained
@@ -50,8 +50,8 @@ class PretrainCommand:
         return 0
 
     def _tune(self, model: Pretrained, robot: RobotWithTask) -> int:
-        rows = try_all(model, robot, values_for(model, robot), self.episodes, self._print_row)
-        chosen = best(rows)
+        rows = tune_threshold(model, robot, values_for(model, robot), self.episodes, self._print_row)
+        chosen = best_threshold(rows)
         if self.json:
             print_json({"tried": [row.figures() for row in rows], "best": chosen.value})
         else:
@@ -60,7 +60,7 @@ class PretrainCommand:
             )
         return 0
 
-    def _print_row(self, row: Tried) -> None:
+    def _print_row(self, row: ThresholdTrial) -> None:
         (errors if self.json else console).print(
             f"{row.value:g}: A* {row.oracle_goals} goals of {row.episodes}, {row.oracle_interventions:.1%} "
             f"interventions; greedy {row.greedy_goals} goals, {row.greedy_collisions} collisions"

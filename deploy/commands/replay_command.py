@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from brakeline.deploy.commands.common_options import LATEST, Certificate, Json, Logs, Mode, console, print_json
-from brakeline.deploy.data.certification import certified
+from brakeline.deploy.data.certification import certify
 from brakeline.deploy.data.model_store import model_for
 from brakeline.deploy.progress import under_way
 from brakeline.deploy.run.replay_run import ROUNDING, Replacement, replay
@@ -64,7 +64,7 @@ class ReplayCommand:
     def _replacement(self) -> Replacement:
         """Return the function that gives, for a robot, the filter to ask instead of the one that was in use."""
         config = ModelConfig(self.certificate or "residual", self.mode)
-        fitted = None if self.data is None else certified(Dataset.load(self.data), config)[0]
+        fitted = None if self.data is None else certify(Dataset.load(self.data), config)[0]
 
         @cache
         def filter_for(robot: Robot) -> Filter:

@@ -10,7 +10,7 @@ import tyro
 from rich.markup import escape
 
 from brakeline.deploy.commands.common_options import Json, console, errors, print_json
-from brakeline.deploy.data.description_plot import picture, summary
+from brakeline.deploy.data.description_plot import draw_description, summary
 from brakeline.logs.console_tables import PLAIN, StackingTable
 from brakeline.messaging.robot import ROBOTS_FOLDER, robot_named
 from brakeline.messaging.robot_description import NAME, BadDescription
@@ -78,7 +78,7 @@ class RobotCommand:
         robot = robot_named(self.file)
         values = summary(robot)
         if self.picture is not None:
-            picture(robot, self.picture)
+            draw_description(robot, self.picture)
             values["picture"] = str(self.picture)
         if self.json:
             print_json(values)
@@ -103,12 +103,12 @@ def _task_text(name: str) -> str:
 
 def _from_log(source: Path, template: str, name: str) -> tuple[str, tuple[str, ...]]:
     """Return the text of a description, and notes on what the log does not show. Raises NoSource, LogError."""
-    from brakeline.deploy.data.description_template import draft
-    from brakeline.deploy.data.embedded_description import carried
+    from brakeline.deploy.data.description_template import fill_template
+    from brakeline.deploy.data.embedded_description import read_embedded_description
     from brakeline.deploy.data.importer import own_log, tables_of
-    from brakeline.deploy.data.schema_inference import told
+    from brakeline.deploy.data.schema_inference import infer_schema
 
     if own_log(source):
-        return carried(source, name), ()
-    schema = told(tables_of(source))
-    return draft(template, schema, source.name), schema.notes
+        return read_embedded_description(source, name), ()
+    schema = infer_schema(tables_of(source))
+    return fill_template(template, schema, source.name), schema.notes

@@ -18,7 +18,7 @@ TRIES = 4  # bounds that mix data and envelopes do not widen in proportion
 ROUNDING = 1e-6
 
 
-def certified(data: Dataset, model_config: ModelConfig, until_held: bool = False) -> tuple[ModelSet, ValidationReport]:
+def certify(data: Dataset, model_config: ModelConfig, until_held: bool = False) -> tuple[ModelSet, ValidationReport]:
     """A model set from 70 % of the trajectories, with its statement about the others.
 
     The envelopes are widened where that brings the statement within the robot's limit (`accept_bound`): by the factor

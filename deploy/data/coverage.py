@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from brakeline.deploy.data.certification import HELD_OUT, WIDEST
-from brakeline.deploy.data.sources.quantity_names import columns_of, split
+from brakeline.deploy.data.sources.quantity_names import column_names, split
 from brakeline.messaging.robot import Array, Robot
 from brakeline.messaging.stated_share import percent
 from brakeline.safety.model.dataset import Dataset
@@ -27,7 +27,7 @@ FEWEST = 20  # periods beyond an eighth of the range: below it nothing was seen 
 
 
 @dataclass(frozen=True)
-class Seen:
+class ValueRange:
     """Of an input, or of a coordinate that comes to one: least and most, against its bounds, in its unit."""
 
     name: str
@@ -46,9 +46,9 @@ class Seen:
 
 @dataclass(frozen=True)
 class Coverage:
-    seen: tuple[Seen, ...]
+    seen: tuple[ValueRange, ...]
     stops: int  # that are long enough to tell what is still travelled after one
-    braked_from: tuple[Seen, ...]  # inputs in force when a stop began
+    braked_from: tuple[ValueRange, ...]  # inputs in force when a stop began
     plans: int  # plan windows of the whole horizon
     windows: int  # free ones
     missing: tuple[str, ...]
@@ -61,7 +61,7 @@ class Coverage:
 
 def coverage(data: Dataset) -> Coverage:
     robot = data.robot
-    names, inputs = columns_of(robot)
+    names, inputs = column_names(robot)
     driven = np.concatenate([t.inputs for t in data.trajectories])
     states = np.concatenate([t.states for t in data.trajectories])
     seen = [
@@ -89,8 +89,8 @@ def coverage(data: Dataset) -> Coverage:
     return Coverage(tuple(seen), stops, tuple(braked), plans, free, tuple(missing))
 
 
-def _seen(name: str, label: str, low: float, high: float, values: Array) -> Seen:
-    return Seen(name, split(label)[1], low, high, float(values.min()), float(values.max()))
+def _seen(name: str, label: str, low: float, high: float, values: Array) -> ValueRange:
+    return ValueRange(name, split(label)[1], low, high, float(values.min()), float(values.max()))
 
 
 def _begun(data: Dataset) -> Array:
@@ -111,14 +111,16 @@ def _stops_missing(robot: Robot, stops: int, rested: int) -> list[str]:
     if stops >= FEWEST_STOPS:
         return []
     seconds = (rested + 2) * robot.period
-    zero = " and ".join(name for name, is_zero in zip(columns_of(robot)[1], robot.zero_at_rest, strict=True) if is_zero)
+    zero = " and ".join(
+        name for name, is_zero in zip(column_names(robot)[1], robot.zero_at_rest, strict=True) if is_zero
+    )
     return [
         f"{'no stops' if not stops else f'only {stops} stops'}, at least {FEWEST_STOPS} are needed: from every speed "
         f"give zero {zero} and let the robot stand for {seconds:.1f} s or more, {2 * FEWEST_STOPS} times or more"
     ]
 
 
-def _never(one: Seen) -> list[str]:
+def _never(one: ValueRange) -> list[str]:
     found = []
     room = NEAR * (one.high - one.low)
     if one.most < one.high - room:
@@ -128,7 +130,7 @@ def _never(one: Seen) -> list[str]:
     return found
 
 
-def _no_braking(one: Seen) -> list[str]:
+def _no_braking(one: ValueRange) -> list[str]:
     found = []
     room = 0.25 * (one.high - one.low)
     if one.most < one.high - room:
@@ -150,7 +152,7 @@ def _windows_missing(plans: int, free: int) -> list[str]:
     return []
 
 
-def more_to_drive(statement: ValidationReport, data: Dataset) -> list[str]:
+def recording_advice(statement: ValidationReport, data: Dataset) -> list[str]:
     """What to record, or to lower, for the statement to come within the robot's limit, and to turn on the spot near
     obstacles; nothing if it does.
     """

@@ -9,15 +9,15 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from brakeline.deploy.data.coverage import Coverage
-from brakeline.deploy.data.sources.quantity_names import columns_of, split
+from brakeline.deploy.data.sources.quantity_names import column_names, split
 from brakeline.messaging.robot import Array
 from brakeline.safety.model.dataset import Dataset
 
 
-def draw(data: Dataset, told: Coverage, path: Path) -> None:
+def draw_coverage(data: Dataset, told: Coverage, path: Path) -> None:
     """Writes a PNG (or what the file's ending says)."""
     robot = data.robot
-    inputs = columns_of(robot)[1]
+    inputs = column_names(robot)[1]
     wide = 1 + robot.action_dim
     figure = Figure(figsize=(4.2 * wide, 4.4), layout="constrained")
     axes = figure.subplots(1, wide)

@@ -13,25 +13,26 @@ from brakeline.messaging.robot import FEEDBACK, HOLD, RAMP, Robot
 Array = NDArray[np.float64]
 
 
-def profile(robot: Robot) -> Array:
+def full_stop_inputs(robot: Robot) -> Array:
     """The inputs (N, m) of the plan that begins at every input's bound of larger size."""
     largest = np.where(np.abs(robot.low()) > np.abs(robot.high()), robot.low(), robot.high())
     return np.asarray(robot.plan_matrix() @ np.tile(largest, robot.free_steps)).reshape(robot.horizon, -1)
 
 
-def way(robot: Robot) -> float:
+def nominal_stopping_distance(robot: Robot) -> float:
     """m, at most, of a full stop if it did at once what its inputs say: an order of magnitude, no bound."""
     speeds = [i for i, label in enumerate(robot.action) if label.endswith("[m/s]") and robot.translates[i]]
-    return float(np.linalg.norm(np.abs(profile(robot)[:, speeds]).sum(0))) * robot.period
+    return float(np.linalg.norm(np.abs(full_stop_inputs(robot)[:, speeds]).sum(0))) * robot.period
 
 
 def remarks(robot: Robot) -> list[str]:
     """What is no mistake and yet worth a thought."""
     found = []
-    if way(robot) + robot.footprint > robot.sight:
+    distance = nominal_stopping_distance(robot)
+    if distance + robot.footprint > robot.sight:
         found.append(
-            f"sight: a stop from full speed takes about {way(robot):.2f} m, the body reaches {robot.footprint:.2f} m, "
-            f"but obstacles are seen from {robot.sight:g} m on: fast driving will rarely be verified"
+            f"sight: a stop from full speed takes about {distance:.2f} m and the body reaches {robot.footprint:.2f} m, "
+            f"but the robot sees obstacles from {robot.sight:g} m only. The filter will rarely verify fast driving."
         )
     if robot.horizon == robot.free_steps + robot.brake_steps and RAMP in robot.stop:
         found.append("plan.horizon: no period of standing after the ramp: a robot with lag has not stopped by then")
@@ -55,7 +56,7 @@ def summary(robot: Robot) -> dict[str, Any]:
         },
         "plan_s": robot.horizon * robot.period,
         "braking_s": robot.brake_steps * robot.period,
-        "way_to_a_stop_m": way(robot),
+        "way_to_a_stop_m": nominal_stopping_distance(robot),
         "footprint_m": robot.footprint,
         "discs": len(robot.body),
         "limits": [limit.name for limit in robot.limits],
@@ -65,7 +66,7 @@ def summary(robot: Robot) -> dict[str, Any]:
     }
 
 
-def picture(robot: Robot, path: Path) -> None:
+def draw_description(robot: Robot, path: Path) -> None:
     """The body from above, and each input's stop, as an image file."""
     import matplotlib
 
@@ -84,7 +85,7 @@ def picture(robot: Robot, path: Path) -> None:
     reach = 1.2 * robot.footprint
     body.set(xlim=(-reach, reach), ylim=(-reach, reach))
     times = robot.period * np.arange(robot.horizon + 1)
-    for label, rule, values in zip(robot.action, robot.stop, profile(robot).T, strict=True):
+    for label, rule, values in zip(robot.action, robot.stop, full_stop_inputs(robot).T, strict=True):
         how = {RAMP: "ramp", HOLD: "held", FEEDBACK: "by feedback"}.get(str(rule), "profile")
         plan.stairs(values, times, baseline=None, label=f"{label}: {how}", linewidth=1.5)
     plan.set(xlabel="time [s]", ylabel="input", title="a plan from the largest inputs")

@@ -6,7 +6,7 @@ import json
 import math
 import re
 
-from brakeline.deploy.data.schema_inference import Column, Told
+from brakeline.deploy.data.schema_inference import Column, InferredSchema
 
 BARE = re.compile(r"[A-Za-z0-9_-]+")
 ERRORS = {"position": 0.01, "heading": 0.02}  # the template's
@@ -16,7 +16,7 @@ MOST_PERIODS = 64  # of a plan
 UNTOLD = "can't be told from the log"
 
 
-def draft(template: str, told: Told, source: str) -> str:
+def fill_template(template: str, told: InferredSchema, source: str) -> str:
     """The template's text with its values replaced; what the log can't tell is the template's, and said to be."""
     horizon, brake = periods(told)
     lines = []
@@ -55,7 +55,7 @@ def draft(template: str, told: Told, source: str) -> str:
     return "\n".join((*about, *lines)) + "\n"
 
 
-def periods(told: Told) -> tuple[int, int]:
+def periods(told: InferredSchema) -> tuple[int, int]:
     """(horizon, brake) that the braking and the delays seen ask for: an order of magnitude, no bound."""
     inputs = [(max(-_low(one), _high(one)), most) for one in told.inputs if (most := slew(one)) is not None]
     falls = [(max(abs(c.least), abs(c.most)), c.change) for c in told.states if c.follows and c.change > 0.0]

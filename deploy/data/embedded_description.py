@@ -14,7 +14,7 @@ from brakeline.logs.reader import open_log
 ROBOTS = "robots"  # a log's metadata: for each name the description as JSON
 
 
-def carried(path: Path, name: str) -> str:
+def read_embedded_description(path: Path, name: str) -> str:
     """The description of the log's robot, under a new name; of several robots, of the one that has this name.
 
     Raises:

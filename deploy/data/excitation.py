@@ -29,7 +29,7 @@ def random_target(robot: Robot, rng: np.random.Generator) -> Array:
     return np.where(rng.random(len(low)) < EXTREMES, edge, drawn)
 
 
-def towards(robot: Robot, before: Array, target: Array) -> Array:
+def limit_slew(robot: Robot, before: Array, target: Array) -> Array:
     """The input nearest to a target that the slew allows after `before`."""
     slew = np.asarray(robot.action_slew)
     return np.asarray(np.clip(target, before - slew, before + slew))
@@ -54,17 +54,19 @@ def excitation(
     while True:
         if held > MOST_HELD and rng.random() < RESTLESS:
             for _ in range(rng.integers(held + 1)):
-                before = towards(robot, before, np.where(rng.random(robot.action_dim) < 0.5, robot.low(), robot.high()))
+                before = limit_slew(
+                    robot, before, np.where(rng.random(robot.action_dim) < 0.5, robot.low(), robot.high())
+                )
                 state = yield before
         for _ in range(rng.integers(MOST_LEAD + 1)):
             target = random_target(robot, rng)
             hasty = longest_lead > MOST_HELD and rng.random() < HASTE
             for _ in range(rng.integers(1, (MOST_HELD if hasty else longest_lead) + 1)):
-                before = towards(robot, before, target)
+                before = limit_slew(robot, before, target)
                 state = yield before
         free = []
         for _ in range(robot.free_steps):
-            before = towards(robot, before, random_target(robot, rng))
+            before = limit_slew(robot, before, random_target(robot, rng))
             free.append(before)
         for k, planned in enumerate((schedule @ np.concatenate(free)).reshape(robot.horizon, -1)):
             before = planned if k < robot.free_steps else _braked(robot, planned, state, before)

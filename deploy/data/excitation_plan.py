@@ -12,14 +12,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from brakeline.deploy.data.description_plot import way
+from brakeline.deploy.data.description_plot import nominal_stopping_distance
 from brakeline.deploy.data.excitation import excitation
-from brakeline.deploy.data.sources.quantity_names import columns_of, quantities
+from brakeline.deploy.data.sources.quantity_names import column_names, quantities
 from brakeline.messaging.robot import Array, Robot
 from brakeline.safety.filter.braking import braking_plan
 from brakeline.safety.model.dataset import BadData
 
-Keep = tuple[float, float, float, float]  # x and y, least and most [m]
+Region = tuple[float, float, float, float]  # x and y, least and most [m]
 
 RUN = 60.0  # s: then the robot is put back to the middle, for what was reckoned here drifts away from where it is
 TRIES = 400  # excitations that are looked at for one that stays inside
@@ -27,13 +27,13 @@ LEAD = 4  # periods, at least, that one is made of
 
 
 @dataclass(frozen=True)
-class Row:
+class InputRow:
     time: float  # s, anew in each run
     run: int
     input: Array
 
 
-def rows(robot: Robot, keep: Keep, minutes: float, seed: int) -> Iterator[Row]:
+def excitation_rows(robot: Robot, keep: Region, minutes: float, seed: int) -> Iterator[InputRow]:
     """Inputs to give a robot, one a period; each run begins at rest in the region's middle, heading along x.
 
     Raises:
@@ -52,7 +52,7 @@ def rows(robot: Robot, keep: Keep, minutes: float, seed: int) -> Iterator[Row]:
             before = done[-1] if done else robot.zero_input()
             inputs, pose = _stretch(robot, rng, motion, pose, low, high, before)
             done += inputs
-        yield from (Row(k * robot.period, run, u) for k, u in enumerate(done))
+        yield from (InputRow(k * robot.period, run, u) for k, u in enumerate(done))
 
 
 def run_length(robot: Robot) -> int:
@@ -60,7 +60,7 @@ def run_length(robot: Robot) -> int:
     return round(RUN / robot.period)
 
 
-def _room(robot: Robot, keep: Keep) -> tuple[Array, Array]:
+def _room(robot: Robot, keep: Region) -> tuple[Array, Array]:
     """Where the position may be, least and most (2,)."""
     low, high = np.array(keep[:2]) + robot.footprint, np.array(keep[2:]) - robot.footprint
     if not (low < high).all():
@@ -68,14 +68,14 @@ def _room(robot: Robot, keep: Keep) -> tuple[Array, Array]:
     return low, high
 
 
-class Excited:
+class RegionExcitation:
     """Excitation as a policy, `(observation, info) -> input`.
 
     Each stretch from rest to rest is chosen from where the robot is measured to be. How it really moves only driving
     shows, so a robot that goes outwards within a stop's way of the edge brakes, and begins anew from there.
     """
 
-    def __init__(self, robot: Robot, keep: Keep, rng: np.random.Generator) -> None:
+    def __init__(self, robot: Robot, keep: Region, rng: np.random.Generator) -> None:
         """
         Raises:
             BadData: the region has no room to drive and stop, or nobody can tell from its inputs where the robot goes.
@@ -83,7 +83,7 @@ class Excited:
         self._robot, self._rng, self._motion = robot, rng, _motion(robot)
         self._low, self._high = _room(robot, keep)
         top = np.abs(self._motion[:2]) @ np.maximum(np.abs(robot.low()), robot.high())
-        self._to_stop = way(robot) + float(np.linalg.norm(top)) * robot.period  # a period late
+        self._to_stop = nominal_stopping_distance(robot) + float(np.linalg.norm(top)) * robot.period  # a period late
         if not (self._low + self._to_stop < self._high - self._to_stop).all():
             raise BadData(f"the region {keep} has no room to stop in: about {self._to_stop:.2f} m on each side")
         self._left: list[Array] = []
@@ -140,7 +140,7 @@ def _to_rest(robot: Robot, rng: np.random.Generator, before: Array) -> list[Arra
 
 def _motion(robot: Robot) -> Array:
     """(3, m): forward, left, turn (with a heading), or along x, along y, none, of each input."""
-    usual, inputs = quantities(robot), columns_of(robot)[1]
+    usual, inputs = quantities(robot), column_names(robot)[1]
     kinds = ("body.x", "body.y", "yaw rate") if robot.heading is not None else ("velocity.x", "velocity.y", "")
     motion = np.array([[usual.get(name) == f"command.{kind}" for name in inputs] for kind in kinds], float)
     if not motion[:2].any():

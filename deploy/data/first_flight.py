@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brakeline.actors.mavlink.mavlink_vehicle import MavlinkVehicle
-from brakeline.deploy.data.coverage import more_to_drive
-from brakeline.deploy.data.excitation import random_target, towards
-from brakeline.deploy.data.supported_modes import Unsupported, supported
+from brakeline.deploy.data.coverage import recording_advice
+from brakeline.deploy.data.excitation import limit_slew, random_target
+from brakeline.deploy.data.supported_modes import Unsupported, certify_supported
 from brakeline.messaging.robot import Robot
 from brakeline.safety.model.dataset import BadData, Dataset, Trajectory
 from brakeline.safety.model.model_set import ModelConfig, ModelSet
@@ -44,7 +44,7 @@ OUTSIDE = 10.0  # m beyond the box at which the flight is over
 ORIGIN = "maiden flight"
 
 
-class Ended(RuntimeError):
+class FlightEnded(RuntimeError):
     """The flight can't go on, and why; what was flown until then counts."""
 
 
@@ -78,8 +78,8 @@ def stretch(robot: Robot, share: float, before: Array, rng: np.random.Generator)
     for _ in range(rng.integers(4)):
         target = share * random_target(robot, rng)
         for _ in range(rng.integers(1, 4 if rng.random() < 0.6 else 12)):
-            inputs.append(towards(robot, inputs[-1], target))
-    chosen = towards(robot, inputs[-1], share * random_target(robot, rng))
+            inputs.append(limit_slew(robot, inputs[-1], target))
+    chosen = limit_slew(robot, inputs[-1], share * random_target(robot, rng))
     waiting = replace(robot.in_lockstep(), free_steps=1)
     inputs += list((waiting.plan_matrix() @ chosen).reshape(waiting.horizon, -1))
     standing = rng.integers(3) if rng.random() < 0.9 else 12
@@ -96,7 +96,7 @@ def homeward(inputs: list[Array], state: Array, box: Box, period: float, rng: np
 
 
 @dataclass
-class Flown:
+class FlightRecording:
     """What was recorded, in pieces."""
 
     trajectories: list[Trajectory] = field(default_factory=list)
@@ -119,7 +119,7 @@ class Flown:
 
 
 @dataclass(frozen=True)
-class Found:
+class FirstFlightResult:
     """What a flight ended with."""
 
     data: Dataset
@@ -130,7 +130,7 @@ class Found:
     seconds: float
 
 
-class Maiden:
+class FirstFlight:
     """Flies one vehicle that hovers where the box's middle is to be."""
 
     def __init__(
@@ -138,10 +138,10 @@ class Maiden:
     ) -> None:
         """robot: in real time."""
         self._vehicle, self._robot, self._box, self._stop = vehicle, robot, box, stop
-        self._rng, self._flown = np.random.default_rng(seed), Flown()
+        self._rng, self._flown = np.random.default_rng(seed), FlightRecording()
         self._periods = 0
 
-    def fly(self, minutes: float, about: dict[str, str]) -> Found:
+    def fly(self, minutes: float, about: dict[str, str]) -> FirstFlightResult:
         """Level after level; the last until the time is up."""
         missing, reached = list[str](), 0.0
         try:
@@ -157,7 +157,7 @@ class Maiden:
                     missing.append(f"no model predicts it at {level:.0%} of its speed: it was not flown faster")
                     break
                 reached = level
-        except Ended as error:
+        except FlightEnded as error:
             missing.append(str(error))
         self._flown.cut()
         data = self._flown.dataset(self._robot.in_lockstep(), about)
@@ -170,11 +170,11 @@ class Maiden:
             )
         if reached < 1.0:
             missing.append(f"nothing is known beyond {reached:.0%} of its speed")
-        missing += [] if statement is None else more_to_drive(statement, data)
-        return Found(data, model, statement, reached, tuple(missing), self._periods * self._robot.period)
+        missing += [] if statement is None else recording_advice(statement, data)
+        return FirstFlightResult(data, model, statement, reached, tuple(missing), self._periods * self._robot.period)
 
     def _record(self, level: float, seconds: float) -> None:
-        """Raises Ended."""
+        """Raises FlightEnded."""
         vehicle, robot = self._vehicle, self._robot
         bounds = level * robot.high()
         log.info("%.0f %% of its speed: %.1f m/s an axis, for %.0f s", 100 * level, bounds.max(), seconds)
@@ -196,7 +196,7 @@ class Maiden:
         return inputs
 
     def _period(self, wanted: Array, level: Array) -> bool:
-        """Fly one; whether the box had its way, or the recording a gap: the stretch is over. Raises Ended."""
+        """Fly one; whether the box had its way, or the recording a gap: the stretch is over. Raises FlightEnded."""
         vehicle, flown, box = self._vehicle, self._flown, self._box
         before = vehicle.current_period
         kept = box.kept(before.report.measured, wanted, level)
@@ -217,11 +217,11 @@ class Maiden:
         if len(flown.inputs) >= PIECE:
             flown.cut()
         if box.outside(period.report.measured) > OUTSIDE:
-            raise Ended(
+            raise FlightEnded(
                 f"it left its box by {box.outside(period.report.measured):.0f} m: it does not do what it is asked to"
             )
         if self._stop():
-            raise Ended("told to stop")
+            raise FlightEnded("told to stop")
         return bool((kept != wanted).any())
 
     def _patiently(self) -> None:
@@ -229,7 +229,7 @@ class Maiden:
         for _ in range(round(10.0 / self._robot.period)):
             if not self._vehicle.wait(self._vehicle.current_period.number + 1).lost:
                 return
-        raise Ended(f"it was lost for 10 s: {self._vehicle.current_period.lost}")
+        raise FlightEnded(f"it was lost for 10 s: {self._vehicle.current_period.lost}")
 
     def _off(self) -> float:
         """m, 95 % of held-out predictions `AHEAD` periods ahead are better: a linear fit of what was flown so far."""
@@ -249,7 +249,7 @@ class Maiden:
     def _model(self, data: Dataset, missing: list[str]) -> tuple[ModelSet, ValidationReport] | tuple[None, None]:
         """While the vehicle hovers."""
         try:
-            model, statement, _ = supported(replace(data, robot=self._robot), ModelConfig().of_minutes())
+            model, statement, _ = certify_supported(replace(data, robot=self._robot), ModelConfig().of_minutes())
         except (BadData, Unsupported) as error:
             missing.append(f"there is no model set: {error}")
             return None, None

@@ -10,7 +10,7 @@ from pathlib import Path
 from mcap.exceptions import McapError
 from mcap.reader import make_reader
 
-from brakeline.deploy.data.resample import HOLD, Imported, Report, resample
+from brakeline.deploy.data.resample import HOLD, ImportedData, ImportReport, resample
 from brakeline.deploy.data.run_dataset import from_log
 from brakeline.deploy.data.sources.quantity_names import mapping
 from brakeline.deploy.data.sources.source_table import NoSource, Table
@@ -64,9 +64,9 @@ def own_log(path: Path) -> bool:
     return (path.suffix == ".mcap" or path.is_dir()) and path.exists() and not is_bag(path)
 
 
-def bring(
+def import_sources(
     paths: Sequence[Path], robot: Robot, words: Sequence[str] = (), delay: float = 0.0, hold: float = HOLD
-) -> Imported:
+) -> ImportedData:
     """The data set in several sources of one robot. words: `--map` options.
 
     Raises:
@@ -89,18 +89,20 @@ def bring(
     ]
     uneven = sum(p.report.uneven * p.report.periods for p in parts) / data.periods
     delays = {name: seconds for p in parts for name, seconds in p.report.delays.items()}
-    report = Report(
+    report = ImportReport(
         data.periods, len(data.trajectories), samples.pop(), data.chord_deviation, delays, uneven, tuple(notes)
     )
-    return Imported(data, report)
+    return ImportedData(data, report)
 
 
-def _one(path: Path, robot: Robot, chosen: dict[str, str], delay: float, hold: float) -> Imported:
+def _one(path: Path, robot: Robot, chosen: dict[str, str], delay: float, hold: float) -> ImportedData:
     if own_log(path):
         recorded = from_log(path, robot, LAST)
         data = recorded.data
         samples = data.trajectories[0].paths.shape[1]
-        return Imported(data, Report(data.periods, len(data.trajectories), samples, 0.0, {}, 0.0, (recorded.note,)))
+        return ImportedData(
+            data, ImportReport(data.periods, len(data.trajectories), samples, 0.0, {}, 0.0, (recorded.note,))
+        )
     try:
         made = resample(tables_of(path), robot, chosen, delay, hold)
     except NoSource as error:

@@ -13,12 +13,12 @@ PARTS = 10  # of a period, that delays are told apart to, if the source is as fi
 MOST = 3.0  # periods: the longest delay that is looked for
 
 
-def followed(robot: Robot) -> Iterator[tuple[int, int]]:
+def followed_inputs(robot: Robot) -> Iterator[tuple[int, int]]:
     """The inputs that a coordinate of the state comes to, each with it."""
     return ((i, index) for i, index in enumerate(robot.follows) if index >= 0)
 
 
-def lag(recordings: Sequence[tuple[Series, Series, float, float]], period: float) -> float | None:
+def estimate_delay(recordings: Sequence[tuple[Series, Series, float, float]], period: float) -> float | None:
     """s from an input to what follows it, over (input, follower, begin, end) of each recording; None: nothing moved.
 
     The shift at which the changes of the one and of the other over a step of time correlate most. Of a first-order

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, TypeVar
 
 from rich.console import Console
 
-from brakeline.deploy.data.build_lock import alone
+from brakeline.deploy.data.build_lock import folder_lock
 from brakeline.deploy.data.data_paths import method_path, model_path
 from brakeline.deploy.progress import under_way
 from brakeline.messaging.robot import Robot
@@ -56,7 +56,7 @@ def _kept_or_made(path: Path, kept: Callable[[], M], made: Callable[[], M], maki
     """What lies at the path, or what is made where `kept` finds nothing of use (BadModel), by one process only."""
     with suppress(BadModel):
         return kept()
-    with alone(path.parent):
+    with folder_lock(path.parent):
         try:
             return kept()
         except BadModel as error:
@@ -74,17 +74,17 @@ def _kept(path: Path, robot: Robot) -> ModelSet:
 
 
 def _made(path: Path, robot: Robot, model_config: ModelConfig) -> ModelSet:
-    from brakeline.deploy.data.certification import certified
-    from brakeline.deploy.data.simulated_recording import data_for, recorded
+    from brakeline.deploy.data.certification import certify
+    from brakeline.deploy.data.simulated_recording import data_for, load_or_record
 
     try:
         data = data_for(robot)
     except BadData as error:
         console.print(f"[yellow]recording again:[/] {error}")
-        recorded(robot.in_lockstep(), again=True)
+        load_or_record(robot.in_lockstep(), again=True)
         data = data_for(robot)
     with under_way(f"certifying {robot.name}: {model_config.certificate}, {model_config.mode}"):
-        model, statement = certified(data, model_config)
+        model, statement = certify(data, model_config)
     console.print(
         f"{robot.name}: {model_config.certificate} ({model_config.mode}) {model.version}: "
         f"{statement.violations} violations in "
@@ -119,7 +119,7 @@ def pretrained(robot: RobotWithTask, method: str, model_config: RivalRecipe, aga
     path = method_path(robot, method, ModelConfig())
     made = partial(_pretrained, path, robot, method, model_config)
     if again:
-        with alone(path.parent):
+        with folder_lock(path.parent):
             return made()
     return _kept_or_made(path, partial(_kept_rival, path, model_config), made, f"pre-training {method}")
 

@@ -13,8 +13,8 @@ from itertools import pairwise
 
 import numpy as np
 
-from brakeline.deploy.data.input_delay import followed, lag
-from brakeline.deploy.data.sources.quantity_names import columns_of, resolve, split
+from brakeline.deploy.data.input_delay import estimate_delay, followed_inputs
+from brakeline.deploy.data.sources.quantity_names import column_names, resolve, split
 from brakeline.deploy.data.sources.source_table import Array, NoSource, Table
 from brakeline.messaging.obstacle import rotate
 from brakeline.messaging.robot import Robot
@@ -31,7 +31,7 @@ LEAP = 2.0  # times the fastest motion: a jump
 
 
 @dataclass(frozen=True)
-class Report:
+class ImportReport:
     """What was made of a source, in figures and in words."""
 
     periods: int
@@ -44,9 +44,9 @@ class Report:
 
 
 @dataclass(frozen=True)
-class Imported:
+class ImportedData:
     data: Dataset
-    report: Report
+    report: ImportReport
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,7 @@ class _Recording:
 
 def resample(
     tables: Sequence[Table], robot: Robot, chosen: dict[str, str], delay: float = 0.0, hold: float = HOLD
-) -> Imported:
+) -> ImportedData:
     """The data set that a source's tables hold. chosen: of `--map`; delay [s] by which inputs are stamped too early.
 
     Raises:
@@ -92,7 +92,9 @@ def resample(
     share = float(np.concatenate(changed).mean())
     delays = _delays(recordings, robot)
     notes += _words(robot, samples, chord_deviation, share, delays)
-    return Imported(data, Report(data.periods, len(parts), samples, chord_deviation, delays, share, tuple(notes)))
+    return ImportedData(
+        data, ImportReport(data.periods, len(parts), samples, chord_deviation, delays, share, tuple(notes))
+    )
 
 
 # --- recordings without gaps --------------------------------------------------------------------------------------
@@ -101,7 +103,7 @@ def resample(
 def _recordings(
     places: dict[str, tuple[Table, str]], robot: Robot, delay: float, hold: float
 ) -> tuple[list[_Recording], list[str]]:
-    names, inputs = columns_of(robot)
+    names, inputs = column_names(robot)
     runs = sorted({int(i) for table, _ in places.values() for i in np.unique(table.run)} or {0})
     found: list[_Recording] = []
     gaps = jumps = 0
@@ -291,11 +293,11 @@ def _between(robot: Robot, parts: Sequence[Trajectory], samples: int) -> float:
 
 
 def _delays(recordings: list[_Recording], robot: Robot) -> dict[str, float]:
-    names = columns_of(robot)[1]
+    names = column_names(robot)[1]
     found = {}
-    for i, follower in followed(robot):
+    for i, follower in followed_inputs(robot):
         series = [(r.inputs[i], r.states[follower], r.begin, r.end) for r in recordings]
-        if (seen := lag(series, robot.period)) is not None:
+        if (seen := estimate_delay(series, robot.period)) is not None:
             found[names[i]] = seen
     return found
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from brakeline.deploy.data.input_delay import lag
+from brakeline.deploy.data.input_delay import estimate_delay
 from brakeline.deploy.data.sources.quantity_names import AXES, COMMAND
 from brakeline.deploy.data.sources.source_table import Array, NoSource, Table
 
@@ -52,7 +52,7 @@ class Column:
 
 
 @dataclass(frozen=True)
-class Told:
+class InferredSchema:
     period: float  # s: the median time between two changes of an input; without any, between two rows
     states: tuple[Column, ...]  # in a description's order
     inputs: tuple[Column, ...]
@@ -88,7 +88,7 @@ class _Log:
             yield run, i[whole], i[whole] + n
 
 
-def told(tables: Sequence[Table]) -> Told:
+def infer_schema(tables: Sequence[Table]) -> InferredSchema:
     """
     Raises:
         NoSource: no two positions are found; the message says by which names they would be.
@@ -120,7 +120,7 @@ def told(tables: Sequence[Table]) -> Told:
     inputs = [_column(log, n, name=_plain(n, log), change=_slew(log, n), moves=_moves(log, n)) for n in log.inputs]
     if not inputs:
         notes.append(f"no column is an input for certain: its name begins with `{COMMAND} `, or its values are held")
-    return Told(float(f"{log.period:.3g}"), tuple(states), tuple(inputs), tuple(notes))
+    return InferredSchema(float(f"{log.period:.3g}"), tuple(states), tuple(inputs), tuple(notes))
 
 
 def _column(log: _Log, column: str, name: str = "", unit: str = "", **more: object) -> Column:
@@ -317,7 +317,7 @@ def _followers(log: _Log, others: Sequence[str]) -> tuple[dict[str, str], dict[s
             ((r.time, r.columns[name]), (r.time, r.columns[other]), float(r.time[0]), float(r.time[-1]))
             for r in log.runs
         ]
-        if (seen := lag(series, log.period)) is not None:
+        if (seen := estimate_delay(series, log.period)) is not None:
             delays[other] = seen
     return pairs, delays
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from rich.console import Console
 
 from brakeline.deploy.data import collect
-from brakeline.deploy.data.build_lock import alone
+from brakeline.deploy.data.build_lock import folder_lock
 from brakeline.deploy.data.data_paths import record_path
 from brakeline.deploy.progress import each
 from brakeline.messaging.robot import Robot
@@ -25,7 +25,7 @@ SEED = 20260
 console = Console(stderr=True, highlight=False, soft_wrap=True)
 
 
-def recorded(
+def load_or_record(
     robot: Robot,
     path: Path | None = None,
     trajectories: int | None = None,
@@ -44,7 +44,7 @@ def recorded(
     path = path or record_path(robot)
     if path.exists() and not again:
         return Dataset.load(path)
-    with alone(path.parent):
+    with folder_lock(path.parent):
         if path.exists() and not again:
             return Dataset.load(path)
         _spare(path, robot)
@@ -120,7 +120,7 @@ def data_for(robot: Robot) -> Dataset:
         BadData: it was recorded of a robot that differs in more than its body, limits and sight.
     """
     now = robot.in_lockstep()
-    data = recorded(now)
+    data = load_or_record(now)
     if replace(data.robot, body=now.body, limits=now.limits, sight=now.sight).layout() != now.layout():
         raise BadData(f"{record_path(now)} was recorded before the description of {now.name} changed")
     return replace(data, robot=robot)

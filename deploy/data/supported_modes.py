@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from brakeline.deploy.data.certification import certified
+from brakeline.deploy.data.certification import certify
 from brakeline.safety.model.dataset import BadData, Dataset
 from brakeline.safety.model.error_bounds import ErrorBoundError
 from brakeline.safety.model.model_set import ModelConfig, ModelSet
@@ -23,11 +23,11 @@ class Unsupported(BadData):
         self.reasons = reasons
 
 
-def supported(
+def certify_supported(
     data: Dataset, model_config: ModelConfig, windows: str = AUTO, until_held: bool = False
 ) -> tuple[ModelSet, ValidationReport, dict[str, str]]:
     """The model set of the first kind of windows that serves, its statement, and why the kinds before it did not.
-    until_held: see `certified`.
+    until_held: see `certify`.
 
     Raises:
         Unsupported: none does.
@@ -35,7 +35,7 @@ def supported(
     reasons: dict[str, str] = {}
     for kind in (PLAN, FREE) if windows == AUTO else (windows,):
         try:
-            model, statement = certified(data, replace(model_config, windows=kind), until_held)
+            model, statement = certify(data, replace(model_config, windows=kind), until_held)
         except (BadData, ErrorBoundError) as error:
             reasons[kind] = str(error) + (NO_PLANS if kind == PLAN else "")
         else:

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from brakeline.deploy.experiments import comparison_cells
-from brakeline.deploy.experiments.comparison_cells import METHODS, Study
+from brakeline.deploy.experiments.comparison_cells import METHODS, CellConfig
 from brakeline.messaging.task import robot_with_task
 
 RESULTS, RUNS = Path("results"), Path("runs/compare")
@@ -23,10 +23,10 @@ SEEDS = (0, 1, 2)
 
 
 @dataclass(frozen=True)
-class Cell:
+class ComparisonJob:
     """A study as a job."""
 
-    study: Study
+    study: CellConfig
 
     @property
     def robot(self) -> str:
@@ -43,8 +43,8 @@ class Cell:
         return comparison_cells.run(self.study, folder, say)
 
 
-def studies(robot: str, seeds: Iterable[int] = SEEDS, quick: bool = False) -> list[Study]:
+def cell_configs(robot: str, seeds: Iterable[int] = SEEDS, quick: bool = False) -> list[CellConfig]:
     """All cells of a robot's table, seed by seed, so that an interrupted comparison has whole seeds."""
     steps = robot_with_task(robot).task.steps
-    wanted = [Study(robot, method, seed, steps, EPISODES) for seed in seeds for method in METHODS]
+    wanted = [CellConfig(robot, method, seed, steps, EPISODES) for seed in seeds for method in METHODS]
     return [comparison_cells.quick(study) for study in wanted] if quick else wanted

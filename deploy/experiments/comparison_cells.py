@@ -15,9 +15,9 @@ from typing import Any
 from brakeline.actors.decision_guard import Ask
 from brakeline.actors.episode_runner import ActorIdentity, EpisodeRunner
 from brakeline.deploy.data.model_store import method_for
-from brakeline.deploy.data.simulated_recording import recorded
+from brakeline.deploy.data.simulated_recording import load_or_record
 from brakeline.deploy.experiments.evaluate import FRESH, in_process
-from brakeline.deploy.experiments.trials import Episodes, Trainer, TrialLog, evaluate
+from brakeline.deploy.experiments.trials import EpisodeTable, Trainer, TrialLog, evaluate
 from brakeline.deploy.policy_loading import TRAINED, UNTRAINED, policy_named
 from brakeline.deploy.vehicle_factory import environment
 from brakeline.learner.learner import Learner
@@ -35,12 +35,12 @@ METHODS = (DDPC, SAILR, SECAS, NONE)  # in the order of the paper's table
 PACKAGES = ("brakeline", "mujoco", "proxsuite", "numpy", "torch")
 
 
-class Unconfirmed(RuntimeError):
+class FigureMismatch(RuntimeError):
     """A run's log does not say what the run counted."""
 
 
 @dataclass(frozen=True)
-class Trial:
+class TrialConfig:
     """An evaluation: whose policy, behind which filter, where, how often."""
 
     policy: str  # trained | untrained | learning
@@ -54,7 +54,7 @@ class Trial:
 
 
 @dataclass(frozen=True)
-class Study:
+class CellConfig:
     """What a cell depends on, besides the version of the code."""
 
     robot: str  # and its task, where that is another than the usual one: ground+tracks
@@ -72,15 +72,15 @@ class Study:
     def name(self) -> str:
         return f"{self.method}-s{self.seed}"
 
-    def trials(self) -> list[Trial]:
+    def trials(self) -> list[TrialConfig]:
         """The table's, then those of deployment: with a filter that was not there in training, and the reverse."""
         first = self.arenas[0]
-        table = [Trial(TRAINED, self.method, arena, self.episodes) for arena in self.arenas]
+        table = [TrialConfig(TRAINED, self.method, arena, self.episodes) for arena in self.arenas]
         if self.method == DDPC:
-            table.append(Trial(TRAINED, NONE, first, self.episodes))
-            table.append(Trial(UNTRAINED, DDPC, first, self.untrained))
+            table.append(TrialConfig(TRAINED, NONE, first, self.episodes))
+            table.append(TrialConfig(UNTRAINED, DDPC, first, self.untrained))
         if self.method == NONE:
-            table.append(Trial(TRAINED, DDPC, first, self.episodes))
+            table.append(TrialConfig(TRAINED, DDPC, first, self.episodes))
         return table
 
     def config(self) -> dict[str, Any]:
@@ -92,11 +92,11 @@ class Study:
 Report = Callable[[str], object]
 
 
-def run(study: Study, folder: Path, say: Report = lambda text: None) -> dict[str, Any]:
+def run(study: CellConfig, folder: Path, say: Report = lambda text: None) -> dict[str, Any]:
     """Train, evaluate, and confirm the figures from the logs, which stay in `folder` with the policy.
 
     Raises:
-        Unconfirmed: a log says something else than was counted.
+        FigureMismatch: a log says something else than was counted.
     """
     folder.mkdir(parents=True, exist_ok=True)
     robot = robot_with_task(study.robot)
@@ -120,10 +120,10 @@ def _cost(model: Model, robot: RobotWithTask) -> dict[str, str]:
     """What was driven beforehand, and how it went. Ours is recorded in an empty yard: there is nothing to touch."""
     if isinstance(model, Pretrained):
         return {name: model.about[name] for name in ("samples", "collisions", "seconds", "error")}
-    return {"samples": str(recorded(robot).periods), "collisions": "0"}
+    return {"samples": str(load_or_record(robot).periods), "collisions": "0"}
 
 
-def _driver(study: Study, trial: Trial, robot: RobotWithTask, seed: int, actor: str) -> EpisodeRunner:
+def _driver(study: CellConfig, trial: TrialConfig, robot: RobotWithTask, seed: int, actor: str) -> EpisodeRunner:
     env = environment(robot, trial.arena, seed)
     identity, filtered = ActorIdentity(actor, 0, study.seed), trial.method != NONE
     # at an intervention training calls the episode off; an evaluation goes on, or its goal rate would mean nothing
@@ -135,12 +135,14 @@ def _question(models: dict[str, Model], method: str) -> Ask | None:
     return None if method == NONE else in_process(models[method])
 
 
-def _train(study: Study, robot: RobotWithTask, models: dict[str, Model], folder: Path, say: Report) -> dict[str, Any]:
-    trial = Trial(LEARNING, study.method, study.arenas[0], 0)
+def _train(
+    study: CellConfig, robot: RobotWithTask, models: dict[str, Model], folder: Path, say: Report
+) -> dict[str, Any]:
+    trial = TrialConfig(LEARNING, study.method, study.arenas[0], 0)
     config = LearnerConfig(td3=study.td3, seed=study.seed, steps=study.steps)
     driver = _driver(study, trial, robot, study.seed, study.name)
     trainer = Trainer(driver, _question(models, study.method), Learner(robot, config))
-    found, log_file = Episodes(), folder / "training.mcap"
+    found, log_file = EpisodeTable(), folder / "training.mcap"
     with TrialLog(log_file, _metadata(study, trial)) as log:
         for count, step in enumerate(trainer.run(log), 1):
             found.step(step)
@@ -152,7 +154,7 @@ def _train(study: Study, robot: RobotWithTask, models: dict[str, Model], folder:
 
 
 def _evaluate(
-    study: Study, trial: Trial, robot: RobotWithTask, models: dict[str, Model], folder: Path, say: Report
+    study: CellConfig, trial: TrialConfig, robot: RobotWithTask, models: dict[str, Model], folder: Path, say: Report
 ) -> dict[str, Any]:
     say(trial.name)
     name = str(folder / "policy.safetensors") if trial.policy == TRAINED else UNTRAINED
@@ -164,13 +166,13 @@ def _evaluate(
     return _confirmed(found, log_file)
 
 
-def _metadata(study: Study, trial: Trial) -> dict[str, dict[str, str]]:
+def _metadata(study: CellConfig, trial: TrialConfig) -> dict[str, dict[str, str]]:
     certificate = {"certificate": study.model_config.certificate} if trial.method == DDPC else {}
     about = {"method": trial.method, "policy": trial.policy, "arena": trial.arena, "seed": str(study.seed)}
     return {"run": about | certificate, "configuration": {"json": json.dumps(study.config())}}
 
 
-def _confirmed(found: Episodes, log_file: Path) -> dict[str, Any]:
+def _confirmed(found: EpisodeTable, log_file: Path) -> dict[str, Any]:
     """The counted figures, with those of the log beside them, which must agree."""
     columns, logged = found.columns(), analyse(log_file)
     for name, counted in (
@@ -182,9 +184,9 @@ def _confirmed(found: Episodes, log_file: Path) -> dict[str, Any]:
         ("contacts_standing", sum(columns["contact_standing"])),
     ):
         if logged[name] != counted:
-            raise Unconfirmed(f"{log_file} says {logged[name]} {name}, the run counted {counted}")
+            raise FigureMismatch(f"{log_file} says {logged[name]} {name}, the run counted {counted}")
     if logged["collisions"] < sum(columns["collision"]):
-        raise Unconfirmed(f"{log_file} says {logged['collisions']} collisions, the run counted more")
+        raise FigureMismatch(f"{log_file} says {logged['collisions']} collisions, the run counted more")
     kept = ("collisions", "interventions", "failsafes", "mean_speed", "max_speed", "mean_reward", "containment")
     return {
         "episodes": columns,
@@ -193,7 +195,7 @@ def _confirmed(found: Episodes, log_file: Path) -> dict[str, Any]:
     }
 
 
-def quick(study: Study) -> Study:
+def quick(study: CellConfig) -> CellConfig:
     """The same in a minute: enough to see that everything works, not to learn anything."""
     td3 = replace(study.td3, hidden=(64, 64), batch=64, warmup=500)
     return replace(study, steps=2_000, episodes=10, untrained=5, td3=td3)

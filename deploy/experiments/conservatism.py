@@ -14,10 +14,10 @@ from pathlib import Path
 from typing import Any
 
 from brakeline.actors.episode_runner import ActorIdentity, EpisodeRunner
-from brakeline.deploy.data.certification import certified
-from brakeline.deploy.data.simulated_recording import recorded
+from brakeline.deploy.data.certification import certify
+from brakeline.deploy.data.simulated_recording import load_or_record
 from brakeline.deploy.experiments.evaluate import FRESH, in_process
-from brakeline.deploy.experiments.trials import Episodes, evaluate
+from brakeline.deploy.experiments.trials import EpisodeTable, evaluate
 from brakeline.deploy.policy_loading import policy_named
 from brakeline.deploy.vehicle_factory import environment
 from brakeline.messaging.task import RobotWithTask, robot_with_task
@@ -50,7 +50,7 @@ class Conservatism:
     def run(self, folder: Path, say: Callable[[str], object] = lambda text: None) -> dict[str, Any]:
         """A row for each certificate and mode, the refused ones with the reason."""
         robot = robot_with_task(self.robot)
-        data = recorded(robot)
+        data = load_or_record(robot)
         rows = []
         for certificate in KINDS:
             for mode in MODES:
@@ -58,7 +58,7 @@ class Conservatism:
                 model_config = ModelConfig(certificate, mode)
                 row: dict[str, Any] = asdict(model_config)
                 try:
-                    model, statement = certified(data, model_config)
+                    model, statement = certify(data, model_config)
                 except (BadData, ErrorBoundError) as error:
                     rows.append(row | {"refused": str(error)})
                     continue
@@ -73,7 +73,7 @@ class Conservatism:
     def _drive(self, robot: RobotWithTask, policy: str, question: Any) -> dict[str, Any]:
         """Closed loop on the first fresh episodes."""
         driver = EpisodeRunner(robot, environment(robot, self.arena, FRESH), ActorIdentity("conservatism", 0, 0))
-        found: Episodes = evaluate(driver, policy_named(policy, robot, 0), question, self.episodes)
+        found: EpisodeTable = evaluate(driver, policy_named(policy, robot, 0), question, self.episodes)
         columns, steps = found.columns(), found.decisions
         return {
             "goals": sum(columns["goal"]),

@@ -64,7 +64,7 @@ def episode(driver: EpisodeRunner, policy: Policy, question: Ask | None, number:
         yield step
 
 
-def prepared(robot: RobotWithTask, what: Evaluation) -> tuple[EpisodeRunner, Policy, Ask | None]:
+def prepare_evaluation(robot: RobotWithTask, what: Evaluation) -> tuple[EpisodeRunner, Policy, Ask | None]:
     """What an evaluation is made of: the driver in a fresh environment, the policy, and whom it asks."""
     policy = policy_named(what.policy, robot, what.seed)
     env = environment(robot, what.arena, FRESH + what.seed, what.conditions)
@@ -80,7 +80,7 @@ def _question(robot: RobotWithTask, what: Evaluation) -> Ask | None:
     return in_process(method_for(robot, what.method, what.model_config, what.accept_bound), what.accept_bound)
 
 
-def prepared_fleet(robot: RobotWithTask, what: Evaluation) -> tuple[RobotGroup, FleetEnv, list[Policy], Ask | None]:
+def prepare_fleet(robot: RobotWithTask, what: Evaluation) -> tuple[RobotGroup, FleetEnv, list[Policy], Ask | None]:
     """The same for several robots in one world.
 
     Raises:
@@ -104,7 +104,7 @@ def evaluate(
     called after every one."""
     if what.fleet:
         return _together(robot, what, each) | _about(what)
-    driver, policy, question = prepared(robot, what)
+    driver, policy, question = prepare_evaluation(robot, what)
     tally = EpisodeStats()
     for number in range(what.episodes):
         for step in episode(driver, policy, question, number):
@@ -115,7 +115,7 @@ def evaluate(
 
 def _together(robot: RobotWithTask, what: Evaluation, each: Callable[[EpisodeStats], Any]) -> dict[str, Any]:
     """A fleet's figures: of all, by kind and by robot as `analyse` has them, and of its worlds."""
-    fleet, world, policies, question = prepared_fleet(robot, what)
+    fleet, world, policies, question = prepare_fleet(robot, what)
     tallies = {driver.identity.actor: EpisodeStats() for driver in fleet.runners}
     rounds, periods = -(-what.episodes // what.fleet), 0
     for number in range(rounds):

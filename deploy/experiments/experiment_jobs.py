@@ -21,7 +21,7 @@ from brakeline.messaging.atomic_files import write_atomically
 LONGEST_LINE = 500  # characters of a job's progress
 
 
-class OtherConfiguration(ValueError):
+class StaleResultError(ValueError):
     """A result that is there was made with other settings."""
 
 
@@ -44,7 +44,7 @@ def read(results: Path, job: Job) -> dict[str, Any] | None:
     """The job's result, None if it has none yet.
 
     Raises:
-        OtherConfiguration: it has one of other settings; the message names them.
+        StaleResultError: it has one of other settings; the message names them.
     """
     path = result_path(results, job)
     if not path.exists():
@@ -53,7 +53,7 @@ def read(results: Path, job: Job) -> dict[str, Any] | None:
     theirs, ours = found.get("study", {}), job.config()
     differing = sorted(name for name in theirs | ours if theirs.get(name) != ours.get(name))
     if differing:
-        raise OtherConfiguration(f"{path} was made with another {', '.join(differing)}: move it away, or give --again")
+        raise StaleResultError(f"{path} was made with another {', '.join(differing)}: move it away, or give --again")
     return found
 
 
@@ -77,7 +77,7 @@ def complete(
     `say` is told a job's name and how far it is.
 
     Raises:
-        OtherConfiguration: before anything is run; or whatever a job raised, once the others under way are done.
+        StaleResultError: before anything is run; or whatever a job raised, once the others under way are done.
     """
     if again:
         for job in jobs:

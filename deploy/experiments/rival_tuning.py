@@ -25,7 +25,7 @@ SETTING = {SECAS: "clearance", SAILR: "threshold"}
 
 
 @dataclass(frozen=True)
-class Tried:
+class ThresholdTrial:
     """A value of the threshold (SECAS: m beside the footprint; SAILR: η), and what came of `episodes` a driver."""
 
     value: float
@@ -44,7 +44,9 @@ def values_for(model: Pretrained, robot: RobotWithTask) -> tuple[float, ...]:
     return robot.task.rivals.margins if model.method == SECAS else ADVANTAGES
 
 
-def tried(model: Pretrained, robot: RobotWithTask, value: float, episodes: int, arena: str = "default") -> Tried:
+def try_threshold(
+    model: Pretrained, robot: RobotWithTask, value: float, episodes: int, arena: str = "default"
+) -> ThresholdTrial:
     """The model with another threshold, on fresh episodes."""
     setting = robot.footprint + value if model.method == SECAS else value
     question = in_process(replace(model, settings=dict(model.settings) | {SETTING[model.method]: setting}))
@@ -53,7 +55,7 @@ def tried(model: Pretrained, robot: RobotWithTask, value: float, episodes: int, 
         driver = EpisodeRunner(robot, environment(robot, arena, FRESH), ActorIdentity("tune", 0, 0))
         found[name] = evaluate(driver, policy_named(name, robot, 0), question, episodes)
     oracle, greedy = found[ORACLE].columns(), found[GREEDY].columns()
-    return Tried(
+    return ThresholdTrial(
         value,
         episodes,
         int(sum(oracle["goal"])),
@@ -63,22 +65,22 @@ def tried(model: Pretrained, robot: RobotWithTask, value: float, episodes: int, 
     )
 
 
-def try_all(
+def tune_threshold(
     model: Pretrained,
     robot: RobotWithTask,
     values: Sequence[float],
     episodes: int,
-    say: Callable[[Tried], object] = lambda row: None,
-) -> list[Tried]:
+    say: Callable[[ThresholdTrial], object] = lambda row: None,
+) -> list[ThresholdTrial]:
     """A row for each value, told as soon as it is known."""
     rows = []
     for value in values:
-        rows.append(tried(model, robot, value, episodes))
+        rows.append(try_threshold(model, robot, value, episodes))
         say(rows[-1])
     return rows
 
 
-def best(rows: Sequence[Tried]) -> Tried:
+def best_threshold(rows: Sequence[ThresholdTrial]) -> ThresholdTrial:
     """By the rule above."""
     most = max(row.oracle_goals for row in rows)
     unharmed = [row for row in rows if row.oracle_goals == most]

@@ -69,7 +69,7 @@ class TrialLog:
 
 
 @dataclass
-class Episodes:
+class EpisodeTable:
     """One row per finished episode, and the times of every decision.
 
     steps; goal, collision, timeout (0 or 1); reward without penalties; speed [m/s] summed over steps, and the highest;
@@ -129,7 +129,7 @@ class Proposal:
 Propose = Callable[[EpisodeRunner], Proposal]
 
 
-def thinking(policy: Policy) -> Propose:
+def timed_policy(policy: Policy) -> Propose:
     """A policy, timed."""
 
     def propose(driver: EpisodeRunner) -> Proposal:
@@ -140,7 +140,7 @@ def thinking(policy: Policy) -> Propose:
     return propose
 
 
-def one_step(driver: EpisodeRunner, propose: Propose, question: Ask | None, version: int = 0) -> pb.Step:
+def take_step(driver: EpisodeRunner, propose: Propose, question: Ask | None, version: int = 0) -> pb.Step:
     """Propose, ask, act."""
     proposal = propose(driver)
     outcome = driver.decide(proposal.action, question)
@@ -162,15 +162,15 @@ def without_observations(step: pb.Step) -> pb.Step:
 
 def evaluate(
     driver: EpisodeRunner, policy: Policy, question: Ask | None, episodes: int, log: TrialLog | None = None
-) -> Episodes:
+) -> EpisodeTable:
     """The policy without exploration, through episodes 0 to `episodes` − 1 of the driver's environment."""
-    found, propose = Episodes(), thinking(policy)
+    found, propose = EpisodeTable(), timed_policy(policy)
     for number in range(episodes):
         message = driver.begin(number)
         if log is not None:
             log.put(EPISODE, message)
         while driver.running:
-            step = one_step(driver, propose, question)
+            step = take_step(driver, propose, question)
             found.step(step)
             if log is not None:
                 log.put(STEP, without_observations(step))
@@ -196,7 +196,7 @@ class Trainer:
                 self._random = scripted("random", self.driver.robot, self.driver.rng)
                 if log is not None:
                     log.put(EPISODE, message)
-            step = one_step(self.driver, thinking(self._explore), self.question, self.policy.version)
+            step = take_step(self.driver, timed_policy(self._explore), self.question, self.policy.version)
             self.learner.insert(step)
             self.learner.work(1 << 30)
             if self.learner.weights_due():

@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 
 from brakeline.actors.episode_runner import ActorIdentity, EpisodeRunner
-from brakeline.deploy.data.excitation_plan import Excited, Keep, run_length
-from brakeline.deploy.experiments.trials import TrialLog, one_step, thinking
+from brakeline.deploy.data.excitation_plan import Region, RegionExcitation, run_length
+from brakeline.deploy.experiments.trials import TrialLog, take_step, timed_policy
 from brakeline.deploy.vehicle_factory import empty_arena, factory
 from brakeline.messaging.task import RobotWithTask
 from brakeline.messaging.topics import EPISODE, STEP
@@ -37,7 +37,7 @@ class Driven:
 
 def drive(
     robot: RobotWithTask,
-    region: Keep,
+    region: Region,
     minutes: float,
     seed: int,
     path: Path,
@@ -56,7 +56,7 @@ def drive(
     """
     if path.exists():
         raise FileExistsError(f"{path} is there already: choose another file")
-    policy = Excited(robot, region, np.random.default_rng(seed))
+    policy = RegionExcitation(robot, region, np.random.default_rng(seed))
 
     def draw(name: str, rng: np.random.Generator, robot: RobotWithTask) -> Arena:
         return empty_arena(robot, ((region[0] + region[2]) / 2.0, (region[1] + region[3]) / 2.0))
@@ -76,7 +76,7 @@ def drive(
             log.put(EPISODE, driver.begin(run))
             before = periods
             while driver.running and periods - before < length:
-                step = one_step(driver, thinking(policy), None)
+                step = take_step(driver, timed_policy(policy), None)
                 log.put(STEP, step)
                 position = np.array(step.true_state[:2])
                 periods, collisions = periods + 1, collisions + step.collision

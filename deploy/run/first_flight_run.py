@@ -15,7 +15,7 @@ from brakeline.messaging.robot import Robot
 from brakeline.messaging.stop_signals import stop_on_signals
 
 if TYPE_CHECKING:
-    from brakeline.deploy.data.first_flight import Found
+    from brakeline.deploy.data.first_flight import FirstFlightResult
 
 LANDING_TIMEOUT = 120.0  # s
 
@@ -40,7 +40,7 @@ class FirstFlightSettings:
     `collect` and `fly`."""
 
 
-def fly(robot: Robot, url: str, seed: int, settings: FirstFlightSettings) -> Found:
+def fly(robot: Robot, url: str, seed: int, settings: FirstFlightSettings) -> FirstFlightResult:
     """Take off, fly, land, and return the recorded data and the model set of it.
 
     SIGINT or SIGTERM land the vehicle at once; the data until then count.
@@ -55,7 +55,7 @@ def fly(robot: Robot, url: str, seed: int, settings: FirstFlightSettings) -> Fou
     """
     from brakeline.actors.mavlink.mavlink_vehicle import MavlinkVehicle
     from brakeline.actors.mavlink.vehicle_socket import listening
-    from brakeline.deploy.data.first_flight import Box, Maiden
+    from brakeline.deploy.data.first_flight import Box, FirstFlight
 
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s", datefmt="%H:%M:%S")
     with (
@@ -77,7 +77,7 @@ def fly(robot: Robot, url: str, seed: int, settings: FirstFlightSettings) -> Fou
             middle = vehicle.current_period.report.measured[:3]
             box = Box(middle, np.array([0.5 * settings.room, 0.5 * settings.room, settings.height * 2.0 / 3.0]))
             metadata = {"autopilot": "; ".join(vehicle.notes), "url": url}
-            flight = Maiden(vehicle, robot, box, seed, stop.is_set).fly(settings.minutes, metadata)
+            flight = FirstFlight(vehicle, robot, box, seed, stop.is_set).fly(settings.minutes, metadata)
             vehicle.wait(vehicle.current_period.number + robot.horizon)
             vehicle.land()
             deadline = time.monotonic() + LANDING_TIMEOUT

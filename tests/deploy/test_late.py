@@ -7,7 +7,7 @@ import pytest
 
 from brakeline.actors.episode_runner import ActorIdentity, EpisodeRunner
 from brakeline.deploy.data.run_dataset import trajectories_of
-from brakeline.deploy.experiments.evaluate import Evaluation, episode, evaluate, prepared
+from brakeline.deploy.experiments.evaluate import Evaluation, episode, evaluate, prepare_evaluation
 from tests.accepting import BOUND
 from tests.robots import QUADROTOR
 
@@ -29,7 +29,7 @@ def test_a_pilot_that_knows_of_its_delay_gets_there() -> None:
 
 
 def test_without_answers_it_brakes_along_the_plan_that_it_was_committed_to(flight_folder: Path) -> None:
-    driver, policy, question = prepared(ROBOT, Evaluation("greedy", accept_bound=BOUND))
+    driver, policy, question = prepare_evaluation(ROBOT, Evaluation("greedy", accept_bound=BOUND))
     assert question is not None
     driver.begin(0)
 
@@ -49,7 +49,7 @@ def test_without_answers_it_brakes_along_the_plan_that_it_was_committed_to(fligh
 
 
 def test_a_flight_that_goes_on_keeps_its_plan_from_goal_to_goal() -> None:
-    driver, _, question = prepared(ROBOT, Evaluation("greedy", accept_bound=BOUND))
+    driver, _, question = prepare_evaluation(ROBOT, Evaluation("greedy", accept_bound=BOUND))
     assert question is not None
     flying = EpisodeRunner(ROBOT, driver.env, ActorIdentity("a", 0, 0), continuous=True)
     flying.begin(0)
@@ -62,7 +62,7 @@ def test_a_flight_that_goes_on_keeps_its_plan_from_goal_to_goal() -> None:
 
 
 def test_a_log_tells_which_input_was_in_force() -> None:
-    driver, policy, question = prepared(ROBOT, Evaluation("greedy", accept_bound=BOUND))
+    driver, policy, question = prepare_evaluation(ROBOT, Evaluation("greedy", accept_bound=BOUND))
     steps, in_force = [], []
     for step in episode(driver, policy, question, 0):
         steps.append(step)

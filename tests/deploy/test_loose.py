@@ -18,7 +18,7 @@ def few(tmp_path_factory):
     folder = tmp_path_factory.mktemp("few")
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("BRAKELINE_DATA", str(folder))
-        simulated_recording.recorded(GROUND, trajectories=24)
+        simulated_recording.load_or_record(GROUND, trajectories=24)
         yield folder
 
 

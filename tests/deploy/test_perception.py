@@ -6,7 +6,7 @@ from itertools import islice
 import pytest
 
 from benchmarks import perception_cost
-from brakeline.deploy.experiments.evaluate import Evaluation, episode, prepared
+from brakeline.deploy.experiments.evaluate import Evaluation, episode, prepare_evaluation
 from brakeline.logs.episode_stats import KINDS
 from brakeline.sim.sim_conditions import Conditions, Perception, SensorFaults
 from tests.accepting import BOUND
@@ -36,7 +36,7 @@ FAULTS = {
 def test_who_flies_by_range_images_alone_hits_nothing(flight_folder, policy, faults):
     conditions = Conditions(perception=Perception("scan", FAULTS[faults]))
     what = Evaluation(policy, conditions=conditions, accept_bound=BOUND)
-    driver, choose, question = prepared(QUADROTOR, what)
+    driver, choose, question = prepare_evaluation(QUADROTOR, what)
     weighed = perception_cost.Weighed(question)
     steps = list(islice(episode(driver, choose, weighed, 0), 40))
     assert len(steps) > 10 and not any(step.collision for step in steps)

@@ -11,7 +11,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from brakeline.deploy.data.certification import certified
+from brakeline.deploy.data.certification import certify
 from brakeline.messaging.bus import Bus, BusSettings
 from brakeline.messaging.free_ports import free_endpoint
 from brakeline.messaging.obstacle import Obstacle
@@ -64,7 +64,7 @@ def test_driving_at_hazards_costs_nothing_behind_a_filter_of_own_data(tmp_path, 
     record, lines = tmp_path / f"{robot}.safetensors", tmp_path / "lines.jsonl"
     told(python, "collect.py", robot, str(record), str(periods))
     models = ModelRegistry(accept_bound=BOUND)
-    models.install(certified(Dataset.load(record), ModelConfig())[0])
+    models.install(certify(Dataset.load(record), ModelConfig())[0])
     endpoint = free_endpoint()
     words = [robot, "adversarial", "--seeds", "0", "1", "--steps", "300"]
     with Bus(BusSettings(listen=(endpoint,)), "safety") as bus:

@@ -13,7 +13,7 @@ import pytest
 from brakeline.actors.episode_runner import ActorIdentity, EpisodeRunner
 from brakeline.deploy.cli import main
 from brakeline.deploy.data import collect, data_paths, model_store, simulated_recording
-from brakeline.deploy.data.certification import certified
+from brakeline.deploy.data.certification import certify
 from brakeline.deploy.experiments.evaluate import FRESH, episode, in_process
 from brakeline.deploy.policy_loading import policy_named
 from brakeline.deploy.run.processes import process_specs
@@ -52,7 +52,7 @@ def recorded(kind: RobotWithTask) -> Dataset:
 
 @pytest.fixture(scope="module")
 def model(recorded: Dataset) -> ModelSet:
-    return certified(recorded, ModelConfig())[0]
+    return certify(recorded, ModelConfig())[0]
 
 
 def exact(name: str) -> Vehicle:
@@ -172,7 +172,7 @@ def test_recorded_inputs_keep_the_steering_at_a_stop() -> None:
 
 def test_what_was_not_fitted_keeps_to_the_tubes(recorded: Dataset) -> None:
     """The share of held-out plans that leave their tubes is what the statement says it can be; narrower tubes fail."""
-    model, statement = certified(recorded, ModelConfig())
+    model, statement = certify(recorded, ModelConfig())
     assert statement.windows > 50 and statement.violations <= 0.05 * statement.windows
     assert statement.bound_plan < 0.2
     assert model.robot == recorded.robot

@@ -17,7 +17,7 @@ GRAVITY = 9.80665  # m/s²
 APART = 0.5  # s between two attitudes, at most, to know one in between
 
 
-def with_accelerations(tables: Sequence[Table]) -> list[Table]:
+def add_accelerations(tables: Sequence[Table]) -> list[Table]:
     """The same tables; those with a force have the acceleration that it shows, where an attitude is known then."""
     attitudes = min((t for t in tables if ATTITUDE[0] in t.columns), key=lambda t: t.rank, default=None)
     if attitudes is None or len(attitudes.time) < 2:

@@ -15,7 +15,7 @@ os.environ.setdefault("MAVLINK20", "1")
 
 from pymavlink import DFReader
 
-from brakeline.deploy.data.sources.acceleration import with_accelerations
+from brakeline.deploy.data.sources.acceleration import add_accelerations
 from brakeline.deploy.data.sources.angles import yaw_from_ned
 from brakeline.deploy.data.sources.message_rows import Kept, Kinds, Row, along_body, vector
 from brakeline.deploy.data.sources.source_table import NoSource, Table
@@ -74,4 +74,4 @@ def read(path: Path) -> list[Table]:
     while (message := log.recv_match(type=list(KINDS))) is not None:
         kept.take(message.get_type(), int(message.TimeUS), message)
     log.close()
-    return with_accelerations(kept.tables())
+    return add_accelerations(kept.tables())

@@ -26,7 +26,7 @@ def split(label: str) -> tuple[str, str]:
     return name, unit.removesuffix("]")
 
 
-def columns_of(robot: Robot) -> tuple[list[str], list[str]]:
+def column_names(robot: Robot) -> tuple[list[str], list[str]]:
     """The names that the state's and the inputs' columns have; an input that shares its name with a coordinate of the
     state is `command NAME`."""
     states = [split(label)[0] for label in robot.state]
@@ -36,7 +36,7 @@ def columns_of(robot: Robot) -> tuple[list[str], list[str]]:
 
 def quantities(robot: Robot) -> dict[str, str]:
     """For each of its columns the quantity it is by role and unit, where that is plain."""
-    states, inputs = columns_of(robot)
+    states, inputs = column_names(robot)
     frame = "velocity" if robot.heading is None else "body"
     found: dict[str, str] = {}
 
@@ -68,7 +68,7 @@ def mapping(words: Iterable[str], robot: Robot) -> dict[str, str]:
     Raises:
         NoSource: one is none, or its name is none of the robot's.
     """
-    states, inputs = columns_of(robot)
+    states, inputs = column_names(robot)
     found: dict[str, str] = {}
     for word in words:
         name, equals, place = word.partition("=")
@@ -87,7 +87,7 @@ def resolve(tables: Sequence[Table], robot: Robot, chosen: dict[str, str]) -> di
     usual = quantities(robot)
     found: dict[str, tuple[Table, str]] = {}
     problems: list[str] = []
-    for name in (*columns_of(robot)[0], *columns_of(robot)[1]):
+    for name in (*column_names(robot)[0], *column_names(robot)[1]):
         if name in chosen:
             offers = [(t, f) for t in tables for f in t.columns if chosen[name] in (f"{t.name}/{f}", f)]
             wanted = f"{chosen[name]!r} (--map)"

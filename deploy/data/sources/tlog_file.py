@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from brakeline.actors.mavlink.ardupilot_dialect import mavlink as dialect
-from brakeline.deploy.data.sources.acceleration import GRAVITY, with_accelerations
+from brakeline.deploy.data.sources.acceleration import GRAVITY, add_accelerations
 from brakeline.deploy.data.sources.angles import yaw_from_ned
 from brakeline.deploy.data.sources.message_rows import Kept, Kinds, Row, vector
 from brakeline.deploy.data.sources.source_table import NoSource, Table
@@ -78,7 +78,7 @@ def read(path: Path) -> list[Table]:
     if len(vehicles) > 1:
         raise NoSource(f"{path} tells of several vehicles: systems {', '.join(map(str, sorted(vehicles)))}")
     tables = kept.tables()
-    return with_accelerations([t if t.name == SENT else _on_our_clock(t) for t in tables])
+    return add_accelerations([t if t.name == SENT else _on_our_clock(t) for t in tables])
 
 
 def _on_our_clock(table: Table) -> Table:

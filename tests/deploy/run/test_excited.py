@@ -9,7 +9,7 @@ import pytest
 
 from brakeline.actors.episode_runner import ActorIdentity, EpisodeRunner
 from brakeline.deploy.cli import main
-from brakeline.deploy.data.excitation_plan import Excited
+from brakeline.deploy.data.excitation_plan import RegionExcitation
 from brakeline.deploy.experiments.evaluate import episode
 from brakeline.deploy.policy_loading import policy_named
 from brakeline.deploy.vehicle_factory import environment
@@ -46,7 +46,7 @@ def test_a_car_is_driven_inside_the_region_and_its_log_is_imported(tmp_path, cap
 
 
 def test_who_goes_outwards_near_the_edge_brakes_by_the_robots_own_rule():
-    policy = Excited(robot_with_task(CAR), KEEP, np.random.default_rng(0))
+    policy = RegionExcitation(robot_with_task(CAR), KEEP, np.random.default_rng(0))
     at = {"time": 0.0, "state": np.zeros(5), "input_in_force": np.zeros(2)}
     policy(None, at)
     driven = np.array([0.4, 0.2])
@@ -59,7 +59,7 @@ def test_who_goes_outwards_near_the_edge_brakes_by_the_robots_own_rule():
 
 def test_a_region_without_room_to_stop_is_refused():
     with pytest.raises(BadData, match="no room to stop in"):
-        Excited(GROUND, (-0.2, -0.2, 0.2, 0.2), np.random.default_rng(0))
+        RegionExcitation(GROUND, (-0.2, -0.2, 0.2, 0.2), np.random.default_rng(0))
 
 
 def test_printed_inputs_are_a_policy_of_any_actor(tmp_path):

@@ -4,14 +4,14 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from brakeline.deploy.experiments.evaluate import Evaluation, prepared
+from brakeline.deploy.experiments.evaluate import Evaluation, prepare_evaluation
 from brakeline.deploy.run.episode_render import Film, record, save
 from tests.robots import GROUND
 
 
 @pytest.fixture(scope="module")
 def film(data_folder) -> Film:
-    driver, policy, question = prepared(GROUND, Evaluation(policy="greedy", episodes=1))
+    driver, policy, question = prepare_evaluation(GROUND, Evaluation(policy="greedy", episodes=1))
     whole = record(driver, policy, question, 0)
     return Film(whole.robot, whole.arena, whole.frames[:12], whole.frames[12].position, "cut")
 
@@ -24,7 +24,7 @@ def test_the_frames_are_what_was_decided(film):
 
 
 def test_without_a_filter_there_is_no_tube(data_folder):
-    driver, policy, question = prepared(GROUND, Evaluation(policy="greedy", method="none"))
+    driver, policy, question = prepare_evaluation(GROUND, Evaluation(policy="greedy", method="none"))
     found = record(driver, policy, question, 1)
     assert found.frames[0].kind == "no filter" and len(found.frames[0].low) == 0
     assert found.end in ("goal", "collision", "out of time")

@@ -7,7 +7,7 @@ import pytest
 from rosbags.rosbag2 import StoragePlugin
 
 from brakeline.deploy.cli import main
-from brakeline.deploy.data.importer import bring, tables_of
+from brakeline.deploy.data.importer import import_sources, tables_of
 from brakeline.deploy.data.resample import resample
 from brakeline.deploy.data.sources.source_table import NoSource, Table
 from brakeline.messaging.robot_description import robot_from_description
@@ -38,17 +38,25 @@ def same(one: Dataset, other: Dataset, within: float) -> None:
 @pytest.mark.parametrize("storage", StoragePlugin)
 def test_a_bag_and_a_csv_of_the_same_drive_are_the_same_data(driven, as_csv, tmp_path, storage):
     bag = write_bag(tmp_path / "bag", *driven, storage)
-    same(bring([as_csv], porter()).data, bring([bag], porter()).data, 1e-9)
+    same(import_sources([as_csv], porter()).data, import_sources([bag], porter()).data, 1e-9)
     if storage is StoragePlugin.MCAP:  # the file alone does, too
-        same(bring([as_csv], porter()).data, bring([bag / "bag.mcap"], porter()).data, 1e-9)
+        same(import_sources([as_csv], porter()).data, import_sources([bag / "bag.mcap"], porter()).data, 1e-9)
 
 
 def test_parquet_is_as_good_as_csv(driven, as_csv, tmp_path):
-    same(bring([as_csv], porter()).data, bring([write_parquet(tmp_path / "a.parquet", *driven)], porter()).data, 1e-9)
+    same(
+        import_sources([as_csv], porter()).data,
+        import_sources([write_parquet(tmp_path / "a.parquet", *driven)], porter()).data,
+        1e-9,
+    )
 
 
 def test_a_rovers_log_of_ardupilot_is_the_same_drive(driven, as_csv, tmp_path):
-    same(bring([as_csv], porter()).data, bring([write_bin(tmp_path / "a.bin", *driven)], porter()).data, 1e-5)
+    same(
+        import_sources([as_csv], porter()).data,
+        import_sources([write_bin(tmp_path / "a.bin", *driven)], porter()).data,
+        1e-5,
+    )
 
 
 PUCK = {
@@ -75,9 +83,9 @@ def test_a_flight_in_ned_is_read_in_enu(tmp_path, write, ending):
     position = np.cumsum(np.vstack([np.zeros(2), 0.05 * u[:-1]]), 0)
     seen = np.hstack([position, u, u])
     robot = robot_from_description(PUCK)
-    data = bring([write(tmp_path / f"a.{ending}", time, seen)], robot).data
+    data = import_sources([write(tmp_path / f"a.{ending}", time, seen)], robot).data
     csv = write_csv(tmp_path / "a.csv", time, seen, ("x", "y", "vx", "vy", "ux", "uy"))
-    same(bring([csv], robot).data, data, 1e-4)
+    same(import_sources([csv], robot).data, data, 1e-4)
 
 
 # --- periods out of columns --------------------------------------------------------------------------------------
@@ -196,17 +204,17 @@ def test_what_is_missing_is_named_with_what_there_is(tmp_path, driven):
     path = write_csv(tmp_path / "a.csv", *driven)
     path.write_text(path.read_text().replace("time,x,y,heading,v,", "time,x,why,heading,v,", 1))
     with pytest.raises(NoSource, match=r"y: there is no column 'y' .*\nthere is: columns: x, why, heading"):
-        bring([path], porter())
-    assert bring([path], porter(), ["y=why"]).report.periods > 500
+        import_sources([path], porter())
+    assert import_sources([path], porter(), ["y=why"]).report.periods > 500
     with pytest.raises(NoSource, match="one of x, y, heading, v, w, speed, turn rate"):
-        bring([path], porter(), ["z=why"])
+        import_sources([path], porter(), ["z=why"])
     slow = write_csv(tmp_path / "slow.csv", driven[0][::25], driven[1][::25])
     with pytest.raises(NoSource, match=r"a sample every 0.5 s: the robot's period of 0.2 s"):
-        bring([slow], porter())
+        import_sources([slow], porter())
     bad = tmp_path / "bad.csv"
     bad.write_text("time,x\n0.0,1.0\n0.1,one\n")
     with pytest.raises(NoSource, match=r"bad.csv, line 3: could not convert string to float: 'one'"):
-        bring([bad], porter())
+        import_sources([bad], porter())
     with pytest.raises(NoSource, match=r"what can be read is \.csv, \.parquet"):
         tables_of(FILE)
 

@@ -15,7 +15,7 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 from pyulog import ULog
 
 from brakeline.deploy.data.coverage import coverage
-from brakeline.deploy.data.importer import bring, tables_of
+from brakeline.deploy.data.importer import import_sources, tables_of
 from brakeline.deploy.data.sources.quantity_names import resolve
 from brakeline.deploy.data.sources.source_table import NoSource
 from brakeline.deploy.data.sources.tlog_file import _frames
@@ -122,13 +122,13 @@ def test_it_does_what_it_was_told(flown):
 
 @pytest.mark.parametrize("name", LOGS)
 def test_a_log_as_it_is_becomes_data(name):
-    made = bring([FLOWN / name], QUADROTOR)
+    made = import_sources([FLOWN / name], QUADROTOR)
     assert made.report.periods > 60 and made.report.samples >= 2
     assert all(0.0 <= late < 0.7 for late in made.report.delays.values())
 
 
 def test_some_seconds_of_flight_are_said_to_be_too_few():
-    told = coverage(bring([FLOWN / "copter.tlog"], QUADROTOR).data)
+    told = coverage(import_sources([FLOWN / "copter.tlog"], QUADROTOR).data)
     assert f"only {told.windows} windows of a plan's length, about 286 are needed: drive on" in told.missing
 
 

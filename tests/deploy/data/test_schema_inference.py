@@ -9,8 +9,8 @@ import pytest
 from mcap.writer import Writer
 
 from brakeline.deploy.cli import main
-from brakeline.deploy.data.importer import bring, tables_of
-from brakeline.deploy.data.schema_inference import told
+from brakeline.deploy.data.importer import import_sources, tables_of
+from brakeline.deploy.data.schema_inference import infer_schema
 from brakeline.deploy.data.sources.source_table import NoSource, Table
 from brakeline.messaging.robot import ROBOTS_FOLDER as ROBOTS
 from brakeline.messaging.robot import robot_named
@@ -44,13 +44,13 @@ def test_a_drafted_description_is_checked_and_reads_the_log_it_was_made_from(dri
     assert robot.action == ("speed [m/s]", "turn rate [rad/s]") and robot.follows == (3, 4)
     assert robot.period == pytest.approx(0.1) and robot.brake_steps == 3
     assert robot.action_low == (0.0, -1.5) and robot.action_high == (0.6, 1.5)
-    assert len(bring([log], robot).data.trajectories) > 5
+    assert len(import_sources([log], robot).data.trajectories) > 5
 
 
 def test_what_is_what_is_seen_by_the_motion_whatever_the_names(driven):
     time, values = driven
     names = ("x", "y", "a", "b", "c", "d", "e")
-    found = told([table(time, values, names)])
+    found = infer_schema([table(time, values, names)])
     assert [(c.name, c.role, c.unit, c.follows) for c in found.states[2:]] == [
         ("a", "heading", "rad", ""),
         ("b", "other", "m/s", "d"),
@@ -58,7 +58,7 @@ def test_what_is_what_is_seen_by_the_motion_whatever_the_names(driven):
     ]
     assert [(c.name, c.unit) for c in found.inputs] == [("d", "m/s"), ("e", "rad/s")]
     shuffled = np.random.default_rng(0).permuted(values[:, 2])
-    found = told([table(time, np.column_stack([values[:, :2], shuffled, values[:, 3:]]), names)])
+    found = infer_schema([table(time, np.column_stack([values[:, :2], shuffled, values[:, 3:]]), names)])
     assert all(c.role != "heading" for c in found.states)
     assert any("no column is the heading for certain" in note for note in found.notes)
 
@@ -66,7 +66,7 @@ def test_what_is_what_is_seen_by_the_motion_whatever_the_names(driven):
 def test_a_delay_is_told_and_makes_the_plan_longer(driven, tmp_path):
     time, values = driven
     late = np.column_stack([values[:-10, :5], values[10:, 5:]])  # states of 0.2 s before
-    prompt, delayed = told([table(time, values)]), told([table(time[: len(late)], late)])
+    prompt, delayed = infer_schema([table(time, values)]), infer_schema([table(time[: len(late)], late)])
     for before, after in zip(prompt.states[3:], delayed.states[3:], strict=True):
         assert after.delay == pytest.approx(before.delay + 0.2, abs=0.03)
     paths = [write_csv(tmp_path / "a.csv", time, values), write_csv(tmp_path / "b.csv", time[: len(late)], late)]
@@ -88,7 +88,7 @@ def test_an_input_of_the_same_name_a_slew_and_one_that_only_turns(tmp_path):
         rows.append([*(np.array([*pose, speed, turn]) + noise), speed, turn])
         pose += step * np.array([speed * math.cos(pose[2]), speed * math.sin(pose[2]), turn])
     names = ("x", "y", "yaw", "speed", "turn", "command speed", "command turn")
-    found = told(tables_of(write_csv(tmp_path / "a.csv", step * np.arange(1200), np.array(rows), names)))
+    found = infer_schema(tables_of(write_csv(tmp_path / "a.csv", step * np.arange(1200), np.array(rows), names)))
     ahead, turning = found.inputs
     assert (ahead.name, turning.name) == ("speed", "turn") and [c.follows for c in found.states[3:]] == [
         "speed",
@@ -100,7 +100,7 @@ def test_an_input_of_the_same_name_a_slew_and_one_that_only_turns(tmp_path):
 def test_without_positions_or_inputs_it_says_what_is_missing(driven, tmp_path):
     time, values = driven
     with pytest.raises(NoSource, match="no columns `x` and `y` of a position; there are: a, b"):
-        told([table(time, values[:, :2], ("a", "b"))])
+        infer_schema([table(time, values[:, :2], ("a", "b"))])
     path = write_csv(tmp_path / "a.csv", time, values[:, :5], COLUMNS[:5])
     out = tmp_path / "seen.toml"
     assert main(["robot", "new", str(out), "--from", str(path)]) == 0
@@ -117,7 +117,7 @@ def test_a_flight_drafts_what_flies(tmp_path, capsys, name):
     robot, known = robot_named(str(path)), robot_named("quadrotor")
     assert robot.state == known.state and robot.follows == known.follows and robot.body[0].at == known.body[0].at
     assert robot.action == ("vx [m/s]", "vy [m/s]", "vz [m/s]") and robot.period == pytest.approx(0.2, abs=0.005)
-    assert len(bring([log], robot).data.trajectories) > 0
+    assert len(import_sources([log], robot).data.trajectories) > 0
 
 
 @pytest.mark.parametrize("name", ["ground", "quadrotor", "../examples/car/car.toml"])

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from brakeline.actors.mavlink.mavlink_vehicle import ControlPeriod
-from brakeline.deploy.data.first_flight import LEVELS, Box, Maiden, homeward, stretch
+from brakeline.deploy.data.first_flight import LEVELS, Box, FirstFlight, homeward, stretch
 from brakeline.safety.model.dataset import Dataset
 from brakeline.safety.model.windows import PLAN, windows
 from brakeline.sim.quadrotor import SAMPLES
@@ -64,7 +64,7 @@ class Sluggish:
 
 def test_an_obedient_vehicle_is_flown_at_every_level_and_stays_inside(tmp_path: Path) -> None:
     vehicle = Sluggish()
-    found = Maiden(vehicle, LATE, BOX, 0).fly(11.0, {"autopilot": "none"})
+    found = FirstFlight(vehicle, LATE, BOX, 0).fly(11.0, {"autopilot": "none"})
     assert found.level == LEVELS[-1] and vehicle.fastest > 4.0 and vehicle.farthest < 0.0
     assert found.model is not None and found.model.robot == LATE
     assert found.statement is not None and found.statement.violations <= 0.25 * found.statement.windows
@@ -78,25 +78,25 @@ def test_an_obedient_vehicle_is_flown_at_every_level_and_stays_inside(tmp_path: 
 
 def test_the_recorded_inputs_are_those_of_the_recorded_periods() -> None:
     """The velocity follows the input of its own period, not of the next."""
-    found = Maiden(Sluggish(constant=0.05), LATE, BOX, 1).fly(2.0, {})
+    found = FirstFlight(Sluggish(constant=0.05), LATE, BOX, 1).fly(2.0, {})
     for t in found.data.trajectories:
         assert t.states[1:, 3:6] == pytest.approx(t.inputs, abs=0.1)
 
 
 def test_a_vehicle_that_nothing_predicts_is_not_flown_faster() -> None:
     vehicle = Sluggish(fickle=True)
-    found = Maiden(vehicle, LATE, BOX, 0).fly(2.0, {})
+    found = FirstFlight(vehicle, LATE, BOX, 0).fly(2.0, {})
     assert found.level == 0.0 and vehicle.fastest < 1.5
     assert any("not flown faster" in line for line in found.missing)
 
 
 def test_an_estimate_that_wanders_is_named_as_what_makes_the_sets_wide() -> None:
-    found = Maiden(Sluggish(drift=0.3), LATE, BOX, 0).fly(2.0, {})
+    found = FirstFlight(Sluggish(drift=0.3), LATE, BOX, 0).fly(2.0, {})
     assert any("its own estimate is 0." in line for line in found.missing)
 
 
 def test_a_vehicle_that_leaves_its_box_ends_the_flight() -> None:
-    found = Maiden(Sluggish(drift=2.0), LATE, BOX, 0).fly(4.0, {})
+    found = FirstFlight(Sluggish(drift=2.0), LATE, BOX, 0).fly(4.0, {})
     assert any("left its box" in line for line in found.missing) and found.seconds < 120.0
 
 

@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from brakeline.deploy.data.certification import WIDEST, certified
-from brakeline.deploy.data.coverage import more_to_drive
+from brakeline.deploy.data.certification import WIDEST, certify
+from brakeline.deploy.data.coverage import recording_advice
 from brakeline.safety.model.error_causes import BOTH, FAST, SLOW, STANDING, TURNING, Leaving, regimes
 from brakeline.safety.model.fitting import make
 from brakeline.safety.model.model_set import ModelConfig
@@ -23,13 +23,13 @@ def data():
 @pytest.fixture(scope="module")
 def held(data):
     """A statement without a violation in some dozens of plans."""
-    _, statement = certified(data, ModelConfig(), until_held=True)
+    _, statement = certify(data, ModelConfig(), until_held=True)
     assert statement.violations == 0 and statement.bound_plan > 0.01
     return statement
 
 
 def test_without_violations_more_of_the_same_will_do(held, data):
-    (line,) = more_to_drive(held, data)
+    (line,) = recording_advice(held, data)
     minutes = data.periods * GROUND.period / 60.0
     assert f"{np.ceil(minutes * (459 / held.windows - 1.0)):.0f} more minutes like these" in line
     assert "459 held-out plans, none outside" in line
@@ -38,7 +38,7 @@ def test_without_violations_more_of_the_same_will_do(held, data):
 def test_with_more_violations_than_the_limit_more_of_the_same_does_not_help(held, data):
     left = Leaving("position ahead", FAST, 20, 200, 3.0), Leaving("heading", STANDING, 13, 100, 1.2)
     bad = replace(held, windows=600, violations=33, bound_plan=upper_bound(33, 600), leaving=left)
-    said = "\n".join(more_to_drive(bad, data))
+    said = "\n".join(recording_advice(bad, data))
     assert "at most 8.1 % of plans" in said
     assert "33 of 600 held-out plans" in said and "0 more minutes like these reach" not in said
     assert "20 by position ahead while fast (of 200 plans there" in said and "13 by heading while standing" in said
@@ -48,13 +48,13 @@ def test_with_more_violations_than_the_limit_more_of_the_same_does_not_help(held
 
 def test_with_few_violations_more_of_the_same_helps_on_a_condition(held, data):
     few = replace(held, windows=600, violations=3, bound_plan=upper_bound(3, 600))
-    said = "\n".join(more_to_drive(few, data))
+    said = "\n".join(recording_advice(few, data))
     assert few.bound_plan > 0.01 and "only if no larger share than 0.5% of them leaves" in said
 
 
 def test_a_statement_within_the_robots_own_limit_asks_for_nothing(held, data):
     limit = 1.01 * held.bound_plan
-    assert not more_to_drive(held, replace(data, robot=replace(GROUND, accept_bound=limit)))
+    assert not recording_advice(held, replace(data, robot=replace(GROUND, accept_bound=limit)))
 
 
 def test_how_it_drove_is_told_by_inputs_and_speeds():
@@ -81,9 +81,9 @@ def test_where_it_left_its_sets_is_found(data):
 @pytest.mark.parametrize("limit", [0.01, 0.05, 0.3])
 def test_sets_are_widened_only_as_far_as_the_limit_asks_for(data, limit):
     narrow = replace(data, robot=replace(GROUND, accept_bound=limit))
-    model, statement = certified(narrow, ModelConfig(inflation=1.0))
+    model, statement = certify(narrow, ModelConfig(inflation=1.0))
     most = most_violations(statement.windows, limit)
-    plain = certified(replace(data, robot=replace(GROUND, accept_bound=1e-6)), ModelConfig(inflation=1.0))[1]
+    plain = certify(replace(data, robot=replace(GROUND, accept_bound=1e-6)), ModelConfig(inflation=1.0))[1]
     if most < 0 or plain.violations <= most or plain.excess > WIDEST:
         assert model.model_config.inflation == 1.0, (
             "too few plans for the limit, or it holds already, or it takes too much"

@@ -11,7 +11,7 @@ from pathlib import Path
 import psutil
 import pytest
 
-from brakeline.deploy.experiments.experiment_jobs import OtherConfiguration, complete, read, write
+from brakeline.deploy.experiments.experiment_jobs import StaleResultError, complete, read, write
 from tests.waiting import until
 
 
@@ -71,7 +71,7 @@ class Nap(Errand):
 NAPS = """
 from pathlib import Path
 from brakeline.deploy.experiments.experiment_jobs import complete
-from tests.deploy.study.test_jobs import Nap
+from tests.deploy.experiments.test_experiment_jobs import Nap
 if __name__ == "__main__":
     complete([Nap(1), Nap(2)], Path({0!r}) / "results", Path({0!r}) / "runs", workers=2)
 """
@@ -100,7 +100,7 @@ def test_a_job_that_fails_loses_nothing_that_was_done(tmp_path):
 
 def test_a_result_of_other_settings_is_refused_unless_it_shall_be_run_again(tmp_path):
     complete([Errand(1)], tmp_path / "results", tmp_path / "runs", workers=1)
-    with pytest.raises(OtherConfiguration, match="another setting") as refused:
+    with pytest.raises(StaleResultError, match="another setting") as refused:
         complete([Errand(2), Errand(1, setting=5)], tmp_path / "results", tmp_path / "other", workers=1)
     assert "errand-1.json" in str(refused.value)
     assert not (tmp_path / "other").exists(), "nothing is run before everything was looked at"

@@ -27,7 +27,7 @@ MAKE = """
 from brakeline.deploy.data import model_store, simulated_recording
 from brakeline.messaging.task import robot_with_task
 from brakeline.safety.model.model_config import ModelConfig
-simulated_recording.recorded(robot_with_task("ground"), trajectories=12)
+simulated_recording.load_or_record(robot_with_task("ground"), trajectories=12)
 model_store.model_for(robot_with_task("ground"), ModelConfig(), 0.3)
 """
 
@@ -67,7 +67,9 @@ def elsewhere(tmp_path, monkeypatch):
     monkeypatch.setenv("BRAKELINE_DATA", str(tmp_path / "data"))
     recordings = []
     original = simulated_recording.collect.record
-    monkeypatch.setattr(simulated_recording, "recorded", partial(simulated_recording.recorded, trajectories=12))
+    monkeypatch.setattr(
+        simulated_recording, "load_or_record", partial(simulated_recording.load_or_record, trajectories=12)
+    )
     monkeypatch.setattr(simulated_recording.collect, "record", lambda *a: (recordings.append(a), original(*a))[1])
     return recordings
 
@@ -101,7 +103,7 @@ def test_of_two_that_find_nothing_one_records_and_the_other_waits_for_it(tmp_pat
 
 
 def test_what_is_imported_meanwhile_is_not_recorded_over(elsewhere, monkeypatch):
-    data = simulated_recording.recorded(GROUND, trajectories=1)
+    data = simulated_recording.load_or_record(GROUND, trajectories=1)
     driven = replace(data, about={"origin": "a log", "source": "drive.csv"})
     path, record = data_paths.record_path(GROUND), collect.record
 
@@ -113,10 +115,10 @@ def test_what_is_imported_meanwhile_is_not_recorded_over(elsewhere, monkeypatch)
     for again in (True, False):
         path.unlink()
         with pytest.raises(BadData, match="is kept"):
-            simulated_recording.recorded(GROUND, trajectories=1, again=again)
+            simulated_recording.load_or_record(GROUND, trajectories=1, again=again)
         assert Dataset.about_of(path)["source"] == "drive.csv"
     with pytest.raises(BadData, match="is kept"):
-        simulated_recording.recorded(GROUND, trajectories=1, again=True)
+        simulated_recording.load_or_record(GROUND, trajectories=1, again=True)
 
 
 def steps(actor: str, episode: int, numbers, run: int = 1) -> list[pb.Step]:
@@ -172,11 +174,11 @@ def test_an_interrupted_recording_is_gone_on_from(elsewhere, monkeypatch, capsys
     with monkeypatch.context() as patch:
         patch.setattr(simulated_recording.collect, "record", interrupted)
         with pytest.raises(KeyboardInterrupt):
-            simulated_recording.recorded(GROUND)
+            simulated_recording.load_or_record(GROUND)
     assert not data_paths.record_path(GROUND).exists()
     assert "recording ground once" in (told := capsys.readouterr().err) and "kept 5 of 12" in told
-    whole = simulated_recording.recorded(GROUND)
+    whole = simulated_recording.load_or_record(GROUND)
     assert elsewhere[-1][-1] == 5, "only what was missing is driven"
     assert {path.name for path in data_paths.record_path(GROUND).parent.iterdir()} == {"record.safetensors", LOCK}
-    fresh = simulated_recording.recorded(GROUND, data_paths.record_path(GROUND).with_name("fresh.safetensors"))
+    fresh = simulated_recording.load_or_record(GROUND, data_paths.record_path(GROUND).with_name("fresh.safetensors"))
     assert whole.digest() == fresh.digest(), "the same data as in one go"

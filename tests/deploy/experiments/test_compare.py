@@ -9,11 +9,11 @@ import pytest
 
 from brakeline.deploy.data import model_store, rival_pretraining
 from brakeline.deploy.experiments.bootstrap import mean, ratio
-from brakeline.deploy.experiments.compare import Cell, studies
-from brakeline.deploy.experiments.comparison_cells import METHODS, Study, Trial, quick, run
+from brakeline.deploy.experiments.compare import ComparisonJob, cell_configs
+from brakeline.deploy.experiments.comparison_cells import METHODS, CellConfig, TrialConfig, quick, run
 from brakeline.deploy.experiments.comparison_plots import learning_curves, seeds_as_points
 from brakeline.deploy.experiments.comparison_table import markdown, plain, steps_to_learn, table, without_times
-from brakeline.learner.rival_networks import Fit
+from brakeline.learner.rival_networks import FitConfig
 from brakeline.logs.report import analyse
 from brakeline.messaging.policy_weights import MLP
 from brakeline.messaging.task import robot_with_task
@@ -25,14 +25,14 @@ DEAR = ("decision_ms", "milliseconds")
 
 # --- studies -------------------------------------------------------------------------------------------------------
 
-TINY = Study("ground", "none", 3, steps=320, episodes=1, arenas=("default",), untrained=1)
+TINY = CellConfig("ground", "none", 3, steps=320, episodes=1, arenas=("default",), untrained=1)
 TINY = replace(TINY, td3=replace(TINY.td3, hidden=(16, 16), batch=16, warmup=60))
 
 
 @pytest.fixture(scope="module")
 def rivals(data_folder):
     """Rivals that know next to nothing, made in seconds."""
-    little = {"samples": 300, "fit": Fit(hidden=(8, 8), epochs=1, batch=32)}
+    little = {"samples": 300, "fit": FitConfig(hidden=(8, 8), epochs=1, batch=32)}
     made = {
         "secas": partial(rival_pretraining.SecasRecipe, **little),
         "sailr": partial(rival_pretraining.SailrRecipe, **little),
@@ -108,9 +108,9 @@ def test_another_task_in_another_arena_has_its_contacts_in_the_table(rivals, tmp
 
 def test_only_where_a_policy_and_a_filter_are_crossed_there_are_more_trials():
     assert [t.name for t in replace(TINY, method="secas").trials()] == ["trained-secas-default"]
-    assert Trial("trained", "none", "default", 1) in replace(TINY, method="ddpc").trials()
-    assert Trial("untrained", "ddpc", "default", 1) in replace(TINY, method="ddpc").trials()
-    assert Trial("trained", "ddpc", "default", 1) in TINY.trials()
+    assert TrialConfig("trained", "none", "default", 1) in replace(TINY, method="ddpc").trials()
+    assert TrialConfig("untrained", "ddpc", "default", 1) in replace(TINY, method="ddpc").trials()
+    assert TrialConfig("trained", "ddpc", "default", 1) in TINY.trials()
 
 
 def test_sailrs_interventions_end_episodes_in_training_and_not_in_evaluation(cells):
@@ -137,11 +137,11 @@ def test_the_table_curves_and_points_of_real_cells(cells, tmp_path):
 
 
 def test_the_studies_of_a_comparison():
-    every = studies("ground", (0, 1, 2))
+    every = cell_configs("ground", (0, 1, 2))
     assert [s.name for s in every[:5]] == ["ddpc-s0", "sailr-s0", "secas-s0", "none-s0", "ddpc-s1"]
     assert len(every) == 12 and {s.episodes for s in every} == {500} and every[0].arenas == ("default", "dense")
     assert len({json.dumps(s.config()) for s in every}) == 12
-    assert quick(every[0]).steps < 5000 and Cell(every[0]).name == "ddpc-s0"
+    assert quick(every[0]).steps < 5000 and ComparisonJob(every[0]).name == "ddpc-s0"
 
 
 # --- figures -------------------------------------------------------------------------------------------------------

@@ -1,27 +1,27 @@
 """How a rival's threshold is chosen: by what came of it in closed loop, not by what the model was stored with."""
 
 from brakeline.deploy.data.rival_pretraining import SailrRecipe, SecasRecipe, pretrain, recipe_for
-from brakeline.deploy.experiments.rival_tuning import Tried, best, try_all, values_for
-from brakeline.learner.rival_networks import Fit
+from brakeline.deploy.experiments.rival_tuning import ThresholdTrial, best_threshold, tune_threshold, values_for
+from brakeline.learner.rival_networks import FitConfig
 from tests.robots import GROUND, QUADROTOR
 
-LITTLE = {"samples": 300, "fit": Fit(hidden=(8,), epochs=1, batch=32)}
+LITTLE = {"samples": 300, "fit": FitConfig(hidden=(8,), epochs=1, batch=32)}
 
 
 def row(value, oracle, collisions, goals):
-    return Tried(value, 10, oracle, 0.0, goals, collisions)
+    return ThresholdTrial(value, 10, oracle, 0.0, goals, collisions)
 
 
 def test_safety_counts_among_those_that_cost_the_oracle_nothing():
     rows = [row(1.0, 10, 3, 5), row(2.0, 10, 1, 4), row(3.0, 10, 1, 6), row(4.0, 9, 0, 9)]
-    assert best(rows).value == 3.0
-    assert best([row(1.0, 8, 0, 9), row(2.0, 9, 5, 0)]).value == 2.0, "the least that any value costs"
+    assert best_threshold(rows).value == 3.0
+    assert best_threshold([row(1.0, 8, 0, 9), row(2.0, 9, 5, 0)]).value == 2.0, "the least that any value costs"
 
 
 def test_a_threshold_that_never_steps_in_and_one_that_always_does():
     model = pretrain(GROUND, SailrRecipe(**LITTLE))
     told = []
-    never, always = try_all(model, GROUND, (1.0, -1.0), 3, told.append)
+    never, always = tune_threshold(model, GROUND, (1.0, -1.0), 3, told.append)
     assert told == [never, always]
     assert never.oracle_goals == 3 and never.oracle_interventions == 0.0
     assert always.oracle_goals == 0 and always.oracle_interventions == 1.0 and always.greedy_collisions == 0

@@ -5,7 +5,7 @@ import pytest
 
 from brakeline.deploy.data.rival_pretraining import RECIPES, SailrRecipe, SecasRecipe, made_by, pretrain
 from brakeline.deploy.data.rival_rollouts import costs, transitions
-from brakeline.learner.rival_networks import Fit
+from brakeline.learner.rival_networks import FitConfig
 from brakeline.safety.methods import ready
 from tests.robots import GROUND
 
@@ -32,7 +32,7 @@ def test_costs_are_of_braking_to_the_end():
 
 @pytest.mark.parametrize("recipe", [SecasRecipe, SailrRecipe])
 def test_a_pretrained_model_says_what_it_cost(recipe):
-    how = recipe(samples=300, fit=Fit(hidden=(8,), epochs=1, batch=32))
+    how = recipe(samples=300, fit=FitConfig(hidden=(8,), epochs=1, batch=32))
     driven = []
     model = pretrain(GROUND, how, lambda: driven.append(1))
     assert len(driven) >= 300 and ready(model).robot is GROUND
