@@ -1,1 +1,1 @@
-"""How the parts are put together, started and measured."""
+"""Put the parts together: commands, runs, data sets and experiments."""

@@ -1,5 +1,7 @@
-"""How other Python processes are started: with the packages that this one has, and never with a module that happens to
-lie in the working directory, which `python -m` and `python -c` search first."""
+"""Start other Python processes with the packages of this one.
+
+They never import a module that happens to lie in the working directory, which `python -m` and `python -c` search first.
+"""
 
 from __future__ import annotations
 
@@ -12,6 +14,6 @@ PYTHON = (sys.executable, "-P")
 
 
 def spawning() -> SpawnContext:
-    """Processes started afresh: a forked one would share locks of libraries that have threads."""
-    os.environ["PYTHONSAFEPATH"] = "1"  # -P for those who start Python by themselves
+    """Return the context that starts new processes. A forked one would share locks of libraries with threads."""
+    os.environ["PYTHONSAFEPATH"] = "1"  # -P for the processes of multiprocessing
     return multiprocessing.get_context("spawn")

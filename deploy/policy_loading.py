@@ -1,5 +1,4 @@
-"""A policy by its name or file: scripted, trained and stored with the program, untrained, a person's own weights, or
-inputs that were written down."""
+"""Load a policy by its name or file: scripted, stored with the program, untrained, own weights, or written inputs."""
 
 from __future__ import annotations
 
@@ -21,11 +20,16 @@ POLICY_FOLDER = Path(__file__).parents[1] / "policies"
 
 
 def policy_named(name: str, robot: RobotWithTask, seed: int) -> Policy:
-    """A scripted policy, a stored one (`trained` and others in policies/, or beside the robot's own task), an untrained
-    one, or a file's: weights, or inputs as `brakeline excite` prints them (.csv).
+    """Return the policy with this name or file.
+
+    Args:
+        name: a scripted policy, a stored one (`trained` and others in policies/, or beside the task file), `untrained`,
+            a weights file, or a CSV file of inputs as `brakeline excite` prints them.
+        seed: of scripted and untrained policies.
 
     Raises:
-        ValueError: neither a name nor a file; BadWeights: a file that is no policy of this robot.
+        ValueError: there is no such name or file.
+        BadWeights: the file is no policy of this robot.
     """
     policies = robot.task.policies
     if name in policies:
@@ -40,13 +44,13 @@ def policy_named(name: str, robot: RobotWithTask, seed: int) -> Policy:
         names = ", ".join([*sorted(stored), UNTRAINED, *policies])
         raise ValueError(f"no policy is called {name!r} and no such file exists; there are: {names}, or a file's path")
     if robot.late:
-        with suppress(BadWeights):  # it may have been trained in lockstep: it proposes in real time too
+        with suppress(BadWeights):  # the weights may be of a training in lockstep
             return driving(MLP.load(path, robot.in_lockstep()))
     return driving(MLP.load(path, robot))
 
 
 def _stored(robot: RobotWithTask) -> dict[str, Path]:
-    """By name: beside the task's file, as robots of other people have it, or in the folder of this repository."""
+    """Return the files of the stored policies by name: in policies/, and beside the task file of your own robot."""
     task = robot.task
     beside = task.folder / f"{TRAINED}.safetensors"
     folder = POLICY_FOLDER / (task.name or robot.kind)
@@ -54,17 +58,17 @@ def _stored(robot: RobotWithTask) -> dict[str, Path]:
 
 
 def driving(mlp: MLP) -> Policy:
-    """The network as a policy, without exploration."""
+    """Return a network as a policy, without exploration."""
     return lambda observation, info: mlp(observation)
 
 
 def replayed(path: Path, robot: RobotWithTask) -> Policy:
-    """The inputs in a file of columns, one a period; an episode is a run of it, and after the last row it stands.
+    """Return the inputs in a CSV file as a policy, one row a control period and one run an episode. It ends at rest.
 
     Raises:
-        NoSource: it is no such file, or has not all inputs of the robot.
+        NoSource: the file can't be read, or lacks an input of the robot.
     """
-    from brakeline.deploy.data.sources.column_files import read_csv  # pyarrow with it, which no other policy needs
+    from brakeline.deploy.data.sources.column_files import read_csv  # imports pyarrow, which no other policy needs
 
     (table,) = read_csv(path)
     names = column_names(robot)[1]

@@ -1,4 +1,4 @@
-"""Says how far a piece of work is: a bar in a terminal; redirected, a line now and then."""
+"""Show the progress of work: as a bar in a terminal, else as a line now and then."""
 
 from __future__ import annotations
 
@@ -12,29 +12,29 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 from rich.progress import TimeRemainingColumn as Remaining
 
-FIRST = 2.0  # s without a word: what is done by then needs none
+FIRST = 2.0  # s until the first line; shorter work prints none
 AGAIN = 10.0  # s between two lines
-UNDER_WAY: list[threading.Event] = []  # that say lines, each within the one before: the last one speaks
+UNDER_WAY: list[threading.Event] = []  # nested work that prints lines; only the innermost prints
 T = TypeVar("T")
 
 console = Console(stderr=True, highlight=False, soft_wrap=True)
 
 
 class Advance(Protocol):
-    """So much more is done; and what is being done, if that has changed."""
+    """Report that `by` more items are done, and optionally what is being done now."""
 
     def __call__(self, by: int = 1, what: str | None = None) -> None: ...
 
 
 @contextmanager
 def under_way(what: str, total: int | None = None) -> Iterator[Advance]:
-    """Shows `what` until the block ends; `total`: how often it will be told to advance, None: nobody knows."""
+    """Show `what` until the block ends. total: number of items; None if it is unknown."""
     with _bar(what, total) if console.is_terminal else _lines(what, total) as advance:
         yield advance
 
 
 def each(items: Iterable[T], what: str, total: int, done: int = 0) -> Iterator[T]:
-    """The items, with a word of how many there were; `done` of the `total` are there already."""
+    """Yield the items and show the progress. `done` of the `total` were done before."""
     with under_way(what, total) as advance:
         advance(done)
         for item in items:
@@ -57,32 +57,32 @@ def _bar(what: str, total: int | None) -> Iterator[Advance]:
 
 @contextmanager
 def _lines(what: str, total: int | None) -> Iterator[Advance]:
-    begun, ended = time.monotonic(), threading.Event()
+    start, ended = time.monotonic(), threading.Event()
     UNDER_WAY.append(ended)
-    said, done = what, 0
+    current, done = what, 0
 
     def advance(by: int = 1, what: str | None = None) -> None:
-        nonlocal said, done
-        said, done = what or said, done + by
+        nonlocal current, done
+        current, done = what or current, done + by
 
-    def talk() -> None:
+    def print_lines() -> None:
         wait = FIRST
         while not ended.wait(wait):
             if UNDER_WAY[-1] is ended:
-                console.print(line(said, done, total, time.monotonic() - begun), markup=False)
+                console.print(line(current, done, total, time.monotonic() - start), markup=False)
             wait = AGAIN
 
-    talker = threading.Thread(target=talk, name="progress", daemon=True)
-    talker.start()
+    printer = threading.Thread(target=print_lines, name="progress", daemon=True)
+    printer.start()
     try:
         yield advance
     finally:
         ended.set()
-        talker.join()
+        printer.join()
         UNDER_WAY.remove(ended)
 
 
 def line(what: str, done: int, total: int | None, seconds: float) -> str:
-    """What is under way, how far it is, and since when [s]."""
+    """Return a line of progress. seconds: time since the start [s]."""
     counted = "" if total is None else f"{done} of {total}, "
     return f"{what}: {counted}{seconds:.0f} s so far"

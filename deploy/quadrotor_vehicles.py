@@ -1,4 +1,4 @@
-"""What makes quadrotors: behind their own autopilots in memory, or behind a real PX4 (`simulator` in a task's file)."""
+"""Make quadrotors behind simulated autopilots in memory, or behind a real PX4 (`simulator` in a task file)."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from brakeline.sim.wind import Wind
 
 
 def embedded(conditions: Conditions, tap: FrameTap | None = None) -> MakeVehicle:
-    """Makes quadrotors behind their own autopilots."""
+    """Return the function that makes quadrotors behind simulated autopilots. tap: is called with each MAVLink frame."""
     return partial(embedded_quadrotor, noise=conditions.flight_noise, wind=conditions.wind, tap=tap)
 
 
@@ -38,9 +38,13 @@ def embedded_quadrotor(
     *,
     tap: FrameTap | None = None,
 ) -> LockstepQuadrotor:
-    """A quadrotor behind its own autopilot, over MAVLink in memory.
+    """Return a quadrotor behind a simulated autopilot, over MAVLink in memory.
 
-    It brakes by itself when a setpoint is overdue by a period. tap: is called with every MAVLink frame.
+    The autopilot brakes when a setpoint is late by one control period.
+
+    Args:
+        rules: px4 or ardupilot.
+        tap: is called with each MAVLink frame.
     """
     parameters = {SETPOINT_TIMEOUT[rules]: QUADROTOR.period}
     autopilot = Autopilot(Quadrotor(arena, rng, noise, wind), rules, parameters=parameters, quiet=True)
@@ -48,10 +52,10 @@ def embedded_quadrotor(
 
 
 def behind_px4(conditions: Conditions, tap: FrameTap | None = None) -> MakeVehicle:
-    """Makes quadrotors behind the real PX4 in the folder `$BRAKELINE_PX4`: one process flies all their episodes.
+    """Return the function that makes quadrotors behind the real PX4 in `$BRAKELINE_PX4`. It flies all episodes.
 
     Raises:
-        ValueError: there is no such folder.
+        ValueError: the variable is not set.
     """
     folder = os.environ.get("BRAKELINE_PX4")
     if not folder:
@@ -65,5 +69,5 @@ def behind_px4(conditions: Conditions, tap: FrameTap | None = None) -> MakeVehic
 
 
 def flight_arena(name: str, seed: int, robot: RobotWithTask | None = None) -> Arena:
-    """The one arena of a flight in real time: the autopilot's world, and the actor's map."""
+    """Return the arena of a flight in real time: the world of the autopilot, and the map of the actor."""
     return draw_arena(name, np.random.default_rng(seed), robot or robot_with_task("quadrotor"))

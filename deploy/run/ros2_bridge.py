@@ -1,8 +1,8 @@
-"""Our simulated ground robot as a ROS 2 robot: odometry, scan, transforms, clock and collisions out, cmd_vel in.
+"""Simulate a ground robot as a ROS 2 robot: odometry, scan, transforms and clock out, cmd_vel in.
 
-Its base does what bases do: it drives at the last command, and stops when none has come for `timeout` s. Time is this
-machine's, or its own on /clock: then as fast as `factor` allows, and with `lockstep` each period waits for a command,
-so that however busy the machine is nothing is late because of it.
+As usual for ROS bases, the robot follows the last command, and stops if none arrives for `timeout` s. The time is this
+machine's, or simulated time on /clock, which runs at most `factor` times as fast as real time. With `lockstep` each
+control period waits for its command, so that no command is late on a busy machine.
 """
 
 from __future__ import annotations
@@ -43,57 +43,63 @@ from brakeline.sim.sim_conditions import Conditions
 Array = NDArray[np.float64]
 
 ODOM, BASE, LASER = "odom", "base_footprint", "base_scan"
-BEHIND = 0.2  # s behind real time at which it is no longer caught up with
+LARGEST_LAG = 0.2  # s behind real time, beyond which the simulation gives up catching up
 
 
 @dataclass(frozen=True)
 class BridgeSettings:
+    """Settings of the simulated robot and its node."""
+
     ros: RosSettings = field(default_factory=lambda: RosSettings(listen=("tcp/127.0.0.1:7447",)))
     arena: str = "default"
     seed: int = 0
-    sim_time: bool = False  # its own, on /clock
-    factor: float = 1.0  # of real time, at most; 0: as fast as it goes
+    sim_time: bool = False  # publish simulated time on /clock
+    factor: float = 1.0  # highest multiple of real time; 0: as fast as possible
     lockstep: bool = False  # each period waits for its command
-    patience: float = 1.0  # s of this machine that a period waits
-    timeout: float = 0.3  # s without a command until the base stops
+    patience: float = 1.0  # s of real time, longest wait of a period
+    timeout: float = 0.3  # s without a command after which the base stops
     stamped: bool = False  # commands are TwistStamped
-    seconds: float = 0.0  # of its time until it ends; 0: when asked to
+    seconds: float = 0.0  # duration; 0: until the stop event
     conditions: Conditions = field(default_factory=Conditions)
 
 
 @dataclass
 class Outcome:
-    """What happened so far."""
+    """Figures of the simulation so far."""
 
     seconds: float = 0.0
     collisions: int = 0
     closest: float = float("inf")  # m from the body's disc to an obstacle
     driven: float = 0.0  # m
     commands: int = 0
-    timeouts: int = 0  # times that the base stopped for want of a command
-    missed: int = 0  # periods of lockstep that got none
-    slips: int = 0  # times that it could not keep up with real time
+    timeouts: int = 0  # stops because no command arrived
+    missed: int = 0  # periods of lockstep without a command
+    slips: int = 0  # times that the simulation gave up catching up with real time
 
     def figures(self) -> dict[str, Any]:
+        """Return the figures by name."""
         return asdict(self)
 
 
 class Bridge:
-    """One robot in one arena, as a node."""
+    """One robot in one arena, as a ROS node."""
 
     def __init__(self, settings: BridgeSettings, tap: MessageTap | None = None) -> None:
-        """Raises Unreachable, UnknownArena."""
+        """Raises Unreachable, UnknownArena.
+
+        tap: records each received and sent message.
+        """
         self.settings, self.outcome = settings, Outcome()
         rng = np.random.default_rng((settings.seed, 11))
         arena = draw_arena(settings.arena, np.random.default_rng(settings.seed), robot_with_task("ground"))
         c = settings.conditions
         self.robot = RealtimeGroundRobot(arena, rng, c.noise, c.payload_kg, c.floor_friction)
         self._lidar = SpinningLidar(arena, rng, c.lidar_noise(flies=False))
-        self._begun = 1.0 if settings.sim_time else time.time()  # its time at the first sample
+        self._start_time = 1.0 if settings.sim_time else time.time()  # s, the robot's time at the first sample
         self._samples = 0
-        self._heard = threading.Condition()
+        self._received = threading.Condition()
         self._command: Array | None = None
-        self._commanded = -np.inf  # its time of the last command
+        self._command_time = -np.inf  # s, the robot's time of the last command
         self._stopped = True
         self.node = RosNode(settings.ros, "brakeline_sim", tap)
         self._clock = self.node.publisher("/clock", Clock, SENSOR) if settings.sim_time else None
@@ -101,22 +107,22 @@ class Bridge:
         self._transforms = self.node.publisher("/tf", TFMessage)
         self._scans = self.node.publisher("scan", LaserScan, SENSOR)
         fixed = self.node.publisher("/tf_static", TFMessage, LATCHED)
-        fixed.put(TFMessage(transforms=[_transform(self._begun, BASE, LASER, self._lidar.mount, 0.0, 0.0)]))
+        fixed.put(TFMessage(transforms=[_transform(self._start_time, BASE, LASER, self._lidar.mount, 0.0, 0.0)]))
         if settings.stamped:
-            self.node.subscribe("cmd_vel", TwistStamped, lambda message: self._hear(message.twist))
+            self.node.subscribe("cmd_vel", TwistStamped, lambda message: self._receive(message.twist))
         else:
-            self.node.subscribe("cmd_vel", Twist, self._hear)
+            self.node.subscribe("cmd_vel", Twist, self._receive)
 
     @property
     def now(self) -> float:
-        """Its time [s]."""
-        return self._begun + self._samples * SAMPLE_TIME
+        """The robot's time [s]."""
+        return self._start_time + self._samples * SAMPLE_TIME
 
     def run(self, stop: threading.Event) -> None:
-        """Until asked to stop, or its time is over."""
+        """Simulate until `stop` is set, or the duration ends."""
         settings = self.settings
         if not settings.sim_time:
-            self._begun = time.time() - self._samples * SAMPLE_TIME
+            self._start_time = time.time() - self._samples * SAMPLE_TIME
         anchor, since = time.monotonic(), self.now
         while not stop.is_set() and not 0.0 < settings.seconds <= self.outcome.seconds:
             self._sample()
@@ -126,36 +132,37 @@ class Bridge:
                 ahead = (self.now - since) / settings.factor - (time.monotonic() - anchor)
                 if ahead > 0.0:
                     stop.wait(ahead)
-                elif ahead < -BEHIND:
+                elif ahead < -LARGEST_LAG:
                     self.outcome.slips += not settings.lockstep
                     anchor, since = time.monotonic(), self.now
                     if not settings.sim_time:
-                        self._begun = time.time() - self._samples * SAMPLE_TIME
+                        self._start_time = time.time() - self._samples * SAMPLE_TIME
                         since = self.now
 
     def close(self) -> None:
+        """Leave the ROS graph."""
         self.node.close()
 
     def _sample(self) -> None:
-        """The next sample: drive, sense, tell."""
+        """Simulate one sample: drive, sense, publish."""
         robot = self.robot
-        with self._heard:
+        with self._received:
             command, self._command = self._command, None
         if command is not None:
             robot.drive(command)
-            self._commanded, self._stopped = self.now, False
-        elif not self._stopped and self.now - self._commanded > self.settings.timeout:
+            self._command_time, self._stopped = self.now, False
+        elif not self._stopped and self.now - self._command_time > self.settings.timeout:
             robot.drive(np.zeros(2))
             self._stopped = True
             self.outcome.timeouts += 1
         robot.advance()
         self._samples += 1
-        self._tell()
+        self._publish()
         self.outcome.seconds = self._samples * SAMPLE_TIME
         self.outcome.collisions, self.outcome.closest = robot.collisions, robot.closest
         self.outcome.driven = robot.driven
 
-    def _tell(self) -> None:
+    def _publish(self) -> None:
         now, (x, y, yaw, speed, turn_rate) = self.now, self.robot.measured.tolist()
         unknown = np.zeros(36)
         self._odometry.put(
@@ -174,7 +181,10 @@ class Bridge:
             self._clock.put(Clock(clock=time_of(now)))
 
     def _scan(self, ranges: Array) -> LaserScan:
-        """Beams are told evenly in time; each was cast at its sample's end, so at most half a sample from that."""
+        """Return the message of a scan.
+
+        The message spaces the beams evenly in time. Each was cast at the end of a sample, at most half a sample off.
+        """
         lidar, turn = self._lidar, SAMPLES * SAMPLE_TIME
         return LaserScan(
             header=header(self.now - turn + 0.5 * SAMPLE_TIME, LASER),
@@ -189,18 +199,20 @@ class Bridge:
             intensities=np.zeros(0, dtype=np.float32),
         )
 
-    def _hear(self, told: Twist) -> None:
-        action = np.array([told.linear.x, told.angular.z])
+    def _receive(self, message: Twist) -> None:
+        action = np.array([message.linear.x, message.angular.z])
         if np.isfinite(action).all():
-            with self._heard:
+            with self._received:
                 self._command = action
                 self.outcome.commands += 1
-                self._heard.notify_all()
+                self._received.notify_all()
 
     def _await_command(self, stop: threading.Event) -> None:
-        with self._heard:
-            heard = self._heard.wait_for(lambda: self._command is not None or stop.is_set(), self.settings.patience)
-        self.outcome.missed += not heard
+        with self._received:
+            received = self._received.wait_for(
+                lambda: self._command is not None or stop.is_set(), self.settings.patience
+            )
+        self.outcome.missed += not received
 
 
 def _transform(at: float, parent: str, child: str, x: float, y: float, yaw: float) -> TransformStamped:
