@@ -112,7 +112,7 @@ class StopPractice:
         counts only if it allows the plan's input, or if the verification of the plan does not hold any more.
         """
         answer = outcome.answer
-        if not self.running or answer is None or answer.kind == ALLOWED or not runner.backup_plan.holds:
+        if not self.running or answer is None or answer.kind == ALLOWED or not runner.backup_plan.still_verified:
             return outcome
         return replace(outcome, answer=None, failure=STOP_PRACTICE)
 

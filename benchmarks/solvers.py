@@ -15,7 +15,7 @@ from benchmarks.timing import Figures, each
 from brakeline.messaging.task import RobotWithTask, robot_with_task
 from brakeline.safety.filter import filter as filtering
 from brakeline.safety.filter.filter import Filter
-from brakeline.safety.filter.qp_solver import ACCURACY, SOLVED, Program, Solution, solve
+from brakeline.safety.filter.qp_solver import ACCURACY, SOLVED, QuadraticProgram, Solution, solve
 from brakeline.sim.sim_conditions import Conditions
 
 APART = 1e-3  # of an input's range
@@ -28,11 +28,11 @@ QUESTIONS: tuple[tuple[str, str, str, Conditions | None], ...] = (
 )
 
 
-def programs(certificate: str, robot: RobotWithTask, conditions: Conditions | None) -> list[Program]:
+def programs(certificate: str, robot: RobotWithTask, conditions: Conditions | None) -> list[QuadraticProgram]:
     """The QPs that come up."""
-    seen: list[Program] = []
+    seen: list[QuadraticProgram] = []
 
-    def note(program: Program) -> Solution:
+    def note(program: QuadraticProgram) -> Solution:
         seen.append(program)
         return solve(program)
 
@@ -43,7 +43,7 @@ def programs(certificate: str, robot: RobotWithTask, conditions: Conditions | No
     return seen
 
 
-def by_daqp(program: Program) -> np.ndarray | None:
+def by_daqp(program: QuadraticProgram) -> np.ndarray | None:
     """None: it can't be met."""
     n = len(program.h)
     low = np.full(len(program.b), -1e30)
@@ -52,7 +52,7 @@ def by_daqp(program: Program) -> np.ndarray | None:
     return np.asarray(x[:n]) if flag >= 1 else None
 
 
-def disagreements(seen: list[Program], inputs: int) -> dict[str, float]:
+def disagreements(seen: list[QuadraticProgram], inputs: int) -> dict[str, float]:
     """How often the two do, and by how much at the most they do on the first so many unknowns."""
     apart, other = [0.0], 0
     for program in seen:

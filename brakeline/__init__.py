@@ -29,9 +29,9 @@ if TYPE_CHECKING:
     from brakeline.safety.gym import SafetyWrapper
     from brakeline.safety.model.dataset import BadData, Dataset, Trajectory
     from brakeline.safety.model.error_bounds import ErrorBoundError
-    from brakeline.safety.model.fitting import make
+    from brakeline.safety.model.fitting import fit_model_set
     from brakeline.safety.model.model_set import BadModel, ModelConfig, ModelSet
-    from brakeline.safety.model.validation import ValidationReport, state
+    from brakeline.safety.model.validation import ValidationReport, validate
     from brakeline.safety.perception.image_memory import filled, memory_of
     from brakeline.safety.service.client import SafetyClient, SafetyError
     from brakeline.safety.service.filter_client import Answer, FilterClient
@@ -53,14 +53,14 @@ PLACES = {
     "brakeline.safety.filter.backup_plan": ("BackupPlan", "Prediction"),
     "brakeline.safety.model.dataset": ("BadData", "Dataset", "Trajectory"),
     "brakeline.safety.filter.filter": ("Filter",),
-    "brakeline.safety.model.fitting": ("make",),
+    "brakeline.safety.model.fitting": ("fit_model_set",),
     "brakeline.safety.service.fleet_client": ("FleetClient",),
     "brakeline.safety.gym": ("SafetyWrapper",),
     "brakeline.safety.perception.image_memory": ("filled", "memory_of"),
     "brakeline.safety.service.in_process": ("InProcess",),
     "brakeline.safety.model.model_set": ("BadModel", "ModelSet", "ModelConfig"),
     "brakeline.safety.filter.request": ("BadRequest", "Decision", "Request"),
-    "brakeline.safety.model.validation": ("ValidationReport", "state"),
+    "brakeline.safety.model.validation": ("ValidationReport", "validate"),
 }
 _PLACE_OF = {name: module for module, names in PLACES.items() for name in names}
 
@@ -108,11 +108,11 @@ __all__ = [
     "ValidationReport",
     "__version__",
     "filled",
-    "make",
+    "fit_model_set",
     "memory_of",
     "robot_named",
     "robot_with_task",
-    "state",
+    "validate",
 ]
 
 

@@ -14,7 +14,7 @@ from brakeline.safety.filter.filter import Filter
 from brakeline.safety.filter.request import Decision, Request
 from brakeline.safety.model.model_config import DDPC as DDPC
 from brakeline.safety.model.model_set import BadModel, ModelSet
-from brakeline.safety.model.tensor_file import holds
+from brakeline.safety.model.tensor_file import has_entry
 from brakeline.safety.rivals.pretrained import ENTRY, Pretrained
 from brakeline.safety.rivals.sailr import SAILR, Sailr
 from brakeline.safety.rivals.secas import SECAS, Secas
@@ -63,7 +63,7 @@ def decode(payload: bytes) -> Model:
     Raises:
         BadModel: of none; the message says why.
     """
-    return Pretrained.decode(payload) if holds(payload, ENTRY) else ModelSet.decode(payload)
+    return Pretrained.decode(payload) if has_entry(payload, ENTRY) else ModelSet.decode(payload)
 
 
 def load(path: Path) -> Model:

@@ -8,9 +8,9 @@ from dataclasses import replace
 import numpy as np
 
 from brakeline.safety.model.dataset import Dataset
-from brakeline.safety.model.fitting import make
+from brakeline.safety.model.fitting import fit_model_set
 from brakeline.safety.model.model_set import ModelConfig, ModelSet
-from brakeline.safety.model.validation import Array, ValidationReport, judged, most_violations
+from brakeline.safety.model.validation import Array, ValidationReport, most_violations, validate_plans
 
 HELD_OUT = 0.3  # of the trajectories, for the statement about a model set
 WIDEST = 1.25  # times: sets that have to be wider for the limit are not what the data support, and are left as they are
@@ -34,8 +34,8 @@ def certify(data: Dataset, model_config: ModelConfig, until_held: bool = False) 
         BadData, CertificateError: the data do not support it; the message says why.
     """
     fitted, held_out = data.split((1.0 - HELD_OUT, HELD_OUT))
-    model = make(fitted, model_config)
-    statement, scores = judged(model, fitted, held_out)
+    model = fit_model_set(fitted, model_config)
+    statement, scores = validate_plans(model, fitted, held_out)
     most = 0 if until_held else most_violations(len(scores), data.robot.accept_bound)
     if not until_held and _widening(scores, most) > WIDEST:
         most = -1
@@ -44,8 +44,8 @@ def certify(data: Dataset, model_config: ModelConfig, until_held: bool = False) 
         if factor <= 1.0 or not math.isfinite(factor):
             break
         model_config = replace(model_config, inflation=model_config.inflation * factor * (1.0 + ROUNDING))
-        model = make(fitted, model_config)
-        statement, scores = judged(model, fitted, held_out)
+        model = fit_model_set(fitted, model_config)
+        statement, scores = validate_plans(model, fitted, held_out)
     about = model.about | {"bound_step": f"{statement.bound_step:.6g}", "bound_plan": f"{statement.bound_plan:.6g}"}
     about |= {"bound_episode": f"{statement.bound_episode:.6g}", "outside_hour": f"{statement.outside_hour:.6g}"}
     about |= {"windows": str(statement.windows), "violations": str(statement.violations)}

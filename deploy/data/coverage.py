@@ -18,7 +18,7 @@ from brakeline.safety.model.model_set import DIRECT, ModelConfig
 from brakeline.safety.model.stated_bound import plans_needed
 from brakeline.safety.model.turning_in_place import standing_limits
 from brakeline.safety.model.validation import ValidationReport, upper_bound
-from brakeline.safety.model.windows import FREE, PLAN, standing_at_the_end, stops_of, windows
+from brakeline.safety.model.windows import FREE, PLAN, resting_periods_at_end, stopping_distances, windows
 
 NEAR = 0.05  # of its range: an input this near to a bound has been there
 MOST_SHOWN = 3  # groups of violations
@@ -73,8 +73,8 @@ def coverage(data: Dataset) -> Coverage:
         for i, k in enumerate(robot.follows)
         if k >= 0
     ]
-    rested = standing_at_the_end(robot)
-    stops = sum(len(stops_of(robot, t, rested)) for t in data.trajectories)
+    rested = resting_periods_at_end(robot)
+    stops = sum(len(stopping_distances(robot, t, rested)) for t in data.trajectories)
     begun = _begun(data)
     braked = [
         _seen(name, robot.action[i], robot.action_low[i], robot.action_high[i], begun[:, i])

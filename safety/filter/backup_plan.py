@@ -99,7 +99,7 @@ class BackupPlan:
         return self._advance()
 
     @property
-    def holds(self) -> bool:
+    def still_verified(self) -> bool:
         """Does what was verified of the plan still hold, by the state that was measured?"""
         outside = self._compare and self.predicted is not None and not self.predicted.contains(self.robot, self.seen)
         return self.model != UNVERIFIED and not outside
@@ -107,7 +107,7 @@ class BackupPlan:
     def fallback(self) -> Array:
         """No decision came: the committed plan's next input. Nobody else saw whether the state that was measured is in
         its predicted set; where it is not, what was verified of the plan does not hold any more."""
-        if not self.holds:
+        if not self.still_verified:
             self.model, self._plan_tokens = UNVERIFIED, ()
         self.predicted = None
         if self.robot.feedback:

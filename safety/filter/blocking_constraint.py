@@ -11,7 +11,7 @@ from brakeline.messaging.moving_obstacles import MovingObstacles
 from brakeline.messaging.obstacle import Shapes
 from brakeline.messaging.robot import Robot
 from brakeline.safety.filter.moving_halfspaces import swept_half_spaces
-from brakeline.safety.filter.reservation import Promises
+from brakeline.safety.filter.reservation import OtherReservations
 from brakeline.safety.perception.occluded_regions import OccludedRegions
 from brakeline.safety.perception.scan_free_space import OccupiedCells
 from brakeline.safety.perception.scan_free_space import half_spaces as unseen_half_spaces
@@ -22,7 +22,7 @@ UNSEEN, SIGHT, ROBOT = "unseen", "sight", "robot"
 
 
 @dataclass(frozen=True)
-class Stopped:
+class BlockingConstraint:
     """by: cylinder | box | sphere | wall, `moving ` before it where it moves, `unseen`, `robot` (its promise),
     `sight` (the tube leaves what can be seen), or a limit's name; room [m, of a limit in its own units]: from the tube
     to the half-space, negative: beyond it; after [s]: when, from now. normal (d,), at (d,): of the half-space, world,
@@ -35,18 +35,18 @@ class Stopped:
     at: Array
 
     @staticmethod
-    def nowhere(by: str, room: float, after: float) -> Stopped:
-        return Stopped(by, room, after, np.zeros(0), np.zeros(0))
+    def nowhere(by: str, room: float, after: float) -> BlockingConstraint:
+        return BlockingConstraint(by, room, after, np.zeros(0), np.zeros(0))
 
 
 @dataclass(frozen=True)
-class Around:
+class ConstraintSources:
     """What half-spaces are about, in the order of their rows, one disc of the body after the other."""
 
     near: Shapes
     moving: MovingObstacles | None
     unseen: OccupiedCells | OccludedRegions | None
-    promised: Promises | None = None  # these come last, once for the whole body
+    other_reservations: OtherReservations | None = None  # these come last, once for the whole body
 
     @property
     def told(self) -> int:
@@ -57,8 +57,8 @@ class Around:
 @dataclass(frozen=True)
 class Planes:
     """Half-spaces for one disc of the body: start (d,) and ends (N, d), world, of its centre's nominal way; normals
-    (n, N, d) and offsets (n, N) about `start`, in the order of `Around`, of obstacles that keep_off [m] and measured
-    (d,) have been taken from."""
+    (n, N, d) and offsets (n, N) about `start`, in the order of `ConstraintSources`, of obstacles that keep_off [m] and
+    measured (d,) have been taken from."""
 
     start: Array
     ends: Array
@@ -74,7 +74,7 @@ class Planes:
         return normal, float(self.offsets[which, period]) + kept
 
 
-def worst(row: int, room: float, robot: Robot, around: Around, planes: list[Planes]) -> Stopped:
+def worst(row: int, room: float, robot: Robot, around: ConstraintSources, planes: list[Planes]) -> BlockingConstraint:
     """What a row is about; planes: of each disc, under the proposal."""
     N, T = robot.horizon, robot.period
     number = row
@@ -83,17 +83,19 @@ def worst(row: int, room: float, robot: Robot, around: Around, planes: list[Plan
         if number < rows:
             return _about_an_obstacle(number, room, robot, around, disc)
         number -= rows
-    if around.promised is not None:
+    if around.other_reservations is not None:
         each = (N + 1) << robot.position_dim  # of a robot
-        if number < len(around.promised) * each:
+        if number < len(around.other_reservations) * each:
             period = (number % each) >> robot.position_dim
-            return Stopped.nowhere(ROBOT, room, T * min(period + 1, N))
-        number -= len(around.promised) * each
+            return BlockingConstraint.nowhere(ROBOT, room, T * min(period + 1, N))
+        number -= len(around.other_reservations) * each
     period, limit = divmod(number, len(robot.limits))
-    return Stopped.nowhere(robot.limits[limit].name, room, T * min(period + 1, N))
+    return BlockingConstraint.nowhere(robot.limits[limit].name, room, T * min(period + 1, N))
 
 
-def _about_an_obstacle(row: int, room: float, robot: Robot, around: Around, planes: Planes) -> Stopped:
+def _about_an_obstacle(
+    row: int, room: float, robot: Robot, around: ConstraintSources, planes: Planes
+) -> BlockingConstraint:
     """The same of a disc's row."""
     N, T = robot.horizon, robot.period
     which, end = divmod(row, 2 * N + 1)
@@ -111,12 +113,14 @@ def _about_an_obstacle(row: int, room: float, robot: Robot, around: Around, plan
         by, normals, offsets = _moving_or_unseen(which - len(around.near), robot, around, start, ends)
         normal, level = normals[0, period], float(offsets[0, period])
     if not np.isfinite(level):
-        return Stopped.nowhere(by, room, T * when)
+        return BlockingConstraint.nowhere(by, room, T * when)
     there = (ends[when - 1] if when else start) - start
-    return Stopped(by, room, T * when, normal, start + there + normal * (level - normal @ there))
+    return BlockingConstraint(by, room, T * when, normal, start + there + normal * (level - normal @ there))
 
 
-def _moving_or_unseen(which: int, robot: Robot, around: Around, start: Array, ends: Array) -> tuple[str, Array, Array]:
+def _moving_or_unseen(
+    which: int, robot: Robot, around: ConstraintSources, start: Array, ends: Array
+) -> tuple[str, Array, Array]:
     """The name of what does not stand still, and its half-spaces (1, N, d), (1, N) themselves."""
     one, exact = np.array([which]), np.zeros(len(start))
     if around.moving is not None:

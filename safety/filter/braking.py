@@ -21,7 +21,7 @@ def brake(robot: Robot, before: Array) -> Array:
     return np.where(robot.zero_at_rest, before - np.clip(before, -slew, slew), before)
 
 
-def within(robot: Robot, wanted: Array, before: Array) -> Array:
+def clip_input(robot: Robot, wanted: Array, before: Array) -> Array:
     """The input (m,) closest to the wanted one within bounds and slew of the one in force."""
     slew = np.asarray(robot.action_slew)
     low, high = np.maximum(robot.low(), before - slew), np.minimum(robot.high(), before + slew)
@@ -37,12 +37,12 @@ def braking_plan(robot: Robot, first: Array) -> Array:
     return plan
 
 
-def braked(robot: Robot, request: Request, version: str, reason: str, total: float) -> Decision:
+def braking_decision(robot: Robot, request: Request, version: str, reason: str, total: float) -> Decision:
     """The failsafe of a method that verifies nothing: μ from the input in force on. total [ms]: inside `decide`."""
     before = request.input_in_force
     return Decision(
         kind=FAILSAFE,
-        plan=braking_plan(robot, within(robot, brake(robot, before), before)),
+        plan=braking_plan(robot, clip_input(robot, brake(robot, before), before)),
         tube_center=np.zeros((0, robot.position_dim)),
         tube_half_width=np.zeros((0, robot.position_dim)),
         predicted=NO_PREDICTION,

@@ -15,17 +15,17 @@ from brakeline.messaging.range_image import RangeImage
 from brakeline.messaging.robot import Robot
 from brakeline.messaging.scan import Scan
 from brakeline.safety.filter.backup_plan import Prediction
-from brakeline.safety.filter.blocking_constraint import SIGHT, Around, Planes, Stopped, worst
-from brakeline.safety.filter.halfspaces import half_spaces, leading_out
+from brakeline.safety.filter.blocking_constraint import SIGHT, BlockingConstraint, ConstraintSources, Planes, worst
+from brakeline.safety.filter.halfspaces import half_spaces, half_spaces_leading_out
 from brakeline.safety.filter.kernels import halfspace_kernels, tube_kernels
 from brakeline.safety.filter.moving_halfspaces import swept_half_spaces
-from brakeline.safety.filter.qp import Layout, Rows
+from brakeline.safety.filter.qp import ConstraintRows, ObstacleRows
 from brakeline.safety.filter.reachable_tube import Tube
-from brakeline.safety.filter.recovery import way_from
+from brakeline.safety.filter.recovery import escape_direction
 from brakeline.safety.filter.request import Request
-from brakeline.safety.filter.reservation import Boxes, Promises, promised_half_spaces
-from brakeline.safety.filter.state_limits import Limits, stacked
-from brakeline.safety.model.model_set import ModelSet, needed
+from brakeline.safety.filter.reservation import OtherReservations, ReservationRows, reservation_half_spaces
+from brakeline.safety.filter.state_limits import StateLimits, stack_rows
+from brakeline.safety.model.model_set import ModelSet, extra_coordinates
 from brakeline.safety.perception import occluded_regions as shades
 from brakeline.safety.perception import scan_free_space as seen
 
@@ -43,7 +43,7 @@ class _Disc:
     radius: float
     swing: float
     position: Array
-    layout: Layout
+    layout: ObstacleRows
 
     @cached_property
     def aside(self) -> bool:
@@ -53,7 +53,7 @@ class _Disc:
 
 def _discs(robot: Robot, tube: Tube) -> list[_Disc]:
     d, found = robot.position_dim, []
-    after = len(needed(robot)) - d * sum(disc.arm > 0.0 for disc in robot.body)
+    after = len(extra_coordinates(robot)) - d * sum(disc.arm > 0.0 for disc in robot.body)
     for disc in robot.body:
         position, directions, swing = tube.position, tube.directions, 0.0
         if disc.arm and robot.heading is not None:
@@ -61,7 +61,7 @@ def _discs(robot: Robot, tube: Tube) -> list[_Disc]:
             swing = disc.arm * robot.measurement_bound[robot.heading]
             after += d
         whole = np.ascontiguousarray(position)
-        found.append(_Disc(np.asarray(disc.at), disc.radius, swing, whole, Layout(position, directions)))
+        found.append(_Disc(np.asarray(disc.at), disc.radius, swing, whole, ObstacleRows(position, directions)))
     return found
 
 
@@ -77,7 +77,7 @@ class LocalMap:
     beyond: float
     moving: MovingObstacles | None = None  # that may meet the tube
     unseen: seen.OccupiedCells | shades.OccludedRegions | None = None  # what a scan does not show to be free
-    promised: Promises | None = None  # to other robots
+    other_reservations: OtherReservations | None = None  # to other robots
 
     @property
     def parked(self) -> LocalMap:
@@ -88,7 +88,7 @@ class LocalMap:
     @property
     def away(self) -> Array | None:
         """A direction (d,), world, off what is nearest to the start; None: nothing is of which that can be told."""
-        ways = [way_from(self.near, self.start)[None]] if len(self.near) else []
+        ways = [escape_direction(self.near, self.start)[None]] if len(self.near) else []
         if isinstance(self.unseen, seen.OccupiedCells):
             ways.append(self.start - self.unseen.corners.reshape(-1, len(self.start)))
         each = np.concatenate(ways or [np.zeros((0, len(self.start)))])
@@ -96,7 +96,7 @@ class LocalMap:
 
     @property
     def empty(self) -> bool:
-        return not len(self.near) and self.moving is None and self.unseen is None and self.promised is None
+        return not len(self.near) and self.moving is None and self.unseen is None and self.other_reservations is None
 
 
 def turning_extent(robot: Robot, tube: Tube) -> float:
@@ -150,8 +150,8 @@ class TubeConstraints:
         # What `next_state` is told of the first period.
         self._next = whole(first.C[:n]), *transposed, first.w, whole(np.abs(first.generators[:n]))
         self._regressor = model.first_regressor
-        self.boxes = Boxes(tube.position, tube.directions)
-        self.limits = Limits(robot, tube) if robot.limits else None
+        self.boxes = ReservationRows(tube.position, tube.directions)
+        self.limits = StateLimits(robot, tube) if robot.limits else None
         self.measured = np.asarray(robot.measurement_bound[: robot.position_dim], dtype=float)
         self._unturned = np.eye(robot.position_dim)
         self.body = robot.footprint + float(np.linalg.norm(self.measured))  # m about where the center was measured
@@ -210,16 +210,16 @@ class TubeConstraints:
         if moving is not None:
             beyond, counts = self._parted(moving.least_distance(start, robot.horizon * robot.period), beyond)
             moving = moving.take(counts) if counts.any() else None
-        promised = request.promised
-        if promised is not None:
-            beyond, counts = self._parted(promised.nearest(start), beyond)
-            promised = promised.take(counts) if counts.any() else None
+        other_reservations = request.other_reservations
+        if other_reservations is not None:
+            beyond, counts = self._parted(other_reservations.nearest(start), beyond)
+            other_reservations = other_reservations.take(counts) if counts.any() else None
         unseen: seen.OccupiedCells | shades.OccludedRegions | None = None
         if isinstance(request.scan, RangeImage):
             unseen = shades.occluded_regions(request.scan, self._room(z_0, inputs, start, turn), self.body, start)
         elif request.scan is not None:
             unseen = self._unseen(request.scan, start)
-        return LocalMap(start, heading, turn, near, beyond, moving, unseen, promised)
+        return LocalMap(start, heading, turn, near, beyond, moving, unseen, other_reservations)
 
     def _parted(self, away: Array, beyond: float) -> tuple[float, NDArray[np.bool_]]:
         """How near [m] the nearest beyond reach is, of these and what was looked at before, and which (n,) are within;
@@ -264,7 +264,7 @@ class TubeConstraints:
             center[self.robot.heading] += scene.heading
         return Prediction(center, half, scene.heading)
 
-    def margin(self, rows: Rows, z: Array) -> float:
+    def margin(self, rows: ConstraintRows, z: Array) -> float:
         """Smallest distance [m] of the exact tube to a half-space (of a limit: in its own units)."""
         return self.least(rows.bound - rows.support(self.tube, z), z)
 
@@ -293,7 +293,7 @@ class TubeConstraints:
             if len(scene.near) or scene.unseen is None:
                 beside.append(half_spaces(scene.near, start, ends, disc.radius, measured))
                 if leaving:
-                    beside[0] = leading_out(scene.near, start, disc.radius, measured, beside[0])
+                    beside[0] = half_spaces_leading_out(scene.near, start, disc.radius, measured, beside[0])
             if scene.moving is not None:
                 beside.append(swept_half_spaces(scene.moving, start, ends, disc.radius, measured, self.robot.period))
                 self._let_pass(beside[-1][1])
@@ -312,13 +312,13 @@ class TubeConstraints:
         late = levels[:, self.stands :]
         late[late == late] = FARTHEST  # not of NaN
 
-    def rows(self, scene: LocalMap, z: Array, planes: list[Planes] | None = None) -> Rows:
+    def rows(self, scene: LocalMap, z: Array, planes: list[Planes] | None = None) -> ConstraintRows:
         """Half-spaces about the rollout of regressors z, as rows of the tube (and of the QP's: its generators are the
         same, only their magnitudes are not). planes: if they are known already."""
         planes = planes or self.planes(scene, z)
         discs = zip(self.discs, planes, strict=True)
         parts = [disc.layout.rows(self._turned(plane.normals, scene), plane.offsets) for disc, plane in discs]
-        return stacked(parts + self._further(scene, z))
+        return stack_rows(parts + self._further(scene, z))
 
     def slack(self, scene: LocalMap, z: Array, planes: list[Planes] | None = None) -> Array:
         """What the same rows leave, `bound - support` (rows,)."""
@@ -334,27 +334,29 @@ class TubeConstraints:
         """Into the frame of now."""
         return normals if self.robot.heading is None else normals @ scene.turn
 
-    def _further(self, scene: LocalMap, z: Array) -> list[Rows]:
+    def _further(self, scene: LocalMap, z: Array) -> list[ConstraintRows]:
         """The rows that are not a disc's own."""
         parts = []
-        if scene.promised is not None:
+        if scene.other_reservations is not None:
             nominal = scene.start + self.tube.centers(z) @ scene.turn.T
             body = self.robot.footprint
-            kept = promised_half_spaces(scene.promised, scene.start, nominal, body, self.measured)
+            kept = reservation_half_spaces(scene.other_reservations, scene.start, nominal, body, self.measured)
             parts.append(self.boxes.rows(*kept, scene.turn))
         if self.limits is not None:
             parts.append(self.limits.rows(scene.start, scene.heading, scene.turn))
         return parts
 
-    def worst_of(self, scene: LocalMap, z: Array, slack: Array, planes: list[Planes], kept_off: Array) -> Stopped:
+    def worst_of(
+        self, scene: LocalMap, z: Array, slack: Array, planes: list[Planes], kept_off: Array
+    ) -> BlockingConstraint:
         """What the proposal, regressors z, comes nearest to; kept_off (rows,): so much nearer than it is each counts,
         and the end of sight as much as the most of them."""
         beyond = self.reach - self.extent(z) if self.far else np.inf
         short = slack - kept_off
         if not len(slack) or beyond - kept_off.max(initial=0.0) < short.min():
-            return Stopped.nowhere(SIGHT, beyond, self.robot.period * self.robot.horizon)
+            return BlockingConstraint.nowhere(SIGHT, beyond, self.robot.period * self.robot.horizon)
         row = int(np.argmin(short))
-        around = Around(scene.near, scene.moving, scene.unseen, scene.promised)
+        around = ConstraintSources(scene.near, scene.moving, scene.unseen, scene.other_reservations)
         return worst(row, max(float(slack[row]), -self.reach), self.robot, around, planes)
 
     def clear(self, request: Request, scene: LocalMap, z: Array, margin: float) -> tuple[float, bool]:

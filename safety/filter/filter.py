@@ -21,11 +21,11 @@ from numpy.typing import NDArray
 
 from brakeline.messaging.scan import OLDEST, Scan
 from brakeline.safety.filter.backup_plan import UNVERIFIED
-from brakeline.safety.filter.blocking_constraint import Stopped
+from brakeline.safety.filter.blocking_constraint import BlockingConstraint
 from brakeline.safety.filter.constraints import LocalMap, TubeConstraints, turning_extent
 from brakeline.safety.filter.kernels import tube_kernels
-from brakeline.safety.filter.plan_inputs import Inputs
-from brakeline.safety.filter.qp import SHARPEN, Builder, Rows
+from brakeline.safety.filter.plan_inputs import PlanInputs
+from brakeline.safety.filter.qp import SHARPEN, ConstraintRows, QPBuilder
 from brakeline.safety.filter.qp_solver import INFEASIBLE, solve
 from brakeline.safety.filter.recovery import SLOW, harmless, least_violating, slow_inputs, turn_towards
 from brakeline.safety.filter.request import (
@@ -35,7 +35,7 @@ from brakeline.safety.filter.request import (
     NOT_FINITE,
     RECOVERING,
     Decision,
-    Ordinary,
+    FastRequestCheck,
     Request,
     check_for_filter,
     check_surroundings,
@@ -62,7 +62,7 @@ class _Attempt:
     reason: str = ""
     contained: bool = True
     broken: int = 0
-    stopped: Stopped | None = None
+    blocked_by: BlockingConstraint | None = None
 
 
 @dataclass(frozen=True)
@@ -92,7 +92,7 @@ class Filter:
         self.bound = stated_bound(model.about)
         self.robot = robot = model.robot
         self.tube, outer = model.tube(), model.outer_tube()
-        self.builder = Builder(robot, outer)
+        self.builder = QPBuilder(robot, outer)
         self.domain = widened(model.domain)
         turning = model.turning()
         in_place = self.tube if turning is None else turning.tube()
@@ -104,8 +104,8 @@ class Filter:
             known = box[:, : robot.regressor_dim]
             own = TubeConstraints(turning, in_place, in_place, known, margin, self.around.reach)
             self.in_place = box, own
-        self.inputs = Inputs(robot)
-        self.ordinary = Ordinary(robot)
+        self.inputs = PlanInputs(robot)
+        self.ordinary = FastRequestCheck(robot)
         self.standing = np.array([not moves for moves in robot.translates])
         driven = np.tile(robot.translates, robot.free_steps)
         self.first_free = robot.regressor_dim + robot.committed_steps * robot.action_dim  # of regressors
@@ -206,7 +206,7 @@ class Filter:
             return _Found(ALLOWED, self.inputs.plan(z), z, margin, True, around)
         attempt.reason = f"the proposal's tube comes within {margin:.3g} m of the free space's edge"
         kept_off = self.clearance_margin * rows.keep if margin >= 0.0 else np.zeros(len(slack))
-        attempt.stopped = around.worst_of(scene, z, slack, planes, kept_off)
+        attempt.blocked_by = around.worst_of(scene, z, slack, planes, kept_off)
         # Keeping the clearance margin, or at least not driving into it; else free space alone: from here even standing
         # still would not do.
         adjusted = None
@@ -247,7 +247,7 @@ class Filter:
         first = z[self.first_free : self.first_free + len(proposal)]
         return float(np.linalg.norm((first - proposal) / (self.inputs.high - self.inputs.low)))
 
-    def _closest(self, rows: Rows, z_0: Array, proposal: Array, attempt: _Attempt) -> Array | None:
+    def _closest(self, rows: ConstraintRows, z_0: Array, proposal: Array, attempt: _Attempt) -> Array | None:
         """The QP's answer, clipped to bounds and slew, as regressors; None if there is no number in it."""
         before = perf_counter_ns()
         program = self.builder.program(rows, z_0, proposal)
@@ -259,7 +259,7 @@ class Filter:
         free = self.inputs.within(self.builder.inputs(solution.x), z_0[-self.robot.action_dim :])
         return np.concatenate([z_0, free])
 
-    def _with_clearance_margin(self, rows: Rows, z_0: Array, proposal: Array) -> Rows:
+    def _with_clearance_margin(self, rows: ConstraintRows, z_0: Array, proposal: Array) -> ConstraintRows:
         """Rows with the clearance margin. Where moving in place would not keep it, the tube may stay as near as the
         free space allows, but no input may translate the robot nearer (one that can't stop at once: not more than
         the strongest braking does): two rows instead of one."""
@@ -272,9 +272,9 @@ class Filter:
         inside = rows.support(self.tube, stay) > rows.bound - kept_off
         bound = np.where(inside, rows.bound, rows.bound - kept_off)
         if not inside.any():
-            return Rows(rows.gradient, rows.spread, bound, rows.keep)
+            return ConstraintRows(rows.gradient, rows.spread, bound, rows.keep)
         closer = rows.gradient[inside] * self.translating
-        return Rows(
+        return ConstraintRows(
             np.vstack([rows.gradient, closer]),
             np.vstack([rows.spread, np.zeros((len(closer), rows.spread.shape[1]))]),
             np.concatenate([bound, closer @ stay + 2.0 * SHARPEN]),
@@ -391,13 +391,13 @@ class Filter:
             solver=attempt.solver,
             iterations=attempt.iterations,
             broken=attempt.broken,
-            stopped=None if found.kind == ALLOWED else attempt.stopped,
+            blocked_by=None if found.kind == ALLOWED else attempt.blocked_by,
             for_clearance=found.for_clearance if found.kind == ADJUSTED else None,
             reservation=reservation,
             bound=self.bound,
         )
 
-    def rest(self, state: Array) -> Reservation:
+    def standing_reservation(self, state: Array) -> Reservation:
         """What a robot promises that stands, and goes on standing, in a measured state (n,)."""
         z = np.concatenate([state[self.regressor], np.tile(self.inputs.nothing, 1 + self.robot.free_steps)])
         heading = float(state[self.robot.heading]) if self.robot.heading is not None else 0.0

@@ -45,13 +45,13 @@ def half_spaces(near: Shapes, start: Array, nominal: Array, keep_off: float, mea
     level = np.einsum("nqd,nqd->nq", unit, towards + seen_from)
     inside = ~(gap > TOUCHING)  # true for NaN, too
     level[inside | inside[:, :1]] = -np.inf
-    choice = roomiest(unit, level, between)
+    choice = roomiest_planes(unit, level, between)
     each = np.arange(len(choice))[:, None]
     normal = unit[each, choice]
     return normal, level[each, choice] - np.maximum(keep_off + near.margin, 0.0)[:, None] - np.abs(normal) @ measured
 
 
-def leading_out(
+def half_spaces_leading_out(
     near: Shapes, start: Array, keep_off: float, measured: Array, planes: tuple[Array, Array]
 ) -> tuple[Array, Array]:
     """The same half-spaces, but of an obstacle that the start is inside of, the one behind which it is left soonest:
@@ -68,7 +68,7 @@ def leading_out(
     return normals, offsets
 
 
-def roomiest(unit: Array, level: Array, ends: Array) -> NDArray[np.intp]:
+def roomiest_planes(unit: Array, level: Array, ends: Array) -> NDArray[np.intp]:
     """Which of the planes (n, 2N+1) serves which period, the ends (N+1, d) of which are nominal: (n, N).
 
     From the first period on whose ends no plane keeps apart from the obstacle, the nominal plan goes through it: the

@@ -35,7 +35,7 @@ def _followed(z_0: Array, braking: Array, action: Array) -> Array:
     return z
 
 
-class Inputs:
+class PlanInputs:
     """z (nz,) is what a tube is linear in: the measured state's part, the input in force, the plan's inputs that are
     given already (together z_0), and the free ones."""
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from brakeline.messaging.robot import Robot
 from brakeline.safety.filter.kernels import halfspace_kernels
-from brakeline.safety.filter.qp_solver import Program
+from brakeline.safety.filter.qp_solver import QuadraticProgram
 from brakeline.safety.filter.reachable_tube import Tube
 
 Array = NDArray[np.float64]
@@ -20,7 +20,7 @@ ROUNDING = 1e-12  # of a unit row of W: an atom that depends on the inputs no mo
 
 
 @dataclass(frozen=True)
-class Rows:
+class ConstraintRows:
     """A half-space for every end of every period: support of the tube in its normal, `gradient z + spread m(z)`.
 
     gradient (rows, nz); spread (rows, L+N+1) >= 0; bound (rows,). keep (rows,): the factor of
@@ -36,7 +36,7 @@ class Rows:
         return np.asarray(self.gradient @ z + self.spread @ tube.magnitudes(z))
 
 
-class Layout:
+class ObstacleRows:
     """The parts of a tube that rows about obstacles are made from, gathered once, for one disc of the body.
 
     Per obstacle there are 2N+1 rows: period k's half-space at the period's start and at its end, both with the bulge
@@ -62,10 +62,10 @@ class Layout:
         self.parts = period, ways, spans, columns, chord_deviation
         self.sizes = L + N + 1
 
-    def rows(self, normals: Array, offsets: Array) -> Rows:
+    def rows(self, normals: Array, offsets: Array) -> ConstraintRows:
         """Rows for half-spaces `a·p <= b` in the frame of now, a (n, N, d), b (n, N)."""
         gradient, spread, bound = halfspace_kernels.rows(normals, offsets, *self.parts, self.sizes)
-        return Rows(gradient, spread, bound, np.ones(len(bound)))
+        return ConstraintRows(gradient, spread, bound, np.ones(len(bound)))
 
     def slack(self, normals: Array, offsets: Array, sizes: Array, z: Array) -> Array:
         """What these rows leave, `bound - support`, of the tube with magnitudes `sizes` (L+N+1,) under regressors z,
@@ -73,7 +73,7 @@ class Layout:
         return halfspace_kernels.slack(normals, offsets, *self.parts, sizes, z)
 
 
-class Builder:
+class QPBuilder:
     """Builds the QP of a decision; everything that does not change from call to call is kept.
 
     Variables [free inputs f; t], t the atoms |W z| that depend on f, as epigraphs:
@@ -119,7 +119,7 @@ class Builder:
         self.slew = np.tile(robot.action_slew, steps)[limited]
         self.box = np.concatenate([np.tile(robot.high(), steps), -np.tile(robot.low(), steps)])
 
-    def program(self, rows: Rows, z_0: Array, proposal: Array) -> Program | None:
+    def program(self, rows: ConstraintRows, z_0: Array, proposal: Array) -> QuadraticProgram | None:
         """The QP for known regressors z_0 (known,) and a proposal r (m,); None if some row rules out every input.
 
         Over the box of inputs that bounds and slew leave, each row's support has a least and a largest value: one
@@ -143,7 +143,9 @@ class Builder:
         g = np.zeros(len(self.h))
         g[:m] = -proposal / self.scale[:m]
         fixed = np.concatenate([-offset, offset, self.box, self.slew + first, self.slew - first]) / self.length
-        return Program(self.h, g, np.vstack([A[:count], self.fixed]), np.concatenate([b[:count], fixed]), len(fixed))
+        return QuadraticProgram(
+            self.h, g, np.vstack([A[:count], self.fixed]), np.concatenate([b[:count], fixed]), len(fixed)
+        )
 
     def reachable(self, before: Array) -> tuple[Array, Array]:
         """Center and half-widths (F·m,) of what bounds and slew leave to the free inputs after `before` (m,)."""

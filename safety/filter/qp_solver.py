@@ -29,7 +29,7 @@ EXACT, FIRMNESS = 1e-7, 1e-2
 
 
 @dataclass(frozen=True)
-class Program:
+class QuadraticProgram:
     """`min ½ xᵀ diag(h) x + gᵀ x  s.t.  A x <= b`: h, g (n,), A (rows, n), b (rows,). The last `always` of them
     (bounds and the like) are looked at from the beginning, whichever others decide."""
 
@@ -57,12 +57,12 @@ class Solution:
 INFEASIBLE = Solution(np.array([np.nan]), "ruled out", 0, np.inf)  # of a program that need not be solved
 
 
-def solve(program: Program) -> Solution:
+def solve(program: QuadraticProgram) -> Solution:
     """Cold start: the answer depends on the program alone, so that a log can be replayed."""
     return _by_few(program) or _solved(program)
 
 
-def _by_few(program: Program) -> Solution | None:
+def _by_few(program: QuadraticProgram) -> Solution | None:
     """By as few rows as will do; None if that does not come soon."""
     inside, iterations = hildreth_active_set(program.h, program.g, program.A, program.b, STEPS), 0
     inside[len(program.b) - program.always :] = True
@@ -79,7 +79,7 @@ def _by_few(program: Program) -> Solution | None:
     return None
 
 
-def _solved(program: Program, few: bool = False) -> Solution:
+def _solved(program: QuadraticProgram, few: bool = False) -> Solution:
     rows, n = program.A.shape
     qp = proxqp.dense.QP(n, 0, rows)
     settings = qp.settings

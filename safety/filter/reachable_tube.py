@@ -90,7 +90,7 @@ def stack_direct(
 
 
 @dataclass(frozen=True)
-class Recursion:
+class RecursionMaps:
     """How regressors follow from states: z_k = [E y_k; u_{k-1}; u_k], y_k (n) with the position first.
 
     E: indices of y in the regressor; relative: the first so many coordinates are predicted as displacement;
@@ -120,7 +120,7 @@ class Recursion:
         return pick
 
 
-def recursion_of(robot: Robot, plans: bool = True) -> Recursion:
+def recursion_maps(robot: Robot, plans: bool = True) -> RecursionMaps:
     """y = (position, heading, speeds ...), all relative to the frame of now; z ends in a plan's chosen inputs, or in
     all of its inputs, one by one."""
     reg = list(robot.regressor)
@@ -129,12 +129,12 @@ def recursion_of(robot: Robot, plans: bool = True) -> Recursion:
     first = np.zeros((robot.state_dim, nz))
     first[reg, np.arange(len(reg))] = 1.0
     E = tuple(range(robot.position_dim, robot.state_dim))
-    return Recursion(E, robot.position_dim, robot.action_dim, S, first)
+    return RecursionMaps(E, robot.position_dim, robot.action_dim, S, first)
 
 
 def stack_recursive(
     steps: Sequence[ErrorBound],
-    how: Recursion,
+    how: RecursionMaps,
     position_dim: int,
     chord_deviations: ErrorBound | None = None,
     stopping_distance: ErrorBound | None = None,
@@ -186,8 +186,8 @@ def stack_recursive(
     W = np.vstack([W, *(w for w, _, _ in extra)])
     M = _block_diagonal([M, *(m for _, m, _ in extra)])
     W, M = _merged(W, M)
-    m_0, stacked, d = np.concatenate([m_0, *(m0 for _, _, m0 in extra)]), np.stack(centers), position_dim
-    return Tube(stacked[:, :d], directions[:, :d], W, M, m_0, stacked[:, d:], directions[:, d:])
+    m_0, stack_rows, d = np.concatenate([m_0, *(m0 for _, _, m0 in extra)]), np.stack(centers), position_dim
+    return Tube(stack_rows[:, :d], directions[:, :d], W, M, m_0, stack_rows[:, d:], directions[:, d:])
 
 
 def _atoms(step: ErrorBound) -> tuple[Array, Array, Array]:

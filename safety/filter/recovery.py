@@ -64,7 +64,7 @@ def lower(one: Array, other: Array) -> bool:
     return False
 
 
-def way_from(near: Shapes, start: Array) -> Array:
+def escape_direction(near: Shapes, start: Array) -> Array:
     """A direction (d,) that leads off the nearest of obstacles, out of the one that the start is deepest inside."""
     out = near.out_of(start)
     depth = np.einsum("nd,nd->n", out, out)

@@ -16,8 +16,8 @@ from brakeline.messaging.robot import Robot
 from brakeline.messaging.scan import Scan
 from brakeline.messaging.sensor_messages import RangeMeasurement
 from brakeline.safety.filter.backup_plan import Prediction
-from brakeline.safety.filter.blocking_constraint import Stopped
-from brakeline.safety.filter.reservation import Promises, Reservation
+from brakeline.safety.filter.blocking_constraint import BlockingConstraint
+from brakeline.safety.filter.reservation import OtherReservations, Reservation
 
 Array = NDArray[np.float64]
 
@@ -66,7 +66,7 @@ class Request:
     movers: MovingObstacles | None = None
     scan: RangeMeasurement | None = None
     reservation: Reservation | None = None
-    promised: Promises | None = None
+    other_reservations: OtherReservations | None = None
     observation: NDArray[np.float32] = field(default_factory=lambda: np.zeros(0, np.float32))
     known_free: bool = False
 
@@ -115,7 +115,9 @@ class Decision:
     solver: str = ""
     iterations: int = 0
     broken: int = 0  # movers that were seen outside of what their bounds allowed
-    stopped: Stopped | None = None  # of a proposal that was not allowed: what it would have come too near to
+    blocked_by: BlockingConstraint | None = (
+        None  # of a proposal that was not allowed: what it would have come too near to
+    )
     reservation: Reservation | None = None  # to the other robots of its world
     # The model set's statement: at most this share of the plans that it verifies leave their tubes, at 99 % confidence;
     # 1: it states nothing; None: of a method that verifies nothing.
@@ -169,7 +171,7 @@ def check_surroundings(robot: Robot, request: Request) -> None:
         raise BadRequest("image", f"a {robot.name} robot has no range image in space: give obstacles, or a scan")
 
 
-class Ordinary:
+class FastRequestCheck:
     """All of a request's numbers at once: what nearly every one takes, in a third of the time."""
 
     def __init__(self, robot: Robot) -> None:

@@ -24,7 +24,7 @@ from brakeline.messaging.obstacle import Shapes
 from brakeline.safety.filter.halfspaces import TOUCHING
 
 if TYPE_CHECKING:
-    from brakeline.safety.filter.qp import Rows
+    from brakeline.safety.filter.qp import ConstraintRows
 
 Array = NDArray[np.float64]
 
@@ -49,14 +49,14 @@ class Reservation:
         parts = self.center, self.half_width, self.radius
         return Reservation(*(np.concatenate([part[1:], part[-1:]]) for part in parts))
 
-    def apart(self, other: Reservation) -> float:
+    def distance(self, other: Reservation) -> float:
         """m between the two in the period in which they are nearest; 0 or less: they overlap."""
         between = np.abs(self.center - other.center) - self.half_width - other.half_width
         return float((np.linalg.norm(np.maximum(between, 0.0), axis=1) - self.radius - other.radius).min())
 
 
 @dataclass(frozen=True)
-class Promises:
+class OtherReservations:
     """Those of n others, stacked: their boxes (n·N) as shapes, with what is added about them as margin."""
 
     shapes: Shapes
@@ -66,7 +66,7 @@ class Promises:
         return len(self.shapes) // self.periods
 
     @staticmethod
-    def to(others: Sequence[Reservation]) -> Promises | None:
+    def to(others: Sequence[Reservation]) -> OtherReservations | None:
         """None: there are none."""
         if not others:
             return None
@@ -74,19 +74,19 @@ class Promises:
         (count, d), periods = center.shape, len(others[0].center)
         axes = np.broadcast_to(np.eye(d), (count, d, d))
         margin = np.concatenate([p.radius for p in others])
-        return Promises(Shapes(center, axes, half, np.zeros(count), np.ones((count, d)), margin), periods)
+        return OtherReservations(Shapes(center, axes, half, np.zeros(count), np.ones((count, d)), margin), periods)
 
     def nearest(self, point: Array) -> Array:
         """(n,) m: how near each comes to a point (d,)."""
         return np.asarray((self.shapes.distance(point) - self.shapes.margin).reshape(-1, self.periods).min(axis=1))
 
-    def take(self, chosen: NDArray[np.bool_]) -> Promises:
+    def take(self, chosen: NDArray[np.bool_]) -> OtherReservations:
         """The chosen (n,) ones."""
-        return Promises(self.shapes.take(np.repeat(chosen, self.periods)), self.periods)
+        return OtherReservations(self.shapes.take(np.repeat(chosen, self.periods)), self.periods)
 
 
-def promised_half_spaces(
-    near: Promises, start: Array, nominal: Array, keep_off: float, measured: Array
+def reservation_half_spaces(
+    near: OtherReservations, start: Array, nominal: Array, keep_off: float, measured: Array
 ) -> tuple[Array, Array]:
     """As `freespace.half_spaces`, for boxes that are each there for one period.
 
@@ -121,7 +121,7 @@ def promised_half_spaces(
     return unit[at], level[at] - np.maximum(keep_off + margin, 0.0) - np.abs(unit[at]) @ measured
 
 
-class Boxes:
+class ReservationRows:
     """Rows that hold a robot's own boxes to half-spaces, as linear in z and its magnitudes as those about its tube.
 
     The support of box(S_k ∪ S_{k+1}) in a direction n is, coordinate by coordinate, that of the one end or the other:
@@ -142,7 +142,7 @@ class Boxes:
         self._extra = np.eye(N + 1)[np.repeat(np.arange(N + 1), len(choices))]
         self._axis = np.arange(d)
 
-    def rows(self, normals: Array, offsets: Array, turn: Array) -> Rows:
+    def rows(self, normals: Array, offsets: Array, turn: Array) -> ConstraintRows:
         """Rows for half-spaces `a·p <= b` relative to where the robot is, a (n, N, d) in the world, b (n, N); turn
         (d, d): world from the frame of now."""
         n = len(normals)
@@ -152,6 +152,10 @@ class Boxes:
         gradient = np.einsum("nrd,rdz->nrz", normals, center).reshape(n * len(self.period), -1)
         spread = np.einsum("nrd,rdl->nrl", np.abs(normals), half).reshape(len(gradient), -1)
         extra = np.tile(self._extra, (n, 1))
-        from brakeline.safety.filter.qp import Rows  # who only keeps a promise, as a client does, needs no solver
+        from brakeline.safety.filter.qp import (
+            ConstraintRows,  # who only keeps a promise, as a client does, needs no solver
+        )
 
-        return Rows(gradient, np.hstack([spread, extra]), offsets[:, self.period].ravel(), np.ones(len(gradient)))
+        return ConstraintRows(
+            gradient, np.hstack([spread, extra]), offsets[:, self.period].ravel(), np.ones(len(gradient))
+        )

@@ -6,14 +6,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brakeline.messaging.robot import Robot
-from brakeline.safety.filter.qp import Rows
+from brakeline.safety.filter.qp import ConstraintRows
 from brakeline.safety.filter.reachable_tube import Tube
-from brakeline.safety.model.model_set import needed
+from brakeline.safety.model.model_set import extra_coordinates
 
 Array = NDArray[np.float64]
 
 
-class Limits:
+class StateLimits:
     """`weights · y_k <= most` at every period's end, y_k the true state; where it is about the position, between them
     too, and after the stop.
 
@@ -32,15 +32,15 @@ class Limits:
         self.place, self.turn = weights[:, :d], np.zeros(self.count)
         if robot.heading is not None:
             self.turn = weights[:, robot.heading]
-        kept = [i for i in needed(robot) if i < n]
+        kept = [i for i in extra_coordinates(robot) if i < n]
         other = weights[:, kept]
-        which = [needed(robot).index(i) for i in kept]
+        which = [extra_coordinates(robot).index(i) for i in kept]
         maps = np.concatenate([tube.more, tube.more_directions], axis=2)[:, which]
         self.rest = np.einsum("cr,nrz->ncz", other, maps).reshape(N, self.count, maps.shape[2])
         self.path = np.concatenate([tube.position, tube.directions], axis=2)  # (N, d, nz + L)
         self.nz, self.extra = tube.position.shape[2], np.eye(N + 1)
 
-    def rows(self, start: Array, heading: float, turn: Array) -> Rows:
+    def rows(self, start: Array, heading: float, turn: Array) -> ConstraintRows:
         """Rows for a robot at `start` (d,) with that heading, `turn` (d, d) world from the frame of now."""
         N = len(self.path)
         both = (self.place @ turn) @ self.path + self.rest  # (N, limits, nz + L)
@@ -53,13 +53,13 @@ class Limits:
         gradient = both[..., : self.nz].reshape(-1, self.nz)
         spread = np.concatenate([np.abs(both[..., self.nz :]), extra], axis=2)
         count = len(gradient)
-        return Rows(gradient, spread.reshape(count, -1), np.tile(bound, N + 1), np.zeros(count))
+        return ConstraintRows(gradient, spread.reshape(count, -1), np.tile(bound, N + 1), np.zeros(count))
 
 
-def stacked(parts: list[Rows]) -> Rows:
+def stack_rows(parts: list[ConstraintRows]) -> ConstraintRows:
     """All rows of several parts."""
     if len(parts) == 1:
         return parts[0]
-    return Rows(
+    return ConstraintRows(
         *(np.concatenate([getattr(p, name) for p in parts]) for name in ("gradient", "spread", "bound", "keep"))
     )

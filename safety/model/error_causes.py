@@ -20,7 +20,7 @@ HALF = 0.5  # of its bounds: from there on it drives fast, or turns
 
 
 @dataclass(frozen=True)
-class Leaving:
+class ViolationGroup:
     """Held-out plans of one regime that left their sets by the same part. of: the held-out plans of that regime."""
 
     part: str
@@ -65,7 +65,7 @@ def regimes(robot: Robot, z: Array) -> NDArray[np.str_]:
     )
 
 
-def leavings(excess: Array, parts: list[str], driving: NDArray[np.str_]) -> tuple[Leaving, ...]:
+def group_violations(excess: Array, parts: list[str], driving: NDArray[np.str_]) -> tuple[ViolationGroup, ...]:
     """The plans whose excess (T,) is above 1, by part and regime; the most plans first."""
     left = ~(excess <= 1.0)
     every = Counter(driving.tolist())
@@ -73,6 +73,7 @@ def leavings(excess: Array, parts: list[str], driving: NDArray[np.str_]) -> tupl
     for row in np.flatnonzero(left):
         groups.setdefault((parts[row], str(driving[row])), []).append(float(excess[row]))
     found = [
-        Leaving(part, regime, len(shares), every[regime], max(shares)) for (part, regime), shares in groups.items()
+        ViolationGroup(part, regime, len(shares), every[regime], max(shares))
+        for (part, regime), shares in groups.items()
     ]
     return tuple(sorted(found, key=lambda one: (-one.plans, -one.excess)))

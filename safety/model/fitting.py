@@ -27,11 +27,11 @@ from brakeline.safety.model.windows import (
     FREE,
     PLAN,
     Windows,
-    outputs,
-    quality,
-    standing_at_the_end,
-    stands_from,
-    stops_of,
+    check_regressors,
+    periods_until_standing,
+    predicted_outputs,
+    resting_periods_at_end,
+    stopping_distances,
     windows,
 )
 
@@ -42,7 +42,7 @@ FEWEST_IN_PLACE = 100  # windows in place: fewer regressors play a part in them 
 MOST_ATOMS = 120_000  # of a matrix zonotope, over the horizon: the exact check looks at every one
 
 
-def make(data: Dataset, model_config: ModelConfig) -> ModelSet:
+def fit_model_set(data: Dataset, model_config: ModelConfig) -> ModelSet:
     """A model set from two parts of the data: one fits C, the other bounds what is left (held-out data: certify).
 
     Raises:
@@ -60,11 +60,11 @@ def make(data: Dataset, model_config: ModelConfig) -> ModelSet:
         seen, rest = windows(fit, k, kind), windows(bound, k, kind)
         columns = _columns(robot, k, kind)
         for part in (seen, rest):
-            quality(part.z[:, columns], f"windows of {k} periods", model_config.fewest)
+            check_regressors(part.z[:, columns], f"windows of {k} periods", model_config.fewest)
         every = windows(data, k, kind)  # no predictor is fitted to bulges: both parts may bound them
         chord_deviations.append(envelope(np.abs(every.z), every.chord_deviation, model_config.inflation))
         if model_config.mode == DIRECT:
-            after, later = outputs(robot, seen.y), outputs(robot, rest.y)
+            after, later = predicted_outputs(robot, seen.y), predicted_outputs(robot, rest.y)
             steps.append(_certificate(seen.z, after, rest.z, later, model_config, columns, MOST_ATOMS // horizon))
         else:
             steps.append(_recursive_step(robot, windows(fit, 1), windows(bound, 1), k - 1, model_config))
@@ -85,7 +85,7 @@ def make(data: Dataset, model_config: ModelConfig) -> ModelSet:
         domain,
         whitening(whole.z),
         about,
-        stands=stands_from(whole, data, kind),
+        stands=periods_until_standing(whole, data, kind),
         in_place=_in_place(fit, bound, model_config),
     )
 
@@ -105,10 +105,12 @@ def _in_place(fit: Dataset, bound: Dataset, model_config: ModelConfig) -> InPlac
         both = windows(fit, k, FREE), windows(bound, k, FREE)
         parts = [part.take(inside(part.z[:, columns], bounds)) for part in both]
         z, z_bound = (np.where(turns, part.z, 0.0) for part in parts)
-        y, y_bound = (outputs(robot, part.y) for part in parts)
+        y, y_bound = (predicted_outputs(robot, part.y) for part in parts)
         try:
             for each in (z, z_bound):
-                quality(each[:, turns], f"windows of {k} periods in place", min(model_config.fewest, FEWEST_IN_PLACE))
+                check_regressors(
+                    each[:, turns], f"windows of {k} periods in place", min(model_config.fewest, FEWEST_IN_PLACE)
+                )
             steps.append(_certificate(z, y, z_bound, y_bound, model_config, turns, MOST_ATOMS // robot.horizon))
         except (BadData, ErrorBoundError):
             return None
@@ -148,8 +150,8 @@ def _latch_of_stops(data: Dataset, model_config: ModelConfig) -> float:
         BadData: that occurs too seldom; the message says what to drive.
     """
     robot = data.robot
-    rested = standing_at_the_end(robot)
-    travels = np.concatenate([stops_of(robot, t, rested) for t in data.trajectories])
+    rested = resting_periods_at_end(robot)
+    travels = np.concatenate([stopping_distances(robot, t, rested) for t in data.trajectories])
     if len(travels) < FEWEST_STOPS:
         raise BadData(
             f"{len(travels)} stops in the data, at least {FEWEST_STOPS} are needed: from every speed give zero input "

@@ -22,7 +22,7 @@ from brakeline.messaging.robot import (
     robot_named,
 )
 from brakeline.messaging.robot_description import robot_from_description
-from brakeline.safety.filter.reachable_tube import Tube, recursion_of, stack_direct, stack_recursive
+from brakeline.safety.filter.reachable_tube import Tube, recursion_maps, stack_direct, stack_recursive
 from brakeline.safety.model.error_bounds import ErrorBound
 from brakeline.safety.model.model_config import DIRECT as DIRECT
 from brakeline.safety.model.model_config import FREE, PLAN
@@ -31,7 +31,7 @@ from brakeline.safety.model.model_config import RECURSION as RECURSION
 from brakeline.safety.model.model_config import ModelConfig as ModelConfig
 from brakeline.safety.model.tensor_file import content, pack, unpack
 from brakeline.safety.model.turning_in_place import InPlace
-from brakeline.safety.model.windows import specialised
+from brakeline.safety.model.windows import plan_regressor_map
 
 Array = NDArray[np.float64]
 
@@ -75,7 +75,7 @@ class ModelSet:
         """The regressor of `first` from z (..., nz): [.. ; input in force; first input]."""
         robot = self.robot
         if self.model_config.mode == DIRECT:
-            return z if self.model_config.windows == PLAN else z @ specialised(robot).T
+            return z if self.model_config.windows == PLAN else z @ plan_regressor_map(robot).T
         reg, m = len(robot.regressor), robot.action_dim
         missing = robot.state_dim - robot.position_dim - reg  # coordinates that are zero in the frame of now
         zeros = np.zeros((*z.shape[:-1], missing))
@@ -99,7 +99,7 @@ class ModelSet:
             return None
         steps = self.in_place.steps
         if self.model_config.windows == PLAN:
-            steps = tuple(step.through(specialised(self.robot)) for step in steps)
+            steps = tuple(step.through(plan_regressor_map(self.robot)) for step in steps)
         return replace(self, steps=steps, in_place=None)
 
     def _check_sizes(self) -> None:
@@ -137,15 +137,15 @@ class ModelSet:
             self.robot.position_dim,
             self.chord_deviations,
             self.stopping_distance,
-            needed(self.robot),
+            extra_coordinates(self.robot),
         )
         if plans and self.model_config.windows == FREE:
-            T = specialised(self.robot)
+            T = plan_regressor_map(self.robot)
             chord_deviations, stopping_distance = chord_deviations.through(T), stopping_distance.through(T)
             steps = [step.through(T) for step in steps] if self.model_config.mode == DIRECT else steps
         if self.model_config.mode == DIRECT:
             return stack_direct(steps, d, chord_deviations, stopping_distance, more)
-        how = recursion_of(self.robot, plans or self.model_config.windows == PLAN)
+        how = recursion_maps(self.robot, plans or self.model_config.windows == PLAN)
         return stack_recursive(steps, how, d, chord_deviations, stopping_distance, more=more)
 
     @property
@@ -282,7 +282,7 @@ def regressors(robot: Robot, model_config: ModelConfig) -> int:
     return robot.regressor_dim + chosen * robot.action_dim
 
 
-def needed(robot: Robot) -> tuple[int, ...]:
+def extra_coordinates(robot: Robot) -> tuple[int, ...]:
     """The predicted coordinates besides the position that a limit or a further disc of the body needs."""
     d, n = robot.position_dim, robot.state_dim
     limited = {i for limit in robot.limits for i, weight in enumerate(limit.weights) if weight and i >= d}

@@ -48,7 +48,7 @@ def unpack(payload: bytes, entry: str) -> tuple[dict[str, NDArray[Any]], dict[st
     return tensors, about
 
 
-def holds(payload: bytes, entry: str) -> bool:
+def has_entry(payload: bytes, entry: str) -> bool:
     """Is it a safetensors file with that metadata entry?"""
     try:
         return entry in _metadata(payload)

@@ -16,10 +16,26 @@ from brakeline.messaging.stated_share import CONFIDENCE as CONFIDENCE
 from brakeline.safety.filter.filter import Filter
 from brakeline.safety.filter.reachable_tube import Tube
 from brakeline.safety.model.dataset import Dataset
-from brakeline.safety.model.error_causes import AFTER, PATH, Leaving, leavings, position_parts, regimes, state_parts
-from brakeline.safety.model.model_set import DIRECT, ModelSet, needed
+from brakeline.safety.model.error_causes import (
+    AFTER,
+    PATH,
+    ViolationGroup,
+    group_violations,
+    position_parts,
+    regimes,
+    state_parts,
+)
+from brakeline.safety.model.model_set import DIRECT, ModelSet, extra_coordinates
 from brakeline.safety.model.turning_in_place import inside
-from brakeline.safety.model.windows import PLAN, Quality, Windows, apart, outputs, quality, windows
+from brakeline.safety.model.windows import (
+    PLAN,
+    RegressorQuality,
+    Windows,
+    check_regressors,
+    non_overlapping,
+    predicted_outputs,
+    windows,
+)
 from brakeline.safety.model.zonotope import facet_normals
 
 Array = NDArray[np.float64]
@@ -57,7 +73,9 @@ class ValidationReport:
     in_place_violations: int = 0
     bound_in_place: float = 1.0  # probability that any part of a plan in place is outside, at 99 % confidence
     inflation: float = 1.0  # of the envelopes that the model set was made with
-    leaving: tuple[Leaving, ...] = ()  # where the violations are: by which coordinate, and how the robot drove then
+    leaving: tuple[
+        ViolationGroup, ...
+    ] = ()  # where the violations are: by which coordinate, and how the robot drove then
 
     def figures(self) -> dict[str, Any]:
         return asdict(self)
@@ -79,19 +97,19 @@ def most_violations(count: int, limit: float) -> int:
     return most
 
 
-def state(model: ModelSet, fitted: Dataset, held_out: Dataset) -> ValidationReport:
+def validate(model: ModelSet, fitted: Dataset, held_out: Dataset) -> ValidationReport:
     """The statement of a model set made from `fitted` about trajectories that it has not seen."""
-    return judged(model, fitted, held_out)[0]
+    return validate_plans(model, fitted, held_out)[0]
 
 
-def judged(model: ModelSet, fitted: Dataset, held_out: Dataset) -> tuple[ValidationReport, Array]:
+def validate_plans(model: ModelSet, fitted: Dataset, held_out: Dataset) -> tuple[ValidationReport, Array]:
     """The statement, and of each held-out plan the largest share of its set that any part of it came to (plans,)."""
     robot, ready, kind = model.robot, Filter(model), model.model_config.windows
     turning = model.turning()
     made_of = windows(fitted, robot.horizon, kind)
-    figures: Quality = quality(made_of.z, "plan windows", model.model_config.fewest)
+    figures: RegressorQuality = check_regressors(made_of.z, "plan windows", model.model_config.fewest)
     whole = windows(held_out, robot.horizon, kind)
-    plans = apart(whole.take(~np.isnan(whole.stopping_distance)) if kind == PLAN else whole, robot.horizon)
+    plans = non_overlapping(whole.take(~np.isnan(whole.stopping_distance)) if kind == PLAN else whole, robot.horizon)
     ends = {tuple(start): row for row, start in enumerate(plans.start)}
     in_place = np.zeros(len(plans), dtype=bool)
     if model.in_place is not None:
@@ -149,7 +167,7 @@ def judged(model: ModelSet, fitted: Dataset, held_out: Dataset) -> tuple[Validat
         in_place_violations=turns_outside,
         bound_in_place=upper_bound(turns_outside, turns),
         inflation=model.model_config.inflation,
-        leaving=leavings(excess, parts, regimes(robot, plans.z)),
+        leaving=group_violations(excess, parts, regimes(robot, plans.z)),
     )
     return statement, excess
 
@@ -169,14 +187,14 @@ def _first_excess(model: ModelSet, w: Windows) -> Array:
 
 def outputs_of(model: ModelSet, w: Windows) -> Array:
     """What the model set's certificates predict of these windows."""
-    return outputs(model.robot, w.y) if model.model_config.mode == DIRECT else w.y
+    return predicted_outputs(model.robot, w.y) if model.model_config.mode == DIRECT else w.y
 
 
 def _excess(model: ModelSet, tube: Tube, w: Windows, k: int) -> tuple[Array, list[str]]:
     """How much of the tube the position comes to after k periods (or what else it speaks of), of its bound the path off
     it between, and of the latch the stop: (T, parts), with the parts' names."""
     robot = model.robot
-    d, more = robot.position_dim, list(needed(robot))
+    d, more = robot.position_dim, list(extra_coordinates(robot))
     normals = facet_normals(tube.directions[k - 1][:, np.abs(tube.directions[k - 1]).any(0)])
     spread = np.abs(normals @ tube.directions[k - 1])  # (facets, L)
     others = outputs_of(model, w)[:, more]

@@ -73,7 +73,7 @@ def windows(data: Dataset, k: int, kind: str = PLAN) -> Windows:
     )
 
 
-def specialised(robot: Robot) -> Array:
+def plan_regressor_map(robot: Robot) -> Array:
     """T with `z' = T z`: the regressors of a free window (all inputs of a plan) from those of a plan window."""
     known = robot.regressor_dim
     S = robot.plan_matrix()
@@ -145,7 +145,7 @@ def _braked(robot: Robot, t: Trajectory) -> Array:
     return robot.stop_by_feedback(np.zeros_like(t.inputs), t.states[:-1], np.vstack([earlier, t.inputs[:-1]]))
 
 
-def resting(robot: Robot, t: Trajectory) -> NDArray[np.bool_]:
+def stop_input_periods(robot: Robot, t: Trajectory) -> NDArray[np.bool_]:
     """In which periods are the inputs those of a stop? (T,)"""
     if not robot.feedback:
         return robot.is_stop_input(t.inputs)
@@ -153,7 +153,7 @@ def resting(robot: Robot, t: Trajectory) -> NDArray[np.bool_]:
     return np.asarray((np.abs(t.inputs - _braked(robot, t)) < near)[:, robot.zero_at_rest].all(1))
 
 
-def outputs(robot: Robot, y: Array) -> Array:
+def predicted_outputs(robot: Robot, y: Array) -> Array:
     """What certificates predict: y (T, n), and the displacement of the centre of each disc that is not about the
     regressed position, in the frame of the start. (T, n + d·discs)"""
     if robot.heading is None:
@@ -175,7 +175,7 @@ def _rest_travel(robot: Robot, t: Trajectory) -> Array:
     """At each period: the way from there [m] while the inputs stay those of a stop; NaN if they are not. (T+1,)."""
     travel = np.full(len(t.inputs) + 1, np.nan)
     arm = max(disc.arm for disc in robot.body)
-    zero = resting(robot, t)
+    zero = stop_input_periods(robot, t)
     runs = np.flatnonzero(np.diff(np.concatenate([[False], zero, [False]]).astype(int)))
     for begin, end in zip(runs[::2], runs[1::2], strict=True):
         turned = np.concatenate([[0.0], np.cumsum(t.turned[begin:end])[:-1]])
@@ -192,14 +192,14 @@ def _rest_travel(robot: Robot, t: Trajectory) -> Array:
     return travel
 
 
-def standing_at_the_end(robot: Robot) -> int:
+def resting_periods_at_end(robot: Robot) -> int:
     """So many of a plan's last inputs are those of a stop: one at least."""
     left = robot.stop_profile()[:, robot.zero_at_rest]
     moving = np.flatnonzero(np.abs(left).max(1, initial=0.0) > 0.0)
     return max(robot.horizon - robot.free_steps - int(moving[-1]), 1)
 
 
-def stands_from(whole: Windows, data: Dataset, kind: str) -> int:
+def periods_until_standing(whole: Windows, data: Dataset, kind: str) -> int:
     """So many periods after a plan began the robot stood, whatever the plan was, and went on standing: no measured
     speed was more than its error can make of none. As many as a plan has where that was not so, or no plans were
     recorded.
@@ -217,9 +217,9 @@ def stands_from(whole: Windows, data: Dataset, kind: str) -> int:
     return 1
 
 
-def stops_of(robot: Robot, t: Trajectory, rested: int) -> Array:
+def stopping_distances(robot: Robot, t: Trajectory, rested: int) -> Array:
     """The ways [m] still travelled from wherever the inputs had been those of a stop for `rested` periods."""
-    still = resting(robot, t)
+    still = stop_input_periods(robot, t)
     lasted = np.zeros(len(still) + 1, dtype=int)
     for i, rests in enumerate(still):
         lasted[i + 1] = lasted[i] + 1 if rests else 0
@@ -227,7 +227,7 @@ def stops_of(robot: Robot, t: Trajectory, rested: int) -> Array:
     return np.asarray(travel[(lasted == rested) & ~np.isnan(travel)])
 
 
-def apart(w: Windows, length: int) -> Windows:
+def non_overlapping(w: Windows, length: int) -> Windows:
     """Those of the windows that do not overlap: each starts at least `length` periods after the one before."""
     chosen = np.zeros(len(w), dtype=bool)
     last = (-1, 0)
@@ -239,7 +239,7 @@ def apart(w: Windows, length: int) -> Windows:
 
 
 @dataclass(frozen=True)
-class Quality:
+class RegressorQuality:
     """Of a set of regressors, each scaled by its largest value."""
 
     samples: int
@@ -248,7 +248,7 @@ class Quality:
     condition: float
 
 
-def quality(z: Array, name: str, fewest: int = FEWEST_WINDOWS) -> Quality:
+def check_regressors(z: Array, name: str, fewest: int = FEWEST_WINDOWS) -> RegressorQuality:
     """Raises BadData when regressors (T, nz) are too few, rank-deficient or nearly collinear."""
     if len(z) < fewest:
         raise BadData(f"{name}: {len(z)} windows, at least {fewest} are needed: record more")
@@ -260,4 +260,4 @@ def quality(z: Array, name: str, fewest: int = FEWEST_WINDOWS) -> Quality:
         raise BadData(f"{name}: the regressors have rank {rank} of {z.shape[1]}: record more varied inputs")
     if condition > WORST_CONDITION:
         raise BadData(f"{name}: condition number {condition:.3g} is above {WORST_CONDITION:.0g}: vary the inputs more")
-    return Quality(len(z), rank, float(singular[-1]), condition)
+    return RegressorQuality(len(z), rank, float(singular[-1]), condition)

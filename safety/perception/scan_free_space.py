@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brakeline.messaging.scan import Scan
-from brakeline.safety.filter.halfspaces import TOUCHING, roomiest
+from brakeline.safety.filter.halfspaces import TOUCHING, roomiest_planes
 from brakeline.safety.perception.occlusion_exits import occlusion_exits
 from brakeline.safety.perception.scan_coverage import gaps, gaps_and_motions
 
@@ -160,7 +160,7 @@ def half_spaces(
     unit = towards / np.maximum(gap, TOUCHING)[..., None]
     level = (unit @ corners.transpose(0, 2, 1) - near.error[:, None]).min(axis=2)
     level[~(gap > TOUCHING)] = -np.inf
-    choice = roomiest(unit, level, ends)
+    choice = roomiest_planes(unit, level, ends)
     cell = np.arange(len(choice))[:, None]
     normal = unit[cell, choice]
     t = near.age + period * np.arange(len(ends))

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from brakeline.messaging.robot import Robot
 from brakeline.safety.filter.backup_plan import NO_PREDICTION
-from brakeline.safety.filter.braking import braked, braking_plan, within
+from brakeline.safety.filter.braking import braking_decision, braking_plan, clip_input
 from brakeline.safety.filter.request import ALLOWED, NOT_FINITE, Decision, Request, check_for_rival
 from brakeline.safety.model.model_config import SAILR as SAILR
 from brakeline.safety.model.model_set import BadModel
@@ -70,12 +70,12 @@ class Sailr:
         robot = self.robot
         check_for_rival(robot, request, self.observed)
         if not request.finite:
-            return braked(robot, request, self.version, NOT_FINITE, (perf_counter_ns() - started) * 1e-6)
-        proposal = within(robot, request.action, request.input_in_force)
+            return braking_decision(robot, request, self.version, NOT_FINITE, (perf_counter_ns() - started) * 1e-6)
+        proposal = clip_input(robot, request.action, request.input_in_force)
         advantage = self.advantage(request.observation, proposal)
         if advantage > self.threshold:
             reason = f"its advantage over braking is {advantage:.3f}, above {self.threshold:g}"
-            return braked(robot, request, self.version, reason, (perf_counter_ns() - started) * 1e-6)
+            return braking_decision(robot, request, self.version, reason, (perf_counter_ns() - started) * 1e-6)
         total = (perf_counter_ns() - started) * 1e-6
         return Decision(
             kind=ALLOWED,

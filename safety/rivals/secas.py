@@ -22,8 +22,8 @@ from brakeline.messaging.ray_directions import LidarRays
 from brakeline.messaging.robot import Robot, shipped_robots
 from brakeline.messaging.task import robot_with_task
 from brakeline.safety.filter.backup_plan import NO_PREDICTION
-from brakeline.safety.filter.braking import braked, braking_plan, within
-from brakeline.safety.filter.qp_solver import Program, solve
+from brakeline.safety.filter.braking import braking_decision, braking_plan, clip_input
+from brakeline.safety.filter.qp_solver import QuadraticProgram, solve
 from brakeline.safety.filter.request import ADJUSTED, ALLOWED, NOT_FINITE, Decision, Request, check_for_rival
 from brakeline.safety.model.model_config import SECAS as SECAS
 from brakeline.safety.model.model_set import BadModel
@@ -104,7 +104,7 @@ def quadratic(r: Array, G: Array, d: Array, low: Array, high: Array) -> tuple[Ar
     k = len(rows)
     A = np.vstack([np.hstack([rows, -np.ones((k, 1))]), np.eye(m + 1)[:m], -np.eye(m + 1)])
     b = np.concatenate([d[moved] / size[moved], high, -low, [0.0]])
-    program = Program(np.append(np.ones(m), CURVED), np.append(-r, UNMET), A, b)
+    program = QuadraticProgram(np.append(np.ones(m), CURVED), np.append(-r, UNMET), A, b)
     solution = solve(program)
     a = solution.x[:m] if solution.found else r
     return a, solution.status, solution.iterations
@@ -150,20 +150,20 @@ class Secas:
         robot = self.robot
         check_for_rival(robot, request, self.observed)
         if not request.finite:
-            return braked(robot, request, self.version, NOT_FINITE, (perf_counter_ns() - started) * 1e-6)
-        proposal = within(robot, request.action, request.input_in_force)
+            return braking_decision(robot, request, self.version, NOT_FINITE, (perf_counter_ns() - started) * 1e-6)
+        proposal = clip_input(robot, request.action, request.input_in_force)
         c = self.constraints(request.observation, request.state)
         G, d = np.asarray(self.g(request.observation), float), self.bound - c
         action, solver, iterations, solve_ns = proposal, "", 0, 0
         r = proposal / self.scale
         if (G @ r - d > INSIDE).any():
-            corrected = within(robot, closed_form(r, G, d) * self.scale, request.input_in_force)
+            corrected = clip_input(robot, closed_form(r, G, d) * self.scale, request.input_in_force)
             if (G @ (corrected / self.scale) - d > INSIDE).any():  # several are active, or a bound is
                 before = perf_counter_ns()
                 low, high = self._bounds(request.input_in_force)
                 a, solver, iterations = quadratic(r, G, d, low, high)
                 solve_ns = perf_counter_ns() - before
-                corrected = within(robot, a * self.scale, request.input_in_force)
+                corrected = clip_input(robot, a * self.scale, request.input_in_force)
             action = corrected
         worst = float((d - G @ (action / self.scale)).min())
         changed = bool((np.abs(action - proposal) > INSIDE * self.scale).any())
@@ -188,4 +188,4 @@ class Secas:
     def _bounds(self, before: Array) -> tuple[Array, Array]:
         """The lowest and highest scaled input after the one in force."""
         robot = self.robot
-        return within(robot, robot.low(), before) / self.scale, within(robot, robot.high(), before) / self.scale
+        return clip_input(robot, robot.low(), before) / self.scale, clip_input(robot, robot.high(), before) / self.scale

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.safety.filter.request import BadRequest
-from brakeline.safety.filter.reservation import Promises, Reservation
+from brakeline.safety.filter.reservation import OtherReservations, Reservation
 
 
 class AskedApart(BadRequest):
@@ -30,9 +30,9 @@ class FleetReservations:
     names: tuple[str, ...]
     reservations: dict[str, Reservation] = field(default_factory=dict)
 
-    def to(self, name: str) -> Promises | None:
+    def to(self, name: str) -> OtherReservations | None:
         """What the others promise to one of them."""
-        return Promises.to([reservation for other, reservation in self.reservations.items() if other != name])
+        return OtherReservations.to([reservation for other, reservation in self.reservations.items() if other != name])
 
 
 def check_fleet(requests: Sequence[pb.Request]) -> None:

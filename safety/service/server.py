@@ -185,7 +185,7 @@ def batch_handler(
         check_for_filter(robot, request)
         if not request.still(robot):
             raise BadRequest("reservation", f"{message.actor} moves and has promised nothing: nobody can keep off it")
-        return method.rest(request.state)
+        return method.standing_reservation(request.state)
 
     def answer(payload: bytes) -> bytes:
         received = perf_counter_ns()

@@ -18,9 +18,9 @@ from brakeline.messaging.scan import BadScan
 from brakeline.messaging.sensor_messages import RangeMeasurement, measurement_in
 from brakeline.messaging.stated_share import valid_bound
 from brakeline.safety.filter.backup_plan import Prediction
-from brakeline.safety.filter.blocking_constraint import Stopped
+from brakeline.safety.filter.blocking_constraint import BlockingConstraint
 from brakeline.safety.filter.request import ADJUSTED, ALLOWED, FAILSAFE, RECOVERING, BadRequest, Decision, Request
-from brakeline.safety.filter.reservation import Promises, Reservation
+from brakeline.safety.filter.reservation import OtherReservations, Reservation
 
 KINDS = {ALLOWED: pb.ALLOWED, ADJUSTED: pb.ADJUSTED, FAILSAFE: pb.FAILSAFE, RECOVERING: pb.RECOVERING}
 NAMES = {number: name for name, number in KINDS.items()}
@@ -77,7 +77,10 @@ def _varint(payload: bytes, at: int) -> tuple[int, int]:
 
 
 def request_of(
-    message: pb.Request, robot: Robot, reservation: Reservation | None = None, promised: Promises | None = None
+    message: pb.Request,
+    robot: Robot,
+    reservation: Reservation | None = None,
+    other_reservations: OtherReservations | None = None,
 ) -> Request:
     """The request in a message; promise, promised: of a fleet's robot, its own and the others'.
 
@@ -104,7 +107,7 @@ def request_of(
         model=message.model,
         predicted=predicted,
         reservation=reservation,
-        promised=promised,
+        other_reservations=other_reservations,
         observation=np.fromiter(message.observation, np.float32, len(message.observation)),
         known_free=message.known_free,
     )
@@ -174,7 +177,7 @@ def decision_reply(decision: Decision, queue_ms: float) -> pb.Reply:
     )
     if decision.for_clearance is not None:
         message.for_clearance = decision.for_clearance
-    if (stopped := decision.stopped) is not None:
+    if (stopped := decision.blocked_by) is not None:
         message.stopped.by, message.stopped.room, message.stopped.after = stopped.by, stopped.room, stopped.after
         message.stopped.normal.extend(stopped.normal.tolist())
         message.stopped.at.extend(stopped.at.tolist())
@@ -202,7 +205,7 @@ def decision_of(m: pb.Decision, robot: Robot) -> Decision:
     stopped = None
     if m.HasField("stopped"):
         where = array_of(m.stopped.normal), array_of(m.stopped.at)
-        stopped = Stopped(m.stopped.by, m.stopped.room, m.stopped.after, *where)
+        stopped = BlockingConstraint(m.stopped.by, m.stopped.room, m.stopped.after, *where)
     return Decision(
         kind=NAMES[m.kind],
         plan=array_of(m.plan).reshape(robot.horizon, robot.action_dim),
@@ -222,7 +225,7 @@ def decision_of(m: pb.Decision, robot: Robot) -> Decision:
         solver=m.solver,
         iterations=m.iterations,
         broken=m.broken,
-        stopped=stopped,
+        blocked_by=stopped,
         reservation=reservation_of(m.reservation, robot) if m.HasField("reservation") else None,
         for_clearance=m.for_clearance if m.HasField("for_clearance") else None,
         bound=valid_bound(m.bound) if m.HasField("bound") else None,

@@ -12,7 +12,7 @@ from brakeline.deploy.experiments.evaluate import in_process
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.bus import NoReply
 from brakeline.safety.filter.filter import Filter
-from brakeline.safety.filter.reservation import Promises
+from brakeline.safety.filter.reservation import OtherReservations
 from brakeline.safety.model.model_set import ModelConfig
 from brakeline.sim.scripted_policies import scripted
 from brakeline.sim.shared_world import FleetEnv
@@ -57,7 +57,7 @@ def begin_close_together(fleet, seed=0):
 def least_distance(fleet):
     """Return the least distance between two reservations [m]."""
     reservations = [r.backup_plan.reservation for r in fleet.runners if r.backup_plan.reservation is not None]
-    return min((a.apart(b) for a, b in combinations(reservations, 2)), default=np.inf)
+    return min((a.distance(b) for a, b in combinations(reservations, 2)), default=np.inf)
 
 
 def drive(fleet, ask, policy, periods, lost=0.0, seed=0):
@@ -102,7 +102,7 @@ def test_without_reservations_the_same_robots_touch(ask):
 def test_a_filter_that_ignores_reservations_lets_robots_touch(data_folder, monkeypatch):
     """A mutant of the filter: robots make reservations, and no plan avoids them."""
     ask = in_process(model_for(GROUND, ModelConfig()))
-    monkeypatch.setattr(Promises, "nearest", lambda self, point: np.full(len(self), np.inf))
+    monkeypatch.setattr(OtherReservations, "nearest", lambda self, point: np.full(len(self), np.inf))
     fleet = fleet_of()
     begin_close_together(fleet)
     least, _ = drive(fleet, ask, "adversary", 60)

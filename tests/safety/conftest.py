@@ -4,7 +4,7 @@ import pytest
 
 from brakeline.safety.filter.filter import Filter
 from brakeline.safety.model.dataset import Dataset
-from brakeline.safety.model.fitting import make
+from brakeline.safety.model.fitting import fit_model_set
 from brakeline.safety.model.model_set import ModelConfig, ModelSet
 from tests.safety.unicycle import record
 
@@ -26,7 +26,7 @@ class Made(dict[tuple[str, str], ModelSet]):
         self._data = data
 
     def __missing__(self, model_config: tuple[str, str]) -> ModelSet:
-        self[model_config] = make(self._data, ModelConfig(*model_config))
+        self[model_config] = fit_model_set(self._data, ModelConfig(*model_config))
         return self[model_config]
 
 

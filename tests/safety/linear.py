@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from brakeline.safety.filter.reachable_tube import Recursion, Tube, stack_recursive
+from brakeline.safety.filter.reachable_tube import RecursionMaps, Tube, stack_recursive
 from brakeline.safety.model.error_bounds import ErrorBound
 
 PUBLISHED = json.loads((Path(__file__).parents[1] / "truth" / "published.json").read_text())
@@ -43,7 +43,7 @@ class Linear:
         """Of `z = [y_0; input in force; u_0 .. u_{N-1}]`; the input in force plays no part."""
         n, m = self.B.shape
         first = np.hstack([np.eye(n), np.zeros((n, m + horizon * m))])
-        how = Recursion(tuple(range(n)), 0, m, np.eye(horizon * m), first)
+        how = RecursionMaps(tuple(range(n)), 0, m, np.eye(horizon * m), first)
         return stack_recursive([with_previous_input(certificate, n, m)] * horizon, how, n)
 
     def rollouts(self, rng, y_0, plan, count, worst):

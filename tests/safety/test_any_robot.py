@@ -10,7 +10,7 @@ from brakeline.safety.action_mapping import normalised
 from brakeline.safety.filter.filter import Filter
 from brakeline.safety.filter.request import ADJUSTED, ALLOWED, FAILSAFE, Request
 from brakeline.safety.gym import SafetyWrapper
-from brakeline.safety.model.fitting import make
+from brakeline.safety.model.fitting import fit_model_set
 from brakeline.safety.model.model_set import ModelConfig
 from tests.safety.toys import Toy, car, discs, hostile, near, puck, seen
 
@@ -39,7 +39,7 @@ def ready(name):
         periods, held = (9000, 6) if robot.feedback else (6000, 5)
         env = Toy(robot, steps=10_000)
         data = collect(env, robot, periods, held=held, state=seen, actions=normalised(robot), shown=False)
-        _made[name] = Filter(make(data, ModelConfig()))
+        _made[name] = Filter(fit_model_set(data, ModelConfig()))
     return _made[name]
 
 
@@ -126,7 +126,7 @@ def test_what_is_replaced_for_clearance_is_not_laid_to_a_limit():
         about = Shapes.of([Obstacle("cylinder", (state[0] + 0.1, rng.uniform(0.2, 0.4)), (0.1,))], 2)
         decision = ours.decide(Request(state, driving, driving, plan, about))
         if decision.for_clearance:
-            assert decision.stopped.by not in limits
+            assert decision.blocked_by.by not in limits
             near += 1
     assert near > 5
 

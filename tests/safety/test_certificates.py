@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from scipy.linalg import expm
 from scipy.optimize import linprog
 
-from brakeline.safety.filter.reachable_tube import Recursion, stack_recursive
+from brakeline.safety.filter.reachable_tube import RecursionMaps, stack_recursive
 from brakeline.safety.model.error_bounds import (
     ErrorBound,
     ErrorBoundError,
@@ -58,7 +58,7 @@ def test_published_reachable_set_of_the_five_dimensional_system():
     n, k = 5, truth["k"]
     A, half = np.array(truth["A"]), np.array(truth["e_half"])
     step = ErrorBound(A, np.zeros((0, n)), np.zeros((n, 0)), np.zeros((n, n)), half, np.eye(n))
-    how = Recursion(tuple(range(n)), 0, 0, np.zeros((0, 0)), np.eye(n))
+    how = RecursionMaps(tuple(range(n)), 0, 0, np.zeros((0, 0)), np.eye(n))
     tube = stack_recursive([step] * k, how, n, initial=truth["x0_half"] * np.eye(n))
     start = np.array(truth["x0_center"], float)
     center, width = tube.centers(start)[-1], tube.half_widths(start)[-1]

@@ -12,7 +12,7 @@ from hypothesis.extra.numpy import arrays
 from brakeline.messaging.obstacle import rotate
 from brakeline.safety.model.dataset import ENTRY, BadData, Dataset, Trajectory
 from brakeline.safety.model.tensor_file import pack, unpack
-from brakeline.safety.model.windows import apart, displacement, quality, windows
+from brakeline.safety.model.windows import check_regressors, displacement, non_overlapping, windows
 from tests.robots import GROUND
 from tests.safety.unicycle import record
 
@@ -132,13 +132,13 @@ def test_files_that_are_no_data_set_are_refused(small, tmp_path):
 def test_poor_regressors_are_refused():
     rng = np.random.default_rng(0)
     good = rng.normal(size=(400, 3))
-    assert quality(good, "these").rank == 3
+    assert check_regressors(good, "these").rank == 3
     with pytest.raises(BadData, match="at least"):
-        quality(good[:50], "these")
+        check_regressors(good[:50], "these")
     with pytest.raises(BadData, match="rank 2 of 3"):
-        quality(np.column_stack([good[:, :2], good[:, 0] + good[:, 1]]), "these")
+        check_regressors(np.column_stack([good[:, :2], good[:, 0] + good[:, 1]]), "these")
     with pytest.raises(BadData, match="condition number"):
-        quality(np.column_stack([good[:, :2], good[:, 0] + 1e-5 * good[:, 2]]), "these")
+        check_regressors(np.column_stack([good[:, :2], good[:, 0] + 1e-5 * good[:, 2]]), "these")
 
 
 def test_splitting_keeps_trajectories_whole(data):
@@ -205,6 +205,6 @@ def test_displacement_does_not_depend_on_where_and_whither(start, end, dx, dy, t
 
 
 def test_windows_apart_do_not_overlap(small):
-    chosen = apart(windows(small, 3), 3)
+    chosen = non_overlapping(windows(small, 3), 3)
     for one, other in zip(chosen.start, chosen.start[1:], strict=False):
         assert one[0] != other[0] or other[1] - one[1] >= 3

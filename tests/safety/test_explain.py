@@ -18,16 +18,16 @@ from tests.safety.asked import cylinder, random_request, request
 def blocked(ready, requests):
     for question in requests:
         decision = ready.decide(question)
-        if decision.kind != ALLOWED and decision.stopped is not None:
+        if decision.kind != ALLOWED and decision.blocked_by is not None:
             yield question, decision
         else:
-            assert decision.stopped is None
+            assert decision.blocked_by is None
 
 
 def test_the_edge_touches_the_obstacle_that_is_in_the_way_and_holds_all_of_it(ready):
     rng, seen = np.random.default_rng(0), 0
     for question, decision in blocked(ready, (random_request(rng, 6, 0.22) for _ in range(120))):
-        stopped, shapes = decision.stopped, question.obstacles
+        stopped, shapes = decision.blocked_by, question.obstacles
         assert stopped.by == "cylinder" and 0.0 <= stopped.after <= ready.robot.horizon * ready.robot.period + 1e-9
         levels = (shapes.center - stopped.at) @ stopped.normal - shapes.rho  # of the nearest point of each
         assert np.abs(levels).min() < 1e-6, "it is the supporting half-space of one of them"
@@ -46,12 +46,12 @@ def test_the_room_is_that_of_the_proposals_tube(ready):
             ready.inputs.limited(question.action, question.input_in_force),
         )
         scene = ready.around.scene(question, z_0, ready.builder.reachable(question.input_in_force))
-        assert decision.stopped.room == pytest.approx(ready.around.margin(ready.around.rows(scene, z), z))
+        assert decision.blocked_by.room == pytest.approx(ready.around.margin(ready.around.rows(scene, z), z))
 
 
 def test_a_wall_a_box_a_mover_and_a_limit_have_their_names(ready):
     def by(filter=ready, movers=None, obstacles=(), action=(0.25, 0.0), state=(0, 0, 0, 0.25, 0)):
-        found = filter.decide(request(state, action, obstacles, movers=movers)).stopped
+        found = filter.decide(request(state, action, obstacles, movers=movers)).blocked_by
         assert found is not None
         return found.by
 
@@ -67,4 +67,4 @@ def test_a_wall_a_box_a_mover_and_a_limit_have_their_names(ready):
 def test_a_short_sight_has_its_name(ready):
     near_sighted = Filter(replace(ready.model, robot=replace(ready.robot, sight=0.15)))
     decision = near_sighted.decide(request((0, 0, 0, 0.25, 0), (0.25, 0.0)))
-    assert decision.stopped is not None and decision.stopped.by == SIGHT
+    assert decision.blocked_by is not None and decision.blocked_by.by == SIGHT

@@ -127,7 +127,7 @@ def test_a_verified_proposal_is_allowed_or_replaced_for_clearance_and_the_decisi
         key = decision.kind, bool(decision.for_clearance), verified
         counts[key] = counts.get(key, 0) + 1
         if decision.for_clearance:
-            assert decision.stopped.room >= 0.0
+            assert decision.blocked_by.room >= 0.0
             assert decision_reply(decision, 0.0).decision.for_clearance
     assert counts[ADJUSTED, True, True] > 10 < counts[ADJUSTED, False, False], counts
     assert {key for key in counts if key[2]} <= {(ALLOWED, False, True), (ADJUSTED, True, True)}, counts

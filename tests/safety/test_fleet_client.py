@@ -33,7 +33,7 @@ def decided(fleet, robots, actions):
             continue
 
 
-def apart(robots):
+def least_distance(robots):
     return float(np.hypot(*(robots[0].state[:2] - robots[1].state[:2])))
 
 
@@ -52,8 +52,8 @@ def test_who_drives_at_each_other_does_not_meet(fleet):
             robot.step(answer.action)
         moved = max(moved, robots[0].state[0] + 0.25)
         one, other = (kept.reservation for kept in fleet.backup_plans)
-        assert one.apart(other) > 0.0
-        assert apart(robots) > 2.0 * GROUND.footprint
+        assert one.distance(other) > 0.0
+        assert least_distance(robots) > 2.0 * GROUND.footprint
     assert moved > 0.02, "they stood all the time"
     fleet.reset()
     assert all(kept.reservation is None and not kept.plan.any() for kept in fleet.backup_plans)

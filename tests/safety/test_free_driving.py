@@ -9,10 +9,10 @@ from brakeline.deploy.data.excitation import excitation
 from brakeline.messaging.robot_description import robot_from_description
 from brakeline.safety.model.dataset import BadData, Dataset, Trajectory
 from brakeline.safety.model.error_bounds import KINDS, RESIDUAL
-from brakeline.safety.model.fitting import make
+from brakeline.safety.model.fitting import fit_model_set
 from brakeline.safety.model.model_set import MODES, ModelConfig
-from brakeline.safety.model.validation import state
-from brakeline.safety.model.windows import FREE, PLAN, specialised, windows
+from brakeline.safety.model.validation import validate
+from brakeline.safety.model.windows import FREE, PLAN, plan_regressor_map, windows
 
 ROBOT = robot_from_description(
     {
@@ -80,14 +80,14 @@ def test_a_plans_regressors_are_a_free_windows(planned):
     place = {tuple(start): i for i, start in enumerate(free.start)}
     rows = [place[tuple(start)] for start in plans.start]
     assert len(plans) > 200 and len(free) > 2 * len(plans)
-    assert np.allclose(plans.z @ specialised(ROBOT).T, free.z[rows], rtol=0.0, atol=1e-12)
+    assert np.allclose(plans.z @ plan_regressor_map(ROBOT).T, free.z[rows], rtol=0.0, atol=1e-12)
     assert np.array_equal(plans.y, free.y[rows])
 
 
 @pytest.mark.parametrize("mode", MODES)
 def test_of_a_linear_robot_both_are_the_same_predictor(planned, mode):
-    plans = make(planned, ModelConfig(mode=mode)).tube()
-    free = make(free_data(1, noise=0.0), ModelConfig(mode=mode, windows=FREE)).tube()
+    plans = fit_model_set(planned, ModelConfig(mode=mode)).tube()
+    free = fit_model_set(free_data(1, noise=0.0), ModelConfig(mode=mode, windows=FREE)).tube()
     z = np.random.default_rng(2).uniform(-1, 1, (50, plans.position.shape[2]))
     for one in z:
         assert np.allclose(plans.centers(one), free.centers(one), rtol=0.0, atol=1e-7)
@@ -95,7 +95,7 @@ def test_of_a_linear_robot_both_are_the_same_predictor(planned, mode):
 
 @pytest.mark.parametrize("which", ALL, ids="-".join)
 def test_tubes_from_free_driving_hold_plans_that_were_never_driven(which):
-    model = make(free_data(3), ModelConfig(*which, windows=FREE))
+    model = fit_model_set(free_data(3), ModelConfig(*which, windows=FREE))
     tube, S = model.tube(), ROBOT.plan_matrix()
     rng = np.random.default_rng(4)
     outside = 0
@@ -117,10 +117,10 @@ def test_tubes_from_free_driving_hold_plans_that_were_never_driven(which):
 
 def test_the_statement_is_about_windows_like_those_it_was_made_from():
     fitted, held_out = free_data(5), free_data(6, count=40)
-    said = state(make(fitted, ModelConfig(windows=FREE)), fitted, held_out)
+    said = validate(fit_model_set(fitted, ModelConfig(windows=FREE)), fitted, held_out)
     assert said.windows > 300 and said.bound_step < 0.05 and said.bound_plan < 0.1
     shaken = free_data(6, noise=10.0, count=40)
-    worse = state(make(fitted, ModelConfig(windows=FREE)), fitted, shaken)
+    worse = validate(fit_model_set(fitted, ModelConfig(windows=FREE)), fitted, shaken)
     assert worse.step_violations > 0.3 * worse.windows
 
 
@@ -128,4 +128,4 @@ def test_driving_without_stops_says_what_to_drive():
     rng = np.random.default_rng(7)
     inputs = [driven(list(rng.uniform(ROBOT.low(), ROBOT.high(), (60, 2))), rng, 1.0) for _ in range(30)]
     with pytest.raises(BadData, match=r"0 stops in the data.*from every speed give zero input and let the robot stand"):
-        make(Dataset(ROBOT, tuple(inputs)), ModelConfig(windows=FREE))
+        fit_model_set(Dataset(ROBOT, tuple(inputs)), ModelConfig(windows=FREE))

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from brakeline.messaging.obstacle import Obstacle, Shapes
-from brakeline.safety.filter.halfspaces import half_spaces, leading_out
+from brakeline.safety.filter.halfspaces import half_spaces, half_spaces_leading_out
 from tests.messaging.test_shapes import obstacles, sample
 
 BODY = 0.1
@@ -69,7 +69,7 @@ def test_what_leads_out_has_all_of_the_obstacle_behind_it_and_is_the_same_outsid
     for start in (drawn[0], rng.uniform(-5, 5, d)):
         nominal = start + rng.uniform(-1, 1, (3, d))
         planes = half_spaces(near, start, nominal, BODY, measured)
-        normals, offsets = leading_out(near, start, BODY, measured, planes)
+        normals, offsets = half_spaces_leading_out(near, start, BODY, measured, planes)
         if near.distance(start)[0] > 0.0:
             assert (normals == planes[0]).all() and (offsets == planes[1]).all()
         elif np.isfinite(offsets).all():  # but in the middle, where no way is known

@@ -17,7 +17,7 @@ from brakeline.safety.filter.request import BadRequest
 from brakeline.safety.gym import UNANSWERED, SafetyWrapper
 from brakeline.safety.gym_vector import VectorSafetyWrapper, view_each_environment
 from brakeline.safety.model.dataset import BadData
-from brakeline.safety.model.fitting import make
+from brakeline.safety.model.fitting import fit_model_set
 from brakeline.safety.model.model_set import ModelConfig, ModelSet
 from brakeline.safety.service.client import SafetyClient
 from brakeline.safety.service.in_process import InProcess
@@ -34,7 +34,7 @@ def data():
 
 @pytest.fixture(scope="module")
 def model(data):
-    return make(data, ModelConfig())
+    return fit_model_set(data, ModelConfig())
 
 
 @pytest.fixture(scope="module")

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from brakeline.safety.filter.kernels.halfspace_kernels import filled_by_plans, presolve_rows
-from brakeline.safety.filter.qp import Layout
+from brakeline.safety.filter.qp import ObstacleRows
 from brakeline.safety.filter.reachable_tube import Tube
 
 SEEDS = st.integers(0, 2**32 - 1)
@@ -25,7 +25,7 @@ def a_tube(rng: np.random.Generator, d: int, own: bool = True) -> Tube:
 
 
 def supports(tube: Tube, normals: np.ndarray, z: np.ndarray) -> np.ndarray:
-    """Of the sets at the ends of all periods' half-spaces (n, 2N+1), from the words of `Layout`."""
+    """Of the sets at the ends of all periods' half-spaces (n, 2N+1), from the words of `ObstacleRows`."""
     N, L, sizes = tube.horizon, tube.generators, tube.magnitudes(z)
     centers = np.vstack([np.zeros(normals.shape[2]), tube.centers(z)])
     spans = np.concatenate([np.zeros((1, *tube.directions.shape[1:])), tube.directions])
@@ -44,7 +44,7 @@ def test_rows_and_what_they_leave_are_what_the_words_say(d: int, seed: int) -> N
     tube = a_tube(rng, d, own=bool(seed % 2))
     normals, offsets = rng.normal(size=(4, tube.horizon, d)), rng.normal(size=(4, tube.horizon))
     z = rng.normal(size=tube.W.shape[1])
-    layout = Layout(tube.position, tube.directions)
+    layout = ObstacleRows(tube.position, tube.directions)
     rows = layout.rows(normals, offsets)
     expected = supports(tube, normals, z)
     assert rows.support(tube, z).reshape(expected.shape) == pytest.approx(expected, abs=1e-9)
@@ -62,7 +62,7 @@ def test_what_is_no_number_leaves_nothing(what: str) -> None:
         "z": rng.normal(size=tube.W.shape[1]),
     }
     told[what].flat[0] = np.nan
-    layout, z = Layout(tube.position, tube.directions), told["z"]
+    layout, z = ObstacleRows(tube.position, tube.directions), told["z"]
     left = layout.slack(told["normals"], told["offsets"], tube.magnitudes(z), z)
     assert np.isnan(left).any()
 

@@ -12,10 +12,10 @@ from brakeline.safety.filter.backup_plan import BackupPlan
 from brakeline.safety.filter.filter import Filter
 from brakeline.safety.filter.request import ADJUSTED, ALLOWED, FAILSAFE, Request
 from brakeline.safety.model.dataset import Dataset, Trajectory
-from brakeline.safety.model.fitting import make
+from brakeline.safety.model.fitting import fit_model_set
 from brakeline.safety.model.model_set import ModelConfig, ModelSet
 from brakeline.safety.model.turning_in_place import standing_limits
-from brakeline.safety.model.validation import state, upper_bound
+from brakeline.safety.model.validation import upper_bound, validate
 from brakeline.safety.model.windows import FREE, PLAN
 from tests.robots import GROUND, QUADROTOR
 from tests.safety.asked import cylinder
@@ -85,13 +85,15 @@ def driving():
 
 @pytest.fixture(scope="module")
 def turner(driving):
-    return make(driving, ModelConfig(windows=FREE))
+    return fit_model_set(driving, ModelConfig(windows=FREE))
 
 
 @pytest.fixture(scope="module")
 def long_turner(driving):
     """The same robot with a body that is not round."""
-    return make(replace(driving, robot=replace(ROBOT, name="long-turner", body=LONG)), ModelConfig(windows=FREE))
+    return fit_model_set(
+        replace(driving, robot=replace(ROBOT, name="long-turner", body=LONG)), ModelConfig(windows=FREE)
+    )
 
 
 def pillars(gap, count, radius=0.1, body=0.15):
@@ -150,14 +152,14 @@ def test_the_shipped_kind_of_recording_supports_it_too(ready):
 
 
 def test_what_the_predictors_in_place_state_holds_on_fresh_data(turner, driving):
-    found = state(turner, driving, record(1, trajectories=120))
+    found = validate(turner, driving, record(1, trajectories=120))
     assert found.in_place_windows > 500
     assert found.bound_in_place == upper_bound(found.in_place_violations, found.in_place_windows)
     assert found.in_place_violations <= 0.01 * found.in_place_windows and found.bound_in_place < 0.03
     narrow = replace(
         turner.in_place, steps=tuple(replace(s, kappa=0.6 * s.kappa, w=0.6 * s.w) for s in turner.in_place.steps)
     )
-    worse = state(replace(turner, in_place=narrow), driving, record(1, trajectories=60))
+    worse = validate(replace(turner, in_place=narrow), driving, record(1, trajectories=60))
     assert worse.in_place_violations > 0.1 * worse.in_place_windows
 
 
@@ -209,7 +211,7 @@ def test_they_are_used_for_plans_in_place_of_a_standing_robot_and_no_others(turn
 
 def test_a_robot_without_such_plans_or_such_data_has_none():
     assert standing_limits(QUADROTOR) is None
-    assert make(record(2, turns=False), ModelConfig(windows=FREE)).in_place is None
+    assert fit_model_set(record(2, turns=False), ModelConfig(windows=FREE)).in_place is None
 
 
 def test_a_file_without_them_is_read_and_decides_by_one_tube(turner):
@@ -253,7 +255,7 @@ def test_a_robot_from_free_driving_hits_nothing_and_does_not_get_stuck(turner, p
 
 @pytest.mark.parametrize("certificate", ["set-membership", "matrix-zonotope"])
 def test_the_other_certificates_have_them_too(driving, certificate):
-    model = make(driving, ModelConfig(certificate, windows=FREE))
+    model = fit_model_set(driving, ModelConfig(certificate, windows=FREE))
     decisions, angle, _ = turn(Filter(model), pillars(0.05, 4), 0.5, steps=20)
     assert {decision.kind for decision in decisions} == {ALLOWED} and angle > 1.4
 
@@ -261,7 +263,7 @@ def test_the_other_certificates_have_them_too(driving, certificate):
 def test_recorded_plans_have_them_too():
     """The ground robot's plans, whose windows have fewer regressors than all inputs."""
     data = record_ground(trajectories=40, periods=300)
-    model = make(data, ModelConfig())
+    model = fit_model_set(data, ModelConfig())
     assert model.model_config.windows == PLAN and model.in_place is not None
-    found = state(model, data, record_ground(trajectories=40, periods=300, seed=3))
+    found = validate(model, data, record_ground(trajectories=40, periods=300, seed=3))
     assert found.in_place_windows > 100 and found.in_place_violations <= 0.02 * found.in_place_windows

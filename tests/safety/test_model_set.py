@@ -8,10 +8,10 @@ import pytest
 from brakeline.safety.filter.filter import Filter
 from brakeline.safety.model.dataset import BadData
 from brakeline.safety.model.error_bounds import KINDS, ErrorBoundError, least_squares
-from brakeline.safety.model.fitting import make
+from brakeline.safety.model.fitting import fit_model_set
 from brakeline.safety.model.model_set import ENTRY, MODES, BadModel, ModelConfig, ModelSet
 from brakeline.safety.model.tensor_file import pack, unpack
-from brakeline.safety.model.windows import stands_from, windows
+from brakeline.safety.model.windows import periods_until_standing, windows
 from tests.robots import GROUND
 from tests.safety.unicycle import record
 
@@ -37,7 +37,7 @@ def test_what_is_encoded_is_decoded(models, which, tmp_path):
 
 def test_the_version_is_the_content(models, model, data):
     assert len({models[which].version for which in ALL}) == len(ALL)
-    assert make(data, ModelConfig()).version == model.version
+    assert fit_model_set(data, ModelConfig()).version == model.version
     wider = replace(model, stopping_distance=replace(model.stopping_distance, w=model.stopping_distance.w + 1e-6))
     assert wider.version != model.version
     assert replace(model, about={"note": "another"}).version == model.version
@@ -55,8 +55,8 @@ def test_from_when_on_a_robot_stands_is_what_was_recorded(model, data):
     states[start + 2, 3] = 0.03
     some = list(data.trajectories)
     some[number] = replace(coasting, states=states)
-    assert stands_from(whole, replace(data, trajectories=some), "plan") == 3
-    assert stands_from(whole, data, "plan") == 2 and stands_from(whole, data, "free") == 3
+    assert periods_until_standing(whole, replace(data, trajectories=some), "plan") == 3
+    assert periods_until_standing(whole, data, "plan") == 2 and periods_until_standing(whole, data, "free") == 3
     assert ModelSet.decode(model.encode()).stands == 2
     assert replace(model, stands=3).version != model.version
     assert replace(model, stands=3).version == replace(model, stands=0).version  # both say: no sooner than at its end
@@ -129,12 +129,12 @@ def test_recipes_that_mean_nothing_are_refused():
 
 def test_data_that_support_no_model_are_refused(data):
     with pytest.raises(BadData, match="trajectory"):
-        make(replace(data, trajectories=data.trajectories[:1]), ModelConfig())
+        fit_model_set(replace(data, trajectories=data.trajectories[:1]), ModelConfig())
     with pytest.raises(BadData, match="at least"):
-        make(record(trajectories=4, periods=60), ModelConfig())
+        fit_model_set(record(trajectories=4, periods=60), ModelConfig())
     slow = tuple(replace(t, inputs=t.inputs * [1.0, 0.0]) for t in data.trajectories)
     with pytest.raises((BadData, ErrorBoundError)):
-        make(replace(data, trajectories=slow), ModelConfig())
+        fit_model_set(replace(data, trajectories=slow), ModelConfig())
 
 
 @pytest.mark.parametrize("which", ALL, ids="-".join)

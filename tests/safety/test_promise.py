@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from brakeline.safety.filter.reservation import Promises, Reservation, promised_half_spaces
+from brakeline.safety.filter.reservation import OtherReservations, Reservation, reservation_half_spaces
 
 FINITE = st.floats(-1.0, 1.0)
 N = 3
@@ -46,7 +46,7 @@ def test_who_keeps_to_the_half_spaces_keeps_off_the_promise_in_every_period(seed
     others = [Reservation.of(*drawn(rng, middle=rng.uniform(-0.6, 0.6, 2))) for _ in range(3)]
     start, nominal = np.zeros(2), np.cumsum(rng.normal(scale=0.06, size=(N, 2)), axis=0)
     measured = 0.01 * rng.random(2)
-    normals, offsets = promised_half_spaces(Promises.to(others), start, nominal, 0.105, measured)
+    normals, offsets = reservation_half_spaces(OtherReservations.to(others), start, nominal, 0.105, measured)
     for normal, offset, other in zip(normals, offsets, others, strict=True):
         for k in range(N):
             points = rng.uniform(-1, 1, (400, 2))
@@ -60,22 +60,24 @@ def test_a_promise_that_passes_by_leaves_room_behind_it():
     centers = np.array([[0.35, 0.0], [0.35, 0.6], [0.35, 1.2], [0.35, 1.8]])
     gone = Reservation.of(centers, np.full((4, 2), 0.01), np.full(3, 0.1))
     nominal = np.array([[0.05, 0.0], [0.1, 0.0], [0.15, 0.0]])
-    normals, offsets = promised_half_spaces(Promises.to([gone]), np.zeros(2), nominal, 0.105, np.zeros(2))
+    normals, offsets = reservation_half_spaces(OtherReservations.to([gone]), np.zeros(2), nominal, 0.105, np.zeros(2))
     room = offsets[0] - np.einsum("kd,kd->k", normals[0], nominal)
     assert room[0] < 0.2 and room[2] > 0.8
 
 
 def test_a_promise_that_is_touched_leaves_no_room():
     here = Reservation.of(np.zeros((4, 2)), np.full((4, 2), 0.05), np.full(3, 0.1))
-    _, offsets = promised_half_spaces(Promises.to([here]), np.zeros(2), np.zeros((3, 2)), 0.105, np.zeros(2))
+    _, offsets = reservation_half_spaces(
+        OtherReservations.to([here]), np.zeros(2), np.zeros((3, 2)), 0.105, np.zeros(2)
+    )
     assert (offsets == -np.inf).all()
 
 
 @pytest.mark.parametrize("away", [0.2, 0.5, 2.0])
 def test_only_what_is_within_reach_counts(away):
     other = Reservation.of(np.full((4, 2), [away + 0.1, 0.0]), np.zeros((4, 2)), np.full(3, 0.1))
-    assert (Promises.to([other]).nearest(np.zeros(2))[0] < 1.0) == (away < 1.0)
-    assert Promises.to([]) is None
-    assert other.apart(Reservation.of(np.zeros((4, 2)), np.zeros((4, 2)), np.full(3, 0.05))) == pytest.approx(
+    assert (OtherReservations.to([other]).nearest(np.zeros(2))[0] < 1.0) == (away < 1.0)
+    assert OtherReservations.to([]) is None
+    assert other.distance(Reservation.of(np.zeros((4, 2)), np.zeros((4, 2)), np.full(3, 0.05))) == pytest.approx(
         away - 0.05
     )

@@ -16,7 +16,7 @@ from brakeline.safety.filter.backup_plan import BackupPlan
 from brakeline.safety.filter.filter import Filter
 from brakeline.safety.filter.recovery import least_violating, lower, slow_inputs
 from brakeline.safety.filter.request import RECOVERING
-from brakeline.safety.model.fitting import make
+from brakeline.safety.model.fitting import fit_model_set
 from brakeline.safety.model.model_set import ModelConfig
 from brakeline.safety.service.in_process import InProcess
 from tests.robots import GROUND, QUADROTOR
@@ -148,7 +148,7 @@ def test_by_a_scan_too_who_was_put_too_close_gets_away(ready, angle):
 def long_filter(data):
     """A body of five discs, half a metre long."""
     body = tuple(Disc((x, 0.0), 0.08) for x in (-0.25, -0.12, 0.0, 0.12, 0.25))
-    return Filter(make(replace(data, robot=replace(data.robot, body=body)), ModelConfig("residual", "direct")))
+    return Filter(fit_model_set(replace(data, robot=replace(data.robot, body=body)), ModelConfig("residual", "direct")))
 
 
 @pytest.mark.parametrize("wall", [0.09, 0.1, 0.12])
@@ -241,7 +241,9 @@ class Hoverer(Toy):
 def test_who_drifts_where_it_hovers_moves_away_before_it_touches():
     """A stop that was verified may end beside a wall; whoever does not stay there must not be taken to stand."""
     env = Hoverer(HOVERER, capsule=((0.0, 0.0), (0.0, 0.0), 0.3), steps=100_000)
-    filter = Filter(make(collect(env, HOVERER, 6000, held=6, state=seen, actions=normalised(HOVERER)), ModelConfig()))
+    filter = Filter(
+        fit_model_set(collect(env, HOVERER, 6000, held=6, state=seen, actions=normalised(HOVERER)), ModelConfig())
+    )
     assert not filter.around.stays
     touched = {True: 0, False: 0}
     for episode in range(12):

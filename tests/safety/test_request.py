@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from brakeline.messaging.obstacle import FARTHEST, Shapes
 from brakeline.messaging.robot import robot_named
 from brakeline.safety.filter.backup_plan import Prediction
-from brakeline.safety.filter.request import MOST_OBSERVED, BadRequest, Ordinary, Request, check_for_filter
+from brakeline.safety.filter.request import MOST_OBSERVED, BadRequest, FastRequestCheck, Request, check_for_filter
 from tests.safety.asked import cylinder, request, same
 from tests.safety.toys import car
 
@@ -62,7 +62,7 @@ def lets_pass(robot, request):
 @settings(max_examples=300)
 @given(st.integers(0, 1000), st.booleans(), st.sampled_from(FIELDS), st.sampled_from(ODD), st.integers(0, 50))
 def test_what_passes_at_once_passes_field_by_field(robot, seed, predicted, field, odd, at):
-    ordinary, sound = Ordinary(robot), usual(robot, seed, predicted)
+    ordinary, sound = FastRequestCheck(robot), usual(robot, seed, predicted)
     assert lets_pass(robot, sound)
     assert ordinary(sound)
 
@@ -84,8 +84,8 @@ def test_what_passes_at_once_passes_field_by_field(robot, seed, predicted, field
 def test_what_has_another_size_does_not_pass_at_once(field, change):
     robot = robot_named("ground")
     sound = usual(robot, 1, True)
-    assert Ordinary(robot)(sound)
-    assert not Ordinary(robot)(with_(sound, field, change))
+    assert FastRequestCheck(robot)(sound)
+    assert not FastRequestCheck(robot)(with_(sound, field, change))
 
 
 @pytest.mark.parametrize("observed", [np.zeros((1, 26)), np.zeros(MOST_OBSERVED + 1), np.float32(0.0)])
@@ -94,9 +94,9 @@ def test_the_filter_refuses_an_observation_that_is_no_list_of_bounded_size(obser
     sound = usual(robot, 1, True)
     for size in (0, 1, MOST_OBSERVED):
         asked = replace(sound, observation=np.zeros(size, np.float32))
-        assert Ordinary(robot)(asked) and lets_pass(robot, asked)
+        assert FastRequestCheck(robot)(asked) and lets_pass(robot, asked)
     asked = replace(sound, observation=observed)
-    assert not Ordinary(robot)(asked) and not lets_pass(robot, asked)
+    assert not FastRequestCheck(robot)(asked) and not lets_pass(robot, asked)
 
 
 def test_arrays_of_any_type_and_layout_are_decided_on_as_usual(ready):
@@ -106,5 +106,5 @@ def test_arrays_of_any_type_and_layout_are_decided_on_as_usual(ready):
     for odd in (stridden, {name: value.astype(np.float32) for name, value in stridden.items()}):
         assert same(ready.decide(replace(sound, **odd)), expected)
     assert same(ready.decide(replace(sound, plan=sound.plan.astype(int))), expected)
-    rest, whole = ready.rest(np.zeros(5)), ready.rest(np.zeros(5, np.float32))
+    rest, whole = ready.standing_reservation(np.zeros(5)), ready.standing_reservation(np.zeros(5, np.float32))
     assert np.array_equal(rest.center, whole.center) and np.array_equal(rest.half_width, whole.half_width)

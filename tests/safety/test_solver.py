@@ -11,8 +11,8 @@ from brakeline.messaging.obstacle import Obstacle, Shapes
 from brakeline.safety.filter import qp_solver
 from brakeline.safety.filter.halfspaces import half_spaces
 from brakeline.safety.filter.kernels.active_set_kernels import hildreth_active_set
-from brakeline.safety.filter.qp import Builder, Layout
-from brakeline.safety.filter.qp_solver import ACCURACY, Program, Solution, solve
+from brakeline.safety.filter.qp import ObstacleRows, QPBuilder
+from brakeline.safety.filter.qp_solver import ACCURACY, QuadraticProgram, Solution, solve
 from brakeline.safety.model.model_set import ModelSet
 
 
@@ -20,7 +20,7 @@ def programs(model: ModelSet, count, seed=0):
     """QPs as the filter builds them, of proposals near obstacles."""
     rng = np.random.default_rng(seed)
     tube, outer = model.tube(), model.outer_tube()
-    layout, builder = Layout(tube.position, tube.directions), Builder(model.robot, outer)
+    layout, builder = ObstacleRows(tube.position, tube.directions), QPBuilder(model.robot, outer)
     for _ in range(count):
         angles, distance = rng.uniform(-np.pi, np.pi, 4), rng.uniform(0.26, 0.36, 4)
         near = Shapes.of(
@@ -64,7 +64,9 @@ def crowded(rng, rows=160, n=6):
     A = np.vstack([A / np.linalg.norm(A, axis=1, keepdims=True), np.eye(n), -np.eye(n)])
     b = A @ rng.uniform(-0.8, 0.8, n) + rng.uniform(-rng.uniform(0.0, 0.4), 0.8, len(A))
     b[-2 * n :] = 1.0
-    return Program(np.array([1.0] * 3 + [1e-4] * 3), np.array([*rng.uniform(-2.0, 2.0, 3), 0, 0, 0]), A, b, 2 * n)
+    return QuadraticProgram(
+        np.array([1.0] * 3 + [1e-4] * 3), np.array([*rng.uniform(-2.0, 2.0, 3), 0, 0, 0]), A, b, 2 * n
+    )
 
 
 def test_of_many_rows_those_that_decide_give_the_answer_to_all(monkeypatch):
@@ -121,7 +123,7 @@ def test_that_few_can_not_be_met_is_not_taken_for_granted(monkeypatch):
 def test_few_rows_are_not_called_solved_before_they_are():
     """Rows that decided for a quadrotor behind a scan: by the residuals alone the answer was 0.07 of a range off."""
     stored = json.loads((Path(__file__).parents[1] / "stored" / "few-rows.json").read_text())
-    program = Program(*(np.array(stored[name]) for name in ("h", "g", "A", "b")))
+    program = QuadraticProgram(*(np.array(stored[name]) for name in ("h", "g", "A", "b")))
     ours, (theirs, flag) = qp_solver._solved(program, few=True), by_daqp(program)
     assert flag >= 1 and ours.status == "solved"
     assert np.abs(ours.x - theirs)[:3].max() < 1e-5
@@ -145,19 +147,19 @@ def test_another_solver_agrees(models, kind):
 
 
 def test_an_infeasible_problem_comes_back_with_its_residual():
-    program = Program(np.ones(1), np.zeros(1), np.array([[1.0], [-1.0]]), np.array([-1.0, -1.0]))
+    program = QuadraticProgram(np.ones(1), np.zeros(1), np.array([[1.0], [-1.0]]), np.array([-1.0, -1.0]))
     solution = solve(program)
     assert solution.residual > 0.5
     assert solution.found  # a candidate: whoever uses it must check
 
 
 def test_without_rows_nothing_holds_the_answer_off():
-    solution = solve(Program(np.ones(2), np.array([-1.0, 2.0]), np.zeros((0, 2)), np.zeros(0)))
+    solution = solve(QuadraticProgram(np.ones(2), np.array([-1.0, 2.0]), np.zeros((0, 2)), np.zeros(0)))
     assert solution.status == "solved" and solution.x == pytest.approx([1.0, -2.0], abs=1e-6)
 
 
 def test_the_residual_is_recomputed_from_the_rows():
-    program = Program(np.ones(2), np.array([-1.0, -1.0]), np.eye(2), np.array([0.5, 2.0]))
+    program = QuadraticProgram(np.ones(2), np.array([-1.0, -1.0]), np.eye(2), np.array([0.5, 2.0]))
     solution = solve(program)
     assert solution.x == pytest.approx([0.5, 1.0], abs=1e-5)
     assert solution.residual == (program.A @ solution.x - program.b).max()
@@ -175,7 +177,7 @@ def test_the_answer_depends_on_the_program_alone(model):
 def test_rows_that_are_left_out_change_no_answer(models, kind, monkeypatch):
     """Against the same programs with every row in them."""
     pruned = [program for _, program in programs(models[kind, "direct"], 150)]
-    monkeypatch.setattr(Builder, "reachable", lambda self, before: (np.zeros(self.free), np.full(self.free, 1e3)))
+    monkeypatch.setattr(QPBuilder, "reachable", lambda self, before: (np.zeros(self.free), np.full(self.free, 1e3)))
     full = [program for _, program in programs(models[kind, "direct"], 150)]
     assert sum(len(program.b) for program in pruned) < 0.7 * sum(len(program.b) for program in full)
     left_out = 0

@@ -8,7 +8,7 @@ import pytest
 
 from brakeline.safety.model.error_bounds import KINDS
 from brakeline.safety.model.model_set import MODES
-from brakeline.safety.model.validation import state, upper_bound
+from brakeline.safety.model.validation import upper_bound, validate
 from brakeline.safety.model.windows import windows
 from tests.safety.unicycle import record
 
@@ -26,7 +26,7 @@ def test_known_values_of_the_bound():
 
 @pytest.mark.parametrize("which", ALL, ids="-".join)
 def test_a_model_set_holds_on_data_it_has_not_seen(models, data, held_out, which):
-    found = state(models[which], data, held_out)
+    found = validate(models[which], data, held_out)
     assert (found.certificate, found.mode) == which
     assert found.version == models[which].version
     assert found.windows > 500
@@ -44,23 +44,23 @@ def test_a_model_set_holds_on_data_it_has_not_seen(models, data, held_out, which
 
 
 def test_a_narrowed_model_shows_its_violations(model, data, held_out):
-    honest = state(model, data, held_out)
+    honest = validate(model, data, held_out)
     narrow = replace(model, steps=tuple(replace(s, kappa=0.5 * s.kappa, w=0.5 * s.w) for s in model.steps))
-    found = state(narrow, data, held_out)
+    found = validate(narrow, data, held_out)
     assert found.violations > 0.2 * found.windows
     assert found.bound_plan > 20 * honest.bound_plan
     for part in ("chord_deviations", "stopping_distance"):
         thin = getattr(model, part)
         gone = replace(model, **{part: replace(thin, kappa=0.0 * thin.kappa, w=0.0 * thin.w)})
-        assert state(gone, data, held_out).violations > 0.2 * honest.windows
+        assert validate(gone, data, held_out).violations > 0.2 * honest.windows
 
 
 def test_a_robot_that_changed_is_noticed(model, data):
     slipping = record(trajectories=10, periods=300, seed=3, slip=0.3)
-    assert state(model, data, slipping).violations > 100
+    assert validate(model, data, slipping).violations > 100
 
 
 def test_only_stops_that_were_seen_count(model, data, held_out):
     cut = replace(held_out, trajectories=tuple(replace(t) for t in held_out.trajectories[:5]))
     whole = windows(cut, 3)
-    assert state(model, data, cut).windows <= (~np.isnan(whole.stopping_distance)).sum()
+    assert validate(model, data, cut).windows <= (~np.isnan(whole.stopping_distance)).sum()

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from brakeline.safety.model.tensor_file import BadTensors, content, holds, pack, unpack
+from brakeline.safety.model.tensor_file import BadTensors, content, has_entry, pack, unpack
 
 WORDS = st.dictionaries(st.text(max_size=5), st.one_of(st.text(max_size=5), st.integers(), st.booleans()), max_size=5)
 ARRAYS = st.dictionaries(st.text("abcx.", min_size=1, max_size=4), arrays(np.float64, (2, 3)), max_size=3)
@@ -25,11 +25,11 @@ def test_what_is_packed_is_unpacked_and_the_same_content_gives_the_same_bytes(te
 
 def test_other_bytes_are_refused_with_a_reason():
     whole = pack({"a": np.arange(6.0)[::2]}, "entry", {"x": 1})
-    assert holds(whole, "entry") and not holds(whole, "another")
+    assert has_entry(whole, "entry") and not has_entry(whole, "another")
     with pytest.raises(BadTensors, match="another"):
         unpack(whole, "another")
     for garbage in (b"", b"garbage", whole[:-1], whole[:20], b"\x02" + b"\0" * 7 + b"[]", b"\xff" * 40):
-        assert not holds(garbage, "another")
+        assert not has_entry(garbage, "another")
         with pytest.raises(BadTensors):
             unpack(garbage, "entry")
     with pytest.raises(BadTensors, match="no object"):

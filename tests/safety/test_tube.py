@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from brakeline.safety.filter.reachable_tube import Recursion, stack_direct, stack_recursive
+from brakeline.safety.filter.reachable_tube import RecursionMaps, stack_direct, stack_recursive
 from brakeline.safety.model.error_bounds import KINDS, ErrorBound
 from brakeline.safety.model.model_set import MODES
 from tests.robots import GROUND
@@ -135,7 +135,7 @@ def test_the_recursion_is_the_explicit_one(seed):
     steps = [random_certificate(rng, n, n + 2 * m, g=3, rows=5) for _ in range(horizon)]
     initial = 0.2 * rng.normal(size=(n, 2))
     first = np.hstack([np.eye(n), np.zeros((n, m + horizon * m))])
-    how = Recursion((0, 1), 0, m, np.eye(horizon), first)
+    how = RecursionMaps((0, 1), 0, m, np.eye(horizon), first)
     tube = stack_recursive(steps, how, n, initial=initial)
     y_0, u_prev, plan = rng.normal(size=n), rng.normal(size=m), rng.normal(size=horizon)
     inputs = np.concatenate([u_prev, plan])
@@ -154,7 +154,7 @@ def test_relative_coordinates_are_carried_on():
     step = ErrorBound(
         np.array([[0.2], [0.5]]), np.zeros((0, 1)), np.zeros((2, 0)), np.zeros((2, 1)), np.ones(2), np.eye(2)
     )
-    how = Recursion((1,), 1, 0, np.zeros((0, 0)), np.array([[0.0], [1.0]]))
+    how = RecursionMaps((1,), 1, 0, np.zeros((0, 0)), np.array([[0.0], [1.0]]))
     tube = stack_recursive([step] * 3, how, 1)
     assert np.allclose(tube.centers(np.array([10.0]))[:, 0], [2.0, 3.0, 3.5])
     assert np.allclose(tube.half_widths(np.array([10.0]))[:, 0], [1.0, 2.2, 3.5])

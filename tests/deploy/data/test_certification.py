@@ -5,7 +5,7 @@ import pytest
 
 from brakeline.deploy.data.certification import certify
 from brakeline.safety.model.model_set import ModelConfig
-from brakeline.safety.model.validation import state, upper_bound
+from brakeline.safety.model.validation import upper_bound, validate
 from tests.safety.unicycle import record
 
 
@@ -35,7 +35,7 @@ def test_what_holds_already_stays_as_it_is(data):
 def test_what_comes_later_is_outside_no_more_often_than_is_stated(data):
     """Drawn like the plans that it was widened by."""
     model, statement = certify(data, ModelConfig(inflation=1.0), until_held=True)
-    found = [state(model, data, record(trajectories=6, periods=150, seed=seed)) for seed in range(20, 26)]
+    found = [validate(model, data, record(trajectories=6, periods=150, seed=seed)) for seed in range(20, 26)]
     outside, plans = sum(one.violations for one in found), sum(one.windows for one in found)
     assert plans > 300 and outside / plans < statement.bound_plan
     assert np.isclose(max(one.excess for one in found) > 1.0, outside > 0)

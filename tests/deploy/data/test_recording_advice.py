@@ -7,10 +7,10 @@ import pytest
 
 from brakeline.deploy.data.certification import WIDEST, certify
 from brakeline.deploy.data.coverage import recording_advice
-from brakeline.safety.model.error_causes import BOTH, FAST, SLOW, STANDING, TURNING, Leaving, regimes
-from brakeline.safety.model.fitting import make
+from brakeline.safety.model.error_causes import BOTH, FAST, SLOW, STANDING, TURNING, ViolationGroup, regimes
+from brakeline.safety.model.fitting import fit_model_set
 from brakeline.safety.model.model_set import ModelConfig
-from brakeline.safety.model.validation import most_violations, state, upper_bound
+from brakeline.safety.model.validation import most_violations, upper_bound, validate
 from tests.robots import GROUND, QUADROTOR
 from tests.safety.unicycle import record
 
@@ -36,7 +36,7 @@ def test_without_violations_more_of_the_same_will_do(held, data):
 
 
 def test_with_more_violations_than_the_limit_more_of_the_same_does_not_help(held, data):
-    left = Leaving("position ahead", FAST, 20, 200, 3.0), Leaving("heading", STANDING, 13, 100, 1.2)
+    left = ViolationGroup("position ahead", FAST, 20, 200, 3.0), ViolationGroup("heading", STANDING, 13, 100, 1.2)
     bad = replace(held, windows=600, violations=33, bound_plan=upper_bound(33, 600), leaving=left)
     said = "\n".join(recording_advice(bad, data))
     assert "at most 8.1 % of plans" in said
@@ -71,7 +71,7 @@ def test_how_it_drove_is_told_by_inputs_and_speeds():
 def test_where_it_left_its_sets_is_found(data):
     """A robot whose wheels slip a little more, at speed, than in the data that the set was made from."""
     slipping = record(trajectories=12, periods=150, seed=9, slip=0.05)
-    statement = state(make(data, ModelConfig()), data, slipping)
+    statement = validate(fit_model_set(data, ModelConfig()), data, slipping)
     assert statement.violations == sum(one.plans for one in statement.leaving) > 0
     most = statement.leaving[0]
     assert most.part in ("position ahead", "speed") and most.regime in (FAST, BOTH) and most.excess > 1.0
