@@ -1,4 +1,4 @@
-"""What is around a robot, as half-spaces that its tube is held against (docs/method.md §3, §8-§10)."""
+"""The surroundings of a robot as rows that constrain its tube (docs/method.md §3, §8-§10)."""
 
 from __future__ import annotations
 
@@ -36,8 +36,13 @@ ASIDE = 0.5  # m beyond all plans: what a range image is looked at for, and so t
 
 @dataclass(frozen=True)
 class _Disc:
-    """A disc of the body with the tube of its centre. at (d,): in the robot's frame; swing [m]: what an error of the
-    measured heading adds to where it is."""
+    """A disc (or sphere) of the body, and the tube of its center.
+
+    Attributes:
+        at (d,): its center in the robot's frame. radius [m].
+        swing [m]: error of its position due to the error of the measured heading.
+        position (N, d, nz): linear maps from regressors to its displacements. layout: builds its rows.
+    """
 
     at: Array
     radius: float
@@ -47,7 +52,7 @@ class _Disc:
 
     @cached_property
     def aside(self) -> bool:
-        """Is it not where the robot is?"""
+        """Whether its center differs from the measured position."""
         return bool(self.at.any() or self.swing)
 
 
@@ -67,27 +72,33 @@ def _discs(robot: Robot, tube: Tube) -> list[_Disc]:
 
 @dataclass(frozen=True)
 class LocalMap:
-    """start (d,): the measured position; turn (d, d): world from the frame of now; near: the obstacles that
-    count; beyond [m]: no other that was told of is nearer, nor the end of sight."""
+    """What a request says about the space within reach of a robot, in the world.
+
+    Attributes:
+        start (d,), heading [rad]: measured pose. turn (d, d): rotation from the robot's frame to the world.
+        near: obstacles within reach. moving: moving obstacles that may come within reach.
+        beyond [m]: the distance below which the request names no further obstacle, at most the sensor's range.
+        unseen: space that a scan does not show to be free. other_reservations: those of other robots.
+    """
 
     start: Array
     heading: float
     turn: Array
     near: Shapes
     beyond: float
-    moving: MovingObstacles | None = None  # that may meet the tube
-    unseen: seen.OccupiedCells | shades.OccludedRegions | None = None  # what a scan does not show to be free
-    other_reservations: OtherReservations | None = None  # to other robots
+    moving: MovingObstacles | None = None
+    unseen: seen.OccupiedCells | shades.OccludedRegions | None = None
+    other_reservations: OtherReservations | None = None
 
     @property
     def parked(self) -> LocalMap:
-        """The same for one that stands: what moves, or may, may stand by, that is its own affair."""
+        """Return the map without what moves: a standing robot need not avoid it (passive safety, §8)."""
         unseen = None if self.unseen is not None and self.unseen.speed > 0.0 else self.unseen
         return replace(self, moving=None, unseen=unseen)
 
     @property
     def away(self) -> Array | None:
-        """A direction (d,), world, off what is nearest to the start; None: nothing is of which that can be told."""
+        """The direction (d,), world, away from what is nearest to the start; None if nothing near has a direction."""
         ways = [escape_direction(self.near, self.start)[None]] if len(self.near) else []
         if isinstance(self.unseen, seen.OccupiedCells):
             ways.append(self.start - self.unseen.corners.reshape(-1, len(self.start)))
@@ -100,10 +111,9 @@ class LocalMap:
 
 
 def turning_extent(robot: Robot, tube: Tube) -> float:
-    """The clearance margin [m] that a robot needs by default: as wide as the tube of moving in place ever gets, so that
-    wherever the robot stopped it can still turn.
+    """Return the default clearance margin [m]: the extent of the tube of turning in place at the highest turn rate.
 
-    Without it a robot may stop so close to an obstacle that no motion can be verified from there, for good.
+    Without this margin a robot may stop so close to an obstacle that no motion can be verified from there.
     """
     in_place = np.where([not moves for moves in robot.translates], robot.high(), 0.0)
     state = robot.state_at_inputs(in_place)
@@ -118,7 +128,16 @@ def turning_extent(robot: Robot, tube: Tube) -> float:
 
 
 class TubeConstraints:
-    """A robot's tube, ready to be held against scenes."""
+    """A tube, and the rows that the surroundings of a robot add to it.
+
+    Attributes:
+        discs: discs of the body, each with its tube. boxes: builds the rows of reservations. limits: of state limits.
+        measured (d,): half-widths of the position's measurement error [m].
+        clearance_margin, reach [m]: see `Filter`. widest [m]: no tube, with the body, goes farther.
+        far: a tube may leave the sensor's range, so every candidate is checked against it.
+        stays: a robot that stands stays where it stands (it does not drift).
+        stands: number of periods after which a plan has brought the robot to a stand.
+    """
 
     def __init__(
         self,
@@ -129,9 +148,14 @@ class TubeConstraints:
         clearance_margin: float,
         reach: float | None = None,
     ) -> None:
-        """tube: the model's; `outer`: the same over-approximated with fewer atoms; domain (2, r): of the recorded
-        regressors; clearance_margin [m]: the distance from the tube to obstacles that the QP keeps; reach [m]: that of
-        the scenes, by default what this tube needs."""
+        """Prepare a tube.
+
+        Args:
+            tube: the exact tube. outer: an outer tube with fewer rows in W.
+            domain (2, r): range of the recorded [x_0; input in force].
+            clearance_margin [m]: distance from obstacles that the QP keeps.
+            reach [m]: radius of the local maps. By default as much as this tube needs.
+        """
         robot = model.robot
         if robot.position_dim == 3:
             shades.prepare()
@@ -142,34 +166,35 @@ class TubeConstraints:
         whole = np.ascontiguousarray
         W_free, moved = whole(np.abs(tube.W[:, -free:])), whole(np.abs(tube.position[..., -free:]))
         parts = whole(tube.W), W_free, whole(tube.M), tube.m_0, whole(tube.position), moved, whole(self._spans)
-        self._filled = parts  # what `filled_by_plans` is told of the tube
-        self._sized = whole(tube.W.T), whole(tube.M.T), tube.m_0  # and what its `magnitudes` are
+        self._filled = parts  # arguments of the kernels that are the same for all requests
+        self._sized = whole(tube.W.T), whole(tube.M.T), tube.m_0
         self._reached = *self._sized, whole(tube.position), whole(tube.directions)
         first, n = model.first, robot.state_dim
         transposed = whole(first.W.T), whole(first.M.T), whole(first.kappa.T)
-        # What `next_state` is told of the first period.
         self._next = whole(first.C[:n]), *transposed, first.w, whole(np.abs(first.generators[:n]))
         self._regressor = model.first_regressor
         self.boxes = ReservationRows(tube.position, tube.directions)
         self.limits = StateLimits(robot, tube) if robot.limits else None
         self.measured = np.asarray(robot.measurement_bound[: robot.position_dim], dtype=float)
         self._unturned = np.eye(robot.position_dim)
-        self.body = robot.footprint + float(np.linalg.norm(self.measured))  # m about where the center was measured
+        self.body = robot.footprint + float(np.linalg.norm(self.measured))  # m
         self.clearance_margin = clearance_margin
         farthest = max((float(np.linalg.norm(disc.at)) for disc in self.discs), default=0.0)
-        self._beside = self.measured + self.clearance_margin + ASIDE + farthest  # of a plan's sets, which is looked at
+        self._beside = self.measured + self.clearance_margin + ASIDE + farthest
         self.stays = self._stays()
         self.widest = self._widest(outer, domain)
         wanted = self.widest + self.clearance_margin
-        # m from the measured position: an obstacle beyond it decides nothing
         self.reach = min(wanted, robot.sight) if reach is None else reach
-        self.far = wanted > robot.sight  # a tube may leave what can be seen: every candidate must be looked at
+        self.far = wanted > robot.sight
 
     # --- what is known before any request ---------------------------------------------------------------------
 
     def _stays(self) -> bool:
-        """Is it, once it stands, where it stands? Who hovers by an estimate may go on drifting: then standing for a
-        plan's length adds more to where it may be than a measurement's error, and than a tenth of its body."""
+        """Return whether a standing robot stays in place.
+
+        A robot that hovers by an estimate may drift: its tube of standing then grows over a plan by more than the
+        measurement error, and by more than a tenth of the body's radius.
+        """
         nothing = self.robot.zero_input()
         state = self.robot.state_at_inputs(nothing)[list(self.robot.regressor)]
         z = np.concatenate([state, np.tile(nothing, 1 + self.robot.free_steps)])
@@ -178,9 +203,10 @@ class TubeConstraints:
         return bool(size[-1] - size[0] <= max(np.linalg.norm(self.measured), 0.1 * self.robot.footprint))
 
     def _widest(self, tube: Tube, domain: Array) -> float:
-        """[m] from the robot's measured position: no plan's tube, with the body about it, goes beyond.
+        """Return a distance [m] from the measured position that no tube, with the body, exceeds.
 
-        By interval arithmetic over the box of all regressors, so wide for certificates whose atoms mix them.
+        It comes from interval arithmetic over the range of all regressors, so it is loose for error bounds with many
+        rows W.
         """
         robot, F = self.robot, self.robot.free_steps
         low = np.concatenate([domain[0], np.tile(robot.low(), F)])
@@ -191,13 +217,13 @@ class TubeConstraints:
         return float(np.linalg.norm(way, axis=1).max() + self.body + sizes[tube.generators :].max())
 
     def extent(self, z: Array) -> float:
-        """[m] from the measured position to the farthest point that the body may reach under regressors z."""
+        """Return the distance [m] from the measured position to the farthest point of the body in the tube of z."""
         return tube_kernels.extent(*self._reached, z, self.body)
 
-    # --- one scene ---------------------------------------------------------------------------------------------
+    # --- one request ---------------------------------------------------------------------------------------------
 
-    def scene(self, request: Request, z_0: Array, inputs: tuple[Array, Array]) -> LocalMap:
-        """inputs: center and half-widths of what a plan's free inputs may be, after z_0."""
+    def local_map(self, request: Request, z_0: Array, inputs: tuple[Array, Array]) -> LocalMap:
+        """Return the map of a request. inputs: center and half-widths of a plan's free inputs after z_0."""
         d, robot = self.robot.position_dim, self.robot
         start, near = np.ascontiguousarray(request.state[:d]), request.obstacles
         heading = float(request.state[robot.heading]) if robot.heading is not None else 0.0
@@ -222,13 +248,15 @@ class TubeConstraints:
         return LocalMap(start, heading, turn, near, beyond, moving, unseen, other_reservations)
 
     def _parted(self, away: Array, beyond: float) -> tuple[float, NDArray[np.bool_]]:
-        """How near [m] the nearest beyond reach is, of these and what was looked at before, and which (n,) are within;
-        one whose distance is no number is."""
+        """Return the distance [m] of the nearest obstacle beyond reach, at most `beyond`, and which (n,) are within.
+
+        An obstacle whose distance is NaN counts as within reach.
+        """
         counts = ~(away > self.reach)
         return float(away[~counts].min(initial=beyond)), counts
 
     def turn(self, heading: float) -> Array:
-        """(d, d), world from the frame of now."""
+        """Return the rotation (d, d) from the robot's frame to the world."""
         if self.robot.heading is None:
             return self._unturned
         turn = self._unturned.copy()
@@ -237,7 +265,7 @@ class TubeConstraints:
         return turn
 
     def _room(self, z_0: Array, inputs: tuple[Array, Array], start: Array, turn: Array) -> shades.PlanBoxes:
-        """Boxes, world, in which every plan's discs stay with their middles after z_0; and some more."""
+        """Return boxes, world, that contain the discs' centers under every plan after z_0, with room to spare."""
         z = np.concatenate([z_0, inputs[0]])
         return shades.PlanBoxes(
             halfspace_kernels.filled_by_plans(*self._filled, z, inputs[1], self._beside, start, turn),
@@ -245,136 +273,145 @@ class TubeConstraints:
         )
 
     def _unseen(self, scan: Scan, start: Array) -> seen.OccupiedCells | None:
-        """What is not known to be free within reach, or may come there before a plan ends."""
+        """Return the cells that a scan does not show to be free, within reach or able to come there during a plan."""
         within = self.reach + scan.speed * (scan.age + self.robot.horizon * self.robot.period)
         within += float(np.linalg.norm(scan.sensor()[0] - start)) + scan.sensor_error
         occupied_cells = seen.occupied_cells(scan, within + scan.heading_error * within)
         return occupied_cells if len(occupied_cells) else None
 
     def sets(self, start: Array, turn: Array, z: Array) -> tuple[Array, Array]:
-        """Where the true positions at the periods' ends lie, world: centers and half-widths (N, d)."""
+        """Return centers and half-widths (N, d), world, of the boxes of the true positions at the periods' ends."""
         return tube_kernels.sets(*self._reached, z, np.ascontiguousarray(start, dtype=float), turn, self.measured)
 
-    def predict(self, scene: LocalMap, z: Array) -> Prediction:
-        """The set of the next measured state, all coordinates."""
+    def predict(self, local_map: LocalMap, z: Array) -> Prediction:
+        """Return the predicted set of the next measured state, all coordinates (docs/method.md §2)."""
         center, half = tube_kernels.next_state(
-            *self._next, self._regressor(z), np.ascontiguousarray(scene.start), scene.turn
+            *self._next, self._regressor(z), np.ascontiguousarray(local_map.start), local_map.turn
         )
         if self.robot.heading is not None:
-            center[self.robot.heading] += scene.heading
-        return Prediction(center, half, scene.heading)
+            center[self.robot.heading] += local_map.heading
+        return Prediction(center, half, local_map.heading)
 
     def margin(self, rows: ConstraintRows, z: Array) -> float:
-        """Smallest distance [m] of the exact tube to a half-space (of a limit: in its own units)."""
+        """Return the smallest slack [m, or the unit of a limit] of the rows for the exact tube of z."""
         return self.least(rows.bound - rows.support(self.tube, z), z)
 
-    def margin_in(self, scene: LocalMap, z: Array) -> float:
-        """The same, to those about the rollout of regressors z."""
-        return self.least(self.slack(scene, z), z)
+    def margin_in(self, local_map: LocalMap, z: Array) -> float:
+        """Return the margin of the plan with regressors z in a map (docs/method.md §3)."""
+        return self.least(self.slack(local_map, z), z)
 
     def least(self, slack: Array, z: Array, nearer: float = 0.0) -> float:
-        """The smallest slack, within ± the reach (less `nearer`); NaN never counts as inside."""
+        """Return the smallest slack, limited to ± the reach (less `nearer`). NaN counts as the worst."""
         most = self.reach - nearer
         margin = halfspace_kernels.least(slack, most)
         if self.far:
             margin = min(margin, most - self.extent(z))
         return max(margin, -self.reach) if margin == margin else -self.reach
 
-    def planes(self, scene: LocalMap, z: Array, leaving: bool = False) -> list[Planes]:
-        """Half-spaces about the rollout of regressors z, of each disc of the body; leaving: where it is inside of an
-        obstacle, those that lead out of it."""
+    def planes(self, local_map: LocalMap, z: Array, leaving: bool = False) -> list[Planes]:
+        """Return the half-spaces for the plan with regressors z, for each disc of the body.
+
+        leaving: for an obstacle that contains the disc, take the half-space that leads out of it.
+        """
         found = []
         for disc in self.discs:
-            start, measured = scene.start, self.measured
+            start, measured = local_map.start, self.measured
             if disc.aside:
-                start, measured = start + scene.turn @ disc.at, measured + disc.swing
-            ends = tube_kernels.places(disc.position, z, start, scene.turn)
+                start, measured = start + local_map.turn @ disc.at, measured + disc.swing
+            ends = tube_kernels.places(disc.position, z, start, local_map.turn)
             beside = []
-            if len(scene.near) or scene.unseen is None:
-                beside.append(half_spaces(scene.near, start, ends, disc.radius, measured))
+            if len(local_map.near) or local_map.unseen is None:
+                beside.append(half_spaces(local_map.near, start, ends, disc.radius, measured))
                 if leaving:
-                    beside[0] = half_spaces_leading_out(scene.near, start, disc.radius, measured, beside[0])
-            if scene.moving is not None:
-                beside.append(swept_half_spaces(scene.moving, start, ends, disc.radius, measured, self.robot.period))
+                    beside[0] = half_spaces_leading_out(local_map.near, start, disc.radius, measured, beside[0])
+            if local_map.moving is not None:
+                beside.append(
+                    swept_half_spaces(local_map.moving, start, ends, disc.radius, measured, self.robot.period)
+                )
                 self._let_pass(beside[-1][1])
-            if scene.unseen is not None:
-                of = shades if isinstance(scene.unseen, shades.OccludedRegions) else seen
-                beside.append(of.half_spaces(scene.unseen, start, ends, disc.radius, measured, self.robot.period))
-                if isinstance(scene.unseen, seen.OccupiedCells) and scene.unseen.speed > 0.0:
+            if local_map.unseen is not None:
+                of = shades if isinstance(local_map.unseen, shades.OccludedRegions) else seen
+                beside.append(of.half_spaces(local_map.unseen, start, ends, disc.radius, measured, self.robot.period))
+                if isinstance(local_map.unseen, seen.OccupiedCells) and local_map.unseen.speed > 0.0:
                     self._let_pass(beside[-1][1])
             normals, offsets = beside[0] if len(beside) == 1 else map(np.concatenate, zip(*beside, strict=True))
             found.append(Planes(start, ends, normals, offsets, disc.radius, measured))
         return found
 
     def _let_pass(self, levels: Array) -> None:
-        """Nothing is asked of half-spaces (n, N) beside what moves from when on the robot stands: what is promised is
-        that it stands when it is touched. A level that is no number goes on to be none."""
+        """Drop the half-spaces (n, N) of moving obstacles for periods in which the robot stands (passive safety, §8).
+
+        A NaN stays NaN.
+        """
         late = levels[:, self.stands :]
         late[late == late] = FARTHEST  # not of NaN
 
-    def rows(self, scene: LocalMap, z: Array, planes: list[Planes] | None = None) -> ConstraintRows:
-        """Half-spaces about the rollout of regressors z, as rows of the tube (and of the QP's: its generators are the
-        same, only their magnitudes are not). planes: if they are known already."""
-        planes = planes or self.planes(scene, z)
-        discs = zip(self.discs, planes, strict=True)
-        parts = [disc.layout.rows(self._turned(plane.normals, scene), plane.offsets) for disc, plane in discs]
-        return stack_rows(parts + self._further(scene, z))
+    def rows(self, local_map: LocalMap, z: Array, planes: list[Planes] | None = None) -> ConstraintRows:
+        """Return the half-spaces of the plan with regressors z as rows, for the tube and for the outer tube of the QP.
 
-    def slack(self, scene: LocalMap, z: Array, planes: list[Planes] | None = None) -> Array:
-        """What the same rows leave, `bound - support` (rows,)."""
+        Both tubes have the same generators; only the magnitudes differ. planes: the half-spaces, if known already.
+        """
+        planes = planes or self.planes(local_map, z)
+        discs = zip(self.discs, planes, strict=True)
+        parts = [disc.layout.rows(self._turned(plane.normals, local_map), plane.offsets) for disc, plane in discs]
+        return stack_rows(parts + self._further(local_map, z))
+
+    def slack(self, local_map: LocalMap, z: Array, planes: list[Planes] | None = None) -> Array:
+        """Return `bound - support` (rows,) of the same rows."""
         sizes = tube_kernels.magnitudes(*self._sized, z)
         found = [
-            disc.layout.slack(self._turned(plane.normals, scene), plane.offsets, sizes, z)
-            for disc, plane in zip(self.discs, planes or self.planes(scene, z), strict=True)
+            disc.layout.slack(self._turned(plane.normals, local_map), plane.offsets, sizes, z)
+            for disc, plane in zip(self.discs, planes or self.planes(local_map, z), strict=True)
         ]
-        found += [rows.bound - rows.support(self.tube, z) for rows in self._further(scene, z)]
+        found += [rows.bound - rows.support(self.tube, z) for rows in self._further(local_map, z)]
         return found[0] if len(found) == 1 else np.concatenate(found)
 
-    def _turned(self, normals: Array, scene: LocalMap) -> Array:
-        """Into the frame of now."""
-        return normals if self.robot.heading is None else normals @ scene.turn
+    def _turned(self, normals: Array, local_map: LocalMap) -> Array:
+        """Turn normals from the world to the robot's frame."""
+        return normals if self.robot.heading is None else normals @ local_map.turn
 
-    def _further(self, scene: LocalMap, z: Array) -> list[ConstraintRows]:
-        """The rows that are not a disc's own."""
+    def _further(self, local_map: LocalMap, z: Array) -> list[ConstraintRows]:
+        """Return the rows of reservations and of state limits."""
         parts = []
-        if scene.other_reservations is not None:
-            nominal = scene.start + self.tube.centers(z) @ scene.turn.T
+        if local_map.other_reservations is not None:
+            nominal = local_map.start + self.tube.centers(z) @ local_map.turn.T
             body = self.robot.footprint
-            kept = reservation_half_spaces(scene.other_reservations, scene.start, nominal, body, self.measured)
-            parts.append(self.boxes.rows(*kept, scene.turn))
+            kept = reservation_half_spaces(local_map.other_reservations, local_map.start, nominal, body, self.measured)
+            parts.append(self.boxes.rows(*kept, local_map.turn))
         if self.limits is not None:
-            parts.append(self.limits.rows(scene.start, scene.heading, scene.turn))
+            parts.append(self.limits.rows(local_map.start, local_map.heading, local_map.turn))
         return parts
 
     def worst_of(
-        self, scene: LocalMap, z: Array, slack: Array, planes: list[Planes], kept_off: Array
+        self, local_map: LocalMap, z: Array, slack: Array, planes: list[Planes], kept_off: Array
     ) -> BlockingConstraint:
-        """What the proposal, regressors z, comes nearest to; kept_off (rows,): so much nearer than it is each counts,
-        and the end of sight as much as the most of them."""
+        """Return the constraint that blocks the proposal with regressors z most. kept_off (rows,) [m]: margin of a row.
+
+        The end of the sensor's range has the largest of these margins.
+        """
         beyond = self.reach - self.extent(z) if self.far else np.inf
         short = slack - kept_off
         if not len(slack) or beyond - kept_off.max(initial=0.0) < short.min():
             return BlockingConstraint.nowhere(SIGHT, beyond, self.robot.period * self.robot.horizon)
         row = int(np.argmin(short))
-        around = ConstraintSources(scene.near, scene.moving, scene.unseen, scene.other_reservations)
+        around = ConstraintSources(local_map.near, local_map.moving, local_map.unseen, local_map.other_reservations)
         return worst(row, max(float(slack[row]), -self.reach), self.robot, around, planes)
 
-    def clear(self, request: Request, scene: LocalMap, z: Array, margin: float) -> tuple[float, bool]:
-        """Smallest distance [m] of the tube to what is in sight, given that to what is within reach; True: it is only a
-        lower bound.
+    def clear(self, request: Request, local_map: LocalMap, z: Array, margin: float) -> tuple[float, bool]:
+        """Return the margin [m] for a report, and whether it is only a lower bound.
 
-        What is beyond the reach decides nothing, but it may be what is nearest to the tube. Of it the bound is told:
-        how far it is, less how far the tube goes.
+        An obstacle beyond reach decides nothing, but it may be nearest to the tube. Then the lower bound is its
+        distance less the extent of the tube. margin [m]: to everything within reach.
         """
-        if isinstance(scene.unseen, shades.OccludedRegions) and margin >= ASIDE:
+        if isinstance(local_map.unseen, shades.OccludedRegions) and margin >= ASIDE:
             return margin, True
         if not self.far and margin + self.widest <= self.reach:
             return margin, False
         extent = self.extent(z)
         if self.far:
             return margin, margin >= self.reach - extent
-        if margin < self.reach and margin <= scene.beyond - extent:
+        if margin < self.reach and margin <= local_map.beyond - extent:
             return margin, False
-        # Of what is within reach no more is known than that; a scan was not looked at beyond it.
-        most = self.robot.sight - self.widest if scene.empty and request.scan is None else self.reach
-        return min(scene.beyond - extent, most), True
+        # The filter does not evaluate a scan beyond its reach.
+        most = self.robot.sight - self.widest if local_map.empty and request.scan is None else self.reach
+        return min(local_map.beyond - extent, most), True

@@ -1,4 +1,4 @@
-"""A robot's inputs as regressors of its tubes: within bounds and slew, followed by braking."""
+"""Inputs of a plan: clipped to bounds and slew, followed by braking, and as regressors z (docs/method.md §2)."""
 
 from __future__ import annotations
 
@@ -12,19 +12,19 @@ Array = NDArray[np.float64]
 
 
 @compiled("f8[::1](f8[::1], f8[::1], f8[::1], f8[::1], f8[::1])")
-def _limited(wanted: Array, before: Array, low: Array, high: Array, slew: Array) -> Array:
-    """The input (m,) closest to the wanted one within bounds and slew; of what is no number, none."""
-    found = np.empty(len(wanted))
+def clip_to_bounds(wanted: Array, before: Array, low: Array, high: Array, slew: Array) -> Array:
+    """Return the input (m,) closest to the wanted one within bounds and slew. NaN stays NaN."""
+    clipped = np.empty(len(wanted))
     for i in range(len(wanted)):
         least, most = max(low[i], before[i] - slew[i]), min(high[i], before[i] + slew[i])
         value = least if wanted[i] < least else wanted[i]
-        found[i] = most if value > most else value
-    return found
+        clipped[i] = most if value > most else value
+    return clipped
 
 
 @compiled("f8[::1](f8[::1], f8[:,::1], f8[::1])")
-def _followed(z_0: Array, braking: Array, action: Array) -> Array:
-    """z_0, and what is left (F, m) of an action (m,) from then on."""
+def regressors_of_braking(z_0: Array, braking: Array, action: Array) -> Array:
+    """Return z = [z_0; free inputs]: free input k is the share braking[k] (m,) of the action (m,)."""
     (F, m), known = braking.shape, len(z_0)
     z = np.empty(known + F * m)
     for j in range(known):
@@ -36,8 +36,17 @@ def _followed(z_0: Array, braking: Array, action: Array) -> Array:
 
 
 class PlanInputs:
-    """z (nz,) is what a tube is linear in: the measured state's part, the input in force, the plan's inputs that are
-    given already (together z_0), and the free ones."""
+    """A robot's plans and their regressors z = [z_0; f].
+
+    z_0 holds the measured speeds, the input in force, and, in real time, the inputs that are decided already. f (F·m,)
+    holds the free inputs, F of them.
+
+    Attributes:
+        low, high, slew (m,): bounds of the inputs, and of their change from one period to the next.
+        nothing (m,): zero input.
+        schedule (N·m, (F + given)·m): S of docs/method.md §2, from the chosen inputs to all inputs of a plan.
+        braking (F, m): share of its value that an input still has in each free period while the robot brakes.
+    """
 
     def __init__(self, robot: Robot) -> None:
         self.robot = robot
@@ -47,25 +56,25 @@ class PlanInputs:
         self.braking = np.ascontiguousarray(robot.stop_profile()[: robot.free_steps - robot.committed_steps])
 
     def limited(self, wanted: Array, before: Array) -> Array:
-        """The input (m,) closest to the wanted one within bounds and slew."""
-        return _limited(wanted, before, self.low, self.high, self.slew)
+        """Return the input (m,) closest to the wanted one within bounds and slew of `before` (m,)."""
+        return clip_to_bounds(wanted, before, self.low, self.high, self.slew)
 
     def within(self, free: Array, before: Array) -> Array:
-        """Free inputs (F·m,) brought within bounds and slew, one after the other."""
+        """Clip free inputs (F·m,) to bounds and slew, one after the other."""
         inputs = free.reshape(-1, self.robot.action_dim).copy()
         for k in range(len(inputs)):
             before = inputs[k] = self.limited(inputs[k], before)
         return inputs.ravel()
 
     def stop(self, state: Array, before: Array) -> Array:
-        """The strongest braking's next input: to zero, held, or what the feedback makes of the state."""
+        """Return the next input (m,) of the strongest braking: towards zero, held, or by feedback of the state (n,)."""
         wanted = np.where(self.robot.zero_at_rest, self.nothing, before)
         return self.limited(self.robot.stop_by_feedback(wanted, state, before), before)
 
     def regressors(self, z_0: Array, action: Array) -> Array:
-        """z of an action followed by braking."""
-        return _followed(z_0, self.braking, action)
+        """Return z (nz,) of an action (m,) followed by braking."""
+        return regressors_of_braking(z_0, self.braking, action)
 
     def plan(self, z: Array) -> Array:
-        """The inputs (N, m) that regressors z speak of."""
+        """Return all inputs (N, m) of the plan with regressors z."""
         return (self.schedule @ z[self.robot.regressor_dim :]).reshape(self.robot.horizon, -1)

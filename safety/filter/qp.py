@@ -14,17 +14,18 @@ from brakeline.safety.filter.reachable_tube import Tube
 
 Array = NDArray[np.float64]
 
-SHARPEN = 1e-6  # m; the QP's rows are this much tighter, so that its answer's rounding passes the exact check
-REGULAR = 1e-4  # weight of what the objective leaves free; much less and the solver needs thousands of iterations
-ROUNDING = 1e-12  # of a unit row of W: an atom that depends on the inputs no more than this does not
+ROW_TIGHTENING = 1e-6  # m by which the QP's rows are tighter, so that a rounded answer passes the exact check
+REGULARIZATION = 1e-4  # ε: weight of all other variables; with much less the solver needs thousands of iterations
+ROUNDING = 1e-12  # of a unit row of W: a row with smaller entries for f does not depend on f
 
 
 @dataclass(frozen=True)
 class ConstraintRows:
-    """A half-space for every end of every period: support of the tube in its normal, `gradient z + spread m(z)`.
+    """Rows (3) of docs/method.md: `gradient z + spread m(z) <= bound`, where m(z) are the tube's magnitudes.
 
-    gradient (rows, nz); spread (rows, L+N+1) >= 0; bound (rows,). keep (rows,): the factor of
-    the clearance margin in a row: 1 if the row is about an obstacle, 0 if it is about a limit in other units.
+    Attributes:
+        gradient (rows, nz), spread (rows, L+N+1) >= 0, bound (rows,) [m, or the unit of a limit].
+        keep (rows,): factor of the clearance margin in a row: 1 for an obstacle, 0 for a limit in other units.
     """
 
     gradient: Array
@@ -33,55 +34,62 @@ class ConstraintRows:
     keep: Array
 
     def support(self, tube: Tube, z: Array) -> Array:
+        """Return the left side of the rows (rows,) for regressors z."""
         return np.asarray(self.gradient @ z + self.spread @ tube.magnitudes(z))
 
 
 class ObstacleRows:
-    """The parts of a tube that rows about obstacles are made from, gathered once, for one disc of the body.
+    """Builds the rows (3) for one disc of the body, from matrices that it gathers once.
 
-    Per obstacle there are 2N+1 rows: period k's half-space at the period's start and at its end, both with the bulge
-    of that period, and the last one again with the stop latch.
+    Each obstacle gives 2N + 1 rows: N for the starts of the periods, N for their ends, both with the chord deviation of
+    the period, and one for the last end with the stopping distance.
     """
 
+    @staticmethod
+    def per_obstacle(horizon: int) -> int:
+        """Return the number of rows for each obstacle; the last of them is the row after the stop."""
+        return 2 * horizon + 1
+
     def __init__(self, position: Array, directions: Array) -> None:
-        """position (N, d, nz), directions (N, d, L): of a point of the body."""
+        """Gather the parts of a tube. position (N, d, nz), directions (N, d, L): of the disc's center."""
         N, d, nz = position.shape
         L = directions.shape[2]
         at_start, at_end = np.arange(N), np.arange(1, N + 1)
         ends = np.concatenate([at_start, at_end, [N]])
         directions = np.concatenate([np.zeros((1, d, L)), directions])[ends]
-        used = np.abs(directions).max(axis=1, initial=0.0) > 0.0  # a generator may be a period's own
+        used = np.abs(directions).max(axis=1, initial=0.0) > 0.0  # in direct mode, each period has its own generators
         most = int(used.sum(axis=1).max(initial=0))
-        period, chord_deviation = (
-            np.concatenate([at_start, at_start, [N - 1]]),
-            L + np.concatenate([at_start, at_start, [N]]),
-        )
-        ways = np.ascontiguousarray(np.concatenate([np.zeros((1, d, nz)), position])[ends])
+        period = np.concatenate([at_start, at_start, [N - 1]])
+        extra = L + np.concatenate([at_start, at_start, [N]])  # the chord deviations, then the stopping distance
+        end_maps = np.ascontiguousarray(np.concatenate([np.zeros((1, d, nz)), position])[ends])
         columns = np.ascontiguousarray(np.argsort(~used, axis=1, kind="stable")[:, :most])
-        spans = np.ascontiguousarray(np.take_along_axis(directions, columns[:, None, :], axis=2))
-        self.parts = period, ways, spans, columns, chord_deviation
+        end_directions = np.ascontiguousarray(np.take_along_axis(directions, columns[:, None, :], axis=2))
+        self.parts = period, end_maps, end_directions, columns, extra
         self.sizes = L + N + 1
 
     def rows(self, normals: Array, offsets: Array) -> ConstraintRows:
-        """Rows for half-spaces `a·p <= b` in the frame of now, a (n, N, d), b (n, N)."""
+        """Return rows for half-spaces `a·p <= b` in the robot's frame, a (n, N, d), b (n, N)."""
         gradient, spread, bound = halfspace_kernels.rows(normals, offsets, *self.parts, self.sizes)
         return ConstraintRows(gradient, spread, bound, np.ones(len(bound)))
 
     def slack(self, normals: Array, offsets: Array, sizes: Array, z: Array) -> Array:
-        """What these rows leave, `bound - support`, of the tube with magnitudes `sizes` (L+N+1,) under regressors z,
-        without the rows themselves: there are hundreds, as wide as the tube has generators."""
+        """Return `bound - support` of these rows for regressors z with magnitudes `sizes` (L+N+1,).
+
+        This is faster than building the rows: there may be hundreds, each as wide as the tube has generators.
+        """
         return halfspace_kernels.slack(normals, offsets, *self.parts, sizes, z)
 
 
 class QPBuilder:
-    """Builds the QP of a decision; everything that does not change from call to call is kept.
+    """Builds the QP of docs/method.md §4 from matrices that it computes once. `qp_solver` solves it.
 
-    Variables [free inputs f; t], t the atoms |W z| that depend on f, as epigraphs:
+    The variables are [f; t]: free inputs f, and slacks t >= |W z| for the rows of W that depend on f:
 
-        min ‖f_0 - r‖² + REGULAR (‖f_1 ..‖² + ‖t‖²)      each in units of its range
+        min ‖f_0 - r‖² + REGULARIZATION (‖f_1 ..‖² + ‖t‖²)      each in units of its range
         s.t. gradient z + spread (M t + ...) <= bound,   ±(W z) <= t,   low <= f <= high,   |f_k - f_{k-1}| <= slew
 
-    Variables are scaled by `scale` and rows to unit length: unscaled, one problem in a hundred took ten milliseconds.
+    Variables are in units of their range (`scale`) and rows have unit length: without that, one problem in a hundred
+    took ten milliseconds.
     """
 
     def __init__(self, robot: Robot, tube: Tube) -> None:
@@ -96,11 +104,11 @@ class QPBuilder:
         W_t, self.M_t = tube.W[moving], whole(tube.M[:, moving])
         self.W_c, self.M_c = whole(tube.W[~moving][:, : self.known]), whole(tube.M[:, ~moving])
         self.W_known, self.W_f = whole(W_t[:, : self.known]), whole(W_t[:, self.known :])
-        self.give = np.abs(self.W_f)
+        self.abs_W_f = np.abs(self.W_f)
         atoms = len(W_t)
         width = np.tile(robot.high() - robot.low(), steps)
-        self.scale = np.concatenate([width, self.give @ width])
-        self.h = np.full(free + atoms, REGULAR)
+        self.scale = np.concatenate([width, self.abs_W_f @ width])
+        self.h = np.full(free + atoms, REGULARIZATION)
         self.h[:m] = 1.0
         above = np.hstack([self.W_f, -np.eye(atoms)])
         below = np.hstack([-self.W_f, -np.eye(atoms)])
@@ -113,27 +121,36 @@ class QPBuilder:
         self.fixed = fixed / self.length[:, None]
         self.limited = limited
         self.low, self.high = robot.low(), robot.high()
-        self.way = np.arange(1.0, steps + 1.0)[:, None] * np.asarray(
-            robot.action_slew
-        )  # of the input, until each free one
+        # Largest change of each free input against the input in force.
+        self.change = np.arange(1.0, steps + 1.0)[:, None] * np.asarray(robot.action_slew)
         self.slew = np.tile(robot.action_slew, steps)[limited]
         self.box = np.concatenate([np.tile(robot.high(), steps), -np.tile(robot.low(), steps)])
 
     def program(self, rows: ConstraintRows, z_0: Array, proposal: Array) -> QuadraticProgram | None:
-        """The QP for known regressors z_0 (known,) and a proposal r (m,); None if some row rules out every input.
+        """Build the QP for known regressors z_0 (known,) and a proposal r (m,); None if a row rules out every input.
 
-        Over the box of inputs that bounds and slew leave, each row's support has a least and a largest value: one
-        whose least is beyond its bound can't be met, one whose largest is within it need not be looked at. With many
-        obstacles that is nearly all of them.
+        Over all inputs within bounds and slew, the left side of a row has a smallest and a largest value. If the
+        smallest violates the bound, no input meets the row. If the largest meets it, the row is left out: with many
+        obstacles, nearly all rows are.
         """
         m = self.robot.action_dim
         constant = self.M_c @ np.abs(self.W_c @ z_0) + self.tube.m_0
         offset = self.W_known @ z_0
         center, radius = self.reachable(z_0[-m:])
-        atom, give = offset + self.W_f @ center, self.give @ radius
-        atoms = np.stack([np.maximum(np.abs(atom) - give, 0.0), np.abs(atom) + give])
+        atom, deviation = offset + self.W_f @ center, self.abs_W_f @ radius
+        atoms = np.stack([np.maximum(np.abs(atom) - deviation, 0.0), np.abs(atom) + deviation])
         count, A, b = halfspace_kernels.presolve_rows(
-            rows.gradient, rows.spread, rows.bound, z_0, constant, self.M_t, center, radius, atoms, self.scale, SHARPEN
+            rows.gradient,
+            rows.spread,
+            rows.bound,
+            z_0,
+            constant,
+            self.M_t,
+            center,
+            radius,
+            atoms,
+            self.scale,
+            ROW_TIGHTENING,
         )
         if count < 0:
             return None
@@ -148,9 +165,9 @@ class QPBuilder:
         )
 
     def reachable(self, before: Array) -> tuple[Array, Array]:
-        """Center and half-widths (F·m,) of what bounds and slew leave to the free inputs after `before` (m,)."""
-        return halfspace_kernels.reachable(self.low, self.high, self.way, before)
+        """Return center and half-widths (F·m,) of the free inputs within bounds and slew after `before` (m,)."""
+        return halfspace_kernels.reachable(self.low, self.high, self.change, before)
 
     def inputs(self, x: Array) -> Array:
-        """The free inputs (F·m,) in a solution."""
+        """Return the free inputs (F·m,) of a solution x."""
         return np.asarray(x[: self.free] * self.scale[: self.free])

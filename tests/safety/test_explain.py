@@ -45,8 +45,8 @@ def test_the_room_is_that_of_the_proposals_tube(ready):
             z_0,
             ready.inputs.limited(question.action, question.input_in_force),
         )
-        scene = ready.around.scene(question, z_0, ready.builder.reachable(question.input_in_force))
-        assert decision.blocked_by.room == pytest.approx(ready.around.margin(ready.around.rows(scene, z), z))
+        scene = ready.constraints.local_map(question, z_0, ready.builder.reachable(question.input_in_force))
+        assert decision.blocked_by.room == pytest.approx(ready.constraints.margin(ready.constraints.rows(scene, z), z))
 
 
 def test_a_wall_a_box_a_mover_and_a_limit_have_their_names(ready):

@@ -102,14 +102,14 @@ def test_adjusted_is_the_closest_input_that_can_be_verified(ready):
             continue
         adjusted += 1
         z_0 = np.concatenate([ask.state[3:], ask.input_in_force])
-        scene = ready.around.scene(ask, z_0, ready.builder.reachable(ask.input_in_force))
+        scene = ready.constraints.local_map(ask, z_0, ready.builder.reachable(ask.input_in_force))
         proposal = ready.inputs.limited(ask.action, ask.input_in_force)
-        rows = ready.around.rows(scene, np.concatenate([z_0, proposal]))
+        rows = ready.constraints.rows(scene, np.concatenate([z_0, proposal]))
         kept = ready._with_clearance_margin(rows, z_0, proposal)
         taken = np.linalg.norm((decision.plan[0] - ask.action) / width)
         best = np.inf
         for u in grid:
-            if ready.around.margin(kept, np.concatenate([z_0, u])) >= 0.0:
+            if ready.constraints.margin(kept, np.concatenate([z_0, u])) >= 0.0:
                 best = min(best, np.linalg.norm((u - ask.action) / width))
         assert taken <= best + 2e-3
         if adjusted == 12:

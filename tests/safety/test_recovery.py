@@ -244,11 +244,11 @@ def test_who_drifts_where_it_hovers_moves_away_before_it_touches():
     filter = Filter(
         fit_model_set(collect(env, HOVERER, 6000, held=6, state=seen, actions=normalised(HOVERER)), ModelConfig())
     )
-    assert not filter.around.stays
+    assert not filter.constraints.stays
     touched = {True: 0, False: 0}
     for episode in range(12):
         for stays in (False, True):  # True: as it was before
-            filter.around.stays = stays
+            filter.constraints.stays = stays
             env.reset(seed=episode)
             env.obstacles, env.worst, kept = [Obstacle("cylinder", (1.42, 0.0), (1.0,))], np.inf, BackupPlan(HOVERER)
             for _ in range(150):

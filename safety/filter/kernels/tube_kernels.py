@@ -1,6 +1,9 @@
-"""Where a tube and its first step lead under regressors z, compiled; what they are say `tube.py`, `certificates.py`.
+"""Compiled loops over a tube and its predicted set (docs/method.md §2; see `Tube` and `ErrorBound`).
 
-W (q, nz), M (K, q) and kappa (g, nz) are told transposed: so many sums are made at a time, each in its own order.
+W_t (nz, q), M_t (q, K) and kappa_t (nz, g) are the transposes of W, M and kappa: so the innermost loops run along
+contiguous rows. start (d,) is the measured position, turn (d, d) the rotation from the robot's frame to the world.
+
+`tests/safety/kernel_twins.py` has each function in plain NumPy.
 """
 
 from __future__ import annotations
@@ -17,46 +20,46 @@ Array = NDArray[np.float64]
 
 @compiled("b1(f8[::1], f8[:,::1])")
 def within(values: Array, bounds: Array) -> bool:
-    """Are the first values, as many as there are bounds (2, k), within them? One that is no number is not."""
-    found = True
+    """Return whether the first k values lie within bounds (2, k). NaN does not."""
+    inside = True
     for i in range(bounds.shape[1]):
-        found &= bounds[0, i] <= values[i] <= bounds[1, i]
-    return found
+        inside &= bounds[0, i] <= values[i] <= bounds[1, i]
+    return inside
 
 
 @compiled("void(f8[:,::1], f8[::1], f8[::1])")
-def _add_product(A: Array, x: Array, found: Array) -> None:
-    """A's transpose (n, k) times x (n,), added to what is found (k,)."""
+def _add_product(A_t: Array, x: Array, total: Array) -> None:
+    """Add A x to `total` (k,), with A_t (n, k) and x (n,)."""
     for i in range(len(x)):
-        row, share = A[i], x[i]
-        for k in range(len(found)):
-            found[k] += row[k] * share
+        column, factor = A_t[i], x[i]
+        for k in range(len(total)):
+            total[k] += column[k] * factor
 
 
 @compiled("f8[::1](f8[:,::1], f8[:,::1], f8[::1], f8[::1])")
-def magnitudes(W: Array, M: Array, m_0: Array, z: Array) -> Array:
-    """Lengths (K,) of what a tube's sets are made of: M |W z| + m_0."""
-    atoms, sizes = np.zeros(W.shape[1]), m_0.copy()
-    _add_product(W, z, atoms)
-    _add_product(M, np.abs(atoms), sizes)
+def magnitudes(W_t: Array, M_t: Array, m_0: Array, z: Array) -> Array:
+    """Return m(z) = M |W z| + m_0 (K,)."""
+    atoms, sizes = np.zeros(W_t.shape[1]), m_0.copy()
+    _add_product(W_t, z, atoms)
+    _add_product(M_t, np.abs(atoms), sizes)
     return sizes
 
 
 @compiled("f8[:,::1](f8[:,:,::1], f8[::1], f8[::1], f8[:,::1])")
 def places(position: Array, z: Array, start: Array, turn: Array) -> Array:
-    """Nominal ends of the periods (N, d), world, from a start (d,) turned by (d, d)."""
-    (N, d, nz), way = position.shape, np.empty(position.shape[1])
-    found = np.empty((N, d))
+    """Return the nominal positions (N, d) at the periods' ends, world: start + turn P_i z."""
+    (N, d, nz), moved = position.shape, np.empty(position.shape[1])
+    nominal = np.empty((N, d))
     for k in range(N):
         for axis in range(d):
-            way[axis] = 0.0
+            moved[axis] = 0.0
             for j in range(nz):
-                way[axis] += position[k, axis, j] * z[j]
+                moved[axis] += position[k, axis, j] * z[j]
         for axis in range(d):
-            found[k, axis] = start[axis]
+            nominal[k, axis] = start[axis]
             for other in range(d):
-                found[k, axis] += turn[axis, other] * way[other]
-    return found
+                nominal[k, axis] += turn[axis, other] * moved[other]
+    return nominal
 
 
 @compiled(
@@ -64,8 +67,8 @@ def places(position: Array, z: Array, start: Array, turn: Array) -> Array:
     "(f8[:,::1], f8[:,::1], f8[::1], f8[:,:,::1], f8[:,:,::1], f8[::1], f8[::1], f8[:,::1], f8[::1])"
 )
 def sets(
-    W: Array,
-    M: Array,
+    W_t: Array,
+    M_t: Array,
     m_0: Array,
     position: Array,
     directions: Array,
@@ -74,9 +77,11 @@ def sets(
     turn: Array,
     measured: Array,
 ) -> tuple[Array, Array]:
-    """Centers and half-widths (N, d), world, of boxes about a tube's positions at the periods' ends, from a start (d,)
-    turned by (d, d), and whatever is measured (d,) beside it."""
-    (N, d, L), sizes = directions.shape, magnitudes(W, M, m_0, z)
+    """Return centers and half-widths (N, d), world, of boxes that contain the true positions at the periods' ends.
+
+    measured (d,): half-widths of the position's measurement error.
+    """
+    (N, d, L), sizes = directions.shape, magnitudes(W_t, M_t, m_0, z)
     half, along = np.empty((N, d)), np.empty(L)
     for k in range(N):
         for axis in range(d):
@@ -91,18 +96,18 @@ def sets(
 
 
 @compiled("f8(f8[:,::1], f8[:,::1], f8[::1], f8[:,:,::1], f8[:,:,::1], f8[::1], f8)")
-def extent(W: Array, M: Array, m_0: Array, position: Array, directions: Array, z: Array, body: float) -> float:
-    """How far [m] from the start any point of a body may be that is so large, anywhere in a tube."""
-    (N, d, L), sizes, farthest = directions.shape, magnitudes(W, M, m_0, z), 0.0
+def extent(W_t: Array, M_t: Array, m_0: Array, position: Array, directions: Array, z: Array, body: float) -> float:
+    """Return the distance [m] from the start that no point of a body of radius `body` [m] exceeds in the tube."""
+    (N, d, L), sizes, farthest = directions.shape, magnitudes(W_t, M_t, m_0, z), 0.0
     for k in range(N):
         square = 0.0
         for axis in range(d):
-            way, aside = 0.0, 0.0
+            moved, width = 0.0, 0.0
             for j in range(len(z)):
-                way += position[k, axis, j] * z[j]
+                moved += position[k, axis, j] * z[j]
             for i in range(L):
-                aside += abs(directions[k, axis, i]) * sizes[i]
-            square += (abs(way) + aside) ** 2
+                width += abs(directions[k, axis, i]) * sizes[i]
+            square += (abs(moved) + width) ** 2
         farthest = max(farthest, square)
     return math.sqrt(farthest) + body + float(sizes[L:].max())
 
@@ -112,12 +117,14 @@ def extent(W: Array, M: Array, m_0: Array, position: Array, directions: Array, z
     "(f8[:,::1], f8[:,::1], f8[:,::1], f8[:,::1], f8[::1], f8[:,::1], f8[::1], f8[::1], f8[:,::1])"
 )
 def next_state(
-    C: Array, W: Array, M: Array, kappa: Array, w: Array, widths: Array, z: Array, start: Array, turn: Array
+    C: Array, W_t: Array, M_t: Array, kappa_t: Array, w: Array, widths: Array, z: Array, start: Array, turn: Array
 ) -> tuple[Array, Array]:
-    """Center and half-widths (n,) of the next state under a certificate (C as it is, and its generators' absolute
-    values), its position from a start (d,), turned by (d, d)."""
-    n, d, sizes = len(C), len(start), magnitudes(W, M, w, z)
-    _add_product(kappa, np.abs(z), sizes)
+    """Return center and half-widths (n,) of the predicted set: bound (1) for one period, position in the world.
+
+    C (n, nz), W, M, kappa, w (g,): of the error bound; widths (n, g): absolute values of its generators.
+    """
+    n, d, sizes = len(C), len(start), magnitudes(W_t, M_t, w, z)
+    _add_product(kappa_t, np.abs(z), sizes)
     center, half, moved = np.zeros(n), np.zeros(n), np.zeros(d)
     for i in range(n):
         for j in range(len(z)):
