@@ -1,4 +1,4 @@
-"""What whoever drives a robot keeps between two decisions: the committed plan and what it predicts."""
+"""The committed backup plan, which an actor keeps between two decisions (docs/method.md §4)."""
 
 from __future__ import annotations
 
@@ -14,15 +14,16 @@ from brakeline.safety.filter.reservation import Reservation
 
 Array = NDArray[np.float64]
 
-SAME_SET = 1e-9  # m, rad, ...: rounding allowed when a measurement is compared with its prediction
-UNVERIFIED = "unverified"  # in place of a model's version: no model vouches for the committed plan
+SAME_SET = 1e-9  # m, rad, ...: rounding allowed in the comparison of a measurement with its predicted set
+UNVERIFIED = "unverified"  # in place of a version: no model set verified the committed plan
 
 
 @dataclass(frozen=True)
 class Prediction:
-    """Where the next measured state must lie: |displacement - center| <= half_width in the frame of `heading`.
+    """The predicted set of the next measured state: |state - center| <= half_width, in the frame of `heading`.
 
-    center, half_width: (n,); the position part of the center is in the world, its box turned by heading [rad].
+    Attributes:
+        center, half_width (n,): the position in center is in the world; its box is turned by heading [rad].
     """
 
     center: Array
@@ -30,7 +31,7 @@ class Prediction:
     heading: float
 
     def contains(self, robot: Robot, state: Array) -> bool:
-        """Does the measured state (n,) lie in the set?"""
+        """Return whether the measured state (n,) lies in the set."""
         away = state - self.center
         if robot.heading is not None:
             cos, sin = math.cos(self.heading), math.sin(self.heading)
@@ -43,12 +44,18 @@ NO_PREDICTION = Prediction(np.zeros(0), np.zeros(0), 0.0)  # of a method that pr
 
 
 class BackupPlan:
-    """The committed plan of one robot: verified when it was made, from then to standstill.
+    """The committed backup plan of one robot, verified from the time when it was made until the robot stands.
 
-    plan (N, m) is its tail: the first row is what to execute if no better answer comes; of a late robot what is being
-    executed, and `accept` and `fallback` return the input of the next period. model is the version of the
-    model set that verified it, empty when the robot stands still, `UNVERIFIED` if none did; voucher is the service's
-    word for that, if it gave one. promise: of a robot that others share its world with, what is left of it.
+    `accept` takes the plan of a decision, `fallback` goes on with the plan when no decision came. Both return the input
+    to execute; for a robot in real time, the input of the next period.
+
+    Attributes:
+        plan (N, m): rest of the plan. Its first row is what to execute without a better answer; in real time, the input
+            that is being executed.
+        model: version of the model set that verified the plan. Empty if the robot stands, `UNVERIFIED` without one.
+        predicted: set of the next measured state, if the decision had one.
+        reservation: what is left of the robot's reservation, in a world with other robots.
+        seen (n,): last measured state.
     """
 
     def __init__(self, robot: Robot) -> None:
@@ -56,16 +63,16 @@ class BackupPlan:
         self.reset()
 
     def reset(self) -> None:
-        """At an episode's start: standing still."""
+        """Start an episode: the robot stands."""
         self.input_in_force: Array = self.robot.zero_input()
         self.plan: Array = np.tile(self.input_in_force, (self.robot.horizon, 1))
         self.model = ""
         self.predicted: Prediction | None = None
         self.reservation: Reservation | None = None
         self.seen: Array = np.zeros(self.robot.state_dim)  # the last measured state: of feedback, a stop is made of it
-        self._compare = False  # was it measured where the prediction speaks of it?
+        self._compare = False  # a state was measured since the last decision
         self._still = self.robot.horizon  # periods of a stop's inputs
-        self._plan_tokens: tuple[bytes, ...] = ()  # of this period and those to come; the last stays
+        self._plan_tokens: tuple[bytes, ...] = ()  # for this period and the later ones; the last one stays
 
     @property
     def next_input(self) -> Array:
@@ -78,7 +85,7 @@ class BackupPlan:
         return self._plan_tokens[0] if self._plan_tokens else b""
 
     def measured(self, state: Array) -> None:
-        """At a period's beginning, before a question about it; one that is no state (n,) counts as none."""
+        """Store the measured state (n,) of a period before its request. Ignore what is not finite or has another shape."""
         if state.shape == self.seen.shape and np.isfinite(state).all():
             self.seen, self._compare = state, True
 
@@ -91,7 +98,7 @@ class BackupPlan:
         plan_tokens: Iterable[bytes] = (),
         reservation: Reservation | None = None,
     ) -> Array:
-        """A decision's plan becomes the committed one; returns the input to execute next."""
+        """Commit to the plan of a decision; return the input to execute next."""
         self.reservation = reservation
         self._plan_tokens = (b"", *plan_tokens)
         self.plan, self.model = plan, model if verified else UNVERIFIED
@@ -100,13 +107,16 @@ class BackupPlan:
 
     @property
     def still_verified(self) -> bool:
-        """Does what was verified of the plan still hold, by the state that was measured?"""
+        """Whether the plan is verified and the measured state is in its predicted set."""
         outside = self._compare and self.predicted is not None and not self.predicted.contains(self.robot, self.seen)
         return self.model != UNVERIFIED and not outside
 
     def fallback(self) -> Array:
-        """No decision came: the committed plan's next input. Nobody else saw whether the state that was measured is in
-        its predicted set; where it is not, what was verified of the plan does not hold any more."""
+        """Return the next input of the committed plan, since no decision came.
+
+        No service compared the measured state with its predicted set. If the state is outside, the plan no longer
+        counts as verified.
+        """
         if not self.still_verified:
             self.model, self._plan_tokens = UNVERIFIED, ()
         self.predicted = None
@@ -127,17 +137,17 @@ class BackupPlan:
         self._still = self._still + 1 if rests else 0
         stopped = self.model != UNVERIFIED or self._still >= robot.horizon
         if stopped and rests and robot.is_stop_input(self.plan).all():
-            self.model = ""  # standing still needs nobody's word
+            self.model = ""  # a standing robot needs no model set
         return self.next_input
 
 
 def correction_penalty(
     robot: Robot, proposed: ArrayLike, before: ArrayLike, executed: ArrayLike, weight: float
 ) -> float:
-    """weight · ‖executed - proposed‖, each input in units of its range: what leaning on the filter costs.
+    """Return weight · ‖executed - proposed‖, with each input in units of its range (docs/method.md §7).
 
-    From the proposal clipped to bounds and to the slew from the input `before`, which is what `allowed` lets pass; one
-    that is no number counts as zero input.
+    The proposal is first clipped to the bounds and to the slew around the input `before`. NaN and infinity count as
+    zero input.
     """
     low, high, slew = robot.low(), robot.high(), np.asarray(robot.action_slew)
     before = np.asarray(before, float)

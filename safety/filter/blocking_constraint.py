@@ -1,4 +1,4 @@
-"""What a proposal was not allowed for: of all half-spaces the one that its tube comes nearest to, or crosses most."""
+"""The constraint that blocks a proposal: the half-space that its tube comes nearest to, or violates most."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from brakeline.messaging.moving_obstacles import MovingObstacles
 from brakeline.messaging.obstacle import Shapes
 from brakeline.messaging.robot import Robot
+from brakeline.safety.filter.halfspaces import rows_per_obstacle
 from brakeline.safety.filter.moving_halfspaces import swept_half_spaces
 from brakeline.safety.filter.reservation import OtherReservations
 from brakeline.safety.perception.occluded_regions import OccludedRegions
@@ -23,7 +24,7 @@ UNSEEN, SIGHT, ROBOT = "unseen", "sight", "robot"
 
 @dataclass(frozen=True)
 class BlockingConstraint:
-    """by: cylinder | box | sphere | wall, `moving ` before it where it moves, `unseen`, `robot` (its promise),
+    """by: cylinder | box | sphere | wall, `moving ` before it where it moves, `unseen`, `robot` (its reservation),
     `sight` (the tube leaves what can be seen), or a limit's name; room [m, of a limit in its own units]: from the tube
     to the half-space, negative: beyond it; after [s]: when, from now. normal (d,), at (d,): of the half-space, world,
     from the free side on, through the obstacle's nearest point; empty where there is none."""
@@ -41,16 +42,16 @@ class BlockingConstraint:
 
 @dataclass(frozen=True)
 class ConstraintSources:
-    """What half-spaces are about, in the order of their rows, one disc of the body after the other."""
+    """The sources of the half-spaces, in the order of their rows, which repeats for each disc of the body."""
 
     near: Shapes
     moving: MovingObstacles | None
     unseen: OccupiedCells | OccludedRegions | None
-    other_reservations: OtherReservations | None = None  # these come last, once for the whole body
+    other_reservations: OtherReservations | None = None  # last, once for the whole body
 
     @property
-    def told(self) -> int:
-        """How many half-spaces a period are about obstacles that were told of."""
+    def obstacles(self) -> int:
+        """Number of half-spaces, for each period, that belong to obstacles in the request."""
         return len(self.near) + (len(self.moving) if self.moving is not None else 0)
 
 
@@ -68,27 +69,28 @@ class Planes:
     measured: Array
 
     def itself(self, which: int, period: int, margin: float = 0.0) -> tuple[Array, float]:
-        """The half-space (d,), () that the surface is of an obstacle of that margin, whatever is to be kept to it."""
+        """Return the half-space (d,), () at the surface of an obstacle with that margin, without the body's radius."""
         normal = self.normals[which, period]
         kept = max(self.keep_off + margin, 0.0) + float(np.abs(normal) @ self.measured)
         return normal, float(self.offsets[which, period]) + kept
 
 
 def worst(row: int, room: float, robot: Robot, around: ConstraintSources, planes: list[Planes]) -> BlockingConstraint:
-    """What a row is about; planes: of each disc, under the proposal."""
+    """Return the constraint of a row; planes: the half-spaces of each disc under the proposal."""
     N, T = robot.horizon, robot.period
     number = row
     for disc in planes:
-        rows = (2 * N + 1) * len(disc.normals)
+        rows = rows_per_obstacle(N) * len(disc.normals)
         if number < rows:
             return _about_an_obstacle(number, room, robot, around, disc)
         number -= rows
     if around.other_reservations is not None:
-        each = (N + 1) << robot.position_dim  # of a robot
-        if number < len(around.other_reservations) * each:
-            period = (number % each) >> robot.position_dim
+        corners = 2**robot.position_dim
+        rows_each = (N + 1) * corners
+        if number < len(around.other_reservations) * rows_each:
+            period = (number % rows_each) // corners
             return BlockingConstraint.nowhere(ROBOT, room, T * min(period + 1, N))
-        number -= len(around.other_reservations) * each
+        number -= len(around.other_reservations) * rows_each
     period, limit = divmod(number, len(robot.limits))
     return BlockingConstraint.nowhere(robot.limits[limit].name, room, T * min(period + 1, N))
 
@@ -96,13 +98,13 @@ def worst(row: int, room: float, robot: Robot, around: ConstraintSources, planes
 def _about_an_obstacle(
     row: int, room: float, robot: Robot, around: ConstraintSources, planes: Planes
 ) -> BlockingConstraint:
-    """The same of a disc's row."""
+    """Return the constraint of a row that belongs to a disc."""
     N, T = robot.horizon, robot.period
-    which, end = divmod(row, 2 * N + 1)
+    which, end = divmod(row, rows_per_obstacle(N))  # N starts of periods, N ends, then the stop
     period = end if end < N else min(end - N, N - 1)
     when = end if end < N else min(end - N + 1, N)
     start, ends = planes.start, planes.ends
-    if isinstance(around.unseen, OccludedRegions) and which >= around.told:
+    if isinstance(around.unseen, OccludedRegions) and which >= around.obstacles:
         by, (normal, level) = UNSEEN, planes.itself(which, period)
     elif which < len(around.near):
         by, (normal, level) = (
@@ -121,7 +123,7 @@ def _about_an_obstacle(
 def _moving_or_unseen(
     which: int, robot: Robot, around: ConstraintSources, start: Array, ends: Array
 ) -> tuple[str, Array, Array]:
-    """The name of what does not stand still, and its half-spaces (1, N, d), (1, N) themselves."""
+    """Return name and half-spaces (1, N, d), (1, N) of a moving obstacle or an unseen cell."""
     one, exact = np.array([which]), np.zeros(len(start))
     if around.moving is not None:
         if which < len(around.moving):

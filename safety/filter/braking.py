@@ -1,9 +1,8 @@
-"""The backup policy μ that every robot has, and the plans that rest on it: brake as fast as the slew allows.
+"""The backup policy μ of every robot: brake as fast as the slew allows, for methods that verify nothing.
 
-    μ(u_before) = u_before − clip(u_before, −slew, slew)      (the ground robot has no slew: zero at once;
-                                                               what a stop holds is held)
+    μ(u_before) = u_before − clip(u_before, −slew, slew)
 
-A plan here is only what to do when no answer comes; the rivals verify nothing.
+Without a slew limit the input is zero at once. An input that the stop rule holds stays as it is.
 """
 
 from __future__ import annotations
@@ -16,20 +15,20 @@ from brakeline.safety.filter.request import FAILSAFE, Decision, Request
 
 
 def brake(robot: Robot, before: Array) -> Array:
-    """μ: the input (m,) that follows the input `before` (m,) while braking."""
+    """Return μ: the input (m,) after the input `before` (m,) while braking."""
     slew = np.asarray(robot.action_slew)
     return np.where(robot.zero_at_rest, before - np.clip(before, -slew, slew), before)
 
 
 def clip_input(robot: Robot, wanted: Array, before: Array) -> Array:
-    """The input (m,) closest to the wanted one within bounds and slew of the one in force."""
+    """Return the input (m,) closest to the wanted one within bounds and slew of the input in force."""
     slew = np.asarray(robot.action_slew)
     low, high = np.maximum(robot.low(), before - slew), np.minimum(robot.high(), before + slew)
     return np.asarray(np.minimum(np.maximum(wanted, low), high))
 
 
 def braking_plan(robot: Robot, first: Array) -> Array:
-    """(N, m): `first`, then μ; the last input is zero (`horizon` periods suffice to brake from any input)."""
+    """Return the plan (N, m): `first`, then μ. Its last input is zero: the horizon suffices to brake from any input."""
     plan = np.zeros((robot.horizon, robot.action_dim))
     plan[0] = first
     for k in range(1, robot.horizon):
@@ -38,7 +37,7 @@ def braking_plan(robot: Robot, first: Array) -> Array:
 
 
 def braking_decision(robot: Robot, request: Request, version: str, reason: str, total: float) -> Decision:
-    """The failsafe of a method that verifies nothing: μ from the input in force on. total [ms]: inside `decide`."""
+    """Return the failsafe of a method that verifies nothing: μ from now on. total [ms]: time in `decide`."""
     before = request.input_in_force
     return Decision(
         kind=FAILSAFE,

@@ -23,9 +23,10 @@ from brakeline.messaging.scan import OLDEST, Scan
 from brakeline.safety.filter.backup_plan import UNVERIFIED
 from brakeline.safety.filter.blocking_constraint import BlockingConstraint
 from brakeline.safety.filter.constraints import LocalMap, TubeConstraints, turning_extent
+from brakeline.safety.filter.halfspaces import rows_per_obstacle
 from brakeline.safety.filter.kernels import tube_kernels
 from brakeline.safety.filter.plan_inputs import PlanInputs
-from brakeline.safety.filter.qp import ROW_TIGHTENING, ConstraintRows, ObstacleRows, QPBuilder
+from brakeline.safety.filter.qp import ROW_TIGHTENING, ConstraintRows, QPBuilder
 from brakeline.safety.filter.qp_solver import INFEASIBLE, solve
 from brakeline.safety.filter.recovery import SLOW, harmless, least_violating, slow_inputs, turn_towards
 from brakeline.safety.filter.request import (
@@ -371,7 +372,7 @@ class Filter:
         # Compare all candidates with the tube width of standing. With their own widths, a robot with a loose model set
         # would go where its motion is known best, which is not the way out.
         violated = standing + (np.array(plans) - stand) @ rows.gradient.T
-        rows_each = ObstacleRows.per_obstacle(robot.horizon)
+        rows_each = rows_per_obstacle(robot.horizon)
         obstacle_rows = rows_each * sum(len(disc.normals) for disc in planes)
         ends = np.zeros(len(rows.bound), dtype=bool)
         ends[rows_each - 1 : obstacle_rows : rows_each] = True  # the row after the stop

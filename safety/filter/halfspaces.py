@@ -1,10 +1,10 @@
 """Free space about a nominal plan, as half-spaces `a·p <= b` (docs/method.md §3).
 
-A supporting half-space per near obstacle and period: the obstacle is convex, so the plane through its point closest
-to some nominal position, normal to the line between them, has all of it on the far side. The same half-space holds for
-both ends of the period, so that the chord between them is inside too: of the planes seen from the period's start,
-middle and end the one is taken that leaves both ends the most room. A fast robot passes by an obstacle within a
-period, and the plane seen from one end alone would cut off the other.
+Each near obstacle gets one half-space for each period. The obstacle is convex, so the plane through its point c closest
+to a nominal position q, with the normal a = (c - q) / |c - q|, has the whole obstacle on its far side. The half-space
+must hold at both ends of the period, so that it contains the chord. Of the planes for q at the start, the middle and
+the end of the period, the filter takes the one that leaves both ends the most room. A fast robot passes an obstacle
+within a period, and a plane for one end alone would exclude the other end.
 """
 
 from __future__ import annotations
@@ -18,18 +18,23 @@ from brakeline.messaging.obstacle import Shapes
 
 Array = NDArray[np.float64]
 
-TOUCHING = 1e-6  # m; nearer than this a direction can't be told
+TOUCHING = 1e-6  # m; at a smaller distance the normal is undefined
+
+
+def rows_per_obstacle(horizon: int) -> int:
+    """Return the number of rows (3) for an obstacle: N starts of periods, N ends, and the last end after the stop."""
+    return 2 * horizon + 1
 
 
 def half_spaces(near: Shapes, start: Array, nominal: Array, keep_off: float, measured: Array) -> tuple[Array, Array]:
-    """Half-spaces for the *measured* position that keep the body off the obstacles.
+    """Return half-spaces for the *measured* position that keep the body off the obstacles: b' of docs/method.md §3.
 
     Args:
         near: n obstacles.
         start: (d,) the position now.
         nominal: (N, d) positions at the ends of the periods.
         keep_off: the footprint's radius [m].
-        measured: (d,) Z_v: half-widths of |measured - true|.
+        measured: (d,) half-widths of the position's measurement error.
 
     Returns:
         normals a (n, N, d) and offsets b (n, N), relative to `start`: `a·(p - start) <= b`. An obstacle that the
@@ -54,8 +59,10 @@ def half_spaces(near: Shapes, start: Array, nominal: Array, keep_off: float, mea
 def half_spaces_leading_out(
     near: Shapes, start: Array, keep_off: float, measured: Array, planes: tuple[Array, Array]
 ) -> tuple[Array, Array]:
-    """The same half-spaces, but of an obstacle that the start is inside of, the one behind which it is left soonest:
-    nothing that is verified, but a way out (docs/method.md §11)."""
+    """Replace the half-spaces of obstacles that contain the start by the plane of their nearest side.
+
+    They verify nothing; recovery uses them to find a way out (docs/method.md §11).
+    """
     out = near.out_of(start)
     depth = np.sqrt(np.einsum("nd,nd->n", out, out))
     inside = depth > TOUCHING
@@ -69,10 +76,11 @@ def half_spaces_leading_out(
 
 
 def roomiest_planes(unit: Array, level: Array, ends: Array) -> NDArray[np.intp]:
-    """Which of the planes (n, 2N+1) serves which period, the ends (N+1, d) of which are nominal: (n, N).
+    """Return the index (n, N) of the plane, among the 2N+1, that each period uses.
 
-    From the first period on whose ends no plane keeps apart from the obstacle, the nominal plan goes through it: the
-    last plane before stays in force, for one beyond the obstacle would hold on the wrong side.
+    unit (n, 2N+1, d), level (n, 2N+1): the planes. ends (N+1, d): nominal positions at the ends of the periods.
+    From the first period in which no plane separates both ends from the obstacle, the plan crosses the obstacle. The
+    plane before then stays in force: a plane from beyond the obstacle would hold on the wrong side.
     """
     places, periods = _places(len(ends) - 1)
     along = unit @ ends.T  # (n, 2N+1, N+1)
@@ -89,6 +97,6 @@ def roomiest_planes(unit: Array, level: Array, ends: Array) -> NDArray[np.intp]:
 
 @cache
 def _places(periods: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Of each period: where its start, middle and end are among the places, (N, 3), and its number, (N, 1)."""
+    """Return the indices (N, 3) of each period's start, middle and end among the 2N+1 planes, and its number (N, 1)."""
     number = np.arange(periods)[:, None]
     return 2 * number + np.arange(3), number

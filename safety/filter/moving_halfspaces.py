@@ -1,13 +1,13 @@
-"""Free space beside what moves: half-spaces that hold for the whole sweep of a period (docs/method.md §8).
+"""Half-spaces beside moving obstacles, for the whole sweep of a period (docs/method.md §8).
 
-In period k = [t_k, t_{k+1}] an obstacle lies within O + c t ⊕ ball(r(t)). For a unit normal n that points from the
-robot to it, `n·p <= b` keeps the robot off all of it at all of these times if
+In period k = [t_k, t_{k+1}] an obstacle lies within O + c t ⊕ ball(r(t)). For a unit normal n from the
+robot to the obstacle, `n·p <= b` keeps the robot off the obstacle at all of these times if
 
     b = min over t in {t_k, t_{k+1}} of (the least n·o over O + c t)  -  r(t_{k+1})
 
-O is convex and only translates, so the two ends suffice; r grows, so its last value does. Normals are taken from the
-nominal position to the closest point of the moved shape at the start, the middle and the end of every period up to this
-one; the one serves that leaves both ends the most room.
+O is convex and only translates, so the two ends suffice; r grows, so its last value suffices. Normals point from
+nominal positions (start, middle and end of each period up to this one) to the closest point of the moved shape. The
+plane that leaves both ends the most room is taken.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ Array = NDArray[np.float64]
 def swept_half_spaces(
     near: MovingObstacles, start: Array, nominal: Array, keep_off: float, measured: Array, period: float
 ) -> tuple[Array, Array]:
-    """As `freespace.half_spaces`, for what moves; period: s, between two of the nominal positions."""
+    """Return half-spaces as `half_spaces` does, for moving obstacles. period [s]: between two nominal positions."""
     n, (N, d) = len(near), nominal.shape
     ends = np.concatenate([np.zeros((1, d)), nominal - start])
     places = np.empty((2 * N + 1, d))  # relative to the start

@@ -41,14 +41,9 @@ class ConstraintRows:
 class ObstacleRows:
     """Builds the rows (3) for one disc of the body, from matrices that it gathers once.
 
-    Each obstacle gives 2N + 1 rows: N for the starts of the periods, N for their ends, both with the chord deviation of
-    the period, and one for the last end with the stopping distance.
+    Each obstacle gives 2N + 1 rows (`rows_per_obstacle`): N for the starts of the periods and N for their ends, both with
+    the chord deviation of the period, and one for the last end with the stopping distance.
     """
-
-    @staticmethod
-    def per_obstacle(horizon: int) -> int:
-        """Return the number of rows for each obstacle; the last of them is the row after the stop."""
-        return 2 * horizon + 1
 
     def __init__(self, position: Array, directions: Array) -> None:
         """Gather the parts of a tube. position (N, d, nz), directions (N, d, L): of the disc's center."""

@@ -1,4 +1,4 @@
-"""Solves a QP with ProxQP; what comes back is a candidate, never a proof."""
+"""Solves a QP with ProxQP. Its answer is a candidate; the filter verifies it with the exact tube."""
 
 from __future__ import annotations
 
@@ -18,12 +18,11 @@ NOT_INFEASIBLE = 1e-12
 SOLVED = "solved"
 MOST_ITERATIONS = 100
 MOST_INNER_ITERATIONS = 50
-# Of all rows few decide: those that a quick ascent comes by (`deciding.py`) are solved alone, then with those that the
-# answer violates most, and so on. An answer within all rows is the answer to all of them. So few are solved exactly,
-# for there are no others to hold the answer off the edge; where that does not come soon, or few are said to be
-# impossible (which the solver is quicker to say of few rows: 13 of 9,727 that could be met), all are solved as usual.
-# Rows are of unit length already, so few need no preconditioner; and few are met the more exactly, the more it costs at
-# once not to meet one (`FIRMNESS`).
+# Only a few rows are active in a solution. The solver gets the rows of a quick guess (`hildreth_active_set`), then also
+# the `FEW` rows that its answer violates most, and so on. An answer that meets all rows solves the whole problem. These
+# small problems need a high accuracy, since no other rows keep the answer off the edge. If this does not end soon, or
+# if a small problem counts as infeasible (13 of 9,727 were feasible), the solver gets all rows. The rows have unit length,
+# so small problems need no preconditioner, and a firm penalty (`FIRMNESS`) makes them converge sooner.
 STEPS, FEW, ROUNDS, SOON = 20, 5, 8, 30  # STEPS: of the ascent; SOON: iterations
 EXACT, FIRMNESS = 1e-7, 1e-2
 
@@ -31,7 +30,7 @@ EXACT, FIRMNESS = 1e-7, 1e-2
 @dataclass(frozen=True)
 class QuadraticProgram:
     """`min ½ xᵀ diag(h) x + gᵀ x  s.t.  A x <= b`: h, g (n,), A (rows, n), b (rows,). The last `always` of them
-    (bounds and the like) are looked at from the beginning, whichever others decide."""
+    (bounds and slew) are in every small problem from the start."""
 
     h: Array
     g: Array
@@ -42,7 +41,7 @@ class QuadraticProgram:
 
 @dataclass(frozen=True)
 class Solution:
-    """x (n,), the solver's word, its iterations, and the residual of the rows recomputed here (positive: violated)."""
+    """x (n,), the solver's status, its iterations, and the recomputed residual of the rows (positive: violated)."""
 
     x: Array
     status: str
@@ -58,12 +57,12 @@ INFEASIBLE = Solution(np.array([np.nan]), "ruled out", 0, np.inf)  # of a progra
 
 
 def solve(program: QuadraticProgram) -> Solution:
-    """Cold start: the answer depends on the program alone, so that a log can be replayed."""
+    """Solve with a cold start: the answer depends on the problem alone, so a log can be replayed."""
     return _by_few(program) or _solved(program)
 
 
 def _by_few(program: QuadraticProgram) -> Solution | None:
-    """By as few rows as will do; None if that does not come soon."""
+    """Solve with as few rows as suffice; None if that does not succeed soon."""
     inside, iterations = hildreth_active_set(program.h, program.g, program.A, program.b, STEPS), 0
     inside[len(program.b) - program.always :] = True
     for _ in range(ROUNDS):
@@ -91,14 +90,14 @@ def _solved(program: QuadraticProgram, few: bool = False) -> Solution:
     settings.max_iter = SOON if few else MOST_ITERATIONS
     settings.max_iter_in = MOST_INNER_ITERATIONS
     settings.verbose = False
-    told = np.diag(program.h), program.g, None, None, program.A, None, program.b
+    parts = np.diag(program.h), program.g, None, None, program.A, None, program.b
     if few:
         # By its residuals alone one answer in seventy was off by more than a thousandth of an input's range.
         settings.check_duality_gap = True
         settings.eps_duality_gap_abs, settings.eps_duality_gap_rel = EXACT, 0.0
-        qp.init(*told, compute_preconditioner=False, mu_in=FIRMNESS)
+        qp.init(*parts, compute_preconditioner=False, mu_in=FIRMNESS)
     else:
-        qp.init(*told)
+        qp.init(*parts)
     qp.solve()
     x = np.array(qp.results.x)
     status = str(qp.results.info.status).rsplit(".", maxsplit=1)[-1].removeprefix("PROXQP_").lower()

@@ -1,12 +1,7 @@
-"""The reachable tube of a plan, stacked over the horizon once, offline (docs/method.md §2).
+"""The reachable tube of a plan, with its matrices stacked over the horizon when the model set is loaded.
 
-The tube is a function of `z = [x_0; input in force; free inputs]` alone. At step i = 1..N the measured position,
-relative to where it is now and in the frame of now, lies in
-
-    { P_i z + Σ_l m_l(z) D_{i,l} [-1, 1] },     m(z) = M |W z| + m_0
-
-so a support in any direction is linear in z and in |W z|. The same magnitudes carry two more families of bounds:
-the bulge of the path off the chord of each step, and the way travelled after the last input (the stop latch).
+There are two ways to stack error bounds (docs/method.md §2): `stack_direct` has a predictor for each number of periods,
+and `stack_recursive` is the recursion of Lemma 2.
 """
 
 from __future__ import annotations
@@ -25,10 +20,18 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Tube:
-    """position (N, d, nz); directions (N, d, L); W (q, nz); M (L+N+1, q); m_0 (L+N+1).
+    """The sets that hold the measured position at the end of each period i = 1..N, for regressors z:
 
-    Magnitudes: of the L generators, of the N bulges, and of the latch. more (N, r, nz), more_directions (N, r, L): the
-    same of other predicted coordinates, where a limit or a further disc of the body needs them.
+        p_i ∈ p_0 + R(θ_0) ( P_i z + Σ_l m_l(z) D_{i,l} [-1, 1] ),     m(z) = M |W z| + m_0
+
+    so the support in a direction is linear in z and |W z| (docs/method.md §2, equation 2).
+
+    Attributes:
+        position (N, d, nz): P. directions (N, d, L): D. W (q, nz).
+        M (L+N+1, q), m_0 (L+N+1,): rows for the L generators, then the N chord deviations β_k, then the stopping
+            distance σ.
+        more (N, r, nz), more_directions (N, r, L): the same for other predicted coordinates, which a limit or a
+            further disc of the body needs.
     """
 
     position: Array
@@ -48,15 +51,15 @@ class Tube:
         return int(self.directions.shape[2])
 
     def centers(self, z: Array) -> Array:
-        """(N, d) for one z (nz,)."""
+        """Return the centers P_i z (N, d) for one z (nz,)."""
         return np.asarray(self.position @ z)
 
     def magnitudes(self, z: Array) -> Array:
-        """For regressors z (..., nz): (..., L+N+1)."""
+        """Return m(z) (..., L+N+1) for regressors z (..., nz)."""
         return np.asarray(np.abs(z @ self.W.T) @ self.M.T + self.m_0)
 
     def half_widths(self, z: Array) -> Array:
-        """Interval hulls of the sets (N, d), the bulge or the latch not included."""
+        """Return half-widths (N, d) of the sets' interval hulls, without chord deviation and stopping distance."""
         return np.asarray(np.abs(self.directions) @ self.magnitudes(z)[: self.generators])
 
 
@@ -67,35 +70,39 @@ def stack_direct(
     stopping_distance: ErrorBound,
     more: Sequence[int] = (),
 ) -> Tube:
-    """One predictor per horizon step: step i has generators of its own and nothing compounds.
+    """Stack one error bound for each number of periods: each has its own generators, and no error accumulates.
 
-    steps: certificate i predicts the displacement after i+1 periods from z. bulges (N rows), latch (1 row) likewise.
-    more: further predicted coordinates to keep.
+    Args:
+        steps: bound i is about the displacement after i+1 periods, from z.
+        chord_deviations: N rows. stopping_distance: one row.
+        more: further predicted coordinates that the tube keeps.
     """
     d, count = position_dim, [c.generators.shape[1] for c in steps]
-    kept = [*range(d), *more]
-    directions = np.zeros((len(steps), len(kept), sum(count)))
+    coordinates = [*range(d), *more]
+    directions = np.zeros((len(steps), len(coordinates), sum(count)))
     for i, step in enumerate(steps):
         at = sum(count[:i])
-        directions[i, :, at : at + count[i]] = step.generators[kept]
-    useful = np.abs(directions).sum((0, 1)) > 0.0  # those of the velocity coordinates never touch the position
+        directions[i, :, at : at + count[i]] = step.generators[coordinates]
+    useful = np.abs(directions).sum((0, 1)) > 0.0  # generators of velocities do not move the position
     atoms = [_atoms(c) for c in (*steps, chord_deviations, stopping_distance)]
     W = np.vstack([w for w, _, _ in atoms])
     M = _block_diagonal([m for _, m, _ in atoms])
     rows = np.concatenate([useful, np.ones(len(steps) + 1, dtype=bool)])
     m_0 = np.concatenate([m0 for _, _, m0 in atoms])
     W, M = _merged(W, M[rows])
-    centers, directions = np.stack([c.C[kept] for c in steps]), directions[:, :, useful]
+    centers, directions = np.stack([c.C[coordinates] for c in steps]), directions[:, :, useful]
     return Tube(centers[:, :d], directions[:, :d], W, M, m_0[rows], centers[:, d:], directions[:, d:])
 
 
 @dataclass(frozen=True)
 class RecursionMaps:
-    """How regressors follow from states: z_k = [E y_k; u_{k-1}; u_k], y_k (n) with the position first.
+    """The linear maps of the recursion: z_k = [E y_k; u_{k-1}; u_k], with the state y_k (n,), position first.
 
-    E: indices of y in the regressor; relative: the first so many coordinates are predicted as displacement;
-    inputs: m; plan: (N·m, F·m), `plan = S free`;
-    first: (n, nz), y_0 from z = [x_0; u_prev; free] with the position at zero; nz = first.shape[1].
+    Attributes:
+        E: indices of the coordinates of y in the regressor.
+        relative: number of leading coordinates that are predicted as displacements.
+        inputs: m. plan (N·m, F·m): S, from free inputs to all inputs.
+        first (n, nz): y_0 from z = [x_0; u_{-1}; f], with the position at zero.
     """
 
     E: tuple[int, ...]
@@ -105,7 +112,7 @@ class RecursionMaps:
     first: Array
 
     def previous(self) -> Array:
-        """(m, nz): the input in force, from z."""
+        """Return the map (m, nz) from z to the input in force."""
         nz, m = self.first.shape[1], self.inputs
         pick = np.zeros((m, nz))
         free = self.plan.shape[1]
@@ -113,7 +120,7 @@ class RecursionMaps:
         return pick
 
     def input(self, k: int) -> Array:
-        """(m, nz): the plan's k-th input, from z."""
+        """Return the map (m, nz) from z to input k of the plan."""
         nz, m = self.first.shape[1], self.inputs
         pick = np.zeros((m, nz))
         pick[:, nz - self.plan.shape[1] :] = self.plan[k * m : (k + 1) * m]
@@ -121,8 +128,7 @@ class RecursionMaps:
 
 
 def recursion_maps(robot: Robot, plans: bool = True) -> RecursionMaps:
-    """y = (position, heading, speeds ...), all relative to the frame of now; z ends in a plan's chosen inputs, or in
-    all of its inputs, one by one."""
+    """Return the maps for a robot. plans: z ends in the free inputs of a plan; otherwise in all N inputs."""
     reg = list(robot.regressor)
     S = robot.plan_matrix() if plans else np.eye(robot.horizon * robot.action_dim)
     nz = robot.regressor_dim + S.shape[1]
@@ -141,41 +147,44 @@ def stack_recursive(
     initial: Array | None = None,
     more: Sequence[int] = (),
 ) -> Tube:
-    """The paper's recursion (lemma 2): step k maps z_k to y_{k+1}, `y+ = A y + B [u_prev; u] + noise`.
+    """Stack the paper's recursion (Lemma 2): step k maps z_k to y_{k+1} = A y_k + B [u_{k-1}; u_k] + error.
 
-    A generator made at step k has length m_{k,j} = w + t + r + Σ K m: t at the centre, r over the generators of the
-    initial set (n, g), K over those made before; K is strictly lower triangular, so `m = (I - K)⁻¹ (w + t + r)`.
+    The lengths of the generators solve m = w + t(z) + r + K m, with K strictly lower triangular, so
+
+        m = (I - K)⁻¹ (w + t(z) + r)                                                   (docs/method.md §2)
+
+    initial: generators (n, g) of the set of the first state; r is their share. None: the measured state is exact.
     """
     n, nz = how.first.shape
     y, before = how.first, how.previous()
-    made = np.zeros((n, 0)) if initial is None else initial  # all generators so far, propagated to step k
-    start = made.shape[1]
-    regress, kept = list(how.E), [*range(position_dim), *more]
+    generators = np.zeros((n, 0)) if initial is None else initial  # all generators so far, propagated to step k
+    start = generators.shape[1]
+    regress, coordinates = list(how.E), [*range(position_dim), *more]
     centers, spreads, atoms, K_rows = [], [], [], []
     for k, step in enumerate(steps):
         z_k = np.vstack([y[regress], before, how.input(k)])
         W, M, w = _atoms(step)
-        K_rows.append(M @ np.abs(W[:, : len(regress)] @ made[regress]))
+        K_rows.append(M @ np.abs(W[:, : len(regress)] @ generators[regress]))
         atoms.append((W @ z_k, M, w))
         carry = np.diag(np.arange(n) < how.relative).astype(float)
         A = carry.copy()
         A[:, regress] += step.C[:, : len(regress)]
         y = carry @ y + step.C @ z_k
-        made = np.hstack([A @ made, step.generators])
+        generators = np.hstack([A @ generators, step.generators])
         before = how.input(k)
-        centers.append(y[kept])
-        spreads.append(made[kept])
-    total = made.shape[1]
+        centers.append(y[coordinates])
+        spreads.append(generators[coordinates])
+    total = generators.shape[1]
     K = np.zeros((total - start, total))
     at = 0
     for row in K_rows:
         K[at : at + len(row), : row.shape[1]] = row
         at += len(row)
-    mix = np.linalg.inv(np.eye(total - start) - K[:, start:])
+    inverse = np.linalg.inv(np.eye(total - start) - K[:, start:])
     W = np.vstack([a for a, _, _ in atoms])
-    M = mix @ _block_diagonal([m for _, m, _ in atoms])
-    m_0 = mix @ (np.concatenate([w for _, _, w in atoms]) + K[:, :start].sum(1))
-    directions = np.zeros((len(steps), len(kept), total))
+    M = inverse @ _block_diagonal([m for _, m, _ in atoms])
+    m_0 = inverse @ (np.concatenate([w for _, _, w in atoms]) + K[:, :start].sum(1))
+    directions = np.zeros((len(steps), len(coordinates), total))
     for i, spread in enumerate(spreads):
         directions[i, :, : spread.shape[1]] = spread
     M = np.vstack([np.zeros((start, M.shape[1])), M])
@@ -191,13 +200,13 @@ def stack_recursive(
 
 
 def _atoms(step: ErrorBound) -> tuple[Array, Array, Array]:
-    """A certificate's κ as further rows of W: (W, M, w)."""
+    """Return (W, M, w) of an error bound, with κ as further rows of W."""
     W = np.vstack([step.W, np.eye(step.kappa.shape[1])])
     return W, np.hstack([step.M, step.kappa]), step.w
 
 
 def _merged(W: Array, M: Array) -> tuple[Array, Array]:
-    """The same sums with parallel rows of W as one and rows that bound nothing left out."""
+    """Merge parallel rows of W, and leave out rows without effect; the sums M |W z| stay the same."""
     length = np.linalg.norm(W, axis=1)
     length[M.max(0, initial=0.0) <= 0.0] = 0.0
     keep = length > 0.0

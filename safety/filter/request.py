@@ -1,4 +1,4 @@
-"""A question to the filter and its answer, and what makes a question one that can't be decided on."""
+"""A request to the filter, its decision, and the checks of a request (docs/method.md §4)."""
 
 from __future__ import annotations
 
@@ -48,13 +48,20 @@ class StaleModel(BadRequest):
 
 @dataclass(frozen=True)
 class Request:
-    """state (n,) measured; action (m,) proposed; input_in_force (m,) of the period before; plan (N, m): the committed
-    plan's tail (of a late robot: from the input on that is in force now), verified by model set `model` (empty:
-    standing still; `UNVERIFIED`: by none); obstacles: at least those within `Filter.reach`; predicted: what the last
-    decision said of this state, if there was one; movers: obstacles that move, at least those that may come within
-    reach before the plan ends; scan: in the place of obstacles, or beside them: what is not seen free in it counts as
-    occupied; promise: its own, if other robots share its world, and promised: theirs, to be kept off; known_free:
-    nothing but the obstacles is near, so all other space within reach is free; needed without obstacles and scan."""
+    """A request: what the filter must know to decide on one input.
+
+    Attributes:
+        state (n,): measured state. action (m,): proposal. input_in_force (m,): input of the period before.
+        plan (N, m): rest of the committed backup plan; in real time, from the input in force on.
+        obstacles: at least those within `Filter.reach`.
+        model: version of the model set that verified the plan. Empty if the robot stands; `UNVERIFIED` without one.
+        predicted: predicted set of this state, from the last decision.
+        movers: moving obstacles, at least those that may come within reach before the plan ends.
+        scan: what it does not show to be free counts as occupied.
+        reservation: this robot's, in a world with other robots. other_reservations: theirs.
+        known_free: all space within reach is free, apart from the obstacles. A request without obstacles and scan needs
+            it.
+    """
 
     state: Array
     action: Array
@@ -71,17 +78,17 @@ class Request:
     known_free: bool = False
 
     def __post_init__(self) -> None:
-        """Of one type and memory layout, which compiled code relies on, whatever arrays they come as."""
+        """Convert arrays to the type and the memory layout that compiled code needs."""
         for name in ("state", "action", "input_in_force", "plan"):
             object.__setattr__(self, name, np.ascontiguousarray(getattr(self, name), dtype=float))
 
     @property
     def finite(self) -> bool:
-        """Is every number of the proposed action finite? If not, no method lets the proposal pass: the robot brakes."""
+        """Whether the proposed action is finite. If not, every method brakes."""
         return all(map(math.isfinite, self.action.ravel().tolist()))
 
     def still(self, robot: Robot) -> bool:
-        """Is the robot said to stand, and to be committed to that? Needs no model's word."""
+        """Return whether the robot stands and its plan is to stand. No model set needs to verify that."""
         committed = (
             not self.model and bool(robot.is_stop_input(self.plan).all()) and robot.may_be_standing(self.input_in_force)
         )
@@ -90,12 +97,18 @@ class Request:
 
 @dataclass(frozen=True)
 class Decision:
-    """kind: allowed | adjusted | failsafe | recovering (never verified); plan (N, m), its first row is for now (of a
-    late robot: is in force, and the second is for the next period); tube: true positions at the N periods' ends,
-    centers and half-widths (N, d), world, of the plan's free inputs and the ramp after them; predicted: the next
-    measured state; margin [m] of that tube to the nearest obstacle's half-space, `at_least`: it is a lower bound, for
-    what is nearest is beyond reach. A failsafe's may be negative though it is verified: it was so when it was made,
-    this is how it looks from the new measurement."""
+    """The answer to a request.
+
+    Attributes:
+        kind: allowed, adjusted, failsafe or recovering (never verified).
+        plan (N, m): the first row is for now; in real time it is in force, and the second row is for the next period.
+        tube_center, tube_half_width (N, d): boxes of the true positions at the ends of the periods, world.
+        predicted: set of the next measured state.
+        margin [m]: distance of the tube to the nearest half-space. Of a failsafe, it may be negative although the plan
+            is verified: the plan was verified earlier, and this is the margin from the new measurement.
+        at_least: the margin is only a lower bound, since what is nearest is beyond reach.
+        model: version of the model set.
+    """
 
     kind: str
     plan: Array
@@ -116,7 +129,7 @@ class Decision:
     iterations: int = 0
     broken: int = 0  # movers that were seen outside of what their bounds allowed
     blocked_by: BlockingConstraint | None = (
-        None  # of a proposal that was not allowed: what it would have come too near to
+        None  # for a proposal that was not allowed: what it would have come too near to
     )
     reservation: Reservation | None = None  # to the other robots of its world
     # The model set's statement: at most this share of the plans that it verifies leave their tubes, at 99 % confidence;
@@ -172,7 +185,7 @@ def check_surroundings(robot: Robot, request: Request) -> None:
 
 
 class FastRequestCheck:
-    """All of a request's numbers at once: what nearly every one takes, in a third of the time."""
+    """Checks all numbers of a request at once, in a third of the time of `check_for_filter`."""
 
     def __init__(self, robot: Robot) -> None:
         n, m, most = robot.state_dim, robot.action_dim, np.finfo(float).max
@@ -186,7 +199,7 @@ class FastRequestCheck:
         self.predicted_high = np.concatenate([self.high, np.full(2 * n + 1, most)])
 
     def __call__(self, request: Request) -> bool:
-        """False: `check_for_filter` may find something in them, and says what."""
+        """Return False if `check_for_filter` must look at the request."""
         (n, m, planned), observed = self.sizes, request.observation
         inputs = request.action, request.input_in_force, request.plan.ravel()
         sized = request.state.shape == (n,) and inputs[0].shape == inputs[1].shape == (m,)
@@ -199,14 +212,14 @@ class FastRequestCheck:
                 return False
         predicted = request.predicted
         if predicted is None:
-            told, low, high = np.concatenate((request.state, *inputs)), self.low, self.high
+            values, low, high = np.concatenate((request.state, *inputs)), self.low, self.high
         else:
             if not predicted.center.shape == predicted.half_width.shape == (n,):
                 return False
             sets = (predicted.heading,), predicted.center, predicted.half_width
-            told = np.concatenate((request.state, *inputs, *sets))
+            values = np.concatenate((request.state, *inputs, *sets))
             low, high = self.predicted_low, self.predicted_high
-        return bool(((told >= low) & (told <= high)).all())
+        return bool(((values >= low) & (values <= high)).all())
 
 
 def check_for_rival(robot: Robot, request: Request, observed: int) -> None:
@@ -219,7 +232,7 @@ def check_for_rival(robot: Robot, request: Request, observed: int) -> None:
 
 
 def _check_motion(robot: Robot, request: Request, further: Named) -> None:
-    """Where the robot is, and its inputs; and that what else is named is of its size, and finite."""
+    """Check state and inputs, and that all further arrays have their shapes and are finite."""
     inputs = (robot.action_dim,)
     named: Named = {
         "state": (request.state, (robot.state_dim,)),

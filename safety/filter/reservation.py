@@ -1,13 +1,13 @@
-"""What robots of one world promise each other: where each is in each period, and for ever after (docs/method.md §9).
+"""Space that the robots of one world reserve, for each period and for all time after the plan (docs/method.md §9).
 
 A tube with sets S_0 (where the robot is), S_1, ..., S_N at the ends of its periods keeps the body, in period k, within
 
-    box(S_k ∪ S_{k+1}) ⊕ ball(ρ_k),    ρ_k = the body's disc + the period's bulge (after the last: the latch)
+    box(S_k ∪ S_{k+1}) ⊕ ball(ρ_k),    ρ_k = body radius + chord deviation (at the end: or stopping distance)
 
-an axis-parallel box in the world. The last one holds from then on: there it stands. While time passes a promise loses
-its first box and keeps its last. Promises of robots that are decided one after the other, each against those of all the
-others at that moment, stay pairwise disjoint: who gets no new plan keeps its old one, which the others were held
-against. So what is verified is the promise itself, corners of its boxes included, not the tube inside it.
+a box along the world's axes. The last box is reserved for all time after the plan, since the robot stands there. With
+each period, a reservation loses its first box and keeps its last. The filter decides robots one after the other, each
+against the current reservations of all others. So disjoint reservations stay disjoint: a robot without a new plan keeps
+its old reservation, and the others were checked against that one. The filter checks the whole reservation, corners included.
 """
 
 from __future__ import annotations
@@ -31,7 +31,11 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Reservation:
-    """Of one robot from now on: center, half_width (N, d) [m] of boxes, radius (N,) [m] that is added about them."""
+    """The reservation of one robot from now on.
+
+    Attributes:
+        center, half_width (N, d) [m]: one box for each period, world. radius (N,) [m]: added around the box.
+    """
 
     center: Array
     half_width: Array
@@ -39,25 +43,25 @@ class Reservation:
 
     @staticmethod
     def of(center: Array, half_width: Array, radius: Array) -> Reservation:
-        """From a tube's sets as boxes (N+1, d), the first where the robot is now; radius (N,)."""
+        """Build it from a tube's sets S_0 (now) to S_N as boxes (N+1, d), and radius (N,)."""
         low, high = center - half_width, center + half_width
         low, high = np.minimum(low[:-1], low[1:]), np.maximum(high[:-1], high[1:])
         return Reservation(0.5 * (low + high), 0.5 * (high - low), radius)
 
     def later(self) -> Reservation:
-        """The same a period later."""
+        """Return the reservation one period later."""
         parts = self.center, self.half_width, self.radius
         return Reservation(*(np.concatenate([part[1:], part[-1:]]) for part in parts))
 
     def distance(self, other: Reservation) -> float:
-        """m between the two in the period in which they are nearest; 0 or less: they overlap."""
+        """Return the distance [m] of two reservations in their nearest period; 0 or less if they overlap."""
         between = np.abs(self.center - other.center) - self.half_width - other.half_width
         return float((np.linalg.norm(np.maximum(between, 0.0), axis=1) - self.radius - other.radius).min())
 
 
 @dataclass(frozen=True)
 class OtherReservations:
-    """Those of n others, stacked: their boxes (n·N) as shapes, with what is added about them as margin."""
+    """The reservations of n other robots: their boxes (n·N) as shapes, with the radii as margins."""
 
     shapes: Shapes
     periods: int
@@ -67,7 +71,7 @@ class OtherReservations:
 
     @staticmethod
     def to(others: Sequence[Reservation]) -> OtherReservations | None:
-        """None: there are none."""
+        """Stack reservations; None if there are none."""
         if not others:
             return None
         center, half = (np.concatenate([getattr(p, name) for p in others]) for name in ("center", "half_width"))
@@ -77,21 +81,21 @@ class OtherReservations:
         return OtherReservations(Shapes(center, axes, half, np.zeros(count), np.ones((count, d)), margin), periods)
 
     def nearest(self, point: Array) -> Array:
-        """(n,) m: how near each comes to a point (d,)."""
+        """Return the least distance (n,) [m] of each reservation from a point (d,)."""
         return np.asarray((self.shapes.distance(point) - self.shapes.margin).reshape(-1, self.periods).min(axis=1))
 
     def take(self, chosen: NDArray[np.bool_]) -> OtherReservations:
-        """The chosen (n,) ones."""
+        """Return the chosen (n,) reservations."""
         return OtherReservations(self.shapes.take(np.repeat(chosen, self.periods)), self.periods)
 
 
 def reservation_half_spaces(
     near: OtherReservations, start: Array, nominal: Array, keep_off: float, measured: Array
 ) -> tuple[Array, Array]:
-    """As `freespace.half_spaces`, for boxes that are each there for one period.
+    """Return half-spaces (n, N, d), (n, N) as `half_spaces` does, for boxes that are reserved for one period each.
 
-    Normals are taken from the places of the nominal plan up to the period's end; the one serves that leaves both ends
-    of the period the most room.
+    For each period, q is any position of the nominal plan up to the end of the period; the plane that leaves both ends
+    the most room is taken.
     """
     n, (N, d) = len(near), nominal.shape
     ends = np.concatenate([np.zeros((1, d)), nominal - start])
@@ -122,13 +126,14 @@ def reservation_half_spaces(
 
 
 class ReservationRows:
-    """Rows that hold a robot's own boxes to half-spaces, as linear in z and its magnitudes as those about its tube.
+    """Builds rows that keep a robot's own reservation inside half-spaces, linear in z and in the magnitudes.
 
-    The support of box(S_k ∪ S_{k+1}) in a direction n is, coordinate by coordinate, that of the one end or the other:
+    The support of box(S_k ∪ S_{k+1}) in a direction n is, coordinate by coordinate, that of one of the two ends:
 
         Σ_i max over e in {k, k+1} of  n_i c_{e,i} + |n_i| h_{e,i}
 
-    one row for each of the 2^d choices of ends, with the period's bulge; the last period's once more with the latch.
+    with one row for each of the 2^d choices of ends, plus the chord deviation of the period. The rows of the last
+    period occur once more with the stopping distance.
     """
 
     def __init__(self, position: Array, directions: Array) -> None:
@@ -143,8 +148,10 @@ class ReservationRows:
         self._axis = np.arange(d)
 
     def rows(self, normals: Array, offsets: Array, turn: Array) -> ConstraintRows:
-        """Rows for half-spaces `a·p <= b` relative to where the robot is, a (n, N, d) in the world, b (n, N); turn
-        (d, d): world from the frame of now."""
+        """Return rows for half-spaces `a·p <= b` relative to the robot's position, a (n, N, d) in the world, b (n, N).
+
+        turn (d, d): rotation from the robot's frame to the world.
+        """
         n = len(normals)
         center = (turn @ self._position)[self._end, self._axis]  # (R, d, nz)
         half = np.abs(turn @ self._directions)[self._end, self._axis]  # (R, d, L)
@@ -153,7 +160,7 @@ class ReservationRows:
         spread = np.einsum("nrd,rdl->nrl", np.abs(normals), half).reshape(len(gradient), -1)
         extra = np.tile(self._extra, (n, 1))
         from brakeline.safety.filter.qp import (
-            ConstraintRows,  # who only keeps a promise, as a client does, needs no solver
+            ConstraintRows,  # here, since a client keeps reservations but needs no solver
         )
 
         return ConstraintRows(

@@ -1,4 +1,4 @@
-"""A robot's limits (speed, tilt, keep-in box) as rows of the same kind as obstacles make."""
+"""Limits of a robot's state (speed, tilt, keep-in box) as rows, like those of obstacles (docs/method.md §3)."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ Array = NDArray[np.float64]
 
 
 class StateLimits:
-    """`weights · y_k <= most` at every period's end, y_k the true state; where it is about the position, between them
-    too, and after the stop.
+    """The rows weightsᵀ y_k <= most at the end of each period, with the true state y_k.
 
-    With y_k relative to the frame of now (position p_0, heading θ_0, turn R):
+    A limit of the position also holds within the periods and after the stop. In the robot's frame (position p_0,
+    heading θ_0, rotation R):
 
         weights · y_k = a·p_0 + b θ_0 + (aᵀR) p_k + rest        a: weights of the position, b: of the heading
 
@@ -41,14 +41,14 @@ class StateLimits:
         self.nz, self.extra = tube.position.shape[2], np.eye(N + 1)
 
     def rows(self, start: Array, heading: float, turn: Array) -> ConstraintRows:
-        """Rows for a robot at `start` (d,) with that heading, `turn` (d, d) world from the frame of now."""
+        """Return the rows for a robot at `start` (d,); turn (d, d): rotation from its frame to the world."""
         N = len(self.path)
         both = (self.place @ turn) @ self.path + self.rest  # (N, limits, nz + L)
         bound = self.most - self.place @ start - self.turn * heading
         way = np.linalg.norm(self.place, axis=1)
         ends = np.concatenate([np.arange(N), [N - 1]])
         both = both[ends]
-        # The bulge of every period, and the latch once more at the last end.
+        # The chord deviation of every period, and the stopping distance at the last end.
         extra = self.extra[:, None, :] * way[None, :, None]
         gradient = both[..., : self.nz].reshape(-1, self.nz)
         spread = np.concatenate([np.abs(both[..., self.nz :]), extra], axis=2)
@@ -57,7 +57,7 @@ class StateLimits:
 
 
 def stack_rows(parts: list[ConstraintRows]) -> ConstraintRows:
-    """All rows of several parts."""
+    """Stack several groups of rows."""
     if len(parts) == 1:
         return parts[0]
     return ConstraintRows(

@@ -14,7 +14,7 @@ from brakeline.messaging.scan import Scan
 from brakeline.safety.action_mapping import normalised
 from brakeline.safety.filter.backup_plan import BackupPlan
 from brakeline.safety.filter.filter import Filter
-from brakeline.safety.filter.recovery import least_violating, lower, slow_inputs
+from brakeline.safety.filter.recovery import least_violating, lexicographically_less, slow_inputs
 from brakeline.safety.filter.request import RECOVERING
 from brakeline.safety.model.fitting import fit_model_set
 from brakeline.safety.model.model_set import ModelConfig
@@ -40,7 +40,8 @@ def test_the_worst_comes_first_and_nothing_gets_worse():
     better = np.array([[0.04, 0.02, -0.1], [0.03, 0.025, -0.1], [0.03, 0.0, -0.1], [0.05, 0.02, -0.1]])
     assert least_violating(better, standing, ends) == 2
     assert least_violating(better[[1, 3]], standing, ends) is None  # the one harms, the other helps nothing
-    assert lower(np.array([1.0, 0.0]), np.array([1.0, 1.0])) and not lower(np.array([1.0, 1.0]), np.array([1.0, 1.0]))
+    small, large = np.array([1.0, 0.0]), np.array([1.0, 1.0])
+    assert lexicographically_less(small, large) and not lexicographically_less(large, large)
 
 
 @pytest.mark.parametrize("angle", [0.0, 1.5, 3.1, -2.0])
