@@ -85,7 +85,7 @@ class BackupPlan:
         return self._plan_tokens[0] if self._plan_tokens else b""
 
     def measured(self, state: Array) -> None:
-        """Store the measured state (n,) of a period before its request. Ignore what is not finite or has another shape."""
+        """Store the measured state (n,) of a period before its request; ignore what is not finite or misshapen."""
         if state.shape == self.seen.shape and np.isfinite(state).all():
             self.seen, self._compare = state, True
 

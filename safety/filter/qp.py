@@ -41,8 +41,8 @@ class ConstraintRows:
 class ObstacleRows:
     """Builds the rows (3) for one disc of the body, from matrices that it gathers once.
 
-    Each obstacle gives 2N + 1 rows (`rows_per_obstacle`): N for the starts of the periods and N for their ends, both with
-    the chord deviation of the period, and one for the last end with the stopping distance.
+    Each obstacle gives 2N + 1 rows (`rows_per_obstacle`): N for the starts of the periods and N for their ends, both
+    with the chord deviation of the period, and one for the last end with the stopping distance.
     """
 
     def __init__(self, position: Array, directions: Array) -> None:

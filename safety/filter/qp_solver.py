@@ -21,8 +21,8 @@ MOST_INNER_ITERATIONS = 50
 # Only a few rows are active in a solution. The solver gets the rows of a quick guess (`hildreth_active_set`), then also
 # the `FEW` rows that its answer violates most, and so on. An answer that meets all rows solves the whole problem. These
 # small problems need a high accuracy, since no other rows keep the answer off the edge. If this does not end soon, or
-# if a small problem counts as infeasible (13 of 9,727 were feasible), the solver gets all rows. The rows have unit length,
-# so small problems need no preconditioner, and a firm penalty (`FIRMNESS`) makes them converge sooner.
+# if a small problem counts as infeasible (13 of 9,727 were feasible), the solver gets all rows. The rows have unit
+# length, so small problems need no preconditioner, and a firm penalty (`FIRMNESS`) makes them converge sooner.
 STEPS, FEW, ROUNDS, SOON = 20, 5, 8, 30  # STEPS: of the ascent; SOON: iterations
 EXACT, FIRMNESS = 1e-7, 1e-2
 

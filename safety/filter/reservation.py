@@ -7,7 +7,8 @@ A tube with sets S_0 (where the robot is), S_1, ..., S_N at the ends of its peri
 a box along the world's axes. The last box is reserved for all time after the plan, since the robot stands there. With
 each period, a reservation loses its first box and keeps its last. The filter decides robots one after the other, each
 against the current reservations of all others. So disjoint reservations stay disjoint: a robot without a new plan keeps
-its old reservation, and the others were checked against that one. The filter checks the whole reservation, corners included.
+its old reservation, and the others were checked against that one. The filter checks the whole reservation, corners
+included.
 """
 
 from __future__ import annotations
