@@ -22,7 +22,7 @@ from brakeline.messaging.task import RobotWithTask
 from brakeline.safety.filter.backup_plan import Array, BackupPlan, correction_penalty
 from brakeline.safety.perception.image_memory import filled, memory_of
 from brakeline.safety.service.client import request_message
-from brakeline.safety.service.wire import KINDS
+from brakeline.safety.service.wire import KIND_NUMBERS
 from brakeline.sim.scripted_policies import Policy
 
 StepResult = tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]  # what an environment's `step` returns
@@ -254,7 +254,7 @@ class EpisodeRunner:
             step.fallback = True
             step.decision = pb.FAILSAFE
             return
-        step.decision, step.decide_ms, step.broken = KINDS[answer.kind], answer.time_ms, answer.broken
+        step.decision, step.decide_ms, step.broken = KIND_NUMBERS[answer.kind], answer.time_ms, answer.broken
         if answer.for_clearance is not None:
             step.for_clearance = answer.for_clearance
         if self.ends_on_intervention:

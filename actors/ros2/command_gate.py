@@ -21,7 +21,7 @@ from brakeline.messaging.robot import Robot
 from brakeline.safety.filter.backup_plan import BackupPlan
 from brakeline.safety.filter.request import ADJUSTED, ALLOWED
 from brakeline.safety.service.client import request_message
-from brakeline.safety.service.wire import KINDS
+from brakeline.safety.service.wire import KIND_NUMBERS
 
 Array = NDArray[np.float64]
 
@@ -64,7 +64,7 @@ class GateStats:
         delays_ms, decide_ms = 1e3 * np.array([*self.delays] or [0.0]), np.array([*self.decide_ms] or [0.0])
         return {
             "periods": self.periods,
-            **{kind: self.kinds[kind] for kind in (*KINDS, NO_ANSWER, LATE, BLIND)},
+            **{kind: self.kinds[kind] for kind in (*KIND_NUMBERS, NO_ANSWER, LATE, BLIND)},
             "commands": self.commands,
             "left the predicted set": self.outside,
             "periods slipped": self.slips,

@@ -37,7 +37,7 @@ from brakeline.messaging.ros2.cdr_messages import (
     twist,
 )
 from brakeline.messaging.task import robot_maybe_with_task
-from brakeline.safety.service.wire import KINDS
+from brakeline.safety.service.wire import KIND_NUMBERS
 
 Array = NDArray[np.float64]
 
@@ -213,7 +213,7 @@ class FilterNode:
         """Publish diagnostics every second and when the decision changes; log a change of its kind."""
         gate, now = self.gate, self.clock.now()
         if gate.kind != self._diagnosed[0]:
-            log.log(logging.INFO if gate.kind in KINDS else logging.WARNING, "%s: %s", gate.kind, gate.reason)
+            log.log(logging.INFO if gate.kind in KIND_NUMBERS else logging.WARNING, "%s: %s", gate.kind, gate.reason)
         if (gate.kind, gate.reason) == self._diagnosed and now - self._diagnosed_at < DIAGNOSTICS_INTERVAL:
             return
         self._diagnosed_at, self._diagnosed = now, (gate.kind, gate.reason)

@@ -25,7 +25,7 @@ from brakeline.messaging.ros2.cdr_messages import (
     vector,
 )
 from brakeline.safety.filter.request import ADJUSTED, ALLOWED, FAILSAFE, Decision
-from brakeline.safety.service.wire import KINDS
+from brakeline.safety.service.wire import KIND_NUMBERS
 
 OBSTACLE_HEIGHT = 0.2  # m
 THICKNESS = 0.01  # m, of lines and of the tube's boxes
@@ -112,7 +112,7 @@ def diagnostics(
     """
     level = DiagnosticStatus.OK if kind == ALLOWED else DiagnosticStatus.WARN
     status = DiagnosticStatus(
-        level=level if kind in KINDS else DiagnosticStatus.ERROR,
+        level=level if kind in KIND_NUMBERS else DiagnosticStatus.ERROR,
         name=f"{node}: safety filter",
         message=f"{kind}: {reason}" if reason else kind,
         hardware_id=robot,

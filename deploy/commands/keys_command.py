@@ -13,7 +13,7 @@ from brakeline.messaging.atomic_files import write_secret
 from brakeline.messaging.bus.certificate_authority import DAYS, Authority
 from brakeline.messaging.bus.identity import SERVERS, role_of
 from brakeline.safety.methods import load
-from brakeline.safety.service.plan_token import KEY as PLAN_TOKEN_KEY
+from brakeline.safety.service.plan_token import KEY_FILE as PLAN_TOKEN_KEY
 from brakeline.safety.service.plan_token import write_key
 from brakeline.safety.service.signature import ANY, SIGNERS, ModelSigner, seal_of, write_signer
 from brakeline.safety.service.signature import KEY as SIGNING_KEY

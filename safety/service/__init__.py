@@ -1,1 +1,1 @@
-"""The safety service as a process, and every way to ask the filter."""
+"""The safety service as a process, and its clients: over the bus and in process."""

@@ -1,8 +1,8 @@
-"""How any program asks the safety service, and what it must keep between two questions.
+"""A client of the safety service for one robot.
 
 with SafetyClient.open("tcp/127.0.0.1:7447", "ground") as safety:
     answer = safety.decide(state=[0, 0, 0, 0, 0], action=[0.25, 0], obstacles=[Obstacle("cylinder", (0.4, 0), (0.1,))])
-    drive(answer.action)          # and next period again; if it raises: drive(safety.fallback())
+    drive(answer.action)          # once a period; if `decide` raises: drive(safety.fallback())
 """
 
 from __future__ import annotations
@@ -35,11 +35,11 @@ Array = NDArray[np.float64]
 
 DEADLINE = 0.1  # s
 NONCE = 16  # bytes
-SAME_INPUT = 1e-9  # rounding allowed where inputs are compared
+SAME_INPUT = 1e-9  # rounding error allowed between two equal inputs
 
 
 class SafetyError(BusError):
-    """The service answered this request with an error: `type` and the `field` that is wrong."""
+    """The service answered a request with an error, or its reply is not valid. `field` names the wrong field."""
 
     def __init__(self, error: pb.Error) -> None:
         super().__init__(f"{error.type}: {error.message}")
@@ -61,7 +61,7 @@ def request_message(
     time: float = 0.0,
     fleet: Sequence[str] = (),
 ) -> pb.Request:
-    """The question about an action. Raises BadRequest: a value is of another type."""
+    """Return the message that requests a decision on an action. Raises BadRequest if a value has another type."""
     backup_plan.measured(np.asarray(state, float))
     message = pb.Request(
         robot=backup_plan.robot.name,
@@ -91,11 +91,11 @@ def request_message(
 
 
 def read_reply(reply: pb.Reply, request: pb.Request, robot: Robot) -> Answer:
-    """The decision in a reply to a request.
+    """Return the answer in the reply to a request.
 
     Raises:
-        SafetyError: it is an error, or its plan or prediction is not one of this robot's, or not one that follows the
-            input in force.
+        SafetyError: the reply is an error, or its plan is not possible for this robot after the input in force, or its
+            prediction is not valid.
     """
     if reply.WhichOneof("result") != "decision":
         raise SafetyError(reply.error)
@@ -115,33 +115,36 @@ def read_reply(reply: pb.Reply, request: pb.Request, robot: Robot) -> Answer:
     sizes = {len(decision.predicted_center), len(decision.predicted_half_width)}
     if sizes not in ({robot.state_dim}, {0}):  # the rivals predict nothing
         raise _bad_reply("predicted_center", "a predicted state of the wrong size")
-    said = [*decision.predicted_center, *decision.predicted_half_width, decision.predicted_heading, decision.margin]
-    if not all(map(math.isfinite, said)) or min(decision.predicted_half_width, default=0.0) < 0.0:
-        raise _bad_reply("predicted_center", "a predicted state or a margin that is none")
+    numbers = [*decision.predicted_center, *decision.predicted_half_width, decision.predicted_heading, decision.margin]
+    if not all(map(math.isfinite, numbers)) or min(decision.predicted_half_width, default=0.0) < 0.0:
+        raise _bad_reply("predicted_center", "a predicted state or a margin that is not valid")
     try:
         if request.fleet:
             reservation_of(decision.reservation, robot)
-        found = decision_of(decision, robot)
+        result = decision_of(decision, robot)
     except BadRequest as error:
         raise _bad_reply(error.field, str(error)) from error
     plan_tokens = tuple(decision.plan_tokens)
     return Answer.of(
-        found, robot, queue_ms=decision.queue_ms, token_rejected=decision.token_rejected, plan_tokens=plan_tokens
+        result, robot, queue_ms=decision.queue_ms, token_rejected=decision.token_rejected, plan_tokens=plan_tokens
     )
 
 
 def _follows(plan: Array, request: pb.Request, robot: Robot) -> bool:
-    """Does a plan (N, m) go on from the input in force, and from step to step, within the slew? A late robot's begins
-    with the input that is in force meanwhile. What feedback will make of a state to come is not in the plan."""
+    """Return whether a plan (N, m) continues the input in force, and each input the one before, within the slew limit.
+
+    A late robot's plan begins with the input that is in force until the decision arrives. Inputs that feedback computes
+    from a future state are not compared.
+    """
     m, slew = robot.action_dim, np.asarray(robot.action_slew) + SAME_INPUT
-    begun = np.array(request.plan[:m] if robot.late else request.input_in_force)
-    if begun.shape != (m,):
+    before = np.array(request.plan[:m] if robot.late else request.input_in_force)
+    if before.shape != (m,):
         return False
-    if robot.late and (np.abs(plan[0] - begun) > SAME_INPUT).any():
+    if robot.late and (np.abs(plan[0] - before) > SAME_INPUT).any():
         return False
     planned = [rule != FEEDBACK for rule in robot.stop]
     steps = np.abs(np.diff(plan, axis=0))[:, planned]
-    return bool((np.abs(plan[0] - begun) <= slew).all() and (steps <= slew[planned]).all())
+    return bool((np.abs(plan[0] - before) <= slew).all() and (steps <= slew[planned]).all())
 
 
 def _bad_reply(field: str, message: str) -> SafetyError:
@@ -149,17 +152,22 @@ def _bad_reply(field: str, message: str) -> SafetyError:
 
 
 def bus_at(connect: str | Sequence[str], keys: Path | str | None, name: str) -> Bus:
-    """A bus of one's own at these endpoints; keys: the folder with the keys of `name`, if the bus has keys.
+    """Connect a new bus to endpoints; keys: the folder with the keys of `name`, if the bus has keys.
 
     Raises:
-        Unreachable: no router at these endpoints; BadKeys: no keys of that name.
+        Unreachable: there is no router at the endpoints.
+        BadKeys: the folder has no keys of that name.
     """
     endpoints = (connect,) if isinstance(connect, str) else tuple(connect)
     return Bus(BusSettings(connect=endpoints, keys=None if keys is None else Path(keys)), name)
 
 
 class BusClient:
-    """A bus to ask about robots of one kind, closed with it if it is its own."""
+    """A client over a bus, for robots of one kind. It closes the bus if it opened it.
+
+    Attributes:
+        deadline: longest wait for a decision [s].
+    """
 
     def __init__(self, bus: Bus, robot: Robot | str, deadline: float) -> None:
         self.bus, self.deadline = bus, deadline
@@ -178,10 +186,10 @@ class BusClient:
 
 
 class SafetyClient(BusClient):
-    """Asks the safety service about one robot, and keeps its committed plan.
+    """Requests decisions about one robot from the safety service, and keeps its backup plan.
 
-    Not for several threads at once; a program with several robots has a client (or a `BackupPlan`) for each, and a
-    `FleetClient` for those that share a world.
+    Use a client in one thread at a time. With several robots, use one client for each, or a `FleetClient` for robots
+    that share a world.
     """
 
     def __init__(self, bus: Bus, robot: Robot | str, deadline: float = DEADLINE) -> None:
@@ -197,14 +205,18 @@ class SafetyClient(BusClient):
         keys: Path | str | None = None,
         name: str = "client",
     ) -> Self:
-        """A client with a bus of its own.
+        """Return a client with a bus of its own.
 
         Args:
+            connect: endpoints, for example tcp/HOST:PORT, or tls/HOST:PORT on a bus with keys.
             robot: the robot, its name, or the path of its description.
-            keys: the folder with the keys of `name`, if the bus has keys; its endpoints are then tls/HOST:PORT.
+            deadline: longest wait for a decision [s].
+            keys: the folder with the keys of `name`, on a bus with keys.
+            name: of this client on the bus.
 
         Raises:
-            Unreachable: no router at these endpoints; BadKeys: no keys of that name.
+            Unreachable: there is no router at the endpoints.
+            BadKeys: the folder has no keys of that name.
         """
         client = cls(bus_at(connect, keys, name), robot, deadline)
         client._owned = True
@@ -224,14 +236,16 @@ class SafetyClient(BusClient):
         step: int = 0,
         time: float = 0.0,
     ) -> Answer:
-        """Ask for the decision on an action and commit to its plan; then execute `answer.action`.
+        """Request the decision on an action and commit to its plan. Then execute `answer.action`.
 
         Args:
-            actor: your name, the same in every question; episode, step, time [s]: for the service's log.
+            actor: your name, the same in every request. The plan tokens are issued to it.
+            episode, step, time: for the service's log; time in s.
+            state, action, obstacles, scan, observation, known_free: as in `FilterClient.decide`.
 
         Raises:
-            BadRequest: a value is of another type; `field` names it.
-            NoReply, Late, Refused, SafetyError: no decision; execute `fallback()` instead.
+            BadRequest: a value has another type; `field` names it.
+            NoReply, Late, Refused, SafetyError: there is no decision. Execute `fallback()` instead.
         """
         request = request_message(
             self.backup_plan,
@@ -251,20 +265,20 @@ class SafetyClient(BusClient):
         return answer
 
     def fallback(self) -> Array:
-        """The committed plan's next input, for when there is no decision."""
+        """Return the backup plan's next input, for a period without a decision."""
         return self.backup_plan.fallback()
 
     def reset(self) -> None:
-        """An episode begins, standing still."""
+        """Begin an episode with a robot that stands still."""
         self.backup_plan.reset()
 
 
 def query_service(bus: Bus, requests: Sequence[pb.Request], deadline: float) -> list[pb.Reply]:
-    """The replies to requests about robots of one kind, in their order.
+    """Query the service with requests about robots of one kind, and return the replies in their order.
 
     Raises:
-        NoReply, Late, Refused: nobody serves, too late, or not understood at all.
-        SafetyError: no batch of replies, or not as many as requests, or not to this question.
+        NoReply, Late, Refused: no service replied, or not in time, or it could not read the query.
+        SafetyError: the reply is not a batch, has another number of replies, or belongs to another query.
     """
     payload = pb.RequestBatch(requests=requests, nonce=secrets.token_bytes(NONCE)).SerializeToString()
     answer = bus.ask(DECIDE, payload, deadline, robot=requests[0].robot)
@@ -273,7 +287,7 @@ def query_service(bus: Bus, requests: Sequence[pb.Request], deadline: float) -> 
     except DecodeError as error:
         raise _bad_reply("", f"not a reply batch: {error}") from error
     if batch.request != digest(payload):
-        raise _bad_reply("request", "replies to another question")
+        raise _bad_reply("request", "replies to another query")
     if len(batch.replies) != len(requests):
         raise _bad_reply("", f"{len(batch.replies)} replies to {len(requests)} requests")
     return list(batch.replies)

@@ -1,8 +1,8 @@
-"""The interface of every asker, in process or over the bus: how it is asked, and what it answers.
+"""The interface of every client of the filter, in process or over the bus.
 
-answer = asker.decide(state, action, obstacles)                # obstacles: at least those within reach
-answer = asker.decide(state, action, scan=scan)                # what the scan does not show to be free is occupied
-answer = asker.decide(state, action, [], known_free=True)      # a map says that all space within reach is free
+answer = client.decide(state, action, obstacles)               # obstacles: at least those within reach
+answer = client.decide(state, action, scan=scan)               # what the scan does not show to be free is occupied
+answer = client.decide(state, action, [], known_free=True)     # a map says that all space within reach is free
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, kw_only=True)
 class Answer(Decision):
-    """A decision as the asker gets it.
+    """A decision as a client returns it.
 
     Attributes:
         action: (m,) the input to execute next. This is the plan's first row. For a late robot it is the second row,
             because the first row is in force already.
-        queue_ms: time from the service's receipt of the question to the decision; 0 in process.
+        queue_ms: time from the service's receipt of the request to the decision; 0 in process.
         token_rejected: the request's plan token did not match its plan, so the service treated the plan as unverified.
         plan_tokens: the plan tokens of the next requests, in order; empty in process.
     """
@@ -44,13 +44,13 @@ class Answer(Decision):
 
     @staticmethod
     def of(decision: Decision, robot: Robot, **more: Any) -> Answer:
-        """The answer that holds this decision; more: the attributes that a decision has not."""
+        """Return the answer with this decision; more: the attributes that a decision does not have."""
         return Answer(**vars(decision), action=decision.plan[robot.committed_steps].copy(), **more)
 
 
 @runtime_checkable
 class FilterClient(Protocol):
-    """Asks for decisions about one robot, and keeps its committed plan between two questions."""
+    """Requests decisions about one robot, and keeps its backup plan between two requests."""
 
     @property
     def robot(self) -> Robot: ...
@@ -68,79 +68,75 @@ class FilterClient(Protocol):
         observation: ArrayLike | None = None,
         known_free: bool = False,
     ) -> Answer:
-        """Ask for the decision on an action and commit to its plan: then execute `answer.action`.
+        """Request the decision on an action and commit to its plan. Then execute `answer.action`.
 
         Args:
             state: (n,) measured.
-            action: (m,) proposed. NaN or infinity in it gives a failsafe.
+            action: (m,) proposed. If it holds NaN or infinity, the decision is a failsafe.
             obstacles: at least those within reach (1 m is enough for `ground`).
-            scan: what a sensor saw, in the obstacles' place or beside them: a `Scan`, in space a `RangeImage`. Fill it
-                in by `brakeline.safety.perception.image_memory.filled`.
-            observation: the task's own; only the rivals read it.
-            known_free: nothing but the obstacles is near, so all other space within reach is free. Say it if a map gave
-                the obstacles. Without it, a question with neither obstacles nor a scan is an error.
+            scan: a sensor's measurement, instead of obstacles or in addition: a `Scan`, or a `RangeImage` in space.
+                Fill it in with `brakeline.filled` first.
+            observation: the task's observation. Only the rivals read it.
+            known_free: whether all space within reach is free except for the obstacles. Set it if a map gave the
+                obstacles. Without it, a request with neither obstacles nor a scan is an error.
 
         Raises:
             BadRequest: a value is missing, not finite, of the wrong size or of another type; `field` names it.
-            BusError: there is no decision; execute `fallback()` instead. In process there always is one.
+            BusError: there is no decision. Execute `fallback()` instead. In process there always is a decision.
         """
 
     def fallback(self) -> Array:
-        """Take the committed plan's next input, for when there is no decision."""
+        """Return the backup plan's next input, for a period without a decision."""
 
     def reset(self) -> None:
-        """Begin an episode, standing still."""
+        """Begin an episode with a robot that stands still."""
 
 
-def obstacles_in(given: Iterable[Obstacle] | None) -> list[Obstacle]:
-    """Return the obstacles that a program gave; none of None.
-
-    Raises:
-        BadRequest: it gave something else.
-    """
-    if isinstance(given, Scan | RangeImage):
-        raise BadRequest("obstacles", f"obstacles is a {type(given).__name__}: give it as scan=")
+def obstacles_in(value: Iterable[Obstacle] | None) -> list[Obstacle]:
+    """Return the argument `obstacles` as a list; an empty one for None. Raises BadRequest for another type."""
+    if isinstance(value, Scan | RangeImage):
+        raise BadRequest("obstacles", f"obstacles is a {type(value).__name__}: give it as scan=")
     try:
-        found = [] if given is None else list(given)
+        obstacles = [] if value is None else list(value)
     except TypeError as error:
-        raise BadRequest("obstacles", f"obstacles is a {type(given).__name__}: give a list of Obstacle") from error
-    for one in found:
-        if not isinstance(one, Obstacle):
-            raise BadRequest("obstacles", f"obstacles holds a {type(one).__name__}: give a list of Obstacle")
-    return found
+        raise BadRequest("obstacles", f"obstacles is a {type(value).__name__}: give a list of Obstacle") from error
+    for obstacle in obstacles:
+        if not isinstance(obstacle, Obstacle):
+            raise BadRequest("obstacles", f"obstacles holds a {type(obstacle).__name__}: give a list of Obstacle")
+    return obstacles
 
 
-def scan_in(given: RangeMeasurement | None) -> RangeMeasurement | None:
-    """Return the scan that a program gave. Raises BadRequest: it gave something else."""
-    if given is not None and not isinstance(given, Scan | RangeImage):
-        raise BadRequest("scan", f"scan is a {type(given).__name__}: give a Scan, in space a RangeImage")
-    return given
+def scan_in(value: RangeMeasurement | None) -> RangeMeasurement | None:
+    """Return the argument `scan`. Raises BadRequest for another type."""
+    if value is not None and not isinstance(value, Scan | RangeImage):
+        raise BadRequest("scan", f"scan is a {type(value).__name__}: give a Scan, in space a RangeImage")
+    return value
 
 
-def observation_in(given: ArrayLike | None) -> NDArray[np.float32]:
-    """Return the observation that a program gave; an empty one of None. Raises BadRequest: it gave something else."""
-    if given is None:
+def observation_in(value: ArrayLike | None) -> NDArray[np.float32]:
+    """Return the argument `observation` as an array; an empty one for None. Raises BadRequest for another type."""
+    if value is None:
         return np.zeros(0, np.float32)
-    if isinstance(given, Scan | RangeImage):
-        raise BadRequest("observation", f"observation is a {type(given).__name__}: give it as scan=")
+    if isinstance(value, Scan | RangeImage):
+        raise BadRequest("observation", f"observation is a {type(value).__name__}: give it as scan=")
     try:
-        found = np.asarray(given, np.float32)
+        observation = np.asarray(value, np.float32)
     except (TypeError, ValueError) as error:
-        raise BadRequest("observation", f"observation is a {type(given).__name__}: give a list of numbers") from error
-    if found.ndim != 1:
-        raise BadRequest("observation", f"observation has shape {found.shape}: give a list of numbers")
-    return found
+        raise BadRequest("observation", f"observation is a {type(value).__name__}: give a list of numbers") from error
+    if observation.ndim != 1:
+        raise BadRequest("observation", f"observation has shape {observation.shape}: give a list of numbers")
+    return observation
 
 
-def known_free_in(given: bool) -> bool:
-    """Return whether a program said that space is known to be free. Raises BadRequest: it said something else."""
-    if not isinstance(given, bool | np.bool_):
-        raise BadRequest("known_free", f"known_free is a {type(given).__name__}: give True or False")
-    return bool(given)
+def known_free_in(value: bool) -> bool:
+    """Return the argument `known_free`. Raises BadRequest for another type."""
+    if not isinstance(value, bool | np.bool_):
+        raise BadRequest("known_free", f"known_free is a {type(value).__name__}: give True or False")
+    return bool(value)
 
 
 def accept(backup_plan: BackupPlan, answer: Answer) -> Array:
-    """Commit to an answer's plan; returns the input to execute next, which is `answer.action`."""
+    """Commit to an answer's plan, and return `answer.action`, the input to execute next."""
     return backup_plan.accept(
         answer.plan, answer.model, answer.predicted, answer.verified, answer.plan_tokens, answer.reservation
     )

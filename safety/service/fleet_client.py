@@ -1,8 +1,8 @@
-"""How any program asks the safety service about robots that share a world: all in one question, each with its promise.
+"""A client of the safety service for robots that share a world: one query for all, each with its reservation.
 
 with FleetClient.open("tcp/127.0.0.1:7447", "ground", ["left", "right"]) as fleet:
-    answers = fleet.decide(states, actions, obstacles)   # one of each for each robot, in the order of their names
-    drive([answer.action for answer in answers])         # and next period again; if it raises: drive(fleet.fallback())
+    answers = fleet.decide(states, actions, obstacles)   # one of each for each robot, in the order of the names
+    drive([answer.action for answer in answers])         # once a period; if it raises: drive(fleet.fallback())
 """
 
 from __future__ import annotations
@@ -31,20 +31,20 @@ from brakeline.safety.service.filter_client import Answer, accept
 
 
 class FleetClient(BusClient):
-    """Asks about all robots of a world, and keeps each one's committed plan and promise (docs/fleets.md).
+    """Requests decisions about all robots of a world, and keeps their backup plans and reservations (docs/fleets.md).
 
-    Time passes for all of them or for none: each period is one `decide`, or one `fallback` where that raised. They
-    begin standing still. Not for several threads at once.
+    Each period, call `decide` once, or `fallback` if that raised. The robots stand still at the start. Use a client in
+    one thread at a time.
     """
 
     def __init__(self, bus: Bus, robot: Robot | str, names: Sequence[str], deadline: float = DEADLINE) -> None:
-        """robot: what all of them are; names: by which the service tells them apart.
+        """Make a client for robots of one kind; names: of the robots.
 
         Raises:
-            ValueError: fewer than two names, or one twice.
+            ValueError: there are fewer than two names, or two are equal.
         """
         if len(names) < 2 or len(set(names)) < len(names):
-            raise ValueError(f"a fleet has two robots or more, each with a name of its own, not {list(names)}")
+            raise ValueError(f"a fleet needs two robots or more with different names, not {list(names)}")
         super().__init__(bus, robot, deadline)
         self.names = tuple(names)
         self.backup_plans = [BackupPlan(self.robot) for _ in self.names]
@@ -60,7 +60,7 @@ class FleetClient(BusClient):
         keys: Path | str | None = None,
         name: str = "client",
     ) -> Self:
-        """A client with a bus of its own. Arguments and errors are those of `SafetyClient.open`."""
+        """Return a client with a bus of its own. For the other arguments and errors, see `SafetyClient.open`."""
         client = cls(bus_at(connect, keys, name), robot, names, deadline)
         client._owned = True
         return client
@@ -74,26 +74,28 @@ class FleetClient(BusClient):
         scans: Sequence[RangeMeasurement | None] | None = None,
         known_free: bool = False,
     ) -> list[Answer]:
-        """The decisions; their plans are committed to, so execute every `answer.action`.
+        """Request the decisions on all actions and commit to their plans. Then execute every `answer.action`.
 
         Args:
-            states: measured, at one time; actions: proposed; obstacles: near each robot, what stands still. The others
-            are not among them: the service keeps each off what the others promise. scans: of each robot, in the
-            obstacles' place or beside them; known_free: nothing but the obstacles and the other robots is near any of
-            them, so all other space is free. Without it, a robot with neither obstacles nor a scan is an error.
+            states: (n,) of each robot, measured at one time.
+            actions: (m,) of each robot, proposed.
+            obstacles: near each robot, without the other robots: their reservations keep the robots apart.
+            scans: of each robot, instead of obstacles or in addition.
+            known_free: whether all space near the robots is free except for the obstacles and the other robots. Without
+                it, a robot with neither obstacles nor a scan is an error.
 
         Raises:
-            BadRequest: a value is of another type; `field` names it.
-            ValueError: not one of each for each robot.
-            NoReply, Late, Refused, SafetyError: no decision about one robot, so none about any, for the others' new
-            plans may rest on that one's: execute `fallback()` instead, all of it.
+            BadRequest: a value has another type; `field` names it.
+            ValueError: there is not one state, action, ... for each robot.
+            NoReply, Late, Refused, SafetyError: one robot has no decision. Then no robot has, because the other plans
+                may depend on it. Execute all inputs of `fallback()` instead.
         """
         nothing: list[None] = [None] * len(self.names)
-        map_for_display = nothing if obstacles is None else obstacles, nothing if scans is None else scans
-        asked = zip(self.names, self.backup_plans, states, actions, *map_for_display, strict=True)
+        local_maps = nothing if obstacles is None else obstacles, nothing if scans is None else scans
+        robots = zip(self.names, self.backup_plans, states, actions, *local_maps, strict=True)
         requests = [
             request_message(
-                kept,
+                backup_plan,
                 state,
                 action,
                 near,
@@ -104,22 +106,22 @@ class FleetClient(BusClient):
                 step=self._step,
                 fleet=self.names,
             )
-            for name, kept, state, action, near, scan in asked
+            for name, backup_plan, state, action, near, scan in robots
         ]
         replies = zip(query_service(self.bus, requests, self.deadline), requests, strict=True)
         answers = [read_reply(reply, request, self.robot) for reply, request in replies]
-        for kept, answer in zip(self.backup_plans, answers, strict=True):
-            accept(kept, answer)
+        for backup_plan, answer in zip(self.backup_plans, answers, strict=True):
+            accept(backup_plan, answer)
         self._step += 1
         return answers
 
     def fallback(self) -> list[Array]:
-        """The committed plans' next inputs, for when there is no decision: all brake along what they promised."""
+        """Return the backup plans' next inputs, for a period without decisions: all brake inside their reservations."""
         self._step += 1
-        return [kept.fallback() for kept in self.backup_plans]
+        return [backup_plan.fallback() for backup_plan in self.backup_plans]
 
     def reset(self) -> None:
-        """They stand somewhere else, and have promised each other nothing."""
-        for kept in self.backup_plans:
-            kept.reset()
+        """Begin an episode with robots that stand still and have no reservations."""
+        for backup_plan in self.backup_plans:
+            backup_plan.reset()
         self._episode, self._step = self._episode + 1, 0

@@ -1,8 +1,8 @@
-"""The filter (or a rival) without a service and without an environment: what a program asks in its own process.
+"""A client of the filter, or of a rival, in the program's own process.
 
 safety = InProcess(Filter(ModelSet.load(path)))
 answer = safety.decide(state, action, obstacles)
-drive(answer.action)                  # and next period again; `safety.reset()` where an episode begins, standing still
+drive(answer.action)                  # once a period; call `safety.reset()` at the start of an episode
 """
 
 from __future__ import annotations
@@ -28,16 +28,20 @@ Array = NDArray[np.float64]
 
 
 class InProcess:
-    """Asks a method about one robot, and keeps its committed plan: `SafetyClient` without a service."""
+    """Requests decisions about one robot from a method, and keeps its backup plan: `SafetyClient` without a service."""
 
     def __init__(self, method: Method, accept_bound: float | None = None) -> None:
-        """accept_bound: the largest stated share of plans outside their tubes that is accepted; unless given the limit
-        of the robot's description counts.
+        """Make a client.
+
+        Args:
+            method: the filter or a rival.
+            accept_bound: largest accepted probability that a verified plan leaves its tube, as the model set's
+                validation report states it. Defaults to the limit in the robot's description.
 
         Raises:
-            TooLoose: the model set states more, or states nothing.
+            TooLoose: the report states a larger probability, or there is no report.
         """
-        from brakeline.safety.model.stated_bound import check_bound  # what only asks a service loads no model
+        from brakeline.safety.model.stated_bound import check_bound  # a client of a service loads no model
 
         check_bound(getattr(method, "model", None), method.robot, accept_bound)
         self.method = method
@@ -57,10 +61,10 @@ class InProcess:
         observation: ArrayLike | None = None,
         known_free: bool = False,
     ) -> Answer:
-        """Decide on an action and commit to its plan, as `FilterClient` says: then execute `answer.action`.
+        """Decide on an action and commit to its plan, as `FilterClient.decide`. Then execute `answer.action`.
 
         Raises:
-            BadRequest, BadShape: a value is missing, not finite, of the wrong size or type; `field` names it.
+            BadRequest, BadShape: a value is missing, not finite, or has the wrong size or type; `field` names it.
         """
         return self.decide_all(
             [self.backup_plan],
@@ -83,25 +87,27 @@ class InProcess:
         observations: Sequence[ArrayLike | None],
         known_free: Sequence[bool],
     ) -> list[Answer]:
-        """The same of several robots of the kind, each with a commitment of its own. Raises as `decide` does, before
-        any plan is committed to."""
-        asked = zip(backup_plans, states, actions, obstacles, scans, observations, known_free, strict=True)
-        answers = [Answer.of(self.method.decide(self._request(*one)), self.robot) for one in asked]
-        for kept, answer in zip(backup_plans, answers, strict=True):
-            accept(kept, answer)
+        """Decide for several robots of the kind, each with its own backup plan.
+
+        It raises as `decide` does, before it commits to any plan.
+        """
+        robots = zip(backup_plans, states, actions, obstacles, scans, observations, known_free, strict=True)
+        answers = [Answer.of(self.method.decide(self._request(*arguments)), self.robot) for arguments in robots]
+        for backup_plan, answer in zip(backup_plans, answers, strict=True):
+            accept(backup_plan, answer)
         return answers
 
     def fallback(self) -> Array:
-        """The committed plan's next input, for when there is no decision."""
+        """Return the backup plan's next input, for a period without a decision."""
         return self.backup_plan.fallback()
 
     def reset(self) -> None:
-        """An episode begins, standing still."""
+        """Begin an episode with a robot that stands still."""
         self.backup_plan.reset()
 
     def _request(
         self,
-        kept: BackupPlan,
+        backup_plan: BackupPlan,
         state: ArrayLike,
         action: ArrayLike,
         obstacles: Iterable[Obstacle] | None,
@@ -110,27 +116,27 @@ class InProcess:
         known_free: bool,
     ) -> Request:
         measured = np.asarray(state, dtype=float)
-        kept.measured(measured)
+        backup_plan.measured(measured)
         standing, moving = split_moving(obstacles_in(obstacles), self.robot.position_dim)
         return Request(
             state=measured,
             action=np.asarray(action, dtype=float),
-            input_in_force=kept.input_in_force,
-            plan=kept.plan,
+            input_in_force=backup_plan.input_in_force,
+            plan=backup_plan.plan,
             obstacles=standing,
             movers=moving,
             scan=scan_in(scan),
-            model=kept.model,
-            predicted=kept.predicted,
+            model=backup_plan.model,
+            predicted=backup_plan.predicted,
             observation=observation_in(observation),
             known_free=known_free_in(known_free),
         )
 
 
 def request_observation(observation: object) -> NDArray[np.float32]:
-    """Return the observation as a request holds it: a list of finite numbers, or an empty one.
+    """Return the observation if a request can hold it, a vector of finite numbers; otherwise an empty one.
 
-    Only the rivals read observations. Another environment may observe an image or a dict: a request holds none of it.
+    Only the rivals read observations. Other environments may observe an image or a dict.
     """
     empty = np.zeros(0, np.float32)
     if not isinstance(observation, np.ndarray) or observation.ndim != 1 or observation.dtype.kind not in "fiu":

@@ -1,15 +1,15 @@
-"""Robots of one world in one question: who is decided when, against whose promises, and who can't be.
+"""Requests of robots that share a world: the order of the decisions, and the reservations that each is checked against.
 
-The service keeps nothing: what each robot is committed to comes with the question, and the tubes of those decided
-before in the same batch replace it. So all robots of a world have to be in the batch; if one is missing, or is asked
-about by somebody else, nothing can be promised to the others, and all of them brake along what they promised before.
+The service keeps nothing about a robot. A request carries the robot's current reservation, and the tubes of the robots
+decided before in the same batch replace theirs. So a batch must hold all robots of a world. If one is missing, the
+service refuses the whole world, and all its robots brake inside their reservations.
 """
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.safety.filter.request import BadRequest
@@ -17,7 +17,7 @@ from brakeline.safety.filter.reservation import OtherReservations, Reservation
 
 
 class AskedApart(BadRequest):
-    """Robots of one world that are not all in one question: no promise can be made."""
+    """A batch does not hold all robots of a world once: the service can check no reservation."""
 
     def __init__(self, message: str) -> None:
         super().__init__("fleet", message)
@@ -25,43 +25,42 @@ class AskedApart(BadRequest):
 
 @dataclass
 class FleetReservations:
-    """The robots of one world in a batch: what each promises at this moment, by its actor's name."""
+    """The current reservations of the robots of one world, by their actors' names."""
 
-    names: tuple[str, ...]
-    reservations: dict[str, Reservation] = field(default_factory=dict)
+    reservations: dict[str, Reservation]
 
     def to(self, name: str) -> OtherReservations | None:
-        """What the others promise to one of them."""
+        """Return the reservations of the other robots."""
         return OtherReservations.to([reservation for other, reservation in self.reservations.items() if other != name])
 
 
 def check_fleet(requests: Sequence[pb.Request]) -> None:
-    """For one world's requests of a batch.
+    """Check the requests of one world.
 
     Raises:
-        AskedApart: they are not about all of its robots, each once, at the same step.
+        AskedApart: the requests are not about all robots of the fleet, each once, at the same step.
     """
     wanted = requests[0].fleet
     if len(set(wanted)) != len(wanted):
         raise AskedApart("a robot is named twice in its fleet")
-    there = Counter(request.actor for request in requests)
-    if twice := sorted(name for name, count in there.items() if count > 1):
-        raise AskedApart(f"{', '.join(twice)}: asked about twice in one question")
-    if foreign := sorted(there.keys() - set(wanted)):
-        raise AskedApart(f"{', '.join(foreign)}: not of the fleet that is named")
-    if missing := sorted(set(wanted) - there.keys()):
+    actors = Counter(request.actor for request in requests)
+    if twice := sorted(name for name, count in actors.items() if count > 1):
+        raise AskedApart(f"{', '.join(twice)}: two requests in one batch")
+    if foreign := sorted(actors.keys() - set(wanted)):
+        raise AskedApart(f"{', '.join(foreign)}: not in the fleet that the request names")
+    if missing := sorted(set(wanted) - actors.keys()):
         raise AskedApart(
-            f"{', '.join(missing)}: of this fleet, but not in this question: robots that are asked apart can't be "
-            "promised anything, so each brakes along its plan"
+            f"{', '.join(missing)}: in the fleet, but not in this batch; put all robots of a fleet into one batch: "
+            "until then, each brakes along its backup plan"
         )
     if len({(request.robot, request.episode, request.step) for request in requests}) > 1:
-        raise AskedApart("the robots of a fleet are of one kind, and asked about at the same step")
+        raise AskedApart("the requests of a fleet must be about robots of one kind at the same step")
 
 
 def group_by_fleet(requests: Sequence[pb.Request]) -> list[list[int]]:
-    """The requests of a batch in the order in which they are decided, those of one world together.
+    """Return the indices of a batch's requests in the order of the decisions, one list for each world.
 
-    Robots of a world take turns: who is first moves on with the period's number, so that nobody is last for ever.
+    The first robot of a world changes with the step, so that no robot is always last.
     """
     alone = [[i] for i, request in enumerate(requests) if not request.fleet]
     shared: dict[frozenset[str], list[int]] = {}
@@ -74,16 +73,18 @@ def group_by_fleet(requests: Sequence[pb.Request]) -> list[list[int]]:
     return alone + list(shared.values())
 
 
-def joint_request(requests: Sequence[pb.Request], standing: Callable[[pb.Request], Reservation]) -> FleetReservations:
-    """What the robots of one world are committed to before any of them is decided.
+def joint_request(
+    requests: Sequence[pb.Request], reservation: Callable[[pb.Request], Reservation]
+) -> FleetReservations:
+    """Return the reservations of the robots of one world before any of them is decided.
 
-    standing: of a robot that has promised nothing yet; raises BadRequest unless it stands.
+    Args:
+        requests: of the world.
+        reservation: returns the current reservation of a request's robot; raises BadRequest if it has none.
 
     Raises:
-        AskedApart: not all of them are there. BadRequest: a promise is none.
+        AskedApart: the requests do not belong together.
+        BadRequest: a reservation is missing or not valid.
     """
     check_fleet(requests)
-    found = FleetReservations(tuple(request.actor for request in requests))
-    for request in requests:
-        found.reservations[request.actor] = standing(request)
-    return found
+    return FleetReservations({request.actor: reservation(request) for request in requests})

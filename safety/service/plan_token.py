@@ -1,12 +1,12 @@
-"""A service's word that it verified a plan, which an actor hands back with its next question and nobody else can make.
+"""Plan tokens: a service's proof that it verified a plan. An actor returns the token with its next request.
 
-The service keeps nothing about a robot, so it has to be told what it decided. A decision on a plan u_0 .. u_{N-1} comes
-with a voucher for each of the next periods, until the plan is at its end: the k-th is a MAC (HMAC-SHA-256, 16 bytes) of
-what the request will say k periods later if nothing better came in between,
+The service keeps nothing about a robot, so a request must state what the service decided before. A decision on a plan
+u_0 .. u_{N-1} comes with a token for each of the next periods, until the plan ends. The k-th token is a MAC
+(HMAC-SHA-256, 16 bytes) of what the request will hold k periods later if no better plan comes in between:
 
-    robot, actor, model | u_{k-1} (the input in force), u_k .. u_{N-1}, stop .. stop (the tail) | prediction, if k = 1,
+    robot, actor, model | u_{k-1} (the input in force), u_k .. u_{N-1}, stop .. stop (the tail) | prediction, if k = 1.
 
-so that a request needs one of them and nothing is put together again. The replicas of a service share the key.
+So a request needs one token, and the service computes one MAC to check it. All replicas of a service share the key.
 """
 
 from __future__ import annotations
@@ -25,63 +25,62 @@ from brakeline.safety.filter.backup_plan import UNVERIFIED
 
 log = logging.getLogger("brakeline.safety")
 
-SIZE = 16  # bytes of a voucher
-KEY = "vouchers.key"  # in the folder of keys
-LEAST = 32  # bytes of a key
+SIZE = 16  # bytes of a token
+KEY_FILE = "vouchers.key"  # in the folder of keys
+KEY_SIZE = 32  # bytes, at least
 
 
 class BadKey(ValueError):
-    """There is a key, but it cannot be one."""
+    """The key of the plan tokens is too short."""
 
 
 def write_key(folder: Path) -> None:
-    """A new key, if there is none in the folder yet."""
-    if not (folder / KEY).exists():
-        write_secret(folder / KEY, secrets.token_bytes(LEAST))
+    """Write a new key, if the folder has none yet."""
+    if not (folder / KEY_FILE).exists():
+        write_secret(folder / KEY_FILE, secrets.token_bytes(KEY_SIZE))
 
 
 class PlanAuthenticator:
-    """Makes vouchers, and knows its own."""
+    """Issues plan tokens, and checks those of requests."""
 
     def __init__(self, key: bytes) -> None:
-        if len(key) < LEAST:
-            raise BadKey(f"a key of {len(key)} bytes; vouchers take {LEAST}")
+        if len(key) < KEY_SIZE:
+            raise BadKey(f"the key of the plan tokens has {len(key)} bytes; it needs {KEY_SIZE}")
         self._key = key
 
     @classmethod
     def of(cls, folder: Path | None) -> PlanAuthenticator:
-        """With the key in a folder of keys; without one, with a key that nobody else has.
+        """Return an authenticator with the key in a folder, or with a new random key if the folder has none.
 
         Raises:
-            BadKey: the key is too short; OSError: it can't be read.
+            BadKey: the key is too short.
+            OSError: the key can't be read.
         """
-        if folder is not None and (folder / KEY).exists():
-            return cls((folder / KEY).read_bytes())
-        log.info("no %s: plans that another replica verified will count as unverified here", KEY)
-        return cls(secrets.token_bytes(LEAST))
+        if folder is not None and (folder / KEY_FILE).exists():
+            return cls((folder / KEY_FILE).read_bytes())
+        log.info("no %s: plans that another replica verified count as unverified here", KEY_FILE)
+        return cls(secrets.token_bytes(KEY_SIZE))
 
     def plan_tokens(self, request: pb.Request, decision: pb.Decision, robot: Robot) -> list[bytes]:
-        """For a decision on a request: the first for the next period, the last for all from there on, when the plan's
-        tail no longer changes."""
+        """Return the tokens of a decision: one for each of the next periods. The last token stays valid: from there on,
+        the plan's tail no longer changes."""
         m, n = robot.action_dim, robot.horizon
         plan = list(decision.plan)
-        last = [0.0 if robot.stop[j] != HOLD else plan[j - m] for j in range(m)]
-        at_end = n
-        while at_end > 0 and plan[(at_end - 1) * m : at_end * m] == last:
-            at_end -= 1
-        inputs = plan + last * (n + 1)
-        tails, held = _bytes(inputs), _bytes(_planned(inputs, robot))
-        said, row = _words(robot.name, request.actor, decision.model), 8 * m
-        predicted = _prediction(decision)
-        return [
-            self._mac(
-                said + held[(k - 1) * row : k * row] + tails[k * row : (k + n) * row] + (predicted if k == 1 else b"")
-            )
-            for k in range(1, max(2, 1 + at_end) + 1)
-        ]
+        stop = [0.0 if robot.stop[j] != HOLD else plan[j - m] for j in range(m)]
+        moving = n  # periods until the plan stops
+        while moving > 0 and plan[(moving - 1) * m : moving * m] == stop:
+            moving -= 1
+        inputs = plan + stop * (n + 1)
+        tails, in_force, row = _bytes(inputs), _bytes(_without_feedback(inputs, robot)), 8 * m
+        names, predicted = _names(robot.name, request.actor, decision.model), _prediction(decision)
+        tokens = []
+        for k in range(1, max(2, 1 + moving) + 1):
+            message = names + in_force[(k - 1) * row : k * row] + tails[k * row : (k + n) * row]
+            tokens.append(self._mac(message + predicted if k == 1 else message))
+        return tokens
 
     def is_authentic(self, request: pb.Request, robot: Robot) -> bool:
-        """Is it true what a request says of its plan: that a model verified it? It may also say nothing of the kind."""
+        """Return whether a request's token proves that the named model verified its plan, or it names no model."""
         if request.model in ("", UNVERIFIED):
             return True
         if len(request.input_in_force) != robot.action_dim:
@@ -89,23 +88,23 @@ class PlanAuthenticator:
         return hmac.compare_digest(self.plan_token(request, robot), request.plan_token)
 
     def plan_token(self, request: pb.Request, robot: Robot) -> bytes:
-        """The one that a request needs."""
-        held = _bytes(_planned(request.input_in_force, robot))
-        said = _words(robot.name, request.actor, request.model) + held + _bytes(request.plan)
+        """Return the token that a request needs."""
+        in_force = _bytes(_without_feedback(request.input_in_force, robot))
+        message = _names(robot.name, request.actor, request.model) + in_force + _bytes(request.plan)
         if request.predicted_center or request.predicted_half_width:
-            said += _prediction(request)
-        return self._mac(said)
+            message += _prediction(request)
+        return self._mac(message)
 
     def _mac(self, message: bytes) -> bytes:
         return hmac.digest(self._key, message, "sha256")[:SIZE]
 
 
-def _words(robot: str, actor: str, model: str) -> bytes:
+def _names(robot: str, actor: str, model: str) -> bytes:
     return repr((robot, actor, model)).encode()
 
 
-def _planned(inputs: Sequence[float], robot: Robot) -> Sequence[float]:
-    """Rows of inputs, those at zero that feedback makes of the state: the others are what was planned when in force."""
+def _without_feedback(inputs: Sequence[float], robot: Robot) -> Sequence[float]:
+    """Return rows of inputs, with zeros for those that feedback computes from the state."""
     if FEEDBACK not in robot.stop:
         return inputs
     m = robot.action_dim
@@ -117,5 +116,5 @@ def _prediction(message: pb.Request | pb.Decision) -> bytes:
 
 
 def _bytes(numbers: Sequence[float]) -> bytes:
-    """Doubles, little-endian; zero has one sign."""
+    """Return the numbers as little-endian doubles, with -0 as +0."""
     return struct.pack(f"<{len(numbers)}d", *[number + 0.0 for number in numbers])

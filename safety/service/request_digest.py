@@ -1,4 +1,4 @@
-"""What names a question, so that an answer can say which one it is to."""
+"""A digest that names a batch of requests, so that a reply can state which batch it belongs to."""
 
 from __future__ import annotations
 
@@ -7,6 +7,6 @@ import hashlib
 SIZE = 16  # bytes
 
 
-def digest(question: bytes) -> bytes:
-    """Of a batch of requests, nonce included, as it crosses the bus."""
-    return hashlib.sha256(question).digest()[:SIZE]
+def digest(batch: bytes) -> bytes:
+    """Return the digest of a batch of requests, nonce included, as it crosses the bus."""
+    return hashlib.sha256(batch).digest()[:SIZE]

@@ -1,4 +1,4 @@
-"""PROCESS: answers `decide` queries; keeps nothing about any robot, so several may run side by side."""
+"""PROCESS: the safety service. It keeps nothing about a robot between two queries, so replicas may run side by side."""
 
 from __future__ import annotations
 
@@ -32,15 +32,20 @@ log = logging.getLogger("brakeline.safety")
 
 
 class NoModel(BadRequest):
-    """No model of this robot is loaded."""
+    """The service has no model of the robot."""
 
 
 @dataclass
 class ModelRegistry:
-    """The method in use for each robot, and every version there has been, with an archive folder if given.
+    """The method in use for each robot, and all versions that have been in use.
 
-    limits: the largest stated bound that is used without a question, by the robot's name; without it the limit in the
-    model set's own description counts. accept_bound: the largest that is accepted explicitly, in place of both.
+    Attributes:
+        archive: folder for every installed version; None: no archive.
+        limits: largest accepted bound of a validation report, by the robot's name. Defaults to the limit in the
+            description that the model set holds.
+        accept_bound: largest bound that the user accepts explicitly, in place of `limits`.
+        filters: the method in use, by the robot's name.
+        known: versions that have been in use.
     """
 
     archive: Path | None = None
@@ -51,11 +56,15 @@ class ModelRegistry:
     _lock: Lock = field(default_factory=Lock)
 
     def install(self, model: Model, signed: SignedModel | None = None) -> None:
-        """Put a model to use; requests in hand finish with the one before. signed: as it came, to be archived so.
+        """Use a model from now on. Running decisions finish with the model before.
+
+        Args:
+            model: a model set or a rival's model.
+            signed: the signed file that it comes from, for the archive.
 
         Raises:
-            BadModel: it does not fit its robot, or its robot has the name of another that comes with the program.
-            TooLoose: its statement is looser than what is used.
+            BadModel: the model does not fit its robot, or uses the name of another robot that Brakeline ships.
+            TooLoose: the bound in its validation report is larger than the accepted one.
         """
         robot = model.robot
         limit = self.limits.get(robot.name, robot.accept_bound)
@@ -73,15 +82,15 @@ class ModelRegistry:
             (signed or model).save(archive_path(self.archive, model.robot.name, method.version))
 
     def method_for(self, request: pb.Request) -> Method:
-        """Raises UnknownRobot, NoModel or StaleModel."""
+        """Return the method for a request. Raises UnknownRobot, NoModel or StaleModel."""
         method = self.filters.get(request.robot)
         if method is None:
             if request.robot.removesuffix(REAL_TIME_SUFFIX) not in shipped_robots():
                 raise UnknownRobot(f"no robot is called {request.robot!r:.80} here")
             have = ", ".join(self.filters) or "none"
             raise NoModel("robot", f"no model of {request.robot} is loaded (loaded: {have})")
-        vouched = request.model in ("", UNVERIFIED) or request.model in self.known
-        if not vouched and not self._archived(request.robot, request.model):
+        known = request.model in ("", UNVERIFIED) or request.model in self.known
+        if not known and not self._archived(request.robot, request.model):
             raise StaleModel("model", f"the plan was verified by model {request.model}, which was never in use here")
         return method
 
@@ -95,12 +104,14 @@ class ModelRegistry:
 
 
 def archive_path(archive: Path, robot: str, version: str) -> Path:
-    """Where a version is kept."""
+    """Return the path of a version in the archive."""
     return archive / robot / "models" / f"{version}.safetensors"
 
 
 @dataclass
 class ServiceCounts:
+    """Counters of a running service, for its health messages."""
+
     decisions: int = 0
     errors: int = 0
     violations: int = 0
@@ -109,7 +120,7 @@ class ServiceCounts:
     token_rejected: int = 0
     not_finite: int = 0  # decisions on proposals with NaN or infinity
     decide_ms: float = 0.0
-    answering: float = 0.0  # s
+    busy_time: float = 0.0  # s
 
     def figures(self) -> dict[str, float]:
         mean = self.decide_ms / max(self.decisions, 1)
@@ -128,30 +139,35 @@ class ServiceCounts:
 def batch_handler(
     models: ModelRegistry, counts: ServiceCounts, authenticator: PlanAuthenticator | None = None
 ) -> Callable[[bytes], bytes]:
-    """The service's core: bytes of a RequestBatch to bytes of a ReplyBatch. Raises BadRequest for no batch at all.
+    """Return the service's core: a function from the bytes of a RequestBatch to the bytes of a ReplyBatch.
 
-    notary: who knows which plans were verified; without one (in process, and when a log is replayed) what requests say
-    of theirs is believed.
+    The function raises BadRequest for bytes that are not a batch.
+
+    Args:
+        models: the methods in use.
+        counts: to count in.
+        authenticator: checks the plan tokens. Without one (in process, or when a log is replayed), every plan counts as
+            verified by the model that the request names.
     """
 
-    def one(message: pb.Request, received: int, shared: FleetReservations | None = None) -> pb.Reply:
+    def decide(message: pb.Request, received: int, shared: FleetReservations | None = None) -> pb.Reply:
         try:
-            chosen = models.method_for(message)
-            believed = authenticator is None or authenticator.is_authentic(message, chosen.robot)
-            if not believed:
+            method = models.method_for(message)
+            authentic = authenticator is None or authenticator.is_authentic(message, method.robot)
+            if not authentic:
                 counts.token_rejected += 1
                 message.model = UNVERIFIED
             if shared is None:
-                request = request_of(message, chosen.robot)
+                request = request_of(message, method.robot)
             else:
                 own = shared.reservations[message.actor]
-                request = request_of(message, chosen.robot, own, shared.to(message.actor))
+                request = request_of(message, method.robot, own, shared.to(message.actor))
             queue_ms = (perf_counter_ns() - received) * 1e-6
-            decision = chosen.decide(request)
+            decision = method.decide(request)
         except (BadRequest, UnknownRobot) as error:
             counts.errors += 1
             return error_reply(error)
-        except Exception as error:  # whatever it is, the robot brakes on an error reply, and the service goes on
+        except Exception as error:  # the robot brakes on the error reply, and the service goes on
             counts.errors += 1
             log.exception("decide failed for %s", message.actor or message.robot)
             return error_reply(error)
@@ -166,25 +182,29 @@ def batch_handler(
         if shared is not None and decision.reservation is not None:
             shared.reservations[message.actor] = decision.reservation
         reply = decision_reply(decision, queue_ms)
-        reply.robot, reply.decision.token_rejected = chosen.robot.name, not believed
+        reply.robot, reply.decision.token_rejected = method.robot.name, not authentic
         if authenticator is not None and decision.verified:
-            reply.decision.plan_tokens.extend(authenticator.plan_tokens(message, reply.decision, chosen.robot))
+            reply.decision.plan_tokens.extend(authenticator.plan_tokens(message, reply.decision, method.robot))
         return reply
 
-    def committed(message: pb.Request) -> Reservation:
-        """What a fleet's robot has promised; one that stands and has not: to go on standing."""
+    def current_reservation(message: pb.Request) -> Reservation:
+        """Return the reservation of a fleet's robot. One that stands without it reserves the space it stands in."""
         method = models.method_for(message)
         if not isinstance(method, Filter):
-            raise BadRequest("fleet", "only our own filter makes promises: the rivals predict nothing")
+            raise BadRequest("fleet", "only the filter makes reservations: the rivals predict nothing")
         robot = method.robot
         if robot.late:
-            raise BadRequest("fleet", f"{robot.name}: what is asked in real time is decided too late for promises")
+            raise BadRequest(
+                "fleet", f"{robot.name}: a robot in real time gets its decisions too late for reservations"
+            )
         if message.HasField("reservation"):
             return reservation_of(message.reservation, robot)
         request = request_of(message, robot)
         check_for_filter(robot, request)
         if not request.still(robot):
-            raise BadRequest("reservation", f"{message.actor} moves and has promised nothing: nobody can keep off it")
+            raise BadRequest(
+                "reservation", f"{message.actor} moves without a reservation: no robot can keep away from it"
+            )
         return method.standing_reservation(request.state)
 
     def answer(payload: bytes) -> bytes:
@@ -194,16 +214,16 @@ def batch_handler(
         for world in group_by_fleet(batch.requests):
             members = [batch.requests[i] for i in world]
             try:
-                shared = joint_request(members, committed) if members[0].fleet else None
+                shared = joint_request(members, current_reservation) if members[0].fleet else None
             except (BadRequest, UnknownRobot) as error:
                 counts.errors += len(members)
                 for i in world:
                     replies[i] = error_reply(error)
                 continue
             for i, request in zip(world, members, strict=True):
-                replies[i] = one(request, received, shared)
+                replies[i] = decide(request, received, shared)
         reply = pb.ReplyBatch(replies=replies, request=digest(payload)).SerializeToString()
-        counts.answering += (perf_counter_ns() - received) * 1e-9
+        counts.busy_time += (perf_counter_ns() - received) * 1e-9
         return reply
 
     return answer
@@ -211,22 +231,32 @@ def batch_handler(
 
 @dataclass(frozen=True)
 class SafetySettings:
+    """Settings of the process.
+
+    Attributes:
+        bus: how to join the bus.
+        models: model files, one for each robot.
+        archive, limits, accept_bound: of `ModelRegistry`.
+        name: of the process.
+        secrets: folder with the key of the plan tokens, on a bus without keys.
+    """
+
     bus: BusSettings
-    models: tuple[Path, ...]  # model files, one a robot; each says which method it is of
-    archive: Path | None = None  # where versions that come over the bus are kept
+    models: tuple[Path, ...]
+    archive: Path | None = None
     name: str = "safety"
-    limits: Mapping[str, float] = field(default_factory=dict)  # as those of `ModelRegistry`
+    limits: Mapping[str, float] = field(default_factory=dict)
     accept_bound: float | None = None
-    secrets: Path | None = None  # folder with the key of vouchers, where the bus has no keys
+    secrets: Path | None = None
 
 
 def main(settings: SafetySettings) -> None:
     """Serve until SIGINT or SIGTERM.
 
     Raises:
-        BadModel: a file is no model, or with keys none that is signed: a service without one would only refuse.
+        BadModel: a file holds no model, or is not signed on a bus with keys.
     """
-    import brakeline.safety.filter.kernels.halfspace_kernels  # noqa: F401  # compiled, which takes seconds the first time: before it is seen to live
+    import brakeline.safety.filter.kernels.halfspace_kernels  # noqa: F401  # compiles for seconds the first time: do it before the service announces itself
 
     keys = settings.bus.keys
     models, counts = ModelRegistry(settings.archive, settings.limits, settings.accept_bound), ServiceCounts()
@@ -241,21 +271,21 @@ def main(settings: SafetySettings) -> None:
 
         def replace(sample: Sample) -> None:
             try:
-                said = sample.message()
+                message = sample.message()
                 if trust is None:
-                    raise Untrusted("models are taken over the bus by a service with keys only: who signed it?")
-                signed = SignedModel(said.file, said.claim, said.signature)
-                models.install(trust.open(signed, said.robot), signed)
+                    raise Untrusted("without keys, a service takes no models over the bus: it cannot check signatures")
+                signed = SignedModel(message.file, message.claim, message.signature)
+                models.install(trust.open(signed, message.robot), signed)
             except (BadModel, BusError) as error:
                 log.error("a model was refused: %s", error)
             except OSError as error:
                 log.error("a model is in use but could not be archived: %s", error)
 
-        before = perf_counter_ns() * 1e-9, 0.0  # when figures were last told, and how long it had answered by then
+        before = perf_counter_ns() * 1e-9, 0.0  # time of the last figures, and the busy time until then [s]
 
         def refresh() -> None:
             nonlocal before
-            now = perf_counter_ns() * 1e-9, counts.answering
+            now = perf_counter_ns() * 1e-9, counts.busy_time
             busy = (now[1] - before[1]) / max(now[0] - before[0], 1e-9)
             before = now
             process.figures.update(counts.figures() | {"busy": busy})

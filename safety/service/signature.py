@@ -1,11 +1,11 @@
-"""Who certified a model: an Ed25519 signature, made where the data are, by a key that no process of a run needs.
+"""Signatures of models: an Ed25519 signature by a key that no process of a run needs, made where the data are.
 
-signer.key          the key, in the folder of keys of whoever certifies; kept offline
-signers/NAME.json   a public key that a service takes models of, and the robots that it may speak about
-MODEL.seal          beside a model's file: a claim, and its signature
+signer.key          the private key, in the folder of keys of the person who certifies; keep it offline
+signers/NAME.json   a public key that a service trusts, and the robots whose models it may sign
+MODEL.seal          beside a model's file: a claim and its signature
 
-What is signed is a claim about a file: its SHA-256, robot, layout and version, and the domain that was recorded. The
-signature is looked at before anything else of a model is.
+The signature covers a claim about the file: its SHA-256, robot, layout and version, and the recorded domain. A service
+checks the signature before it reads anything else of a model.
 """
 
 from __future__ import annotations
@@ -33,35 +33,35 @@ from brakeline.safety.model.dataset import Dataset
 from brakeline.safety.model.model_set import Array, BadModel, ModelSet
 from brakeline.safety.model.windows import windows
 
-CONTEXT = b"brakeline model 1\n"  # what a signature of ours is about, so that it is good for nothing else
+CONTEXT = b"brakeline model 1\n"  # signed with each claim, so that a signature is valid for nothing else
 KEY, SIGNERS = "signer.key", "signers"
-ANY = "*"  # in a signer's list of robots
+ANY = "*"  # in a signer's list of robots: it may sign models of all
 
 
 class Untrusted(BadModel):
-    """Nobody who is believed says what the model is, or it is not that."""
+    """No trusted signer signed the model, or the model is not what was signed."""
 
 
 @dataclass(frozen=True)
 class SignedModel:
-    """A model's file, the claim about it (JSON) and the claim's signature."""
+    """The bytes of a model's file, of the claim about it (JSON), and of the claim's signature."""
 
     file: bytes
     claim: bytes
     signature: bytes
 
     def save(self, path: Path) -> None:
-        """The file, with its seal beside it; the seal first, so that there is never a model without one."""
-        said = {"claim": self.claim.decode(), "signature": self.signature.hex()}
-        write_atomically(seal_of(path), json.dumps(said, indent=2).encode())
+        """Write the file and its seal. The seal comes first, so that no model is ever without one."""
+        seal = {"claim": self.claim.decode(), "signature": self.signature.hex()}
+        write_atomically(seal_of(path), json.dumps(seal, indent=2).encode())
         write_atomically(path, self.file)
 
     @classmethod
     def load(cls, path: Path) -> Self:
-        """Raises Untrusted: there is no such file, or no seal beside it."""
+        """Read a model's file and its seal. Raises Untrusted if either is missing or not readable."""
         try:
-            said = json.loads(seal_of(path).read_bytes())
-            return cls(path.read_bytes(), str(said["claim"]).encode(), bytes.fromhex(said["signature"]))
+            seal = json.loads(seal_of(path).read_bytes())
+            return cls(path.read_bytes(), str(seal["claim"]).encode(), bytes.fromhex(seal["signature"]))
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise Untrusted(
                 f"{path} has no seal ({error}): sign it with `brakeline keys FOLDER --sign {path}`"
@@ -73,17 +73,14 @@ def seal_of(path: Path) -> Path:
 
 
 class ModelSigner:
-    """Whoever certifies."""
+    """Signs models with a private key."""
 
     def __init__(self, key: Ed25519PrivateKey) -> None:
         self._key = key
 
     @classmethod
     def load(cls, folder: Path) -> Self:
-        """
-        Raises:
-            Untrusted: the folder has no key to sign with.
-        """
+        """Read the private key in a folder. Raises Untrusted if there is none."""
         try:
             key = load_pem_private_key((folder / KEY).read_bytes(), None)
         except (OSError, ValueError) as error:
@@ -93,10 +90,14 @@ class ModelSigner:
         return cls(key)
 
     def sign(self, model: Model, data: Dataset | None = None) -> SignedModel:
-        """A model with a claim about it; data: those that it was made from, else its own word is taken for its domain.
+        """Return a model with a signed claim about it.
+
+        Args:
+            model: a model set or a rival's model.
+            data: the data set that the model set was made from. Without it, the claim states the model set's domain.
 
         Raises:
-            Untrusted: it claims to know more than was recorded.
+            Untrusted: the model set's domain is larger than the data's.
         """
         file = model.encode()
         domain = None
@@ -116,39 +117,36 @@ class ModelSigner:
 
 @dataclass(frozen=True)
 class TrustedSigners:
-    """Whose models are taken: public keys, each with the robots that it may speak about."""
+    """The public keys that a service trusts, each with the robots whose models it may sign."""
 
     signers: tuple[tuple[Ed25519PublicKey, tuple[str, ...]], ...] = ()
 
     @classmethod
     def load(cls, folder: Path) -> Self:
-        """Those in a folder of keys.
-
-        Raises:
-            Untrusted: a file there is none.
-        """
-        found = []
+        """Read the public keys in a folder. Raises Untrusted if a file holds none."""
+        signers = []
         for path in sorted((folder / SIGNERS).glob("*.json")):
             try:
-                said = json.loads(path.read_bytes())
-                key = Ed25519PublicKey.from_public_bytes(bytes.fromhex(said["key"]))
-                found.append((key, tuple(map(str, said["robots"]))))
+                signer = json.loads(path.read_bytes())
+                key = Ed25519PublicKey.from_public_bytes(bytes.fromhex(signer["key"]))
+                signers.append((key, tuple(map(str, signer["robots"]))))
             except (ValueError, KeyError, TypeError) as error:
                 raise Untrusted(f"{path}: no signer's public key: {error!r}") from error
-        return cls(tuple(found))
+        return cls(tuple(signers))
 
     def open(self, signed: SignedModel, robot: str | None = None) -> Model:
-        """The model in a signed file; robot: what it is said to be for, by where it was published.
+        """Return the model in a signed file; robot: the name under which it was published, if it was.
 
         Raises:
-            Untrusted: nobody of these signed it, or it is not what was signed; BadModel: it is none.
+            Untrusted: no trusted signer signed it, or it is not what was signed.
+            BadModel: the file holds no model.
         """
-        robots = self._signer_of(signed)
+        robots = self._robots_of_signer(signed)
         claim = _claim(signed)
         if hashlib.sha256(signed.file).hexdigest() != claim["sha256"]:
             raise Untrusted("the model's file is not the one that was signed")
         if ANY not in robots and claim["robot"] not in robots:
-            raise Untrusted(f"who signed it may not speak about {claim['robot']}")
+            raise Untrusted(f"the signer may not sign models of {claim['robot']}")
         if robot is not None and claim["robot"] != robot:
             raise Untrusted(f"a model of {claim['robot']} was published as one of {robot}")
         model = decode(signed.file)
@@ -158,48 +156,48 @@ class TrustedSigners:
             ("version", model.version),
         ):
             if claim[name] != value:
-                raise Untrusted(f"its {name} is {value}, and {claim[name]} was signed")
+                raise Untrusted(f"the model's {name} is {value}, but {claim[name]} was signed")
         if isinstance(model, ModelSet):
             _within(model, np.array(claim["domain"], float))
         return model
 
     def load_model(self, path: Path) -> Model:
-        """The model in a file with a seal beside it. Raises as `open`, naming the file."""
+        """Return the model in a file with a seal beside it. Raises like `open`, with the file's name."""
         try:
             return self.open(SignedModel.load(path))
         except Untrusted as error:
             raise Untrusted(f"{path}: {error}") from error
 
-    def _signer_of(self, signed: SignedModel) -> tuple[str, ...]:
-        """The robots that whoever signed it may speak about."""
+    def _robots_of_signer(self, signed: SignedModel) -> tuple[str, ...]:
+        """Return the robots whose models the signer may sign. Raises Untrusted if the signer is not trusted."""
         for key, robots in self.signers:
             try:
                 key.verify(signed.signature, CONTEXT + signed.claim)
             except InvalidSignature:
                 continue
             return robots
-        raise Untrusted("nobody who is trusted signed the model")
+        raise Untrusted("no trusted signer signed the model")
 
 
 def recorded_domain(data: Dataset) -> Array:
-    """(2, regressor_dim): the smallest and largest [x_0; input in force] in the data."""
+    """Return the smallest and the largest [x_0; input in force] (2, regressor_dim) in the data."""
     known = windows(data, 1).z[:, : data.robot.regressor_dim]
     return np.stack([known.min(0), known.max(0)])
 
 
 def write_signer(folder: Path, name: str = "certify", robots: tuple[str, ...] = (ANY,)) -> None:
-    """A new key to sign with, and its public half among those that are trusted, if there is none yet."""
+    """Write a new private key, and its public key among the trusted ones, if the folder has none yet."""
     if (folder / KEY).exists():
         return
     key = Ed25519PrivateKey.generate()
     public = key.public_key().public_bytes(Encoding.Raw, PublicFormat.Raw)
     write_secret(folder / KEY, key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption()))
-    said = {"key": public.hex(), "robots": list(robots)}
-    write_atomically(folder / SIGNERS / f"{name}.json", json.dumps(said, indent=2).encode())
+    signer = {"key": public.hex(), "robots": list(robots)}
+    write_atomically(folder / SIGNERS / f"{name}.json", json.dumps(signer, indent=2).encode())
 
 
 def _claim(signed: SignedModel) -> dict[str, Any]:
-    """What was signed. Raises Untrusted."""
+    """Return the claim that was signed. Raises Untrusted if it is not readable."""
     try:
         claim = json.loads(signed.claim)
         return {name: claim[name] for name in ("robot", "layout", "version", "sha256", "domain")}
@@ -208,8 +206,8 @@ def _claim(signed: SignedModel) -> dict[str, Any]:
 
 
 def _within(model: ModelSet, recorded: Array) -> None:
-    """Raises Untrusted for a model that claims to know more than was recorded."""
+    """Raise Untrusted if a model set's domain is larger than the recorded one (2, regressor_dim)."""
     if recorded.shape != model.domain.shape:
-        raise Untrusted("the claim does not say what was recorded")
+        raise Untrusted("the claim does not state the recorded domain")
     if (model.domain[0] < recorded[0]).any() or (model.domain[1] > recorded[1]).any():
         raise Untrusted("the model claims a wider domain than was recorded")

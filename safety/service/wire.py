@@ -1,5 +1,7 @@
-"""Requests and decisions, between messages and the filter's own types; every field of a request is checked here or
-in `Filter.decide` before it is used."""
+"""Conversion between messages and the filter's requests and decisions.
+
+This module or `Filter.decide` checks every field of a request before its use.
+"""
 
 from __future__ import annotations
 
@@ -22,21 +24,21 @@ from brakeline.safety.filter.blocking_constraint import BlockingConstraint
 from brakeline.safety.filter.request import ADJUSTED, ALLOWED, FAILSAFE, RECOVERING, BadRequest, Decision, Request
 from brakeline.safety.filter.reservation import OtherReservations, Reservation
 
-KINDS = {ALLOWED: pb.ALLOWED, ADJUSTED: pb.ADJUSTED, FAILSAFE: pb.FAILSAFE, RECOVERING: pb.RECOVERING}
-NAMES = {number: name for name, number in KINDS.items()}
-# What a batch may cost, known before it is worked on: its bytes to decode, its requests and obstacles to decide on.
-LARGEST = 2**20  # bytes of a request batch: some thirty with a range image each
-MOST_REQUESTS = 64
-FIXED_64, LENGTH, FIXED_32 = 1, 2, 5  # how protobuf writes a field; else as one number
-MOST_OBSTACLES = 1000  # of all its requests
+KIND_NUMBERS = {ALLOWED: pb.ALLOWED, ADJUSTED: pb.ADJUSTED, FAILSAFE: pb.FAILSAFE, RECOVERING: pb.RECOVERING}
+KIND_NAMES = {number: name for name, number in KIND_NUMBERS.items()}
+# Limits on the cost of a batch, which the service checks before it does the work.
+MAX_BATCH_SIZE = 2**20  # bytes: about thirty requests with a range image each
+MAX_REQUESTS = 64  # of a batch
+MAX_OBSTACLES = 1000  # of all requests of a batch
+FIXED_64, LENGTH, FIXED_32 = 1, 2, 5  # wire types of protobuf; the others are one varint
 
 
 def batch_of(payload: bytes) -> pb.RequestBatch:
-    """Raises BadRequest for anything that is not a batch of a sensible size."""
-    if len(payload) > LARGEST:
-        raise BadRequest("payload", f"{len(payload)} bytes; a request batch has at most {LARGEST}")
-    if _fields(payload, MOST_REQUESTS) > MOST_REQUESTS:
-        raise BadRequest("requests", f"a batch has at most {MOST_REQUESTS} requests")
+    """Return the batch in a payload. Raises BadRequest if it is not a batch, or too large."""
+    if len(payload) > MAX_BATCH_SIZE:
+        raise BadRequest("payload", f"{len(payload)} bytes; a request batch has at most {MAX_BATCH_SIZE}")
+    if _count_fields(payload, MAX_REQUESTS) > MAX_REQUESTS:
+        raise BadRequest("requests", f"a batch has at most {MAX_REQUESTS} requests")
     try:
         batch = pb.RequestBatch.FromString(payload)
     except DecodeError as error:
@@ -44,14 +46,16 @@ def batch_of(payload: bytes) -> pb.RequestBatch:
     if not batch.requests:
         raise BadRequest("requests", "the batch holds no request")
     obstacles = sum(len(request.obstacles) for request in batch.requests)
-    if obstacles > MOST_OBSTACLES:
-        raise BadRequest("obstacles", f"{obstacles} obstacles; at most {MOST_OBSTACLES} can be decided on at once")
+    if obstacles > MAX_OBSTACLES:
+        raise BadRequest("obstacles", f"{obstacles} obstacles; at most {MAX_OBSTACLES} can be decided on at once")
     return batch
 
 
-def _fields(payload: bytes, most: int) -> int:
-    """How many fields a message has on the wire, counted no further than one beyond `most`: decoding half a million
-    empty requests would take longer than a robot can wait."""
+def _count_fields(payload: bytes, most: int) -> int:
+    """Return the number of fields of a message on the wire, or `most + 1` if there are more.
+
+    Decoding half a million empty requests would take longer than a robot can wait.
+    """
     at = count = 0
     while at < len(payload) and count <= most:
         count += 1
@@ -66,7 +70,7 @@ def _fields(payload: bytes, most: int) -> int:
 
 
 def _varint(payload: bytes, at: int) -> tuple[int, int]:
-    """A number and where it ends; a cut one as far as it goes."""
+    """Return the varint at a position, and the position after it. A truncated varint ends with the payload."""
     value = shift = 0
     while at < len(payload):
         byte = payload[at]
@@ -82,10 +86,16 @@ def request_of(
     reservation: Reservation | None = None,
     other_reservations: OtherReservations | None = None,
 ) -> Request:
-    """The request in a message; promise, promised: of a fleet's robot, its own and the others'.
+    """Return the request in a message.
+
+    Args:
+        message: about the robot.
+        robot: of the method that decides.
+        reservation: current one of a fleet's robot.
+        promised: reservations of the fleet's other robots.
 
     Raises:
-        BadRequest: an obstacle, a size or a value is wrong, with the field's name.
+        BadRequest: an obstacle, a size or a value is wrong; `field` names it.
     """
     predicted = None
     if message.predicted_center or message.predicted_half_width:
@@ -93,8 +103,8 @@ def request_of(
         predicted = Prediction(center, half, message.predicted_heading)
     plan = array_of(message.plan)
     if plan.size != robot.horizon * robot.action_dim:
-        wanted = f"{robot.horizon} x {robot.action_dim}"
-        raise BadRequest("plan", f"plan has {plan.size} numbers, a {robot.name} robot's has {wanted}")
+        size = f"{robot.horizon} x {robot.action_dim}"
+        raise BadRequest("plan", f"plan has {plan.size} numbers; a plan of {robot.name} has {size}")
     obstacles, movers = split_moving(obstacles_of(message.obstacles, robot.position_dim), robot.position_dim)
     return Request(
         state=array_of(message.state),
@@ -103,7 +113,7 @@ def request_of(
         plan=plan.reshape(robot.horizon, robot.action_dim),
         obstacles=obstacles,
         movers=movers,
-        scan=seen(message),
+        scan=measurement_of(message),
         model=message.model,
         predicted=predicted,
         reservation=reservation,
@@ -114,23 +124,23 @@ def request_of(
 
 
 def array_of(field: Collection[float]) -> NDArray[np.float64]:
-    """A repeated field as an array: `np.array` takes five times as long for it."""
+    """Return a repeated field as an array. `np.array` would take five times as long."""
     return np.fromiter(field, np.float64, len(field))
 
 
 def obstacles_of(messages: Sequence[pb.Obstacle], dim: int) -> list[Obstacle]:
-    """Raises BadRequest naming the obstacle and its field."""
+    """Return the obstacles in messages. Raises BadRequest; `field` names the obstacle and its field."""
     obstacles = []
-    for i, o in enumerate(messages):
+    for i, message in enumerate(messages):
         try:
-            obstacles.append(obstacle_of(o, dim))
+            obstacles.append(obstacle_of(message, dim))
         except BadShape as error:
             raise BadRequest(f"obstacles[{i}].{error.field}", str(error)) from error
     return obstacles
 
 
-def seen(message: pb.Request) -> RangeMeasurement | None:
-    """Raises BadRequest: it is none."""
+def measurement_of(message: pb.Request) -> RangeMeasurement | None:
+    """Return the scan or range image in a request. Raises BadRequest if it is not valid."""
     try:
         return measurement_in(message)
     except BadScan as error:
@@ -138,22 +148,21 @@ def seen(message: pb.Request) -> RangeMeasurement | None:
 
 
 def reservation_of(m: pb.Reservation, robot: Robot) -> Reservation:
-    """Raises BadRequest: it is none of this robot's."""
+    """Return the reservation in a message. Raises BadRequest if it does not fit the robot."""
     shape = robot.horizon, robot.position_dim
     if {len(m.center), len(m.half_width)} != {shape[0] * shape[1]} or len(m.radius) != shape[0]:
-        raise BadRequest(
-            "reservation", f"a {robot.name} robot's promise has {shape[0]} boxes in {shape[1]} coordinates"
-        )
+        raise BadRequest("reservation", f"a reservation of {robot.name} has {shape[0]} boxes in {shape[1]} coordinates")
     center, half, radius = array_of(m.center), array_of(m.half_width), array_of(m.radius)
     within = all((np.abs(part) <= FARTHEST).all() for part in (center, half, radius))  # NaN fails too
     if not within or (half < 0.0).any() or (radius < 0.0).any():
-        raise BadRequest("reservation", "a promise's boxes are within reason and not negative")
+        raise BadRequest("reservation", f"a reservation's numbers are {FARTHEST:g} at most, and its sizes not negative")
     return Reservation(center.reshape(shape), half.reshape(shape), radius)
 
 
 def decision_reply(decision: Decision, queue_ms: float) -> pb.Reply:
+    """Return the reply with a decision; queue_ms: time from receipt to the decision."""
     message = pb.Decision(
-        kind=KINDS[decision.kind],
+        kind=KIND_NUMBERS[decision.kind],
         plan=decision.plan.ravel().tolist(),
         tube_center=decision.tube_center.ravel().tolist(),
         tube_half_width=decision.tube_half_width.ravel().tolist(),
@@ -189,12 +198,12 @@ def decision_reply(decision: Decision, queue_ms: float) -> pb.Reply:
 
 
 def decision_of(m: pb.Decision, robot: Robot) -> Decision:
-    """The decision in a message, its plan's size having been checked.
+    """Return the decision in a message. The caller has checked the size of its plan.
 
     Raises:
-        BadRequest: its kind, tube or promise is none of this robot's, with the field's name.
+        BadRequest: its kind, tube or reservation does not fit the robot; `field` names it.
     """
-    if m.kind not in NAMES:
+    if m.kind not in KIND_NAMES:
         raise BadRequest("kind", f"kind {m.kind}")
     d = robot.position_dim
     tube = array_of(m.tube_center), array_of(m.tube_half_width)
@@ -207,7 +216,7 @@ def decision_of(m: pb.Decision, robot: Robot) -> Decision:
         where = array_of(m.stopped.normal), array_of(m.stopped.at)
         stopped = BlockingConstraint(m.stopped.by, m.stopped.room, m.stopped.after, *where)
     return Decision(
-        kind=NAMES[m.kind],
+        kind=KIND_NAMES[m.kind],
         plan=array_of(m.plan).reshape(robot.horizon, robot.action_dim),
         tube_center=tube[0].reshape(-1, d),
         tube_half_width=tube[1].reshape(-1, d),
@@ -233,6 +242,7 @@ def decision_of(m: pb.Decision, robot: Robot) -> Decision:
 
 
 def reservation_message(reservation: Reservation) -> pb.Reservation:
+    """Return the message of a reservation."""
     return pb.Reservation(
         center=reservation.center.ravel().tolist(),
         half_width=reservation.half_width.ravel().tolist(),
@@ -241,6 +251,6 @@ def reservation_message(reservation: Reservation) -> pb.Reservation:
 
 
 def error_reply(error: Exception) -> pb.Reply:
-    """An error reply: type, field if it has one, and what to do."""
+    """Return the reply with an error: its type, its field if it has one, and its message."""
     name = type(error).__name__
     return pb.Reply(error=pb.Error(type=name, field=str(getattr(error, "field", "")), message=str(error)))

@@ -12,7 +12,7 @@ from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.bus import NoReply
 from brakeline.safety.filter.request import NOT_FINITE
 from brakeline.safety.model.model_set import ModelConfig
-from brakeline.safety.service.wire import KINDS
+from brakeline.safety.service.wire import KIND_NUMBERS
 from tests.robots import GROUND
 
 FAST = np.array([0.25, 0.1])
@@ -41,7 +41,7 @@ def test_a_step_records_the_proposal_the_decision_and_the_result(ask):
         assert (step.episode, step.step, step.index, step.weights_version) == (5, number, number + 1, 3)
         assert np.array_equal(np.float32(step.observation), observation)
         assert np.array_equal(np.float32(step.next_observation), robot.observation)
-        assert step.decision == KINDS[outcome.answer.kind] and step.decide_ms > 0 and not step.fallback
+        assert step.decision == KIND_NUMBERS[outcome.answer.kind] and step.decide_ms > 0 and not step.fallback
         assert np.allclose(step.action, outcome.answer.action) and np.allclose(step.proposed, FAST)
         intervened = step.decision != pb.ALLOWED
         assert (step.penalty > 0) == intervened and step.penalty <= 2.0 * np.sqrt(2)

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.obstacle import BOX, CYLINDER, FARTHEST, SPHERE, WALL, BadShape, Obstacle, Shapes
 from brakeline.safety.filter.request import BadRequest
-from brakeline.safety.service.wire import LARGEST, MOST_REQUESTS, _fields, batch_of
+from brakeline.safety.service.wire import MAX_BATCH_SIZE, MAX_REQUESTS, _count_fields, batch_of
 
 NEAR = 1e-6  # m: what rounding may hide of a distance
 
@@ -89,8 +89,8 @@ ODD = b"\x10\x01\x19" + bytes(8) + b"\x25" + bytes(4)  # fields that nobody know
 
 @pytest.mark.parametrize("before", [b"", ODD], ids=["plain", "odd"])
 def test_half_a_million_empty_requests_are_refused_at_once(before: bytes) -> None:
-    assert refused(before + EMPTY * LARGEST)[0] == "payload"
-    field, seconds = refused(before + EMPTY * (LARGEST // 2 - len(before)))
+    assert refused(before + EMPTY * MAX_BATCH_SIZE)[0] == "payload"
+    field, seconds = refused(before + EMPTY * (MAX_BATCH_SIZE // 2 - len(before)))
     assert field == "requests" and seconds < 0.02
 
 
@@ -103,10 +103,10 @@ def test_16_requests_with_1000_obstacles_are_refused_before_they_are_worked_on()
 
 @given(st.binary(max_size=200))
 def test_counting_fields_ends_and_raises_nothing(payload: bytes) -> None:
-    assert 0 <= _fields(payload, MOST_REQUESTS) <= MOST_REQUESTS + 1
+    assert 0 <= _count_fields(payload, MAX_REQUESTS) <= MAX_REQUESTS + 1
 
 
-@given(st.integers(0, MOST_REQUESTS + 5), st.binary(max_size=20).map(lambda data: pb.Request(robot=data.hex())))
+@given(st.integers(0, MAX_REQUESTS + 5), st.binary(max_size=20).map(lambda data: pb.Request(robot=data.hex())))
 def test_fields_are_counted_as_the_decoder_does(count: int, request: pb.Request) -> None:
     payload = pb.RequestBatch(requests=[request] * count).SerializeToString()
-    assert _fields(payload, MOST_REQUESTS) == min(count, MOST_REQUESTS + 1)
+    assert _count_fields(payload, MAX_REQUESTS) == min(count, MAX_REQUESTS + 1)

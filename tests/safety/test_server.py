@@ -14,7 +14,7 @@ from brakeline.safety.filter.request import NOT_FINITE, BadRequest
 from brakeline.safety.model.model_set import ModelSet
 from brakeline.safety.service.client import SafetyClient, SafetyError, query_service, read_reply, request_message
 from brakeline.safety.service.server import ModelRegistry, ServiceCounts, batch_handler
-from brakeline.safety.service.wire import LARGEST, request_of
+from brakeline.safety.service.wire import MAX_BATCH_SIZE, request_of
 from tests.messaging.conftest import endpoint, join  # noqa: F401 - fixtures
 from tests.robots import GROUND, QUADROTOR
 from tests.safety.unicycle import Unicycle
@@ -144,7 +144,15 @@ def test_a_bad_request_spoils_no_other_of_its_batch(service):
 def test_what_is_no_batch_is_refused_and_the_service_goes_on(service):
     rng = np.random.default_rng(0)
     whole = pb.RequestBatch(requests=[good()]).SerializeToString()
-    for payload in (rng.bytes(10 << 20), bytes(LARGEST + 1), b"", b"\xff" * 50, rng.bytes(500), whole[:-3], whole[:40]):
+    for payload in (
+        rng.bytes(10 << 20),
+        bytes(MAX_BATCH_SIZE + 1),
+        b"",
+        b"\xff" * 50,
+        rng.bytes(500),
+        whole[:-3],
+        whole[:40],
+    ):
         with pytest.raises(BadRequest) as caught:
             service.answer(payload)
         assert caught.value.field in ("payload", "requests")
