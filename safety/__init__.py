@@ -1,1 +1,1 @@
-"""From recorded data to a decision: which plans can be verified, and which input is the closest safe one."""
+"""The safety filter: from recorded data to a decision on each proposed input."""

@@ -1,4 +1,4 @@
-"""Between an environment's actions and a robot's inputs."""
+"""Mapping between an environment's actions and a robot's inputs."""
 
 from __future__ import annotations
 
@@ -14,27 +14,31 @@ from brakeline.messaging.robot import Robot
 
 Array = NDArray[np.float64]
 
-SAME_BOUND = 1e-6  # of an input's range: bounds are often held in single precision
+SAME_BOUND = 1e-6  # of an input's range: rounding error of bounds in single precision
 
 
 class Mismatch(ValueError):
-    """The environment is not one of this robot, as it stands; the message says what to give."""
+    """The environment does not fit the robot. The message says which argument to give."""
 
 
 @dataclass(frozen=True)
 class ActionMapping:
-    """action_to_control: an action of the environment as the robot's input (m,); control_to_action: the way back.
-    Both also of many at once, (k, m), where a vector environment is to be wrapped."""
+    """A mapping and its inverse. For a vector environment, both also map k actions at once, (k, m).
+
+    Attributes:
+        action_to_control: from an action of the environment to an input (m,) of the robot.
+        control_to_action: from an input (m,) to an action.
+    """
 
     action_to_control: Callable[[Any], ArrayLike]
     control_to_action: Callable[[Array], Any]
 
 
-SAME = ActionMapping(lambda action: action, lambda control: control)
+IDENTITY = ActionMapping(lambda action: action, lambda control: control)
 
 
 def normalised(robot: Robot) -> ActionMapping:
-    """Actions in [-1, 1], as RL libraries like them: -1 is each input's lowest value, 1 its highest."""
+    """Return the mapping for actions in [-1, 1]: -1 is each input's lowest value, 1 its highest."""
     low, width = robot.low(), robot.high() - robot.low()
     return ActionMapping(
         lambda action: low + 0.5 * width * (np.clip(np.asarray(action, float), -1.0, 1.0) + 1.0),
@@ -43,30 +47,30 @@ def normalised(robot: Robot) -> ActionMapping:
 
 
 def mapping_for_space(space: gymnasium.Space[Any], robot: Robot, given: ActionMapping | None) -> ActionMapping:
-    """Those given, or none needed: the space is that of the robot's inputs.
+    """Return the given mapping, or the identity if an action space is that of the robot's inputs.
 
     Raises:
-        Mismatch: it is not, and nothing is given.
+        Mismatch: no mapping is given, and the spaces differ.
     """
     if given is not None:
         return given
-    wanted = ", ".join(
+    inputs = ", ".join(
         f"{name} from {low:g} to {high:g}"
         for name, low, high in zip(robot.action, robot.action_low, robot.action_high, strict=True)
     )
     give = "give actions=Actions(action_to_control, control_to_action)"
     if not isinstance(space, gymnasium.spaces.Box) or space.shape != (robot.action_dim,):
-        raise Mismatch(f"the action space {space} is not that of {robot.name}'s inputs ({wanted}): {give}")
+        raise Mismatch(f"the action space {space} is not that of {robot.name}'s inputs ({inputs}): {give}")
     near = SAME_BOUND * (robot.high() - robot.low())
     if (np.abs(space.low - robot.low()) > near).any() or (np.abs(space.high - robot.high()) > near).any():
         if (space.low == -1.0).all() and (space.high == 1.0).all():
             give = f"give actions=normalised(robot) if ±1 stands for the bounds, else {give.removeprefix('give ')}"
-        raise Mismatch(f"the action space {space} has other bounds than {robot.name}'s inputs ({wanted}): {give}")
-    return SAME
+        raise Mismatch(f"the action space {space} has other bounds than {robot.name}'s inputs ({inputs}): {give}")
+    return IDENTITY
 
 
 def cast_action(action: Any, space: gymnasium.Space[Any]) -> Any:
-    """The action in the type that the environment takes."""
+    """Return the action with the type and shape of the environment's action space."""
     if isinstance(space, gymnasium.spaces.Box):
         return np.asarray(action, dtype=space.dtype).reshape(space.shape)
     return action

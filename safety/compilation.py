@@ -1,6 +1,7 @@
-"""Loops that NumPy has no words for, compiled when their module is first imported on a machine, and kept (Numba).
+"""Compilation of loops that NumPy cannot express, with Numba.
 
-Import such a module where it is needed, not at the top: Numba takes 0.1 s to load.
+Numba compiles them at the first import of their module on a machine, and caches the result. Import such a module where
+it is needed, not at the top of a file: Numba takes 0.1 s to load.
 """
 
 from __future__ import annotations
@@ -14,15 +15,16 @@ F = TypeVar("F", bound=Callable[..., object])
 
 
 def compiled(signature: str) -> Callable[[F], F]:
-    """For these types, in Numba's words (`f8[::1]`: a contiguous row of float64); others raise TypeError.
+    """Return a decorator that compiles a function for a signature in Numba's notation.
 
-    Division by zero gives inf or NaN as NumPy's does; indices are not looked at.
+    `f8[::1]` is a contiguous array of float64. Arguments of other types raise TypeError. Division by zero gives inf or
+    NaN, as in NumPy. The compiled code does not check indices, unless NUMBA_BOUNDSCHECK=1 is set.
     """
 
-    def of(function: F) -> F:
+    def decorate(function: F) -> F:
         try:
             return cast(F, njit(signature, cache=True, error_model="numpy")(function))
-        except RuntimeError:  # no folder to keep it in: each process compiles it
+        except RuntimeError:  # no folder for the cache: each process compiles anew
             return cast(F, njit(signature, error_model="numpy")(function))
 
-    return of
+    return decorate

@@ -1,4 +1,4 @@
-"""What a filter is told of an environment's moment: the measured state and the obstacles, read by callables."""
+"""Views: callables that read the measured state and the obstacles from an environment, for the filter."""
 
 from __future__ import annotations
 
@@ -7,27 +7,23 @@ from typing import Any
 
 from brakeline.safety.action_mapping import Mismatch
 
-# (environment, observation, info) -> what is wanted
+# (environment, observation, info) -> the state or the obstacles
 View = Callable[[Any, Any, dict[str, Any]], Any]
 
-WANTED = {
+CONTENTS = {
     "state": "the measured state, as the robot's description names its coordinates",
-    "obstacles": "a list of messaging.shapes.Obstacle; none are needed beside a `scan`",
+    "obstacles": "a list of brakeline.Obstacle; not needed with a `scan`",
 }
 
 
 def in_info(name: str) -> View:
-    """Reads `info[name]`.
-
-    Raises (when called):
-        Mismatch: there is no such thing, and what to give instead.
-    """
+    """Return a view of `info[name]`. The view raises Mismatch if `info` has no such entry."""
 
     def view(env: Any, observation: Any, info: dict[str, Any]) -> Any:
         if name not in info:
-            there = ", ".join(sorted(map(str, info))) or "nothing"
+            names = ", ".join(sorted(map(str, info))) or "nothing"
             raise Mismatch(
-                f"the environment's info has no {name!r} ({WANTED[name]}; it has: {there}): "
+                f"the environment's info has no {name!r} ({CONTENTS[name]}; it has: {names}): "
                 f"give {name}=, a callable (env, observation, info)"
             )
         return info[name]
@@ -36,7 +32,7 @@ def in_info(name: str) -> View:
 
 
 def _obstacles(env: Any, observation: Any, info: dict[str, Any]) -> Any:
-    """`info["obstacles"]`; None beside a scan, if there are none: only the scan says what is free."""
+    """Return `info["obstacles"]`, or None if there is a scan instead, which alone shows free space."""
     return None if "scan" in info and "obstacles" not in info else in_info("obstacles")(env, observation, info)
 
 

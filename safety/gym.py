@@ -1,9 +1,9 @@
-"""The filter (or a rival: `safety/methods.py`) in front of any policy, as a Gymnasium wrapper.
+"""A Gymnasium wrapper that puts the filter, or a rival, in front of any policy.
 
 env = SafetyWrapper(NavigationEnv(robot), Filter(ModelSet.load(path)))
 model = AnyLibrary("MlpPolicy", env).learn(...)
 
-Of an environment that knows nothing of this:
+For an environment that does not provide the robot's state and obstacles in `info`:
 
 env = SafetyWrapper.load(env, path, state=state, obstacles=obstacles, actions=normalised(robot))
 """
@@ -31,17 +31,20 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
-UNANSWERED = "unanswered"  # in place of a decision's kind: the service was not there, and the committed plan went on
+UNANSWERED = "unanswered"  # in place of a decision's kind: no service answered, so the backup plan continued
 
 
 class SafetyWrapper(gymnasium.Wrapper[Any, Any, Any, Any]):
-    """Replaces each action by the filter's decision on it.
+    """Replaces each action by the filter's decision on it, and subtracts a penalty from the reward.
 
-    `info` may hold `scan` (`Scan`, in space `RangeImage`) in the obstacles' place. The wrapper adds, after `step`:
-    `safety` (the `Answer`, None if a service gave none), `proposed` (the action given), `penalty`, and `diagnostics`, a
-    dict of plain values: kind, verified, contained, margin [m], time_ms, model, reason, bound (the largest share of
-    verified plans that leave their tubes, as stated; NaN: none is), and proposed and executed as inputs of the robot.
-    The penalty is subtracted from the reward.
+    `info` may hold `scan` (a `Scan`, or a `RangeImage` in space) instead of obstacles. `step` adds to `info`:
+
+        safety: the `Answer`; None if a service did not answer.
+        proposed: the action that the policy proposed.
+        penalty: subtracted from the reward.
+        diagnostics: a dict of plain values: kind, verified, contained, margin [m], time_ms, model, reason, bound (the
+            probability that a verified plan leaves its tube, as the validation report states it; NaN without one), and
+            the proposed and the executed input.
     """
 
     def __init__(
@@ -55,38 +58,41 @@ class SafetyWrapper(gymnasium.Wrapper[Any, Any, Any, Any]):
         actions: ActionMapping | None = None,
         accept_bound: float | None = None,
     ) -> None:
-        """
+        """Wrap an environment.
+
         Args:
-            filter: or an asker: `SafetyClient` asks a service, and brakes along the committed plan without an answer.
-            penalty: of leaning on the filter, in reward (`correction_penalty`).
-            state: (env, observation, info) -> measured state (n,); unless given, `info["state"]`.
-            obstacles: likewise -> a list of `Obstacle` with at least those within `filter.reach`, as a map says: where
-                the list has nothing, space is free. None instead of a list: nothing is known, but by a scan.
-            actions: between the environment's actions and the robot's inputs; unless given they are the same.
-            accept_bound: of a filter, the largest stated share of plans outside their tubes that is accepted; unless
-                given the limit of the robot's description counts.
+            env: the environment.
+            filter: a method, or a client of a service, such as `SafetyClient`.
+            penalty: reward for a correction as large as an input's range (`correction_penalty`).
+            state: (env, observation, info) -> measured state (n,). Defaults to `info["state"]`.
+            obstacles: (env, observation, info) -> list of at least the obstacles within `filter.reach`. All other space
+                is free. None: only a scan shows free space. Defaults to `info["obstacles"]`.
+            actions: mapping between the environment's actions and the robot's inputs. Defaults to the identity.
+            accept_bound: largest accepted probability that a verified plan leaves its tube, as the model set's
+                validation report states it. Defaults to the limit in the robot's description.
 
         Raises:
             Mismatch: the action space is not that of the robot's inputs, and `actions` is not given.
-            TooLoose: the model set's statement is looser than that.
+            TooLoose: the validation report states a larger probability, or there is no report.
         """
         super().__init__(env)
-        self.asker = filter if isinstance(filter, FilterClient) else InProcess(filter, accept_bound)
-        self.penalty, self.backup_plan = penalty, self.asker.backup_plan
+        self.client = filter if isinstance(filter, FilterClient) else InProcess(filter, accept_bound)
+        self.penalty, self.backup_plan = penalty, self.client.backup_plan
         self._state, self._obstacles = state, obstacles
-        self._actions = mapping_for_space(env.action_space, self.asker.robot, actions)
+        self._actions = mapping_for_space(env.action_space, self.client.robot, actions)
         self._now: tuple[Any, dict[str, Any]] | None = None
-        self._memory = memory_of(self.asker.robot)
+        self._memory = memory_of(self.client.robot)
         self._scan: RangeMeasurement | None = None
 
     @classmethod
     def load(cls, env: gymnasium.Env[Any, Any], model: Path | str, penalty: float = 0.0, **how: Any) -> Self:
-        """With the model in a file.
+        """Wrap an environment with the model in a file; how: the keyword arguments of the constructor.
 
         Raises:
-            BadModel: it is none; TooLoose, Mismatch: see above.
+            BadModel: the file holds no model.
+            TooLoose, Mismatch: see the constructor.
         """
-        from brakeline.safety.methods import load, ready  # what only asks a service needs no solver
+        from brakeline.safety.methods import load, ready  # a client of a service needs no solver
 
         return cls(env, ready(load(Path(model))), penalty, **how)
 
@@ -99,48 +105,44 @@ class SafetyWrapper(gymnasium.Wrapper[Any, Any, Any, Any]):
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         if self._now is None:
-            raise gymnasium.error.ResetNeeded("reset the environment before anything else")
+            raise gymnasium.error.ResetNeeded("reset the environment before the first step")
         before = self.backup_plan.next_input
-        wanted = np.asarray(self._actions.action_to_control(action), dtype=float)
-        answer, reason = self._decide(wanted)
+        proposed = np.asarray(self._actions.action_to_control(action), dtype=float)
+        answer, reason = self._decide(proposed)
         executed = self.backup_plan.next_input
-        made = cast_action(self._actions.control_to_action(executed), self.env.action_space)
-        observation, reward, terminated, truncated, info = self.env.step(made)
-        cost = correction_penalty(self.asker.robot, wanted, before, executed, self.penalty)
-        told = diagnostics(answer, reason) | {"proposed": wanted, "executed": executed}
-        info = info | {"safety": answer, "proposed": action, "penalty": cost, "diagnostics": told}
+        safe_action = cast_action(self._actions.control_to_action(executed), self.env.action_space)
+        observation, reward, terminated, truncated, info = self.env.step(safe_action)
+        penalty = correction_penalty(self.client.robot, proposed, before, executed, self.penalty)
+        figures = diagnostics(answer, reason) | {"proposed": proposed, "executed": executed}
+        info = info | {"safety": answer, "proposed": action, "penalty": penalty, "diagnostics": figures}
         self._now = observation, info
         self._remember()
-        return observation, float(reward) - cost, terminated, truncated, info
+        return observation, float(reward) - penalty, terminated, truncated, info
 
-    def _decide(self, wanted: Array) -> tuple[Answer | None, str]:
-        """The decision, committed to, or None and why there is none: then the committed plan goes on."""
+    def _decide(self, proposed: Array) -> tuple[Answer | None, str]:
+        """Return the decision and commit to it; or None and the reason, and continue the backup plan."""
         assert self._now is not None
-        seen = self._now[0], self._now[1]
-        state, near = self._state(self.env, *seen), self._obstacles(self.env, *seen)
-        observation, known_free = request_observation(seen[0]), near is not None
+        state, near = self._state(self.env, *self._now), self._obstacles(self.env, *self._now)
+        observation, known_free = request_observation(self._now[0]), near is not None
         try:
-            answer = self.asker.decide(
-                state, wanted, near, scan=self._scan, observation=observation, known_free=known_free
+            answer = self.client.decide(
+                state, proposed, near, scan=self._scan, observation=observation, known_free=known_free
             )
             return answer, ""
         except BusError as error:
-            self.asker.fallback()
+            self.client.fallback()
             return None, str(error)
 
     def _remember(self) -> None:
-        """The scan, if there is one, with what was seen free before."""
+        """Fill in the scan from memory, if the environment has one."""
         assert self._now is not None
-        self._scan = filled(self._memory, self._now[1], self.asker.robot.period)
+        self._scan = filled(self._memory, self._now[1], self.client.robot.period)
 
 
 def diagnostics(answer: Answer | None, reason: str = "") -> dict[str, Any]:
-    """The figures of a decision as a dict."""
+    """Return the figures of a decision; reason: of a missing one."""
     if answer is None:
-        return {"kind": UNANSWERED, "verified": False, "contained": False, "margin": np.nan, "time_ms": np.nan} | {
-            "model": "",
-            "reason": reason,
-            "bound": np.nan,
-        }
+        nothing = {"margin": np.nan, "time_ms": np.nan, "bound": np.nan, "model": ""}
+        return {"kind": UNANSWERED, "verified": False, "contained": False, "reason": reason} | nothing
     names = ("kind", "verified", "contained", "margin", "time_ms", "model", "reason")
     return {name: getattr(answer, name) for name in names} | {"bound": np.nan if answer.bound is None else answer.bound}

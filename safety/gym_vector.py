@@ -1,4 +1,4 @@
-"""The filter in front of a vector of environments: one call decides for all of them."""
+"""A Gymnasium wrapper that puts the filter in front of a vector of environments: one call decides for all."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ Array = NDArray[np.float64]
 
 
 class VectorSafetyWrapper(VectorWrapper):
-    """`SafetyWrapper` of a `gymnasium.vector` environment, whatever its autoreset mode.
+    """`SafetyWrapper` for a `gymnasium.vector` environment with k environments, in any autoreset mode.
 
-    `state(env, observations, infos)` gives (k, n), `obstacles` k lists, `actions` maps (k, m); all of them unless given
-    as `SafetyWrapper` has them, and scans in `infos` likewise. `infos` gains `safety` (k answers; None where an
-    environment is being reset), `penalty` (k,) and `diagnostics` (a dict of k values each).
+    The arguments are those of `SafetyWrapper` for k environments: `state(env, observations, infos)` returns (k, n),
+    `obstacles` returns k lists, and `actions` maps (k, m). `step` adds to `infos`: `safety` (k answers; None for an
+    environment that is reset in this step), `penalty` (k,) and `diagnostics` (a dict of k values each).
     """
 
     def __init__(
@@ -43,13 +43,14 @@ class VectorSafetyWrapper(VectorWrapper):
         actions: ActionMapping | None = None,
         accept_bound: float | None = None,
     ) -> None:
-        """
+        """Wrap a vector environment; see `SafetyWrapper` for the arguments.
+
         Raises:
             Mismatch: the action space is not that of the robot's inputs, and `actions` is not given.
-            TooLoose: the model set's statement is looser than what is used (`InProcess`).
+            TooLoose: the validation report states a larger probability than accepted, or there is no report.
         """
         super().__init__(env)
-        self.asker, self.penalty = InProcess(filter, accept_bound), penalty
+        self.client, self.penalty = InProcess(filter, accept_bound), penalty
         self.backup_plans = [BackupPlan(filter.robot) for _ in range(env.num_envs)]
         self._state, self._obstacles = state, obstacles
         self._actions = mapping_for_space(env.single_action_space, filter.robot, actions)
@@ -67,81 +68,79 @@ class VectorSafetyWrapper(VectorWrapper):
 
     def step(self, actions: Any) -> tuple[Any, Array, NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]:
         if self._now is None:
-            raise gymnasium.error.ResetNeeded("reset the environment before anything else")
-        robot, seen = self.asker.robot, self._now
-        wanted = np.asarray(self._actions.action_to_control(actions), dtype=float)
-        # In the mode NEXT_STEP an environment that has ended takes no action, it is reset.
+            raise gymnasium.error.ResetNeeded("reset the environment before the first step")
+        robot, now = self.client.robot, self._now
+        proposed = np.asarray(self._actions.action_to_control(actions), dtype=float)
+        # In the mode NEXT_STEP, an environment that has ended is reset and takes no action.
         resets = self._ended if self._mode == AutoresetMode.NEXT_STEP else np.zeros(self.num_envs, dtype=bool)
         deciding = np.flatnonzero(~resets)
-        before = np.array([kept.next_input for kept in self.backup_plans])
-        states, near = self._state(self.env, *seen), self._obstacles(self.env, *seen)
+        before = np.array([plan.next_input for plan in self.backup_plans])
+        states, near = self._state(self.env, *now), self._obstacles(self.env, *now)
         near = [] if near is None else near
-        if not len(near) and all(scan is not None for scan in self._scans):  # only these say what is free
+        if not len(near) and all(scan is not None for scan in self._scans):  # the scans alone show free space
             near = [None] * self.num_envs
         if len(near) != self.num_envs:
-            raise Mismatch(f"obstacles were told for {len(near)} of {self.num_envs} environments: give a list for each")
-        answers = self.asker.decide_all(
+            raise Mismatch(f"obstacles has {len(near)} lists for {self.num_envs} environments: give a list for each")
+        answers = self.client.decide_all(
             [self.backup_plans[i] for i in deciding],
             [states[i] for i in deciding],
-            [wanted[i] for i in deciding],
+            [proposed[i] for i in deciding],
             [near[i] for i in deciding],
             scans=[self._scans[i] for i in deciding],
-            observations=[
-                request_observation(seen[0][i] if isinstance(seen[0], np.ndarray) else None) for i in deciding
-            ],
+            observations=[request_observation(now[0][i] if isinstance(now[0], np.ndarray) else None) for i in deciding],
             known_free=[near[i] is not None for i in deciding],
         )
-        executed = np.array([kept.next_input for kept in self.backup_plans])
+        executed = np.array([plan.next_input for plan in self.backup_plans])
         executed[resets] = robot.zero_input()
         space = self.env.action_space
-        made = np.asarray(self._actions.control_to_action(executed), dtype=space.dtype).reshape(space.shape)
-        observations, rewards, terminated, truncated, infos = self.env.step(made)
+        safe_actions = np.asarray(self._actions.control_to_action(executed), dtype=space.dtype).reshape(space.shape)
+        observations, rewards, terminated, truncated, infos = self.env.step(safe_actions)
         decided = dict(zip(deciding.tolist(), answers, strict=True))
         penalty = np.zeros(self.num_envs)
         for i in deciding:
-            penalty[i] = correction_penalty(robot, wanted[i], before[i], executed[i], self.penalty)
+            penalty[i] = correction_penalty(robot, proposed[i], before[i], executed[i], self.penalty)
         self._ended = np.asarray(terminated | truncated)
         self._begin(self._ended if self._mode == AutoresetMode.SAME_STEP else resets)
         self._remember(infos)
         safety = np.array([decided.get(i) for i in range(self.num_envs)], dtype=object)
-        told = [diagnostics(one, "" if one is not None else "reset") for one in safety]
+        figures = [diagnostics(answer, "" if answer is not None else "reset") for answer in safety]
         infos = infos | {
             "safety": safety,
             "penalty": penalty,
-            "diagnostics": {name: np.array([one[name] for one in told]) for name in told[0]},
+            "diagnostics": {name: np.array([row[name] for row in figures]) for name in figures[0]},
         }
         self._now = observations, infos
         return observations, np.asarray(rewards) - penalty, terminated, truncated, infos
 
     def _begin(self, which: NDArray[np.bool_]) -> None:
-        """These environments stand at an episode's start."""
+        """Begin an episode in the chosen environments (k,)."""
         for i in np.flatnonzero(which):
             self.backup_plans[i].reset()
             self._memories[i].reset()
             self._ended[i] = False
 
     def _remember(self, infos: dict[str, Any]) -> None:
-        """The scans, if there are any, with what was seen free before."""
+        """Fill in the scans from memory, if the environments have any."""
         by_environment = [{"scan": scan} for scan in infos["scan"]] if "scan" in infos else [{}] * self.num_envs
-        period = self.asker.robot.period
+        period = self.client.robot.period
         self._scans = [
             filled(memory, info, period) for memory, info in zip(self._memories, by_environment, strict=True)
         ]
 
 
 def view_each_environment(view: Callable[[Any, Any, dict[str, Any]], Any]) -> View:
-    """A vector's view from that of one environment, for `SyncVectorEnv`: asks each with its own observation and what
-    `infos` has of it."""
+    """Return a view of a `SyncVectorEnv` from a view of one environment."""
 
     def views(env: Any, observations: Any, infos: dict[str, Any]) -> list[Any]:
-        own = env.unwrapped.envs
+        environments = env.unwrapped.envs
+        by_environment = {
+            name: values
+            for name, values in infos.items()
+            if isinstance(values, np.ndarray) and len(values) == len(environments)
+        }
         return [
-            view(one, observations[i], {k: v[i] for k, v in infos.items() if _held(v, len(own))})
-            for i, one in enumerate(own)
+            view(one, observations[i], {name: values[i] for name, values in by_environment.items()})
+            for i, one in enumerate(environments)
         ]
 
     return views
-
-
-def _held(values: Any, count: int) -> bool:
-    return isinstance(values, np.ndarray) and len(values) == count

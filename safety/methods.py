@@ -1,6 +1,6 @@
-"""THE table of the methods that a safety service can serve: what turns a request into a decision, behind one interface.
+"""THE table of the methods that a safety service can serve: the filter and its rivals, behind one interface.
 
-`none` is not among them: a robot without a filter asks nobody.
+A robot without a filter (method `none`) uses no service.
 """
 
 from __future__ import annotations
@@ -23,21 +23,21 @@ Model = ModelSet | Pretrained
 
 
 class Method(Protocol):
-    """A pure function of the request and the model: it keeps nothing about a robot."""
+    """Turns a request into a decision. It is a pure function of the request and the model."""
 
     @property
     def robot(self) -> Robot: ...
 
     @property
     def version(self) -> str:
-        """Of the model: its hash."""
+        """The hash of the model."""
 
     @property
     def observed(self) -> int:
-        """The number of values in the observation that it reads; 0: it reads none."""
+        """The size of the observation that the method reads; 0: it reads none."""
 
     def decide(self, request: Request) -> Decision:
-        """Raises BadRequest."""
+        """Return the decision. Raises BadRequest if a value of the request is not valid."""
 
 
 RIVALS: dict[str, Callable[[Pretrained], Method]] = {SECAS: Secas, SAILR: Sailr}
@@ -45,10 +45,10 @@ METHODS = (DDPC, *RIVALS)
 
 
 def ready(model: Model) -> Method:
-    """A model made ready for decisions.
+    """Return the method of a model, ready for decisions.
 
     Raises:
-        BadModel: it is of no method here, or does not fit its robot.
+        BadModel: no method has this name, or the model does not fit its robot.
     """
     if isinstance(model, ModelSet):
         return Filter(model)
@@ -58,16 +58,12 @@ def ready(model: Model) -> Method:
 
 
 def decode(payload: bytes) -> Model:
-    """The model in a file, of whichever kind.
-
-    Raises:
-        BadModel: of none; the message says why.
-    """
+    """Return the model set or the rival's model in the bytes of a file. Raises BadModel if there is none."""
     return Pretrained.decode(payload) if has_entry(payload, ENTRY) else ModelSet.decode(payload)
 
 
 def load(path: Path) -> Model:
-    """Raises BadModel, naming the file."""
+    """Return the model in a file. Raises BadModel, with the file's name, if there is none."""
     try:
         return decode(path.read_bytes())
     except (OSError, BadModel) as error:

@@ -1,7 +1,7 @@
-"""What a rival knows of a robot: trained networks and a few settings, as one file with a version that is its hash.
+"""A rival's model of a robot: trained networks and settings in one file, with a hash as its version.
 
-The file is safetensors; the metadata entry `pretrained` holds, as JSON, the robot, the hash of its layout, the method,
-the settings, what is known of the training, and the version. Nothing of it is believed before it was checked.
+The file is safetensors. Its metadata entry `pretrained` holds, as JSON, the robot, the hash of its layout, the method,
+the settings, notes on the training, and the version. `Pretrained.decode` checks all of it.
 """
 
 from __future__ import annotations
@@ -23,15 +23,20 @@ from brakeline.safety.model.model_set import BadModel, robot_in
 from brakeline.safety.model.tensor_file import pack, unpack
 
 ENTRY = "pretrained"
-RAYS = "rays"  # the name of the tensor with the directions
+RAYS = "rays"  # the tensor with the directions
 
 
 @dataclass(frozen=True)
 class Pretrained:
-    """What a rival needs for decisions.
+    """A rival's model.
 
-    networks: by name. settings: the numbers that a decision depends on. about: the origin, in words. rays: of the lidar
-    whose ranges come first in an observation, where the method reads them.
+    Attributes:
+        robot: that the model is for.
+        method: that uses the model.
+        networks: by name.
+        settings: the numbers that a decision depends on.
+        about: notes on the training.
+        rays: of the lidar whose ranges come first in an observation; None if the method does not read them.
     """
 
     robot: Robot
@@ -43,9 +48,9 @@ class Pretrained:
 
     @property
     def version(self) -> str:
-        """Hash of everything that decisions depend on."""
-        words = json.dumps([self.robot.layout(), self.method, sorted(self.settings.items())])
-        digest = hashlib.sha256(words.encode())
+        """The hash of everything that decisions depend on."""
+        text = json.dumps([self.robot.layout(), self.method, sorted(self.settings.items())])
+        digest = hashlib.sha256(text.encode())
         for name, tensor in sorted(self._tensors().items()):
             digest.update(f"{name}{tensor.shape}".encode() + tensor.tobytes())
         return digest.hexdigest()[:12]
@@ -63,7 +68,7 @@ class Pretrained:
             "networks": sorted(self.networks),
             "about": self.about,
             "version": self.version,
-            "description": json.dumps(self.robot.description),  # a text: the order of its names counts
+            "description": json.dumps(self.robot.description),  # as text, because the order of its names counts
         }
         if self.rays is not None:
             about["range"] = self.rays.range
@@ -74,10 +79,7 @@ class Pretrained:
 
     @staticmethod
     def decode(payload: bytes) -> Pretrained:
-        """
-        Raises:
-            BadModel: it is no pretrained model, or not of this layout; the message says why.
-        """
+        """Return the model in the bytes of a file. Raises BadModel if they hold none, or one for another layout."""
         try:
             tensors, about = unpack(payload, ENTRY)
             robot = robot_in(about) if "description" in about else robot_named(str(about["robot"]))  # older files

@@ -1,15 +1,13 @@
-"""SAILR: the proposed action, unless it is riskier by more than η than handing over to the backup policy at once.
+"""SAILR: execute the proposed action, unless it is riskier by more than η than the backup policy.
 
-Wagener et al. 2021, "Safe Reinforcement Learning Using Advantage-Based Intervention". The rule is (Q, μ, η): Q(s, a)
-and V(s) are the costs to be expected from a followed by the backup policy μ, and from μ alone,
+Wagener et al. 2021, "Safe Reinforcement Learning Using Advantage-Based Intervention". The rule is (Q, μ, η). Q(s, a) is
+the expected cost of action a followed by the backup policy μ, and V(s) is the expected cost of μ alone:
 
     intervene  ⟺  Q(s, a) − V(s) > η                 (their eq. 6: the advantage of a over μ); then execute μ(s)
 
-Q and V are learned beforehand, two networks each: the larger Q and the smaller V count. μ brakes
-(`safety/filter/braking.py`).
-In training an intervention ends the episode: for the learner with a terminal step and the lowest reward, for the robot
-as one that was called off (`actors/episode_runner.py`, `learner/n_step.py`). In use the rule applies at every step
-anew.
+Q and V are learned beforehand, with two networks each: the larger Q and the smaller V count. μ brakes
+(`safety/filter/braking.py`). In training, an intervention ends the episode: the learner sees a terminal step with the
+lowest reward (`actors/episode_runner.py`, `learner/n_step.py`). In use, the rule applies anew at every step.
 """
 
 from __future__ import annotations
@@ -31,19 +29,16 @@ Array = NDArray[np.float64]
 
 
 def normalised_input(robot: Robot, action: Array) -> Array:
-    """Inputs (..., m) in units of half their range about its middle: what Q is a function of."""
+    """Return inputs (..., m) scaled to [-1, 1], the units of Q."""
     low, high = robot.low(), robot.high()
     return np.asarray((2.0 * action - low - high) / (high - low))
 
 
 class Sailr:
-    """Critics made ready for decisions. Their outputs are logits of the cost in [0, 1]."""
+    """The rule of SAILR with trained critics, whose outputs are logits of the cost in [0, 1]."""
 
     def __init__(self, model: Pretrained) -> None:
-        """
-        Raises:
-            BadModel: not of this method, or its networks do not fit the robot.
-        """
+        """Make the method. Raises BadModel if the model is of another method or does not fit the robot."""
         self.model, self.robot, self.version = model, model.robot, model.version
         try:
             self.q, self.v, self.threshold = model.networks["q"], model.networks["v"], model.settings["threshold"]
@@ -55,16 +50,16 @@ class Sailr:
             raise BadModel(f"no model of SAILR for {self.robot.name}: {model.method}, networks {found}")
 
     def advantage(self, observation: NDArray[np.float32], action: Array) -> float:
-        """max Q(s, a) − min V(s), in [-1, 1]: how much more costly the action is than the backup."""
+        """Return max Q(s, a) − min V(s), in [-1, 1]: how much costlier the action is than the backup policy."""
         worst = self.q(np.concatenate([observation, normalised_input(self.robot, action)])).max()
         best = self.v(observation).min()
         return _sigmoid(float(worst)) - _sigmoid(float(best))
 
     def decide(self, request: Request) -> Decision:
-        """The proposal, or the backup policy's input.
+        """Return the proposal, or the backup policy's input.
 
         Raises:
-            BadRequest: a value is missing, not finite or of the wrong size, with the field's name.
+            BadRequest: a value is missing, not finite, or has the wrong size; `field` names it.
         """
         started = perf_counter_ns()
         robot = self.robot

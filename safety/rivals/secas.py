@@ -1,4 +1,4 @@
-"""SECAS: the proposed action, corrected as little as a learned linear model of each constraint asks for.
+"""SECAS: correct the proposed action as little as a learned linear model of each constraint requires.
 
 Dalal et al. 2018, "Safe Exploration in Continuous Action Spaces". For constraints c_i(s) ≤ C and networks g_i trained
 beforehand on random actions,
@@ -7,8 +7,8 @@ beforehand on random actions,
     min ½‖a − r‖²  s.t.  c_i(s) + g_i(s)ᵀ a ≤ C                                                     (eq. 4)
     λ_i* = [(g_iᵀ r + c_i − C) / (g_iᵀ g_i)]₊,   a* = r − λ* g_{i*},   i* = argmax λ_i*             (eqs. 5 and 6)
 
-with the closed form if one constraint is active, and the QP with the input's bounds if several are. Nothing is verified
-and no plan is made: only the next sample is looked at, with errors of the fit that nobody bounds.
+The closed form applies if one constraint is active, and the QP with the input's bounds if several are. SECAS verifies
+nothing and makes no plan: it predicts the next sample only, with fitting errors that nothing bounds.
 """
 
 from __future__ import annotations
@@ -31,30 +31,30 @@ from brakeline.safety.rivals.pretrained import Pretrained
 
 Array = NDArray[np.float64]
 
-SECTOR = 0.55  # rad, about the width of a sector of rays
-LAG = 0.5  # periods that an input needs to take hold
-BESIDE = 0.3  # m beside the footprint, and twice the way to a stop: what is farther is far
-GUARD = 1e-6  # m² per squared unit of scaled input: a constraint below is one that the input does not move
-INSIDE = 1e-6  # m: a constraint violated by less is met
-UNMET = 100.0  # price of violating a unit row of the QP by one unit of scaled input; inputs are worth at most about 4
-CURVED = 1e-3
+SECTOR = 0.55  # rad: width of a sector of rays, about
+LAG = 0.5  # periods until an input takes effect
+NEAR_MARGIN = 0.3  # m: nearby ranges reach this far beyond the footprint and twice the stopping distance
+LEAST_GRADIENT = 1e-6  # m² per squared unit of scaled input: below it, the input does not move the constraint
+TOLERANCE = 1e-6  # m: a constraint violated by less is met
+SLACK_COST = 100.0  # of violating a unit row of the QP by 1; the cost of an input is at most about 4
+SLACK_CURVATURE = 1e-3  # of the slack's cost, so that the QP is strictly convex
 
 
 class Constraints:
-    """c (K,) of a state, in m: for each sector of the lidar the way to a stop, less the range, at its worst ray.
+    """The constraints c (K,) [m] of a state: for each sector of the lidar, the stopping distance minus the range.
 
         c_j = max over rays e of sector j:  T (v·e)₊ − min(range_e, near),      T the time in which braking covers v·T
 
-    For a robot that stops within a period that is nearly −range; for one that does not, the next sample's range alone
-    would be looked at too late. Ranges beyond `near` are all the same: what enters or leaves a sector far away says
-    nothing about the input, and would drown what is near in the fit.
+    If a robot stops within a period, c is nearly −range. For a slower robot, the next sample's range alone would react
+    too late. Ranges beyond `near` count as equal: obstacles that enter or leave a sector far away do not depend on the
+    input and would dominate the fit.
     """
 
     def __init__(self, robot: Robot, rays: LidarRays) -> None:
         self.robot, self.directions, self.range = robot, rays.directions, rays.range
         self.stopping = robot.period * (0.5 * robot.brake_steps + LAG)  # s
         fastest = float(np.linalg.norm(np.where(robot.translates, robot.high(), 0.0)))
-        self.near = min(rays.range, robot.footprint + BESIDE + 2.0 * self.stopping * fastest)  # m
+        self.near = min(rays.range, robot.footprint + NEAR_MARGIN + 2.0 * self.stopping * fastest)  # m
         self.sectors = _sectors(rays.directions)
 
     @property
@@ -62,7 +62,7 @@ class Constraints:
         return len(self.sectors)
 
     def __call__(self, observation: NDArray[np.floating], state: Array) -> Array:
-        """Of an observation and the measured state with it."""
+        """Return c for an observation and the measured state."""
         speeds = state[self.robot.speed_indices]
         velocity = speeds if self.robot.heading is None else np.eye(self.directions.shape[1])[0] * speeds[0]
         ranges = np.minimum(np.asarray(observation[: len(self.directions)], float) * self.range, self.near)
@@ -71,7 +71,7 @@ class Constraints:
 
 
 def _sectors(directions: Array) -> list[NDArray[np.intp]]:
-    """The rays of each sector: equal shares of the azimuths and, for a robot that flies, of the elevations."""
+    """Return the rays of each sector: equal shares of the azimuths and, for a flying robot, of the elevations."""
     azimuth = np.arctan2(directions[:, 1], directions[:, 0])
     low, high = azimuth.min(), azimuth.max()
     count = max(1, round((high - low) / SECTOR))
@@ -83,9 +83,9 @@ def _sectors(directions: Array) -> list[NDArray[np.intp]]:
 
 
 def closed_form(r: Array, G: Array, d: Array) -> Array:
-    """The correction of r (m,) for the most violated of `G a ≤ d`, G (K, m), d (K,); the others are ignored."""
+    """Return r (m,) corrected for the most violated of `G a ≤ d`, G (K, m), d (K,), without regard to the others."""
     square = (G * G).sum(axis=1)
-    moved = square > GUARD
+    moved = square > LEAST_GRADIENT
     if not moved.any():
         return r
     multiplier = np.where(moved, np.maximum(G @ r - d, 0.0) / np.where(moved, square, 1.0), 0.0)
@@ -94,37 +94,34 @@ def closed_form(r: Array, G: Array, d: Array) -> Array:
 
 
 def quadratic(r: Array, G: Array, d: Array, low: Array, high: Array) -> tuple[Array, str, int]:
-    """The a closest to r with `G a ≤ d` and `low ≤ a ≤ high`, where that is impossible with the least worst violation.
+    """Return the a closest to r with `G a ≤ d` and `low ≤ a ≤ high`, the solver's status and its iterations.
 
-    Returns a, the solver's word and its iterations; without a word a is r.
+    If no a meets all constraints, the worst violation is the least possible. If the solver fails, a is r.
     """
     size = np.sqrt((G * G).sum(axis=1))
-    moved = size**2 > GUARD
+    moved = size**2 > LEAST_GRADIENT
     rows, m = G[moved] / size[moved, None], len(r)
     k = len(rows)
     A = np.vstack([np.hstack([rows, -np.ones((k, 1))]), np.eye(m + 1)[:m], -np.eye(m + 1)])
     b = np.concatenate([d[moved] / size[moved], high, -low, [0.0]])
-    program = QuadraticProgram(np.append(np.ones(m), CURVED), np.append(-r, UNMET), A, b)
+    program = QuadraticProgram(np.append(np.ones(m), SLACK_CURVATURE), np.append(-r, SLACK_COST), A, b)
     solution = solve(program)
     a = solution.x[:m] if solution.found else r
     return a, solution.status, solution.iterations
 
 
 def _usual_rays(robot: Robot) -> LidarRays:
-    """Return the rays of a robot's usual task: older files do not hold the rays. Raises BadModel if there is none."""
+    """Return the rays of a robot's usual task, for older files without rays. Raises BadModel if there is none."""
     if robot.kind not in shipped_robots():
         raise BadModel(f"the model of {robot.name} does not hold the lidar's rays: pretrain it again")
     return robot_with_task(robot.kind).task.rays
 
 
 class Secas:
-    """Networks made ready for decisions. Inputs are scaled by the robot's highest: zero stays zero."""
+    """The rule of SECAS with trained networks. Inputs are scaled by their upper bounds."""
 
     def __init__(self, model: Pretrained) -> None:
-        """
-        Raises:
-            BadModel: not of this method, or its networks do not fit the robot.
-        """
+        """Make the method. Raises BadModel if the model is of another method or does not fit the robot."""
         self.model, self.robot, self.version = model, model.robot, model.version
         rays = model.rays or _usual_rays(self.robot)
         self.constraints = Constraints(model.robot, rays)
@@ -141,10 +138,10 @@ class Secas:
         self.scale = self.robot.high()
 
     def decide(self, request: Request) -> Decision:
-        """The proposal, corrected.
+        """Return the corrected proposal.
 
         Raises:
-            BadRequest: a value is missing, not finite or of the wrong size, with the field's name.
+            BadRequest: a value is missing, not finite, or has the wrong size; `field` names it.
         """
         started = perf_counter_ns()
         robot = self.robot
@@ -156,9 +153,9 @@ class Secas:
         G, d = np.asarray(self.g(request.observation), float), self.bound - c
         action, solver, iterations, solve_ns = proposal, "", 0, 0
         r = proposal / self.scale
-        if (G @ r - d > INSIDE).any():
+        if (G @ r - d > TOLERANCE).any():
             corrected = clip_input(robot, closed_form(r, G, d) * self.scale, request.input_in_force)
-            if (G @ (corrected / self.scale) - d > INSIDE).any():  # several are active, or a bound is
+            if (G @ (corrected / self.scale) - d > TOLERANCE).any():  # several are active, or a bound is
                 before = perf_counter_ns()
                 low, high = self._bounds(request.input_in_force)
                 a, solver, iterations = quadratic(r, G, d, low, high)
@@ -166,7 +163,7 @@ class Secas:
                 corrected = clip_input(robot, a * self.scale, request.input_in_force)
             action = corrected
         worst = float((d - G @ (action / self.scale)).min())
-        changed = bool((np.abs(action - proposal) > INSIDE * self.scale).any())
+        changed = bool((np.abs(action - proposal) > TOLERANCE * self.scale).any())
         total, solved = (perf_counter_ns() - started) * 1e-6, solve_ns * 1e-6
         return Decision(
             kind=ADJUSTED if changed else ALLOWED,
@@ -186,6 +183,6 @@ class Secas:
         )
 
     def _bounds(self, before: Array) -> tuple[Array, Array]:
-        """The lowest and highest scaled input after the one in force."""
+        """Return the lowest and the highest scaled input that the slew allows after the one in force."""
         robot = self.robot
         return clip_input(robot, robot.low(), before) / self.scale, clip_input(robot, robot.high(), before) / self.scale

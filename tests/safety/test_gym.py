@@ -200,7 +200,7 @@ def test_a_view_of_a_vector_that_tells_nothing_is_no_world_without_obstacles(rea
         vector, ready, accept_bound=1.0, state=seen, obstacles=lambda *_: [], actions=normalised(CAR)
     )
     env.reset(seed=0)
-    with pytest.raises(Mismatch, match="0 of 2 environments: give a list for each"):
+    with pytest.raises(Mismatch, match="0 lists for 2 environments: give a list for each"):
         env.step(np.ones((2, 2), np.float32))
 
 
