@@ -1,4 +1,4 @@
-"""The commands as they are typed: help, errors, and JSON."""
+"""Test the command line: help, errors and JSON."""
 
 import io
 import json
@@ -127,7 +127,9 @@ def test_a_typing_error_is_answered_with_a_suggestion(command):
         ("keys {folder}/none --sign {folder}/none", "no key to sign models with"),
     ],
 )
-def test_what_cannot_be_is_said_in_a_line(command, data_folder, tmp_path, monkeypatch, words, said):
+def test_an_impossible_command_fails_with_one_line_that_says_why(
+    command, data_folder, tmp_path, monkeypatch, words, said
+):
     monkeypatch.chdir(tmp_path)
     status, out, err = command(*words.format(folder=tmp_path).split())
     assert (status, out) == (1, "") and said in err and err.startswith("brakeline ")
@@ -135,7 +137,7 @@ def test_what_cannot_be_is_said_in_a_line(command, data_folder, tmp_path, monkey
 
 
 @pytest.mark.parametrize("words", ["train --method prayer", "evaluate --certificate hope", "certify --mode loud"])
-def test_a_wrong_choice_is_answered_with_the_choices(command, words):
+def test_a_wrong_choice_is_answered_with_the_possible_ones(command, words):
     status, out, err = command(*words.split())
     assert (status, out) == (2, "") and "invalid choice" in err
 
@@ -148,7 +150,7 @@ def test_a_run_that_could_not_listen_can_be_started_again(command, data_folder, 
         assert status == 1 and "cannot listen" in err
 
 
-def test_obstacles_are_read_as_words():
+def test_an_obstacle_is_parsed_from_words():
     assert parse_obstacle(("cylinder", "0.4", "0", "0.1"), 2) == Obstacle("cylinder", (0.4, 0.0), (0.1,))
     assert parse_obstacle(("box", "1", "2", "0.3", "0.4", "0.5"), 2) == Obstacle("box", (1.0, 2.0), (0.3, 0.4), 0.5)
     assert parse_obstacle(("wall", "1", "0", "3.14"), 2) == Obstacle("wall", (1.0, 0.0), (), 3.14)
@@ -165,7 +167,7 @@ def test_collect_is_reproducible_by_its_seed(figures, tmp_path):
     assert (said[0]["trajectories"], said[0]["periods"]) == (2, 600) and said[0]["about"]["seed"] == "5"
 
 
-def test_certify_states_every_certificate(figures, data_folder):
+def test_certify_reports_each_error_bound(figures, data_folder):
     said = figures("certify", data_folder / "ground" / "record.safetensors", "--mode", "direct")
     assert said.keys() >= {"residual", "set-membership", "matrix-zonotope"}
     for name in ("residual", "set-membership", "matrix-zonotope"):
@@ -235,7 +237,7 @@ def said(**figures):
 
 
 @pytest.mark.parametrize("columns", [60, 80, 160])
-def test_certificates_are_told_whole_at_any_width(columns):
+def test_the_validation_table_is_complete_at_any_width(columns):
     file = io.StringIO()
     console = Console(file=file, width=columns, force_terminal=True, color_system=None, soft_wrap=True)
     console.print(
@@ -258,7 +260,7 @@ def test_certificates_are_told_whole_at_any_width(columns):
     assert shown.count("diverges") == 2 and "149810" not in shown
 
 
-def test_certify_says_on_its_page_how_sure_it_is_as_in_json(command, data_folder):
+def test_certify_prints_the_same_bounds_in_words_as_in_json(command, data_folder):
     words = ("certify", data_folder / "ground" / "record.safetensors", "--certificates", "residual", "--mode", "direct")
     s, page = json.loads(command(*words, "--json")[1])["residual"], command(*words)[1]
     assert s["outside_hour"] == pytest.approx(18_000 * s["bound_step"])
@@ -273,7 +275,7 @@ def test_certify_says_on_its_page_how_sure_it_is_as_in_json(command, data_folder
         assert said in page
 
 
-def test_certify_says_what_it_does_and_keeps_the_conditions_for_those_who_ask(command, data_folder, monkeypatch):
+def test_certify_shows_its_progress_and_with_verbose_the_conditions(command, data_folder, monkeypatch):
     monkeypatch.setattr(progress, "FIRST", 0.01)
     words = ("certify", data_folder / "ground" / "record.safetensors", "--certificates", "residual", "--mode", "direct")
     status, out, err = command(*words)
@@ -282,7 +284,7 @@ def test_certify_says_what_it_does_and_keeps_the_conditions_for_those_who_ask(co
     assert "encoder ticks" in command(*words, "--verbose")[1]
 
 
-def test_of_works_within_each_other_the_innermost_is_told(monkeypatch, capsys):
+def test_only_the_innermost_of_nested_work_prints_its_progress(monkeypatch, capsys):
     monkeypatch.setattr(progress, "FIRST", 0.01)
     monkeypatch.setattr(progress, "AGAIN", 0.01)
     monkeypatch.setattr(progress, "console", Console(stderr=True, force_terminal=False))
@@ -302,7 +304,7 @@ HEAVY = ("torch", "mujoco", "zenoh", "scipy", "numpy", "pymavlink", "proxsuite",
 
 
 @pytest.mark.parametrize("words, status", [(["train", "--help"], 0), (["train", "--stps", "3"], 2), (["--version"], 0)])
-def test_help_and_typing_mistakes_wait_for_nothing_heavy(words, status):
+def test_help_and_typing_errors_import_nothing_heavy(words, status):
     script = f"""
 import sys
 from brakeline.deploy.cli import main
@@ -316,7 +318,7 @@ print("loaded:", status, [name for name in {HEAVY!r} if name in sys.modules])
     assert done.stdout.splitlines()[-1] == f"loaded: {status} []", done.stderr
 
 
-def test_help_has_what_one_needs_first_and_all_of_it_when_asked(command, monkeypatch):
+def test_help_shows_the_common_options_and_help_all_shows_all(command, monkeypatch):
     monkeypatch.setenv("COLUMNS", "80")
     status, short, _ = command("train", "--help")
     rows = short.splitlines()
@@ -334,16 +336,16 @@ def test_help_has_what_one_needs_first_and_all_of_it_when_asked(command, monkeyp
     assert command("train", "--payload", "heavy")[0] == 2, "what is not shown is understood all the same"
 
 
-def test_the_version_is_told(command):
+def test_the_version_is_printed(command):
     status, out, _ = command("--version")
     assert status == 0 and re.fullmatch(r"brakeline \d+\.\d+\S*\n", out)
 
 
-def test_a_configuration_may_say_every_method_that_can_be_served():
+def test_a_configuration_can_name_each_method_of_the_service():
     assert model_config.METHODS == methods.METHODS
 
 
-def test_a_scan_is_read_from_a_file(tmp_path):
+def test_a_scan_is_loaded_from_a_file(tmp_path):
     def read(dim, text):
         (tmp_path / "seen.json").write_text(text)
         return load_scan(tmp_path / "seen.json", dim)

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 import tyro
 
-from brakeline.deploy.cli import find
+from brakeline.deploy.cli import command_class
 
 ROOT = Path(__file__).parents[2]
 DEPLOY = ROOT / "deploy"
@@ -51,13 +51,13 @@ def commands():
 
 
 @pytest.mark.parametrize(("where", "words"), [pytest.param(*command, id=command[0]) for command in commands()])
-def test_each_command_is_one(where, words):
-    command = tyro.cli(find(words[0]), args=words[1:])
+def test_each_command_of_an_engine_file_is_parsed(where, words):
+    command = tyro.cli(command_class(words[0]), args=words[1:])
     assert command.endpoints.keys is not None
     assert all(endpoint.startswith("tls/") for endpoint in (*command.endpoints.connect, *command.endpoints.listen))
 
 
-def test_every_kind_of_process_is_started_by_every_engine():
+def test_every_engine_starts_every_kind_of_process():
     kinds = {"router", "safety", "learner", "actor", "recorder"}
     for engine in ("kubernetes", "compose", "systemd"):
         assert {words[0] for where, words in commands() if where.startswith(engine)} == kinds
@@ -66,13 +66,13 @@ def test_every_kind_of_process_is_started_by_every_engine():
 @pytest.mark.parametrize(
     "manifest", [pytest.param(m, id=f"{m['kind']} {m.get('metadata', {}).get('name', '')}") for m in manifests()]
 )
-def test_kubernetes_manifests_are_of_its_schema(manifest):
+def test_kubernetes_manifests_match_the_schema(manifest):
     validate = pytest.importorskip("kubernetes_validate")
     if manifest["kind"] != "Kustomization":
         validate.validate(manifest, validate.latest_version(), strict=True)
 
 
-def test_kubernetes_manifests_hang_together():
+def test_kubernetes_manifests_are_consistent():
     by = {(m["kind"], m["metadata"]["name"]): m for m in manifests() if m["kind"] != "Kustomization"}
     for name in ("safety", "actor"):
         target = by["HorizontalPodAutoscaler", name]["spec"]["scaleTargetRef"]
@@ -87,7 +87,7 @@ def test_kubernetes_manifests_hang_together():
             assert {mount["name"] for mount in container["volumeMounts"]} <= volumes
 
 
-def test_kustomize_builds_all_of_it():
+def test_kustomize_builds_all_manifests():
     if shutil.which("kubectl") is None:
         pytest.skip("no kubectl here")
     done = subprocess.run(["kubectl", "kustomize", DEPLOY / "kubernetes"], check=False, capture_output=True, text=True)
@@ -99,7 +99,7 @@ def test_kustomize_builds_all_of_it():
     assert len(images) == 1 and re.fullmatch(r"brakeline:[\d.]+", images.pop())
 
 
-def test_compose_file_is_of_its_schema():
+def test_compose_file_matches_the_schema():
     jsonschema = pytest.importorskip("jsonschema")
     said = yaml.safe_load((DEPLOY / "compose.yaml").read_text())
     del said["name"]  # newer than the schema
@@ -109,7 +109,7 @@ def test_compose_file_is_of_its_schema():
     assert {name for name in named if not name.startswith(".")} == set(said["volumes"])
 
 
-def test_systemd_takes_the_units(tmp_path):
+def test_systemd_verifies_the_units(tmp_path):
     if shutil.which("systemd-analyze") is None:
         pytest.skip("no systemd-analyze here")
     units = []

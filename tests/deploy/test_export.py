@@ -1,4 +1,4 @@
-"""What a log is exported to, read back by others than wrote it."""
+"""Test the formats that a log is exported to, with the programs that read them."""
 
 import csv
 import json
@@ -50,7 +50,7 @@ def test_csv_has_every_step_with_every_field(log: Path, tmp_path: Path, capsys: 
     assert missing == {"path"}
 
 
-def test_minari_gives_the_episodes_back(
+def test_minari_loads_the_episodes(
     log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     minari = pytest.importorskip("minari")
@@ -93,7 +93,9 @@ def test_foxglove_draws_every_step_and_keeps_every_byte(
     assert cli.main(["export", str(log), "--foxglove", str(out)]) == 1
 
 
-def test_what_cannot_be_exported_is_said(log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_impossible_export_fails_with_a_reason(
+    log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert cli.main(["export", str(log)]) == 1
     assert "--csv, --minari, --foxglove" in capsys.readouterr().err
     assert cli.main(["export", str(tmp_path), "--csv", str(tmp_path / "a.csv")]) == 1

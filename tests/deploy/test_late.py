@@ -1,4 +1,4 @@
-"""The filter for a robot in real time, in a closed loop: it asks about the period after this one."""
+"""Test the filter for a robot in real time, in a closed loop: each request is about the next period."""
 
 from pathlib import Path
 
@@ -16,19 +16,19 @@ pytestmark = pytest.mark.usefixtures("flight_folder")
 
 
 @pytest.mark.parametrize("policy", ["adversary", "greedy", "random"])
-def test_nothing_is_hit_and_states_are_where_they_were_predicted(policy: str) -> None:
+def test_no_policy_collides_and_states_stay_in_their_predicted_sets(policy: str) -> None:
     figures = evaluate(ROBOT, Evaluation(policy, episodes=3, accept_bound=BOUND))
     assert figures["collisions"] == 0
     assert figures["containment"]["violations"] <= 0.01 * figures["containment"]["steps"]
 
 
-def test_a_pilot_that_knows_of_its_delay_gets_there() -> None:
+def test_a_policy_that_accounts_for_the_delay_reaches_every_goal() -> None:
     figures = evaluate(ROBOT, Evaluation("astar", episodes=5, accept_bound=BOUND))
     assert figures["goals"] == 5 and figures["collisions"] == 0
     assert figures["mean_speed"] > 3.5
 
 
-def test_without_answers_it_brakes_along_the_plan_that_it_was_committed_to(flight_folder: Path) -> None:
+def test_without_answers_the_robot_brakes_along_its_backup_plan(flight_folder: Path) -> None:
     driver, policy, question = prepare_evaluation(ROBOT, Evaluation("greedy", accept_bound=BOUND))
     assert question is not None
     driver.begin(0)
@@ -48,7 +48,7 @@ def test_without_answers_it_brakes_along_the_plan_that_it_was_committed_to(fligh
     assert np.linalg.norm(driver.info["state"][3:6]) < 0.2
 
 
-def test_a_flight_that_goes_on_keeps_its_plan_from_goal_to_goal() -> None:
+def test_a_continuous_flight_keeps_its_plan_from_goal_to_goal() -> None:
     driver, _, question = prepare_evaluation(ROBOT, Evaluation("greedy", accept_bound=BOUND))
     assert question is not None
     flying = EpisodeRunner(ROBOT, driver.env, ActorIdentity("a", 0, 0), continuous=True)
@@ -61,7 +61,7 @@ def test_a_flight_that_goes_on_keeps_its_plan_from_goal_to_goal() -> None:
     assert (flying.backup_plan.plan == plan).all()
 
 
-def test_a_log_tells_which_input_was_in_force() -> None:
+def test_a_log_has_the_inputs_in_force() -> None:
     driver, policy, question = prepare_evaluation(ROBOT, Evaluation("greedy", accept_bound=BOUND))
     steps, in_force = [], []
     for step in episode(driver, policy, question, 0):

@@ -1,4 +1,4 @@
-"""No command puts a model set to use that states less than the robot's limit asks for, unless that is accepted."""
+"""Test that no command uses a model set whose stated bound is above the robot's limit, unless you accept the bound."""
 
 import json
 
@@ -35,7 +35,7 @@ def model_of(folder):
     return folder / "ground" / "residual-direct.safetensors"
 
 
-def test_certify_use_refuses_and_puts_nothing_there(few, capsys):
+def test_certify_use_refuses_a_loose_model_set_and_writes_nothing(few, capsys):
     model_of(few).unlink(missing_ok=True)
     status, out, err = run(capsys, *CERTIFY, "--json")
     assert status == 1 and not model_of(few).exists()
@@ -44,7 +44,7 @@ def test_certify_use_refuses_and_puts_nothing_there(few, capsys):
     assert said["bound_plan"] > 0.01 and "--accept-bound" in said["not_used"]
 
 
-def test_certify_use_takes_what_is_accepted(few, capsys):
+def test_certify_use_writes_a_model_set_with_an_accepted_bound(few, capsys):
     status, out, err = run(capsys, *CERTIFY, "--accept-bound", 0.5, "--json")
     assert status == 0 and "not put to use" not in err
     assert ModelSet.load(model_of(few)).about["bound_plan"] == f"{json.loads(out)['residual']['bound_plan']:.6g}"
@@ -59,7 +59,7 @@ def test_certify_use_takes_what_is_accepted(few, capsys):
         "ros2 ground --seconds 1",
     ],
 )
-def test_whoever_drives_behind_it_refuses(words, few, capsys, tmp_path):
+def test_each_command_that_drives_refuses_a_loose_model_set(words, few, capsys, tmp_path):
     run(capsys, *CERTIFY, "--accept-bound", 0.5, "--json")
     status, _, err = run(capsys, *words.format(out=tmp_path / "run").split())
     assert status == 1, err
@@ -67,7 +67,7 @@ def test_whoever_drives_behind_it_refuses(words, few, capsys, tmp_path):
     assert not (tmp_path / "run").exists()
 
 
-def test_evaluate_drives_behind_what_is_accepted(few, capsys):
+def test_evaluate_uses_a_model_set_with_an_accepted_bound(few, capsys):
     run(capsys, *CERTIFY, "--accept-bound", 0.5, "--json")
     words = ("evaluate", "ground", "--episodes", 1, "--policy", "random", "--json")
     assert run(capsys, *words, "--accept-bound", 0.5)[0] == 0
@@ -78,7 +78,7 @@ def test_evaluate_drives_behind_what_is_accepted(few, capsys):
 
 
 @pytest.mark.parametrize("bound", [None, "nan", "a few"])
-def test_a_set_without_a_readable_statement_is_refused(bound, few, capsys):
+def test_a_model_set_without_a_readable_bound_is_refused(bound, few, capsys):
     run(capsys, *CERTIFY, "--accept-bound", 0.5, "--json")
     model = ModelSet.load(model_of(few))
     model.about.pop("bound_plan")
@@ -89,7 +89,7 @@ def test_a_set_without_a_readable_statement_is_refused(bound, few, capsys):
     assert status == 1 and "any share may leave their tubes" in err and "--accept-bound 1 " in err
 
 
-def test_a_description_may_have_a_limit_of_its_own(tmp_path):
+def test_a_description_can_set_its_own_limit(tmp_path):
     text = (ROBOTS_FOLDER / "ground.toml").read_text()
     mine = tmp_path / "mine.toml"
     mine.write_text(text.replace('name = "ground"', 'name = "mine"\naccept_bound = 0.05'))

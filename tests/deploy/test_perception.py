@@ -1,4 +1,4 @@
-"""What free space costs by where it comes from; and driving by what a sensor in the air sees."""
+"""Test the cost of each source of free space, and flights by range images."""
 
 from collections import Counter
 from itertools import islice
@@ -13,7 +13,7 @@ from tests.accepting import BOUND
 from tests.robots import QUADROTOR
 
 
-def test_a_scan_weighs_kilobytes_and_a_map_hundreds_of_bytes(data_folder, monkeypatch):
+def test_a_request_has_kilobytes_with_a_scan_and_hundreds_of_bytes_with_a_map(data_folder, monkeypatch):
     monkeypatch.setattr(perception_cost, "POLICIES", ("random",))
     names = ("map", "scan", "fleet of 2")
     monkeypatch.setattr(perception_cost, "SITUATIONS", {name: perception_cost.SITUATIONS[name] for name in names})
@@ -33,7 +33,7 @@ FAULTS = {
 
 @pytest.mark.parametrize("faults", FAULTS)
 @pytest.mark.parametrize("policy", ["adversary", "greedy"])
-def test_who_flies_by_range_images_alone_hits_nothing(flight_folder, policy, faults):
+def test_a_flight_by_range_images_alone_does_not_collide(flight_folder, policy, faults):
     conditions = Conditions(perception=Perception("scan", FAULTS[faults]))
     what = Evaluation(policy, conditions=conditions, accept_bound=BOUND)
     driver, choose, question = prepare_evaluation(QUADROTOR, what)

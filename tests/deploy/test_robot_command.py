@@ -1,4 +1,4 @@
-"""`brakeline robot`: a new description, a check, a look."""
+"""Test `brakeline robot`: a new description, a check, a look."""
 
 import json
 
@@ -12,7 +12,7 @@ def run(capsys, *words):
     return code, capsys.readouterr()
 
 
-def test_a_new_description_is_right_as_it_stands(tmp_path, capsys):
+def test_a_new_description_has_no_mistake(tmp_path, capsys):
     path = tmp_path / "rover.toml"
     code, said = run(capsys, "new", path)
     assert code == 0 and f"robot check {path}" in said.out.replace("\n", "")
@@ -23,7 +23,7 @@ def test_a_new_description_is_right_as_it_stands(tmp_path, capsys):
     assert code == 1 and "exists" in said.err
 
 
-def test_every_mistake_is_told_and_the_exit_status_says_so(tmp_path, capsys):
+def test_check_lists_every_mistake_and_fails(tmp_path, capsys):
     path = tmp_path / "rover.toml"
     run(capsys, "new", path)
     path.write_text(path.read_text().replace("brake = 3", "brakes = 3").replace('"m/s"', '"km/h"', 1))
@@ -36,7 +36,7 @@ def test_every_mistake_is_told_and_the_exit_status_says_so(tmp_path, capsys):
     }
 
 
-def test_a_short_sight_is_remarked(tmp_path, capsys):
+def test_check_remarks_on_a_short_sensor_range(tmp_path, capsys):
     path = tmp_path / "rover.toml"
     run(capsys, "new", path)
     path.write_text(path.read_text().replace("sight = 3.0", "sight = 0.2"))
@@ -45,7 +45,7 @@ def test_a_short_sight_is_remarked(tmp_path, capsys):
 
 
 @pytest.mark.parametrize("robot", ["ground", "quadrotor"])
-def test_it_can_be_looked_at(tmp_path, capsys, robot):
+def test_show_prints_and_draws_a_description(tmp_path, capsys, robot):
     picture = tmp_path / "robot.png"
     code, said = run(capsys, "show", robot, "--picture", picture, "--json")
     shown = json.loads(said.out)

@@ -3,7 +3,7 @@
 import pytest
 
 from brakeline.deploy.experiments.evaluate import Evaluation, evaluate
-from brakeline.deploy.run.replay_run import _question
+from brakeline.deploy.run.replay_run import _joint_requests
 from brakeline.messaging import brakeline_pb2 as pb
 from tests.robots import GROUND
 
@@ -30,9 +30,9 @@ def test_what_was_one_question_is_asked_again_as_one():
         return pb.Request(actor=actor, step=step, fleet=["a", "b"]), pb.Reply()
 
     waiting = {}
-    assert _question(waiting, *one("b", 1)) == [] == _question(waiting, *one("a", 2))
-    asked = _question(waiting, *one("a", 1))
+    assert _joint_requests(waiting, *one("b", 1)) == [] == _joint_requests(waiting, *one("a", 2))
+    asked = _joint_requests(waiting, *one("a", 1))
     assert [request.actor for request, _ in asked] == ["a", "b"] and {request.step for request, _ in asked} == {1}
-    assert len(_question(waiting, *one("b", 2))) == 2 and not waiting
+    assert len(_joint_requests(waiting, *one("b", 2))) == 2 and not waiting
     alone = pb.Request(actor="a"), pb.Reply()
-    assert _question(waiting, *alone) == [alone]
+    assert _joint_requests(waiting, *alone) == [alone]

@@ -18,7 +18,7 @@ ROUNDING = 1e-9  # m/s, rad/s, m
 
 
 @pytest.mark.parametrize(("robot", "count", "allowed_now"), [("ground", 400, 0), ("quadrotor", 250, 1)])
-def test_stored_questions_are_decided_as_they_were(robot, count, allowed_now, monkeypatch):
+def test_stored_requests_are_decided_as_before(robot, count, allowed_now, monkeypatch):
     monkeypatch.setattr(qp_solver, "_by_few", lambda program: None)
     result = replay(STORED / f"{robot}-before-files.mcap")
     assert (result.requests, result.unanswered) == (count, 0)
@@ -30,7 +30,7 @@ def test_stored_questions_are_decided_as_they_were(robot, count, allowed_now, mo
     assert all(size < ROUNDING for field in rest.values() for size in field), rest
 
 
-def test_by_the_rows_that_decide_no_answer_is_lost():
+def test_the_active_rows_alone_lose_no_decision():
     found = replay(STORED / "ground-before-files.mcap").figures()
     assert found["kinds"] == {"adjusted": {"adjusted": 171}, "allowed": {"allowed": 229}}
     assert found["fields"]["plan"]["largest"] < 1e-5

@@ -1,4 +1,4 @@
-"""What a replay promises where sums are made in another order: the same kinds, and numbers equal but for rounding."""
+"""Test a replay with sums in another order: the same kinds, and numbers equal to within rounding."""
 
 import json
 import os
@@ -75,7 +75,7 @@ def move_arrays(thing: object, offset: int) -> int:
 
 
 @pytest.mark.parametrize("offset", range(8, LINE, 8))
-def test_wherever_arrays_lie_in_memory_no_decision_differs(log: Path, offset: int) -> None:
+def test_with_another_alignment_of_arrays_no_decision_differs(log: Path, offset: int) -> None:
     ready, elsewhere = (Filter(model_for(GROUND, ModelConfig())) for _ in range(2))
     assert move_arrays(elsewhere, offset) > 30
     assert elsewhere.tube.W.ctypes.data % LINE == offset

@@ -1,4 +1,4 @@
-"""What fails again and again is told from an accident, however long a busy machine takes to start it."""
+"""Test that repeated failures end the run and accidents do not, however slowly a busy machine starts a process."""
 
 import subprocess
 import sys
@@ -61,7 +61,7 @@ def test_however_slowly_it_starts_the_fifth_failure_in_a_row_ends_the_run(
 @pytest.mark.parametrize(
     ("speaks", "after"), [(5.0, HEALTHY_AFTER + 1.0), (None, START_ALLOWANCE + HEALTHY_AFTER + 1.0)]
 )
-def test_who_was_healthy_before_may_fail_as_often_as_it_likes(
+def test_a_process_that_was_healthy_may_fail_any_number_of_times(
     speaks: float | None, after: float, clock: list[float], tmp_path: Path
 ) -> None:
     child = Failing(ProcessSpec("autopilot", "autopilot"), tmp_path)

@@ -1,4 +1,4 @@
-"""Excitation that is driven: it stays inside by what is measured, and what is recorded is data of the robot."""
+"""Test driven excitation: the robot stays in its region, and the log is data of the robot."""
 
 import json
 from itertools import islice
@@ -45,7 +45,7 @@ def test_a_car_is_driven_inside_the_region_and_its_log_is_imported(tmp_path, cap
     assert main(["excite", CAR]) == 1 and "how it turns can't be told" in capsys.readouterr().err
 
 
-def test_who_goes_outwards_near_the_edge_brakes_by_the_robots_own_rule():
+def test_a_robot_that_leaves_the_region_brakes_by_its_own_rule():
     policy = RegionExcitation(robot_with_task(CAR), KEEP, np.random.default_rng(0))
     at = {"time": 0.0, "state": np.zeros(5), "input_in_force": np.zeros(2)}
     policy(None, at)

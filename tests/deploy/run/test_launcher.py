@@ -1,4 +1,4 @@
-"""Messages that killed the launcher, and modules that its children ran."""
+"""Test the launcher against malformed messages, and its processes against modules in the working directory."""
 
 import os
 from pathlib import Path
@@ -27,13 +27,13 @@ def say(launcher: Launcher, topic: Topic, message: object) -> None:
 
 
 @pytest.mark.parametrize("text", ["", "\n", " \r\n\n"])
-def test_an_error_without_words_does_not_kill_the_launcher(launcher: Launcher, text: str) -> None:
+def test_an_empty_error_message_does_not_end_the_launcher(launcher: Launcher, text: str) -> None:
     say(launcher, LOG, pb.LogLine(process="a", level="ERROR", text=text))
     say(launcher, LOG, pb.LogLine(header=pb.Header(sequence=2), process="a", level="ERROR", text="words"))
     assert list(launcher.lines) == ["a: ", "a: words"]
 
 
-def test_what_it_cannot_handle_is_passed_over(launcher: Launcher) -> None:
+def test_the_launcher_skips_messages_that_it_cannot_handle(launcher: Launcher) -> None:
     for topic in (LOG, HEALTH, STEP, EPISODE, EXCHANGE):
         say(launcher, topic, b"\xff\xff")
     say(launcher, STEP, pb.Step(header=pb.Header(time=float("inf")), actor="a"))
@@ -42,7 +42,7 @@ def test_what_it_cannot_handle_is_passed_over(launcher: Launcher) -> None:
     assert launcher.metrics.figures()["steps"] == 1
 
 
-def test_its_figures_stay_bounded(launcher: Launcher, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_launchers_figures_stay_bounded(launcher: Launcher, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("brakeline.logs.metrics.MOST_STREAMS", 100)
     monkeypatch.setattr("brakeline.logs.metrics.MOST_NAMES", 100)
     for number in range(300):
@@ -58,7 +58,7 @@ def test_its_figures_stay_bounded(launcher: Launcher, monkeypatch: pytest.Monkey
     assert launcher._rejected.count > 0
 
 
-def test_modules_in_the_working_directory_are_not_run_by_children(
+def test_processes_do_not_import_modules_of_the_working_directory(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A launched process and a worker of `compare` begin as usual, with the packages that this process has."""

@@ -1,4 +1,4 @@
-"""Replay: the same decisions, and every difference there is."""
+"""Test the replay: the same decisions, and each difference with its size."""
 
 import json
 import math
@@ -35,7 +35,7 @@ def test_the_same_version_decides_the_same(log: Path, capsys: pytest.CaptureFixt
     assert figures["fields"] == {} and figures["examples"] == [] and figures["same_input"] == STEPS
 
 
-def test_the_log_alone_is_enough(
+def test_a_log_suffices_for_a_replay(
     log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     shutil.copy(log, tmp_path / "elsewhere.mcap")
@@ -57,9 +57,7 @@ def test_a_log_without_models_is_replayed_from_its_folder_or_not_at_all(
     assert (again.requests, again.unanswered, again.different) == (20, 0, 0)
 
 
-def test_another_margin_decides_otherwise_and_it_is_told_by_how_much(
-    log: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_another_margin_changes_decisions_by_stated_amounts(log: Path, capsys: pytest.CaptureFixture[str]) -> None:
     margin = Filter(model_for(GROUND, ModelConfig())).clearance_margin
     status, figures = run(capsys, "replay", log, "--margin", margin + 0.05)
     assert status == 0, "it was asked for"
@@ -71,7 +69,7 @@ def test_another_margin_decides_otherwise_and_it_is_told_by_how_much(
     assert run(capsys, "replay", log, "--margin", margin)[1]["different"] == 0
 
 
-def test_another_certificate_and_other_data_can_be_asked(log: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_another_error_bound_and_other_data_can_be_replayed(log: Path, capsys: pytest.CaptureFixture[str]) -> None:
     words = ("replay", log, "--certificate", "set-membership")
     _, wider = run(capsys, *words)
     assert wider["different"] == STEPS and "model" not in wider["fields"]
@@ -80,7 +78,7 @@ def test_another_certificate_and_other_data_can_be_asked(log: Path, capsys: pyte
     assert same["kinds"] == wider["kinds"] and same["instead"]["data"] == str(record_path(GROUND))
 
 
-def test_questions_from_before_known_free_are_asked_as_they_were_meant(data_folder: Path, tmp_path: Path) -> None:
+def test_requests_older_than_known_free_keep_their_meaning(data_folder: Path, tmp_path: Path) -> None:
     ask = in_process(model_for(GROUND, ModelConfig()))
 
     def before(exchange: pb.Exchange) -> None:
@@ -126,7 +124,7 @@ def test_falsified_decisions_are_found(data_folder: Path, tmp_path: Path, capsys
     assert "11 requests; 1 had no answer" in shown and "different: 3" in shown
 
 
-def test_a_log_that_begins_after_a_change_of_models_has_no_stale_ones(data_folder: Path, tmp_path: Path) -> None:
+def test_a_log_that_begins_after_a_change_of_models_has_no_stale_models(data_folder: Path, tmp_path: Path) -> None:
     def verified_before(exchange: pb.Exchange) -> None:
         if exchange.request.model:
             exchange.request.model = "0123456789ab"
@@ -151,7 +149,7 @@ def test_differences_of_replies() -> None:
     assert differences(error, pb.Reply(error=pb.Error(type="NoModel")), 2) == {"error": APART}
 
 
-def test_rounding_is_of_a_numbers_size_or_of_one() -> None:
+def test_rounding_is_relative_to_the_number_or_to_one() -> None:
     def off(value: float, by: float) -> bool:
         one, other = (pb.Reply(decision=pb.Decision(margin=m)) for m in (value, value + by))
         return differences(one, other, 2)["margin"].rounding
@@ -160,7 +158,7 @@ def test_rounding_is_of_a_numbers_size_or_of_one() -> None:
     assert not off(0.1, 2e-12) and not off(5000.0, 6e-9) and not off(0.1, math.inf) and not off(0.1, math.nan)
 
 
-def test_a_log_from_before_a_field_was_there_is_no_different_for_it() -> None:
+def test_a_field_that_an_older_log_lacks_is_no_difference() -> None:
     before, now = pb.Decision(kind=pb.ADJUSTED), pb.Decision(kind=pb.ADJUSTED, for_clearance=True)
     assert differences(pb.Reply(decision=before), pb.Reply(decision=now), 2) == {}
     now.for_clearance = before.for_clearance = False

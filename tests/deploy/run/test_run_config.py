@@ -1,4 +1,4 @@
-"""Configurations: what is saved is what is read, and nothing unknown or impossible passes."""
+"""Test configurations: the saved one is loaded, and nothing unknown or impossible is accepted."""
 
 import json
 from dataclasses import replace
@@ -37,7 +37,13 @@ def test_a_saved_configuration_is_read_back(config: RunConfig, tmp_path: Path) -
     assert load(tmp_path / "config.json") == config
 
 
-def test_what_is_unknown_or_damaged_is_refused_with_the_files_name(tmp_path: Path) -> None:
+def test_a_configuration_with_a_former_field_name_is_read() -> None:
+    values = json.loads(encode(CHANGED))
+    values["recipe"] = values.pop("model_config")
+    assert decode(json.dumps(values)) == CHANGED
+
+
+def test_an_unknown_or_damaged_configuration_is_refused_with_the_name_of_its_file(tmp_path: Path) -> None:
     path = tmp_path / "config.json"
     values = json.loads(encode(RunConfig()))
     for damage, said in (
@@ -87,7 +93,7 @@ def test_the_processes_of_a_run() -> None:
     assert [spec.number for spec in several if spec.kind == "actor"] == [0, 4, 8], "no robot's number comes twice"
 
 
-def test_an_experiment_is_where_the_options_start(tmp_path: Path) -> None:
+def test_the_options_start_from_the_experiment(tmp_path: Path) -> None:
     debug = EXPERIMENTS["debug"]
     assert TrainCommand.defaults(["ground", "--experiment", "debug"]).config() == debug
     assert TrainCommand.defaults(["ground", "--experiment=debug"]).config() == debug
@@ -102,7 +108,7 @@ def test_a_resumed_run_keeps_its_configuration_but_for_the_steps(tmp_path: Path)
     assert TrainCommand(resume=tmp_path, steps=5).config() == replace(CHANGED, steps=5)
 
 
-def test_what_no_world_is_made_for_is_refused_before_anything_starts() -> None:
+def test_an_impossible_world_is_refused_before_anything_starts() -> None:
     scans = Conditions(perception=Perception("scan"))
     for wrong, said in (
         ({"fleet": 2, "arena": "walkers"}, "things that move"),

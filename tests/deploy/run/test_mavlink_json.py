@@ -1,4 +1,4 @@
-"""MAVLink frames in the log: the bytes as they were, and JSON beside them that needs nothing of ours to be read."""
+"""Test MAVLink frames in the log: the received bytes, and JSON that other programs can read."""
 
 import json
 from pathlib import Path
@@ -78,12 +78,12 @@ def test_a_recorder_stores_bytes_and_json(tmp_path: Path) -> None:
     assert (tmp_path / "a.tlog").read_bytes() == expected
 
 
-def test_a_log_without_frames_says_how_to_have_some(log: Path, tmp_path: Path) -> None:
+def test_a_tlog_of_a_log_without_frames_fails_with_what_to_do(log: Path, tmp_path: Path) -> None:
     with (tmp_path / "a.tlog").open("wb") as file, pytest.raises(ExportError, match="--mavlink"):
         to_tlog(log, file)
 
 
-def test_what_is_no_frame_is_left_out() -> None:
+def test_bytes_that_are_no_frame_are_left_out() -> None:
     line = Sample(LOG, "log/a", pb.LogLine(text="x").SerializeToString(), 1)
     assert frames_as_json(line) == []
     garbage = pb.MavlinkFrames(frames=[pb.MavlinkFrame(wall_time=1, raw=b"\xfd\x00no frame")])

@@ -1,4 +1,4 @@
-"""Which of a log's steps a learner is given, under which names, and how a run that learns from logs is put together."""
+"""Test the steps that a learner gets from logs, and the processes of a run that learns from logs."""
 
 import shutil
 from pathlib import Path
@@ -32,14 +32,14 @@ def names(steps: LoggedSteps) -> list[tuple[str, int, int]]:
     return [(one.actor, one.episode, one.step) for one in steps]
 
 
-def test_each_step_once_in_its_order(tmp_path: Path) -> None:
+def test_the_learner_gets_each_step_once_in_its_order(tmp_path: Path) -> None:
     record(tmp_path / "run.mcap", step(0), step(1), step(1), step(0, "b"), step(3), step(2))
     steps = LoggedSteps([str(tmp_path)], GROUND)
     assert names(steps) == [("a", 0, 0), ("a", 0, 1), ("b", 0, 0), ("a", 0, 3), ("a", 0, 2)]
     assert steps.counts == {"taken": 5, "duplicate": 1}
 
 
-def test_what_nobody_can_learn_from_is_counted_and_left_out(tmp_path: Path) -> None:
+def test_unusable_steps_are_counted_and_left_out(tmp_path: Path) -> None:
     bad = [step(1, observation=[0.5]), step(2, reward=float("nan")), step(3, action=[float("inf"), 0.0])]
     record(tmp_path / "run.mcap", step(0), *bad, step(4))
     steps = LoggedSteps([str(tmp_path)], GROUND)
@@ -47,7 +47,7 @@ def test_what_nobody_can_learn_from_is_counted_and_left_out(tmp_path: Path) -> N
     assert steps.counts == {"taken": 2, "unusable": 2}  # the reader has passed over the reward that is no number
 
 
-def test_actors_of_other_runs_are_others_and_those_of_other_segments_the_same(tmp_path: Path) -> None:
+def test_actors_of_different_runs_differ_and_of_one_run_stay_the_same(tmp_path: Path) -> None:
     for folder in ("one", "two"):
         (tmp_path / folder).mkdir()
         record(tmp_path / folder / "run.mcap", step(0), step(1))
@@ -59,7 +59,7 @@ def test_actors_of_other_runs_are_others_and_those_of_other_segments_the_same(tm
         count([str(tmp_path / "one")], QUADROTOR)
 
 
-def test_a_truncated_log_feeds_what_is_left_of_it(log: Path, tmp_path: Path) -> None:
+def test_a_truncated_log_gives_its_remaining_steps(log: Path, tmp_path: Path) -> None:
     whole = log.read_bytes()
     (tmp_path / "cut.mcap").write_bytes(whole[: len(whole) * 2 // 3])
     shutil.copy(log, tmp_path / "whole.mcap")
