@@ -162,7 +162,7 @@ class Dataset:
         )
         chord_deviation = about.get("bulge", 0.0)
         if not isinstance(chord_deviation, int | float) or not 0.0 <= chord_deviation < math.inf:
-            raise BadData(f"{path}: a bulge of {chord_deviation!r} is none")
+            raise BadData(f"{path}: the chord deviation {chord_deviation!r} is no length")
         data = Dataset(robot, trajectories, about_data, float(chord_deviation))
         data.check()
         return data

@@ -1,10 +1,10 @@
-"""What recorded data say about the next step: one form, three certificates (docs/method.md §1, paper lemmas 1 and 2).
+"""Error bounds of a predictor from recorded data: one form, three kinds (docs/method.md §1; Lemmas 1 and 2).
 
-Every certificate bounds one step from a regressor z = [x; u] (column vector of length nz) by
+Every kind of error bound has form (1) of docs/method.md, for a regressor z (nz,):
 
     y+ ∈ C z + Σ_j ( M_j·|W z| + κ_j·|z| + w_j ) g_j [-1, 1]
 
-which is (1) of docs/method.md with `H_j = diag(M_j) W` factored, because the H_j of one data set share their rows W.
+The generators g_j share the rows of W.
 """
 
 from __future__ import annotations
@@ -21,16 +21,21 @@ from brakeline.safety.model.model_config import SET_MEMBERSHIP as SET_MEMBERSHIP
 
 Array = NDArray[np.float64]
 
-ROWS_A_ROUND = 64  # constraints added a round when an LP over all samples is solved on few of them
+ROWS_A_ROUND = 64  # samples that each round adds to a linear program
 
 
 class ErrorBoundError(ValueError):
-    """The data do not support the certificate; the message says why."""
+    """The data do not support the error bound; the message says why."""
 
 
 @dataclass(frozen=True)
 class ErrorBound:
-    """C (n, nz), W (q, nz), M (g, q) >= 0, kappa (g, nz) >= 0, w (g,) >= 0, generators (n, g)."""
+    """y ∈ C z + Σ_j ( M_j |W z| + κ_j |z| + w_j ) g_j [-1, 1]        (docs/method.md §1, form 1)
+
+    Attributes:
+        C (n, nz): linear predictor. W (q, nz): rows that all generators share.
+        M (g, q), kappa (g, nz), w (g,): non-negative lengths. generators (n, g): g_j as columns.
+    """
 
     C: Array
     W: Array
@@ -40,25 +45,25 @@ class ErrorBound:
     generators: Array
 
     def __post_init__(self) -> None:
-        """One memory layout, whether made or read: the order of summation, and so the last bit, depends on it."""
+        """Use one memory layout for all arrays: the order of summation, and so the last bit, depends on it."""
         for name in ("C", "W", "M", "kappa", "w", "generators"):
             object.__setattr__(self, name, np.ascontiguousarray(getattr(self, name), dtype=float))
 
     def magnitudes(self, z: Array) -> Array:
-        """Lengths of the generators for regressors z (..., nz): (..., g)."""
+        """Return the lengths (..., g) of the generators for regressors z (..., nz)."""
         return np.asarray(np.abs(z @ self.W.T) @ self.M.T + np.abs(z) @ self.kappa.T + self.w)
 
     def half_widths(self, z: Array) -> Array:
-        """Half-widths of the interval hull of the next step's set: (..., n)."""
+        """Return half-widths (..., n) of the interval hull of the bound for regressors z (..., nz)."""
         return np.asarray(self.magnitudes(z) @ np.abs(self.generators).T)
 
     def matrix_hull(self) -> tuple[Array, Array]:
-        """Lower and upper interval matrix of the model set `C + Σ_j g_j (M_j β) W` (n, nz)."""
+        """Return the interval hull, two matrices (n, nz), of all matrices C + Σ_j g_j (M_j β) W with |β| <= 1."""
         half = np.abs(self.generators) @ self.M @ np.abs(self.W)
         return self.C - half, self.C + half
 
     def through(self, T: Array) -> ErrorBound:
-        """The same for regressors z' = T z (nz', nz), as a certificate of z."""
+        """Return this bound, which is about z' = T z with T (nz', nz), as a bound about z."""
         unbent = np.zeros((len(self.w), T.shape[1]))
         return ErrorBound(
             self.C @ T,
@@ -70,10 +75,9 @@ class ErrorBound:
         )
 
     def outer(self, basis: Array) -> ErrorBound:
-        """The same with W replaced by `basis` (nz, nz), never narrower: for the QP, whose size goes with W's rows.
+        """Return an outer bound with `basis` B (nz, nz) in place of W: for the QP, whose size grows with the rows of W.
 
-        `M_j·|W z| = M_j·|(W basis⁻¹)(basis z)| <= (M_j |W basis⁻¹|)·|basis z|`: the zonotope of W's rows, boxed in
-        the coordinates in which the data are white.
+        M |W z| = M |(W B⁻¹)(B z)| <= M |W B⁻¹| |B z|                          (docs/method.md §2)
         """
         if len(self.W) <= len(basis):
             return self
@@ -82,7 +86,7 @@ class ErrorBound:
 
 
 def least_squares(z: Array, y: Array, columns: NDArray[np.bool_] | None = None) -> Array:
-    """C (n, nz) of least squares for regressors z (T, nz) and targets y (T, n); other `columns` are zero."""
+    """Return C (n, nz) of least squares for regressors z (T, nz) and targets y (T, n), zero outside `columns`."""
     C = np.zeros((y.shape[1], z.shape[1]))
     chosen = slice(None) if columns is None else columns
     C[:, chosen] = np.linalg.lstsq(z[:, chosen], y, rcond=None)[0].T
@@ -90,7 +94,7 @@ def least_squares(z: Array, y: Array, columns: NDArray[np.bool_] | None = None) 
 
 
 def whitening(z: Array) -> Array:
-    """B (nz, nz) with `B z` white over the samples z (T, nz). Raises CertificateError if they span less."""
+    """Return B (nz, nz) with `B z` white over the samples z (T, nz); raise ErrorBoundError if they do not span."""
     moment = z.T @ z / len(z)
     try:
         return np.asarray(np.linalg.inv(np.linalg.cholesky(moment)))
@@ -99,12 +103,12 @@ def whitening(z: Array) -> Array:
 
 
 def envelope(features: Array, values: Array, inflation: float) -> tuple[Array, float]:
-    """The smallest `κ·f + w >= v` over all samples, f (T, q) >= 0, v (T,) >= 0, scaled by `inflation`.
+    """Return the envelope (κ, w) with κ f + w >= v for all samples, times `inflation` (docs/method.md §1c).
 
-    Minimises the mean of the bound over the samples, by an LP to which violated samples are added until none is; what
-    the solver's tolerance leaves violated is added to w.
+    A linear program minimises the mean of the bound over features f (T, q) >= 0 with values v (T,) >= 0. It starts from
+    few samples and adds violated ones until there are none. What its tolerance leaves violated is added to w.
     """
-    from scipy.optimize import linprog  # half a second, and nothing that a service needs
+    from scipy.optimize import linprog  # here: it takes half a second to load, and a service does not need it
 
     if not len(values):
         raise ErrorBoundError("no sample to bound")
@@ -128,7 +132,7 @@ def envelope(features: Array, values: Array, inflation: float) -> tuple[Array, f
 
 
 def residual(z: Array, y: Array, C: Array, inflation: float = 1.0) -> ErrorBound:
-    """(c): C is trusted, the residual is bounded by an envelope over the samples z (T, nz), y (T, n); axes as g_j."""
+    """Return bound (c): the predictor C (n, nz), and an envelope of its residual over z (T, nz), y (T, n)."""
     n, nz = C.shape
     rest = np.abs(y - z @ C.T)
     bounds = [envelope(np.abs(z), rest[:, j], inflation) for j in range(n)]
@@ -137,7 +141,7 @@ def residual(z: Array, y: Array, C: Array, inflation: float = 1.0) -> ErrorBound
 
 
 def matrix_zonotope(z: Array, y: Array, generators: Array, sizes: Array, kappa: Array, w: Array) -> ErrorBound:
-    """(a): all matrices `(Y+ - noise) Z⁺` of lemma 1, exactly, and the noise of the step itself (lemma 2).
+    """Return bound (a): all matrices (Y - noise) Z⁺ of Lemma 1, exactly, plus the noise of the step (Lemma 2).
 
     The noise at sample t is `Σ_j sizes[j, t] g_j [-1, 1]`, centred: every generator matrix has rank one,
     `g_j h_tᵀ` with h_t row t of Z⁺, and for a fixed z the terms of one g_j are parallel.
@@ -151,13 +155,13 @@ def matrix_zonotope(z: Array, y: Array, generators: Array, sizes: Array, kappa: 
 
 
 def set_membership(z: Array, y: Array, sizes: Array, kappa: Array, w: Array) -> ErrorBound:
-    """(b): row by row, all a with `|y_t - a·z_t| <= sizes[t]` for every sample, boxed in whitened coordinates.
+    """Return bound (b): for each coordinate, all rows a with |y_t - aᵀ z_t| <= sizes[t], boxed in white coordinates.
 
     Args:
         z: (T, nz); y: (T, n); sizes: (n, T); kappa, w: (n, nz) and (n,), the noise of the predicted step.
 
     Raises:
-        CertificateError: no matrix is consistent with all samples: the noise bound is too small.
+        ErrorBoundError: no matrix is consistent with all samples: the noise bound is too small.
     """
     basis = whitening(z)
     white = z @ basis.T
@@ -169,9 +173,9 @@ def set_membership(z: Array, y: Array, sizes: Array, kappa: Array, w: Array) -> 
 
 
 def _row_box(white: Array, y: Array, size: Array) -> tuple[Array, Array]:
-    """Interval hull of the polytope `|y_t - a·white_t| <= size_t`, by 2 nz LPs that share their active samples.
+    """Return the interval hull of the polytope |y_t - aᵀ white_t| <= size_t, by 2 nz linear programs.
 
-    Leaving samples out only widens it, so it holds whatever the loop stops at.
+    They share their active samples. Samples left out only widen the hull, so every result is an outer bound.
     """
     from scipy.optimize import linprog
 
@@ -211,21 +215,21 @@ def _row_box(white: Array, y: Array, size: Array) -> tuple[Array, Array]:
 
 
 def measured_noise(z: Array, y: Array, w_half: Array, v_half: Array) -> Array:
-    """Half-widths of `w + v+ - A v` for a linear system with box noise, without knowing A (docs/method.md §1).
+    """Return half-widths of w + v⁺ - A v for a linear system with box noise and unknown A (docs/method.md §1).
 
-    `|A v| <= s = (|C_A| v̄ + β (w̄ + v̄)) / (1 - β)`, `β = Σ_i v̄_i ‖Z⁺_{:,i}‖₁`, where the state comes first in z.
+        |A v| <= s = (|C_A| v̄ + γ (w̄ + v̄)) / (1 - γ),    γ = Σ_i v̄_i ‖Z⁺_{:,i}‖₁,    with the state first in z.
 
     Args:
         z: (T, nz) measured regressors; y: (T, n); w_half, v_half: (n,).
 
     Raises:
-        CertificateError: β >= 1: the measurements are too noisy for the data to bound A.
+        ErrorBoundError: γ >= 1: the measurements are too noisy for the data to bound A.
     """
     n = y.shape[1]
     pseudo = np.linalg.pinv(z.T)
-    beta = float(v_half @ np.abs(pseudo[:, :n]).sum(0))
-    if beta >= 1.0:
-        raise ErrorBoundError(f"β = {beta:.3g} >= 1: the measurement noise is too large for a bound on A v")
+    gamma = float(v_half @ np.abs(pseudo[:, :n]).sum(0))
+    if gamma >= 1.0:
+        raise ErrorBoundError(f"γ = {gamma:.3g} >= 1: the measurement noise is too large for a bound on A v")
     C = y.T @ pseudo
-    s = (np.abs(C[:, :n]) @ v_half + beta * (w_half + v_half)) / (1.0 - beta)
+    s = (np.abs(C[:, :n]) @ v_half + gamma * (w_half + v_half)) / (1.0 - gamma)
     return np.asarray(w_half + v_half + s)

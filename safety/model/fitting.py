@@ -1,4 +1,4 @@
-"""A model set from recorded data (docs/method.md §1, §2): predictors, their bounds, bulges and the stop latch."""
+"""Fit a model set to recorded data: predictors and all its bounds (docs/method.md §1, §2)."""
 
 from __future__ import annotations
 
@@ -37,16 +37,17 @@ from brakeline.safety.model.windows import (
 
 Array = NDArray[np.float64]
 
-FEWEST_STOPS = 5  # that a bound of the way after a stop is worth anything from
-FEWEST_IN_PLACE = 100  # windows in place: fewer regressors play a part in them than in others
-MOST_ATOMS = 120_000  # of a matrix zonotope, over the horizon: the exact check looks at every one
+FEWEST_STOPS = 5  # with fewer stops, the bound of the stopping distance would mean little
+FEWEST_IN_PLACE = 100  # windows in place; they have fewer regressors than others
+MOST_ATOMS = 120_000  # rows of W of a matrix zonotope, over the horizon: the exact check evaluates each
 
 
 def fit_model_set(data: Dataset, model_config: ModelConfig) -> ModelSet:
-    """A model set from two parts of the data: one fits C, the other bounds what is left (held-out data: certify).
+    """Fit a model set: one half of the trajectories fits C, the other half bounds the error.
 
     Raises:
-        BadData: a check failed; CertificateError: the data do not support the certificate.
+        BadData: a check of the data failed.
+        ErrorBoundError: the data do not support this kind of error bound.
     """
     robot, kind = data.robot, model_config.windows
     if model_config.mode == RECURSION and any(disc.arm for disc in robot.body):
@@ -61,18 +62,19 @@ def fit_model_set(data: Dataset, model_config: ModelConfig) -> ModelSet:
         columns = _columns(robot, k, kind)
         for part in (seen, rest):
             check_regressors(part.z[:, columns], f"windows of {k} periods", model_config.fewest)
-        every = windows(data, k, kind)  # no predictor is fitted to bulges: both parts may bound them
+        every = windows(data, k, kind)  # chord deviations have no predictor, so both halves bound them
         chord_deviations.append(envelope(np.abs(every.z), every.chord_deviation, model_config.inflation))
         if model_config.mode == DIRECT:
             after, later = predicted_outputs(robot, seen.y), predicted_outputs(robot, rest.y)
-            steps.append(_certificate(seen.z, after, rest.z, later, model_config, columns, MOST_ATOMS // horizon))
+            steps.append(_error_bound(seen.z, after, rest.z, later, model_config, columns, MOST_ATOMS // horizon))
         else:
             steps.append(_recursive_step(robot, windows(fit, 1), windows(bound, 1), k - 1, model_config))
     whole = windows(data, horizon, kind)
     nz = whole.z.shape[1]
-    stopping_distance = (
-        _latch_of_plans(whole, model_config) if kind == PLAN else (np.zeros(nz), _latch_of_stops(data, model_config))
-    )
+    if kind == PLAN:
+        stopping_distance = _stopping_distance_of_plans(whole, model_config)
+    else:
+        stopping_distance = np.zeros(nz), _stopping_distance_of_stops(data, model_config)
     known = windows(data, 1).z[:, : robot.regressor_dim]
     domain = np.stack([known.min(0), known.max(0)])
     about = data.about | {"data": data.digest(), "periods": str(data.periods)}
@@ -91,8 +93,10 @@ def fit_model_set(data: Dataset, model_config: ModelConfig) -> ModelSet:
 
 
 def _in_place(fit: Dataset, bound: Dataset, model_config: ModelConfig) -> InPlace | None:
-    """The predictors for plans in place, from all windows in place; None where the data do not support them (too few
-    such windows, or no varied turning among them) or the robot has no such plans."""
+    """Return predictors for plans in place, fitted to all windows in place.
+
+    None if the data do not support them (too few windows, no varied turning), or if the robot has no such plans.
+    """
     robot = fit.robot
     limits = standing_limits(robot)
     if limits is None or model_config.mode != DIRECT:
@@ -111,16 +115,16 @@ def _in_place(fit: Dataset, bound: Dataset, model_config: ModelConfig) -> InPlac
                 check_regressors(
                     each[:, turns], f"windows of {k} periods in place", min(model_config.fewest, FEWEST_IN_PLACE)
                 )
-            steps.append(_certificate(z, y, z_bound, y_bound, model_config, turns, MOST_ATOMS // robot.horizon))
+            steps.append(_error_bound(z, y, z_bound, y_bound, model_config, turns, MOST_ATOMS // robot.horizon))
         except (BadData, ErrorBoundError):
             return None
     return InPlace(tuple(steps), np.where(free, _range(robot, np.vstack([z, z_bound])), limits))
 
 
 def _range(robot: Robot, z: Array) -> Array:
-    """(2, r + m): the least and the largest [x_0; input in force] and input of the plans among regressors z (T, nz).
+    """Return the range (2, r + m) of [x_0; input in force] and of the plans' inputs in regressors z (T, nz).
 
-    A speed that follows an input may be measured beyond what was recorded of it by its error.
+    A speed that follows an input may be measured outside the input's range by its measurement error.
     """
     known, m = robot.regressor_dim, robot.action_dim
     inputs = z[:, known - m :].reshape(-1, m)
@@ -134,20 +138,21 @@ def _range(robot: Robot, z: Array) -> Array:
     return found
 
 
-def _latch_of_plans(whole: Windows, model_config: ModelConfig) -> tuple[Array, float]:
-    """The way still travelled after a plan's last input, bounded by what the plan was."""
+def _stopping_distance_of_plans(whole: Windows, model_config: ModelConfig) -> tuple[Array, float]:
+    """Return the envelope (κ, w) of the stopping distance σ(z) after the last input of plan windows."""
     still = ~np.isnan(whole.stopping_distance)
     if not still.any():
         raise BadData("no plan's stop was recorded: let the robot stand after braking")
     return envelope(np.abs(whole.z[still]), whole.stopping_distance[still], model_config.inflation)
 
 
-def _latch_of_stops(data: Dataset, model_config: ModelConfig) -> float:
-    """The same whatever the plan was: from wherever inputs had been those of a stop for as long as they are at a
-    plan's end.
+def _stopping_distance_of_stops(data: Dataset, model_config: ModelConfig) -> float:
+    """Return one bound [m] of the stopping distance for all plans.
+
+    It comes from all times at which the inputs had been those of a stop for as long as at the end of a plan.
 
     Raises:
-        BadData: that occurs too seldom; the message says what to drive.
+        BadData: there are too few stops; the message says what to record.
     """
     robot = data.robot
     rested = resting_periods_at_end(robot)
@@ -161,7 +166,7 @@ def _latch_of_stops(data: Dataset, model_config: ModelConfig) -> float:
 
 
 def _columns(robot: Robot, k: int, kind: str) -> NDArray[np.bool_]:
-    """Which coordinates of z can matter after k periods: later chosen inputs can't."""
+    """Return the coordinates of z that matter after k periods; later inputs do not."""
     chosen = robot.free_steps if kind == PLAN else robot.horizon
     used = np.ones(robot.regressor_dim + chosen * robot.action_dim, dtype=bool)
     used[robot.regressor_dim + min(k, chosen) * robot.action_dim :] = False
@@ -169,13 +174,13 @@ def _columns(robot: Robot, k: int, kind: str) -> NDArray[np.bool_]:
 
 
 def _scalar(bounds: list[tuple[Array, float]], nz: int) -> ErrorBound:
-    """Bounds of lengths as a certificate: nothing but κ and w."""
+    """Return bounds of lengths, κ and w only, as an error bound."""
     n = len(bounds)
     kappa, w = np.array([b[0] for b in bounds]), np.array([b[1] for b in bounds])
     return ErrorBound(np.zeros((n, nz)), np.zeros((0, nz)), np.zeros((n, 0)), kappa, w, np.eye(n))
 
 
-def _certificate(
+def _error_bound(
     z: Array,
     y: Array,
     z_bound: Array,
@@ -184,10 +189,10 @@ def _certificate(
     columns: NDArray[np.bool_],
     most_atoms: int,
 ) -> ErrorBound:
-    """The recipe's certificate: the noise of all three is the residual's envelope, they differ in trusting C.
+    """Return the error bound of the configured kind. The residual's envelope is the noise bound of all three kinds.
 
-    A matrix zonotope has an atom a sample and more samples do not shrink it: it takes no more than `most_atoms`,
-    evenly over the data.
+    A matrix zonotope has one row of W for each sample, and more samples do not make it smaller. So it uses at most
+    `most_atoms` samples, spread evenly over the data.
     """
     trusted = residual(z_bound, y_bound, least_squares(z, y, columns), model_config.inflation)
     if model_config.certificate == RESIDUAL:
@@ -209,18 +214,19 @@ def _certificate(
 
 
 def _recursive_step(robot: Robot, fit: Windows, bound: Windows, k: int, model_config: ModelConfig) -> ErrorBound:
-    """Period k of the recursion: z_k = [heading, ...; u_prev; u] from one-period windows turned by a random offset.
+    """Return the error bound of step k of the recursion, z_k = [heading, ...; u_{k-1}; u_k] (docs/method.md §5).
 
-    After k periods the robot may have turned by k ω_max dt against the frame of now, as measured a bit more; without
-    offsets the heading would be zero in every window and the data would say nothing about it.
+    It is fitted to one-period windows turned by a random offset of up to k times the largest turn in a period, plus
+    twice the measurement error. Without offsets, the heading would be zero in all windows.
     """
     rng = np.random.default_rng((model_config.seed, k))
     turned = [_turned(robot, w, k, rng) for w in (fit, bound)]
     columns = np.abs(turned[0][0]).max(0) > 0.0
-    return _certificate(*turned[0], *turned[1], model_config, columns, MOST_ATOMS // robot.horizon)
+    return _error_bound(*turned[0], *turned[1], model_config, columns, MOST_ATOMS // robot.horizon)
 
 
 def _turned(robot: Robot, w: Windows, k: int, rng: np.random.Generator) -> tuple[Array, Array]:
+    """Return regressors z_k and targets of one-period windows, turned by random offsets."""
     reg, m = len(robot.regressor), robot.action_dim
     values, inputs = w.z[:, :reg], w.z[:, reg : reg + 2 * m]
     y = w.y.copy()

@@ -1,4 +1,4 @@
-"""A model set: everything the filter knows about a robot, made from recorded data, versioned by its content."""
+"""Model sets: everything that the filter knows about a robot, from recorded data (docs/method.md §1, §2)."""
 
 from __future__ import annotations
 
@@ -47,7 +47,12 @@ class BadModel(ValueError):
 
 @dataclass(frozen=True)
 class ModelSet:
-    """steps[k]: direct, what k+1 periods do to z; recursion, what period k does to z_k. bulges: one row a step."""
+    """The predictors of a robot with all their error bounds; its version is a hash of the content.
+
+    Attributes:
+        steps: in mode direct, bound k is about k+1 periods from z; in mode recursion, about period k from z_k.
+        chord_deviations: N rows, β_k(z). stopping_distance: one row, σ(z). In files: "bulges" and "latch".
+    """
 
     robot: Robot
     model_config: ModelConfig
@@ -57,22 +62,22 @@ class ModelSet:
     domain: Array  # (2, regressor_dim): smallest and largest recorded [x_0; input in force]
     basis: Array  # (nz, nz): coordinates in which the recorded z are white
     about: dict[str, str]
-    layout: str = ""  # of the robot when it was made, if that was before robots were files
-    stands: int = 0  # so many periods after a plan began the robot stands; 0: no sooner than at its end
-    in_place: InPlace | None = None  # predictors for turning on the spot, where the data support them
+    layout: str = ""  # layout of the robot, for model sets older than descriptions in files
+    stands: int = 0  # periods after which a plan has brought the robot to a stand; 0: at its end
+    in_place: InPlace | None = None  # predictors for plans in place, if the data support them
 
     @property
     def moving(self) -> int:
-        """So many of a plan's periods the robot may move in."""
+        """Number of periods of a plan in which the robot may move."""
         return self.stands or self.robot.horizon
 
     @property
     def first(self) -> ErrorBound:
-        """What one period does: for comparing the next measurement with its prediction."""
+        """The bound for one period, which the next measurement is compared with."""
         return self.steps[0]
 
     def first_regressor(self, z: Array) -> Array:
-        """The regressor of `first` from z (..., nz): [.. ; input in force; first input]."""
+        """Return the regressor of `first` from z (..., nz): [...; input in force; first input]."""
         robot = self.robot
         if self.model_config.mode == DIRECT:
             return z if self.model_config.windows == PLAN else z @ plan_regressor_map(robot).T
@@ -82,19 +87,19 @@ class ModelSet:
         return np.concatenate([zeros, z[..., : reg + 2 * m]], axis=-1)
 
     def tube(self) -> Tube:
-        """The stacked tube with every generator as it is: for checks."""
+        """Return the exact tube, for checks."""
         return self._stack(self.steps)
 
     def tube_of_windows(self) -> Tube:
-        """The same of the windows that it was made from: their regressors may be all inputs of a plan, one by one."""
+        """Return the exact tube for the regressors of the windows; of free windows, they hold all N inputs."""
         return self._stack(self.steps, plans=False)
 
     def outer_tube(self) -> Tube:
-        """One that contains it and has few atoms: for the QP."""
+        """Return the outer tube, with few rows in W, for the QP."""
         return self._stack([step.outer(whitening_of(step, self.basis)) for step in self.steps])
 
     def turning(self) -> ModelSet | None:
-        """The same with the predictors for plans in place; None if there are none."""
+        """Return the model set with the predictors for plans in place; None without them."""
         if self.in_place is None:
             return None
         steps = self.in_place.steps
@@ -103,7 +108,7 @@ class ModelSet:
         return replace(self, steps=steps, in_place=None)
 
     def _check_sizes(self) -> None:
-        """Raises BadModel unless every array has the size that robot and mode give it."""
+        """Raise BadModel unless every array has the size that robot and mode require."""
         robot = self.robot
         nz = regressors(robot, self.model_config)
         one = nz if self.model_config.mode == DIRECT else robot.state_dim - robot.position_dim + 2 * robot.action_dim
@@ -150,7 +155,7 @@ class ModelSet:
 
     @property
     def version(self) -> str:
-        """Hash of the content and of what it means, so that one name can't mean two models."""
+        """Hash of the content and of its meaning: robot layout, kind of error bound, mode."""
         layout = self.layout or self.robot.layout()
         meaning = f"{layout} {self.model_config.certificate} {self.model_config.mode} "
         meaning += f"stands {self.stands} " if self.moving < self.robot.horizon else ""
@@ -167,7 +172,7 @@ class ModelSet:
         return {f"{n}.{t}": getattr(c, t) for n, c in named.items() for t in TENSORS} | more
 
     def encode(self) -> bytes:
-        """Bytes of a safetensors file, with the recipe as its metadata."""
+        """Return the bytes of a safetensors file, with configuration and version as metadata."""
         about = {
             "robot": self.robot.name,
             "layout": self.layout or self.robot.layout(),
@@ -185,7 +190,7 @@ class ModelSet:
 
     @staticmethod
     def decode(payload: bytes) -> ModelSet:
-        """Raises BadModel unless the bytes are a complete, finite model set of a robot that this program knows."""
+        """Read a model set; raise BadModel unless it is complete, finite, and of a robot that this program knows."""
         try:
             tensors, about = unpack(payload, ENTRY)
             robot = robot_in(about)
@@ -193,7 +198,7 @@ class ModelSet:
             names = ["bulges", "latch", *(f"step{k}" for k in range(robot.horizon))]
             if BOX in tensors:
                 names += [f"{IN_PLACE}{k}" for k in range(robot.horizon)]
-            certificates = {name: ErrorBound(*(tensors[f"{name}.{t}"] for t in TENSORS)) for name in names}
+            bounds = {name: ErrorBound(*(tensors[f"{name}.{t}"] for t in TENSORS)) for name in names}
             more = tensors["domain"], tensors["basis"], dict(about["about"])
             stands = int(about.get("stands", 0))
         except (KeyError, TypeError, ValueError, UnknownRobot) as error:
@@ -203,15 +208,15 @@ class ModelSet:
         layout = "" if about["layout"] == robot.layout() else str(about["layout"])
         if not all(t.dtype == np.float64 and np.isfinite(t).all() for t in tensors.values()):
             raise BadModel("the model set holds NaN, infinity or numbers of another type")
-        if any((c.M < 0).any() or (c.kappa < 0).any() or (c.w < 0).any() for c in certificates.values()):
+        if any((c.M < 0).any() or (c.kappa < 0).any() or (c.w < 0).any() for c in bounds.values()):
             raise BadModel("the model set has a negative width")
-        steps = tuple(certificates[f"step{k}"] for k in range(robot.horizon))
+        steps = tuple(bounds[f"step{k}"] for k in range(robot.horizon))
         if not 0 <= stands <= robot.horizon:
             raise BadModel(f"a plan of {robot.horizon} periods can't have come to a stand after {stands}")
         in_place = None
         if BOX in tensors:
-            in_place = InPlace(tuple(certificates[f"{IN_PLACE}{k}"] for k in range(robot.horizon)), tensors[BOX])
-        chord_deviations, stopping_distance = certificates["bulges"], certificates["latch"]
+            in_place = InPlace(tuple(bounds[f"{IN_PLACE}{k}"] for k in range(robot.horizon)), tensors[BOX])
+        chord_deviations, stopping_distance = bounds["bulges"], bounds["latch"]
         model = ModelSet(
             robot, model_config, steps, chord_deviations, stopping_distance, *more, layout, stands, in_place
         )
@@ -259,10 +264,10 @@ class ModelSet:
 
 
 def robot_in(about: dict[str, Any]) -> Robot:
-    """The robot that a model set is of: it carries its description, unless it is older than those.
+    """Return the robot of a model set, from the description that it carries or, in old files, by its name.
 
     Raises:
-        UnknownRobot: its description is none, or another's name.
+        UnknownRobot: the description is missing or belongs to another robot.
     """
     name = str(about["robot"])
     if "description" not in about:
@@ -277,13 +282,13 @@ def robot_in(about: dict[str, Any]) -> Robot:
 
 
 def regressors(robot: Robot, model_config: ModelConfig) -> int:
-    """Length of the regressors of the windows that a recipe takes."""
+    """Return the length of the regressors of the configured windows."""
     chosen = robot.free_steps if model_config.windows == PLAN else robot.horizon
     return robot.regressor_dim + chosen * robot.action_dim
 
 
 def extra_coordinates(robot: Robot) -> tuple[int, ...]:
-    """The predicted coordinates besides the position that a limit or a further disc of the body needs."""
+    """Return the predicted coordinates, besides the position, that limits and further discs of the body need."""
     d, n = robot.position_dim, robot.state_dim
     limited = {i for limit in robot.limits for i, weight in enumerate(limit.weights) if weight and i >= d}
     discs = d * sum(disc.arm > 0.0 for disc in robot.body)
@@ -291,14 +296,14 @@ def extra_coordinates(robot: Robot) -> tuple[int, ...]:
 
 
 def whitening_of(step: ErrorBound, basis: Array) -> Array:
-    """The basis for a step whose regressor may have more coordinates than z (the recursion's has the heading)."""
+    """Return the basis B for a step; regressors of the recursion have more coordinates than z (the heading)."""
     if step.C.shape[1] == len(basis):
         return basis
     return np.eye(step.C.shape[1]) if not len(step.W) else whitening_from(step.W)
 
 
 def whitening_from(pseudo: Array) -> Array:
-    """Rows of Z⁺ have the inverse second moment of the regressors: its root whitens. Unused coordinates stay."""
+    """Return a whitening basis from the rows of Z⁺, whose second moment is the inverse of the regressors'."""
     inverse = pseudo.T @ pseudo
     used = np.diag(inverse) > 0.0
     basis = np.eye(len(inverse))

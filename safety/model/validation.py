@@ -1,4 +1,4 @@
-"""How often tubes fail to hold held-out windows, bounded at 99 % confidence (docs/method.md §12).
+"""Validate a model set on held-out plans, at 99 % confidence (docs/method.md §12).
 
 A statement about the distribution that was recorded, and about no other.
 """
@@ -58,7 +58,7 @@ class ValidationReport:
     smallest_singular: float
     condition: float
     windows: int  # held out
-    violations: int  # windows of which some step, bulge or the stop latch was outside
+    violations: int  # windows of which a step, the chord deviation or the stopping distance was outside
     step_violations: int  # windows of which the first step was outside, in any coordinate
     bound_step: float  # probability that a step's measured state is outside, at 99 % confidence
     bound_plan: float  # the same of any part of a plan
@@ -191,8 +191,10 @@ def outputs_of(model: ModelSet, w: Windows) -> Array:
 
 
 def _excess(model: ModelSet, tube: Tube, w: Windows, k: int) -> tuple[Array, list[str]]:
-    """How much of the tube the position comes to after k periods (or what else it speaks of), of its bound the path off
-    it between, and of the latch the stop: (T, parts), with the parts' names."""
+    """Return the share of its bound (T, parts) that each part comes to after k periods, and the names of the parts.
+
+    The parts are position and further coordinates of the tube, chord deviation, and, at the end, stopping distance.
+    """
     robot = model.robot
     d, more = robot.position_dim, list(extra_coordinates(robot))
     normals = facet_normals(tube.directions[k - 1][:, np.abs(tube.directions[k - 1]).any(0)])

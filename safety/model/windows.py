@@ -1,4 +1,4 @@
-"""The windows that model sets are made from: a state, the inputs after it, and what came of them.
+"""Windows of recorded data, to which model sets are fitted: a state, the inputs after it, and what followed.
 
 A *plan window* of length k starts at a period whose inputs follow the robot's schedule (chosen inputs, then its stop
 rules) for k periods; a *free window* at any period, and has every one of its inputs as a regressor. Displacement is
@@ -28,15 +28,21 @@ WORST_CONDITION = 1e4  # of the whitened regressors' second moment
 
 @dataclass(frozen=True)
 class Windows:
-    """Windows of k periods: z (T, nz) = [x_0; u_prev; free inputs], targets y (T, n) after k periods, in the frame of
-    the start (position: displacement, heading: change, else the value); bulge (T,) [m] of the last period off its
-    chord; latch (T,) [m] travelled after the window while the inputs stay those of a stop, NaN where they do not."""
+    """Windows of k periods of recorded data (docs/method.md §2).
+
+    Attributes:
+        z (T, nz): regressors [x_0; u_{-1}; inputs].
+        y (T, n): state after k periods, in the frame of the start: displacement, change of heading, other values.
+        chord_deviation (T,) [m]: largest distance of the path from its chord, in the last period.
+        stopping_distance (T,) [m]: way after the window while the inputs stay those of a stop; NaN if they do not.
+        start (T, 2): trajectory and period.
+    """
 
     z: Array
     y: Array
     chord_deviation: Array
     stopping_distance: Array
-    start: NDArray[np.intp]  # (T, 2): trajectory, period
+    start: NDArray[np.intp]
 
     def __len__(self) -> int:
         return len(self.z)
@@ -48,7 +54,7 @@ class Windows:
 
 
 def displacement(robot: Robot, start: Array, end: Array) -> Array:
-    """`end` (..., n) as seen from `start` (..., n): position and heading relative, in the frame of the start."""
+    """Return state `end` (..., n) with position and heading relative to `start` (..., n), in the frame of the start."""
     seen = end.copy()
     position = end[..., : robot.position_dim] - start[..., : robot.position_dim]
     if robot.heading is not None:
@@ -60,7 +66,7 @@ def displacement(robot: Robot, start: Array, end: Array) -> Array:
 
 
 def windows(data: Dataset, k: int, kind: str = PLAN) -> Windows:
-    """All windows of k periods in the data, within trajectories only. Raises BadData when there is no trajectory."""
+    """Return all windows of k periods within a trajectory; raise BadData without any trajectory."""
     if not data.trajectories:
         raise BadData("no trajectory: record more of them")
     cut = _plans_of if kind == PLAN else _free_of
@@ -74,7 +80,7 @@ def windows(data: Dataset, k: int, kind: str = PLAN) -> Windows:
 
 
 def plan_regressor_map(robot: Robot) -> Array:
-    """T with `z' = T z`: the regressors of a free window (all inputs of a plan) from those of a plan window."""
+    """Return T with z' = T z, from the regressors of a plan window to those of a free window."""
     known = robot.regressor_dim
     S = robot.plan_matrix()
     T = np.zeros((known + len(S), known + S.shape[1]))
@@ -84,7 +90,7 @@ def plan_regressor_map(robot: Robot) -> Array:
 
 
 def _plans_of(robot: Robot, t: Trajectory, k: int) -> tuple[NDArray[np.intp], Array]:
-    """Where plan windows of k periods start, and their chosen inputs (T, F·m)."""
+    """Return the starts of plan windows of k periods, and their free inputs (T, F·m)."""
     m, free = robot.action_dim, robot.free_steps
     count = max(len(t.inputs) - k + 1, 0)
     padded = np.vstack([t.inputs, np.zeros((free, m))])  # the free inputs beyond k play no part
@@ -104,7 +110,7 @@ def _plans_of(robot: Robot, t: Trajectory, k: int) -> tuple[NDArray[np.intp], Ar
 
 
 def _free_of(robot: Robot, t: Trajectory, k: int) -> tuple[NDArray[np.intp], Array]:
-    """Every start, and all inputs of the horizon (T, N·m), zero from the k-th on."""
+    """Return all starts, and all inputs of the horizon (T, N·m), zero from input k on."""
     m = robot.action_dim
     count = max(len(t.inputs) - k + 1, 0)
     inputs = np.zeros((count, robot.horizon * m))
@@ -140,13 +146,13 @@ _found: WeakKeyDictionary[Trajectory, tuple[Robot, Array, Array]] = WeakKeyDicti
 
 
 def _braked(robot: Robot, t: Trajectory) -> Array:
-    """What the stop rules make of each state when every input is on its way to zero: (T, m)."""
+    """Return the inputs (T, m) that the stop rules give for each state while braking."""
     earlier = np.zeros((1, robot.action_dim)) if t.before is None else t.before[None]
     return robot.stop_by_feedback(np.zeros_like(t.inputs), t.states[:-1], np.vstack([earlier, t.inputs[:-1]]))
 
 
 def stop_input_periods(robot: Robot, t: Trajectory) -> NDArray[np.bool_]:
-    """In which periods are the inputs those of a stop? (T,)"""
+    """Return the periods (T,) in which the inputs are those of a stop."""
     if not robot.feedback:
         return robot.is_stop_input(t.inputs)
     near = INPUT_TOLERANCE * (robot.high() - robot.low())
@@ -164,7 +170,7 @@ def predicted_outputs(robot: Robot, y: Array) -> Array:
 
 
 def _off_chord(paths: Array) -> Array:
-    """Largest distance of the positions (T, S, d) within a period from the chord of its ends: (T,)."""
+    """Return the largest distance (T,) of positions (T, S, d) within a period from its chord."""
     chord = paths[:, -1:]
     length2 = np.maximum((chord**2).sum(-1, keepdims=True), 1e-18)
     along = np.clip((paths * chord).sum(-1, keepdims=True) / length2, 0.0, 1.0)
@@ -172,7 +178,7 @@ def _off_chord(paths: Array) -> Array:
 
 
 def _rest_travel(robot: Robot, t: Trajectory) -> Array:
-    """At each period: the way from there [m] while the inputs stay those of a stop; NaN if they are not. (T+1,)."""
+    """Return the way (T+1,) [m] from each period on while the inputs stay those of a stop; NaN if they are not."""
     travel = np.full(len(t.inputs) + 1, np.nan)
     arm = max(disc.arm for disc in robot.body)
     zero = stop_input_periods(robot, t)
@@ -193,7 +199,7 @@ def _rest_travel(robot: Robot, t: Trajectory) -> Array:
 
 
 def resting_periods_at_end(robot: Robot) -> int:
-    """So many of a plan's last inputs are those of a stop: one at least."""
+    """Return how many of the last inputs of a plan are those of a stop, at least one."""
     left = robot.stop_profile()[:, robot.zero_at_rest]
     moving = np.flatnonzero(np.abs(left).max(1, initial=0.0) > 0.0)
     return max(robot.horizon - robot.free_steps - int(moving[-1]), 1)
@@ -218,7 +224,7 @@ def periods_until_standing(whole: Windows, data: Dataset, kind: str) -> int:
 
 
 def stopping_distances(robot: Robot, t: Trajectory, rested: int) -> Array:
-    """The ways [m] still travelled from wherever the inputs had been those of a stop for `rested` periods."""
+    """Return the ways [m] after all times at which the inputs had been those of a stop for `rested` periods."""
     still = stop_input_periods(robot, t)
     lasted = np.zeros(len(still) + 1, dtype=int)
     for i, rests in enumerate(still):
@@ -228,7 +234,7 @@ def stopping_distances(robot: Robot, t: Trajectory, rested: int) -> Array:
 
 
 def non_overlapping(w: Windows, length: int) -> Windows:
-    """Those of the windows that do not overlap: each starts at least `length` periods after the one before."""
+    """Return windows that do not overlap: each starts at least `length` periods after the one before."""
     chosen = np.zeros(len(w), dtype=bool)
     last = (-1, 0)
     for i, (trajectory, period) in enumerate(w.start):
@@ -240,7 +246,7 @@ def non_overlapping(w: Windows, length: int) -> Windows:
 
 @dataclass(frozen=True)
 class RegressorQuality:
-    """Of a set of regressors, each scaled by its largest value."""
+    """Number, rank and condition of regressors, each scaled by its largest value."""
 
     samples: int
     rank: int
@@ -249,7 +255,7 @@ class RegressorQuality:
 
 
 def check_regressors(z: Array, name: str, fewest: int = FEWEST_WINDOWS) -> RegressorQuality:
-    """Raises BadData when regressors (T, nz) are too few, rank-deficient or nearly collinear."""
+    """Raise BadData if regressors (T, nz) are too few, rank-deficient or nearly collinear; return their quality."""
     if len(z) < fewest:
         raise BadData(f"{name}: {len(z)} windows, at least {fewest} are needed: record more")
     scaled = z / np.maximum(np.abs(z).max(0), 1e-12)

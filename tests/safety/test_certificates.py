@@ -125,7 +125,7 @@ def test_the_true_matrices_are_in_both_sets():
 def test_too_much_measurement_noise_is_refused():
     system = lti5(v_half=0.5)
     z, y = system.data(0, trajectories=5)
-    with pytest.raises(ErrorBoundError, match="β"):
+    with pytest.raises(ErrorBoundError, match="γ"):
         measured_noise(z, y, np.full(5, 0.005), np.full(5, 0.5))
 
 
