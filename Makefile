@@ -38,8 +38,8 @@ test-fast: setup
 	$(BIN)/ruff check .
 	$(BIN)/python -m pytest -m "not long" tests/messaging/test_descriptions.py tests/messaging/test_robots.py \
 		tests/messaging/test_shapes.py tests/messaging/test_topics.py tests/messaging/test_weights.py \
-		tests/safety/test_zonotope.py tests/safety/test_certificates.py tests/safety/test_dataset.py \
-		tests/safety/test_freespace.py tests/safety/test_tube.py tests/deploy/run/test_stored.py tests/front
+		tests/safety/test_zonotope.py tests/safety/test_error_bounds.py tests/safety/test_dataset.py \
+		tests/safety/test_halfspaces.py tests/safety/test_reachable_tube.py tests/deploy/run/test_stored.py tests/front
 
 bench: setup
 	$(BIN)/python -m benchmarks
