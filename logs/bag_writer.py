@@ -1,6 +1,6 @@
-"""What a ROS 2 node heard and sent, as a bag: a folder with `metadata.yaml` and an MCAP file of `ros2msg` schemas.
+"""Record the messages of a ROS 2 node as a bag: a folder with `metadata.yaml` and an MCAP file with `ros2msg` schemas.
 
-It is written by `rosbags`, so that `ros2 bag`, Foxglove and every other reader of bags take it.
+The `rosbags` package writes it; `ros2 bag`, Foxglove and other programs read it.
 """
 
 from __future__ import annotations
@@ -21,15 +21,15 @@ from brakeline.messaging.ros2.cdr_messages import definition_of, digest_of, type
 
 log = logging.getLogger("brakeline.bag")
 
-PERIOD = 1.0  # s: a process that is killed loses what came since
+PERIOD = 1.0  # s between flushes: the most that a killed process loses
 FOREVER = QosTime(sec=9223372036, nsec=854775807)
 
 
 class BagWriter:
-    """Records into a folder that is not there yet; a `brakeline.messaging.ros2.Tap`.
+    """Records to a new folder; a `brakeline.messaging.ros2.Tap`.
 
     Raises:
-        OSError: the folder is there already, or can't be made.
+        OSError: the folder exists or cannot be created.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -50,14 +50,14 @@ class BagWriter:
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None) -> None:
         with self._lock:
-            self._failed = True  # nothing comes after the end
+            self._failed = True  # ignore later messages
             try:
                 self._writer.close()
             except OSError as failure:
-                log.error("%s has no end: %s", self.folder, failure)
+                log.error("cannot finish %s: %s", self.folder, failure)
 
     def __call__(self, topic: str, kind: type, payload: bytes, at: int, qos: ros2.Qos) -> None:
-        """One message. A disk that is full ends the recording, and is said once; the robot drives on."""
+        """Record one message. A full disk ends the recording with one error message; the robot drives on."""
         with self._lock:
             if self._failed:
                 return
@@ -69,7 +69,7 @@ class BagWriter:
                     self._flush()
             except OSError as error:
                 self._failed = True
-                log.error("NOT RECORDING any more: %s", error)
+                log.error("RECORDING STOPPED: %s", error)
 
     def _connection(self, topic: str, kind: type, qos: ros2.Qos) -> Connection:
         name = type_of(kind)
@@ -84,7 +84,7 @@ class BagWriter:
         return self._topics[topic, name]
 
     def _flush(self) -> None:
-        """Hand what has come to the operating system."""
+        """Flush the recorded messages to the operating system."""
         storage = self._writer.storage
         assert isinstance(storage, McapWriter)
         storage.close_chunk()

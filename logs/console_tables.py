@@ -1,4 +1,4 @@
-"""Tables for a console that stay whole: where a row does not fit, its cells are put below each other."""
+"""Console tables that are never truncated: if a row does not fit, its cells go on separate lines."""
 
 from __future__ import annotations
 
@@ -14,9 +14,10 @@ UNLIMITED = 10_000  # columns
 
 
 class StackingTable(Table):
-    """A table that is never cut: too wide for the terminal, every row becomes a block of `column: cell` lines.
+    """A rich table that is never truncated (rich itself cuts or wraps cells).
 
-    Into a file it goes as wide as it is, unless $COLUMNS says how wide the reader is.
+    If the table is wider than the terminal, each row becomes a block of `column: cell` lines. A file has no width
+    limit unless $COLUMNS sets one.
     """
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
@@ -24,7 +25,7 @@ class StackingTable(Table):
         needed = self.__rich_measure__(console, wide).maximum
         bounded = console.is_terminal or "COLUMNS" in os.environ
         if needed <= options.max_width or not bounded:
-            console.width = max(console.width, needed)  # beyond it a console cuts what it is given
+            console.width = max(console.width, needed)  # the console truncates wider lines
             yield from super().__rich_console__(console, options.update(width=needed))
         else:
             yield from self._stacked()

@@ -1,4 +1,4 @@
-"""A decision explained: what was done instead of the proposal and what for, in a sentence and for a picture."""
+"""Explain a decision: what the filter executed instead of the proposal and why, as a sentence and as marks to draw."""
 
 from __future__ import annotations
 
@@ -14,19 +14,26 @@ from brakeline.messaging.stated_share import UNSTATED, describe_verification, pe
 
 Array = NDArray[np.float64]
 
-LEAST = 0.02  # of an input's range: a smaller change is none to speak of
+LEAST = 0.02  # of an input's range: smaller changes are not described
 AHEAD = math.radians(40.0)
 BEHIND = math.radians(140.0)
-UPRIGHT = 0.8  # of a unit vector: more than that is up or down
+UPRIGHT = 0.8  # vertical part of a unit vector above which a direction counts as up or down
 NEARER = "verified, but nearer than the clearance margin"
-ARROW = 3  # periods: an input's arrow ends where it would take the robot in that time, followed at once
+ARROW = 3  # periods: an arrow ends where the input would take the robot in that time without delay
 
 
 @dataclass(frozen=True)
 class Explanation:
-    """said: the sentence; trust: what `verified` is worth, where the sentence does not say it; inputs: (name, unit,
-    proposed, executed) of each; proposed, executed (d,): arrows, m, world; at, normal (d,): a point of the edge of the
-    half-space that stopped the proposal, and its normal from the free side on, world; empty if there is none."""
+    """Why the filter changed a proposal. Lengths in m, in the world frame.
+
+    Attributes:
+        said: the sentence.
+        inputs: (name, unit, proposed value, executed value) of each input.
+        proposed, executed: (d,), arrows of the inputs.
+        at, normal: (d,), a point on the edge of the half-space that blocks the proposal, and the normal from the free
+            side to the blocked side; empty without such a half-space.
+        trust: what the verification is worth, if the sentence does not contain it.
+    """
 
     said: str
     inputs: list[tuple[str, str, float, float]]
@@ -38,7 +45,7 @@ class Explanation:
 
 
 def explain(robot: Robot, request: pb.Request, decision: pb.Decision) -> Explanation:
-    """For whoever draws a decision. A proposal with NaN or infinity has an arrow of length zero."""
+    """Explain a decision. A proposal with NaN or infinity has an arrow of length zero."""
     proposed, executed = np.array(request.action), np.array(decision.plan[: robot.action_dim])
     heading = 0.0 if robot.heading is None else request.state[robot.heading]
     names = [split(label) for label in robot.action]
@@ -56,12 +63,12 @@ def explain(robot: Robot, request: pb.Request, decision: pb.Decision) -> Explana
 
 
 def bound_in(decision: pb.Decision) -> float | None:
-    """The model set's statement, where the decision has it."""
+    """Return the bound that the model set states; None if the decision has none."""
     return valid_bound(decision.bound) if decision.HasField("bound") else None
 
 
 def fits(robot: Robot, request: pb.Request, decision: pb.Decision) -> bool:
-    """Have question and answer the robot's sizes? Else nothing of them can be explained."""
+    """Return whether request and decision have the robot's dimensions; otherwise they cannot be explained."""
     sizes = len(request.state), len(request.action), len(decision.plan)
     edge = {len(decision.stopped.normal), len(decision.stopped.at)}
     whole = sizes == (robot.state_dim, robot.action_dim, robot.horizon * robot.action_dim)
@@ -69,13 +76,16 @@ def fits(robot: Robot, request: pb.Request, decision: pb.Decision) -> bool:
 
 
 def split(label: str) -> tuple[str, str]:
-    """("turn rate", "rad/s") of "turn rate [rad/s]"."""
+    """Split "turn rate [rad/s]" into ("turn rate", "rad/s")."""
     name, _, unit = label.removesuffix("]").partition(" [")
     return name, unit
 
 
 def arrow(robot: Robot, heading: float, inputs: Array) -> Array:
-    """(d,) m, world: where an input would take the robot in `ARROW` periods; steering bends it half its way."""
+    """Return where an input would take the robot in `ARROW` periods, (d,), m, world frame.
+
+    Turning rotates the arrow by half the turn.
+    """
     seconds, d = ARROW * robot.period, robot.position_dim
     vector = seconds * _moves(robot, inputs)[:d]
     if robot.heading is None:
@@ -92,7 +102,7 @@ def arrow(robot: Robot, heading: float, inputs: Array) -> Array:
 
 
 def sentence(robot: Robot, request: pb.Request, decision: pb.Decision) -> str:
-    """E.g. "turned left: straight on, the stop would have come 3 cm too close to the cylinder ahead"."""
+    """Return e.g. "turned left: straight on, the stop would have come 3 cm too close to the cylinder ahead"."""
     why = _why(robot, request, decision)
     if decision.kind == pb.ADJUSTED:
         did, instead = change(robot, np.array(request.action), np.array(decision.plan[: robot.action_dim]))
@@ -106,7 +116,7 @@ def sentence(robot: Robot, request: pb.Request, decision: pb.Decision) -> str:
 
 
 def fell_back_on(decision: pb.Decision) -> str:
-    """That the committed plan goes on, and what its having been verified is worth."""
+    """Say that the robot follows the committed plan, and what the plan's verification is worth."""
     bound = bound_in(decision)
     if bound is None:
         return "braked along the plan verified before"
@@ -115,12 +125,12 @@ def fell_back_on(decision: pb.Decision) -> str:
 
 
 def fell_back() -> str:
-    """Where there was no decision."""
+    """Return the sentence for a step without a decision."""
     return "no answer in time: braked along the plan verified before"
 
 
 def _why(robot: Robot, request: pb.Request, decision: pb.Decision) -> str:
-    """What would have come of the proposal; empty: it is not said."""
+    """Say what the proposal would have caused; empty if the decision does not contain it."""
     if not decision.HasField("stopped") or decision.broken:
         return ""
     stopped = decision.stopped
@@ -151,7 +161,7 @@ def _length(metres: float) -> str:
 
 
 def _where(robot: Robot, request: pb.Request, stopped: pb.Stopped) -> str:
-    """Ahead, to the left ... as the robot looks, or where it looks nowhere, as it would have moved."""
+    """Return the obstacle's direction relative to the heading; without a heading, to the proposed motion."""
     normal = np.array(stopped.normal)
     if not len(normal):
         return ""
@@ -160,7 +170,7 @@ def _where(robot: Robot, request: pb.Request, stopped: pb.Stopped) -> str:
     if robot.heading is not None:
         looks = request.state[robot.heading]
         if sum(robot.translates) == 1 and _moves(robot, np.array(request.action))[0] < 0.0:
-            looks += math.pi  # it sees, and is said to see, where it drives
+            looks += math.pi  # the direction is relative to the driving direction
     else:
         moves = _moves(robot, np.array(request.action))
         if np.hypot(*moves[:2]) < 1e-6:
@@ -175,18 +185,20 @@ def _where(robot: Robot, request: pb.Request, stopped: pb.Stopped) -> str:
 
 
 def change(robot: Robot, proposed: Array, executed: Array) -> tuple[str, str]:
-    """What was done instead, and how the proposal is called: ("turned left", "straight on")."""
+    """Return the executed action and a name for the proposal: ("turned left", "straight on")."""
     width = robot.high() - robot.low()
     difference = (executed - proposed) / np.where(width > 0.0, width, 1.0)
     if np.abs(difference).max() < LEAST:
         return "changed it a little", "as proposed"
     if robot.heading is not None:
-        return _of_wheels(robot, proposed, executed, difference)
-    return _of_vector(_moves(robot, proposed), _moves(robot, executed)) or _of_input(robot, proposed, executed)
+        return _describe_turning(robot, proposed, executed, difference)
+    return _describe_velocity(_moves(robot, proposed), _moves(robot, executed)) or _describe_input(
+        robot, proposed, executed
+    )
 
 
-def _of_wheels(robot: Robot, proposed: Array, executed: Array, difference: Array) -> tuple[str, str]:
-    """Of what has a heading: inputs that translate it, and others that turn it."""
+def _describe_turning(robot: Robot, proposed: Array, executed: Array, difference: Array) -> tuple[str, str]:
+    """Describe the change for a robot with a heading: some inputs translate it, the others turn it."""
     most = int(np.abs(difference).argmax())
     turns = [i for i, moves in enumerate(robot.translates) if not moves]
     if most in turns:
@@ -194,7 +206,9 @@ def _of_wheels(robot: Robot, proposed: Array, executed: Array, difference: Array
         straight = abs(proposed[most]) < LEAST * (robot.high()[most] - robot.low()[most])
         return way, "straight on" if straight else "as proposed"
     if sum(robot.translates) > 1:  # a vector, as it looks
-        return _of_vector(_moves(robot, proposed), _moves(robot, executed)) or _of_input(robot, proposed, executed)
+        return _describe_velocity(_moves(robot, proposed), _moves(robot, executed)) or _describe_input(
+            robot, proposed, executed
+        )
     before, now = proposed[most], executed[most]
     if before * now < 0.0:
         return ("backed off" if now < 0.0 else "went forward"), "as proposed"
@@ -204,13 +218,13 @@ def _of_wheels(robot: Robot, proposed: Array, executed: Array, difference: Array
 
 
 def _moves(robot: Robot, inputs: Array) -> Array:
-    """The inputs that translate a robot, as a vector (>= 2,)."""
+    """Return the inputs that translate the robot, padded to at least 2 elements."""
     vector = inputs[np.asarray(robot.translates)]
     return np.concatenate([vector, np.zeros(max(0, 2 - len(vector)))])
 
 
-def _of_vector(before: Array, now: Array) -> tuple[str, str] | None:
-    """Of what moves by a vector of speeds; None: it is not that."""
+def _describe_velocity(before: Array, now: Array) -> tuple[str, str] | None:
+    """Describe the change of a velocity vector; None if the input is none."""
     fast, slow = float(np.linalg.norm(before)), float(np.linalg.norm(now))
     if len(before) not in (2, 3) or fast < 1e-9:
         return None
@@ -225,8 +239,8 @@ def _of_vector(before: Array, now: Array) -> tuple[str, str] | None:
     return f"turned aside to the {'left' if left else 'right'}", "straight on"
 
 
-def _of_input(robot: Robot, proposed: Array, executed: Array) -> tuple[str, str]:
-    """The input that changed most, by its name."""
+def _describe_input(robot: Robot, proposed: Array, executed: Array) -> tuple[str, str]:
+    """Describe the input that changed most."""
     width = robot.high() - robot.low()
     most = int(np.abs((executed - proposed) / np.where(width > 0.0, width, 1.0)).argmax())
     name, unit = split(robot.action[most])

@@ -1,5 +1,4 @@
-"""How the filter decided, from the exchanges between actors and the safety service: where the time went, what the
-solver did, how wide the tubes were."""
+"""Summarize the exchanges between actors and the safety service: latency by part, solver, tube widths."""
 
 from __future__ import annotations
 
@@ -16,22 +15,22 @@ from brakeline.logs.episode_stats import KINDS, Figures
 from brakeline.logs.quantiles import BATCH, QuantileSketch, merged, spread, summary
 from brakeline.messaging import brakeline_pb2 as pb
 
-# Parts of the time from an actor's question to its answer.
+# Parts of the latency from an actor's request to the reply.
 PARTS = {
-    "round_trip": "from the question to the answer, as the actor saw it",
-    "network": "the rest of the round trip: the bus, coding, and the other robots of the same question",
-    "queue": "from the service's receipt of the question to the beginning of the decision",
-    "decide": "inside the filter; solve and verify are parts of it",
-    "solve": "of it, the quadratic programs (where there was one)",
-    "verify": "of it, the exact verification of plans",
+    "round_trip": "from the request to the reply, measured by the actor",
+    "network": "the rest of the round trip: bus, encoding, and the other robots of the same request",
+    "queue": "from the receipt of the request in the service to the start of the decision",
+    "decide": "in the filter, including solve and verify",
+    "solve": "quadratic programs, for decisions that solve one",
+    "verify": "exact verification of plans",
 }
-MOST_WORDS, OTHER = 50, "other"
-SOLVED = "solved"  # the solver's word for success
+MOST_REASONS, OTHER = 50, "other"
+SOLVED = "solved"  # the solver's status after success
 
 
 Row = tuple[float, ...]  # kind, round trip, queue, decide, verify, solve [ms], iterations, half-width, margin [m]
-WIDTH = 9
-NOTHING = math.nan  # in a row, where there was no program or no tube
+ROW = 9  # numbers in a row
+MISSING = math.nan  # in a row without a program or a tube
 
 
 def _latency() -> dict[int, dict[str, QuantileSketch]]:
@@ -40,26 +39,26 @@ def _latency() -> dict[int, dict[str, QuantileSketch]]:
 
 @dataclass
 class DecisionStats:
-    """The figures of one actor's exchanges."""
+    """Statistics of one actor's exchanges."""
 
     round_trip_ms: QuantileSketch = field(default_factory=QuantileSketch)
     latency: dict[int, dict[str, QuantileSketch]] = field(default_factory=_latency)
-    iterations: QuantileSketch = field(default_factory=QuantileSketch)  # of decisions for which a program was solved
-    statuses: Counter[str] = field(default_factory=Counter)  # of these, how the last one ended
-    half_width: QuantileSketch = field(default_factory=QuantileSketch)  # m: the largest in a tube
-    margin: QuantileSketch = field(default_factory=QuantileSketch)  # m: of a tube to the free space's edge
-    unverified: int = 0  # failsafes whose plan could not be verified
-    not_finite: int = 0  # decisions on proposals with NaN or infinity
+    iterations: QuantileSketch = field(default_factory=QuantileSketch)  # of decisions that solved a program
+    statuses: Counter[str] = field(default_factory=Counter)  # status of the last program of these decisions
+    half_width: QuantileSketch = field(default_factory=QuantileSketch)  # m, the largest of each tube
+    margin: QuantileSketch = field(default_factory=QuantileSketch)  # m, from the tube to the edge of free space
+    unverified: int = 0  # failsafe decisions without a verified plan
+    not_finite: int = 0  # proposals with NaN or infinity
     failures: Counter[str] = field(default_factory=Counter)  # exchanges without a decision, by reason
-    waiting: array[float] = field(default_factory=lambda: array("d"))  # rows that are not in the histograms yet
+    pending: array[float] = field(default_factory=lambda: array("d"))  # rows that the sketches do not include yet
 
     def exchange(self, exchange: pb.Exchange) -> None:
-        """Take an exchange."""
+        """Add an exchange."""
         if failure := exchange.failure:
             count(self.failures, failure.split(":", 1)[0])
             return
         decision = exchange.reply.decision
-        solve = iterations = width = margin = NOTHING
+        solve = iterations = width = margin = MISSING
         if solver := decision.solver:
             solve, iterations = decision.solve_ms, decision.iterations
             count(self.statuses, solver)
@@ -70,30 +69,30 @@ class DecisionStats:
         if widths := decision.tube_half_width[:]:
             width, margin = max(widths), decision.margin
         times = exchange.round_trip_ms, decision.queue_ms, decision.time_ms, decision.verify_ms
-        waiting = self.waiting
-        waiting.extend((decision.kind, *times, solve, iterations, width, margin))
-        if len(waiting) >= WIDTH * BATCH:
-            self._sort()
+        pending = self.pending
+        pending.extend((decision.kind, *times, solve, iterations, width, margin))
+        if len(pending) >= ROW * BATCH:
+            self._flush()
 
-    def _sort(self) -> None:
-        """Bring the rows that wait into the histograms."""
-        rows, self.waiting = np.asarray(self.waiting).reshape(-1, WIDTH), array("d")
+    def _flush(self) -> None:
+        """Add the pending rows to the sketches."""
+        rows, self.pending = np.asarray(self.pending).reshape(-1, ROW), array("d")
         kind, round_trip, queue, decide, verify, solve, iterations, width, margin = rows.T
-        self.round_trip_ms.take(round_trip)
-        with np.errstate(invalid="ignore"):  # between infinities, which anybody may send, there is no difference
+        self.round_trip_ms.add_array(round_trip)
+        with np.errstate(invalid="ignore"):  # a message may have infinities, whose difference is NaN
             network = np.maximum(0.0, round_trip - queue - decide)
         values = {
             "round_trip": round_trip, "network": network, "queue": queue, "decide": decide, "solve": solve,
             "verify": verify,
         }  # fmt: skip
-        for number, histograms in self.latency.items():
-            for part, histogram in histograms.items():
-                histogram.take(values[part][kind == number])
-        for histogram, column in ((self.iterations, iterations), (self.half_width, width), (self.margin, margin)):
-            histogram.take(column)
+        for number, sketches in self.latency.items():
+            for part, sketch in sketches.items():
+                sketch.add_array(values[part][kind == number])
+        for sketch, column in ((self.iterations, iterations), (self.half_width, width), (self.margin, margin)):
+            sketch.add_array(column)
 
     def figures(self) -> Figures:
-        """Figures of all exchanges; None where nothing was measured."""
+        """Return the figures of all exchanges; None for what was not measured."""
         programs = self.statuses.total()
         return {
             "round_trip_ms": spread(self.round_trip_ms),
@@ -116,13 +115,13 @@ class DecisionStats:
 
 
 def count(words: Counter[str], word: str) -> None:
-    """Count a word that somebody else chose: the first `MOST_WORDS` each, the rest together."""
-    words[word if word in words or len(words) < MOST_WORDS else OTHER] += 1
+    """Count a word from a message: the first `MOST_REASONS` words separately, the others as `OTHER`."""
+    words[word if word in words or len(words) < MOST_REASONS else OTHER] += 1
 
 
-def joined(parts: Iterable[DecisionStats]) -> DecisionStats:
-    """All exchanges of the parts; the sums are the same whenever the parts come in the same order."""
-    parts = [_settled(part) for part in parts]
+def merge_decisions(parts: Iterable[DecisionStats]) -> DecisionStats:
+    """Merge parts. The floating-point sums depend only on the order of the parts."""
+    parts = [_flushed(part) for part in parts]
     return DecisionStats(
         round_trip_ms=merged(part.round_trip_ms for part in parts),
         latency={kind: {name: merged(part.latency[kind][name] for part in parts) for name in PARTS} for kind in KINDS},
@@ -136,8 +135,8 @@ def joined(parts: Iterable[DecisionStats]) -> DecisionStats:
     )
 
 
-def _settled(part: DecisionStats) -> DecisionStats:
-    """A copy with no rows waiting: looking at figures does not change when rows are sorted, and so no sum."""
+def _flushed(part: DecisionStats) -> DecisionStats:
+    """Return a copy without pending rows, so that reading the figures never changes the sums."""
     copy = deepcopy(part)
-    copy._sort()
+    copy._flush()
     return copy

@@ -1,7 +1,7 @@
-"""Episodes worth looking at, chosen while a log streams by: a bounded number, each as small as a picture needs.
+"""Select a bounded number of episodes for the report while a log is read.
 
-Of every robot kind the nearest misses are kept, the collisions, those with most failsafes, a sample spread evenly over
-the log, and the last.
+For each robot kind: the nearest misses, collisions, the episodes with the most failsafes, a sample spread evenly over
+the log, and the last episode.
 """
 
 from __future__ import annotations
@@ -19,26 +19,26 @@ from brakeline.messaging.robot import Robot
 
 NEAREST = 8
 COLLISIONS = 8
-BRAKED = 4  # those with most failsafes
+MOST_FAILSAFES = 4  # episodes with the most failsafes
 SPREAD = 24
-MOST_STEPS = 3000  # of an episode that are kept
-MOST_QUESTIONS = 600  # the latest of an actor, in memory
+MOST_STEPS = 3000  # steps of one episode in memory
+MOST_EXCHANGES = 600  # latest exchanges of one actor in memory
 
 
 @dataclass
 class EpisodeRecord:
-    """An episode of one actor, as far as it was seen."""
+    """The part of one actor's episode that is in the log; at least one step."""
 
-    label: str  # of its run; empty if there is only one
+    label: str  # prefix of the run; empty if there is only one run
     number: int
-    about: pb.Episode | None  # None: it began before the log did
+    about: pb.Episode | None  # None: the log does not have the beginning of the episode
     steps: list[pb.Step] = field(default_factory=list)
     closest: float = math.inf  # m
     failsafes: int = 0
-    questions: Iterable[pb.Exchange] = ()  # some of which belong to it
-    others: Iterable[pb.Exchange] = ()  # of the other robots of its world, some of which belong to it
+    actor_exchanges: Iterable[pb.Exchange] = ()  # of this actor, also of other episodes
+    other_exchanges: Iterable[pb.Exchange] = ()  # of the other robots of the world, also of other episodes
 
-    def take(self, step: pb.Step) -> None:
+    def add(self, step: pb.Step) -> None:
         if len(self.steps) < MOST_STEPS:
             self.steps.append(step)
         clearance = step.clearance
@@ -48,16 +48,16 @@ class EpisodeRecord:
             self.failsafes += 1
 
     def exchanges(self) -> dict[int, pb.Exchange]:
-        """Its questions and their answers, by step."""
-        return {e.request.step: e for e in self.questions if e.request.episode == self.number}
+        """Return the episode's exchanges by step."""
+        return {e.request.step: e for e in self.actor_exchanges if e.request.episode == self.number}
 
-    def beside(self) -> dict[int, list[pb.Exchange]]:
-        """The others' questions and their answers, by step."""
-        found: dict[int, list[pb.Exchange]] = {}
-        for e in self.others:
+    def exchanges_of_others(self) -> dict[int, list[pb.Exchange]]:
+        """Return the exchanges of the other robots of the world, by step."""
+        by_step: dict[int, list[pb.Exchange]] = {}
+        for e in self.other_exchanges:
             if e.request.episode == self.number:
-                found.setdefault(e.request.step, []).append(e)
-        return found
+                by_step.setdefault(e.request.step, []).append(e)
+        return by_step
 
     @property
     def actor(self) -> str:
@@ -77,39 +77,41 @@ class EpisodeRecord:
 
 
 class ActorBuffer:
-    """What of one actor is in memory: its running episode and its latest questions."""
+    """The running episode and the latest messages of one actor."""
 
     def __init__(self) -> None:
         self.running: EpisodeRecord | None = None
         self.about: deque[pb.Episode] = deque(maxlen=2)
-        self.exchanges: deque[pb.Exchange] = deque(maxlen=MOST_QUESTIONS)
+        self.exchanges: deque[pb.Exchange] = deque(maxlen=MOST_EXCHANGES)
 
     def episode(self, number: int) -> pb.Episode | None:
         return next((about for about in self.about if about.episode == number), None)
 
 
 class EpisodeSampler:
-    """Takes the messages of one robot kind, and keeps the episodes that are worth it.
+    """Select episodes of one robot kind.
 
-    `wanted` is the number of an episode that is kept whatever happens in it, of every actor (or of `actor` alone).
+    Attributes:
+        wanted: number of an episode that is always selected, of every actor or only of `actor`.
+        requested_episodes: the episodes with this number, with all their steps.
     """
 
     def __init__(self, robot: Robot | None, wanted: int | None = None, actor: str | None = None) -> None:
         self.robot = robot
         self.label = ""
         self.wanted, self.actor = wanted, actor
-        self.found: list[Figures] = []  # the wanted ones, with all their steps
+        self.requested_episodes: list[Figures] = []
         self.last: EpisodeRecord | None = None
         self._sources: dict[str, ActorBuffer] = {}
-        self._nearest: list[tuple[float, int, Figures]] = []  # heaps: the least worth keeping comes first
-        self._braked: list[tuple[float, int, Figures]] = []
+        self._nearest: list[tuple[float, int, Figures]] = []  # heaps: the entry to replace comes first
+        self._most_failsafes: list[tuple[float, int, Figures]] = []
         self._collisions: list[Figures] = []
         self._spread: dict[int, Figures] = {}
         self._stride = 1
         self._count = 0
 
     def source(self, name: str) -> ActorBuffer:
-        """What is in memory of the actor of that name; new if there is none."""
+        """Return the buffer of an actor; create it for a new actor."""
         name = self.label + name
         source = self._sources.get(name)
         if source is None:
@@ -117,64 +119,65 @@ class EpisodeSampler:
         return source
 
     def step(self, source: ActorBuffer, step: pb.Step) -> None:
-        """Take a step of the actor. An episode is looked at when the next begins: questions may come after steps."""
-        held = source.running
+        """Add a step. An episode is evaluated when the next one begins, because exchanges may follow their steps."""
+        episode = source.running
         number = step.episode
-        if held is None or held.number != number or step.step == 0:
-            if held is not None:
-                self._ended(source, held)
-            held = source.running = EpisodeRecord(self.label, number, source.episode(number))
-        held.take(step)
+        if episode is None or episode.number != number or step.step == 0:
+            if episode is not None:
+                self._ended(source, episode)
+            episode = source.running = EpisodeRecord(self.label, number, source.episode(number))
+        episode.add(step)
 
     def close(self) -> None:
-        """No more comes of this run."""
+        """Evaluate the running episodes: the run has ended."""
         for source in self._sources.values():
             if source.running is not None:
-                held, source.running = source.running, None
-                self._ended(source, held)
+                episode, source.running = source.running, None
+                self._ended(source, episode)
         self._sources.clear()
 
     def figures(self) -> Figures:
-        """`near`: the nearest misses, worst first; `episodes`: all that were kept, in the order in which they ended."""
+        """Return `near`, the order of the nearest misses, smallest clearance first; and all selected `episodes`."""
         near = [item for *_, item in sorted(self._nearest, key=lambda entry: -entry[0])]
-        braked = [item for *_, item in self._braked]
+        failsafes = [item for *_, item in self._most_failsafes]
         last = [self._picture(self.last, self._count - 1)] if self.last is not None else []
-        every = (*self._spread.values(), *last, *braked, *self._collisions, *near, *self.found)
-        kept = {item["order"]: item for item in every}
-        return {"near": [item["order"] for item in near], "episodes": [kept[order] for order in sorted(kept)]}
+        every = (*self._spread.values(), *last, *failsafes, *self._collisions, *near, *self.requested_episodes)
+        selected = {item["order"]: item for item in every}
+        return {"near": [item["order"] for item in near], "episodes": [selected[order] for order in sorted(selected)]}
 
-    def _ended(self, source: ActorBuffer, held: EpisodeRecord) -> None:
-        """Keep the episode if it is worth it. Its picture is made only then."""
+    def _ended(self, source: ActorBuffer, episode: EpisodeRecord) -> None:
+        """Select the episode if it belongs to one of the groups. Only then is its picture computed."""
         order, self._count = self._count, self._count + 1
-        held.questions, held.others = source.exchanges, self._others(source, held)
-        self.last = replace(held, questions=list(source.exchanges))
-        if math.isfinite(held.closest):
-            self._push(self._nearest, -held.closest, NEAREST, held, order)
-        if held.failsafes:
-            self._push(self._braked, held.failsafes, BRAKED, held, order)
-        if len(self._collisions) < COLLISIONS and held.outcome() == "collision":
-            self._collisions.append(self._picture(held, order))
+        episode.actor_exchanges = source.exchanges
+        episode.other_exchanges = self._others(source, episode)
+        self.last = replace(episode, actor_exchanges=list(source.exchanges))
+        if math.isfinite(episode.closest):
+            self._push(self._nearest, -episode.closest, NEAREST, episode, order)
+        if episode.failsafes:
+            self._push(self._most_failsafes, episode.failsafes, MOST_FAILSAFES, episode, order)
+        if len(self._collisions) < COLLISIONS and episode.outcome() == "collision":
+            self._collisions.append(self._picture(episode, order))
         if order % self._stride == 0:
-            self._spread[order] = self._picture(held, order)
+            self._spread[order] = self._picture(episode, order)
             if len(self._spread) > SPREAD:
                 self._stride *= 2
                 self._spread = {k: item for k, item in self._spread.items() if k % self._stride == 0}
-        if held.number == self.wanted and self.actor in (None, held.actor):
-            self.found.append(self._picture(held, order) | {"rows": list(rows(held, self.robot))})
+        if episode.number == self.wanted and self.actor in (None, episode.actor):
+            self.requested_episodes.append(self._picture(episode, order) | {"rows": list(rows(episode, self.robot))})
 
-    def _others(self, source: ActorBuffer, held: EpisodeRecord) -> list[pb.Exchange]:
-        """What the other robots of its world asked and were answered; alone: nothing."""
-        own = next((e.request for e in source.exchanges if e.request.episode == held.number), None)
+    def _others(self, source: ActorBuffer, episode: EpisodeRecord) -> list[pb.Exchange]:
+        """Return the exchanges of the other robots of the episode's world; empty for a single robot."""
+        own = next((e.request for e in source.exchanges if e.request.episode == episode.number), None)
         names = [] if own is None else [self.label + name for name in own.fleet if name != own.actor]
         return [e for name in names if name in self._sources for e in self._sources[name].exchanges]
 
     def _push(
-        self, heap: list[tuple[float, int, Figures]], worth: float, most: int, held: EpisodeRecord, order: int
+        self, heap: list[tuple[float, int, Figures]], worth: float, most: int, episode: EpisodeRecord, order: int
     ) -> None:
         if len(heap) < most:
-            heapq.heappush(heap, (worth, -order, self._picture(held, order)))
+            heapq.heappush(heap, (worth, -order, self._picture(episode, order)))
         elif worth > heap[0][0]:
-            heapq.heapreplace(heap, (worth, -order, self._picture(held, order)))
+            heapq.heapreplace(heap, (worth, -order, self._picture(episode, order)))
 
-    def _picture(self, held: EpisodeRecord, order: int) -> Figures:
-        return {"order": order, **picture(held, self.robot)}
+    def _picture(self, episode: EpisodeRecord, order: int) -> Figures:
+        return {"order": order, **picture(episode, self.robot)}

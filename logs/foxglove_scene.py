@@ -1,6 +1,7 @@
-"""Our messages drawn with Foxglove's well-known schemas: arena, robot, tube, plan, lidar, frames, log lines.
+"""Convert messages to Foxglove's well-known schemas: arena, robot, tube, plan, lidar, frames, log lines.
 
-Frames: `world` — ACTOR (an arena's own frame, where the messages' coordinates are) — ACTOR/body. Lengths in m, ENU.
+Frames: `world` → ACTOR (the frame of the actor's arena, in which messages give coordinates) → ACTOR/body. Lengths in m,
+axes east, north, up.
 """
 
 from __future__ import annotations
@@ -30,17 +31,18 @@ from foxglove_schemas_protobuf.TextPrimitive_pb2 import TextPrimitive
 from foxglove_schemas_protobuf.Vector3_pb2 import Vector3
 from google.protobuf.timestamp_pb2 import Timestamp
 
-from brakeline.logs.decision_explanation import Explanation, explain, fell_back, fits
+from brakeline.logs.decision_explanation import Explanation, fell_back
+from brakeline.logs.decision_view import DecisionView, decision_view
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.obstacle import BOX, CYLINDER, SPHERE, WALL
 from brakeline.messaging.ray_directions import LidarRays
 from brakeline.messaging.robot import Robot
-from brakeline.safety.perception.displayed_map import DisplayedMap, map_for_display
+from brakeline.safety.perception.displayed_map import DisplayedMap
 
 WORLD = "world"
-HEIGHT = 0.4  # m, of what is drawn of a plane's obstacles
-MARKED = 400  # hits of a scan that are drawn at the most: the request in the log has all
-FLAT = 0.02  # m, of what is drawn on a plane's floor, and half of it the thickness of walls
+HEIGHT = 0.4  # m, drawn height of obstacles in the plane
+MOST_HITS = 400  # scan hits in one scene; the request in the log has all of them
+FLAT = 0.02  # m, height of marks on the floor; walls are twice as thick
 LEVELS = {"DEBUG": Log.DEBUG, "INFO": Log.INFO, "WARNING": Log.WARNING, "ERROR": Log.ERROR}
 
 
@@ -50,7 +52,7 @@ def _color(red: int, green: int, blue: int, alpha: float = 1.0) -> Color:
 
 SOLID, WALLS, GOAL = _color(120, 128, 140), _color(120, 128, 140, 0.25), _color(52, 168, 100, 0.35)
 PROPOSED, EXECUTED, EDGE = _color(199, 125, 0), _color(31, 95, 191), _color(192, 32, 48, 0.5)
-FREE, HIT, PROMISE = _color(20, 140, 120), _color(90, 40, 140), _color(40, 96, 190, 0.18)
+FREE, HIT, RESERVED = _color(20, 140, 120), _color(90, 40, 140), _color(40, 96, 190, 0.18)
 MOVER, SWEPT = _color(170, 90, 40), _color(170, 90, 40, 0.15)
 BODY, NOSE = _color(40, 96, 190), _color(250, 250, 250)
 KINDS: dict[int, tuple[int, int, int]] = {
@@ -67,24 +69,24 @@ def body_frame(actor: str) -> str:
 
 
 def stamp(time: int) -> Timestamp:
-    """A time in ns since the Unix epoch."""
+    """Convert ns since the Unix epoch."""
     return Timestamp(seconds=time // 10**9, nanos=time % 10**9)
 
 
 def half_width(episode: pb.Episode) -> float:
-    """Half of the edge of the square about the origin that holds an episode's arena, m."""
+    """Return half the edge of the smallest square around the origin that holds the episode's arena, m."""
     walls = [o.position[:2] for o in episode.obstacles if o.kind == WALL]
     points = walls or [o.position[:2] for o in episode.obstacles] + [episode.goal[:2], episode.start[:2]]
     return max((abs(value) for point in points for value in point), default=1.0) or 1.0
 
 
 def arena(robot: Robot, episode: pb.Episode, time: int) -> SceneUpdate:
-    """Obstacles, walls, goal and the robot's body, to be sent at the start of an episode."""
+    """Draw obstacles, walls, goal and the robot's body. Sent once, at the start of an episode."""
     half = half_width(episode)
     room = SceneEntity(timestamp=stamp(time), frame_id=episode.actor, id="arena")
     height = _ceiling(episode, half)
     for obstacle in episode.obstacles:
-        _draw(room, obstacle, half, height)
+        _draw_obstacle(room, obstacle, half, height)
     radius = 2.0 * episode.goal_radius
     if robot.position_dim == 3:
         room.spheres.append(SpherePrimitive(pose=_pose(episode.goal), size=_vector(radius, radius, radius), color=GOAL))
@@ -96,18 +98,18 @@ def arena(robot: Robot, episode: pb.Episode, time: int) -> SceneUpdate:
 
 
 def _ceiling(episode: pb.Episode, half: float) -> float:
-    """How high the walls are drawn: up to the box above the start that closes the room, if there is one."""
+    """Return the drawn height of the walls, m: up to the ceiling, if the arena has one."""
     lids = [o.position[2] - 0.5 * o.size[2] for o in episode.obstacles if _closes(o, half)]
     return max(lids, default=0.0) or HEIGHT
 
 
 def _closes(obstacle: pb.Obstacle, half: float) -> bool:
-    """Is it a floor or a ceiling?"""
+    """Return whether the obstacle is a floor or a ceiling."""
     return obstacle.kind == BOX and len(obstacle.size) == 3 and min(obstacle.size[:2]) >= 2.0 * half
 
 
-def _draw(room: SceneEntity, obstacle: pb.Obstacle, half: float, height: float) -> None:
-    """Add an obstacle. A ceiling, and a floor that the grid shows as well, would only hide what is between them."""
+def _draw_obstacle(room: SceneEntity, obstacle: pb.Obstacle, half: float, height: float) -> None:
+    """Add an obstacle, except a floor or a ceiling, which would hide the room."""
     if _closes(obstacle, half):
         return
     flat = len(obstacle.position) == 2
@@ -130,7 +132,7 @@ def _draw(room: SceneEntity, obstacle: pb.Obstacle, half: float, height: float) 
 
 
 def _body(robot: Robot, actor: str, time: int) -> SceneEntity:
-    """Its discs or spheres; they move with the robot's frame."""
+    """Draw the discs or spheres of the body in the body frame."""
     body = SceneEntity(timestamp=stamp(time), frame_id=body_frame(actor), id="body", frame_locked=True)
     tall = 0.5 * HEIGHT
     for disc in robot.body:
@@ -153,43 +155,57 @@ def _body(robot: Robot, actor: str, time: int) -> SceneEntity:
 def decision(
     robot: Robot, step: pb.Step, exchange: pb.Exchange | None, time: int, reservations: Iterable[np.ndarray] = ()
 ) -> SceneUpdate:
-    """What was decided for the period that ended with this step: the tube's boxes, that of standstill with the body
-    about it, the plan's way through their middles, a word if the filter stepped in; and what the filter was told of the
-    surroundings. promises: of the other robots of its world, as
-    `brakeline.safety.perception.displayed_map.promised`."""
+    """Draw the decision for the period that ended with this step.
+
+    The scene has the tube, the robot's stopping area, the plan, the explanation of an intervention, and the perceived
+    surroundings.
+
+    Args:
+        exchange: request and decision of the step; None if the log does not have it.
+        time: ns since the Unix epoch.
+        reservations: of each other robot of the world, as `displayed_map.reserved_boxes` returns them.
+
+    Raises:
+        ValueError: the tube or the scan is malformed.
+    """
     kind = pb.FAILSAFE if step.fallback else step.decision
     entity = SceneEntity(timestamp=stamp(time), frame_id=step.actor, id="decision")
-    color = KINDS.get(kind, (120, 120, 120))
-    d, said = robot.position_dim, ""
-    if exchange is not None and exchange.reply.HasField("decision"):
-        made = exchange.reply.decision
-        centers = [made.tube_center[i : i + d] for i in range(0, len(made.tube_center), d)]
-        halves = [made.tube_half_width[i : i + d] for i in range(0, len(made.tube_half_width), d)]
-        for center, half in zip(centers, halves, strict=True):
-            edges = [2.0 * h for h in half] + [FLAT] * (3 - d)
-            entity.cubes.append(CubePrimitive(pose=_pose(center), size=_vector(*edges), color=_color(*color, 0.6)))
-        if centers:
-            _stop(entity, centers[-1], 2.0 * (math.hypot(*halves[-1]) + robot.footprint), _color(*color, 0.2))
-        points = [_point(at) for at in (exchange.request.state[:d], *centers)]
-        way = LinePrimitive(type=LinePrimitive.LINE_STRIP, pose=_pose(()), thickness=3.0, scale_invariant=True)
-        way.points.extend(points)
-        way.color.CopyFrom(_color(*color))
-        entity.lines.append(way)
-        if kind in WORDS and not step.fallback and fits(robot, exchange.request, made):
-            about = explain(robot, exchange.request, made)
-            said = f"{WORDS[kind]}: {about.said}"
-            _explained(entity, exchange.request.state[:d], about, robot.footprint)
+    color, words = KINDS.get(kind, (120, 120, 120)), WORDS.get(kind, "")
     if exchange is not None:
-        _told(entity, map_for_display(robot, exchange.request), reservations)
+        view = decision_view(robot, exchange, reservations)
+        start = exchange.request.state[: robot.position_dim]
+        if exchange.reply.HasField("decision"):
+            _draw_tube(entity, view, start, robot.footprint, color)
+        if view.explanation is not None and kind in WORDS and not step.fallback:
+            words = f"{WORDS[kind]}: {view.explanation.said}"
+            _draw_explanation(entity, start, view.explanation, robot.footprint)
+        if view.perceived is not None:
+            _draw_perceived(entity, view.perceived, view.reservations)
     if kind in WORDS:
-        word = fell_back() if step.fallback else said or WORDS[kind]
         above = HEIGHT + 3.0 * robot.footprint
-        entity.texts.append(_text(word, step.state[:d], _color(*color), above))
+        text = fell_back() if step.fallback else words
+        entity.texts.append(_text(text, step.state[: robot.position_dim], _color(*color), above))
     return SceneUpdate(entities=[entity])
 
 
-def _explained(entity: SceneEntity, start: Sequence[float], about: Explanation, size: float) -> None:
-    """Add the proposed and the executed input as arrows, and the edge of the half-space that stopped the proposal."""
+def _draw_tube(
+    entity: SceneEntity, view: DecisionView, start: Sequence[float], footprint: float, color: tuple[int, int, int]
+) -> None:
+    """Add the boxes of the tube, the area where the robot stops, and the plan from the robot through the centers."""
+    for center, half in zip(view.centers, view.half_widths, strict=True):
+        edges = [*(2.0 * half), *[FLAT] * (3 - len(half))]
+        entity.cubes.append(CubePrimitive(pose=_pose(center), size=_vector(*edges), color=_color(*color, 0.6)))
+    if len(view.centers):
+        across = 2.0 * (math.hypot(*view.half_widths[-1]) + footprint)
+        _draw_stop(entity, view.centers[-1], across, _color(*color, 0.2))
+    plan = LinePrimitive(type=LinePrimitive.LINE_STRIP, pose=_pose(()), thickness=3.0, scale_invariant=True)
+    plan.points.extend([_point(at) for at in (start, *view.centers)])
+    plan.color.CopyFrom(_color(*color))
+    entity.lines.append(plan)
+
+
+def _draw_explanation(entity: SceneEntity, start: Sequence[float], about: Explanation, size: float) -> None:
+    """Add the proposed and the executed input as arrows, and the edge of the half-space that blocks the proposal."""
     for way, color in ((about.proposed, PROPOSED), (about.executed, EXECUTED)):
         length = float(np.linalg.norm(way))
         if length > 0.0:
@@ -205,15 +221,14 @@ def _explained(entity: SceneEntity, start: Sequence[float], about: Explanation, 
         entity.cubes.append(edge)
 
 
-def _told(entity: SceneEntity, about: DisplayedMap, reservations: Iterable[np.ndarray]) -> None:
-    """Add where beams ended, the outline of what they showed to be free, what moves with where it may come to, and the
-    boxes that others promise to be in."""
+def _draw_perceived(entity: SceneEntity, about: DisplayedMap, reservations: np.ndarray) -> None:
+    """Add scan hits, the outline of free space, moving obstacles with their reachable sets, and the reservations."""
     if len(about.free):
         free = LinePrimitive(type=LinePrimitive.LINE_LOOP, pose=_pose(()), thickness=2.0, scale_invariant=True)
         free.points.extend(map(_point, about.free))
         free.color.CopyFrom(FREE)
         hits = LinePrimitive(type=LinePrimitive.LINE_LIST, pose=_pose(()), thickness=4.0, scale_invariant=True)
-        hits.points.extend(map(_point, _marks(about.hits)))
+        hits.points.extend(map(_point, _hit_marks(about.hits)))
         hits.color.CopyFrom(HIT)
         entity.lines.extend([free, hits])
     swept = about.swept.reshape(-1, about.swept.shape[-1])
@@ -227,16 +242,15 @@ def _told(entity: SceneEntity, about: DisplayedMap, reservations: Iterable[np.nd
             entity.cylinders.append(
                 CylinderPrimitive(pose=place, size=size, color=color, bottom_scale=1.0, top_scale=1.0)
             )
-    for boxes in reservations:
-        for box in boxes:
-            d = len(box) // 2
-            edges = [2.0 * (half + box[-1]) for half in box[d:-1]] + [FLAT] * (3 - d)
-            entity.cubes.append(CubePrimitive(pose=_pose(box[:d]), size=_vector(*edges), color=PROMISE))
+    for box in reservations:
+        d = len(box) // 2
+        edges = [2.0 * (half + box[-1]) for half in box[d:-1]] + [FLAT] * (3 - d)
+        entity.cubes.append(CubePrimitive(pose=_pose(box[:d]), size=_vector(*edges), color=RESERVED))
 
 
-def _marks(hits: np.ndarray) -> list[list[float]]:
-    """Ends of a short upright line at some of the points (k, d)."""
-    some = hits[:: max(1, -(-len(hits) // MARKED))]
+def _hit_marks(hits: np.ndarray) -> list[list[float]]:
+    """Return the two ends of a short upright line at each of at most `MOST_HITS` points (k, d)."""
+    some = hits[:: max(1, -(-len(hits) // MOST_HITS))]
     ends = np.zeros((len(some), 2, 3))
     ends[..., : some.shape[1]] = some[:, None]
     ends[:, 1, 2] += FLAT
@@ -244,7 +258,7 @@ def _marks(hits: np.ndarray) -> list[list[float]]:
 
 
 def _along(at: Iterable[float], way: Sequence[float] | np.ndarray) -> Pose:
-    """A pose whose x axis points along a unit vector."""
+    """Return a pose whose x axis points along a unit vector."""
     x, y, z = [*way, 0.0, 0.0][:3]
     yaw, pitch = math.atan2(y, x), -math.asin(max(-1.0, min(1.0, z)))
     cy, sy, cp, sp = math.cos(0.5 * yaw), math.sin(0.5 * yaw), math.cos(0.5 * pitch), math.sin(0.5 * pitch)
@@ -253,8 +267,8 @@ def _along(at: Iterable[float], way: Sequence[float] | np.ndarray) -> Pose:
     return pose
 
 
-def _stop(entity: SceneEntity, center: Sequence[float], across: float, color: Color) -> None:
-    """Add the disc (ball) that holds the body wherever in its last box the robot comes to a stop."""
+def _draw_stop(entity: SceneEntity, center: Sequence[float] | np.ndarray, across: float, color: Color) -> None:
+    """Add the disc or sphere that holds the body wherever in the tube's last box the robot stops."""
     if len(center) == 3:
         entity.spheres.append(SpherePrimitive(pose=_pose(center), size=_vector(across, across, across), color=color))
         return
@@ -264,7 +278,7 @@ def _stop(entity: SceneEntity, center: Sequence[float], across: float, color: Co
 
 
 def frames(robot: Robot, actor: str, site: tuple[float, float], state: Sequence[float], time: int) -> FrameTransforms:
-    """Where the actor's arena stands in the world, and where its robot in the arena."""
+    """Return the transforms from the world to the actor's arena and from the arena to the robot's body."""
     at, d = stamp(time), robot.position_dim
     yaw = 0.0 if robot.heading is None else state[robot.heading]
     place = FrameTransform(timestamp=at, parent_frame_id=WORLD, child_frame_id=actor)
@@ -277,7 +291,7 @@ def frames(robot: Robot, actor: str, site: tuple[float, float], state: Sequence[
 
 
 def lidar(rays: LidarRays, actor: str, observation: Sequence[float], time: int) -> LaserScan | PointCloud:
-    """The rays of an observation: a scan in the plane; in space a cloud of the points that were hit."""
+    """Convert the rays of an observation: in the plane to a scan, in space to a cloud of the hit points."""
     ranges = np.asarray(observation[: len(rays.directions)], float) * rays.range
     frame, at = body_frame(actor), stamp(time)
     if rays.directions.shape[1] == 2:

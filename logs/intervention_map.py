@@ -1,4 +1,4 @@
-"""Where the filter stepped in: a top-down map of bounded size, of all episodes together."""
+"""Map where the filter intervened: a bounded grid from above, over all episodes."""
 
 from __future__ import annotations
 
@@ -14,14 +14,18 @@ _ADJUSTED, _FAILSAFE = int(pb.ADJUSTED), int(pb.FAILSAFE)
 
 
 class InterventionMap:
-    """Counts of steps by the cell of the plane in which they ended. Too many cells become fewer, twice as wide."""
+    """Counts of steps by grid cell. When there are too many cells, their width doubles."""
 
     def __init__(self) -> None:
         self.cell = FIRST_CELL
         self.cells: dict[tuple[int, int], list[int]] = {}  # steps, adjusted, failsafes, collisions
 
     def step(self, state: Sequence[float], step: pb.Step) -> None:
-        """`state` is the step's, taken out of it; the first two coordinates are x and y in m."""
+        """Add a step.
+
+        Args:
+            state: `step.state`, which the caller has read already; x and y [m] come first.
+        """
         cell = self.cell
         place = int(state[0] // cell), int(state[1] // cell)
         counts = self.cells.get(place)
@@ -49,5 +53,5 @@ class InterventionMap:
         self.cells = coarse
 
     def figures(self) -> Figures:
-        """`cells`: [x, y of the cell's lower left corner in cells, steps, adjusted, failsafes, collisions]."""
+        """Return `cells`: [x, y of the lower left corner in cells, steps, adjusted, failsafes, collisions]."""
         return {"cell": self.cell, "cells": [[x, y, *counts] for (x, y), counts in sorted(self.cells.items())]}

@@ -1,7 +1,7 @@
-"""How a robot changes while it learns: rates over the steps of all actors, in a bounded number of bins.
+"""Compute learning curves: rates over the steps of all actors of a robot kind, in a bounded number of bins.
 
-When the bins are used up, each two become one that is twice as wide. What is "over training" depends on the order in
-which the steps of different actors came in, so this is no part of `Metrics`.
+When all bins are used, each two neighbours become one bin of twice the width. Learning curves depend on the order in
+which the steps of different actors arrive, so they are not part of `Metrics`.
 """
 
 from __future__ import annotations
@@ -16,16 +16,16 @@ from brakeline.messaging import brakeline_pb2 as pb
 
 MOST_BINS = 200
 FIRST_WIDTH = 50  # steps
-LAST = 100  # episodes that the headline is about
-MOST_LEARNED = 400  # points of a learner's curves
-CURVES = ("steps", "updates", "critic_loss", "actor_loss", "mean_q")  # of them
+LAST = 100  # latest episodes that the report summarizes
+MOST_POINTS = 400  # points of a learner's curves
+CURVES = ("steps", "updates", "critic_loss", "actor_loss", "mean_q")  # of the learner
 
 _ADJUSTED, _FAILSAFE = int(pb.ADJUSTED), int(pb.FAILSAFE)
 
 
 @dataclass
 class Bin:
-    """Sums over some steps, and over the episodes that ended in them."""
+    """Sums over consecutive steps and over the episodes that ended in them."""
 
     steps: int = 0
     adjusted: int = 0
@@ -33,43 +33,43 @@ class Bin:
     episodes: int = 0
     goals: int = 0
     collisions: int = 0
-    reward: float = 0.0  # of these episodes, without the penalty
+    reward: float = 0.0  # of these episodes, without the intervention penalty
     closest: float = math.inf  # m
 
     def join(self, other: Bin) -> None:
         for item in fields(self):
-            mine, its = getattr(self, item.name), getattr(other, item.name)
-            setattr(self, item.name, min(mine, its) if item.name == "closest" else mine + its)
+            one, two = getattr(self, item.name), getattr(other, item.name)
+            setattr(self, item.name, min(one, two) if item.name == "closest" else one + two)
 
 
 @dataclass
 class Episode:
-    """What came of an episode so far."""
+    """Sums over a running episode."""
 
     steps: int = 0
     interventions: int = 0
-    reward: float = 0.0  # without the penalty
+    reward: float = 0.0  # without the intervention penalty
     goal: bool = False
     collision: bool = False
 
 
 class LearningCurve:
-    """Takes the steps of one robot kind in the order in which they came in."""
+    """The learning curves of one robot kind, from its steps in the order of arrival."""
 
     def __init__(self) -> None:
         self.width = FIRST_WIDTH
         self.bins: list[Bin] = [Bin()]
-        self.staleness = QuantileSketch()  # versions that a step's weights were behind the newest that was known
+        self.staleness = QuantileSketch()  # versions between a step's weights and the newest known weights
         self.last: deque[Episode] = deque(maxlen=LAST)
         self._running: dict[str, Episode] = {}
-        self._learned: list[tuple[float, ...]] = []  # a point each, as CURVES names them
-        self._stride = 1  # of a learner's words that become a point
-        self._heard = 0
+        self._learned: list[tuple[float, ...]] = []  # points with the values of CURVES
+        self._stride = 1  # learner messages per point
+        self._messages = 0
         self._newest = 0
-        self._now = self.bins[0]
+        self._current = self.bins[0]
 
     def step(self, step: pb.Step) -> None:
-        now = self._now
+        now = self._current
         if now.steps >= self.width:
             now = self._next()
         now.steps += 1
@@ -102,16 +102,16 @@ class LearningCurve:
             self.last.append(self._running.pop(actor))
 
     def learner(self, metrics: pb.LearnerMetrics) -> None:
-        """The learner says how far it is; of many such words some are kept, evenly."""
+        """Add a learner's metrics; of many messages, evenly spaced ones become points."""
         self._newest = max(self._newest, metrics.weights_version)
-        if self._heard % self._stride == 0:
+        if self._messages % self._stride == 0:
             self._learned.append(tuple(float(getattr(metrics, name)) for name in CURVES))
-            if len(self._learned) >= MOST_LEARNED:
+            if len(self._learned) >= MOST_POINTS:
                 self._learned, self._stride = self._learned[::2], 2 * self._stride
-        self._heard += 1
+        self._messages += 1
 
     def figures(self) -> Figures:
-        """`bins`: one row each, up to the step `until`; None where no episode ended."""
+        """Return the curves. Each row of `bins` ends at the step `until`; None: no episode ended in the bin."""
         rows, until = [], 0
         for row in self.bins:
             until += row.steps
@@ -138,7 +138,7 @@ class LearningCurve:
         }
 
     def _last(self) -> Figures:
-        """What came of the last episodes that ended; None where there was none."""
+        """Return the figures of the last episodes; None without an episode."""
         last, steps = list(self.last), sum(episode.steps for episode in self.last)
         return {
             "episodes": len(last),
@@ -149,12 +149,12 @@ class LearningCurve:
         }
 
     def _next(self) -> Bin:
-        """Begin a bin, after making room for it."""
+        """Begin a bin; merge neighbours if all bins are used."""
         if len(self.bins) == MOST_BINS:
             for even, odd in zip(self.bins[::2], self.bins[1::2], strict=True):
                 even.join(odd)
             self.bins = self.bins[::2]
             self.width *= 2
         self.bins.append(Bin())
-        self._now = self.bins[-1]
-        return self._now
+        self._current = self.bins[-1]
+        return self._current

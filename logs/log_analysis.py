@@ -1,4 +1,4 @@
-"""Reads logs once, front to back, and gives all that can be said of them, in memory that does not grow with them."""
+"""Analyse logs in one pass from front to back, in memory that does not grow with the log."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from brakeline.logs.episode_stats import Figures
 from brakeline.logs.intervention_map import InterventionMap
 from brakeline.logs.learning_curve import LearningCurve
 from brakeline.logs.mcap_container import LogChannel
-from brakeline.logs.metrics import Metrics, closed_loop, together
+from brakeline.logs.metrics import Metrics, closed_loop, merge_runs
 from brakeline.logs.process_timeline import ProcessTimeline
 from brakeline.logs.reader import Log, Paths, by_run, find
 from brakeline.messaging.rejected_messages import RejectedMessages
@@ -25,109 +25,121 @@ SETUP = ("method", "certificate", "policy", "arena", "perception", "seed")
 
 @dataclass
 class AnalysisOptions:
-    """What is wanted besides the figures."""
+    """What an analysis computes besides the figures.
 
-    pictures: bool = False  # what the report draws
-    episode: int | None = None  # this one in detail ...
-    actor: str | None = None  # ... of this actor; None: of all
+    Attributes:
+        pictures: the data that the report draws.
+        episode: number of an episode to list step by step.
+        actor: only this actor's episode; None: every actor's.
+    """
+
+    pictures: bool = False
+    episode: int | None = None
+    actor: str | None = None
 
 
 class RunAnalysis:
-    """Takes the log of one run; `figures` and `pictures` are what it comes to."""
+    """The analysis of the log of one run."""
 
-    def __init__(self, label: str, log: Log, look: AnalysisOptions | None = None, prefix: str = "") -> None:
-        """`prefix` goes before the names of actors in episodes: it tells runs apart."""
+    def __init__(self, label: str, log: Log, options: AnalysisOptions | None = None, prefix: str = "") -> None:
+        """Read the log.
+
+        Args:
+            label: name of the run.
+            options: what to compute besides the figures.
+            prefix: for the names of actors, to distinguish runs.
+        """
         self.label, self.log, self.prefix = label, log, prefix
-        self.look = look or AnalysisOptions()
+        self.options = options or AnalysisOptions()
         self.metrics = Metrics(robots=log.robots)
         self.training: dict[str, LearningCurve] = {}  # by robot kind
-        self.places: dict[str, InterventionMap] = {}
-        self.galleries: dict[str, EpisodeSampler] = {}
+        self.intervention_maps: dict[str, InterventionMap] = {}
+        self.samplers: dict[str, EpisodeSampler] = {}
         self.timeline = ProcessTimeline()
         self._drawn: dict[LogChannel, tuple[InterventionMap, EpisodeSampler, ActorBuffer]] = {}
-        self._kept: dict[LogChannel, deque[Any]] = {}
+        self._buffers: dict[LogChannel, deque[Any]] = {}
         self._rejected = RejectedMessages()
-        self._take(log)
-        for gallery in self.galleries.values():
-            gallery.close()
+        self._read(log)
+        for sampler in self.samplers.values():
+            sampler.close()
         self._drawn.clear()
-        self._kept.clear()
+        self._buffers.clear()
 
     def figures(self) -> Figures:
-        """All figures of the run."""
+        """Return all figures of the run."""
         return LogAnalysis([self]).figures()
 
     def pictures(self) -> Figures:
-        """What the report draws besides the figures."""
+        """Return what the report draws besides the figures."""
         decisions = self.metrics.latency()
         return {
             "latency": {
                 kind: {part: values.bars() for part, values in parts.items()} for kind, parts in decisions.items()
             },
-            "places": {robot: self.places[robot].figures() for robot in sorted(self.places)},
-            "galleries": {robot: self.galleries[robot].figures() for robot in sorted(self.galleries)},
+            "places": {robot: self.intervention_maps[robot].figures() for robot in sorted(self.intervention_maps)},
+            "galleries": {robot: self.samplers[robot].figures() for robot in sorted(self.samplers)},
             "timeline": self.timeline.figures(),
         }
 
-    def _take(self, log: Log) -> None:
-        """The one loop over all messages; what is seldom has a function of its own."""
-        add, look = self.metrics.add, self.look
-        drawn = look.pictures or look.episode is not None
-        takers: dict[str, Callable[[LogChannel, Any], None]] = {
+    def _read(self, log: Log) -> None:
+        """Read all messages in one loop."""
+        add, options = self.metrics.add, self.options
+        detailed = options.pictures or options.episode is not None
+        handlers: dict[str, Callable[[LogChannel, Any], None]] = {
             LEARNER.name: self._learner,
-            **({HEALTH.name: self._health, LOG.name: self._line} if drawn else {}),
+            **({HEALTH.name: self._health, LOG.name: self._line} if detailed else {}),
         }
-        trained: dict[str, LearningCurve] = {}
+        curves: dict[str, LearningCurve] = {}
         for series, message, _, _ in log.decoded():
             try:
                 if not add(series.key, message):
                     continue
                 topic = series.topic
                 if topic == STEP.name:
-                    training = trained.get(series.key)
-                    if training is None:
-                        training = trained[series.key] = self.training.setdefault(message.robot, LearningCurve())
-                    training.step(message)
-                    if drawn:
+                    curve = curves.get(series.key)
+                    if curve is None:
+                        curve = curves[series.key] = self.training.setdefault(message.robot, LearningCurve())
+                    curve.step(message)
+                    if detailed:
                         self._draw(series, message)
                 elif topic == EXCHANGE.name or topic == EPISODE.name:
-                    if drawn:
-                        self._keep(series, message)
-                elif taker := takers.get(topic):
-                    taker(series, message)
-            except Exception as error:  # one message is one message: the log goes on
+                    if detailed:
+                        self._buffer(series, message)
+                elif handler := handlers.get(topic):
+                    handler(series, message)
+            except Exception as error:  # reject one message and go on
                 log.malformed += 1
                 self._rejected.reject(series.key, error)
 
     def _draw(self, series: LogChannel, step: Any) -> None:
-        known = self._drawn.get(series)
-        if known is None:
+        targets = self._drawn.get(series)
+        if targets is None:
             robot, _, name = series.place.partition("/")
-            places = self.places.setdefault(robot, InterventionMap())
-            gallery = self._gallery(robot)
-            known = self._drawn[series] = places, gallery, gallery.source(name)
-        places, gallery, source = known
+            places = self.intervention_maps.setdefault(robot, InterventionMap())
+            sampler = self._sampler(robot)
+            targets = self._drawn[series] = places, sampler, sampler.source(name)
+        places, sampler, source = targets
         if len(state := step.state[:2]) == 2:
             places.step(state, step)
-        gallery.step(source, step)
+        sampler.step(source, step)
         self.timeline.step(step.header.wall_time)
 
-    def _keep(self, series: LogChannel, message: Any) -> None:
-        kept = self._kept.get(series)
-        if kept is None:
+    def _buffer(self, series: LogChannel, message: Any) -> None:
+        buffer = self._buffers.get(series)
+        if buffer is None:
             robot, _, name = series.place.partition("/")
-            source = self._gallery(robot).source(name)
-            kept = self._kept[series] = source.exchanges if series.topic == EXCHANGE.name else source.about
-        kept.append(message)
+            source = self._sampler(robot).source(name)
+            buffer = self._buffers[series] = source.exchanges if series.topic == EXCHANGE.name else source.about
+        buffer.append(message)
 
-    def _gallery(self, robot: str) -> EpisodeSampler:
-        gallery = self.galleries.get(robot)
-        if gallery is None:
-            gallery = self.galleries[robot] = EpisodeSampler(
-                self.log.robots.named(robot), self.look.episode, self.look.actor
+    def _sampler(self, robot: str) -> EpisodeSampler:
+        sampler = self.samplers.get(robot)
+        if sampler is None:
+            sampler = self.samplers[robot] = EpisodeSampler(
+                self.log.robots.named(robot), self.options.episode, self.options.actor
             )
-            gallery.label = self.prefix
-        return gallery
+            sampler.label = self.prefix
+        return sampler
 
     def _learner(self, _: LogChannel, message: Any) -> None:
         self.training.setdefault(message.robot, LearningCurve()).learner(message)
@@ -139,7 +151,7 @@ class RunAnalysis:
         self.timeline.line(message.process, message)
 
     def about(self) -> Figures:
-        """The run's row: how it was set up, what came of it, and what is missing."""
+        """Return one row about the run: configuration, figures, missing messages."""
         metrics, log = self.metrics, self.log
         about = log.metadata.get("run", {})
         setup: Figures = {name: about.get(name) for name in SETUP}
@@ -161,27 +173,30 @@ class RunAnalysis:
 
 
 def perception_in(conditions: Mapping[str, str]) -> str:
-    """What the conditions of a run say of where free space came from, in a word or two."""
+    """Return the source of free space in a run: "map", "scan" ..., also with tracks."""
     kind = conditions.get("perception", "map")
     return f"{kind} with tracks" if conditions.get("tracks") == "True" else kind
 
 
 class LogAnalysis:
-    """Several runs beside each other: counts are summed up, curves and processes stay each run's own."""
+    """The analyses of several runs. Counts are summed; curves and processes stay separate."""
 
     def __init__(self, parts: Sequence[RunAnalysis]) -> None:
         self.parts = parts
 
     def figures(self) -> Figures:
-        """All figures; `runs` has those of each run. With several runs, their labels go before the names of actors,
-        learners, processes and of the robot kinds in `training`."""
+        """Return all figures; `runs` has one row for each run.
+
+        With several runs, the label of the run is the prefix of actors, learners, processes and of the robot kinds in
+        `training`.
+        """
         rows = {part.label: part.about() for part in self.parts}
         logs = [part.log for part in self.parts]
         prefixes = [part.prefix if len(self.parts) > 1 else "" for part in self.parts]
-        every = together({prefix: part.metrics for prefix, part in zip(prefixes, self.parts, strict=True)})
+        merged = merge_runs({prefix: part.metrics for prefix, part in zip(prefixes, self.parts, strict=True)})
         return {
             **_common([{name: run[name] for name in SETUP} for run in rows.values()], SETUP),
-            **every,
+            **merged,
             "training": {
                 prefix + robot: part.training[robot].figures()
                 for prefix, part in zip(prefixes, self.parts, strict=True)
@@ -196,44 +211,47 @@ class LogAnalysis:
             **self._episode(),
         }
 
-    def each(self) -> dict[str, tuple[Figures, Figures]]:
-        """Figures and pictures of every run by itself, by its label."""
+    def by_label(self) -> dict[str, tuple[Figures, Figures]]:
+        """Return figures and pictures of each run, by its label."""
         return {part.label: (part.figures(), part.pictures()) for part in self.parts}
 
     def _episode(self) -> Figures:
-        """The episode that was asked for, of every run."""
-        wanted = next((part.look.episode for part in self.parts), None)
+        """Return the requested episode of every run, step by step."""
+        wanted = next((part.options.episode for part in self.parts), None)
         if wanted is None:
             return {}
-        galleries = [part.galleries[robot] for part in self.parts for robot in sorted(part.galleries)]
-        return {"episode": wanted, "episode_detail": [episode for gallery in galleries for episode in gallery.found]}
+        samplers = [part.samplers[robot] for part in self.parts for robot in sorted(part.samplers)]
+        return {
+            "episode": wanted,
+            "episode_detail": [episode for sampler in samplers for episode in sampler.requested_episodes],
+        }
 
 
-def analyse_runs(paths: Paths, look: AnalysisOptions | None = None) -> LogAnalysis:
-    """Everything about the logs at `paths`, run by run.
+def analyse_runs(paths: Paths, options: AnalysisOptions | None = None) -> LogAnalysis:
+    """Analyse the logs at `paths`, run by run.
 
     Raises:
-        NoLog: there is none.
-        NotALog: a file is something else.
+        NoLog: a path has no log.
+        NotALog: a file is not an MCAP file.
     """
     runs = by_run(find(paths))
     several = len(runs) > 1
     return LogAnalysis(
-        [RunAnalysis(label, Log(files), look, f"{label}/" if several else "") for label, files in runs.items()]
+        [RunAnalysis(label, Log(files), options, f"{label}/" if several else "") for label, files in runs.items()]
     )
 
 
 def _metadata(log: Log) -> Figures:
-    """The log's metadata but for its legend; the configuration as an object."""
-    found: Figures = {name: dict(values) for name, values in log.metadata.items() if name != "brakeline"}
-    if "json" in found.get("configuration", {}):
-        with contextlib.suppress(ValueError):  # else it is shown as it is
-            found["configuration"] = json.loads(found["configuration"]["json"])
-    return found
+    """Return the log's metadata without the legend `brakeline`; the configuration is parsed."""
+    metadata: Figures = {name: dict(values) for name, values in log.metadata.items() if name != "brakeline"}
+    if "json" in metadata.get("configuration", {}):
+        with contextlib.suppress(ValueError):  # a configuration that is not JSON stays a string
+            metadata["configuration"] = json.loads(metadata["configuration"]["json"])
+    return metadata
 
 
 def _common(all_: list[Figures], names: tuple[str, ...] | None = None) -> Figures:
-    """What is the same in all; with `names`, None for what is not."""
+    """Return the values that all share; with `names`, also None for each name whose values differ."""
     first, rest = (all_[0], all_[1:]) if all_ else ({}, [])
     same = {name: value for name, value in first.items() if all(other.get(name) == value for other in rest)}
     return same if names is None else {name: same.get(name) for name in names}

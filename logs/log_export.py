@@ -1,4 +1,4 @@
-"""A log in other forms: its steps as CSV, and all of it with a picture of every step for Foxglove."""
+"""Export a log: its steps as CSV, or all messages with a Foxglove scene of every step."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from brakeline.logs.segment import Entry, Segment, open_segment
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.task import RobotWithTask
 
-BATCH = 1000  # messages that are written at once
+BATCH = 1000  # messages per write
 
 
 def columns(robot: RobotWithTask) -> dict[str, tuple[str, ...]]:
-    """The names within each repeated field of a step, in their order. What is not here is not exported: `path`."""
+    """Return the names of the elements of each exported repeated field of a step. `path` is not exported."""
     return {
         "observation": robot.task.observed,
         "proposed": robot.action,
@@ -33,13 +33,14 @@ def columns(robot: RobotWithTask) -> dict[str, tuple[str, ...]]:
 
 
 def to_csv(paths: Paths, robot: RobotWithTask, file: TextIO) -> int:
-    """Write every step of a robot kind in the log as a line, in the order of receipt; returns how many, at least one.
+    """Write each step of a robot kind as a line, in the order of receipt, and return the number of steps.
 
-    Columns: log_time [ns], header.time [s], header.source, header.run, header.sequence, the message's fields by their
-    names; those that are vectors as `field.name [unit]`, the decision by its name.
+    Columns: log_time [ns], header.time [s], header.source, header.run, header.sequence, and the fields of the message;
+    vectors as `field.name [unit]`, the decision by its name.
 
     Raises:
-        ExportError: there is no step of this robot; it says whose there are. NoLog, NotALog: there is no log.
+        ExportError: the log has no step of this robot; the message lists the robots that it has.
+        NoLog, NotALog: as `open_log`.
     """
     vectors = columns(robot)
     plain = [f.name for f in pb.Step.DESCRIPTOR.fields if not f.is_repeated and f.message_type is None]
@@ -73,23 +74,27 @@ def _plain(step: pb.Step, name: str) -> Any:
 
 
 def to_foxglove(paths: Paths, out: Path, rate: float = math.inf) -> int:
-    """Write a log's messages to `out`, with `rate` pictures a second and actor (infinite: one of every step), in place
-    of those that it has; returns how many messages there are.
+    """Write a log's messages to `out` with new Foxglove scenes, and return the number of messages.
+
+    Args:
+        rate: scenes per second and actor; infinity draws every step.
 
     Raises:
-        ExportError: `out` is there already; NoLog, NotALog: there is no log; OSError: there is no space.
+        ExportError: `out` exists, or the log has no message.
+        NoLog, NotALog: as `open_log`.
+        OSError: the disk is full or broken.
     """
     if out.exists():
-        raise ExportError(f"{out} is there already")
+        raise ExportError(f"{out} exists already")
     log = open_log(paths)
-    pictures = FoxgloveConverter(rate, log.robots)
+    converter = FoxgloveConverter(rate, log.robots)
     segment: Segment | None = None
     count = 0
     batch: list[Entry] = []
     for stored, record in _stored(log):
-        if segment is None:  # by now the metadata are known
+        if segment is None:  # the metadata come before the first message
             segment = open_segment(out, {k: v for k, v in log.metadata.items() if k != "brakeline"}, log.attachments)
-        batch += [stored, *pictures.from_record(record)]
+        batch += [stored, *converter.from_record(record)]
         if len(batch) >= BATCH:
             segment.save(batch)
             count, batch = count + len(batch), []
@@ -101,7 +106,7 @@ def to_foxglove(paths: Paths, out: Path, rate: float = math.inf) -> int:
 
 
 def _stored(log: Log) -> Iterator[tuple[Entry, Record]]:
-    """The messages of a log, as they are stored, and decoded."""
+    """Yield the messages of a log, as stored and decoded."""
     for series, log_time, publish_time, payload in log.rows():
         kind = TYPES[series.schema.name]
         try:

@@ -1,4 +1,4 @@
-"""How many messages a log holds, from its files' summaries: for progress displays, and known at once."""
+"""Count the messages of a log from the summaries of its files, for progress displays."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from brakeline.messaging.topics import Topic
 
 
 def count(paths: Paths, topic: Topic) -> int | None:
-    """Messages of a topic in the log at `paths`; None if a file has no summary, as a killed recorder leaves it.
+    """Return the number of messages of a topic; None if a file has no summary because its recorder was killed.
 
     Raises:
-        NoLog: there is none.
+        NoLog: a path has no log.
     """
     root, total = topic.key.split("/", 1)[0], 0
     for path in find(paths):

@@ -1,7 +1,7 @@
-"""Makes a damaged log whole: all that can be read of it, in a file with a summary that every MCAP tool opens.
+"""Repair a damaged log: write everything that can be read to a file with a summary, which every MCAP tool opens.
 
-Messages, channels, schemas, metadata and attachments are taken over as they are, those of others' channels too. The
-damaged file is kept beside the new one, as run.mcap.damaged.
+The new file has the same messages, channels, schemas, metadata and attachments. The damaged file stays beside it as
+run.mcap.damaged.
 """
 
 from __future__ import annotations
@@ -24,69 +24,78 @@ UNFINISHED = ".recovering"
 
 
 class BeingRecorded(LogError):
-    """A recorder writes to the file now: there is nothing to recover before it has ended."""
+    """A recorder is writing to the file."""
 
 
 @dataclass
 class Recovery:
-    """What became of a file."""
+    """Result of repairing one file.
 
-    path: Path  # the whole file
-    kept: Path | None = None  # the damaged one; None: it was whole, and nothing was done
+    Attributes:
+        path: the repaired file.
+        kept: where the damaged file is now; None if the file was intact and nothing was done.
+        messages: number of messages in the file.
+        last: receipt of the last message, ns since the Unix epoch.
+        lost: bytes that could not be read.
+        cuts: descriptions of the damage.
+    """
+
+    path: Path
+    kept: Path | None = None
     messages: int = 0
-    last: int = 0  # ns since the Unix epoch, receipt of the last message
-    lost: int = 0  # bytes that could not be read
+    last: int = 0
+    lost: int = 0
     cuts: list[str] = field(default_factory=list)
 
     def __str__(self) -> str:
         if self.kept is None:
-            return f"{self.path}: whole, {self.messages} messages; nothing to do"
-        said = "; ".join(self.cuts)
-        return f"{self.path}: {self.messages} messages recovered; {said}; the damaged file is {self.kept}"
+            return f"{self.path}: intact, {self.messages} messages; nothing to do"
+        damage = "; ".join(self.cuts)
+        return f"{self.path}: {self.messages} messages recovered; {damage}; the damaged file is {self.kept}"
 
 
 def recover(path: Path, out: Path | None = None) -> Recovery:
-    """Recover a log file in its place, or to `out`. A whole file is left as it is (but copied to `out`).
+    """Repair a log file in place or to `out`. An intact file stays as it is, or is copied to `out`.
 
-    It is written beside, and renamed when it is complete: whatever happens meanwhile, nothing is lost.
+    The repaired file gets its name only when it is complete, so that an interruption loses nothing.
 
     Raises:
-        BeingRecorded: a recorder holds it.
-        NotALog: it is something else.
-        FileExistsError: `out`, or a damaged file from before, would be overwritten.
-        OSError: there is no space.
+        BeingRecorded: a recorder is writing to the file.
+        NotALog: the file is not an MCAP file.
+        FileExistsError: `out` or an earlier damaged file would be overwritten.
+        OSError: the disk is full or broken.
     """
     if being_written(path):
-        raise BeingRecorded(f"{path} is being recorded: end its recorder first")
-    target, kept = out or path, path if out is not None else path.with_name(path.name + DAMAGED)
+        raise BeingRecorded(f"{path} is being recorded: stop its recorder first")
+    target, damaged = out or path, path if out is not None else path.with_name(path.name + DAMAGED)
     if out is not None and out.exists():
         raise FileExistsError(f"{out} exists already")
     beside = target.with_name(target.name + UNFINISHED)
-    found = Recovery(target)
+    result = Recovery(target)
     try:
         with path.open("rb") as source, beside.open("wb") as sink:
-            _copy(source, path.stat().st_size, sink, found)
+            _copy(source, path.stat().st_size, sink, result)
             sink.flush()
             os.fsync(sink.fileno())
-        if not found.cuts and out is None:
-            return found
+        if not result.cuts and out is None:
+            return result
         if out is None:
-            if kept.exists():
-                raise FileExistsError(f"{kept} exists already: move it away")
+            if damaged.exists():
+                raise FileExistsError(f"{damaged} exists already: move it away")
             try:
-                os.link(path, kept)  # so that there is a file under the log's name at every moment
+                os.link(path, damaged)  # a file with the log's name exists at every moment
             except PermissionError:  # a file system without links
-                path.rename(kept)
+                path.rename(damaged)
         beside.replace(target)
     except NotMcap as error:
         raise NotALog(f"{path} is not an MCAP file: {error}") from error
     finally:
         beside.unlink(missing_ok=True)
-    found.kept = kept
-    return found
+    result.kept = damaged
+    return result
 
 
-def _copy(source: IO[bytes], size: int, sink: IO[bytes], found: Recovery) -> None:
+def _copy(source: IO[bytes], size: int, sink: IO[bytes], result: Recovery) -> None:
     writer: Any = mcap.writer.Writer(sink, chunk_size=CHUNK)
     writer.start(profile="", library="brakeline recover")
     numbers: dict[LogChannel, int] = {}
@@ -97,11 +106,11 @@ def _copy(source: IO[bytes], size: int, sink: IO[bytes], found: Recovery) -> Non
             if series not in numbers:
                 numbers[series] = _register(writer, series, schemas)
             writer.add_message(numbers[series], log_time, payload, publish_time, series.sequence)
-            found.messages += 1
-            found.last = max(found.last, log_time)
+            result.messages += 1
+            result.last = max(result.last, log_time)
         elif isinstance(item, DamagedBytes):
-            found.lost += item.lost
-            found.cuts.append(str(item))
+            result.lost += item.lost
+            result.cuts.append(str(item))
         elif isinstance(item, Metadata):
             writer.add_metadata(item.name, item.metadata)
         elif isinstance(item, Attachment):
@@ -110,19 +119,19 @@ def _copy(source: IO[bytes], size: int, sink: IO[bytes], found: Recovery) -> Non
 
 
 def _register(writer: Any, series: LogChannel, schemas: dict[tuple[str, bytes], int]) -> int:
-    """The number of a channel in the new file, and of its schema."""
+    """Return the number of a channel in the new file; register its schema if needed."""
     schema, channel = series.schema, series.channel
-    assert channel is not None, "the container fills it in"
+    assert channel is not None, "the container has set it"
     number = 0  # no schema
     if schema is not None:
-        place = schema.name, schema.data
-        if place not in schemas:
-            schemas[place] = writer.register_schema(schema.name, schema.encoding, schema.data)
-        number = schemas[place]
+        content = schema.name, schema.data
+        if content not in schemas:
+            schemas[content] = writer.register_schema(schema.name, schema.encoding, schema.data)
+        number = schemas[content]
     return int(writer.register_channel(channel.topic, channel.message_encoding, number, channel.metadata))
 
 
 def recover_all(paths: tuple[Path, ...]) -> Iterator[Recovery]:
-    """Recover each file in its place. Raises as `recover`."""
+    """Repair each file in place. Raises as `recover`."""
     for path in paths:
         yield recover(path)

@@ -1,8 +1,9 @@
-"""MCAP's container, front to back: what a file holds, also when it was cut off or bytes of it were changed.
+"""Read an MCAP file from front to back, also when its end is missing or bytes of it were changed.
 
-Messages come as plain tuples, taken out of their chunks without an object each: several times as fast as the `mcap`
-package's own non-seeking reader, whose classes read all other kinds of records here. A chunk whose checksum is wrong is
-skipped, and said.
+Why not `mcap.stream_reader.StreamReader`: it stops at the first damaged record, it decompresses as much as a chunk
+contains (not as much as the chunk declares), and it creates an object for each message, which is several times slower.
+The `mcap` package's record classes read everything but messages here. A chunk with a wrong checksum is skipped and
+reported.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, Chunk, Metadata, Schema
 
 MAGIC = b"\x89MCAP0\r\n"
-LARGEST = 2**27  # bytes of a chunk's content: more is damage, not data
+MOST_CHUNK_BYTES = 2**27  # a chunk that declares more is damaged
 BROKEN = (McapError, struct.error, ValueError, EOFError, RuntimeError, zstandard.ZstdError)
 
 SCHEMA, CHANNEL, MESSAGE = int(Opcode.SCHEMA), int(Opcode.CHANNEL), int(Opcode.MESSAGE)
@@ -33,37 +34,44 @@ _TO_PAYLOAD = _HEAD.size + _MESSAGE.size
 
 
 class NotMcap(Exception):
-    """The file does not begin as an MCAP file does."""
+    """The file does not start with the MCAP magic bytes."""
 
 
 @dataclass(frozen=True)
 class DamagedBytes:
-    """Bytes that cannot be read."""
+    """A range of bytes that cannot be read."""
 
-    at: int  # where they begin
-    lost: int  # how many there are; 0: the file only lacks its summary
+    at: int  # offset of the first byte
+    lost: int  # number of bytes; 0: only the summary is missing
     reason: str
-    at_end: bool  # nothing can be read after them
+    at_end: bool  # the range extends to the end of the file
 
     def __str__(self) -> str:
         if not self.lost:
-            return f"it ended without a summary ({self.reason})"
+            return f"the file had no summary ({self.reason})"
         where = "its end" if self.at_end else f"byte {self.at}"
         return f"{self.lost} bytes at {where} could not be read ({self.reason})"
 
 
 @dataclass(slots=True, eq=False)
 class LogChannel:
-    """A channel: the messages published at one key."""
+    """A channel of the file: the messages published at one key.
+
+    Attributes:
+        decode: None for an unknown message type.
+        known: whether the message type is known.
+        place: the key without the topic, e.g. "ground/actor-0".
+        sequence: of the message that was read last.
+    """
 
     topic: str
     key: str
-    decode: Callable[[bytes], Any] | None  # None: a type that we do not know
+    decode: Callable[[bytes], Any] | None
     schema: Schema | None = None
     channel: Channel | None = None
     known: bool = False
-    place: str = ""  # the key without the topic: "ground/actor-0"
-    sequence: int = 0  # of the message that was read last
+    place: str = ""
+    sequence: int = 0
 
     def __post_init__(self) -> None:
         self.known = self.decode is not None
@@ -75,44 +83,46 @@ Item = Row | Metadata | Attachment | DamagedBytes
 
 
 class _Tables:
-    """The schemas and channels that were read so far."""
+    """The schemas and channels that have been read."""
 
     def __init__(self, make: Callable[[str, str], LogChannel]) -> None:
         self.make, self.schemas, self.series = make, dict[int, Schema](), dict[int, LogChannel]()
 
-    def learn(self, opcode: int, content: bytes) -> None:
+    def add(self, opcode: int, content: bytes) -> None:
         stream = ReadDataStream(BytesIO(content))
         if opcode == SCHEMA:
-            schema = Schema.read(stream)
-            self.schemas[schema.id] = schema
+            new = Schema.read(stream)
+            self.schemas[new.id] = new
         else:
             channel = Channel.read(stream)
-            known = self.schemas.get(channel.schema_id)
-            if channel.id not in self.series:  # it is repeated in the summary
-                series = self.make(channel.topic, known.name if known is not None else "")
-                series.schema, series.channel = known, channel
+            schema = self.schemas.get(channel.schema_id)
+            if channel.id not in self.series:  # the summary repeats it
+                series = self.make(channel.topic, schema.name if schema is not None else "")
+                series.schema, series.channel = schema, channel
                 self.series[channel.id] = series
 
 
 def records(file: IO[bytes], size: int, make: Callable[[str, str], LogChannel]) -> Iterator[Item]:
-    """Messages, metadata and attachments of a file of `size` bytes, and what of it is damaged, in order.
+    """Yield the messages, metadata, attachments and damage of a file, in order.
 
-    `make` gives the series for a channel's topic and the name of its schema.
+    Args:
+        size: of the file, bytes.
+        make: creates the channel from its topic and the name of its schema.
 
     Raises:
-        NotMcap: it begins with something else; an empty file is only damaged.
+        NotMcap: the file starts with other bytes. An empty file is only damaged.
     """
     tables = _Tables(make)
     magic = file.read(len(MAGIC))
     if not MAGIC.startswith(magic):
-        raise NotMcap(f"it begins with {magic!r}")
-    good = len(magic)  # bytes up to the end of the last whole record
+        raise NotMcap(f"the file starts with {magic!r}")
+    good = len(magic)  # offset of the end of the last complete record
     while True:
         head = file.read(_HEAD.size)
         opcode, length = _HEAD.unpack(head) if len(head) == _HEAD.size else (0, 0)
         end = good + _HEAD.size + length
         if not opcode or end > size:
-            reason = "a record is cut off" if good < size else "the recorder was killed, or is still at work"
+            reason = "a record is incomplete" if good < size else "the recorder was killed or is still running"
             yield DamagedBytes(good, size - good, reason, at_end=True)
             return
         content = file.read(length)
@@ -121,7 +131,7 @@ def records(file: IO[bytes], size: int, make: Callable[[str, str], LogChannel]) 
                 yield from _unpacked(_uncompressed(content), tables)
             elif opcode == Opcode.FOOTER:
                 if file.read(len(MAGIC)) != MAGIC:
-                    yield DamagedBytes(end, size - end, "its last bytes are cut off", at_end=True)
+                    yield DamagedBytes(end, size - end, "the last bytes are missing", at_end=True)
                 return
             else:
                 yield from _plain(opcode, content, tables)
@@ -131,9 +141,9 @@ def records(file: IO[bytes], size: int, make: Callable[[str, str], LogChannel]) 
 
 
 def _plain(opcode: int, content: bytes, tables: _Tables) -> Iterator[Item]:
-    """A record outside a chunk; those that only help to seek give nothing."""
+    """Read a record outside a chunk. Index records yield nothing."""
     if opcode in (SCHEMA, CHANNEL):
-        tables.learn(opcode, content)
+        tables.add(opcode, content)
     elif opcode == MESSAGE:
         yield from _unpacked(_HEAD.pack(opcode, len(content)) + content, tables)
     elif opcode == Opcode.METADATA:
@@ -143,34 +153,34 @@ def _plain(opcode: int, content: bytes, tables: _Tables) -> Iterator[Item]:
 
 
 def _uncompressed(content: bytes) -> bytes:
-    """The records in a chunk, in memory for as many bytes as it says that it holds, whatever is packed in it.
+    """Return the uncompressed records of a chunk. Memory is limited to the size that the chunk declares.
 
     Raises one of `BROKEN`.
     """
     chunk = Chunk.read(ReadDataStream(BytesIO(content)))
     size = chunk.uncompressed_size
-    if size > LARGEST:
-        raise ValueError(f"a chunk says that it holds {size} bytes")
+    if size > MOST_CHUNK_BYTES:
+        raise ValueError(f"a chunk declares {size} bytes, more than {MOST_CHUNK_BYTES}")
     if chunk.compression == "zstd":
-        packed = zstandard.frame_content_size(chunk.data)  # -1: it does not say
-        if packed not in (-1, size):  # `decompress` would believe it
-            raise ValueError(f"a chunk says that it holds {size} bytes, and what is in it that it is {packed}")
+        declared = zstandard.frame_content_size(chunk.data)  # -1: the frame does not declare it
+        if declared not in (-1, size):  # `decompress` would allocate this size
+            raise ValueError(f"a chunk declares {size} bytes, and its zstd frame {declared}")
         data = zstandard.decompress(chunk.data, size)
     elif chunk.compression == "lz4":
         data = lz4.frame.LZ4FrameDecompressor().decompress(chunk.data, size + 1)
     elif chunk.compression == "":
         data = chunk.data
     else:
-        raise ValueError(f"a chunk is compressed by {chunk.compression!r}, which we do not know")
+        raise ValueError(f"a chunk has the unknown compression {chunk.compression!r}")
     if len(data) != size:
-        raise ValueError(f"a chunk says that it holds {size} bytes, and holds {len(data)} or more")
+        raise ValueError(f"a chunk declares {size} bytes and contains {len(data)} or more")
     if chunk.uncompressed_crc and zlib.crc32(data) != chunk.uncompressed_crc:
         raise ValueError("the checksum of a chunk is wrong")
     return data
 
 
 def _unpacked(data: bytes, tables: _Tables) -> Iterator[Row]:
-    """The messages among the records in `data`. Raises one of `BROKEN`."""
+    """Yield the messages among the records in `data`. Raises one of `BROKEN`."""
     series, head, message = tables.series, _HEAD.unpack_from, _MESSAGE.unpack_from
     at, end = 0, len(data)
     while at < end:
@@ -182,14 +192,14 @@ def _unpacked(data: bytes, tables: _Tables) -> Iterator[Row]:
             number, sequence, log_time, publish_time = message(data, at + 9)
             channel = series.get(number)
             if channel is None:
-                raise ValueError(f"a message is of channel {number}, which is not declared")
+                raise ValueError(f"a message is on the undeclared channel {number}")
             channel.sequence = sequence
             yield channel, log_time, publish_time, data[at + _TO_PAYLOAD : after]
         elif opcode in (SCHEMA, CHANNEL):
-            tables.learn(opcode, data[at + 9 : after])
+            tables.add(opcode, data[at + 9 : after])
         at = after
 
 
 def model_attachment_name(robot: str, version: str) -> str:
-    """The name in a log of a model set."""
+    """Return the name of a model set's attachment in a log."""
     return f"model/{robot}/{version}.safetensors"

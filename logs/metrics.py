@@ -1,7 +1,7 @@
-"""The figures of a run, kept up to date message by message: the live display and `analyse` share them.
+"""Compute the figures of a run message by message, for the live display and for `analyse`.
 
-Sums are kept per actor and joined in the order of the actors' names, so that the same messages give the same figures to
-the last bit, however those of different actors were interleaved.
+Each actor has sums of its own, which are merged in the order of the actors' names. So the same messages give the same
+figures to the last bit, however the messages of different actors are interleaved.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from typing import Any, TypeVar
 from google.protobuf.message import Message
 
 from brakeline.logs import tube_stats
-from brakeline.logs.decision_stats import DecisionStats, joined
+from brakeline.logs.decision_stats import DecisionStats, merge_decisions
 from brakeline.logs.episode_stats import KINDS, EpisodeStats, Figures, closed_loop
 from brakeline.logs.quantiles import QuantileSketch, spread
 from brakeline.logs.recorded_robots import RecordedRobots
@@ -29,25 +29,25 @@ V = TypeVar("V")
 
 __all__ = ["KINDS", "EpisodeStats", "Figures", "Metrics", "closed_loop", "spread"]
 
-MOST_STREAMS = 20_000  # what would be one more is nobody's
-MOST_NAMES = 4_000  # of actors, learners, processes; an actor's histograms take 10 kB and more
+MOST_STREAMS = 20_000  # keys and process starts; a message beyond them is rejected
+MOST_NAMES = 4_000  # actors, learners or processes; the sketches of one actor take 10 kB and more
 LEVELS = ("DEBUG", "INFO", "WARNING", "ERROR")
-SILENT = HEALTH.stale_after or 3.0  # s without a sign of life after which a process counts as gone
+SILENT = HEALTH.stale_after or 3.0  # s without a Health message after which a process counts as silent
 
 
 class Crowded(ValueError):
-    """More publishers, actors or processes than any run has."""
+    """The run has too many publishers, actors or processes."""
 
 
 @dataclass(slots=True)
 class PublisherStream:
-    """One publisher's messages at one key: the gaps in their numbers are losses."""
+    """Counts of one publisher's messages at one key; gaps in the sequence numbers are losses."""
 
     received: int = 0
     duplicates: int = 0
-    published: int = 0  # the most that is known of, by the last number or by its process's Health
+    published: int = 0  # largest count known from a sequence number or from the process's Health
     last: int = 0
-    first_at: int = 0  # ns since the Unix epoch, published
+    first_at: int = 0  # ns since the Unix epoch, of publication
     last_at: int = 0
 
     @property
@@ -57,54 +57,72 @@ class PublisherStream:
 
 @dataclass
 class ProcessFigures:
-    """What a process last said of itself, and how regularly it spoke."""
+    """The latest Health message of a process, and the gaps between its messages.
+
+    Attributes:
+        alive: the process has not announced its end.
+        silences: how often no Health message came for `SILENT` seconds.
+        longest_silence: s.
+        runs: the starts of the process.
+        last_health_at: ns since the Unix epoch.
+    """
 
     starts: int = 0
     run: int = 0
-    alive: bool = True  # it has not said goodbye
+    alive: bool = True
     figures: dict[str, float] = field(default_factory=dict)
     notes: dict[str, str] = field(default_factory=dict)
-    silences: int = 0  # times that it was not heard of for `SILENT` seconds while it lived
-    longest_silence: float = 0.0  # s
+    silences: int = 0
+    longest_silence: float = 0.0
     runs: set[int] = field(default_factory=set)
-    heard_at: int = 0  # ns since the Unix epoch
+    last_health_at: int = 0
 
 
 class Metrics:
-    """Takes messages one by one, in the order in which each publisher sent them; `figures` is what they come to, in
-    memory that is bounded whatever they say.
+    """Computes figures from messages in bounded memory. Add each publisher's messages in their order.
 
-    `topics` are those of which it is given every message: of these, what a process says it published and what never
-    came is missing. robots: those that the messages name.
+    Attributes:
+        actors, decisions, plans: statistics by actor.
+        streams: counts by key and start of the process.
+        learners: the latest metrics by robot.
+        processes: by name.
+        log_lines: counts by level.
     """
 
     def __init__(self, topics: Iterable[Topic] = RECORDED, robots: RecordedRobots | None = None) -> None:
+        """Create empty statistics.
+
+        Args:
+            topics: the topics whose messages are all added. For these, a message that a process has published and that
+                was not added counts as missing.
+            robots: the robots that messages name.
+        """
         self._robots = robots or RecordedRobots()
         self.actors: dict[str, EpisodeStats] = {}
-        self.decisions: dict[str, DecisionStats] = {}  # by actor
-        self.plans: dict[str, TubeStats] = {}  # by actor
-        self.streams: dict[tuple[str, int], PublisherStream] = {}  # by key and start of the process
-        self.learners: dict[str, pb.LearnerMetrics] = {}  # the latest, by robot
+        self.decisions: dict[str, DecisionStats] = {}
+        self.plans: dict[str, TubeStats] = {}
+        self.streams: dict[tuple[str, int], PublisherStream] = {}
+        self.learners: dict[str, pb.LearnerMetrics] = {}
         self.processes: dict[str, ProcessFigures] = {}
-        self.log_lines: Counter[str] = Counter()  # by level
+        self.log_lines: Counter[str] = Counter()
         self._roots = {topic.key.split("/", 1)[0] for topic in topics}
-        self._takers: dict[type[Message], Callable[[Any], None]] = {
+        self._handlers: dict[type[Message], Callable[[Any], None]] = {
             pb.Step: self._step,
             pb.Exchange: self._exchange,
-            pb.LearnerMetrics: self._learner,
+            pb.LearnerMetrics: self._add_learner,
             pb.Health: self._health,
             pb.LogLine: self._log_line,
         }
 
     def add(self, key: str, message: Any) -> bool:
-        """Take a message that was published at `key`; False: it came before, and is only counted as a duplicate.
+        """Add a message that was published at `key`; return False for a duplicate, which is only counted.
 
         Raises:
-            Crowded: it is of somebody who is one too many.
+            Crowded: the message is from a new publisher, actor or process, and there are too many.
         """
         header: pb.Header = message.header
         sequence, place = header.sequence, (key, header.run)
-        stream = self.streams.get(place) or _entered(self.streams, place, PublisherStream)
+        stream = self.streams.get(place) or _get_or_create(self.streams, place, PublisherStream)
         if sequence and sequence <= stream.last:
             stream.duplicates += 1
             return False
@@ -115,34 +133,37 @@ class Metrics:
         stream.last_at = header.wall_time
         if not stream.first_at:
             stream.first_at = stream.last_at
-        taker = self._takers.get(type(message))
-        if taker is not None:
-            taker(message)
+        handler = self._handlers.get(type(message))
+        if handler is not None:
+            handler(message)
         return True
 
     @property
     def failures(self) -> Counter[str]:
-        """Exchanges without a decision, by reason."""
+        """Return the number of exchanges without a decision, by reason."""
         return sum((decisions.failures for decisions in self.decisions.copy().values()), Counter())
 
     def figures(self) -> Figures:
-        """All figures; None where nothing was measured."""
-        return together({"": self})
+        """Return all figures; None for what was not measured."""
+        return merge_runs({"": self})
 
     def seconds(self, topic: Topic | None = None) -> float:
-        """How long at least one process was heard of (of the topic: from its first to its last message); a pause before
-        a run was resumed does not count."""
+        """Return for how long at least one process published messages [s], without the pause before a resumption.
+
+        Args:
+            topic: count only the messages of this topic.
+        """
         root = "" if topic is None else topic.key.partition("/")[0] + "/"
         streams = {place: stream for place, stream in self.streams.items() if place[0].startswith(root)}
         return covered(self.spans(streams).values())
 
     def latency(self) -> dict[str, dict[str, QuantileSketch]]:
-        """By kind of decision and part of the time, in ms."""
-        every = joined([self.decisions[name] for name in sorted(self.decisions)])
-        return {KINDS[kind]: parts for kind, parts in every.latency.items()}
+        """Return the latency [ms] by kind of decision and by part."""
+        total = merge_decisions([self.decisions[name] for name in sorted(self.decisions)])
+        return {KINDS[kind]: parts for kind, parts in total.latency.items()}
 
     def topics(self) -> dict[str, dict[str, int]]:
-        """Per key: `messages` received, `missing` ones (gaps in the numbers, or never come) and `duplicates`."""
+        """Return the counts of received `messages`, `missing` messages and `duplicates`, by key."""
         totals: dict[str, dict[str, int]] = {}
         for key, _ in sorted(self.streams):
             totals[key] = {"messages": 0, "missing": 0, "duplicates": 0}
@@ -154,7 +175,7 @@ class Metrics:
 
     @staticmethod
     def spans(streams: dict[tuple[str, int], PublisherStream]) -> dict[int, tuple[int, int]]:
-        """When each start of a process was first and last heard of, in ns."""
+        """Return the times of the first and the last message of each start of a process, ns."""
         spans: dict[int, tuple[int, int]] = {}
         for (_, run), stream in streams.items():
             if stream.received:
@@ -163,18 +184,18 @@ class Metrics:
         return spans
 
     def process(self, name: str) -> Figures:
-        """The figures of a process; how it ended is seen from the last message of all."""
+        """Return the figures of a process. It counts as silent relative to the last message of all processes."""
         process = self.processes[name]
         spans = self.spans(self.streams)
         seconds = math.fsum((spans[run][1] - spans[run][0]) * 1e-9 for run in process.runs if run in spans)
         messages = sum(stream.received for (_, run), stream in self.streams.items() if run in process.runs)
         latest = max((last for _, last in spans.values()), default=0)
-        silent = (latest - process.heard_at) * 1e-9 > SILENT
+        silent = (latest - process.last_health_at) * 1e-9 > SILENT
         return {
             "starts": process.starts,
             "run": process.run,
             "alive": process.alive,
-            "ended": "in order" if not process.alive else "without a word" if silent else "lived at the log's end",
+            "ended": "in order" if not process.alive else "silently" if silent else "alive at the end of the log",
             "seconds": seconds,
             "messages": messages,
             "messages_per_s": messages / seconds if seconds > 0.0 else None,
@@ -185,34 +206,34 @@ class Metrics:
         }
 
     def _stream(self, key: str, run: int) -> PublisherStream:
-        return _entered(self.streams, (key, run), PublisherStream)
+        return _get_or_create(self.streams, (key, run), PublisherStream)
 
     def _step(self, step: pb.Step) -> None:
         name = step.actor
-        tally = self.actors.get(name) or _entered(self.actors, name, EpisodeStats)
-        tally.step(step)
+        stats = self.actors.get(name) or _get_or_create(self.actors, name, EpisodeStats)
+        stats.step(step)
 
     def _exchange(self, exchange: pb.Exchange) -> None:
         name = exchange.request.actor
-        decisions = self.decisions.get(name) or _entered(self.decisions, name, DecisionStats)
+        decisions = self.decisions.get(name) or _get_or_create(self.decisions, name, DecisionStats)
         decisions.exchange(exchange)
-        (self.plans.get(name) or _entered(self.plans, name, partial(TubeStats, self._robots))).exchange(exchange)
+        (self.plans.get(name) or _get_or_create(self.plans, name, partial(TubeStats, self._robots))).exchange(exchange)
 
-    def _learner(self, metrics: pb.LearnerMetrics) -> None:
+    def _add_learner(self, metrics: pb.LearnerMetrics) -> None:
         name = metrics.robot
-        _entered(self.learners, name, pb.LearnerMetrics)
+        _get_or_create(self.learners, name, pb.LearnerMetrics)
         self.learners[name] = metrics
 
     def _health(self, health: pb.Health) -> None:
-        process = _entered(self.processes, health.process, ProcessFigures)
+        process = _get_or_create(self.processes, health.process, ProcessFigures)
         now = health.header.wall_time
         if health.header.run == process.run:
-            silence = (now - process.heard_at) * 1e-9
+            silence = (now - process.last_health_at) * 1e-9
             process.silences += silence > SILENT
             process.longest_silence = max(process.longest_silence, silence)
         else:
             process.starts += 1
-        process.run, process.heard_at = health.header.run, now
+        process.run, process.last_health_at = health.header.run, now
         if len(process.runs) < MOST_STREAMS:
             process.runs.add(process.run)
         process.alive = not health.last
@@ -226,26 +247,26 @@ class Metrics:
         self.log_lines[line.level if line.level in LEVELS else "other"] += 1
 
 
-def _entered(table: dict[K, V], name: K, make: Callable[[], V]) -> V:
-    """What the table has under the name, made anew if it is the first time. Raises Crowded."""
+def _get_or_create(table: dict[K, V], name: K, make: Callable[[], V]) -> V:
+    """Return the entry of a name; create it for a new name. Raises Crowded."""
     if name not in table:
         most = MOST_STREAMS if make is PublisherStream else MOST_NAMES
         if len(table) >= most:
-            raise Crowded(f"{name} is one more than {most}")
+            raise Crowded(f"{name} is rejected: there are already {most}")
         table[name] = make()
     return table[name]
 
 
-def together(runs: Mapping[str, Metrics]) -> Figures:
-    """The figures of runs, by the prefix that tells apart the names of their actors, learners and processes.
+def merge_runs(runs: Mapping[str, Metrics]) -> Figures:
+    """Merge the figures of runs.
 
-    Counts and histograms are those of all; each process is seen against its own run, so that who ended with an earlier
-    one is not missed.
+    Args:
+        runs: by the prefix that distinguishes the names of their actors, learners and processes.
     """
-    actors = {prefix + name: tally for prefix, run in runs.items() for name, tally in run.actors.items()}
+    actors = {prefix + name: stats for prefix, run in runs.items() for name, stats in run.actors.items()}
     names = sorted(actors)
     figures = closed_loop([actors[name] for name in names])
-    robots = sorted({tally.robot for tally in actors.values()})
+    robots = sorted({stats.robot for stats in actors.values()})
     by_robot = {robot: [actors[name] for name in names if actors[name].robot == robot] for robot in robots}
     decisions = {prefix + name: part for prefix, run in runs.items() for name, part in run.decisions.items()}
     learners = {prefix + robot: last for prefix, run in runs.items() for robot, last in run.learners.items()}
@@ -254,10 +275,10 @@ def together(runs: Mapping[str, Metrics]) -> Figures:
         "seconds": seconds,
         "steps_per_s": figures["steps"] / seconds if seconds > 0.0 else None,
         "driven_s": math.fsum(run.seconds(STEP) for run in runs.values()),
-        "robots": {robot: closed_loop(tallies) for robot, tallies in by_robot.items()},
+        "robots": {robot: closed_loop(parts) for robot, parts in by_robot.items()},
         "actors": {name: closed_loop([actors[name]]) for name in names},
         "learners": {robot: learner(learners[robot]) for robot in sorted(learners)},
-        **joined([decisions[name] for name in sorted(decisions)]).figures(),
+        **merge_decisions([decisions[name] for name in sorted(decisions)]).figures(),
         "plans": tube_stats.figures(part for run in runs.values() for part in run.plans.copy().values()),
         "topics": _summed([run.topics() for run in runs.values()]),
         "processes": {
@@ -268,18 +289,18 @@ def together(runs: Mapping[str, Metrics]) -> Figures:
 
 
 def _summed(parts: Iterable[dict[str, dict[str, int]]]) -> dict[str, dict[str, int]]:
-    """Counts by key and name, added up."""
+    """Add counts by key and name."""
     totals: dict[str, dict[str, int]] = {}
     for part in parts:
         for key, counts in part.items():
-            known = totals.setdefault(key, dict.fromkeys(counts, 0))
+            sums = totals.setdefault(key, dict.fromkeys(counts, 0))
             for name, count in counts.items():
-                known[name] += count
+                sums[name] += count
     return dict(sorted(totals.items()))
 
 
 def covered(spans: Iterable[tuple[int, int]]) -> float:
-    """Seconds in the union of spans of ns."""
+    """Return the length of the union of intervals [ns], in s."""
     total, end = 0, 0
     for first, last in sorted(spans):
         total += max(0, last - max(first, end))
@@ -288,6 +309,6 @@ def covered(spans: Iterable[tuple[int, int]]) -> float:
 
 
 def learner(metrics: pb.LearnerMetrics) -> Figures:
-    """A learner's latest figures under the names of the message."""
+    """Return a learner's latest metrics by the names of the message's fields."""
     names = [field.name for field in metrics.DESCRIPTOR.fields if field.name not in ("header", "robot")]
     return {name: getattr(metrics, name) for name in names}

@@ -1,4 +1,4 @@
-"""The steps of a log as episodes, and these as a Minari data set: what other offline learners read."""
+"""Export the episodes of a log as a Minari data set for offline learners."""
 
 from __future__ import annotations
 
@@ -15,28 +15,30 @@ from brakeline.logs.reader import Paths, open_log
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.task import RobotWithTask
 
-BATCH = 100  # episodes that are written at once
-# Per step, besides what Minari knows; `infos` of a data set.
+BATCH = 100  # episodes per write
+# Fields of a step in the `infos` of the data set.
 INFOS = ("penalty", "goal", "collision", "decision", "clearance", "speed", "weights_version")
 
 
 class ExportError(ValueError):
-    """Nothing can be written; the message says why."""
+    """The log cannot be exported."""
 
 
 def nothing_of(robot: RobotWithTask, others: Collection[str]) -> str:
-    """What to say of a log without a step of this robot, and what to give instead."""
+    """Return the error message for a log without a step of this robot."""
     if not others:
-        return f"no step of {robot.name} in the log, nor of any other robot"
+        return f"the log has no step of {robot.name} or of any other robot"
     names = ", ".join(sorted(others))
-    return f"no step of {robot.name} in the log; it has those of {names}: give --robot NAME, or its description's path"
+    return (
+        f"the log has no step of {robot.name}, but steps of {names}: give --robot NAME or the path of its description"
+    )
 
 
 def episodes(paths: Paths, robot: RobotWithTask) -> Iterator[list[pb.Step]]:
-    """Consecutive steps of one episode of one actor, in the order in which they ended.
+    """Yield the consecutive steps of each episode of each actor, in the order of the episodes' ends.
 
-    An episode that is cut off, by the log's end or by a lost step, comes in parts whose last step does not end it.
-    A step that is there twice counts once.
+    A lost step splits an episode into parts; the last step of an incomplete part does not end the episode. Duplicate
+    steps are skipped.
     """
     running: dict[str, list[pb.Step]] = {}
     for record in open_log(paths):
@@ -46,10 +48,10 @@ def episodes(paths: Paths, robot: RobotWithTask) -> Iterator[list[pb.Step]]:
         steps = running.setdefault(step.actor, [])
         if steps:
             last = steps[-1]
-            here, there = (step.episode, step.step), (last.episode, last.step)
-            if step.header.run == last.header.run and here <= there:
+            current, previous = (step.episode, step.step), (last.episode, last.step)
+            if step.header.run == last.header.run and current <= previous:
                 continue
-            if here != (there[0], there[1] + 1) or step.header.run != last.header.run:
+            if current != (previous[0], previous[1] + 1) or step.header.run != last.header.run:
                 yield steps
                 steps = running[step.actor] = []
         steps.append(step)
@@ -61,7 +63,7 @@ def episodes(paths: Paths, robot: RobotWithTask) -> Iterator[list[pb.Step]]:
 
 @dataclass(frozen=True)
 class Written:
-    """A Minari data set."""
+    """A Minari data set on the disk."""
 
     path: Path
     episodes: int
@@ -71,12 +73,13 @@ class Written:
 def to_minari(paths: Paths, robot: RobotWithTask, name: str) -> Written:
     """Write the episodes of a robot kind as the local Minari data set `name`, e.g. "brakeline/ground-v0".
 
-    Actions are those executed, rewards without the penalty; the proposed actions, the penalty and what the filter did
-    are in `infos`. An episode that was cut off ends truncated. It lies under `$MINARI_DATASETS_PATH`, else in
-    ~/.minari/datasets.
+    Actions are the executed ones; rewards have no intervention penalty. `infos` has the proposed actions, the penalty
+    and the decisions. The last step of an incomplete episode is truncated. The data set is in
+    `$MINARI_DATASETS_PATH`, by default ~/.minari/datasets.
 
     Raises:
-        ExportError: there is such a data set, or the log holds no step of this robot; NoLog, NotALog: there is no log.
+        ExportError: the data set exists, or the log has no step of this robot.
+        NoLog, NotALog: as `open_log`.
     """
     import gymnasium
     import minari
@@ -84,7 +87,7 @@ def to_minari(paths: Paths, robot: RobotWithTask, name: str) -> Written:
 
     path = Path(get_dataset_path(name))
     if path.exists():
-        raise ExportError(f"{path} is there already: give another name, e.g. with the next -v<number>")
+        raise ExportError(f"{path} exists already: give another name, e.g. with the next -v<number>")
     about: dict[str, Any] = {
         "observation_space": gymnasium.spaces.Box(-np.inf, np.inf, (robot.task.observation_dim,), np.float32),
         "action_space": gymnasium.spaces.Box(robot.low().astype(np.float32), robot.high().astype(np.float32)),
@@ -94,21 +97,21 @@ def to_minari(paths: Paths, robot: RobotWithTask, name: str) -> Written:
         "code_permalink": "none",
         "description": f"{robot.name}: observation {robot.task.observed}; action {robot.action}",
     }
-    every = episodes(paths, robot)
+    all_episodes = episodes(paths, robot)
     dataset: Any = None
     count = steps = 0
-    while batch := [_buffer(number, episode) for number, episode in enumerate(islice(every, BATCH), count)]:
+    while batch := [_buffer(number, episode) for number, episode in enumerate(islice(all_episodes, BATCH), count)]:
         if dataset is None:
             with warnings.catch_warnings():
-                warnings.simplefilter("ignore", UserWarning)  # it has no environment of Gymnasium's registry
+                warnings.simplefilter("ignore", UserWarning)  # the data set has no registered environment
                 dataset = minari.create_dataset_from_buffers(name, batch, **about)
         else:
             dataset.update_dataset_from_buffer(batch)
         count += len(batch)
         steps += sum(len(buffer.rewards) for buffer in batch)
     if dataset is None:
-        there = {record.message.robot for record in open_log(paths) if record.topic == "step"}
-        raise ExportError(nothing_of(robot, there))
+        others = {record.message.robot for record in open_log(paths) if record.topic == "step"}
+        raise ExportError(nothing_of(robot, others))
     return Written(path, count, steps)
 
 

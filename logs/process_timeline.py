@@ -1,4 +1,4 @@
-"""How the processes of a run fared over its time: when each lived, fell silent, was started again, and complained."""
+"""Compute the timeline of a run's processes: when each was alive, silent or restarted, and its warnings."""
 
 from __future__ import annotations
 
@@ -10,25 +10,25 @@ from brakeline.logs.metrics import SILENT
 from brakeline.messaging import brakeline_pb2 as pb
 
 MOST_LIVES = 500
-MOST_LINES = 200  # log lines kept: the first half of them and the last
+MOST_LINES = 200  # log lines: the first 100 and the last 100
 MOST_BINS = 240
 LEVELS = ("WARNING", "ERROR")
 
 
 @dataclass
 class Life:
-    """A stretch of time in which a process gave a sign of life at least every few seconds."""
+    """A period in which a process sent a Health message at least every `SILENT` seconds."""
 
     process: str
     start: float  # s since the Unix epoch
     end: float
-    run: int = field(repr=False)  # its start
-    goodbye: bool = False  # it ended in order
-    restart: bool = False  # it was started again, not merely heard of again
+    run: int = field(repr=False)  # identifies the start of the process
+    goodbye: bool = False  # the process announced its end
+    restart: bool = False  # the process was started again, not only silent before
 
 
 class ProcessTimeline:
-    """Takes what says how processes fare; steps only as times."""
+    """Collects Health messages, log lines and the times of steps."""
 
     def __init__(self) -> None:
         self.lives: list[Life] = []
@@ -36,7 +36,7 @@ class ProcessTimeline:
         self.last_lines: deque[Figures] = deque(maxlen=MOST_LINES // 2)
         self.begin: float | None = None
         self.width = 1.0  # s of a bin
-        self.steps: dict[int, int] = {}  # taken, by bin
+        self.steps: dict[int, int] = {}  # steps by bin
         self._latest: dict[str, Life] = {}
 
     def health(self, name: str, health: pb.Health) -> None:
@@ -60,12 +60,12 @@ class ProcessTimeline:
                 self.last_lines.append(row)
 
     def step(self, wall_time: int) -> None:
-        """A step was published at that time, in ns."""
+        """Count a step that was published at this time, ns."""
         now = wall_time * 1e-9
         if self.begin is None:
             self.begin = now
-        place = int((now - self.begin) / self.width)
-        self.steps[place] = self.steps.get(place, 0) + 1
+        number = int((now - self.begin) / self.width)
+        self.steps[number] = self.steps.get(number, 0) + 1
         if len(self.steps) > MOST_BINS:
             self.width *= 2.0
             coarse: dict[int, int] = {}
@@ -74,7 +74,7 @@ class ProcessTimeline:
             self.steps = coarse
 
     def figures(self) -> Figures:
-        """Times in s since the Unix epoch; `steps`: (beginning of the bin, steps per second)."""
+        """Return the timeline; times in s since the Unix epoch; `steps`: (start of the bin, steps per second)."""
         begin = self.begin or 0.0
         return {
             "lives": [{name: value for name, value in asdict(life).items() if name != "run"} for life in self.lives],

@@ -1,4 +1,8 @@
-"""How far a rate can be trusted: intervals at 95 % confidence."""
+"""Compute confidence intervals of rates, at 95 %.
+
+Why not `scipy.stats.binomtest(...).proportion_ci()`: it takes 5 ms for each interval and importing `scipy.stats` takes
+up to 3 s; the inverse beta function of `scipy.special`, which it uses too, takes 5 µs. The tests compare both.
+"""
 
 from __future__ import annotations
 
@@ -7,17 +11,17 @@ import math
 Interval = tuple[float, float]
 
 CONFIDENCE = 0.95
-_Z = 1.959963984540054  # of the normal distribution, for CONFIDENCE
+_Z = 1.959963984540054  # 97.5 % quantile of the standard normal distribution
 
 
 def clopper_pearson(count: int, of: int) -> Interval | None:
-    """The exact interval of a probability that showed itself `count` times in `of` independent trials.
+    """Return the exact interval of a probability, after `count` successes in `of` independent trials.
 
-    Never shorter than it claims: with 0 of n, the upper end is 1 - 0.025^(1/n). None without a trial.
+    Its coverage is at least 95 %; with 0 of n, the upper end is 1 - 0.025^(1/n). None without a trial.
     """
     if of <= 0:
         return None
-    from scipy.special import betaincinv  # a third of a second: a launcher needs it at its end
+    from scipy.special import betaincinv  # imported late: a third of a second that a launcher needs only at its end
 
     tail = (1.0 - CONFIDENCE) / 2.0
     low = 0.0 if count == 0 else float(betaincinv(count, of - count + 1, tail))
@@ -26,8 +30,10 @@ def clopper_pearson(count: int, of: int) -> Interval | None:
 
 
 def poisson(count: int, of: int) -> Interval | None:
-    """The exact interval (Garwood's) of how often something happens in a trial, that happened `count` times in `of`
-    trials, and may happen several times in one. None without a trial."""
+    """Return Garwood's exact interval of the mean number of events per trial, after `count` events in `of` trials.
+
+    One trial may have several events. None without a trial.
+    """
     if of <= 0:
         return None
     from scipy.special import gammaincinv
@@ -38,10 +44,10 @@ def poisson(count: int, of: int) -> Interval | None:
 
 
 class ClusteredProportion:
-    """The interval of a share of steps, when the steps of one episode resemble each other.
+    """Interval of a fraction of steps when the steps of one episode are correlated.
 
-    With x_e of n_e steps in episode e, r = Σx / Σn has about the variance E/(E-1) Σ(x_e - r n_e)² / (Σn)²: that of a
-    ratio of sums over episodes, which are independent where steps are not. Three sums are enough.
+    With x_e of n_e steps in episode e = 1..E, the ratio estimator r = Σx / Σn has approximately the variance
+    E/(E-1) Σ(x_e - r n_e)² / (Σn)². Episodes are independent; steps are not.
     """
 
     def __init__(self) -> None:
@@ -49,7 +55,7 @@ class ClusteredProportion:
         self.xx = self.xn = self.nn = 0
 
     def add(self, hits: int, trials: int) -> None:
-        """Take an episode."""
+        """Add an episode."""
         self.clusters += 1
         self.hits += hits
         self.trials += trials
@@ -58,12 +64,12 @@ class ClusteredProportion:
         self.nn += trials * trials
 
     def join(self, other: ClusteredProportion) -> None:
-        """Take all episodes of another."""
+        """Add all episodes of another."""
         for name in ("clusters", "hits", "trials", "xx", "xn", "nn"):
             setattr(self, name, getattr(self, name) + getattr(other, name))
 
     def interval(self) -> Interval | None:
-        """None with fewer than two episodes; within [0, 1]."""
+        """Return the interval, within [0, 1]; None for fewer than two episodes."""
         if self.clusters < 2 or not self.trials:
             return None
         rate = self.hits / self.trials

@@ -1,4 +1,4 @@
-"""Reads the logs of runs back, the damaged ones too: whatever a killed recorder left is given, and what is cut is said.
+"""Read the logs of runs, also damaged ones. The reader returns every intact message and lists the damage.
 
 for record in read("runs/demo"):
     print(record.key, record.message)
@@ -29,7 +29,7 @@ NAMES: dict[str, str] = {topic.key.split("/", 1)[0]: topic.name for topic in TOP
 
 
 class LogError(Exception):
-    """A log cannot be read."""
+    """The log cannot be read."""
 
 
 class NoLog(LogError):
@@ -41,53 +41,60 @@ class NotALog(LogError):
 
 
 class Record(NamedTuple):
-    """One message of a log."""
+    """One message of a log.
 
-    topic: str  # its name in messaging/topics.py, e.g. "step"
-    key: str  # e.g. "step/ground/actor-0"
+    Attributes:
+        topic: the topic's name in messaging/topics.py, e.g. "step".
+        key: e.g. "step/ground/actor-0".
+        log_time: time of receipt, ns since the Unix epoch.
+        publish_time: simulated time if the message has one, otherwise the time of publication, ns.
+    """
+
+    topic: str
+    key: str
     message: Any
-    log_time: int  # ns since the Unix epoch, when it was received
-    publish_time: int  # ns: simulated time if the message has one, else when it was published
+    log_time: int
+    publish_time: int
 
 
 @dataclass(frozen=True)
 class DamagedFile:
-    """A file that is not as it should be: the recorder was killed, its disk was full, or bytes were changed."""
+    """Damage of a file: the recorder was killed, the disk was full, or bytes were changed."""
 
     path: Path
-    lost: int  # bytes that cannot be read; 0: only the summary is missing
+    lost: int  # bytes; 0: only the summary is missing
     reason: str
-    at: int | None = None  # where in the file these bytes are; None: at its end
+    at: int | None = None  # offset of the damage; None: at the end of the file
 
     def __str__(self) -> str:
         if not self.lost:
-            return f"{self.path}: it ends without a summary ({self.reason})"
+            return f"{self.path}: the file has no summary ({self.reason})"
         where = "its end" if self.at is None else f"byte {self.at}"
         return f"{self.path}: {self.lost} bytes at {where} cannot be read ({self.reason})"
 
 
 @dataclass(frozen=True)
 class MissingSegment:
-    """A segment that must have been there: later ones are."""
+    """A missing segment of a run that has later segments."""
 
     path: Path
 
     def __str__(self) -> str:
-        return f"{self.path}: this segment is missing, with all that was recorded in it"
+        return f"{self.path}: this segment is missing"
 
 
 @dataclass
 class Segment:
-    """What was found in a file, once it was read."""
+    """Counts of one file, complete once it has been read."""
 
     path: Path
     size: int  # bytes
     messages: int = 0
-    start: int = 0  # ns since the Unix epoch: first and last time of receipt; 0 without messages
+    start: int = 0  # ns since the Unix epoch, first and last time of receipt; 0 without a message
     end: int = 0
-    recording: bool = False  # somebody writes to it now
+    recording: bool = False  # a recorder is writing to the file
 
-    def took(self, log_time: int) -> None:
+    def count(self, log_time: int) -> None:
         self.messages += 1
         if log_time > self.end:
             self.end = log_time
@@ -98,13 +105,20 @@ class Segment:
 
 @dataclass
 class Log:
-    """The segments of one or more runs, in order. The other attributes fill up while it is iterated over."""
+    """The segments of one or more runs, in order. Iterating over the log fills the other attributes.
+
+    Attributes:
+        metadata: the latest of each name.
+        attachments: the latest of each name, e.g. the model sets at the start of the run.
+        cuts: damage and missing segments.
+        malformed: number of messages that cannot be decoded or have impossible values.
+    """
 
     paths: tuple[Path, ...]
-    metadata: dict[str, dict[str, str]] = field(default_factory=dict)  # the latest of each name
-    attachments: dict[str, bytes] = field(default_factory=dict)  # likewise: the model sets of the run's start
+    metadata: dict[str, dict[str, str]] = field(default_factory=dict)
+    attachments: dict[str, bytes] = field(default_factory=dict)
     cuts: list[DamagedFile | MissingSegment] = field(default_factory=list)
-    malformed: int = 0  # messages that are not of their type, or say what nobody can handle
+    malformed: int = 0
     segments: list[Segment] = field(default_factory=list)
     robots: RecordedRobots = field(default_factory=RecordedRobots)
 
@@ -113,7 +127,7 @@ class Log:
             yield Record(series.topic, series.key, message, log_time, publish_time)
 
     def decoded(self) -> Iterator[tuple[LogChannel, Any, int, int]]:
-        """As iterating, with plain tuples (channel, message, log_time, publish_time): faster."""
+        """Yield (channel, message, log_time, publish_time) for each valid message: faster than iterating."""
         for series, log_time, publish_time, payload in self.rows():
             try:
                 message = series.decode(payload)
@@ -124,24 +138,24 @@ class Log:
             yield series, message, log_time, publish_time
 
     def rows(self) -> Iterator[Row]:
-        """The messages of types that we know as they are stored: (channel, log_time, publish_time, payload)."""
-        self.cuts += absent(self.paths)
+        """Yield (channel, log_time, publish_time, payload) for each message of a known type, without decoding it."""
+        self.cuts += missing_segments(self.paths)
         for path in self.paths:
             yield from self._rows_of(path)
 
     def _rows_of(self, path: Path) -> Iterator[Row]:
-        """The messages of one file, front to back; that needs no summary, so it works for every file."""
-        about = Segment(path, path.stat().st_size, recording=being_written(path))
-        self.segments.append(about)
+        """Yield the messages of one file from front to back, which needs no summary."""
+        segment = Segment(path, path.stat().st_size, recording=being_written(path))
+        self.segments.append(segment)
         try:
             with path.open("rb") as file:
-                for item in records(file, about.size, self._series):
+                for item in records(file, segment.size, self._channel):
                     if type(item) is tuple:
-                        about.took(item[1])
-                        if item[0].known:  # others may have added channels of their own
+                        segment.count(item[1])
+                        if item[0].known:  # other programs may have added channels
                             yield item
                     elif isinstance(item, DamagedBytes):
-                        self._note(about, item)
+                        self._add_damage(segment, item)
                     elif isinstance(item, Metadata):
                         self.metadata[item.name] = dict(item.metadata)
                         if item.name == "robots":
@@ -151,25 +165,25 @@ class Log:
         except NotMcap as error:
             raise NotALog(f"{path} is not an MCAP file: {error}") from error
 
-    def _note(self, about: Segment, damage: DamagedBytes) -> None:
-        reason = "it is being recorded" if about.recording and damage.at_end else damage.reason
-        self.cuts.append(DamagedFile(about.path, damage.lost, reason, None if damage.at_end else damage.at))
+    def _add_damage(self, segment: Segment, damage: DamagedBytes) -> None:
+        reason = "the file is being recorded" if segment.recording and damage.at_end else damage.reason
+        self.cuts.append(DamagedFile(segment.path, damage.lost, reason, None if damage.at_end else damage.at))
 
     @staticmethod
-    def _series(key: str, schema: str) -> LogChannel:
+    def _channel(key: str, schema: str) -> LogChannel:
         kind, root = TYPES.get(schema), key.split("/", 1)[0]
         return LogChannel(NAMES.get(root, root), key, None if kind is None else kind.FromString)
 
 
 def find(paths: Paths) -> tuple[Path, ...]:
-    """The log files meant: all of a folder; for run.mcap its later segments run_0001.mcap … too; else the file itself.
+    """Return the files at `paths`: for a folder all its logs, for run.mcap also its segments run_0001.mcap …
 
     Raises:
-        NoLog: there is none.
+        NoLog: a path has no log.
     """
-    asked = [paths] if isinstance(paths, str | os.PathLike) else list(paths)
-    found: dict[Path, None] = {}
-    for path in map(Path, asked):
+    given = [paths] if isinstance(paths, str | os.PathLike) else list(paths)
+    logs: dict[Path, None] = {}
+    for path in map(Path, given):
         if path.is_dir():
             files = list(path.glob("*.mcap"))
         elif path.is_file():
@@ -180,14 +194,14 @@ def find(paths: Paths) -> tuple[Path, ...]:
             files = []
         if not files:
             raise NoLog(f"no log at {path}: give an .mcap file or the folder of a run")
-        found.update(dict.fromkeys(sorted(files, key=number_of)))
-    return tuple(found)
+        logs.update(dict.fromkeys(sorted(files, key=number_of)))
+    return tuple(logs)
 
 
 def by_run(paths: Sequence[Path]) -> dict[str, tuple[Path, ...]]:
-    """The files that belong to one run, under a name for it: its folder, and the file's name unless that is `run`.
+    """Group files by run, in the order of recording. A resumed or restarted run has several files.
 
-    A resumed or restarted run has several files; they come in the order in which they were recorded.
+    The label of a run is its folder, with the file's name unless that is `run`.
     """
     runs: dict[str, tuple[Path, ...]] = {}
     for (folder, name), files in groupby(paths, key=lambda path: (path.parent, number_of(path)[0])):
@@ -198,27 +212,27 @@ def by_run(paths: Sequence[Path]) -> dict[str, tuple[Path, ...]]:
     return runs
 
 
-def absent(paths: Sequence[Path]) -> list[DamagedFile | MissingSegment]:
-    """The segments that are missing between those at `paths`: numbers that were left out."""
-    found: list[DamagedFile | MissingSegment] = []
+def missing_segments(paths: Sequence[Path]) -> list[DamagedFile | MissingSegment]:
+    """Return the missing segments: gaps in the numbers of the segments at `paths`."""
+    missing: list[DamagedFile | MissingSegment] = []
     for (folder, name), files in groupby(paths, key=lambda path: (path.parent, number_of(path)[0])):
         numbers = [number_of(path)[1] for path in files]
         if len(numbers) > 1:
             gone = sorted(set(range(numbers[-1])) - set(numbers))
-            found += [MissingSegment(folder / name_of(f"{name}.mcap", number)) for number in gone]
-    return found
+            missing += [MissingSegment(folder / name_of(f"{name}.mcap", number)) for number in gone]
+    return missing
 
 
 def open_log(paths: Paths) -> Log:
-    """The log at `paths`, one or many files or folders, to iterate over.
+    """Open the logs at `paths`, one or more files or folders.
 
     Raises:
-        NoLog: there is none.
-        NotALog: while iterating: a file is something else.
+        NoLog: a path has no log.
+        NotALog: while iterating, if a file is not an MCAP file.
     """
     return Log(find(paths))
 
 
 def read(paths: Paths) -> Iterator[Record]:
-    """The messages of the log at `paths`, in the order in which they were recorded; as `open_log` where it fails."""
+    """Yield the messages of the logs at `paths` in the order of recording. Raises as `open_log`."""
     yield from open_log(paths)

@@ -1,4 +1,4 @@
-"""The robots that the messages of one log, or one run, name."""
+"""Look up the robots that the messages of a log or a run name."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ log = logging.getLogger("brakeline.logs")
 
 
 class RecordedRobots:
-    """Robots by name: those that the log describes, and those that come with the program, with their usual tasks."""
+    """Robots by name: those that the log describes and those that come with the program, with their default tasks."""
 
     def __init__(self, robots: Iterable[Robot] = ()) -> None:
         self._robots = {robot.name: robot for robot in robots}
 
     def describe(self, descriptions: Mapping[str, str]) -> None:
-        """Add the robots that a log's metadata describe; warn of a description that cannot be read, and go on."""
+        """Add the robots that a log's metadata describe. A malformed description is skipped with a warning."""
         for name, text in descriptions.items():
             try:
                 robot = refuse_shipped_name(robot_from_description(json.loads(text), f"the log's {name}"))
@@ -31,12 +31,12 @@ class RecordedRobots:
                 self._robots.setdefault(robot.name, robot)
 
     def named(self, name: str) -> Robot | None:
-        """The robot of that name, or None. It reads no path: names come from messages."""
-        if name not in self._robots and (robot := self._found(name)) is not None:
+        """Return the robot with this name, or None. A name comes from a message, so it is never used as a path."""
+        if name not in self._robots and (robot := self._lookup(name)) is not None:
             self._robots[name] = robot
         return self._robots.get(name)
 
-    def _found(self, name: str) -> Robot | None:
+    def _lookup(self, name: str) -> Robot | None:
         base = name.removesuffix(REAL_TIME_SUFFIX)
         robot = self._robots.get(base)
         if robot is None and base in shipped_robots():

@@ -1,8 +1,8 @@
-"""PROCESS: stores every recorded topic, as the bytes that came from the wire, in the run's MCAP log.
+"""PROCESS: record every recorded topic in the run's MCAP log, as the bytes from the wire.
 
-Subscribers only put samples into an inbox; one thread empties it into the file twice a second. So a `kill -9` loses
-less than a second. While the disk is full the inbox fills up; what no longer fits is counted as dropped, and said.
-A file that has grown large or old is finished, and the log goes on in the next.
+Subscribers only put samples into an inbox; one thread writes the inbox to the file twice a second. So `kill -9` loses
+less than a second. While the disk is full, the inbox grows up to its limit; the recorder counts and reports the samples
+that it drops. When a file is large or old, the recorder finishes it and continues in the next one.
 """
 
 from __future__ import annotations
@@ -25,64 +25,77 @@ from brakeline.messaging.topics import RECORDED
 log = logging.getLogger("brakeline.recorder")
 
 PERIOD = 0.5  # s between flushes
-RETRY = 1.0  # s between attempts to write on a disk that is full
-QUIET = 0.3  # s without a message after which a recorder that was asked to stop has seen the last one
-PATIENCE = 3.0  # s that it waits for this at most
+RETRY = 1.0  # s between attempts to write to a full disk
+QUIET = 0.3  # s without a message after which a stopping recorder ends
+PATIENCE = 3.0  # s that a stopping recorder waits for this at most
 INBOX = 64 * 2**20  # bytes
-AROUND = 100  # bytes of a sample besides its payload
-PORTION = 2**20  # bytes saved at once: what fits on a nearly full disk is saved
-HURRY = 2.0  # s of one flush after which the messages that are left are saved as they came, without pictures
+OVERHEAD = 100  # bytes of a sample besides its payload
+BATCH = 2**20  # bytes per write, so that a nearly full disk still takes what fits
+MOST_DRAWING = 2.0  # s of one flush after which the remaining messages are recorded without scenes
 
 Open = Callable[[Path, Metadata], Segment]
-Derive = Callable[[Sample], Iterable[Entry]]  # what is stored of a sample besides itself: Foxglove's pictures
+Derive = Callable[[Sample], Iterable[Entry]]  # additional entries for a sample, e.g. Foxglove's scenes
 
 
-def weight(sample: Sample) -> int:
-    """Bytes that a sample takes in memory, at least: an empty one counts too."""
-    return AROUND + len(sample.payload)
+def size_in_memory(sample: Sample) -> int:
+    """Return a lower bound on the memory of a sample, bytes; an empty sample counts too."""
+    return OVERHEAD + len(sample.payload)
 
 
 class Inbox:
-    """Samples that are not in the file yet, at most `limit` bytes of them."""
+    """Samples that are not in the file yet.
+
+    Attributes:
+        limit: bytes.
+        bytes: of the waiting samples.
+        dropped: number of dropped samples by key.
+    """
 
     def __init__(self, limit: int = INBOX) -> None:
         self.limit = limit
-        self.dropped: Counter[str] = Counter()  # per key
+        self.dropped: Counter[str] = Counter()
         self.bytes = 0
         self._samples: deque[Sample] = deque()
         self._lock = threading.Lock()
 
     def put(self, sample: Sample) -> None:
-        """Take the sample, or count it as dropped."""
+        """Add the sample, or count it as dropped."""
         with self._lock:
-            if self.bytes + weight(sample) > self.limit:
+            if self.bytes + size_in_memory(sample) > self.limit:
                 self.dropped[sample.key] += 1
             else:
-                self.bytes += weight(sample)
+                self.bytes += size_in_memory(sample)
                 self._samples.append(sample)
 
-    def portion(self, size: int = PORTION) -> list[Sample]:
-        """The oldest samples, about `size` bytes of them; they stay until `forget`."""
-        taken: list[Sample] = []
+    def oldest(self, size: int = BATCH) -> list[Sample]:
+        """Return the oldest samples, about `size` bytes; they stay in the inbox until `remove`."""
+        batch: list[Sample] = []
         total = 0
         with self._lock:
             for sample in self._samples:
-                if taken and total + weight(sample) > size:
+                if batch and total + size_in_memory(sample) > size:
                     break
-                taken.append(sample)
-                total += weight(sample)
-        return taken
+                batch.append(sample)
+                total += size_in_memory(sample)
+        return batch
 
-    def forget(self, samples: list[Sample]) -> None:
-        """Remove what `portion` gave: it is saved."""
+    def remove(self, samples: list[Sample]) -> None:
+        """Remove the samples that `oldest` returned: they are in the file."""
         with self._lock:
             for sample in samples:
                 self._samples.popleft()
-                self.bytes -= weight(sample)
+                self.bytes -= size_in_memory(sample)
 
 
 class Recording:
-    """Empties an inbox into the segments of a run, on a disk that may fill up. For one thread."""
+    """Writes an inbox to the segments of a run, on a disk that may fill up. Use it from one thread only.
+
+    Attributes:
+        recorded: number of messages in the files, by key.
+        undrawn: number of messages without scenes, because drawing took too long.
+        failure: why the recorder cannot write now; empty if it can.
+        path: of the latest segment.
+    """
 
     def __init__(
         self,
@@ -94,36 +107,38 @@ class Recording:
         rotation: Rotation | None = None,
         rejected: RejectedMessages | None = None,
     ) -> None:
-        self.recorded: Counter[str] = Counter()  # messages in the files, per key
-        self.failure = ""  # why nothing can be written at present
-        self.path: Path | None = None  # of the latest segment
+        self.recorded: Counter[str] = Counter()
+        self.failure = ""
+        self.path: Path | None = None
         self._run, self._metadata, self._inbox, self._open = run, metadata, inbox, open_one
         self._derive = derive or (lambda sample: ())
         self._rotation = rotation or Rotation()
         self._rejected = rejected or RejectedMessages()
         self._segment: Segment | None = None
-        self._begun_at = 0.0
+        self._opened_at = 0.0
         self._retry_at = 0.0
-        self._complained_of = 0
-        self.undrawn = 0  # messages of which nothing was derived: it would have taken too long
+        self._reported_drops = 0
+        self.undrawn = 0
         self._flush_began = 0.0
 
     def save(self) -> None:
-        """Bring what is in the inbox now to the operating system; what can't be written stays there."""
-        self._complain_of_drops()
+        """Write the inbox to the file and flush it; what cannot be written stays in the inbox."""
+        self._report_drops()
         self._flush_began = time.monotonic()
         if time.monotonic() < self._retry_at:
             return
         try:
-            segment = self._begun()
+            segment = self._current_segment()
             waiting = self._inbox.bytes
-            while waiting > 0 and (portion := self._inbox.portion()):
-                left_out = segment.save([item for sample in portion for item in self._entries(sample)])
+            while waiting > 0 and (batch := self._inbox.oldest()):
+                left_out = segment.save([item for sample in batch for item in self._entries(sample)])
                 if left_out:
-                    self._rejected.reject(portion[-1].key, ValueError(f"{left_out} messages of one channel too many"))
-                waiting -= sum(weight(sample) for sample in portion)
-                self._inbox.forget(portion)
-                self.recorded.update(sample.key for sample in portion)
+                    self._rejected.reject(
+                        batch[-1].key, ValueError(f"{left_out} messages on channels beyond the limit of a file")
+                    )
+                waiting -= sum(size_in_memory(sample) for sample in batch)
+                self._inbox.remove(batch)
+                self.recorded.update(sample.key for sample in batch)
                 segment = self._rotated(segment)
             self._rotated(segment)
         except OSError as error:
@@ -132,7 +147,7 @@ class Recording:
             self.failure = ""
 
     def finish(self) -> None:
-        """Save what is left, try hard, and close the file with its summary."""
+        """Write the rest of the inbox and close the file with its summary."""
         self._retry_at = 0.0
         self.save()
         self._close(sync=True)
@@ -140,44 +155,44 @@ class Recording:
             log.error("%d bytes of messages could not be recorded: %s", self._inbox.bytes, self.failure)
 
     def _entries(self, sample: Sample) -> list[Entry]:
-        """The sample, whatever it holds, and what is made of it, if there is time."""
+        """Return the entries of a sample: itself, also if it is malformed, and what `derive` adds."""
         try:
-            if time.monotonic() - self._flush_began > HURRY:
-                self._leave_out()
+            if time.monotonic() - self._flush_began > MOST_DRAWING:
+                self._count_undrawn()
                 return [entry(sample)]
             return [entry(sample), *self._derive(sample)]
         except Exception as error:  # its bytes are kept all the same
             self._rejected.reject(sample.key, error)
-            return [as_it_came(sample)]
+            return [malformed_entry(sample)]
 
-    def _leave_out(self) -> None:
+    def _count_undrawn(self) -> None:
         if not self.undrawn:
-            log.warning("messages come faster than they can be drawn: some are recorded without pictures")
+            log.warning("messages arrive faster than they can be drawn: some are recorded without scenes")
         self.undrawn += 1
 
-    def _begun(self) -> Segment:
-        """The file to write to, a new one if there is none. Raises OSError."""
+    def _current_segment(self) -> Segment:
+        """Return the file to write to; open a new one if needed. Raises OSError."""
         if self._segment is None:
-            self._segment, self._begun_at = self._open(self._run, self._metadata), time.monotonic()
+            self._segment, self._opened_at = self._open(self._run, self._metadata), time.monotonic()
             self.path = self._segment.path
             log.log(logging.WARNING if self.failure else logging.INFO, "recording to %s", self.path)
         return self._segment
 
     def _rotated(self, segment: Segment) -> Segment:
-        """The file to go on with: the next one, if this one has had enough. Raises OSError."""
-        if not self._rotation.due(segment, time.monotonic() - self._begun_at):
+        """Return the file to continue with: a new one if rotation is due. Raises OSError."""
+        if not self._rotation.due(segment, time.monotonic() - self._opened_at):
             return segment
         self._close()
-        return self._begun()
+        return self._current_segment()
 
     def _close(self, sync: bool = False) -> None:
-        """Finish the file, if there is one."""
+        """Finish the open file, if there is one."""
         segment, self._segment = self._segment, None
         if segment is not None:
             try:
                 segment.finish(sync)
             except OSError as error:
-                log.error("no summary for %s: %s; `analyse` reads it all the same", segment.path, error)
+                log.error("no summary for %s: %s; `brakeline analyse` reads the file nevertheless", segment.path, error)
 
     def _fail(self, error: OSError) -> None:
         self._retry_at = time.monotonic() + RETRY
@@ -188,22 +203,22 @@ class Recording:
             self._segment.abandon()
             self._segment = None
 
-    def _complain_of_drops(self) -> None:
+    def _report_drops(self) -> None:
         dropped = self._inbox.dropped.total()
-        if dropped > self._complained_of:
+        if dropped > self._reported_drops:
             log.error("%d messages were dropped so far: %s", dropped, self.failure or "too many to write")
-            self._complained_of = dropped
+            self._reported_drops = dropped
 
 
 def entry(sample: Sample) -> Entry:
-    """A sample as it is stored. Raises Malformed."""
+    """Return a sample's entry. Raises Malformed."""
     header = sample.message().header
     publish_time = round(header.time * 1e9) if header.time > 0.0 else header.wall_time
     return Entry(sample.key, sample.topic.message, sample.payload, sample.received, publish_time, header.sequence)
 
 
-def as_it_came(sample: Sample) -> Entry:
-    """A sample that cannot be understood, published when it was received."""
+def malformed_entry(sample: Sample) -> Entry:
+    """Return the entry of a malformed sample; its time of publication is the time of receipt."""
     return Entry(sample.key, sample.topic.message, sample.payload, sample.received, sample.received, 0)
 
 
@@ -215,10 +230,10 @@ def record(
     derive: Derive | None = None,
     rotation: Rotation | None = None,
 ) -> Recording:
-    """Record until `process.stop` is set and nothing more comes. Its Health has the note `file` once it listens.
+    """Record until `process.stop` is set and no more messages arrive.
 
-    Health figures: `recorded`, `dropped` and `undrawn` messages, `waiting` bytes, and `recorded <key>` per channel; the
-    note `failure` says why nothing can be written.
+    Health messages have the figures `recorded`, `dropped` and `undrawn` (messages), `waiting` (bytes), `recorded <key>`
+    for each channel, and the notes `file` and `failure` (why the recorder cannot write).
     """
     inbox = Inbox()
     opened = partial(open_segment, attachments=attachments)
@@ -249,7 +264,7 @@ def record(
 
 
 def _until_quiet(inbox: Inbox, recording: Recording) -> None:
-    """Wait for the last messages of those who stopped just before."""
+    """Wait for the last messages of processes that stopped just before."""
     deadline = time.monotonic() + PATIENCE
     while time.monotonic() < deadline:
         recording.save()
@@ -267,7 +282,12 @@ def main(
     derive: Derive | None = None,
     rotation: Rotation | None = None,
 ) -> None:
-    """The recorder's process: `run` is the log's path; metadata, attachments and what `derive` makes of the samples go
-    into each of its files besides the messages."""
+    """Run the recorder process.
+
+    Args:
+        run: path of the log.
+        metadata, attachments: written to each file of the log.
+        derive: returns additional entries for a sample.
+    """
     with Process(settings, source) as process:
         record(process, run, metadata, attachments, derive, rotation)

@@ -1,4 +1,4 @@
-"""What a log says, as figures and as a table."""
+"""Print the figures of a log as tables."""
 
 from __future__ import annotations
 
@@ -19,19 +19,25 @@ BLOCKS = "▁▂▃▄▅▆▇█"
 
 
 def analyse(paths: Paths) -> Figures:
-    """The figures of the logs at `paths`: those of `Metrics` and of `LearningCurve`, how each run was set up (from the
-    metadata in its log; None where it does not tell, or where runs differ), and what of the logs is damaged.
+    """Return the figures of the logs at `paths`: metrics, learning curves, configuration of each run, damage.
+
+    A value of the configuration is None if the log does not have it or if the runs differ.
 
     Raises:
-        NoLog: there is none.
-        NotALog: a file is something else.
+        NoLog: a path has no log.
+        NotALog: a file is not an MCAP file.
     """
     return analyse_runs(paths).figures()
 
 
 def show(figures: Figures, verbose: bool = False) -> RenderableType:
-    """The figures that `analyse`, `Metrics` or `closed_loop` gave, as tables for a rich console. Several runs stand
-    beside each other, and nothing of them is pooled; `verbose`: with all that the log says of its making."""
+    """Format figures of `analyse`, `Metrics` or `closed_loop` as tables for a rich console.
+
+    Several runs are rows of one table; their figures are not pooled.
+
+    Args:
+        verbose: also show the metadata of the log.
+    """
     several = len(figures.get("runs", {})) > 1
     parts: list[RenderableType] = [_runs(figures["runs"]) if several else _summary(figures)]
     if not several:
@@ -48,17 +54,17 @@ def show(figures: Figures, verbose: bool = False) -> RenderableType:
 
 
 def _times(figures: Figures) -> list[RenderableType]:
-    """How long decisions took: by part where the exchanges were recorded."""
+    """Format decision times: by part if the log has the exchanges."""
     if any(part for parts in figures.get("latency_ms", {}).values() for part in parts.values()):
         return [_latency(figures["latency_ms"])]
     return [_decisions(figures["decision_ms"])] if figures.get("decision_ms") else []
 
 
 def show_episode(episode: Figures) -> RenderableType:
-    """One of the `episode_detail` of figures, step by step."""
+    """Format one entry of `episode_detail`, step by step."""
     closest = _optional(", closest approach {:.3f} m", episode["closest"])
     title = (
-        f"{episode['actor']}, episode {episode['episode']} ({episode['arena'] or 'its beginning is in no file'}): "
+        f"{episode['actor']}, episode {episode['episode']} ({episode['arena'] or 'arena not in the log'}): "
         f"{episode['outcome']} after {episode['steps']} steps, reward {episode['reward']:.2f}{closest}"
     )
     table = StackingTable(
@@ -89,21 +95,21 @@ def _summary(figures: Figures) -> Table:
     within = figures.get("intervals") or {}
     setup = [f"{name} {figures[name]}" for name in SETUP if figures.get(name) is not None]
     if setup:
-        table.add_row("set-up", ", ".join(setup))
+        table.add_row("configuration", ", ".join(setup))
     table.add_row("steps", f"{steps}" + _optional(", {:.1f}/s", figures.get("steps_per_s")))
     table.add_row("episodes", f"{episodes}" + _optional(", mean reward {:.2f}", figures["mean_reward"]))
     touched = CONTACTS if figures["fleet"] else CONTACTS[:2]
     for name in ("goals", "collisions", *touched, "timeouts"):
         table.add_row(name.replace("_", " "), _share(figures[name], episodes, within.get(name)))
     interventions = _share(figures["interventions"], steps, within.get("interventions"))
-    table.add_row("interventions", f"{interventions}, of these failsafe {figures['failsafes']}")
+    table.add_row("interventions", f"{interventions}, {figures['failsafes']} of them failsafe")
     table.add_row("adjusted", _share(figures["adjusted"], steps))
     table.add_row("adjusted for clearance", for_clearance(figures))
     table.add_row(
         "speed",
         _optional("{:.3f} m/s", figures["mean_speed"]) + _optional(", at most {:.3f} m/s", figures["max_speed"]),
     )
-    table.add_row("closest approach", _optional("{:.3f} m, to what stands still", figures.get("closest_approach")))
+    table.add_row("closest approach", _optional("{:.3f} m, to fixed obstacles", figures.get("closest_approach")))
     containment = figures["containment"]
     outside = _share(containment["violations"], containment["steps"], within.get("violations"), digits=3)
     table.add_row("outside the predicted set", outside)
@@ -111,7 +117,7 @@ def _summary(figures: Figures) -> Table:
         table.add_row("recovering", _share(figures["recovering"], steps))
     if figures["broken"]:
         table.add_row("obstacles outside their bounds", str(figures["broken"]))
-    table.add_row("outside the measurement's bound", _share(figures["outside"], steps))
+    table.add_row("outside the measurement bound", _share(figures["outside"], steps))
     _add_safety(table, figures)
     for robot, learner in figures.get("learners", {}).items():
         table.add_row(f"learner {robot}", LEARNER.format(**learner))
@@ -119,16 +125,16 @@ def _summary(figures: Figures) -> Table:
 
 
 def for_clearance(figures: Figures) -> str:
-    """How many proposals the filter replaced though it had verified them."""
+    """Describe how many verified proposals the filter replaced to keep the clearance margin."""
     if figures["for_clearance"] is None:
         return "not recorded by this method or version"
-    return f"{figures['for_clearance']} of {figures['adjusted']} adjusted: the proposal itself was verified"
+    return f"{figures['for_clearance']} of {figures['adjusted']} adjusted proposals were verified themselves"
 
 
 def _add_safety(table: Table, figures: Figures) -> None:
-    """What only the exchanges with the safety service tell."""
+    """Add the rows that need the exchanges with the safety service."""
     if figures.get("round_trip_ms"):
-        table.add_row("question to answer", "p50 {p50:.2f} ms, p99 {p99:.2f} ms".format(**figures["round_trip_ms"]))
+        table.add_row("request to reply", "p50 {p50:.2f} ms, p99 {p99:.2f} ms".format(**figures["round_trip_ms"]))
     for reason, count in figures.get("no_decision", {}).items():
         table.add_row("no decision", f"{count}: {reason}")
     if figures.get("tube_half_width"):
@@ -142,8 +148,8 @@ def _add_safety(table: Table, figures: Figures) -> None:
         )
     plans = figures.get("plans") or {}
     if plans.get("flown"):
-        outside = f"outside of their tubes {_share(plans['outside'], plans['flown'])}; {stated(plans)}"
-        table.add_row("verified plans that were gone on along", f"{plans['flown']}, {outside}")
+        outside = f"{_share(plans['outside'], plans['flown'])}; {stated(plans)}"
+        table.add_row("verified plans that were followed", f"{plans['flown']}, left their tube: {outside}")
     if figures.get("unverified"):
         table.add_row("[red]unverified failsafes[/]", str(figures["unverified"]))
     if figures.get("not_finite"):
@@ -152,12 +158,12 @@ def _add_safety(table: Table, figures: Figures) -> None:
 
 LEARNER = (
     "{updates} updates, critic loss {critic_loss:.4g}, actor loss {actor_loss:.4g}, weights v{weights_version}, "
-    "staleness {staleness:.1f}, steps missing {missing}, twice {duplicates}"
+    "staleness {staleness:.1f}, steps missing {missing}, duplicate {duplicates}"
 )
 
 
 def _runs(runs: dict[str, Figures]) -> Table:
-    """One row for each run, where there are several."""
+    """Format one row for each of several runs."""
     columns = (
         "method",
         "certificate",
@@ -193,7 +199,7 @@ def _decisions(times: Figures) -> Table:
 
 
 def _latency(latency: Figures) -> Table:
-    """Where the time of a decision goes, by its kind."""
+    """Format the latency by kind of decision and part."""
     columns = ("mean", "std", "p50", "p90", "p99", "max")
     table = StackingTable("decision [ms]", "part", *columns, **PLAIN)
     for kind, parts in latency.items():
@@ -205,7 +211,7 @@ def _latency(latency: Figures) -> Table:
 
 
 def _training(robot: str, training: Figures) -> Table:
-    """Rates over the training, as rows of characters."""
+    """Format the learning curves as sparklines."""
     bins = _coarse(training["bins"], 60)
     table = StackingTable(f"{robot} over training", "first", "last", "", **PLAIN)
     for label, name in (("interventions", "interventions"), ("goals", "goals"), ("reward", "reward")):
@@ -221,7 +227,7 @@ def _training(robot: str, training: Figures) -> Table:
 
 
 def _coarse(bins: list[Figures], most: int) -> list[Figures]:
-    """Neighbours put together until there are no more than `most`."""
+    """Merge neighbouring bins to at most `most` bins."""
     per = -(-len(bins) // most) or 1
     rows = []
     for start in range(0, len(bins), per):
@@ -245,7 +251,7 @@ def _sparkline(values: list[float]) -> str:
 
 
 def _processes(processes: Figures) -> Table:
-    table = StackingTable("process", "starts", "lived, s", "messages/s", "silences", "ended", **PLAIN)
+    table = StackingTable("process", "starts", "alive, s", "messages/s", "silences", "ended", **PLAIN)
     for name, process in processes.items():
         rate = _optional("{:.1f}", process["messages_per_s"])
         longest = process["longest_silence"]
@@ -263,7 +269,7 @@ def _topics(topics: dict[str, dict[str, int]]) -> Table:
 
 
 def _metadata(metadata: Figures) -> Table:
-    """What the log says of its run; the configuration is long, and left to --json and --html."""
+    """Format the metadata, without the configuration, which is long: --json and --html have it."""
     table = StackingTable("metadata", "", **PLAIN)
     for name, values in metadata.items():
         if name != "configuration" and isinstance(values, dict):
@@ -272,8 +278,8 @@ def _metadata(metadata: Figures) -> Table:
 
 
 def _share(count: int, of: int, within: list[float] | None = None, digits: int = 1) -> str:
-    said = f"{count}" + (f" ({count / of:.{digits}%})" if of else "")
-    return said + (f", 95 %: {within[0]:.{digits}%} to {within[1]:.{digits}%}" if within is not None else "")
+    text = f"{count}" + (f" ({count / of:.{digits}%})" if of else "")
+    return text + (f", 95 %: {within[0]:.{digits}%} to {within[1]:.{digits}%}" if within is not None else "")
 
 
 def _optional(form: str, value: Any) -> str:

@@ -1,4 +1,4 @@
-"""Pictures of a log: how goals, reward and interventions change while a robot learns."""
+"""Plot goals, reward and interventions over a training."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ from matplotlib.figure import Figure
 from brakeline.logs.episode_stats import Figures
 
 
-def _or_gap(name: str) -> Callable[[Figures], float]:
+def _value_or_nan(name: str) -> Callable[[Figures], float]:
     return lambda row: math.nan if row[name] is None else float(row[name])
 
 
 ROWS: tuple[tuple[str, Callable[[Figures], float]], ...] = (
-    ("goals reached", _or_gap("goals")),
-    ("reward of an episode", _or_gap("reward")),
+    ("goals reached", _value_or_nan("goals")),
+    ("reward of an episode", _value_or_nan("reward")),
     ("interventions", lambda row: row["adjusted"] + row["failsafes"]),
 )
 
 
 def draw(training: Figures, png: Path) -> None:
-    """Draw the learning curves of `figures["training"]`, one column a robot kind, to `png`."""
+    """Plot the learning curves `figures["training"]` to `png`, one column for each robot kind."""
     robots = list(training) or [""]
     picture = Figure(figsize=(8.0 * len(robots), 7.0), layout="constrained")
     grid = picture.subplots(len(ROWS), len(robots), sharex="col", squeeze=False)

@@ -1,5 +1,7 @@
-"""One MCAP file of a run: run.mcap, then run_0001.mcap, run_0002.mcap …, names that sort. There are several if the run
-was resumed, the recorder restarted, the disk full or a file too long. Each can be read without the others.
+"""Write one MCAP file of a run: run.mcap, then run_0001.mcap, run_0002.mcap …
+
+A run has several files if it was resumed, the recorder restarted, the disk was full, or a file grew too long. Each file
+can be read without the others.
 """
 
 from __future__ import annotations
@@ -21,12 +23,12 @@ from mcap.well_known import MessageEncoding, SchemaEncoding
 from mcap_protobuf.schema import build_file_descriptor_set
 
 NO_SCHEMA = 0
-CHUNK = 256 * 1024  # bytes before compression; a flush ends one early
-MOST_CHANNELS = 2**16 - 1  # of a file: MCAP numbers them with two bytes
-AFTER_ALL = 2**64  # ns: no time in a file is as late
+CHUNK = 256 * 1024  # bytes before compression; a flush ends a chunk early
+MOST_CHANNELS = 2**16 - 1  # per file: MCAP numbers channels with two bytes
+TIME_LIMIT = 2**64  # ns: MCAP stores smaller times only
 
 Metadata = Mapping[str, Mapping[str, str]]
-Attachments = Mapping[str, bytes]  # by name: files that come along with the messages, e.g. model sets
+Attachments = Mapping[str, bytes]  # file contents by name, e.g. model sets
 
 TIMES = {
     "log_time": "ns since the Unix epoch, when the recorder received the message",
@@ -39,44 +41,48 @@ TIMES = {
 
 @dataclass(frozen=True)
 class Entry:
-    """What is stored of one message: its bytes as they came from the wire, and when.
+    """One message to store, as the bytes from the wire.
+
+    Attributes:
+        type: the message's class, or the name of a self-describing encoding.
+        log_time, publish_time: ns.
 
     Raises:
-        ValueError: a time that no file can hold.
+        ValueError: MCAP cannot store a time.
     """
 
     key: str
-    type: type[Message] | str  # a name: of the encoding of a message that describes itself
+    type: type[Message] | str
     payload: bytes
-    log_time: int  # ns
-    publish_time: int  # ns
+    log_time: int
+    publish_time: int
     sequence: int
 
     def __post_init__(self) -> None:
-        if not (0 <= self.log_time < AFTER_ALL and 0 <= self.publish_time < AFTER_ALL):
-            raise ValueError(f"{self.key}: received at {self.log_time} ns, published at {self.publish_time} ns")
+        if not (0 <= self.log_time < TIME_LIMIT and 0 <= self.publish_time < TIME_LIMIT):
+            raise ValueError(f"{self.key}: MCAP cannot store the times {self.log_time} ns and {self.publish_time} ns")
 
 
 def name_of(path: Path | str, number: int) -> str:
-    """The file name of a run's segment: run.mcap for 0, then run_0001.mcap, run_0002.mcap …"""
+    """Return the file name of a segment: run.mcap for 0, then run_0001.mcap, run_0002.mcap …"""
     path = Path(path)
     return f"{path.stem}_{number:04}{path.suffix}" if number else path.name
 
 
 def segments(path: Path) -> Iterator[Path]:
-    """The names of a run's segments, without end."""
+    """Yield the paths of a run's segments, without end."""
     for number in itertools.count():
         yield path.with_name(name_of(path, number))
 
 
 def number_of(path: Path) -> tuple[str, int]:
-    """The name of a segment's run, and which of its segments it is: ("run", 2) for run_0002.mcap, 0 for run.mcap."""
-    numbered = re.fullmatch(r"(.+?)(?:_(\d{4,})|\.(\d+))", path.stem)  # run.2.mcap: as they were called before
+    """Return the run's name and the segment's number: ("run", 2) for run_0002.mcap, ("run", 0) for run.mcap."""
+    numbered = re.fullmatch(r"(.+?)(?:_(\d{4,})|\.(\d+))", path.stem)  # run.2.mcap: the names of earlier versions
     return (numbered[1], int(numbered[2] or numbered[3])) if numbered else (path.stem, 0)
 
 
 def being_written(path: Path) -> bool:
-    """Does a recorder hold the file now?"""
+    """Return whether a recorder is writing to the file."""
     with path.open("rb") as file:
         try:
             fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
@@ -88,13 +94,10 @@ def being_written(path: Path) -> bool:
 
 
 class BufferedFile:
-    """A file whose bytes wait in memory until `flush` writes all of them, or none.
-
-    A disk that is full thus leaves the file as it was after the last flush.
-    """
+    """A file that `flush` extends by all waiting bytes or by none: a full disk never leaves part of a record."""
 
     def __init__(self, file: BinaryIO) -> None:
-        """`file` is unbuffered: else an error would come late, and again when it is closed."""
+        """Wrap a file, which must be unbuffered: otherwise an error would come late, and again on closing."""
         self._file = file
         self._waiting = bytearray()
         self._written = 0
@@ -107,10 +110,10 @@ class BufferedFile:
         return self._written + len(self._waiting)
 
     def flush(self) -> None:
-        """Hand everything to the operating system.
+        """Write all waiting bytes.
 
         Raises:
-            OSError: the disk is full, or broken; nothing of what waited is in the file.
+            OSError: the disk is full or broken; no waiting byte is in the file.
         """
         waiting = memoryview(self._waiting)
         try:
@@ -124,30 +127,37 @@ class BufferedFile:
         self._waiting = bytearray()
 
     def sync(self) -> None:
-        """Wait until the disk has what was flushed. Raises OSError."""
+        """Wait until the flushed bytes are on the disk. Raises OSError."""
         os.fsync(self._file.fileno())
 
     def close(self) -> None:
-        """Close the file as it was after the last flush."""
+        """Close the file in the state of the last flush."""
         self._file.close()
 
 
 class Segment:
-    """Writes one MCAP file: a channel per key, protobuf schemas with all they depend on, zstd chunks."""
+    """Writes one MCAP file: one channel per key, self-contained protobuf schemas, zstd chunks.
+
+    Attributes:
+        empty: the file has no message.
+    """
 
     def __init__(self, path: Path, file: BinaryIO, metadata: Metadata, attachments: Attachments | None = None) -> None:
-        """`file` is `path` opened for writing, unbuffered. Metadata and attachments are written at once.
+        """Start the file and write its metadata and attachments.
+
+        Args:
+            file: `path`, opened for writing without a buffer.
 
         Raises:
-            OSError: there is no space for it.
+            OSError: the disk is full or broken.
         """
         self.path = path
         self._spool = BufferedFile(file)
-        output: Any = self._spool  # of a file it needs `write`, `tell` and `flush`
+        output: Any = self._spool  # the writer uses `write`, `tell` and `flush`
         self._writer: Any = mcap.writer.Writer(output, chunk_size=CHUNK)
         self._schemas: dict[str, int] = {}
         self._channels: dict[str, int] = {}
-        self.empty = True  # it holds no message
+        self.empty = True
         self._writer.start(profile="", library="brakeline")
         about = TIMES | {"segment": str(number_of(path)[1])}
         for name, values in (("brakeline", about), *metadata.items()):
@@ -159,16 +169,17 @@ class Segment:
 
     @property
     def size(self) -> int:
-        """Bytes in the file."""
+        """Size of the file, bytes."""
         return self._spool.tell()
 
     def save(self, entries: Iterable[Entry]) -> int:
-        """Write the entries and hand them to the operating system: from then on only a power cut can lose them.
+        """Write the entries and flush the file, so that only a power cut can lose them.
 
-        Returns how many were left out, being of channels that are too many for a file.
+        Returns:
+            How many entries were left out, because their channels exceed the limit of a file.
 
         Raises:
-            OSError: as `BufferedFile.flush`; no entry is in the file, which must then be abandoned.
+            OSError: the disk is full or broken. No entry is in the file; call `abandon`.
         """
         left_out = 0
         for entry in entries:
@@ -187,10 +198,13 @@ class Segment:
         return left_out
 
     def finish(self, sync: bool = False) -> None:
-        """Write the summary, and close; with `sync`, wait until the disk has it: then not even a power cut can lose it.
+        """Write the summary and close the file.
+
+        Args:
+            sync: wait until the file is on the disk, so that a power cut cannot lose it.
 
         Raises:
-            OSError: there is no space for the summary; all messages are there.
+            OSError: there is no space for the summary; all messages are in the file.
         """
         try:
             self._writer.finish()
@@ -201,7 +215,7 @@ class Segment:
             self._spool.close()
 
     def abandon(self) -> None:
-        """Close without a summary. A file that holds no message is removed."""
+        """Close the file without a summary. Remove a file without a message."""
         self._spool.close()
         if self.empty:
             self.path.unlink(missing_ok=True)
@@ -220,10 +234,10 @@ class Segment:
 
 
 def open_segment(run: Path, metadata: Metadata, attachments: Attachments | None = None) -> Segment:
-    """The first segment of the run that does not exist yet.
+    """Create the first segment of the run that does not exist yet.
 
     Raises:
-        OSError: it cannot be made, or there is no space for it; then it is not left behind.
+        OSError: the file cannot be created or the disk is full; no file is left behind.
     """
     run.parent.mkdir(parents=True, exist_ok=True)
     for path in segments(run):
@@ -232,11 +246,11 @@ def open_segment(run: Path, metadata: Metadata, attachments: Attachments | None 
         except FileExistsError:
             continue
         with contextlib.suppress(OSError):  # a file system without locks
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)  # until it is closed, or we are killed
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)  # held until the file is closed or the process ends
         try:
             return Segment(path, file, metadata, attachments)
         except OSError:
             file.close()
             path.unlink(missing_ok=True)
             raise
-    raise AssertionError("unreachable: there is always another name")
+    raise AssertionError("unreachable: the names never end")

@@ -1,4 +1,4 @@
-"""When a log goes on in another file."""
+"""When a log continues in another file."""
 
 from __future__ import annotations
 
@@ -11,17 +11,19 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Rotation:
-    """When a file is finished and the log goes on in the next one. What is finished can be moved away."""
+    """When the recorder finishes a file and continues in the next one. You can move a finished file away."""
 
     mib: float = 512.0
-    """MiB in a file of the log; then the next one is begun."""
+    """Size of a file of the log, MiB, after which the next one begins."""
     seconds: float = 3600.0
-    """s that a file of the log covers; then the next one is begun."""
+    """Duration of a file of the log, s, after which the next one begins."""
 
     def __post_init__(self) -> None:
         if not self.mib > 0.0 or not self.seconds > 0.0:
-            raise ValueError(f"a log's files have a size and a duration above 0, not {self.mib} MiB, {self.seconds} s")
+            raise ValueError(
+                f"the size and the duration of a log file must be above 0, not {self.mib} MiB, {self.seconds} s"
+            )
 
     def due(self, segment: Segment, age: float) -> bool:
-        """Has the file had enough? One without a message never has."""
+        """Return whether to finish the file, of this age [s]. A file without a message is never finished."""
         return not segment.empty and (segment.size >= self.mib * 2**20 or age >= self.seconds)

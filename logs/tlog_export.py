@@ -1,6 +1,6 @@
-"""The MAVLink frames of a log as a .tlog, which ground stations and pymavlink read.
+"""Export the MAVLink frames of a log as a .tlog file for ground stations and pymavlink.
 
-Before each frame stands its time, µs since the Unix epoch, 8 bytes, the highest first.
+Each frame follows its time: µs since the Unix epoch, 8 bytes, big-endian.
 """
 
 from __future__ import annotations
@@ -15,10 +15,11 @@ TIME = struct.Struct(">Q")
 
 
 def to_tlog(paths: Paths, file: BinaryIO) -> int:
-    """Write every frame of every vehicle in the log, in the order in which they came; returns how many.
+    """Write all frames of all vehicles in the order of arrival, and return their number.
 
     Raises:
-        ExportError: it holds none; NoLog, NotALog: there is no log.
+        ExportError: the log has no frame.
+        NoLog, NotALog: as `open_log`.
     """
     count = 0
     for record in open_log(paths):
@@ -27,5 +28,5 @@ def to_tlog(paths: Paths, file: BinaryIO) -> int:
                 file.write(TIME.pack(frame.wall_time // 1000) + frame.raw)
                 count += 1
     if not count:
-        raise ExportError("no MAVLink frame is in the log: training in memory logs them only with --mavlink")
+        raise ExportError("the log has no MAVLink frame: `brakeline train` records frames only with --mavlink")
     return count

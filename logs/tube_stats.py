@@ -1,7 +1,7 @@
-"""Verified plans that robots went on along: did they stay in the tubes that had been verified for them?
+"""Count how many verified plans left their tubes while robots followed them.
 
-A measured state is compared with what was predicted a period before (`containment`). That says little about a stop of
-many periods, and a stop is what keeps a robot from hitting anything: the unit is a plan (docs/method.md §12).
+`containment` compares a measured state with the prediction one period before. That says little about a stop of many
+periods, and the stop is what prevents a collision. So the unit here is a plan (docs/method.md §12).
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brakeline.logs.decision_explanation import bound_in
+from brakeline.logs.decision_view import tube_boxes
 from brakeline.logs.episode_stats import Figures
 from brakeline.logs.recorded_robots import RecordedRobots
 from brakeline.messaging import brakeline_pb2 as pb
@@ -20,30 +21,34 @@ from brakeline.messaging.stated_share import UNSTATED, percent
 
 Array = NDArray[np.float64]
 
-SAME = 1e-6  # of inputs, in their units: rounding between a plan and what is asked about as its tail
-SMALLEST, MOST = 1e-9, 1e9  # m; and what is no number counts as
+SAME = 1e-6  # input units: rounding between a plan and its tail in the next request
+SMALLEST, MOST = 1e-9, 1e9  # m; a ratio that is not finite counts as MOST
 _OWN = (int(pb.ALLOWED), int(pb.ADJUSTED))
 
 
 @dataclass
 class TubeStats:
-    """Of one actor. flown: verified plans that it went on along for more than their first period, for nothing newer was
-    verified; outside: of these, in which it was measured outside of the plan's tube, at any period's end; excess: the
-    largest share of a tube's half-width that any position came to; bound: the largest share of them outside that the
-    model sets stated which verified them, None: not all say."""
+    """Plans that one actor followed beyond their first period, because no newer plan was verified.
+
+    Attributes:
+        flown: number of these plans.
+        outside: how many of them left their tube: a measured position was outside at the end of a period.
+        excess: largest ratio of the distance from the tube's center to its half-width.
+        bound: largest fraction of plans outside that the model sets state; None if a decision has no bound.
+    """
 
     robots: RecordedRobots = field(default_factory=RecordedRobots)
     flown: int = 0
     outside: int = 0
     excess: float = 0.0
     bound: float | None = 0.0
-    _own: pb.Exchange | None = None  # the latest with a verified plan of its own
-    _tube: tuple[Array, Array] | None = None  # of that plan, once it is gone on along: centers and half-widths (N, d)
-    _periods: int = 0  # since then
+    _own: pb.Exchange | None = None  # latest exchange whose own proposal was verified
+    _tube: tuple[Array, Array] | None = None  # centers and half-widths (N, d), once the actor follows the plan
+    _periods: int = 0  # since `_own`
     _worst: float = 0.0
 
     def exchange(self, exchange: pb.Exchange) -> None:
-        """Take the actor's next exchange."""
+        """Add the actor's next exchange."""
         decision = exchange.reply.decision
         if self._own is not None and not self._goes_on(exchange):
             self._end()
@@ -61,7 +66,7 @@ class TubeStats:
             self._end()
 
     def _goes_on(self, exchange: pb.Exchange) -> bool:
-        """Is it the next period of the same episode, and of who accepted the plan?"""
+        """Return whether this is the next period of the same episode and the request has the tail of the plan."""
         assert self._own is not None
         before, now = self._own.request, exchange.request
         same = self._own.header.run == exchange.header.run and before.episode == now.episode
@@ -69,11 +74,11 @@ class TubeStats:
             return False
         inputs, following = len(now.action), self._own.reply.decision.plan
         start = min(inputs * (self._periods + 1), len(following) - inputs)
-        tail, given = following[max(start, 0) : start + inputs], now.plan[:inputs]
-        return 0 < inputs == len(tail) == len(given) and np.allclose(given, tail, rtol=0.0, atol=SAME)
+        tail, committed = following[max(start, 0) : start + inputs], now.plan[:inputs]
+        return 0 < inputs == len(tail) == len(committed) and np.allclose(committed, tail, rtol=0.0, atol=SAME)
 
     def _compare(self, request: pb.Request) -> None:
-        """The measured position with the tube's set at the end of the last period, while there is one."""
+        """Compare the measured position with the tube's box at the end of the last period."""
         assert self._tube is not None
         centers, half = self._tube
         k, d = self._periods - 1, centers.shape[1]
@@ -86,7 +91,7 @@ class TubeStats:
         self._worst = max(self._worst, float(np.nan_to_num(share, nan=MOST, posinf=MOST).max(initial=0.0)))
 
     def _end(self) -> None:
-        """That plan is followed no longer."""
+        """Count the plan: the actor no longer follows it."""
         if self._tube is not None:
             self.flown += 1
             self.outside += self._worst > 1.0
@@ -97,17 +102,16 @@ class TubeStats:
 
 
 def _tube_of(exchange: pb.Exchange) -> tuple[Array, Array] | None:
-    """Of its decision; None: it is not one."""
-    decision, inputs = exchange.reply.decision, len(exchange.request.action)
-    periods = len(decision.plan) // max(inputs, 1)
-    centers, half = np.array(decision.tube_center), np.array(decision.tube_half_width)
-    if not periods or len(centers) != len(half) or len(centers) % periods or not len(centers):
+    """Return the tube of an exchange; None if it is missing or malformed."""
+    try:
+        centers, half_widths = tube_boxes(exchange)
+    except ValueError:
         return None
-    return centers.reshape(periods, -1), half.reshape(periods, -1)
+    return (centers, half_widths) if len(centers) else None
 
 
 def figures(parts: Iterable[TubeStats]) -> Figures:
-    """Of all actors."""
+    """Return the figures of all actors."""
     parts = [part for part in parts if part.flown]
     stated = [part.bound for part in parts]
     known = [bound for bound in stated if bound is not None]
@@ -120,7 +124,7 @@ def figures(parts: Iterable[TubeStats]) -> Figures:
 
 
 def stated(plans: Figures) -> str:
-    """What was stated of such plans, beside the count of those whose tubes were left."""
+    """Describe the bound on the fraction of plans that leave their tube."""
     bound = plans.get("bound")
     if bound is None:
         return "no bound was recorded"

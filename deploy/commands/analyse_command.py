@@ -46,7 +46,7 @@ class AnalyseCommand:
         if self.html is not None:
             from brakeline.logs.report_page import write
 
-            write(self.html, figures, analysis.each())
+            write(self.html, figures, analysis.by_label())
             errors.print(f"report: {self.html}", markup=False)
         if self.png is not None:
             from brakeline.logs.run_plots import draw  # imports Matplotlib, which takes a second

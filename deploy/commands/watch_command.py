@@ -72,8 +72,8 @@ def show_received(
     for _ in range(len(inbox)):
         sample = inbox.popleft()
         with rejected.skip_on_error(sample.key):
-            board.take(sample)
+            board.add(sample)
             if live is not None:
-                live.take(sample)
+                live.publish(sample)
     if live is not None:
         live.refresh()

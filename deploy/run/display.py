@@ -1,4 +1,4 @@
-"""What a person sees of a run: a live table while it lasts, and a summary at its end."""
+"""Show a run on the console: a live table during the run and a summary at its end."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from brakeline.deploy.run.run_view import RunView
 from brakeline.logs.report import show
 from brakeline.logs.tube_stats import stated
 
-REFRESH = 0.5  # s between two looks at the figures
-PLAIN = 10.0  # s between two lines where there is no terminal
-LINES = 5  # of warnings shown
+REFRESH = 0.5  # s between updates of the table
+PLAIN = 10.0  # s between lines without a terminal
+LINES = 5  # shown warnings
 
 
 class Display:
-    """Call it with the view of a run, as often as you like; it redraws when there is something to see."""
+    """Shows the view of a run. You can call it at any rate: it limits the redrawing itself."""
 
     def __init__(self, console: Console, steps: int) -> None:
         self.console = console
@@ -33,7 +33,7 @@ class Display:
         self._task = self._bar.add_task("steps", total=steps)
         self._live = Live(console=console, auto_refresh=False, transient=True) if console.is_terminal else None
         self._last = -1e9 if self._live is not None else time.monotonic()
-        self._said = ""  # what was being done, as it was last said where there is no terminal
+        self._last_phase = ""  # the last printed phase, without a terminal
 
     def __enter__(self) -> Self:
         if self._live is not None:
@@ -45,40 +45,40 @@ class Display:
             self._live.stop()
 
     def __call__(self, view: RunView) -> None:
-        if self._live is None and (now := doing(view)) != self._said:
-            self._said = now
-            self.console.print(now, markup=False)
+        if self._live is None and (phase := run_phase(view)) != self._last_phase:
+            self._last_phase = phase
+            self.console.print(phase, markup=False)
         spacing = REFRESH if self._live is not None else PLAIN
         if time.monotonic() - self._last < spacing and not (view.ending and self._live is not None):
             return
         self._last = time.monotonic()
         figures = view.metrics.figures()
         learned = sum(learner["steps"] for learner in figures["learners"].values())
-        self._bar.update(self._task, completed=max(figures["steps"], learned))  # resumed: learned of earlier ones too
+        self._bar.update(self._task, completed=max(figures["steps"], learned))  # a resumed run has earlier steps
         if self._live is not None:
             self._live.update(live(view, figures, self._bar), refresh=True)
         else:
             self.console.print(line(figures))
 
 
-def doing(view: RunView) -> str:
-    """What the run is at: most of its first half minute goes into starting processes."""
+def run_phase(view: RunView) -> str:
+    """Return what the run is doing now."""
     if view.ending:
         return "ending every process in order"
-    heard = view.metrics.processes.copy()
-    starting = [child.spec.name for child in view.processes if child.spec.name not in heard and not child.finished]
+    known = view.metrics.processes.copy()
+    starting = [child.spec.name for child in view.processes if child.spec.name not in known and not child.finished]
     if starting:
         return f"starting {', '.join(starting)}"
-    if not any(tally.steps for tally in view.metrics.actors.copy().values()) and view.config.actors:
+    if not any(stats.steps for stats in view.metrics.actors.copy().values()) and view.config.actors:
         return "waiting for the first step"
     return "driving" if view.config.policy else "driving and learning" if view.config.actors else "learning from logs"
 
 
 def line(figures: dict[str, Any]) -> str:
-    """The figures that matter most, for a log."""
+    """Format the main figures as one line."""
     learners = figures["learners"].values()
     updates = sum(learner["updates_per_s"] for learner in learners)
-    steps = max(figures["steps"], sum(learner["steps"] for learner in learners))  # offline nobody drives
+    steps = max(figures["steps"], sum(learner["steps"] for learner in learners))  # offline training has no actor
     return (
         f"steps {steps}  episodes {figures['episodes']}  goals {figures['goals']}  "
         f"collisions {figures['collisions']}  interventions {share(figures['interventions'], figures['steps'])}  "
@@ -87,8 +87,8 @@ def line(figures: dict[str, Any]) -> str:
 
 
 def live(view: RunView, figures: dict[str, Any], bar: Progress) -> RenderableType:
-    """The whole picture: progress, the learning, the safety, the processes, the latest warnings."""
-    parts: list[RenderableType] = [Text(doing(view), "bold"), bar, _run(figures), _processes(view)]
+    """Format progress, learning, safety, processes and the latest warnings."""
+    parts: list[RenderableType] = [Text(run_phase(view), "bold"), bar, _run(figures), _processes(view)]
     if view.lines:
         parts += [Text(text, "yellow", no_wrap=True, overflow="ellipsis") for text in list(view.lines)[-LINES:]]
     subtitle = "ending" if view.ending else "^C ends every process in order"
@@ -96,7 +96,7 @@ def live(view: RunView, figures: dict[str, Any], bar: Progress) -> RenderableTyp
 
 
 def _run(figures: dict[str, Any]) -> Table:
-    """Pairs of a name and a value, two in a row: it fits 80 columns."""
+    """Format the figures in two columns of names and values, for 80 columns."""
     table = Table(box=None, show_header=False, padding=(0, 2, 0, 0))
     episodes, steps = figures["episodes"], figures["steps"]
     times, trip, contained = figures["decision_ms"], figures["round_trip_ms"], figures["containment"]
@@ -107,20 +107,20 @@ def _run(figures: dict[str, Any]) -> Table:
     clearance = "-" if figures["for_clearance"] is None else str(figures["for_clearance"])
     table.add_row("adjusted", share(figures["adjusted"], steps), "for clearance", clearance)
     table.add_row(
-        "left the set", share(contained["violations"], contained["steps"]), "no answer", str(figures["fallbacks"])
+        "outside the set", share(contained["violations"], contained["steps"]), "no answer", str(figures["fallbacks"])
     )
     plans = figures["plans"]
     if plans["flown"]:
         left = f"{share(plans['outside'], plans['flown'])}; {stated(plans)}"
-        table.add_row("plans that left", left)
-    table.add_row("decide p50 / p99", _pair(times), "asked p50 / p99", _pair(trip))
+        table.add_row("plans outside tube", left)
+    table.add_row("decide p50 / p99", _pair(times), "request p50 / p99", _pair(trip))
     several = len(figures["learners"]) > 1
     for robot, learner in figures["learners"].items():
         steps_per_s, updates_per_s = (f"{learner[name]:.0f}/s" for name in ("steps_per_s", "updates_per_s"))
         table.add_row(f"steps {robot}" if several else "steps", steps_per_s, "updates", updates_per_s)
         critic, actor = (f"{learner[name]:.3f}" for name in ("critic_loss", "actor_loss"))
         table.add_row("critic loss", critic, "actor loss", actor)
-        table.add_row("steps lost", str(learner["missing"]), "steps twice", str(learner["duplicates"]))
+        table.add_row("steps lost", str(learner["missing"]), "duplicate steps", str(learner["duplicates"]))
     return table
 
 
@@ -145,22 +145,26 @@ def _processes(view: RunView) -> Table:
 
 
 def share(count: int, of: int) -> str:
-    """A count with its share."""
+    """Format a count and its share."""
     return f"{count} ({count / of:.1%})" if of else str(count)
 
 
 def summary(console: Console, figures: dict[str, Any]) -> None:
-    """The end of a run: what happened, and where it is."""
+    """Print the figures of a run and the paths of its files."""
     console.print(show({name: value for name, value in figures.items() if name != "topics"}))
     lost = sum(topic["missing"] for topic in figures["topics"].values())
     restarts = ", ".join(f"{name} {count}" for name, count in figures["restarts"].items())
     console.print(f"messages lost: {lost}; restarts: {restarts or 'none'}")
     if "from_logs" in figures:
         fed = figures["from_logs"]
-        console.print(f"steps from logs: {fed.get('published', 0)}, and {fed.get('known', 0)} that the learner knew")
+        console.print(
+            f"steps from logs: {fed.get('published', 0)}, and {fed.get('known', 0)} that the learner had already"
+        )
     if not figures["finished"] and figures.get("policy") in (None, "learning"):
-        console.print(f"[yellow]stopped before the last step[/]; go on: brakeline train --resume {figures['folder']}")
-    console.print(f"log:    {figures['log'] or 'none was recorded'}", markup=False)
+        console.print(
+            f"[yellow]stopped before the last step[/]; continue with: brakeline train --resume {figures['folder']}"
+        )
+    console.print(f"log:    {figures['log'] or 'not recorded'}", markup=False)
     for path in figures["policies"]:
         console.print(f"policy: {path}", markup=False)
     for command in following(figures):
@@ -168,11 +172,14 @@ def summary(console: Console, figures: dict[str, Any]) -> None:
 
 
 def following(figures: dict[str, Any]) -> list[str]:
-    """Commands that one may want after a run."""
-    found = []
+    """Return useful commands after a run."""
+    commands = []
     if figures["log"]:
-        found += [f"brakeline analyse {figures['folder']} --html report.html", f"brakeline replay {figures['folder']}"]
+        commands += [
+            f"brakeline analyse {figures['folder']} --html report.html",
+            f"brakeline replay {figures['folder']}",
+        ]
     robots = list(figures["robots"])
     if figures["policies"] and len(robots) == 1:
-        found.append(f"brakeline evaluate {robots[0]} --policy {figures['policies'][0]}")
-    return found
+        commands.append(f"brakeline evaluate {robots[0]} --policy {figures['policies'][0]}")
+    return commands

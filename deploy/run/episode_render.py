@@ -1,6 +1,6 @@
-"""An episode seen from above: obstacles, the way driven, the plan and its tube; as a picture, or moving.
+"""Render an episode from above as a picture or a film: obstacles, path, plan and tube.
 
-What flies is drawn from above too: colours say how high things are.
+For a robot in space, colours show heights.
 """
 
 from __future__ import annotations
@@ -22,12 +22,13 @@ from numpy.typing import NDArray
 
 from brakeline.actors.decision_guard import Ask, request_decisions
 from brakeline.actors.episode_runner import EpisodeRunner
-from brakeline.logs.decision_explanation import Explanation, explain
+from brakeline.logs.decision_explanation import Explanation
+from brakeline.logs.decision_view import decision_view
 from brakeline.logs.episode_stats import KINDS as DECISIONS
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.obstacle import BOX, WALL, Obstacle
 from brakeline.messaging.robot import Robot
-from brakeline.safety.perception.displayed_map import DisplayedMap, map_for_display
+from brakeline.safety.perception.displayed_map import DisplayedMap
 from brakeline.sim.scripted_policies import Policy
 
 Array = NDArray[np.float64]
@@ -36,20 +37,26 @@ KINDS = {pb.UNKNOWN: "no filter", **DECISIONS}
 COLOURS = {"no filter": "#444444", "allowed": "#0072b2", "adjusted": "#e69f00", "failsafe": "#d55e00"}
 COLOURS["recovering"] = "#8e44ad"
 ARROWS = {"proposed": "#c77d00", "executed": "#1f5fbf"}
-EDGE = "#c02030"  # of what the proposal would have crossed
-HITS = 400  # of a scan that are drawn
-FREE, HIT, MOVER = "#148c78", "#5a288c", "#aa5a28"  # what the filter was told: a scan, and what moves
+EDGE = "#c02030"  # of the half-space that blocks the proposal
+HITS = 400  # scan hits in one frame
+FREE, HIT, MOVER = "#148c78", "#5a288c", "#aa5a28"  # perceived surroundings: scan and moving obstacles
 FORMATS = (".png", ".gif", ".mp4")
-SPEED = 3.0  # times as fast as the robot
-REST = 8  # frames that the last picture stands
+SPEED = 3.0  # of the film relative to real time
+LAST_FRAMES = 8  # repetitions of the last frame
 HEIGHTS = "viridis"
 
 
 @dataclass(frozen=True)
 class Frame:
-    """One period: where the robot truly was before it, what was decided, and the set that its plan may reach.
+    """One period of an episode.
 
-    position (d,), heading [rad]; tube: lowest and highest corners (N, d), none without one; center (N, d).
+    Attributes:
+        position: (d,), true position at the start of the period, m; heading: rad.
+        kind: of decision.
+        low, high, center: (N, d), corners and centers of the tube's boxes, m; N = 0 without a tube.
+        margin: from the tube to the edge of free space, m.
+        why: the explanation of the decision; None without one.
+        around: the perceived surroundings.
     """
 
     position: Array
@@ -59,13 +66,18 @@ class Frame:
     high: Array
     center: Array
     margin: float
-    why: Explanation | None = None  # of a decision, one that was not as proposed or not
-    around: DisplayedMap | None = None  # what the filter, or whoever might have been asked, was told
+    why: Explanation | None = None
+    around: DisplayedMap | None = None
 
 
 @dataclass(frozen=True)
 class Film:
-    """An episode, frame by frame; `end` is where it ended and how."""
+    """An episode, frame by frame.
+
+    Attributes:
+        last: (d,), the last position, m.
+        end: the outcome.
+    """
 
     robot: Robot
     arena: Any
@@ -75,61 +87,58 @@ class Film:
 
 
 def record(driver: EpisodeRunner, policy: Policy, question: Ask | None, number: int) -> Film:
-    """Drive episode `number` and keep what can be seen."""
+    """Run episode `number` and return its frames."""
     driver.begin(number)
     d = driver.robot.position_dim
     frames, step = [], pb.Step()
     while driver.running:
         proposal = np.asarray(policy(driver.observation, driver.info), dtype=float)
-        asked = driver.request(proposal)
-        outcome = request_decisions(question, [asked], driver.robot)[0] if question is not None else None
-        reply = None if outcome is None or outcome.answer is None else outcome.reply
-        decision = pb.Decision() if reply is None else reply.decision
+        request = driver.request(proposal)
+        outcome = request_decisions(question, [request], driver.robot)[0] if question is not None else None
+        reply = pb.Reply() if outcome is None or outcome.answer is None else outcome.reply
         before = np.asarray(driver.info["true_state"])
         step = driver.execute(proposal, outcome)
-        center = np.reshape(decision.tube_center, (-1, d))
-        half = np.reshape(decision.tube_half_width, (-1, d))
         heading = 0.0 if driver.robot.heading is None else float(before[driver.robot.heading])
         kind = KINDS.get(step.decision, "no filter")
-        why = explain(driver.robot, asked, decision) if len(center) else None
-        boxes = center - half, center + half, center
-        around = map_for_display(driver.robot, asked)
-        frames.append(Frame(before[:d], heading, kind, *boxes, decision.margin, why, around))
+        view = decision_view(driver.robot, pb.Exchange(request=request, reply=reply))
+        boxes = view.centers - view.half_widths, view.centers + view.half_widths, view.centers
+        why = view.explanation if len(view.centers) else None
+        frames.append(Frame(before[:d], heading, kind, *boxes, reply.decision.margin, why, view.perceived))
     touched = step.contact_moving or step.contact_standing
     end = "goal" if step.goal else "collision" if step.collision else "run into" if touched else "out of time"
     return Film(driver.robot, driver.info["arena"], frames, np.asarray(step.true_state[:d]), end)
 
 
 def check_ending(path: Path) -> None:
-    """Raises ValueError: it is none of a picture's."""
+    """Raise ValueError unless the file name has the ending of a picture or a film."""
     if path.suffix not in FORMATS:
-        raise ValueError(f"{path}: a picture ends in {', '.join(FORMATS)}")
+        raise ValueError(f"{path}: the name must end in {', '.join(FORMATS)}")
 
 
 def save(films: Sequence[Film], path: Path) -> None:
-    """Draw the films side by side: one picture of all of each (.png), or a moving one (.gif, .mp4).
+    """Draw films side by side, as one picture of all frames (.png) or as a film (.gif, .mp4).
 
     Raises:
-        ValueError: another ending.
+        ValueError: the file name has another ending.
     """
     check_ending(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     figure = Figure(figsize=(7.0 * len(films), 7.4), layout="constrained")
-    stages = [_Stage(film, axes) for film, axes in zip(films, np.ravel(figure.subplots(1, len(films))), strict=True)]
+    panels = [_FilmAxes(film, axes) for film, axes in zip(films, np.ravel(figure.subplots(1, len(films))), strict=True)]
     if path.suffix == ".png":
-        for stage in stages:
-            stage.all_at_once()
+        for panel in panels:
+            panel.all_at_once()
         figure.savefig(path, dpi=130)
         return
     dpi, last = 90 // len(films), max(len(film.frames) for film in films)
     with (writer := _writer(path, round(SPEED / films[0].robot.period))).saving(figure, str(path), dpi=dpi):
         for k in range(last):
-            for stage in stages:
-                stage.show(k)
+            for panel in panels:
+                panel.show(k)
             writer.grab_frame()
-        for stage in stages:
-            stage.ended()
-        for _ in range(REST):
+        for panel in panels:
+            panel.ended()
+        for _ in range(LAST_FRAMES):
             writer.grab_frame()
 
 
@@ -143,14 +152,14 @@ def _writer(path: Path, rate: int) -> AbstractMovieWriter:
     return FFMpegWriter(fps=rate, codec="h264", extra_args=["-pix_fmt", "yuv420p", "-crf", "20"])
 
 
-class _Stage:
-    """The room, and what moves in it."""
+class _FilmAxes:
+    """The axes of one film: the fixed arena and the artists of the current frame."""
 
     def __init__(self, film: Film, axes: Axes) -> None:
         self.film, self.robot = film, film.robot
         self.flies = film.robot.position_dim == 3
         self.axes = axes
-        self.way = np.array([frame.position for frame in film.frames] + [film.last])
+        self.path = np.array([frame.position for frame in film.frames] + [film.last])
         self._room()
         self.lines = LineCollection([], linewidths=2.2, zorder=4)
         self.axes.add_collection(self.lines)
@@ -169,29 +178,31 @@ class _Stage:
         if self.flies:
             drawn.set_array(np.array([_top(o) for o in inside]))
             drawn.set(cmap=HEIGHTS, clim=arena.bounds[2], alpha=0.45)
-            axes.figure.colorbar(drawn, ax=axes, label="height: tops of obstacles, and of the way [m]", shrink=0.7)
+            axes.figure.colorbar(
+                drawn, ax=axes, label="height of the path and of the tops of obstacles [m]", shrink=0.7
+            )
         else:
             drawn.set_facecolor("#9a9a9a")
         axes.add_collection(drawn)
         goal = arena.goal
         axes.add_patch(Circle(goal[:2], arena.goal_radius, color="#009e73", alpha=0.35, zorder=1))
         axes.plot(*goal[:2], marker="*", color="#009e73", markersize=12, zorder=3)
-        axes.plot(*self.way[0, :2], marker="o", color="white", markeredgecolor="black", markersize=6, zorder=6)
+        axes.plot(*self.path[0, :2], marker="o", color="white", markeredgecolor="black", markersize=6, zorder=6)
 
     def _closes(self, obstacle: Obstacle) -> bool:
-        """Is it a floor or a ceiling?"""
+        """Return whether the obstacle is a floor or a ceiling."""
         (left, right), _ = self.film.arena.bounds[:2]
         return obstacle.kind == BOX and obstacle.size[0] >= right - left
 
     def show(self, k: int) -> None:
-        """The state before period k, with its plan; after the last one, how it ended."""
+        """Draw the start of period k with its plan; after the last period, the outcome."""
         if k >= len(self.film.frames):
             return self.ended()
         frame = self.film.frames[k]
         for artist in self._moving:
             artist.remove()
         self._moving = [
-            *self._told(frame.around),
+            *self._draw_perceived(frame.around),
             *self._tube(frame, 0.35),
             *self._body(frame.position, frame.heading, frame.kind),
         ]
@@ -200,27 +211,27 @@ class _Stage:
             self._moving += self.axes.plot(
                 points[:, 0], points[:, 1], color=COLOURS[frame.kind], linewidth=1.2, zorder=5
             )
-        self._draw_way(k)
+        self._draw_path(k)
         said = frame.kind
         if frame.why is not None:
-            self._moving += self._explained(frame, frame.why)
+            self._moving += self._draw_explanation(frame, frame.why)
             said = frame.kind if frame.kind == "allowed" else textwrap.fill(f"{frame.kind}: {frame.why.said}", 80)
         self.axes.set_title(f"{self._heading()}{k * self.robot.period:5.1f} s\n{said}", fontsize=10, loc="left")
 
     def ended(self) -> None:
-        """The end of the way, and how it ended."""
+        """Draw the whole path and the outcome."""
         for artist in self._moving:
             artist.remove()
         frames = self.film.frames
         self._moving = self._body(self.film.last, frames[-1].heading, frames[-1].kind)
         if self.film.end == "collision":
             self._moving += self.axes.plot(*self.film.last[:2], marker="x", color=EDGE, markersize=18, mew=4, zorder=10)
-        self._draw_way(len(frames))
+        self._draw_path(len(frames))
         seconds = len(frames) * self.robot.period
         self.axes.set_title(f"{self._heading()}{seconds:5.1f} s\n{self.film.end}", fontsize=10, loc="left")
 
-    def _explained(self, frame: Frame, why: Explanation) -> list[Any]:
-        """The proposed and the executed input as arrows, and the edge of what stopped the proposal."""
+    def _draw_explanation(self, frame: Frame, why: Explanation) -> list[Any]:
+        """Draw the proposed and the executed input, and the edge of the half-space that blocks the proposal."""
         drawn: list[Any] = []
         x, y = frame.position[:2]
         for label, way in (("proposed", why.proposed), ("executed", why.executed)):
@@ -236,8 +247,8 @@ class _Stage:
             drawn += self.axes.plot(ends[:, 0], ends[:, 1], color=EDGE, linewidth=2.5, zorder=9)
         return drawn
 
-    def _told(self, about: DisplayedMap | None, alpha: float = 1.0) -> list[Any]:
-        """Where beams ended, what they showed to be free, what moves and where it may come to while a plan lasts."""
+    def _draw_perceived(self, about: DisplayedMap | None, alpha: float = 1.0) -> list[Any]:
+        """Draw scan hits, free space, and moving obstacles with the sets that they can reach during the plan."""
         if about is None:
             return []
         drawn: list[Any] = []
@@ -255,14 +266,14 @@ class _Stage:
         return drawn
 
     def all_at_once(self) -> None:
-        """The whole way; the tubes of a few plans; where it was corrected."""
+        """Draw the whole path, and tubes and bodies of some frames."""
         frames = self.film.frames
         for k in np.unique(np.linspace(0, len(frames) - 1, 16).astype(int)):
-            self._told(frames[k].around, 0.2)
+            self._draw_perceived(frames[k].around, 0.2)
             self._tube(frames[k], 0.18)
             self._body(frames[k].position, frames[k].heading, frames[k].kind, alpha=0.25)
         self._body(self.film.last, frames[-1].heading, frames[-1].kind)
-        self._draw_way(len(frames))
+        self._draw_path(len(frames))
         shares = [f"{100 * np.mean([f.kind == kind for f in frames]):.0f} % {kind}" for kind in COLOURS]
         shown = ", ".join(text for text in shares if not text.startswith("0 %"))
         time = f"{len(frames) * self.robot.period:.1f} s"
@@ -283,9 +294,9 @@ class _Stage:
         unfiltered = all(frame.kind == "no filter" for frame in self.film.frames)
         return f"{self.robot.name}, {self.film.arena.name}{', without the filter' if unfiltered else ''}: "
 
-    def _draw_way(self, k: int) -> None:
-        """The way up to period k; on the ground in the colour of each decision, in the air in that of its height."""
-        pieces = np.stack([self.way[:k], self.way[1 : k + 1]], axis=1)
+    def _draw_path(self, k: int) -> None:
+        """Draw the path up to period k, coloured by decision; in space, by height."""
+        pieces = np.stack([self.path[:k], self.path[1 : k + 1]], axis=1)
         self.lines.set_segments(list(pieces[:, :, :2]))
         if self.flies:
             self.lines.set(array=pieces[:, :, 2].mean(axis=1), cmap=HEIGHTS, clim=self.film.arena.bounds[2])
@@ -293,7 +304,7 @@ class _Stage:
             self.lines.set_color([COLOURS[frame.kind] for frame in self.film.frames[:k]])
 
     def _tube(self, frame: Frame, alpha: float) -> list[Any]:
-        """The sets of the body's position at the periods' ends, grown by the footprint."""
+        """Draw the tube's boxes, enlarged by the footprint."""
         drawn = []
         for low, high in zip(frame.low, frame.high, strict=True):
             size, round_off = high - low, f"Round, pad={self.robot.footprint}, rounding_size={self.robot.footprint}"
@@ -303,7 +314,7 @@ class _Stage:
         return drawn
 
     def _body(self, position: Array, heading: float, kind: str, alpha: float = 1.0) -> list[Any]:
-        """All discs of the body, and a line to its front."""
+        """Draw the discs of the body and a line to its front."""
         turn = np.array([[np.cos(heading), -np.sin(heading)], [np.sin(heading), np.cos(heading)]])
         drawn: list[Any] = []
         for disc in self.robot.body:
@@ -326,7 +337,7 @@ def _patch(obstacle: Obstacle) -> Patch:
 
 
 def _top(obstacle: Obstacle) -> float:
-    """The height of an obstacle's highest point, m."""
+    """Return the height of an obstacle's highest point, m."""
     if len(obstacle.position) == 2:
         return 0.0
     vertical = obstacle.size[0] if obstacle.kind == "sphere" else 0.5 * obstacle.size[-1]

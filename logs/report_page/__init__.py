@@ -1,8 +1,8 @@
-"""The report: one HTML page about logs that needs nothing but itself, in the browser or on paper.
+"""Render the report: one self-contained HTML page about logs, for the browser or for paper.
 
-Styles, scripts and data are in the page; its own policy forbids every request to another host, and every script and
-style but these, by their hashes. Tables are written here, so that they can be read without scripts; drawings are made
-by the scripts, from the data in the page.
+The page contains its styles, scripts and data. Its content security policy forbids requests to other hosts and allows
+only these scripts and styles, by their hashes. Python writes the tables, so that they need no scripts; the scripts draw
+the figures from the data in the page.
 """
 
 from __future__ import annotations
@@ -27,16 +27,16 @@ from brakeline.logs.tube_stats import stated
 STYLES = ("report.css",)
 PAGE = "report.html.j2"
 PIECES = ("headline.html.j2", "details.html.j2")
-SCRIPTS = ("svg.js", "save.js", "learning.js", "charts.js", "arena.js", "episodes.js", "main.js")
+SCRIPTS = ("svg.js", "save.js", "learning.js", "charts.js", "scene.js", "episodes.js", "main.js")
 
-RATES = (  # name, of what, in words
+RATES = (  # name, unit, description
     ("goals", "episodes", "goals reached"),
-    ("collisions", "episodes", "collisions with what stands still"),
-    ("contacts_moving", "episodes", "contacts with what moves, in motion"),
-    ("contacts_standing", "episodes", "times that it was run into while it stood"),
-    ("contacts_robots", "episodes", "contacts with other robots of its world"),
+    ("collisions", "episodes", "collisions with fixed obstacles"),
+    ("contacts_moving", "episodes", "contacts with moving obstacles while the robot moves"),
+    ("contacts_standing", "episodes", "times that an obstacle ran into the standing robot"),
+    ("contacts_robots", "episodes", "contacts with other robots"),
     ("timeouts", "episodes", "timeouts"),
-    ("interventions", "steps", "steps in which the filter stepped in"),
+    ("interventions", "steps", "steps with an intervention of the filter"),
 )
 
 
@@ -56,7 +56,7 @@ def render(figures: Figures, runs: Mapping[str, tuple[Figures, Figures]]) -> str
         runs=[
             {
                 "label": label,
-                "mark": f"run{place}-" if place else "",  # before names that a page has once
+                "mark": f"run{place}-" if place else "",  # prefix of the element ids of this run
                 "f": own | {"rates": rates(own)},
                 "kept": sum(len(gallery["episodes"]) for gallery in pictures["galleries"].values()),
             }
@@ -64,25 +64,25 @@ def render(figures: Figures, runs: Mapping[str, tuple[Figures, Figures]]) -> str
         ],
         style="\n".join(map(_text, STYLES)),
         script="\n".join(['"use strict";', *map(_text, SCRIPTS)]),
-        data=embedded([_drawn(label, own, pictures) for label, (own, pictures) in runs.items()]),
+        data=embedded([_drawing_data(label, own, pictures) for label, (own, pictures) in runs.items()]),
     )
 
 
-def _drawn(label: str, figures: Figures, pictures: Figures) -> Figures:
-    """What the drawings need of a run; the whole of it is what `analyse --json` is for."""
+def _drawing_data(label: str, figures: Figures, pictures: Figures) -> Figures:
+    """Return the data for the drawings of one run."""
     setup = {name: figures[name] for name in SETUP}
     return {"run": label, "setup": setup, "training": figures["training"]} | pictures
 
 
 def write(path: Path, figures: Figures, runs: Mapping[str, tuple[Figures, Figures]]) -> None:
-    """Write the page to a file; its folder is made if it is missing."""
+    """Write the page to a file; create its folder if needed."""
     page = render(figures, runs)
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(page, encoding="utf-8")
 
 
 def rates(figures: Figures) -> list[Figures]:
-    """Rows of the table of rates: what, how often, of how many, and the interval."""
+    """Return the rows of the table of rates: description, count, number of trials, interval."""
     rows = [
         {"name": name, "what": what, "count": figures[name], "of": figures[of], "unit": of}
         | {"interval": figures["intervals"][name]}
@@ -98,28 +98,28 @@ def rates(figures: Figures) -> list[Figures]:
 
 
 def missing(figures: Figures) -> list[str]:
-    """What the logs lack, in words."""
-    said = list(figures["cuts"])
+    """Describe damage, lost and malformed messages of the logs."""
+    lines = list(figures["cuts"])
     lost = {key: topic["missing"] for key, topic in figures["topics"].items() if topic["missing"]}
-    said += [f"{key}: {count} messages were published and are in no file" for key, count in lost.items()]
+    lines += [f"{key}: {count} messages were published, but are not in the log" for key, count in lost.items()]
     if figures["malformed"]:
-        said.append(f"{figures['malformed']} messages are not of their type, or say what can't be handled")
-    return said
+        lines.append(f"{figures['malformed']} messages are malformed")
+    return lines
 
 
 def embedded(data: Any) -> str:
-    """JSON that may stand in a script element: nothing in it can end the element."""
+    """Encode JSON for a script element: nothing in it can end the element."""
     text = json.dumps(finite(data), separators=(",", ":"), allow_nan=False)
     return text.replace("<", "\\u003c").replace("\u2028", "\\u2028").replace("\u2029", "\\u2029")
 
 
 def hashed(text: str) -> str:
-    """As a content security policy names a script or a style."""
+    """Return the hash by which a content security policy allows a script or a style."""
     return f"sha256-{b64encode(sha256(text.encode()).digest()).decode()}"
 
 
 def finite(value: Any) -> Any:
-    """The value, with None for each number that is not finite."""
+    """Replace each number that is not finite by None."""
     if isinstance(value, dict):
         return {key: finite(inner) for key, inner in value.items()}
     if isinstance(value, list | tuple):
@@ -128,7 +128,7 @@ def finite(value: Any) -> Any:
 
 
 def number(value: float | None, digits: int = 3) -> str:
-    """For people: thousands apart, no more digits than matter; a dash for None, and for what is no number."""
+    """Format a number with 3 significant digits and separated thousands; a dash for None and NaN."""
     if value is None or not math.isfinite(value):
         return "–"
     if isinstance(value, int) or (value == int(value) and abs(value) >= 1000):
@@ -144,12 +144,12 @@ def percent(share: float | None) -> str:
 
 
 def within(interval: tuple[float, float] | None) -> str:
-    """An interval of a share, to stand below it."""
+    """Format the confidence interval of a rate."""
     return "" if interval is None else f"[{percent(interval[0])}, {percent(interval[1])}]"
 
 
 def moment(seconds: float | None) -> str:
-    """A time since the Unix epoch, in UTC."""
+    """Format a time since the Unix epoch, in UTC."""
     return "–" if seconds is None else time.strftime("%Y-%m-%d %H:%M:%S UTC", time.gmtime(seconds))
 
 
@@ -158,7 +158,7 @@ def pretty(value: Any) -> str:
 
 
 def raw(value: Any) -> str:
-    """The value as `--json` prints it, for programs that read the page."""
+    """Encode a value as `--json` does, for programs that read the page."""
     return json.dumps(finite(value))
 
 
@@ -167,5 +167,5 @@ def _text(name: str) -> str:
 
 
 def names() -> Iterable[str]:
-    """The files that a page is made of."""
+    """Return the names of all files of the page."""
     return (PAGE, *PIECES, *STYLES, *SCRIPTS)

@@ -30,7 +30,7 @@ function latency(target, kinds) {
 
 function bars(kinds, part) {
   const rows = Object.entries(KINDS).filter(([, k]) => kinds[k.name]?.[part]?.length).map(([, k]) => [k, kinds[k.name][part]]);
-  if (!rows.length) return nothing("Nothing of this kind was measured.");
+  if (!rows.length) return nothing("The log has no such measurement.");
   const frame = { left: 56, right: 1030, top: 12, bottom: 60 };
   const low = Math.min(...rows.map(([, b]) => b[0][0])), high = Math.max(...rows.map(([, b]) => b.at(-1)[1]));
   const x = scale(Math.log(low), Math.log(high), frame.left, frame.right), at = (v) => x(Math.log(v));
@@ -48,21 +48,21 @@ function bars(kinds, part) {
   });
   const bottom = frame.top + rows.length * height;
   for (const v of marks.filter((v) => v >= low && v <= high)) out.push(label(at(v), bottom + 16, figure(v), { "text-anchor": "middle" }), tag("line", { x1: at(v), x2: at(v), y1: bottom, y2: bottom + 4, class: "axis" }));
-  out.push(label(frame.right, bottom + 32, "ms, logarithmic; each kind to its own height", { "text-anchor": "end" }));
+  out.push(label(frame.right, bottom + 32, "ms, logarithmic; each kind has its own vertical scale", { "text-anchor": "end" }));
   const box = element("div");
   box.innerHTML = drawing(1040, bottom + 38, `latency of decisions, ${part}`, out, { "data-part": part });
   saves(box, `latency, ${part}`, () => rows.flatMap(([kind, given]) => given.map(([from, to, count]) => ({ decision: kind.name, from_ms: from, to_ms: to, count }))));
   return box;
 }
 
-/** White to amber to red: readable in grey too. */
+/** White to amber to red; also readable in grey. */
 function heat(share) {
   const stops = [[240, 244, 248], [250, 206, 120], [224, 120, 20], [160, 30, 24]];
   const at = Math.min(0.999, Math.max(0, share)) * 3, k = Math.floor(at), f = at - k;
   return `rgb(${stops[k].map((v, i) => Math.round(v + f * (stops[k + 1][i] - v))).join(",")})`;
 }
 
-/** One map: `value` of a cell between 0 and `most`, said as `form` says it. */
+/** One map: the color shows `value(cell)` between 0 and `most`; `form` formats a value. */
 function map(cells, cell, what, value, most, form) {
   const xs = cells.map((c) => c[0]), ys = cells.map((c) => c[1]);
   const box = { x0: Math.min(...xs) * cell, x1: (Math.max(...xs) + 1) * cell, y0: Math.min(...ys) * cell, y1: (Math.max(...ys) + 1) * cell };
@@ -91,7 +91,7 @@ function places(target, robots) {
     const high = (value, some) => { const found = some.map(value).sort((a, b) => a - b); return found[Math.floor(0.98 * (found.length - 1))] ?? 0; };
     const often = cells.filter((c) => c[2] >= 5);
     const made = element("div", { class: "charts", "data-robot": robot }, element("div"), element("div"));
-    made.children[0].innerHTML = map(cells, cell, `interventions, share of the steps in a cell of ${figure(cell)} m`, share, Math.max(0.02, high(share, often)), percents);
+    made.children[0].innerHTML = map(cells, cell, `interventions: share of the steps in a cell of ${figure(cell)} m`, share, Math.max(0.02, high(share, often)), percents);
     made.children[1].innerHTML = map(cells, cell, "steps in a cell", steps, Math.max(2, high(steps, cells)), (v) => figure(Math.round(v)));
     const rows = () => cells.map(([cx, cy, steps, adjusted, failsafe, collisions]) => ({ x_m: cx * cell, y_m: cy * cell, steps, adjusted, failsafe, collisions }));
     saves(made.children[0], `interventions of ${robot} by place`, rows);
@@ -99,11 +99,11 @@ function places(target, robots) {
     if (Object.keys(robots).length > 1) target.append(element("h3", {}, robot));
     target.append(made);
   }
-  if (!target.children.length) target.append(nothing("No positions were recorded."));
+  if (!target.children.length) target.append(nothing("The log has no positions."));
 }
 
 function timeline(target, { lives, lines, bin_s, steps }) {
-  if (!lives.length) return target.append(nothing("No process gave a sign of life."));
+  if (!lives.length) return target.append(nothing("The log has no Health message."));
   const names = [...new Set(lives.map((life) => life.process))];
   const begin = Math.min(...lives.map((l) => l.start)), end = Math.max(...lives.map((l) => l.end), begin + 1);
   const frame = { left: 120, right: 1030, top: 90, bottom: 90 + 24 * names.length };
@@ -118,10 +118,10 @@ function timeline(target, { lives, lines, bin_s, steps }) {
     const y = frame.top + 24 * k;
     out.push(label(4, y + 12, name.length > 20 ? `…${name.slice(-19)}` : name), tag("rect", { x: frame.left, y, width: frame.right - frame.left, height: 16, class: "paper" }));
     for (const life of lives.filter((l) => l.process === name)) {
-      const said = `${name}: ${figure(life.start - begin)} to ${figure(life.end - begin)} s, ${life.goodbye ? "ended in order" : end - life.end > 3 ? "then not heard of" : "lived at the log's end"}`;
+      const said = `${name}: ${figure(life.start - begin)} to ${figure(life.end - begin)} s, ${life.goodbye ? "ended in order" : end - life.end > 3 ? "then silent" : "alive at the end of the log"}`;
       out.push(tag("rect", { x: at(life.start), y, width: Math.max(2, at(life.end) - at(life.start)), height: 16, fill: "#4f9d78", rx: 2 }, tag("title", {}, said)));
       if (!life.goodbye && end - life.end > 3) out.push(tag("rect", { x: at(life.end) - 1.5, y: y - 2, width: 3, height: 20, fill: KINDS.a.color }, tag("title", {}, said)));
-      if (life.restart) out.push(tag("path", { d: `M${at(life.start)} ${y - 2} l6 10 l-6 10 z`, class: "solid" }, tag("title", {}, `${name} was started again`)));
+      if (life.restart) out.push(tag("path", { d: `M${at(life.start)} ${y - 2} l6 10 l-6 10 z`, class: "solid" }, tag("title", {}, `${name} was restarted`)));
     }
     for (const line of lines.filter((l) => l.process === name)) out.push(tag("circle", { cx: at(line.t), cy: y + 8, r: 3.2, fill: line.level === "ERROR" ? KINDS.a.color : "#f2c14e", stroke: "#fff" }, tag("title", {}, `${line.level}: ${line.text}`)));
   });
@@ -129,5 +129,5 @@ function timeline(target, { lives, lines, bin_s, steps }) {
   const box = element("div");
   box.innerHTML = drawing(1040, frame.bottom + 22, "health of the processes", out);
   saves(box, "health of the processes", () => lives.map((life) => ({ process: life.process, from_s: life.start - begin, to_s: life.end - begin, goodbye: life.goodbye, restart: life.restart })));
-  target.append(box, legend([["#4f9d78", "alive"], [KINDS.a.color, "not heard of from here on; an error"], ["#f2c14e", "a warning"], ["#1b2430", "started again"]]));
+  target.append(box, legend([["#4f9d78", "alive"], [KINDS.a.color, "silent from here on; an error"], ["#f2c14e", "a warning"], ["#1b2430", "restarted"]]));
 }

@@ -1,28 +1,46 @@
 // The nearest misses, and the picker of episodes.
 
+/** The smallest rectangle that holds an episode: its path, start, goal and obstacles. */
+function episodeBounds(episode) {
+  const xs = [...episode.x], ys = [...episode.y];
+  const add = (x, y, reach = 0) => { xs.push(x - reach, x + reach); ys.push(y - reach, y + reach); };
+  if (episode.goal) add(...episode.goal, episode.goal_radius);
+  if (episode.start) add(...episode.start);
+  for (const o of episode.obstacles) add(o.at[0], o.at[1], o.kind === "wall" ? 0 : 0.5 * Math.hypot(...o.size.slice(0, 2)));
+  const pad = 0.04 * Math.max(Math.max(...xs) - Math.min(...xs), Math.max(...ys) - Math.min(...ys), 0.5);
+  return [Math.min(...xs) - pad, Math.min(...ys) - pad, Math.max(...xs) + pad, Math.max(...ys) + pad];
+}
+
+/** The episode at step `k` as an SVG, within `bounds` or all of it. */
+function drawEpisode(episode, k, size, bounds = episodeBounds(episode)) {
+  const { x, y, heading, tubes } = episode;
+  const scene = { ...episode, points: x.map((value, i) => [value, y[i]]), pose: [x[k], y[k], heading?.[k] ?? null], decision: tubes[k] };
+  return drawScene(scene, bounds, size, `${episode.actor}, episode ${episode.episode}, step ${episode.first + k}`, k);
+}
+
 function why(episode, k) {
   const t = episode.tubes[k];
   if (!t) return KINDS[episode.kinds[k]].name;
   const inputs = t.inputs?.map(([name, unit, proposed, executed]) => `${name} ${figure(proposed)} → ${figure(executed)} ${unit}`) ?? [`${t.proposed.join(", ")} → ${t.plan.join(", ")}`];
-  const said = (episode.kinds[k] !== "l" && t.said) || t.reason;
-  return `${KINDS[episode.kinds[k]].name}${said ? `: ${said}` : ""}; proposed → executed: ${inputs.join(", ")}; margin ${t.at_least ? "> " : ""}${figure(100 * t.margin)} cm${t.trust ? `; ${t.trust}` : ""}`;
+  const reason = (episode.kinds[k] !== "l" && t.said) || t.reason;
+  return `${KINDS[episode.kinds[k]].name}${reason ? `: ${reason}` : ""}; proposed → executed: ${inputs.join(", ")}; margin ${t.at_least ? "> " : ""}${figure(100 * t.margin)} cm${t.trust ? `; ${t.trust}` : ""}`;
 }
 
-/** The nearest misses of all robot kinds, worst first. */
+/** Draw the nearest misses of all robot kinds, the smallest clearance first. */
 function near(target, galleries, choose) {
-  const found = Object.entries(galleries).flatMap(([robot, { near: orders, episodes }]) => orders.map((order) => ({ robot, order, episode: episodes.find((e) => e.order === order) })));
-  for (const { robot, order, episode } of found.sort((a, b) => a.episode.closest - b.episode.closest)) {
+  const misses = Object.entries(galleries).flatMap(([robot, { near: orders, episodes }]) => orders.map((order) => ({ robot, order, episode: episodes.find((e) => e.order === order) })));
+  for (const { robot, order, episode } of misses.sort((a, b) => a.episode.closest - b.episode.closest)) {
     const k = episode.closest_at;
     const reach = Math.max(0.1, 3.4 * episode.footprint, 1.3 * Math.max(0, ...(episode.tubes[k]?.boxes ?? []).map(([x, y]) => Math.hypot(x - episode.x[k], y - episode.y[k]))));
-    const box = [episode.x[k] - reach, episode.y[k] - reach, episode.x[k] + reach, episode.y[k] + reach];
+    const bounds = [episode.x[k] - reach, episode.y[k] - reach, episode.x[k] + reach, episode.y[k] + reach];
     const picture = element("div");
-    picture.innerHTML = arena(episode, k, 260, box);
+    picture.innerHTML = drawEpisode(episode, k, 260, bounds);
     picture.querySelector("svg").setAttribute("width", "100%");
     const facts = element("p", {}, element("b", {}, `${figure(100 * episode.closest)} cm`), ` ${episode.actor}, episode ${episode.episode}, step ${episode.first + k} (${episode.outcome}) `);
     facts.append(element("button", { onclick: () => choose(robot, order, k) }, "show"));
     target.append(element("div", { class: "card", "data-closest": episode.closest }, picture, facts, element("p", { class: "why" }, why(episode, k))));
   }
-  if (!target.children.length) target.append(nothing("No episode was recorded with its clearance."));
+  if (!target.children.length) target.append(nothing("The log has no episode with a clearance."));
 }
 
 /** Clearance over the steps of an episode, coloured by decision. */
@@ -38,12 +56,12 @@ function strip(episode, k) {
 }
 
 class Picker {
-  /** `mark` goes before names that the page has once; `said(order, step)` hears what is shown. */
-  constructor(target, galleries, mark, said) {
+  /** `mark` is a prefix for element ids of this run; `onshow(order, step)` is called for each step that is shown. */
+  constructor(target, galleries, mark, onshow) {
     this.target = target;
-    this.said = said;
+    this.onshow = onshow;
     this.all = Object.entries(galleries).flatMap(([robot, { near: nearest, episodes }]) => episodes.map((episode) => ({ robot, episode, near: nearest.indexOf(episode.order) })));
-    if (!this.all.length) return void target.append(nothing("No episode was recorded."));
+    if (!this.all.length) return void target.append(nothing("The log has no episode."));
     this.select = element("select", { "aria-label": "episode", onchange: () => this.show(+this.select.value) });
     this.all.forEach(({ episode: e, near: rank }, i) => {
       const marks = [e.outcome, `${e.steps} steps`, e.failsafes ? `${e.failsafes} failsafe` : "", rank >= 0 ? `near miss ${rank + 1}` : ""].filter(Boolean);
@@ -53,14 +71,14 @@ class Picker {
     this.slider = element("input", { type: "range", min: 0, "aria-label": "step", oninput: () => this.step(+this.slider.value) });
     this.play = element("button", { onclick: () => this.toggle() }, "play");
     target.append(element("div", { class: "bar" }, element("button", { onclick: () => move(-1), "aria-label": "previous episode" }, "‹"), this.select, element("button", { onclick: () => move(1), "aria-label": "next episode" }, "›"), this.play, this.slider));
-    this.map = element("div", { id: `${mark}episode-map`, class: "episode-map", tabindex: 0, "aria-label": "an episode: arrow keys step through it, space plays it", onkeydown: (event) => this.key(event) });
+    this.map = element("div", { id: `${mark}episode-map`, class: "episode-map", tabindex: 0, "aria-label": "Episode from above. Left and right arrow: step. Up and down arrow: episode. Space: play.", onkeydown: (event) => this.key(event) });
     this.facts = element("dl", { class: "facts", id: `${mark}episode-facts` });
     this.strip = element("div");
-    const seen = element("div", {}, this.map), course = element("div", { class: "course" }, this.strip);
-    saves(seen, "an episode from above");
+    const map = element("div", {}, this.map), course = element("div", { class: "course" }, this.strip);
+    saves(map, "an episode from above");
     saves(course, "clearance over the episode", () => this.rows());
-    target.append(element("div", { class: "split" }, seen, element("div", {}, this.facts, course)));
-    target.append(legend([...["l", "d", "a", "e"].map((k) => [KINDS[k].color, KINDS[k].name]), ["#7a4fc0", "tube, and the plan in it"], [ARROWS[0], "→ proposed"], [ARROWS[1], "→ executed"], [EDGE, "what the proposal would have crossed"], ["#1d7f4e", "goal"], ["#c9d1da", "obstacles"], ...this.told()]));
+    target.append(element("div", { class: "split" }, map, element("div", {}, this.facts, course)));
+    target.append(legend([...["l", "d", "a", "e"].map((k) => [KINDS[k].color, KINDS[k].name]), [TUBE, "tube and plan"], [ARROWS[0], "→ proposed"], [ARROWS[1], "→ executed"], [EDGE, "edge of the half-space that blocks the proposal"], [GOAL, "goal"], [OBSTACLE, "obstacles"], ...this.perceivedLegend()]));
     const wanted = this.all.findIndex(({ episode }) => episode.rows);
     this.show(wanted >= 0 ? wanted : Math.max(0, this.all.findIndex(({ near: rank }) => rank === 0)));
   }
@@ -71,10 +89,10 @@ class Picker {
     return e.clearance.map((clearance, k) => ({ step: e.first + k, x_m: e.x[k], y_m: e.y[k], speed_m_s: e.speed[k], clearance_m: clearance, decision: KINDS[e.kinds[k]].name }));
   }
 
-  /** Of what the filter was told, the parts that any picture here shows. */
-  told() {
-    const parts = [["free", FREE, "what the scan showed to be free"], ["hits", HIT, "where beams ended"], ["movers", MOVER, "what moves, and where it may come to"], ["promises", PROMISE, "where other robots promise to be"]];
-    return parts.filter(([name]) => this.all.some(({ episode }) => Object.values(episode.tubes).some((t) => t[name]))).map(([, color, said]) => [color, said]);
+  /** Legend of the perceived surroundings that at least one picture of the page shows. */
+  perceivedLegend() {
+    const parts = [["free", FREE, "free space by the scan"], ["hits", HIT, "hits of the scan"], ["movers", MOVER, "moving obstacle and its reachable set"], ["promises", PROMISE, "reserved by other robots"]];
+    return parts.filter(([name]) => this.all.some(({ episode }) => Object.values(episode.tubes).some((t) => t[name]))).map(([, color, words]) => [color, words]);
   }
 
   choose(robot, order, k) {
@@ -95,18 +113,18 @@ class Picker {
     const { episode: e } = this.all[this.at];
     this.k = k;
     this.slider.value = k;
-    this.map.innerHTML = arena(e, k, 600);
+    this.map.innerHTML = drawEpisode(e, k, 600);
     this.strip.innerHTML = strip(e, k);
     const facts = {
-      actor: e.actor, episode: e.episode, arena: e.arena ?? "its beginning is in no file", outcome: e.outcome, steps: e.steps, reward: figure(e.reward, 4),
-      interventions: `${e.interventions}, of these failsafe ${e.failsafes}`, "closest approach": e.closest === null ? "–" : `${figure(100 * e.closest)} cm at step ${e.first + e.closest_at}`,
+      actor: e.actor, episode: e.episode, arena: e.arena ?? "not in the log", outcome: e.outcome, steps: e.steps, reward: figure(e.reward, 4),
+      interventions: `${e.interventions}, ${e.failsafes} of them failsafe`, "closest approach": e.closest === null ? "–" : `${figure(100 * e.closest)} cm at step ${e.first + e.closest_at}`,
       step: e.first + k, position: `${figure(e.x[k])}, ${figure(e.y[k])} m`, speed: `${figure(e.speed[k])} m/s`, clearance: `${figure(100 * e.clearance[k])} cm`, decision: why(e, k),
     };
-    this.said(e.order, e.first + k);
+    this.onshow(e.order, e.first + k);
     this.facts.replaceChildren(...Object.entries(facts).flatMap(([name, value]) => [element("dt", {}, name), element("dd", { "data-fact": name }, String(value))]));
   }
 
-  /** Steps to the sides, episodes up and down, space plays. */
+  /** Left and right change the step, up and down the episode; space plays. */
   key(event) {
     const steps = this.all[this.at].episode.steps;
     const moves = {
@@ -124,7 +142,7 @@ class Picker {
     moves[event.key]();
   }
 
-  /** The episode of that number in the log's order, at a step; false: it is not in the page. */
+  /** Show the episode with this place in the log at this step; return false if the page does not have it. */
   jump(order, step) {
     const place = this.all?.findIndex(({ episode }) => episode.order === order) ?? -1;
     if (place < 0) return false;

@@ -1,14 +1,14 @@
-// Learning curves: each run on its own steps, over each other; raw values beside smoothed ones; seeds as bands.
+// Learning curves: one curve per run, raw and smoothed values, bands over seeds.
 
-const COLORS = ["#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#5d6b7c"]; // told apart by every eye
-const GRID = 60; // places at which seeds are compared
+const COLORS = ["#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#5d6b7c"]; // distinguishable with color vision deficiency
+const GRID = 60; // steps at which seeds are averaged
 
 const CURVES = [
   { title: "goals reached", unit: "share of episodes", of: "bins", value: (b) => b.goals, form: percents, low: 0, high: 1, weight: "episodes" },
   { title: "reward of an episode", unit: "without the penalty", of: "bins", value: (b) => b.reward, form: figure, weight: "episodes" },
   { title: "interventions", unit: "share of steps", of: "bins", value: (b) => b.adjusted + b.failsafes, form: percents, low: 0, weight: "steps" },
-  { title: "closest approach", unit: "cm, the least in a bin", of: "bins", value: (b) => b.closest === null ? null : 100 * b.closest, form: figure, low: 0 },
-  { title: "critic loss", unit: "as the learner says", of: "learner", value: (b) => b.critic_loss, form: figure },
+  { title: "closest approach", unit: "cm, smallest in a bin", of: "bins", value: (b) => b.closest === null ? null : 100 * b.closest, form: figure, low: 0 },
+  { title: "critic loss", unit: "from the learner", of: "learner", value: (b) => b.critic_loss, form: figure },
   { title: "mean Q", unit: "discounted reward", of: "learner", value: (b) => b.mean_q, form: figure },
 ];
 
@@ -109,7 +109,7 @@ function chart(lines, what, view) {
   return box;
 }
 
-/** Curves with their controls; `runs` as the page's data has them. */
+/** Draw the curves with their controls; `runs` is the page's data. */
 function learning(target, controls, runs) {
   const robots = [...new Set(runs.flatMap((run) => Object.keys(run.training)))].sort();
   const setups = runs.map((run) => Object.entries(run.setup).filter(([name]) => name !== "seed").map(([, value]) => value).filter(Boolean).join(", ") || "run");
@@ -127,7 +127,7 @@ function learning(target, controls, runs) {
       grid.append(...drawn);
       target.append(grid);
     }
-    if (!target.children.length) target.append(nothing("No steps were recorded."));
+    if (!target.children.length) target.append(nothing("The log has no steps."));
   };
   if (runs.length > 1) controls.append(picker(runs, view, draw));
   const smooth = element("select", { id: "smoothing", "aria-label": "smoothing", onchange: () => { view.share = +smooth.value; draw(); } });
@@ -141,7 +141,7 @@ function learning(target, controls, runs) {
   draw();
 }
 
-/** Which runs are drawn. */
+/** Checkboxes that select the drawn runs. */
 function picker(runs, view, draw) {
   const box = element("span", { class: "runs", role: "group", "aria-label": "runs that are drawn" });
   for (const run of runs) {

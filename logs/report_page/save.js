@@ -1,6 +1,6 @@
-// Figures and their data as files: SVG that needs no retouching, CSV that any program reads.
+// Save figures as SVG and their data as CSV.
 
-/** What a figure needs to look alike outside the page, always on white. */
+/** The styles of a saved figure, on white. */
 const LOOK = `svg{font:11px "DejaVu Sans",Helvetica,Arial,sans-serif;background:#fff}text{fill:#3c4856}.title{fill:#1b2430;font-weight:600;font-size:12.5px}
 .grid{stroke:#e6eaef}.axis{stroke:#aab4c0}.ink{stroke:#1b2430}.solid{fill:#1b2430;stroke:none}.paper{fill:#fcfdfe}`;
 
@@ -10,13 +10,13 @@ function save(name, kind, text) {
   setTimeout(() => URL.revokeObjectURL(link.href), 1000);
 }
 
-/** A drawing as a file of its own. */
+/** Return the text of an SVG file. */
 function standalone(svg) {
   const text = new XMLSerializer().serializeToString(svg);
   return `<?xml version="1.0" encoding="UTF-8"?>\n${text.replace(/>/, `><style>${LOOK}</style>`)}`;
 }
 
-/** Rows of named values; names of columns come from the first. */
+/** Encode rows of named values; the first row gives the columns. */
 function csv(rows) {
   const columns = Object.keys(rows[0] ?? {});
   const cell = (value) => {
@@ -28,7 +28,7 @@ function csv(rows) {
 
 const fileName = (words) => words.toLowerCase().replace(/[^a-z0-9]+/g, "-").replace(/^-|-$/g, "");
 
-/** Buttons that save what is drawn in `box`, and `rows()` of its data. */
+/** Add buttons that save the drawing in `box` and its data `rows()`. */
 function saves(box, name, rows) {
   const buttons = element("div", { class: "saves" });
   buttons.append(element("button", { onclick: () => save(`${fileName(name)}.svg`, "image/svg+xml", standalone(box.querySelector("svg"))), "aria-label": `save “${name}” as SVG` }, "SVG"));

@@ -8,22 +8,22 @@ const KINDS = {
   n: { name: "no filter", color: "#7b8794" },
 };
 
-/** What `tag` has made. Everything else that comes into a drawing is a text, and is escaped. */
+/** Markup made by `tag`. Every other value in a drawing is text and is escaped. */
 class Markup extends String {}
 
-/** THE way of a value into markup, and the only one. */
+/** Escape a value for markup. No value gets into a drawing in another way. */
 function escaped(value) {
   if (value instanceof Markup) return value;
   if (Array.isArray(value)) return value.map(escaped).join("");
   return String(value).replace(/[&<>"']/g, (c) => `&#${c.charCodeAt(0)};`);
 }
 
-/** An SVG element; attributes without a value are left out. `content`: texts, elements, or arrays of them. */
+/** Return an SVG element without its attributes that are null or undefined. `content`: texts, elements, or arrays. */
 function tag(name, attributes, content = "") {
-  const said = Object.entries(attributes)
+  const list = Object.entries(attributes)
     .filter(([, value]) => value !== null && value !== undefined)
     .map(([key, value]) => ` ${key}="${typeof value === "number" ? +value.toFixed(3) : escaped(String(value))}"`);
-  return new Markup(`<${name}${said.join("")}>${escaped(content)}</${name}>`);
+  return new Markup(`<${name}${list.join("")}>${escaped(content)}</${name}>`);
 }
 
 function label(x, y, text, attributes = {}) {
@@ -36,14 +36,14 @@ function drawing(width, height, what, content, attributes = {}) {
 }
 
 function element(name, attributes = {}, ...children) {
-  const made = document.createElement(name);
+  const node = document.createElement(name);
   for (const [key, value] of Object.entries(attributes)) {
-    if (key.startsWith("on")) made.addEventListener(key.slice(2), value);
-    else if (key === "style") made.style.cssText = value; // the page's policy forbids the attribute
-    else if (value !== null) made.setAttribute(key, value);
+    if (key.startsWith("on")) node.addEventListener(key.slice(2), value);
+    else if (key === "style") node.style.cssText = value; // the page's policy forbids the attribute
+    else if (value !== null) node.setAttribute(key, value);
   }
-  made.append(...children);
-  return made;
+  node.append(...children);
+  return node;
 }
 
 function figure(value, digits = 3) {
@@ -59,12 +59,12 @@ function percent(share) {
   return `${value >= 1 || value === 0 ? value.toFixed(1) : value.toPrecision(2)} %`;
 }
 
-/** Percent for an axis. */
+/** Format a share for an axis, in percent. */
 function percents(share) {
   return `${+(100 * share).toPrecision(3)} %`;
 }
 
-/** Round values between low and high, about `count` of them. */
+/** Return about `count` round values between low and high. */
 function ticks(low, high, count = 5) {
   if (!(high > low)) return [low];
   const rough = (high - low) / count;
@@ -80,7 +80,7 @@ function scale(from, to, begin, end) {
   return (value) => begin + (value - from) * factor;
 }
 
-/** Grid lines and numbers of both axes. `frame`: left, right, top, bottom in the drawing. */
+/** Return grid lines and labels of both axes. `frame`: left, right, top, bottom of the plot. */
 function axes(frame, x, y, xs, ys, form = {}) {
   const { left, right, top, bottom } = frame;
   const parts = [];
@@ -111,16 +111,16 @@ function nothing(text) {
 
 const tip = element("div", { id: "tip" });
 
-/** Show a text beside the pointer while it is over `target`; `text(x, y)` in the drawing's units, or null. */
+/** Show `text(x, y)` beside the pointer while it is over `target`; x and y in units of the drawing; null hides it. */
 function hovers(target, text) {
   const svg = target.querySelector("svg");
   const hide = () => { tip.style.display = "none"; };
   target.addEventListener("pointermove", (event) => {
     const box = svg.getBoundingClientRect();
     const per = svg.viewBox.baseVal.width / box.width;
-    const said = text((event.clientX - box.left) * per, (event.clientY - box.top) * per);
-    if (said === null) return hide();
-    tip.textContent = said;
+    const words = text((event.clientX - box.left) * per, (event.clientY - box.top) * per);
+    if (words === null) return hide();
+    tip.textContent = words;
     tip.style.display = "block";
     const left = Math.min(event.clientX + 14, innerWidth - tip.offsetWidth - 8);
     tip.style.left = `${left}px`;

@@ -1,1 +1,1 @@
-"""A running system, live: in Foxglove, and without it on a web page of its own."""
+"""Watch a running system: in Foxglove or on a web page."""

@@ -1,9 +1,8 @@
-"""Who may look at a running system through a browser: nobody's page but ours, under no name that somebody else gave to
-this machine.
+"""Decide which browser requests may read a running system: only those of the live page itself.
 
-A page of a stranger can make a browser ask any address, also this machine's own. It can read the answer if the name in
-its own address leads here (DNS rebinding: the `Host` that is asked for is the stranger's), and what a websocket says in
-any case; then `Origin` is the stranger's.
+A foreign web page can make a browser send requests to this machine. It can read the reply after DNS rebinding (the
+`Host` header then has the foreign name), and it can always read a WebSocket (the `Origin` header then has the foreign
+page).
 """
 
 from __future__ import annotations
@@ -15,23 +14,23 @@ from urllib.parse import urlsplit
 
 
 def rejection_reason(headers: Message, host: str, port: int, origins: Collection[str] = ()) -> str:
-    """Why a request with these headers is refused; empty: it is not.
+    """Return why a request is rejected; empty if it is allowed.
 
-    It is for `host`:`port` (or an address, or localhost), and comes from a page from there, from one of `origins`, or
-    from a program that is no browser.
+    An allowed request names `host`, localhost or an IP address with `port`, and comes from a page of this server, from
+    one of `origins`, or from a program that is no browser.
     """
-    hosts, said = headers.get_all("Host") or [], headers.get_all("Origin") or []
-    if len(hosts) != 1 or not _leads_here(hosts[0], host, port):
+    hosts, sources = headers.get_all("Host") or [], headers.get_all("Origin") or []
+    if len(hosts) != 1 or not _names_this_server(hosts[0], host, port):
         return f"{' and '.join(hosts)[:200] or 'no host'} is not this machine"
-    if len(said) > 1 or any(origin not in (f"http://{hosts[0]}", *origins) for origin in said):
-        return f"a page of {' and '.join(said)[:200]} may not look"
+    if len(sources) > 1 or any(origin not in (f"http://{hosts[0]}", *origins) for origin in sources):
+        return f"a page of {' and '.join(sources)[:200]} may not look"
     return ""
 
 
-def _leads_here(asked: str, host: str, port: int) -> bool:
-    """Is it what a visitor would write who means this server?"""
+def _names_this_server(header: str, host: str, port: int) -> bool:
+    """Return whether a `Host` header names this server."""
     try:
-        place = urlsplit(f"//{asked}")
+        place = urlsplit(f"//{header}")
         name, number = place.hostname or "", place.port or 80
     except ValueError:
         return False
@@ -41,7 +40,7 @@ def _leads_here(asked: str, host: str, port: int) -> bool:
 
 
 def _is_address(name: str) -> bool:
-    """A stranger's page has a name; an address leads where it says."""
+    """Return whether a name is an IP address, which DNS rebinding cannot forge."""
     try:
         ip_address(name)
     except ValueError:

@@ -1,4 +1,4 @@
-"""What the live page shows: the latest of every robot, and the figures of the run."""
+"""State of the live page: the latest decision of every robot, and the counts of the run."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from collections import deque
 from dataclasses import dataclass, field
 from typing import Any
 
-from brakeline.logs.decision_explanation import explain, fits
-from brakeline.logs.episode_view import discs
+from brakeline.logs.decision_view import body_discs, boxes_from_above, decision_view
+from brakeline.logs.episode_stats import KINDS
 from brakeline.logs.foxglove_scene import half_width
 from brakeline.logs.metrics import SILENT, Crowded, Metrics
 from brakeline.logs.recorded_robots import RecordedRobots
@@ -20,51 +20,66 @@ from brakeline.messaging.bus import Sample
 from brakeline.messaging.obstacle import WALL
 from brakeline.messaging.rejected_messages import headline
 from brakeline.messaging.robot import Robot
-from brakeline.safety.perception.displayed_map import map_for_display, reserved_boxes
+from brakeline.safety.perception.displayed_map import reserved_boxes
 
-LINES = 8  # of warnings
-EPISODES = 300  # whose rewards are drawn
+LINES = 8  # warnings
+EPISODES = 300  # episodes in the reward curve
 TRAIL = 600  # positions of the running episode
 FIGURES_EVERY = 1.0  # s
-MOST_CARDS = 200
-KINDS = {pb.ALLOWED: "allowed", pb.ADJUSTED: "adjusted", pb.FAILSAFE: "failsafe", pb.RECOVERING: "recovering"}
+MOST_PANELS = 200
 LAUNCHER = "launcher"  # the process that knows the run from its beginning
-SETUP = ("run", "method", "arena", "seed", "steps")  # its notes about it
+SETUP = ("run", "method", "arena", "seed", "steps")  # the launcher's notes about the run
 
 
 @dataclass
 class RobotPanel:
-    """One robot, in its running episode. Positions are x and y in m, in the arena's frame."""
+    """One robot in its running episode. Positions are x and y in m, in the arena's frame.
+
+    Attributes:
+        arena: half of the arena's edge, obstacles, goal; empty before the first Episode message.
+        pose: x, y, heading; the heading is 0 for a robot without one.
+        height: z, for a robot in space.
+        tube: for each period of the plan: center x, y and half-width x, y.
+        margin: of the tube to the edge of free space; `at_least` if it is a lower bound.
+        said: why the filter changed the proposal; trust: what the verification of the plan is worth.
+        inputs: name, unit, proposed and executed value of each input; arrows: where both would take the robot.
+        edge: point and normal of the half-space that blocks the proposal.
+        around: scan and moving obstacles, as `DisplayedMap.flat`.
+        fleet: the actors of the robot's world; reservation: the boxes that this robot reserves.
+        trail: positions of the episode; marks: its interventions (x, y, kind).
+        ended: outcome of the previous episode.
+    """
 
     robot: Robot
     actor: str
-    number: int = 0  # of the episode
+    number: int = 0
     arena: dict[str, Any] = field(default_factory=dict)
-    pose: list[float] = field(default_factory=list)  # x, y, heading (0 where there is none)
-    height: float | None = None  # m, in space
+    pose: list[float] = field(default_factory=list)
+    height: float | None = None
     kind: str = ""
-    tube: list[list[float]] = field(default_factory=list)  # per period: center x, y, half-width x, y
+    tube: list[list[float]] = field(default_factory=list)
     margin: float | None = None
-    at_least: bool = False  # the margin is a lower bound
-    said: str = ""  # why it was not as proposed
-    trust: str = ""  # what the plan's having been verified is worth, where `said` does not say it
-    inputs: list[tuple[str, str, float, float]] = field(default_factory=list)  # name, unit, proposed, executed
-    arrows: list[list[float]] = field(default_factory=list)  # of the proposed and the executed input, m
-    edge: list[float] = field(default_factory=list)  # of what stopped the proposal: a point, and the normal there
-    around: dict[str, list[Any]] = field(default_factory=dict)  # `DisplayedMap.flat`
-    fleet: list[str] = field(default_factory=list)  # the actors of its world
-    reservation: list[list[float]] = field(default_factory=list)  # boxes: center x, y, half-width x, y with the radius
+    at_least: bool = False
+    said: str = ""
+    trust: str = ""
+    inputs: list[list[Any]] = field(default_factory=list)
+    arrows: list[list[float]] = field(default_factory=list)
+    edge: list[float] = field(default_factory=list)
+    around: dict[str, list[Any]] = field(default_factory=dict)
+    fleet: list[str] = field(default_factory=list)
+    reservation: list[list[float]] = field(default_factory=list)
     trail: deque[tuple[float, float]] = field(default_factory=lambda: deque(maxlen=TRAIL))
-    marks: deque[tuple[float, float, str]] = field(default_factory=lambda: deque(maxlen=TRAIL))  # interventions
+    marks: deque[tuple[float, float, str]] = field(default_factory=lambda: deque(maxlen=TRAIL))
     reward: float = 0.0
-    ended: str = ""  # how the episode before this one ended
+    ended: str = ""
 
     def begin(self, episode: pb.Episode) -> None:
+        """Start an episode."""
         self.number, self.reward = episode.episode, 0.0
         self.trail.clear()
         self.marks.clear()
         half = half_width(episode)
-        # Floors and ceilings would cover all; walls are the square's edges.
+        # A floor or a ceiling would cover the map; the walls are the edges of the square.
         inside = [o for o in episode.obstacles if o.kind != WALL and max(o.size) < 2.0 * half]
         self.arena = {
             "half": half,
@@ -74,40 +89,27 @@ class RobotPanel:
             "goal": list(episode.goal[:2]),
             "goal_radius": episode.goal_radius,
         }
-        self._stand(list(episode.start))
+        self._move_to(list(episode.start))
 
     def decide(self, exchange: pb.Exchange) -> None:
-        if not exchange.reply.HasField("decision"):
-            self.tube, self.margin = [], None
-            self._unexplained()
-            return
-        decision, d = exchange.reply.decision, self.robot.position_dim
-        centers, halves = decision.tube_center, decision.tube_half_width
-        if len(centers) != len(halves) or len(centers) % d or len(centers) > self.robot.horizon * d:
-            raise ValueError(f"a tube of {len(centers)} and {len(halves)} numbers")
-        self.tube = [[*centers[i : i + 2], *halves[i : i + 2]] for i in range(0, len(centers), d)]
-        self.margin, self.at_least = decision.margin, decision.at_least
-        self.around = map_for_display(self.robot, exchange.request).flat()
-        self.fleet = list(exchange.request.fleet)
-        boxes = reserved_boxes(self.robot, exchange)
-        self.reservation = [[*box[:2].tolist(), *(box[d : d + 2] + box[-1]).tolist()] for box in boxes]
-        self._explain(exchange.request, decision)
-
-    def _explain(self, request: pb.Request, decision: pb.Decision) -> None:
-        if not fits(self.robot, request, decision):
-            self._unexplained()
-            return
-        about = explain(self.robot, request, decision)
-        self.said = "" if decision.kind == pb.ALLOWED else about.said
-        self.trust = about.trust
-        self.inputs, self.arrows = about.inputs, [about.proposed[:2].tolist(), about.executed[:2].tolist()]
-        self.edge = [*about.at[:2].tolist(), *about.normal[:2].tolist()] if len(about.at) else []
-
-    def _unexplained(self) -> None:
+        """Show a decision; an exchange without a decision clears the panel's tube and explanation."""
+        self.tube, self.margin, self.at_least = [], None, False
         self.said, self.trust, self.inputs, self.arrows, self.edge = "", "", [], [], []
+        if not exchange.reply.HasField("decision"):
+            return
+        decision, view = exchange.reply.decision, decision_view(self.robot, exchange)
+        self.tube, self.margin, self.at_least = view.boxes_json(), decision.margin, decision.at_least
+        self.around = view.perceived_json()
+        self.fleet = list(exchange.request.fleet)
+        self.reservation = boxes_from_above(reserved_boxes(self.robot, exchange))
+        if about := view.explanation_json():
+            self.said = "" if decision.kind == pb.ALLOWED else about["said"]
+            self.trust, self.inputs, self.arrows = about["trust"], about["inputs"], about["arrows"]
+            self.edge = about["edge"] or []
 
     def step(self, step: pb.Step) -> None:
-        self._stand(list(step.state))
+        """Move the robot to its next state."""
+        self._move_to(list(step.state))
         self.kind = "failsafe" if step.fallback else KINDS.get(step.decision, "")
         self.reward += step.reward
         x, y, _ = self.pose
@@ -117,46 +119,48 @@ class RobotPanel:
         if step.terminated or step.truncated:
             self.ended = "collision" if step.collision else "goal" if step.goal else "time limit"
 
-    def _stand(self, state: list[float]) -> None:
+    def _move_to(self, state: list[float]) -> None:
         if len(state) != self.robot.state_dim:
-            raise ValueError(f"a state of {len(state)} numbers, a {self.robot.name} robot's has {self.robot.state_dim}")
+            raise ValueError(f"a state has {len(state)} numbers, not the {self.robot.state_dim} of {self.robot.name}")
         heading = 0.0 if self.robot.heading is None else state[self.robot.heading]
         self.pose = [state[0], state[1], heading]
         self.height = state[2] if self.robot.position_dim == 3 else None
 
     def view(self) -> dict[str, Any]:
+        """Return the panel for JSON."""
         names = (
             *("actor", "number", "arena", "pose", "height", "kind", "tube", "margin", "at_least", "reward", "ended"),
             *("said", "trust", "inputs", "arrows", "edge", "around"),
         )
         about = {name: getattr(self, name) for name in names}
         lists = {"trail": list(self.trail), "marks": list(self.marks)}
-        return about | lists | {"robot": self.robot.name, "footprint": self.robot.footprint, "discs": discs(self.robot)}
+        robot = {"robot": self.robot.name, "footprint": self.robot.footprint, "discs": body_discs(self.robot)}
+        return about | lists | robot
 
 
 class Dashboard:
-    """Takes samples in one thread; others ask for its `view`."""
+    """Collects samples from one thread; other threads read `view`."""
 
     def __init__(self) -> None:
         self._robots = RecordedRobots()
         self.metrics = Metrics(robots=self._robots)
-        self._cards: dict[str, RobotPanel] = {}
+        self._panels: dict[str, RobotPanel] = {}
         self._lines: deque[str] = deque(maxlen=LINES)
         self._returns: dict[str, deque[float]] = {}  # by robot kind
-        self._begun = self._heard = time.monotonic()
+        self._started = self._last_message = time.monotonic()
         self._figures: dict[str, Any] = {}
         self._figures_at = -1e9
         self._lock = threading.Lock()
 
-    def take(self, sample: Sample) -> None:
-        """One message; one of a robot that is not known here is left out.
+    def add(self, sample: Sample) -> None:
+        """Add one message. A message of an unknown robot is ignored.
 
         Raises:
-            Malformed, Crowded, ValueError: it can't be shown.
+            Malformed, Crowded, ValueError: the page cannot show the message.
         """
         message = sample.message()
         with self._lock:
-            self._heard = time.monotonic()
+            self._last_message = time.monotonic()
             self.metrics.add(sample.key, message)
             if isinstance(message, pb.LogLine):
                 if message.level in ("WARNING", "ERROR"):
@@ -164,42 +168,45 @@ class Dashboard:
             elif isinstance(message, pb.Episode | pb.Step):
                 self._robot(message)
             elif isinstance(message, pb.Exchange):
-                card = self._cards.get(message.request.actor)
-                if card is not None:
-                    card.decide(message)
+                panel = self._panels.get(message.request.actor)
+                if panel is not None:
+                    panel.decide(message)
 
     def _robot(self, message: pb.Episode | pb.Step) -> None:
-        card = self._cards.get(message.actor)
-        if card is None:
+        panel = self._panels.get(message.actor)
+        if panel is None:
             robot = self._robots.named(message.robot)
             if robot is None:
                 return
-            card = RobotPanel(robot, message.actor)
-            if len(self._cards) == MOST_CARDS:
-                raise Crowded(f"{message.actor} is one robot more than the {MOST_CARDS} that are shown")
-            self._cards[message.actor] = card
+            panel = RobotPanel(robot, message.actor)
+            if len(self._panels) == MOST_PANELS:
+                raise Crowded(f"{message.actor} cannot be shown: the page shows at most {MOST_PANELS} robots")
+            self._panels[message.actor] = panel
         if isinstance(message, pb.Episode):
-            card.begin(message)
+            panel.begin(message)
             return
-        card.step(message)
+        panel.step(message)
         if message.terminated or message.truncated:
-            self._returns.setdefault(card.robot.name, deque(maxlen=EPISODES)).append(card.reward)
+            self._returns.setdefault(panel.robot.name, deque(maxlen=EPISODES)).append(panel.reward)
 
     def view(self) -> dict[str, Any]:
-        """All that the page shows, as JSON can hold it."""
+        """Return everything that the page shows, for JSON."""
         with self._lock:
             now = time.monotonic()
             if now - self._figures_at > FIGURES_EVERY:
-                self._figures, self._figures_at = self._count(), now
-            cards = [self._cards[name].view() | {"promises": self._promises(name)} for name in sorted(self._cards)]
-            return {"robots": cards, "silent": now - self._heard} | self._figures
+                self._figures, self._figures_at = self._counts(), now
+            panels = [
+                panel.view() | {"promises": self._reservations_of_others(name)}
+                for name, panel in sorted(self._panels.items())
+            ]
+            return {"robots": panels, "silent": now - self._last_message} | self._figures
 
-    def _promises(self, name: str) -> list[list[float]]:
-        """The boxes in which the other robots of its world promise to be."""
-        others = (self._cards[actor] for actor in self._cards[name].fleet if actor != name and actor in self._cards)
-        return [box for card in others for box in card.reservation]
+    def _reservations_of_others(self, name: str) -> list[list[float]]:
+        """Return the boxes that the other robots of the actor's world reserve."""
+        others = (self._panels[actor] for actor in self._panels[name].fleet if actor != name and actor in self._panels)
+        return [box for panel in others for box in panel.reservation]
 
-    def _count(self) -> dict[str, Any]:
+    def _counts(self) -> dict[str, Any]:
         figures = self.metrics.figures()
         learners = {
             name: {key: about[key] for key in ("steps", "updates", "steps_per_s", "updates_per_s")}
@@ -207,12 +214,12 @@ class Dashboard:
         }
         times = figures.get("decision_ms") or {}
         launcher = self.metrics.processes.get(LAUNCHER)
-        whole = totals_from_health(launcher.figures) if launcher is not None else {}
-        counted = whole or run_totals(self.metrics)
+        reported = totals_from_health(launcher.figures) if launcher is not None else {}
+        counted = reported or run_totals(self.metrics)
         return {
             "run": self._run(),
-            # Counts of the whole run, or only of what was seen here.
-            "since": None if whole else time.monotonic() - self._begun,
+            # None: the counts cover the whole run, not only the time since this page started, s.
+            "since": None if reported else time.monotonic() - self._started,
             "totals": {robot: _means(counts) for robot, counts in sorted(counted.items())},
             "plans": figures["plans"] | {"stated": stated(figures["plans"])},
             "decide": {"p50": times.get("p50"), "p99": times.get("p99")},
@@ -223,7 +230,7 @@ class Dashboard:
         }
 
     def _run(self) -> dict[str, str]:
-        """What the launcher says of the run; `outcome` once it has ended. Without one, nothing."""
+        """Return the launcher's notes about the run, with `outcome` after the run's end."""
         launcher = self.metrics.processes.get(LAUNCHER)
         if launcher is None:
             return {}
@@ -231,16 +238,18 @@ class Dashboard:
         return about if launcher.alive else about | {"outcome": launcher.notes.get("outcome", "ended")}
 
     def _state(self, name: str) -> str:
-        """alive; ended: it said goodbye; silent: it did not, and nothing is heard of it."""
+        """Return alive, ended (its last Health message said so) or silent (no Health message for too long)."""
         processes = self.metrics.processes
         if not processes[name].alive:
             return "ended"
-        latest = max(process.heard_at for process in processes.values())  # by their clock, which may not be ours
-        quiet = (latest - processes[name].heard_at) * 1e-9 + time.monotonic() - self._heard
+        latest = max(
+            process.last_health_at for process in processes.values()
+        )  # by their clock, which may differ from the clock here
+        quiet = (latest - processes[name].last_health_at) * 1e-9 + time.monotonic() - self._last_message
         return "silent" if quiet > SILENT else "alive"
 
 
 def _means(counts: dict[str, float]) -> dict[str, float | None]:
-    """Counts with the mean reward in place of its sum."""
+    """Replace the sum of the rewards by their mean."""
     mean = counts["reward"] / counts["episodes"] if counts["episodes"] else None
     return {name: value for name, value in counts.items() if name != "reward"} | {"mean_reward": mean}

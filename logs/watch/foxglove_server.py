@@ -1,4 +1,4 @@
-"""Serves a running system to Foxglove: our messages and their pictures, on the channels that a log has."""
+"""Serve a running system to Foxglove: the messages and their scenes, on the same channels as in a log."""
 
 from __future__ import annotations
 
@@ -14,36 +14,41 @@ from google.protobuf.message import Message
 from mcap_protobuf.schema import build_file_descriptor_set
 
 from brakeline.logs.foxglove import ROOT, FoxgloveConverter
-from brakeline.logs.recorder import entry
+from brakeline.logs.recorder import entry as stored_entry
 from brakeline.logs.segment import Entry
 from brakeline.logs.watch.websocket_gate import WebSocketGate, hidden_host
 from brakeline.messaging.bus import Sample
 
-RATE = 20.0  # pictures a second and robot
+RATE = 20.0  # drawn steps per second and robot
 ORIGINS = ("https://app.foxglove.dev",)  # Foxglove in a browser
 
 
 class FoxgloveServer:
-    """A Foxglove server at `url`, from `with` to the end of the block. `take` is for one thread.
+    """A Foxglove WebSocket server at `url`; a context manager. Call `publish` from one thread only.
 
     Raises:
-        OSError: on entering, when the port is taken.
+        OSError: on entering, if the port is in use.
     """
 
     def __init__(
         self, host: str = "127.0.0.1", port: int = 0, rate: float = RATE, origins: Collection[str] = ORIGINS
     ) -> None:
-        """`port` 0: a free one; origins: of the pages that may connect; programs that are no browser always may."""
+        """Create a server.
+
+        Args:
+            port: 0 selects a free port.
+            origins: web pages that may connect. Programs that are no browser can always connect.
+        """
         self.host, self.port, self._origins = host, port, origins
-        self._pictures = FoxgloveConverter(rate)
+        self._converter = FoxgloveConverter(rate)
         self._context = foxglove.Context()
         self._channels: dict[str, foxglove.Channel] = {}
         self._schemas: dict[str, foxglove.Schema] = {}
-        self._arenas: dict[str, Entry] = {}  # the latest of each: a viewer that comes later needs it too
-        self._wanted: deque[str] = deque()
+        self._arenas: dict[str, Entry] = {}  # the latest arena of each actor, for viewers that connect later
+        self._subscribed: deque[str] = deque()
 
     def __enter__(self) -> Self:
-        listener: Any = _Listener(self._wanted)
+        listener: Any = _Listener(self._subscribed)
         hidden = hidden_host()
         self._server = foxglove.start_server(
             name="brakeline", host=hidden, port=0, context=self._context, server_listener=listener
@@ -61,29 +66,29 @@ class FoxgloveServer:
         self._gate.close()
         self._server.stop()
 
-    def take(self, sample: Sample) -> None:
-        """Publish a message and what is drawn of it."""
-        self._publish(entry(sample))
-        for picture in self._pictures.from_sample(sample):
+    def publish(self, sample: Sample) -> None:
+        """Publish a message and its scenes."""
+        self._log(stored_entry(sample))
+        for picture in self._converter.from_sample(sample):
             if picture.key.startswith(f"{ROOT}/arena/"):
                 self._arenas[picture.key] = picture
-            self._publish(picture)
+            self._log(picture)
 
     def refresh(self) -> None:
-        """Show the arenas to viewers that came since the last call."""
-        while self._wanted:
-            arena = self._arenas.get(self._wanted.popleft())
+        """Publish the arenas again for viewers that subscribed since the last call."""
+        while self._subscribed:
+            arena = self._arenas.get(self._subscribed.popleft())
             if arena is not None:
-                self._publish(arena)
+                self._log(arena)
 
-    def _publish(self, one: Entry) -> None:
-        if one.key not in self._channels:
-            assert not isinstance(one.type, str), "what we publish has a schema"
-            schema = self._schema(one.type)
-            self._channels[one.key] = foxglove.Channel(
-                one.key, message_encoding="protobuf", schema=schema, context=self._context
+    def _log(self, entry: Entry) -> None:
+        if entry.key not in self._channels:
+            assert not isinstance(entry.type, str), "every published message has a schema"
+            schema = self._schema(entry.type)
+            self._channels[entry.key] = foxglove.Channel(
+                entry.key, message_encoding="protobuf", schema=schema, context=self._context
             )
-        self._channels[one.key].log(one.payload, log_time=one.log_time)
+        self._channels[entry.key].log(entry.payload, log_time=entry.log_time)
 
     def _schema(self, kind: type[Message]) -> foxglove.Schema:
         name = kind.DESCRIPTOR.full_name
@@ -94,11 +99,11 @@ class FoxgloveServer:
 
 
 class _Listener(ServerListener):
-    """Notes, in the server's thread, which channels viewers begin to look at."""
+    """Records, in the server's thread, the channels that viewers subscribe to."""
 
-    def __init__(self, wanted: deque[str]) -> None:
-        self._wanted, self._lock = wanted, threading.Lock()
+    def __init__(self, subscribed: deque[str]) -> None:
+        self._subscribed, self._lock = subscribed, threading.Lock()
 
     def on_subscribe(self, client: Any, channel: Any) -> None:
         with self._lock:
-            self._wanted.append(channel.topic)
+            self._subscribed.append(channel.topic)

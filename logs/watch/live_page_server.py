@@ -1,7 +1,7 @@
-"""Serves the live page: a few static files, and the board's view as server-sent events.
+"""Serve the live page: static files, and the dashboard's view as server-sent events.
 
-It answers nobody but this machine unless told to, no page but its own in any case, and the page asks nobody else: its
-policy forbids it.
+By default only this machine can connect. Foreign web pages are rejected, and the page's content security policy forbids
+requests to other servers.
 """
 
 from __future__ import annotations
@@ -20,11 +20,13 @@ from typing import Any, Self
 from brakeline.logs.watch.allowed_hosts import rejection_reason
 
 RATE = 10.0  # Hz of events
-PATIENCE = 10.0  # s for a request, and for a reader that does not read
-FILES = {
-    "/": ("page.html", "text/html; charset=utf-8"),
-    "/page.js": ("page.js", "text/javascript; charset=utf-8"),
-    "/page.css": ("page.css", "text/css; charset=utf-8"),
+TIMEOUT = 10.0  # s for a request, and for a client that does not read
+FILES = {  # path: file in logs/, media type. The report and the live page share svg.js and scene.js.
+    "/": ("watch/page.html", "text/html; charset=utf-8"),
+    "/page.css": ("watch/page.css", "text/css; charset=utf-8"),
+    "/svg.js": ("report_page/svg.js", "text/javascript; charset=utf-8"),
+    "/scene.js": ("report_page/scene.js", "text/javascript; charset=utf-8"),
+    "/page.js": ("watch/page.js", "text/javascript; charset=utf-8"),
 }
 HEADERS = {
     "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; "
@@ -38,14 +40,14 @@ View = Callable[[], dict[str, Any]]
 
 
 class LivePageServer:
-    """The page at `url`, from `with` to the end of the block.
+    """An HTTP server of the live page at `url`; a context manager.
 
     Raises:
-        OSError: the port is taken.
+        OSError: the port is in use.
     """
 
     def __init__(self, view: View, host: str = "127.0.0.1", port: int = 0) -> None:
-        """`port` 0: a free one."""
+        """Create the server; `port` 0 selects a free port. `view` returns what the page shows."""
         self._ended = threading.Event()
         self._http = ThreadingHTTPServer((host, port), partial(_Handler, view, self._ended, host))
         self._http.daemon_threads = True
@@ -65,7 +67,7 @@ class LivePageServer:
 class _Handler(BaseHTTPRequestHandler):
     protocol_version = "HTTP/1.1"
 
-    timeout = PATIENCE
+    timeout = TIMEOUT
 
     def __init__(self, view: View, ended: threading.Event, host: str, *rest: Any) -> None:
         self._view, self._ended, self._host = view, ended, host
@@ -82,10 +84,10 @@ class _Handler(BaseHTTPRequestHandler):
                 self._send(200, "application/json", encode(self._view()).encode())
             elif path in FILES:
                 name, kind = FILES[path]
-                self._send(200, kind, (files("brakeline.logs.watch") / name).read_bytes())
+                self._send(200, kind, (files("brakeline.logs") / name).read_bytes())
             else:
-                self._send(404, "text/plain; charset=utf-8", b"there is only /\n")
-        except (ConnectionError, TimeoutError):  # whoever looked has gone
+                self._send(404, "text/plain; charset=utf-8", b"not found; the page is at /\n")
+        except (ConnectionError, TimeoutError):  # the client has disconnected
             self.close_connection = True
 
     def _send(self, status: int, kind: str, body: bytes) -> None:
@@ -95,7 +97,7 @@ class _Handler(BaseHTTPRequestHandler):
         self.wfile.write(body)
 
     def _events(self) -> None:
-        """The view, again and again, until the reader or the server goes."""
+        """Send the view repeatedly until the client disconnects or the server stops."""
         self.close_connection = True
         self._head(200, "text/event-stream")
         self.send_header("Connection", "close")
@@ -112,11 +114,11 @@ class _Handler(BaseHTTPRequestHandler):
             self.send_header(name, value)
 
     def log_message(self, format: str, *args: Any) -> None:
-        """Nobody needs to know who looks."""
+        """Log no requests."""
 
 
 def encode(view: dict[str, Any]) -> str:
-    """One line of JSON; what is not finite becomes null."""
+    """Encode the view as one line of JSON; a number that is not finite becomes null."""
     return json.dumps(_finite(view), separators=(",", ":"))
 
 

@@ -1,6 +1,6 @@
-"""Counts of a run from its beginning: the launcher tells them with its signs of life, for those who come late.
+"""Encode the counts of a run in the launcher's Health messages, for viewers that start later than the run.
 
-A count of a robot kind is called `ROBOT NAME` in a Health's figures.
+The figure of a Health message with the count NAME of a robot kind has the key `ROBOT NAME`.
 """
 
 from __future__ import annotations
@@ -10,35 +10,35 @@ from collections.abc import Mapping
 
 from brakeline.logs.metrics import Metrics
 
-COUNTS = ("steps", "episodes", "goals", "collisions", "interventions", "failsafes", "reward")  # reward: summed
+COUNTS = ("steps", "episodes", "goals", "collisions", "interventions", "failsafes", "reward")  # reward: the sum
 
-Totals = dict[str, dict[str, float]]  # by robot kind and name
+Totals = dict[str, dict[str, float]]  # by robot kind and name of the count
 
 
 def run_totals(metrics: Metrics) -> Totals:
-    """What metrics have counted so far. They may be added to meanwhile."""
-    found: Totals = {}
-    for tally in metrics.actors.copy().values():
-        if tally.robot:
-            counts = found.setdefault(tally.robot, dict.fromkeys(COUNTS, 0.0))
-            returns = tally.returns[:]
+    """Return the counts of the metrics, which another thread may extend meanwhile."""
+    totals: Totals = {}
+    for stats in metrics.actors.copy().values():
+        if stats.robot:
+            counts = totals.setdefault(stats.robot, dict.fromkeys(COUNTS, 0.0))
+            returns = stats.returns[:]
             counts["episodes"] += len(returns)
             counts["reward"] += math.fsum(returns)
             for name in ("steps", "goals", "collisions", "interventions", "failsafes"):
-                counts[name] += getattr(tally, name)
-    return found
+                counts[name] += getattr(stats, name)
+    return totals
 
 
-def totals_to_health(found: Totals) -> dict[str, float]:
-    """As a Health's figures."""
-    return {f"{robot} {name}": value for robot, counts in found.items() for name, value in counts.items()}
+def totals_to_health(totals: Totals) -> dict[str, float]:
+    """Encode counts as figures of a Health message."""
+    return {f"{robot} {name}": value for robot, counts in totals.items() for name, value in counts.items()}
 
 
 def totals_from_health(figures: Mapping[str, float]) -> Totals:
-    """What `totals_to_health` said, among other figures; a kind of which a count is missing or odd is left out."""
-    found: Totals = {}
+    """Decode counts from a Health message, without robot kinds whose counts are incomplete or invalid."""
+    totals: Totals = {}
     for key, value in figures.items():
         robot, _, name = key.partition(" ")
         if name in COUNTS and math.isfinite(value) and (value >= 0.0 or name == "reward"):
-            found.setdefault(robot, {})[name] = value
-    return {robot: counts for robot, counts in found.items() if len(counts) == len(COUNTS)}
+            totals.setdefault(robot, {})[name] = value
+    return {robot: counts for robot, counts in totals.items() if len(counts) == len(COUNTS)}

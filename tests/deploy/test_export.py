@@ -73,7 +73,7 @@ def test_minari_loads_the_episodes(
         assert np.array_equal(episode.infos["proposed"], np.array([s.proposed for s in mine], np.float32))
         assert episode.infos["decision"].tolist() == [s.decision for s in mine]
     assert cli.main(["export", str(log), "--minari", "brakeline/ground-v0"]) == 1
-    assert "is there already" in capsys.readouterr().err
+    assert "exists already" in capsys.readouterr().err
 
 
 def test_foxglove_draws_every_step_and_keeps_every_byte(

@@ -44,7 +44,7 @@ def report(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, An
     log = mixed(folder / "<b>mixed")
     analysis = analyse_runs(log, AnalysisOptions(pictures=True))
     path = folder / "report.html"
-    path.write_text(render(analysis.figures(), analysis.each()), encoding="utf-8")
+    path.write_text(render(analysis.figures(), analysis.by_label()), encoding="utf-8")
     return path, json.loads(json.dumps(analysis.figures()))
 
 

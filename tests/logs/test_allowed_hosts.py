@@ -1,4 +1,4 @@
-"""Who may look at a running system: no stranger's page, under whatever name it asks."""
+"""Foreign web pages cannot read a running system, whatever host name they use."""
 
 import http.client
 import json
@@ -38,12 +38,12 @@ def asked(server: LivePageServer, path: str, **headers: str) -> tuple[int, bytes
 
 
 @pytest.mark.parametrize("host", ["127.0.0.1:{port}", "localhost:{port}", "[::1]:{port}", "192.168.1.7:{port}"])
-def test_our_own_page_is_answered(server: LivePageServer, host: str) -> None:
+def test_the_live_page_itself_is_allowed(server: LivePageServer, host: str) -> None:
     status, body = asked(server, "/view.json", Host=host, Origin=f"http://{host}")
     assert status == 200 and json.loads(body)["robots"] == []
 
 
-@pytest.mark.parametrize("path", ["/", "/view.json", "/events", "/page.js"])
+@pytest.mark.parametrize("path", ["/", "/view.json", "/events", "/page.js", "/scene.js"])
 @pytest.mark.parametrize(
     "headers",
     [
@@ -53,7 +53,7 @@ def test_our_own_page_is_answered(server: LivePageServer, host: str) -> None:
     ],
     ids=str,
 )
-def test_a_strangers_page_is_not(server: LivePageServer, path: str, headers: dict[str, str]) -> None:
+def test_a_foreign_page_is_rejected(server: LivePageServer, path: str, headers: dict[str, str]) -> None:
     status, body = asked(server, path, **headers)
     assert status == 403 and b"robots" not in body
 
@@ -65,7 +65,7 @@ def live() -> Iterator[FoxgloveServer]:
 
 
 @pytest.mark.parametrize("origin", [None, "https://app.foxglove.dev"])
-def test_foxglove_is_let_in(live: FoxgloveServer, origin: str | None) -> None:
+def test_foxglove_can_connect(live: FoxgloveServer, origin: str | None) -> None:
     with connect(live.url, subprotocols=["foxglove.sdk.v1"], origin=origin) as visit:  # type: ignore[arg-type, list-item]
         assert json.loads(visit.recv(timeout=10.0))["op"] == "serverInfo"
 
@@ -74,7 +74,7 @@ def test_foxglove_is_let_in(live: FoxgloveServer, origin: str | None) -> None:
     "headers",
     [{"Origin": "https://evil"}, {"Origin": "null"}, {"Host": "evil"}, {"Origin": "https://app.foxglove.dev.evil"}],
 )
-def test_a_strangers_page_hears_nothing_of_what_foxglove_is_told(live: FoxgloveServer, headers: dict[str, str]) -> None:
+def test_a_foreign_page_cannot_connect_to_the_foxglove_server(live: FoxgloveServer, headers: dict[str, str]) -> None:
     url = live.url.replace("127.0.0.1", headers.get("Host", "127.0.0.1"))
     there = socket.create_connection(("127.0.0.1", live.port))
     with there, pytest.raises(InvalidStatus) as refused:
@@ -87,7 +87,7 @@ def listening() -> set[tuple[str, int]]:
     return {tuple(c.laddr) for c in psutil.Process().net_connections("tcp") if c.status == psutil.CONN_LISTEN}
 
 
-def test_the_server_behind_the_gate_is_where_no_page_looks() -> None:
+def test_the_foxglove_server_listens_on_a_hidden_address() -> None:
     before = listening()  # also a server that was told to stop, and has not yet
     with FoxgloveServer() as live:
         new = listening() - before

@@ -1,4 +1,4 @@
-"""Bags: what readers of bags make of them, whole, cut off, and when the disk is full."""
+"""Bags read back by other readers: complete ones, incomplete ones, and ones of a full disk."""
 
 import time
 
@@ -27,7 +27,7 @@ def test_a_bag_holds_every_message_with_its_type_and_qos(tmp_path):
     assert bag.count == 21
 
 
-def test_what_came_a_second_before_a_kill_is_in_the_file(tmp_path, monkeypatch):
+def test_a_message_from_a_second_before_a_kill_is_in_the_file(tmp_path, monkeypatch):
     monkeypatch.setattr(bags, "PERIOD", 0.01)
     bag = BagWriter(tmp_path / "bag")
     for i in range(30):
@@ -49,7 +49,7 @@ def test_a_folder_that_is_there_is_left_alone(tmp_path):
         BagWriter(tmp_path)
 
 
-def test_a_full_disk_is_said_once_and_the_rest_goes_on(tmp_path, monkeypatch, caplog):
+def test_a_full_disk_is_reported_once_and_the_node_goes_on(tmp_path, monkeypatch, caplog):
     def full(*_):
         raise OSError("no space left")
 
@@ -59,7 +59,7 @@ def test_a_full_disk_is_said_once_and_the_rest_goes_on(tmp_path, monkeypatch, ca
     monkeypatch.setattr(bag, "_flush", full)
     for i in range(5):
         bag("/cmd_vel", Twist, encode(twist(0.0, 0.0)), i, Qos())
-    assert caplog.text.count("NOT RECORDING") == 1 and bag.count == 1
+    assert caplog.text.count("RECORDING STOPPED") == 1 and bag.count == 1
     monkeypatch.setattr(bag, "_flush", flush)
     with bag:
         pass

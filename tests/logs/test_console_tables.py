@@ -1,4 +1,4 @@
-"""Tables into files and terminals: no cell is cut."""
+"""Console tables never truncate a cell, in files and in terminals."""
 
 import io
 
@@ -18,19 +18,19 @@ def printed(**console):
     return file.getvalue()
 
 
-def test_into_a_file_a_table_goes_as_wide_as_it_is(monkeypatch):
+def test_a_table_in_a_file_has_its_full_width(monkeypatch):
     monkeypatch.delenv("COLUMNS", raising=False)
     (row,) = (line for line in printed().splitlines() if CELLS[0] in line)
     assert all(cell in row for cell in CELLS)
 
 
 @pytest.mark.parametrize("width", [40, 80])
-def test_in_a_terminal_what_does_not_fit_is_put_below_each_other(width):
+def test_a_table_wider_than_the_terminal_is_stacked(width):
     text = printed(force_terminal=True, width=width, no_color=True)
     assert "column 5:" in text
     assert max(map(len, text.splitlines())) < width + 40  # and colours
 
 
-def test_columns_says_how_wide_who_reads_a_file_is(monkeypatch):
+def test_the_variable_columns_limits_the_width_of_a_file(monkeypatch):
     monkeypatch.setenv("COLUMNS", "80")
     assert "column 5:" in printed() and "not short" in printed().replace("\n", " ")

@@ -1,4 +1,4 @@
-"""What the live page says: of the whole run, of each robot kind apart, and that a run has ended rather than died."""
+"""The live page: counts of the whole run, robot kinds apart, and a run that has ended in order."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -31,9 +31,9 @@ def mixed(say: Say) -> Dashboard:
     """A board in the middle of a run with two robot kinds, of which each ends an episode while it is watched."""
     board = Dashboard()
     for number in range(3):
-        board.take(say("step/ground/a", step("ground", "a", number, 10.0, number == 2)))
-        board.take(say("step/quadrotor/b", step("quadrotor", "b", number, -1.0, number == 2)))
-    board.take(say("health/learner", health("learner")))
+        board.add(say("step/ground/a", step("ground", "a", number, 10.0, number == 2)))
+        board.add(say("step/quadrotor/b", step("quadrotor", "b", number, -1.0, number == 2)))
+    board.add(say("health/learner", health("learner")))
     return board
 
 
@@ -43,7 +43,7 @@ def launched(say: Say, board: Dashboard, last: bool = False, outcome: str = "") 
     counts = {"steps": 30.0, "episodes": 10.0, "goals": 9.0, "collisions": 0.0, "interventions": 3.0, "failsafes": 1.0}
     figures = totals_to_health({"ground": counts | {"reward": 290.0}, "quadrotor": counts | {"reward": -30.0}})
     notes |= {"outcome": outcome} if outcome else {}
-    board.take(say("health/launcher", health("launcher", last, figures=figures, notes=notes)))
+    board.add(say("health/launcher", health("launcher", last, figures=figures, notes=notes)))
 
 
 def test_rewards_of_different_robots_are_not_mixed(mixed: Dashboard) -> None:
@@ -55,7 +55,7 @@ def test_rewards_of_different_robots_are_not_mixed(mixed: Dashboard) -> None:
     assert shown["returns"] == {"ground": [30.0], "quadrotor": [-3.0]}
 
 
-def test_counts_are_of_the_whole_run_or_it_is_said_that_they_are_not(say: Say, mixed: Dashboard) -> None:
+def test_counts_cover_the_whole_run_or_the_page_says_that_they_do_not(say: Say, mixed: Dashboard) -> None:
     shown = mixed.view()
     assert shown["since"] is not None and shown["totals"]["ground"]["steps"] == 3
     launched(say, mixed)
@@ -69,23 +69,23 @@ def test_counts_are_of_the_whole_run_or_it_is_said_that_they_are_not(say: Say, m
 def test_a_run_that_ended_in_order_is_not_a_run_that_died(say: Say, mixed: Dashboard) -> None:
     launched(say, mixed)
     assert mixed.view()["processes"] == {"launcher": "alive", "learner": "alive"}
-    mixed.take(say("health/learner", health("learner", last=True)))
+    mixed.add(say("health/learner", health("learner", last=True)))
     launched(say, mixed, last=True, outcome="finished")
-    mixed._heard -= 1000.0
+    mixed._last_message -= 1000.0
     mixed._figures_at = -1e9
     shown = mixed.view()
     assert shown["run"]["outcome"] == "finished"
     assert shown["processes"] == {"launcher": "ended", "learner": "ended"}
 
 
-def test_who_said_no_goodbye_is_silent(say: Say, mixed: Dashboard) -> None:
+def test_a_process_without_a_last_health_message_is_silent(say: Say, mixed: Dashboard) -> None:
     launched(say, mixed)
-    mixed._heard -= 1000.0
+    mixed._last_message -= 1000.0
     shown = mixed.view()
     assert "outcome" not in shown["run"] and shown["processes"] == {"launcher": "silent", "learner": "silent"}
 
 
-def test_what_a_launcher_tells_is_what_it_counted() -> None:
+def test_totals_survive_a_health_message() -> None:
     metrics = Metrics()
     for number in range(4):
         metrics.add("step/ground/a", step("ground", "a", number, 2.5, number == 3))
@@ -111,19 +111,19 @@ def page(mixed: Dashboard, tmp_path: Path) -> Iterator[Page]:
         yield page
 
 
-def test_the_page_says_so(say: Say, mixed: Dashboard, page: Page) -> None:
+def test_the_page_shows_counts_and_the_end_of_the_run(say: Say, mixed: Dashboard, page: Page) -> None:
     tiles = "[...document.querySelectorAll('#figures .group')].map(g => g.dataset.robot + ': ' + g.textContent)"
     page.until(f"{tiles}.length === 2")
     assert "that were watched" in page.value("document.getElementById('scope').textContent")
-    mixed._heard += 1000.0  # the browser's start takes as long as it likes
+    mixed._last_message += 1000.0  # the browser's start takes as long as it likes
     page.until("document.getElementById('link').textContent === 'live'")
     launched(say, mixed)
-    mixed.take(say("health/learner", health("learner", last=True)))
+    mixed.add(say("health/learner", health("learner", last=True)))
     launched(say, mixed, last=True, outcome="finished")
     page.until("document.getElementById('link').textContent === 'the run has ended: finished'")
-    page.until("document.getElementById('scope').textContent.startsWith('Counts are of the whole run')")
+    page.until("document.getElementById('scope').textContent.startsWith('Counts cover the whole run')")
     page.until("document.getElementById('done').textContent === '60 of 600 steps (10 %)'")
-    mixed._heard -= 2000.0
+    mixed._last_message -= 2000.0
     page.until("document.querySelectorAll('#processes .ended').length === 2")
     assert page.value("document.getElementById('link').className") == "ended"
     rewards = "[...document.querySelectorAll('#figures .group')].map(g => g.querySelectorAll('dd')[6].textContent)"

@@ -1,4 +1,4 @@
-"""Foxglove's pictures: what stands where, how many there are, and that a bad message costs no more than its picture."""
+"""Foxglove scenes: positions, rates, and that a malformed message loses only its scene."""
 
 import importlib
 import json
@@ -152,7 +152,7 @@ def test_calm_steps_are_thinned_out_and_interventions_are_not(say: Say) -> None:
     assert 3 + 18 <= drawn["decision"] <= 3 + 20  # a step comes every 2 s
 
 
-def test_what_is_drawn_has_the_time_of_receipt_and_is_no_loss_in_the_numbers(studio: Studio, say: Say) -> None:
+def test_a_scene_has_the_time_of_receipt_and_no_sequence_number(studio: Studio, say: Say) -> None:
     sample = say("episode/ground/actor-0", episode())
     for entry in studio.pictures.from_sample(sample):
         assert entry.log_time == entry.publish_time == sample.received and entry.sequence == 0
@@ -162,13 +162,13 @@ def test_what_is_drawn_has_the_time_of_receipt_and_is_no_loss_in_the_numbers(stu
 
 
 def test_arenas_of_several_actors_do_not_overlap() -> None:
-    sites = ArenaLayout()
-    squares = [(sites.of("ground", f"a{i}", 10.0), 10.0) for i in range(3)]
-    squares += [(sites.of("quadrotor", f"q{i}", 40.0), 40.0) for i in range(2)]
+    layout = ArenaLayout()
+    squares = [(layout.position("ground", f"a{i}", 10.0), 10.0) for i in range(3)]
+    squares += [(layout.position("quadrotor", f"q{i}", 40.0), 40.0) for i in range(2)]
     for i, ((x, y), edge) in enumerate(squares):
         for (u, v), other in squares[:i]:
             assert max(abs(x - u), abs(y - v)) >= (edge + other) / 2
-    assert sites.of("ground", "a1", 10.0) == squares[1][0], "an actor keeps its place"
+    assert layout.position("ground", "a1", 10.0) == squares[1][0], "an actor keeps its place"
 
 
 def test_the_quadrotors_rays_are_a_cloud_of_the_points_that_were_hit() -> None:

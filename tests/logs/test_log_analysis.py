@@ -73,13 +73,13 @@ def test_a_resumed_run_is_one_run_and_its_pause_is_not_counted(log: Path) -> Non
     first, last = (figures["segments"][place][edge] for place, edge in ((0, "start"), (1, "end")))
     assert last - first > 100.0 > figures["seconds"] > 1.0
     actor = figures["processes"]["actor-1"]
-    assert (actor["starts"], actor["ended"]) == (2, "lived at the log's end")
+    assert (actor["starts"], actor["ended"]) == (2, "alive at the end of the log")
     assert figures["processes"]["actor-0"]["ended"] == "in order"
     assert figures["metadata"]["configuration"] == {"steps": 12}
     assert figures["metadata"]["model ground"] == ABOUT["model ground"] and figures["seed"] == 7
 
 
-def test_many_runs_are_told_apart_and_joined(tmp_path: Path) -> None:
+def test_runs_are_labelled_and_merged(tmp_path: Path) -> None:
     folders = [mixed(tmp_path / name, seed, 8) for seed, name in enumerate(("one", "two"), 5)]
     both, single = analyse(folders), [analyse(folder) for folder in folders]
     assert list(both["runs"]) == ["one", "two"]
@@ -96,12 +96,12 @@ def test_many_runs_are_told_apart_and_joined(tmp_path: Path) -> None:
     ]
 
 
-def test_who_ended_with_an_earlier_run_is_not_missed_by_a_later_one(tmp_path: Path) -> None:
+def test_a_process_of_an_earlier_run_is_not_silent_in_a_later_one(tmp_path: Path) -> None:
     folders = [mixed(tmp_path / "one", 1, 8), mixed(tmp_path / "two", 2, 8, later=1e4)]
     both, single = analyse(folders), analyse(folders[0])
     for name, process in single["processes"].items():
         assert both["processes"][f"one/{name}"]["ended"] == process["ended"]
-    assert {p["ended"] for p in both["processes"].values()} == {"in order", "lived at the log's end"}
+    assert {p["ended"] for p in both["processes"].values()} == {"in order", "alive at the end of the log"}
     for label, folder in zip(("one", "two"), folders, strict=True):
         assert both["training"][f"{label}/ground"] == analyse(folder)["training"]["ground"], "curves are not joined"
 
@@ -121,7 +121,7 @@ def test_names_of_runs() -> None:
     assert [path.name for path in runs["a"]] == ["run.mcap", "run_0001.mcap"]
 
 
-def test_what_is_missing_is_said(tmp_path: Path) -> None:
+def test_missing_segments_and_damage_are_reported(tmp_path: Path) -> None:
     writer = Writer()
     for number in range(4):
         writer.episode("actor-0", number)
@@ -137,7 +137,7 @@ def test_what_is_missing_is_said(tmp_path: Path) -> None:
     assert figures["topics"]["step/ground/actor-0"]["missing"] > 0
 
 
-def test_an_episode_in_detail_is_what_was_recorded(log: Path) -> None:
+def test_the_table_of_an_episode_has_the_recorded_values(log: Path) -> None:
     figures = analyse_runs(log, AnalysisOptions(episode=3, actor="actor-1")).figures()
     (detail,) = figures["episode_detail"]
     messages = once(decoded(find(log)))
@@ -156,7 +156,7 @@ def test_an_episode_in_detail_is_what_was_recorded(log: Path) -> None:
 
 
 def test_the_nearest_misses_are_the_nearest(log: Path) -> None:
-    pictures = analyse_runs(log, AnalysisOptions(pictures=True)).each()["mixed"][1]
+    pictures = analyse_runs(log, AnalysisOptions(pictures=True)).by_label()["mixed"][1]
     closest: dict[tuple[str, int, int], float] = {}
     for key, step in once(decoded(find(log))):
         if key.startswith("step/ground"):
@@ -205,7 +205,7 @@ def test_memory_does_not_grow_with_the_log(tmp_path: Path) -> None:
         analysis = analyse_runs(tmp_path / name, AnalysisOptions(pictures=True))
         held.append(tracemalloc.get_traced_memory()[1])
         tracemalloc.stop()
-        _, pictures = analysis.each()[name]
+        _, pictures = analysis.by_label()[name]
         assert len(pictures["galleries"]["ground"]["episodes"]) <= SPREAD + 8 + 8 + 4 + 1
     assert held[1] - held[0] < 2**20
 
@@ -259,7 +259,7 @@ def test_a_damaged_chunk_in_the_middle_is_skipped_and_the_rest_is_read(tmp_path:
 
 
 @pytest.mark.parametrize("columns", [60, 80, 160])
-def test_what_the_terminal_says_is_whole_at_any_width(tmp_path: Path, columns: int) -> None:
+def test_console_output_is_complete_at_any_width(tmp_path: Path, columns: int) -> None:
     folders = [mixed(tmp_path / name, seed, 6) for seed, name in enumerate(("one", "two"), 1)]
     for figures in (analyse(folders[0]), analyse(folders)):
         file = io.StringIO()

@@ -19,7 +19,7 @@ from mcap_protobuf.decoder import DecoderFactory
 from brakeline.deploy.cli import main
 from brakeline.logs.log_recovery import BeingRecorded, recover
 from brakeline.logs.reader import Log, NotALog, open_log
-from brakeline.logs.recorder import Inbox, Recording, Rotation, as_it_came
+from brakeline.logs.recorder import Inbox, Recording, Rotation, malformed_entry
 from brakeline.logs.segment import being_written, open_segment
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.bus import Bus, BusSettings, Sample
@@ -54,7 +54,7 @@ def whole(path: Path) -> list[int]:
     return numbers
 
 
-def test_a_file_cut_anywhere_is_made_whole_and_what_was_cut_is_said(tmp_path: Path) -> None:
+def test_a_truncated_file_is_repaired_and_the_damage_is_reported(tmp_path: Path) -> None:
     writer = Writer(losses=0.0)
     for number in range(6):
         writer.episode("actor-0", number)
@@ -103,13 +103,13 @@ def test_everything_in_the_file_is_taken_over_that_of_others_too(tmp_path: Path)
         assert len(list(reader.iter_messages(topics=["/bare"]))) == 40
 
 
-def test_what_is_being_recorded_or_is_no_log_is_left_alone(tmp_path: Path) -> None:
+def test_a_file_that_is_being_recorded_or_is_no_log_is_not_changed(tmp_path: Path) -> None:
     segment = open_segment(tmp_path / "run.mcap", {})
     assert being_written(segment.path)
     with pytest.raises(BeingRecorded, match="is being recorded"):
         recover(segment.path)
     log = open_log(segment.path)
-    assert list(log) == [] and "it is being recorded" in str(log.cuts[0]) and log.segments[0].recording
+    assert list(log) == [] and "the file is being recorded" in str(log.cuts[0]) and log.segments[0].recording
     segment.finish()
     assert not being_written(segment.path)
     (tmp_path / "text.mcap").write_text("a long story, but not a log")
@@ -205,5 +205,5 @@ def test_killed_at_ten_random_moments_nothing_older_than_a_second_is_missing(rou
         assert len(found) >= old, f"kill {number}: {old - len(found)} older than a second are missing"
 
 
-def test_entries_keep_what_cannot_be_decoded() -> None:
-    assert as_it_came(Sample(STEP, "step/ground/a", b"\xff", 7)).payload == b"\xff"
+def test_entries_of_malformed_messages_have_their_bytes() -> None:
+    assert malformed_entry(Sample(STEP, "step/ground/a", b"\xff", 7)).payload == b"\xff"

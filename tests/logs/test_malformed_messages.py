@@ -1,4 +1,4 @@
-"""Messages that killed the recorder and `watch`, or made a log that nothing could read."""
+"""Malformed messages never stop the recorder, `watch` or an analysis."""
 
 import json
 import math
@@ -54,7 +54,7 @@ def record(path: Path, samples: list[Sample], rejected: RejectedMessages | None 
 
 
 @pytest.mark.parametrize("hostile", HOSTILE, ids=lambda one: one.key)
-def test_the_recorder_keeps_what_it_cannot_date_and_goes_on(hostile: Sample, say: Say, tmp_path: Path) -> None:
+def test_the_recorder_stores_malformed_messages_and_goes_on(hostile: Sample, say: Say, tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     good = say("log/a", pb.LogLine(text="after it"))
     recording = record(path, [hostile, good])
@@ -92,7 +92,7 @@ MALFORMED = [
 
 
 @pytest.mark.parametrize("malformed", MALFORMED, ids=lambda one: one.key)
-def test_watch_passes_over_what_it_cannot_show(malformed: Sample, say: Say) -> None:
+def test_watch_skips_malformed_messages(malformed: Sample, say: Say) -> None:
     board, rejected = Dashboard(), RejectedMessages()
     step = pb.Step(robot="ground", actor="b", state=[1.0, 0.0, 0.0, 0.0, 0.0])
     show_received(deque([malformed, say("step/ground/b", step)]), board, None, rejected)
@@ -100,14 +100,14 @@ def test_watch_passes_over_what_it_cannot_show(malformed: Sample, say: Say) -> N
     assert shown["b"]["pose"] == [1.0, 0.0, 0.0]
 
 
-def test_an_analysis_counts_what_it_cannot_handle_and_goes_on(say: Say, tmp_path: Path) -> None:
+def test_an_analysis_counts_malformed_messages_and_goes_on(say: Say, tmp_path: Path) -> None:
     step = pb.Step(robot="ground", actor="b", state=[1.0, 0.0, 0.0, 0.0, 0.0], truncated=True)
     infinite = pb.Step(robot="ground", actor="a", state=[math.inf] * 5)
     record(tmp_path / "run.mcap", [*HOSTILE, *MALFORMED, sample(STEP, infinite), say("step/ground/b", step)])
     found = analyse_runs(tmp_path, AnalysisOptions(pictures=True))
     figures = found.figures()
     assert figures["actors"]["b"]["episodes"] == 1 and figures["malformed"] >= 5
-    found.each()
+    found.by_label()
 
 
 def chunk_of(size: int, compression: str, frame: bytes) -> bytes:

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from brakeline.logs.decision_stats import DecisionStats, joined
+from brakeline.logs.decision_stats import DecisionStats, merge_decisions
 from brakeline.logs.learning_curve import LearningCurve
 from brakeline.logs.metrics import EpisodeStats, Metrics, closed_loop, spread
 from brakeline.logs.recorder import entry
@@ -79,7 +79,7 @@ def test_steps_adjusted_for_clearance_are_counted_where_every_adjusted_step_says
         new.step(step)
     figures = closed_loop([new])
     assert (figures["interventions"], figures["adjusted"], figures["for_clearance"]) == (3, 3, 2)
-    assert for_clearance(figures) == "2 of 3 adjusted: the proposal itself was verified"
+    assert for_clearance(figures) == "2 of 3 adjusted proposals were verified themselves"
     for step in some_steps():  # as logged by a version that did not say
         old.step(step)
     figures = closed_loop([old])
@@ -111,7 +111,7 @@ def put(metrics: Metrics, sample: Sample) -> None:
     metrics.add(sample.key, sample.message())
 
 
-def test_losses_are_gaps_in_the_numbers_and_what_health_tells_of(say: Say) -> None:
+def test_losses_are_gaps_in_sequence_numbers_and_in_health_counts(say: Say) -> None:
     lines = [say("log/a", pb.LogLine(level="INFO")) for _ in range(10)]
     metrics = Metrics()
     for line in (*lines[2:5], lines[4], lines[7]):
@@ -181,7 +181,7 @@ def test_the_figures_do_not_depend_on_how_actors_are_interleaved(say: Say) -> No
     assert one.figures() == two.figures()
 
 
-def test_analyse_gives_what_a_live_listener_had(tmp_path: Path, say: Say) -> None:
+def test_analyse_and_a_live_listener_compute_the_same_figures(tmp_path: Path, say: Say) -> None:
     samples = run_of_two_actors(say)
     live = Metrics()
     about = {"method": "ddpc", "certificate": "residual", "arena": "default", "seed": "7"}
@@ -223,4 +223,4 @@ def test_times_that_are_none_warn_nobody() -> None:
     decisions = DecisionStats()
     said = pb.Decision(kind=pb.ALLOWED, queue_ms=math.inf, time_ms=math.inf)
     decisions.exchange(pb.Exchange(round_trip_ms=math.inf, reply=pb.Reply(decision=said)))
-    assert joined([decisions]).figures()["latency_ms"]["allowed"]["network"] is None
+    assert merge_decisions([decisions]).figures()["latency_ms"]["allowed"]["network"] is None

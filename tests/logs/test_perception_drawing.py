@@ -1,4 +1,4 @@
-"""What the filter was told is in Foxglove's scene, on the live page and in the report, with the promises of others."""
+"""Foxglove, the live page and the report draw the perceived surroundings and the reservations."""
 
 from pathlib import Path
 
@@ -30,7 +30,7 @@ FAN = np.linspace(-np.pi, np.pi, 360, endpoint=False)
 WALKER = Obstacle(CYLINDER, (1.0, 0.5), (0.2,), motion=Motion((0.5, 0.0), 0.03, 0.05, acceleration=1.0))
 
 
-def told(actor: str, number: int = 0, x: float = 0.0) -> pb.Exchange:
+def fleet_exchange(actor: str, number: int = 0, x: float = 0.0) -> pb.Exchange:
     """A robot of a fleet of two that has a scan and sees a walker, and promises to be about x."""
     reservation = pb.Reservation(center=[x, 0.0] * 3, half_width=[0.1, 0.2] * 3, radius=[0.15] * 3)
     decision = pb.Decision(
@@ -50,22 +50,22 @@ def told(actor: str, number: int = 0, x: float = 0.0) -> pb.Exchange:
     return pb.Exchange(request=request, reply=pb.Reply(decision=decision))
 
 
-def test_foxgloves_scene_has_it(say: Say) -> None:
+def test_foxglove_draws_the_perceived_surroundings(say: Say) -> None:
     studio = Studio(say)
     for actor, x in (("a", 0.0), ("b", 2.0)):
         studio(f"episode/ground/{actor}", episode(actor))
-        studio(f"exchange/ground/{actor}", told(actor, x=x))
+        studio(f"exchange/ground/{actor}", fleet_exchange(actor, x=x))
         drawn = studio(f"step/ground/{actor}", step(0, pb.RECOVERING, actor))
     shown = drawn["foxglove/decision/ground/b"].entities[0]
     free, hits = shown.lines[1:]
     assert max(np.hypot(p.x - 2.0, p.y) for p in free.points) <= 2.0 and len(hits.points) == 2 * 360
     discs = [round(0.5 * cylinder.size.x, 3) for cylinder in shown.cylinders]
-    swept = map_for_display(GROUND, told("b").request).swept[0, :, 2].round(3).tolist()
+    swept = map_for_display(GROUND, fleet_exchange("b").request).swept[0, :, 2].round(3).tolist()
     assert 0.2 in discs and set(swept) <= set(discs)
     boxes = [
         (c.pose.position.x, round(c.size.x, 6), round(c.size.y, 6))
         for c in shown.cubes
-        if c.color == foxglove_scene.PROMISE
+        if c.color == foxglove_scene.RESERVED
     ]
     assert boxes == [(0.0, 0.5, 0.7)] * 3, "the other's alone"
     assert shown.texts[0].color.r == pytest.approx(142 / 255), "recovering is violet"
@@ -80,37 +80,37 @@ def test_of_a_range_image_so_few_hits_are_drawn_that_a_recorder_keeps_up(say: Sa
     exchange.reply.decision.kind = pb.ADJUSTED
     drawn = foxglove_scene.decision(QUADROTOR, pb.Step(actor="q", state=[0.0] * 9, decision=pb.ADJUSTED), exchange, 0)
     (hits,) = (line for line in drawn.entities[0].lines if line.type == line.LINE_LIST)
-    assert foxglove_scene.MARKED <= len(hits.points) <= 2 * foxglove_scene.MARKED and drawn.ByteSize() < 2**16
+    assert foxglove_scene.MOST_HITS <= len(hits.points) <= 2 * foxglove_scene.MOST_HITS and drawn.ByteSize() < 2**16
     away = [np.linalg.norm([p.x - 1.0, p.y, p.z - 2.0]) for p in hits.points[::2]]
     assert np.allclose(away, 5.0)
 
 
-def test_a_scan_that_is_none_costs_its_picture_only(say: Say) -> None:
+def test_a_malformed_scan_loses_only_its_scene(say: Say) -> None:
     pictures = FoxgloveConverter(float("inf"))
-    broken = told("a")
+    broken = fleet_exchange("a")
     broken.request.scan.pose.append(1.0)
     for key, message in (("episode", episode("a")), ("exchange", broken), ("step", step(0, pb.RECOVERING, "a"))):
         pictures.from_sample(say(f"{key}/ground/a", message))
     assert pictures.failures == 1
 
 
-def test_the_live_page_is_told(say: Say) -> None:
+def test_the_live_page_has_the_perceived_surroundings(say: Say) -> None:
     board = Dashboard()
     for actor, x in (("a", 0.0), ("b", 2.0)):
-        board.take(say(f"episode/ground/{actor}", episode(actor)))
-        board.take(say(f"exchange/ground/{actor}", told(actor, x=x)))
+        board.add(say(f"episode/ground/{actor}", episode(actor)))
+        board.add(say(f"exchange/ground/{actor}", fleet_exchange(actor, x=x)))
     a, b = board.view()["robots"]
     assert np.allclose(a["promises"], [[2.0, 0.0, 0.25, 0.35]] * 3) and np.allclose(b["promises"][0][0], 0.0)
     assert a["around"]["movers"] == [[1.0, 0.5, 0.2]] and len(a["around"]["swept"][0]) == 3
     assert len(a["around"]["free"]) > 50 < len(a["around"]["hits"])
 
 
-def test_a_picture_of_the_report_has_it() -> None:
+def test_the_report_has_the_perceived_surroundings() -> None:
     gallery = EpisodeSampler(GROUND)
     for actor, x in (("a", 0.0), ("b", 2.0)):
         source = gallery.source(actor)
         source.about.append(episode(actor))
-        source.exchanges.extend(told(actor, k, x) for k in range(3))
+        source.exchanges.extend(fleet_exchange(actor, k, x) for k in range(3))
     for k in range(3):
         for actor in ("a", "b"):
             gallery.step(gallery.source(actor), step(k, pb.RECOVERING, actor, clearance=0.5))
@@ -128,27 +128,27 @@ def drawn(page: Page, name: str) -> int:
 
 
 @pytest.mark.skipif(CHROMIUM is None, reason="there is no Chromium: the pages were not looked at")
-def test_browsers_draw_it(say: Say, tmp_path: Path) -> None:
+def test_browsers_draw_the_perceived_surroundings(say: Say, tmp_path: Path) -> None:
     writer, board = Writer(losses=0.0), Dashboard()
     for actor in ("a", "b"):
         writer.put(f"episode/ground/{actor}", episode(actor))
-        board.take(say(f"episode/ground/{actor}", episode(actor)))
+        board.add(say(f"episode/ground/{actor}", episode(actor)))
     for k in range(3):
         for actor, x in (("a", 0.0), ("b", 2.0)):
             after = step(k, pb.RECOVERING, actor, clearance=0.5, truncated=k == 2)
-            for topic, message in (("exchange", told(actor, k, x)), ("step", after)):
+            for topic, message in (("exchange", fleet_exchange(actor, k, x)), ("step", after)):
                 writer.put(f"{topic}/ground/{actor}", message)
-                board.take(say(f"{topic}/ground/{actor}", message))
+                board.add(say(f"{topic}/ground/{actor}", message))
     analysis = analyse_runs(writer.write(tmp_path / "run.mcap"), AnalysisOptions(pictures=True))
     path = tmp_path / "report.html"
-    path.write_text(render(analysis.figures(), analysis.each()), encoding="utf-8")
+    path.write_text(render(analysis.figures(), analysis.by_label()), encoding="utf-8")
     with LivePageServer(board.view) as server, Page(tmp_path / "profile") as page:
         page.open(path.as_uri())
         page.until("document.documentElement.dataset.drawn === 'yes'")
         shown = {name: drawn(page, name) for name in ("free", "hit", "mover", "swept", "promise")}
         assert shown == {"free": 1, "hit": 90, "mover": 1, "swept": 3, "promise": 3}
         legend = page.value("document.querySelector('#picker').textContent")
-        assert "where other robots promise to be" in legend and "recovering" in legend
+        assert "reserved by other robots" in legend and "recovering" in legend
         page.open(server.url)
         page.until("document.body.dataset.drawn > 0")
         page.picture(tmp_path / "live.png")

@@ -1,4 +1,4 @@
-"""Laws of the histograms and the intervals, against NumPy and SciPy on all the values."""
+"""Quantile sketches and intervals of rates, compared with NumPy and SciPy on all the values."""
 
 import math
 import random
@@ -24,21 +24,21 @@ def filled(values: list[float]) -> QuantileSketch:
 
 
 @given(VALUES, st.floats(0.0, 100.0))
-def test_percentiles_are_right_to_the_resolution(values: list[float], percent: float) -> None:
+def test_the_relative_error_of_a_percentile_is_at_most_the_resolution(values: list[float], percent: float) -> None:
     exact = float(np.percentile(values, percent, method="inverted_cdf"))
     said = merged([filled(values)]).percentile(percent)
     assert math.isclose(said, exact, rel_tol=RESOLUTION, abs_tol=1e-12)
 
 
 @given(VALUES, VALUES)
-def test_merging_is_taking_all_values(one: list[float], two: list[float]) -> None:
+def test_merged_sketches_equal_one_sketch_of_all_values(one: list[float], two: list[float]) -> None:
     parts, whole = merged([filled(one), filled(two)]), merged([filled(one + two)])
     assert (parts.bins, parts.count, parts.low, parts.high) == (whole.bins, whole.count, whole.low, whole.high)
     assert parts.total == pytest.approx(whole.total, rel=1e-9, abs=1e-6)
 
 
 @given(VALUES)
-def test_moments(values: list[float]) -> None:
+def test_mean_and_deviation_are_numpys(values: list[float]) -> None:
     found = summary(filled(values))
     assert found is not None
     largest = max(map(abs, values))
@@ -47,7 +47,7 @@ def test_moments(values: list[float]) -> None:
     assert (found["min"], found["max"], found["count"]) == (min(values), max(values), len(values))
 
 
-def test_looking_changes_nothing() -> None:
+def test_reading_the_figures_does_not_change_them() -> None:
     chance = random.Random(1)
     values = [chance.lognormvariate(0.0, 2.0) for _ in range(3 * BATCH)]
     one, two = QuantileSketch(), QuantileSketch()
@@ -59,11 +59,11 @@ def test_looking_changes_nothing() -> None:
     assert spread(one) == spread(two), "to the last bit"
 
 
-def test_what_is_no_number_is_counted_apart() -> None:
+def test_nan_and_infinity_are_counted_apart() -> None:
     found = merged([filled([1.0, math.inf, -math.inf, math.nan, 0.0])])
-    assert (found.count, found.strange, found.low, found.high) == (2, 3, 0.0, 1.0)
+    assert (found.count, found.not_finite, found.low, found.high) == (2, 3, 0.0, 1.0)
     assert summary(QuantileSketch()) is None and spread() is None
-    with pytest.raises(ValueError, match="nothing was measured"):
+    with pytest.raises(ValueError, match="no value"):
         QuantileSketch().percentile(50)
 
 
@@ -87,21 +87,21 @@ def test_clopper_pearson_is_scipys_exact_interval(count: int, of: int) -> None:
 
 
 @given(st.integers(0, 400), st.integers(1, 400))
-def test_what_may_happen_several_times_in_a_trial_has_garwoods_interval(count: int, of: int) -> None:
+def test_the_poisson_interval_is_garwoods(count: int, of: int) -> None:
     low, high = poisson(count, of) or (0.0, 0.0)
     assert low == pytest.approx(chi2.ppf(0.025, 2 * count) / 2.0 / of if count else 0.0, rel=1e-9)
     assert high == pytest.approx(chi2.ppf(0.975, 2 * count + 2) / 2.0 / of, rel=1e-9)
     assert low <= count / of <= high
 
 
-def test_no_trial_no_interval() -> None:
+def test_without_a_trial_there_is_no_interval() -> None:
     assert clopper_pearson(0, 0) is None and poisson(0, 0) is None and ClusteredProportion().interval() is None
     alone = ClusteredProportion()
     alone.add(3, 10)
     assert alone.interval() is None
 
 
-def test_intervals_by_episodes_cover_where_intervals_by_steps_do_not() -> None:
+def test_intervals_by_episode_cover_the_true_rate_and_intervals_by_step_do_not() -> None:
     """Episodes of 50 steps, each with a rate of its own: 95 % intervals hold the true mean rate about as often."""
     chance = np.random.default_rng(0)
     covered = naive = 0

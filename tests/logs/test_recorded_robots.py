@@ -1,4 +1,4 @@
-"""Which robot a log's message is about: one that the log describes, or one that comes with the program."""
+"""Which robot a message of a log names: one that the log describes, or one of the program."""
 
 import json
 from dataclasses import replace
@@ -10,7 +10,7 @@ from brakeline.messaging.robot import robot_named
 from brakeline.messaging.task import RobotWithTask
 
 
-def test_what_one_log_describes_no_other_log_knows():
+def test_a_robot_of_one_log_is_unknown_in_another():
     minted = replace(robot_named("ground"), name="minted")
     one, other = RecordedRobots(), RecordedRobots()
     one.describe({"minted": json.dumps(minted.description)})
@@ -30,7 +30,7 @@ def test_a_description_that_takes_a_shipped_name_is_not_believed(caplog: pytest.
     assert "choose another" in caplog.text and len(caplog.records) == 2
 
 
-def test_a_message_names_no_path(tmp_path):
+def test_a_robot_name_in_a_message_is_never_a_path(tmp_path):
     path = tmp_path / "my.toml"
     path.write_text("")
     assert RecordedRobots().named(str(path)) is None and RecordedRobots().named("../robots/ground") is None

@@ -17,7 +17,7 @@ from mcap.reader import make_reader
 from brakeline.logs import recorder
 from brakeline.logs.metrics import Metrics
 from brakeline.logs.reader import open_log, read
-from brakeline.logs.recorder import Inbox, Recording, as_it_came
+from brakeline.logs.recorder import Inbox, Recording, malformed_entry
 from brakeline.logs.segment import Entry, Metadata, Segment, name_of, open_segment
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.bus import Bus, BusSettings, Sample
@@ -179,7 +179,7 @@ class Quota:
         self.file.close()
 
 
-def test_a_full_disk_keeps_what_is_recorded_and_goes_on_when_there_is_space(
+def test_recording_survives_a_full_disk_and_resumes(
     tmp_path: Path, say: Say, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     caplog.set_level("INFO")
@@ -210,7 +210,9 @@ def test_a_full_disk_keeps_what_is_recorded_and_goes_on_when_there_is_space(
     assert levels[0] == "INFO" and set(levels[1:]) == {"WARNING"}  # more than one where only a header still fitted
 
 
-def test_a_disk_that_stays_full_is_said_at_the_end(tmp_path: Path, say: Say, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_disk_that_stays_full_is_reported_at_the_end(
+    tmp_path: Path, say: Say, caplog: pytest.LogCaptureFixture
+) -> None:
     inbox = Inbox()
     recording = Recording(tmp_path / "run.mcap", {}, inbox, SmallDisk(0).open_segment)
     inbox.put(say("log/a", pb.LogLine(text="x")))
@@ -224,7 +226,7 @@ def test_pictures_that_take_too_long_cost_no_message(
     tmp_path: Path, say: Say, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """It fell behind for its pictures, and when the run ended, it was killed with all that waited."""
-    monkeypatch.setattr(recorder, "HURRY", 0.1)
+    monkeypatch.setattr(recorder, "MOST_DRAWING", 0.1)
 
     def drawn(sample: Sample) -> list[Entry]:
         time.sleep(0.03)
@@ -237,7 +239,7 @@ def test_pictures_that_take_too_long_cost_no_message(
     recording.finish()
     topics = Counter(key.partition("/")[0] for key in _keys(tmp_path / "run.mcap"))
     assert topics["log"] == 100 and topics["picture"] == 100 - recording.undrawn > 0
-    assert recording.undrawn > 80 and caplog.text.count("without pictures") == 1
+    assert recording.undrawn > 80 and caplog.text.count("without scenes") == 1
 
 
 def _keys(path: Path) -> list[str]:
@@ -253,5 +255,5 @@ def test_a_folder_that_cannot_be_written_is_a_failure_too(tmp_path: Path, say: S
 
 
 def test_a_message_that_cannot_be_decoded_is_stored_all_the_same() -> None:
-    stored = as_it_came(Sample(STEP, "step/ground/a", b"\xff", 7))
+    stored = malformed_entry(Sample(STEP, "step/ground/a", b"\xff", 7))
     assert (stored.payload, stored.log_time, stored.publish_time, stored.sequence) == (b"\xff", 7, 7, 0)

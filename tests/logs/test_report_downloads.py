@@ -1,4 +1,4 @@
-"""What a figure of the report is saved as: a picture of its own, and the rows that it was drawn from."""
+"""Figures of the report are saved as SVG and their data as CSV."""
 
 import csv
 import io

@@ -1,4 +1,4 @@
-"""The report in a real browser: it draws without a complaint and without a request, and says what `--json` says."""
+"""The report in a real browser: it draws without errors or requests, with the values of `--json`."""
 
 import json
 import math
@@ -42,7 +42,7 @@ def looked_up(figures: dict[str, Any], name: str) -> Any:
     raise KeyError(name)
 
 
-def test_the_tables_say_what_json_says_without_a_script(report: tuple[Path, dict[str, Any]]) -> None:
+def test_the_tables_have_the_values_of_json_without_a_script(report: tuple[Path, dict[str, Any]]) -> None:
     path, figures = report
     cells = Cells()
     cells.feed(path.read_text())
@@ -66,7 +66,7 @@ def test_the_tables_say_what_json_says_without_a_script(report: tuple[Path, dict
 
 def test_it_says_in_words_how_sure_a_model_set_is(tmp_path: Path) -> None:
     analysis = analyse_runs(mixed(tmp_path / "run"), AnalysisOptions(pictures=True))
-    [(label, (figures, pictures))] = analysis.each().items()
+    [(label, (figures, pictures))] = analysis.by_label().items()
 
     def said(**more: str) -> str:
         metadata = {"model ground": {"version": "abc", "bound_step": "0.003", **more}}
@@ -112,7 +112,7 @@ def test_a_decision_is_explained_by_a_sentence_arrows_and_an_edge(page: Page) ->
     assert stepped_in and all("it (after 0.2 s) would have come 3 cm too close" in words for words in stepped_in)
     assert any("speed 0.2 → 0.1 m/s, turn rate 0.2 → 0.1 rad/s" in words for words in shown["words"])
     assert shown["proposed"] == shown["executed"] > 0 and shown["edges"] > 0
-    assert "→ proposed" in shown["legend"] and "what the proposal would have crossed" in shown["legend"]
+    assert "→ proposed" in shown["legend"] and "half-space that blocks the proposal" in shown["legend"]
 
 
 def test_everything_is_drawn(page: Page, report: tuple[Path, dict[str, Any]]) -> None:
@@ -317,7 +317,7 @@ def test_numbers_are_for_people() -> None:
     assert "<" not in embedded(TRICKS)
 
 
-def test_what_a_page_is_made_of_is_packaged() -> None:
+def test_all_files_of_the_page_are_packaged() -> None:
     folder = Path(__file__).parents[2] / "logs" / "report_page"
     assert {item.name for item in folder.iterdir() if item.suffix in (".j2", ".css", ".js")} == set(names())
 
@@ -329,7 +329,7 @@ def hostile(folder: Path) -> Path:
     """A page of figures in which every text that a log can choose is a script."""
 
     analysis = analyse_runs(mixed(folder / "log"), AnalysisOptions(pictures=True))
-    figures, pictures = json.loads(json.dumps(analysis.each()["log"]))
+    figures, pictures = json.loads(json.dumps(analysis.by_label()["log"]))
     figures["processes"] |= {HOSTILE: next(iter(figures["processes"].values()))}
     figures["topics"] |= {HOSTILE: {"messages": 1, "missing": 1, "duplicates": 1}}
     figures["training"] = {HOSTILE: next(iter(figures["training"].values()))} | figures["training"]
@@ -347,7 +347,7 @@ def hostile(folder: Path) -> Path:
     return path
 
 
-def test_no_name_in_a_log_is_a_script_of_the_page(tmp_path: Path) -> None:
+def test_no_text_of_a_log_runs_as_a_script(tmp_path: Path) -> None:
     if CHROMIUM is None:
         pytest.skip("there is no Chromium: the report was not driven in a browser")
     path = hostile(tmp_path)

@@ -64,7 +64,7 @@ def stored(name: str) -> tuple[np.ndarray, np.ndarray]:
 
 @pytest.mark.skipif(not installed(FONT), reason=f"no {FONT}: the report was not compared with its pictures")
 @pytest.mark.parametrize("name", LAYOUTS)
-def test_it_looks_as_it_did(page: Page, name: str) -> None:
+def test_the_report_looks_like_the_stored_screenshots(page: Page, name: str) -> None:
     width, medium, scheme = LAYOUTS[name]
     page.size(width, 900)
     page.media(medium, scheme)

@@ -1,4 +1,4 @@
-"""A body of several discs is drawn as such, where the robot is and as it stands: in Foxglove, films, reports, watch."""
+"""Foxglove, films, the report and the live page draw every disc of a body at its pose."""
 
 import math
 from pathlib import Path
@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from brakeline.deploy.run.episode_render import Film, Frame, _Stage
+from brakeline.deploy.run.episode_render import Film, Frame, _FilmAxes
 from brakeline.logs import foxglove_scene
-from brakeline.logs.episode_view import discs
+from brakeline.logs.decision_view import body_discs
 from brakeline.logs.watch.dashboard import RobotPanel
 from brakeline.messaging.robot import robot_named
 from brakeline.sim.arena import staged_arena
@@ -21,15 +21,15 @@ CAR = robot_named(str(ROOT / "examples" / "car" / "car.toml"))
 AT, HEADING = np.array([1.0, 2.0]), math.pi / 2
 
 
-def test_foxglove_has_a_drum_a_disc() -> None:
+def test_foxglove_has_a_cylinder_for_each_disc() -> None:
     drums = foxglove_scene._body(CAR, "actor-0", 0).cylinders
     assert [(d.pose.position.x, d.pose.position.y, d.size.x) for d in drums] == [(0.11, 0, 0.31), (-0.11, 0, 0.31)]
 
 
-def test_a_film_has_them_at_the_heading() -> None:
+def test_a_film_draws_the_body_at_its_heading() -> None:
     none = np.zeros((0, 2))
     film = Film(CAR, staged_arena(), [Frame(AT, HEADING, "allowed", none, none, none, 0.0)], AT, "cut")
-    drawn = _Stage(film, Figure().subplots())._body(AT, HEADING, "allowed")
+    drawn = _FilmAxes(film, Figure().subplots())._body(AT, HEADING, "allowed")
     middles = np.array([circle.center for circle in drawn[:2]])
     assert np.allclose(middles, [(1.0, 2.11), (1.0, 1.89)]) and [c.radius for c in drawn[:2]] == [0.155, 0.155]
     assert (
@@ -38,20 +38,22 @@ def test_a_film_has_them_at_the_heading() -> None:
     )
 
 
-def test_pages_are_told_of_all_of_them() -> None:
-    assert discs(CAR) == [[0.11, 0.0, 0.155], [-0.11, 0.0, 0.155]] and discs(GROUND) == [[0.0, 0.0, GROUND.footprint]]
-    assert RobotPanel(CAR, "actor-0").view()["discs"] == discs(CAR)
+def test_pages_have_all_discs_of_the_body() -> None:
+    assert body_discs(CAR) == [[0.11, 0.0, 0.155], [-0.11, 0.0, 0.155]] and body_discs(GROUND) == [
+        [0.0, 0.0, GROUND.footprint]
+    ]
+    assert RobotPanel(CAR, "actor-0").view()["discs"] == body_discs(CAR)
 
 
-def test_a_report_draws_them_at_the_heading(tmp_path: Path) -> None:
+def test_the_report_draws_the_body_at_its_heading(tmp_path: Path) -> None:
     if CHROMIUM is None:
         pytest.skip("there is no Chromium: the report was not driven in a browser")
-    script = "\n".join((ROOT / "logs" / "page" / name).read_text() for name in ("svg.js", "arena.js"))
+    script = "\n".join((ROOT / "logs" / "report_page" / name).read_text() for name in ("svg.js", "scene.js"))
     (tmp_path / "page.html").write_text(f"<!doctype html><body></body><script>{script}</script>")
     view = "{ x: (a) => 100 * a, y: (a) => -100 * a, per: 100 }"
-    episode = f"{{ x: [1], y: [2], heading: [Math.PI / 2], footprint: {CAR.footprint}, discs: {discs(CAR)} }}"
+    episode = f"{{ pose: [1, 2, Math.PI / 2], footprint: {CAR.footprint}, discs: {body_discs(CAR)} }}"
     with Page(tmp_path / "browser") as page:
         page.open((tmp_path / "page.html").as_uri())
-        page.value(f"document.body.innerHTML = '<svg>' + robot({view}, {episode}, 0).join('') + '</svg>'")
+        page.value(f"document.body.innerHTML = '<svg>' + bodyMarks({view}, {episode}).join('') + '</svg>'")
         seen = "[...document.querySelectorAll('circle')].map((c) => ['cx', 'cy', 'r'].map((n) => +c.getAttribute(n)))"
         assert np.allclose(page.value(seen), [(100, -211, 15.5), (100, -189, 15.5)])

@@ -11,7 +11,7 @@ from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 
 from brakeline.logs.reader import NoLog, NotALog, find, open_log, read
-from brakeline.logs.recorder import as_it_came, entry
+from brakeline.logs.recorder import entry, malformed_entry
 from brakeline.logs.segment import Entry, Segment, number_of, open_segment, segments
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.bus import Sample
@@ -75,7 +75,7 @@ def test_names_of_segments() -> None:
     assert first == sorted(first)
 
 
-def test_a_file_cut_anywhere_gives_what_is_whole_and_says_what_is_not(tmp_path: Path, say: Say) -> None:
+def test_a_truncated_file_yields_its_intact_messages_and_reports_the_damage(tmp_path: Path, say: Say) -> None:
     run = tmp_path / "run.mcap"
     portions = [[say("log/a", pb.LogLine(text="x" * 50)) for _ in range(20)] for _ in range(5)]
     segment = open_segment(run, {})
@@ -102,7 +102,7 @@ def test_a_segment_that_was_never_finished_is_read_in_full(tmp_path: Path, say: 
     log = open_log(tmp_path)
     assert [record.message.text for record in log] == ["1", "2"]
     assert [cut.path.name for cut in log.cuts] == ["run.mcap", "run_0002.mcap"]
-    assert "ends without a summary" in str(log.cuts[0])
+    assert "has no summary" in str(log.cuts[0])
 
 
 def test_a_damaged_chunk_is_noticed(tmp_path: Path, say: Say) -> None:
@@ -116,10 +116,10 @@ def test_a_damaged_chunk_is_noticed(tmp_path: Path, say: Say) -> None:
     assert log.cuts[0].lost > 0
 
 
-def test_what_is_not_of_its_type_is_stored_as_it_came_and_counted(tmp_path: Path, say: Say) -> None:
+def test_a_malformed_message_is_stored_and_counted(tmp_path: Path, say: Say) -> None:
     noise = Sample(STEP, "step/ground/a", b"\xff\xff", 5)
     segment = open_segment(tmp_path / "run.mcap", {})
-    segment.save([as_it_came(noise), entry(say("log/a", pb.LogLine()))])
+    segment.save([malformed_entry(noise), entry(say("log/a", pb.LogLine()))])
     segment.finish()
     log = open_log(tmp_path)
     assert [record.topic for record in log] == ["log"]
@@ -128,7 +128,7 @@ def test_what_is_not_of_its_type_is_stored_as_it_came_and_counted(tmp_path: Path
         assert next(message.data for _, _, message in make_reader(file).iter_messages()) == b"\xff\xff"
 
 
-def test_what_is_no_log_is_said(tmp_path: Path) -> None:
+def test_a_file_that_is_no_log_is_rejected(tmp_path: Path) -> None:
     with pytest.raises(NoLog, match="no log at"):
         find(tmp_path)
     with pytest.raises(NoLog):

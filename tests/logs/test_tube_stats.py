@@ -50,7 +50,7 @@ def test_a_stop_that_keeps_to_its_tube_is_counted_once():
 
 
 @pytest.mark.parametrize("late", range(2, 5))
-def test_that_it_is_left_at_any_period_counts(late):
+def test_a_tube_that_is_left_at_any_period_counts(late):
     steps = [asked(0, pb.ALLOWED)]
     for k in range(1, 5):
         off = 0.06 if k == late else 0.0
@@ -60,7 +60,7 @@ def test_that_it_is_left_at_any_period_counts(late):
     assert (plans.flown, plans.outside) == (1, 1) and plans.excess == pytest.approx(1.2)
 
 
-def test_that_it_is_left_counts_also_where_the_next_plan_begins():
+def test_a_tube_that_is_left_when_the_next_plan_begins_counts():
     plans = of(asked(0, pb.ALLOWED), asked(1, pb.FAILSAFE, 0.1, 1), asked(2, pb.ADJUSTED, 0.26, 2))
     assert (plans.flown, plans.outside) == (1, 1)
 
@@ -70,7 +70,7 @@ def test_a_plan_that_another_follows_at_once_was_not_gone_on_along():
     assert (plans.flown, plans.outside) == (0, 0)
 
 
-def test_without_an_answer_it_goes_on_along_its_plan():
+def test_a_robot_without_a_reply_follows_its_plan():
     silent = pb.Exchange(header=pb.Header(run=1), request=asked(1, pb.FAILSAFE, 0.3, 1).request, failure="timeout: 80")
     assert of(asked(0, pb.ALLOWED), silent, asked(2, pb.ALLOWED, 0.2, 2)).outside == 1
 
@@ -78,7 +78,7 @@ def test_without_an_answer_it_goes_on_along_its_plan():
 @pytest.mark.parametrize(
     "change", [{"episode": 1}, {"run": 2}, {"step": 3}, {"given": 2}], ids=["episode", "process", "gap", "other plan"]
 )
-def test_what_was_not_flown_is_not_compared(change):
+def test_a_plan_that_is_not_followed_is_not_compared(change):
     """Another episode, a process that began anew, a lost exchange, an answer that came too late to be taken."""
     plans = of(asked(0, pb.ALLOWED), asked(**{"step": 1, "kind": pb.FAILSAFE, "x": 9.0, "given": 1} | change))
     plans._end()
@@ -97,7 +97,7 @@ def test_a_position_that_is_no_number_is_outside():
 
 @settings(max_examples=60)
 @given(st.data())
-def test_whatever_somebody_sends_is_no_error(data):
+def test_malformed_exchanges_raise_no_error(data):
     numbers = st.lists(st.floats(width=32), max_size=6)
     plans = TubeStats()
     for step in range(4):
@@ -110,7 +110,7 @@ def test_whatever_somebody_sends_is_no_error(data):
     assert plans.outside <= plans.flown
 
 
-def test_it_is_one_of_a_runs_figures():
+def test_plans_are_among_the_figures_of_a_run():
     metrics = Metrics()
     for sequence, exchange in enumerate(
         (asked(0, pb.ALLOWED), asked(1, pb.FAILSAFE, 0.9, 1), asked(2, pb.ALLOWED, 0.2, 2)), 1
@@ -140,7 +140,7 @@ def left(*bounds):
     return figures(plans)
 
 
-def test_what_was_stated_stands_beside_the_count():
+def test_the_stated_bound_is_reported_with_the_count():
     assert left(0.0113)["bound"] == 0.0113 and stated(left(0.0113)) == "stated: at most 1.2 %, at 99 % confidence"
     assert left(0.01, 0.26)["bound"] == 0.26, "that of the loosest"
     assert left(0.01, None)["bound"] is None and stated(left(None)) == "no bound was recorded"
@@ -153,4 +153,4 @@ def test_the_table_of_a_run_shows_both():
     console = Console(file=io.StringIO(), width=160)
     console.print(show(figures_of))
     shown = console.file.getvalue()
-    assert "1, outside of their tubes 1 (100.0%); stated: at most 26 %, at 99 % confidence" in shown
+    assert "1, left their tube: 1 (100.0%); stated: at most 26 %, at 99 % confidence" in shown

@@ -9,7 +9,7 @@ from rich.console import Console
 from rich.progress import Progress
 
 from brakeline.deploy.commands import common_options
-from brakeline.deploy.run.display import Display, doing, line, live, summary
+from brakeline.deploy.run.display import Display, line, live, run_phase, summary
 from brakeline.deploy.run.processes import process_specs
 from brakeline.deploy.run.run_config import RunConfig
 from brakeline.deploy.run.run_view import RunView
@@ -99,8 +99,8 @@ def test_what_a_run_is_at_is_said_from_the_first_second(view: RunView) -> None:
     for number, child in enumerate(view.processes):
         name = child.spec.name
         young.metrics.add(f"health/{name}", pb.Health(header=pb.Header(sequence=1, run=number + 1), process=name))
-    assert doing(young) == "waiting for the first step"
+    assert run_phase(young) == "waiting for the first step"
     young.metrics.add("step/ground/actor-0", step(0))
-    assert doing(young) == "driving and learning"
+    assert run_phase(young) == "driving and learning"
     young.ending = True
-    assert doing(young) == "ending every process in order"
+    assert run_phase(young) == "ending every process in order"
