@@ -43,7 +43,7 @@ function near(target, galleries, choose) {
   if (!target.children.length) target.append(nothing("The log has no episode with a clearance."));
 }
 
-/** Clearance over the steps of an episode, coloured by decision. */
+/** Plot the clearance over the steps of an episode, coloured by decision. */
 function strip(episode, k) {
   const frame = { left: 40, right: 390, top: 22, bottom: 112 };
   const most = Math.max(0.05, ...episode.clearance);

@@ -5,14 +5,14 @@ const GRID = 60; // steps at which seeds are averaged
 
 const CURVES = [
   { title: "goals reached", unit: "share of episodes", of: "bins", value: (b) => b.goals, form: percents, low: 0, high: 1, weight: "episodes" },
-  { title: "reward of an episode", unit: "without the penalty", of: "bins", value: (b) => b.reward, form: figure, weight: "episodes" },
+  { title: "reward of an episode", unit: "without the intervention penalty", of: "bins", value: (b) => b.reward, form: figure, weight: "episodes" },
   { title: "interventions", unit: "share of steps", of: "bins", value: (b) => b.adjusted + b.failsafes, form: percents, low: 0, weight: "steps" },
   { title: "closest approach", unit: "cm, smallest in a bin", of: "bins", value: (b) => b.closest === null ? null : 100 * b.closest, form: figure, low: 0 },
   { title: "critic loss", unit: "from the learner", of: "learner", value: (b) => b.critic_loss, form: figure },
   { title: "mean Q", unit: "discounted reward", of: "learner", value: (b) => b.mean_q, form: figure },
 ];
 
-/** Means over neighbours, weighted by how much is in each: bins with few episodes are noisy. */
+/** Moving average over `reach` rows on each side, weighted by `weight`: bins with few episodes are noisy. */
 function smoothed(rows, value, weight, reach) {
   return rows.map((_, k) => {
     let sum = 0, total = 0;
@@ -24,7 +24,7 @@ function smoothed(rows, value, weight, reach) {
   });
 }
 
-/** Points of one run's curve: step, raw and smoothed value, `share` of all bins on each side put together. */
+/** Points of one run's curve: step, raw value, and smoothed value over a share of all bins on each side. */
 function pointsOf(run, robot, what, share) {
   const rows = run.training[robot]?.[what.of] ?? [];
   const reach = what.weight || what.of === "learner" ? Math.round(share * rows.length) : 0;
@@ -41,10 +41,10 @@ function between(points, step) {
   return a.smooth + ((b.smooth - a.smooth) * (step - a.step)) / Math.max(1e-9, b.step - a.step);
 }
 
-/** Student's t for 95 %, by degrees of freedom. */
+/** 97.5 % quantiles of Student's t distribution for 1, 2, … degrees of freedom. */
 const T95 = [12.71, 4.3, 3.18, 2.78, 2.57, 2.45, 2.36, 2.31, 2.26];
 
-/** Mean and interval over runs that differ in their seed alone, as far as all of them go. */
+/** Mean and 95 % interval over runs that differ only in their seed, up to the end of the shortest run. */
 function bandOf(curves) {
   const end = Math.min(...curves.map((points) => points.at(-1).step)), n = curves.length;
   const band = [];
@@ -58,7 +58,7 @@ function bandOf(curves) {
   return band;
 }
 
-/** Lines of a chart: a run each, or a band for each set-up of which there are several seeds. */
+/** Lines of a chart: one line per run, or one band per configuration with several seeds. */
 function linesOf(runs, robot, what, view) {
   const single = (run, color) => ({ name: run.run, color, points: pointsOf(run, robot, what, view.share) });
   if (!view.bands) return runs.map((run) => single(run, run.color)).filter((line) => line.points.length > 1);

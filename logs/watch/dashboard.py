@@ -218,7 +218,7 @@ class Dashboard:
         counted = reported or run_totals(self.metrics)
         return {
             "run": self._run(),
-            # None: the counts cover the whole run, not only the time since this page started, s.
+            # s since this page started; None: the counts cover the whole run.
             "since": None if reported else time.monotonic() - self._started,
             "totals": {robot: _means(counts) for robot, counts in sorted(counted.items())},
             "plans": figures["plans"] | {"stated": stated(figures["plans"])},
@@ -242,9 +242,8 @@ class Dashboard:
         processes = self.metrics.processes
         if not processes[name].alive:
             return "ended"
-        latest = max(
-            process.last_health_at for process in processes.values()
-        )  # by their clock, which may differ from the clock here
+        # The clocks of the processes may differ from the clock here.
+        latest = max(process.last_health_at for process in processes.values())
         quiet = (latest - processes[name].last_health_at) * 1e-9 + time.monotonic() - self._last_message
         return "silent" if quiet > SILENT else "alive"
 
