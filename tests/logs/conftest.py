@@ -1,4 +1,4 @@
-"""Samples as the bus hands them to a recorder; a report, and a browser that shows it."""
+"""Fixtures: samples as a recorder receives them, a report, and a browser that shows the report."""
 
 import itertools
 import json
@@ -22,7 +22,7 @@ Say = Callable[..., Sample]
 
 @pytest.fixture
 def say() -> Say:
-    """`say("log/a", pb.LogLine(text="x"))`: numbered per key, a second after the one before."""
+    """Return a function that creates samples: numbered by key, each a second after the previous one."""
     numbers: dict[str, itertools.count[int]] = {}
     seconds = itertools.count(1)
 
@@ -39,7 +39,7 @@ def say() -> Say:
 
 @pytest.fixture(scope="module")
 def report(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]]:
-    """The page of a log, and the figures that `analyse --json` gives for it."""
+    """The report of a log, and the figures of `analyse --json`."""
     folder = tmp_path_factory.mktemp("page")
     log = mixed(folder / "<b>mixed")
     analysis = analyse_runs(log, AnalysisOptions(pictures=True))

@@ -1,4 +1,4 @@
-"""A log in which everything happens, and a count of it: another reader, the raw messages, other formulas."""
+"""Write a log with every kind of event, and compute its figures independently: another reader and other formulas."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ ABOUT = {
 
 
 class Writer:
-    """Numbers and dates messages as publishers do, loses some of them, and doubles others."""
+    """Numbers and dates messages as publishers do; loses some and duplicates others."""
 
     def __init__(self, seed: int = 0, losses: float = 0.01) -> None:
         self.chance = random.Random(seed)
@@ -48,7 +48,7 @@ class Writer:
         self.entries += [entry] * (1 + (not always and self.chance.random() < self.losses))
 
     def episode(self, actor: str, number: int, version: int = 0, robot: str = "ground", run: int = 1) -> None:
-        """An episode of random length, decisions and ends; sometimes it is never finished."""
+        """Write an episode of random length, decisions and outcome, or an unfinished one."""
         chance, dim = self.chance, 3 if robot == "quadrotor" else 2
         place = f"{robot}/{actor}"
         box = pb.Obstacle(kind="box", position=[1.0] * dim, size=[0.5] * dim, yaw=0.3)
@@ -119,7 +119,7 @@ class Writer:
         self.put(f"health/{process}", message, run, always=True)
 
     def write(self, path: Path, portion: int = 100) -> Path:
-        """All of it, as one file; returns its path."""
+        """Write all messages to one file and return its path."""
         segment = open_segment(path, ABOUT)
         for start in range(0, len(self.entries), portion):
             segment.save(self.entries[start : start + portion])
@@ -129,7 +129,7 @@ class Writer:
 
 
 def mixed(folder: Path, seed: int = 0, episodes: int = 30, later: float = 0.0) -> Path:
-    """The log of a run of three actors, two robot kinds, with a restart and a second segment, begun `later` [s]."""
+    """Write the log of a run with three actors, two robot kinds, a restart and two segments, started `later` [s]."""
     writer = Writer(seed)
     writer.now += round(later * SECOND)
     for number in range(episodes):
@@ -152,7 +152,7 @@ def mixed(folder: Path, seed: int = 0, episodes: int = 30, later: float = 0.0) -
 
 
 def decoded(paths: Iterable[Path]) -> list[tuple[str, Any]]:
-    """Key and message of everything of ours in whole files, by the `mcap` package."""
+    """Return the keys and messages of intact files, read by the `mcap` package."""
     found = []
     for path in paths:
         with path.open("rb") as file:
@@ -164,7 +164,7 @@ def decoded(paths: Iterable[Path]) -> list[tuple[str, Any]]:
 
 
 def once(messages: list[tuple[str, Any]]) -> list[tuple[str, Any]]:
-    """Without those that came before: the first message of each number of a publisher."""
+    """Remove duplicates: keep the first message of each sequence number of a publisher."""
     seen: set[tuple[str, int, int]] = set()
     first = []
     for key, message in messages:
@@ -176,7 +176,7 @@ def once(messages: list[tuple[str, Any]]) -> list[tuple[str, Any]]:
 
 
 def percentiles(values: list[float]) -> dict[str, float] | None:
-    """Of all values, kept in memory."""
+    """Compute the exact summary of all values."""
     if not values:
         return None
     p50, p90, p99 = np.percentile(values, (50, 90, 99), method="inverted_cdf")
@@ -187,7 +187,7 @@ def percentiles(values: list[float]) -> dict[str, float] | None:
 
 
 def counted(messages: list[tuple[str, Any]]) -> dict[str, Any]:
-    """What `analyse` says, field by field, from lists of everything."""
+    """Compute the expected figures of `analyse` from all messages."""
     every, messages = messages, once(messages)
     steps = [m for key, m in messages if key.startswith("step/")]
     exchanges = [m for key, m in messages if key.startswith("exchange/")]
@@ -266,7 +266,7 @@ def _latency(answered: list[Any], kind: int) -> dict[str, Any]:
 
 
 def _topics(every: list[tuple[str, Any]], first: list[tuple[str, Any]]) -> dict[str, dict[str, int]]:
-    """Published: the largest number of each publisher, or what its Health says."""
+    """Count published messages: the largest sequence number of each publisher, or the count in its Health messages."""
     published: dict[tuple[str, int], int] = defaultdict(int)
     for key, message in first:
         place = key, message.header.run
@@ -285,7 +285,7 @@ def _topics(every: list[tuple[str, Any]], first: list[tuple[str, Any]]) -> dict[
 
 
 def agree(said: Any, expected: Any, place: str = "") -> None:
-    """Assert that figures are the expected ones: counts exactly, percentiles to half a percent."""
+    """Assert that figures have the expected values: exact counts, percentiles to 0.5 %."""
     if isinstance(expected, dict):
         assert isinstance(said, dict) and said.keys() == expected.keys(), place
         for name in expected:

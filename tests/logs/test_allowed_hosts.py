@@ -22,7 +22,7 @@ def server() -> Iterator[LivePageServer]:
 
 
 def asked(server: LivePageServer, path: str, **headers: str) -> tuple[int, bytes]:
-    """Status and body; `Host` is the server's unless given; an empty one is left out."""
+    """Request a path and return status and body. The default `Host` is the server's; an empty header is not sent."""
     port = int(server.url.rsplit(":", 1)[1].strip("/"))
     connection = http.client.HTTPConnection("127.0.0.1", port, timeout=10.0)
     try:
@@ -83,7 +83,7 @@ def test_a_foreign_page_cannot_connect_to_the_foxglove_server(live: FoxgloveServ
 
 
 def listening() -> set[tuple[str, int]]:
-    """Where this process does."""
+    """Return the addresses at which this process listens."""
     return {tuple(c.laddr) for c in psutil.Process().net_connections("tcp") if c.status == psutil.CONN_LISTEN}
 
 

@@ -28,7 +28,7 @@ def health(name: str, last: bool = False, **told: Any) -> pb.Health:
 
 @pytest.fixture
 def mixed(say: Say) -> Dashboard:
-    """A board in the middle of a run with two robot kinds, of which each ends an episode while it is watched."""
+    """A dashboard during a run of two robot kinds, each with one finished episode."""
     board = Dashboard()
     for number in range(3):
         board.add(say("step/ground/a", step("ground", "a", number, 10.0, number == 2)))
@@ -38,7 +38,7 @@ def mixed(say: Say) -> Dashboard:
 
 
 def launched(say: Say, board: Dashboard, last: bool = False, outcome: str = "") -> None:
-    """What the launcher says: ten times as many steps as were watched."""
+    """Publish the launcher's Health message, with ten times as many steps as were watched."""
     notes = {"run": "crossing", "method": "ddpc", "arena": "dense", "seed": "3", "steps": "600"}
     counts = {"steps": 30.0, "episodes": 10.0, "goals": 9.0, "collisions": 0.0, "interventions": 3.0, "failsafes": 1.0}
     figures = totals_to_health({"ground": counts | {"reward": 290.0}, "quadrotor": counts | {"reward": -30.0}})

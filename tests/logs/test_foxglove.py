@@ -56,7 +56,7 @@ def exchange(number: int, kind: int = pb.ALLOWED, actor: str = "actor-0") -> pb.
 
 
 class Studio:
-    """Draws messages as they are said, and decodes what was drawn."""
+    """Converts messages and decodes the resulting scenes."""
 
     def __init__(self, say: Say, rate: float = math.inf) -> None:
         self.say, self.pictures = say, FoxgloveConverter(rate)

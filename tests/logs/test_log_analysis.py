@@ -1,4 +1,4 @@
-"""All figures against a count by another reader; many logs at once; memory that does not grow."""
+"""All figures equal those of an independent reader; several logs; memory that does not grow."""
 
 import io
 import itertools
@@ -191,8 +191,8 @@ def test_it_is_shown_whole(log: Path) -> None:
 
 
 def test_memory_does_not_grow_with_the_log(tmp_path: Path) -> None:
-    """Five times the messages need hardly more: bins of histograms that were empty before. (How much for gigabytes,
-    with all that is not Python's: `python -m benchmarks logs-2gb`.)"""
+    """Five times the messages need little more memory, for new bins of sketches. For gigabytes of messages, run
+    `python -m benchmarks logs-2gb`."""
     held = []
     for name, rounds in (("short", 50), ("long", 250)):
         writer = Writer(3, losses=0.0)

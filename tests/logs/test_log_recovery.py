@@ -1,4 +1,4 @@
-"""Damaged files become whole ones, and a recorder that is killed at any moment leaves all but the last second."""
+"""Damaged files are repaired, and a recorder that is killed at any moment loses at most the last second."""
 
 import json
 import os
@@ -41,7 +41,7 @@ main(BusSettings(connect=(sys.argv[1],)), Path(sys.argv[2]), {"run": {"seed": "3
 
 
 def whole(path: Path) -> list[int]:
-    """The sequence numbers in a file that the `mcap` package's seeking reader finds whole."""
+    """Return the sequence numbers of a file that the `mcap` package's seeking reader can read."""
     with path.open("rb") as file:
         reader = make_reader(file, validate_crcs=True, decoder_factories=[DecoderFactory()])
         decoded = reader.iter_decoded_messages(topics=["step/ground/actor-0"])
@@ -176,7 +176,7 @@ def router() -> Iterator[Bus]:
 
 
 def test_killed_at_ten_random_moments_nothing_older_than_a_second_is_missing(router: Bus, tmp_path: Path) -> None:
-    """Files rotate all the time, so that some moments fall into the end of one and the beginning of the next."""
+    """Files rotate all the time, so that some kills happen between the end of a file and the start of the next."""
     chance, publisher = random.Random(os.urandom(8)), router.publisher(STEP, robot="ground")
     ready: list[str] = []
     router.subscribe(HEALTH, lambda sample: ready.append(sample.message().notes["file"]), source="recorder")

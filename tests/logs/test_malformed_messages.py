@@ -111,14 +111,14 @@ def test_an_analysis_counts_malformed_messages_and_goes_on(say: Say, tmp_path: P
 
 
 def chunk_of(size: int, compression: str, frame: bytes) -> bytes:
-    """A chunk's record that says it holds so many bytes."""
+    """Return the record of a chunk that declares `size` bytes."""
     name = compression.encode()
     body = struct.pack("<QQQII", 0, 0, size, 0, len(name)) + name + struct.pack("<Q", len(frame)) + frame
     return struct.pack("<BQ", 6, len(body)) + body
 
 
 def packed(compression: str, said: bool) -> bytes:
-    """64 MiB of zeros in a few kB; `said`: the frame itself tells how large it is."""
+    """Compress 64 MiB of zeros to a few kB; `said`: the frame declares its size."""
     zeros = bytes(2**26)
     if compression == "lz4":
         return bytes(lz4.frame.compress(zeros, store_size=said))

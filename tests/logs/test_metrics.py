@@ -1,4 +1,4 @@
-"""Figures against counts made by hand."""
+"""Figures equal counts made by hand."""
 
 import json
 import math
@@ -25,7 +25,7 @@ Say = Callable[..., Sample]
 
 
 def episode(number: int, decisions: list[int], actor: str = "a", **last: object) -> list[pb.Step]:
-    """Steps of 0.1 m/s more each and a reward of 1; the fields of the last one as given."""
+    """Return steps with a reward of 1, each 0.1 m/s faster; the arguments set fields of the last step."""
     steps = [
         pb.Step(actor=actor, robot="ground", episode=number, step=k, reward=1.0, penalty=5.0, speed=0.1 * (k + 1))
         for k in range(len(decisions))

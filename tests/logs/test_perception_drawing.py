@@ -31,7 +31,7 @@ WALKER = Obstacle(CYLINDER, (1.0, 0.5), (0.2,), motion=Motion((0.5, 0.0), 0.03, 
 
 
 def fleet_exchange(actor: str, number: int = 0, x: float = 0.0) -> pb.Exchange:
-    """A robot of a fleet of two that has a scan and sees a walker, and promises to be about x."""
+    """Return the exchange of a robot in a fleet of two: with a scan, a walker, and reserved boxes around x."""
     reservation = pb.Reservation(center=[x, 0.0] * 3, half_width=[0.1, 0.2] * 3, radius=[0.15] * 3)
     decision = pb.Decision(
         kind=pb.RECOVERING, tube_center=[x, 0.0] * 3, tube_half_width=[0.01] * 6, reservation=reservation
@@ -72,7 +72,7 @@ def test_foxglove_draws_the_perceived_surroundings(say: Say) -> None:
 
 
 def test_of_a_range_image_so_few_hits_are_drawn_that_a_recorder_keeps_up(say: Say) -> None:
-    """A picture of all 16,200 took half a second: the recorder fell behind, and a flight's log ended in its middle."""
+    """Drawing all 16,200 points took half a second: the recorder fell behind and lost the end of a flight."""
     ranges = np.full((90, 180), 5.0)
     edge = 0.5 * np.pi * (1.0 - 1.0 / 90)
     exchange = pb.Exchange(request=pb.Request(robot="quadrotor", actor="q", state=[0.0] * 9, action=[0.0] * 3))

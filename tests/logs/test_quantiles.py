@@ -102,7 +102,7 @@ def test_without_a_trial_there_is_no_interval() -> None:
 
 
 def test_intervals_by_episode_cover_the_true_rate_and_intervals_by_step_do_not() -> None:
-    """Episodes of 50 steps, each with a rate of its own: 95 % intervals hold the true mean rate about as often."""
+    """With episodes of 50 steps and different rates, 95 % intervals contain the true rate in about 95 % of logs."""
     chance = np.random.default_rng(0)
     covered = naive = 0
     for _ in range(300):

@@ -135,7 +135,7 @@ def test_a_killed_recorder_loses_less_than_a_second_and_the_next_goes_on(
 
 
 class SmallDisk:
-    """Files that share `free` bytes, as a full disk does: it takes what fits and then fails."""
+    """Files that share `free` bytes, like a full disk: a write takes what fits and then fails."""
 
     def __init__(self, free: int) -> None:
         self.free = free
@@ -225,7 +225,7 @@ def test_a_disk_that_stays_full_is_reported_at_the_end(
 def test_pictures_that_take_too_long_cost_no_message(
     tmp_path: Path, say: Say, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """It fell behind for its pictures, and when the run ended, it was killed with all that waited."""
+    """A recorder fell behind because of its drawing; at the end of the run it was killed with all waiting messages."""
     monkeypatch.setattr(recorder, "MOST_DRAWING", 0.1)
 
     def drawn(sample: Sample) -> list[Entry]:

@@ -20,7 +20,7 @@ TRICKS = "</script><script>alert(1)</script><!-- \u2028"
 
 
 class Cells(HTMLParser):
-    """What stands in the elements that show a figure, by its name."""
+    """Collects the values of the elements with a figure, by the figure's name."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -33,7 +33,7 @@ class Cells(HTMLParser):
 
 
 def looked_up(figures: dict[str, Any], name: str) -> Any:
-    """The figure of a dotted name; keys may have dots and slashes themselves."""
+    """Return the figure with a dotted name; keys may contain dots and slashes."""
     if name in figures:
         return figures[name]
     for key in figures:
@@ -179,7 +179,7 @@ def test_the_picker_shows_the_episode_that_was_picked(page: Page, report: tuple[
 
 @pytest.fixture(scope="module")
 def compared(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[dict[str, Any]]]:
-    """The page of three runs, of which the last is another method's; and what `analyse --json` says of each."""
+    """The report of three runs, the last one of another method, and the figures of each in `analyse --json`."""
     folder = tmp_path_factory.mktemp("compared")
     logs = [mixed(folder / name, seed, 12 + 4 * seed, later=1e4 * seed) for seed, name in enumerate(("a", "b"), 1)]
     with pytest.MonkeyPatch.context() as patch:
@@ -326,7 +326,7 @@ HOSTILE = '"><img src=x onerror="document.title=\'owned\'"></title></text><scrip
 
 
 def hostile(folder: Path) -> Path:
-    """A page of figures in which every text that a log can choose is a script."""
+    """Write a page in which every text that a log can contain is a script."""
 
     analysis = analyse_runs(mixed(folder / "log"), AnalysisOptions(pictures=True))
     figures, pictures = json.loads(json.dumps(analysis.by_label()["log"]))

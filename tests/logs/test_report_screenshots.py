@@ -1,4 +1,4 @@
-"""How the report looks: at a phone's and a desk's width, light and dark, and in print, beside stored pictures.
+"""The report looks like its stored screenshots: on a phone and on a desktop, light and dark, and in print.
 
 Of each section a small picture is kept, averaged so much that a browser's next version changes little, and what is
 gone, doubled or in another colour changes much. They are of one font, which has to be there. After a
@@ -36,7 +36,7 @@ def installed(font: str) -> bool:
 
 
 def sections(page: Page) -> tuple[np.ndarray, np.ndarray]:
-    """Small pictures (n, EDGE, EDGE, 3) of the page's sections, and their heights [px]."""
+    """Return small pictures (n, EDGE, EDGE, 3) of the page's sections, and the sections' heights [px]."""
     places = page.value(
         "[...document.querySelectorAll('section')].map(s => s.getBoundingClientRect())"
         ".filter(r => r.height > 0).map(r => [r.x + scrollX, r.y + scrollY, r.width, r.height])"
@@ -51,7 +51,7 @@ def sections(page: Page) -> tuple[np.ndarray, np.ndarray]:
 
 
 def apart(one: np.ndarray, other: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(n,) each: how far sections are apart on average, and their worst tile."""
+    """Return the mean difference and the largest difference of a tile, (n,) each."""
     tiles = np.abs(one - other).reshape(len(one), EDGE // 8, 8, EDGE // 8, 8, 3).mean(axis=(2, 4, 5))
     return tiles.mean(axis=(1, 2)), tiles.max(axis=(1, 2))
 

@@ -1,4 +1,4 @@
-"""What is written is what was received, readable by anyone's MCAP tools."""
+"""A segment has the received bytes, and every MCAP tool can read it."""
 
 import itertools
 import json
@@ -139,7 +139,7 @@ def test_a_file_that_is_no_log_is_rejected(tmp_path: Path) -> None:
 
 
 def test_the_two_lines_of_the_documentation_read_json_channels_too(tmp_path: Path) -> None:
-    """A flight's log: the plain reader stops at its JSON channels."""
+    """A flight's log has JSON channels, at which the strict reader stops."""
     text = json.dumps({"type": 2}).encode()
     segment = open_segment(tmp_path / "run.mcap", {})
     segment.save(

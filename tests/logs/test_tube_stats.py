@@ -1,4 +1,4 @@
-"""Plans that robots went on along, beside the tubes that had been verified for them."""
+"""Plans that robots followed are compared with their verified tubes."""
 
 import io
 
@@ -18,8 +18,8 @@ PLAN = [0.3, 0.2, 0.1, 0.0]  # of one input
 
 
 def asked(step, kind, x=0.0, given=0, own=0.0, verified=True, episode=0, run=1):
-    """An exchange at a place x, of a robot whose committed plan's tail begins with that input. A plan of its own leads
-    to x + 0.1 a period, ± 0.05."""
+    """Return an exchange at position x. The committed plan's tail begins with the given input; the robot's own plan
+    leads to x + 0.1 per period, ± 0.05."""
     exchange = pb.Exchange(header=pb.Header(run=run))
     exchange.request.CopyFrom(
         pb.Request(robot="nobody", actor="a", episode=episode, step=step, state=[x], action=[0.0], plan=PLAN[given:])
@@ -79,7 +79,7 @@ def test_a_robot_without_a_reply_follows_its_plan():
     "change", [{"episode": 1}, {"run": 2}, {"step": 3}, {"given": 2}], ids=["episode", "process", "gap", "other plan"]
 )
 def test_a_plan_that_is_not_followed_is_not_compared(change):
-    """Another episode, a process that began anew, a lost exchange, an answer that came too late to be taken."""
+    """Another episode, a restarted process, a lost exchange, a reply that came too late."""
     plans = of(asked(0, pb.ALLOWED), asked(**{"step": 1, "kind": pb.FAILSAFE, "x": 9.0, "given": 1} | change))
     plans._end()
     assert plans.flown == 0
@@ -130,7 +130,7 @@ def test_plans_are_among_the_figures_of_a_run():
 
 
 def left(*bounds):
-    """A plan for each bound, whose tube was left; None: its decision has none, as in old logs."""
+    """Return the figures of one plan per bound, whose tube was left; None: a decision without a bound."""
     plans = []
     for bound in bounds:
         first = asked(0, pb.ALLOWED)

@@ -1,4 +1,4 @@
-"""What a person sees: on a terminal of 80 columns, and in a file."""
+"""Console output of a run, on a terminal of 80 columns and in a file."""
 
 import io
 from collections import deque
@@ -27,7 +27,7 @@ def step(number: int) -> pb.Step:
 
 @pytest.fixture
 def view() -> RunView:
-    """Of a run with figures as wide as they get."""
+    """The view of a run with the widest possible figures."""
     metrics = Metrics()
     for number in range(1000):
         metrics.add("step/ground/actor-0", step(number))

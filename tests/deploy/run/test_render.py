@@ -1,4 +1,4 @@
-"""Pictures of an episode: what is in them, and that every kind of file is made."""
+"""Pictures and films of an episode: their content, and every file format."""
 
 import numpy as np
 import pytest
