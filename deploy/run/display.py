@@ -113,7 +113,7 @@ def _run(figures: dict[str, Any]) -> Table:
     if plans["flown"]:
         left = f"{share(plans['outside'], plans['flown'])}; {stated(plans)}"
         table.add_row("plans outside tube", left)
-    table.add_row("decide p50 / p99", _pair(times), "request p50 / p99", _pair(trip))
+    table.add_row("decide p50 / p99", _pair(times), "reply p50 / p99", _pair(trip))
     several = len(figures["learners"]) > 1
     for robot, learner in figures["learners"].items():
         steps_per_s, updates_per_s = (f"{learner[name]:.0f}/s" for name in ("steps_per_s", "updates_per_s"))

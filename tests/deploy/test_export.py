@@ -101,5 +101,5 @@ def test_an_impossible_export_fails_with_a_reason(
     assert cli.main(["export", str(tmp_path), "--csv", str(tmp_path / "a.csv")]) == 1
     assert "no log" in capsys.readouterr().err
     assert cli.main(["export", str(log), "--csv", str(tmp_path / "q.csv"), "--robot", "quadrotor"]) == 1
-    assert "it has those of ground: give --robot NAME" in capsys.readouterr().err
+    assert "but steps of ground: give --robot NAME" in capsys.readouterr().err
     assert not list(tmp_path.glob("q.csv*")), "no file with a headline alone"
