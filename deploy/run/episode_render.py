@@ -95,7 +95,9 @@ def record(driver: EpisodeRunner, policy: Policy, question: Ask | None, number: 
         proposal = np.asarray(policy(driver.observation, driver.info), dtype=float)
         request = driver.request(proposal)
         outcome = request_decisions(question, [request], driver.robot)[0] if question is not None else None
-        reply = pb.Reply() if outcome is None or outcome.answer is None else outcome.reply
+        reply = pb.Reply()
+        if outcome is not None and outcome.answer is not None and outcome.reply is not None:
+            reply = outcome.reply
         before = np.asarray(driver.info["true_state"])
         step = driver.execute(proposal, outcome)
         heading = 0.0 if driver.robot.heading is None else float(before[driver.robot.heading])
