@@ -79,7 +79,7 @@ def test_after_a_violation_the_proposal_may_still_be_verified_from_the_new_measu
     assert not decision.contained
 
 
-def test_standing_still_needs_nobodys_word(ready):
+def test_standing_still_needs_no_token(ready):
     decision = ready.decide(request(obstacles=[cylinder(0.2, 0)]))
     assert decision.kind == FAILSAFE
     assert decision.verified

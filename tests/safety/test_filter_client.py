@@ -1,4 +1,4 @@
-"""Every asker answers alike: in process and over the bus."""
+"""The clients return equal answers in process and over the bus."""
 
 from dataclasses import fields, replace
 from inspect import signature
@@ -35,7 +35,7 @@ def late(data_folder):
 
 
 class Wire:
-    """The client's part and the service's core, without a bus."""
+    """A client and the service's core, without a bus."""
 
     def __init__(self, model):
         models = ModelRegistry(accept_bound=1.0)
@@ -66,7 +66,7 @@ def test_an_answer_in_process_is_the_answer_of_a_service(model):
     alone, asked = InProcess(Filter(model), accept_bound=1.0), Wire(model)
     kinds = set()
     for action, away in (([0.1, 0.1], 3.0), ([float("nan"), 0.0], 3.0), ([0.25, 0.0], 0.4), ([0.25, 0.0], 0.3)):
-        one, other = (asker.decide(np.zeros(5), action, [cylinder(away, 0.0)]) for asker in (alone, asked))
+        one, other = (client.decide(np.zeros(5), action, [cylinder(away, 0.0)]) for client in (alone, asked))
         assert type(one) is type(other) is Answer
         for field in fields(Answer):
             if field.name not in MEASURED:
@@ -79,14 +79,14 @@ def test_an_answer_in_process_is_the_answer_of_a_service(model):
     "ask", [lambda model: InProcess(Filter(model), accept_bound=1.0), Wire], ids=["in process", "service"]
 )
 def test_the_action_of_a_late_robot_is_the_input_of_the_next_period(late, ask):
-    asker = ask(late)
+    client = ask(late)
     far = [Obstacle("cylinder", (3.0, 0.0), (0.1,))]
-    first = asker.decide(np.zeros(5), [0.25, 0.0], far)
+    first = client.decide(np.zeros(5), [0.25, 0.0], far)
     assert first.kind == "allowed" and not first.plan[0].any(), "zero is in force while the answer is on its way"
-    assert np.array_equal(first.action, [0.25, 0.0]) and np.array_equal(first.action, asker.backup_plan.next_input)
-    second = asker.decide(np.zeros(5), [0.1, 0.2], far)
+    assert np.array_equal(first.action, [0.25, 0.0]) and np.array_equal(first.action, client.backup_plan.next_input)
+    second = client.decide(np.zeros(5), [0.1, 0.2], far)
     assert np.array_equal(second.plan[0], [0.25, 0.0]), "what was answered before is in force now"
-    assert np.array_equal(second.action, asker.backup_plan.next_input)
+    assert np.array_equal(second.action, client.backup_plan.next_input)
 
 
 FAN = np.linspace(-np.pi, np.pi, 360, endpoint=False)
@@ -94,22 +94,22 @@ WALL = Scan(np.full(360, 0.13), FAN, (0.0, 0.0, 0.0))  # 13 cm away all round
 
 
 class Unsent(SafetyClient):
-    """A client of a bus that nobody is on: what it refuses it refuses before it asks."""
+    """A client on an empty bus: it refuses bad values before it sends a request."""
 
     def __init__(self, model):
         self.robot, self.backup_plan, self.deadline = model.robot, BackupPlan(model.robot), 0.1
 
 
 @pytest.fixture(params=[lambda model: InProcess(Filter(model), accept_bound=1.0), Unsent], ids=["in process", "client"])
-def asker(request, model):
+def client(request, model):
     return request.param(model)
 
 
-def test_every_asker_is_one(asker, model):
-    assert isinstance(asker, FilterClient) and not isinstance(Filter(model), FilterClient)
+def test_every_client_implements_the_interface(client, model):
+    assert isinstance(client, FilterClient) and not isinstance(Filter(model), FilterClient)
 
 
-def test_both_sign_alike():
+def test_the_clients_have_the_same_parameters():
     wanted = list(signature(FilterClient.decide).parameters.values())
     for kind in (SafetyClient, InProcess):
         own = list(signature(kind.decide).parameters.values())
@@ -119,11 +119,11 @@ def test_both_sign_alike():
         assert all(p.kind is p.KEYWORD_ONLY for p in own[4:])
 
 
-def test_nothing_after_the_obstacles_is_taken_by_its_place(asker):
+def test_arguments_after_the_obstacles_are_keyword_only(client):
     with pytest.raises(TypeError, match="positional"):
-        asker.decide(np.zeros(5), [0.25, 0.0], [], WALL)
+        client.decide(np.zeros(5), [0.25, 0.0], [], WALL)
     with pytest.raises(TypeError, match="scna"):
-        asker.decide(np.zeros(5), [0.25, 0.0], [], scna=WALL)
+        client.decide(np.zeros(5), [0.25, 0.0], [], scna=WALL)
 
 
 @pytest.mark.parametrize(
@@ -143,16 +143,16 @@ def test_nothing_after_the_obstacles_is_taken_by_its_place(asker):
         ("known_free", {"known_free": []}, "is a list"),
     ],
 )
-def test_another_type_is_refused_by_the_field(asker, field, more, said):
+def test_a_value_of_another_type_is_refused_with_its_field(client, field, more, said):
     with pytest.raises(BadRequest, match=said) as caught:
-        asker.decide(np.zeros(5), [0.25, 0.0], **more)
+        client.decide(np.zeros(5), [0.25, 0.0], **more)
     assert caught.value.field == field
 
 
-def test_where_nothing_is_known_nothing_is_decided(model):
-    """Before, an empty list said that all space is free, and so did a scan that was dropped."""
+def test_a_request_without_obstacles_scan_or_map_is_refused(model):
+    """An empty list or a dropped scan does not mean that space is free."""
     alone, asked = InProcess(Filter(model), accept_bound=1.0), Wire(model)
-    blocked = [asker.decide(np.zeros(5), [0.25, 0.0], [], scan=WALL) for asker in (alone, asked)]
+    blocked = [client.decide(np.zeros(5), [0.25, 0.0], [], scan=WALL) for client in (alone, asked)]
     assert [answer.kind for answer in blocked] == ["failsafe", "failsafe"]
     for nothing in ((), (None,), ([],)):
         with pytest.raises(BadRequest, match="known_free") as caught:
@@ -161,15 +161,15 @@ def test_where_nothing_is_known_nothing_is_decided(model):
         with pytest.raises(SafetyError, match="known_free") as refused:
             asked.decide(np.zeros(5), [0.25, 0.0], *nothing)
         assert refused.value.field == "obstacles"
-    for asker in (alone, asked):
-        asker.backup_plan.reset()
-        assert asker.decide(np.zeros(5), [0.25, 0.0], known_free=True).kind == "allowed"
-        asker.backup_plan.reset()
-        assert asker.decide(np.zeros(5), [0.25, 0.0], scan=WALL, known_free=True).kind == "failsafe", "the scan counts"
+    for client in (alone, asked):
+        client.backup_plan.reset()
+        assert client.decide(np.zeros(5), [0.25, 0.0], known_free=True).kind == "allowed"
+        client.backup_plan.reset()
+        assert client.decide(np.zeros(5), [0.25, 0.0], scan=WALL, known_free=True).kind == "failsafe", "the scan counts"
 
 
 @pytest.mark.parametrize("prediction", [False, True])
-def test_the_quick_check_and_the_whole_one_both_ask_what_is_known(ready, prediction):
+def test_the_quick_check_and_the_full_check_both_need_known_space(ready, prediction):
     sets = Prediction(np.zeros(5), np.full(5, 0.1), 0.0) if prediction else None
     silent = request(known_free=False, predicted=sets)
     assert ready.ordinary(silent), "nothing else is wrong with it"
@@ -183,7 +183,7 @@ def test_the_quick_check_and_the_whole_one_both_ask_what_is_known(ready, predict
     assert ready.decide(replace(silent, movers=walker)).kind in ("allowed", "adjusted", "failsafe")
 
 
-def test_a_tube_that_is_none_of_this_robots_is_no_answer(model):
+def test_a_tube_of_another_robot_is_refused(model):
     asked = Wire(model)
     question = request_message(asked.backup_plan, np.zeros(5), [0.1, 0.0], [AHEAD])
     payload = pb.RequestBatch(requests=[question]).SerializeToString()

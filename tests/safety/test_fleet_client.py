@@ -1,4 +1,4 @@
-"""Robots that share a world, asked about through the documented client: together, or not at all."""
+"""The fleet client decides for all robots of a world, or for none."""
 
 import numpy as np
 import pytest
@@ -20,12 +20,12 @@ NAMES = ("left", "right")
 
 
 def facing(rng):
-    """Two robots, half a metre from each other."""
+    """Return two robots half a metre apart that face each other."""
     return [Unicycle((-0.25, 0.0, 0.0), rng, noise=0.0), Unicycle((0.25, 0.0, np.pi), rng, noise=0.0)]
 
 
 def decided(fleet, robots, actions):
-    """An answer, however long the service takes to be known on this side."""
+    """Return the answers, after retries until the service is found."""
     while True:
         try:
             return fleet.decide([r.measure() for r in robots], actions, [[POST], [POST]])
@@ -44,7 +44,7 @@ def fleet(join, endpoint, model):  # noqa: F811
         yield client
 
 
-def test_who_drives_at_each_other_does_not_meet(fleet):
+def test_two_robots_that_drive_at_each_other_do_not_meet(fleet):
     robots, moved = facing(np.random.default_rng(0)), 0.0
     for _ in range(15):
         answers = decided(fleet, robots, [[0.25, 0.0], [0.25, 0.0]])
@@ -59,7 +59,7 @@ def test_who_drives_at_each_other_does_not_meet(fleet):
     assert all(kept.reservation is None and not kept.plan.any() for kept in fleet.backup_plans)
 
 
-def test_an_answer_that_misses_one_counts_for_none(fleet):
+def test_without_a_decision_for_one_robot_no_robot_has_one(fleet):
     robots = facing(np.random.default_rng(1))
     answers = decided(fleet, robots, [[0.1, 0.0], [0.1, 0.0]])
     for robot, answer in zip(robots, answers, strict=True):
@@ -77,7 +77,7 @@ def test_an_answer_that_misses_one_counts_for_none(fleet):
     assert [a.verified for a in decided(fleet, robots, [[0.1, 0.0], [0.1, 0.0]])] == [True, True]
 
 
-def test_each_period_somebody_else_is_decided_first(fleet, monkeypatch):
+def test_the_first_robot_changes_each_period(fleet, monkeypatch):
     asked = []
     monkeypatch.setattr(fleet.bus, "ask", lambda key, payload, *_, **__: asked.append(payload) or b"")
     for _ in range(3):
@@ -90,7 +90,7 @@ def test_each_period_somebody_else_is_decided_first(fleet, monkeypatch):
     ]
 
 
-def test_a_fleet_says_where_space_is_known_to_be_free(fleet):
+def test_a_fleet_needs_known_free_space(fleet):
     robots = facing(np.random.default_rng(2))
     decided(fleet, robots, [[0.0, 0.1]] * 2)
     fleet.reset()
@@ -105,7 +105,7 @@ def test_a_fleet_says_where_space_is_known_to_be_free(fleet):
     assert {answer.kind for answer in fleet.decide(*asked, scans=blind)} == {"failsafe"}
 
 
-def test_what_is_no_fleet_is_refused(fleet):
+def test_a_malformed_fleet_is_refused(fleet):
     for names in ((), ("alone",), ("same", "same")):
         with pytest.raises(ValueError, match="two robots or more"):
             FleetClient(fleet.bus, "ground", names)

@@ -58,7 +58,7 @@ def test_inputs_as_normalised_actions_and_back(share):
     assert np.allclose(between.action_to_control(action), control, atol=1e-12)
 
 
-def test_normalised_actions_are_never_taken_for_metres_a_second(ready):
+def test_normalised_actions_are_never_taken_for_inputs(ready):
     with pytest.raises(Mismatch, match=r"speed \[m/s\] from 0 to 0.6.*actions=normalised\(robot\)"):
         SafetyWrapper(Toy(CAR), ready, accept_bound=1.0)
     with pytest.raises(Mismatch, match="normalised"):
@@ -73,7 +73,7 @@ def test_an_action_space_of_another_kind_is_refused_unless_mapped(space):
     assert mapping_for_space(space, CAR, mapped) is mapped
 
 
-def test_what_is_missing_is_said_by_name(ready):
+def test_an_error_names_the_missing_entry(ready):
     env = SafetyWrapper(Toy(CAR), ready, accept_bound=1.0, actions=normalised(CAR))
     with pytest.raises(gymnasium.error.ResetNeeded):
         env.step(np.zeros(2))
@@ -87,7 +87,7 @@ def test_what_is_missing_is_said_by_name(ready):
     assert STATE(None, None, {"state": 3}) == 3
 
 
-def test_the_wrapper_from_a_file_tells_what_it_did(tmp_path, model):
+def test_the_wrapper_from_a_file_reports_its_decisions(tmp_path, model):
     model.save(tmp_path / "model.safetensors")
     env = SafetyWrapper.load(Toy(CAR, discs()), tmp_path / "model.safetensors", penalty=1.0, accept_bound=1.0, **HOW)
     env.reset(seed=0)
@@ -99,7 +99,7 @@ def test_the_wrapper_from_a_file_tells_what_it_did(tmp_path, model):
     assert ModelSet.load(tmp_path / "model.safetensors").version == told["model"]
 
 
-def test_without_an_environment_it_decides_the_same(ready):
+def test_the_client_in_process_decides_like_the_wrapper(ready):
     env, alone = SafetyWrapper(Toy(CAR, discs()), ready, accept_bound=1.0, **HOW), InProcess(ready, accept_bound=1.0)
     observation, _ = env.reset(seed=1)
     for _ in range(30):
@@ -112,7 +112,7 @@ def test_without_an_environment_it_decides_the_same(ready):
 
 
 class Silent(SafetyClient):
-    """A client whose service is away."""
+    """A client whose service does not answer."""
 
     def __init__(self):
         self.robot, self.backup_plan = CAR, BackupPlan(CAR)
@@ -123,7 +123,7 @@ class Silent(SafetyClient):
         raise NoReply("nobody serves")
 
 
-def test_without_a_service_the_committed_plan_goes_on():
+def test_without_a_service_the_backup_plan_continues():
     env = SafetyWrapper(Toy(CAR), Silent(), **HOW)
     env.reset(seed=0)
     *_, info = env.step(np.array([1.0, 0.0]))
@@ -164,7 +164,7 @@ def test_a_vector_decides_as_its_environments_do_alone(ready, mode):
 
 
 class Walled(Toy):
-    """With a scan in the place of obstacles: something at arm's length all round."""
+    """An environment with a scan instead of obstacles: a wall all around."""
 
     FAN = np.linspace(-np.pi, np.pi, 360, endpoint=False)
     blind = False  # from now on no scan comes
@@ -194,7 +194,7 @@ def test_a_vector_decides_by_scans_too(ready):
     assert infos["diagnostics"]["margin"][0] == info["diagnostics"]["margin"]
 
 
-def test_a_view_of_a_vector_that_tells_nothing_is_no_world_without_obstacles(ready):
+def test_a_vector_view_without_lists_is_refused(ready):
     vector = gymnasium.vector.SyncVectorEnv([lambda: Toy(CAR, discs())] * 2)
     env = VectorSafetyWrapper(
         vector, ready, accept_bound=1.0, state=seen, obstacles=lambda *_: [], actions=normalised(CAR)
@@ -205,7 +205,7 @@ def test_a_view_of_a_vector_that_tells_nothing_is_no_world_without_obstacles(rea
 
 
 @pytest.mark.parametrize("many", [False, True])
-def test_an_empty_list_says_that_space_is_free_and_none_says_nothing(ready, many):
+def test_an_empty_list_means_free_space_and_none_means_unknown_space(ready, many):
     def stepped(near):
         env = Toy(CAR)
         if many:
@@ -222,7 +222,7 @@ def test_an_empty_list_says_that_space_is_free_and_none_says_nothing(ready, many
         stepped(None)
 
 
-def test_a_scan_that_does_not_come_is_not_a_world_without_obstacles(ready):
+def test_a_missing_scan_frees_nothing(ready):
     env = SafetyWrapper(Walled(CAR), ready, accept_bound=1.0, state=seen, actions=normalised(CAR))
     env.reset(seed=0)
     *_, before = env.step(np.array([-1.0, 0.0]))
@@ -252,7 +252,7 @@ def test_before_the_first_scan_nothing_is_free(ready, many):
     assert np.all(info["diagnostics"]["kind"] == "failsafe")
 
 
-def test_collecting_leaves_out_what_ended_in_a_collision(data):
+def test_collecting_drops_episodes_that_end_in_a_collision(data):
     assert data.periods == 2500 and len(data.trajectories) == 9
     env = Toy(CAR, discs(away=0.45), steps=10_000)
     cut = collect(env, CAR, 200, held=8, state=seen, actions=normalised(CAR), shown=False)
@@ -262,14 +262,14 @@ def test_collecting_leaves_out_what_ended_in_a_collision(data):
     assert min(gaps) > 0.3 - 1e-9, "no state in which it touched one is in the data"
 
 
-def test_collecting_cuts_where_something_else_moved_it():
+def test_collecting_splits_where_something_else_moved_the_robot():
     pushed = lambda env, observation, info: env.unwrapped.count % 10 == 0  # noqa: E731
     cut = collect(Toy(CAR), CAR, 54, state=seen, actions=normalised(CAR), disturbed=pushed, shown=False)
     assert [len(t.inputs) for t in cut.trajectories] == [9, 9, 9, 9, 9, 4, 5]
     assert cut.trajectories[0].before is None and cut.trajectories[1].before is not None
 
 
-def test_collecting_gives_up_where_every_episode_ends_at_once():
+def test_collecting_gives_up_if_every_episode_ends_at_once():
     with pytest.raises(BadData, match="nothing to learn from"):
         collect(Toy(CAR, [Obstacle("cylinder", (0.0, 0.0), (0.1,))]), CAR, 10, state=seen, actions=normalised(CAR))
 

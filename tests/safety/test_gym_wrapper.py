@@ -1,4 +1,4 @@
-"""The wrapper around an environment: what is safe passes, what is not is replaced; episodes start standing."""
+"""The wrapper passes safe actions and replaces unsafe ones."""
 
 from dataclasses import replace
 
@@ -49,7 +49,7 @@ class Yard(gymnasium.Env):
         return observation, 1.0, False, False, info
 
 
-def test_the_wrapper_lets_through_what_is_safe(ready):
+def test_the_wrapper_passes_safe_actions(ready):
     env = SafetyWrapper(Yard(Obstacle("cylinder", (3.0, 0.0), (0.1,))), ready, penalty=2.0, accept_bound=1.0)
     env.reset(seed=0)
     _, reward, _, _, info = env.step(np.array([0.2, 0.25], np.float32))
@@ -61,7 +61,7 @@ def test_the_wrapper_lets_through_what_is_safe(ready):
     assert reward == 1.0, "clipping to bounds costs nothing"
 
 
-def test_the_wrapper_replaces_and_penalises_what_is_not(ready):
+def test_the_wrapper_replaces_and_penalises_unsafe_actions(ready):
     env = SafetyWrapper(Yard(), ready, penalty=2.0, accept_bound=1.0)
     env.reset(seed=1)
     kinds, costs = set(), []
@@ -98,12 +98,12 @@ def test_every_episode_starts_standing(ready):
     assert env.backup_plan.predicted is None
 
 
-def test_a_filter_needs_no_more_than_the_model_set(model):
+def test_a_filter_needs_only_the_model_set(model):
     assert Filter(replace(model, about={})).version == model.version
 
 
 class Hearing(SafetyClient):
-    """A client of a service that answers nothing."""
+    """A client of a service that does not answer."""
 
     def __init__(self) -> None:
         self.robot, self.backup_plan, self.asked = GROUND, BackupPlan(GROUND), {}
@@ -113,8 +113,8 @@ class Hearing(SafetyClient):
         raise NoReply("nobody serves")
 
 
-def test_a_service_hears_the_observation_too():
-    """Those of the rivals refused every question without it."""
+def test_the_wrapper_sends_the_observation_to_a_service():
+    """The rivals refuse every request without it."""
     client = Hearing()
     env = SafetyWrapper(NavigationEnv(GROUND), client)
     observation, _ = env.reset(seed=0)

@@ -1,4 +1,4 @@
-"""Questions that were meant to make an obstacle vanish, or a service too busy for others."""
+"""Hostile requests neither make an obstacle vanish nor keep the service busy."""
 
 from fractions import Fraction
 from math import isqrt, pi
@@ -22,7 +22,7 @@ sizes = st.floats(0.0, FARTHEST, exclude_min=True)
 
 @st.composite
 def scenes(draw: st.DrawFn) -> tuple[Obstacle, list[float]]:
-    """An obstacle that is accepted, and a place that is."""
+    """Draw a valid obstacle and a valid position."""
     dim, kind = draw(st.sampled_from([2, 3])), draw(st.sampled_from([BOX, CYLINDER, SPHERE, WALL]))
     count = {BOX: dim, CYLINDER: dim - 1, SPHERE: 1, WALL: 0}[kind]
     obstacle = Obstacle(
@@ -35,7 +35,7 @@ def scenes(draw: st.DrawFn) -> tuple[Obstacle, list[float]]:
 
 
 def exact(obstacle: Obstacle, point: list[float]) -> float:
-    """The distance, in rational numbers but for the sines and the last root."""
+    """Return the distance in rational numbers, apart from the sines and the last root."""
     away = [Fraction(p) - Fraction(c) for p, c in zip(point, obstacle.position, strict=True)]
     cos, sin = Fraction(float(np.cos(obstacle.yaw))), Fraction(float(np.sin(obstacle.yaw)))
     along, across = cos * away[0] + sin * away[1], cos * away[1] - sin * away[0]
@@ -57,7 +57,7 @@ def _root(square: Fraction | int) -> Fraction:
 
 @settings(max_examples=400, deadline=None)
 @given(scenes())
-def test_no_obstacle_is_farther_off_than_it_is(scene: tuple[Obstacle, list[float]]) -> None:
+def test_the_distance_to_an_obstacle_is_exact(scene: tuple[Obstacle, list[float]]) -> None:
     obstacle, point = scene
     found = float(Shapes.of([obstacle], len(point)).distance(np.array(point))[0])
     assert abs(found - exact(obstacle, point)) <= NEAR
@@ -65,7 +65,7 @@ def test_no_obstacle_is_farther_off_than_it_is(scene: tuple[Obstacle, list[float
 
 @pytest.mark.parametrize("far", [2e4, 1e5, 1e154, 1e300, float("inf"), float("nan")])
 @pytest.mark.parametrize("field", ["position", "size"])
-def test_what_is_beyond_all_bounds_is_no_obstacle(far: float, field: str) -> None:
+def test_an_obstacle_out_of_bounds_is_refused(far: float, field: str) -> None:
     place = {"position": (1.0, 1.0), "size": (0.1,)} | {field: (far, 0.0) if field == "position" else (far,)}
     with pytest.raises(BadShape) as refused:
         Obstacle(SPHERE, **place)
@@ -76,7 +76,7 @@ def test_what_is_beyond_all_bounds_is_no_obstacle(far: float, field: str) -> Non
 
 
 def refused(payload: bytes) -> tuple[str, float]:
-    """The field that is wrong, and the seconds of work that saying so took."""
+    """Return the field in the error, and the CPU time [s] until it was raised."""
     start = thread_time()
     with pytest.raises(BadRequest) as error:
         batch_of(payload)
@@ -94,7 +94,7 @@ def test_half_a_million_empty_requests_are_refused_at_once(before: bytes) -> Non
     assert field == "requests" and seconds < 0.02
 
 
-def test_16_requests_with_1000_obstacles_are_refused_before_they_are_worked_on() -> None:
+def test_too_many_obstacles_are_refused_before_any_decision() -> None:
     sphere = pb.Obstacle(kind="sphere", position=[1.0, 0.0], size=[0.1])
     many = pb.RequestBatch(requests=[pb.Request(robot="ground", obstacles=[sphere] * 400)] * 16)
     field, seconds = refused(many.SerializeToString())

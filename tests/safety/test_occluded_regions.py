@@ -1,4 +1,4 @@
-"""Half-spaces from range images: nothing solid is in the free space, whatever the errors of the pose."""
+"""Half-spaces from range images keep off every obstacle, for any pose error within its bounds."""
 
 import math
 from dataclasses import replace
@@ -80,7 +80,7 @@ def test_every_point_within_reach_is_beyond_some_half_space(seed, dropped):
 
 @settings(max_examples=12)
 @given(st.integers(0, 100_000))
-def test_of_every_period_all_that_may_be_touched_in_its_boxes_is_beyond_some_half_space(seed):
+def test_no_body_in_the_boxes_of_a_period_touches_an_obstacle(seed):
     """Boxes as plans' ends fill them, which grow with time: what is out of reach of a period's own is left out."""
     rng = np.random.default_rng(seed)
     obstacles = hall(rng)
@@ -101,19 +101,19 @@ def test_of_every_period_all_that_may_be_touched_in_its_boxes_is_beyond_some_hal
 
 
 @pytest.mark.parametrize("end", [0, 2])
-def test_a_box_that_is_no_number_leaves_nothing_free(end):
+def test_a_box_with_nan_leaves_nothing_free(end):
     boxes = room().boxes.repeat(3, axis=1)
     boxes[1, end, 1] = np.nan
     seen = replace(occluded_regions(clear(), room(), BODY, ORIGIN), room=PlanBoxes(boxes, 2.4))
     assert np.isneginf(half_spaces(seen, ORIGIN, np.zeros((2, 3)), BODY, ORIGIN, 0.2)[1]).all()
 
 
-def test_from_a_whole_sensor_the_start_is_rarely_said_to_be_occupied():
+def test_with_all_beams_known_the_start_is_rarely_occupied():
     assert sum(np.isneginf(bounded(seed, 0.0)[1]).all() for seed in range(12)) <= 1
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_whatever_is_not_shown_to_be_free_is_beyond_some_half_space(seed, monkeypatch):
+def test_all_space_that_is_not_shown_to_be_free_is_beyond_some_half_space(seed, monkeypatch):
     """Not what is solid alone: all of every patch, behind what its beams say; with nothing given up besides."""
     monkeypatch.setattr("brakeline.safety.perception.occluded_regions.GIVE", 0.0)
     monkeypatch.setattr("brakeline.safety.perception.occluded_regions.PLANES", 1500)
@@ -129,7 +129,7 @@ def test_whatever_is_not_shown_to_be_free_is_beyond_some_half_space(seed, monkey
         assert (hidden @ normals[:-6, k].T >= offsets[:-6, k] - 1e-6).any(axis=1).all()
 
 
-def test_the_body_is_kept_off_and_what_may_move_takes_room_with_time():
+def test_half_spaces_keep_the_body_off_and_recede_with_time_from_what_may_move():
     wall = [Obstacle("box", (2.0, 0.0, 0.0), (2.0, 20.0, 20.0))]
     rng = np.random.default_rng(0)
     nominal = np.zeros((3, 3))
@@ -142,7 +142,7 @@ def test_the_body_is_kept_off_and_what_may_move_takes_room_with_time():
     assert np.allclose(lost, 0.5 * (0.1 + 0.2 * np.arange(1, 4)), atol=0.02)
 
 
-def test_a_sensor_on_a_mast_swings_aside_when_its_attitude_is_wrong():
+def test_an_attitude_error_displaces_a_sensor_on_a_mast():
     """A wall 0.5 m ahead of the robot, which in truth is tilted by all that its attitude may be wrong by."""
     error, ahead, rings, columns = 0.05, 0.5, 90, 180
     edge = 0.5 * math.pi * (1.0 - 1.0 / rings)
@@ -175,7 +175,7 @@ def test_no_direction_is_farther_from_its_patch_than_half_a_meshes_diagonal(low)
     assert nearest.max() <= grid.half_diagonal + 1e-6
 
 
-def test_where_nothing_is_there_is_only_the_rooms_box():
+def test_in_empty_space_only_the_boxes_faces_remain():
     normals, offsets = half_spaces(
         occluded_regions(clear(), room(), BODY, ORIGIN), ORIGIN, np.zeros((2, 3)), BODY, ORIGIN, 0.2
     )
@@ -183,14 +183,14 @@ def test_where_nothing_is_there_is_only_the_rooms_box():
 
 
 @pytest.mark.parametrize("image", [clear(ranges=np.zeros((RINGS, COLUMNS))), clear(range_error=FAR)])
-def test_nothing_seen_is_nothing_free(image):
+def test_an_image_without_known_beams_leaves_nothing_free(image):
     _, offsets = half_spaces(
         occluded_regions(image, room(), BODY, ORIGIN), ORIGIN, np.full((2, 3), 0.1), BODY, ORIGIN, 0.2
     )
     assert (offsets.min(axis=0) < 0.0).all()
 
 
-def test_a_way_through_a_shadow_keeps_the_half_spaces_from_before_it():
+def test_a_path_through_a_shadow_keeps_the_half_spaces_from_before_it():
     wall = [Obstacle("box", (2.0, 0.0, 0.0), (2.0, 20.0, 20.0))]
     seen = occluded_regions(taken(np.random.default_rng(0), wall), room(4.0), BODY, ORIGIN)
     nominal = np.array([[0.5, 0.0, 0.0], [1.5, 0.0, 0.0], [2.5, 0.0, 0.0]])
@@ -221,7 +221,7 @@ def behind():
 
 @settings(max_examples=5)
 @given(st.integers(0, 100_000))
-def test_what_is_remembered_is_free(seed):
+def test_space_that_memory_shows_to_be_free_is_free(seed):
     rng = np.random.default_rng(seed)
     obstacles = hall(rng)
     memory, at, remembered = ImageMemory(0.3 - ImageMemory.START), np.zeros(3), 0
@@ -242,7 +242,7 @@ def test_what_is_remembered_is_free(seed):
     assert remembered > 0
 
 
-def test_who_flies_ahead_knows_what_is_behind_and_at_the_start_only_the_room_about_the_body():
+def test_memory_fills_a_blind_sector_after_flying_ahead_and_a_ring_at_the_start():
     memory, reached = ImageMemory(0.3), []
     for k in range(8):
         image = clear(ranges=np.where(behind(), 0.0, FAR), position_error=0.02, angle_error=0.01)
@@ -253,7 +253,7 @@ def test_who_flies_ahead_knows_what_is_behind_and_at_the_start_only_the_room_abo
     assert reached[-1] > 1.5
 
 
-def test_a_world_that_moves_takes_it_back():
+def test_in_a_moving_world_memory_fades():
     memory = ImageMemory(0.3)
     for k in range(8):
         image = clear(ranges=np.where(behind(), 0.0, FAR), speed=3.0)
@@ -262,7 +262,7 @@ def test_a_world_that_moves_takes_it_back():
 
 
 @pytest.mark.parametrize(("error", "free"), [(0.0, True), (0.03, False)])
-def test_a_wrong_attitude_displaces_what_is_far_from_the_sensor_now_however_near_it_was_before(error, free):
+def test_an_attitude_error_counts_at_the_distance_from_the_sensor_now(error, free):
     """A point 0.4 m from where an image was taken that shows 0.6 m to be free, 3.6 m from where the sensor is now."""
     before = _StoredImage(clear(ranges=np.full((RINGS, COLUMNS), 0.6)))
     now = replace(clear(angle_error=error), at=(4.0, 0.0, 0.0))

@@ -1,4 +1,4 @@
-"""Nobody but the service can say that a plan was verified: not by making it up, and not with another plan's voucher."""
+"""Only the service can prove that it verified a plan: neither a forged token nor another plan's token does."""
 
 from pathlib import Path
 
@@ -34,7 +34,7 @@ class Service:
 
 
 def driving(service: Service) -> tuple[BackupPlan, pb.Request]:
-    """A robot that drives, and its next honest question, before a wall that has come up."""
+    """Return the backup plan of a driving robot, and its next honest request, in front of a wall that has come up."""
     backup_plan = BackupPlan(GROUND)
     request = request_message(backup_plan, np.zeros(5), [0.25, 0.1], known_free=True, actor="actor-0")
     accept(backup_plan, read_reply(service(request), request, GROUND))
@@ -42,7 +42,7 @@ def driving(service: Service) -> tuple[BackupPlan, pb.Request]:
     return backup_plan, request_message(backup_plan, state, [0.25, 0.0], [WALL], actor="actor-0")
 
 
-def test_an_honest_question_is_believed(model: ModelSet) -> None:
+def test_a_request_with_its_token_counts_as_verified(model: ModelSet) -> None:
     service = Service(model)
     _, request = driving(service)
     assert len(request.plan_token) == SIZE
@@ -65,8 +65,8 @@ FORGERIES = {
 
 
 @pytest.mark.parametrize("changes", FORGERIES.values(), ids=FORGERIES.keys())
-def test_what_no_service_verified_does_not_count_as_verified(model: ModelSet, changes: dict[str, object]) -> None:
-    """Before a wall, where nothing can be verified anew: today's attack gave `failsafe, verified=True`."""
+def test_a_forged_request_does_not_count_as_verified(model: ModelSet, changes: dict[str, object]) -> None:
+    """In front of a wall, where no new plan can be verified."""
     service = Service(model)
     _, request = driving(service)
     for name, value in changes.items():
@@ -77,7 +77,7 @@ def test_what_no_service_verified_does_not_count_as_verified(model: ModelSet, ch
             setattr(request, name, value)
     decision = service(request).decision
     assert (decision.kind, decision.verified, decision.token_rejected) == (pb.FAILSAFE, False, True)
-    assert not decision.plan_tokens, "and nobody vouches for what was not verified"
+    assert not decision.plan_tokens, "an unverified plan gets no token"
     assert service.counts.token_rejected == 1
     trusting = ModelRegistry(accept_bound=1.0)
     trusting.install(model)
@@ -93,22 +93,22 @@ def test_replicas_share_the_key_and_others_do_not(model: ModelSet) -> None:
     assert not stranger(request).decision.verified
 
 
-def test_standing_still_needs_nobodys_word(model: ModelSet) -> None:
+def test_standing_still_needs_no_token(model: ModelSet) -> None:
     request = request_message(BackupPlan(GROUND), np.zeros(5), [0.0, 0.0], [WALL], actor="actor-0")
     decision = Service(model)(request).decision
     assert decision.verified and not decision.token_rejected
 
 
 def plan_of(robot: Robot, rng: np.random.Generator) -> np.ndarray:
-    """A plan that ends in a stop, with zeros in between, some of them negative."""
+    """Return a plan that ends in a stop, with some zeros negative."""
     plan = rng.uniform(robot.low(), robot.high(), (robot.horizon, robot.action_dim)) * rng.integers(0, 2, (1,))
     plan[rng.integers(1, robot.horizon) :] = 0.0
     return np.where(rng.random(plan.shape) < 0.2, -0.0, plan)
 
 
 @pytest.mark.parametrize("robot", [GROUND, QUADROTOR, LATE], ids=lambda robot: robot.name)
-def test_each_period_has_its_voucher_until_the_robot_stands(robot: Robot) -> None:
-    """Law: without a better answer the commitment goes on, and every request on the way is vouched for."""
+def test_each_period_has_its_token_until_the_robot_stands(robot: Robot) -> None:
+    """Without a better plan, the backup plan continues, and each request on the way has a valid token."""
     authenticator, rng = PlanAuthenticator(KEY), np.random.default_rng(0)
     for _ in range(50):
         backup_plan, plan = BackupPlan(robot), plan_of(robot, rng)
@@ -131,7 +131,7 @@ def test_each_period_has_its_voucher_until_the_robot_stands(robot: Robot) -> Non
             backup_plan.fallback()
 
 
-def test_a_plan_that_nobody_verified_gets_no_voucher_and_needs_none(model: ModelSet) -> None:
+def test_an_unverified_plan_gets_no_token_and_needs_none(model: ModelSet) -> None:
     service = Service(model)
     _, request = driving(service)
     request.model, request.plan_token = UNVERIFIED, b""
@@ -139,7 +139,7 @@ def test_a_plan_that_nobody_verified_gets_no_voucher_and_needs_none(model: Model
     assert not decision.verified and not decision.token_rejected and not decision.plan_tokens
 
 
-def test_the_key_is_kept_where_the_keys_are(tmp_path: Path) -> None:
+def test_the_key_of_the_tokens_is_in_the_folder_of_keys(tmp_path: Path) -> None:
     write_key(tmp_path)
     first = (tmp_path / "vouchers.key").read_bytes()
     write_key(tmp_path)

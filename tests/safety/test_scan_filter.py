@@ -36,7 +36,7 @@ def taken(true, measured, rng, blind=0.0):
     return Scan(ranges, FAN, tuple(measured[:3].tolist()), far=FAR, least_width=WIDTH, **error)
 
 
-def test_nothing_seen_is_nothing_free(ready):
+def test_an_image_without_known_beams_leaves_nothing_free(ready):
     blind = Scan(np.zeros(360), FAN, (0.0, 0.0, 0.0))
     decision = ready.decide(request(scan=blind))
     assert decision.kind == FAILSAFE and not decision.plan.any()

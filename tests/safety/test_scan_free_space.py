@@ -1,4 +1,4 @@
-"""Free space from scans of random scenes: no point of anything in them is in it."""
+"""Free space from scans of random scenes contains no point of an obstacle."""
 
 import math
 
@@ -17,7 +17,7 @@ FAN = np.linspace(-math.pi, math.pi, 360, endpoint=False)
 
 
 def cast(obstacles, at, angles, far=FAR):
-    """Ranges by marching: the step is the distance to the nearest obstacle."""
+    """Return ranges by sphere tracing: each step is the distance to the nearest obstacle."""
     shapes = Shapes.of(obstacles, 2)
     ranges, going = np.zeros(len(angles)), np.arange(len(angles))
     directions = np.stack([np.cos(angles), np.sin(angles)], axis=1)
@@ -54,7 +54,7 @@ def taken(rng, obstacles, drop=0.0, noise=0.0, pose=(0.0, 0.0, 0.0), **more):
 
 @settings(max_examples=60, deadline=None)
 @given(st.integers(0, 100_000), st.sampled_from([0.0, 0.1, 0.5]), st.sampled_from([0.0, 0.02]))
-def test_nothing_is_where_it_is_said_to_be_free(seed, drop, noise):
+def test_no_obstacle_lies_in_a_free_gap(seed, drop, noise):
     rng = np.random.default_rng(seed)
     obstacles = scene(rng)
     angles, _, free = gaps(taken(rng, obstacles, drop, noise))
@@ -66,8 +66,8 @@ def test_nothing_is_where_it_is_said_to_be_free(seed, drop, noise):
 
 @settings(max_examples=40, deadline=None)
 @given(st.integers(0, 100_000), st.sampled_from([0.0, 0.2]))
-def test_every_point_within_is_beyond_some_half_space(seed, drop):
-    """In the world, whatever the pose, for errors of the pose as large as they may be."""
+def test_every_point_of_an_obstacle_is_beyond_some_half_space(seed, drop):
+    """For any pose, with the largest pose errors."""
     rng = np.random.default_rng(seed)
     obstacles = scene(rng)
     scan = taken(rng, obstacles, drop, 0.01, position_error=0.02, heading_error=0.02)
@@ -90,7 +90,7 @@ def test_every_point_within_is_beyond_some_half_space(seed, drop):
         assert beyond.any(axis=1).all()
 
 
-def test_a_wall_is_a_handful_of_cells_and_leaves_its_room():
+def test_a_wall_becomes_a_few_cells_and_leaves_the_space_before_it_free():
     wall = [Obstacle("wall", (0.5, 0.0), yaw=math.pi)]
     near = occupied_cells(taken(np.random.default_rng(0), wall), 1.0)
     assert 5 <= len(near) <= 14
@@ -99,7 +99,7 @@ def test_a_wall_is_a_handful_of_cells_and_leaves_its_room():
     assert ((normals[:, 0] @ [0.3, 0.3]) < offsets[:, 0]).all()
 
 
-def test_what_was_not_seen_is_not_free():
+def test_unknown_space_is_not_free():
     blind = Scan(np.zeros(360), FAN, (0.0, 0.0, 0.0))
     assert (gaps(blind)[2] == 0.0).all() and len(occupied_cells(blind, 1.0)) > 0
     none = Scan(np.zeros(0), np.zeros(0), (0.0, 0.0, 0.0))
@@ -109,13 +109,13 @@ def test_what_was_not_seen_is_not_free():
         assert offsets.min() < 0.0
 
 
-def test_one_dropped_beam_costs_nothing_near_by():
+def test_a_dropped_beam_costs_no_free_space_nearby():
     ranges = np.full(360, FAR)
     ranges[[10, 100]] = 0.0
     assert gaps(Scan(ranges, FAN, (0.0, 0.0, 0.0)))[2].min() > 1.8
 
 
-def test_lone_false_ranges_do_no_harm_where_they_are_doubted():
+def test_with_doubt_a_lone_false_range_frees_nothing():
     rng = np.random.default_rng(0)
     wall = [Obstacle("wall", (0.5, 0.0), yaw=math.pi)]
     scan = taken(rng, wall)
@@ -128,7 +128,7 @@ def test_lone_false_ranges_do_no_harm_where_they_are_doubted():
 
 
 @pytest.mark.parametrize("beams", [90, 180, 360])
-def test_one_false_range_hides_nothing_as_wide_as_things_are(beams):
+def test_with_doubt_one_false_range_hides_no_obstacle_of_the_least_width(beams):
     """A box's corner between two beams, of which one sees through it: the edge must reach the next."""
     rng, fan = np.random.default_rng(beams), np.linspace(-math.pi, math.pi, beams, endpoint=False)
     grid = (np.stack(np.meshgrid(*[np.linspace(-0.5, 0.5, 25)] * 2), axis=-1).reshape(-1, 2)) * WIDTH
@@ -151,7 +151,7 @@ def test_one_false_range_hides_nothing_as_wide_as_things_are(beams):
     assert looked > 50
 
 
-def test_a_lone_ghost_is_none_and_a_thing_as_narrow_as_things_may_be_is_no_ghost():
+def test_a_lone_return_is_a_ghost_and_an_obstacle_of_the_least_width_is_not():
     ranges = np.full(360, FAR)
     ranges[[50, 100, 102]] = 0.4
     assert gaps(Scan(ranges, FAN, (0.0, 0.0, 0.0)))[2].min() > 1.0
@@ -160,7 +160,7 @@ def test_a_lone_ghost_is_none_and_a_thing_as_narrow_as_things_may_be_is_no_ghost
         assert gaps(taken(np.random.default_rng(0), post))[2][178:182].max() < 0.6
 
 
-def test_what_may_move_takes_room_with_time():
+def test_cells_that_may_move_grow_with_time():
     wall = [Obstacle("wall", (0.5, 0.0), yaw=math.pi)]
     still, moving = (occupied_cells(taken(np.random.default_rng(0), wall, speed=s, age=0.1), 1.0) for s in (0.0, 1.6))
     at = (np.zeros(2), np.zeros((3, 2)), 0.0, np.zeros(2), 0.2)
@@ -184,7 +184,7 @@ def test_what_may_move_takes_room_with_time():
         {"ranges": np.full(360, 1200, np.uint16)},
     ],
 )
-def test_a_scan_that_is_none_is_refused(wrong):
+def test_a_malformed_scan_is_refused(wrong):
     right = {"ranges": np.ones(360), "angles": FAN, "pose": (0.0, 0.0, 0.0)}
     Scan(**right)
     with pytest.raises(BadScan):

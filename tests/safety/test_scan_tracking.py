@@ -1,4 +1,4 @@
-"""What is followed from scan to scan: whoever keeps to the bounds is where he may be, wherever he was hidden."""
+"""Tracking from scan to scan: a person within the bounds stays inside the occupied cells, even if hidden before."""
 
 import math
 from dataclasses import replace
@@ -30,7 +30,7 @@ ROOM = [Obstacle("wall", (-3.0 * math.cos(a), -3.0 * math.sin(a)), yaw=a) for a 
 
 
 def taken(obstacles, at, rng, **more):
-    """By a sensor at a true place, with the errors that it states."""
+    """Return a scan from a true position, with errors within the stated bounds."""
     ranges = cast(obstacles, at, FAN)
     noise = np.clip(rng.normal(0.0, 0.01, len(FAN)), -0.02, 0.02)
     ranges = np.where(ranges < FAR, np.clip(ranges + noise, 1e-3, FAR), FAR)
@@ -47,7 +47,7 @@ def disc(place):
 
 
 def starts(rng, sensor, still):
-    """Stands for a while, then comes as fast as it can."""
+    """Return a person's path: stand, then come at the largest acceleration and speed."""
     way = rng.uniform(0.0, math.tau)
     begin = sensor + rng.uniform(0.5, 1.1) * np.array([math.cos(way), math.sin(way)])
     wait = rng.uniform(0.3, 1.4)
@@ -61,7 +61,7 @@ def starts(rng, sensor, still):
 
 
 def turns(rng, sensor, still):
-    """Goes by, and then turns to the sensor as soon as it can."""
+    """Return a person's path: pass by, then turn to the sensor at the largest acceleration."""
     way, side = rng.uniform(0.0, math.tau), rng.choice([-1.0, 1.0])
     begin = sensor + rng.uniform(0.6, 1.3) * np.array([math.cos(way), math.sin(way)])
     velocity = side * rng.uniform(0.3, SPEED) * np.array([-math.sin(way), math.cos(way)])
@@ -77,7 +77,7 @@ def turns(rng, sensor, still):
 
 
 def comes_out(rng, sensor, still):
-    """Goes straight at full speed past something that hides it, through nothing."""
+    """Return a person's path: straight at full speed past an obstacle that hides the person."""
     hiding = still[int(rng.integers(len(still)))]
     off = np.array(hiding.position) - sensor
     out = off / np.linalg.norm(off)
@@ -90,7 +90,7 @@ def comes_out(rng, sensor, still):
 
 
 def outside(rng, kind, scans=9, count=24):
-    """(points looked at, m by which the worst was where it could not be): the sensor drives, somebody moves."""
+    """Return the number of tested points and the largest distance [m] of one from all occupied cells."""
     sensor, drives = rng.uniform(-0.5, 0.5, 2), rng.uniform(-0.2, 0.2, 2)
     still = []
     while kind is comes_out and len(still) < 2:  # else nobody hides: what follows from what was seen is enough
@@ -122,7 +122,7 @@ def outside(rng, kind, scans=9, count=24):
 
 
 def away(points, near: OccupiedCells, t):
-    """How far [m] each point is from all that may be occupied t s after the scan."""
+    """Return the distance [m] from each point to all that may be occupied t s after the scan."""
     least = np.full(len(points), math.inf)
     for corners, error, (cx, cy, v, a) in zip(near.corners, near.error, near.motions, strict=True):
         least = np.minimum(least, off(points - t * np.array([cx, cy]), corners) - error.max() - v * t - 0.5 * a * t * t)
@@ -130,7 +130,7 @@ def away(points, near: OccupiedCells, t):
 
 
 def off(points, corners):
-    """Distances to the convex hull of corners, by another library's hull."""
+    """Return distances to the convex hull of corners, with SciPy's hull."""
     corners = np.unique(corners.round(9), axis=0)
     flat = len(corners) < 3 or np.linalg.matrix_rank(corners - corners[0], tol=1e-6) < 2
     if not flat:
@@ -146,25 +146,25 @@ def off(points, corners):
 
 @settings(max_examples=25)
 @given(st.integers(0, 100_000), st.sampled_from([starts, turns, comes_out]))
-def test_who_keeps_the_bounds_is_where_he_may_be(seed, kind):
+def test_a_person_within_the_bounds_stays_inside_the_occupied_cells(seed, kind):
     _, worst = outside(np.random.default_rng(seed), kind)
     assert worst <= 1e-6
 
 
 def standing(scan, motions=scan_free_space.possible_motions):
-    """The mutant: what stood goes on standing."""
+    """A mutant: standing surfaces never move."""
     return np.where(
         (motions(scan)[:, :2] == 0.0).all(axis=1)[:, None] & (motions(scan)[:, 3:] > 0.0), 0.0, motions(scan)
     )
 
 
 def exact(scan, motions=scan_free_space.possible_motions):
-    """The mutant: velocities are as they were measured, for good."""
+    """A mutant: measured velocities are exact and constant."""
     return np.where(motions(scan)[:, 3:] > 0.0, motions(scan) * [1.0, 1.0, 0.0, 0.0], motions(scan))
 
 
 def none(scan, *rest, exits=scan_free_space._exit_cells):
-    """The mutant: nothing comes out."""
+    """A mutant: nothing comes out of a shadow."""
     return exits(scan, *rest).take(np.zeros(0, dtype=int))
 
 
@@ -172,7 +172,7 @@ def none(scan, *rest, exits=scan_free_space._exit_cells):
     ("kind", "name", "mutant"),
     [(starts, "possible_motions", standing), (turns, "possible_motions", exact), (comes_out, "_exit_cells", none)],
 )
-def test_a_mutant_does_not(monkeypatch, kind, name, mutant):
+def test_a_mutated_bound_loses_the_person(monkeypatch, kind, name, mutant):
     monkeypatch.setattr(scan_free_space, name, mutant)
     assert max(outside(np.random.default_rng(seed), kind)[1] for seed in range(25)) > 0.02
 
@@ -181,8 +181,8 @@ def test_a_mutant_does_not(monkeypatch, kind, name, mutant):
 
 
 @pytest.mark.parametrize(("missing", "doubt", "followed"), [(0, 0, True), (1, 0, False), (0, 1, False)])
-def test_nobody_is_followed_across_a_missing_scan_or_by_doubtful_beams(missing, doubt, followed):
-    """Then the only place near by may be somebody else's."""
+def test_no_group_is_tracked_across_a_missing_scan_or_with_doubted_beams(missing, doubt, followed):
+    """Otherwise a group could be matched to another's place."""
     rng, follower, now = np.random.default_rng(0), ScanTracker(), 0.0
     for k in range(5):
         scan = taken([*ROOM, disc(np.array([1.0, -0.5 + 0.8 * now]))], np.zeros(2), rng, doubt=doubt)
@@ -194,14 +194,14 @@ def test_nobody_is_followed_across_a_missing_scan_or_by_doubtful_beams(missing, 
 
 
 def followed(world, scans=4, seed=0):
-    """What is known after so many scans of what is there at each time, from where the sensor stands."""
+    """Return the last scan of a world that changes with time, from a standing sensor."""
     memory, rng = FanMemory(GROUND.footprint), np.random.default_rng(seed)
     for k in range(scans):
         scan = memory.fill(taken(world(k * DT), np.zeros(2), rng), DT)
     return scan
 
 
-def test_what_stood_is_told_from_what_moved_and_how_fast():
+def test_the_tracker_separates_standing_surfaces_from_moving_groups():
     pillar = Obstacle("cylinder", (0.8, 0.0), (0.15,))
     velocity = np.array([0.5, -0.3])
     scan = followed(lambda t: [*ROOM, pillar, disc(np.array([-1.0, 0.6]) + t * velocity)])
@@ -216,7 +216,7 @@ def test_what_stood_is_told_from_what_moved_and_how_fast():
     assert np.linalg.norm(ways[moved - 1, :2] - velocity) < 0.15 and ways[moved - 1, 2] < 0.5
 
 
-def test_who_may_have_been_one_of_two_is_not_followed():
+def test_an_ambiguous_group_is_not_tracked():
     """The one ahead may have been either of them; the one behind was too far from where the other was."""
     velocity, legs = np.array([0.5, 0.0]), [np.array([-0.5, 0.8]), np.array([-0.25, 0.8])]
     world = [lambda t, leg=leg: Obstacle("cylinder", tuple(leg + t * velocity), (0.06,)) for leg in legs]
@@ -225,7 +225,7 @@ def test_who_may_have_been_one_of_two_is_not_followed():
         assert np.count_nonzero(scan.tracks.motions[:, 0]) == count
 
 
-def test_what_is_new_may_go_anywhere_and_what_nothing_bounds_is_not_followed():
+def test_a_new_surface_may_go_anywhere_and_without_bounds_nothing_is_tracked():
     new = followed(lambda t: [*ROOM, *([disc((0.8, 0.0))] if t > 2.5 * DT else [])])
     assert not new.tracks.track_index[np.abs(FAN) < 0.1].any() and new.tracks.track_index[np.abs(FAN) > 0.5].any()
     scan = taken(ROOM, np.zeros(2), np.random.default_rng(0))
@@ -233,7 +233,7 @@ def test_what_is_new_may_go_anywhere_and_what_nothing_bounds_is_not_followed():
         assert scan_tracking.ScanTracker().follow(unknown) is unknown
 
 
-def test_where_a_scan_does_not_come_what_was_followed_is_older():
+def test_tracks_age_while_no_scan_comes():
     memory, rng = FanMemory(GROUND.footprint), np.random.default_rng(0)
     for _ in range(4):
         last = memory.fill(taken(ROOM, np.zeros(2), rng), DT)
@@ -243,7 +243,7 @@ def test_where_a_scan_does_not_come_what_was_followed_is_older():
     assert not memory.fill(taken(ROOM, np.zeros(2), rng), DT).tracks.track_index.any()
 
 
-def test_who_hides_needs_room():
+def test_a_hidden_person_needs_room_behind_the_surface():
     """Behind a pillar as wide as he is, somebody is as far off as the shadow takes to be as wide; behind a thin one
     farther; of any size, he may stand right behind it."""
     angles, free = np.radians(np.arange(-180.0, 180.0)), np.full(360, FAR)
@@ -257,7 +257,7 @@ def test_who_hides_needs_room():
     assert occlusion_exits(angles, width, narrow, SIZE).near.min() > 2.0  # only beyond sight is room: 4 m off
 
 
-def test_by_what_stood_it_drives_and_where_somebody_may_come_out_it_does_not(ready, monkeypatch):
+def test_the_filter_allows_driving_past_standing_surfaces_but_not_past_exits(ready, monkeypatch):
     wall = Obstacle("wall", (0.0, -0.55), yaw=math.pi / 2)
     scan = followed(lambda t: [*ROOM, wall])
     assert ready.decide(request(scan=scan)).kind == ALLOWED
@@ -268,7 +268,7 @@ def test_by_what_stood_it_drives_and_where_somebody_may_come_out_it_does_not(rea
     assert ready.decide(request(scan=scan)).kind == ALLOWED
 
 
-def test_what_was_followed_crosses_the_wire():
+def test_tracks_survive_the_wire():
     scan = followed(lambda t: [*ROOM, disc((-1.0 + 0.5 * t, 0.6))])
     got = scan_of(scan_message(scan))
     assert np.array_equal(got.tracks.track_index, scan.tracks.track_index)
@@ -288,7 +288,7 @@ def test_what_was_followed_crosses_the_wire():
         (np.ones(360, np.uint8), np.array([[-1e300, 0.0, 0.1, 1.0]])),
     ],
 )
-def test_what_nobody_can_have_followed_is_refused(which, ways):
+def test_malformed_tracks_are_refused(which, ways):
     with pytest.raises(BadScan):
         Scan(np.ones(360), FAN, (0.0, 0.0, 0.0), tracks=BeamTracks(which, ways))
     message = scan_message(Scan(np.ones(360), FAN, (0.0, 0.0, 0.0)))

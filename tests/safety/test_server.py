@@ -1,4 +1,4 @@
-"""The service's core, the client and the wrapper: what comes in is checked, what goes out can be relied on."""
+"""The service checks each request, and the client each reply."""
 
 import logging
 
@@ -28,7 +28,7 @@ def good(**more):
 
 
 class Service:
-    """The core, called with bytes."""
+    """The service's core, called with bytes."""
 
     def __init__(self, *models: ModelSet, archive=None):
         self.models, self.counts = ModelRegistry(archive, accept_bound=1.0), ServiceCounts()
@@ -51,7 +51,7 @@ def service(model):
     return Service(model)
 
 
-def test_a_batch_is_answered_in_its_order(service, model):
+def test_replies_are_in_the_order_of_the_requests(service, model):
     replies = service.replies(*(good(step=i) for i in range(5)), good(time=2.0))
     assert len(replies) == 6
     for reply in replies:
@@ -136,12 +136,12 @@ def test_bad_requests_get_an_error_that_names_the_field(service, field, message)
     assert read_reply(service.replies(good())[0], good(), GROUND).verified
 
 
-def test_a_bad_request_spoils_no_other_of_its_batch(service):
+def test_a_bad_request_does_not_affect_the_others_of_its_batch(service):
     replies = service.replies(good(), bad(action=[0.0]), good())
     assert [reply.WhichOneof("result") for reply in replies] == ["decision", "error", "decision"]
 
 
-def test_what_is_no_batch_is_refused_and_the_service_goes_on(service):
+def test_bytes_that_are_no_batch_are_refused_and_the_service_goes_on(service):
     rng = np.random.default_rng(0)
     whole = pb.RequestBatch(requests=[good()]).SerializeToString()
     for payload in (
@@ -219,7 +219,7 @@ def test_a_model_is_replaced_while_the_service_runs(model, models, tmp_path):
     assert read_reply(other.replies(moving)[0], moving, GROUND)
 
 
-def test_violations_and_what_could_not_be_verified_are_counted(service, caplog):
+def test_violations_and_unverified_decisions_are_counted(service, caplog):
     message = good()
     message.predicted_center.extend([9.0] * 5)
     message.predicted_half_width.extend([0.1] * 5)
@@ -236,7 +236,7 @@ def test_violations_and_what_could_not_be_verified_are_counted(service, caplog):
 # --- what the client believes -------------------------------------------------------------------------------------
 
 
-def test_the_client_believes_no_bad_reply(service):
+def test_the_client_refuses_a_bad_reply(service):
     reply = service.replies(good())[0]
     for change, field in (
         (lambda d: d.plan.append(0.0), "plan"),
@@ -268,14 +268,14 @@ class FakeBus:
         return self.answer
 
 
-def test_replies_that_are_none_are_typed_errors():
+def test_malformed_replies_raise_safety_errors():
     for answer in (b"\xff\xff", pb.ReplyBatch().SerializeToString(), b""):
         with pytest.raises(SafetyError, match="BadReply"):
             query_service(FakeBus(answer), [good()], 0.1)
 
 
-def test_a_recorded_reply_is_no_answer_at_another_place(service):
-    """Not even to the same question: each has a nonce, which the reply names with it."""
+def test_a_replayed_reply_is_refused(service):
+    """Even for an equal request: each batch has a nonce, and the reply names the digest of its batch."""
     recorded = []
 
     class Recording(FakeBus):
@@ -291,7 +291,7 @@ def test_a_recorded_reply_is_no_answer_at_another_place(service):
         assert caught.value.field == "request"
 
 
-def test_a_plan_that_no_actuator_could_follow_is_not_believed():
+def test_a_plan_that_violates_the_slew_limit_is_refused():
     """Its first input must follow the one in force within the slew, every other the one before; and it is about this
     robot."""
     flying = BackupPlan(QUADROTOR)

@@ -1,4 +1,4 @@
-"""A service takes only models that somebody signed whom it was told to trust, of what they were signed for."""
+"""A service accepts only models that a trusted signer signed for their robot."""
 
 import json
 import subprocess
@@ -40,12 +40,12 @@ def keys(tmp_path: Path) -> Path:
 
 
 def shrunken(model: ModelSet) -> ModelSet:
-    """The attack: sets a tenth as wide, and a hash that is right."""
+    """Return a forged model set: sets a tenth as wide, and a matching hash."""
     steps = tuple(ErrorBound(s.C, s.W, 0.1 * s.M, 0.1 * s.kappa, 0.1 * s.w, s.generators) for s in model.steps)
     return replace(model, steps=steps)
 
 
-def test_what_was_signed_is_taken(model: ModelSet, keys: Path, tmp_path: Path) -> None:
+def test_a_signed_model_is_accepted(model: ModelSet, keys: Path, tmp_path: Path) -> None:
     signed = ModelSigner.load(keys).sign(model)
     assert TrustedSigners.load(keys).open(signed, "ground").version == model.version
     path = tmp_path / "model.safetensors"
@@ -55,7 +55,7 @@ def test_what_was_signed_is_taken(model: ModelSet, keys: Path, tmp_path: Path) -
     assert (keys / "signer.key").stat().st_mode & 0o077 == 0
 
 
-def test_a_hash_that_one_computes_oneself_proves_nothing(model: ModelSet, keys: Path) -> None:
+def test_a_matching_hash_without_a_signature_is_refused(model: ModelSet, keys: Path) -> None:
     signed, trust = ModelSigner.load(keys).sign(model), TrustedSigners.load(keys)
     evil = shrunken(model)
     assert ModelSet.decode(evil.encode()).version == evil.version, "its own hash is right: yesterday it was taken"
@@ -74,7 +74,7 @@ def test_a_hash_that_one_computes_oneself_proves_nothing(model: ModelSet, keys: 
         TrustedSigners().open(signed, "ground")
 
 
-def test_it_is_of_the_robot_that_topic_and_key_say(model: ModelSet, tmp_path: Path) -> None:
+def test_a_model_must_be_of_the_robot_that_topic_and_key_name(model: ModelSet, tmp_path: Path) -> None:
     write_signer(tmp_path / "any")
     signed = ModelSigner.load(tmp_path / "any").sign(model)
     with pytest.raises(Untrusted, match="published as one of quadrotor"):
@@ -85,8 +85,8 @@ def test_it_is_of_the_robot_that_topic_and_key_say(model: ModelSet, tmp_path: Pa
 
 
 @pytest.mark.parametrize("field", ["robot", "layout", "version", "domain"])
-def test_the_claim_is_what_the_file_is(model: ModelSet, keys: Path, field: str) -> None:
-    """Even where the right key signed something else: the file has to agree with every word."""
+def test_the_claim_must_match_the_file(model: ModelSet, keys: Path, field: str) -> None:
+    """Even if a trusted key signed the claim: the file must agree with each entry."""
     signed = ModelSigner.load(keys).sign(model)
     claim = json.loads(signed.claim) | {field: "quadrotor" if field != "domain" else (0.5 * model.domain).tolist()}
     words = json.dumps(claim, sort_keys=True).encode()
@@ -97,7 +97,7 @@ def test_the_claim_is_what_the_file_is(model: ModelSet, keys: Path, field: str) 
     assert TrustedSigners.load(keys).open(replace(signed, signature=key.sign(CONTEXT + signed.claim)))
 
 
-def test_nobody_signs_for_more_than_was_recorded(model: ModelSet, data, keys: Path) -> None:
+def test_a_domain_wider_than_the_data_is_not_signed(model: ModelSet, data, keys: Path) -> None:
     signer, recorded = ModelSigner.load(keys), recorded_domain(data)
     assert (model.domain[0] >= recorded[0]).all() and (model.domain[1] <= recorded[1]).all()
     assert TrustedSigners.load(keys).open(signer.sign(model, data))
@@ -112,7 +112,7 @@ def test_nobody_signs_for_more_than_was_recorded(model: ModelSet, data, keys: Pa
         TrustedSigners.load(keys).open(SignedModel(nothing.file, words, key.sign(CONTEXT + words)))
 
 
-def test_a_restart_goes_on_with_the_newest_that_somebody_signed(model: ModelSet, keys: Path, tmp_path: Path) -> None:
+def test_a_restart_uses_the_newest_signed_model(model: ModelSet, keys: Path, tmp_path: Path) -> None:
     trust, evil = TrustedSigners.load(keys), shrunken(model)
     good, bad = (archive_path(tmp_path, "ground", m.version) for m in (model, evil))
     ModelSigner.load(keys).sign(model).save(good)
@@ -135,7 +135,7 @@ main(SafetySettings(bus, (Path(model),), Path(archive), accept_bound=1.0))
 """
 
 
-def test_a_service_takes_over_the_bus_only_what_is_signed(
+def test_a_service_accepts_only_signed_models_over_the_bus(
     model: ModelSet, models: dict[tuple[str, str], ModelSet], tmp_path: Path
 ) -> None:
     """A certificate of `certify` gets a message through; what is in it has to be signed all the same."""
@@ -169,7 +169,7 @@ def test_a_service_takes_over_the_bus_only_what_is_signed(
     assert newest_model(archive, "ground", TrustedSigners.load(keys)) == archive_path(archive, "ground", newer.version)
 
 
-def test_with_keys_a_file_that_the_user_names_is_signed_too(model: ModelSet, tmp_path: Path) -> None:
+def test_with_keys_a_models_file_must_be_signed_too(model: ModelSet, tmp_path: Path) -> None:
     keys, endpoint = keyring(tmp_path / "keys"), free_endpoint("tls")
     write_signer(keys)
     unsigned = tmp_path / "unsigned.safetensors"

@@ -1,4 +1,4 @@
-"""What is remembered as free is free: in random scenes, with the errors of every pose."""
+"""Memory shows only free space to be free: random scenes, with errors in every pose."""
 
 import math
 from dataclasses import replace
@@ -20,7 +20,7 @@ BODY, BLIND = 0.02, math.radians(30.0)  # rad on either side of straight behind
 
 
 def taken(obstacles, pose, rng, error=0.01, turn=0.02, speed=0.0):
-    """A scan at the true pose, blind behind, with a measured pose that is off."""
+    """Return a scan from the true pose, blind behind, with a measured pose that is wrong within its bounds."""
     ranges = cast(obstacles, np.array(pose[:2]), FAN + pose[2])
     ranges[np.abs(FAN) > math.pi - BLIND] = 0.0
     off = rng.normal(size=2)
@@ -32,7 +32,7 @@ def taken(obstacles, pose, rng, error=0.01, turn=0.02, speed=0.0):
 
 @settings(max_examples=8, deadline=None)
 @given(st.integers(0, 100_000))
-def test_what_is_remembered_is_free(seed):
+def test_space_that_memory_shows_to_be_free_is_free(seed):
     rng = np.random.default_rng(seed)
     obstacles = scene(rng, 8)
     shapes = Shapes.of(obstacles, 2)
@@ -52,7 +52,7 @@ def test_what_is_remembered_is_free(seed):
     assert remembered > 0
 
 
-def test_who_drives_ahead_knows_what_is_behind():
+def test_memory_fills_a_blind_sector_after_driving_ahead():
     rng = np.random.default_rng(0)
     memory = FanMemory(0.105)
     for k in range(20):
@@ -61,7 +61,7 @@ def test_who_drives_ahead_knows_what_is_behind():
     assert behind.min() > 0.3
 
 
-def test_a_world_that_moves_takes_it_back():
+def test_in_a_moving_world_memory_fades():
     rng = np.random.default_rng(0)
     memory = FanMemory(0.105)
     for k in range(20):
@@ -69,13 +69,13 @@ def test_a_world_that_moves_takes_it_back():
     assert not filled.known[np.abs(FAN) > math.pi - BLIND].any()
 
 
-def test_at_the_start_there_is_room_about_the_body_and_no_more():
+def test_at_the_start_only_a_ring_around_the_body_is_free():
     filled = FanMemory(0.105).fill(_open(0.0, np.random.default_rng(0)), 0.0)
     behind = filled.ranges[np.abs(FAN) > math.pi - BLIND] - filled.range_error
     assert (behind > 0.17).all() and (behind <= 0.205).all()
 
 
-def test_where_no_scan_comes_the_last_one_goes_on_so_much_older():
+def test_without_a_new_scan_the_last_one_ages():
     memory, rng = FanMemory(0.105), np.random.default_rng(0)
     assert not len(memory.fill(None, 0.2).ranges), "before the first nothing is known to be free"
     seen = memory.fill(_open(0.0, rng, speed=1.2), 0.2)
@@ -89,8 +89,8 @@ def test_where_no_scan_comes_the_last_one_goes_on_so_much_older():
     assert not memory.fill(blind, 0.2).known.any(), "what may walk took it all back meanwhile"
 
 
-def test_the_room_where_it_was_put_is_as_old_as_that():
-    """However late the first scan comes: somebody may have walked in meanwhile."""
+def test_the_ring_at_the_start_ages_before_the_first_scan():
+    """If the first scan comes late, somebody may have walked in."""
     blind = replace(_open(0.0, np.random.default_rng(0), speed=1.2), ranges=np.zeros(len(FAN)))
     memory = FanMemory(0.105)
     assert memory.fill(blind, 0.2).known.any(), "at once"
@@ -101,7 +101,7 @@ def test_the_room_where_it_was_put_is_as_old_as_that():
 
 
 @pytest.mark.parametrize("memory", [FanMemory(0.105), ImageMemory(0.3)])
-def test_who_fills_his_array_again_does_not_change_what_was_seen(memory):
+def test_overwriting_the_callers_array_does_not_change_the_memory(memory):
     beams = np.full(36, 0.5) if isinstance(memory, FanMemory) else np.full((30, 60), 0.5)
     angles = np.linspace(-math.pi, math.pi, 36, endpoint=False)
     memory.fill(Scan(beams, angles, (0.0, 0.0, 0.0)) if beams.ndim == 1 else RangeImage(beams, (0.0, 0.0, 0.0)), 0.2)
@@ -113,7 +113,7 @@ def test_who_fills_his_array_again_does_not_change_what_was_seen(memory):
 
 
 def _open(x, rng, speed=0.0):
-    """Nothing anywhere, blind behind."""
+    """Return a scan of empty space, blind behind."""
     ranges = np.where(np.abs(FAN) > math.pi - BLIND, 0.0, FAR)
     pose = (x + rng.uniform(-0.005, 0.005), rng.uniform(-0.005, 0.005), rng.uniform(-0.01, 0.01))
     known = {"position_error": 0.01, "heading_error": 0.02, "range_error": 0.02}
