@@ -1,4 +1,4 @@
-"""What real time does to a vehicle, in simulation: while the next input is decided on, the last is carried out."""
+"""Simulate the delay of real time: a vehicle carries out each input one period after the policy chose it."""
 
 from __future__ import annotations
 
@@ -6,16 +6,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brakeline.messaging.robot import Robot
+from brakeline.messaging.task import RobotWithTask
 from brakeline.sim.arena import Arena
-from brakeline.sim.vehicle import BadInput, MakeVehicle, Period, Vehicle
+from brakeline.sim.sim_conditions import Conditions
+from brakeline.sim.vehicle import MakeVehicle, Period, Vehicle, clip_input
 
 Array = NDArray[np.float64]
 
 
 class DelayedVehicle:
-    """A vehicle that carries out each input one period after it was given; at first, zero.
+    """A vehicle that carries out each input one period later; zero during the first period.
 
-    `input` is the one in force, which `step` carries out while its argument waits for its turn.
+    `input` is the input in force: `step` carries it out, while the argument of `step` waits for the next period.
     """
 
     def __init__(self, vehicle: Vehicle, robot: Robot) -> None:
@@ -24,41 +26,50 @@ class DelayedVehicle:
 
     @property
     def true(self) -> Array:
-        """(n,) the state as it is."""
+        """The true state (n,)."""
         return self._vehicle.true
 
     @property
     def measured(self) -> Array:
-        """(n,) the state as it is estimated."""
+        """The measured state (n,)."""
         return self._vehicle.measured
 
     def step(self, input: Array) -> Period:
-        """A period at the input in force; the argument, clipped to bounds and slew, is in force from its end on.
+        """Carry out the input in force for one period, then put the argument (m,), clipped, in force.
 
         Raises:
-            BadInput: when the input is not m finite numbers.
+            BadInput: the input is not m finite numbers.
         """
-        robot, wanted = self._robot, np.asarray(input, dtype=np.float64)
-        if wanted.shape != (robot.action_dim,) or not np.isfinite(wanted).all():
-            raise BadInput(f"an input is {robot.action_dim} finite numbers, not {input!r}")
+        following = clip_input(self._robot, input, self.input)
         period = self._vehicle.step(self.input)
-        slew = np.asarray(robot.action_slew)
-        self.input = np.clip(np.clip(wanted, robot.low(), robot.high()), self.input - slew, self.input + slew)
+        self.input = following
         return period
 
     def initial_period(self) -> Period:
-        """The present state as a period in which nothing happened."""
         return self._vehicle.initial_period()
 
     def alter(self, **changes: float) -> None:
-        """As the vehicle's own."""
         self._vehicle.alter(**changes)
 
 
 def delayed(make: MakeVehicle, robot: Robot) -> MakeVehicle:
-    """Makes the same vehicles for a robot in real time."""
+    """Return a function that makes the same vehicles with the delay of real time."""
 
-    def make_late(arena: Arena, rng: np.random.Generator) -> DelayedVehicle:
+    def make_delayed(arena: Arena, rng: np.random.Generator) -> DelayedVehicle:
         return DelayedVehicle(make(arena, rng), robot)
 
-    return make_late
+    return make_delayed
+
+
+def simulated_vehicle(robot: RobotWithTask, conditions: Conditions, tap: object = None) -> MakeVehicle:
+    """Return a function that makes the vehicles of a robot's task under some conditions.
+
+    A robot in real time gets delayed vehicles. A simulator behind MAVLink calls `tap` with every frame.
+
+    Raises:
+        UnknownTask: the code that the task names cannot be loaded.
+    """
+    if robot.late:
+        return delayed(simulated_vehicle(robot.in_lockstep(), conditions, tap), robot)
+    make: MakeVehicle = robot.task.code(robot.task.simulator)(conditions, tap)
+    return make

@@ -1,4 +1,4 @@
-"""The Gymnasium environment: reach the goal, touch nothing. Robot, arena and vehicle are arguments."""
+"""The Gymnasium environment: reach the goal without touching anything. Robot, arena and vehicle are arguments."""
 
 from __future__ import annotations
 
@@ -13,101 +13,137 @@ from numpy.typing import NDArray
 
 from brakeline.messaging.moving_obstacles import MovingObstacles
 from brakeline.messaging.obstacle import Obstacle
-from brakeline.messaging.task import Reward, RobotWithTask
+from brakeline.messaging.task import Reward, RobotWithTask, robot_with_task
 from brakeline.sim.arena import Arena
 from brakeline.sim.arena_generator import draw_arena
+from brakeline.sim.delayed_vehicle import simulated_vehicle
 from brakeline.sim.ground_estimator import wrap
-from brakeline.sim.observations import LIDAR_NOISE, ObservationModel
-from brakeline.sim.range_sensors import Perception, make_scanner
+from brakeline.sim.observations import ObservationModel
+from brakeline.sim.range_sensors import make_scanner
 from brakeline.sim.sim_conditions import Conditions
+from brakeline.sim.top_view import Image, TopView, Window
 from brakeline.sim.traffic import Crowd, CrowdSensor
 from brakeline.sim.vehicle import MakeVehicle, Period, Vehicle
 
 Array = NDArray[np.float64]
 Observation = NDArray[np.float32]
 Info = dict[str, Any]
+StepResult = tuple[Observation, float, bool, bool, Info]
 DrawArena = Callable[[str, np.random.Generator, RobotWithTask], Arena]
 
 OBSERVED_LIMIT = 1.5  # every coordinate of the observation is clipped to ± this
 
 
 class NavigationEnv(gymnasium.Env[Observation, Any]):
-    """One robot, a fresh random arena each episode.
+    """One robot in a fresh random arena each episode.
 
-    Action: the robot's input in physical units, clipped to its bounds and slew. Observation: `task.observed`,
-    float32. Terminated on reaching the goal or touching anything (both judged on the true position), truncated at
-    the arena's step limit. An episode is determined by `seed_key` and its episode seed alone; `reset(seed=…)` fixes the
-    sequence of episode seeds, `reset(options={"episode_seed": …})` a single one; `options={"arena": …}` changes the
-    arena's name, for good.
+    Action: the robot's input in physical units; the vehicle clips it to the robot's bounds and slew.
+    Observation: the coordinates that `task.observed` names, float32, clipped to ±`OBSERVED_LIMIT`.
+    Reward: `task.reward`.
 
-    `info`, after reset and after step, has these keys (n state coordinates, d of them the position, m inputs, S samples
-    in a period):
+    An episode terminates when the robot reaches the goal or touches anything; both follow the true position. It is
+    truncated at the arena's step limit. `seed_key` and the episode seed alone determine an episode. `reset(seed=...)`
+    fixes the sequence of episode seeds, `reset(options={"episode_seed": ...})` a single one.
+    `reset(options={"arena": ...})` changes the arena's name for this and all later episodes.
+
+    `render()` returns a view from above: an image (H, W, 3) with `render_mode="rgb_array"`. With
+    `render_mode="human"`, `reset` and `step` show it in a window.
+
+    `reset` and `step` return an `info` with these keys. Dimensions: n coordinates of the state, d of the position,
+    m inputs, S samples in a period.
 
     =================  =================================================================================
-    robot              name of the robot
-    state              (n,) measured state, as `robot.state` names it
-    true_state         (n,) the same without measurement error; nothing that drives may look at it
-    outside            the true state is farther from the measured one than `robot.measurement_bound`
-    input_in_force     (m,) the input executed last, within bounds and slew; zero at the start
-    obstacles          list[Obstacle]: those with their surface within `robot.sight` of the measured position; those
-                       that move, as measured, with their motion, if they may come as near within a plan;
-                       none where free space comes from scans
-    scan               Scan | RangeImage | None: the newest there is, where free space comes from scans
+    robot              the robot's name
+    state              (n,) measured state; `robot.state` names its coordinates
+    true_state         (n,) true state; only for evaluation, a policy must not read it
+    outside            whether the measurement error exceeds `robot.measurement_bound`
+    input_in_force     (m,) input executed last, within bounds and slew; zero at the start
+    obstacles          list[Obstacle]: the static obstacles within `robot.sight` of the measured position, and the
+                       moving ones that can come within it before a plan ends, as measured; empty if free space
+                       comes from scans
+    scan               Scan | RangeImage: the newest scan; only if free space comes from scans
     arena              Arena: the whole map
     goal               (d,) m
-    time               s since the episode's start
-    collision          some part of the robot touched an obstacle that stands during the last period
-    contact_moving     it touched something that moves, and was moving itself when that began
-    contact_standing   it was run into while it stood
-    contact_robot      it touched another robot of its world (`brakeline.sim.shared_world`)
-    at_goal            the goal is reached
+    time               s since the start of the episode
+    collision          the robot touched a static obstacle during the last period
+    contact_moving     the robot touched a moving obstacle while it was moving itself
+    contact_standing   a moving obstacle touched the robot while the robot stood
+    contact_robot      the robot touched another robot (`brakeline.sim.shared_world`)
+    at_goal            the robot is at the goal, without a contact
     clearance          m from the nearest disc (sphere) of the body to the nearest obstacle, true
     speed              m/s, true
     subsamples         (S, d) m: estimated positions within the last period, in the robot's frame at its start
     turned             rad: estimated change of heading over the last period
-    episode_seed       what `options` takes to get this episode again
+    episode_seed       the value that `options` takes to repeat this episode
     =================  =================================================================================
     """
 
+    metadata: dict[str, Any] = {"render_modes": ["rgb_array", "human"], "render_fps": 5}  # noqa: RUF012
+
     def __init__(
         self,
-        robot: RobotWithTask,
+        robot: RobotWithTask | str,
         arena: str = "default",
         make_vehicle: MakeVehicle | None = None,
-        lidar_noise: float = LIDAR_NOISE,
+        *,
+        conditions: Conditions | None = None,
+        lidar_noise: float | None = None,
         seed_key: int = 0,
         reward: Reward | None = None,
         draw: DrawArena = draw_arena,
-        perception: Perception | None = None,
+        render_mode: str | None = None,
     ) -> None:
-        """make_vehicle: puts a vehicle of that robot kind at an arena's start, for one episode (None: the task's
-        own, under usual conditions); lidar_noise: m, sigma
-        of a range; seed_key: sets apart the episodes of two environments whose episode seeds are the same, 0 or more;
-        draw: makes an episode's arena; perception: where free space comes from; from the map, unless given.
+        """Make the environment; `reset` draws the first episode.
+
+        Args:
+            robot: a robot with its task, or its name (`"ground"`), or the path of its file.
+            arena: the name of one of the task's arenas.
+            make_vehicle: puts a vehicle at the start of an arena, for one episode. Defaults to the task's simulator
+                under `conditions`.
+            conditions: sensor noise, payload, friction, wind, and the source of free space (`perception`).
+            lidar_noise: standard deviation of a range [m]. Defaults to the conditions' value for this robot.
+            seed_key: a number that is 0 or more; environments with different keys have different episodes.
+            reward: replaces the task's reward.
+            draw: draws the arena of an episode.
+            render_mode: None, "rgb_array" or "human".
+
+        Raises:
+            UnknownRobot: no robot has this name.
+            UnknownTask: the robot has no task.
+            ValueError: the render mode is none of `metadata["render_modes"]`.
         """
-        self.robot, self.arena_name, self.seed_key = robot, arena, seed_key
-        self.task = robot.task
+        if render_mode not in (None, *self.metadata["render_modes"]):
+            raise ValueError(f"render_mode is None, 'rgb_array' or 'human', not {render_mode!r}")
+        self.robot = robot_with_task(robot) if isinstance(robot, str) else robot
+        self.arena_name, self.seed_key, self.render_mode = arena, seed_key, render_mode
+        self.task = self.robot.task
         self.reward = reward or self.task.reward
-        self.action_space = Box(robot.low().astype(np.float32), robot.high().astype(np.float32), dtype=np.float32)
+        self.conditions = conditions or Conditions()
+        self.metadata = {**self.metadata, "render_fps": round(1.0 / self.robot.period)}
+        low, high = self.robot.low().astype(np.float32), self.robot.high().astype(np.float32)
+        self.action_space = Box(low, high, dtype=np.float32)
         limit = np.full(self.task.observation_dim, OBSERVED_LIMIT, dtype=np.float32)
         self.observation_space = Box(-limit, limit, dtype=np.float32)
-        self._make_senses = self.task.code(self.task.senses)
-        self._make_vehicle: MakeVehicle = make_vehicle or self.task.code(self.task.simulator)(Conditions(), None)
-        self._lidar_noise, self._draw = lidar_noise, draw
-        self._bound = np.asarray(robot.measurement_bound)
-        self._perception = perception or Perception()
+        self._make_observation_model = self.task.code(self.task.senses)
+        self._make_vehicle = make_vehicle or simulated_vehicle(self.robot, self.conditions)
+        flies = self.robot.position_dim == 3
+        self._lidar_noise = self.conditions.lidar_noise(flies) if lidar_noise is None else lidar_noise
+        self._draw = draw
+        self._measurement_bound = np.asarray(self.robot.measurement_bound)
         self._changes: dict[str, float] = {}
         self._vehicle: Vehicle | None = None
+        self._view: TopView | None = None
+        self._window: Window | None = None
 
     @property
     def vehicle(self) -> Vehicle:
-        """The robot of the running episode."""
+        """The robot of the running episode. Raises gymnasium.error.ResetNeeded before the first one."""
         if self._vehicle is None:
-            raise gymnasium.error.ResetNeeded("reset the environment before anything else")
+            raise gymnasium.error.ResetNeeded("call reset() before the first step")
         return self._vehicle
 
     def alter(self, **changes: float) -> None:
-        """Change the vehicle's physics from now on, this episode and later ones, as `Vehicle.alter` does."""
+        """Change the vehicle's physics in this and all later episodes (`Vehicle.alter`)."""
         self._changes |= changes
         if self._vehicle is not None:
             self._vehicle.alter(**changes)
@@ -116,31 +152,35 @@ class NavigationEnv(gymnasium.Env[Observation, Any]):
         super().reset(seed=seed)
         options = options or {}
         self.arena_name = options.get("arena", self.arena_name)
-        drawn = int(self.np_random.integers(2**31)) if "episode_seed" not in options else options["episode_seed"]
-        self._episode_seed = int(drawn)
+        episode_seed = options["episode_seed"] if "episode_seed" in options else self.np_random.integers(2**31)
+        self._episode_seed = int(episode_seed)
         rng = np.random.default_rng((self.seed_key, self._episode_seed))
         self._arena = self._draw(self.arena_name, rng, self.robot)
         self._vehicle = self._make_vehicle(self._arena, rng)
         if self._changes:
             self._vehicle.alter(**self._changes)
-        self._senses: ObservationModel = self._make_senses(self.robot, self._arena, rng, self._lidar_noise)
+        self._observation_model: ObservationModel = self._make_observation_model(
+            self.robot, self._arena, rng, self._lidar_noise
+        )
         self._scanner = None
-        if self._perception.kind == "scan":
-            self._scanner = make_scanner(self.robot, self._arena, rng, self._lidar_noise, self._perception)
+        if self.conditions.perception.kind == "scan":
+            self._scanner = make_scanner(self.robot, self._arena, rng, self._lidar_noise, self.conditions.perception)
         crowd = self._arena.crowd
-        self._pushed = crowd is not None and crowd.pushes  # by whoever runs into it
-        self._watch = (
-            CrowdSensor(crowd, rng) if isinstance(crowd, Crowd) else None
-        )  # other robots promise where they will be
+        self._crowd_pushes = crowd is not None and crowd.pushes
+        # Other robots announce their plans: only people and aircraft are measured.
+        self._crowd_sensor = CrowdSensor(crowd, rng) if isinstance(crowd, Crowd) else None
         self._steps = 0
         self._distance = self._goal_distance(self._vehicle.true)
-        return self._observe(), self._info(self._vehicle.initial_period())
+        self._view = None
+        result = self._observe(), self._info(self._vehicle.initial_period())
+        self._show()
+        return result
 
-    def step(self, action: Array) -> tuple[Observation, float, bool, bool, Info]:
-        return self.after(self.vehicle.step(action))
+    def step(self, action: Array) -> StepResult:
+        return self.finish_step(self.vehicle.step(action))
 
-    def after(self, period: Period) -> tuple[Observation, float, bool, bool, Info]:
-        """What `step` returns of a period that was driven."""
+    def finish_step(self, period: Period) -> StepResult:
+        """Return what `step` returns, for a period that the vehicle has carried out."""
         self._steps += 1
         before, self._distance = self._distance, self._goal_distance(period.true)
         at_goal = self._at_goal(period)
@@ -148,9 +188,38 @@ class NavigationEnv(gymnasium.Env[Observation, Any]):
         hit = period.collision or period.contact_moving or period.contact_robot
         reward += self.reward.goal * at_goal + self.reward.collision * hit
         reward += self.reward.run_into * period.contact_standing
-        terminated = at_goal or hit or (period.contact_standing and self._pushed)
+        terminated = at_goal or hit or (period.contact_standing and self._crowd_pushes)
         truncated = not terminated and self._steps >= self._arena.step_limit
-        return self._observe(), float(reward), terminated, truncated, self._info(period)
+        result = self._observe(), float(reward), terminated, truncated, self._info(period)
+        self._show()
+        return result
+
+    def render(self) -> Image | None:
+        """Return the view from above (H, W, 3) in the mode "rgb_array"; show it in the mode "human"."""
+        if self.render_mode == "human":
+            self._show()
+        return self._image() if self.render_mode == "rgb_array" else None
+
+    def close(self) -> None:
+        """Close the window, if there is one."""
+        if self._window is not None:
+            self._window.close()
+            self._window = None
+
+    def _show(self) -> None:
+        if self.render_mode == "human":
+            self._window = self._window or Window(f"{self.robot.name}: {self.arena_name}")
+            self._window.show(self._image())
+
+    def _image(self) -> Image:
+        vehicle = self.vehicle
+        self._view = self._view or TopView(self.robot, self._arena)
+        return self._view.draw(vehicle.true, self._time)
+
+    @property
+    def _time(self) -> float:
+        """Time since the start of the episode [s]."""
+        return self._steps * self.robot.period
 
     def _goal_distance(self, state: Array) -> float:
         return math.dist(self._arena.goal, state[: self.robot.position_dim])
@@ -162,35 +231,33 @@ class NavigationEnv(gymnasium.Env[Observation, Any]):
 
     def _observe(self) -> Observation:
         vehicle = self.vehicle
-        observation = self._senses.observe(
-            vehicle.true, vehicle.measured, vehicle.input, self._steps * self.robot.period
-        )
+        observation = self._observation_model.observe(vehicle.true, vehicle.measured, vehicle.input, self._time)
         return np.clip(observation, -OBSERVED_LIMIT, OBSERVED_LIMIT).astype(np.float32)
 
     def _outside(self, period: Period) -> bool:
-        """Whether the measurement is farther from the truth than it may be."""
+        """Whether the measurement error exceeds the bound of the robot's description."""
         error = np.abs(period.measured - period.true)
         if (heading := self.robot.heading) is not None:
             error[heading] = abs(wrap(period.measured[heading] - period.true[heading]))
-        return bool((error > self._bound).any())
+        return bool((error > self._measurement_bound).any())
 
-    def _moving(self, position: Array) -> list[Obstacle]:
-        """What moves and may come within sight before a plan ends, as measured now."""
-        if self._watch is None:
+    def _moving_obstacles(self, position: Array) -> list[Obstacle]:
+        """Return the measured moving obstacles that can come within sight before a plan ends."""
+        if self._crowd_sensor is None:
             return []
-        seen = self._watch.look(self._steps * self.robot.period)
-        within = self.robot.horizon * self.robot.period
-        nearest = MovingObstacles.of(seen, self.robot.position_dim).least_distance(position, within)
-        return [seen[i] for i in np.flatnonzero(nearest <= self.robot.sight)]
+        measured = self._crowd_sensor.measure(self._time)
+        horizon = self.robot.horizon * self.robot.period
+        nearest = Movers.of(measured, self.robot.position_dim).least_distance(position, horizon)
+        return [measured[i] for i in np.flatnonzero(nearest <= self.robot.sight)]
 
     def _info(self, period: Period) -> Info:
-        position, time = period.measured[: self.robot.position_dim], self._steps * self.robot.period
-        obstacles, sensed = [], {}
+        position = period.measured[: self.robot.position_dim]
+        obstacles, scan = [], {}
         if self._scanner is not None:
-            sensed["scan"] = self._scanner.scan(period.true, period.measured, time)
+            scan["scan"] = self._scanner.scan(period.true, period.measured, self._time)
         else:
             near = self._arena.shapes.distance(position) <= self.robot.sight
-            obstacles = [self._arena.obstacles[i] for i in np.flatnonzero(near)] + self._moving(position)
+            obstacles = [self._arena.obstacles[i] for i in np.flatnonzero(near)] + self._moving_obstacles(position)
         return {
             "robot": self.robot.name,
             "state": period.measured,
@@ -198,17 +265,17 @@ class NavigationEnv(gymnasium.Env[Observation, Any]):
             "outside": self._outside(period),
             "input_in_force": self.vehicle.input,
             "obstacles": obstacles,
-            **sensed,
+            **scan,
             "arena": self._arena,
             "goal": self._arena.goal,
-            "time": time,
+            "time": self._time,
             "collision": period.collision,
             "contact_moving": period.contact_moving,
             "contact_standing": period.contact_standing,
             "contact_robot": period.contact_robot,
             "at_goal": self._at_goal(period),
             "clearance": period.clearance,
-            "speed": self._senses.speed(period.true),
+            "speed": self._observation_model.speed(period.true),
             "subsamples": period.subsamples,
             "turned": period.turned,
             "episode_seed": self._episode_seed,

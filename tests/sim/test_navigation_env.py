@@ -1,22 +1,25 @@
-"""The environment: Gymnasium's rules, determinism, what it pays and tells, and its speed; with both robots."""
+"""The environment keeps Gymnasium's rules, and episodes, rewards and info are as documented, with both robots."""
 
 import time
 from collections.abc import Callable
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import gymnasium
+import matplotlib
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 
-import brakeline.sim
 from brakeline.deploy.vehicle_factory import environment
 from brakeline.messaging.obstacle import Shapes
+from brakeline.messaging.robot import UnknownRobot
 from brakeline.sim.navigation_env import NavigationEnv, Reward
 from brakeline.sim.quadrotor import Quadrotor
+from brakeline.sim.registration import ENVIRONMENTS, register
 from brakeline.sim.scripted_policies import scripted
+from brakeline.sim.sim_conditions import Conditions
+from brakeline.sim.top_view import GOAL, OBSTACLE, ROBOT
 from tests.robots import GROUND, QUADROTOR, ROBOTS
 from tests.sim.kinematic import PointMass
 
@@ -57,7 +60,7 @@ Make = Callable[..., NavigationEnv]
 
 
 def episode(env: NavigationEnv, policy: str, options: dict[str, Any], steps: int = 60) -> tuple[list[Any], list[Any]]:
-    """Observations and infos of the first steps of one episode."""
+    """Return observations and infos of the first steps of one episode."""
     act = scripted(policy, env.robot, np.random.default_rng(0))
     observation, info = env.reset(options=options)
     observations, infos = [observation], [info]
@@ -70,18 +73,60 @@ def episode(env: NavigationEnv, policy: str, options: dict[str, Any], steps: int
     return observations, infos
 
 
-def test_ours_is_imported() -> None:
-    assert Path(brakeline.sim.__file__).resolve().parent == Path(__file__).parents[2] / "sim"
-
-
 @pytest.mark.filterwarnings("ignore:.*symmetric and normalized space.*")  # actions are physical: speed is not negative
 @each_arena
-def test_gymnasium_accepts_it(robot: str, arena: str) -> None:
+def test_gymnasiums_checker_accepts_the_environment(robot: str, arena: str) -> None:
     check_env(ENVS[robot](arena=arena), skip_render_check=True)
 
 
+@pytest.mark.filterwarnings("ignore:.*symmetric and normalized space.*")
+@pytest.mark.parametrize("name", ENVIRONMENTS)
+def test_gymnasium_makes_the_environment_by_its_id_in_every_render_mode(name: str) -> None:
+    register()
+    register()
+    env = gymnasium.make(name, arena="dense", conditions=Conditions(payload_kg=0.1))
+    assert env.reset(seed=0)[1]["arena"].name == "dense" and env.unwrapped.robot.name == ENVIRONMENTS[name]
+    with matplotlib.rc_context({"backend": "agg"}):
+        check_env(env.unwrapped)
+
+
+def test_an_environment_takes_a_robot_by_its_name() -> None:
+    assert NavigationEnv("ground").robot == GROUND
+    with pytest.raises(UnknownRobot, match="grond"):
+        NavigationEnv("grond")
+    with pytest.raises(ValueError, match="render_mode is None, 'rgb_array' or 'human', not 'ansi'"):
+        NavigationEnv("ground", render_mode="ansi")
+
+
 @each_robot
-def test_a_seed_makes_the_episode(make: Make) -> None:
+def test_the_image_shows_obstacles_the_goal_and_the_robot_from_above(make: Make) -> None:
+    env = make(render_mode="rgb_array")
+    _, info = env.reset(options={"episode_seed": 1})
+    before = env.render()
+    assert before.dtype == np.uint8 and before.shape == (360, 360, 3)
+    arena, d = info["arena"], env.robot.position_dim
+    (left, right), (_, top) = arena.bounds[:2]
+    height = info["true_state"][2:d]
+
+    def colour(x: float, y: float) -> tuple[int, ...]:
+        scale = 360 / (right - left)
+        return tuple(before[int((top - y) * scale), int((x - left) * scale)])
+
+    points = np.random.default_rng(0).uniform((left, left), (right, top), (300, 2))
+    clearance = arena.shapes.distance(np.column_stack([points, np.tile(height, (len(points), 1))])).min(axis=0)
+    inside = [colour(*point) for point in points[clearance == 0.0]]
+    assert len(inside) > 3 and inside.count(OBSTACLE) > 0.9 * len(inside)
+    assert colour(*arena.goal[:2]) == GOAL
+    x, y = info["true_state"][:2]
+    assert colour(x, y - 0.7 * env.robot.footprint) == ROBOT or env.robot.heading is not None
+    for _ in range(15):
+        env.step(env.robot.high())
+    assert (env.render() != before).any()
+    assert make().render() is None
+
+
+@each_robot
+def test_the_episode_seed_determines_the_episode(make: Make) -> None:
     env = make()
     first, infos = episode(env, "random", {"episode_seed": 5})
     episode(env, "greedy", {"episode_seed": 6})
@@ -94,7 +139,7 @@ def test_a_seed_makes_the_episode(make: Make) -> None:
     assert infos[0]["episode_seed"] == 5
 
 
-def test_reset_seeds_the_sequence_of_episodes() -> None:
+def test_the_seed_of_reset_determines_the_sequence_of_episodes() -> None:
     env = environment(GROUND, "default", 0)
     seeds = [env.reset(seed=3)[1]["episode_seed"], env.reset()[1]["episode_seed"], env.reset()[1]["episode_seed"]]
     assert len(set(seeds)) == 3
@@ -102,7 +147,7 @@ def test_reset_seeds_the_sequence_of_episodes() -> None:
 
 
 @each_robot
-def test_info_has_its_keys_and_they_agree(make: Make) -> None:
+def test_info_has_its_documented_keys_and_values(make: Make) -> None:
     env = make()
     robot, d = env.robot, env.robot.position_dim
     _, infos = episode(env, "greedy", {"episode_seed": 1})
@@ -122,7 +167,7 @@ def test_info_has_its_keys_and_they_agree(make: Make) -> None:
 
 
 @each_robot
-def test_progress_is_paid_and_the_goal(make: Make) -> None:
+def test_the_reward_is_progress_and_the_goal(make: Make) -> None:
     env = make()
     d, paid = env.robot.position_dim, {"ground": 20.0, "quadrotor": 2.0}[env.robot.name]
     act = scripted("astar", env.robot, np.random.default_rng(0))
@@ -140,7 +185,7 @@ def test_progress_is_paid_and_the_goal(make: Make) -> None:
 
 
 @each_robot
-def test_a_collision_costs_and_ends_the_episode(make: Make) -> None:
+def test_a_collision_is_penalised_and_terminates_the_episode(make: Make) -> None:
     env = make(reward=Reward(progress=0.0))
     act = scripted("adversary", env.robot, np.random.default_rng(0))
     observation, info = env.reset(options={"episode_seed": 4})
@@ -154,7 +199,7 @@ def test_a_collision_costs_and_ends_the_episode(make: Make) -> None:
 
 
 @each_robot
-def test_time_runs_out(make: Make) -> None:
+def test_an_episode_is_truncated_at_the_step_limit(make: Make) -> None:
     env = make()
     env.reset(options={"episode_seed": 4})
     limit = {"ground": 300, "quadrotor": 200}[env.robot.name]
@@ -179,7 +224,7 @@ def test_payload_and_friction_last_over_resets() -> None:
         env.alter(wings=2.0)
 
 
-def test_what_is_altered_before_the_first_episode_holds_in_it() -> None:
+def test_a_change_before_the_first_episode_applies_to_it() -> None:
     plain, altered = ENVS["quadrotor"](), ENVS["quadrotor"]()
     altered.alter(scale=0.5)
     speeds = []
@@ -189,7 +234,7 @@ def test_what_is_altered_before_the_first_episode_holds_in_it() -> None:
     assert speeds[1] == pytest.approx(0.5 * speeds[0])
 
 
-def test_a_measurement_off_its_bound_is_counted() -> None:
+def test_a_measurement_beyond_its_bound_is_reported() -> None:
     class Off(PointMass):
         def _measure(self) -> np.ndarray:
             return self.true + np.array([0.0, 0.0, 0.0301, *np.zeros(6)])
@@ -215,8 +260,8 @@ def test_a_step_before_reset_is_refused() -> None:
     [(environment(GROUND, "default", 0), 4.0), (NavigationEnv(QUADROTOR, "default", Quadrotor), 5.0)],
     ids=["ground", "quadrotor"],
 )
-def test_it_is_fast(env: NavigationEnv, most: float) -> None:
-    """Measured against this machine's own pace in plain Python, then and there: steps a second say as much about it."""
+def test_a_step_is_fast(env: NavigationEnv, most: float) -> None:
+    """Compare with the machine's present speed in plain Python, since steps a second depend on the machine."""
     low, high = env.robot.low(), env.robot.high()
     costs = []
     for seed in range(4):
@@ -228,7 +273,7 @@ def test_it_is_fast(env: NavigationEnv, most: float) -> None:
             env.step(0.1 * high if i % 2 else np.maximum(low, -0.1 * high))
         costs.append((time.process_time() - middle) / (middle - begin))
     print(f"100 steps of the environment: {min(costs):.2f} times 1,000,000 rounds of a loop")
-    assert min(costs) < most  # about half of it when it was written
+    assert min(costs) < most  # about half of it at the time of writing
 
 
 def _plain_python() -> int:
