@@ -1,1 +1,1 @@
-"""The quadrotor's autopilot: a MAVLink 2 endpoint over a simulated vehicle. pymavlink stays inside this package."""
+"""The quadrotor's autopilot: a MAVLink 2 endpoint for a simulated vehicle. Only this part of `sim` uses pymavlink."""

@@ -1,12 +1,13 @@
-"""Autopilots in real time on a link, and what a simulator knows beside them: the truth, on a channel of its own.
+"""Run autopilots in real time on a link, and send the ground truth of their vehicles over a separate channel.
 
-The truth goes out as UDP datagrams, one JSON object each, at `TRUTH_RATE` for each vehicle and at once on a collision:
+The ground truth goes out as UDP datagrams, one JSON object each, at `TRUTH_RATE` for each vehicle and at once on a
+collision:
 
     {"system": 1, "time": 12.34, "state": [p, v, a: nine numbers, ENU, m, m/s, m/s²],
      "collisions": 0, "clearance": 1.25}
 
-`collisions` counts touches of an obstacle since the start, at every physics step; `clearance` [m] is from the
-footprint's sphere to the nearest obstacle, null where there are none; `system` is the vehicle's system id.
+`collisions` counts the contacts with an obstacle that began since the start. `clearance` [m] is the distance from the
+sphere of the footprint to the nearest obstacle, null without obstacles. `system` is the vehicle's system id.
 """
 
 from __future__ import annotations
@@ -23,21 +24,21 @@ from brakeline.sim.autopilot.endpoint import TICK, Autopilot
 from brakeline.sim.quadrotor import Quadrotor
 
 TRUTH_RATE = 25.0  # Hz
-PATIENCE = 0.25  # s that it may be late before it gives up catching up
+PATIENCE = 0.25  # s behind the clock, from which the server stops catching up
 
 
 class TruthSender:
-    """Sends what the vehicles really do to one UDP address."""
+    """Sends the ground truth of vehicles to one UDP address."""
 
     def __init__(self, host: str, port: int) -> None:
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._address = (host, port)
 
     def send(self, system: int, time: float, vehicle: Quadrotor, collisions: int) -> None:
-        """time: s since the autopilot was switched on; collisions: touches of an obstacle since then."""
+        """Send one datagram. time: s since the autopilot started; collisions: contacts that began since then."""
         state = vehicle.state()
         clearance = float(vehicle.clearance(state[:3]))
-        told = {
+        message = {
             "system": system,
             "time": round(time, 3),
             "state": state.tolist(),
@@ -45,9 +46,9 @@ class TruthSender:
             "clearance": clearance if math.isfinite(clearance) else None,
         }
         try:
-            self._socket.sendto(json.dumps(told).encode(), self._address)
+            self._socket.sendto(json.dumps(message).encode(), self._address)
         except OSError:
-            return  # nobody listens
+            return  # without a listener the datagram is lost
 
     def close(self) -> None:
         self._socket.close()
@@ -55,11 +56,11 @@ class TruthSender:
 
 @dataclass
 class ServerStats:
-    """How a server has fared."""
+    """Statistics of a server."""
 
     ticks: int = 0
     late: int = 0  # ticks begun more than one tick late
-    slips: int = 0  # times it gave up catching up
+    slips: int = 0  # times that it stopped catching up
     collisions: int = 0
 
     def __str__(self) -> str:
@@ -73,17 +74,17 @@ def serve(
     stop: Callable[[], bool],
     truth: TruthSender | None = None,
 ) -> ServerStats:
-    """Run autopilots in the clock's time until told to stop; all hear all that comes over the link."""
-    tally = ServerStats()
+    """Run autopilots in the clock's time until `stop()`. Every autopilot receives all data of the link."""
+    stats = ServerStats()
     touches = [0] * len(autopilots)
     every = round(1.0 / TRUTH_RATE / TICK)
     due = clock.now()
     while not stop():
         clock.sleep_until(due)
         behind = clock.now() - due
-        tally.late += behind > TICK
+        stats.late += behind > TICK
         if behind > PATIENCE:
-            tally.slips += 1
+            stats.slips += 1
             due = clock.now()
         due += TICK
         data = link.receive()
@@ -95,10 +96,10 @@ def serve(
             autopilot.advance(TICK)
             begun = autopilot.vehicle.collided and not touching
             touches[i] += begun
-            tally.collisions += begun
+            stats.collisions += begun
             if out := autopilot.take():
                 link.send(out)
-            if truth is not None and (begun or tally.ticks % every == 0):
-                truth.send(autopilot.system, autopilot.pilot.time, autopilot.vehicle, touches[i])
-        tally.ticks += 1
-    return tally
+            if truth is not None and (begun or stats.ticks % every == 0):
+                truth.send(autopilot.system, autopilot.flight.time, autopilot.vehicle, touches[i])
+        stats.ticks += 1
+    return stats

@@ -1,4 +1,4 @@
-"""One vehicle's MAVLink endpoint: bytes in, bytes out, time injected."""
+"""The MAVLink endpoint of one simulated vehicle: bytes in, bytes out; the caller advances time."""
 
 from __future__ import annotations
 
@@ -10,44 +10,50 @@ from typing import Any
 from brakeline.sim.autopilot import ned_frames
 from brakeline.sim.autopilot.autopilot_rules import RULES
 from brakeline.sim.autopilot.common_dialect import mavlink
-from brakeline.sim.autopilot.flight_modes import CommandRefused, FlightStateMachine, Mode, UnknownMode
-from brakeline.sim.autopilot.parameters import BadParameter
+from brakeline.sim.autopilot.flight_modes import FlightStateMachine, Mode, RequestRefused, UnknownMode
+from brakeline.sim.autopilot.parameters import BadParameter, Parameters
 from brakeline.sim.autopilot.telemetry_sender import BUILDERS, StreamSchedule, TelemetryBuilder
+from brakeline.sim.ground_estimator import heading_of
 from brakeline.sim.lidar import Lidar
 from brakeline.sim.quadrotor import Quadrotor
 
-TICK = 0.02  # s between two looks at modes, timeouts and streams; the vehicle's own control runs faster
+TICK = 0.02  # s between two updates of modes, timeouts and streams; the flight controller runs faster
 HEARTBEAT = mavlink.MAVLINK_MSG_ID_HEARTBEAT
-FORCED = 21196.0  # param2 of an arming command that is to be carried out regardless
+FORCED = 21196.0  # param2 of an arming command that skips all checks
 ACCEPTED, DENIED = int(mavlink.MAV_RESULT_ACCEPTED), int(mavlink.MAV_RESULT_DENIED)
 FAILED = int(mavlink.MAV_RESULT_FAILED)
 
 
 class UnknownRules(ValueError):
-    """There is no such rule set."""
+    """No rule set has this name."""
 
 
 @dataclass(frozen=True)
 class Command:
-    """COMMAND_LONG and COMMAND_INT alike."""
+    """A COMMAND_LONG or COMMAND_INT."""
 
     number: int
     params: tuple[float, ...]  # 1 to 7
-    frame: int  # of the seventh
+    frame: int  # MAV_FRAME of the seventh
 
 
-class Outbox(bytearray):
-    """What pymavlink writes to."""
+class _SendBuffer(bytearray):
+    """The file that pymavlink writes to."""
 
     def write(self, data: bytes) -> None:
         self.extend(data)
 
 
 class Autopilot:
-    """A simulated vehicle behind MAVLink 2. `advance` lets time pass for the vehicle and sends telemetry.
+    """A simulated vehicle behind MAVLink 2. `advance` advances the vehicle and sends telemetry.
 
-    system: its MAVLink system id. A message to another system or component is not heard; a frame that is damaged is
-    dropped. The vehicle is the caller's, for what a real one would not tell: its true state and its collisions.
+    The endpoint ignores messages to another system or component, and drops damaged frames.
+
+    Attributes:
+        vehicle: the simulated vehicle, also for its true state and its collisions.
+        rules: of PX4 or of ArduCopter.
+        parameters: their values.
+        flight: the flight modes.
     """
 
     def __init__(
@@ -59,22 +65,29 @@ class Autopilot:
         lidar: Lidar | None = None,
         quiet: bool = False,
     ) -> None:
-        """parameters: other values than the table's; lidar: for OBSTACLE_DISTANCE; quiet: nothing but the heartbeat is
-        sent without being asked for.
+        """
+        Args:
+            rules: `px4` or `ardupilot`.
+            system: MAVLink system id.
+            parameters: values that replace the defaults.
+            lidar: the source of OBSTACLE_DISTANCE.
+            quiet: send only the heartbeat, and messages on request.
 
         Raises:
-            UnknownRules, BadParameter.
+            UnknownRules: no rule set has this name.
+            BadParameter: a parameter does not exist, or cannot have this value.
         """
         if rules not in RULES:
             raise UnknownRules(f"no rule set is called {rules!r}; there are: {', '.join(RULES)}")
-        self.vehicle, self.rules = vehicle, RULES[rules]()
+        self.vehicle, self.rules = vehicle, RULES[rules]
+        self.parameters = Parameters(self.rules.parameters, self.rules.bitwise_integers)
         for name, value in (parameters or {}).items():
-            self.rules.parameters.set(name, value)
-        self.pilot = FlightStateMachine(vehicle, self.rules.limits(), self.rules.boots_in)
-        self.reports = TelemetryBuilder(self.pilot, lidar)
+            self.parameters.set(name, value)
+        self.flight = FlightStateMachine(vehicle, self.rules.limits(self.parameters), self.rules.initial_mode)
+        self.telemetry = TelemetryBuilder(self.flight, lidar)
         self._ticks = round(TICK / vehicle.timestep)
-        self._outbox = Outbox()
-        self.mav = mavlink.MAVLink(self._outbox, srcSystem=system, srcComponent=mavlink.MAV_COMP_ID_AUTOPILOT1)
+        self._send_buffer = _SendBuffer()
+        self.mav = mavlink.MAVLink(self._send_buffer, srcSystem=system, srcComponent=mavlink.MAV_COMP_ID_AUTOPILOT1)
         self.mav.robust_parsing = True
         self.schedule = StreamSchedule(TICK)
         self.schedule.set(HEARTBEAT, 1.0, 0.0)
@@ -84,43 +97,43 @@ class Autopilot:
 
     @property
     def system(self) -> int:
-        """Its MAVLink system id."""
+        """The MAVLink system id."""
         return int(self.mav.srcSystem)
 
     def receive(self, data: bytes) -> None:
-        """Bytes from the link, in pieces of any size."""
+        """Handle bytes from the link, in pieces of any size."""
         for message in self.mav.parse_buffer(data) or ():
             handler = HANDLERS.get(message.get_msgId())
             if handler is not None and self._for_me(message):
                 handler(self, message)
 
     def take(self) -> bytes:
-        """The bytes to be sent since the last call."""
-        data = bytes(self._outbox)
-        self._outbox.clear()
+        """Return the bytes to send since the last call."""
+        data = bytes(self._send_buffer)
+        self._send_buffer.clear()
         return data
 
     def advance(self, seconds: float) -> None:
-        """Let time pass, in whole ticks of `TICK`."""
-        pilot, send, schedule = self.pilot, self.mav.send, self.schedule
+        """Advance time, in whole ticks of `TICK`."""
+        flight, send, schedule = self.flight, self.mav.send, self.schedule
         for _ in range(round(seconds / TICK)):
-            pilot.steer(TICK)
-            self.vehicle.fly(self._ticks)
-            pilot.tick(TICK)
-            if pilot.news:
-                self._tell_news()
-            for kind in schedule.due(pilot.time):
+            flight.steer(TICK)
+            self.vehicle.advance(self._ticks)
+            flight.tick(TICK)
+            if flight.announcements:
+                self._send_announcements()
+            for kind in schedule.due(flight.time):
                 if kind == HEARTBEAT:
                     self._heartbeat()
-                elif (message := self.reports.build(kind)) is not None:
+                elif (message := self.telemetry.build(kind)) is not None:
                     send(message)
 
-    def knows(self, kind: int) -> bool:
-        """It can send that message."""
-        return kind == HEARTBEAT or (kind in BUILDERS and kind not in self.rules.lacks)
+    def can_send(self, kind: int) -> bool:
+        """Return whether the autopilot knows this message."""
+        return kind == HEARTBEAT or (kind in BUILDERS and kind not in self.rules.unsupported)
 
-    def say(self, text: str, severity: int = mavlink.MAV_SEVERITY_WARNING) -> None:
-        """STATUSTEXT, cut to its 50 bytes."""
+    def send_text(self, text: str, severity: int = mavlink.MAV_SEVERITY_WARNING) -> None:
+        """Send a STATUSTEXT, cut to its 50 bytes."""
         self.mav.statustext_send(severity, text.encode()[:50])
 
     def _for_me(self, message: mavlink.MAVLink_message) -> bool:
@@ -128,32 +141,32 @@ class Autopilot:
         component = getattr(message, "target_component", 0)
         return system in (0, self.system) and component in (0, mavlink.MAV_COMP_ID_AUTOPILOT1)
 
-    def _tell_news(self) -> None:
-        for text in self.pilot.news:
-            self.say(text, mavlink.MAV_SEVERITY_INFO)
-        self.pilot.news.clear()
+    def _send_announcements(self) -> None:
+        for text in self.flight.announcements:
+            self.send_text(text, mavlink.MAV_SEVERITY_INFO)
+        self.flight.announcements.clear()
 
     def _heartbeat(self) -> None:
-        armed = self.pilot.armed
+        armed = self.flight.armed
         mode = mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED | mavlink.MAV_MODE_FLAG_STABILIZE_ENABLED
         mode |= mavlink.MAV_MODE_FLAG_GUIDED_ENABLED | (mavlink.MAV_MODE_FLAG_SAFETY_ARMED if armed else 0)
         self.mav.heartbeat_send(
             mavlink.MAV_TYPE_QUADROTOR,
             self.rules.autopilot,
             mode,
-            self.rules.custom_mode(self.pilot),
+            self.rules.custom_mode(self.flight),
             mavlink.MAV_STATE_ACTIVE if armed else mavlink.MAV_STATE_STANDBY,
         )
 
     def _heading(self) -> float:
-        """rad from north."""
-        return ned_frames.yaw(ned_frames.heading(self.reports.estimate.attitude))
+        """Return the heading, rad from north."""
+        return ned_frames.yaw(heading_of(self.telemetry.estimate.attitude))
 
     def _on_setpoint(self, message: mavlink.MAVLink_set_position_target_local_ned_message) -> None:
         try:
-            self.rules.setpoint(self.pilot, message, self._heading())
-        except CommandRefused as refusal:
-            self.say(str(refusal), mavlink.MAV_SEVERITY_CRITICAL)
+            self.rules.setpoint(self.flight, message, self._heading())
+        except RequestRefused as refusal:
+            self.send_text(str(refusal), mavlink.MAV_SEVERITY_CRITICAL)
 
     def _on_command_long(self, message: mavlink.MAVLink_command_long_message) -> None:
         m = message
@@ -166,58 +179,58 @@ class Autopilot:
         self._command(message, Command(m.command, params, m.frame))
 
     def _command(self, message: mavlink.MAVLink_message, command: Command) -> None:
-        """Carry out, and say how it went."""
+        """Carry out a command and acknowledge it."""
         action = ACTIONS.get(command.number)
         try:
             result = mavlink.MAV_RESULT_UNSUPPORTED if action is None else action(self, command)
-        except CommandRefused as refusal:
+        except RequestRefused as refusal:
             unknown = isinstance(refusal, UnknownMode)
             result = mavlink.MAV_RESULT_UNSUPPORTED if unknown else self.rules.refusal
-            self.say(str(refusal))
+            self.send_text(str(refusal))
         self.mav.command_ack_send(command.number, result, 0, 0, message.get_srcSystem(), message.get_srcComponent())
-        self._tell_news()
+        self._send_announcements()
 
     def _on_set_mode(self, message: mavlink.MAVLink_set_mode_message) -> None:
         try:
             if message.base_mode & mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED:
-                self.rules.change(self.pilot, message.custom_mode)
-        except CommandRefused as refusal:
-            self.say(str(refusal))
+                self.rules.change(self.flight, message.custom_mode)
+        except RequestRefused as refusal:
+            self.send_text(str(refusal))
 
     def _on_data_stream(self, message: mavlink.MAVLink_request_data_stream_message) -> None:
-        for kind in self.rules.groups.get(message.req_stream_id, ()):
+        for kind in self.rules.stream_groups.get(message.req_stream_id, ()):
             rate = message.req_message_rate if message.start_stop else 0
-            self.schedule.set(kind, 1.0 / rate if rate else 0.0, self.pilot.time)
+            self.schedule.set(kind, 1.0 / rate if rate else 0.0, self.flight.time)
 
     def _on_list(self, _: mavlink.MAVLink_message) -> None:
-        parameters = self.rules.parameters
+        parameters = self.parameters
         for index in range(len(parameters.table)):
             self.mav.send(parameters.message(index))
 
     def _on_read(self, message: mavlink.MAVLink_param_request_read_message) -> None:
-        parameters = self.rules.parameters
+        parameters = self.parameters
         try:
-            index = message.param_index if message.param_index >= 0 else parameters.find(message.param_id)
+            index = message.param_index if message.param_index >= 0 else parameters.index(message.param_id)
             self.mav.send(parameters.message(index))
         except (BadParameter, IndexError):
-            self.say(f"unknown parameter {message.param_id or message.param_index}")
+            self.send_text(f"unknown parameter {message.param_id or message.param_index}")
 
     def _on_set(self, message: mavlink.MAVLink_param_set_message) -> None:
-        """Answered with the value that it now has, the new one or, refused, the old one."""
-        parameters, name = self.rules.parameters, message.param_id
+        """Set a parameter, and answer with its value: the new one, or the old one if the new one is refused."""
+        parameters, name = self.parameters, message.param_id
         try:
-            parameters.set(name, parameters.sent(name, message.param_value, message.param_type))
-            self.pilot.limits = self.rules.limits()
+            parameters.set(name, parameters.decode(name, message.param_value, message.param_type))
+            self.flight.limits = self.rules.limits(self.parameters)
         except BadParameter as error:
-            self.say(str(error))
+            self.send_text(str(error))
         try:
-            self.mav.send(parameters.message(parameters.find(name)))
+            self.mav.send(parameters.message(parameters.index(name)))
         except BadParameter:
             return
 
     def _on_time(self, message: mavlink.MAVLink_timesync_message) -> None:
         if message.tc1 == 0:
-            self.mav.timesync_send(round(1e9 * self.pilot.time), message.ts1)
+            self.mav.timesync_send(round(1e9 * self.flight.time), message.ts1)
 
 
 HANDLERS: dict[int, Callable[[Autopilot, Any], None]] = {
@@ -238,21 +251,22 @@ def _arm_disarm(autopilot: Autopilot, command: Command) -> int:
     if switch not in (0.0, 1.0):
         return int(mavlink.MAV_RESULT_UNSUPPORTED)
     if switch:
-        autopilot.rules.arm(autopilot.pilot)
+        autopilot.rules.arm(autopilot.flight)
     else:
-        autopilot.pilot.disarm(force)
+        autopilot.flight.disarm(force)
     return ACCEPTED
 
 
 def _take_off(autopilot: Autopilot, command: Command) -> int:
-    if command.frame != mavlink.MAV_FRAME_GLOBAL_RELATIVE_ALT and autopilot.rules.name == "ardupilot":
+    frames = autopilot.rules.takeoff_frames
+    if frames is not None and command.frame not in frames:
         return DENIED
-    autopilot.rules.take_off(autopilot.pilot, command.params[6])
+    autopilot.rules.take_off(autopilot.flight, command.params[6])
     return ACCEPTED
 
 
 def _land(autopilot: Autopilot, _: Command) -> int:
-    autopilot.pilot.change(Mode.LAND)
+    autopilot.flight.change(Mode.LAND)
     return ACCEPTED
 
 
@@ -260,28 +274,28 @@ def _set_mode(autopilot: Autopilot, command: Command) -> int:
     base, main, sub = (round(p) if math.isfinite(p) else 0 for p in command.params[:3])
     if not base & mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED:
         return DENIED
-    autopilot.rules.change(autopilot.pilot, autopilot.rules.command_mode(main, sub))
+    autopilot.rules.change(autopilot.flight, autopilot.rules.mode_number(main, sub))
     return ACCEPTED
 
 
 def _set_interval(autopilot: Autopilot, command: Command) -> int:
-    """param1: message id; param2: µs; 0: the default rate; -1: none."""
+    """Set the interval of a message. param1: message id; param2: µs, 0 for the default rate, -1 to stop."""
     kind, microseconds = round(command.params[0]), command.params[1]
-    if not autopilot.knows(kind):
-        autopilot.say(f"message {kind} is not known")
+    if not autopilot.can_send(kind):
+        autopilot.send_text(f"message {kind} is not known")
         return FAILED
     interval = 1e-6 * microseconds
     if microseconds == 0.0:
         interval = 1.0 / autopilot.rules.rates[kind] if kind in autopilot.rules.rates else 0.0
     elif 0.0 < interval < TICK - 1e-9:
-        interval = TICK  # no faster than it is
-    autopilot.schedule.set(kind, interval, autopilot.pilot.time)
+        interval = TICK
+    autopilot.schedule.set(kind, interval, autopilot.flight.time)
     return ACCEPTED
 
 
 def _get_interval(autopilot: Autopilot, command: Command) -> int:
     kind = round(command.params[0])
-    if not autopilot.knows(kind):
+    if not autopilot.can_send(kind):
         return DENIED
     interval = autopilot.schedule.interval(kind)
     autopilot.mav.message_interval_send(kind, round(1e6 * interval) if interval else -1)
@@ -290,7 +304,7 @@ def _get_interval(autopilot: Autopilot, command: Command) -> int:
 
 def _request_message(autopilot: Autopilot, command: Command) -> int:
     kind = round(command.params[0])
-    message = autopilot.reports.build(kind) if kind in BUILDERS and autopilot.knows(kind) else None
+    message = autopilot.telemetry.build(kind) if kind in BUILDERS and autopilot.can_send(kind) else None
     if message is None:
         return int(mavlink.MAV_RESULT_UNSUPPORTED)
     autopilot.mav.send(message)
@@ -298,7 +312,7 @@ def _request_message(autopilot: Autopilot, command: Command) -> int:
 
 
 def _request_capabilities(autopilot: Autopilot, _: Command) -> int:
-    autopilot.mav.send(autopilot.reports.autopilot_version())
+    autopilot.mav.send(autopilot.telemetry.autopilot_version())
     return ACCEPTED
 
 

@@ -1,4 +1,4 @@
-"""What the autopilot does with its vehicle: modes, arming, takeoff, landing, setpoints and their timeout. ENU, SI."""
+"""The autopilot's flight modes: arming, takeoff, landing, setpoints and their timeout. ENU, SI units."""
 
 from __future__ import annotations
 
@@ -9,30 +9,30 @@ from enum import Enum
 from brakeline.sim.flight_controller import STILL, Vector
 from brakeline.sim.quadrotor import Quadrotor
 
-CLIMB = 1.5  # m/s, of a takeoff
-REACHED = 0.2  # m below its height at which a takeoff is done
-TOUCHED = 0.3  # s on the floor after which a descending vehicle has landed
-UPWARD = 0.1  # m/s, a setpoint's climb from which a vehicle leaves the floor
-READY_AFTER = 1.0  # s from switching on until the estimate is good enough to arm
-EDGE = 1e-6  # s, rounding of times
+TAKEOFF_CLIMB = 1.5  # m/s
+TAKEOFF_TOLERANCE = 0.2  # m below its height at which a takeoff is complete
+TOUCHDOWN_TIME = 0.3  # s on the floor after which a descending vehicle has landed
+LIFT_OFF_CLIMB = 0.1  # m/s, the climb of a setpoint from which a vehicle leaves the floor
+READY_AFTER = 1.0  # s after switching on until the estimate is good enough to arm
+ROUNDING = 1e-6  # s
 
 
-class CommandRefused(Exception):
-    """The vehicle does not do that now, and why."""
+class RequestRefused(Exception):
+    """The vehicle refuses a command or a setpoint now; the message says why."""
 
 
-class UnknownMode(CommandRefused):
-    """There is no such thing at all."""
+class UnknownMode(RequestRefused):
+    """The requested mode does not exist."""
 
 
 class Mode(Enum):
-    MANUAL = "manual"  # sticks, of which there are none
+    MANUAL = "manual"  # by sticks; there are none
     HOLD = "hold"
-    POSITION = "position"  # sticks move it; there are none, so it holds
+    POSITION = "position"  # by sticks; there are none, so the vehicle holds
     BRAKE = "brake"
     TAKEOFF = "takeoff"
     LAND = "land"
-    OFFBOARD = "offboard"
+    OFFBOARD = "offboard"  # by setpoints; ArduCopter's guided mode
 
 
 class LandedState(Enum):
@@ -44,25 +44,26 @@ class LandedState(Enum):
 
 @dataclass(frozen=True)
 class FlightLimits:
-    """What the vehicle's parameters say."""
+    """The limits that the vehicle's parameters set."""
 
     setpoint_timeout: float  # s
-    on_loss: Mode  # what follows an offboard stream that stopped; OFFBOARD: brake, and stay
-    lifts: bool  # an upward setpoint takes an armed vehicle off the floor
+    on_loss: Mode  # the mode after an offboard stream has stopped; OFFBOARD: brake, and stay in it
+    lifts_off_by_setpoint: bool  # an upward setpoint lifts an armed vehicle off the floor
     speed: float  # m/s, horizontal
     climb: float  # m/s
     sink: float  # m/s
     land_speed: float  # m/s
     disarm_landed: float  # s after a landing
     disarm_unused: float  # s from arming without taking off
-    goes_back: bool  # once it has landed it is in the mode of before
-    across: float = math.inf  # m/s², horizontal, by which the velocity that it flies follows setpoints
-    upright: float = math.inf  # m/s², the same up and down
+    restores_mode: bool  # after a landing the vehicle returns to the mode before
+    horizontal_acceleration: float = math.inf  # m/s², with which the flown velocity follows setpoints
+    vertical_acceleration: float = math.inf  # m/s²
+    takeoff_height: float = 0.0  # m above home, of a takeoff without a height
 
 
 @dataclass(frozen=True)
 class Setpoint:
-    """A velocity [m/s] in the world, and where to look: a yaw [rad] or a rate of it [rad/s] or neither."""
+    """A velocity [m/s] in the world, and a yaw [rad], a yaw rate [rad/s] or neither."""
 
     velocity: Vector
     yaw: float | None = None
@@ -70,10 +71,19 @@ class Setpoint:
 
 
 class FlightStateMachine:
-    """One vehicle's modes. `time` is seconds since it was switched on; all methods but `tick` act at that moment."""
+    """The modes of one vehicle. All methods but `tick` act at the present moment.
+
+    Attributes:
+        time: s since the vehicle was switched on.
+        armed, mode, landed: its state.
+        home: (x, y, z) m, where it armed last.
+        setpoint: the newest setpoint in offboard mode.
+        last_setpoint: s, when the newest setpoint came; None before the first.
+        announcements: texts for the ground station.
+    """
 
     def __init__(self, vehicle: Quadrotor, limits: FlightLimits, mode: Mode) -> None:
-        """It starts as the vehicle does: armed and holding in the air, or in `mode` on the ground."""
+        """Start armed and holding if the vehicle flies, otherwise in `mode` on the ground."""
         self.vehicle, self.limits = vehicle, limits
         self.time = 0.0
         self.armed = vehicle.flying
@@ -81,67 +91,67 @@ class FlightStateMachine:
         self.mode = Mode.HOLD if vehicle.flying else mode
         self.home = vehicle.position_and_velocity()[0]
         self.setpoint = Setpoint(STILL)
-        self.last_setpoint: float | None = None  # s, when one was heard
-        self.news: list[str] = []  # for the ground station
-        self._before_landing = mode
-        self._flown = STILL  # m/s, of a setpoint what it has come to
-        self._height = 0.0  # m, of a takeoff
-        self._interrupted = False  # it lost its setpoints, and was told nothing else since
+        self.last_setpoint: float | None = None
+        self.announcements: list[str] = []
+        self._mode_before_landing = mode
+        self._flown_velocity = STILL  # m/s, the setpoint after the limits of acceleration
+        self._takeoff_height = 0.0  # m
+        self._lost_setpoints = False  # and no other mode was chosen since
         self._since = 0.0  # s, when it armed or landed; in the air: when it last did not press on the floor
 
     @property
     def streaming(self) -> bool:
-        """Setpoints come in, and not too slowly."""
+        """Whether setpoints come in within their timeout."""
         if self.last_setpoint is None:
             return False
-        return self.time - self.last_setpoint <= self.limits.setpoint_timeout + EDGE
+        return self.time - self.last_setpoint <= self.limits.setpoint_timeout + ROUNDING
 
     def arm(self) -> None:
-        """Raises Refused."""
+        """Raises RequestRefused: the estimate is not ready yet."""
         if self.armed:
             return
         if self.time < READY_AFTER:
-            raise CommandRefused("the estimate is not ready")
+            raise RequestRefused("the estimate is not ready")
         self.armed, self._since = True, self.time
         self.home = self.vehicle.position_and_velocity()[0]
-        self.news.append("Armed")
-        if self.mode is Mode.TAKEOFF:  # asked for before
+        self.announcements.append("Armed")
+        if self.mode is Mode.TAKEOFF:
             self._leave_floor(LandedState.TAKING_OFF)
 
     def disarm(self, force: bool = False) -> None:
-        """Raises Refused in the air, unless forced."""
+        """Stop the rotors. Raises RequestRefused: the vehicle is in the air, and `force` is false."""
         if self.landed is not LandedState.ON_GROUND and not force:
-            raise CommandRefused("not landed")
+            raise RequestRefused("not landed")
         if self.armed:
-            self.news.append("Disarmed")
+            self.announcements.append("Disarmed")
         self.armed = False
         self.vehicle.cut_rotors()
-        if self.mode is Mode.LAND and self.limits.goes_back:
-            self.mode = self._before_landing
+        if self.mode is Mode.LAND and self.limits.restores_mode:
+            self.mode = self._mode_before_landing
 
     def change(self, mode: Mode) -> None:
-        """To a mode. What may precede which is the rules' business."""
+        """Change the mode; the autopilot's rules decide which changes are allowed."""
         if mode is not self.mode:
             self.setpoint = Setpoint(STILL)
             if self.landed in (LandedState.LANDING, LandedState.TAKING_OFF):
                 self.landed = LandedState.IN_AIR
         if mode is Mode.LAND and self.mode is not Mode.LAND:
-            self._before_landing = self.mode
-        self.mode, self._interrupted = mode, False
+            self._mode_before_landing = self.mode
+        self.mode, self._lost_setpoints = mode, False
         if mode is Mode.LAND and self.landed is LandedState.IN_AIR:
             self.landed = LandedState.LANDING
 
     def take_off(self, height: float) -> None:
-        """Climb to a height [m, in the world] and hold it."""
-        self._height = height
+        """Climb to a height [m, in the world] and hold it; if not armed yet, when armed."""
+        self._takeoff_height = height
         if self.armed and self.landed is LandedState.ON_GROUND:
             self._leave_floor(LandedState.TAKING_OFF)
 
-    def hear(self, setpoint: Setpoint) -> None:
-        """A setpoint came, to be flown if the mode is offboard, or was until there were none."""
+    def receive_setpoint(self, setpoint: Setpoint) -> None:
+        """Take a setpoint; the vehicle follows it in offboard mode, which it returns to after a loss of setpoints."""
         self.last_setpoint = self.time
-        if self._interrupted:
-            self.news.append("Setpoints again")
+        if self._lost_setpoints:
+            self.announcements.append("Setpoints again")
             self.change(Mode.OFFBOARD)
         if self.mode is not Mode.OFFBOARD:
             return
@@ -150,7 +160,7 @@ class FlightStateMachine:
             self.landed = LandedState.IN_AIR
 
     def tick(self, seconds: float) -> None:
-        """That much time has passed: see what has become of it, and steer the vehicle's controller."""
+        """Update the state after some time has passed, and steer."""
         self.time += seconds
         if not self.armed:
             return
@@ -160,72 +170,74 @@ class FlightStateMachine:
             self._rest()
         elif not (self.vehicle.on_floor and self._wants_down()):
             self._since = self.time
-        elif self.time - self._since > TOUCHED:
+        elif self.time - self._since > TOUCHDOWN_TIME:
             self._land()
         self.steer()
 
     def steer(self, seconds: float = 0.0) -> None:
-        """Give the controller what the mode asks for now, to be followed for so long."""
+        """Set the controller's setpoint for the mode, for the next `seconds`."""
         controller, wanted = self.vehicle.controller, self.setpoint
         if self.mode is Mode.OFFBOARD and self.landed is not LandedState.TAKING_OFF:
-            self._flown = controller.setpoint = self._following(self._limited(wanted.velocity), seconds)
+            self._flown_velocity = controller.setpoint = self._followed(self._limited(wanted.velocity), seconds)
             controller.yaw_rate = wanted.yaw_rate or 0.0
             if wanted.yaw is not None:
                 controller.yaw_goal = wanted.yaw
             return
-        self._flown, controller.yaw_rate = self.vehicle.position_and_velocity()[1], 0.0
+        position, self._flown_velocity = self.vehicle.position_and_velocity()
+        controller.yaw_rate = 0.0
         if self.landed is LandedState.TAKING_OFF:
-            left = self._height - self.vehicle.position_and_velocity()[0][2]
-            controller.setpoint = (0.0, 0.0, min(max(left, 0.3), CLIMB))
-            if left < REACHED:
-                self._arrive()
+            left = self._takeoff_height - position[2]
+            controller.setpoint = (0.0, 0.0, min(max(left, 0.3), TAKEOFF_CLIMB))
+            if left < TAKEOFF_TOLERANCE:
+                self._complete_takeoff()
         elif self.mode is Mode.LAND:
             controller.setpoint = (0.0, 0.0, -self.limits.land_speed)
         else:
             controller.setpoint = STILL
 
     def _limited(self, velocity: Vector) -> Vector:
+        """Return a velocity within the limits of speed."""
         x, y, z = velocity
         level = (x * x + y * y) ** 0.5
         share = min(1.0, self.limits.speed / level) if level > 0.0 else 1.0
         return (x * share, y * share, min(max(z, -self.limits.sink), self.limits.climb))
 
-    def _following(self, wanted: Vector, seconds: float) -> Vector:
-        """The velocity on the way to the wanted one that it may come to in that time."""
+    def _followed(self, wanted: Vector, seconds: float) -> Vector:
+        """Return the velocity that the limits of acceleration allow after `seconds`, on the way to a wanted one."""
         limits = self.limits
-        if math.isinf(limits.across):
+        if math.isinf(limits.horizontal_acceleration):
             return wanted
-        (x, y, z), (u, v, w) = self._flown, wanted
-        away, up = math.hypot(u - x, v - y), limits.upright * seconds
-        share = min(1.0, limits.across * seconds / away) if away > 0.0 else 1.0
-        return (x + share * (u - x), y + share * (v - y), z + min(max(w - z, -up), up))
+        (x, y, z), (u, v, w) = self._flown_velocity, wanted
+        away, most_up = math.hypot(u - x, v - y), limits.vertical_acceleration * seconds
+        share = min(1.0, limits.horizontal_acceleration * seconds / away) if away > 0.0 else 1.0
+        return (x + share * (u - x), y + share * (v - y), z + min(max(w - z, -most_up), most_up))
 
     def _lose_setpoints(self) -> None:
-        """Nobody asks for anything any more: brake, and do what the parameters say."""
+        """Brake, and change to the mode of the parameters."""
         stays = self.limits.on_loss is Mode.OFFBOARD
         if stays and self.setpoint.velocity == STILL:
             return
-        self.news.append("Setpoints lost, braking")
+        self.announcements.append("Setpoints lost, braking")
         self.setpoint = Setpoint(STILL)
         if not stays:
             self.change(self.limits.on_loss)
-            self._interrupted = self.limits.on_loss is not Mode.LAND
+            self._lost_setpoints = self.limits.on_loss is not Mode.LAND
 
     def _leave_floor(self, landed: LandedState) -> None:
         self.vehicle.start_rotors()
         self.landed = landed
 
-    def _arrive(self) -> None:
-        """The height of a takeoff is reached."""
+    def _complete_takeoff(self) -> None:
         self.landed = LandedState.IN_AIR
         self.vehicle.controller.setpoint = STILL
         if self.mode is Mode.TAKEOFF:
             self.mode = Mode.HOLD
 
     def _rest(self) -> None:
-        """Armed on the floor, since `_since`."""
+        """Stand armed on the floor: lift off by a setpoint, or disarm after a delay."""
         rested = self.time - self._since
-        if self.mode is Mode.OFFBOARD and self.limits.lifts and self.setpoint.velocity[2] > UPWARD:
+        upward = self.setpoint.velocity[2] > LIFT_OFF_CLIMB
+        if self.mode is Mode.OFFBOARD and self.limits.lifts_off_by_setpoint and upward:
             self._leave_floor(LandedState.IN_AIR)
         elif rested > (self.limits.disarm_landed if self.mode is Mode.LAND else self.limits.disarm_unused):
             self.disarm()
@@ -234,7 +246,6 @@ class FlightStateMachine:
         return self.mode is Mode.LAND or (self.mode is Mode.OFFBOARD and self.setpoint.velocity[2] < 0.0)
 
     def _land(self) -> None:
-        """It has come down."""
         self.landed, self._since = LandedState.ON_GROUND, self.time
         self.vehicle.cut_rotors()
-        self.news.append("Landing detected")
+        self.announcements.append("Landing detected")

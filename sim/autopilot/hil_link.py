@@ -1,8 +1,8 @@
-"""Physics for a real autopilot, from outside: our vehicle's sensors go to it, its rotors' commands come back.
+"""Simulate the physics of a real autopilot: send it our vehicle's sensors, and apply its commands to the rotors.
 
-In lockstep, as PX4's `simulator_mavlink` has it: its clock is the one in HIL_SENSOR, it computes, it answers with
-HIL_ACTUATOR_CONTROLS, and time stands still until it has. So flight code that runs in real time on a vehicle runs here
-as fast as both can, and nothing is ever late.
+Both run in lockstep, as PX4's `simulator_mavlink` does: the autopilot takes its time from HIL_SENSOR, answers with
+HIL_ACTUATOR_CONTROLS, and the simulator waits for the answer. So flight code made for real time runs as fast as both
+can, and nothing is ever late.
 """
 
 from __future__ import annotations
@@ -17,65 +17,70 @@ from brakeline.sim.quadrotor import Quadrotor
 
 LOCKSTEP, ARMED = 0x1, int(mavlink.MAV_MODE_FLAG_SAFETY_ARMED)
 ROTORS = 4
-PATIENCE = 2.0  # s of real time for an answer
-UNANSWERED = 5  # of those in a row, and it is gone
-BOOTING = 0.004  # s that an answer is waited for as long as none has come
+ANSWER_TIMEOUT = 2.0  # s of real time
+MOST_UNANSWERED = 5  # timeouts in a row after which the autopilot counts as gone
+BOOT_TIMEOUT = 0.004  # s, the timeout before the first answer
 
 
 class AutopilotGone(RuntimeError):
-    """The autopilot does not answer any more, or cannot be run in lockstep."""
+    """The autopilot no longer answers, or does not support lockstep."""
 
 
 class HilLink:
-    """The simulator's end of one autopilot. vehicle: may be exchanged for another one between two ticks.
+    """The simulator's end of the connection to one autopilot.
 
-    shift: m, ENU: where the autopilot believes to be when the vehicle is at its arena's origin. An arena that is
-    exchanged for the next one is, for the autopilot, another corner of one large field.
+    Attributes:
+        vehicle: may be exchanged for another one between two ticks.
+        shift: (x, y, z) m, ENU: the autopilot's position when the vehicle is at the origin of its arena. Another arena
+            is, for the autopilot, another corner of one large field.
+        armed: whether the autopilot lets the rotors turn.
+        unanswered: number of steps without an answer in time.
+        answering: whether the autopilot has started up, so that lockstep has begun.
     """
 
     def __init__(self, connection: socket.socket, vehicle: Quadrotor, sensors: HilSensors) -> None:
         self.vehicle, self.shift = vehicle, (0.0, 0.0, 0.0)
-        self.armed = False  # it lets the rotors turn
-        self.unanswered = 0  # steps on which no answer came in time
-        self.answering = False  # it has started up: lockstep has begun
+        self.armed = False
+        self.unanswered = 0
+        self.answering = False
         self._sensors, self._connection = sensors, connection
         self._step = round(1e6 * vehicle.timestep)  # µs
         self._now = 0  # µs
-        self._most = float(vehicle.controller.body.most_thrust)
+        self._most_thrust = float(vehicle.controller.body.most_thrust)
         self._parser = mavlink.MAVLink(None)
         self._parser.robust_parsing = True
         self._packer = mavlink.MAVLink(None, srcSystem=1, srcComponent=mavlink.MAV_COMP_ID_ONBOARD_COMPUTER)
-        self._silent = 0
-        self._heard = 0  # µs, time of the newest command
+        self._unanswered_in_a_row = 0
+        self._last_command = 0  # µs
 
     @property
     def time(self) -> float:
-        """s since the autopilot was switched on."""
+        """Time since the autopilot was switched on [s]."""
         return 1e-6 * self._now
 
     def tick(self) -> None:
-        """One physics step: what is sensed now goes out, what the autopilot makes of it moves the vehicle.
+        """Advance by one physics step: send the sensors, wait for the commands, move the vehicle.
 
         Raises:
-            AutopilotGone.
+            AutopilotGone: the autopilot closed the connection, no longer answers, or has no lockstep.
         """
         vehicle = self.vehicle
         self._now += self._step
         truth, (dx, dy, dz) = vehicle.true_reading(), self.shift
         x, y, z = truth.position
-        where: Vector = (x + dx, y + dy, z + dz)
-        packets = [message.pack(self._packer) for message in self._sensors.read(truth, where, self._now)]
+        position: Vector = (x + dx, y + dy, z + dz)
+        packets = [message.pack(self._packer) for message in self._sensors.read(truth, position, self._now)]
         try:
             self._connection.sendall(b"".join(packets))
         except OSError as error:
             raise AutopilotGone("the autopilot closed the connection") from error
         self._wait()
-        vehicle.fly(1)
+        vehicle.advance(1)
 
     def _wait(self) -> None:
-        """For the command that belongs to the newest sensors; before the first one ever, not for long."""
-        end = time.monotonic() + (PATIENCE if self.answering else BOOTING)
-        while self._heard < self._now - self._step // 2:
+        """Wait for the command that answers the newest sensors."""
+        end = time.monotonic() + (ANSWER_TIMEOUT if self.answering else BOOT_TIMEOUT)
+        while self._last_command < self._now - self._step // 2:
             left = end - time.monotonic()
             if left <= 0.0:
                 return self._miss()
@@ -90,24 +95,24 @@ class HilLink:
                 raise AutopilotGone("the autopilot closed the connection")
             for message in self._parser.parse_buffer(data) or ():
                 if message.get_msgId() == mavlink.MAVLINK_MSG_ID_HIL_ACTUATOR_CONTROLS:
-                    self._obey(message)
-        self._silent = 0
+                    self._apply(message)
+        self._unanswered_in_a_row = 0
         return None
 
-    def _obey(self, message: mavlink.MAVLink_hil_actuator_controls_message) -> None:
+    def _apply(self, message: mavlink.MAVLink_hil_actuator_controls_message) -> None:
         if not message.flags & LOCKSTEP:
             raise AutopilotGone(
-                "this autopilot was built without lockstep: it cannot be given physics from outside here"
+                "the autopilot was built without lockstep; build PX4 for SITL with lockstep, its default"
             )
         self.answering = True
-        self._heard = message.time_usec
+        self._last_command = message.time_usec
         self.armed = bool(message.mode & ARMED)
-        self.vehicle.set_thrusts(tuple(self._most * min(max(c, 0.0), 1.0) for c in message.controls[:ROTORS]))
+        self.vehicle.set_thrusts(tuple(self._most_thrust * min(max(c, 0.0), 1.0) for c in message.controls[:ROTORS]))
 
     def _miss(self) -> None:
         if not self.answering:
             return
         self.unanswered += 1
-        self._silent += 1
-        if self._silent >= UNANSWERED:
-            raise AutopilotGone(f"the autopilot has not answered for {UNANSWERED * PATIENCE:g} s")
+        self._unanswered_in_a_row += 1
+        if self._unanswered_in_a_row >= MOST_UNANSWERED:
+            raise AutopilotGone(f"the autopilot has not answered for {MOST_UNANSWERED * ANSWER_TIMEOUT:g} s")

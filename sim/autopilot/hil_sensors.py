@@ -1,5 +1,5 @@
-"""The sensors that a real autopilot estimates its state from, made of a simulated vehicle's truth: IMU, magnetometer,
-barometer and GPS, as MAVLink's HIL_SENSOR and HIL_GPS carry them."""
+"""Simulate the sensors of a real autopilot from the true state: IMU, magnetometer, barometer and GPS, as HIL_SENSOR and
+HIL_GPS messages."""
 
 from __future__ import annotations
 
@@ -13,28 +13,29 @@ from brakeline.sim.autopilot.common_dialect import mavlink
 from brakeline.sim.flight_controller import Vector
 from brakeline.sim.flight_estimator import Estimate
 
-IMU, MAGNETOMETER, BAROMETER = 0x3F, 0x1C0, 0x1A00  # of HIL_SENSOR's fields: what is new
+IMU, MAGNETOMETER, BAROMETER = 0x3F, 0x1C0, 0x1A00  # bits of HIL_SENSOR.fields_updated
 FIX = int(mavlink.GPS_FIX_TYPE_RTK_FIXED)
-# The Earth's field where `frames.globe` puts the origin: gauss; rad from true north; rad below the horizon
+# The Earth's magnetic field at the origin of `ned_frames.globe`: gauss; rad from true north; rad below the horizon
 FIELD, DECLINATION, INCLINATION = 0.485, math.radians(3.2), math.radians(63.3)
-NORTHWARD: Vector = (
+MAGNETIC_FIELD: Vector = (
     FIELD * math.cos(INCLINATION) * math.cos(DECLINATION),
     FIELD * math.cos(INCLINATION) * math.sin(DECLINATION),
     FIELD * math.sin(INCLINATION),
 )  # NED
-CHUNK = 256  # draws at once: one alone costs as much as many
-DRAWN = 16  # numbers for one reading of everything
+DRAWS_AT_ONCE = 256  # one draw alone takes as long as many
+DRAW_SIZE = 16  # random numbers for one reading of all sensors
+GPS_DRAWS = slice(10, 16)
 
 
 @dataclass(frozen=True)
 class SensorNoise:
-    """Errors of the sensors: normal, sigma of each axis, anew at each reading; a bias is drawn once. `scale` = 0: none.
+    """Standard deviations of the sensors' normal errors: of each axis at each reading; a bias is drawn once.
 
-    As of a small IMU and an RTK receiver: what is about the vehicle is known on a map to centimetres, and no filter can
-    use that behind a position that is wrong by metres. An ordinary receiver has `gps_position` 0.5, `gps_velocity` 0.1.
+    The defaults are those of a small IMU and an RTK receiver. The map is exact to centimetres, and a filter cannot use
+    it behind a position that is wrong by metres. An ordinary receiver has `gps_position` 0.5 and `gps_velocity` 0.1.
     """
 
-    scale: float = 1.0  # multiplies every sigma below
+    scale: float = 1.0  # multiplies every value below; 0 switches errors off
     accelerometer: float = 0.05  # m/s²
     accelerometer_bias: float = 0.05  # m/s²
     gyro: float = 0.003  # rad/s
@@ -42,14 +43,14 @@ class SensorNoise:
     magnetometer: float = 0.003  # gauss
     magnetometer_bias: float = 0.005  # gauss
     barometer: float = 0.15  # m
-    barometer_bias: float = 1.0  # m, of the weather
+    barometer_bias: float = 1.0  # m, from the weather
     gps_position: float = 0.015  # m
     gps_velocity: float = 0.02  # m/s
 
 
 @dataclass(frozen=True)
 class SensorRates:
-    """How often a sensor reads, Hz; the IMU at every physics step."""
+    """Sampling rates of the sensors [Hz]. The IMU reads at every physics step."""
 
     magnetometer: float = 50.0
     barometer: float = 25.0
@@ -57,7 +58,7 @@ class SensorRates:
 
 
 class HilSensors:
-    """One vehicle's sensors. Everything comes from its generator, so a run can be had again."""
+    """The sensors of one vehicle. The generator determines all errors, so a run can be repeated."""
 
     def __init__(
         self, noise: SensorNoise, rng: np.random.Generator, period: float, rates: SensorRates | None = None
@@ -69,17 +70,20 @@ class HilSensors:
         n = noise
         sigma = n.scale * np.repeat((n.accelerometer_bias, n.gyro_bias, n.magnetometer_bias, n.barometer_bias), 3)
         bias: list[float] = (sigma * rng.standard_normal(12)).tolist()
-        self._force, self._turning, self._field, self._weather = bias[:3], bias[3:6], bias[6:9], bias[9]
+        self._force_bias, self._gyro_bias, self._field_bias, self._height_bias = bias[:3], bias[3:6], bias[6:9], bias[9]
         self._draws: list[list[float]] = []
         self._count = 0
 
     def read(self, truth: Estimate, position: Vector, microseconds: int) -> list[mavlink.MAVLink_message]:
-        """What is said at that time: an IMU's reading with whatever else is due, and perhaps a fix of GPS.
+        """Return the messages of one time: HIL_SENSOR with the sensors that are due, and HIL_GPS if it is due.
 
-        position: m, ENU, from the place that `frames.globe` calls the origin.
+        Args:
+            truth: the true state, as an estimate without errors.
+            position: m, ENU, from the origin of `ned_frames.globe`.
+            microseconds: the time.
         """
         if not self._draws:
-            self._draws = (self.noise.scale * self._rng.standard_normal((CHUNK, DRAWN))).tolist()
+            self._draws = (self.noise.scale * self._rng.standard_normal((DRAWS_AT_ONCE, DRAW_SIZE))).tolist()
         draw, n, count = self._draws.pop(), self.noise, self._count
         magnetic, barometric, fix = (count % every == 0 for every in self._every)
         self._count += 1
@@ -87,22 +91,22 @@ class HilSensors:
         fields, field, pressure, height = IMU, (0.0, 0.0, 0.0), 0.0, 0.0
         if magnetic:
             fields |= MAGNETOMETER
-            field = ned_frames.into_body(ned_frames.attitude(truth.attitude), NORTHWARD)
+            field = ned_frames.into_body(ned_frames.attitude(truth.attitude), MAGNETIC_FIELD)
         if barometric:
             fields |= BAROMETER
-            height = ned_frames.ALTITUDE + position[2] + self._weather + n.barometer * draw[9]
-            pressure = 1013.25 * (1.0 - 2.25577e-5 * height) ** 5.25588  # hPa, of the standard atmosphere
+            height = ned_frames.ALTITUDE + position[2] + self._height_bias + n.barometer * draw[9]
+            pressure = 1013.25 * (1.0 - 2.25577e-5 * height) ** 5.25588  # hPa, standard atmosphere
         messages: list[mavlink.MAVLink_message] = [
             mavlink.MAVLink_hil_sensor_message(
                 microseconds,
-                *(force[i] + self._force[i] + n.accelerometer * draw[i] for i in range(3)),
-                *(rates[i] + self._turning[i] + n.gyro * draw[3 + i] for i in range(3)),
-                *(field[i] + self._field[i] + n.magnetometer * draw[6 + i] for i in range(3)),
+                *(force[i] + self._force_bias[i] + n.accelerometer * draw[i] for i in range(3)),
+                *(rates[i] + self._gyro_bias[i] + n.gyro * draw[3 + i] for i in range(3)),
+                *(field[i] + self._field_bias[i] + n.magnetometer * draw[6 + i] for i in range(3)),
                 pressure, 0.0, height, 15.0, fields,
             )
         ]  # fmt: skip
         if fix:
-            messages.append(self._fix(truth, position, microseconds, draw[10:]))
+            messages.append(self._fix(truth, position, microseconds, draw[GPS_DRAWS]))
         return messages
 
     def _fix(

@@ -1,4 +1,4 @@
-"""The autopilot's edge: ENU and body forward-left-up inside, NED and body forward-right-down in messages."""
+"""Convert frames: ENU and body forward-left-up inside the program, NED and body forward-right-down in messages."""
 
 from __future__ import annotations
 
@@ -6,56 +6,52 @@ import math
 
 from brakeline.sim.flight_controller import Vector
 from brakeline.sim.flight_estimator import Quaternion, rotate
+from brakeline.sim.ground_estimator import heading_of
 
-HALF = math.sqrt(0.5)
+HALF_ROOT = math.sqrt(0.5)
 
-# Where the arena's origin lies on Earth, for those who want a position as GPS has it; metres to degrees on a sphere
+# The arena's origin on Earth, for GPS positions; the Earth counts as a sphere
 LATITUDE, LONGITUDE, ALTITUDE = 47.397742, 8.545594, 488.0  # deg, deg, m above mean sea level
-DEGREES = 180.0 / (math.pi * 6371000.0)  # of latitude to a metre
+DEGREES = 180.0 / (math.pi * 6371000.0)  # of latitude in a metre
 
 
 def world(vector: Vector) -> Vector:
-    """ENU to NED, or back: the exchange is its own inverse."""
+    """Convert a vector from ENU to NED, or back: the function is its own inverse."""
     return (vector[1], vector[0], -vector[2])
 
 
 def body(vector: Vector) -> Vector:
-    """Forward-left-up to forward-right-down, or back."""
+    """Convert a vector from forward-left-up to forward-right-down, or back."""
     return (vector[0], -vector[1], -vector[2])
 
 
 def yaw(angle: float) -> float:
-    """From east, counterclockwise, to from north, clockwise, or back; in (-π, π], rad."""
+    """Convert a yaw from east, counterclockwise, to north, clockwise, or back; in (-π, π], rad."""
     return math.remainder(0.5 * math.pi - angle, math.tau)
 
 
 def attitude(q: Quaternion) -> Quaternion:
-    """ENU from forward-left-up, to NED from forward-right-down."""
+    """Convert an attitude (w, x, y, z) from (ENU, forward-left-up) to (NED, forward-right-down)."""
     w, x, y, z = q
-    return (HALF * (w + z), HALF * (x + y), HALF * (x - y), HALF * (w - z))
+    return (HALF_ROOT * (w + z), HALF_ROOT * (x + y), HALF_ROOT * (x - y), HALF_ROOT * (w - z))
 
 
 def euler(q: Quaternion) -> Vector:
-    """Roll, pitch, yaw of an attitude, rad."""
+    """Return roll, pitch and yaw of an attitude [rad]."""
     w, x, y, z = q
     roll = math.atan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y))
     pitch = math.asin(min(max(2.0 * (w * y - z * x), -1.0), 1.0))
-    return (roll, pitch, math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z)))
-
-
-def heading(q: Quaternion) -> float:
-    """Where the x axis points, about the third axis, rad."""
-    return euler(q)[2]
+    return (roll, pitch, heading_of(q))
 
 
 def into_body(q: Quaternion, vector: Vector) -> Vector:
-    """A vector in the world, along the axes of a body with this attitude."""
+    """Convert a vector from the world to the axes of a body with this attitude."""
     w, x, y, z = q
     return rotate((w, -x, -y, -z), vector)
 
 
 def globe(position: Vector) -> tuple[float, float, float]:
-    """ENU position [m] as latitude and longitude [deg] and altitude [m]."""
+    """Return latitude [deg], longitude [deg] and altitude [m] of an ENU position [m]."""
     east, north, up = position
     return (
         LATITUDE + north * DEGREES,

@@ -1,4 +1,4 @@
-"""The parameters of both rule sets, and how a value travels: PX4 sends its bits, ArduPilot casts it to a float."""
+"""The parameters of both rule sets, and their encoding: PX4 sends an integer's bits, ArduPilot casts it to a float."""
 
 from __future__ import annotations
 
@@ -12,29 +12,31 @@ INTEGER, REAL = mavlink.MAV_PARAM_TYPE_INT32, mavlink.MAV_PARAM_TYPE_REAL32
 
 
 class BadParameter(ValueError):
-    """There is no such parameter, or it cannot have this value."""
+    """The parameter does not exist, or cannot have this value."""
 
 
 @dataclass(frozen=True)
 class Parameter:
     name: str
-    value: float
+    value: float  # by default
     low: float
     high: float
-    what: str
+    description: str
     integer: bool = False
 
     @property
     def type(self) -> int:
-        """As MAVLink numbers it."""
+        """MAV_PARAM_TYPE"""
         return int(INTEGER if self.integer else REAL)
 
 
-PX4: tuple[Parameter, ...] = (
-    Parameter("COM_DISARM_LAND", 2.0, -1.0, 20.0, "s after a landing until it disarms"),
-    Parameter("COM_DISARM_PRFLT", 10.0, -1.0, 60.0, "s after arming until it disarms if it stays on the ground"),
+PX4_PARAMETERS: tuple[Parameter, ...] = (
+    Parameter("COM_DISARM_LAND", 2.0, -1.0, 20.0, "s after a landing until the vehicle disarms"),
+    Parameter(
+        "COM_DISARM_PRFLT", 10.0, -1.0, 60.0, "s after arming until the vehicle disarms if it stays on the ground"
+    ),
     Parameter("COM_OBL_RC_ACT", 0, 0, 5, "setpoints lost: 0 to 3 position, 4 land, 5 hold", integer=True),
-    Parameter("COM_OF_LOSS_T", 1.0, 0.1, 60.0, "s without a setpoint until it leaves offboard"),
+    Parameter("COM_OF_LOSS_T", 1.0, 0.1, 60.0, "s without a setpoint until the vehicle leaves offboard mode"),
     Parameter("MIS_TAKEOFF_ALT", 2.5, 0.5, 80.0, "m above home to take off to"),
     Parameter("MPC_LAND_SPEED", 0.7, 0.3, 2.0, "m/s"),
     Parameter("MPC_XY_VEL_MAX", 8.0, 0.5, 8.0, "m/s, horizontal"),
@@ -43,21 +45,24 @@ PX4: tuple[Parameter, ...] = (
     Parameter("SYS_AUTOSTART", 4001, 0, 9999999, "airframe", integer=True),
 )
 
-ARDUPILOT: tuple[Parameter, ...] = (
-    Parameter("DISARM_DELAY", 10, 0, 127, "s after arming until it disarms if it stays on the ground", integer=True),
+ARDUPILOT_PARAMETERS: tuple[Parameter, ...] = (
+    Parameter(
+        "DISARM_DELAY", 10, 0, 127, "s after arming until the vehicle disarms if it stays on the ground", integer=True
+    ),
     Parameter("FRAME_CLASS", 1, 0, 15, "1: quadrotor", integer=True),
-    Parameter("GUID_TIMEOUT", 3.0, 0.1, 5.0, "s without a setpoint until it stops"),
+    Parameter("GUID_TIMEOUT", 3.0, 0.1, 5.0, "s without a setpoint until the vehicle stops"),
     Parameter("LAND_SPEED", 70, 30, 200, "cm/s", integer=True),
     Parameter(
-        "WPNAV_ACCEL", 100.0, 1.0, 1e6, "cm/s², horizontal, by which the velocity that it flies follows setpoints"
+        "WPNAV_ACCEL", 100.0, 1.0, 1e6, "cm/s², horizontal acceleration with which the flown velocity follows setpoints"
     ),
-    Parameter("WPNAV_ACCEL_Z", 100.0, 1.0, 1e6, "cm/s², the same up and down"),
+    Parameter("WPNAV_ACCEL_Z", 100.0, 1.0, 1e6, "cm/s², the vertical acceleration"),
     Parameter("WPNAV_SPEED", 500.0, 20.0, 2000.0, "cm/s, horizontal"),
     Parameter("WPNAV_SPEED_DN", 150.0, 10.0, 500.0, "cm/s"),
     Parameter("WPNAV_SPEED_UP", 250.0, 10.0, 1000.0, "cm/s"),
 )
 
-# What makes a vehicle follow setpoints at once, within what the quadrotor's description may ask for: as it is recorded.
+# Values with which a vehicle follows setpoints without a limit of acceleration, up to the bounds of the quadrotor's
+# description; the recorded data have them.
 AT_ONCE: dict[str, dict[str, float]] = {
     "px4": {},
     "ardupilot": {
@@ -68,32 +73,32 @@ AT_ONCE: dict[str, dict[str, float]] = {
 
 
 class Parameters:
-    """One vehicle's parameters, by name, in the table's order."""
+    """The parameters of one vehicle, by name."""
 
     def __init__(self, table: tuple[Parameter, ...], bitwise: bool) -> None:
-        """bitwise: an integer's 32 bits travel in the place of the float's (PX4); else its value does (ArduPilot)."""
+        """bitwise: the 32 bits of an integer travel in place of the float's (PX4), not its value (ArduPilot)."""
         self.table, self.bitwise = table, bitwise
         self._values = {parameter.name: parameter.value for parameter in table}
 
     def __getitem__(self, name: str) -> float:
         return self._values[name]
 
-    def find(self, name: str) -> int:
-        """Its index. Raises BadParameter."""
+    def index(self, name: str) -> int:
+        """Return the index of a parameter in the table. Raises BadParameter: it does not exist."""
         for index, parameter in enumerate(self.table):
             if parameter.name == name:
                 return index
         raise BadParameter(f"no parameter {name}")
 
     def set(self, name: str, value: float) -> None:
-        """Raises BadParameter: unknown, not finite, out of range."""
-        parameter = self.table[self.find(name)]
+        """Set a value. Raises BadParameter: it does not exist, or the value is not finite or out of range."""
+        parameter = self.table[self.index(name)]
         if not (math.isfinite(value) and parameter.low <= value <= parameter.high):
             raise BadParameter(f"{name} is {parameter.low:g} to {parameter.high:g}")
         self._values[name] = float(round(value)) if parameter.integer else value
 
     def message(self, index: int) -> mavlink.MAVLink_param_value_message:
-        """PARAM_VALUE of the parameter with that index."""
+        """Return the PARAM_VALUE message of the parameter with this index."""
         parameter = self.table[index]
         value = self._values[parameter.name]
         if parameter.integer and self.bitwise:
@@ -102,9 +107,9 @@ class Parameters:
             parameter.name.encode(), value, parameter.type, len(self.table), index
         )
 
-    def sent(self, name: str, value: float, kind: int) -> float:
-        """The value that somebody sent. Raises BadParameter when it is not of the parameter's type."""
-        parameter = self.table[self.find(name)]
+    def decode(self, name: str, value: float, kind: int) -> float:
+        """Decode a value that came in PARAM_SET. Raises BadParameter: the type is not the parameter's."""
+        parameter = self.table[self.index(name)]
         if not self.bitwise:
             return value
         if kind != parameter.type:

@@ -1,4 +1,4 @@
-"""A PX4 process whose physics come from outside: found, told what it flies, started, ended."""
+"""Run a PX4 process whose physics this program simulates: find it, configure it, start it, end it."""
 
 from __future__ import annotations
 
@@ -15,19 +15,20 @@ from pathlib import Path
 from brakeline.messaging.free_ports import free_udp_port
 from brakeline.sim.flight_controller import GRAVITY, Airframe
 
-AIRFRAME = "none_iris"  # the one of PX4's own that expects its simulator at a TCP port
-FIRST_PORT = 4560  # of the simulator of instance 0; PX4's scripts add the instance
-INSTANCES = range(10, 200)  # PX4's own tools start with 0
-# Becomes PX4, and ends with us: without a simulator it would wait forever (1: PR_SET_PDEATHSIG, 9: SIGKILL)
+AIRFRAME = "none_iris"  # the airframe of PX4 that expects its simulator at a TCP port
+FIRST_PORT = 4560  # of the simulator of instance 0; PX4's scripts add the number of the instance
+INSTANCES = range(10, 200)  # PX4's own tools use those from 0 on
+# Starts PX4 so that it ends with this process; without a simulator it would wait forever (1: PR_SET_PDEATHSIG,
+# 9: SIGKILL)
 LAUNCH = "import ctypes, os, sys; ctypes.CDLL(None).prctl(1, 9); os.execv(sys.argv[1], sys.argv[1:])"
-TRACES = ("px4-sock-{}", "px4_lock-{}")  # files of an instance in the folder for such
-STARTS_IN = 30.0  # s until it must have connected
+TRACES = ("px4-sock-{}", "px4_lock-{}")  # files of an instance in the folder for temporary files
+START_TIMEOUT = 30.0  # s until PX4 must have connected
 ALIAS = re.compile(r"^alias (\w+)='px4-", re.MULTILINE)
 
 BODY = Airframe()
 ARM, TORQUE = BODY.arm, BODY.rotor_torque
 
-# What PX4 must know of the vehicle in sim/quadrotor.xml, and of a companion that sends velocities
+# The parameters of the vehicle in sim/quadrotor.xml, and of a companion computer that sends velocities
 PARAMETERS: dict[str, float] = {
     "MAV_SYS_ID": 1,
     "IMU_INTEG_RATE": 200,  # Hz, as the physics
@@ -37,34 +38,44 @@ PARAMETERS: dict[str, float] = {
     "CA_ROTOR3_PX": -ARM, "CA_ROTOR3_PY": ARM, "CA_ROTOR3_KM": -TORQUE,
     "THR_MDL_FAC": 0.0,  # thrust is proportional to the command
     "MPC_THR_HOVER": 0.25 * BODY.mass * GRAVITY / BODY.most_thrust,
-    "MPC_XY_VEL_MAX": 7.1, "MPC_Z_VEL_MAX_UP": 5.0, "MPC_Z_VEL_MAX_DN": 5.0,  # m/s, what the filter may ask for
-    "MPC_XY_VEL_P_ACC": 4.0, "MPC_XY_VEL_I_ACC": 1.0, "MPC_Z_VEL_P_ACC": 6.0,  # it is nimbler than what PX4 expects
+    "MPC_XY_VEL_MAX": 7.1, "MPC_Z_VEL_MAX_UP": 5.0, "MPC_Z_VEL_MAX_DN": 5.0,  # m/s, the bounds of the robot's inputs
+    "MPC_XY_VEL_P_ACC": 4.0, "MPC_XY_VEL_I_ACC": 1.0, "MPC_Z_VEL_P_ACC": 6.0,  # more agile than PX4's default
     "COM_OF_LOSS_T": 0.5,  # s without a setpoint
-    "COM_RC_IN_MODE": 4, "NAV_RCL_ACT": 0, "NAV_DLL_ACT": 0, "COM_RCL_EXCEPT": 4,  # nobody holds a stick
-    "EKF2_MULTI_IMU": 0, "SENS_IMU_MODE": 1,  # one IMU is simulated: one estimator
-    "EKF2_HGT_REF": 1,  # GPS: its height is of the same map
-    "SDLOG_MODE": -1,  # no log of its own
+    "COM_RC_IN_MODE": 4, "NAV_RCL_ACT": 0, "NAV_DLL_ACT": 0, "COM_RCL_EXCEPT": 4,  # no remote control
+    "EKF2_MULTI_IMU": 0, "SENS_IMU_MODE": 1,  # one IMU: one estimator
+    "EKF2_HGT_REF": 1,  # height from GPS, which agrees with the map
+    "SDLOG_MODE": -1,  # no log
 }  # fmt: skip
 
 
 class Px4Error(RuntimeError):
-    """There is no PX4 in that folder, or it did not start."""
+    """The folder holds no PX4, or PX4 did not start."""
 
 
 class Px4Process:
-    """A running PX4. It sends MAVLink to `127.0.0.1:remote` from `local`, and waits for sensors on `connection`."""
+    """A running PX4.
+
+    Attributes:
+        remote, local: UDP ports of 127.0.0.1 that PX4 sends MAVLink to and from.
+        connection: TCP connection on which PX4 waits for sensors.
+        log: the file with the output of PX4.
+    """
 
     def __init__(self, folder: Path, remote: int, parameters: dict[str, float] | None = None) -> None:
-        """folder: with `px4` or `bin/px4`, and `etc`, as a build for SITL leaves them; parameters: besides
-        `PARAMETERS`.
+        """Start PX4.
+
+        Args:
+            folder: a build for SITL, with `px4` or `bin/px4`, and `etc`.
+            remote: UDP port for MAVLink.
+            parameters: values besides `PARAMETERS`.
 
         Raises:
-            Px4Error.
+            Px4Error: the folder holds no PX4, or PX4 did not start.
         """
-        binary, aliases, etc = _parts(folder)
+        binary, aliases, etc = _find_parts(folder)
         self.remote, self.local = remote, free_udp_port()
-        self._place = tempfile.TemporaryDirectory(prefix="px4-")
-        root = Path(self._place.name)
+        self._folder = tempfile.TemporaryDirectory(prefix="px4-")
+        root = Path(self._folder.name)
         for name in ("bin", "rootfs"):
             (root / name).mkdir()
         self.log = root / "px4.log"
@@ -89,7 +100,7 @@ class Px4Process:
                 stdin=subprocess.DEVNULL,
                 stdout=output,
                 stderr=output,
-                start_new_session=True,  # ^C is ours
+                start_new_session=True,  # so that ^C ends only this program
             )
         try:
             self.connection = self._accept()
@@ -102,47 +113,45 @@ class Px4Process:
     def alive(self) -> bool:
         return self._process.poll() is None
 
-    def last_words(self) -> str:
-        """The end of what it printed."""
+    def last_output(self) -> str:
+        """Return the end of its output."""
         return "\n".join(self.log.read_text(errors="replace").strip().splitlines()[-8:])
 
     def close(self) -> None:
-        """End it, and leave nothing behind."""
+        """End PX4, and delete its files."""
         self.connection.close()
         self._end()
 
     def _end(self) -> None:
-        self._process.kill()  # asked kindly it would wait for a clock that stands still
+        self._process.kill()  # on SIGTERM it would wait for a clock that stands still
         self._process.wait()
         self._listener.close()
         for trace in self._traces:
             trace.unlink(missing_ok=True)
-        self._place.cleanup()
+        self._folder.cleanup()
 
     def _accept(self) -> socket.socket:
-        end = time.monotonic() + STARTS_IN
+        end = time.monotonic() + START_TIMEOUT
         self._listener.settimeout(0.1)
         while time.monotonic() < end and self.alive:
             try:
                 return self._listener.accept()[0]
             except TimeoutError:
                 continue
-        raise Px4Error(f"PX4 did not ask for its simulator; its last words:\n{self.last_words()}")
+        raise Px4Error(f"PX4 did not connect to its simulator; the end of its output:\n{self.last_output()}")
 
 
-def _parts(folder: Path) -> tuple[Path, Path, Path]:
-    """The program, its script of aliases, and its scripts' folder."""
+def _find_parts(folder: Path) -> tuple[Path, Path, Path]:
+    """Return the program, its script of aliases, and the folder of its scripts."""
     folder = folder.resolve()
     for place in (folder / "bin", folder):
         if (place / "px4").is_file() and (place / "px4-alias.sh").is_file() and (folder / "etc").is_dir():
             return place / "px4", place / "px4-alias.sh", folder / "etc"
-    raise Px4Error(
-        f"{folder} holds no PX4 for SITL: px4 and px4-alias.sh (or both in bin/), and etc/ are expected there"
-    )
+    raise Px4Error(f"{folder} holds no PX4 for SITL: it must have px4 and px4-alias.sh (or both in bin/), and etc/")
 
 
 def _free_instance() -> tuple[int, socket.socket]:
-    """One that no other PX4 of this machine has, and where its simulator is to listen."""
+    """Return an instance that no other PX4 of this machine uses, and the socket for its connection."""
     for instance in INSTANCES:
         with Path(tempfile.gettempdir(), TRACES[1].format(instance)).open("a") as lock:
             try:
@@ -150,4 +159,4 @@ def _free_instance() -> tuple[int, socket.socket]:
                 return instance, socket.create_server(("127.0.0.1", FIRST_PORT + instance))
             except OSError:
                 continue
-    raise Px4Error("too many instances of PX4 run on this machine")
+    raise Px4Error("no free instance of PX4: too many run on this machine")

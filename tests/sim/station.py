@@ -36,8 +36,8 @@ class Station:
             arena, np.random.default_rng(0), QuadrotorNoise(scale=0.0), floor=None if airborne else 0.02
         )
         self.autopilot = Autopilot(vehicle, rules, **options)
-        self.pilot = self.autopilot.pilot
-        self.heard: list[Any] = []
+        self.flight = self.autopilot.flight
+        self.received: list[Any] = []
         self.mav = mavlink.MAVLink(self, srcSystem=255, srcComponent=190)
 
     def write(self, data: bytes) -> None:
@@ -45,21 +45,21 @@ class Station:
         self.listen()
 
     def listen(self) -> None:
-        self.heard += self.mav.parse_buffer(self.autopilot.take()) or []
+        self.received += self.mav.parse_buffer(self.autopilot.take()) or []
 
     def wait(self, seconds: float) -> None:
         self.autopilot.advance(seconds)
         self.listen()
 
     def last(self, kind: str) -> Any:
-        return [message for message in self.heard if message.get_type() == kind][-1]
+        return [message for message in self.received if message.get_type() == kind][-1]
 
     def texts(self) -> str:
-        return "; ".join(message.text for message in self.heard if message.get_type() == "STATUSTEXT")
+        return "; ".join(message.text for message in self.received if message.get_type() == "STATUSTEXT")
 
     def command(self, number: int, *params: float, system: int = 1) -> int:
-        """The result of a command."""
-        self.heard.clear()
+        """Send a command and return its result."""
+        self.received.clear()
         self.mav.command_long_send(system, 1, number, 0, *params, *[0.0] * (7 - len(params)))
         ack = self.last("COMMAND_ACK")
         assert (ack.command, ack.target_system, ack.target_component) == (number, 255, 190)
@@ -71,7 +71,7 @@ class Station:
         )
 
     def fly(self, *setpoint: float, seconds: float = 2.0, **options: Any) -> np.ndarray:
-        """Stream a setpoint; the true velocity after it, in NED."""
+        """Send a setpoint every 0.1 s; return the true velocity afterwards, in NED."""
         for _ in range(round(seconds / 0.1)):
             self.setpoint(*setpoint, **options)
             self.wait(0.1)
@@ -79,7 +79,7 @@ class Station:
         return np.array([north, east, -up])
 
     def into_the_air(self) -> None:
-        """Take off to three metres, and be ready for setpoints."""
+        """Take off, and change to the mode that follows setpoints."""
         self.wait(2.0)
         if self.autopilot.rules.name == "px4":
             assert self.command(ARM, 1) == ACCEPTED
@@ -92,4 +92,4 @@ class Station:
             assert self.command(ARM, 1) == ACCEPTED
             assert self.command(TAKEOFF, *[0.0] * 6, 3.0) == ACCEPTED
             self.wait(6.0)
-        assert self.pilot.landed is LandedState.IN_AIR
+        assert self.flight.landed is LandedState.IN_AIR

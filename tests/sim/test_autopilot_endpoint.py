@@ -1,4 +1,4 @@
-"""The autopilot at the level of its bytes: what it accepts, what it refuses, what it says, with both rule sets."""
+"""The embedded autopilot accepts and refuses commands and setpoints by both rule sets."""
 
 from __future__ import annotations
 
@@ -33,29 +33,29 @@ from tests.sim.station import (
 )
 
 
-def test_heartbeat_says_who_it_is_once_a_second(station: Station) -> None:
+def test_the_heartbeat_names_the_autopilot_once_a_second(station: Station) -> None:
     station.wait(5.0)
-    beats = [m for m in station.heard if m.get_type() == "HEARTBEAT"]
+    beats = [m for m in station.received if m.get_type() == "HEARTBEAT"]
     assert len(beats) == 6  # one at once
     assert beats[0].type == mavlink.MAV_TYPE_QUADROTOR
     assert beats[0].autopilot == {"px4": 12, "ardupilot": 3}[station.autopilot.rules.name]
     assert beats[0].get_msgbuf()[0] == 0xFD  # MAVLink 2
 
 
-def test_it_takes_off_lands_and_disarms(flying: Station) -> None:
+def test_the_vehicle_takes_off_lands_and_disarms(flying: Station) -> None:
     height = flying.autopilot.vehicle.state()[2]
     assert height == pytest.approx({"px4": 2.55, "ardupilot": 3.05}[flying.autopilot.rules.name], abs=0.25)
     assert flying.command(ARM, 0) == flying.autopilot.rules.refusal  # not in the air
     assert flying.command(LAND) == ACCEPTED
     flying.wait(1.0)
-    assert flying.pilot.landed is LandedState.LANDING
+    assert flying.flight.landed is LandedState.LANDING
     flying.wait(10.0)
-    assert flying.pilot.landed is LandedState.ON_GROUND and not flying.pilot.armed
+    assert flying.flight.landed is LandedState.ON_GROUND and not flying.flight.armed
     assert not flying.autopilot.vehicle.collided
     assert "Landing detected" in flying.texts()
 
 
-def test_arming_is_checked(station: Station) -> None:
+def test_arming_is_refused_before_the_estimate_is_ready_and_in_land_mode(station: Station) -> None:
     refusal = station.autopilot.rules.refusal
     assert station.command(ARM, 1) == refusal  # the estimate needs a second
     station.wait(2.0)
@@ -67,16 +67,16 @@ def test_arming_is_checked(station: Station) -> None:
     assert station.command(ARM, 1) == refusal
 
 
-def test_unused_it_disarms_by_itself(station: Station) -> None:
+def test_an_armed_vehicle_on_the_ground_disarms_after_its_delay(station: Station) -> None:
     station.wait(2.0)
     station.command(ARM, 1)
     station.wait(9.0)
-    assert station.pilot.armed
+    assert station.flight.armed
     station.wait(2.0)
-    assert not station.pilot.armed
+    assert not station.flight.armed
 
 
-def test_px4_wants_setpoints_before_offboard() -> None:
+def test_px4_needs_setpoints_before_offboard() -> None:
     station = Station("px4")
     station.wait(2.0)
     assert station.command(MODE, 1, OFFBOARD) == ACCEPTED  # disarmed: it may be any
@@ -85,15 +85,15 @@ def test_px4_wants_setpoints_before_offboard() -> None:
     station.setpoint(0, 0, 0)
     assert station.command(MODE, 1, OFFBOARD) == ACCEPTED
     station.wait(1.5)
-    assert station.pilot.mode is Mode.OFFBOARD  # disarmed: nothing happens
-    assert station.command(ARM, 1) == REJECTED  # the stream has dried up
+    assert station.flight.mode is Mode.OFFBOARD  # disarmed: nothing happens
+    assert station.command(ARM, 1) == REJECTED  # the setpoints have stopped
     assert station.command(MODE, 1, 1) == REJECTED  # manual: no sticks
     assert station.command(MODE, 0, OFFBOARD) == DENIED  # no custom mode
-    assert station.command(MODE, 1, 99) == ACCEPTED  # there is no such mode: nothing happens
-    assert station.pilot.mode is Mode.OFFBOARD
+    assert station.command(MODE, 1, 99) == ACCEPTED  # no such mode: nothing happens
+    assert station.flight.mode is Mode.OFFBOARD
 
 
-def test_px4_takes_off_when_it_is_armed_if_that_was_asked_for_before() -> None:
+def test_px4_takes_off_on_arming_after_a_takeoff_command() -> None:
     station = Station("px4")
     station.wait(2.0)
     assert station.command(TAKEOFF, *[0.0] * 6, math.nan) == ACCEPTED
@@ -116,7 +116,7 @@ def test_px4_lifts_off_by_an_upward_setpoint() -> None:
     assert station.fly(0, 0, -1)[2] == pytest.approx(-1.0, abs=0.1)
 
 
-def test_ardupilot_wants_guided_arming_and_a_takeoff_in_this_order() -> None:
+def test_ardupilot_needs_guided_arming_and_takeoff_in_this_order() -> None:
     station = Station("ardupilot")
     station.wait(2.0)
     high = (*[0.0] * 6, 3.0)
@@ -125,7 +125,7 @@ def test_ardupilot_wants_guided_arming_and_a_takeoff_in_this_order() -> None:
     assert station.command(TAKEOFF, *high) == FAILED  # not armed
     station.command(ARM, 1)
     station.fly(0, 0, -1)
-    assert station.autopilot.vehicle.state()[2] < 0.1  # a velocity does not lift it
+    assert station.autopilot.vehicle.state()[2] < 0.1  # a velocity does not lift the vehicle off
     assert station.command(TAKEOFF, *[0.0] * 7) == FAILED  # to no height
     assert station.command(TAKEOFF, *high) == ACCEPTED
     station.wait(5.0)
@@ -135,28 +135,28 @@ def test_ardupilot_wants_guided_arming_and_a_takeoff_in_this_order() -> None:
     assert station.command(MODE, 1, 0) == FAILED  # stabilize: no sticks
 
 
-def test_commands_that_nobody_knows_and_strangers(station: Station) -> None:
+def test_unknown_commands_and_messages_to_others_have_no_effect(station: Station) -> None:
     assert station.command(31000) == UNSUPPORTED
-    station.heard.clear()
-    station.mav.command_long_send(7, 1, ARM, 0, 1, 0, 0, 0, 0, 0, 0)  # another vehicle's
-    station.mav.command_long_send(1, 100, ARM, 0, 1, 0, 0, 0, 0, 0, 0)  # its camera's
-    assert not station.heard
+    station.received.clear()
+    station.mav.command_long_send(7, 1, ARM, 0, 1, 0, 0, 0, 0, 0, 0)  # to another vehicle
+    station.mav.command_long_send(1, 100, ARM, 0, 1, 0, 0, 0, 0, 0, 0)  # to a camera
+    assert not station.received
     station.autopilot.receive(b"\xfd\x03garbage\x00\xfe\xff" * 5)
-    for _ in range(20):  # what looked like a frame may swallow a true one
+    for _ in range(20):  # garbage that looks like a frame can swallow a real one
         station.mav.heartbeat_send(6, 8, 0, 0, 4)
-    assert station.command(31000) == UNSUPPORTED  # and it still listens
+    assert station.command(31000) == UNSUPPORTED  # the autopilot still receives
 
 
-def test_velocities_are_flown_in_ned(flying: Station) -> None:
+def test_the_vehicle_follows_velocities_in_ned(flying: Station) -> None:
     for wanted in ((2, 0, 0), (0, 3, 0), (0, 0, -1.5), (-2, 1, 0.5)):
         assert flying.fly(*wanted, seconds=3.0) == pytest.approx(np.array(wanted), abs=0.1)
 
 
-def test_velocities_are_flown_in_the_body_frame(flying: Station) -> None:
-    """It looks east: ahead is east, right is south."""
+def test_the_vehicle_follows_velocities_in_the_body_frame(flying: Station) -> None:
+    """The vehicle faces east: ahead is east, right is south."""
     assert flying.fly(2, 0, 0, frame=BODY, seconds=3.0) == pytest.approx(np.array([0, 2, 0]), abs=0.1)
     assert flying.fly(0, 2, -1, frame=BODY, seconds=3.0) == pytest.approx(np.array([-2, 0, -1]), abs=0.1)
-    flying.fly(0, 0, 0, mask=VELOCITY_YAW, yaw=0.0, seconds=4.0)  # look north
+    flying.fly(0, 0, 0, mask=VELOCITY_YAW, yaw=0.0, seconds=4.0)  # turn to the north
     assert flying.autopilot._heading() == pytest.approx(0.0, abs=0.05)
     assert flying.fly(2, 0, 0, frame=BODY, seconds=3.0) == pytest.approx(np.array([2, 0, 0]), abs=0.15)
 
@@ -178,34 +178,34 @@ def test_a_yaw_rate_turns_clockwise(flying: Station) -> None:
         (LOCAL, VELOCITY, (math.nan, 0, 0)),
     ],
 )
-def test_wrong_frames_and_masks_are_not_flown(
+def test_setpoints_with_a_wrong_frame_or_mask_are_ignored(
     flying: Station, frame: int, mask: int, velocity: tuple[float, float, float]
 ) -> None:
     flying.fly(0, 1.5, 0)
-    flying.heard.clear()
+    flying.received.clear()
     reached = flying.fly(*velocity, frame=frame, mask=mask, seconds=6.0)
-    assert reached == pytest.approx(np.zeros(3), abs=0.1)  # nothing was heard for long
+    assert reached == pytest.approx(np.zeros(3), abs=0.1)  # no valid setpoint came within the timeout
     if flying.autopilot.rules.name == "px4":
         assert "SET_POSITION_TARGET_LOCAL_NED" in flying.texts()
-        assert flying.pilot.mode is Mode.POSITION
+        assert flying.flight.mode is Mode.POSITION
 
 
-def test_only_ardupilot_knows_the_body_offset_frame(flying: Station) -> None:
+def test_only_ardupilot_supports_the_body_offset_frame(flying: Station) -> None:
     reached = flying.fly(2, 0, 0, frame=BODY_OFFSET, seconds=3.0)
     expected = 2.0 if flying.autopilot.rules.name == "ardupilot" else 0.0
     assert reached[1] == pytest.approx(expected, abs=0.1)
 
 
-def test_setpoints_are_not_flown_in_another_mode() -> None:
+def test_setpoints_in_another_mode_have_no_effect() -> None:
     station = Station("px4", airborne=True)
     assert station.fly(2, 0, 0) == pytest.approx(np.zeros(3), abs=0.05)
 
 
 @pytest.mark.parametrize(("acceleration", "speed", "way"), [(None, 1.0, 4.5), (500.0, 2.9, 0.9)])
-def test_what_an_arducopter_flies_follows_setpoints_by_an_acceleration(
+def test_an_arducopter_follows_setpoints_with_its_acceleration(
     acceleration: float | None, speed: float, way: float
 ) -> None:
-    """As the real one does (`python -m benchmarks manners`): as delivered it takes seconds, and as long to stop."""
+    """With the default parameters it takes seconds to follow a setpoint, and as long to stop, as a real ArduCopter."""
     station = Station("ardupilot", parameters={} if acceleration is None else {"WPNAV_ACCEL": acceleration})
     station.into_the_air()
     for k in range(50):
@@ -222,7 +222,7 @@ def test_what_an_arducopter_flies_follows_setpoints_by_an_acceleration(
 
 
 @pytest.mark.parametrize("timeout", [None, 0.2])
-def test_a_stream_that_stops_ends_in_a_hold(flying: Station, timeout: float | None) -> None:
+def test_the_vehicle_holds_after_its_setpoints_stop(flying: Station, timeout: float | None) -> None:
     rules = flying.autopilot.rules
     name, usual = {"px4": ("COM_OF_LOSS_T", 1.0), "ardupilot": ("GUID_TIMEOUT", 3.0)}[rules.name]
     if timeout is not None:
@@ -237,37 +237,37 @@ def test_a_stream_that_stops_ends_in_a_hold(flying: Station, timeout: float | No
     where = flying.autopilot.vehicle.state()[:3]
     flying.wait(5.0)
     assert flying.autopilot.vehicle.state()[:3] == pytest.approx(where, abs=0.05)
-    assert flying.pilot.mode is (Mode.POSITION if rules.name == "px4" else Mode.OFFBOARD)
+    assert flying.flight.mode is (Mode.POSITION if rules.name == "px4" else Mode.OFFBOARD)
     assert "Setpoints lost" in flying.texts()
 
 
 @pytest.mark.parametrize(("action", "mode"), [(0, Mode.POSITION), (4, Mode.LAND), (5, Mode.HOLD)])
-def test_what_follows_lost_setpoints_is_a_parameter_of_px4s(action: float, mode: Mode) -> None:
+def test_a_parameter_of_px4_sets_the_mode_after_lost_setpoints(action: float, mode: Mode) -> None:
     station = Station("px4", parameters={"COM_OBL_RC_ACT": action})
     station.into_the_air()
     station.fly(0, 1, 0)
     station.wait(1.5)
-    assert station.pilot.mode is mode
+    assert station.flight.mode is mode
 
 
-def test_a_px4_that_has_landed_is_in_the_mode_of_before(flying: Station) -> None:
-    """As the real ones (`python -m benchmarks manners`): an ArduCopter stays in its landing mode."""
+def test_a_landed_px4_returns_to_the_mode_before(flying: Station) -> None:
+    """An ArduCopter stays in its landing mode, as the real one."""
     rules = flying.autopilot.rules.name
     flying.fly(0, 0, 0, seconds=0.2)
     assert flying.command(MODE, 1, *{"px4": (4, 6), "ardupilot": (COPTER_LAND,)}[rules]) == ACCEPTED
-    assert flying.pilot.mode is Mode.LAND
+    assert flying.flight.mode is Mode.LAND
     flying.wait(12.0)
-    assert not flying.pilot.armed
-    assert flying.pilot.mode is {"px4": Mode.OFFBOARD, "ardupilot": Mode.LAND}[rules]
+    assert not flying.flight.armed
+    assert flying.flight.mode is {"px4": Mode.OFFBOARD, "ardupilot": Mode.LAND}[rules]
 
 
-def test_setpoints_that_come_again_are_flown_unless_somebody_chose_another_mode(flying: Station) -> None:
-    """As a real PX4 does (`python -m benchmarks manners`): a stall of who sends them is not the end of the flight."""
+def test_setpoints_take_effect_again_after_a_loss_unless_another_mode_was_chosen(flying: Station) -> None:
+    """As with a real PX4, a pause of the sender does not end the flight."""
     flying.fly(0, 3, 0)
     flying.wait(4.0)
     flying.wait(0.1)
-    assert flying.pilot.setpoint.velocity == (0.0, 0.0, 0.0)
-    assert flying.fly(0, 3, 0)[1] == pytest.approx(3.0, abs=0.1) and flying.pilot.mode is Mode.OFFBOARD
+    assert flying.flight.setpoint.velocity == (0.0, 0.0, 0.0)
+    assert flying.fly(0, 3, 0)[1] == pytest.approx(3.0, abs=0.1) and flying.flight.mode is Mode.OFFBOARD
     flying.wait(4.0)
-    flying.pilot.change(Mode.HOLD)
-    assert flying.fly(0, 3, 0) == pytest.approx(np.zeros(3), abs=0.1) and flying.pilot.mode is Mode.HOLD
+    flying.flight.change(Mode.HOLD)
+    assert flying.fly(0, 3, 0) == pytest.approx(np.zeros(3), abs=0.1) and flying.flight.mode is Mode.HOLD

@@ -1,4 +1,4 @@
-"""What a real autopilot is told of our vehicle, and that time waits for its answer; the autopilot is a stand-in."""
+"""The simulated sensors are right, and the simulator waits for the autopilot, which is a stand-in here."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def field() -> Arena:
     return staged_arena(start=(0.0, 0.0, 10.0), goal=(9.0, 9.0, 9.0), half_width=500.0, height=500.0)
 
 
-def told(truth: Estimate, scale: float = 0.0, readings: int = 1) -> list[Any]:
+def sensor_messages(truth: Estimate, scale: float = 0.0, readings: int = 1) -> list[Any]:
     sensors = HilSensors(SensorNoise(scale=scale), np.random.default_rng(0), 0.005)
     return [m for i in range(readings) for m in sensors.read(truth, truth.position, 5000 * (i + 1))]
 
@@ -41,8 +41,8 @@ def at_rest(heading: float) -> Estimate:
 
 
 @pytest.mark.parametrize(("heading", "from_north"), [(0.0, 90.0), (0.5 * math.pi, 0.0), (math.pi, -90.0)])
-def test_sensors_without_errors_tell_the_truth_in_their_own_frames(heading: float, from_north: float) -> None:
-    imu, fix = told(at_rest(heading))
+def test_sensors_without_errors_measure_the_true_state_in_their_frames(heading: float, from_north: float) -> None:
+    imu, fix = sensor_messages(at_rest(heading))
     assert (imu.xacc, imu.yacc, imu.zacc) == pytest.approx((0.0, 0.0, -GRAVITY))
     assert (imu.xgyro, imu.ygyro, imu.zgyro) == pytest.approx((0.1, -0.2, -0.3))
     compass = math.degrees(math.atan2(-imu.ymag, imu.xmag) + DECLINATION)  # of a level body, from true north
@@ -58,22 +58,24 @@ def test_sensors_without_errors_tell_the_truth_in_their_own_frames(heading: floa
     assert fix.cog == round(100.0 * math.degrees(math.atan2(1.0, 2.0)))
 
 
-def test_errors_are_as_large_as_is_said_and_come_from_the_seed() -> None:
-    messages = told(at_rest(0.0), scale=1.0, readings=4000)
+def test_sensor_errors_have_their_size_and_follow_from_the_seed() -> None:
+    messages = sensor_messages(at_rest(0.0), scale=1.0, readings=4000)
     noise = SensorNoise()
     force = np.array([m.xacc for m in messages if m.get_type() == "HIL_SENSOR"])
     fixes = np.array([m.alt for m in messages if m.get_type() == "HIL_GPS"]) * 1e-3
     assert force.std() == pytest.approx(noise.accelerometer, rel=0.1)
     assert abs(force.mean()) < 4.0 * noise.accelerometer_bias and abs(force.mean()) > 1e-4
     assert len(fixes) == 200 and fixes.std() == pytest.approx(noise.gps_position, rel=0.3)
-    again = told(at_rest(0.0), scale=1.0, readings=4000)
+    again = sensor_messages(at_rest(0.0), scale=1.0, readings=4000)
     assert [m.to_dict() for m in again] == [m.to_dict() for m in messages]
 
 
 @contextmanager
 def stand_in(share: float = HOVER, lockstep: int = 1, answers: float = math.inf) -> Iterator[tuple[HilLink, list[int]]]:
-    """A simulator's end, and the times that an autopilot at its other end has heard; that one answers every IMU reading
-    with the same share of full thrust, so many times."""
+    """Yield the simulator's end of a connection, and the times of the readings that the autopilot received.
+
+    That autopilot answers each of the first `answers` readings with the same share of full thrust.
+    """
     ours, theirs = socket.socketpair()
     vehicle = Quadrotor(field(), np.random.default_rng(0), QuadrotorNoise(scale=0.0))
     hil = HilLink(ours, vehicle, HilSensors(SensorNoise(), np.random.default_rng(0), vehicle.timestep))
@@ -100,7 +102,7 @@ def stand_in(share: float = HOVER, lockstep: int = 1, answers: float = math.inf)
         theirs.close()
 
 
-def test_the_command_of_every_step_moves_the_vehicle_and_time_waits_for_it() -> None:
+def test_the_simulator_waits_for_every_command_and_applies_it() -> None:
     with stand_in() as (hil, heard):
         for _ in range(200):
             hil.tick()
@@ -116,13 +118,13 @@ def test_the_command_of_every_step_moves_the_vehicle_and_time_waits_for_it() -> 
 def test_an_autopilot_without_lockstep_or_without_answers_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
     with stand_in(lockstep=0) as (hil, _), pytest.raises(AutopilotGone, match="lockstep"):
         hil.tick()
-    monkeypatch.setattr("brakeline.sim.autopilot.hil_link.PATIENCE", 0.02)
+    monkeypatch.setattr("brakeline.sim.autopilot.hil_link.ANSWER_TIMEOUT", 0.02)
     with stand_in(answers=3) as (hil, _), pytest.raises(AutopilotGone, match="has not answered"):
         for _ in range(100):
             hil.tick()
     assert hil.unanswered == 5
 
 
-def test_a_folder_without_px4_is_said_to_hold_none(tmp_path: Any) -> None:
+def test_a_folder_without_px4_is_refused(tmp_path: Any) -> None:
     with pytest.raises(Px4Error, match="holds no PX4"):
         Px4Process(tmp_path, 14540)

@@ -1,4 +1,4 @@
-"""What the simulated autopilots tell: at the rates asked for, in their units and frames, and their parameters."""
+"""Telemetry of the embedded autopilot has its rates, units and frames; parameters can be read and set."""
 
 from __future__ import annotations
 
@@ -26,25 +26,25 @@ from tests.sim.station import (
 )
 
 
-def test_messages_come_at_the_rates_asked_for(station: Station) -> None:
+def test_messages_have_the_requested_rates(station: Station) -> None:
     kind = mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED
     assert station.command(511, kind, 40_000) == ACCEPTED
     assert station.command(511, 77_777, 40_000) == FAILED
-    station.heard.clear()
+    station.received.clear()
     station.wait(2.0)
-    stamps = [m.time_boot_ms for m in station.heard if m.get_type() == "LOCAL_POSITION_NED"]
+    stamps = [m.time_boot_ms for m in station.received if m.get_type() == "LOCAL_POSITION_NED"]
     assert stamps == list(range(40, 2001, 40))
     assert station.command(510, kind) == ACCEPTED
     assert station.last("MESSAGE_INTERVAL").interval_us == 40_000
     assert station.command(511, kind, -1) == ACCEPTED
-    station.heard.clear()
+    station.received.clear()
     station.wait(1.0)
-    assert not [m for m in station.heard if m.get_type() == "LOCAL_POSITION_NED"]
+    assert not [m for m in station.received if m.get_type() == "LOCAL_POSITION_NED"]
     assert station.command(512, kind) == ACCEPTED
     assert station.last("LOCAL_POSITION_NED")
 
 
-def test_every_message_can_be_asked_for() -> None:
+def test_every_message_can_be_requested() -> None:
     lidar = Lidar(field(), QUADROTOR.task.rays)
     station = Station("px4", airborne=True, lidar=lidar)
     for name in (
@@ -56,18 +56,18 @@ def test_every_message_can_be_asked_for() -> None:
         assert station.last(name)
 
 
-def test_what_arducopter_does_not_know_is_refused() -> None:
-    """So 4.0 answers; `benchmarks manners` asks a real one."""
+def test_arducopter_refuses_unsupported_messages() -> None:
+    """ArduCopter 4.0 refuses these messages."""
     station = Station("ardupilot", airborne=True)
     for name in ("ATTITUDE_QUATERNION", "HIGHRES_IMU", "ODOMETRY"):
         kind = getattr(mavlink, f"MAVLINK_MSG_ID_{name}")
         assert station.command(511, kind, 40_000) == FAILED
         assert station.command(512, kind) == UNSUPPORTED
         assert station.command(510, kind) != ACCEPTED
-    station.heard.clear()
+    station.received.clear()
     station.mav.request_data_stream_send(1, 1, mavlink.MAV_DATA_STREAM_ALL, 10, 1)
     station.wait(1.0)
-    names = {message.get_type() for message in station.heard}
+    names = {message.get_type() for message in station.received}
     assert {"SCALED_IMU", "ATTITUDE"} < names and not names & {"ATTITUDE_QUATERNION", "HIGHRES_IMU", "ODOMETRY"}
 
 
@@ -89,7 +89,7 @@ def test_telemetry_is_in_ned(flying: Station) -> None:
             assert flying.last(name).vx == pytest.approx(100, abs=10)
 
 
-def test_frames_turn_back_and_forth() -> None:
+def test_frame_conversions_are_inverse_to_each_other() -> None:
     rng = np.random.default_rng(0)
     for _ in range(20):
         w, x, y, z = (q := rng.standard_normal(4)) / np.linalg.norm(q)
@@ -102,7 +102,9 @@ def test_frames_turn_back_and_forth() -> None:
 
 
 def test_obstacle_distance_is_the_least_of_each_sector() -> None:
-    pillar = Obstacle(CYLINDER, (0.0, -4.0, 10.0), (0.5, 20.0))  # to the south: to the right of who looks east
+    pillar = Obstacle(
+        CYLINDER, (0.0, -4.0, 10.0), (0.5, 20.0)
+    )  # to the south: on the right of a vehicle that faces east
     arena = field(pillar)
     station = Station("px4", airborne=True, arena=arena, lidar=Lidar(arena, QUADROTOR.task.rays))
     station.command(512, mavlink.MAVLINK_MSG_ID_OBSTACLE_DISTANCE)
@@ -117,20 +119,20 @@ def test_obstacle_distance_is_the_least_of_each_sector() -> None:
 
 def test_parameters_are_listed_read_and_set(station: Station) -> None:
     station.listen()
-    station.heard.clear()
+    station.received.clear()
     station.mav.param_request_list_send(1, 1)
-    table = station.autopilot.rules.parameters.table
-    assert [m.param_id for m in station.heard] == [parameter.name for parameter in table]
+    table = station.autopilot.parameters.table
+    assert [m.param_id for m in station.received] == [parameter.name for parameter in table]
     station.mav.param_request_read_send(1, 1, b"", 1)
     assert station.last("PARAM_VALUE").param_id == table[1].name
     name = table[2].name if not table[2].integer else table[3].name
     station.mav.param_set_send(1, 1, name.encode(), 2.0, mavlink.MAV_PARAM_TYPE_REAL32)
     assert station.last("PARAM_VALUE").param_value == 2.0
     station.mav.param_set_send(1, 1, name.encode(), -5.0, mavlink.MAV_PARAM_TYPE_REAL32)
-    assert station.last("PARAM_VALUE").param_value == 2.0  # out of range: as it was
-    station.heard.clear()
+    assert station.last("PARAM_VALUE").param_value == 2.0  # out of range: unchanged
+    station.received.clear()
     station.mav.param_set_send(1, 1, b"NONSENSE", 1.0, mavlink.MAV_PARAM_TYPE_REAL32)
-    assert [m.get_type() for m in station.heard] == ["STATUSTEXT"]
+    assert [m.get_type() for m in station.received] == ["STATUSTEXT"]
 
 
 def test_integers_travel_as_bits_in_px4_and_as_values_in_ardupilot() -> None:
@@ -139,15 +141,15 @@ def test_integers_travel_as_bits_in_px4_and_as_values_in_ardupilot() -> None:
     assert struct.unpack("<i", struct.pack("<f", px4.last("PARAM_VALUE").param_value))[0] == 4001
     (bits,) = struct.unpack("<f", struct.pack("<i", 4))
     px4.mav.param_set_send(1, 1, b"COM_OBL_RC_ACT", bits, mavlink.MAV_PARAM_TYPE_INT32)
-    assert px4.pilot.limits.on_loss is Mode.LAND
+    assert px4.flight.limits.on_loss is Mode.LAND
     ardupilot.mav.param_request_read_send(1, 1, b"FRAME_CLASS", -1)
     assert ardupilot.last("PARAM_VALUE").param_value == 1.0
 
 
-def test_lockstep_time_is_the_ticks_time() -> None:
+def test_time_advances_by_ticks() -> None:
     station = Station("px4", airborne=True)
     station.wait(1.0)
-    assert station.pilot.time == pytest.approx(1.0)
+    assert station.flight.time == pytest.approx(1.0)
     assert round(1.0 / TICK) == 50
 
 
