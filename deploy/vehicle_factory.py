@@ -14,7 +14,7 @@ import numpy as np
 from brakeline.messaging.task import RobotWithTask
 from brakeline.sim.arena import Arena, room_boundary, room_bounds
 from brakeline.sim.arena_generator import arena_kind
-from brakeline.sim.delayed_vehicle import delayed
+from brakeline.sim.delayed_vehicle import simulated_vehicle
 from brakeline.sim.navigation_env import NavigationEnv
 from brakeline.sim.sim_conditions import Conditions
 from brakeline.sim.vehicle import MakeVehicle, Vehicle
@@ -36,11 +36,7 @@ def factory(robot: RobotWithTask, conditions: Conditions, tap: FrameTap | None =
     Raises:
         UnknownTask: the robot has no simulator.
     """
-    if robot.late:
-        return delayed(factory(robot.in_lockstep(), conditions, tap), robot)
-    task = robot.task
-    make: MakeVehicle = task.code(task.simulator)(conditions, tap)
-    return make
+    return simulated_vehicle(robot, conditions, tap)
 
 
 def environment(
@@ -60,8 +56,7 @@ def environment(
     conditions = conditions or Conditions()
     make = factory(robot, conditions, tap)
     arena_kind(robot, arena)
-    noise = conditions.lidar_noise(robot.position_dim == 3)
-    return NavigationEnv(robot, arena, make, noise, seed_key=seed, perception=conditions.perception)
+    return NavigationEnv(robot, arena, make, conditions=c, seed_key=seed)
 
 
 def fleet_world(

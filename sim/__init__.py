@@ -1,1 +1,1 @@
-"""Physics: arenas, sensors and robots. Knows nothing of the bus."""
+"""Simulation: arenas, sensors, robots and the Gymnasium environment. It does not use the bus."""

@@ -11,14 +11,14 @@ from brakeline.messaging.obstacle import BOX, WALL, Obstacle, Shapes
 from brakeline.sim.grid_planner import ClearanceMap
 from brakeline.sim.traffic import Crowd, OtherRobots
 
-SLAB = 2.0  # m, thickness of floors and ceilings
+SLAB_THICKNESS = 2.0  # m, of floors and ceilings
 
 
 @dataclass(frozen=True)
 class Arena:
     """One room, for one episode. Lengths in m, angles in rad, world frame; d = 2 (plane) or 3 (space).
 
-    What closes the room comes last among the obstacles: four walls, in space also floor and ceiling.
+    The boundary of the room comes last among the obstacles: four walls, in space also floor and ceiling.
     """
 
     name: str
@@ -27,8 +27,8 @@ class Arena:
     goal: tuple[float, ...]  # (d,)
     goal_radius: float
     step_limit: int  # periods until the episode is cut off
-    bounds: tuple[tuple[float, float], ...]  # lowest and highest coordinate inside the room, for each of the d axes
-    crowd: Crowd | OtherRobots | None = field(default=None, compare=False)  # what moves in it
+    bounds: tuple[tuple[float, float], ...]  # (low, high) of the room, for each of the d axes
+    crowd: Crowd | OtherRobots | None = field(default=None, compare=False)  # the moving obstacles
 
     @property
     def dim(self) -> int:
@@ -44,22 +44,25 @@ class Arena:
 
 
 def same_room(arena: Arena, **changes: Any) -> Arena:
-    """The same room with another start, goal or crowd; what was made of its obstacles is kept: it costs a period."""
-    other = replace(arena, **changes)
-    vars(other).update(shapes=arena.shapes, clearance_map=arena.clearance_map)
-    return other
+    """Return the same room with another start, goal or crowd.
+
+    The copy shares `shapes` and `clearance_map`, which take about a period to compute.
+    """
+    copy = replace(arena, **changes)
+    vars(copy).update(shapes=arena.shapes, clearance_map=arena.clearance_map)
+    return copy
 
 
 def room_bounds(half_width: float, height: float | None) -> tuple[tuple[float, float], ...]:
-    """Bounds of a square room about the origin, in space from 0 up to `height`."""
+    """Return the bounds of a square room around the origin, in space from 0 up to `height`."""
     plan = ((-half_width, half_width),) * 2
     return plan if height is None else (*plan, (0.0, height))
 
 
 def room_boundary(half_width: float, height: float | None) -> tuple[Obstacle, ...]:
-    """What closes that room: four walls whose yaw points into it; in space also a floor and a ceiling.
+    """Return the walls of that room, whose yaw points into it; in space also floor and ceiling.
 
-    Floor and ceiling are boxes whose upper and lower face is the surface: a wall's half-space has a yaw only.
+    Floor and ceiling are boxes, because a wall's half-space can only turn about the vertical.
     """
     middle = () if height is None else (0.5 * height,)
     walls = tuple(
@@ -68,8 +71,11 @@ def room_boundary(half_width: float, height: float | None) -> tuple[Obstacle, ..
     )
     if height is None:
         return walls
-    size = (2.0 * (half_width + SLAB), 2.0 * (half_width + SLAB), SLAB)
-    return (*walls, *(Obstacle(BOX, (0.0, 0.0, z), size) for z in (-0.5 * SLAB, height + 0.5 * SLAB)))
+    size = (2.0 * (half_width + SLAB_THICKNESS), 2.0 * (half_width + SLAB_THICKNESS), SLAB_THICKNESS)
+    return (
+        *walls,
+        *(Obstacle(BOX, (0.0, 0.0, z), size) for z in (-0.5 * SLAB_THICKNESS, height + 0.5 * SLAB_THICKNESS)),
+    )
 
 
 def staged_arena(
@@ -79,9 +85,9 @@ def staged_arena(
     half_width: float = 5.0,
     height: float | None = None,
 ) -> Arena:
-    """A closed room about the origin with these obstacles and nothing left to chance, for tests and trials.
+    """Return a closed room around the origin with given obstacles, for tests.
 
-    In the plane, unless there is a height: then `start`, `goal` and the obstacles have three coordinates.
+    The room is in the plane. With a `height` it is in space: start, goal and obstacles then have three coordinates.
     """
     obstacles = (*obstacles, *room_boundary(half_width, height))
     radius = 0.25 if height is None else 1.0

@@ -1,7 +1,7 @@
-"""How an arena of a task is drawn: at random, so that a way through exists.
+"""Draw random arenas of a task in which the robot can get from start to goal.
 
-An arena in space is drawn as a plan whose obstacles then get heights: pillars from floor to ceiling, boxes that stand
-on the floor or hang from the ceiling, spheres that float.
+An arena in space starts as a plan in the plane. Its obstacles then get heights: pillars from floor to ceiling, boxes
+that stand on the floor or hang from the ceiling, spheres that float.
 """
 
 from __future__ import annotations
@@ -24,38 +24,39 @@ Array = NDArray[np.float64]
 
 
 class UnknownArena(ValueError):
-    """The robot has no arena of that name."""
+    """The robot has no arena of this name; the message lists the names."""
 
 
 class NoArena(RuntimeError):
-    """No draw of an arena kind had a way from start to goal: its numbers ask for too much."""
+    """No drawn arena had a path from start to goal: the numbers of its kind leave too little room."""
 
 
-ATTEMPTS = 1000  # whole arenas drawn before giving up
-CANDIDATES = 12  # drawn at once for each obstacle, of which the first that fits stays
-ENDS = 64  # points drawn at once, of which the first two that are free and far apart are start and goal
+ATTEMPTS = 1000  # arenas drawn before giving up
+CANDIDATES = 12  # drawn for each obstacle; the first that fits stays
+POINTS = 64  # drawn at once for start, goal and moving obstacles
+MOVER_GAP = 0.1  # m, least distance of a moving obstacle to static ones at the start
 
 
 def bounds_of(kind: ArenaKind) -> tuple[tuple[float, float], ...]:
-    """Lowest and highest coordinate inside the room, for each axis."""
+    """Return (low, high) of the room for each axis."""
     return room_bounds(kind.half_width, kind.height)
 
 
 def arena_kind(robot: RobotWithTask, name: str) -> ArenaKind:
-    """Raises UnknownArena with the names there are for this robot."""
+    """Return the kind of a robot's arena. Raises UnknownArena: the robot has no arena of this name."""
     kinds = robot.task.arenas
     if name not in kinds:
-        there = ", ".join(sorted(kinds)) or "none"
-        raise UnknownArena(f"no arena is called {name!r}; there are: {there} ({robot.kind})")
+        names = ", ".join(sorted(kinds)) or "none"
+        raise UnknownArena(f"no arena is called {name!r}; there are: {names} ({robot.kind})")
     return kinds[name]
 
 
 def draw_arena(name: str, rng: np.random.Generator, robot: RobotWithTask) -> Arena:
-    """An arena of that name in which `robot` can get from start to goal.
+    """Draw an arena in which a robot can get from start to goal.
 
     Raises:
-        UnknownArena: with the names there are.
-        NoArena: when a kind's numbers leave no solvable arena.
+        UnknownArena: the robot has no arena of this name.
+        NoArena: no draw has a path from start to goal.
     """
     kind = arena_kind(robot, name)
     if kind.ring is not None:
@@ -73,41 +74,41 @@ def draw_arena(name: str, rng: np.random.Generator, robot: RobotWithTask) -> Are
         arena = Arena(name, obstacles, start, goal, kind.goal_radius, kind.step_limit, bounds_of(kind))
         if arena.clearance_map.connected(start[: arena.dim], goal, robot.footprint + kind.path_clearance):
             return arena if kind.movers is None else _with_movers(arena, kind.movers, rng)
-    raise NoArena(f"no arena {name!r} with a way from start to goal in {ATTEMPTS} draws")
+    raise NoArena(f"none of {ATTEMPTS} drawn arenas {name!r} has a path from start to goal; leave it more room")
 
 
 def draw_fleet(name: str, rng: np.random.Generator, robot: RobotWithTask, size: int) -> tuple[Arena, ...]:
-    """The same arena for several robots, each with a start and a goal of its own.
+    """Draw one arena for several robots, each with its own start and goal.
 
     Raises:
-        UnknownArena: with the names there are.
-        NoArena: when a kind's numbers leave no room for so many.
+        UnknownArena: the robot has no arena of this name.
+        NoArena: no draw has room for so many robots.
     """
     kind = arena_kind(robot, name)
     for _ in range(ATTEMPTS):
         obstacles = _place(kind, rng, robot)
         if obstacles is None:
             continue
-        ends = _ends(kind, Shapes.of(obstacles, robot.position_dim), rng, robot, size)
-        if ends is None:
+        points = _fleet_ends(kind, Shapes.of(obstacles, robot.position_dim), rng, robot, size)
+        if points is None:
             continue
-        starts, goals = (tuple(map(tuple, points.tolist())) for points in ends)
+        starts, goals = (tuple(map(tuple, side.tolist())) for side in points)
         first = Arena(name, obstacles, starts[0], goals[0], kind.goal_radius, kind.step_limit, bounds_of(kind))
-        wide = robot.footprint + kind.path_clearance
-        if not all(first.clearance_map.connected(*way, wide) for way in zip(starts, goals, strict=True)):
+        clearance = robot.footprint + kind.path_clearance
+        if not all(first.clearance_map.connected(*ends, clearance) for ends in zip(starts, goals, strict=True)):
             continue
         headings = rng.uniform(-math.pi, math.pi, size)
         return tuple(
             same_room(first, start=(*start, float(heading)), goal=goal)
             for start, goal, heading in zip(starts, goals, headings, strict=True)
         )
-    raise NoArena(f"no arena {name!r} with ways for {size} robots in {ATTEMPTS} draws: ask for fewer")
+    raise NoArena(f"none of {ATTEMPTS} drawn arenas {name!r} has paths for {size} robots; use fewer robots")
 
 
-def _ends(
+def _fleet_ends(
     kind: ArenaKind, shapes: Shapes, rng: np.random.Generator, robot: Robot, size: int
 ) -> tuple[Array, Array] | None:
-    """Starts and goals (size, d) of a fleet: opposite each other on the kind's ring, else anywhere; None: no room."""
+    """Draw starts and goals (size, d): opposite each other on the kind's ring, or anywhere; None: no room."""
     low, high = np.array(bounds_of(kind)).T
     clear = robot.footprint + kind.start_clearance
     apart = 2.0 * clear
@@ -129,28 +130,28 @@ def _ends(
 
 
 def _with_movers(arena: Arena, kind: MoverKind, rng: np.random.Generator) -> Arena:
-    """The arena with movers at free places off the start; they may be fewer than the least where there is no room."""
+    """Add moving obstacles at free positions off the start; fewer than the least if there is no room."""
     low, high = np.array(arena.bounds).T
-    points = rng.uniform(low, high, (ENDS, arena.dim))
-    free = arena.shapes.distance(points).min(axis=0) >= kind.radius + 0.1
+    points = rng.uniform(low, high, (POINTS, arena.dim))
+    free = arena.shapes.distance(points).min(axis=0) >= kind.radius + MOVER_GAP
     free &= np.linalg.norm(points - arena.start[: arena.dim], axis=1) >= kind.radius + kind.keep
-    places = points[free][: int(rng.integers(*kind.count, endpoint=True))]
-    return replace(arena, crowd=Crowd(kind, places, arena.shapes, int(rng.integers(2**31))))
+    positions = points[free][: int(rng.integers(*kind.count, endpoint=True))]
+    return replace(arena, crowd=Crowd(kind, positions, arena.shapes, int(rng.integers(2**31))))
 
 
 def goal_sequence(arena: Arena, goals: int, rng: np.random.Generator, robot: RobotWithTask) -> tuple[Arena, ...]:
-    """The same arena with one goal after another, for a robot that is not put back: each start is the goal before.
+    """Return the same arena with one goal after another: each start is the goal before.
 
     Raises:
-        UnknownArena: the robot has no arena of that name.
-        NoArena: no goals were found that a way leads to.
+        UnknownArena: the robot has no arena of this name.
+        NoArena: no path leads to further goals.
     """
     kind, stages, start = arena_kind(robot, arena.name), list[Arena](), arena.start[: arena.dim]
     low, high = np.array(bounds_of(kind)).T
     for _ in range(ATTEMPTS):
         if len(stages) == goals:
             return tuple(stages)
-        points = rng.uniform(low, high, (ENDS, arena.dim))
+        points = rng.uniform(low, high, (POINTS, arena.dim))
         free = arena.shapes.distance(points).min(axis=0) >= robot.footprint + kind.start_clearance
         far = np.linalg.norm(points - start, axis=1) >= kind.goal_distance
         for goal in (tuple(point) for point in points[free & far].tolist()):
@@ -158,11 +159,11 @@ def goal_sequence(arena: Arena, goals: int, rng: np.random.Generator, robot: Rob
                 stages.append(same_room(arena, start=start, goal=goal))
                 start = goal
                 break
-    raise NoArena(f"no {goals} goals that a way leads to in {arena.name!r}")
+    raise NoArena(f"no sequence of {goals} goals with paths between them in the arena {arena.name!r}")
 
 
 def _place(kind: ArenaKind, rng: np.random.Generator, robot: Robot) -> tuple[Obstacle, ...] | None:
-    """Obstacles at least a gap apart in plan, what closes the room last; None: fewer than the least found room."""
+    """Draw obstacles with gaps between their plans, the room's boundary last; None: too few of them found room."""
     walls = room_boundary(kind.half_width, None)
     placed: list[Obstacle] = []
     least = 2.0 * robot.footprint + kind.gap
@@ -180,7 +181,7 @@ def _place(kind: ArenaKind, rng: np.random.Generator, robot: Robot) -> tuple[Obs
 
 
 def _draw_obstacle(shape: str, kind: ArenaKind, least: float, rng: np.random.Generator) -> Obstacle:
-    """The plan of one that is at least `least` m from the walls, but for the corners of boxes."""
+    """Draw the plan of an obstacle at least `least` m from the walls, apart from the corners of boxes."""
     if shape == BOX:
         length, width = rng.uniform(*kind.edge, 2)
         size: tuple[float, ...] = (float(length), float(length if kind.square else width))
@@ -194,20 +195,20 @@ def _draw_obstacle(shape: str, kind: ArenaKind, least: float, rng: np.random.Gen
 
 
 def _lift(plan: Obstacle, kind: ArenaKind, height: float, rng: np.random.Generator) -> Obstacle:
-    """The obstacle in space whose plan this is."""
+    """Return the obstacle in space that has this plan."""
     if plan.kind == SPHERE:
         z = float(rng.uniform(plan.size[0], height - plan.size[0]))
         return Obstacle(SPHERE, (*plan.position, z), plan.size)
     if plan.kind == CYLINDER:
         return Obstacle(CYLINDER, (*plan.position, 0.5 * height), (*plan.size, height))
-    tall = float(rng.uniform(*kind.tall))
-    z = height - 0.5 * tall if rng.random() < 0.5 else 0.5 * tall
-    return Obstacle(BOX, (*plan.position, z), (*plan.size, tall), plan.yaw)
+    box_height = float(rng.uniform(*kind.tall))
+    z = height - 0.5 * box_height if rng.random() < 0.5 else 0.5 * box_height
+    return Obstacle(BOX, (*plan.position, z), (*plan.size, box_height), plan.yaw)
 
 
 @lru_cache(maxsize=1024)
 def _outline(obstacle: Obstacle) -> tuple[Array, float]:
-    """Points (5, 2) and a radius: the points' convex hull, grown by the radius, is the obstacle's plan."""
+    """Return points (5, 2) and a radius: the plan is the convex hull of the points, grown by the radius."""
     if obstacle.kind != BOX:
         return np.tile(obstacle.position, (5, 1)), obstacle.size[0]
     cos, sin = math.cos(obstacle.yaw), math.sin(obstacle.yaw)
@@ -216,9 +217,9 @@ def _outline(obstacle: Obstacle) -> tuple[Array, float]:
 
 
 def gaps(candidates: Sequence[Obstacle], others: Sequence[Obstacle]) -> Array:
-    """From each candidate (in the plane, no wall) the way to the nearest other, in m; 0 or less on overlap. Shape (k,).
+    """Return the distance (k,) [m] from each candidate (in the plane, no wall) to the nearest other; overlap: <= 0.
 
-    Two disjoint convex polygons are closest at a corner of one of them: the corners of each are measured to the other.
+    Two disjoint convex polygons are closest at a corner of one of them, so it measures the corners of each.
     """
     mine = [_outline(candidate) for candidate in candidates]
     points, radii = np.stack([outline[0] for outline in mine]), np.array([outline[1] for outline in mine])
@@ -234,9 +235,9 @@ def gaps(candidates: Sequence[Obstacle], others: Sequence[Obstacle]) -> Array:
 def _start_and_goal(
     kind: ArenaKind, obstacles: tuple[Obstacle, ...], rng: np.random.Generator, robot: Robot
 ) -> tuple[tuple[float, ...], tuple[float, ...]] | None:
-    """Two free points far enough apart, or None."""
+    """Draw two free points that are far enough apart, or None."""
     low, high = np.array(bounds_of(kind)).T
-    points = rng.uniform(low, high, (ENDS, len(low)))
+    points = rng.uniform(low, high, (POINTS, len(low)))
     free = Shapes.of(obstacles, dim=len(low)).distance(points).min(axis=0) >= robot.footprint + kind.start_clearance
     points = points[free]
     if not len(points):

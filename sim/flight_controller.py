@@ -1,6 +1,6 @@
 """The quadrotor's flight controller: velocity setpoint -> acceleration -> attitude and thrust -> body rates -> rotors.
 
-Scalar code: at these sizes NumPy costs ten times as much. ENU, SI units; body axes x forward, y left, z up.
+The code is scalar: at these sizes NumPy takes ten times as long. ENU, SI units; body axes x forward, y left, z up.
 """
 
 from __future__ import annotations
@@ -12,52 +12,52 @@ from dataclasses import dataclass
 Vector = tuple[float, float, float]
 
 GRAVITY = 9.81  # m/s²
-STOPPED = 0.05  # m/s; a reference slower than this, with nothing more asked, is at rest
+STOPPED = 0.05  # m/s; below this speed, and at the setpoint zero, the reference is at rest
 STILL: Vector = (0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True)
 class Airframe:
-    """What the controller knows of the airframe (sim/quadrotor.xml)."""
+    """The airframe as the controller knows it (sim/quadrotor.xml)."""
 
     mass: float = 1.2  # kg
     inertia: Vector = (0.009, 0.009, 0.016)  # kg m²
     arm: float = 0.12  # m, of each rotor along x and along y
-    rotor_torque: float = 0.016  # m, torque about z for a newton of thrust
+    rotor_torque: float = 0.016  # m, torque about z per thrust
     least_thrust: float = 0.1  # N, a rotor
     most_thrust: float = 8.8  # N, a rotor
-    drag_linear: float = 0.15  # 1/s, of the speed through the air, by mass
-    drag_quadratic: float = 0.02  # 1/m
+    drag_linear: float = 0.15  # 1/s, drag per mass and airspeed
+    drag_quadratic: float = 0.02  # 1/m, drag per mass and squared airspeed
 
 
 @dataclass(frozen=True)
 class Gains:
-    """How it flies. Times in s, limits in SI units."""
+    """The gains of all loops. Times in s, limits in SI units."""
 
-    ramp: float = 0.2  # the setpoint is averaged over this time: the period of those who send one
-    round: float = 0.4  # and once more over this
-    ease: float = 0.06  # and a third time
-    attitude_lag: float = 0.03  # how late a wanted horizontal acceleration comes
-    thrust_lag: float = 0.02  # and a vertical one
+    ramp: float = 0.2  # averaging time of the setpoint: the period of its sender
+    round: float = 0.4  # of the second average
+    ease: float = 0.06  # of the third
+    attitude_lag: float = 0.03  # delay of a horizontal acceleration
+    thrust_lag: float = 0.02  # delay of a vertical acceleration
     velocity: float = 4.0  # 1/s
     integral: float = 2.0  # 1/s²
     integral_limit: float = 4.0  # m/s²
-    position: float = 1.5  # 1/s, in hold
+    position: float = 1.5  # 1/s, while holding
     attitude: float = 16.0  # 1/s
     rate: float = 30.0  # 1/s
     yaw: float = 3.0  # 1/s
     yaw_rate_limit: float = 1.5  # rad/s
     tilt_limit: float = 1.0  # rad
     rate_limit: float = 8.0  # rad/s
-    known_drag: float = 0.9  # share of the drag that is known beforehand
-    # A setpoint may jump by `jump`; what is more is made up for at `acceleration`. A robot's own slew, 0.8 m/s every
-    # 0.2 s, passes unchanged, with some room for jitter
+    known_drag: float = 0.9  # share of the drag in the feedforward
+    # A setpoint may jump by `jump`; a larger change continues at `acceleration`. The robot's own slew, 0.8 m/s every
+    # 0.2 s, passes unchanged, with some room for jitter.
     acceleration: float = 4.2  # m/s²
     jump: float = 0.82  # m/s
 
 
 class MovingAverage:
-    """The mean of the last samples: `value`; what it gains from a sample to the next follows from `push`'s answer."""
+    """The moving average `value` of the last samples."""
 
     __slots__ = ("_samples", "_share", "_sum", "value")
 
@@ -67,13 +67,13 @@ class MovingAverage:
         self.fill(0.0)
 
     def fill(self, value: float) -> None:
-        """As if that had been the value for long."""
+        """Set all samples to one value."""
         samples = len(self._samples)
         self._samples = deque([value] * samples)
         self._sum, self.value = value * samples, value
 
     def push(self, value: float) -> float:
-        """Take in a sample; returns how much the new mean differs from the old one."""
+        """Add a sample; return the change of the average."""
         change = value - self._samples.popleft()
         self._samples.append(value)
         self._sum += change
@@ -84,9 +84,16 @@ class MovingAverage:
 class VelocityAxis:
     """One axis of the outer loop: reference, velocity control, hold.
 
-    The reference is the setpoint averaged over `ramp`, that over `round`, and that over `ease`. Stairs of a step every
-    `ramp` seconds become a straight line, so acceleration has no ripple; `round` bounds jerk and `ease` snap; and the
-    past is forgotten after the sum of the three, which makes the closed loop nearly linear and of short memory.
+    The reference is the setpoint after three moving averages in a row, over `ramp`, `round` and `ease` seconds. A
+    staircase with a step every `ramp` seconds becomes a straight line, so the acceleration has no ripple. `round`
+    bounds the jerk and `ease` the snap. The reference forgets the past after the sum of the three times, so the closed
+    loop is nearly linear and has a short memory.
+
+    Attributes:
+        target: m/s, the setpoint after the limit of its jumps.
+        velocity: m/s, the reference, delayed by the lag of the acceleration.
+        integral: m/s², the integral term.
+        hold: m, the position to hold; None while following a velocity.
     """
 
     __slots__ = (
@@ -95,7 +102,7 @@ class VelocityAxis:
     )  # fmt: skip
 
     def __init__(self, gains: Gains, period: float, lag: float) -> None:
-        """period: s between two updates; lag: s until a commanded acceleration is there."""
+        """period: s between two updates; lag: s until the vehicle has a commanded acceleration."""
         self._gains, self._period = gains, period
         self._ramped, self._rounded = (
             MovingAverage(round(gains.ramp / period)),
@@ -107,17 +114,17 @@ class VelocityAxis:
         self.reset(0.0)
 
     def reset(self, velocity: float) -> None:
-        """Follow this velocity [m/s] as if it had been the setpoint for long; the integral stays."""
+        """Start in steady state at a velocity [m/s]; keep the integral."""
         self.target = self.velocity = self._velocity = velocity
         self._ramped.fill(velocity)
         for mean in (self._rounded, self._eased, self._jerk):
             mean.fill(0.0)
         self._late = deque([velocity] * len(self._late))
         self._allowance = self._gains.jump
-        self.hold: float | None = None  # m, the position to be held
+        self.hold: float | None = None
 
     def follow(self, setpoint: float) -> tuple[float, float]:
-        """Move the reference for one period; returns its jerk, m/s³, and snap, m/s⁴."""
+        """Move the reference on by one period; return its jerk [m/s³] and snap [m/s⁴]."""
         g, period = self._gains, self._period
         allowance = min(self._allowance + g.acceleration * period, g.jump)
         change = min(max(setpoint - self.target, -allowance), allowance)
@@ -133,7 +140,7 @@ class VelocityAxis:
         return self._jerk.value, snap
 
     def acceleration(self, position: float, velocity: float) -> float:
-        """What to command, m/s², without gravity and drag, seeing an estimated position and velocity."""
+        """Return the commanded acceleration [m/s²] without gravity and drag, from estimated position and velocity."""
         g = self._gains
         wanted = self.velocity
         if self.hold is not None:
@@ -145,15 +152,19 @@ class VelocityAxis:
 
 
 class FlightController:
-    """Flies velocity setpoints; a setpoint of zero ends in holding the position.
+    """Follows velocity setpoints; at the setpoint zero, the vehicle stops and holds its position.
 
-    setpoint: (x, y, z) m/s; yaw: rad from east, the heading to keep; yaw_rate: rad/s at which it turns on.
+    Attributes:
+        setpoint: (x, y, z) m/s.
+        yaw: rad from east, the reference of the heading.
+        yaw_goal: rad from east, the heading that the reference turns to.
+        yaw_rate: rad/s; if not zero, the reference turns at this rate.
     """
 
     def __init__(
         self, period: float, outer_every: int, gains: Gains | None = None, body: Airframe | None = None
     ) -> None:
-        """period: s between two updates; outer_every: updates of attitude and rates for one of the velocity loop."""
+        """period: s between two updates; outer_every: updates of the attitude loop for one of the velocity loop."""
         self.gains, self.body = gains or Gains(), body or Airframe()
         self._period, self._outer_every = period, outer_every
         outer = period * outer_every
@@ -162,10 +173,10 @@ class FlightController:
         self.reset()
 
     def reset(self, yaw: float = 0.0) -> None:
-        """Stand still, as if switched on now."""
+        """Start at rest with a heading [rad]."""
         self.setpoint: Vector = STILL
         self.yaw, self.yaw_goal, self.yaw_rate = yaw, yaw, 0.0
-        self._turn = 0.0  # rad/s of the yaw's reference
+        self._turn = 0.0  # rad/s, of the yaw reference
         for axis in (self.x, self.y, self.z):
             axis.reset(0.0)
             axis.integral = 0.0
@@ -175,16 +186,19 @@ class FlightController:
 
     @property
     def holding(self) -> bool:
-        """It holds a position."""
+        """Whether the controller holds a position."""
         return self.x.hold is not None
 
     def update(
         self, position: Vector, velocity: Vector, attitude: tuple[float, float, float, float], rates: Vector
     ) -> tuple[float, float, float, float]:
-        """Thrusts [N] of the four rotors from the estimated state.
+        """Return the thrusts [N] of the four rotors for an estimated state.
 
-        position [m], velocity [m/s]: in the world; attitude: quaternion (w, x, y, z), world from body; rates: of the
-        body about its own axes, rad/s.
+        Args:
+            position: m, in the world.
+            velocity: m/s, in the world.
+            attitude: quaternion (w, x, y, z), world from body.
+            rates: rad/s, of the body about its own axes.
         """
         if self._count == 0:
             self._count = self._outer_every
@@ -193,7 +207,7 @@ class FlightController:
         return self._attitude_loop(attitude, rates)
 
     def _velocity_loop(self, position: Vector, velocity: Vector) -> None:
-        """Bring the wanted specific force, and its rate of change, up to date."""
+        """Update the wanted specific force and its first two derivatives."""
         g, x, y, z = self.gains, self.x, self.y, self.z
         px, py, pz = position
         ux, uy, uz = self.setpoint
@@ -218,24 +232,26 @@ class FlightController:
         self._steer_yaw(self._period * self._outer_every)
 
     def _steer_yaw(self, period: float) -> None:
-        """Turn the yaw's reference towards its goal, no faster than allowed."""
+        """Turn the yaw reference towards its goal, within the limit of the yaw rate."""
         limit = self.gains.yaw_rate_limit
         if self.yaw_rate:
             self.yaw_goal = self.yaw + self.yaw_rate * period
-        way = math.remainder(self.yaw_goal - self.yaw, math.tau)
-        self._turn = min(max(way / period, -limit), limit)
+        remaining = math.remainder(self.yaw_goal - self.yaw, math.tau)
+        self._turn = min(max(remaining / period, -limit), limit)
         self.yaw += self._turn * period
 
     def _attitude_loop(
         self, attitude: tuple[float, float, float, float], rates: Vector
     ) -> tuple[float, float, float, float]:
+        """Return the rotors' thrusts [N] that turn the body towards the wanted force."""
         g, body = self.gains, self.body
         w, x, y, z = attitude
         fx, fy, fz = self._force
         jx, jy, jz = self._force_rate
         sx, sy, sz = self._force_curve
-        xx, xy, xz = 1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y + w * z), 2.0 * (x * z - w * y)  # body's x axis
-        yx, yy, yz = 2.0 * (x * y - w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z + w * x)  # its y axis
+        # the body's x and y axes in the world
+        xx, xy, xz = 1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y + w * z), 2.0 * (x * z - w * y)
+        yx, yy, yz = 2.0 * (x * y - w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z + w * x)
         upright = max(1.0 - 2.0 * (x * x + y * y), 0.3)  # cosine of the tilt
         # the wanted force in the body's axes
         bx, by = xx * fx + xy * fy + xz * fz, yx * fx + yy * fy + yz * fz
@@ -252,11 +268,11 @@ class FlightController:
         turn = 0.3 * g.rate * iz * (r - rates[2]) / (4.0 * body.rotor_torque)
         turn = min(max(turn, -1.0), 1.0)
         low, high = body.least_thrust, body.most_thrust
-        lift = min(max(0.25 * body.mass * fz / upright, low + 0.5), high - 1.0)  # the height comes first
-        # what a rotor cannot give is taken from the torques, not from the lift
-        asked, room = abs(roll) + abs(pitch) + abs(turn), min(lift - low, high - lift)
-        if asked > room:
-            roll, pitch, turn = roll * room / asked, pitch * room / asked, turn * room / asked
+        lift = min(max(0.25 * body.mass * fz / upright, low + 0.5), high - 1.0)  # height has priority
+        # at the rotors' limits, reduce the torques, not the lift
+        needed, room = abs(roll) + abs(pitch) + abs(turn), min(lift - low, high - lift)
+        if needed > room:
+            roll, pitch, turn = roll * room / needed, pitch * room / needed, turn * room / needed
         return (
             lift - roll - pitch - turn,
             lift + roll + pitch - turn,

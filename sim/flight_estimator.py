@@ -1,4 +1,4 @@
-"""What the quadrotor knows of itself: estimates of position, velocity and attitude, and its IMU, each with errors."""
+"""State estimation of the quadrotor: position, velocity, attitude and IMU, each with errors."""
 
 from __future__ import annotations
 
@@ -15,29 +15,32 @@ Quaternion = tuple[float, float, float, float]  # w, x, y, z; world from body
 
 @dataclass(frozen=True)
 class Estimate:
-    """One reading of all of it: ENU, SI units, body axes x forward, y left, z up."""
+    """One estimate: ENU, SI units; body axes x forward, y left, z up."""
 
     position: Vector  # m
     velocity: Vector  # m/s
     attitude: Quaternion
     rates: Vector  # rad/s, about the body's axes
-    specific_force: Vector  # m/s² along the body's axes: what an accelerometer feels, gravity's reaction included
+    specific_force: Vector  # m/s² along the body's axes, as an accelerometer measures it
 
     @property
     def acceleration(self) -> Vector:
-        """In the world, gravity taken out, m/s²."""
+        """Acceleration in the world, without gravity [m/s²]."""
         x, y, z = rotate(self.attitude, self.specific_force)
         return (x, y, z - GRAVITY)
 
 
 class FlightEstimator:
-    """Errors that wander: drawn anew once a period, and on a straight line from draw to draw in between.
+    """Adds errors that change slowly, as those of a Kalman filter: drawn once a period and interpolated linearly.
 
-    So they never leave the cut, change slowly as a filter's do, and those of different periods are independent.
+    Interpolated errors never exceed the cut-off, and errors of different periods are independent.
+
+    Attributes:
+        errors: (9) of position, velocity and attitude.
     """
 
     def __init__(self, noise: QuadrotorNoise, rng: np.random.Generator, steps: int) -> None:
-        """steps: calls of `advance` in a period."""
+        """steps: number of calls of `advance` in a period."""
         self.noise, self._rng, self._steps = noise, rng, steps
         self._sigma = noise.scale * np.repeat((noise.position, noise.velocity, noise.attitude), 3)
         self.errors = self._next = self._draw()
@@ -45,7 +48,7 @@ class FlightEstimator:
         self._left = 0
 
     def advance(self) -> None:
-        """One step on: `errors` of position, velocity and attitude (9)."""
+        """Advance the errors by one step."""
         if self._left == 0:
             self.errors, self._next = self._next, self._draw()
             self._slopes = [(b - a) / self._steps for a, b in zip(self.errors, self._next, strict=True)]
@@ -59,19 +62,23 @@ class FlightEstimator:
     def read(
         self, position: Vector, velocity: Vector, attitude: Quaternion, rates: Vector, acceleration: Vector
     ) -> Estimate:
-        """The estimate of a true state; acceleration in the world."""
+        """Return the estimate of a true state. acceleration: in the world [m/s²]."""
         e = self.errors
         white = cut_normal(self._rng, self.noise.scale, (6,)).tolist()
         ax, ay, az = acceleration
         w, x, y, z = attitude
-        felt = rotate((w, -x, -y, -z), (ax, ay, az + GRAVITY))
+        specific_force = rotate((w, -x, -y, -z), (ax, ay, az + GRAVITY))
         force, gyro = self.noise.accelerometer, self.noise.gyro
         return Estimate(
             (position[0] + e[0], position[1] + e[1], position[2] + e[2]),
             (velocity[0] + e[3], velocity[1] + e[4], velocity[2] + e[5]),
             tilted(attitude, (e[6], e[7], e[8])),
             (rates[0] + gyro * white[0], rates[1] + gyro * white[1], rates[2] + gyro * white[2]),
-            (felt[0] + force * white[3], felt[1] + force * white[4], felt[2] + force * white[5]),
+            (
+                specific_force[0] + force * white[3],
+                specific_force[1] + force * white[4],
+                specific_force[2] + force * white[5],
+            ),
         )
 
     def _draw(self) -> list[float]:
@@ -80,7 +87,7 @@ class FlightEstimator:
 
 
 def rotate(attitude: Quaternion, vector: Vector) -> Vector:
-    """A vector in the body's axes, in the world's."""
+    """Rotate a vector from the body's axes to the world."""
     w, x, y, z = attitude
     a, b, c = vector
     tx, ty, tz = 2.0 * (y * c - z * b), 2.0 * (z * a - x * c), 2.0 * (x * b - y * a)
@@ -88,7 +95,7 @@ def rotate(attitude: Quaternion, vector: Vector) -> Vector:
 
 
 def tilted(attitude: Quaternion, angles: Vector) -> Quaternion:
-    """The attitude turned by small angles about the body's axes, rad."""
+    """Return the attitude turned by small angles about the body's axes [rad]."""
     w, x, y, z = attitude
     a, b, c = 0.5 * angles[0], 0.5 * angles[1], 0.5 * angles[2]
     q = (w - x * a - y * b - z * c, x + w * a + y * c - z * b, y + w * b + z * a - x * c, z + w * c + x * b - y * a)

@@ -1,6 +1,6 @@
-"""Ways through an arena on a grid: each cell's distance from the obstacles, the best way from every cell to a goal.
+"""Plan paths on a grid: the clearance of every cell, and the best path from every cell to a goal.
 
-SciPy is imported by who looks for a way: every actor's process draws arenas, and it takes a third of its start.
+Only the functions that need SciPy import it: it takes a third of the start of an actor's process.
 """
 
 from __future__ import annotations
@@ -21,16 +21,22 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 CELL = {2: 0.05, 3: 0.625}  # m, edge of a cell in the plane and in space
-MOST_CELLS = {2: 110**2, 3: 65_536}  # larger rooms get larger cells
+MOST_CELLS = {2: 110**2, 3: 65_536}  # larger rooms have larger cells
 
 
 class ClearanceMap:
-    """Distance from every cell's centre to the nearest obstacle: `clearance`, m, one index per axis, x first."""
+    """The distance from the centre of every cell to the nearest obstacle.
+
+    Attributes:
+        clearance: m, one index per axis, x first.
+        centres: (cells, d) m.
+        cell: m, edge of a cell.
+    """
 
     def __init__(self, obstacles: Sequence[Obstacle], bounds: Sequence[tuple[float, float]]) -> None:
-        """bounds: lowest and highest coordinate of each of the d = 2 or 3 axes, m.
+        """bounds: (low, high) of each of the d = 2 or 3 axes [m].
 
-        Cells are cubes that fill the first axis; along the others the last may end half a cell beside the bound.
+        Cells are cubes that fill the first axis. On the other axes the last one may end half a cell off the bound.
         """
         widths = [high - low for low, high in bounds]
         self.dim = len(bounds)
@@ -45,57 +51,58 @@ class ClearanceMap:
         self.clearance: Array = _nearest(shapes, plan, *axes[2:]).reshape(self.shape)
 
     def index(self, points: Array) -> NDArray[np.intp]:
-        """Cells of points (..., d), the outermost ones for points beyond the walls: (..., d)."""
+        """Return the cells (..., d) of points (..., d); points beyond the walls belong to the outermost cells."""
         cells = np.floor((points - self.low) / self.cell).astype(np.intp)
         return np.clip(cells, 0, np.array(self.shape) - 1)
 
     def number(self, points: Array) -> NDArray[np.intp]:
-        """Cells of points (..., d) as places in `centres`: (...)."""
+        """Return the cells of points (..., d) as indices (...) into `centres`."""
         return np.asarray(np.ravel_multi_index(tuple(np.moveaxis(self.index(points), -1, 0)), self.shape))
 
     def at(self, points: Array) -> Array:
-        """Clearance of the cells that hold points (..., d), in m."""
+        """Return the clearance (...) [m] of the cells that hold points (..., d)."""
         return np.asarray(self.clearance[tuple(np.moveaxis(self.index(points), -1, 0))])
 
-    def between(self, values: Array, points: Array) -> Array:
-        """Values of the cells (as `clearance` is shaped), interpolated linearly at points (..., d): (...)."""
+    def interpolate(self, values: Array, points: Array) -> Array:
+        """Interpolate values of the cells (with the shape of `clearance`) linearly at points (..., d): (...)."""
         from scipy.ndimage import map_coordinates
 
-        places = np.moveaxis((points - self.low) / self.cell - 0.5, -1, 0)
-        return np.asarray(map_coordinates(values, places, order=1, mode="nearest"))
+        coordinates = np.moveaxis((points - self.low) / self.cell - 0.5, -1, 0)
+        return np.asarray(map_coordinates(values, coordinates, order=1, mode="nearest"))
 
     def connected(self, start: Sequence[float], goal: Sequence[float], clearance: float) -> bool:
-        """Whether a disc (ball) of radius `clearance` (m) can go from start to goal.
+        """Return whether a disc (ball) of radius `clearance` [m] can go from start to goal.
 
-        Between two cells h = cell·√d apart, both at least c from a point, the way is at least √(c² − h²/4) from it.
+        If two cell centres h = cell·√d apart are both at least c from a point, then the line between them is at least
+        √(c² − h²/4) from it.
         """
         least = float(np.hypot(clearance, 0.5 * self.cell * np.sqrt(self.dim)))
-        free = np.pad(self.clearance >= least, 1)  # what is outside is solid
+        free = np.pad(self.clearance >= least, 1)  # outside is solid
         first, last = np.ravel_multi_index(tuple((self.index(np.array([start, goal])) + 1).T), free.shape)
-        beside = np.array(list(product((-1, 0, 1), repeat=self.dim))) @ free.strides  # a cell is a byte
+        neighbours = np.array(list(product((-1, 0, 1), repeat=self.dim))) @ free.strides  # a cell is a byte
         to_reach, front = free.ravel(), np.array([first])
-        place = np.zeros(free.size, np.intp)
+        number = np.zeros(free.size, np.intp)
         if not (to_reach[first] and to_reach[last]):
             return False
-        while to_reach[last] and len(front):  # a cell farther each time
-            front = (front[:, None] + beside).ravel()
+        while to_reach[last] and len(front):  # breadth-first search
+            front = (front[:, None] + neighbours).ravel()
             front = front[to_reach[front]]
             to_reach[front] = False
-            places = np.arange(len(front))
-            place[front] = places
-            front = front[place[front] == places]  # each once
+            numbers = np.arange(len(front))
+            number[front] = numbers
+            front = front[number[front] == numbers]  # without duplicates
         return bool(not to_reach[last])
 
 
 def _nearest(shapes: Shapes, plan: Array, heights: Array | None = None) -> Array:
-    """Distances to the nearest shape from points (p, 2); with heights (q,): from all points above these, (p, q).
+    """Return the distances (p,) to the nearest shape from points (p, 2), or (p, q) from all points at heights (q,).
 
-    `Shapes.distance`, ten times faster for many points: shapes turn about the vertical only, so what lies in the plan
-    is the same for all heights.
+    This is `Shapes.distance`, ten times faster for many points: shapes turn about the vertical only, so the distances
+    in the plan are the same for all heights.
     """
     x, y = np.ascontiguousarray(plan.T)
     least = np.full(len(plan) if heights is None else (len(plan), len(heights)), np.inf)
-    square = least.copy()  # of the distance to all but balls, in space: it takes one root for all
+    square = least.copy()  # squared distance to all shapes but balls in space, for one common root
     scratch = np.empty_like(least)
     for center, axes, half, rho, rounded in zip(
         shapes.center, shapes.axes, shapes.half, shapes.rho, shapes.round, strict=True
@@ -119,39 +126,39 @@ def _nearest(shapes: Shapes, plan: Array, heights: Array | None = None) -> Array
 
 
 class Routes:
-    """The best way from every cell to one goal, as Dijkstra's algorithm finds it.
+    """The best paths from every cell to one goal, by Dijkstra's algorithm.
 
-    A way costs its length times 1 + `AVOIDANCE`·(lack/comfort)², where lack is what the clearance misses to `comfort`;
-    cells that the body does not fit in cost `BLOCKED` times their length, so that a robot that strayed into one gets
-    out again. One run serves the whole episode: whoever leaves the way follows the one from the new cell.
+    A path costs its length times 1 + `AVOIDANCE`·lack², where lack in [0, 1] is the share of the wanted clearance that
+    is missing. Cells that the body does not fit in cost `BLOCKED` times their length, so that a robot in one of them
+    still finds a way out. One run serves the whole episode: a robot off its path follows the path of its new cell.
     """
 
     AVOIDANCE = 30.0
     BLOCKED = 1e4
 
-    def __init__(self, grid: ClearanceMap, goal: Sequence[float], footprint: float, comfort: float) -> None:
-        """footprint, comfort: m; distances from the position to an obstacle that are possible, and that are liked."""
+    def __init__(self, grid: ClearanceMap, goal: Sequence[float], footprint: float, wanted: float) -> None:
+        """footprint, wanted: m, the least possible and the wanted distance from the robot's position to an obstacle."""
         from scipy.ndimage import minimum_filter
         from scipy.sparse.csgraph import dijkstra
 
         self.grid = grid
-        lack = np.clip((comfort - grid.clearance) / (comfort - footprint), 0.0, 1.0)
+        lack = np.clip((wanted - grid.clearance) / (wanted - footprint), 0.0, 1.0)
         free = grid.clearance > footprint
         weight = np.where(free, 1.0 + self.AVOIDANCE * lack**2, self.BLOCKED)
         self._goal = int(grid.number(np.asarray(goal, dtype=np.float64)))
         cost, before = dijkstra(_graph(weight, grid.cell), directed=False, indices=self._goal, return_predecessors=True)
         self._next = before
         self._cost = cost.reshape(grid.shape)
-        # For interpolation: no free cell's neighbour may look as far from the goal as crossing a solid is
-        around = minimum_filter(self._cost, size=3) + grid.cell
-        self._cost[~free] = np.minimum(self._cost, around)[~free]
+        # For interpolation: beside a free cell, no cell may have the cost of a path through a solid
+        nearby = minimum_filter(self._cost, size=3) + grid.cell
+        self._cost[~free] = np.minimum(self._cost, nearby)[~free]
 
-    def to_go(self, points: Array) -> Array:
-        """Cost of the best way from points (..., d) to the goal, interpolated between cells, m: (...)."""
-        return self.grid.between(self._cost, points)
+    def cost_to_go(self, points: Array) -> Array:
+        """Return the cost (...) [m] of the best path from points (..., d) to the goal, interpolated between cells."""
+        return self.grid.interpolate(self._cost, points)
 
-    def way(self, position: Array, length: float) -> Array:
-        """Centres of the next cells from a position (d,) on towards the goal, up to `length` m: (k, d), k ≥ 1."""
+    def path(self, position: Array, length: float) -> Array:
+        """Return the centres (k, d), k ≥ 1, of the cells from a position (d,) to the goal, up to `length` m."""
         cell = int(self.grid.number(position))
         cells = [cell]
         while cell != self._goal and len(cells) * self.grid.cell < length:
@@ -161,7 +168,7 @@ class Routes:
 
 
 def _graph(weight: Array, cell: float) -> csr_array:
-    """Edges from every cell to half of its neighbours (the others are these reversed), each length times weight."""
+    """Return the edges, length times weight, from every cell to half of its neighbours; the others are reversed."""
     from scipy.sparse import csr_array
 
     ids = np.arange(weight.size).reshape(weight.shape)

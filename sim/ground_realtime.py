@@ -1,4 +1,5 @@
-"""The ground robot in continuous time, as its nodes see it: commands come when they come, sensors tell every sample."""
+"""The ground robot in continuous time, as its ROS nodes see it: it takes a command at any sample and measures at every
+sample."""
 
 from __future__ import annotations
 
@@ -10,93 +11,108 @@ from numpy.typing import NDArray
 from brakeline.messaging.ray_directions import LidarRays
 from brakeline.sim.arena import Arena
 from brakeline.sim.ground_estimator import Estimator, NoiseLevels, wrap
-from brakeline.sim.ground_robot import GROUND, SAMPLES, WHEEL_RADIUS, GroundRobot
+from brakeline.sim.ground_robot import GROUND, SAMPLE_TIME, SAMPLES, WHEEL_RADIUS, GroundRobot
 from brakeline.sim.lidar import Lidar
 from brakeline.sim.vehicle import clip_input
 
 Array = NDArray[np.float64]
 
-SAMPLE_TIME = GROUND.period / SAMPLES  # s
-
 
 class RealtimeEstimator(Estimator):
-    """The same estimator, asked at every sample: between two pose fixes it tells its dead reckoning."""
-
-    def begin(self) -> None:
-        """Before the first sample."""
-        self._ways: list[float] = []
-        self._rates: list[float] = []  # both since the last fix
-        self._recent: list[tuple[float, float]] = []
-
-    def feel(self, wheels: Array, turn_rate: float, pose: Array) -> Array:
-        """The measured state (5,) after one more sample: true wheel angles (2,), turn rate [rad/s] and pose (3,)."""
-        way = float(self._encoder_ways(wheels[None])[0])
-        noise = self.noise.scale * self.noise.gyro * float(np.clip(self._rng.standard_normal(), -2.0, 2.0))
-        rate = turn_rate + self._bias + noise
-        self._ways.append(way)
-        self._rates.append(rate)
-        self._recent = [*self._recent, (way, rate)][-self.RECENT :]
-        path, turned = self._dead_reckon(np.array(self._ways), np.array(self._rates))
-        if len(self._ways) == SAMPLES:
-            self._correct(path[-1], turned, pose)
-            self._ways, self._rates = [], []
-            x, y, heading = self.pose
-        else:
-            x, y, heading = self._moved(path[-1], turned)
-        ways, rates = np.mean(self._recent, axis=0)
-        return np.array([x, y, wrap(heading), ways / self._sample_time, rates])
-
-
-class RealtimeGroundRobot(GroundRobot):
-    """A ground robot in one arena. An input counts from the next sample on, and until another one comes.
-
-    collisions: how often it began to touch something; closest: m, the least distance from its disc to an obstacle so
-    far; driven: m.
-    """
+    """`Estimator`, one sample at a time: between two pose fixes it returns its dead reckoning."""
 
     def __init__(
         self,
-        arena: Arena,
+        noise: NoiseLevels,
         rng: np.random.Generator,
-        noise: NoiseLevels | None = None,
-        payload_kg: float = 0.0,
-        floor_friction: float = 1.0,
+        pose: Array,
+        wheels: Array,
+        wheel_radius: float,
+        sample_time: float,
     ) -> None:
-        super().__init__(arena, rng, noise, payload_kg, floor_friction)
-        self.estimator: RealtimeEstimator = RealtimeEstimator(
+        super().__init__(noise, rng, pose, wheels, wheel_radius, sample_time)
+        self._distances: list[float] = []  # m, since the last fix
+        self._rates: list[float] = []  # rad/s, since the last fix
+        self._recent: list[tuple[float, float]] = []
+
+    def add_sample(self, wheels: Array, turn_rate: float, pose: Array) -> Array:
+        """Return the measured state (5,) after one more sample.
+
+        Args:
+            wheels: (2,) rad, true angles of the wheels.
+            turn_rate: rad/s, true.
+            pose: (3,) true pose.
+        """
+        distance = float(self._wheel_distances(wheels[None])[0])
+        noise = self.noise.scale * self.noise.gyro * float(np.clip(self._rng.standard_normal(), -2.0, 2.0))
+        rate = turn_rate + self._bias + noise
+        self._distances.append(distance)
+        self._rates.append(rate)
+        self._recent = [*self._recent, (distance, rate)][-self.RECENT :]
+        path, turned = self._dead_reckon(np.array(self._distances), np.array(self._rates))
+        if len(self._distances) == SAMPLES:
+            self._correct(path[-1], turned, pose)
+            self._distances, self._rates = [], []
+            x, y, heading = self.pose
+        else:
+            x, y, heading = self._moved(path[-1], turned)
+        distances, rates = np.mean(self._recent, axis=0)
+        return np.array([x, y, wrap(heading), distances / self._sample_time, rates])
+
+
+class RealtimeGroundRobot(GroundRobot):
+    """A ground robot in one arena. An input takes effect at the next sample and lasts until another one comes.
+
+    Attributes:
+        collisions: how often the robot began to touch a static obstacle.
+        closest: m, least distance from its footprint to an obstacle so far.
+        distance_driven: m.
+    """
+
+    def __init__(
+        self, arena: Arena, rng: np.random.Generator, noise: NoiseLevels | None = None, **physics: float
+    ) -> None:
+        """physics: `payload_kg` and `floor_friction`, as `GroundRobot` takes them."""
+        super().__init__(arena, rng, noise, **physics)
+        self.realtime_estimator = RealtimeEstimator(
             noise or NoiseLevels(), rng, self._true_pose(), self._wheels(), WHEEL_RADIUS, SAMPLE_TIME
         )
-        self.estimator.begin()
         self.collisions, self._touches = 0, False
         self.closest = float(self._clearance(self.true[:2]))
-        self.driven = 0.0
+        self.distance_driven = 0.0
 
     def drive(self, input: Array) -> None:
-        """From now on at (speed [m/s], turn rate [rad/s]), clipped to the robot's bounds.
+        """Drive at (speed [m/s], turn rate [rad/s]) from now on, clipped to the robot's bounds.
 
         Raises:
-            BadInput: when the input is not two finite numbers.
+            BadInput: the input is not two finite numbers.
         """
         self.input = clip_input(GROUND, input, self.input)
         self._set_wheels(self.input)
 
     def advance(self) -> None:
-        """To the next sample, `SAMPLE_TIME` s on."""
+        """Advance to the next sample, by `SAMPLE_TIME` seconds."""
         before = self._true_pose()
-        touches = self._run_sample(bool(self.input.any()))
+        touches = self._physics.advance(at_rest=not self.input.any())
         self.collisions += touches and not self._touches
         self._touches = touches
         pose = self._true_pose()
-        self.driven += math.dist(before[:2], pose[:2])
+        self.distance_driven += math.dist(before[:2], pose[:2])
         self.true = self._true_state()
-        self.measured = self.estimator.feel(self._wheels(), wrap(pose[2] - before[2]) / SAMPLE_TIME, pose)
+        turn_rate = wrap(pose[2] - before[2]) / SAMPLE_TIME
+        self.measured = self.realtime_estimator.add_sample(self._wheels(), turn_rate, pose)
         self.closest = min(self.closest, float(self._clearance(pose[:2])))
 
 
 class SpinningLidar:
-    """A lidar that looks round once in so many samples, beam after beam: what it tells is of different times.
+    """A lidar that measures beam after beam, one turn in `SAMPLES` samples: the ranges of a turn have different times.
 
-    With the sensor's own errors; a beam that hits nothing reports inf, one that hits too near -inf (REP 117).
+    A beam that hits nothing reports inf, one that hits something too near reports -inf (REP 117).
+
+    Attributes:
+        nearest, farthest: m, the limits of a range.
+        mount: m, its position on the robot's x axis.
+        gap: rad between two beams.
     """
 
     def __init__(
@@ -109,25 +125,27 @@ class SpinningLidar:
         farthest: float = 3.5,
         mount: float = -0.032,
     ) -> None:
-        """noise: m, sigma of a range; nearest, farthest: m; mount: m, its place along the robot's x axis."""
+        """noise: standard deviation of a range [m]."""
         self.nearest, self.farthest, self.mount = nearest, farthest, mount
         self.gap = 2.0 * math.pi / beams
         angles = self.gap * np.arange(beams)
         directions = np.stack([np.cos(angles), np.sin(angles)], axis=1)
-        self._sectors = [
-            Lidar(arena, LidarRays(part, farthest), noise, rng) for part in np.array_split(directions, SAMPLES)
-        ]
-        self._seen: list[Array] = []
+        sectors = np.array_split(directions, SAMPLES)
+        self._sectors = [Lidar(arena, Rays(sector, farthest), noise, rng) for sector in sectors]
+        self._measured: list[Array] = []
 
-    def look(self, true: Array) -> Array | None:
-        """The next sector from a true state (5,); all ranges (beams,) [m] when a turn is complete."""
+    def measure_sector(self, true: Array) -> Array | None:
+        """Measure the next sector from a true state (5,).
+
+        Returns:
+            all ranges (beams,) [m] when the turn is complete, None before.
+        """
         heading = float(true[2])
-        place = true[:2] + self.mount * np.array([math.cos(heading), math.sin(heading)])
-        sector = self._sectors[len(self._seen)]
-        ranges = sector.ranges(place, heading)
+        origin = true[:2] + self.mount * np.array([math.cos(heading), math.sin(heading)])
+        ranges = self._sectors[len(self._measured)].ranges(origin, heading)
         ranges = np.where(ranges >= self.farthest, np.inf, np.where(ranges < self.nearest, -np.inf, ranges))
-        self._seen.append(ranges)
-        if len(self._seen) < len(self._sectors):
+        self._measured.append(ranges)
+        if len(self._measured) < len(self._sectors):
             return None
-        whole, self._seen = np.concatenate(self._seen), []
-        return whole
+        turn, self._measured = np.concatenate(self._measured), []
+        return turn

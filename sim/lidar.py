@@ -1,4 +1,4 @@
-"""Lidars: exact ranges along a fan of beams, cast at the obstacles of an arena by MuJoCo, with the sensor's noise."""
+"""Simulate a lidar: ranges along a fan of beams, cast at the obstacles of an arena by MuJoCo, with noise."""
 
 from __future__ import annotations
 
@@ -16,15 +16,19 @@ Array = NDArray[np.float64]
 
 
 class Lidar:
-    """One lidar in one arena. What it sees are the obstacles of the arena's map, and what moves there; robots are not
-    among them."""
+    """One lidar in one arena. It sees the static and the moving obstacles of the arena, and no robot of its own.
 
-    def __init__(
-        self, arena: Arena, rays: LidarRays, noise: float = 0.0, rng: np.random.Generator | None = None
-    ) -> None:
-        """rays: of the arena's dimension, in the frame of the robot's heading; noise: m, sigma of a range.
+    Attributes:
+        rays: the directions of the beams and their range.
+        max_range: m, the value of a beam that hits nothing.
+    """
 
-        The noise is normal, cut off at 2 sigma, anew each range; it needs `rng`.
+    def __init__(self, arena: Arena, rays: Rays, noise: float = 0.0, rng: np.random.Generator | None = None) -> None:
+        """
+        Args:
+            rays: in the frame of the robot's heading, of the arena's dimension.
+            noise: standard deviation of a range [m]; normal, cut off at two standard deviations, independent.
+            rng: the source of the noise; without it ranges are exact.
         """
         self.rays, self.max_range, self._noise, self._rng = rays, rays.range, noise, rng
         beams = np.zeros((len(rays.directions), 3))
@@ -32,20 +36,24 @@ class Lidar:
         self._beams = beams
         self._height = 0.5 * HEIGHT if arena.dim == 2 else None
         self._model, self._data = map_model(arena)
-        self._moving = MoverBodies(self._model, self._data, arena.crowd)
+        self._movers = MoverBodies(self._model, self._data, arena.crowd)
         self._hit, self._ranges = np.empty(len(beams), np.int32), np.empty(len(beams))
 
-    def at(self, time: float) -> None:
-        """From now on what moves is seen where it is at that time, s."""
-        if self._moving:
-            self._moving.place(time)
+    def move_obstacles(self, time: float) -> None:
+        """Move the moving obstacles to their positions at a time [s]."""
+        if self._movers:
+            self._movers.place(time)
             mujoco.mj_kinematics(self._model, self._data)
 
     def cast(self, origin: Array, turn: float | Array = 0.0) -> Array:
-        """True ranges (R,) in m from a point (d,) of free space; `max_range` where nothing is hit within it.
-        turn: of the robot's frame in the world, a heading [rad] or (3, 3).
+        """Return the true ranges (R,) [m] from a point (d,) in free space.
 
-        A point inside an obstacle has no true range: a beam then ends where it leaves the obstacle.
+        A beam that hits nothing within `max_range` has that value. From a point inside an obstacle, a beam ends where
+        it leaves the obstacle.
+
+        Args:
+            origin: (d,) m.
+            turn: from the robot's frame to the world: a heading [rad] or a rotation matrix (3, 3).
         """
         if isinstance(turn, np.ndarray):
             beams = self._beams @ turn.T
@@ -57,9 +65,9 @@ class Lidar:
             self._data,
             point,
             beams.ravel(),
-            None,  # no groups of geoms
-            True,  # geoms that can't move are seen
-            -1,  # no body is left out
+            None,  # all groups of geoms
+            True,  # static geoms too
+            -1,  # exclude no body
             self._hit,
             self._ranges,
             None,  # no normals
@@ -69,7 +77,7 @@ class Lidar:
         return np.where((self._hit >= 0) & (self._ranges < self.max_range), self._ranges, self.max_range)
 
     def ranges(self, origin: Array, turn: float | Array = 0.0) -> Array:
-        """What the lidar reports there, (R,) m in [0, max_range]; a beam that hits nothing reports `max_range`."""
+        """Return `cast` with noise, (R,) m in [0, max_range]; beams that hit nothing have none."""
         true = self.cast(origin, turn)
         if self._rng is None:
             return true

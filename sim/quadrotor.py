@@ -1,4 +1,4 @@
-"""The quadrotor: a rigid body with four rotors in MuJoCo, its flight controller, and the vehicle that they make."""
+"""The quadrotor: a rigid body with four rotors in MuJoCo, and its flight controller."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from brakeline.messaging.robot import robot_named
 from brakeline.sim.arena import Arena
 from brakeline.sim.flight_controller import GRAVITY, Airframe, FlightController, Gains, Vector
 from brakeline.sim.flight_estimator import Estimate, FlightEstimator, QuadrotorNoise, rotate
+from brakeline.sim.ground_estimator import heading_of
 from brakeline.sim.mujoco_obstacles import MoverBodies, add_movers, add_obstacles
 from brakeline.sim.vehicle import Period, clip_input
 from brakeline.sim.wind import Wind, WindProcess
@@ -24,17 +25,23 @@ Array = NDArray[np.float64]
 QUADROTOR = robot_named("quadrotor")
 MODEL = Path(__file__).with_name("quadrotor.xml").read_text()
 SAMPLES = 5  # of the position in a period
-OUTER_EVERY = 2  # physics steps for one of the velocity loop
+OUTER_EVERY = 2  # physics steps for one step of the velocity loop
 FLOOR_BIT = 1
-STANDING = 0.15  # m/s; no faster, and at no setpoint, it stands in the air
-SETTLE = 5  # periods of hovering before the start
+STANDING = 0.15  # m/s; below this speed, and at the setpoint zero, it hovers in place
+SETTLE = 5  # periods of hovering before the episode starts
 
 
 class Quadrotor:
     """One quadrotor in one arena, hovering at its start, or standing on the floor with its motors off.
 
-    true, measured: states (p [m], v [m/s], a [m/s²]; ENU) of the centre of mass; input: the velocity setpoint executed
-    last, after clipping and slew. The heading is kept at zero, east, unless `controller` is told otherwise.
+    `controller` holds the heading at zero (east) by default.
+
+    Attributes:
+        true, measured: (9,) states (p [m], v [m/s], a [m/s²]; ENU) of the centre of mass.
+        input: (3,) velocity setpoint executed last [m/s], after clipping and slew.
+        flying: whether the controller drives the rotors; otherwise they stand, idle, or `set_thrusts` drives them.
+        collided: whether the vehicle touched a static obstacle since this was last set to False.
+        on_floor: whether the vehicle touched the floor in the last physics step.
     """
 
     def __init__(
@@ -46,67 +53,72 @@ class Quadrotor:
         gains: Gains | None = None,
         floor: float | None = None,
     ) -> None:
-        """floor: height of a plane to start from and to land on, m; None: there is none, and it starts hovering."""
+        """floor: m, height of a plane to start from and to land on; None: no plane, and the vehicle starts hovering."""
         self.arena = arena
         self._model = _build(arena, floor)
         self._data = mujoco.MjData(self._model)
         self.timestep: float = self._model.opt.timestep
-        self._ticks = round(QUADROTOR.period / SAMPLES / self.timestep)  # in a sample
+        self._steps_per_sample = round(QUADROTOR.period / SAMPLES / self.timestep)
         self._body = Airframe()
         self.controller = FlightController(self.timestep, OUTER_EVERY, gains, self._body)
         steps = round(QUADROTOR.period / self.timestep / OUTER_EVERY)
         self._estimator = FlightEstimator(noise or QuadrotorNoise(), rng, steps)
         self._rng, self._wind = rng, wind or Wind()
-        self._air = None if self._wind.calm else WindProcess(self._wind, rng, self.timestep)
-        self._moving = MoverBodies(self._model, self._data, arena.crowd)
+        self._wind_process = None if self._wind.calm else WindProcess(self._wind, rng, self.timestep)
+        self._movers = MoverBodies(self._model, self._data, arena.crowd)
         self._time = 0.0  # s
         self._floor_geom = -1 if floor is None else self._model.geom("floor").id
-        self.flying = floor is None  # the controller has the rotors; else they stand or idle
-        self.collided = False  # an obstacle was touched since it was last set to False
-        self.on_floor = False  # the floor was touched in the last tick
+        self.flying = floor is None
+        self.collided = False
+        self.on_floor = False
         self._count = 0
-        self._track: deque[list[float]] = deque(maxlen=64)  # positions at the end of each `fly` since `watch`
+        self._path: deque[list[float]] = deque(maxlen=64)  # true positions after each `advance` of the period
         self._acceleration = (0.0, 0.0, 0.0)
         self.input = np.zeros(QUADROTOR.action_dim)
         mujoco.mj_forward(self._model, self._data)
         if self.flying:
             self._hover()
         self._time = 0.0
-        self._moving.begin()
+        self._movers.begin_period()
         self.true, self.measured = self.state(), self.estimated_state(self.estimate())
 
     def step(self, input: Array) -> Period:
         """Fly one period at a velocity setpoint (3,) [m/s], clipped to bounds and to the slew from the one before.
 
         Raises:
-            BadInput: when the input is not three finite numbers.
+            BadInput: the input is not three finite numbers.
         """
         self.input = clip_input(QUADROTOR, input, self.input)
         x, y, z = self.input.tolist()
         self.controller.setpoint = (x, y, z)
         self.begin_period()
-        start, seen = self.measured[:3], np.empty((SAMPLES, 3))
+        start, path = self.measured[:3], np.empty((SAMPLES, 3))
         for i in range(SAMPLES):
-            self.fly(self._ticks)
-            seen[i] = self.position_and_velocity()[0]
+            self.advance(self._steps_per_sample)
+            path[i] = self.position_and_velocity()[0]
         self.measured = self.estimated_state(self.estimate())
-        return self.end_period(self.measured, seen - start)
+        return self.end_period(self.measured, path - start)
 
     def begin_period(self) -> None:
-        """A period begins: note from now on what is touched, and where it has been."""
+        """Begin to record contacts and positions."""
         self.collided = False
-        self._moving.begin()
-        self._track.clear()
+        self._movers.begin_period()
+        self._path.clear()
 
     def end_period(self, measured: Array, path: Array) -> Period:
-        """The period since `watch`, as it was; measured (9,) and path (S, 3) are what others made of it."""
+        """Return the report of the period since `begin_period`.
+
+        Args:
+            measured: (9,) measured state at the end.
+            path: (S, 3) m, estimated positions from the start of the period.
+        """
         self.true = self.state()
-        distances = self.clearance(np.array(self._track))
+        distances = self.clearance(np.array(self._path))
         closest, clearance = float(distances.min()), float(distances[-1])
-        return Period(measured, self.true, self.collided, closest, clearance, path, 0.0, *self._moving.contacts)
+        return Period(measured, self.true, self.collided, closest, clearance, path, 0.0, *self._movers.contacts)
 
     def initial_period(self) -> Period:
-        """The present state as a period in which nothing happened: what there is to say before the first step."""
+        """Return the report of a period in which nothing happened, at the present state."""
         clearance = float(self.clearance(self.true[:3]))
         return Period(self.measured, self.true, False, clearance, clearance, np.zeros((SAMPLES, 3)), 0.0)
 
@@ -114,7 +126,7 @@ class Quadrotor:
         """Change `payload_kg` (at the centre of mass), `wind_speed` or `gust` [m/s], from now on.
 
         Raises:
-            ValueError: it has no such thing, or it cannot have this value.
+            ValueError: the name is another one, or the value is negative or not finite.
         """
         for name, value in changes.items():
             if not (math.isfinite(value) and value >= 0.0):
@@ -124,17 +136,17 @@ class Quadrotor:
                 mujoco.mj_setConst(self._model, mujoco.MjData(self._model))
             elif name in ("wind_speed", "gust"):
                 self._wind = replace(self._wind, **{"speed" if name == "wind_speed" else name: value})
-                self._air = None if self._wind.calm else WindProcess(self._wind, self._rng, self.timestep)
+                self._wind_process = None if self._wind.calm else WindProcess(self._wind, self._rng, self.timestep)
             else:
                 raise ValueError(f"a quadrotor has no {name}; it has: payload_kg, wind_speed, gust")
 
-    def fly(self, ticks: int) -> None:
-        """Let that many physics steps pass, each with the rotors' thrusts from the controller."""
+    def advance(self, steps: int) -> None:
+        """Advance by some physics steps, each with the rotors' thrusts from the controller."""
         model, data, estimator, controller = self._model, self._data, self._estimator, self.controller
         qpos, qvel, control = data.qpos, data.qvel, data.ctrl
         position, velocity = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
         before = (0.0, 0.0, 0.0)
-        for _ in range(ticks):
+        for _ in range(steps):
             px, py, pz, qw, qx, qy, qz = qpos.tolist()
             vx, vy, vz, p, q, r = qvel.tolist()
             before = (vx, vy, vz)
@@ -146,41 +158,40 @@ class Quadrotor:
             self._count += 1
             if self.flying:
                 control[:] = controller.update(position, velocity, (qw, qx, qy, qz), (p, q, r))
-            self._blow(vx, vy, vz)
-            if self._moving:
+            self._apply_drag(vx, vy, vz)
+            if self._movers:
                 self._time += self.timestep
-                self._moving.place(self._time)
-            # step2 before step1: contacts are then those of the position just reached
+                self._movers.place(self._time)
+            # step2 before step1, so that the contacts belong to the new position
             mujoco.mj_step2(model, data)
             mujoco.mj_step1(model, data)
             if data.ncon:
-                self._touch()
+                self._note_contacts()
             else:
                 self.on_floor = False
-                self._moving.part()
+                self._movers.note_no_contact()
         vx, vy, vz = qvel[:3].tolist()
         dt = self.timestep
-        self._track.append(qpos[:3].tolist())
+        self._path.append(qpos[:3].tolist())
         self._acceleration = ((vx - before[0]) / dt, (vy - before[1]) / dt, (vz - before[2]) / dt)
 
     def cut_rotors(self) -> None:
-        """Rotors at rest, or idling: no thrust to speak of, until `launch`."""
+        """Stop the rotors, or let them idle, until `start_rotors`."""
         self.flying = False
         self._data.ctrl[:] = 0.0
 
     def set_thrusts(self, thrusts: tuple[float, ...]) -> None:
-        """Another controller has the rotors: thrusts [N] in the order of the model's, until told otherwise."""
+        """Set the rotors' thrusts [N] instead of the controller, until the next call."""
         self.flying = False
-        self._data.ctrl[:] = thrusts  # clipped to what a rotor can give
+        self._data.ctrl[:] = thrusts  # MuJoCo clips them
 
     def start_rotors(self) -> None:
-        """The controller takes the rotors, holding the heading as it is."""
-        w, x, y, z = self._data.qpos[3:7].tolist()
-        self.controller.reset(math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z)))
+        """Let the controller drive the rotors and hold the present heading."""
+        self.controller.reset(heading_of(self._data.qpos[3:7].tolist()))
         self.flying = True
 
     def copy_motion(self, other: Quadrotor) -> None:
-        """Go on as another one flies, but from here: its attitude, speeds and rotors."""
+        """Copy the attitude, the velocities and the rotors of another quadrotor; keep the position."""
         mine, theirs = self._data, other._data
         mine.qpos[3:], mine.qvel[:] = theirs.qpos[3:], theirs.qvel
         mine.act[:], mine.ctrl[:] = theirs.act, theirs.ctrl
@@ -188,79 +199,79 @@ class Quadrotor:
         mujoco.mj_forward(self._model, mine)
 
     def position_and_velocity(self) -> tuple[Vector, Vector]:
-        """Position [m] and velocity [m/s] as estimated now: the cheap part of `estimate`, with the same errors."""
+        """Return the estimated position [m] and velocity [m/s]: the fast part of `estimate`, with the same errors."""
         x, y, z = self._data.qpos[:3].tolist()
         vx, vy, vz = self._data.qvel[:3].tolist()
         e = self._estimator.errors
         return (x + e[0], y + e[1], z + e[2]), (vx + e[3], vy + e[4], vz + e[5])
 
     def estimate(self) -> Estimate:
-        """What the vehicle knows of itself now."""
+        """Return the full estimate now."""
         px, py, pz, qw, qx, qy, qz = self._data.qpos.tolist()
         vx, vy, vz, p, q, r = self._data.qvel.tolist()
         return self._estimator.read((px, py, pz), (vx, vy, vz), (qw, qx, qy, qz), (p, q, r), self._acceleration)
 
     def true_reading(self) -> Estimate:
-        """What sensors without any error would say now."""
+        """Return the estimate that sensors without errors would give now."""
         px, py, pz, qw, qx, qy, qz = self._data.qpos.tolist()
         vx, vy, vz, p, q, r = self._data.qvel.tolist()
         ax, ay, az = self._acceleration
-        felt = rotate((qw, -qx, -qy, -qz), (ax, ay, az + GRAVITY))
-        return Estimate((px, py, pz), (vx, vy, vz), (qw, qx, qy, qz), (p, q, r), felt)
+        force = rotate((qw, -qx, -qy, -qz), (ax, ay, az + GRAVITY))
+        return Estimate((px, py, pz), (vx, vy, vz), (qw, qx, qy, qz), (p, q, r), force)
 
     def state(self) -> Array:
-        """The true state (9,); its acceleration is the mean over the last physics step."""
+        """Return the true state (9,); its acceleration is the mean over the last physics step."""
         return np.array([*self._data.qpos[:3], *self._data.qvel[:3], *self._acceleration])
 
     @staticmethod
     def estimated_state(estimate: Estimate) -> Array:
-        """The state (9,) of an estimate."""
+        """Return the state (9,) of an estimate."""
         return np.array([*estimate.position, *estimate.velocity, *estimate.acceleration])
 
     def clearance(self, positions: Array) -> Array:
-        """From the footprint's sphere at positions (..., 3) to the nearest obstacle, m; inf without any."""
+        """Return the distance [m] from the footprint at positions (..., 3) to the nearest obstacle; inf without any."""
         if not len(self.arena.shapes):
             return np.full(positions.shape[:-1], math.inf)
         return np.asarray(self.arena.shapes.distance(positions).min(axis=0) - QUADROTOR.footprint)
 
     def _hover(self) -> None:
-        """Be in the air for long: rotors at hovering thrust, the mean wind leant against, the start held."""
+        """Start in steady hover: rotors at hovering thrust, tilted against the mean wind, holding the start."""
         self._data.act[:] = 0.25 * self._body.mass * GRAVITY
         controller = self.controller
         controller.x.hold, controller.y.hold, controller.z.hold = self._data.qpos[:3].tolist()
-        if self._air is not None:
-            for axis, wind in zip((controller.x, controller.y, controller.z), self._air.mean, strict=True):
+        if self._wind_process is not None:
+            for axis, wind in zip((controller.x, controller.y, controller.z), self._wind_process.mean, strict=True):
                 axis.integral = -wind * (
-                    self._body.drag_linear + self._body.drag_quadratic * math.hypot(*self._air.mean)
+                    self._body.drag_linear + self._body.drag_quadratic * math.hypot(*self._wind_process.mean)
                 )
-        self.fly(SETTLE * SAMPLES * self._ticks)
+        self.advance(SETTLE * SAMPLES * self._steps_per_sample)
         self.collided = False
 
-    def _blow(self, vx: float, vy: float, vz: float) -> None:
-        """The air's drag on the body moving at a velocity, m/s."""
-        if self._air is not None:
-            self._air.advance()
-            wx, wy, wz = self._air.velocity
+    def _apply_drag(self, vx: float, vy: float, vz: float) -> None:
+        """Apply the air's drag on the body, at a velocity [m/s]."""
+        if self._wind_process is not None:
+            self._wind_process.advance()
+            wx, wy, wz = self._wind_process.velocity
             vx, vy, vz = vx - wx, vy - wy, vz - wz
         body = self._body
         drag = body.mass * (body.drag_linear + body.drag_quadratic * math.sqrt(vx * vx + vy * vy + vz * vz))
         self._data.qfrc_applied[:3] = (-drag * vx, -drag * vy, -drag * vz)
 
-    def _touch(self) -> None:
-        """Note what the vehicle touches: a plane is the lowest type of geom, and comes first in a contact."""
+    def _note_contacts(self) -> None:
+        """Note the present contacts. A plane is the lowest type of geom, and comes first in a contact."""
         first = self._data.contact.geom[:, 0]
         floor = self._floor_geom
-        if self._moving:
+        if self._movers:
             speed = math.hypot(*self._data.qvel[:3].tolist())
-            movers = self._moving.meet(speed > STANDING or any(self.controller.setpoint))
+            movers = self._movers.note_contacts(speed > STANDING or any(self.controller.setpoint))
             first = first[~movers]
         self.on_floor = bool((first == floor).any())
-        if not self._moving.pushed:
+        if not self._movers.pushed:
             self.collided = self.collided or bool((first != floor).any())
 
 
 def _build(arena: Arena, floor: float | None) -> mujoco.MjModel:
-    """Compile vehicle and arena, the vehicle at the start, or on the floor below it."""
+    """Compile the vehicle and the arena, with the vehicle at the start or on the floor below it."""
     spec = mujoco.MjSpec.from_string(MODEL)
     add_obstacles(spec, arena)
     add_movers(spec, arena.crowd)

@@ -1,7 +1,6 @@
-"""Scripted policies of both robots, by name; those of the ground robot (`brakeline.sim.quadrotor_policies` has the
-quadrotor's).
+"""Scripted policies by name, and those of the ground robot; `brakeline.sim.quadrotor_policies` has the quadrotor's.
 
-They are there to collect data, to test a safety filter, and to show what an arena allows.
+They collect data, test the safety filter, and show what an arena allows.
 """
 
 from __future__ import annotations
@@ -13,141 +12,148 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from brakeline.messaging.obstacle import Shapes
 from brakeline.messaging.robot import Robot
 from brakeline.messaging.task import RobotWithTask
 from brakeline.sim.arena import Arena
 from brakeline.sim.grid_planner import Routes
 from brakeline.sim.ground_estimator import wrap
-from brakeline.sim.quadrotor_policies import way_to_nearest
 from brakeline.sim.reciprocal_avoidance import ReciprocalAvoidance
 
 Array = NDArray[np.float64]
-Policy = Callable[[NDArray[np.float32], dict[str, Any]], Array]  # (observation, info) -> action in physical units
+Observation = NDArray[np.float32]
+Policy = Callable[[Observation, dict[str, Any]], Array]  # (observation, info) -> input in physical units
 
 
 class UnknownPolicy(ValueError):
-    """No scripted policy has that name."""
+    """The robot has no scripted policy of this name; the message lists the names."""
 
 
 def scripted(name: str, robot: RobotWithTask, rng: np.random.Generator) -> Policy:
-    """The scripted policy of that name (`task.policies`). It notices new episodes itself.
+    """Return the scripted policy of a name in `task.policies`. It notices by itself that a new episode starts.
 
     Raises:
-        UnknownPolicy: with the names there are, or because the robot has none.
+        UnknownPolicy: the robot has no policy of this name.
     """
     task = robot.task
     if name not in task.policies:
-        there = ", ".join(task.policies) or "none"
-        raise UnknownPolicy(f"no policy of the {robot.kind} is called {name!r}; there are: {there}")
+        names = ", ".join(task.policies) or "none"
+        raise UnknownPolicy(f"no policy of the {robot.kind} is called {name!r}; there are: {names}")
     policy: Policy = task.code(task.policies[name])(robot, rng)
     return policy
 
 
 def bearing(state: Array, target: Array | tuple[float, float]) -> float:
-    """Angle from the robot's heading to a point, rad in [-π, π)."""
+    """Return the angle from the robot's heading to a point, rad in [-π, π)."""
     return wrap(math.atan2(target[1] - state[1], target[0] - state[0]) - float(state[2]))
 
 
 def bounded(robot: Robot, speed: float, turn_rate: float) -> Array:
-    """The input (speed [m/s], turn rate [rad/s]) within the robot's bounds."""
+    """Return the input (speed [m/s], turn rate [rad/s]) within the robot's bounds."""
     return np.asarray(np.clip((speed, turn_rate), robot.low(), robot.high()))
 
 
-class RandomPolicy:
-    """Inputs drawn evenly from the bounds, each held for 1 to `LONGEST` periods."""
+def vector_to_nearest(info: dict[str, Any]) -> Array:
+    """Return the vector (d,) [m] from the measured position to the nearest obstacle, moving or not, or robot."""
+    arena: Arena = info["arena"]
+    position = info["state"][: arena.dim]
+    vectors = arena.shapes.towards(position)
+    if moving := [obstacle for obstacle in info["obstacles"] if obstacle.motion is not None]:
+        vectors = np.concatenate([vectors, Shapes.of(moving, arena.dim).towards(position)])
+    if len(others := info.get("others", ())):
+        vectors = np.concatenate([vectors, others[:, : arena.dim] - position])
+    return np.asarray(vectors[np.argmin(np.einsum("ni,ni->n", vectors, vectors))])
 
-    LONGEST = 10
+
+class ScriptedPolicy:
+    """The base of policies that need the robot and a generator."""
 
     def __init__(self, robot: Robot, rng: np.random.Generator) -> None:
         self._robot, self._rng = robot, rng
-        self._left = 0
 
-    def __call__(self, observation: NDArray[np.float32], info: dict[str, Any]) -> Array:
-        if info["time"] == 0.0 or self._left == 0:
-            self._left = int(self._rng.integers(1, self.LONGEST, endpoint=True))
+
+class RandomPolicy(ScriptedPolicy):
+    """Draws inputs uniformly from the bounds, and repeats each for 1 to `LONGEST` periods."""
+
+    LONGEST = 10
+    _periods_left = 0
+
+    def __call__(self, observation: Observation, info: dict[str, Any]) -> Array:
+        if info["time"] == 0.0 or self._periods_left == 0:
+            self._periods_left = int(self._rng.integers(1, self.LONGEST, endpoint=True))
             self._input = self._rng.uniform(self._robot.low(), self._robot.high())
-        self._left -= 1
+        self._periods_left -= 1
         return self._input
 
 
-class GroundGreedyPolicy:
-    """Full speed, turning towards the goal on the way, whatever stands there."""
+class GroundGreedyPolicy(ScriptedPolicy):
+    """Drives at full speed, turning towards the goal, whatever stands in between."""
 
-    def __init__(self, robot: Robot, rng: np.random.Generator) -> None:
-        self._robot = robot
-
-    def __call__(self, observation: NDArray[np.float32], info: dict[str, Any]) -> Array:
-        wanted = bearing(info["state"], info["goal"]) / self._robot.period
-        return bounded(self._robot, self._robot.high()[0], wanted)
+    def __call__(self, observation: Observation, info: dict[str, Any]) -> Array:
+        turn_rate = bearing(info["state"], info["goal"]) / self._robot.period
+        return bounded(self._robot, self._robot.high()[0], turn_rate)
 
 
-class GroundAdversary:
-    """Turns to the nearest obstacle on the spot, be it one that moves or a robot, then drives at it at full speed."""
+class GroundAdversary(ScriptedPolicy):
+    """Turns on the spot towards the nearest obstacle, moving or not, or robot, then drives at it at full speed."""
 
-    AIMED = 0.5  # rad; a larger bearing is turned off first, else it could circle the obstacle for ever
+    AIMED = 0.5  # rad; at a larger bearing it only turns, else it could circle the obstacle for ever
 
-    def __init__(self, robot: Robot, rng: np.random.Generator) -> None:
-        self._robot = robot
-
-    def __call__(self, observation: NDArray[np.float32], info: dict[str, Any]) -> Array:
-        nearest = way_to_nearest(info)
-        angle = bearing(info["state"], info["state"][:2] + nearest)
+    def __call__(self, observation: Observation, info: dict[str, Any]) -> Array:
+        angle = bearing(info["state"], info["state"][:2] + vector_to_nearest(info))
         speed = self._robot.high()[0] if abs(angle) < self.AIMED else 0.0
         return bounded(self._robot, speed, angle / self._robot.period)
 
 
-class GroundRoutePolicy:
-    """Knows the map: follows the best way of `Routes` by pure pursuit of a point ahead that can be driven at straight.
+class GroundRoutePolicy(ScriptedPolicy):
+    """Follows the best path on the map (`Routes`) by pure pursuit of the farthest point in a straight line.
 
-    The larger the bearing of that point, the slower it drives; a point far to the side is turned to on the spot.
-    Leaving the way needs no new search: `Routes` has one from every cell. Where other robots drive, it gets past them
-    as `ReciprocalAvoidance` says.
+    The larger the bearing of that point, the slower it drives; it turns on the spot towards a point far to the side.
+    It needs no new search after leaving its path: `Routes` has a path from every cell. Other robots it avoids by
+    `ReciprocalAvoidance`.
     """
 
-    COMFORT = 0.25  # m beside the footprint: more clearance than this is worth no detour
-    AHEAD = 1.0  # m of the way that are looked at
-    SPACING = 0.03  # m between the points at which a straight line is checked
-    GIVE = 0.01  # m of clearance that a straight line may lose against the way it cuts short
+    WANTED_GAP = 0.25  # m beside the footprint; more clearance than this is worth no detour
+    LOOKAHEAD = 1.0  # m of the path
+    SPACING = 0.03  # m between the points at which it checks a straight line
+    CLEARANCE_LOSS = 0.01  # m of clearance that a straight line may lose against the path that it cuts short
     GAIN = 1.5  # 1/s, turn rate per bearing
     ALIGNED = 0.35  # rad; at larger bearings it turns on the spot
 
-    def __init__(self, robot: Robot, rng: np.random.Generator) -> None:
-        self._robot, self._rng = robot, rng
-        self._arena: Arena | None = None
+    _arena: Arena | None = None
 
-    def __call__(self, observation: NDArray[np.float32], info: dict[str, Any]) -> Array:
+    def __call__(self, observation: Observation, info: dict[str, Any]) -> Array:
         if info["arena"] is not self._arena:
             self._arena = info["arena"]
-            self._passing = ReciprocalAvoidance(self._robot, info["arena"].clearance_map, self._rng)
-            self._routes = Routes(
-                info["arena"].clearance_map, info["goal"], self._robot.footprint, self._robot.footprint + self.COMFORT
-            )
+            grid, footprint = info["arena"].clearance_map, self._robot.footprint
+            self._avoidance = ReciprocalAvoidance(self._robot, grid, self._rng)
+            self._routes = Routes(grid, info["goal"], footprint, footprint + self.WANTED_GAP)
         target = self._target(info["state"][:2])
         if len(others := info.get("others", ())):
-            way = self._passing.direction(info["state"], target, others)
-            return self._pursue(wrap(way - float(info["state"][2])))
+            direction = self._avoidance.direction(info["state"], target, others)
+            return self._pursue(wrap(direction - float(info["state"][2])))
         return self._pursue(bearing(info["state"], target))
 
     def _target(self, position: Array) -> Array:
-        """The farthest point of the way ahead that a straight line reaches with (nearly) the way's own clearance."""
-        way = self._routes.way(position, self.AHEAD)
+        """Return the farthest point of the path that a straight line reaches with nearly the path's own clearance."""
+        path = self._routes.path(position, self.LOOKAHEAD)
         grid = self._routes.grid
-        comfort = self._robot.footprint + self.COMFORT
-        least = np.minimum.accumulate(np.minimum(grid.at(way), comfort)) - self.GIVE
-        for i in range(len(way) - 1, 1, -1):
-            steps = max(2, math.ceil(float(np.linalg.norm(way[i] - position)) / self.SPACING))
-            line = position + np.linspace(0.0, 1.0, steps)[:, None] * (way[i] - position)
+        wanted = self._robot.footprint + self.WANTED_GAP
+        least = np.minimum.accumulate(np.minimum(grid.at(path), wanted)) - self.CLEARANCE_LOSS
+        for i in range(len(path) - 1, 1, -1):
+            steps = max(2, math.ceil(float(np.linalg.norm(path[i] - position)) / self.SPACING))
+            line = position + np.linspace(0.0, 1.0, steps)[:, None] * (path[i] - position)
             if grid.at(line).min() >= least[i]:
-                return np.asarray(way[i])
-        return np.asarray(way[min(1, len(way) - 1)])
+                return np.asarray(path[i])
+        return np.asarray(path[min(1, len(path) - 1)])
 
     def _pursue(self, angle: float) -> Array:
-        """The input that turns to a bearing (rad) as fast as is smooth, and drives when roughly aligned."""
+        """Return the input that turns towards a bearing [rad], and drives when roughly aligned."""
         speed = self._robot.high()[0] * max(0.0, 1.0 - abs(angle) / self.ALIGNED)
         return bounded(self._robot, speed, self.GAIN * angle)
 
 
 class GroundCarefulPolicy(GroundRoutePolicy):
-    """The same, that keeps a wide berth: where whatever is seen may move, what is near lets nobody pass."""
+    """Keeps a larger distance: if free space comes from scans, obstacles close to the path block it."""
 
-    COMFORT = 0.6
+    WANTED_GAP = 0.6

@@ -1,4 +1,4 @@
-"""What every vehicle has in common, whatever it is and wherever it runs: one input in, one period's report out."""
+"""The interface of every vehicle, simulated or real: one input in, the report of one period out."""
 
 from __future__ import annotations
 
@@ -16,36 +16,36 @@ Array = NDArray[np.float64]
 
 
 class BadInput(ValueError):
-    """An input that is not a finite vector of the robot's length."""
+    """The input is not a finite vector with one number for each of the robot's inputs."""
 
 
 def clip_input(robot: Robot, input: Array, before: Array) -> Array:
-    """What is executed of an input (m,) after `before`: within the robot's bounds and slew.
+    """Return the input (m,) that a robot executes after `before` (m,): within its bounds and its slew.
 
     Raises:
-        BadInput: when it is not as many finite numbers as the robot has inputs.
+        BadInput: the input is not m finite numbers.
     """
     input = np.asarray(input, dtype=np.float64)
     if input.shape != (robot.action_dim,) or not np.isfinite(input).all():
-        raise BadInput(f"an input is {robot.action_dim} finite numbers, not {input!r}")
+        raise BadInput(f"the input of {robot.name} must be {robot.action_dim} finite numbers, not {input!r}")
     slew = np.asarray(robot.action_slew)
     return np.clip(np.clip(input, robot.low(), robot.high()), before - slew, before + slew)
 
 
 @dataclass(frozen=True)
 class Period:
-    """What happened in one period. n: state coordinates; d: of them the position; S: samples in a period."""
+    """The report of one period. Dimensions: n coordinates of the state, d of the position, S samples in a period."""
 
-    measured: Array  # (n,) state at its end, as estimated
-    true: Array  # (n,) state at its end, as it is
-    collision: bool  # some geom of the robot touched an obstacle at some physics step
-    closest: float  # m, least distance from a disc (sphere) of the body to an obstacle, at the samples
-    clearance: float  # m, the same at the period's end
-    subsamples: Array  # (S, d) m, estimated positions from the period's start, in the robot's frame of that moment
-    turned: float  # rad, estimated change of heading; 0 for a robot whose state has none
-    contact_moving: bool = False  # it touched something that moves, and was moving itself when that began
-    contact_standing: bool = False  # it was run into while it stood
-    contact_robot: bool = False  # it began to touch another robot of its world
+    measured: Array  # (n,) measured state at the end
+    true: Array  # (n,) true state at the end
+    collision: bool  # the robot touched a static obstacle in some physics step
+    closest: float  # m, least distance from a disc (sphere) of the body to an obstacle, over the samples
+    clearance: float  # m, the same distance at the end
+    subsamples: Array  # (S, d) m, estimated positions relative to the start, in the robot's frame at the start
+    turned: float  # rad, estimated change of heading; 0 for a robot without a heading
+    contact_moving: bool = False  # the robot touched a moving obstacle while it was moving itself
+    contact_standing: bool = False  # a moving obstacle touched the robot while the robot stood
+    contact_robot: bool = False  # the robot began to touch another robot of its world
 
 
 class Vehicle(Protocol):
@@ -53,32 +53,32 @@ class Vehicle(Protocol):
 
     @property
     def true(self) -> Array:
-        """(n,) the state as it is."""
+        """The true state (n,)."""
 
     @property
     def measured(self) -> Array:
-        """(n,) the state as it is estimated."""
+        """The measured state (n,)."""
 
     @property
     def input(self) -> Array:
-        """(m,) what was executed last, within bounds and slew; zero before the first step."""
+        """The input (m,) executed last, within bounds and slew; zero before the first step."""
 
     def step(self, input: Array) -> Period:
-        """Carry out an input for one period; it is clipped to the robot's bounds and slew.
+        """Carry out an input (m,) for one period, clipped to the robot's bounds and slew.
 
         Raises:
-            BadInput: when the input is not m finite numbers.
+            BadInput: the input is not m finite numbers.
         """
 
     def initial_period(self) -> Period:
-        """The present state as a period in which nothing happened: what there is to say before the first step."""
+        """Return the report of a period in which nothing happened, at the present state."""
 
     def alter(self, **changes: float) -> None:
-        """Change the vehicle's physics, from now on, by the names that its kind documents.
+        """Change the vehicle's physics from now on; each kind of vehicle documents the names that it takes.
 
         Raises:
-            ValueError: this kind of vehicle has no such thing, or it cannot have this value.
+            ValueError: the vehicle does not take this name, or not this value.
         """
 
 
-MakeVehicle = Callable[[Arena, np.random.Generator], Vehicle]  # from the generator comes every error of its sensors
+MakeVehicle = Callable[[Arena, np.random.Generator], Vehicle]  # the generator is the source of all sensor errors

@@ -36,8 +36,8 @@ from brakeline.messaging.ros2.cdr_messages import (
 )
 from brakeline.messaging.task import robot_with_task
 from brakeline.sim.arena_generator import draw_arena
-from brakeline.sim.ground_realtime import SAMPLE_TIME, RealtimeGroundRobot, SpinningLidar
-from brakeline.sim.ground_robot import SAMPLES
+from brakeline.sim.ground_realtime import RealtimeGroundRobot, SpinningLidar
+from brakeline.sim.ground_robot import SAMPLE_TIME, SAMPLES
 from brakeline.sim.sim_conditions import Conditions
 
 Array = NDArray[np.float64]
@@ -93,7 +93,7 @@ class Bridge:
         rng = np.random.default_rng((settings.seed, 11))
         arena = draw_arena(settings.arena, np.random.default_rng(settings.seed), robot_with_task("ground"))
         c = settings.conditions
-        self.robot = RealtimeGroundRobot(arena, rng, c.noise, c.payload_kg, c.floor_friction)
+        self.robot = RealtimeGroundRobot(arena, rng, c.noise, payload_kg=c.payload_kg, floor_friction=c.floor_friction)
         self._lidar = SpinningLidar(arena, rng, c.lidar_noise(flies=False))
         self._start_time = 1.0 if settings.sim_time else time.time()  # s, the robot's time at the first sample
         self._samples = 0
@@ -160,7 +160,7 @@ class Bridge:
         self._publish()
         self.outcome.seconds = self._samples * SAMPLE_TIME
         self.outcome.collisions, self.outcome.closest = robot.collisions, robot.closest
-        self.outcome.driven = robot.driven
+        self.outcome.driven = robot.distance_driven
 
     def _publish(self) -> None:
         now, (x, y, yaw, speed, turn_rate) = self.now, self.robot.measured.tolist()
@@ -174,7 +174,7 @@ class Bridge:
             )
         )
         self._transforms.put(TFMessage(transforms=[_transform(now, ODOM, BASE, x, y, yaw)]))
-        ranges = self._lidar.look(self.robot.true)
+        ranges = self._lidar.measure_sector(self.robot.true)
         if ranges is not None:
             self._scans.put(self._scan(ranges))
         if self._clock is not None:

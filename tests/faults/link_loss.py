@@ -50,7 +50,7 @@ class Loss:
 
     def __init__(self, question: Ask, timeout: float) -> None:
         self._question, self._timeout = question, timeout
-        self._env = NavigationEnv(ROBOT, "default", self._vehicle, 0.02, seed_key=77)
+        self._env = NavigationEnv(ROBOT, "default", self._vehicle, seed_key=77)
         self.collisions = 0
 
     def outside(self, policy: str, number: int) -> float:

@@ -1,4 +1,4 @@
-"""The embedded autopilots, on the ground and in the air, by both rule sets."""
+"""Fixtures: a ground station with an embedded autopilot, on the ground and in the air, with both rule sets."""
 
 import pytest
 
@@ -13,7 +13,7 @@ def station(request: pytest.FixtureRequest) -> Station:
 
 @pytest.fixture(params=["px4", "ardupilot"])
 def flying(request: pytest.FixtureRequest) -> Station:
-    """Set to follow setpoints at once."""
+    """Return a station whose vehicle flies and follows setpoints without a limit of acceleration."""
     station = Station(request.param, parameters=AT_ONCE[request.param])
     station.into_the_air()
     return station

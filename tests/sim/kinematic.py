@@ -1,4 +1,4 @@
-"""A quadrotor without physics: a point whose velocity lags its setpoint; it touches what comes nearer than its body."""
+"""A quadrotor without physics: a point whose velocity lags behind its setpoint."""
 
 import math
 
@@ -10,11 +10,11 @@ from tests.robots import QUADROTOR
 
 SAMPLES = 10
 LAG = 0.2  # s
-BODY = 0.28  # m
+BODY = 0.28  # m, distance of a collision
 
 
 class PointMass:
-    """Stands in for a quadrotor; see `brakeline.sim.vehicle.Vehicle`."""
+    """A point mass with the interface `brakeline.sim.vehicle.Vehicle`."""
 
     def __init__(self, arena: Arena, rng: np.random.Generator) -> None:
         self.arena, self._rng = arena, rng
@@ -32,9 +32,9 @@ class PointMass:
         self.input = np.clip(np.clip(input, QUADROTOR.low(), QUADROTOR.high()), self.input - slew, self.input + slew)
         start, path = self.measured[:3], np.empty((SAMPLES, 3))
         position, velocity = self.true[:3], self.true[3:6]
-        keep = math.exp(-QUADROTOR.period / SAMPLES / LAG)
+        decay = math.exp(-QUADROTOR.period / SAMPLES / LAG)
         for i in range(SAMPLES):
-            velocity = self.scale * self.input + keep * (velocity - self.scale * self.input)
+            velocity = self.scale * self.input + decay * (velocity - self.scale * self.input)
             position = path[i] = position + velocity * (QUADROTOR.period / SAMPLES)
         self.true = np.concatenate((position, velocity, (self.input - velocity) / LAG))
         self.measured = self._measure()

@@ -1,4 +1,4 @@
-"""Arenas: what is drawn keeps its promises, a way through above all."""
+"""Drawn arenas keep the numbers of their kind and have a path from start to goal."""
 
 import math
 from heapq import heappop, heappush
@@ -32,8 +32,8 @@ def ends(drawn: Arena) -> np.ndarray:
     return np.array([drawn.start[: drawn.dim], drawn.goal])
 
 
-def way_through(drawn: Arena, clearance: float) -> np.ndarray | None:
-    """Cell centres of some way from start to goal over cells with that clearance: always on from the nearest to it."""
+def find_path(drawn: Arena, clearance: float) -> np.ndarray | None:
+    """Return the cell centres of a path from start to goal over cells with a clearance, by greedy best-first search."""
     grid = drawn.clearance_map
     start, goal = (tuple(cell) for cell in grid.index(ends(drawn)).tolist())
     before = {start: start}
@@ -57,21 +57,21 @@ def way_through(drawn: Arena, clearance: float) -> np.ndarray | None:
 @each_arena
 @settings(max_examples=6, deadline=None)
 @given(seed=st.integers(0, 2**32))
-def test_a_way_exists_at_every_point_of_it(robot: Robot, name: str, seed: int) -> None:
+def test_every_drawn_arena_has_a_path_with_its_clearance(robot: Robot, name: str, seed: int) -> None:
     drawn = arena(name, seed, robot)
     needed = robot.footprint + arena_kind(robot, name).path_clearance
     half_step = 0.5 * drawn.clearance_map.cell * np.sqrt(drawn.dim)
-    way = way_through(drawn, float(np.hypot(needed, half_step)))
+    way = find_path(drawn, float(np.hypot(needed, half_step)))
     assert way is not None
     way = np.concatenate(([drawn.goal], way, [drawn.start[: drawn.dim]]))
     fine = np.concatenate([np.linspace(a, b, 12) for a, b in pairwise(way)])
-    # from start and goal to the centres of their cells the clearance falls by no more than that way
+    # from start and goal to the centres of their cells the clearance falls by at most that distance
     assert drawn.shapes.distance(fine[12:-12]).min() >= needed - 1e-9
     assert drawn.shapes.distance(fine).min() >= needed - half_step
 
 
 @each_arena
-def test_what_is_drawn_is_within_the_kind(robot: Robot, name: str) -> None:
+def test_a_drawn_arena_keeps_the_numbers_of_its_kind(robot: Robot, name: str) -> None:
     kind = arena_kind(robot, name)
     smallest_gaps = []
     for seed in range(25):
@@ -91,11 +91,11 @@ def test_what_is_drawn_is_within_the_kind(robot: Robot, name: str) -> None:
             smallest_gaps.append(float(gaps([obstacle], [*plans[:i], *plans[i + 1 :], *walls])[0]))
     assert min(smallest_gaps) >= 2.0 * robot.footprint + kind.gap
     if name == "dense":
-        assert min(smallest_gaps) < 2.0 * robot.footprint + 1.1 * kind.gap  # it gets as narrow as it may
+        assert min(smallest_gaps) < 2.0 * robot.footprint + 1.1 * kind.gap  # some gap is as narrow as allowed
 
 
 def plan(obstacle: Obstacle) -> Obstacle:
-    """What an obstacle looks like from above."""
+    """Return the obstacle seen from above."""
     size = obstacle.size[:2] if obstacle.kind == BOX else obstacle.size[:1]
     return Obstacle(obstacle.kind, obstacle.position[:2], size, obstacle.yaw)
 
@@ -113,12 +113,12 @@ def test_obstacles_in_space_stand_hang_and_float_between_floor_and_ceiling() -> 
                 assert z + half == pytest.approx(10.0) or z == half
             else:
                 assert half <= z <= 10.0 - half
-        for z in (0.0, 10.0):  # floor and ceiling are surfaces, as the walls are
+        for z in (0.0, 10.0):  # floor and ceiling are surfaces like the walls
             assert drawn.shapes.distance(np.array([19.9, -19.9, abs(z - 0.03)]))[-2:].min() == pytest.approx(0.03)
     assert 10 < hanging < 40
 
 
-def test_default_is_what_it_is_called_for() -> None:
+def test_the_default_arenas_have_their_documented_numbers() -> None:
     counts = [len(arena("default", seed).obstacles) - 4 for seed in range(40)]
     assert (min(counts), max(counts)) == (6, 10)
     kind = arena_kind(GROUND, "default")
@@ -130,13 +130,13 @@ def test_default_is_what_it_is_called_for() -> None:
     assert bounds_of(arena_kind(QUADROTOR, "tall"))[2] == (0.0, 30.0)
 
 
-def test_the_generator_decides() -> None:
+def test_the_generator_determines_the_arena() -> None:
     for robot in (GROUND, QUADROTOR):
         assert arena("dense", 7, robot) == arena("dense", 7, robot)
         assert arena("dense", 7, robot) != arena("dense", 8, robot)
 
 
-def test_an_unknown_name_is_refused_with_the_names_there_are() -> None:
+def test_an_unknown_arena_is_refused_with_the_names_that_exist() -> None:
     with pytest.raises(
         UnknownArena,
         match="no arena is called 'moon'; there are: crossing, default, dense, few-walkers, many-walkers, open, walk",
@@ -146,7 +146,7 @@ def test_an_unknown_name_is_refused_with_the_names_there_are() -> None:
         arena("open", 0, QUADROTOR)
 
 
-def test_gaps_of_staged_shapes() -> None:
+def test_gaps_between_shapes_are_exact() -> None:
     crate = Obstacle(BOX, (0.0, 0.0), (2.0, 1.0))
     assert gaps([crate], [pillar(2.0, 0.0, 0.5)])[0] == pytest.approx(0.5)
     assert gaps([pillar(2.0, 0.0, 0.5)], [crate])[0] == pytest.approx(0.5)

@@ -1,4 +1,4 @@
-"""Real time in simulation: inputs come a period late; and goals that follow each other without a reset."""
+"""Simulated real time: inputs take effect one period later, and goals follow each other without a reset."""
 
 import numpy as np
 import pytest
@@ -14,7 +14,7 @@ from tests.robots import GROUND, QUADROTOR
 ROBOT = QUADROTOR.in_real_time()
 
 
-def test_each_input_is_carried_out_a_period_after_it_was_given() -> None:
+def test_each_input_is_executed_one_period_later() -> None:
     arena = staged_arena(start=(0.0, 0.0, 50.0), goal=(9.0, 9.0, 50.0), half_width=100.0, height=100.0)
     at_once = Quadrotor(arena, np.random.default_rng(3))
     late_vehicle = delayed(Quadrotor, ROBOT)(arena, np.random.default_rng(3))
@@ -29,13 +29,13 @@ def test_each_input_is_carried_out_a_period_after_it_was_given() -> None:
         late_vehicle.step(np.array([np.nan, 0.0, 0.0]))
 
 
-def test_a_late_robot_has_the_same_body_senses_and_arenas() -> None:
+def test_a_robot_in_real_time_has_the_same_kind_and_arenas() -> None:
     assert ROBOT.kind == QUADROTOR.kind == QUADROTOR.name != ROBOT.name
     assert arena_kind(ROBOT, "default") is arena_kind(QUADROTOR, "default")
 
 
 @pytest.mark.parametrize("robot", [GROUND, ROBOT], ids=lambda robot: robot.name)
-def test_a_tour_leads_from_goal_to_goal(robot) -> None:  # type: ignore[no-untyped-def]
+def test_a_goal_sequence_leads_from_goal_to_goal(robot) -> None:  # type: ignore[no-untyped-def]
     arena, kind = draw_arena("default", np.random.default_rng(5), robot), arena_kind(robot, "default")
     stages = goal_sequence(arena, 6, np.random.default_rng(6), robot)
     start = arena.start[: arena.dim]
@@ -48,10 +48,10 @@ def test_a_tour_leads_from_goal_to_goal(robot) -> None:  # type: ignore[no-untyp
         start = stage.goal
 
 
-def test_a_pilot_that_is_prepared_proposes_the_same() -> None:
+def test_a_prepared_policy_proposes_the_same_inputs() -> None:
     arena = draw_arena("default", np.random.default_rng(7), QUADROTOR)
     state = np.array([*arena.start, *np.zeros(6)])
     info = {"arena": arena, "goal": arena.goal, "state": state, "input_in_force": np.zeros(3)}
-    pilot, ready = (QuadrotorRoutePolicy(ROBOT, np.random.default_rng(0)) for _ in range(2))
+    unprepared, ready = (QuadrotorRoutePolicy(ROBOT, np.random.default_rng(0)) for _ in range(2))
     ready.prepare(arena)
-    assert (pilot(np.zeros(0, np.float32), info) == ready(np.zeros(0, np.float32), info)).all()
+    assert (unprepared(np.zeros(0, np.float32), info) == ready(np.zeros(0, np.float32), info)).all()

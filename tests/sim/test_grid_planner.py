@@ -1,4 +1,4 @@
-"""The planner's grid against the distances of the shapes, and its routes against staged rooms."""
+"""The planner's grid has the distances of the shapes, and its paths go around obstacles."""
 
 import math
 from collections.abc import Callable
@@ -17,7 +17,7 @@ from tests.robots import GROUND, QUADROTOR
 
 
 @pytest.mark.parametrize("robot", [GROUND, QUADROTOR], ids=lambda robot: robot.name)
-def test_the_map_holds_the_distances_to_the_shapes(robot: Robot) -> None:
+def test_the_clearance_map_has_the_exact_distances(robot: Robot) -> None:
     drawn = draw_arena("default", np.random.default_rng(3), robot)
     grid = drawn.clearance_map
     some = np.random.default_rng(0).choice(len(grid.centres), 5000)
@@ -25,15 +25,15 @@ def test_the_map_holds_the_distances_to_the_shapes(robot: Robot) -> None:
     assert grid.clearance.ravel()[some] == pytest.approx(exact, abs=1e-9)
     assert (grid.number(grid.centres[some]) == some).all()
     assert grid.at(grid.centres[some]) == pytest.approx(exact, abs=1e-9)
-    assert grid.between(grid.clearance, grid.centres[some]) == pytest.approx(exact, abs=1e-9)
+    assert grid.interpolate(grid.clearance, grid.centres[some]) == pytest.approx(exact, abs=1e-9)
 
 
-def test_between_cells_values_are_linear() -> None:
+def test_interpolation_between_cells_is_linear() -> None:
     grid = draw_arena("default", np.random.default_rng(3), QUADROTOR).clearance_map
     slope = np.array([1.0, -2.0, 3.0])
     points = np.random.default_rng(0).uniform((-19.0, -19.0, 1.0), (19.0, 19.0, 9.0), (200, 3))
     values = (grid.centres @ slope).reshape(grid.shape)
-    assert grid.between(values, points) == pytest.approx(points @ slope)
+    assert grid.interpolate(values, points) == pytest.approx(points @ slope)
 
 
 def flat(*obstacles: Obstacle) -> Arena:
@@ -44,18 +44,18 @@ def hall(*obstacles: Obstacle) -> Arena:
     return staged_arena(*obstacles, start=(-6.0, 0.0, 2.0), goal=(6.0, 0.0, 2.0), half_width=10.0, height=10.0)
 
 
-def test_routes_go_round_and_keep_away() -> None:
+def test_paths_go_around_obstacles_with_clearance() -> None:
     walled = flat(Obstacle(BOX, (0.0, 0.0), (0.2, 4.0)))
     routes = Routes(walled.clearance_map, walled.goal, GROUND.footprint, GROUND.footprint + 0.25)
-    way = routes.way(np.array([-1.0, 0.0]), 100.0)
-    assert np.linalg.norm(way[-1] - walled.goal) < 0.05
-    assert walled.shapes.distance(way).min() > GROUND.footprint + 0.15
+    path = routes.path(np.array([-1.0, 0.0]), 100.0)
+    assert np.linalg.norm(path[-1] - walled.goal) < 0.05
+    assert walled.shapes.distance(path).min() > GROUND.footprint + 0.15
     assert not walled.clearance_map.connected((-1.0, 0.0), (1.0, 0.0), 0.51)
     assert walled.clearance_map.connected((-1.0, 0.0), (1.0, 0.0), 0.4)
 
 
 @pytest.mark.parametrize(("robot", "name"), [(GROUND, "dense"), (QUADROTOR, "default")])
-def test_what_hangs_together_is_what_scipy_labels_alike(robot: Robot, name: str) -> None:
+def test_connected_agrees_with_the_labels_of_scipy(robot: Robot, name: str) -> None:
     together = []
     for seed, clearance in product(range(3), (0.1, 0.2, 0.35, 0.8, 1.2, 1.6)):
         arena = draw_arena(name, np.random.default_rng(seed), robot)
@@ -68,30 +68,30 @@ def test_what_hangs_together_is_what_scipy_labels_alike(robot: Robot, name: str)
     assert {True, False} == set(together)
 
 
-def test_routes_go_over_what_stands_on_the_floor() -> None:
+def test_paths_go_over_obstacles_on_the_floor() -> None:
     barrier = hall(Obstacle(BOX, (0.0, 0.0, 2.5), (1.0, 20.0, 5.0)))
     routes = Routes(barrier.clearance_map, barrier.goal, QUADROTOR.footprint, 2.0)
-    way = routes.way(np.array(barrier.start), 100.0)
-    assert way[:, 2].max() > 6.0
-    assert barrier.shapes.distance(way).min() > 1.0
+    path = routes.path(np.array(barrier.start), 100.0)
+    assert path[:, 2].max() > 6.0
+    assert barrier.shapes.distance(path).min() > 1.0
     assert barrier.clearance_map.connected(barrier.start, barrier.goal, 1.5)
     assert not barrier.clearance_map.connected(barrier.start, barrier.goal, 2.6)  # 5 m are left above it
 
 
-def test_the_cost_to_go_falls_along_the_way_and_is_its_length_where_there_is_room() -> None:
+def test_the_cost_to_go_falls_along_the_path_and_is_its_length_in_free_space() -> None:
     free = hall()
     routes = Routes(free.clearance_map, free.goal, QUADROTOR.footprint, 2.0)
     along = np.stack((np.linspace(-6.0, 5.0, 12), np.zeros(12), np.full(12, 2.5)), axis=1)
-    to_go = routes.to_go(along)
+    to_go = routes.cost_to_go(along)
     assert np.diff(to_go) == pytest.approx(np.full(11, -1.0), abs=0.2)
-    way = routes.way(np.array([-6.0, 5.0, 2.5]), 100.0)
-    assert (np.diff(routes.to_go(way)) < 0.0).all()
+    path = routes.path(np.array([-6.0, 5.0, 2.5]), 100.0)
+    assert (np.diff(routes.cost_to_go(path)) < 0.0).all()
 
 
 @pytest.mark.parametrize(
     "solid", [lambda at: Obstacle(SPHERE, at, (2.0,)), lambda at: Obstacle(CYLINDER, at, (2.0, 10.0))]
 )
-def test_beside_a_solid_the_cost_to_go_is_that_of_going_round_it(
+def test_beside_an_obstacle_the_cost_to_go_is_that_of_the_path_around_it(
     solid: Callable[[tuple[float, float, float]], Obstacle],
 ) -> None:
     room = hall(solid((0.0, 0.0, 5.0)))
@@ -100,4 +100,4 @@ def test_beside_a_solid_the_cost_to_go_is_that_of_going_round_it(
     clearance = room.shapes.distance(beside).min(axis=0)
     beside = beside[(clearance > QUADROTOR.footprint) & (clearance < 1.0)]
     assert len(beside) > 200
-    assert routes.to_go(beside).max() < 60.0  # a tenth of what one cell inside costs
+    assert routes.cost_to_go(beside).max() < 60.0  # a tenth of the cost of one cell inside

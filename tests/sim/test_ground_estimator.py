@@ -1,4 +1,4 @@
-"""Sensors and their fusion."""
+"""The ground robot's sensors and their fusion."""
 
 import math
 
@@ -24,7 +24,7 @@ def test_noise_is_cut_off_and_otherwise_normal() -> None:
 
 
 @pytest.mark.parametrize(("drift", "fix"), [(0.001, 0.005), (0.01, 0.005)])
-def test_steady_gain_is_what_the_kalman_filter_settles_at(drift: float, fix: float) -> None:
+def test_the_steady_gain_is_the_limit_of_the_kalman_gain(drift: float, fix: float) -> None:
     variance = 1.0
     for _ in range(1000):
         prior = variance + drift**2
@@ -47,7 +47,7 @@ def test_dead_reckoning_of_an_arc_without_noise() -> None:
     assert reading.measured == pytest.approx([*path[-1], angle[-1], speed, turn], abs=2.0 * tick / SAMPLE)
 
 
-def test_speed_and_turn_rate_are_the_current_ones() -> None:
+def test_speed_and_turn_rate_come_from_the_last_samples() -> None:
     sensors = estimator(NoiseLevels(scale=0.0))
     steps = np.where(np.arange(SAMPLES) < 5, 0.0, 0.2 * SAMPLE / RADIUS)
     wheels = np.cumsum(np.stack((steps, steps), axis=1), axis=0)
@@ -57,7 +57,7 @@ def test_speed_and_turn_rate_are_the_current_ones() -> None:
     assert measured[4] == 0.0
 
 
-def test_fusion_is_better_than_a_fix_and_stays_near() -> None:
+def test_fusion_is_better_than_a_fix_and_within_its_bound() -> None:
     noise, errors = NoiseLevels(), []
     for seed in range(30):
         sensors = estimator(noise, seed)

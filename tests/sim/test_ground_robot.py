@@ -37,7 +37,7 @@ def moved(vehicle: GroundRobot, speed: float, turn: float, periods: int = 1) -> 
     return float(np.linalg.norm(drive(vehicle, speed, turn, periods).true[:2] - before))
 
 
-def test_it_stops_from_full_speed_within_a_period() -> None:
+def test_the_robot_stops_from_full_speed_within_a_period() -> None:
     vehicle = robot()
     drive(vehicle, 0.25, 0.0, 5)
     assert 0.006 < moved(vehicle, 0.0, 0.0) < 0.015
@@ -45,7 +45,7 @@ def test_it_stops_from_full_speed_within_a_period() -> None:
     assert moved(vehicle, 0.0, 0.0) < 1e-4
 
 
-def test_it_stands_still() -> None:
+def test_the_robot_stands_still_at_zero_input() -> None:
     vehicle = robot()
     drive(vehicle, 0.25, 0.5, 5)
     drive(vehicle, 0.0, 0.0, 2)
@@ -55,7 +55,7 @@ def test_it_stands_still() -> None:
 
 
 @pytest.mark.parametrize("speed", [0.05, 0.15, 0.25])
-def test_it_drives_as_far_as_it_is_told(speed: float) -> None:
+def test_the_speed_is_that_of_the_input(speed: float) -> None:
     vehicle = robot()
     drive(vehicle, speed, 0.0, 2)
     assert moved(vehicle, speed, 0.0, 10) == pytest.approx(speed * 2.0, rel=0.01)  # the caster does not drag
@@ -64,7 +64,7 @@ def test_it_drives_as_far_as_it_is_told(speed: float) -> None:
 
 
 @pytest.mark.parametrize(("speed", "turn"), [(0.0, 0.5), (0.0, -0.5), (0.0, 0.1), (0.1, 0.3), (0.25, -0.5)])
-def test_it_turns_as_fast_as_it_is_told(speed: float, turn: float) -> None:
+def test_the_turn_rate_is_that_of_the_input(speed: float, turn: float) -> None:
     vehicle = robot()
     drive(vehicle, speed, turn, 2)
     before = vehicle.true[2]
@@ -83,7 +83,7 @@ def test_wheels_roll_without_slip() -> None:
         assert period.turned == pytest.approx(period.true[2] - before[2], abs=1e-6)
 
 
-def test_subsamples_are_the_way_within_the_period_in_the_body_frame() -> None:
+def test_subsamples_are_the_path_within_the_period_in_the_robots_frame() -> None:
     vehicle = robot(room(start=(1.0, -1.0, 2.0)))
     drive(vehicle, 0.25, 0.0, 3)
     period = drive(vehicle, 0.25, 0.0)
@@ -92,7 +92,7 @@ def test_subsamples_are_the_way_within_the_period_in_the_body_frame() -> None:
     assert period.subsamples[:, 1] == pytest.approx(np.zeros(10), abs=1e-4)
 
 
-def test_payload_and_slippery_floors_change_the_motion_in_mid_run() -> None:
+def test_payload_and_friction_change_the_motion_during_a_run() -> None:
     vehicle = robot()
     drive(vehicle, 0.25, 0.0, 3)
     bare = moved(vehicle, 0.0, 0.0, 2)
@@ -112,7 +112,7 @@ def test_payload_and_slippery_floors_change_the_motion_in_mid_run() -> None:
 
 
 @pytest.mark.parametrize("bad", [[0.1], [0.1, math.nan], [math.inf, 0.0], [0.1, 0.0, 0.0]])
-def test_an_input_that_is_none_is_refused(bad: list[float]) -> None:
+def test_an_input_that_is_not_two_finite_numbers_is_refused(bad: list[float]) -> None:
     with pytest.raises(BadInput):
         robot().step(np.array(bad))
 
@@ -144,7 +144,7 @@ def test_a_wheel_hits_or_misses_by_a_centimetre(side: float, miss: float, hit: b
     assert any(drive(vehicle, 0.25, 0.0).collision for _ in range(25)) == hit
 
 
-def test_the_floor_is_no_collision_and_a_wall_is_one() -> None:
+def test_a_wall_is_a_collision_and_the_floor_is_not() -> None:
     vehicle = robot(room(half_width=0.5))
     periods = [drive(vehicle, 0.25, 0.0) for _ in range(12)]
     first = next(i for i, period in enumerate(periods) if period.collision)
@@ -166,7 +166,7 @@ def body_gap(state: np.ndarray, arena: Arena) -> float:
     return float(arena.shapes.distance(points).min())
 
 
-def test_contacts_are_where_the_geometry_says() -> None:
+def test_collisions_agree_with_the_geometry() -> None:
     env = environment(GROUND, "dense", 0)
     policies = [scripted(name, GROUND, np.random.default_rng(0)) for name in ("adversary", "random", "greedy")]
     collisions = 0
@@ -185,9 +185,9 @@ def test_contacts_are_where_the_geometry_says() -> None:
     assert collisions > 30
 
 
-def test_everything_that_can_touch_lies_within_the_footprint() -> None:
+def test_every_geom_lies_within_the_footprint() -> None:
     vehicle = robot()
-    model, data = vehicle._model, vehicle._data
+    model, data = vehicle._physics.model, vehicle._physics.data
     for name, reach in (("plates", 0.069), ("caster", 0.005)):
         centre = data.geom_xpos[model.geom(name).id, :2] - data.qpos[:2]
         assert np.linalg.norm(centre) + reach <= GROUND.footprint

@@ -1,4 +1,4 @@
-"""Lidars against the distances to the shapes along their beams, and against MuJoCo's rays one by one."""
+"""Ranges agree with the distances to the shapes along the beams, and with MuJoCo's single rays."""
 
 import mujoco
 import numpy as np
@@ -18,8 +18,8 @@ PLANE, SPACE = GROUND.task.rays, QUADROTOR.task.rays
 SAMPLES = 60  # along a beam
 
 
-def agree(arena: Arena, rays: LidarRays, origin: np.ndarray, heading: float) -> None:
-    """Each beam ends on a surface or at the full range, and is free up to there."""
+def agree(arena: Arena, rays: Rays, origin: np.ndarray, heading: float) -> None:
+    """Check that each beam ends on a surface or at the full range, in free space up to there."""
     ranges = Lidar(arena, rays).cast(origin, heading)
     directions = rotate(rays.directions, heading)
     hit = ranges < rays.range
@@ -68,7 +68,7 @@ def test_in_space_beams_end_at_the_first_surface(seed: int, heading: float) -> N
         agree(arena, SPACE, origin, heading)
 
 
-def test_all_rays_at_once_are_mujocos_rays_one_by_one() -> None:
+def test_casting_all_rays_at_once_agrees_with_single_rays() -> None:
     for seed in range(5):
         arena = draw_arena("dense", np.random.default_rng(seed), QUADROTOR)
         model, data = map_model(arena)
@@ -79,15 +79,15 @@ def test_all_rays_at_once_are_mujocos_rays_one_by_one() -> None:
         assert Lidar(arena, SPACE).cast(np.array(arena.start)) == pytest.approx(np.minimum(alone, SPACE.range))
 
 
-def test_staged_ranges_in_the_plane() -> None:
+def test_ranges_in_the_plane_are_exact() -> None:
     arena = staged_arena(Obstacle(WALL, (2.0, 0.0), yaw=np.pi), Obstacle(CYLINDER, (0.0, -1.0), (0.25,)))
     ranges = Lidar(arena, PLANE).cast(np.zeros(2))
-    assert ranges[0] == pytest.approx(0.75)  # the first ray looks to the right
+    assert ranges[0] == pytest.approx(0.75)  # the first ray points to the right
     assert ranges[-1] == PLANE.range
     assert ranges[9] == pytest.approx(2.0 / PLANE.directions[9, 0])
 
 
-def test_staged_ranges_in_space() -> None:
+def test_ranges_in_space_are_exact() -> None:
     ball = Obstacle(SPHERE, (0.0, 6.0, 3.0), (1.5,))
     lidar = Lidar(staged_arena(ball, goal=(9.0, 9.0, 3.0), half_width=10.0, height=8.0), SPACE)
     ranges = lidar.cast(np.array([0.0, 0.0, 3.0])).reshape(36, 5)  # azimuths from ahead to the left, elevations upwards
@@ -98,7 +98,7 @@ def test_staged_ranges_in_space() -> None:
     assert lidar.cast(np.array([0.0, -9.0, 3.0])).reshape(36, 5)[9, 2] == SPACE.range
 
 
-def test_noise_is_cut_and_leaves_rays_that_hit_nothing() -> None:
+def test_noise_is_cut_off_and_only_on_beams_that_hit() -> None:
     arena = staged_arena(goal=(9.0, 9.0, 3.0), half_width=20.0, height=30.0)
     origin = np.array([12.0, 0.0, 3.0])
     true = Lidar(arena, SPACE).cast(origin)

@@ -1,4 +1,4 @@
-"""Obstacles as geoms: they are where `brakeline.messaging.obstacle` says."""
+"""The geoms of obstacles have the distances of `brakeline.messaging.obstacle`."""
 
 import mujoco
 import numpy as np
@@ -14,7 +14,7 @@ REACH = 3.0  # m
 
 
 def distances(arena: Arena, points: np.ndarray) -> np.ndarray:
-    """From points (p, 3) to the geoms of the obstacles, by MuJoCo: (n, p), at most `REACH`."""
+    """Return MuJoCo's distances (n, p) from points (p, 3) to the geoms of the obstacles, at most `REACH`."""
     spec = mujoco.MjSpec()
     add_obstacles(spec, arena)
     probe = spec.worldbody.add_body(name="probe", mocap=True)
@@ -32,7 +32,7 @@ def distances(arena: Arena, points: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("name", ["default", "dense", "tall"])
-def test_in_space_the_geoms_are_the_shapes(name: str) -> None:
+def test_geoms_in_space_have_the_distances_of_their_shapes(name: str) -> None:
     arena = draw_arena(name, np.random.default_rng(4), QUADROTOR)
     low, high = np.array(arena.bounds).T
     points = np.random.default_rng(0).uniform(low, high, (60, 3))
@@ -41,7 +41,7 @@ def test_in_space_the_geoms_are_the_shapes(name: str) -> None:
     assert distances(arena, points) == pytest.approx(np.minimum(exact, REACH + 1e-3), abs=2e-3)
 
 
-def test_in_the_plane_they_stand_on_the_floor() -> None:
+def test_geoms_in_the_plane_stand_on_the_floor() -> None:
     arena = draw_arena("dense", np.random.default_rng(4), GROUND)
     points = np.random.default_rng(0).uniform(-2.5, 2.5, (60, 2))
     exact = arena.shapes.distance(points)
@@ -51,6 +51,6 @@ def test_in_the_plane_they_stand_on_the_floor() -> None:
         assert distances(arena, at) == pytest.approx(np.minimum(exact, REACH + 1e-3), abs=2e-3)
 
 
-def test_on_the_ground_there_are_no_spheres() -> None:
+def test_a_sphere_in_the_plane_is_refused() -> None:
     with pytest.raises(ValueError, match="no sphere"):
         add_obstacles(mujoco.MjSpec(), staged_arena(Obstacle(SPHERE, (0.0, 1.0), (0.5,))))

@@ -1,4 +1,4 @@
-"""The quadrotor flies setpoints: fast, settled, level with what was promised about its noise, its wind and its size."""
+"""The quadrotor follows setpoints, and keeps the bounds of its estimate, its wind and its size."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def room(*obstacles: Obstacle, start: tuple[float, ...] = (0.0, 0.0, 500.0)) -> 
 
 
 def fly(vehicle: Quadrotor, setpoint: tuple[float, float, float], periods: int) -> list[np.ndarray]:
-    """The true states after each period."""
+    """Return the true states after each period."""
     return [vehicle.step(np.array(setpoint)).true for _ in range(periods)]
 
 
@@ -32,7 +32,7 @@ def quadrotor(seed: int = 0, noise: QuadrotorNoise = QUIET, wind: Wind | None = 
     return Quadrotor(room(), np.random.default_rng(seed), noise, wind)
 
 
-def test_it_starts_hovering_at_the_start() -> None:
+def test_the_quadrotor_starts_in_steady_hover() -> None:
     vehicle = quadrotor()
     assert np.abs(vehicle.true - [0, 0, 500, *[0] * 6]).max() < 1e-3
     assert not vehicle.initial_period().collision
@@ -44,9 +44,9 @@ def test_full_speed_on_every_axis_at_once_then_a_stop(setpoint: tuple[float, flo
     vehicle = quadrotor()
     at_speed = fly(vehicle, setpoint, 20)[-1][3:6]
     assert np.abs(at_speed - setpoint).max() < 0.1
-    stop = fly(vehicle, (0, 0, 0), 7 + 4)  # the slew takes seven periods, settling three, and one to spare
+    stop = fly(vehicle, (0, 0, 0), 7 + 4)  # seven periods of slew, three to settle, one spare
     assert np.abs(stop[-1][3:6]).max() < 0.03
-    assert (np.sign(setpoint) * (stop[-1][:3] - stop[9][:3]) < 0.02).all()  # no way back worth mentioning
+    assert (np.sign(setpoint) * (stop[-1][:3] - stop[9][:3]) < 0.02).all()  # almost no overshoot
     for axis in range(3):
         backward = -np.sign(setpoint[axis]) * np.array([state[3 + axis] for state in stop])
         assert backward.max() < 0.05 or setpoint[axis] == 0
@@ -70,13 +70,13 @@ def test_a_setpoint_is_clipped_to_bounds_and_slew() -> None:
 
 
 @pytest.mark.parametrize("bad", [[1.0, 2.0], [np.nan, 0.0, 0.0], [np.inf, 0.0, 0.0]])
-def test_no_vector_of_three_numbers_is_refused(bad: list[float]) -> None:
+def test_an_input_that_is_not_three_finite_numbers_is_refused(bad: list[float]) -> None:
     with pytest.raises(BadInput):
         quadrotor().step(np.array(bad))
 
 
 def test_the_closed_loop_is_nearly_linear() -> None:
-    """A linear map of (v, a, setpoint in force, new setpoint) foretells the next displacement to a centimetre or so."""
+    """A linear map of (v, a, setpoint in force, new setpoint) predicts the next displacement to about a centimetre."""
     vehicle, rng = quadrotor(), np.random.default_rng(5)
     rows, moved = [], []
     for _ in range(500):
@@ -91,7 +91,7 @@ def test_the_closed_loop_is_nearly_linear() -> None:
     assert np.abs(residual).max() < 0.03
 
 
-def test_hold_stays_where_it_stopped() -> None:
+def test_a_stopped_quadrotor_holds_its_position() -> None:
     vehicle = quadrotor(noise=QuadrotorNoise())
     fly(vehicle, (3, -2, 1), 15)
     fly(vehicle, (0, 0, 0), 12)
@@ -107,7 +107,7 @@ def test_the_estimate_stays_within_its_bound() -> None:
         errors.append(np.abs(period.measured - period.true))
     worst = np.max(errors, axis=0)
     assert (worst < QUADROTOR.measurement_bound).all()
-    assert (worst[:6] > 0.9 * np.array(QUADROTOR.measurement_bound[:6])).all()  # and the bound is not idle
+    assert (worst[:6] > 0.9 * np.array(QUADROTOR.measurement_bound[:6])).all()  # the bound is not loose
 
 
 def test_subsamples_lead_from_the_measured_start_to_the_measured_end() -> None:
@@ -126,7 +126,7 @@ def test_every_geom_lies_within_the_footprint() -> None:
         assert np.linalg.norm(model.geom_pos[geom]) + model.geom_rbound[geom] < QUADROTOR.footprint
 
 
-def test_running_into_a_pillar_is_a_collision_at_the_clearance_zero() -> None:
+def test_a_pillar_is_a_collision_at_zero_clearance() -> None:
     pillar = Obstacle(CYLINDER, (3.0, 0.0, 5.0), (0.5, 10.0))
     vehicle = Quadrotor(room(pillar, start=(0.0, 0.0, 5.0)), np.random.default_rng(0), QUIET)
     for _ in range(20):
@@ -138,7 +138,7 @@ def test_running_into_a_pillar_is_a_collision_at_the_clearance_zero() -> None:
     assert abs(period.true[0] - 2.5) < 0.4
 
 
-def test_wind_is_leant_against() -> None:
+def test_the_controller_compensates_the_wind() -> None:
     vehicle = quadrotor(wind=Wind(speed=6.0, direction=0.7, gust=1.0))
     held = np.array(fly(vehicle, (0, 0, 0), 100))
     assert np.abs(held[:, :3] - [0, 0, 500]).max() < 0.6
@@ -146,7 +146,7 @@ def test_wind_is_leant_against() -> None:
     assert abs(moving.mean() - 3.0) < 0.1
 
 
-def test_gusts_have_their_spread_and_their_cut() -> None:
+def test_gusts_have_their_standard_deviation_and_cut_off() -> None:
     air = WindProcess(Wind(speed=2.0, direction=0.0, gust=1.5, correlation=0.5), np.random.default_rng(0), 0.05)
     course = []
     for _ in range(20000):
@@ -157,7 +157,7 @@ def test_gusts_have_their_spread_and_their_cut() -> None:
     assert np.abs(gusts).max() <= 4.5
 
 
-def test_physics_can_be_altered_and_nonsense_cannot() -> None:
+def test_payload_and_wind_can_change_and_invalid_changes_are_refused() -> None:
     vehicle = quadrotor()
     vehicle.alter(payload_kg=0.2, wind_speed=3.0)
     assert np.abs(fly(vehicle, (0, 0, 0), 40)[-1][:3] - [0, 0, 500]).max() < 1.0
@@ -167,7 +167,7 @@ def test_physics_can_be_altered_and_nonsense_cannot() -> None:
         vehicle.alter(payload_kg=-1.0)
 
 
-def test_the_same_seed_is_the_same_flight() -> None:
+def test_the_seed_determines_the_flight() -> None:
     flights = []
     for _ in range(2):
         vehicle = Quadrotor(room(), np.random.default_rng(3), QuadrotorNoise(), Wind(speed=2.0, gust=1.0))
@@ -176,7 +176,7 @@ def test_the_same_seed_is_the_same_flight() -> None:
 
 
 def test_a_large_jump_of_the_setpoint_is_ramped() -> None:
-    """Whoever does not slew is slewed: the reference never asks for more than the body can give."""
+    """The reference limits a setpoint without slew to the acceleration that the airframe can give."""
     axis = VelocityAxis(FlightController(0.005, 2).gains, 0.01, 0.03)
     speeds = []
     for _ in range(300):

@@ -1,85 +1,194 @@
-"""Scripted policies of the ground robot, and what they say of its arenas; the random one and the names of both."""
+"""Scripted policies of both robots drive as their classes say. A point mass without physics stands in for the
+quadrotor."""
 
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import pytest
 
-from brakeline.deploy.vehicle_factory import environment
-from brakeline.messaging.robot import Robot
+from brakeline.messaging.obstacle import BOX, CYLINDER, Obstacle
+from brakeline.messaging.task import RobotWithTask
+from brakeline.sim.arena import Arena, staged_arena
+from brakeline.sim.navigation_env import NavigationEnv
+from brakeline.sim.quadrotor import Quadrotor
+from brakeline.sim.quadrotor_policies import (
+    QuadrotorCarefulPolicy,
+    QuadrotorRoutePolicy,
+    StopPrediction,
+    full_speed,
+)
 from brakeline.sim.scripted_policies import UnknownPolicy, scripted
-from tests.robots import GROUND, ROBOTS
+from tests.robots import GROUND, QUADROTOR, ROBOTS
+from tests.sim.kinematic import PointMass
+
+NO_OBSERVATION = np.zeros(189, np.float32)
+each_robot = pytest.mark.parametrize("robot", ROBOTS.values(), ids=ROBOTS)
 
 
-def play(policy_name: str, arena: str, episodes: int) -> list[dict[str, float]]:
-    """Per episode: collision, at_goal, steps, least clearance, steps nearer than 4 cm, outside (before any touch)."""
-    env = environment(GROUND, arena, 0)
-    policy = scripted(policy_name, GROUND, np.random.default_rng(1))
-    results = []
-    for episode in range(episodes):
-        observation, info = env.reset(options={"episode_seed": episode})
-        clearances, outside, done = [], 0, False
-        while not done:
-            observation, _, terminated, truncated, info = env.step(policy(observation, info))
-            clearances.append(info["clearance"])
-            outside += info["outside"] and not info["collision"]
-            done = terminated or truncated
-        results.append(
-            {
-                "collision": info["collision"],
-                "at_goal": info["at_goal"],
-                "steps": len(clearances),
-                "least": min(clearances),
-                "near": sum(c < 0.04 for c in clearances),
-                "outside": outside,
-            }
-        )
-    return results
+class Episodes:
+    """Episodes of a scripted policy: of all steps the speeds, of each episode the last info and what happened."""
+
+    def __init__(self, robot: RobotWithTask, policy_name: str, arena: str, episodes: int) -> None:
+        env = NavigationEnv(robot, arena, PointMass if robot is QUADROTOR else None)
+        policy = scripted(policy_name, robot, np.random.default_rng(1))
+        self.last: list[dict[str, Any]] = []
+        self.steps: list[int] = []
+        self.least: list[float] = []  # clearance
+        self.clearances, self.speeds = list[float](), list[float]()
+        self.outside = 0  # steps before any touch
+        for episode in range(episodes):
+            observation, info = env.reset(options={"episode_seed": episode})
+            infos, done = [], False
+            while not done:
+                observation, _, terminated, truncated, info = env.step(policy(observation, info))
+                infos.append(info)
+                done = terminated or truncated
+            self.last.append(info)
+            self.steps.append(len(infos))
+            self.clearances += [i["clearance"] for i in infos]
+            self.least.append(min(i["clearance"] for i in infos))
+            self.speeds += [i["speed"] for i in infos]
+            self.outside += sum(i["outside"] and not i["collision"] for i in infos)
+
+    def share(self, key: str) -> float:
+        return float(np.mean([info[key] for info in self.last]))
 
 
-def share(results: list[dict[str, float]], key: str) -> float:
-    return sum(result[key] for result in results) / len(results)
-
-
+@each_robot
 @pytest.mark.parametrize(("arena", "least"), [("default", 0.40), ("dense", 0.65)])
-def test_greed_collides_often_enough(arena: str, least: float) -> None:
-    results = play("greedy", arena, 70)
-    assert least <= share(results, "collision") <= 0.9
-    assert share(results, "outside") == 0.0
+def test_the_greedy_policy_collides_in_many_episodes(robot: RobotWithTask, arena: str, least: float) -> None:
+    episodes = Episodes(robot, "greedy", arena, 60)
+    assert least <= episodes.share("collision") <= 0.9
+    if robot is QUADROTOR:
+        assert episodes.share("collision") + episodes.share("at_goal") == 1.0
+    assert episodes.outside == 0
 
 
-def test_knowing_the_map_reaches_every_goal_and_keeps_away() -> None:
-    results = play("astar", "default", 25)
-    assert share(results, "at_goal") == 1.0
-    assert share(results, "collision") == 0.0
-    assert share(results, "outside") == 0.0
-    assert sorted(result["least"] for result in results)[1] > 0.08
-    assert sum(result["near"] for result in results) <= 0.01 * sum(result["steps"] for result in results)
+def test_the_ground_route_policy_reaches_every_goal_with_clearance() -> None:
+    episodes = Episodes(GROUND, "astar", "default", 25)
+    assert episodes.share("at_goal") == 1.0 and episodes.share("collision") == 0.0 and episodes.outside == 0
+    assert sorted(episodes.least)[1] > 0.08
+    assert (np.array(episodes.clearances) < 0.04).mean() <= 0.01
 
 
-def test_the_adversary_hits_always_and_soon() -> None:
-    results = play("adversary", "default", 20)
-    assert share(results, "collision") == 1.0
-    assert share(results, "steps") < 60
+def test_the_quadrotor_route_policy_reaches_every_goal_fast_and_with_clearance() -> None:
+    episodes = Episodes(QUADROTOR, "astar", "default", 20)
+    assert episodes.share("at_goal") == 1.0
+    assert np.mean(episodes.speeds) > 4.0 and max(episodes.speeds) > 6.5
+    assert min(episodes.least) > 0.2
 
 
-@pytest.mark.parametrize("robot", ROBOTS.values(), ids=ROBOTS)
-def test_random_inputs_are_held_and_within_bounds(robot: Robot) -> None:
-    policy = scripted("random", robot, np.random.default_rng(0))
-    inputs = [policy(np.zeros(26, np.float32), {"time": 0.2 * i}) for i in range(300)]
+def test_the_quadrotor_route_policy_works_among_many_obstacles() -> None:
+    episodes = Episodes(QUADROTOR, "astar", "dense", 15)
+    assert episodes.share("collision") == 0.0
+    assert episodes.share("at_goal") > 0.9
+
+
+def test_the_quadrotor_route_policy_is_fast_on_all_axes_at_once_in_a_tall_room() -> None:
+    episodes = Episodes(QUADROTOR, "astar", "tall", 10)
+    assert episodes.share("at_goal") == 1.0
+    assert max(episodes.speeds) > 8.0
+
+
+def test_the_careful_quadrotor_policy_arrives_among_many_obstacles() -> None:
+    episodes = Episodes(QUADROTOR, "careful", "dense", 15)
+    assert episodes.share("at_goal") == 1.0
+    assert np.mean(episodes.speeds) > 3.5
+
+
+@pytest.mark.parametrize(("robot", "most_steps"), [(GROUND, 60), (QUADROTOR, 15)], ids=["ground", "quadrotor"])
+def test_the_adversary_collides_in_every_episode_and_soon(robot: RobotWithTask, most_steps: int) -> None:
+    episodes = Episodes(robot, "adversary", "default", 20)
+    assert episodes.share("collision") == 1.0
+    assert np.mean(episodes.steps) < most_steps
+
+
+@each_robot
+def test_the_random_policy_repeats_inputs_within_the_bounds(robot: RobotWithTask) -> None:
+    first, second = (scripted("random", robot, np.random.default_rng(0)) for _ in range(2))
+    infos = [{"time": 0.2 * i} for i in range(300)]
+    inputs = [first(NO_OBSERVATION, info) for info in infos]
     assert all((robot.low() <= u).all() and (u <= robot.high()).all() for u in inputs)
     assert np.ptp(inputs, axis=0) == pytest.approx(robot.high() - robot.low(), rel=0.1)
     changes = sum(bool((a != b).any()) for a, b in pairwise(inputs))
     assert 30 < changes < 120
+    assert np.array_equal(inputs, [second(NO_OBSERVATION, info) for info in infos]), "the generator determines it"
 
 
-def test_the_generator_decides() -> None:
-    first, second = (scripted("random", GROUND, np.random.default_rng(3)) for _ in range(2))
-    for i in range(20):
-        info = {"time": 0.2 * i}
-        assert (first(np.zeros(26, np.float32), info) == second(np.zeros(26, np.float32), info)).all()
-
-
-def test_an_unknown_name_is_refused_with_the_names_there_are() -> None:
+def test_an_unknown_name_is_refused_with_the_names_that_exist() -> None:
     with pytest.raises(UnknownPolicy, match="random, greedy, adversary, astar"):
         scripted("psychic", GROUND, np.random.default_rng(0))
+
+
+def test_full_speed_is_the_largest_input_in_a_direction() -> None:
+    assert full_speed(QUADROTOR, np.array([0.1, -0.2, 0.0])) == pytest.approx([2.5, -5.0, 0.0])
+    assert (full_speed(QUADROTOR, np.zeros(3)) == 0.0).all()
+
+
+def test_stop_prediction_agrees_with_the_simulated_quadrotor() -> None:
+    arena = staged_arena(start=(0.0, 0.0, 50.0), goal=(90.0, 0.0, 50.0), half_width=100.0, height=100.0)
+    vehicle = Quadrotor(arena, np.random.default_rng(0))
+    top = np.array([5.0, -5.0, 2.0])
+    for k in range(12):
+        vehicle.step(np.clip(0.8 * k, -np.abs(top), np.abs(top)) * np.sign(top))
+    predicted = StopPrediction(QUADROTOR)(vehicle.true[:3], vehicle.true[3:6], top[None])[0]
+    flown = []
+    for fraction in QUADROTOR.schedule()[::3, 0]:
+        vehicle.step(top * fraction)
+        flown.append(vehicle.true[:3])
+    assert predicted[1::2] == pytest.approx(np.array(flown), abs=0.35)
+
+
+def staged_info(
+    arena: Arena, position: tuple[float, float, float], velocity: tuple[float, float, float]
+) -> dict[str, Any]:
+    state = np.array([*position, *velocity, 0.0, 0.0, 0.0])
+    return {"arena": arena, "goal": arena.goal, "state": state, "input_in_force": state[3:6], "time": 0.0}
+
+
+def test_the_route_policy_brakes_in_time_before_a_narrow_passage() -> None:
+    wall = Obstacle(BOX, (0.0, 0.0, 4.5), (1.0, 30.0, 9.0))  # 3 m are left above it
+    arena = staged_arena(wall, start=(-12.0, 0.0, 2.0), goal=(12.0, 0.0, 2.0), half_width=15.0, height=12.0)
+    policy = QuadrotorRoutePolicy(QUADROTOR, np.random.default_rng(0))
+    assert policy(NO_OBSERVATION, staged_info(arena, (-12.0, 0.0, 2.0), (4.0, 0.0, 0.0)))[0] > 4.0
+    assert policy(NO_OBSERVATION, staged_info(arena, (-5.0, 0.0, 2.0), (5.0, 0.0, 0.0)))[0] < 5.0
+    vehicle = PointMass(arena, np.random.default_rng(0))
+    policy = QuadrotorRoutePolicy(QUADROTOR, np.random.default_rng(0))
+    for k in range(80):
+        info = {"arena": arena, "goal": arena.goal, "state": vehicle.measured, "input_in_force": vehicle.input}
+        assert not vehicle.step(policy(NO_OBSERVATION, info | {"time": 0.2 * k})).collision
+        if np.linalg.norm(vehicle.true[:3] - arena.goal) < 1.0:
+            break
+    assert k < 60
+
+
+def test_the_route_policy_leaves_a_position_without_clearance() -> None:
+    pillar = Obstacle(CYLINDER, (0.0, 0.0, 5.0), (1.0, 10.0))
+    arena = staged_arena(pillar, start=(-1.4, 0.0, 5.0), goal=(8.0, 0.0, 5.0), half_width=10.0, height=10.0)
+    first = QuadrotorRoutePolicy(QUADROTOR, np.random.default_rng(0))(
+        NO_OBSERVATION, staged_info(arena, (-1.4, 0.0, 5.0), (0.0, 0.0, 0.0))
+    )
+    assert first[0] < 0.0
+
+
+def nearest_to(pillar: Obstacle, policy: type[QuadrotorRoutePolicy]) -> float:
+    """Return how near the policy passes a pillar [m]."""
+    arena = staged_arena(pillar, start=(-10.0, 0.0, 5.0), goal=(10.0, 0.0, 5.0), half_width=15.0, height=10.0)
+    vehicle, fly, least = (
+        PointMass(arena, np.random.default_rng(0)),
+        policy(QUADROTOR, np.random.default_rng(0)),
+        np.inf,
+    )
+    for k in range(60):
+        info = {"arena": arena, "goal": arena.goal, "state": vehicle.measured, "input_in_force": vehicle.input}
+        vehicle.step(fly(NO_OBSERVATION, info | {"time": 0.2 * k}))
+        least = min(least, float(np.hypot(*(vehicle.true[:2] - pillar.position[:2]))) - pillar.size[0])
+        if np.linalg.norm(vehicle.true[:3] - arena.goal) < 1.0:
+            return least
+    raise AssertionError("the policy did not arrive")
+
+
+def test_the_careful_policy_keeps_a_larger_distance() -> None:
+    pillar = Obstacle(CYLINDER, (0.0, 0.5, 5.0), (1.0, 10.0))
+    assert nearest_to(pillar, QuadrotorCarefulPolicy) > nearest_to(pillar, QuadrotorRoutePolicy) + 0.5

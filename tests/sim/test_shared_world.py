@@ -1,4 +1,4 @@
-"""Several robots in one physics."""
+"""Several robots share one physics."""
 
 import math
 
@@ -23,26 +23,26 @@ def world(*starts):
     return GroundWorld([same_room(arena, start=start) for start in starts], rngs, Conditions())
 
 
-def test_robots_touch_each_other_and_that_is_no_collision():
+def test_a_contact_between_robots_is_no_collision():
     two = world((-0.4, 0.0, 0.0), (0.4, 0.02, math.pi), (0.0, 3.0, 0.0))
     contacts = [[(p.contact_robot, p.collision) for p in two.step([AHEAD, AHEAD, STAND])] for _ in range(20)]
-    assert two.touches >= 1
+    assert two.robot_contacts >= 1
     met = [k for k, now in enumerate(contacts) if now[0][0]]
-    assert met and all(contacts[k][1][0] for k in met), "both of them"
-    # 0.8 m apart at 0.5 m/s: their plates, 0.069 m about a point 0.032 m behind the axle, meet after 1.4 s or so.
+    assert met and all(contacts[k][1][0] for k in met), "the contact counts for both"
+    # 0.8 m apart at 0.5 m/s: the plates (0.069 m around a point 0.032 m behind the axle) meet after about 1.4 s.
     assert 5 <= met[0] <= 9
     assert not any(hit or touched for now in contacts for touched, hit in now[2:])
     assert not any(hit for now in contacts for _, hit in now)
 
 
-def test_a_wall_is_a_collision_and_no_contact_of_robots():
+def test_a_wall_is_a_collision_and_no_contact_between_robots():
     one = world((4.5, 0.0, 0.0), (0.0, 3.0, 0.0))
     periods = [one.step([AHEAD, STAND]) for _ in range(15)]
     assert any(p[0].collision for p in periods) and not any(p[1].collision for p in periods)
-    assert one.touches == 0 and not any(p[0].contact_robot for p in periods)
+    assert one.robot_contacts == 0 and not any(p[0].contact_robot for p in periods)
 
 
-def test_alone_it_drives_as_in_an_arena_of_its_own():
+def test_a_robot_of_a_world_drives_as_one_in_its_own_arena():
     arena = staged_arena()
     alone = GroundRobot(arena, np.random.default_rng(0))
     shared = world((0.0, 0.0, 0.0), (3.0, 3.0, 0.0))
@@ -53,7 +53,7 @@ def test_alone_it_drives_as_in_an_arena_of_its_own():
     assert np.allclose(one.measured, other.measured, atol=1e-6)
 
 
-def test_on_the_ring_everybodys_goal_is_opposite():
+def test_on_the_ring_every_goal_is_opposite_its_start():
     arenas = draw_fleet("crossing", np.random.default_rng(1), GROUND, 6)
     for arena in arenas:
         assert np.allclose(arena.goal, -np.array(arena.start[:2])) and arena.obstacles == arenas[0].obstacles
@@ -63,7 +63,7 @@ def test_on_the_ring_everybodys_goal_is_opposite():
     assert between.min() > 1.0
 
 
-def test_a_world_follows_from_its_seed_and_its_members_see_each_other():
+def test_the_seed_determines_a_world_and_its_members_know_each_other():
     paths = []
     for _ in range(2):
         env = FleetEnv(GROUND, "crossing", 3, seed=5)
@@ -93,7 +93,7 @@ def test_a_lidar_sees_another_robot():
     assert middle.max() < 0.5 and middle.max() < near[8:10].min() * 3.5
 
 
-def test_what_there_is_no_world_for_is_refused():
+def test_an_impossible_fleet_is_refused():
     for robot, arena, size, conditions, why in (
         (QUADROTOR, "default", 2, None, "quadrotor"),
         (GROUND, "walkers", 2, None, "move"),

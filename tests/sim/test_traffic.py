@@ -1,4 +1,4 @@
-"""What moves by itself keeps to its bounds and off what stands, and what is told of it holds."""
+"""Moving obstacles keep their bounds and avoid static ones, and their measured motion is right."""
 
 from dataclasses import replace
 
@@ -32,37 +32,37 @@ def walked():
     return [np.array(part) for part in zip(*(crowd.at(t) for t in TIMES), strict=True)]
 
 
-def test_they_never_walk_into_what_stands(walked):
+def test_moving_obstacles_never_enter_static_ones(walked):
     distance = Shapes.of(ROOM, 2).distance(walked[0].reshape(-1, 2)).min(axis=0)
     assert distance.min() >= KIND.radius
 
 
-def test_they_keep_to_their_speed_and_acceleration(walked):
+def test_moving_obstacles_keep_their_speed_and_acceleration(walked):
     places, velocities = walked
     assert np.linalg.norm(velocities, axis=-1).max() <= KIND.speed + 1e-9
     assert np.linalg.norm(np.diff(velocities, axis=0), axis=-1).max() <= KIND.acceleration * 0.01 + 1e-9
     assert np.allclose(np.diff(places, axis=0), 0.5 * 0.01 * (velocities[1:] + velocities[:-1]), atol=1e-3)
 
 
-def test_they_go_about_turn_and_stop(walked):
+def test_moving_obstacles_walk_turn_and_stop(walked):
     speeds = np.linalg.norm(walked[1], axis=-1)
     assert speeds.max() > 0.8 and (speeds < 0.01).mean() > 0.02
     assert (np.ptp(walked[0], axis=0) > 1.0).any(axis=1).all()
 
 
-def test_where_they_are_does_not_depend_on_who_asks_when():
+def test_positions_depend_on_the_time_alone():
     one, other = (Crowd(KIND, PLACES, Shapes.of(ROOM, 2), seed=5) for _ in range(2))
     one.at(7.0)
     for t in (0.0, 3.33, 1.0):
         assert np.array_equal(one.at(t)[0], other.at(t)[0])
 
 
-def test_what_is_told_of_them_holds():
+def test_the_measured_motion_bounds_the_true_motion():
     crowd = Crowd(KIND, PLACES, Shapes.of(ROOM, 2), seed=9)
     watch = CrowdSensor(crowd, np.random.default_rng(0))
     for k in range(200):
         time = 0.2 * k
-        seen = watch.look(time)
+        seen = watch.measure(time)
         truth = crowd.at(time)
         for obstacle, place, pace in zip(seen, *truth, strict=True):
             motion = obstacle.motion
@@ -77,7 +77,7 @@ def test_what_is_told_of_them_holds():
 
 
 class Straight(Crowd):
-    """One that walks along x at a constant velocity."""
+    """One person who walks along x at a constant velocity."""
 
     kind = KIND
 
@@ -93,9 +93,13 @@ class Straight(Crowd):
 
 
 def met(vehicle, input, periods=20):
-    """Which contacts there were, and whether anything else was touched."""
-    found = [vehicle.step(np.array(input)) for _ in range(periods)]
-    return any(p.contact_moving for p in found), any(p.contact_standing for p in found), any(p.collision for p in found)
+    """Return whether a contact was moving, standing, or with a static obstacle."""
+    reports = [vehicle.step(np.array(input)) for _ in range(periods)]
+    return (
+        any(p.contact_moving for p in reports),
+        any(p.contact_standing for p in reports),
+        any(p.collision for p in reports),
+    )
 
 
 def on_the_ground(crowd):
@@ -107,26 +111,26 @@ def in_the_air(crowd):
     return Quadrotor(arena, np.random.default_rng(0))
 
 
-def test_who_is_run_into_stood_and_who_runs_into_somebody_moved():
+def test_a_contact_counts_as_moving_or_standing_by_the_robots_own_motion():
     assert met(on_the_ground(Straight(1.0, -0.5)), (0.0, 0.0), 8) == (False, True, False)
     assert met(on_the_ground(Straight(0.5, 0.0)), (0.25, 0.0)) == (True, False, False)
     assert met(on_the_ground(Straight(1.0, 0.5)), (0.25, 0.0)) == (False, False, False)
 
 
-def test_the_same_in_the_air():
+def test_contacts_in_the_air_count_the_same_way():
     assert met(in_the_air(Straight(1.5, -1.0, 3)), (0.0, 0.0, 0.0), 7) == (False, True, False)
     assert met(in_the_air(Straight(1.5, 0.0, 3)), (2.0, 0.0, 0.0)) == (True, False, False)
 
 
-def test_a_lidar_sees_them_where_they_are():
+def test_a_lidar_sees_moving_obstacles_at_their_positions():
     crowd = Straight(1.0, -0.5)
     lidar = Lidar(replace(staged_arena(), crowd=crowd), LidarRays(np.array([[1.0, 0.0], [0.0, 1.0]]), 10.0))
     for time, there in ((0.0, 0.8), (1.0, 0.3)):
-        lidar.at(time)
+        lidar.move_obstacles(time)
         assert lidar.cast(np.zeros(2)) == pytest.approx([there, 5.0])
 
 
-def test_an_episode_ends_with_a_contact_and_tells_of_what_may_come():
+def test_info_has_the_moving_obstacles_and_a_contact_ends_the_episode():
     env = NavigationEnv(GROUND, draw=lambda *_: replace(staged_arena(), crowd=Straight(1.0, -0.5)))
     _, info = env.reset(seed=0)
     told = [o for o in info["obstacles"] if o.motion is not None]
@@ -138,12 +142,12 @@ def test_an_episode_ends_with_a_contact_and_tells_of_what_may_come():
 
 
 class Stepping(Straight):
-    """It steps over a robot that stands."""
+    """A person who steps over a robot that stands."""
 
     kind = replace(KIND, steps_over=True)
 
 
-def test_who_is_stepped_over_stays_where_it_is_and_goes_on():
+def test_an_episode_goes_on_after_a_person_steps_over_the_robot():
     env = NavigationEnv(GROUND, draw=lambda *_: replace(staged_arena(), crowd=Stepping(1.0, -0.5)))
     env.reset(seed=0)
     ends, contacts = [], []
@@ -155,13 +159,13 @@ def test_who_is_stepped_over_stays_where_it_is_and_goes_on():
     assert np.abs(env.vehicle.true[:2]).max() < 1e-3
 
 
-def test_nobody_may_drive_off_under_who_steps_over_him():
+def test_a_robot_that_starts_under_a_person_counts_as_moving():
     robot = on_the_ground(Stepping(1.0, -0.5))
     assert met(robot, (0.0, 0.0), 8) == (False, True, False)
     assert met(robot, (0.25, 0.0), 1) == (True, False, False)
 
 
-def test_the_crowd_of_an_arena_is_drawn_with_it_and_the_others_stay_as_they_were():
+def test_the_generator_determines_the_crowd_of_an_arena():
     arena = draw_arena("walkers", np.random.default_rng(4), GROUND)
     again = draw_arena("walkers", np.random.default_rng(4), GROUND)
     assert arena.crowd is not None and len(arena.crowd) >= 3

@@ -66,7 +66,7 @@ def test_obstacles_contain_all_hits_in_random_rooms_with_the_largest_errors():
             true = np.array([*place, rng.uniform(-math.pi, math.pi), 0.0, 0.0])
             ranges = None
             while ranges is None:
-                ranges = lidar.look(true)
+                ranges = lidar.measure_sector(true)
             ranges = np.maximum(ranges + rng.choice([-1.0, 1.0]) * ERRORS.range, 0.0)
             wrong = true[:3] + rng.choice([-1.0, 1.0], 3) * GROUND.measurement_bound[:3]
             found = Shapes.of(seen(scan_of(ranges, range_min=0.0), wrong), dim=2)

@@ -1,0 +1,87 @@
+"""Physics of one robot on a floor among the obstacles of an arena, in MuJoCo."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import mujoco
+import numpy as np
+
+from brakeline.sim.arena import Arena
+from brakeline.sim.mujoco_obstacles import MoverBodies, add_movers, add_obstacles
+
+STANDING = 0.02  # m/s; a robot at rest by its input stands below this speed
+
+
+class FloorPhysics:
+    """One robot and one arena, compiled.
+
+    A collision is any contact, at any physics step, with a static obstacle. The robot's geoms answer to the contact
+    bits 1 (floor) and 2 (obstacles) and offer none, so they never touch each other.
+
+    Attributes:
+        model, data: MuJoCo's; the robot's coordinates come first.
+        movers: the moving obstacles, and whether the robot touched one.
+    """
+
+    def __init__(self, mjcf: str, height: float, arena: Arena, sample_time: float, period: float) -> None:
+        """
+        Args:
+            mjcf: the robot, with a body `base` that has a free joint, and the floor as its first geom.
+            height: m, of the origin of the base above the floor.
+            arena: the robot stands at its start.
+            sample_time: s, advanced by each call of `advance`.
+            period: s, which the robot has to settle on its wheels before the episode starts at time 0.
+        """
+        self.model = _compile(mjcf, height, arena)
+        self.data = mujoco.MjData(self.model)
+        self.movers = MoverBodies(self.model, self.data, arena.crowd)
+        self._time = -period
+        self._steps = round(sample_time / self.model.opt.timestep)
+
+    def advance(self, at_rest: bool, control: Callable[[], None] | None = None) -> bool:
+        """Advance by one sample and return whether the robot collided.
+
+        Args:
+            at_rest: whether the robot's input is that of standing still.
+            control: called before each physics step to set the actuators.
+        """
+        model, data, collision = self.model, self.data, False
+        for _ in range(self._steps):
+            moving = not at_rest or math.hypot(*data.qvel[:2].tolist()) > STANDING
+            if self.movers:
+                self._time += model.opt.timestep
+                self.movers.place(self._time)
+            if control is not None:
+                control()
+            # step2 before step1, so that the contacts belong to the new position
+            mujoco.mj_step2(model, data)
+            mujoco.mj_step1(model, data)
+            collision = self._touches(moving) or collision
+        return collision
+
+    def _touches(self, moving: bool) -> bool:
+        """Return whether the robot touches a static obstacle now; note contacts with moving obstacles.
+
+        The floor is geom 0: a plane is the lowest type of geom, and a contact names the geom of lower type first.
+        """
+        first = self.data.contact.geom[:, 0]
+        if self.movers:
+            first = first * ~self.movers.note_contacts(moving)
+        return bool(np.count_nonzero(first)) and not self.movers.pushed
+
+
+def _compile(mjcf: str, height: float, arena: Arena) -> mujoco.MjModel:
+    spec = mujoco.MjSpec.from_string(mjcf)
+    add_obstacles(spec, arena)
+    add_movers(spec, arena.crowd)
+    place_base(spec.body("base"), arena, height)
+    return spec.compile()
+
+
+def place_base(base: mujoco.MjsBody, arena: Arena, height: float) -> None:
+    """Place a robot's base at the start of an arena in the plane, at a height [m]."""
+    x, y, heading = arena.start
+    base.pos = (x, y, height)
+    base.quat = (math.cos(0.5 * heading), 0.0, 0.0, math.sin(0.5 * heading))
