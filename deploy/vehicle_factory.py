@@ -56,7 +56,7 @@ def environment(
     conditions = conditions or Conditions()
     make = factory(robot, conditions, tap)
     arena_kind(robot, arena)
-    return NavigationEnv(robot, arena, make, conditions=c, seed_key=seed)
+    return NavigationEnv(robot, arena, make, conditions=conditions, seed_key=seed)
 
 
 def fleet_world(

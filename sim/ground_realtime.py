@@ -131,7 +131,7 @@ class SpinningLidar:
         angles = self.gap * np.arange(beams)
         directions = np.stack([np.cos(angles), np.sin(angles)], axis=1)
         sectors = np.array_split(directions, SAMPLES)
-        self._sectors = [Lidar(arena, Rays(sector, farthest), noise, rng) for sector in sectors]
+        self._sectors = [Lidar(arena, LidarRays(sector, farthest), noise, rng) for sector in sectors]
         self._measured: list[Array] = []
 
     def measure_sector(self, true: Array) -> Array | None:

@@ -23,7 +23,9 @@ class Lidar:
         max_range: m, the value of a beam that hits nothing.
     """
 
-    def __init__(self, arena: Arena, rays: Rays, noise: float = 0.0, rng: np.random.Generator | None = None) -> None:
+    def __init__(
+        self, arena: Arena, rays: LidarRays, noise: float = 0.0, rng: np.random.Generator | None = None
+    ) -> None:
         """
         Args:
             rays: in the frame of the robot's heading, of the arena's dimension.

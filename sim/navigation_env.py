@@ -247,7 +247,7 @@ class NavigationEnv(gymnasium.Env[Observation, Any]):
             return []
         measured = self._crowd_sensor.measure(self._time)
         horizon = self.robot.horizon * self.robot.period
-        nearest = Movers.of(measured, self.robot.position_dim).least_distance(position, horizon)
+        nearest = MovingObstacles.of(measured, self.robot.position_dim).least_distance(position, horizon)
         return [measured[i] for i in np.flatnonzero(nearest <= self.robot.sight)]
 
     def _info(self, period: Period) -> Info:

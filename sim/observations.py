@@ -155,7 +155,7 @@ class PlanarObservation:
         self._robot, self._goal = robot, arena.goal
         self._lidar = Lidar(arena, robot.task.rays, lidar_noise, rng)
         self._largest = np.maximum(np.abs(robot.low()), robot.high())
-        full = robot.driving(self._largest)[3:]
+        full = robot.state_at_inputs(self._largest)[3:]
         self._scales = np.where(full > 0.0, full, 1.0)
 
     def speed(self, state: Array) -> float:

@@ -105,7 +105,7 @@ class PlanarRobot:
         """Run the physics of one period; return the poses (S, 3) at the samples, and whether the robot collided."""
         poses, collision = np.empty((SAMPLES, 3)), False
         self._physics.movers.begin_period()
-        at_rest = bool(self.robot.rests(self.input))
+        at_rest = bool(self.robot.is_stop_input(self.input))
         for i in range(SAMPLES):
             collision |= self._physics.advance(at_rest, self.drive)
             poses[i] = *self.data.qpos[:2], self.heading()

@@ -52,7 +52,7 @@ class StopPrediction:
         fine = 20  # integration steps for each point
         step = robot.period / (self.POINTS * fine)
         # the share of u in each period of the plan
-        fractions = robot.schedule()[robot.given * robot.action_dim :: robot.action_dim, -robot.action_dim]
+        fractions = robot.plan_matrix()[robot.committed_steps * robot.action_dim :: robot.action_dim, -robot.action_dim]
         velocity, offset = np.array([1.0, 0.0]), np.zeros(2)  # coefficients of v and u
         offsets: list[Array] = []
         for fraction in np.repeat(fractions, self.POINTS * fine):

@@ -35,7 +35,7 @@ class Scanner(ABC, Generic[S]):
         self,
         robot: Robot,
         arena: Arena,
-        rays: Rays,
+        rays: LidarRays,
         least_range: float,
         rng: np.random.Generator,
         noise: float,
@@ -139,7 +139,7 @@ class DomeScanner(Scanner[RangeImage]):
         if perception.tracks:
             raise ValueError("no tracker works in space: leave out --tracks")
         beams = directions(np.linspace(self.LOW, -self.LOW, self.RINGS), self.COLUMNS)
-        super().__init__(robot, arena, Rays(beams.reshape(-1, 3), self.FAR), self.NEAR, rng, noise, perception)
+        super().__init__(robot, arena, LidarRays(beams.reshape(-1, 3), self.FAR), self.NEAR, rng, noise, perception)
 
     def _take_scan(self, true: Array, measured: Array) -> RangeImage:
         ranges = self._faulty(self._lidar.ranges(true[:3], _random_rotation(self._rng, self.TILT_ERROR)))

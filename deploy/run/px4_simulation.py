@@ -84,7 +84,7 @@ def fly(settings: HilSettings, on_start: Callable[[Quadrotor], Any] = lambda veh
             end = settings.seconds or float("inf")
             return serve(hil, WallClock(), settings.speed, lambda: stop.is_set() or hil.time >= end, truth)
     except AutopilotGone as error:
-        raise AutopilotGone(f"{error}; PX4's last words:\n{px4.last_output()}") from error
+        raise AutopilotGone(f"{error}; PX4's last output:\n{px4.last_output()}") from error
     finally:
         px4.close()
         if truth is not None:

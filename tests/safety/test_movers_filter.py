@@ -138,7 +138,7 @@ def contacts(ready, policy, seed, sees=True, steps=300):
     for k in range(steps):
         state = robot.measure()
         seen = watch.measure(k * GROUND.period)
-        still, movers = parted([*ROOM, *(seen if sees else ())], 2)
+        still, movers = split_moving([*ROOM, *(seen if sees else ())], 2)
         places = np.array([o.position for o in seen]) - state[:2]
         nearest = places[np.argmin(np.linalg.norm(places, axis=1))]
         bearing = (np.arctan2(nearest[1], nearest[0]) - state[2] + np.pi) % (2 * np.pi) - np.pi

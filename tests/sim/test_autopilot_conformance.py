@@ -30,8 +30,9 @@ def test_an_arducopter_of_ours_is_as_delivered_or_as_it_was_recorded(at_once: bo
     """`fly` flies it behind a model set of one that follows setpoints at once: else states leave their sets."""
     settings = AutopilotSettings("", "ardupilot", airborne=True, at_once=at_once, setpoint_timeout=0.2)
     autopilot = vehicle(settings, open_field(), 1)
-    assert autopilot.pilot.limits.across == autopilot.pilot.limits.upright == acceleration
-    assert autopilot.pilot.limits.setpoint_timeout == 0.2
+    assert autopilot.flight.limits.horizontal_acceleration == acceleration
+    assert autopilot.flight.limits.vertical_acceleration == acceleration
+    assert autopilot.flight.limits.setpoint_timeout == 0.2
 
 
 def test_where_there_is_no_real_one_the_variable_is_named(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -18,7 +18,7 @@ PLANE, SPACE = GROUND.task.rays, QUADROTOR.task.rays
 SAMPLES = 60  # along a beam
 
 
-def agree(arena: Arena, rays: Rays, origin: np.ndarray, heading: float) -> None:
+def agree(arena: Arena, rays: LidarRays, origin: np.ndarray, heading: float) -> None:
     """Check that each beam ends on a surface or at the full range, in free space up to there."""
     ranges = Lidar(arena, rays).cast(origin, heading)
     directions = rotate(rays.directions, heading)
