@@ -237,7 +237,9 @@ class FlightRunner(ActorRunner):
 
         def make(robot: RobotWithTask, arena: str, seed: int, *, tap: FrameTap | None = None) -> NavigationEnv:
             vehicle = lambda arena, rng: self.vehicle  # noqa: E731
-            return NavigationEnv(robot, arena, vehicle, noise, seed, draw=draw, perception=conditions.perception)
+            return NavigationEnv(
+                robot, arena, vehicle, conditions=conditions, lidar_noise=noise, seed_key=seed, draw=draw
+            )
 
         return make
 

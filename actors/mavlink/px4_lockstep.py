@@ -154,14 +154,14 @@ class Px4Flight:
         while not self.hil.answering:
             self.hil.tick()
         if not self.wait(lambda: self.client.position is not None, POSITION_TIMEOUT):
-            raise MavlinkError(f"PX4 does not know its position; its last output:\n{px4.last_words()}")
+            raise MavlinkError(f"PX4 does not know its position; its last output:\n{px4.last_output()}")
         for kind, interval in INTERVALS.items():
             self.client.stream(kind, interval, self.wait)
         self.client.follow_setpoints(self.wait)
         self.client.arm(self.wait)
         self.send_setpoint(np.array([0.0, 0.0, CLIMB]))
         if not self.wait(lambda: vehicle.state()[2] > FAR + HEIGHT, CLIMB_TIMEOUT) or not self._stop():
-            raise MavlinkError(f"PX4 does not take off; its last output:\n{px4.last_words()}")
+            raise MavlinkError(f"PX4 does not take off; its last output:\n{px4.last_output()}")
         self.advance(SETTLING_TIME)
 
     def _stop(self) -> bool:

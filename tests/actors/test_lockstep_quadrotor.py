@@ -41,8 +41,8 @@ def embedded(rules: str, *obstacles: Obstacle) -> Autopilot:
 def test_the_vehicle_is_under_control_before_time_begins(rules: str) -> None:
     autopilot = embedded(rules)
     vehicle = LockstepQuadrotor(autopilot, QUADROTOR)
-    assert autopilot.pilot.time == 0.0
-    assert autopilot.pilot.mode is Mode.OFFBOARD
+    assert autopilot.flight.time == 0.0
+    assert autopilot.flight.mode is Mode.OFFBOARD
     assert vehicle.initial_period().clearance > 9.0
 
 
@@ -51,7 +51,7 @@ def test_an_integer_parameter_is_set_in_each_autopilots_encoding(rules: str, nam
     autopilot = embedded(rules)
     vehicle = LockstepQuadrotor(autopilot, QUADROTOR)
     assert vehicle._client.set_parameter(name, value, vehicle._wait)
-    assert autopilot.rules.parameters[name] == value
+    assert autopilot.parameters[name] == value
     assert not vehicle._client.set_parameter(name, 1e6, vehicle._wait), "out of its range"
     assert not vehicle._client.set_parameter("NONSENSE", 1.0, vehicle._wait)
 
@@ -91,9 +91,9 @@ def test_periods_are_shorter_than_the_setpoint_timeout() -> None:
     vehicle = LockstepQuadrotor(autopilot, QUADROTOR)
     for _ in range(50):
         vehicle.step(np.array([2.0, 0.0, 0.0]))
-    assert autopilot.pilot.mode is Mode.OFFBOARD
+    assert autopilot.flight.mode is Mode.OFFBOARD
     autopilot.advance(0.22)  # without another step
-    assert autopilot.pilot.mode is Mode.POSITION
+    assert autopilot.flight.mode is Mode.POSITION
 
 
 def test_collisions_come_from_the_simulator() -> None:

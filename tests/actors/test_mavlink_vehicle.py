@@ -67,7 +67,7 @@ def setpoints(frames: list[CapturedFrame]) -> list[tuple[float, float, float]]:
 
 def test_a_vehicle_takes_off_flies_brakes_and_lands(stalled: Callable[[], float], flying: Flying) -> None:
     vehicle, autopilot, _ = flying
-    assert autopilot.pilot.armed and autopilot.pilot.mode is Mode.OFFBOARD
+    assert autopilot.flight.armed and autopilot.flight.mode is Mode.OFFBOARD
     for _ in range(12):
         period = vehicle.step(np.array([2.0, 1.0, 0.0]))
     assert period.measured[3:6] == pytest.approx([2.0, 1.0, 0.0], abs=0.3)
@@ -83,9 +83,9 @@ def test_a_vehicle_takes_off_flies_brakes_and_lands(stalled: Callable[[], float]
 
     vehicle.land()
     deadline = time.monotonic() + 15.0
-    while autopilot.pilot.armed and time.monotonic() < deadline:
+    while autopilot.flight.armed and time.monotonic() < deadline:
         time.sleep(0.1)
-    assert not autopilot.pilot.armed
+    assert not autopilot.flight.armed
 
 
 def test_a_plan_is_flown_input_by_input_and_then_the_vehicle_hovers(flying: Flying) -> None:
@@ -159,7 +159,7 @@ def test_a_period_outside_of_the_geofence_is_lost(flying: Flying) -> None:
 
 def test_a_pilot_may_take_over_and_keeps_control(flying: Flying) -> None:
     vehicle, autopilot, _ = flying
-    autopilot.pilot.change(Mode.HOLD)
+    autopilot.flight.change(Mode.HOLD)
     for _ in range(25):  # until a heartbeat arrives, on a machine that may stall
         if "does not follow" in (current := vehicle.wait(vehicle.current_period.number + 1)).lost:
             break
@@ -167,7 +167,7 @@ def test_a_pilot_may_take_over_and_keeps_control(flying: Flying) -> None:
         "does not follow" in current.lost
         and {"px4": "HOLD", "ardupilot": "LOITER"}[vehicle._client.kind] in current.lost
     )
-    assert autopilot.pilot.mode is Mode.HOLD, "the pilot keeps control"
+    assert autopilot.flight.mode is Mode.HOLD, "the pilot keeps control"
 
 
 def test_the_autopilot_brakes_when_the_link_dies(flying: Flying) -> None:

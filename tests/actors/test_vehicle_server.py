@@ -109,7 +109,7 @@ def test_a_dead_actors_plan_is_flown_to_its_end_and_the_next_actor_takes_over(
         period = next_vehicle.current_period
         assert period.number >= number + QUADROTOR.horizon, "the periods went on"
         assert np.linalg.norm(period.report.measured[3:6]) < 0.3 and not period.lost, "it hovers"
-        assert period.report.measured[0] > 0.5 and autopilot.pilot.mode is Mode.OFFBOARD, "where the plan ended"
+        assert period.report.measured[0] > 0.5 and autopilot.flight.mode is Mode.OFFBOARD, "where the plan ended"
         next_vehicle.wait(next_vehicle.current_period.number + 6)
         assert next_vehicle.figures()["periods"] >= number
     times = np.array([frame.wall_time for frame in first + second]) * 1e-9
@@ -133,7 +133,7 @@ def test_a_vehicle_has_one_actor_at_a_time_and_its_server_ends_with_the_flight(
             assert other.current_period.number < vehicle.current_period.number, "it is taken over anew"
     with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as client_socket, pytest.raises(ConnectionRefusedError):
         client_socket.connect(address(url, 1))
-    until(lambda: autopilot.pilot.mode is not Mode.OFFBOARD, "the autopilot leaves offboard mode by its own timeout")
+    until(lambda: autopilot.flight.mode is not Mode.OFFBOARD, "the autopilot leaves offboard mode by its own timeout")
 
 
 def test_closing_a_flight_at_speed_brakes_the_vehicle(flown: tuple[str, Autopilot]) -> None:
@@ -153,11 +153,11 @@ def test_a_vehicle_that_a_pilot_took_meanwhile_is_taken_over_anew(flown: tuple[s
     url, autopilot = flown
     with actor(url) as vehicle:
         vehicle.leave()
-        autopilot.pilot.mode = Mode.HOLD
+        autopilot.flight.mode = Mode.HOLD
         time.sleep(0.5)
         with actor(url) as next_vehicle:
             next_vehicle.wait(next_vehicle.current_period.number + 5)
-            assert not next_vehicle.current_period.lost and autopilot.pilot.mode is Mode.OFFBOARD
+            assert not next_vehicle.current_period.lost and autopilot.flight.mode is Mode.OFFBOARD
 
 
 def test_a_process_of_another_user_is_rejected(monkeypatch: pytest.MonkeyPatch) -> None:
