@@ -1,4 +1,4 @@
-"""Ports of this machine that nobody has at the moment."""
+"""Find free ports on this machine."""
 
 from __future__ import annotations
 
@@ -8,11 +8,12 @@ HERE = "127.0.0.1"
 
 
 def free_udp_port() -> int:
+    """Return a free UDP port."""
     return _free(socket.SOCK_DGRAM)
 
 
 def free_endpoint(protocol: str = "tcp") -> str:
-    """To listen on, as `BusSettings` writes it; with keys the protocol is `tls`."""
+    """Return a free endpoint to listen on, in the form of `BusSettings`; with keys the protocol is `tls`."""
     return f"{protocol}/{HERE}:{_free(socket.SOCK_STREAM)}"
 
 

@@ -1,13 +1,14 @@
-"""Obstacles as rounded boxes, and the distances from points to them, for many obstacles and points at once.
+"""Obstacles as rounded boxes, with distances between many obstacles and points at once.
 
-Every shape is `{c + R(yaw)(s + r)}`, s in the box |s_i| <= half_i, r in the disc (in x and y) or ball of radius rho:
+Each shape is `{c + R(yaw)(s + r)}` with s in the box |s_i| <= half_i, and r in the disc (in x and y) or ball of radius
+rho:
 
     box       half, rho = 0
     cylinder  vertical; half = (0, 0, h), rho = radius, disc      (in the plane: a disc)
     sphere    half = 0, rho = radius, ball
     wall      the half-space behind a plane: a box of edge 2 WALL_DEPTH with one face in it
 
-so one vectorised formula serves all. Shapes are convex: the closest point gives a supporting half-space.
+One vectorised formula covers all kinds. Shapes are convex: the closest point gives a supporting half-space.
 """
 
 from __future__ import annotations
@@ -23,16 +24,16 @@ from brakeline.messaging.obstacle_motion import Motion
 
 Array = NDArray[np.float64]
 
-# Whoever is within FARTHEST of the origin, as far as obstacles are, sees a wall of WALL_DEPTH as a half-space, and no
-# obstacle as anything that rounding (1e-11 m there) or an overflow could make smaller than it is.
-FARTHEST = 1e4  # m: of an obstacle's position from the origin along each axis, and its size
-WALL_DEPTH = 1e5  # m; half the edge of the box that a wall is: more than anybody's distance from its middle
+# For all positions within FARTHEST of the origin, a wall of WALL_DEPTH acts as a half-space, and rounding (1e-11 m) or
+# overflow makes no obstacle smaller than it is.
+FARTHEST = 1e4  # largest coordinate of an obstacle's position, and largest size [m]
+WALL_DEPTH = 1e5  # half the edge of the box that represents a wall [m]
 BOX, CYLINDER, SPHERE, WALL = "box", "cylinder", "sphere", "wall"
 KINDS = (BOX, CYLINDER, SPHERE, WALL)
 
 
 class BadShape(ValueError):
-    """An obstacle that is none: `field` names what is wrong."""
+    """An obstacle is invalid. `field` names the invalid field."""
 
     def __init__(self, field: str, message: str) -> None:
         super().__init__(message)
@@ -41,13 +42,17 @@ class BadShape(ValueError):
 
 @dataclass(frozen=True)
 class Obstacle:
-    """One obstacle, 2-D or 3-D by the length of `position`.
+    """One obstacle in the plane or in space, by the length of `position`.
 
-    size: box: full edge lengths (one per axis); cylinder: (radius,) in the plane, (radius, height) in space;
-    sphere: (radius,); wall: () — a plane through `position` whose free side is the direction `yaw` points to.
-    yaw: rad about the vertical (box and wall). margin: m that are kept beside the body's own radius; negative where the
-    body may reach over it, down to minus its radius where only the regressed position counts.
-    motion: how it moves; None: it stands still (`Shapes` takes every obstacle for standing: see `movers.split_moving`).
+    Attributes:
+        kind: box, cylinder, sphere or wall.
+        position: center [m]; of a wall: a point on its surface.
+        size: [m]; box: full edge lengths, one for each axis; cylinder: (radius,) in the plane, (radius, height) in
+            space; sphere: (radius,); wall: ().
+        yaw: rotation of a box about the vertical [rad]; of a wall: direction in which its free side lies.
+        margin: extra clearance beyond the body's radius [m]. A negative margin, down to minus the body's radius, allows
+            the body to overlap the obstacle.
+        motion: None: the obstacle stands still. `Shapes` ignores motions; see `moving_obstacles.split_moving`.
     """
 
     kind: str
@@ -76,30 +81,42 @@ class Obstacle:
             raise BadShape(
                 "size", f"the sizes of a {self.kind} are above 0 and up to {FARTHEST:g} m, not {list(self.size)}"
             )
-        if self.motion is not None and (why := self.motion.wrong(dim)):
-            raise BadShape("motion", why)
+        if self.motion is not None and (problem := self.motion.problem(dim)):
+            raise BadShape("motion", problem)
 
 
 @dataclass(frozen=True)
 class Shapes:
-    """Obstacles as arrays: center (n, d), axes (n, d, d) world-from-local, half (n, d), rho (n,), round (n, d),
-    margin (n,)."""
+    """n obstacles as arrays.
+
+    Attributes:
+        center: (n, d) [m].
+        axes: rotations (n, d, d), world from local.
+        half: half edge lengths of the boxes (n, d) [m].
+        rho: rounding radii (n,) [m].
+        round: (n, d), 1 on the axes along which the rounding acts.
+        margin: (n,) [m].
+    """
 
     center: Array
     axes: Array
     half: Array
     rho: Array
-    round: Array  # 1 on the axes that the rounding acts on
-    margin: Array  # m
+    round: Array
+    margin: Array
 
     def __len__(self) -> int:
         return len(self.rho)
 
     @staticmethod
     def of(obstacles: Sequence[Obstacle], dim: int) -> Shapes:
-        """Stack obstacles of one dimension. Raises BadShape when one has another dimension."""
+        """Stack obstacles.
+
+        Raises:
+            BadShape: an obstacle has another dimension than `dim`.
+        """
         n, flat = len(obstacles), dim == 2
-        center, axes, half, rho, rounded = [], [], [], [], []  # lists: filling arrays number by number costs more
+        center, axes, half, rho, rounded = [], [], [], [], []  # lists: filling arrays one number at a time is slower
         for i, obstacle in enumerate(obstacles):
             position, size = obstacle.position, obstacle.size
             if len(position) != dim:
@@ -130,22 +147,22 @@ class Shapes:
         )
 
     def kind(self, i: int) -> str:
-        """What the i-th is; in the plane a disc is a cylinder."""
+        """Return the kind of obstacle i; a disc in the plane is a cylinder."""
         if self.rho[i] > 0.0:
             return SPHERE if self.round.shape[1] == 3 and self.round[i].all() else CYLINDER
         return WALL if self.half[i, 0] >= WALL_DEPTH else BOX
 
     def take(self, index: NDArray[np.intp] | NDArray[np.bool_]) -> Shapes:
-        """The chosen obstacles."""
+        """Return the selected obstacles."""
         parts = self.center, self.axes, self.half, self.rho, self.round, self.margin
         return Shapes(*(part[index] for part in parts))
 
     def towards(self, points: Array) -> Array:
-        """Vectors from points (..., d) to the closest points of the n obstacles: (n, ..., d); zero inside."""
-        return self.each_towards(points.reshape(1, -1, points.shape[-1])).reshape(len(self), *points.shape)
+        """Return vectors (n, ..., d) from points (..., d) to the closest points of each obstacle; zero inside."""
+        return self.towards_from_own_points(points.reshape(1, -1, points.shape[-1])).reshape(len(self), *points.shape)
 
-    def each_towards(self, points: Array) -> Array:
-        """The same of each from points of its own (n, points, d)."""
+    def towards_from_own_points(self, points: Array) -> Array:
+        """Return vectors (n, P, d) from each obstacle's own points (n, P, d) to the closest points of that obstacle."""
         local = (points - self.center[:, None]) @ self.axes
         half = self.half[:, None]
         rest = local - np.minimum(np.maximum(local, -half), half)
@@ -154,33 +171,35 @@ class Shapes:
         rest -= rounded * (self.rho[:, None] / np.maximum(norm, np.maximum(self.rho, 1e-300)[:, None]))[..., None]
         return np.asarray(-(rest @ self.axes.transpose(0, 2, 1)))
 
-    def out_of(self, point: Array) -> Array:
-        """Vectors (n, d) from a point (d,) inside of obstacles to the closest points of their surfaces; zero outside,
-        and in the middle of what is round, from where every way is as long."""
+    def to_surface(self, point: Array) -> Array:
+        """Return vectors (n, d) from a point (d,) inside obstacles to the closest points of their surfaces.
+
+        A vector is zero if the point is outside, and at the center of a disc or ball, where no direction is closest.
+        """
         local = np.einsum("nji,nj->ni", self.axes, point - self.center)
-        beside = local * self.round
-        norm = np.sqrt(np.einsum("ni,ni->n", beside, beside))
-        rounded = beside * ((self.rho - norm) / np.maximum(norm, 1e-300))[:, None]
+        radial = local * self.round
+        norm = np.sqrt(np.einsum("ni,ni->n", radial, radial))
+        to_round = radial * ((self.rho - norm) / np.maximum(norm, 1e-300))[:, None]
         room = np.where(self.half > 0.0, self.half - np.abs(local), np.inf)  # to the flat faces
         face = room.argmin(axis=1)
-        each = np.arange(len(self))
-        flat = np.zeros_like(local)
-        flat[each, face] = np.copysign(room[each, face], local[each, face])
-        depth_flat, depth_round = room[each, face], np.where(self.rho > 0.0, self.rho - norm, np.inf)
-        out = np.where((depth_flat < depth_round)[:, None], flat, rounded)
+        rows = np.arange(len(self))
+        to_flat = np.zeros_like(local)
+        to_flat[rows, face] = np.copysign(room[rows, face], local[rows, face])
+        depth_flat, depth_round = room[rows, face], np.where(self.rho > 0.0, self.rho - norm, np.inf)
+        vectors = np.where((depth_flat < depth_round)[:, None], to_flat, to_round)
         inside = (np.minimum(depth_flat, depth_round) >= 0.0)[:, None]
-        return np.asarray(np.einsum("nij,nj->ni", self.axes, np.where(inside, out, 0.0)))
+        return np.asarray(np.einsum("nij,nj->ni", self.axes, np.where(inside, vectors, 0.0)))
 
     def distance(self, points: Array) -> Array:
-        """Distances from points (..., d) to the n obstacles: (n, ...); 0 inside."""
+        """Return distances (n, ...) from points (..., d) to each obstacle [m]; 0 inside."""
         vector = self.towards(points)
         return np.asarray(np.sqrt(np.einsum("n...i,n...i->n...", vector, vector)))
 
 
 def rotate(vectors: Array, angle: ArrayLike) -> Array:
-    """Turn vectors (..., d >= 2) by `angle` (...) about the vertical."""
+    """Rotate vectors (..., d >= 2) about the vertical by angles (...) [rad]."""
     cos, sin = np.cos(angle), np.sin(angle)
-    turned = np.array(vectors)
-    turned[..., 0] = cos * vectors[..., 0] - sin * vectors[..., 1]
-    turned[..., 1] = sin * vectors[..., 0] + cos * vectors[..., 1]
-    return turned
+    rotated = np.array(vectors)
+    rotated[..., 0] = cos * vectors[..., 0] - sin * vectors[..., 1]
+    rotated[..., 1] = sin * vectors[..., 0] + cos * vectors[..., 1]
+    return rotated

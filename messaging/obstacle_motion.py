@@ -1,9 +1,9 @@
-"""How an obstacle moves: what was measured of it, how wrong that may be, and a bound on what it does from then on.
+"""The motion of an obstacle: its measured velocity, the measurement errors, and a bound on its future motion.
 
-`t` seconds after the measurement an obstacle O with velocity c lies in
+`t` seconds after the measurement, an obstacle O with velocity c lies in
 
-    O + c t + ball(r(t)),    r(t) = δ_p + δ_v t + a t²/2    (a: its largest acceleration)
-                             r(t) = δ_p + s t, c = 0        (s: its largest speed; nothing else is known)
+    O + c t + ball(r(t)),    r(t) = δ_p + δ_v t + a t²/2    with a largest acceleration a
+                             r(t) = δ_p + s t, c = 0        with a largest speed s
 """
 
 from __future__ import annotations
@@ -11,32 +11,32 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-SAME = 1e-9  # m, m/s: rounding allowed when a measurement is compared with an earlier one
+ROUNDING = 1e-9  # when two measurements are compared [m, m/s]
 
 
 @dataclass(frozen=True)
 class Sighting:
-    """The measurement before: where it was, how fast, and how many seconds earlier."""
+    """The previous measurement of an obstacle."""
 
-    position: tuple[float, ...]  # m
-    velocity: tuple[float, ...]  # m/s
-    since: float  # s
+    position: tuple[float, ...]  # [m]
+    velocity: tuple[float, ...]  # [m/s]
+    since: float  # time between the previous measurement and this one [s]
 
 
 @dataclass(frozen=True)
 class Motion:
-    """Of one obstacle. Either `acceleration` [m/s²] or `speed` [m/s] bounds it; with `speed` no velocity is used."""
+    """The motion of an obstacle. Exactly one of `acceleration` and `speed` bounds it; `speed` ignores the velocity."""
 
-    velocity: tuple[float, ...]  # m/s, measured
-    position_error: float  # m, δ_p: how far its true place may be from the measured one
-    velocity_error: float = 0.0  # m/s, δ_v
-    acceleration: float | None = None
-    speed: float | None = None
-    age: float = 0.0  # s since it was measured
-    before: Sighting | None = None  # to be compared with; None: seen for the first time
+    velocity: tuple[float, ...]  # measured [m/s]
+    position_error: float  # δ_p [m]
+    velocity_error: float = 0.0  # δ_v [m/s]
+    acceleration: float | None = None  # a [m/s²]
+    speed: float | None = None  # s [m/s]
+    age: float = 0.0  # time since the measurement [s]
+    before: Sighting | None = None  # None: this is the first measurement
 
-    def wrong(self, dim: int) -> str:
-        """What is wrong with it as the motion of a `dim`-dimensional obstacle; empty: nothing."""
+    def problem(self, dim: int) -> str:
+        """Return the reason why this is no valid motion of an obstacle with `dim` coordinates; empty if it is valid."""
         vectors = [self.velocity, *((self.before.position, self.before.velocity) if self.before else ())]
         if any(len(vector) != dim for vector in vectors):
             return f"a motion's vectors have {dim} coordinates here"
@@ -50,26 +50,31 @@ class Motion:
             return "a motion's errors, bounds and times must be finite and not negative"
         return ""
 
-    def radius(self, t: float) -> float:
-        """r(t) [m]."""
+    def growth(self) -> tuple[float, float, float]:
+        """Return the coefficients of r(t) = growth · (1, t, t²)."""
         if self.speed is not None:
-            return self.position_error + self.speed * t
-        return self.position_error + self.velocity_error * t + 0.5 * (self.acceleration or 0.0) * t * t
+            return self.position_error, self.speed, 0.0
+        return self.position_error, self.velocity_error, 0.5 * (self.acceleration or 0.0)
+
+    def radius(self, t: float) -> float:
+        """Return r(t) [m]."""
+        constant, linear, quadratic = self.growth()
+        return constant + linear * t + quadratic * t * t
 
     def drift(self) -> tuple[float, ...]:
-        """c [m/s]."""
+        """Return c [m/s]."""
         return self.velocity if self.speed is None else (0.0,) * len(self.velocity)
 
-    def kept(self, position: tuple[float, ...]) -> bool:
-        """Is what is measured now where the measurement before, with these bounds, says that it can be?"""
+    def is_consistent(self, position: tuple[float, ...]) -> bool:
+        """Return whether the measured position and velocity lie within the bounds of the previous measurement."""
         if self.before is None:
             return True
-        then, t = self.before, self.before.since
-        moves = then.velocity if self.speed is None else (0.0,) * len(position)
-        away = math.dist(position, [p + c * t for p, c in zip(then.position, moves, strict=True)])
-        if away > self.radius(t) + self.position_error + SAME:
+        t = self.before.since
+        drift = self.before.velocity if self.speed is None else (0.0,) * len(position)
+        expected = [p + c * t for p, c in zip(self.before.position, drift, strict=True)]
+        if math.dist(position, expected) > self.radius(t) + self.position_error + ROUNDING:
             return False
         if self.acceleration is None:
             return True
-        turned = math.dist(self.velocity, then.velocity)
-        return turned <= self.acceleration * t + 2.0 * self.velocity_error + SAME
+        change = math.dist(self.velocity, self.before.velocity)
+        return change <= self.acceleration * t + 2.0 * self.velocity_error + ROUNDING

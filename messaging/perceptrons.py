@@ -1,6 +1,6 @@
-"""Perceptrons side by side and their forward pass without torch: the networks of the rivals' models.
+"""Multilayer perceptrons of equal shape, evaluated in NumPy without torch: the networks of the rivals' models.
 
-x → relu(W₀ x + b₀) → … → W_L x + b_L        for each of `count` perceptrons of one shape, all on the same input
+x → relu(W₀ x + b₀) → … → W_L x + b_L        for each of `count` perceptrons, all with the same input x
 """
 
 from __future__ import annotations
@@ -16,16 +16,17 @@ Layer = tuple[Tensor, Tensor]  # weight (count, out, in), bias (count, out)
 
 
 class BadPerceptrons(ValueError):
-    """The layers do not fit each other, or are not finite; the message says which."""
+    """Layers do not fit each other, or are not finite; the message names the layer."""
 
 
 class Perceptrons:
-    """`count` perceptrons of one shape; the same input gives the same output, bit for bit."""
+    """`count` perceptrons of equal shape. Equal inputs give equal outputs, bit for bit."""
 
     def __init__(self, layers: Sequence[Layer]) -> None:
-        """
+        """Copy the layers.
+
         Raises:
-            BadPerceptrons: as it says.
+            BadPerceptrons: layers do not fit each other, or are not finite.
         """
         self.layers = [(np.ascontiguousarray(w, np.float32), np.ascontiguousarray(b, np.float32)) for w, b in layers]
         if not self.layers:
@@ -41,7 +42,7 @@ class Perceptrons:
         self.outputs = width
 
     def __call__(self, x: NDArray[Any]) -> Tensor:
-        """Outputs (count, outputs) for one input (inputs,)."""
+        """Return the outputs (count, outputs) for one input (inputs,)."""
         value: Tensor = np.broadcast_to(np.asarray(x, np.float32), (self.count, self.inputs))
         last = len(self.layers) - 1
         for number, (weight, bias) in enumerate(self.layers):
@@ -51,7 +52,7 @@ class Perceptrons:
         return value
 
     def tensors(self, name: str) -> dict[str, Tensor]:
-        """As they rest: `<name>.<layer>.weight` and `.bias`."""
+        """Return the parameters under their names in a file: `<name>.<layer>.weight` and `.bias`."""
         parts = {}
         for number, (weight, bias) in enumerate(self.layers):
             parts[f"{name}.{number}.weight"], parts[f"{name}.{number}.bias"] = weight, bias
@@ -59,10 +60,10 @@ class Perceptrons:
 
     @classmethod
     def of(cls, tensors: Mapping[str, NDArray[Any]], name: str) -> Perceptrons:
-        """The perceptrons of that name among the tensors.
+        """Return the perceptrons with a name from the tensors of a file.
 
         Raises:
-            BadPerceptrons: missing, of another type, or not fitting.
+            BadPerceptrons: a layer is missing, has another type, or does not fit.
         """
         layers: list[Layer] = []
         while f"{name}.{len(layers)}.weight" in tensors:

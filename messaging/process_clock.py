@@ -1,4 +1,4 @@
-"""The time a process lives by: the wall's, or a simulation's that runs as fast as it can."""
+"""Clocks: real time, or simulated time that passes as fast as possible."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Protocol
 
 
 class Clock(Protocol):
-    """Seconds since the clock was made; waiting until a time."""
+    """Time in seconds since the clock was created."""
 
     def now(self) -> float: ...
 
@@ -16,7 +16,7 @@ class Clock(Protocol):
 
 
 class WallClock:
-    """Real seconds; jumps of the system's date do not matter."""
+    """Real time, independent of changes to the system's date."""
 
     def __init__(self) -> None:
         self._start = time.monotonic()
@@ -29,7 +29,7 @@ class WallClock:
 
 
 class SimulatedClock:
-    """Time passes only by sleeping, and then at once."""
+    """Simulated time, which passes only in `sleep_until`, without waiting."""
 
     def __init__(self, now: float = 0.0) -> None:
         self._now = now

@@ -1,4 +1,4 @@
-"""What the processes have in common: a place on the bus, log lines, a sign of life each second, an orderly end.
+"""Run a process on the bus: connection, log lines, a Health message each second, and an orderly end.
 
 with Process(settings, "safety") as process:
     process.bus.serve(DECIDE, answer)
@@ -18,30 +18,30 @@ from typing import Self
 
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.bus import Bus, BusError, BusSettings, Publisher
-from brakeline.messaging.metrics_endpoint import MetricsServer, State
+from brakeline.messaging.metrics_endpoint import MetricsServer, ProcessStatus
 from brakeline.messaging.stop_signals import stop_on_signals
 from brakeline.messaging.topics import HEALTH, LOG
 
 log = logging.getLogger("brakeline.process")
 
-SILENT = 10.0  # s without a beat after which a process does not live any more: its threads are stuck
-LEVELS = {"CRITICAL": "ERROR"}  # names that LogLine does not know
+MAX_SILENCE = 10.0  # time without a Health after which the process counts as stuck [s]
+LEVELS = {"CRITICAL": "ERROR"}  # levels that LogLine does not have
 
 
 class Process:
-    """A process under the name `source`, from `with` to the end of the block.
+    """A process on the bus under the name `source`, from `with` to the end of the block.
 
-    `stop` is set by SIGINT and SIGTERM (and by whoever wants the process to end), see
-    `brakeline.messaging.stop_signals`. `figures`
-    and `notes` go out with the next Health, and how many messages were passed over; `refresh`, if set, is called before
-    each to bring them up to date. All that is logged goes to stderr (unless `stderr` is False) and to the LOG topic. An
-    exception that leaves the block goes to the LOG topic with its traceback, is noted in the last Health, and goes on
-    its way: stderr is for who catches it. The first Health follows `announce`, or a second (not if `reserved`). With
-    `settings.metrics` all of it is to be had over HTTP too (messaging/metrics_endpoint.py).
+    - SIGINT, SIGTERM and code that wants the process to end set `stop` (`brakeline.messaging.stop_signals`).
+    - Each second the process publishes a Health with `figures` and `notes`; `refresh`, if set, updates them before. The
+      first Health follows `announce`, or comes after a second (not if `reserved`).
+    - Log lines go to stderr, unless `stderr` is False, and to the LOG topic.
+    - An exception that leaves the block is logged with its traceback to the LOG topic, noted in the last Health, and
+      raised again; the caller writes it to stderr.
+    - With `settings.metrics`, the process serves its status over HTTP (messaging/metrics_endpoint.py).
 
     Raises:
-        Unreachable, Insecure, BadKeys: on entering, when there is no bus at `settings`, or not such a one.
-        ValueError, OSError: on entering, when nothing can be served at `settings.metrics`.
+        Unreachable, Insecure, BadKeys: on entering, if the process cannot join the bus at `settings`.
+        ValueError, OSError: on entering, if the process cannot serve its metrics at `settings.metrics`.
     """
 
     def __init__(self, settings: BusSettings, source: str, stderr: bool = True, reserved: bool = False) -> None:
@@ -57,14 +57,14 @@ class Process:
         self._ended = False
         self._due = threading.Event()
         self._announced = False
-        self._beat_at = time.monotonic()
-        self._exposition: MetricsServer | None = None
+        self._published_at = time.monotonic()
+        self._metrics: MetricsServer | None = None
 
     def __enter__(self) -> Self:
         self.bus = Bus(self.settings, self.source)
         try:
             if self.settings.metrics:
-                self._exposition = MetricsServer(self.settings.metrics, self._state)
+                self._metrics = MetricsServer(self.settings.metrics, self._status)
         except (ValueError, OSError):
             self.bus.close()
             raise
@@ -75,8 +75,8 @@ class Process:
         self._signals.__enter__()
         if self.settings.warning:
             log.warning("%s", self.settings.warning)
-        self._pulse = threading.Thread(target=self._beat, name="health", daemon=True)
-        self._pulse.start()
+        self._health_thread = threading.Thread(target=self._publish_health, name="health", daemon=True)
+        self._health_thread.start()
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None) -> None:
@@ -88,66 +88,69 @@ class Process:
         self.stop.set()
         self._ended = True
         self._due.set()
-        self._pulse.join(2.0)
-        if self._exposition is not None:
-            self._exposition.close()
+        self._health_thread.join(2.0)
+        if self._metrics is not None:
+            self._metrics.close()
         self._stop_logging()
         try:
-            self._report(last=True)
+            self._put_health(last=True)
         except Exception:
-            log.exception("no goodbye")
+            log.exception("the last Health was not published")
         self.bus.close()
         self._signals.__exit__(None, None, None)
 
     def announce(self) -> None:
-        """Send a Health now: the process is ready, or something changed that cannot wait."""
+        """Publish a Health now: the process is ready, or an important value changed."""
         self._announced = True
         self._due.set()
 
-    def _beat(self) -> None:
+    def _publish_health(self) -> None:
         period = 1.0 / (HEALTH.rate or 1.0)
         waiting = None if self._reserved else period
         while True:
             self._due.wait(waiting)
             waiting = period
             self._due.clear()
-            self._beat_at = time.monotonic()
+            self._published_at = time.monotonic()
             if self._ended:
                 return
             try:
-                self._report()
+                self._put_health()
             except Exception:
-                log.exception("no sign of life")
+                log.exception("the Health was not published")
 
-    def _state(self) -> State:
+    def _status(self) -> ProcessStatus:
         connected = bool(self.settings.listen) or self.bus.connected
-        return State(
+        return ProcessStatus(
             self.source,
-            live=time.monotonic() - self._beat_at < SILENT,
+            live=time.monotonic() - self._published_at < MAX_SILENCE,
             ready=self._announced and connected and not self.stop.is_set(),
             connected=connected,
-            figures=dict(self.figures) | {"passed over": self.bus.rejected.count},
+            figures=self._all_figures(),
             published=self.bus.published(),
         )
 
-    def _report(self, last: bool = False) -> None:
+    def _all_figures(self) -> dict[str, float]:
+        return self.figures | {"passed over": self.bus.rejected.count}
+
+    def _put_health(self, last: bool = False) -> None:
         if self.refresh is not None:
             self.refresh()
         published = self.bus.published()
-        published[self._health.key] += 1  # this one
+        published[self._health.key] += 1  # this message
         self._health.put(
             pb.Health(
                 process=self.source,
                 pid=os.getpid(),
                 published=published,
-                figures=dict(self.figures) | {"passed over": self.bus.rejected.count},
+                figures=self._all_figures(),
                 notes=dict(self.notes),
                 last=last,
             )
         )
 
     def _start_logging(self) -> None:
-        self._handlers = [BusHandler(self.bus.publisher(LOG), self.source)]  # the bus's comes first
+        self._handlers = [BusHandler(self.bus.publisher(LOG), self.source)]  # `__exit__` relies on this order
         if self._stderr:
             stream = logging.StreamHandler(sys.stderr)
             stream.setFormatter(logging.Formatter(f"%(asctime)s {self.source} %(levelname)s %(message)s"))
@@ -166,7 +169,7 @@ class Process:
 
 
 class BusHandler(logging.Handler):
-    """Publishes what is logged. What happens while it does so is not published again."""
+    """A handler that publishes log records, except those that arise while it publishes."""
 
     def __init__(self, publisher: Publisher, process: str) -> None:
         super().__init__()

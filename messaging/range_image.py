@@ -1,7 +1,7 @@
-"""What a ranging sensor with beams all about saw in one turn: the raw material of free space in the air.
+"""A range image: one turn of a range sensor with beams in all directions, from which free space in the air is computed.
 
-A beam that reports a range ρ says: free from the sensor up to ρ, within its error. One that reports nothing (0) says
-nothing: too near, dropped, blind. The picture is a grid: rings of the same elevation, columns of the same azimuth.
+A beam with a range ρ means: space is free from the sensor up to ρ, within the range error. A beam with 0 has no
+information. The image is a grid: rings of equal elevation, columns of equal azimuth.
 """
 
 from __future__ import annotations
@@ -14,86 +14,82 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from brakeline.messaging.obstacle import FARTHEST
-from brakeline.messaging.scan import BadScan, check_unit
+from brakeline.messaging.scan import BadScan, check_numbers, check_unit
 
 Array = NDArray[np.float64]
 
-MOST_BEAMS = 40_000
-MOST_AROUND = 400_000  # if its rings went on from pole to pole
-COARSEST = math.radians(12.0)  # between rings or columns
-MOST_TURNED = 0.3  # rad: who knows its attitude no better has no picture of what is about it
+MAX_BEAMS = 40_000
+MAX_SPHERE_BEAMS = 400_000  # number of beams if the rings continued from pole to pole
+MAX_STEP = math.radians(12.0)  # between rings, and between columns
+MAX_ANGLE_ERROR = 0.3  # [rad]; with a larger error an image shows no free space
 
 
 @dataclass(frozen=True, eq=False)
 class RangeImage:
-    """A grid of beams over the sphere.
+    """A range image with E rings and A columns.
 
-    ranges (E, A): m, `far` where nothing was hit, 0: not known; row i is a ring of elevation `low + i (high - low) /
-    (E - 1)` rad, column j of azimuth `2π j / A`, from straight ahead to the left, in the sensor's frame; what is above
-    and below the rings is not seen. at (3,): the robot's measured position, m; attitude: unit quaternion (w, x, y, z),
-    the world from the sensor's frame; mount (3,): the sensor's place in its own frame, m. Nothing that it may meet is
-    narrower than `least_width`: every point of an obstacle's surface is the corner of a cube with such edges that lies
-    in it, as in a box with such edges, a ball of 0.87 of it in radius, an upright cylinder of 0.71 of it in radius that
-    is as tall.
+    Ring i has the elevation `low + i (high - low) / (E - 1)`, column j the azimuth `2π j / A`, from straight ahead to
+    the left, in the sensor's frame. The sensor does not see above and below the rings.
+
+    No obstacle is narrower than `least_width`: each point of an obstacle's surface is the corner of a cube with such
+    edges inside the obstacle. This holds for a box with such edges, for a ball with a radius of at least 0.87 times
+    that length, and for an upright cylinder of at least that height with a radius of at least 0.71 times that length.
     """
 
-    ranges: Array
-    at: tuple[float, float, float]
-    attitude: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
-    low: float = -0.5 * math.pi
-    high: float = 0.5 * math.pi
-    mount: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    far: float = 20.0  # m
-    range_error: float = 0.05  # m, largest error of a range
-    position_error: float = 0.0  # m, of `at`
-    angle_error: float = 0.0  # rad, of the attitude: by which all beams are turned, the same way
-    least_width: float = 0.5  # m
-    doubt: int = 0  # so many of any four neighbouring beams, 0 or 1, may see through what is there
-    speed: float = 0.0  # m/s: whatever was hit may move as fast; 0: the world stands
-    age: float = 0.0  # s since it was taken
+    ranges: Array  # (E, A) [m]; `far`: no hit; 0: no information
+    at: tuple[float, float, float]  # measured position of the robot at the time of the image [m]
+    attitude: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)  # unit quaternion w, x, y, z: world from sensor
+    low: float = -0.5 * math.pi  # elevation of the lowest ring [rad]
+    high: float = 0.5 * math.pi  # elevation of the highest ring [rad]
+    mount: tuple[float, float, float] = (0.0, 0.0, 0.0)  # position of the sensor in its own frame [m]
+    far: float = 20.0  # largest range of the sensor [m]
+    range_error: float = 0.05  # largest error of a range [m]
+    position_error: float = 0.0  # largest error of `at` [m]
+    angle_error: float = 0.0  # largest error of the attitude, the same rotation for all beams [rad]
+    least_width: float = 0.5  # [m]
+    doubt: int = 0  # number of beams, 0 or 1, that may miss an obstacle among any four neighbouring beams
+    speed: float = 0.0  # largest speed of the surfaces that were hit [m/s]; 0: the world is static
+    age: float = 0.0  # time since the image [s]
 
     def __post_init__(self) -> None:
         check_unit(self.ranges)
-        object.__setattr__(self, "ranges", np.ascontiguousarray(self.ranges, dtype=float))  # as loops are compiled for
-        if self.ranges.ndim != 2 or not all(self.ranges.shape) or self.ranges.size > MOST_BEAMS:
-            raise BadScan(f"a range image has rings and columns, of {MOST_BEAMS} beams at most")
+        # Compiled functions expect contiguous double precision.
+        object.__setattr__(self, "ranges", np.ascontiguousarray(self.ranges, dtype=float))
+        if self.ranges.ndim != 2 or not all(self.ranges.shape) or self.ranges.size > MAX_BEAMS:
+            raise BadScan(f"a range image has rings and columns, of {MAX_BEAMS} beams at most")
         if not np.isfinite(self.ranges).all() or (self.ranges < 0.0).any():
-            raise BadScan("a range image's ranges are finite, and 0 or more: `far` where nothing was hit, 0: not known")
+            raise BadScan("a range image's ranges are finite, and 0 or more: `far` for no hit, 0 for no information")
         for name in ("at", "attitude", "mount"):
             object.__setattr__(self, name, tuple(map(float, getattr(self, name))))
         if (len(self.at), len(self.attitude), len(self.mount)) != (3, 4, 3):
             raise BadScan("a range image's place and mount have 3 coordinates, its attitude 4")
-        if not all(abs(value) <= FARTHEST for value in (*self.at, *self.attitude, *self.mount)):  # NaN fails too
-            raise BadScan(f"a range image's place, attitude and mount must be finite, and within {FARTHEST:g}")
+        bounds = (self.far, self.range_error, self.position_error, self.angle_error, self.speed, self.age)
+        check_numbers("range image", (*self.at, *self.attitude, *self.mount), bounds, self.least_width)
         if abs(math.hypot(*self.attitude) - 1.0) > 1e-3:
             raise BadScan("a range image's attitude is a unit quaternion")
-        bounds = (self.far, self.range_error, self.position_error, self.angle_error, self.speed, self.age)
-        if not all(0.0 <= value <= FARTHEST for value in bounds):
-            raise BadScan(f"a range image's errors, speed and age are finite, not negative, and {FARTHEST:g} at most")
-        if self.angle_error > MOST_TURNED:
-            raise BadScan(f"a range image's angle error is {MOST_TURNED:g} rad at most")
-        if not (math.isfinite(self.least_width) and self.least_width > 0.0):
-            raise BadScan("a range image's least width must be positive")
+        if self.angle_error > MAX_ANGLE_ERROR:
+            raise BadScan(f"a range image's angle error is {MAX_ANGLE_ERROR:g} rad at most")
         if self.doubt not in (0, 1):
-            raise BadScan("of a range image one beam of four is doubted, or none")
+            raise BadScan("a range image's doubt is 0 or 1")
         object.__setattr__(self, "doubt", int(self.doubt))
         if not -0.5 * math.pi <= self.low < self.high <= 0.5 * math.pi:
             raise BadScan("a range image's rings go from one elevation up to another, between -90° and 90°")
-        if len(self.ranges) < 2 or max(self.step) > COARSEST:
-            raise BadScan(f"a range image has rings and columns at most {math.degrees(COARSEST):.0f}° apart")
-        if math.pi / self.step[0] * self.ranges.shape[1] > MOST_AROUND:
-            raise BadScan(f"a range image's rings are so close that all about there were over {MOST_AROUND} beams")
+        if len(self.ranges) < 2 or max(self.step) > MAX_STEP:
+            raise BadScan(f"a range image has rings and columns at most {math.degrees(MAX_STEP):.0f}° apart")
+        if math.pi / self.step[0] * self.ranges.shape[1] > MAX_SPHERE_BEAMS:
+            raise BadScan(
+                f"a range image's rings are so close that a full sphere would have over {MAX_SPHERE_BEAMS} beams"
+            )
 
     @cached_property
     def step(self) -> tuple[float, float]:
-        """rad between rings, and between columns."""
+        """Angles between rings and between columns [rad]."""
         rings, columns = self.ranges.shape
         return (self.high - self.low) / (rings - 1), math.tau / columns
 
     @cached_property
-    def turn(self) -> Array:
-        """(3, 3): the world from the sensor's frame."""
+    def rotation(self) -> Array:
+        """Rotation matrix (3, 3), world from sensor."""
         length = math.hypot(*self.attitude)
         w, x, y, z = (float(part) / length for part in self.attitude)
         return np.array(
@@ -105,23 +101,29 @@ class RangeImage:
         )
 
     @property
-    def known(self) -> NDArray[np.bool_]:
-        """Which beams say something."""
+    def valid_beams(self) -> NDArray[np.bool_]:
+        """Whether each beam (E, A) has information."""
         return np.asarray(self.ranges > 0.0)
 
     @property
     def sensor_error(self) -> float:
-        """m, largest error of where the sensor was: a wrong attitude swings it about the robot."""
+        """Largest error of the sensor's position [m]; an angle error moves a mounted sensor about the robot."""
         return self.position_error + self.angle_error * math.hypot(*self.mount)
 
     def sensor(self) -> Array:
-        """(3,): where the sensor was, by the measured place, m."""
-        place: Array = np.asarray(self.at) + self.turn @ np.asarray(self.mount)
-        return place
+        """Return the sensor's position (3,) [m], by the measured position and attitude."""
+        position: Array = np.asarray(self.at) + self.rotation @ np.asarray(self.mount)
+        return position
 
 
 def directions(elevations: NDArray[Any], columns: int, at: NDArray[Any] | None = None) -> Array:
-    """(E, A, 3): unit vectors of a grid, in the sensor's frame; at (A,): which of that many columns, or between."""
+    """Return unit vectors (E, A, 3) of a grid of beams in the sensor's frame.
+
+    Args:
+        elevations: of the rings (E,) [rad].
+        columns: number of columns of a full turn.
+        at: column numbers (A,), which may be fractions; all columns by default.
+    """
     around = math.tau / columns * (np.arange(columns) if at is None else at)
     level, up = np.cos(elevations)[:, None], np.sin(elevations)[:, None]
     flat = np.broadcast_to(up, (len(up), len(around)))

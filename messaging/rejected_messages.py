@@ -1,5 +1,7 @@
-"""One message is one message: what can't be handled is counted, named in the log once a second at the most, and passed
-over. Every process has one `RejectedMessages`, its bus's; the count is in its Health."""
+"""Count and log messages that cannot be handled, so that one bad message never stops a process.
+
+Each process has one `RejectedMessages`, that of its bus. Its count is in the process's Health.
+"""
 
 from __future__ import annotations
 
@@ -9,42 +11,45 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
-log = logging.getLogger("brakeline.tolerant")
+log = logging.getLogger("brakeline.rejected")
 
-SPACING = 1.0  # s between two lines: a line may come back over the bus to the handler that failed
-LONGEST = 300  # characters of a line
+LOG_PERIOD = 1.0  # least time between two log lines [s]: the bus may bring a line back to the handler that failed
+MAX_LINE_LENGTH = 300
 
 
 class RejectedMessages:
-    """Counts what was passed over, in any thread."""
+    """A thread-safe counter of rejected messages."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self.count = 0
-        self._clock, self._said_at, self._lock = clock, -1e9, threading.Lock()
+        self._clock, self._logged_at, self._lock = clock, -1e9, threading.Lock()
 
     @contextmanager
-    def skip_on_error(self, what: str) -> Iterator[None]:
-        """Pass over `what` if the block raises."""
+    def skip_on_error(self, name: str) -> Iterator[None]:
+        """Reject the message `name` if the block raises an exception."""
         try:
             yield
         except Exception as error:
-            self.reject(what, error)
+            self.reject(name, error)
 
-    def reject(self, what: str, error: Exception, level: int = logging.ERROR) -> None:
-        """`what` could not be handled, for this reason; below an error's level it is named without its place."""
+    def reject(self, name: str, error: Exception, level: int = logging.ERROR) -> None:
+        """Count a message that cannot be handled, and log why, at most once in `LOG_PERIOD`.
+
+        The log has a traceback if the level is ERROR and the error is unexpected: not a ValueError, which describes a
+        mistake in the message.
+        """
         with self._lock:
             self.count += 1
-            due = self._clock() - self._said_at >= SPACING
+            due = self._clock() - self._logged_at >= LOG_PERIOD
             if due:
-                self._said_at = self._clock()
+                self._logged_at = self._clock()
         if due:
-            why = headline(f"{what}: {type(error).__name__}: {error}")
-            # A ValueError says what is wrong with the message; any other error, where we did not expect it.
+            text = headline(f"{name}: {type(error).__name__}: {error}")
             expected = level < logging.ERROR or isinstance(error, ValueError)
-            log.log(level, "passed over (%d so far): %s", self.count, why, exc_info=None if expected else error)
+            log.log(level, "passed over (%d so far): %s", self.count, text, exc_info=None if expected else error)
 
 
-def headline(text: str, longest: int = LONGEST) -> str:
-    """The first line of a text that somebody else wrote, fit for a terminal: no control characters, not too long."""
-    line = text[: 4 * longest].strip().split("\n", 1)[0]
-    return "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in line)[:longest]
+def headline(text: str, length: int = MAX_LINE_LENGTH) -> str:
+    """Return the first line of an untrusted text, shortened, with control characters replaced."""
+    line = text[: 4 * length].strip().split("\n", 1)[0]
+    return "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in line)[:length]

@@ -1,8 +1,7 @@
-"""What every part must agree on about a robot: names, order, units and bounds of its vectors, how it stops, its clock.
+"""The robot model that all parts share: its vectors with names, units and bounds, its body, and how it stops.
 
-A robot is a file (`robots/NAME.toml`, or anybody's own), read by `brakeline.messaging.robot_description`. SI units
-and ENU throughout.
-The first `position_dim` coordinates of a state are its position.
+A robot is a file (`robots/NAME.toml`, or a file of your own); `brakeline.messaging.robot_description` reads it. All
+values are in SI units and ENU frames. The first `position_dim` coordinates of a state are the position.
 """
 
 from __future__ import annotations
@@ -20,44 +19,46 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-INPUT_ROUNDING = 1e-9  # of an input
-
-REAL_TIME_SUFFIX = "-late"  # ends the name of a robot in real time
-TASK_SEPARATOR = (
-    "+"  # stands between a robot's name and that of another task than its usual one (`brakeline.messaging.task`)
-)
+INPUT_ROUNDING = 1e-9  # rounding that the bounds of an input allow
+REAL_TIME_SUFFIX = "-late"  # suffix of a robot's name in real time
+TASK_SEPARATOR = "+"  # between a robot's name and the name of an additional task (`brakeline.messaging.task`)
 RAMP, HOLD, FEEDBACK = "ramp", "hold", "feedback"
-INPUT_TOLERANCE = (
-    1e-6  # of an input's range: two inputs this close are the same (they were rounded to single precision)
-)
-DEFAULT_ACCEPT_BOUND = (
-    0.01  # largest stated share of plans outside their tubes that a robot is driven behind without a question
-)
+INPUT_TOLERANCE = 1e-6  # share of an input's range: closer inputs are equal (logs hold single precision)
+DEFAULT_ACCEPT_BOUND = 0.01
 ROBOTS_FOLDER = Path(__file__).parents[1] / "robots"
 
 
 class UnknownRobot(ValueError):
-    """No robot of that name is known here, or its description is none."""
+    """No robot has this name, or its description is invalid."""
 
-    field = "robot"  # of a request, where it stands
+    field = "robot"  # the field of a request that is wrong
 
 
 @dataclass(frozen=True)
 class Disc:
-    """A disc (sphere in space) fixed to the robot's frame. at (d,) [m] from the regressed position; radius [m]."""
+    """A disc (a sphere in space) fixed to the robot's frame.
+
+    Attributes:
+        at: center (d,) relative to the position [m].
+        radius: [m].
+    """
 
     at: tuple[float, ...]
     radius: float
 
     @property
     def arm(self) -> float:
-        """m from the regressed position to its centre."""
+        """Distance from the position to the center [m]."""
         return math.hypot(*self.at)
 
 
 @dataclass(frozen=True)
 class Limit:
-    """`weights · state <= most`, to be kept along every plan like an obstacle. weights (n,), in units of each."""
+    """A half-space `weights · state <= most` that every plan must respect, as it respects obstacles.
+
+    Attributes:
+        weights: (n,), one for each state coordinate.
+    """
 
     name: str
     weights: tuple[float, ...]
@@ -66,44 +67,47 @@ class Limit:
 
 @dataclass(frozen=True)
 class Robot:
-    """A robot kind.
+    """A kind of robot with n state coordinates and m inputs.
 
-    A plan has `horizon` inputs, one a period: `free_steps` chosen ones, then each input by its own `stop` rule: down to
-    zero linearly in `brake_steps` (`RAMP`), held as it is (`HOLD`: a car keeps its steering), fractions of the last
-    chosen one (a profile that ends in zero), or what `feedback` makes of the measured state (`FEEDBACK`). After it the
-    robot stands.
+    A plan has `horizon` inputs, one for each period. The first `free_steps` inputs are free. After them, each input
+    follows its own `stop` rule, at the end of which the robot stands:
+
+        RAMP       falls linearly to zero in `brake_steps` periods
+        HOLD       keeps the last free value (a car keeps its steering angle)
+        fractions  multiplies the last free value by each fraction in turn; the last one is zero
+        FEEDBACK   equals `feedback` times the measured state
     """
 
     name: str
-    period: float  # s between decisions
-    state: tuple[str, ...]  # name [unit]; the position comes first
+    period: float  # time between decisions [s]
+    state: tuple[str, ...]  # "name [unit]"; the position comes first
     position_dim: int
-    heading: int | None  # index of the heading in the state; None: displacement is regressed in the world frame
-    action: tuple[str, ...]
+    heading: int | None  # index of the heading in the state; None: displacements are in the world frame
+    action: tuple[str, ...]  # "name [unit]"
     action_low: tuple[float, ...]
     action_high: tuple[float, ...]
-    translates: tuple[bool, ...]  # which inputs move the position; the others can be used while standing
-    action_slew: tuple[float, ...]  # largest change of the input from one period to the next; inf: none
-    regressor: tuple[int, ...]  # state coordinates that matter for the next step, besides the input in force
-    measurement_bound: tuple[float, ...]  # Z_v: half-widths of |measured - true|, one a state coordinate
-    sight: float  # m from the measured position: the obstacles that come with every request
+    translates: tuple[bool, ...]  # whether each input moves the position; the others may be used at standstill
+    action_slew: tuple[float, ...]  # largest change of each input in one period; inf: no limit
+    regressor: tuple[int, ...]  # state coordinates that, with the inputs, determine the next displacement
+    measurement_bound: tuple[float, ...]  # Z_v: largest |measured - true| of each state coordinate
+    sight: float  # radius about the measured position within which a request lists all obstacles [m]
     horizon: int
     free_steps: int
     brake_steps: int
-    body: tuple[Disc, ...]  # holds the whole body
-    stop: tuple[str | tuple[float, ...], ...]  # a rule an input
-    follows: tuple[int, ...]  # for each input the state coordinate that comes to it; -1: none does
-    feedback: tuple[tuple[float, ...], ...] = ()  # (m, n): of inputs that stop by it, gains on the measured state
-    stopped: float = math.inf  # residual speed, in units of each followed or regressed coordinate, that counts as none
+    body: tuple[Disc, ...]  # discs that together cover the body
+    stop: tuple[str | tuple[float, ...], ...]  # the stop rule of each input
+    follows: tuple[int, ...]  # for each input, the state coordinate that converges to it; -1: none
+    feedback: tuple[tuple[float, ...], ...] = ()  # (m, n): gains on the measured state, for inputs with FEEDBACK
+    stopped: float = math.inf  # largest residual speed that counts as standing, in the units of each coordinate
     limits: tuple[Limit, ...] = ()
-    late: bool = False  # an answer counts from the next period on: a plan's first input is the one in force meanwhile
-    # The largest share of plans outside their tubes, as a model set states it, that is used without a question. It says
-    # nothing about the robot's vectors: robots that differ in nothing else are equal, and have one layout.
+    late: bool = False  # real time: an answer takes effect one period later, so the first input of a plan is fixed
+    # Largest stated share of plans outside their tubes that a model set may have without an explicit confirmation.
+    # Robots that differ only in it are equal and have the same layout.
     accept_bound: float = field(default=DEFAULT_ACCEPT_BOUND, compare=False)
 
     @property
     def kind(self) -> str:
-        """Its name but for the time it lives in: robots of one kind have the same body, senses, arenas and policies."""
+        """The name without the real-time suffix. Robots of one kind share body, sensors, arenas and policies."""
         return self.name.removesuffix(REAL_TIME_SUFFIX)
 
     @property
@@ -116,50 +120,54 @@ class Robot:
 
     @property
     def regressor_dim(self) -> int:
-        """Length of z_0 = [x_0 (regressor coordinates); input in force], to which a plan's inputs are appended."""
+        """Length of z_0 = [regressor coordinates of x_0; input in force], which precedes the inputs of a plan."""
         return len(self.regressor) + self.action_dim
 
     @property
     def committed_steps(self) -> int:
-        """So many of a plan's free inputs are no longer free when the question is asked."""
+        """Number of free inputs that are already fixed when the filter decides: 1 in real time, otherwise 0."""
         return int(self.late)
 
     def in_real_time(self) -> Self:
-        """The same robot where the world does not wait for an answer: it decides on the period after this one.
+        """Return the same robot in real time, where the world moves on while the filter decides.
 
         Raises:
-            UnknownRobot: it stops by feedback: what the input in force then is, is not known when it is asked about.
+            UnknownRobot: the robot stops by feedback, so the input in force is unknown when the filter decides.
         """
         if self.feedback:
             raise UnknownRobot(f"{self.name} stops by feedback: it has no real-time mode")
         return replace(
-            self, name=self.name + REAL_TIME_SUFFIX, late=True, horizon=self.horizon + 1, free_steps=self.free_steps + 1
+            self,
+            name=self.name + REAL_TIME_SUFFIX,
+            late=True,
+            horizon=self.horizon + 1,
+            free_steps=self.free_steps + 1,
         )
 
     def in_lockstep(self) -> Self:
-        """The same robot where the world waits."""
+        """Return the same robot in a world that waits for each decision."""
         if not self.late:
             return self
         return replace(self, name=self.kind, late=False, horizon=self.horizon - 1, free_steps=self.free_steps - 1)
 
     @cached_property
     def footprint(self) -> float:
-        """m, radius of the disc (sphere) about the position that holds the body in every attitude."""
+        """Radius of the disc (sphere) about the position that contains the body in every attitude [m]."""
         return max(disc.arm + disc.radius for disc in self.body)
 
     @cached_property
     def front_extent(self) -> float:
-        """m from the position straight ahead to where the discs of the body end."""
+        """Distance from the position straight ahead to the edge of the body [m]."""
         ends = [d.at[0] + math.sqrt(d.radius**2 - d.at[1] ** 2) for d in self.body if abs(d.at[1]) <= d.radius]
         return max(ends, default=self.footprint)
 
     @property
     def speed_indices(self) -> list[int]:
-        """The state coordinates that come to the inputs, in the order of those that any comes to."""
+        """Indices of the state coordinates that converge to an input, in the order of the inputs."""
         return [index for index in self.follows if index >= 0]
 
     def state_at_inputs(self, inputs: Array) -> Array:
-        """The state (n,), at the origin, of a robot that has come to these inputs (m,)."""
+        """Return the state (n,) at the origin after the speeds have converged to the inputs (m,)."""
         state = np.zeros(self.state_dim)
         for index, value in zip(self.follows, inputs, strict=True):
             if index >= 0:
@@ -174,55 +182,63 @@ class Robot:
 
     @cached_property
     def bounds(self) -> tuple[Array, Array]:
-        """(m,), (m,): what no input may be beyond, rounding allowed."""
+        """Lower and upper bounds of the inputs, (m,) each, widened by `INPUT_ROUNDING`."""
         return self.low() - INPUT_ROUNDING, self.high() + INPUT_ROUNDING
 
     @cached_property
     def zero_at_rest(self) -> NDArray[np.bool_]:
-        """(m,) which inputs are zero when it stands: all but those that are held."""
+        """Whether each input (m,) is zero when the robot stands: true for all rules except HOLD."""
         return np.array([rule != HOLD for rule in self.stop])
 
     @cached_property
     def stops_by_feedback(self) -> NDArray[np.bool_]:
-        """(m,) which inputs stop by feedback."""
+        """Whether each input (m,) follows the rule FEEDBACK."""
         return np.array([rule == FEEDBACK for rule in self.stop])
 
     def zero_input(self) -> Array:
-        """The input (m,) nearest to none: that of a robot that has not been given any."""
+        """Return the input (m,) within the bounds that is closest to zero: the input before the first decision."""
         return np.asarray(np.clip(0.0, self.low(), self.high()))
 
     def is_stop_input(self, inputs: Array) -> NDArray[np.bool_]:
-        """Are these inputs (..., m) those of a stop?"""
+        """Return whether inputs (..., m) are zero where a standing robot has zero: (...,)."""
         return np.asarray((np.abs(inputs) < 1e-9)[..., self.zero_at_rest].all(-1))
 
     def stop_profile(self) -> Array:
-        """What the rules leave of the last chosen input, j periods after it: (horizon, m), ones for j = 0."""
-        left = np.ones((self.horizon, self.action_dim))
+        """Return the fraction of the last free input that remains j periods later: (horizon, m); row 0 is ones."""
+        profile = np.ones((self.horizon, self.action_dim))
         for j in range(1, self.horizon):
             for i, rule in enumerate(self.stop):
                 if rule == RAMP:
-                    left[j, i] = max(0.0, 1.0 - j / self.brake_steps)
+                    profile[j, i] = max(0.0, 1.0 - j / self.brake_steps)
                 elif rule == FEEDBACK:
-                    left[j, i] = 0.0
+                    profile[j, i] = 0.0
                 elif rule != HOLD:
-                    left[j, i] = float(rule[min(j, len(rule)) - 1])
-        return left
+                    profile[j, i] = float(rule[min(j, len(rule)) - 1])
+        return profile
 
     def plan_matrix(self) -> Array:
-        """S with `plan = S @ free`, plan (horizon·m) and free (free_steps·m) stacked step by step. Shape (N·m, F·m).
+        """Return S (horizon·m, free_steps·m) with `plan = S @ free`; both vectors are stacked step by step.
 
-        What `feedback` adds to it is not known before.
+        The contribution of `feedback` is not included: it depends on the measured state.
         """
-        m, F, left = self.action_dim, self.free_steps, self.stop_profile()
+        m, F, profile = self.action_dim, self.free_steps, self.stop_profile()
         S = np.zeros((self.horizon * m, F * m))
         for k in range(self.horizon):
             for i in range(m):
-                S[k * m + i, min(k, F - 1) * m + i] = 1.0 if k < F else left[k - F + 1, i]
+                S[k * m + i, min(k, F - 1) * m + i] = 1.0 if k < F else profile[k - F + 1, i]
         return S
 
     def stop_by_feedback(self, planned: Array, state: Array, before: Array) -> Array:
-        """A plan's rows while it brakes (..., m), with what `feedback` makes of the measured state (..., n), in bounds
-        and slew after the input `before` (..., m)."""
+        """Replace the inputs with the rule FEEDBACK by the feedback on the measured state.
+
+        Args:
+            planned: inputs of a plan while it brakes (..., m).
+            state: measured state (..., n).
+            before: input of the period before (..., m), for the slew limit.
+
+        Returns:
+            Inputs (..., m) within the bounds and the slew limit. Without feedback, `planned` itself.
+        """
         if not self.feedback:
             return planned
         wanted = np.where(self.stops_by_feedback, state @ np.asarray(self.feedback).T, planned)
@@ -231,20 +247,22 @@ class Robot:
         return np.asarray(np.clip(wanted, low, high))
 
     def is_standing(self, state: Array) -> bool:
-        """Is no measured speed more than counts as stopped?"""
+        """Return whether all measured speeds in a state (n,) are at most `stopped`."""
         return bool((np.abs(state[list(self.regressor)]) <= self.stopped).all())
 
     def is_stopping(self, inputs: Array, state: Array, before: Array) -> bool:
-        """Are these the inputs (m,) of a stop, given in that measured state (n,) after the input `before` (m,)?"""
+        """Return whether the inputs (m,) keep a robot standing, in the measured state (n,) after the input `before`."""
         if not self.feedback:
             return bool(self.is_stop_input(inputs))
-        near = INPUT_TOLERANCE * (self.high() - self.low())
-        off = np.abs(inputs - self.stop_by_feedback(np.where(self.zero_at_rest, 0.0, inputs), state, before))
-        return self.is_standing(state) and bool((off <= near).all())
+        rejected = INPUT_TOLERANCE * (self.high() - self.low())
+        stop_inputs = self.stop_by_feedback(np.where(self.zero_at_rest, 0.0, inputs), state, before)
+        return self.is_standing(state) and bool((np.abs(inputs - stop_inputs) <= rejected).all())
 
     def may_be_standing(self, inputs: Array) -> bool:
-        """May a robot that stands have been given these inputs (m,)? By feedback it is given what its residual speed
-        makes of it."""
+        """Return whether a standing robot may have executed the inputs (m,).
+
+        With feedback, a standing robot still has inputs in proportion to its residual speed.
+        """
         if not self.feedback:
             return bool(self.is_stop_input(inputs))
         gains = np.abs(np.asarray(self.feedback))[:, list(self.regressor)]
@@ -254,24 +272,23 @@ class Robot:
 
     @cached_property
     def description(self) -> dict[str, Any]:
-        """What its file says, as JSON would hold it (`brakeline.messaging.robot_description`); of a late robot: the
-        one that waits."""
+        """The description of the robot in lockstep, as JSON values (`brakeline.messaging.robot_description`)."""
         from brakeline.messaging.robot_description import describe
 
         return describe(self.in_lockstep())
 
     def layout(self) -> str:
-        """Hash of everything that two processes must share to understand each other's vectors."""
+        """Return the hash of everything that two processes must share to exchange the robot's vectors."""
         shared = {name: value for name, value in self.description.items() if name != "accept_bound"}
-        words = json.dumps([shared, self.late])  # the order of names is part of it
-        return hashlib.sha256(words.encode()).hexdigest()[:16]
+        text = json.dumps([shared, self.late])  # not sorted: the order of the coordinates matters
+        return hashlib.sha256(text.encode()).hexdigest()[:16]
 
     def accepts_layout(self, layout: object) -> bool:
-        """Is it this robot's layout, or the one it had before robots were files?"""
+        """Return whether a layout is this robot's, or the one it had before robots were files."""
         return layout == self.layout() or layout == FORMER_LAYOUTS.get(self.name)
 
 
-# Of what was recorded, certified and trained before robots were files.
+# Layouts of logs, model sets and policies from before robots were files.
 FORMER_LAYOUTS = {
     "ground": "746231dcb2e4fad7",
     "ground-late": "d013241bb63d32ac",
@@ -281,41 +298,41 @@ FORMER_LAYOUTS = {
 
 
 def shipped_robots() -> tuple[str, ...]:
-    """The names of the robots that come with the program."""
+    """Return the names of the robots that are shipped with Brakeline."""
     return tuple(sorted(path.stem for path in ROBOTS_FOLDER.glob("*.toml") if "." not in path.stem))
 
 
 def robot_named(name: str) -> Robot:
-    """Read the robot of a name or at a path.
+    """Read a robot by its name or path.
 
     Args:
         name: the name of a shipped robot, or the path of a description (.toml). With the suffix `-late`, the robot is
             returned in real time. A task's name after the robot's (`ground+tracks`) does not change the robot.
 
     Raises:
-        UnknownRobot: with the names there are, or every mistake in the file.
+        UnknownRobot: no robot has this name (the message lists the names), or the file has mistakes (it lists all).
     """
-    from brakeline.messaging.robot_description import read
+    from brakeline.messaging.robot_description import read_robot
 
     base = name.removesuffix(REAL_TIME_SUFFIX)
     if base.endswith(".toml"):
-        robot = refuse_shipped_name(read(Path(base)))
+        robot = refuse_shipped_name(read_robot(Path(base)))
     else:
         base = base.partition(TASK_SEPARATOR)[0]
         if base not in shipped_robots():
             raise UnknownRobot(
-                f"no robot is called {name!r}; choose one of {', '.join(shipped_robots())}, or give the path of a "
-                "description (.toml)"
+                f"no robot is called {name!r}; there are: {', '.join(shipped_robots())}, or the path of a description "
+                "(.toml)"
             )
-        robot = read(ROBOTS_FOLDER / f"{base}.toml")
+        robot = read_robot(ROBOTS_FOLDER / f"{base}.toml")
     return robot.in_real_time() if name.endswith(REAL_TIME_SUFFIX) else robot
 
 
 def refuse_shipped_name(robot: Robot) -> Robot:
-    """Return the robot, unless it takes the name of a robot that comes with the program and differs from it.
+    """Return the robot.
 
     Raises:
-        UnknownRobot: it does.
+        UnknownRobot: the robot has the name of a shipped robot but differs from it.
     """
     name = robot.in_lockstep().name
     if name in shipped_robots() and robot.description != robot_named(name).description:

@@ -1,6 +1,6 @@
-"""A robot's description as a file (TOML) or as JSON in a model set, checked field by field, and the `Robot` in it.
+"""Read a robot from a description (a TOML file, or JSON in a model set), and write its description.
 
-Every mistake is told at once, each with its field and what is allowed there.
+A description with mistakes is refused with all of them at once: each with its field and the values allowed there.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ import math
 import re
 import tomllib
 from collections import Counter
+from collections.abc import Iterator
 from functools import lru_cache
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -30,26 +31,32 @@ from brakeline.messaging.robot import (
 )
 
 NAME = re.compile(r"[A-Za-z0-9_.]+(-[A-Za-z0-9_.]+)*")
-LONGEST = 64  # characters of a name
+MAX_NAME_LENGTH = 64
 UNITS = ("m", "rad", "m/s", "rad/s", "m/s2", "rad/s2", "N", "N m", "V", "A", "1")
-UNIT_OF = {"position": "m", "heading": "rad"}
+UNIT_OF_ROLE = {"position": "m", "heading": "rad"}
+INPUT_ROUNDING = 1e-12
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
+Problem = tuple[str, str]  # a field, and its mistake with the allowed values
 
 
-def _si(unit: str) -> str:
+def _check_unit(unit: str) -> str:
     if unit not in UNITS:
         raise ValueError(f"one of {', '.join(UNITS)} (SI)")
     return unit
 
 
-Unit = Annotated[str, AfterValidator(_si)]
+Unit = Annotated[str, AfterValidator(_check_unit)]
 
 
 class BadDescription(UnknownRobot):
-    """A description that is none: `problems` has a (field, what is wrong and what is allowed) for every mistake."""
+    """A robot description has mistakes.
 
-    def __init__(self, source: str, problems: list[tuple[str, str]]) -> None:
+    Attributes:
+        problems: (field, mistake and allowed values) of every mistake.
+    """
+
+    def __init__(self, source: str, problems: list[Problem]) -> None:
         lines = "".join(f"\n  {field}: {text}" for field, text in problems)
         super().__init__(f"{source} is no robot's description:{lines}")
         self.problems = problems
@@ -59,75 +66,96 @@ class _Strict(BaseModel):
     model_config = ConfigDict(extra="forbid", strict=False, frozen=True)
 
 
-class Coordinate(_Strict):
-    """One of the state."""
+class CoordinateModel(_Strict):
+    """One coordinate of the state."""
 
     unit: Unit
     role: Literal["position", "heading", "other"] = "other"
     error: Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
     follows: str | None = None
-    regressor: bool | None = None  # None: all but position and heading
+    regressor: bool | None = None  # None: true for the role "other"
 
 
-class Input(_Strict):
+class InputModel(_Strict):
+    """One input."""
+
     unit: Unit
     low: Finite
     high: Finite
     moves: bool = True
-    slew: Positive | None = None  # None: none
+    slew: Positive | None = None  # None: no limit
     stop: Literal["ramp", "hold"] | list[Finite] | dict[str, Finite] = "ramp"
 
 
-class Plan(_Strict):
+class PlanModel(_Strict):
+    """The number of periods of a plan, of its free inputs, and of a ramp to zero."""
+
     horizon: Annotated[int, Field(ge=2, le=64)]
     free: Annotated[int, Field(ge=1, le=8)] = 1
     brake: Annotated[int, Field(ge=1, le=64)]
 
 
-class Body(_Strict):
+class DiscModel(_Strict):
+    """One disc of the body."""
+
     at: list[Finite]
     radius: Positive
 
 
-class Bound(_Strict):
-    """A half-space over named coordinates: the sum of weights times coordinates is at most that."""
+class LimitModel(_Strict):
+    """A half-space over named coordinates: the sum of weights times coordinates is at most `most`."""
 
-    name: Annotated[str, Field(min_length=1, max_length=LONGEST)]
+    name: Annotated[str, Field(min_length=1, max_length=MAX_NAME_LENGTH)]
     weights: dict[str, Finite]
     most: Finite
 
 
-class Description(_Strict):
-    name: Annotated[str, Field(max_length=LONGEST)]
+class DescriptionModel(_Strict):
+    """A robot description before the checks that concern several fields."""
+
+    name: Annotated[str, Field(max_length=MAX_NAME_LENGTH)]
     period: Annotated[float, Field(ge=0.002, le=10.0)]
     sight: Positive
-    state: Annotated[dict[str, Coordinate], Field(min_length=1, max_length=32)]
-    input: Annotated[dict[str, Input], Field(min_length=1, max_length=16)]
-    plan: Plan
-    body: Annotated[list[Body], Field(min_length=1, max_length=8)]
-    limit: Annotated[list[Bound], Field(max_length=32)] = []
+    state: Annotated[dict[str, CoordinateModel], Field(min_length=1, max_length=32)]
+    input: Annotated[dict[str, InputModel], Field(min_length=1, max_length=16)]
+    plan: PlanModel
+    body: Annotated[list[DiscModel], Field(min_length=1, max_length=8)]
+    limit: Annotated[list[LimitModel], Field(max_length=32)] = []
     stopped: Positive | None = None
-    # The largest share of plans outside their tubes, as a model set states it, that is used without a question. It is
-    # below 1, which is what a model set without a statement counts as.
+    # Below 1: a model set that states no bound counts as 1 and must always be confirmed.
     accept_bound: Annotated[float, Field(gt=0.0, lt=1.0, allow_inf_nan=False)] = DEFAULT_ACCEPT_BOUND
 
+    def role_names(self, role: str) -> list[str]:
+        """Return the names of the coordinates with a role."""
+        return [name for name, coordinate in self.state.items() if coordinate.role == role]
 
-def read(path: Path) -> Robot:
-    """The robot in a file.
+
+SECTIONS: dict[str, type[BaseModel]] = {
+    "state": CoordinateModel,
+    "input": InputModel,
+    "plan": PlanModel,
+    "body": DiscModel,
+    "limit": LimitModel,
+}
+
+
+def read_robot(path: Path) -> Robot:
+    """Read the robot in a file.
 
     Raises:
-        BadDescription: with every mistake; UnknownRobot: there is no such file, or it is no TOML.
+        BadDescription: the file has mistakes.
+        UnknownRobot: the file cannot be read.
     """
     try:
         text = path.read_text()
     except (OSError, UnicodeDecodeError) as error:
         raise UnknownRobot(f"{path}: {error}; a robot is a name or the path of a description (.toml)") from error
-    return _robot_in(text, str(path))
+    return _parse(text, str(path))
 
 
 @lru_cache(maxsize=64)
-def _robot_in(text: str, source: str) -> Robot:
-    """The robot in a file of this content: the file is read each time, and checked once."""
+def _parse(text: str, source: str) -> Robot:
+    """Return the robot in the text of a file; each text is validated once."""
     try:
         return robot_from_description(tomllib.loads(text), source)
     except tomllib.TOMLDecodeError as error:
@@ -135,238 +163,222 @@ def _robot_in(text: str, source: str) -> Robot:
 
 
 def robot_from_description(values: Any, source: str = "this") -> Robot:
-    """The robot that a description, as nested dicts, says.
+    """Return the robot that a description, as nested dicts, defines.
+
+    Args:
+        source: name of the description in error messages.
 
     Raises:
-        BadDescription: with every mistake.
+        BadDescription: the description has mistakes.
     """
     try:
-        said = Description.model_validate(values)
+        model = DescriptionModel.model_validate(values)
     except ValidationError as error:
-        raise BadDescription(source, [_problem(detail, values) for detail in error.errors()]) from error
-    if problems := list(_inconsistent(said)):
+        raise BadDescription(source, [_problem(detail) for detail in error.errors()]) from error
+    if problems := list(_inconsistencies(model)):
         raise BadDescription(source, problems)
-    return _robot(said)
+    return _robot(model)
 
 
-def _robot(said: Description) -> Robot:
-    names, inputs = list(said.state), list(said.input.values())
-    roles = [c.role for c in said.state.values()]
-    d = roles.count("position")
-    gains = [_weights(names, one.stop) if isinstance(one.stop, dict) else (0.0,) * len(names) for one in inputs]
-    following = {c.follows: i for i, c in enumerate(said.state.values()) if c.follows is not None}
-    rules = [_rule(one.stop) for one in inputs]
+def _robot(model: DescriptionModel) -> Robot:
+    names, coordinates, inputs = list(model.state), list(model.state.values()), list(model.input.values())
+    followers = {c.follows: index for index, c in enumerate(coordinates) if c.follows is not None}
+    roles = [c.role for c in coordinates]
+    rules = [
+        FEEDBACK if isinstance(i.stop, dict) else tuple(i.stop) if isinstance(i.stop, list) else i.stop for i in inputs
+    ]
+    gains = [_weights(names, i.stop if isinstance(i.stop, dict) else {}) for i in inputs]
     return Robot(
-        name=said.name,
-        period=said.period,
-        state=tuple(f"{name} [{c.unit}]" for name, c in said.state.items()),
-        position_dim=d,
+        name=model.name,
+        period=model.period,
+        state=tuple(f"{name} [{c.unit}]" for name, c in model.state.items()),
+        position_dim=roles.count("position"),
         heading=roles.index("heading") if "heading" in roles else None,
-        action=tuple(f"{name} [{i.unit}]" for name, i in said.input.items()),
+        action=tuple(f"{name} [{i.unit}]" for name, i in model.input.items()),
         action_low=tuple(i.low for i in inputs),
         action_high=tuple(i.high for i in inputs),
         translates=tuple(i.moves for i in inputs),
         action_slew=tuple(math.inf if i.slew is None else i.slew for i in inputs),
         regressor=tuple(
-            k for k, c in enumerate(said.state.values()) if (c.role == "other" if c.regressor is None else c.regressor)
+            k for k, c in enumerate(coordinates) if (c.role == "other" if c.regressor is None else c.regressor)
         ),
-        measurement_bound=tuple(c.error for c in said.state.values()),
-        sight=said.sight,
-        horizon=said.plan.horizon,
-        free_steps=said.plan.free,
-        brake_steps=said.plan.brake,
-        body=tuple(Disc(tuple(disc.at), disc.radius) for disc in said.body),
+        measurement_bound=tuple(c.error for c in coordinates),
+        sight=model.sight,
+        horizon=model.plan.horizon,
+        free_steps=model.plan.free,
+        brake_steps=model.plan.brake,
+        body=tuple(Disc(tuple(disc.at), disc.radius) for disc in model.body),
         stop=tuple(rules),
-        follows=tuple(following.get(name, -1) for name in said.input),
+        follows=tuple(followers.get(name, -1) for name in model.input),
         feedback=tuple(gains) if FEEDBACK in rules else (),
-        stopped=math.inf if said.stopped is None else said.stopped,
-        limits=tuple(Limit(bound.name, _weights(names, bound.weights), bound.most) for bound in said.limit),
-        accept_bound=said.accept_bound,
+        stopped=math.inf if model.stopped is None else model.stopped,
+        limits=tuple(Limit(limit.name, _weights(names, limit.weights), limit.most) for limit in model.limit),
+        accept_bound=model.accept_bound,
     )
-
-
-def _rule(said: str | list[float] | dict[str, float]) -> str | tuple[float, ...]:
-    if isinstance(said, dict):
-        return FEEDBACK
-    return tuple(said) if isinstance(said, list) else said
-
-
-def describe(robot: Robot) -> dict[str, Any]:
-    """The description of a robot: `robot_from_description` makes the same robot of it."""
-
-    def plain(label: str) -> tuple[str, str]:
-        name, _, unit = label.rpartition(" [")
-        return name, unit.removesuffix("]")
-
-    names = [plain(label)[0] for label in robot.state]
-    inputs = [plain(label)[0] for label in robot.action]
-    state: dict[str, Any] = {}
-    for k, label in enumerate(robot.state):
-        role = "position" if k < robot.position_dim else "heading" if k == robot.heading else "other"
-        state[names[k]] = {"unit": plain(label)[1], "role": role, "error": robot.measurement_bound[k]}
-        state[names[k]]["regressor"] = k in robot.regressor
-        if k in robot.follows:
-            state[names[k]]["follows"] = inputs[robot.follows.index(k)]
-    given: dict[str, Any] = {}
-    for i, label in enumerate(robot.action):
-        rule: Any = robot.stop[i]
-        if rule == FEEDBACK:
-            rule = {name: gain for name, gain in zip(names, robot.feedback[i], strict=True) if gain}
-        given[inputs[i]] = {
-            "unit": plain(label)[1],
-            "low": robot.action_low[i],
-            "high": robot.action_high[i],
-            "moves": robot.translates[i],
-            "stop": list(rule) if isinstance(rule, tuple) else rule,
-        }
-        if math.isfinite(robot.action_slew[i]):
-            given[inputs[i]]["slew"] = robot.action_slew[i]
-    limits = [
-        {"name": one.name, "most": one.most, "weights": {n: w for n, w in zip(names, one.weights, strict=True) if w}}
-        for one in robot.limits
-    ]
-    said = {
-        "name": robot.name,
-        "period": robot.period,
-        "sight": robot.sight,
-        "state": state,
-        "input": given,
-        "plan": {"horizon": robot.horizon, "free": robot.free_steps, "brake": robot.brake_steps},
-        "body": [{"at": list(disc.at), "radius": disc.radius} for disc in robot.body],
-        "limit": limits,
-    }
-    said |= {"stopped": robot.stopped} if math.isfinite(robot.stopped) else {}
-    return said | ({"accept_bound": robot.accept_bound} if robot.accept_bound != DEFAULT_ACCEPT_BOUND else {})
 
 
 def _weights(names: list[str], by_name: dict[str, float]) -> tuple[float, ...]:
     return tuple(float(by_name.get(name, 0.0)) for name in names)
 
 
-def _problem(detail: Any, values: Any) -> tuple[str, str]:
-    """A field and what is wrong there, from one of pydantic's errors."""
-    place = [str(part) for part in detail["loc"]]
-    field, text = ".".join(place), str(detail["msg"])
-    if detail["type"] == "extra_forbidden":
-        allowed = _allowed([str(part) for part in detail["loc"][:-1]])
-        near = difflib.get_close_matches(place[-1], allowed, 1)
-        meant = f"; did you mean {near[0]!r}?" if near else ""
-        text = f"unknown{meant} (allowed here: {', '.join(allowed)})"
-    elif detail["type"] == "missing":
-        text = "missing"
-    else:
-        text = text.removeprefix("Value error, ")
-        text = f"{text[:1].lower()}{text[1:]}, not {detail['input']!r:.80}"
-    return field, text
+def describe(robot: Robot) -> dict[str, Any]:
+    """Return the description of a robot as nested dicts, the inverse of `robot_from_description`."""
 
+    def split(labels: tuple[str, ...]) -> list[tuple[str, str]]:
+        parts = [label.rpartition(" [") for label in labels]
+        return [(name, unit.removesuffix("]")) for name, _, unit in parts]
 
-def _allowed(place: list[str]) -> list[str]:
-    """The fields that there are at a place in the description."""
-    kinds: dict[str, type[BaseModel]] = {
-        "state": Coordinate,
-        "input": Input,
-        "plan": Plan,
-        "body": Body,
-        "limit": Bound,
+    def nonzero(weights: tuple[float, ...]) -> dict[str, float]:
+        return {name: weight for name, weight in zip(state, weights, strict=True) if weight}
+
+    state: dict[str, Any] = {}
+    inputs: dict[str, Any] = {}
+    input_labels = split(robot.action)
+    for k, (name, unit) in enumerate(split(robot.state)):
+        role = "position" if k < robot.position_dim else "heading" if k == robot.heading else "other"
+        state[name] = {
+            "unit": unit,
+            "role": role,
+            "error": robot.measurement_bound[k],
+            "regressor": k in robot.regressor,
+        }
+        if k in robot.follows:
+            state[name]["follows"] = input_labels[robot.follows.index(k)][0]
+    for i, (name, unit) in enumerate(input_labels):
+        rule: Any = robot.stop[i]
+        inputs[name] = {
+            "unit": unit,
+            "low": robot.action_low[i],
+            "high": robot.action_high[i],
+            "moves": robot.translates[i],
+            "stop": nonzero(robot.feedback[i]) if rule == FEEDBACK else list(rule) if isinstance(rule, tuple) else rule,
+        }
+        if math.isfinite(robot.action_slew[i]):
+            inputs[name]["slew"] = robot.action_slew[i]
+    description: dict[str, Any] = {
+        "name": robot.name,
+        "period": robot.period,
+        "sight": robot.sight,
+        "state": state,
+        "input": inputs,
+        "plan": {"horizon": robot.horizon, "free": robot.free_steps, "brake": robot.brake_steps},
+        "body": [{"at": list(disc.at), "radius": disc.radius} for disc in robot.body],
+        "limit": [{"name": one.name, "most": one.most, "weights": nonzero(one.weights)} for one in robot.limits],
     }
-    return list((kinds[place[0]] if place else Description).model_fields)
+    if math.isfinite(robot.stopped):
+        description["stopped"] = robot.stopped
+    if robot.accept_bound != DEFAULT_ACCEPT_BOUND:
+        description["accept_bound"] = robot.accept_bound
+    return description
 
 
-def _inconsistent(said: Description) -> list[tuple[str, str]]:
-    """What no field alone can tell."""
-    found: list[tuple[str, str]] = []
-    if not NAME.fullmatch(said.name) or said.name.endswith(REAL_TIME_SUFFIX):
-        found.append(
-            ("name", f"letters, digits, '_', '.' and '-', not ending in {REAL_TIME_SUFFIX!r}; not {said.name!r}")
+def _problem(detail: Any) -> Problem:
+    """Return the field and the mistake in one of pydantic's errors."""
+    path = [str(part) for part in detail["loc"]]
+    text = str(detail["msg"]).removeprefix("Value error, ")
+    if detail["type"] == "missing":
+        text = "missing"
+    elif detail["type"] == "extra_forbidden":
+        allowed = list((SECTIONS[path[0]] if len(path) > 1 else DescriptionModel).model_fields)
+        similar = difflib.get_close_matches(path[-1], allowed, 1)
+        hint = f"; did you mean {similar[0]!r}?" if similar else ""
+        text = f"unknown{hint} (allowed here: {', '.join(allowed)})"
+    else:
+        text = f"{text[:1].lower()}{text[1:]}, not {detail['input']!r:.80}"
+    return ".".join(path), text
+
+
+def _inconsistencies(model: DescriptionModel) -> Iterator[Problem]:
+    """Yield the mistakes that concern several fields."""
+    if not NAME.fullmatch(model.name) or model.name.endswith(REAL_TIME_SUFFIX):
+        yield "name", f"letters, digits, '_', '.' and '-', not ending in {REAL_TIME_SUFFIX!r}; not {model.name!r}"
+    yield from _state_problems(model)
+    for name, one in model.input.items():
+        for field, text in _input_problems(model, one):
+            yield f"input.{name}.{field}", text
+    least = model.plan.free + model.plan.brake
+    if model.plan.horizon < least:
+        yield (
+            "plan.horizon",
+            f"{model.plan.horizon} periods do not fit {model.plan.free} free inputs and {model.plan.brake} periods "
+            f"of braking: at least {least}",
         )
-    found += _bad_state(said)
-    for name, one in said.input.items():
-        found += [(f"input.{name}.{field}", text) for field, text in _bad_input(said, name, one)]
-    if said.plan.horizon < said.plan.free + said.plan.brake:
-        found.append(
-            (
-                "plan.horizon",
-                f"{said.plan.horizon} periods, but {said.plan.free} chosen inputs and {said.plan.brake} periods of "
-                f"braking do not fit into them: at least {said.plan.free + said.plan.brake}",
-            )
-        )
-    d = sum(c.role == "position" for c in said.state.values())
-    for i, disc in enumerate(said.body):
+    d = len(model.role_names("position"))
+    for i, disc in enumerate(model.body):
         if len(disc.at) != d:
-            found.append((f"body.{i}.at", f"{len(disc.at)} coordinates, the position has {d}"))
-        if any(disc.at) and not any(c.role == "heading" for c in said.state.values()):
-            found.append((f"body.{i}.at", "a robot without a heading is held by discs about its position: all zeros"))
-    for i, bound in enumerate(said.limit):
-        unknown = [name for name in bound.weights if name not in said.state]
-        if unknown or not any(bound.weights.values()):
-            names = ", ".join(said.state)
-            found.append((f"limit.{i}.weights", f"names of state coordinates ({names}), not {', '.join(unknown)}"))
-    return found
+            yield f"body.{i}.at", f"{len(disc.at)} coordinates, the position has {d}"
+        if any(disc.at) and not model.role_names("heading"):
+            yield f"body.{i}.at", "all zeros: without a heading, the discs of the body are about the position"
+    for i, limit in enumerate(model.limit):
+        unknown = [name for name in limit.weights if name not in model.state]
+        if unknown or not any(limit.weights.values()):
+            names = ", ".join(model.state)
+            yield f"limit.{i}.weights", f"names of state coordinates ({names}), not {', '.join(unknown)}"
 
 
-def _bad_state(said: Description) -> list[tuple[str, str]]:
-    found = []
-    roles = [c.role for c in said.state.values()]
+def _state_problems(model: DescriptionModel) -> Iterator[Problem]:
+    roles = [c.role for c in model.state.values()]
     d = roles.count("position")
     if d not in (2, 3) or roles[:d] != ["position"] * d:
-        found.append(("state", "two or three coordinates with role 'position' come first"))
+        yield "state", "two or three coordinates with role 'position' come first"
     if roles.count("heading") > 1 or ("heading" in roles and roles.index("heading") != d):
-        found.append(("state", "one coordinate with role 'heading' at most, right after the position"))
+        yield "state", "one coordinate with role 'heading' at most, right after the position"
     if "heading" in roles and d == 3:
-        found.append(("state", "a heading belongs to a robot in the plane"))
+        yield "state", "a heading belongs to a robot in the plane"
     if "other" not in roles:
-        found.append(("state", "a speed or whatever else matters for the next step is needed besides the pose"))
-    for name, c in said.state.items():
-        where = f"state.{name}"
-        if c.unit != UNIT_OF.get(c.role, c.unit):
-            found.append((f"{where}.unit", f"a {c.role} is in {UNIT_OF[c.role]}, not {c.unit!r}"))
+        yield "state", "besides the pose, a speed or another coordinate that determines the next step is needed"
+    for name, c in model.state.items():
+        if c.unit != UNIT_OF_ROLE.get(c.role, c.unit):
+            yield f"state.{name}.unit", f"a {c.role} is in {UNIT_OF_ROLE[c.role]}, not {c.unit!r}"
         if c.role != "other" and c.regressor:
-            found.append((f"{where}.regressor", "displacement is what is regressed: a pose is no regressor"))
-        if c.follows is not None and c.follows not in said.input:
-            found.append((f"{where}.follows", f"one of the inputs ({', '.join(said.input)}), not {c.follows!r}"))
-        elif c.follows is not None and said.input[c.follows].unit != c.unit:
-            unit = said.input[c.follows].unit
-            found.append((f"{where}.follows", f"in {c.unit!r} it can't come to {c.follows!r}, which is in {unit!r}"))
-    followers = Counter(c.follows for c in said.state.values() if c.follows is not None)
-    return found + [("state", f"two coordinates follow {name!r}") for name, count in followers.items() if count > 1]
+            yield f"state.{name}.regressor", "the model predicts the displacement: a pose is no regressor"
+        if c.follows is None:
+            continue
+        if c.follows not in model.input:
+            yield f"state.{name}.follows", f"one of the inputs ({', '.join(model.input)}), not {c.follows!r}"
+        elif (unit := model.input[c.follows].unit) != c.unit:
+            yield f"state.{name}.follows", f"in {c.unit!r} it can't follow {c.follows!r}, which is in {unit!r}"
+    followers = Counter(c.follows for c in model.state.values() if c.follows is not None)
+    for name, count in followers.items():
+        if count > 1:
+            yield "state", f"two coordinates follow {name!r}"
 
 
-def _bad_input(said: Description, name: str, one: Input) -> list[tuple[str, str]]:
-    """Bounds, slew and stop rule of one input, against each other and the plan."""
-    found = []
+def _input_problems(model: DescriptionModel, one: InputModel) -> Iterator[Problem]:
+    """Check the bounds, the slew and the stop rule of an input against each other and against the plan."""
     if not one.low < one.high:
-        found.append(("high", f"above low ({one.low:g}), not {one.high:g}"))
+        yield "high", f"above low ({one.low:g}), not {one.high:g}"
     rule = one.stop
     if rule != HOLD and not one.low <= 0.0 <= one.high:
-        found.append(("low", f"a stop is zero input, which must lie within the bounds {one.low:g} to {one.high:g}"))
+        yield "low", f"a stop is zero input, which must lie within the bounds {one.low:g} to {one.high:g}"
     if rule == RAMP and one.slew is not None:
-        steepest = max(abs(one.low), abs(one.high)) / said.plan.brake
-        if steepest > one.slew + 1e-12:
-            text = f"{one.slew:g} a period can't follow the ramp, which falls by {steepest:g} (plan.brake)"
-            found.append(("slew", text))
+        steepest = max(abs(one.low), abs(one.high)) / model.plan.brake
+        if steepest > one.slew + INPUT_ROUNDING:
+            yield "slew", f"{one.slew:g} a period can't follow the ramp, which falls by {steepest:g} (plan.brake)"
     if isinstance(rule, list):
-        found += [("stop", text) for text in _bad_profile(said.plan, one, rule)]
+        for text in _profile_problems(model.plan, one, rule):
+            yield "stop", text
     if isinstance(rule, dict):
-        unknown = [n for n in rule if n not in said.state or said.state[n].role != "other"]
+        allowed = model.role_names("other")
+        unknown = [name for name in rule if name not in allowed]
         if unknown or not rule:
-            can = ", ".join(n for n, c in said.state.items() if c.role == "other")
-            found.append(("stop", f"gains on speeds and the like ({can}), not on {', '.join(unknown) or 'nothing'}"))
-        if said.plan.free != 1:
-            found.append(("stop", "a stop by feedback goes with one chosen input: plan.free = 1"))
-        if said.stopped is None:
-            found.append(("stop", "a stop by feedback needs `stopped`: the residual speed that counts as none"))
-    return found
+            yield (
+                "stop",
+                f"gains on speeds ({', '.join(allowed)}), not on {', '.join(unknown) or 'nothing'}",
+            )
+        if model.plan.free != 1:
+            yield "stop", "a stop by feedback needs one free input: plan.free = 1"
+        if model.stopped is None:
+            yield "stop", "a stop by feedback needs `stopped`: the residual speed that counts as standing"
 
 
-def _bad_profile(plan: Plan, one: Input, profile: list[float]) -> list[str]:
-    found = []
+def _profile_problems(plan: PlanModel, one: InputModel, profile: list[float]) -> Iterator[str]:
     if not profile or profile[-1] != 0.0:
-        found.append("a profile of fractions of the last chosen input ends in 0")
+        yield "a profile of fractions of the last free input ends in 0"
     if len(profile) > plan.horizon - plan.free:
-        found.append(f"{len(profile)} fractions, but the plan has {plan.horizon - plan.free} periods for them")
-    ends = np.outer((one.low, one.high), [1.0, *profile])
-    if (ends < one.low - 1e-12).any() or (ends > one.high + 1e-12).any():
-        found.append("the profile of an input at its bound leaves the bounds")
-    if one.slew is not None and (np.abs(np.diff(ends)) > one.slew + 1e-12).any():
-        found.append(f"slew {one.slew:g} can't follow the profile")
-    return found
+        yield f"{len(profile)} fractions, but the plan has {plan.horizon - plan.free} periods for them"
+    inputs = np.outer((one.low, one.high), [1.0, *profile])
+    if (inputs < one.low - INPUT_ROUNDING).any() or (inputs > one.high + INPUT_ROUNDING).any():
+        yield "the profile of an input at its bound leaves the bounds"
+    if one.slew is not None and (np.abs(np.diff(inputs)) > one.slew + INPUT_ROUNDING).any():
+        yield f"slew {one.slew:g} can't follow the profile"

@@ -1,13 +1,14 @@
-"""What a ranging sensor saw in one turn: the raw material of free space where there is no map.
+"""A planar scan: ranges of one turn of a range sensor, from which free space is computed where there is no map.
 
-A beam that reports a range ρ says: free from the sensor up to ρ, within its error. One that reports nothing (0, or NaN)
-says nothing: too near, dropped, blind. Memory fills such beams in (`safety/perception/visibility_memory.py`) with
-what was seen free before.
+A beam with a range ρ means: space is free from the sensor up to ρ, within the range error. A beam with 0 or NaN has no
+information: the target was too near, the return was lost, or the sensor is blind there. The visibility memory
+(`safety/perception/visibility_memory.py`) fills such beams with space that was free before.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,73 +18,96 @@ from brakeline.messaging.obstacle import FARTHEST
 
 Array = NDArray[np.float64]
 
-MOST_BEAMS = 1000
-OLDEST = 2.0  # s: what a scan or range image showed to be free is not taken to be so any longer
-FASTEST = 1e4  # m/s, m/s²: nothing that is followed goes or speeds up faster
+MAX_BEAMS = 1000
+MAX_SCAN_AGE = 2.0  # age from which a scan or range image shows no free space any more [s]
+MAX_TRACK_VALUE = 1e4  # largest speed [m/s], error [m/s] and acceleration [m/s²] of a track
 
 
 class BadScan(ValueError):
-    """A scan that is none."""
+    """A scan or range image is invalid."""
 
     field = "scan"
 
 
 def check_unit(ranges: object) -> None:
-    """Raises BadScan for an array of whole numbers: a depth camera's millimetres, which in m were free space."""
+    """Refuse ranges that may be in millimetres, as depth cameras give them.
+
+    Raises:
+        BadScan: the array has an integer type.
+    """
     if isinstance(ranges, np.ndarray) and ranges.dtype.kind in "iu":
         raise BadScan(f"ranges are in m: an array of {ranges.dtype} may be in mm; divide, or give `.astype(float)`")
 
 
+def check_numbers(name: str, coordinates: Iterable[float], bounds: Iterable[float], least_width: float) -> None:
+    """Check the numbers that scans and range images have in common.
+
+    Args:
+        name: "scan" or "range image".
+        coordinates: of the pose and the mount.
+        bounds: errors, speeds, times and other values that are not negative.
+
+    Raises:
+        BadScan: a number is not finite, or out of bounds.
+    """
+    if not all(abs(value) <= FARTHEST for value in coordinates):  # NaN fails too
+        raise BadScan(f"a {name}'s pose, attitude and mount must be finite, and within {FARTHEST:g}")
+    if not all(0.0 <= value <= FARTHEST for value in bounds):
+        raise BadScan(f"a {name}'s errors, speed and age must be finite, not negative, and {FARTHEST:g} at most")
+    if not (math.isfinite(least_width) and least_width > 0.0):
+        raise BadScan(f"a {name}'s least width must be positive")
+
+
 @dataclass(frozen=True, eq=False)
 class BeamTracks:
-    """What earlier scans say of where whatever was hit goes (`safety/perception/scan_tracking.py`).
+    """The tracked motion of the surfaces that a scan hit (`safety/perception/scan_tracking.py`).
 
-    which (R,): of each beam, the row of `ways` that what it hit keeps to, from 1 on; 0: none, it may go anywhere at the
-    scan's speed. ways (K, 4): velocity x, y [m/s, world], how wrong it may be [m/s], largest acceleration [m/s²]: t
-    seconds after the scan it has gone by the velocity times t, give or take error·t + acceleration·t²/2.
+    Attributes:
+        track_index: (R,) for each beam, the row in `motions` of the surface that it hit, counted from 1. 0: the surface
+            is not tracked and may move in any direction at the scan's speed.
+        motions: (K, 4) velocity x, y in the world [m/s], its error [m/s], and the largest acceleration [m/s²]. t
+            seconds after the scan the displacement is velocity·t, within error·t + acceleration·t²/2.
     """
 
     track_index: NDArray[np.uint8]
     motions: Array
 
-    def wrong(self, beams: int) -> str:
-        """What is wrong with it, of a scan of so many beams; empty: nothing."""
+    def problem(self, beams: int) -> str:
+        """Return the reason why these tracks do not fit a scan with so many beams; empty if they fit."""
         if self.track_index.shape != (beams,) or self.track_index.dtype != np.uint8:
             return "a scan's tracks need one byte for each beam"
         if self.motions.ndim != 2 or self.motions.shape[1] != 4:
             return "a track's motion has four numbers"
         if int(self.track_index.max(initial=0)) > len(self.motions):
             return "a beam's track index is larger than the number of tracks"
-        if not (np.abs(self.motions) <= FASTEST).all() or (self.motions[:, 2:] < 0.0).any():  # NaN fails too
-            return f"the numbers of a track's motion must be within {FASTEST:g}, and its last two not negative"
+        if not (np.abs(self.motions) <= MAX_TRACK_VALUE).all() or (self.motions[:, 2:] < 0.0).any():  # NaN fails too
+            return f"a track's numbers must be within {MAX_TRACK_VALUE:g}, its error and acceleration not negative"
         return ""
 
 
 @dataclass(frozen=True, eq=False)
 class Scan:
-    """A fan in the plane.
+    """A scan in the plane with R beams.
 
-    ranges (R,): m, `far` where nothing was hit, 0: not known; angles (R,): rad in the sensor's frame, ascending, less
-    than a turn; pose: the robot's measured x, y [m] and heading [rad] when it was taken; mount: the sensor's place in
-    the robot, m. Nothing that it may meet is narrower than `least_width`: from every point of an obstacle's surface two
-    edges of that length at right angles lie in it, as in every corner of a box with such edges, or in a disc of √½ of
-    it or more in radius.
+    No obstacle is narrower than `least_width`: from each point of an obstacle's surface, two edges of that length at a
+    right angle lie in the obstacle. This holds for a box with such edges, and for a disc with a radius of at least √½
+    times that length.
     """
 
-    ranges: Array
-    angles: Array
-    pose: tuple[float, float, float]
-    mount: tuple[float, float] = (0.0, 0.0)
-    far: float = 3.5  # m
-    range_error: float = 0.02  # m, largest error of a range
-    position_error: float = 0.0  # m, of the pose
-    heading_error: float = 0.0  # rad, of the pose
-    least_width: float = 0.1  # m
-    doubt: int = 0  # this many beams on either side must agree that something is free: lone false ranges do no harm
-    speed: float = 0.0  # m/s: whatever was hit may move as fast; 0: the world stands
-    age: float = 0.0  # s since it was taken
-    acceleration: float = 0.0  # m/s²: no more than that whatever moves speeds up or slows down; 0: not known
-    least_radius: float = 0.0  # m: whatever moves is at least as large
+    ranges: Array  # (R,) [m]; `far`: no hit; 0 or NaN: no information
+    angles: Array  # (R,) in the sensor's frame, ascending, over less than a turn [rad]
+    pose: tuple[float, float, float]  # measured pose of the robot at the time of the scan: x, y [m], heading [rad]
+    mount: tuple[float, float] = (0.0, 0.0)  # position of the sensor in the robot's frame [m]
+    far: float = 3.5  # largest range of the sensor [m]
+    range_error: float = 0.02  # largest error of a range [m]
+    position_error: float = 0.0  # largest error of the pose's position [m]
+    heading_error: float = 0.0  # largest error of the pose's heading [rad]
+    least_width: float = 0.1  # [m]
+    doubt: int = 0  # number of beams on either side that must agree that space is free, against single false ranges
+    speed: float = 0.0  # largest speed of the surfaces that were hit [m/s]; 0: the world is static
+    age: float = 0.0  # time since the scan [s]
+    acceleration: float = 0.0  # largest acceleration of moving obstacles [m/s²]; 0: unknown
+    least_radius: float = 0.0  # least radius of moving obstacles [m]
     tracks: BeamTracks | None = None
 
     def __post_init__(self) -> None:
@@ -91,45 +115,39 @@ class Scan:
         for name in ("ranges", "angles"):
             object.__setattr__(self, name, np.asarray(getattr(self, name), dtype=float))
         n = self.ranges.size
-        if self.ranges.shape != (n,) or self.angles.shape != (n,) or n > MOST_BEAMS:
-            raise BadScan(f"a scan has as many ranges as angles, {MOST_BEAMS} at most")
+        if self.ranges.shape != (n,) or self.angles.shape != (n,) or n > MAX_BEAMS:
+            raise BadScan(f"a scan has as many ranges as angles, {MAX_BEAMS} at most")
         if not np.isfinite(self.angles).all() or (np.diff(self.angles) <= 0.0).any():
             raise BadScan("a scan's angles must be finite and ascend")
         if n and self.angles[-1] - self.angles[0] >= 2.0 * math.pi:
-            raise BadScan("a scan's angles [rad] span less than a turn: leave out a last beam that is the first again")
+            raise BadScan("a scan's angles [rad] span less than a turn: leave out a last beam that repeats the first")
         if np.isinf(self.ranges).any():
-            raise BadScan("a scan's ranges are finite: `far` where nothing was hit, 0 or NaN where nothing is known")
+            raise BadScan("a scan's ranges are finite: `far` without a hit, 0 or NaN without information")
         if (np.nan_to_num(self.ranges, nan=0.0) < 0.0).any():
             raise BadScan("a scan's ranges are 0 or more")
         if len(self.pose) != 3 or len(self.mount) != 2:
             raise BadScan("a scan's pose has 3 coordinates, its mount 2")
-        values = (*self.pose, *self.mount)
-        bounds = [self.far, self.range_error, self.position_error, self.heading_error, self.speed, self.age, self.doubt]
-        bounds += [self.acceleration, self.least_radius]
-        if not all(abs(value) <= FARTHEST for value in values):  # NaN fails too
-            raise BadScan(f"a scan's pose and mount must be finite, and within {FARTHEST:g}")
-        if not all(0.0 <= value <= FARTHEST for value in bounds):
-            raise BadScan(f"a scan's errors, speed and age must be finite, not negative, and {FARTHEST:g} at most")
+        bounds = (self.far, self.range_error, self.position_error, self.heading_error, self.speed, self.age)
+        more = (self.doubt, self.acceleration, self.least_radius)
+        check_numbers("scan", (*self.pose, *self.mount), (*bounds, *more), self.least_width)
         if self.doubt != int(self.doubt):
             raise BadScan("a scan's doubt is a whole number of beams")
         object.__setattr__(self, "doubt", int(self.doubt))
-        if not (math.isfinite(self.least_width) and self.least_width > 0.0):
-            raise BadScan("a scan's least width must be positive")
-        if self.tracks is not None and (wrong := self.tracks.wrong(n)):
-            raise BadScan(wrong)
+        if self.tracks is not None and (problem := self.tracks.problem(n)):
+            raise BadScan(problem)
 
     @property
-    def known(self) -> NDArray[np.bool_]:
-        """Which beams say something."""
+    def valid_beams(self) -> NDArray[np.bool_]:
+        """Whether each beam (R,) has information."""
         return np.asarray(self.ranges > 0.0)
 
     @property
     def sensor_error(self) -> float:
-        """m, largest error of where the sensor was: a wrong heading swings it about the robot."""
+        """Largest error of the sensor's position [m]; a heading error moves a mounted sensor about the robot."""
         return self.position_error + self.heading_error * math.hypot(*self.mount)
 
     def sensor(self) -> tuple[Array, float]:
-        """Where the sensor was, by the measured pose: place (2,) and heading."""
+        """Return the sensor's position (2,) [m] and heading [rad], by the measured pose."""
         x, y, heading = self.pose
         cos, sin = math.cos(heading), math.sin(heading)
         mx, my = self.mount

@@ -1,6 +1,8 @@
-"""What a ranging sensor saw, in messages: a fan in the plane, or an image all about."""
+"""Convert measurements of range sensors, scans and range images, to messages and back."""
 
 from __future__ import annotations
+
+from typing import Any
 
 import numpy as np
 
@@ -10,20 +12,32 @@ from brakeline.messaging.scan import BadScan, BeamTracks, Scan
 
 RangeMeasurement = Scan | RangeImage
 
-MILLI = 1e-3  # m: of what an image's ranges are multiples, rounded down
-MOST = 65_535  # of them
+RANGE_STEP = 1e-3  # resolution of the ranges of an image in a message, rounded down [m]
+MAX_RANGE_STEPS = 65_535
+# Fields that have the same name and form in the class and in the message.
+SHARED_FIELDS = ("far", "range_error", "position_error", "least_width", "doubt", "speed", "age")
+SCAN_FIELDS = (*SHARED_FIELDS, "heading_error", "acceleration", "least_radius")
+IMAGE_FIELDS = (*SHARED_FIELDS, "angle_error", "low", "high")
 
 
-def set_measurement(request: pb.Request, sensed: RangeMeasurement | None) -> None:
-    """Put it into a request."""
-    if isinstance(sensed, Scan):
-        request.scan.CopyFrom(scan_message(sensed))
-    elif sensed is not None:
-        request.image.CopyFrom(image_message(sensed))
+def _values(source: Any, names: tuple[str, ...]) -> dict[str, Any]:
+    return {name: getattr(source, name) for name in names}
+
+
+def set_measurement(request: pb.Request, measurement: RangeMeasurement | None) -> None:
+    """Set the scan or the range image of a request."""
+    if isinstance(measurement, Scan):
+        request.scan.CopyFrom(scan_message(measurement))
+    elif measurement is not None:
+        request.image.CopyFrom(image_message(measurement))
 
 
 def measurement_in(request: pb.Request) -> RangeMeasurement | None:
-    """What a request holds. Raises BadScan: it is none, or two."""
+    """Return the scan or the range image of a request, if it has one.
+
+    Raises:
+        BadScan: the measurement is invalid, or the request has both.
+    """
     scan, image = request.HasField("scan"), request.HasField("image")
     if scan and image:
         raise BadScan("a request has a scan or a range image, not both")
@@ -33,96 +47,71 @@ def measurement_in(request: pb.Request) -> RangeMeasurement | None:
 
 
 def scan_message(scan: Scan) -> pb.Scan:
+    """Return the message of a scan."""
     return pb.Scan(
         ranges=scan.ranges.astype(np.float32).tolist(),
         angles=scan.angles.astype(np.float32).tolist(),
         pose=scan.pose,
         mount=scan.mount,
-        far=scan.far,
-        range_error=scan.range_error,
-        position_error=scan.position_error,
-        heading_error=scan.heading_error,
-        least_width=scan.least_width,
-        doubt=scan.doubt,
-        speed=scan.speed,
-        age=scan.age,
-        acceleration=scan.acceleration,
-        least_radius=scan.least_radius,
         which=b"" if scan.tracks is None else scan.tracks.track_index.tobytes(),
         ways=[] if scan.tracks is None else scan.tracks.motions.ravel().tolist(),
+        **_values(scan, SCAN_FIELDS),
     )
 
 
-def scan_of(m: pb.Scan) -> Scan:
-    """Raises BadScan: it is none."""
-    if len(m.pose) != 3 or len(m.mount) != 2:
+def scan_of(message: pb.Scan) -> Scan:
+    """Return the scan in a message.
+
+    Raises:
+        BadScan: the scan is invalid.
+    """
+    if len(message.pose) != 3 or len(message.mount) != 2:
         raise BadScan("a scan's pose has 3 coordinates, its mount 2")
-    if len(m.ways) % 4:
+    if len(message.ways) % 4:
         raise BadScan("a scan's ways have four numbers each")
     tracks = None
-    if m.which:
-        tracks = BeamTracks(np.frombuffer(m.which, np.uint8), np.array(m.ways, dtype=float).reshape(-1, 4))
-    x, y, heading = m.pose
+    if message.which:
+        motions = np.array(message.ways, dtype=float).reshape(-1, 4)
+        tracks = BeamTracks(np.frombuffer(message.which, np.uint8), motions)
+    x, y, heading = message.pose
     return Scan(
-        np.fromiter(m.ranges, np.float64, len(m.ranges)),  # `np.array` takes five times as long
-        np.fromiter(m.angles, np.float64, len(m.angles)),
+        np.fromiter(message.ranges, np.float64, len(message.ranges)),  # five times as fast as `np.array`
+        np.fromiter(message.angles, np.float64, len(message.angles)),
         (x, y, heading),
-        (m.mount[0], m.mount[1]),
-        far=m.far,
-        range_error=m.range_error,
-        position_error=m.position_error,
-        heading_error=m.heading_error,
-        least_width=m.least_width,
-        doubt=m.doubt,
-        speed=m.speed,
-        age=m.age,
-        acceleration=m.acceleration,
-        least_radius=m.least_radius,
+        (message.mount[0], message.mount[1]),
         tracks=tracks,
+        **_values(message, SCAN_FIELDS),
     )
 
 
 def image_message(image: RangeImage) -> pb.RangeImage:
-    ranges = np.minimum(image.ranges / MILLI + 1e-6, MOST).astype("<u2")
+    """Return the message of a range image."""
+    ranges = np.minimum(image.ranges / RANGE_STEP + 1e-6, MAX_RANGE_STEPS).astype("<u2")
     return pb.RangeImage(
         ranges=ranges.tobytes(),
         rings=len(ranges),
-        low=image.low,
-        high=image.high,
         at=image.at,
         attitude=image.attitude,
         mount=image.mount,
-        far=image.far,
-        range_error=image.range_error,
-        position_error=image.position_error,
-        angle_error=image.angle_error,
-        least_width=image.least_width,
-        doubt=image.doubt,
-        speed=image.speed,
-        age=image.age,
+        **_values(image, IMAGE_FIELDS),
     )
 
 
-def image_of(m: pb.RangeImage) -> RangeImage:
-    """Raises BadScan: it is none."""
-    if (len(m.at), len(m.attitude), len(m.mount)) != (3, 4, 3):
+def image_of(message: pb.RangeImage) -> RangeImage:
+    """Return the range image in a message.
+
+    Raises:
+        BadScan: the image is invalid.
+    """
+    if (len(message.at), len(message.attitude), len(message.mount)) != (3, 4, 3):
         raise BadScan("a range image's place and mount have 3 coordinates, its attitude 4")
-    if not m.rings or not m.ranges or len(m.ranges) % (2 * m.rings):
+    if not message.rings or not message.ranges or len(message.ranges) % (2 * message.rings):
         raise BadScan("a range image has two bytes for each beam, and as many beams in every ring")
-    w, x, y, z = m.attitude
+    w, x, y, z = message.attitude
     return RangeImage(
-        np.frombuffer(m.ranges, "<u2").reshape(m.rings, -1) * MILLI,
-        (m.at[0], m.at[1], m.at[2]),
+        np.frombuffer(message.ranges, "<u2").reshape(message.rings, -1) * RANGE_STEP,
+        (message.at[0], message.at[1], message.at[2]),
         (w, x, y, z),
-        low=m.low,
-        high=m.high,
-        mount=(m.mount[0], m.mount[1], m.mount[2]),
-        far=m.far,
-        range_error=m.range_error,
-        position_error=m.position_error,
-        angle_error=m.angle_error,
-        least_width=m.least_width,
-        doubt=m.doubt,
-        speed=m.speed,
-        age=m.age,
+        mount=(message.mount[0], message.mount[1], message.mount[2]),
+        **_values(message, IMAGE_FIELDS),
     )

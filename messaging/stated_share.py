@@ -1,21 +1,21 @@
-"""A stated bound in words: the share of verified plans that leave their tubes, at most, at 99 % confidence."""
+"""The stated bound of a model set: the largest share of verified plans that leave their tubes, at 99 % confidence."""
 
 from __future__ import annotations
 
 import math
 
 CONFIDENCE = 0.99
-UNSTATED = 1.0  # what a statement that is missing or can't be read counts as
-DIGITS = 2  # of a bound that is shown
+UNSTATED = 1.0  # value of a bound that is missing or invalid
+DIGITS = 2  # significant digits of a displayed bound
 
 
 def valid_bound(bound: float) -> float:
-    """A bound that came from outside: `UNSTATED` if it is no share. NaN is none."""
+    """Return a bound from outside, or `UNSTATED` if it is no share (NaN included)."""
     return bound if 0.0 <= bound <= 1.0 else UNSTATED
 
 
 def rounded_up(bound: float) -> float:
-    """To two digits: what is shown, and what is accepted, is never below what is stated."""
+    """Round a bound up to two digits, so that the displayed bound is never below the stated one."""
     if bound <= 0.0:
         return 0.0
     scale = 10.0 ** (DIGITS - 1 - math.floor(math.log10(bound)))
@@ -23,12 +23,15 @@ def rounded_up(bound: float) -> float:
 
 
 def percent(bound: float) -> str:
+    """Return a bound, rounded up, in percent."""
     return f"{100.0 * rounded_up(bound):g} %"
 
 
 def describe_verification(verified: bool, bound: float | None) -> str:
-    """What a decision's `verified` is worth, e.g. "verified; at most 1.1 % of such plans leave their tube, at 99 %
-    confidence". bound: None where none was recorded."""
+    """Describe whether a plan was verified, with the stated bound (None: none was recorded).
+
+    Example: "verified; at most 1.1 % of such plans leave their tube, at 99 % confidence".
+    """
     if not verified:
         return "not verified"
     if bound is None:

@@ -1,9 +1,9 @@
-"""What is learned with a robot: what its policy observes and is paid, in which arenas, and what stands for the robot.
+"""Read the task of a robot: its observation, rewards and arenas, and the code that simulates it.
 
-A task is a file beside the robot's: `robots/NAME.task.toml`, or `my.task.toml` beside `my.toml`. A robot that comes
-with the program may have further ones, `robots/NAME+OTHER.task.toml`, each of which says what it is `like`; give the
-name `NAME+OTHER` to get that task. What a task names as code (`simulator`, `senses`, `policies`) is `module:name`, or
-`file.py:name` beside the task; only `deploy` and `sim` load it.
+A task is a file beside the robot's file: `robots/NAME.task.toml`, or `my.task.toml` beside `my.toml`. A shipped robot
+may have additional tasks, `robots/NAME+OTHER.task.toml`, which are based on the task named in `like`; the name
+`NAME+OTHER` selects such a task. A task refers to code (`simulator`, `senses`, `policies`) as `module:name`, or as
+`file.py:name` beside the task. Only `deploy` and `sim` load that code.
 
 Robots and tasks are values: a program reads them once, by name or path, and passes them on.
 """
@@ -37,68 +37,68 @@ _STRICT = ConfigDict(extra="forbid")
 
 
 class UnknownTask(ValueError):
-    """There is no task for this robot, or its file is none; the message says what is wrong in it."""
+    """The robot has no such task, or the task's file has mistakes, which the message lists."""
 
 
 @dataclass(frozen=True)
 class Reward:
-    """What an episode pays. Progress adds up to the way made towards the goal, whichever way was taken."""
+    """Rewards of an episode. The progress of all steps sums to the distance gained, whatever the path."""
 
     __pydantic_config__ = _STRICT
-    progress: float = 20.0  # a metre nearer to the goal
+    progress: float = 20.0  # per metre closer to the goal
     goal: float = 100.0
     collision: float = -100.0
-    run_into: float = -50.0  # while it stood
-    cut: float = -20.0  # where an intervention ends the episode: SAILR's lowest
+    run_into: float = -50.0  # collision while the robot stood
+    cut: float = -20.0  # an intervention that ends the episode (SAILR)
 
 
 @dataclass(frozen=True)
 class MoverKind:
-    """What goes about in an arena: how many (least, most), how large, how fast; what a sensor tells of them."""
+    """Moving obstacles of an arena, and the errors with which a sensor measures them."""
 
     __pydantic_config__ = _STRICT
-    count: tuple[int, int]
-    radius: float  # m; in the plane a disc, in space a ball
-    speed: float  # m/s, at most
-    acceleration: float  # m/s², at most
-    keep: float  # m from the robot's start to its surface, at the start
-    position_error: float = 0.03  # m, of what is measured of them
-    velocity_error: float = 0.05  # m/s
-    steps_over: bool = False  # whoever it runs into while that stands, and which then goes on; else that is its end
+    count: tuple[int, int]  # (least, most)
+    radius: float  # of a disc in the plane, of a ball in space [m]
+    speed: float  # largest [m/s]
+    acceleration: float  # largest [m/s²]
+    keep: float  # least distance from the robot's start to the surface, when an episode begins [m]
+    position_error: float = 0.03  # [m]
+    velocity_error: float = 0.05  # [m/s]
+    steps_over: bool = False  # True: passes over a standing robot, which then continues; False: the episode ends
 
 
 @dataclass(frozen=True)
 class ArenaKind:
-    """What is drawn for an arena of one name. Pairs are (least, most)."""
+    """Distribution from which arenas of one name are drawn. Pairs are (least, most)."""
 
     __pydantic_config__ = _STRICT
-    half_width: float  # m
+    half_width: float  # [m]
     cylinders: tuple[int, int]
-    radius: tuple[float, float]  # m
+    radius: tuple[float, float]  # of a cylinder [m]
     boxes: tuple[int, int]
-    edge: tuple[float, float]  # m, both edges of a box
+    edge: tuple[float, float]  # of a box [m]
     square: bool  # boxes have two equal edges
-    gap: float  # m between any two obstacles in plan, walls included, beyond the robot's diameter
-    path_clearance: float  # m beside the footprint, all along some way from start to goal
-    goal_distance: float  # m from the start, at least
+    gap: float  # least gap between obstacles in plan view, walls included, beyond the robot's diameter [m]
+    path_clearance: float  # clearance beyond the footprint along at least one path from start to goal [m]
+    goal_distance: float  # least distance from the start [m]
     step_limit: int
-    start_clearance: float = 0.1  # m beside the footprint, at the start and at the goal
-    goal_radius: float = 0.25  # m
-    height: float | None = None  # m from floor to ceiling; None: an arena in the plane, without
-    tall: tuple[float, float] = (0.0, 0.0)  # m, a box's height in space
+    start_clearance: float = 0.1  # clearance beyond the footprint at the start and at the goal [m]
+    goal_radius: float = 0.25  # [m]
+    height: float | None = None  # from floor to ceiling [m]; None: an arena in the plane
+    tall: tuple[float, float] = (0.0, 0.0)  # height of a box in space [m]
     spheres: tuple[int, int] = (0, 0)
-    ball: tuple[float, float] = (0.0, 0.0)  # m, radius of a sphere
+    ball: tuple[float, float] = (0.0, 0.0)  # radius of a sphere [m]
     movers: MoverKind | None = None
-    ring: float | None = None  # m: starts are on a circle of this radius, goals opposite: who shares it has to pass
+    ring: float | None = None  # radius of a circle with starts and, opposite, goals, so that paths cross [m]
 
 
 @dataclass(frozen=True)
 class Lidar:
-    """The rays of an observation: a fan of so many in the plane, or azimuths x elevations in space."""
+    """The rays of an observation: `fan` rays in the plane, or `azimuths` times `elevations` rays in space."""
 
     __pydantic_config__ = _STRICT
-    range: float  # m, observed as 1
-    degrees: float  # that the fan, or the elevations, spread over
+    range: float  # observed as 1 [m]
+    degrees: float  # angle that the fan or the elevations span
     fan: int = 0
     azimuths: int = 0
     elevations: int = 0
@@ -106,7 +106,7 @@ class Lidar:
 
 @dataclass(frozen=True)
 class Rivals:
-    """Where SECAS and SAILR are tuned otherwise than by default, and the margins [m] that SECAS's tuning tries."""
+    """Settings of SECAS and SAILR that differ from the defaults, and the margins [m] that SECAS's tuning tries."""
 
     __pydantic_config__ = _STRICT
     secas: dict[str, float] = field(default_factory=dict)
@@ -116,34 +116,34 @@ class Rivals:
 
 @dataclass(frozen=True)
 class Task:
-    """A task as its file says it. observation: what follows the rays, each name with its scale."""
+    """The task in a file."""
 
     __pydantic_config__ = _STRICT
-    simulator: str  # makes vehicles: (conditions, tap) -> MakeVehicle
-    senses: str  # observes: (robot, arena, rng, noise of a range) -> Senses
-    policies: dict[str, str]  # scripted ones by name: (robot, rng) -> Policy
-    observation: tuple[str, ...]
+    simulator: str  # code: (conditions, tap) -> MakeVehicle
+    senses: str  # code: (robot, arena, rng, noise of a range) -> Senses
+    policies: dict[str, str]  # scripted policies by name, code: (robot, rng) -> Policy
+    observation: tuple[str, ...]  # "name [scale]" of each coordinate after the rays
     arenas: dict[str, ArenaKind]
     lidar: Lidar | None = None
     reward: Reward = field(default_factory=Reward)
-    trajectories: int = 200  # of 300 periods, that are recorded for a model set
-    steps: int = 60_000  # of training, in a comparison
-    symmetry: Literal["none", "turns"] = "none"  # turns: the world turned by quarters and mirrored is as true
+    trajectories: int = 200  # number to record for a model set, 300 periods each
+    steps: int = 60_000  # training steps in a comparison
+    symmetry: Literal["none", "turns"] = "none"  # turns: the task is invariant to quarter turns and mirroring
     rivals: Rivals = field(default_factory=Rivals)
-    folder: Path = Path()  # where its file lies
-    name: str = ""  # of its file; empty: it has none
+    folder: Path = Path()  # folder of the task's file
+    name: str = ""  # name of the file without its suffix; empty: there is no file
 
     @cached_property
     def rays(self) -> LidarRays:
-        """Where the observation's rays point; none without a lidar."""
-        seen = self.lidar or Lidar(1.0, 0.0)
-        if seen.azimuths:
-            return spherical_rays(seen.azimuths, seen.elevations, seen.degrees, seen.range)
-        return planar_rays(seen.fan, seen.degrees, seen.range)
+        """Directions and range of the observation's rays; no rays without a lidar."""
+        lidar = self.lidar or Lidar(1.0, 0.0)
+        if lidar.azimuths:
+            return spherical_rays(lidar.azimuths, lidar.elevations, lidar.degrees, lidar.range)
+        return planar_rays(lidar.fan, lidar.degrees, lidar.range)
 
     @cached_property
     def observed(self) -> tuple[str, ...]:
-        """The names of all coordinates of an observation, the rays first."""
+        """Names of all coordinates of an observation, rays first."""
         rays = self.rays
         return (*(f"ray {i} [range/{rays.range:g} m]" for i in range(len(rays.directions))), *self.observation)
 
@@ -152,10 +152,10 @@ class Task:
         return len(self.observed)
 
     def code(self, place: str) -> Any:
-        """What stands at `module:name`, or `file.py:name` beside the task's file.
+        """Import the object at `module:name`, or at `file.py:name` beside the task's file.
 
         Raises:
-            UnknownTask: there is no such thing.
+            UnknownTask: the object cannot be imported.
         """
         module, _, name = place.partition(":")
         try:
@@ -167,85 +167,86 @@ class Task:
 
 
 def _module_in(path: Path) -> Any:
-    """The module in a file, loaded once."""
+    """Import the module in a file; each file is executed once."""
     name = f"task_{hashlib.sha256(str(path.resolve()).encode()).hexdigest()[:12]}"
     if name not in sys.modules:
-        found = importlib.util.spec_from_file_location(name, path)
-        if found is None or found.loader is None:
+        spec = importlib.util.spec_from_file_location(name, path)
+        if spec is None or spec.loader is None:
             raise ImportError(f"{path} is no Python file")
-        module = importlib.util.module_from_spec(found)
+        module = importlib.util.module_from_spec(spec)
         sys.modules[name] = module
-        found.loader.exec_module(module)
+        spec.loader.exec_module(module)
     return sys.modules[name]
 
 
 @dataclass(frozen=True)
 class RobotWithTask(Robot):
-    """A robot together with its task: what an environment, a policy, and a learner need.
+    """A robot with its task, as environments, policies and learners need it.
 
-    The filter needs a `Robot` alone: a request, a model set, and a data set know no task.
+    The filter, its requests, model sets and data sets use a `Robot` without a task.
     """
 
     task: Task = field(kw_only=True, hash=False)
 
     def learning_layout(self) -> str:
-        """Return the hash of what an actor and a learner must share: the robot's vectors and the observation."""
-        words = json.dumps([self.layout(), *self.task.observed])
-        return hashlib.sha256(words.encode()).hexdigest()[:16]
+        """Return the hash of what an actor and a learner must share: the robot's layout and the observation."""
+        text = json.dumps([self.layout(), *self.task.observed])
+        return hashlib.sha256(text.encode()).hexdigest()[:16]
 
     def accepts_learning_layout(self, layout: object) -> bool:
-        """Is it this learning layout, or the one that the robot had before robots were files?"""
+        """Return whether a layout is this learning layout, or the one from before robots were files."""
         return layout == self.learning_layout() or layout == FORMER_LAYOUTS.get(self.name)
 
 
 def with_task(robot: Robot, task: Task) -> RobotWithTask:
     """Return the robot together with a task."""
-    return RobotWithTask(**{part.name: getattr(robot, part.name) for part in fields(Robot)}, task=task)
+    return RobotWithTask(**{item.name: getattr(robot, item.name) for item in fields(Robot)}, task=task)
 
 
 def robot_with_task(name: str) -> RobotWithTask:
-    """Read the robot of a name or at a path, and its task.
+    """Read a robot by its name or path, with its task.
 
     Args:
-        name: as `robot_named` takes it. The task of `my.toml` is `my.task.toml` beside it; `ground+tracks` is the robot
-            `ground` with another task than its usual one.
+        name: as for `robot_named`. The task of `my.toml` is `my.task.toml` beside it; `ground+tracks` is the robot
+            `ground` with the additional task `tracks`.
 
     Raises:
-        UnknownRobot; UnknownTask: there is no such task.
+        UnknownRobot: no robot has this name, or its description has mistakes.
+        UnknownTask: the robot has no such task, or the task's file has mistakes.
     """
-    return with_task(robot_named(name), read(task_path(name)))
+    return with_task(robot_named(name), read_task(task_path(name)))
 
 
 def robot_maybe_with_task(name: str) -> Robot:
-    """Read the robot of a name or at a path, together with its task if it has one: somebody's own robot needs none.
+    """Read a robot by its name or path, with its task if there is one; a robot from a path may have no task.
 
     Raises:
-        UnknownRobot; UnknownTask: the name says a task that there is not, or its file is none.
+        UnknownRobot, UnknownTask: as for `robot_with_task`.
     """
     robot = robot_named(name)
     if name.endswith(".toml") and not _task_beside(name).is_file():
         return robot
-    return with_task(robot, read(task_path(name)))
+    return with_task(robot, read_task(task_path(name)))
 
 
 def needs_task(robot: Robot) -> RobotWithTask:
-    """Return the robot if it has a task.
+    """Return the robot, which must have a task.
 
     Raises:
-        UnknownTask: it has none.
+        UnknownTask: the robot has no task.
     """
     if not isinstance(robot, RobotWithTask):
         raise UnknownTask(
-            f"{robot.name} has no task: what it observes, is paid, and drives in ({robot.kind}.task.toml)"
+            f"{robot.name} has no task: write its observation, rewards and arenas to {robot.kind}.task.toml"
         )
     return robot
 
 
 def task_path(name: str) -> Path:
-    """Return the file of the task that belongs to a robot's name or path.
+    """Return the path of the task of a robot's name or path.
 
     Raises:
-        UnknownRobot; UnknownTask: there is no such file.
+        UnknownRobot, UnknownTask: there is no such robot, or no such file.
     """
     if name.removesuffix(REAL_TIME_SUFFIX).endswith(".toml"):
         path = _task_beside(name)
@@ -255,11 +256,11 @@ def task_path(name: str) -> Path:
         return path
     kind = robot_named(name).kind
     if TASK_SEPARATOR in name and not name.removesuffix(REAL_TIME_SUFFIX).endswith(".toml"):
-        there = sorted(
+        names = sorted(
             p.name.removesuffix(".task.toml") for p in ROBOTS_FOLDER.glob(f"{kind}{TASK_SEPARATOR}*.task.toml")
         )
-        raise UnknownTask(f"there is no {name}; of {kind} there are, besides itself: {', '.join(there)}")
-    raise UnknownTask(f"{kind} has no task: what it observes, is paid, and drives in (expected: {path})")
+        raise UnknownTask(f"there is no task {name}; additional tasks of {kind}: {', '.join(names)}")
+    raise UnknownTask(f"{kind} has no task: write its observation, rewards and arenas to {path}")
 
 
 def _task_beside(path: str) -> Path:
@@ -267,10 +268,10 @@ def _task_beside(path: str) -> Path:
 
 
 def address(name: str) -> str:
-    """Return the name or the absolute path from which another process reads the same robot and task.
+    """Return the name or the absolute path by which another process reads the same robot and task.
 
     Raises:
-        UnknownRobot; UnknownTask: there is no such robot, or no such task of it.
+        UnknownRobot, UnknownTask: there is no such robot, or no such task.
     """
     base = name.removesuffix(REAL_TIME_SUFFIX)
     if base.endswith(".toml"):
@@ -284,16 +285,16 @@ def address_in_real_time(name: str) -> str:
     return address(name.removesuffix(REAL_TIME_SUFFIX)) + REAL_TIME_SUFFIX
 
 
-def read(path: Path) -> Task:
-    """The task in a file.
+def read_task(path: Path) -> Task:
+    """Read the task in a file.
 
     Raises:
-        UnknownTask: with every mistake in it.
+        UnknownTask: the file has mistakes; the message lists all of them.
     """
     try:
         values = _with_base(path)
         arenas = values.get("arenas", {})
-        values["arenas"] = {name: _alike(arenas, name) for name in arenas}
+        values["arenas"] = {name: _arena(arenas, name) for name in arenas}
         return TypeAdapter(Task).validate_python(
             values | {"folder": path.parent, "name": path.name.removesuffix(".task.toml")}
         )
@@ -305,14 +306,14 @@ def read(path: Path) -> Task:
 
 
 def _with_base(path: Path) -> dict[str, Any]:
-    """What a task's file says, with what the one beside it says that it is `like` where it says nothing itself."""
-    own = tomllib.loads(path.read_text())
-    base = own.pop("like", None)
-    return ({} if base is None else _with_base(path.with_name(f"{base}.task.toml"))) | own
+    """Return the values in a task's file, with those of the task that it is `like` as defaults."""
+    values = tomllib.loads(path.read_text())
+    base = values.pop("like", None)
+    return ({} if base is None else _with_base(path.with_name(f"{base}.task.toml"))) | values
 
 
-def _alike(arenas: dict[str, Any], name: str) -> dict[str, Any]:
-    """An arena's values, with those of the one that it is `like` where it has none of its own."""
-    own = dict(arenas[name])
-    base = own.pop("like", None)
-    return (_alike(arenas, base) if base is not None else {}) | own
+def _arena(arenas: dict[str, Any], name: str) -> dict[str, Any]:
+    """Return the values of an arena, with those of the arena that it is `like` as defaults."""
+    values = dict(arenas[name])
+    base = values.pop("like", None)
+    return ({} if base is None else _arena(arenas, base)) | values

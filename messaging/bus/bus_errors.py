@@ -1,4 +1,4 @@
-"""What can go wrong between processes."""
+"""Errors of the bus."""
 
 from __future__ import annotations
 
@@ -11,43 +11,49 @@ from brakeline.messaging import brakeline_pb2 as pb
 
 
 class BusError(Exception):
-    """Something went wrong between processes."""
+    """Base class of the errors of the bus."""
 
 
 class Unreachable(BusError):
-    """No router answered at any endpoint, or an endpoint cannot be listened on."""
+    """No router answers at any endpoint, or the process cannot listen on an endpoint."""
 
 
 class Insecure(BusError):
-    """Others could get at this bus, and nothing would tell who they are."""
+    """Other machines could reach this bus without authentication."""
 
 
 class BadKeys(BusError):
-    """A folder of keys does not hold what is needed; the message says what."""
+    """A folder of keys lacks a file that is needed; the message names it."""
 
 
 class NoReply(BusError):
-    """Nobody serves this question, or who served it went away."""
+    """No service answers this query, or the service has ended."""
 
 
 class Late(BusError):
-    """The deadline passed without an answer."""
+    """The deadline passed without a reply."""
 
 
 class Busy(BusError):
-    """So many questions of this asker wait, or of so many askers, that this one can't."""
+    """The queue of queries is full."""
 
 
 class Expired(BusError):
-    """A question that came to its turn when nobody waited for the answer any more."""
+    """The deadline of a query passed while it was in the queue."""
 
 
 class Malformed(BusError, ValueError):
-    """The bytes are not a message of the topic's type, or it says what no honest sender would."""
+    """The bytes are no message of the topic's type, or the message is implausible."""
 
 
 class Refused(BusError):
-    """The service answered with an error: its `type`, the `field` that is wrong (or empty) and `text`."""
+    """The service replied with an error.
+
+    Attributes:
+        type: name of the error.
+        field: the invalid field of the query, or empty.
+        text: the message.
+    """
 
     def __init__(self, error: pb.Error) -> None:
         super().__init__(f"{error.type}: {error.message}")
@@ -56,7 +62,7 @@ class Refused(BusError):
 
 @contextmanager
 def as_bus_error(what: str) -> Iterator[None]:
-    """Zenoh's errors as the bus's."""
+    """Raise Zenoh's errors as `BusError`."""
     try:
         yield
     except zenoh.ZError as error:

@@ -1,4 +1,4 @@
-"""Whose question is answered next: each asker's in turn, so that the many of one delay another's by one at the most."""
+"""A queue that serves clients in turn, so that many queries of one client delay another client's query by at most one."""
 
 from __future__ import annotations
 
@@ -7,34 +7,38 @@ from typing import Generic, TypeVar
 
 T = TypeVar("T")
 
-EACH = 8  # questions of one asker that wait; a newer one takes the place of the oldest
-MOST = 1024  # askers whose questions wait
+MAX_PER_CLIENT = 8  # queries of one client in the queue; a newer query replaces the oldest
+MAX_CLIENTS = 1024
 
 
 class FairQueue(Generic[T]):
-    """Questions that wait, by who asked. Not for several threads at once."""
+    """Queries by client. Not thread-safe."""
 
     def __init__(self) -> None:
-        self._waiting: dict[str, deque[T]] = {}  # in the order of their turns
+        self._waiting: dict[str, deque[T]] = {}  # by client, in the order of their turns
 
     def __len__(self) -> int:
         return sum(map(len, self._waiting.values()))
 
-    def add(self, who: str, question: T) -> T | None:
-        """Let a question wait; returns the one that can't wait any more, if there is one."""
-        if who not in self._waiting:
-            if len(self._waiting) == MOST:
-                return question
-            self._waiting[who] = deque()
-        waiting = self._waiting[who]
-        waiting.append(question)
-        return waiting.popleft() if len(waiting) > EACH else None
+    def add(self, client: str, query: T) -> T | None:
+        """Add a query; return the query that has lost its place, if any."""
+        if client not in self._waiting:
+            if len(self._waiting) == MAX_CLIENTS:
+                return query
+            self._waiting[client] = deque()
+        waiting = self._waiting[client]
+        waiting.append(query)
+        return waiting.popleft() if len(waiting) > MAX_PER_CLIENT else None
 
     def next(self) -> T:
-        """The question whose turn it is. Raises StopIteration when none waits."""
-        who = next(iter(self._waiting))
-        waiting = self._waiting.pop(who)
-        question = waiting.popleft()
+        """Remove and return the next query.
+
+        Raises:
+            StopIteration: the queue is empty.
+        """
+        client = next(iter(self._waiting))
+        waiting = self._waiting.pop(client)
+        query = waiting.popleft()
         if waiting:
-            self._waiting[who] = waiting  # behind the others
-        return question
+            self._waiting[client] = waiting  # behind the other clients
+        return query

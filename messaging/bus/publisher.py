@@ -1,4 +1,4 @@
-"""Who publishes one topic at one key."""
+"""Publish the messages of one topic at one key."""
 
 from __future__ import annotations
 
@@ -14,24 +14,24 @@ from brakeline.messaging.topics import Topic
 
 
 class Publisher:
-    """Publishes one topic at one key, and numbers what it publishes."""
+    """A publisher of one topic at one key. It numbers its messages."""
 
     def __init__(self, topic: Topic, key: str, source: str, run: int, sender: zenoh.Publisher) -> None:
         self.topic = topic
         self.key = key
-        self.count = 0  # messages put so far: the last one's sequence
+        self.count = 0  # messages put so far; also the sequence number of the last one
         self._source, self._run, self._sender = source, run, sender
         self._stamped = "header" in topic.message.DESCRIPTOR.fields_by_name
         self._lock = threading.Lock()
 
     def put(self, message: Message) -> None:
-        """Fill in the message's header (all but `time`, which is the caller's), encode it once and send it.
+        """Fill in the header of a message (except `time`, which the caller sets), and send it.
 
-        It is lost without an error while the router is away; the sequence then has a gap. It blocks for as long as
-        `BusSettings.stall` if the topic's delivery is BLOCK and a receiver does not drain.
+        Without a router the message is lost without an error; the sequence then has a gap. With BLOCK delivery and a slow
+        receiver, the call blocks for up to `BusSettings.stall`.
 
         Raises:
-            TypeError: not the topic's type.
+            TypeError: the message has another type than the topic.
             BusError: the bus is closed.
         """
         if not isinstance(message, self.topic.message):

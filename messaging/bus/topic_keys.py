@@ -1,4 +1,4 @@
-"""The keys of a topic, with the names filled in."""
+"""Build the keys of topics, and read the names in keys."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from brakeline.messaging.topics import Topic
 
 
 def key_of(topic: Topic, names: dict[str, str]) -> str:
-    """The topic's key without the prefix, wildcards where names are left out.
+    """Return the topic's key without the prefix, with wildcards for names that are left out.
 
     Raises:
         ValueError: the topic's key has no such name, or a name cannot be part of a key.
@@ -21,19 +21,19 @@ def key_of(topic: Topic, names: dict[str, str]) -> str:
 
 
 def exact_key(topic: Topic, names: dict[str, str]) -> str:
-    """As `key_of`, where no name may be left out."""
+    """Return the topic's key like `key_of`, but refuse to leave out a name."""
     key = key_of(topic, names)
     if "*" in key:
         raise ValueError(f"{topic.key}: give every name, not only {', '.join(names) or 'none'}")
     return key
 
 
-def own_key(key: str, who: object) -> str:
-    """Where one of those that serve a question at `key` is asked by itself: its session's id comes last."""
-    return f"{key}/{who}"
+def own_key(key: str, session_id: object) -> str:
+    """Return the key that addresses one of several services at `key`, by the id of its session."""
+    return f"{key}/{session_id}"
 
 
 def names_of(topic: Topic, key: str) -> dict[str, str]:
-    """The names in a key of the topic."""
+    """Return the names in a key of the topic, by field."""
     parts = zip(topic.key.split("/"), key.split("/"), strict=False)
     return {part[1:-1]: name for part, name in parts if part.startswith("{")}

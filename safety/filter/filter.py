@@ -19,7 +19,7 @@ from time import perf_counter_ns
 import numpy as np
 from numpy.typing import NDArray
 
-from brakeline.messaging.scan import OLDEST, Scan
+from brakeline.messaging.scan import MAX_SCAN_AGE, Scan
 from brakeline.safety.filter.backup_plan import UNVERIFIED
 from brakeline.safety.filter.blocking_constraint import BlockingConstraint
 from brakeline.safety.filter.constraints import LocalMap, TubeConstraints, turning_extent
@@ -177,10 +177,10 @@ class Filter:
         else:
             check_for_filter(self.robot, request)
         record.contained = request.predicted is None or request.predicted.contains(self.robot, request.state)
-        record.broken = 0 if request.movers is None else int((~request.movers.kept).sum())
+        record.broken = 0 if request.movers is None else int((~request.movers.consistent).sum())
         blind = "" if not record.broken else BROKEN
-        if request.scan is not None and request.scan.age > OLDEST:
-            blind = f"the scan is {request.scan.age:.3g} s old, over {OLDEST:g}: it shows nothing to be free any more"
+        if request.scan is not None and request.scan.age > MAX_SCAN_AGE:
+            blind = f"the scan is {request.scan.age:.3g} s old, over {MAX_SCAN_AGE:g}: it shows nothing to be free any more"
             request = replace(request, scan=replace(request.scan, ranges=np.zeros_like(request.scan.ranges)))
         if not request.finite:
             blind = NOT_FINITE

@@ -63,7 +63,7 @@ def half_spaces_leading_out(
 
     They verify nothing; recovery uses them to find a way out (docs/method.md §11).
     """
-    out = near.out_of(start)
+    out = near.to_surface(start)
     depth = np.sqrt(np.einsum("nd,nd->n", out, out))
     inside = depth > TOUCHING
     if not inside.any():

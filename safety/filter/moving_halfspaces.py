@@ -32,7 +32,7 @@ def swept_half_spaces(
     places[1::2] = 0.5 * (ends[1:] + ends[:-1])
     seen_from = places - near.moved(0.5 * period * np.arange(2 * N + 1))  # (n, q, d), as if the obstacle stood
     each = np.arange(n)
-    towards = near.shapes.each_towards(start + seen_from)
+    towards = near.shapes.towards_from_own_points(start + seen_from)
     gap = np.sqrt(np.einsum("nqd,nqd->nq", towards, towards))
     unit = towards / np.maximum(gap, TOUCHING)[..., None]
     level = np.einsum("nqd,nqd->nq", unit, towards + seen_from)  # least n·o over O where it was measured

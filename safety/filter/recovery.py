@@ -64,7 +64,7 @@ def lexicographically_less(one: Array, other: Array) -> bool:
 
 def escape_direction(near: Shapes, start: Array) -> Array:
     """Return the direction (d,) away from the nearest obstacle, or out of the obstacle that the start is deepest in."""
-    out = near.out_of(start)
+    out = near.to_surface(start)
     depth = np.einsum("nd,nd->n", out, out)
     if depth.any():
         return np.asarray(out[np.argmax(depth)])

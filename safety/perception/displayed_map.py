@@ -90,7 +90,7 @@ def _tracked(scan: Scan, times: Array) -> tuple[Array, Array]:
     """Return a disc around the hits of each tracked surface (k, 3), and that disc at times (N,) [s] after the scan."""
     assert scan.tracks is not None
     points = np.zeros((len(scan.ranges), 2))
-    points[scan.known & (scan.ranges < scan.far)] = _scan_hits(scan)
+    points[scan.valid_beams & (scan.ranges < scan.far)] = _scan_hits(scan)
     discs, swept = [np.zeros((0, 3))], [np.zeros((0, len(times), 3))]
     for number, (vx, vy, error, acceleration) in enumerate(scan.tracks.motions, start=1):
         hits = points[scan.tracks.track_index == number]
@@ -107,7 +107,7 @@ def _tracked(scan: Scan, times: Array) -> tuple[Array, Array]:
 def _scan_hits(scan: Scan) -> Array:
     """Return the ends (k, 2) of the beams that hit something."""
     at, heading = scan.sensor()
-    hit = scan.known & (scan.ranges < scan.far)
+    hit = scan.valid_beams & (scan.ranges < scan.far)
     angles = heading + scan.angles[hit]
     return np.asarray(at + scan.ranges[hit, None] * np.column_stack([np.cos(angles), np.sin(angles)]))
 
@@ -126,9 +126,9 @@ def _scan_outline(scan: Scan, most: int) -> Array:
 def _image_hits(image: RangeImage) -> Array:
     """Return the ends (k, 3) of the beams that hit something."""
     elevations = image.low + image.step[0] * np.arange(len(image.ranges))
-    hit = image.known & (image.ranges < image.far)
+    hit = image.valid_beams & (image.ranges < image.far)
     ways = directions(elevations, image.ranges.shape[1])[hit]
-    return np.asarray(image.sensor() + image.ranges[hit, None] * ways @ image.turn.T)
+    return np.asarray(image.sensor() + image.ranges[hit, None] * ways @ image.rotation.T)
 
 
 def _image_outline(image: RangeImage, most: int) -> Array:
@@ -140,7 +140,7 @@ def _image_outline(image: RangeImage, most: int) -> Array:
     reach = np.repeat(np.minimum.reduceat(free[ring], first), 2)
     sides = np.column_stack([first, np.append(first[1:], columns)]).ravel() - 0.5
     ways = directions(np.zeros(1), columns, sides)[0]
-    return np.asarray(image.sensor() + reach[:, None] * ways @ image.turn.T)
+    return np.asarray(image.sensor() + reach[:, None] * ways @ image.rotation.T)
 
 
 def reserved_boxes(robot: Robot, exchange: pb.Exchange) -> Array:

@@ -62,10 +62,10 @@ class ImageMemory(VisibilityMemory[RangeImage]):
 
     def _beams_to_fill(self, scan: RangeImage) -> NDArray[np.bool_]:
         """Return the unknown beams next to a mesh without any known beam. Single unknown beams cost little."""
-        none = ~by_mesh(np.logical_or, scan.known)
+        none = ~by_mesh(np.logical_or, scan.valid_beams)
         none |= np.roll(none, 1, axis=1)
         none[1:] |= none[:-1].copy()
-        return np.asarray(none & ~scan.known)
+        return np.asarray(none & ~scan.valid_beams)
 
     def _store(self, scan: RangeImage) -> None:
         if self._stored and math.dist(self._stored[-1].image.at, scan.at) < SPACING:
@@ -77,7 +77,7 @@ class ImageMemory(VisibilityMemory[RangeImage]):
 
     def _free_along(self, scan: RangeImage, beams: NDArray[np.bool_]) -> Array:
         elevations = scan.low + scan.step[0] * np.arange(len(scan.ranges))
-        ways = directions(elevations, scan.ranges.shape[1])[beams] @ scan.turn.T
+        ways = directions(elevations, scan.ranges.shape[1])[beams] @ scan.rotation.T
         points = scan.sensor() + DISTANCES[:, None, None] * ways  # (S, B, 3)
         free = self._near_start(points, scan, STEPS[:, None])
         for stored, age in zip(self._stored, self._ages, strict=True):
@@ -88,7 +88,7 @@ class ImageMemory(VisibilityMemory[RangeImage]):
     def _shown_free(self, stored: _StoredImage, age: float, points: Array, scan: RangeImage) -> NDArray[np.bool_]:
         """Return which points a stored image shows to be free, with everything within the errors around them."""
         image = stored.image
-        away = (points - image.sensor()) @ image.turn
+        away = (points - image.sensor()) @ image.rotation
         far = np.sqrt(np.einsum("sbd,sbd->sb", away, away))
         drift = image.sensor_error + scan.position_error + scan.speed * age + STEPS[:, None]
         reach = np.linalg.norm(points - np.asarray(scan.at), axis=-1)

@@ -40,7 +40,7 @@ def gaps(scan: Scan) -> tuple[Array, Array, Array]:
 
 def gaps_and_motions(scan: Scan) -> tuple[Array, Array, Array, NDArray[np.uint8]]:
     """Return `gaps(scan)`, and the motion of the surface behind each gap: its number in `BeamTracks.motions`, or 0."""
-    beams = np.flatnonzero(scan.known)
+    beams = np.flatnonzero(scan.valid_beams)
     angles = scan.angles[beams]
     ranges = np.maximum(np.minimum(scan.ranges[beams], scan.far) - scan.range_error, 0.0)
     if len(angles) > 2 * scan.doubt + 2:

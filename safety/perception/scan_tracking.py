@@ -132,8 +132,8 @@ def _only_one(centers: Array, position: Array, within: float) -> Array | None:
 
 def _hits(scan: Scan) -> _Hits:
     at, heading = scan.sensor()
-    ranges = np.where(scan.known, scan.ranges, 0.0)
-    beams = np.flatnonzero(scan.known & (ranges < scan.far))
+    ranges = np.where(scan.valid_beams, scan.ranges, 0.0)
+    beams = np.flatnonzero(scan.valid_beams & (ranges < scan.far))
     angles = scan.angles[beams]
     away = ranges[beams]
     points = at + away[:, None] * np.column_stack([np.cos(heading + angles), np.sin(heading + angles)])

@@ -172,7 +172,7 @@ class FanMemory(VisibilityMemory[Scan]):
         return replace(scan, ranges=scan.ranges.copy(), angles=scan.angles.copy())
 
     def _beams_to_fill(self, scan: Scan) -> NDArray[np.bool_]:
-        return ~scan.known
+        return ~scan.valid_beams
 
     def _store(self, scan: Scan) -> None:
         if self._stored:

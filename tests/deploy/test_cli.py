@@ -351,7 +351,11 @@ def test_a_scan_is_loaded_from_a_file(tmp_path):
         return load_scan(tmp_path / "seen.json", dim)
 
     scan = read(2, '{"ranges": [1, null, 0], "angles": [0, 0.1, 0.2], "pose": [1, 2, 0], "doubt": 1}')
-    assert isinstance(scan, Scan) and scan.known.tolist() == [True, False, False] and (scan.doubt, scan.far) == (1, 3.5)
+    assert (
+        isinstance(scan, Scan)
+        and scan.valid_beams.tolist() == [True, False, False]
+        and (scan.doubt, scan.far) == (1, 3.5)
+    )
     image = read(3, json.dumps({"ranges": np.ones((45, 90)).tolist(), "at": [0, 0, 1]}))
     assert isinstance(image, RangeImage) and image.ranges.shape == (45, 90)
     for dim, text, said in (

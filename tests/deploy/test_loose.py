@@ -7,7 +7,7 @@ import pytest
 from brakeline.deploy.cli import main
 from brakeline.deploy.data import simulated_recording
 from brakeline.messaging.robot import ROBOTS_FOLDER
-from brakeline.messaging.robot_description import read
+from brakeline.messaging.robot_description import read_robot
 from brakeline.safety.model.model_set import ModelSet
 from tests.robots import GROUND
 
@@ -93,10 +93,10 @@ def test_a_description_can_set_its_own_limit(tmp_path):
     text = (ROBOTS_FOLDER / "ground.toml").read_text()
     mine = tmp_path / "mine.toml"
     mine.write_text(text.replace('name = "ground"', 'name = "mine"\naccept_bound = 0.05'))
-    robot = read(mine)
+    robot = read_robot(mine)
     assert robot.accept_bound == 0.05 and robot.description["accept_bound"] == 0.05
     assert robot.in_real_time().accept_bound == 0.05
     (tmp_path / "plain.toml").write_text(mine.read_text().replace("accept_bound = 0.05\n", ""))
-    plain = read(tmp_path / "plain.toml")
+    plain = read_robot(tmp_path / "plain.toml")
     assert plain == robot and plain.layout() == robot.layout(), "it says nothing about vectors"
     assert plain.accept_bound == 0.01 and "accept_bound" not in plain.description

@@ -11,9 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from brakeline.messaging.robot import ROBOTS_FOLDER, Robot, UnknownRobot, refuse_shipped_name, robot_named
-from brakeline.messaging.robot_description import UNITS, BadDescription, describe, read, robot_from_description
-from brakeline.messaging.task import UnknownTask, needs_task, robot_maybe_with_task, robot_with_task
-from brakeline.messaging.task import read as read_task
+from brakeline.messaging.robot_description import UNITS, BadDescription, describe, read_robot, robot_from_description
+from brakeline.messaging.task import UnknownTask, needs_task, read_task, robot_maybe_with_task, robot_with_task
 from tests.robots import GROUND, QUADROTOR, ROBOTS
 
 CAR = {
@@ -54,7 +53,7 @@ def changed(*path_and_value):
 def test_a_description_makes_the_same_robot_again(robot):
     assert robot_from_description(json.loads(json.dumps(robot.description))) == robot
     assert robot.in_real_time().in_lockstep() == robot
-    assert read(ROBOTS_FOLDER / f"{robot.name}.toml") == robot
+    assert read_robot(ROBOTS_FOLDER / f"{robot.name}.toml") == robot
 
 
 def test_what_a_description_says_is_what_the_robot_has():

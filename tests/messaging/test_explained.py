@@ -7,10 +7,10 @@ import pytest
 
 from brakeline.logs.decision_explanation import arrow, explain, fits, sentence
 from brakeline.messaging import brakeline_pb2 as pb
-from brakeline.messaging.robot_description import read
+from brakeline.messaging.robot_description import read_robot
 from tests.robots import GROUND, QUADROTOR
 
-OMNI = read(Path(__file__).parents[2] / "examples" / "omni" / "omni.toml")
+OMNI = read_robot(Path(__file__).parents[2] / "examples" / "omni" / "omni.toml")
 
 
 def asked(robot, action, heading=0.0):

@@ -11,7 +11,7 @@ from prometheus_client.parser import text_string_to_metric_families
 
 from brakeline.messaging.bus import BusSettings
 from brakeline.messaging.free_ports import free_endpoint
-from brakeline.messaging.metrics_endpoint import FIGURES, MetricsServer, State
+from brakeline.messaging.metrics_endpoint import FIGURES, MetricsServer, ProcessStatus
 from brakeline.messaging.process_runtime import Process
 from brakeline.messaging.topics import LOG
 from tests.waiting import until
@@ -42,7 +42,7 @@ def everything(**more):
         "figures": figures,
         "published": {"log/a": 2},
     }
-    return State(**(state | more))
+    return ProcessStatus(**(state | more))
 
 
 @pytest.fixture
@@ -62,7 +62,7 @@ def exposed():
 def test_a_process_is_scraped_and_asked_whether_it_is_ready():
     settings = BusSettings(listen=(free_endpoint(),), metrics="0")
     with Process(settings, "safety-0", stderr=False) as process:
-        port = process._exposition.port
+        port = process._metrics.port
         with pytest.raises(urllib.error.HTTPError, match="503"):
             get(port, "/ready")
         process.figures.update(decisions=7, decide_ms=2.5)

@@ -113,4 +113,4 @@ def test_a_refresh_that_fails_does_not_stop_the_signs_of_life(join: Join, endpoi
         time.sleep(0.3)
         process.refresh = None
     wait_for_goodbye(health)
-    assert "no sign of life" in lines[0].text
+    assert "the Health was not published" in lines[0].text

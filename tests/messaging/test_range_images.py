@@ -169,10 +169,10 @@ def test_an_image_crosses_the_wire_and_its_ranges_never_grow():
     got = measurement_in(pb.Request.FromString(message.SerializeToString()))
     assert isinstance(got, RangeImage) and message.ByteSize() < 2 * ranges.size + 200
     assert (got.ranges <= sent.ranges + 1e-6).all() and np.abs(got.ranges - sent.ranges).max() <= 0.001
-    assert np.array_equal(got.known, sent.known)
+    assert np.array_equal(got.valid_beams, sent.valid_beams)
     names = [field.name for field in fields(RangeImage) if field.name != "ranges"]
     assert [getattr(got, name) for name in names] == [getattr(sent, name) for name in names]
-    assert np.allclose(got.turn @ [1.0, 0.0, 0.0], [0.0, 1.0, 0.0])
+    assert np.allclose(got.rotation @ [1.0, 0.0, 0.0], [0.0, 1.0, 0.0])
     assert np.allclose(got.sensor(), [1.0, 2.1, 3.2])
 
 
@@ -197,7 +197,7 @@ def test_two_at_once_and_half_a_beam_are_refused():
         ({"ranges": np.ones(90)}, "rings and columns"),
         ({"ranges": np.ones((1, 90))}, "at most 12°"),
         ({"ranges": np.full((45, 90), 1200, np.uint16)}, "may be in mm"),
-        ({"doubt": 0.5}, "doubted"),
+        ({"doubt": 0.5}, "doubt is 0 or 1"),
         ({"ranges": np.ones((45, 12))}, "at most 12°"),
         ({"ranges": np.ones((300, 300))}, "beams at most"),
         ({"ranges": np.full((45, 90), np.nan)}, "finite"),
@@ -212,7 +212,7 @@ def test_two_at_once_and_half_a_beam_are_refused():
         ({"position_error": 1e39}, "10000 at most"),  # finite, but not in single precision
         ({"at": (1e20, 0.0, 0.0)}, "within 10000"),
         ({"least_width": 0.0}, "positive"),
-        ({"doubt": 2}, "doubted"),
+        ({"doubt": 2}, "doubt is 0 or 1"),
         ({"angle_error": 1.0}, "angle error"),  # degrees, say: so wide is every shadow that none would be left
         ({"low": 0.5, "high": 0.5 + 1e-6}, "so close"),
     ],

@@ -80,7 +80,7 @@ def test_the_way_out_ends_on_the_surface_and_none_is_shorter(obstacle, seed):
     rng = np.random.default_rng(seed)
     shapes = Shapes.of([obstacle], len(obstacle.position))
     for point in [*sample(obstacle, rng, 10), *rng.uniform(-5, 5, (10, shapes.center.shape[1]))]:
-        out = shapes.out_of(point)[0]
+        out = shapes.to_surface(point)[0]
         depth = np.linalg.norm(out)
         if not holds(obstacle, point, -1e-7):  # outside, or as good as on the surface
             assert depth <= 1e-6

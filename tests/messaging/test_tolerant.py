@@ -7,8 +7,8 @@ import pytest
 
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.bus import Malformed, Sample
-from brakeline.messaging.message_checks import MOST_NUMBERS, MOST_OBSTACLES
-from brakeline.messaging.rejected_messages import LONGEST, RejectedMessages, headline
+from brakeline.messaging.message_checks import MAX_NUMBERS, MAX_OBSTACLES
+from brakeline.messaging.rejected_messages import MAX_LINE_LENGTH, RejectedMessages, headline
 from brakeline.messaging.topics import EPISODE, EXCHANGE, HEALTH, LOG, STEP, Topic
 
 
@@ -45,7 +45,7 @@ def test_what_was_not_expected_is_named_with_its_place_and_an_interrupt_goes_thr
         ("\n", ""),
         ("one\ntwo", "one"),
         ("\x1b[2Jgone\x07", "\N{REPLACEMENT CHARACTER}[2Jgone\N{REPLACEMENT CHARACTER}"),
-        ("a" * 10**6, "a" * LONGEST),
+        ("a" * 10**6, "a" * MAX_LINE_LENGTH),
     ],
 )
 def test_a_headline_is_one_line_that_a_terminal_can_show(text: str, line: str) -> None:
@@ -65,9 +65,9 @@ def stamped(time: float = 0.0, wall_time: int = 0, source: str = "a") -> pb.Head
         (HEALTH, pb.Health(process="a" * 101)),
         (STEP, pb.Step(actor="actor/0")),
         (EXCHANGE, pb.Exchange(request=pb.Request(actor="a\nb"))),
-        (EXCHANGE, pb.Exchange(request=pb.Request(obstacles=[pb.Obstacle()] * (MOST_OBSTACLES + 1)))),
-        (EPISODE, pb.Episode(obstacles=[pb.Obstacle()] * (MOST_OBSTACLES + 1))),
-        (STEP, pb.Step(state=[0.0] * (MOST_NUMBERS + 1))),
+        (EXCHANGE, pb.Exchange(request=pb.Request(obstacles=[pb.Obstacle()] * (MAX_OBSTACLES + 1)))),
+        (EPISODE, pb.Episode(obstacles=[pb.Obstacle()] * (MAX_OBSTACLES + 1))),
+        (STEP, pb.Step(state=[0.0] * (MAX_NUMBERS + 1))),
     ],
 )
 def test_what_no_honest_sender_says_is_malformed(topic: Topic, message: object) -> None:

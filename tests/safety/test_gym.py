@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from brakeline.deploy.data.environment_episodes import collect
 from brakeline.messaging.obstacle import Obstacle
-from brakeline.messaging.scan import OLDEST, Scan
+from brakeline.messaging.scan import MAX_SCAN_AGE, Scan
 from brakeline.safety.action_mapping import ActionMapping, Mismatch, mapping_for_space, normalised
 from brakeline.safety.environment_views import STATE
 from brakeline.safety.filter.backup_plan import BackupPlan
@@ -231,7 +231,7 @@ def test_a_missing_scan_frees_nothing(ready):
         *_, after = env.step(np.array([-1.0, 0.0]))
     assert after["scan"] is None
     assert after["diagnostics"]["margin"] == pytest.approx(before["diagnostics"]["margin"], abs=0.02)
-    for _ in range(round(OLDEST / CAR.period) + CAR.horizon):
+    for _ in range(round(MAX_SCAN_AGE / CAR.period) + CAR.horizon):
         *_, after = env.step(np.array([1.0, 0.0]))
     told = after["diagnostics"]
     assert told["kind"] == "failsafe" and "s old" in told["reason"] and CAR.is_stop_input(told["executed"]), (

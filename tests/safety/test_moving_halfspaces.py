@@ -152,7 +152,7 @@ def test_who_keeps_the_bounds_is_seen_where_it_may_be(data, seed):
     limits = {"speed": motion.speed if motion.speed is not None else 2.0}
     later = Motion((0.0, 0.0), motion.position_error, before=Sighting((0.0, 0.0), motion.velocity, since), **limits)
     if motion.speed is not None:
-        assert later.kept(now)
+        assert later.is_consistent(now)
     wide = Motion(
         motion.velocity,
         motion.position_error,
@@ -161,14 +161,14 @@ def test_who_keeps_the_bounds_is_seen_where_it_may_be(data, seed):
         before=Sighting((0.0, 0.0), motion.velocity, since),
     )
     if motion.speed is None:
-        assert wide.kept(now)
+        assert wide.is_consistent(now)
 
 
 def test_who_breaks_the_bound_is_seen_to():
     before = Sighting((0.0, 0.0), (1.0, 0.0), 0.2)
 
     def kept(x, velocity=(1.0, 0.0)):
-        return Motion(velocity, 0.01, 0.01, acceleration=1.0, before=before).kept((x, 0.0))
+        return Motion(velocity, 0.01, 0.01, acceleration=1.0, before=before).is_consistent((x, 0.0))
 
     assert kept(0.2) and kept(0.24) and not kept(0.25) and not kept(0.15)
     assert kept(0.2, (1.2, 0.05)) and not kept(0.2, (1.25, 0.0))

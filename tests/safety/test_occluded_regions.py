@@ -232,11 +232,11 @@ def test_space_that_memory_shows_to_be_free_is_free(seed):
         known = {"far": FAR, "range_error": 0.005, "position_error": 0.02, "angle_error": 0.01, "least_width": WIDTH}
         image = RangeImage(ranges, seen, low=-EDGE, high=EDGE, **known)
         filled = memory.fill(image, 0.2)
-        new = ~image.known & filled.known
+        new = ~image.valid_beams & filled.valid_beams
         remembered += int(new.sum())
         if new.any():
             assert (filled.ranges[new] - image.range_error <= cast(obstacles, at, GRID[new]) + 1e-6).all()
-        assert np.array_equal(filled.ranges[image.known], image.ranges[image.known])
+        assert np.array_equal(filled.ranges[image.valid_beams], image.ranges[image.valid_beams])
         step = np.array([0.55, 0.0, 0.0])
         at = at + step if cast(obstacles, at, np.array([1.0, 0.0, 0.0])) > 0.8 else at - 0.3 * step
     assert remembered > 0
@@ -258,7 +258,7 @@ def test_in_a_moving_world_memory_fades():
     for k in range(8):
         image = clear(ranges=np.where(behind(), 0.0, FAR), speed=3.0)
         filled = memory.fill(replace(image, at=(0.6 * k, 0.0, 0.0)), 0.2)
-    assert not filled.known[behind()].any()
+    assert not filled.valid_beams[behind()].any()
 
 
 @pytest.mark.parametrize(("error", "free"), [(0.0, True), (0.03, False)])

@@ -64,11 +64,11 @@ def test_a_capsule_holds_all_of_its_shadow_in_the_boxes_for_any_error_within_bou
     ways /= np.linalg.norm(ways, axis=1, keepdims=True)
     off = rng.normal(size=(4000, 3))
     off *= image.position_error / np.linalg.norm(off, axis=1, keepdims=True)
-    points = image.sensor() + (free[which] * rng.uniform(1.0, 3.0, 4000))[:, None] * (ways @ image.turn.T) + off
+    points = image.sensor() + (free[which] * rng.uniform(1.0, 3.0, 4000))[:, None] * (ways @ image.rotation.T) + off
     inside = (np.abs(points) < 2.0).all(axis=1)
     assert inside.sum() > 50
     for point, patch in zip(points[inside][:100], which[inside][:100], strict=True):
-        (index,) = np.flatnonzero(capsules[AXIS].T @ (image.turn @ middles[patch]) > 1.0 - 5e-7)
+        (index,) = np.flatnonzero(capsules[AXIS].T @ (image.rotation @ middles[patch]) > 1.0 - 5e-7)
         capsule, share = capsules[:, index], np.linspace(0.0, 1.0, 400)
         centers = capsule[NEAR] + (share * capsule[LENGTH])[:, None] * capsule[AXIS]
         radii = capsule[NEAR_RADIUS] + share * (capsule[FAR_RADIUS] - capsule[NEAR_RADIUS])

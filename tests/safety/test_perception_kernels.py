@@ -79,7 +79,7 @@ def test_a_rotation_matrix_is_that_of_the_range_image(seed):
     attitude /= np.linalg.norm(attitude)
     matrix = shadow_kernels.rotation_matrix(tuple(attitude))
     assert np.allclose(matrix, twins.rotation_matrix(attitude), atol=1e-12)
-    assert np.allclose(matrix, RangeImage(np.ones((20, 40)), (0.0, 0.0, 0.0), tuple(attitude)).turn, atol=1e-12)
+    assert np.allclose(matrix, RangeImage(np.ones((20, 40)), (0.0, 0.0, 0.0), tuple(attitude)).rotation, atol=1e-12)
 
 
 @pytest.mark.parametrize("sensor", [(0.2, -0.1, 0.3), (3.4, -0.1, 0.3)], ids=["inside", "outside"])

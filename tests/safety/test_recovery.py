@@ -88,7 +88,7 @@ def test_who_came_to_stand_inside_of_what_only_its_middle_must_not_be_in_is_led_
         ask = request(robot.measure(), (0.25, 0.0), obstacles, input_in_force=kept.input_in_force, plan=kept.plan)
         decision = ready.decide(type(ask)(**vars(ask) | {"model": kept.model, "predicted": kept.predicted}))
         kinds.append(decision.kind)
-        depths.append(float(np.linalg.norm(obstacles.out_of(robot.state[:2]))))
+        depths.append(float(np.linalg.norm(obstacles.to_surface(robot.state[:2]))))
         assert decision.verified or decision.kind in (RECOVERING, "failsafe")
         assert not (decision.verified and depths[-1] > 0.0) or decision.kind == "failsafe"
         robot.step(kept.accept(decision.plan, decision.model, decision.predicted, decision.verified))

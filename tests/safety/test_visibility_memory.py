@@ -40,11 +40,11 @@ def test_space_that_memory_shows_to_be_free_is_free(seed):
     for _ in range(12):
         scan = taken(obstacles, pose, rng)
         filled = memory.fill(scan, 0.2)
-        new = ~scan.known & filled.known
+        new = ~scan.valid_beams & filled.valid_beams
         remembered += int(new.sum())
         true = cast(obstacles, pose[:2], FAN[new] + pose[2])
         assert (filled.ranges[new] - scan.range_error <= true + 1e-9).all()
-        assert np.array_equal(filled.ranges[scan.known], scan.ranges[scan.known])
+        assert np.array_equal(filled.ranges[scan.valid_beams], scan.ranges[scan.valid_beams])
         ahead = pose + 0.05 * np.array([math.cos(pose[2]), math.sin(pose[2]), 0.0])
         if shapes.distance(ahead[:2]).min() > BODY:
             pose = ahead
@@ -66,7 +66,7 @@ def test_in_a_moving_world_memory_fades():
     memory = FanMemory(0.105)
     for k in range(20):
         filled = memory.fill(_open(0.05 * k, rng, speed=1.6), 0.2)
-    assert not filled.known[np.abs(FAN) > math.pi - BLIND].any()
+    assert not filled.valid_beams[np.abs(FAN) > math.pi - BLIND].any()
 
 
 def test_at_the_start_only_a_ring_around_the_body_is_free():
@@ -86,18 +86,18 @@ def test_without_a_new_scan_the_last_one_ages():
     for _ in range(10):
         memory.fill(None, 0.2)
     blind = replace(_open(0.0, rng, speed=1.2), ranges=np.zeros(len(FAN)))
-    assert not memory.fill(blind, 0.2).known.any(), "what may walk took it all back meanwhile"
+    assert not memory.fill(blind, 0.2).valid_beams.any(), "what may walk took it all back meanwhile"
 
 
 def test_the_ring_at_the_start_ages_before_the_first_scan():
     """If the first scan comes late, somebody may have walked in."""
     blind = replace(_open(0.0, np.random.default_rng(0), speed=1.2), ranges=np.zeros(len(FAN)))
     memory = FanMemory(0.105)
-    assert memory.fill(blind, 0.2).known.any(), "at once"
+    assert memory.fill(blind, 0.2).valid_beams.any(), "at once"
     memory.reset()
     for _ in range(3):
         memory.fill(None, 0.2)
-    assert not memory.fill(blind, 0.2).known.any()
+    assert not memory.fill(blind, 0.2).valid_beams.any()
 
 
 @pytest.mark.parametrize("memory", [FanMemory(0.105), ImageMemory(0.3)])

@@ -6,7 +6,7 @@ import pytest
 from brakeline.messaging.obstacle import CYLINDER, Obstacle
 from brakeline.messaging.policy_weights import MLP, BadWeights, decode
 from brakeline.messaging.robot import ROBOTS_FOLDER, robot_named
-from brakeline.messaging.task import MoverKind, RobotWithTask, UnknownTask, address, read, robot_with_task
+from brakeline.messaging.task import MoverKind, RobotWithTask, UnknownTask, address, read_task, robot_with_task
 from brakeline.sim.arena import same_room, staged_arena
 from brakeline.sim.lidar import Lidar
 from brakeline.sim.observations import GroundObservation, QuadrotorObservation, TrackingObservation, TurnMemory
@@ -66,7 +66,7 @@ def test_the_turn_memory_is_a_low_pass_filter() -> None:
     assert memory.value == pytest.approx(0.5 * (1.0 - np.exp(-1.0)))
 
 
-TRACKS = read(ROBOTS_FOLDER / "ground+tracks.task.toml")
+TRACKS = read_task(ROBOTS_FOLDER / "ground+tracks.task.toml")
 
 
 def test_tracks_have_position_velocity_and_time_to_encounter() -> None:
@@ -138,5 +138,5 @@ def test_another_task_of_a_robot_is_read_by_its_name(tracking) -> None:
     assert GROUND.task.observation_dim == 26, "without a suffix the robot has its usual task"
     with pytest.raises(BadWeights, match="layout"):
         decode(ours, GROUND)
-    with pytest.raises(UnknownTask, match=r"of ground there are, besides itself: ground\+tracks"):
+    with pytest.raises(UnknownTask, match=r"additional tasks of ground: ground\+tracks"):
         robot_with_task("ground+trucks")

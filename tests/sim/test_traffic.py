@@ -69,7 +69,7 @@ def test_the_measured_motion_bounds_the_true_motion():
             assert np.linalg.norm(np.array(obstacle.position) - place) <= motion.position_error
             assert np.linalg.norm(np.array(motion.velocity) - pace) <= motion.velocity_error
             assert (motion.before is None) == (k == 0)
-            assert motion.kept(obstacle.position)
+            assert motion.is_consistent(obstacle.position)
             for later in (0.1, 0.6):
                 ahead = np.array(obstacle.position) + later * np.array(motion.velocity)
                 i = [o is obstacle for o in seen].index(True)

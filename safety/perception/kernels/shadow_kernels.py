@@ -143,7 +143,7 @@ def derive_rows(capsules: Single) -> None:
 
 @compiled("f8[:,::1](UniTuple(f8, 4))")
 def rotation_matrix(attitude: tuple[float, float, float, float]) -> Array:
-    """Return the rotation matrix (3, 3) of a quaternion (w, x, y, z), like `RangeImage.turn`."""
+    """Return the rotation matrix (3, 3) of a quaternion (w, x, y, z), like `RangeImage.rotation`."""
     a, b, c, d = attitude
     length = math.sqrt(a * a + b * b + c * c + d * d)
     w, x, y, z = a / length, b / length, c / length, d / length
