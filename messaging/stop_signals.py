@@ -18,7 +18,8 @@ NUMBERS = (signal.SIGINT, signal.SIGTERM)
 def stop_on_signals(stop: threading.Event, patient: bool = False) -> Iterator[threading.Event]:
     """Set `stop` on SIGINT and SIGTERM within the block; only in the main thread.
 
-    A second signal more than `REPEAT_TIME` later ends the process at once with status 128 + its number, unless `patient`.
+    A second signal more than `REPEAT_TIME` later ends the process at once, with status 128 + its number, unless
+    `patient`.
 
     Python's own signal handlers cannot set an event safely: they run in the main thread between two instructions, and
     within `Event.wait` or `Event.set` a handler would deadlock on the event's lock. They also do not run while the main

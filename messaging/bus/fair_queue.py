@@ -1,4 +1,4 @@
-"""A queue that serves clients in turn, so that many queries of one client delay another client's query by at most one."""
+"""A queue that serves clients in turn: many queries of one client delay another client's query by at most one."""
 
 from __future__ import annotations
 

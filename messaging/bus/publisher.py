@@ -27,8 +27,8 @@ class Publisher:
     def put(self, message: Message) -> None:
         """Fill in the header of a message (except `time`, which the caller sets), and send it.
 
-        Without a router the message is lost without an error; the sequence then has a gap. With BLOCK delivery and a slow
-        receiver, the call blocks for up to `BusSettings.stall`.
+        Without a router the message is lost without an error; the sequence then has a gap. With BLOCK delivery and a
+        slow receiver, the call blocks for up to `BusSettings.stall`.
 
         Raises:
             TypeError: the message has another type than the topic.

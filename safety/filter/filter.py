@@ -180,7 +180,7 @@ class Filter:
         record.broken = 0 if request.movers is None else int((~request.movers.consistent).sum())
         blind = "" if not record.broken else BROKEN
         if request.scan is not None and request.scan.age > MAX_SCAN_AGE:
-            blind = f"the scan is {request.scan.age:.3g} s old, over {MAX_SCAN_AGE:g}: it shows nothing to be free any more"
+            blind = f"the scan is {request.scan.age:.3g} s old, over {MAX_SCAN_AGE:g}: it shows no free space any more"
             request = replace(request, scan=replace(request.scan, ranges=np.zeros_like(request.scan.ranges)))
         if not request.finite:
             blind = NOT_FINITE

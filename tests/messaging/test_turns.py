@@ -10,7 +10,7 @@ import pytest
 
 from brakeline.messaging.bus import BusError, query_server
 from brakeline.messaging.bus import fair_queue as module
-from brakeline.messaging.bus.fair_queue import EACH, FairQueue, T
+from brakeline.messaging.bus.fair_queue import MAX_PER_CLIENT, FairQueue, T
 from brakeline.messaging.bus.query_client import PATIENT
 from brakeline.messaging.topics import DECIDE
 from tests.messaging.test_bus import Join
@@ -30,9 +30,9 @@ def test_each_askers_questions_are_answered_in_turn() -> None:
 
 def test_of_too_many_the_oldest_of_the_same_asker_goes(monkeypatch: pytest.MonkeyPatch) -> None:
     turns = FairQueue[int]()
-    gone = [turns.add("a", number) for number in range(EACH + 3)]
-    assert gone == [None] * EACH + [0, 1, 2]
-    monkeypatch.setattr(module, "MOST", 1)
+    gone = [turns.add("a", number) for number in range(MAX_PER_CLIENT + 3)]
+    assert gone == [None] * MAX_PER_CLIENT + [0, 1, 2]
+    monkeypatch.setattr(module, "MAX_CLIENTS", 1)
     assert turns.add("b", 7) == 7 and turns.add("a", 99) == 3
 
 
@@ -52,7 +52,7 @@ def test_an_asker_is_not_delayed_by_the_many_questions_of_another(join: Join) ->
         with contextlib.suppress(BusError):
             flood.ask(DECIDE, b"flood", timeout=5.0, robot="ground")
 
-    threads = [threading.Thread(target=ask, args=(number,)) for number in range(EACH)]
+    threads = [threading.Thread(target=ask, args=(number,)) for number in range(MAX_PER_CLIENT)]
     for thread in threads:
         thread.start()
     until(lambda: b"flood" in order)
