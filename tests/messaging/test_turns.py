@@ -74,7 +74,7 @@ def test_a_question_for_which_nobody_waits_is_dropped_with_a_warning(
             came_in.append(question)
             return super().add(who, question)
 
-    monkeypatch.setattr(query_server, "Turns", Noted)
+    monkeypatch.setattr(query_server, "FairQueue", Noted)
     router, actor = join("launcher", listen=True), join("actor-0")
     answered: list[bytes] = []
     held, release = threading.Event(), threading.Event()
