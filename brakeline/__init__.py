@@ -11,6 +11,7 @@ Names are imported when they are first used, so that an asker needs no simulator
 from __future__ import annotations
 
 import importlib
+import sys
 from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING, Any
 
@@ -136,3 +137,7 @@ def __getattr__(name: str) -> Any:
 
 def __dir__() -> list[str]:
     return __all__
+
+
+if "gymnasium" in sys.modules:  # else `brakeline.envs` registers: a client of the service needs no Gymnasium
+    from brakeline import envs as _envs  # noqa: F401

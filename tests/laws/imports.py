@@ -30,7 +30,8 @@ PARTS: dict[str, tuple[str, ...]] = {
     "safety": ("messaging", "errors"),
     "sim": ("messaging", "errors"),
     "messaging": ("errors",),
-    "errors": (),
+    "errors": ("messaging.brakeline_pb2",),  # for its types alone
+    "envs": ("sim.registration",),
     "extras": ("errors",),
     "robots": (),
     "policies": (),

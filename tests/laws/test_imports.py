@@ -27,7 +27,7 @@ PLANTED = {
     "the vocabulary that knows of a part": ("messaging/robot.py", "def late():\n    import brakeline.sim.arena"),
     "Zenoh outside the bus": ("messaging/process_runtime.py", "import zenoh"),
     "Torch outside the learner": ("actors/policies.py", "import torch"),
-    "pymavlink inside": ("deploy/commands/fly.py", "from pymavlink import mavutil"),
+    "pymavlink inside": ("deploy/commands/fly_command.py", "from pymavlink import mavutil"),
     "MuJoCo in the filter": ("safety/filter/filter.py", "import mujoco"),
     "a package that no list names": ("messaging/topics.py", "import requests"),
     "a part that imports the public names": ("actors/policies.py", "from brakeline import Filter"),
