@@ -22,11 +22,11 @@ from brakeline.deploy.commands.common_options import (
     errors,
     print_json,
 )
+from brakeline.deploy.data.certification import Unsupported, certify_supported
 from brakeline.deploy.data.coverage import recording_advice
 from brakeline.deploy.data.data_paths import model_path, record_path
 from brakeline.deploy.data.run_dataset import Recorded, from_log
 from brakeline.deploy.data.simulated_recording import data_for
-from brakeline.deploy.data.supported_modes import Unsupported, certify_supported
 from brakeline.deploy.progress import under_way
 from brakeline.logs.console_tables import StackingTable
 from brakeline.messaging import brakeline_pb2 as pb

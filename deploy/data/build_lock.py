@@ -1,4 +1,4 @@
-"""One process at a time makes what is missing in a folder; others wait, and find it then."""
+"""A lock on a folder of data: one process writes the missing files, the others wait and then read them."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ console = Console(stderr=True, highlight=False, soft_wrap=True)
 
 @contextmanager
 def folder_lock(folder: Path) -> Iterator[None]:
-    """Nobody else makes anything in the folder until the block ends; may be entered again inside of it."""
+    """Hold the lock of `folder` until the block ends. The same process may enter it again inside the block."""
     folder.mkdir(parents=True, exist_ok=True)
     lock = FileLock(folder / LOCK, is_singleton=True)
     try:
         lock.acquire(blocking=False)
     except Timeout:
-        console.print(f"another process is at work in {folder}: waiting for it", markup=False)
+        console.print(f"another process is writing to {folder}: waiting for it to finish", markup=False)
         lock.acquire()
     try:
         yield

@@ -1,4 +1,4 @@
-"""A model set from a data set, with its statement about what it was not made from."""
+"""Certify a data set: fit a model set to 70 % of the trajectories and validate it on the other 30 %."""
 
 from __future__ import annotations
 
@@ -7,54 +7,99 @@ from dataclasses import replace
 
 import numpy as np
 
-from brakeline.safety.model.dataset import Dataset
+from brakeline.safety.model.dataset import BadData, Dataset
+from brakeline.safety.model.error_bounds import ErrorBoundError
 from brakeline.safety.model.fitting import fit_model_set
 from brakeline.safety.model.model_set import ModelConfig, ModelSet
 from brakeline.safety.model.validation import Array, ValidationReport, most_violations, validate_plans
+from brakeline.safety.model.windows import FREE, PLAN
 
-HELD_OUT = 0.3  # of the trajectories, for the statement about a model set
-WIDEST = 1.25  # times: sets that have to be wider for the limit are not what the data support, and are left as they are
-TRIES = 4  # bounds that mix data and envelopes do not widen in proportion
+HELD_OUT = 0.3  # share of the trajectories that the validation uses
+MAX_INFLATION = 1.25  # largest factor that `certify` widens sets by itself: the data do not support a larger one
+MAX_ROUNDS = 4  # error bounds that mix data and envelopes do not widen in proportion, so that widening takes rounds
 ROUNDING = 1e-6
+AUTO = "auto"
+PLAN_HINT = " (in a plan window the robot brakes as the filter does: a chosen input, then the description's stop rules)"
+
+
+class Unsupported(BadData):
+    """No kind of windows supports a model set. `reasons` maps each kind to the reason; the message lists them."""
+
+    def __init__(self, reasons: dict[str, str]) -> None:
+        super().__init__("; ".join(f"{kind} windows: {reason}" for kind, reason in reasons.items()))
+        self.reasons = reasons
 
 
 def certify(data: Dataset, model_config: ModelConfig, until_held: bool = False) -> tuple[ModelSet, ValidationReport]:
-    """A model set from 70 % of the trajectories, with its statement about the others.
+    """Fit a model set to 70 % of the trajectories and validate it on the held-out ones.
 
-    The envelopes are widened where that brings the statement within the robot's limit (`accept_bound`): by the factor
-    that leaves as many held-out plans outside as the limit allows among so many (split conformal prediction,
-    docs/method.md §12). How many those are follows from the number of plans alone, so the bound that is stated holds
-    for the widened sets: what comes is beyond the score that v of n are above with a probability that has the
-    Clopper-Pearson bound of v violations in n plans.
-    Where there are too few plans for the limit, or a larger factor than `WIDEST` would be needed, nothing is widened.
+    If the bound is above the robot's limit (`accept_bound`), widen the envelopes by the smallest factor that brings it
+    within the limit (split conformal prediction, docs/method.md §12). The number of violations that the limit allows
+    follows from the number of held-out plans alone. Therefore the stated Clopper-Pearson bound also holds for the
+    widened sets. Nothing is widened if there are too few plans for the limit, or if the factor would be above
+    `MAX_INFLATION`.
 
-    until_held: they are widened until no held-out plan leaves its set, by whatever factor.
+    Args:
+        data: the recorded trajectories.
+        model_config: error bound, mode, windows and first inflation.
+        until_held: widen the envelopes by any factor, until no held-out plan leaves its set.
+
+    Returns:
+        The model set, with the main figures of its validation in `about`, and the validation report.
 
     Raises:
-        BadData, CertificateError: the data do not support it; the message says why.
+        BadData, ErrorBoundError: the data do not support a model set; the message gives the reason.
     """
     fitted, held_out = data.split((1.0 - HELD_OUT, HELD_OUT))
     model = fit_model_set(fitted, model_config)
-    statement, scores = validate_plans(model, fitted, held_out)
-    most = 0 if until_held else most_violations(len(scores), data.robot.accept_bound)
-    if not until_held and _widening(scores, most) > WIDEST:
-        most = -1
-    for _ in range(TRIES):
-        factor = _widening(scores, most)
+    report, scores = validate_plans(model, fitted, held_out)
+    allowed = 0 if until_held else most_violations(len(scores), data.robot.accept_bound)
+    if not until_held and _inflation(scores, allowed) > MAX_INFLATION:
+        allowed = -1
+    for _ in range(MAX_ROUNDS):
+        factor = _inflation(scores, allowed)
         if factor <= 1.0 or not math.isfinite(factor):
             break
         model_config = replace(model_config, inflation=model_config.inflation * factor * (1.0 + ROUNDING))
         model = fit_model_set(fitted, model_config)
-        statement, scores = validate_plans(model, fitted, held_out)
-    about = model.about | {"bound_step": f"{statement.bound_step:.6g}", "bound_plan": f"{statement.bound_plan:.6g}"}
-    about |= {"bound_episode": f"{statement.bound_episode:.6g}", "outside_hour": f"{statement.outside_hour:.6g}"}
-    about |= {"windows": str(statement.windows), "violations": str(statement.violations)}
+        report, scores = validate_plans(model, fitted, held_out)
+    figures = {name: getattr(report, name) for name in ("bound_step", "bound_plan", "bound_episode", "outside_hour")}
+    about = {name: f"{value:.6g}" for name, value in figures.items()}
+    about |= {"windows": str(report.windows), "violations": str(report.violations)}
     about |= {"minutes": f"{data.periods * data.robot.period / 60.0:.6g}", "inflation": f"{model_config.inflation:.6g}"}
-    return replace(model, about=about), statement
+    return replace(model, about=model.about | about), report
 
 
-def _widening(scores: Array, most: int) -> float:
-    """The factor by which sets have to be wider for no more than `most` of the scores (plans,) to be above 1."""
-    if not 0 <= most < len(scores):
+def certify_supported(
+    data: Dataset, model_config: ModelConfig, windows: str = AUTO, until_held: bool = False
+) -> tuple[ModelSet, ValidationReport, dict[str, str]]:
+    """Certify with plan windows if the data hold enough of them, else with free windows.
+
+    Args:
+        data: the recorded trajectories.
+        model_config: its kind of windows is replaced.
+        windows: `plan` or `free` to try one kind only.
+        until_held: see `certify`.
+
+    Returns:
+        The model set, its validation report, and for each kind that failed the reason.
+
+    Raises:
+        Unsupported: no kind of windows supports a model set.
+    """
+    reasons: dict[str, str] = {}
+    for kind in (PLAN, FREE) if windows == AUTO else (windows,):
+        try:
+            model, report = certify(data, replace(model_config, windows=kind), until_held)
+        except (BadData, ErrorBoundError) as error:
+            reasons[kind] = str(error) + (PLAN_HINT if kind == PLAN else "")
+        else:
+            return model, report, reasons
+    raise Unsupported(reasons)
+
+
+def _inflation(scores: Array, allowed: int) -> float:
+    """Return the factor that leaves at most `allowed` of the scores (plans,) above 1; a negative `allowed` gives 1."""
+    if not 0 <= allowed < len(scores):
         return 1.0
-    return float(np.sort(scores)[-1 - most])
+    return float(np.sort(scores)[-1 - allowed])

@@ -1,4 +1,4 @@
-"""`brakeline collect`: record the data that the filter learns a robot from."""
+"""Record trajectories of a simulated robot: the data of its model set (`brakeline collect`)."""
 
 from __future__ import annotations
 
@@ -14,14 +14,21 @@ from brakeline.messaging.task import RobotWithTask
 from brakeline.safety.model.dataset import Dataset, Trajectory
 from brakeline.sim.sim_conditions import Conditions
 
-PERIODS = 300  # a trajectory
+PERIODS = 300  # per trajectory
 ORIGIN = "collect"
 
 
 def record(
     robot: RobotWithTask, trajectories: int, seed: int, conditions: Conditions, first: int = 0
 ) -> Iterator[Trajectory]:
-    """Drive trajectories from number `first` on, each from standing still, with its own generator: (seed, number)."""
+    """Yield trajectories `first` to `trajectories` - 1 from the robot's simulator.
+
+    Each one begins at rest and has its own random generator, seeded with (seed, number). Therefore a recording that
+    was interrupted can continue and give the same data.
+
+    Raises:
+        RuntimeError: the robot touched something.
+    """
     for number in range(first, trajectories):
         rng = np.random.default_rng((seed, number))
         vehicle = vehicle_in_empty_arena(robot, rng, conditions)
@@ -29,7 +36,9 @@ def record(
         for u in itertools.islice(excitation(robot, rng), PERIODS):
             period = vehicle.step(u)
             if period.collision:
-                raise RuntimeError(f"trajectory {number} touched something: the yard is too small")
+                raise RuntimeError(
+                    f"trajectory {number} touched something: the recording yard is too small for the robot"
+                )
             states.append(period.measured)
             inputs.append(vehicle.input)
             paths.append(period.subsamples)
@@ -38,12 +47,12 @@ def record(
 
 
 def dataset(robot: Robot, trajectories: list[Trajectory], seed: int, conditions: Conditions) -> Dataset:
-    """The trajectories as a checked data set that says where it comes from."""
+    """Return the trajectories as a checked data set, with its origin in `about`."""
     data = Dataset(robot, tuple(trajectories), origin(seed, conditions))
     data.check()
     return data
 
 
 def origin(seed: int, conditions: Conditions) -> dict[str, str]:
-    """What a recorded data set says of itself."""
+    """Return the `about` entries of a simulated recording: conditions, seed and origin."""
     return conditions.describe() | {"seed": str(seed), "origin": ORIGIN}

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from brakeline.deploy.data.certification import HELD_OUT, WIDEST
+from brakeline.deploy.data.certification import HELD_OUT, MAX_INFLATION
 from brakeline.deploy.data.sources.quantity_names import column_names, split
 from brakeline.messaging.robot import Array, Robot
 from brakeline.messaging.stated_share import percent
@@ -201,7 +201,7 @@ def _too_loose(statement: ValidationReport, data: Dataset) -> list[str]:
     found.append(
         f"or wider sets: `certify --until-held` widens every envelope {statement.excess:.2g} times, so that none of "
         f"the {plans} plans leaves its set, and states at most {percent(upper_bound(0, plans))}; from "
-        f"{plans_needed(limit)} held-out plans on `certify` widens them by itself, {WIDEST} times at most"
+        f"{plans_needed(limit)} held-out plans on `certify` widens them by itself, {MAX_INFLATION} times at most"
     )
     return found
 

@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brakeline.actors.mavlink.mavlink_vehicle import MavlinkVehicle
+from brakeline.deploy.data.certification import Unsupported, certify_supported
 from brakeline.deploy.data.coverage import recording_advice
 from brakeline.deploy.data.excitation import limit_slew, random_target
-from brakeline.deploy.data.supported_modes import Unsupported, certify_supported
 from brakeline.messaging.robot import Robot
 from brakeline.safety.model.dataset import BadData, Dataset, Trajectory
 from brakeline.safety.model.model_set import ModelConfig, ModelSet

@@ -1,4 +1,7 @@
-"""From any sources to a data set: the reader that fits, then resampling; own logs come with periods already."""
+"""Import recordings as a data set: choose a reader by the file's kind, then resample to the robot's period.
+
+Brakeline's own logs are sampled at the period already, so that no resampling is needed.
+"""
 
 from __future__ import annotations
 
@@ -27,27 +30,27 @@ READERS = {
     ".ulg": "px4_log:read",
 }
 KINDS = f"{', '.join(READERS)}, the folder of a ROS 2 bag, .mcap (a ROS 2 bag, or a log of a run)"
-LAST = 1_000_000  # steps of an own log: all
+ALL_STEPS = 1_000_000  # of a Brakeline log
 
 
 def tables_of(path: Path) -> list[Table]:
-    """What a source holds, by its ending.
+    """Read the tables of a source with the reader for its file name's ending.
 
     Raises:
-        NoSource: there is none, no reader knows it, or it is damaged.
+        NoSource: the file does not exist, its kind is not supported, or it is damaged.
     """
     if not path.exists():
-        raise NoSource(f"{path}: there is no such file or folder")
+        raise NoSource(f"{path}: this file or folder does not exist")
     place = ROS2 if is_bag(path) else READERS.get(path.suffix.lower())
     if place is None:
-        raise NoSource(f"{path}: what can be read is {KINDS}")
+        raise NoSource(f"{path}: this kind of file is not supported. Brakeline reads {KINDS}.")
     module, _, name = place.partition(":")
     tables: list[Table] = getattr(importlib.import_module(f"brakeline.deploy.data.sources.{module}"), name)(path)
     return tables
 
 
 def is_bag(path: Path) -> bool:
-    """Is it a ROS 2 bag: a folder with its metadata, or an MCAP file that says so?"""
+    """Return True for a ROS 2 bag: a folder with `metadata.yaml`, or an MCAP file with the profile `ros2`."""
     if path.is_dir():
         return (path / "metadata.yaml").is_file()
     if path.suffix != ".mcap":
@@ -56,27 +59,37 @@ def is_bag(path: Path) -> bool:
         with path.open("rb") as file:
             return make_reader(file).get_header().profile == "ros2"
     except McapError:
-        return False  # damaged: only our own reader goes on from there
+        return False  # damaged: only Brakeline's own reader can recover a log
 
 
 def own_log(path: Path) -> bool:
-    """Is it the log of a run, a file or a folder?"""
+    """Return True for a log of a Brakeline run, a file or a folder."""
     return (path.suffix == ".mcap" or path.is_dir()) and path.exists() and not is_bag(path)
 
 
 def import_sources(
     paths: Sequence[Path], robot: Robot, words: Sequence[str] = (), delay: float = 0.0, hold: float = HOLD
 ) -> ImportedData:
-    """The data set in several sources of one robot. words: `--map` options.
+    """Import one or more recordings of one robot as one data set.
+
+    Args:
+        paths: the sources.
+        robot: its description names the columns.
+        words: `--map` options, NAME=TABLE/FIELD.
+        delay: time in s by which the stamps of the inputs are too early.
+        hold: time in s for which an input is valid after its last message.
 
     Raises:
-        BadData: with the source and what is wrong; LogError: an own log is none.
+        BadData: a source cannot be used; the message names the source and the reason.
+        LogError: a Brakeline log cannot be read.
     """
-    chosen = mapping(words, robot)
-    parts = [_one(path, robot, chosen, delay, hold) for path in paths]
+    field_map = mapping(words, robot)
+    parts = [_import_one(path, robot, field_map, delay, hold) for path in paths]
     samples = {part.report.samples for part in parts}
     if len(samples) > 1:
-        raise NoSource(f"the sources have {samples} positions a period: import them one by one")
+        raise NoSource(
+            f"the sources have different numbers of positions per period ({samples}): import them one by one"
+        )
     data = Dataset(
         robot,
         tuple(t for part in parts for t in part.data.trajectories),
@@ -95,17 +108,17 @@ def import_sources(
     return ImportedData(data, report)
 
 
-def _one(path: Path, robot: Robot, chosen: dict[str, str], delay: float, hold: float) -> ImportedData:
+def _import_one(path: Path, robot: Robot, field_map: dict[str, str], delay: float, hold: float) -> ImportedData:
     if own_log(path):
-        recorded = from_log(path, robot, LAST)
+        recorded = from_log(path, robot, ALL_STEPS)
         data = recorded.data
         samples = data.trajectories[0].paths.shape[1]
         return ImportedData(
             data, ImportReport(data.periods, len(data.trajectories), samples, 0.0, {}, 0.0, (recorded.note,))
         )
     try:
-        made = resample(tables_of(path), robot, chosen, delay, hold)
+        imported = resample(tables_of(path), robot, field_map, delay, hold)
     except NoSource as error:
         text = str(error)
         raise NoSource(text if text.startswith(str(path)) else f"{path}: {text}") from error
-    return replace(made, data=replace(made.data, about=made.data.about | {"source": path.name}))
+    return replace(imported, data=replace(imported.data, about=imported.data.about | {"source": path.name}))

@@ -1,7 +1,7 @@
-"""The models in use of a robot, made if they are missing.
+"""Load the models that a robot uses, and build those that are missing.
 
-What makes them (simulators, PyTorch, SciPy's statistics) is imported where something has to be made: a service and a
-launcher that find their model would else spend seconds, and hundreds of megabytes, on nothing.
+Simulators, PyTorch and SciPy's statistics are imported only where a model is built. A service that finds its model
+saves seconds and hundreds of megabytes.
 """
 
 from __future__ import annotations
@@ -35,45 +35,49 @@ console = Console(stderr=True, highlight=False, soft_wrap=True)
 
 
 def model_for(robot: Robot, model_config: ModelConfig, accept_bound: float | None = None) -> ModelSet:
-    """The model set in use, made (and its data recorded) if it is not there or not of this layout.
+    """Load the model set in use. If the file is missing or of another layout, record data and certify first.
 
-    accept_bound: the largest stated share of plans outside their tubes that is accepted; unless given the limit of the
-    robot's description counts.
+    Args:
+        robot: the robot, with its description of today.
+        model_config: error bound and mode.
+        accept_bound: largest accepted bound on the share of plans that leave their tubes, in [0, 1]. Defaults to the
+            limit in the robot's description.
 
     Raises:
-        TooLoose: the model set states more, or states nothing; ValueError: `accept_bound` is no share.
+        TooLoose: the model set states a larger bound, or none.
+        ValueError: `accept_bound` is not in [0, 1].
     """
     accepted_bound(robot, accept_bound)
     path = model_path(robot, model_config)
-    made = partial(_made, path, robot, model_config)
-    model = _kept_or_made(path, partial(_kept, path, robot), made, "making the model set")
+    build = partial(_build_model_set, path, robot, model_config)
+    model = _load_or_build(path, partial(_load_model_set, path, robot), build, "building the model set")
     check_bound(model, robot, accept_bound)
-    limit = robot.accept_bound  # of the description today, not of when the model set was made
+    limit = robot.accept_bound  # of today's description, not of the description at certification
     return replace(model, robot=replace(model.robot, accept_bound=limit))
 
 
-def _kept_or_made(path: Path, kept: Callable[[], M], made: Callable[[], M], making: str) -> M:
-    """What lies at the path, or what is made where `kept` finds nothing of use (BadModel), by one process only."""
+def _load_or_build(path: Path, load: Callable[[], M], build: Callable[[], M], activity: str) -> M:
+    """Return `load()`; if it raises BadModel, return `build()`, which one process runs while the others wait."""
     with suppress(BadModel):
-        return kept()
+        return load()
     with folder_lock(path.parent):
         try:
-            return kept()
+            return load()
         except BadModel as error:
             if path.exists():
-                console.print(f"[yellow]{making} again:[/] {error}")
-        return made()
+                console.print(f"[yellow]{activity} again:[/] {error}")
+        return build()
 
 
-def _kept(path: Path, robot: Robot) -> ModelSet:
-    """Raises BadModel: it is not there, or not of this layout or robot."""
+def _load_model_set(path: Path, robot: Robot) -> ModelSet:
+    """Load a model set. Raises BadModel if the file is missing or belongs to another description."""
     model = ModelSet.load(path)
     if model.robot.layout() != robot.layout():
         raise BadModel(f"the description of {robot.name} has changed")
     return model
 
 
-def _made(path: Path, robot: Robot, model_config: ModelConfig) -> ModelSet:
+def _build_model_set(path: Path, robot: Robot, model_config: ModelConfig) -> ModelSet:
     from brakeline.deploy.data.certification import certify
     from brakeline.deploy.data.simulated_recording import data_for, load_or_record
 
@@ -84,30 +88,31 @@ def _made(path: Path, robot: Robot, model_config: ModelConfig) -> ModelSet:
         load_or_record(robot.in_lockstep(), again=True)
         data = data_for(robot)
     with under_way(f"certifying {robot.name}: {model_config.certificate}, {model_config.mode}"):
-        model, statement = certify(data, model_config)
+        model, report = certify(data, model_config)
     console.print(
         f"{robot.name}: {model_config.certificate} ({model_config.mode}) {model.version}: "
-        f"{statement.violations} violations in "
-        f"{statement.windows} held-out plans, at most {statement.bound_plan:.2%} of plans and "
-        f"{statement.bound_step:.2%} of steps leave their sets (99 % confidence)"
+        f"{report.violations} of {report.windows} held-out plans left their sets; at most {report.bound_plan:.2%} of "
+        f"plans and {report.bound_step:.2%} of steps leave them (99 % confidence)"
     )
     model.save(path)
     return model
 
 
 def method_for(robot: Robot, method: str, model_config: ModelConfig, accept_bound: float | None = None) -> Model:
-    """What a method must know of a robot: ours a model set, a rival its networks, made if they are not there.
+    """Return the model that a method needs: a model set for ours, trained networks for a rival.
+
+    A missing model is built first.
 
     Raises:
-        ValueError: no method of that name needs anything, or it knows nothing of robots in real time.
-        TooLoose: the model set's statement is looser than what is used (`model_for`).
+        ValueError: the method does not exist, or it does not support robots in real time.
+        TooLoose: the model set states a bound above the limit (`model_for`).
     """
     if method == DDPC:
         return model_for(robot, model_config, accept_bound)
     if method not in METHODS:
-        raise ValueError(f"no method is called {method!r}; there are: {', '.join(METHODS)}")
+        raise ValueError(f"there is no method {method!r}; choose one of {', '.join(METHODS)}")
     if robot.late:
-        raise ValueError(f"{method} has no real-time mode: its answer counts for the period in which it was asked for")
+        raise ValueError(f"{method} has no real-time mode: its decision is for the period of the request")
     from brakeline.deploy.data.rival_pretraining import recipe_for
 
     robot = needs_task(robot)
@@ -115,29 +120,29 @@ def method_for(robot: Robot, method: str, model_config: ModelConfig, accept_boun
 
 
 def pretrained(robot: RobotWithTask, method: str, model_config: RivalRecipe, again: bool = False) -> Pretrained:
-    """A rival's model of this recipe, pre-trained if it is not there (or `again`)."""
+    """Return a rival's model of this configuration. Pre-train it if the file is missing, or if `again`."""
     path = method_path(robot, method, ModelConfig())
-    made = partial(_pretrained, path, robot, method, model_config)
+    build = partial(_pretrain, path, robot, method, model_config)
     if again:
         with folder_lock(path.parent):
-            return made()
-    return _kept_or_made(path, partial(_kept_rival, path, model_config), made, f"pre-training {method}")
+            return build()
+    return _load_or_build(path, partial(_load_rival, path, model_config), build, f"pre-training {method}")
 
 
-def _kept_rival(path: Path, model_config: RivalRecipe) -> Pretrained:
-    """Raises BadModel: it is not there, or not of this layout or recipe."""
+def _load_rival(path: Path, model_config: RivalRecipe) -> Pretrained:
+    """Load a rival's model. Raises BadModel if the file is missing, damaged or of another configuration."""
     from brakeline.deploy.data.rival_pretraining import made_by
 
     try:
-        kept = Pretrained.decode(path.read_bytes())
+        model = Pretrained.decode(path.read_bytes())
     except OSError as error:
         raise BadModel(f"{path}: {error}") from error
-    if not made_by(kept, model_config):
-        raise BadModel(f"{path} is of another recipe")
-    return kept
+    if not made_by(model, model_config):
+        raise BadModel(f"{path} was trained with another configuration")
+    return model
 
 
-def _pretrained(path: Path, robot: RobotWithTask, method: str, model_config: RivalRecipe) -> Pretrained:
+def _pretrain(path: Path, robot: RobotWithTask, method: str, model_config: RivalRecipe) -> Pretrained:
     from brakeline.deploy.data.rival_pretraining import pretrain
 
     with under_way(f"pre-training {method} for {robot.name}", model_config.samples) as advance:
@@ -145,7 +150,7 @@ def _pretrained(path: Path, robot: RobotWithTask, method: str, model_config: Riv
     model.save(path)
     about = model.about
     console.print(
-        f"{robot.name}: {method} {model.version}: {about['samples']} steps with {about['collisions']} collisions and "
-        f"{about['seconds']} s of pre-training; on held-out steps {about['error']}"
+        f"{robot.name}: {method} {model.version}: pre-trained on {about['samples']} steps with {about['collisions']} "
+        f"collisions, in {about['seconds']} s; error on held-out steps: {about['error']}"
     )
     return model

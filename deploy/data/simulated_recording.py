@@ -1,4 +1,4 @@
-"""The data set of a robot, recorded in its simulator where it is missing; interrupted, it is gone on from."""
+"""Load a robot's data set; if it is missing, record it in the simulator. An interrupted recording continues."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from brakeline.messaging.task import RobotWithTask, needs_task
 from brakeline.safety.model.dataset import BadData, Dataset, Trajectory
 from brakeline.sim.sim_conditions import Conditions
 
-PACE = 0.25  # s a trajectory, on a core that is not quite its own
-SAVE_EVERY = 20.0  # s: no more of a recording is lost when it is killed
+PACE = 0.25  # s per trajectory, on a core that other processes share
+SAVE_EVERY = 20.0  # s: a killed recording loses no more than this
 SEED = 20260
 
 console = Console(stderr=True, highlight=False, soft_wrap=True)
@@ -33,13 +33,13 @@ def load_or_record(
     conditions: Conditions | None = None,
     again: bool = False,
 ) -> Dataset:
-    """The data set at `path`, recorded first if it is not there (or `again`).
+    """Load the data set at `path`. Record it first if the file is missing, or if `again`.
 
-    What was driven before an interruption lies beside it, and is gone on from: every trajectory has a generator of its
-    own, so the data are the same as in one go.
+    An interrupted recording continues from the file beside it. Each trajectory has its own random generator, so the
+    data are the same as without the interruption.
 
     Raises:
-        BadData: there are data that no simulator could bring back (`again`): these are kept.
+        BadData: `again` would overwrite data that do not come from the simulator.
     """
     path = path or record_path(robot)
     if path.exists() and not again:
@@ -47,18 +47,18 @@ def load_or_record(
     with folder_lock(path.parent):
         if path.exists() and not again:
             return Dataset.load(path)
-        _spare(path, robot)
+        _check_replaceable(path, robot)
         count = trajectories or needs_task(robot).task.trajectories
         return _record(needs_task(robot), path, count, seed, conditions or Conditions())
 
 
 def _record(robot: RobotWithTask, path: Path, trajectories: int, seed: int, conditions: Conditions) -> Dataset:
     part = path.with_name(f"{path.stem}.part{path.suffix}")
-    driven = _begun(part, robot, trajectories, seed, conditions)
+    driven = _load_partial(part, robot, trajectories, seed, conditions)
     console.print(
         f"recording {robot.name} once, into {path}: {trajectories} trajectories, "
-        + (f"{len(driven)} of them there already" if driven else about(PACE * trajectories))
-        + "; interrupted, it goes on from there the next time",
+        + (f"{len(driven)} of them recorded before" if driven else about(PACE * trajectories))
+        + ". You can interrupt it: the next call continues.",
         markup=False,
     )
     rest = collect.record(robot, trajectories, seed, conditions, len(driven))
@@ -72,55 +72,61 @@ def _record(robot: RobotWithTask, path: Path, trajectories: int, seed: int, cond
     except KeyboardInterrupt:
         if driven:
             collect.dataset(robot, driven, seed, conditions).save(part)
-            console.print(f"[yellow]kept {len(driven)} of {trajectories} trajectories[/]: the same command goes on")
+            console.print(
+                f"[yellow]kept {len(driven)} of {trajectories} trajectories[/]: run the same command again to continue"
+            )
         raise
     data = collect.dataset(robot, driven, seed, conditions)
-    _spare(path, robot)  # what was put there meanwhile
+    _check_replaceable(path, robot)  # an import may have written the file in the meantime
     data.save(path)
     part.unlink(missing_ok=True)
     return data
 
 
-def _spare(path: Path, robot: Robot) -> None:
-    """Raises BadData if somebody drove what lies at the path: a recording in a simulator must not replace it."""
+def _check_replaceable(path: Path, robot: Robot) -> None:
+    """Raise BadData if the data set at `path` does not come from the simulator: a recording must not replace it."""
     about = Dataset.about_of(path)
     origin = about.get("origin", collect.ORIGIN)
     if origin != collect.ORIGIN:
         source = about.get("sources", about.get("source", ""))
         raise BadData(
-            f"{path} is kept: it was not recorded in the simulator ({origin}{f': {source}' if source else ''}). If the "
-            f"description of {robot.name} has changed, import the log again (`brakeline import LOG --robot ...`); to "
-            f"record in the simulator, move the file away first, or give `collect` another --out"
+            f"{path} is kept: the data do not come from the simulator ({origin}{f': {source}' if source else ''}). If "
+            f"the description of {robot.name} has changed, import the log again (`brakeline import LOG --robot ...`). To "
+            f"record in the simulator, move the file away first, or call `collect` with another --out."
         )
 
 
-def _begun(part: Path, robot: Robot, trajectories: int, seed: int, conditions: Conditions) -> list[Trajectory]:
-    """What an interrupted recording of the same kind had driven."""
+def _load_partial(part: Path, robot: Robot, trajectories: int, seed: int, conditions: Conditions) -> list[Trajectory]:
+    """Return the trajectories of an interrupted recording with the same settings, or an empty list."""
     if not part.exists():
         return []
     try:
-        kept = Dataset.load(part)
+        partial = Dataset.load(part)
     except BadData:
         return []
-    if kept.robot.layout() != robot.layout() or kept.about != collect.origin(seed, conditions):
+    if partial.robot.layout() != robot.layout() or partial.about != collect.origin(seed, conditions):
         return []
-    return [replace(t, before=None) for t in kept.trajectories[:trajectories]]  # as driven: from standing still
+    return [replace(t, before=None) for t in partial.trajectories[:trajectories]]  # each began at rest
 
 
 def about(seconds: float) -> str:
-    """How long something will take, roughly."""
+    """Return a rough duration as text."""
     return f"about {seconds / 60.0:.0f} min" if seconds > 90.0 else f"about {10 * math.ceil(seconds / 10.0)} s"
 
 
 def data_for(robot: Robot) -> Dataset:
-    """The data set in use of a robot, recorded first if it is not there: one record serves, whether questions are late
-    or not.
+    """Load the robot's data set in use, and record it first if it is missing.
+
+    One data set serves both modes: in lockstep and in real time.
 
     Raises:
-        BadData: it was recorded of a robot that differs in more than its body, limits and sight.
+        BadData: the description has changed since the recording in more than body, limits and sight.
     """
-    now = robot.in_lockstep()
-    data = load_or_record(now)
-    if replace(data.robot, body=now.body, limits=now.limits, sight=now.sight).layout() != now.layout():
-        raise BadData(f"{record_path(now)} was recorded before the description of {now.name} changed")
+    lockstep = robot.in_lockstep()
+    data = load_or_record(lockstep)
+    if (
+        replace(data.robot, body=lockstep.body, limits=lockstep.limits, sight=lockstep.sight).layout()
+        != lockstep.layout()
+    ):
+        raise BadData(f"{record_path(lockstep)} was recorded before the description of {robot.name} changed")
     return replace(data, robot=robot)

@@ -215,7 +215,7 @@ def test_what_is_missing_is_named_with_what_there_is(tmp_path, driven):
     bad.write_text("time,x\n0.0,1.0\n0.1,one\n")
     with pytest.raises(NoSource, match=r"bad.csv, line 3: could not convert string to float: 'one'"):
         import_sources([bad], porter())
-    with pytest.raises(NoSource, match=r"what can be read is \.csv, \.parquet"):
+    with pytest.raises(NoSource, match=r"Brakeline reads \.csv, \.parquet"):
         tables_of(FILE)
 
 

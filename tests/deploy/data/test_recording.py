@@ -85,7 +85,7 @@ def test_the_store_makes_what_is_missing_and_only_that(elsewhere, capsys):
     data_paths.model_path(GROUND, ModelConfig()).write_bytes(b"damaged")
     assert model_store.model_for(GROUND, ModelConfig(), BOUND).version == model.version
     said = capsys.readouterr()
-    assert "making the model set again" in said.err and said.out == ""
+    assert "building the model set again" in said.err and said.out == ""
     data_paths.model_path(GROUND, ModelConfig()).unlink()
     data_paths.record_path(GROUND).write_bytes(b"damaged")
     assert model_store.model_for(GROUND, ModelConfig(), BOUND).version == model.version, "the same seed, the same data"
@@ -98,7 +98,7 @@ def test_of_two_that_find_nothing_one_records_and_the_other_waits_for_it(tmp_pat
     said = [process.communicate(timeout=PATIENCE)[1] for process in both]
     assert [process.returncode for process in both] == [0, 0], said
     assert sorted(text.count("recording ground once") for text in said) == [0, 1], said
-    assert sorted(text.count("waiting for it") for text in said) == [0, 1], said
+    assert sorted(text.count("waiting for it to finish") for text in said) == [0, 1], said
     assert not list((tmp_path / "data").rglob("*.new"))
 
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from brakeline.deploy.data.certification import WIDEST, certify
+from brakeline.deploy.data.certification import MAX_INFLATION, certify
 from brakeline.deploy.data.coverage import recording_advice
 from brakeline.safety.model.error_causes import BOTH, FAST, SLOW, STANDING, TURNING, ViolationGroup, regimes
 from brakeline.safety.model.fitting import fit_model_set
@@ -84,7 +84,7 @@ def test_sets_are_widened_only_as_far_as_the_limit_asks_for(data, limit):
     model, statement = certify(narrow, ModelConfig(inflation=1.0))
     most = most_violations(statement.windows, limit)
     plain = certify(replace(data, robot=replace(GROUND, accept_bound=1e-6)), ModelConfig(inflation=1.0))[1]
-    if most < 0 or plain.violations <= most or plain.excess > WIDEST:
+    if most < 0 or plain.violations <= most or plain.excess > MAX_INFLATION:
         assert model.model_config.inflation == 1.0, (
             "too few plans for the limit, or it holds already, or it takes too much"
         )
