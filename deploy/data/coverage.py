@@ -1,4 +1,4 @@
-"""What a data set shows of a robot, and, in words, what is still to be driven."""
+"""Measure what a data set covers of a robot's inputs and states, and advise what to record next."""
 
 from __future__ import annotations
 
@@ -20,15 +20,17 @@ from brakeline.safety.model.turning_in_place import standing_limits
 from brakeline.safety.model.validation import ValidationReport, upper_bound
 from brakeline.safety.model.windows import FREE, PLAN, resting_periods_at_end, stopping_distances, windows
 
-NEAR = 0.05  # of its range: an input this near to a bound has been there
-MOST_SHOWN = 3  # groups of violations
-MOST_PLANS = 10**6  # beyond it nobody records
-FEWEST = 20  # periods beyond an eighth of the range: below it nothing was seen there
+NEAR = 0.05  # share of an input's range: values this close to a bound count as at the bound
+MOST_SHOWN = 3  # groups of violations in a message
+MOST_PLANS = 10**6  # largest number of plans that advice asks for
 
 
 @dataclass(frozen=True)
 class ValueRange:
-    """Of an input, or of a coordinate that comes to one: least and most, against its bounds, in its unit."""
+    """The range of an input, or of a coordinate that follows one, with the bounds of the input, in `unit`.
+
+    low, high: bounds of the description; least, most: smallest and largest value in the data.
+    """
 
     name: str
     unit: str
@@ -39,27 +41,30 @@ class ValueRange:
 
     @property
     def share(self) -> float:
-        """Of the range between the bounds."""
+        """Return the covered share of the range between the bounds, in [0, 1]."""
         inside = min(self.most, self.high) - max(self.least, self.low)
         return max(inside, 0.0) / (self.high - self.low)
 
 
 @dataclass(frozen=True)
 class Coverage:
+    """What a data set covers. `missing` lists in words what to record next."""
+
     seen: tuple[ValueRange, ...]
-    stops: int  # that are long enough to tell what is still travelled after one
-    braked_from: tuple[ValueRange, ...]  # inputs in force when a stop began
+    stops: int  # long enough to measure the remaining motion after a stop
+    braked_from: tuple[ValueRange, ...]  # strongest inputs in the time before each stop
     plans: int  # plan windows of the whole horizon
-    windows: int  # free ones
+    windows: int  # free windows
     missing: tuple[str, ...]
 
     @property
     def refused(self) -> str:
-        """Why no model set at all can be made of it; empty if one may."""
+        """Return the reason why no model set can be built from the data, or an empty string."""
         return "" if self.stops >= FEWEST_STOPS else self.missing[0]
 
 
 def coverage(data: Dataset) -> Coverage:
+    """Measure the coverage of a data set."""
     robot = data.robot
     names, inputs = column_names(robot)
     driven = np.concatenate([t.inputs for t in data.trajectories])
@@ -82,8 +87,8 @@ def coverage(data: Dataset) -> Coverage:
         if robot.zero_at_rest[i] and len(begun)
     ]
     missing = _stops_missing(robot, stops, rested)
-    missing += [text for one in seen[: len(inputs)] for text in _never(one)]
-    missing += [text for one in braked for text in _no_braking(one)]
+    missing += [text for one in seen[: len(inputs)] for text in _unreached_bounds(one)]
+    missing += [text for one in braked for text in _unbraked_ranges(one)]
     plans, free = (len(windows(data, robot.horizon, kind)) for kind in (PLAN, FREE))
     missing += _windows_missing(plans, free)
     return Coverage(tuple(seen), stops, tuple(braked), plans, free, tuple(missing))
@@ -94,7 +99,7 @@ def _seen(name: str, label: str, low: float, high: float, values: Array) -> Valu
 
 
 def _begun(data: Dataset) -> Array:
-    """For each stop the strongest inputs in the time that a plan brakes for, before they were zero: (stops, m)."""
+    """Return the strongest inputs (stops, m) in the `brake_steps` periods before each stop."""
     robot = data.robot
     found = []
     for t in data.trajectories:
@@ -115,46 +120,48 @@ def _stops_missing(robot: Robot, stops: int, rested: int) -> list[str]:
         name for name, is_zero in zip(column_names(robot)[1], robot.zero_at_rest, strict=True) if is_zero
     )
     return [
-        f"{'no stops' if not stops else f'only {stops} stops'}, at least {FEWEST_STOPS} are needed: from every speed "
-        f"give zero {zero} and let the robot stand for {seconds:.1f} s or more, {2 * FEWEST_STOPS} times or more"
+        f"{'no stops' if not stops else f'only {stops} stops'}, but at least {FEWEST_STOPS} are needed: from various "
+        f"speeds, set {zero} to zero and let the robot stand for {seconds:.1f} s or more; repeat this "
+        f"{2 * FEWEST_STOPS} times or more"
     ]
 
 
-def _never(one: ValueRange) -> list[str]:
+def _unreached_bounds(one: ValueRange) -> list[str]:
     found = []
     room = NEAR * (one.high - one.low)
     if one.most < one.high - room:
-        found.append(f"{one.name} never above {one.most:.3g} {one.unit} (bound {one.high:g}): drive this")
+        found.append(f"{one.name} never above {one.most:.3g} {one.unit} (bound {one.high:g}): record this")
     if one.least > one.low + room:
-        found.append(f"{one.name} never below {one.least:.3g} {one.unit} (bound {one.low:g}): drive this")
+        found.append(f"{one.name} never below {one.least:.3g} {one.unit} (bound {one.low:g}): record this")
     return found
 
 
-def _no_braking(one: ValueRange) -> list[str]:
+def _unbraked_ranges(one: ValueRange) -> list[str]:
     found = []
     room = 0.25 * (one.high - one.low)
     if one.most < one.high - room:
-        found.append(f"no braking above {max(one.most, 0.0):.2g} {one.unit} of {one.name}: drive this")
+        found.append(f"no braking above {max(one.most, 0.0):.2g} {one.unit} of {one.name}: record this")
     if one.low < 0.0 and one.least > one.low + room:
-        found.append(f"no braking below {min(one.least, 0.0):.2g} {one.unit} of {one.name}: drive this")
+        found.append(f"no braking below {min(one.least, 0.0):.2g} {one.unit} of {one.name}: record this")
     return found
 
 
 def _windows_missing(plans: int, free: int) -> list[str]:
     enough = math.ceil(ModelConfig().fewest / (1.0 - HELD_OUT))
     if free < enough:
-        return [f"only {free} windows of a plan's length, about {enough} are needed: drive on"]
+        return [f"only {free} windows of a plan's length, but about {enough} are needed: record more"]
     if plans < enough:
         return [
-            f"{plans} windows brake as the filter's plans do; about {enough} would make narrower sets than all driving "
-            "does: hold an input for a period, then stop by the description's rules"
+            f"only {plans} windows brake as the filter's plans do; with about {enough} the sets become narrower than "
+            "with free windows: hold an input for one period, then stop by the description's rules"
         ]
     return []
 
 
 def recording_advice(statement: ValidationReport, data: Dataset) -> list[str]:
-    """What to record, or to lower, for the statement to come within the robot's limit, and to turn on the spot near
-    obstacles; nothing if it does.
+    """Return advice, in sentences, on how to bring the bound within the robot's limit and to bound turns on the spot.
+
+    The list is empty if the bound is within the limit.
     """
     return _turns_missing(statement, data.robot) + _too_loose(statement, data)
 
@@ -163,57 +170,62 @@ def _turns_missing(statement: ValidationReport, robot: Robot) -> list[str]:
     if statement.mode != DIRECT or statement.in_place_windows or standing_limits(robot) is None:
         return []
     return [
-        "too few turns on the spot to bound them apart from driving, so the filter keeps far off obstacles: "
-        f"stand, then turn at various rates for {robot.horizon * robot.period:.1f} s or more each"
+        "too few turns on the spot to bound them separately, so the filter keeps far away from obstacles: let the "
+        f"robot stand, then turn at various rates, each for {robot.horizon * robot.period:.1f} s or more"
     ]
 
 
 def _too_loose(statement: ValidationReport, data: Dataset) -> list[str]:
-    """How the bound can come within the robot's limit. More of the same helps only while the share of held-out plans
-    that leave their sets is below the limit."""
+    """Return advice on a bound above the limit.
+
+    More data of the same kind help only if the share of held-out plans that leave their sets is below the limit.
+    """
     limit, plans = data.robot.accept_bound, statement.windows
     if statement.bound_plan <= limit:
         return []
     bound = percent(statement.bound_plan)
-    said = f"at most {bound} of plans leave their sets (99 % confidence), and the limit is {percent(limit)}"
+    bounded = f"at most {bound} of plans leave their sets (99 % confidence), and the limit is {percent(limit)}"
     wanted = _plans_for(statement.violations, plans, limit)
     minutes = data.periods * data.robot.period / 60.0
     more = math.inf if not plans or wanted is None else minutes * (wanted / plans - 1.0)
     if not statement.violations:
-        how = f": {math.ceil(more)} more minutes like these" if plans else ""
-        return [f"{said}; to state that it takes {wanted} held-out plans, none outside, and there are {plans}{how}"]
+        how = f": record {math.ceil(more)} more minutes like these" if plans else ""
+        return [
+            f"{bounded}; to state the limit, {wanted} held-out plans without a violation are needed, and there are "
+            f"{plans}{how}"
+        ]
     share = statement.violations / plans
     left = f"{statement.violations} of {plans} held-out plans ({share:.1%})"
-    found = [f"{said}; {left} left their sets: {_where(statement)}"]
+    advice = [f"{bounded}; {left} left their sets: {_where(statement)}"]
     if wanted is None:
-        found.append(
-            f"more minutes like these do not make fewer plans leave: {share:.1%} is above the limit of {percent(limit)}"
+        advice.append(
+            f"more minutes like these do not help: the share of {share:.1%} is above the limit of {percent(limit)}"
         )
     else:
-        found.append(
+        advice.append(
             f"{math.ceil(more)} more minutes like these, {wanted} held-out plans, reach the limit only if no larger "
             f"share than {share:.1%} of them leaves its sets"
         )
     driving = dict.fromkeys(one.regime for one in statement.leaving if one.part not in ABOUT_PARTS)
-    found += [f"{regime}: {_remedy(data.robot, regime)}" for regime in driving]
+    advice += [f"{regime}: {_remedy(data.robot, regime)}" for regime in driving]
     parts = {one.part for one in statement.leaving}
-    found += [text for part, text in ABOUT_PARTS.items() if part in parts]
-    found.append(
-        f"or wider sets: `certify --until-held` widens every envelope {statement.excess:.2g} times, so that none of "
-        f"the {plans} plans leaves its set, and states at most {percent(upper_bound(0, plans))}; from "
-        f"{plans_needed(limit)} held-out plans on `certify` widens them by itself, {MAX_INFLATION} times at most"
+    advice += [text for part, text in ABOUT_PARTS.items() if part in parts]
+    advice.append(
+        f"or wider sets: `certify --until-held` widens each envelope {statement.excess:.2g} times, so that none of "
+        f"the {plans} plans leaves its set, and states at most {percent(upper_bound(0, plans))}; with "
+        f"{plans_needed(limit)} or more held-out plans `certify` widens them by itself, at most {MAX_INFLATION} times"
     )
-    return found
+    return advice
 
 
 ABOUT_PARTS = {
-    PATH: f"{PATH}: log positions more often than once a period, or state the path's bulge",
-    AFTER: f"{AFTER}: let it stand longer after each stop, or brake for more periods (`plan.brake`, `plan.horizon`)",
+    PATH: f"{PATH}: log positions more than once per period, or (Gymnasium) set `chord_deviation`",
+    AFTER: f"{AFTER}: stand longer after each stop, or brake for more periods (`plan.brake`, `plan.horizon`)",
 }
 
 
 def _plans_for(violations: int, plans: int, limit: float) -> int | None:
-    """So many held-out plans state the limit if as large a share of them leaves its sets; None: no number does."""
+    """Return how many held-out plans state the limit at the same share of violations; None if no number does."""
     if not violations:
         return plans_needed(limit)
     share = violations / plans
@@ -231,7 +243,7 @@ def _plans_for(violations: int, plans: int, limit: float) -> int | None:
 
 
 def _where(statement: ValidationReport) -> str:
-    """Most of the violations, with the regime's own count beside them."""
+    """Describe the largest groups of violations, each with the number of plans in its regime."""
     shown = [
         f"{one.plans} by {one.part} while {one.regime} (of {one.of} plans there; up to {one.excess:.2g} × its bound)"
         for one in statement.leaving[:MOST_SHOWN]
@@ -241,19 +253,19 @@ def _where(statement: ValidationReport) -> str:
 
 
 def _remedy(robot: Robot, regime: str) -> str:
-    """What to record more of, or which bounds to lower, where plans left their sets while it drove so."""
+    """Return what to record, or which bounds to lower, if plans left their sets in this regime."""
     inputs = [split(label)[0] for label in robot.action]
     moving, turning = (
         " and ".join(name for name, moves in zip(inputs, robot.translates, strict=True) if moves == wanted)
         for wanted in (True, False)
     )
     if regime == STANDING:
-        return "let it stand between drives and after every stop, with what moves it then (wind, its own estimate)"
+        return "record standing between drives and after every stop (with wind, estimator drift)"
     if regime == TURNING:
         return f"record more turning on the spot and at low speed, or lower the bounds of {turning}"
     if regime == FAST:
         return (
-            f"record more driving above half of its speed, with changes of direction, or lower the bounds of {moving}"
+            f"record more driving above half of top speed, with changes of direction, or lower the bounds of {moving}"
         )
     if regime == BOTH:
         return f"record more turning at speed, or lower the bounds of {moving} or {turning}"

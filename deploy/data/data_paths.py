@@ -1,8 +1,8 @@
-"""Where data sets and model sets lie. Nothing heavy here: every process of a run reads it.
+"""Paths of data sets and model sets. Every process of a run imports this module: keep its imports light.
 
 data/<robot>/record.safetensors                     the recorded trajectories
 data/<robot>/<certificate>-<mode>.safetensors       the model set in use, made from them
-data/<robot>/<rival>.safetensors                    the rival's networks, pre-trained (<rival>+<task>: of another task)
+data/<robot>/<rival>.safetensors                    the rival's networks, pre-trained (<rival>+<task> for another task)
 data/<robot>/models/<version>.safetensors           every version a service has used
 """
 
@@ -17,20 +17,22 @@ from brakeline.safety.model.model_config import DDPC, ModelConfig
 
 
 def data_root() -> Path:
-    """`$BRAKELINE_DATA`, else `data` in the working directory."""
+    """Return `$BRAKELINE_DATA`, or `data` in the working directory if it is not set."""
     return Path(os.environ.get("BRAKELINE_DATA", "data"))
 
 
 def record_path(robot: Robot) -> Path:
+    """Return the path of the robot's data set in use."""
     return data_root() / robot.name / "record.safetensors"
 
 
 def model_path(robot: Robot, model_config: ModelConfig) -> Path:
+    """Return the path of the model set in use with this error bound and mode."""
     return data_root() / robot.name / f"{model_config.certificate}-{model_config.mode}.safetensors"
 
 
 def method_path(robot: Robot, method: str, model_config: ModelConfig) -> Path:
-    """Of the model that the safety service needs for a method."""
+    """Return the path of the model that the safety service loads for a method."""
     if method == DDPC:
         return model_path(robot, model_config)
     other = robot.task.name.partition(TASK_SEPARATOR)[2] if isinstance(robot, RobotWithTask) else ""

@@ -6,7 +6,7 @@ import json
 import math
 import re
 
-from brakeline.deploy.data.schema_inference import Column, InferredSchema
+from brakeline.deploy.data.schema_inference import InferredColumn, InferredSchema
 
 BARE = re.compile(r"[A-Za-z0-9_-]+")
 ERRORS = {"position": 0.01, "heading": 0.02}  # the template's
@@ -64,16 +64,16 @@ def periods(told: InferredSchema) -> tuple[int, int]:
     return min(1 + brake + late + 1, MOST_PERIODS), min(brake, MOST_PERIODS - 2)
 
 
-def slew(one: Column) -> float | None:
+def slew(one: InferredColumn) -> float | None:
     """Of an input; None: it was seen to jump."""
     return _outwards(one.change) if 0.0 < one.change < JUMP * (one.most - one.least) else None
 
 
-def _low(one: Column) -> float:
+def _low(one: InferredColumn) -> float:
     return min(_outwards(one.least), 0.0)
 
 
-def _high(one: Column) -> float:
+def _high(one: InferredColumn) -> float:
     return max(_outwards(one.most), 0.0)
 
 
@@ -82,7 +82,7 @@ def _template_inputs(template: str) -> list[str]:
     return [f"# Inputs {UNTOLD}: these are the template's.", *body.splitlines()]
 
 
-def _state(one: Column) -> list[str]:
+def _state(one: InferredColumn) -> list[str]:
     error = ERRORS.get(one.role, ERROR)
     words = [f"unit = {json.dumps(one.unit or '1')}"]
     words += [f"role = {json.dumps(one.role)}"] if one.role != "other" else []
@@ -95,7 +95,7 @@ def _state(one: Column) -> list[str]:
     return [f"{key(one.name)} = {{ {', '.join(words)} }}" + (f" # {'; '.join(seen)}" if seen else "")]
 
 
-def _input(one: Column) -> list[str]:
+def _input(one: InferredColumn) -> list[str]:
     words = [f"unit = {json.dumps(one.unit or '1')}", f"low = {_low(one):g}", f"high = {_high(one):g}"]
     most = slew(one)
     words += [f"slew = {most:g}"] if most is not None else []

@@ -1,4 +1,4 @@
-"""How much later a robot moves than it was told to: the cross-correlation of its inputs with what follows them."""
+"""Estimate the delay from an input to the coordinate that follows it, by cross-correlation."""
 
 from __future__ import annotations
 
@@ -9,36 +9,39 @@ import numpy as np
 from brakeline.messaging.robot import Array, Robot
 
 Series = tuple[Array, Array]
-PARTS = 10  # of a period, that delays are told apart to, if the source is as fine
-MOST = 3.0  # periods: the longest delay that is looked for
+STEPS_PER_PERIOD = 10  # resolution of the delay, if the source is sampled that often
+MAX_DELAY = 3.0  # periods
 
 
 def followed_inputs(robot: Robot) -> Iterator[tuple[int, int]]:
-    """The inputs that a coordinate of the state comes to, each with it."""
+    """Yield (input index, state index) for each input that a state coordinate follows."""
     return ((i, index) for i, index in enumerate(robot.follows) if index >= 0)
 
 
 def estimate_delay(recordings: Sequence[tuple[Series, Series, float, float]], period: float) -> float | None:
-    """s from an input to what follows it, over (input, follower, begin, end) of each recording; None: nothing moved.
+    """Return the dead time in s from an input to its follower, or None if nothing moved.
 
-    The shift at which the changes of the one and of the other over a step of time correlate most. Of a first-order
-    lag the response to a change is strongest at once, so it counts for nothing here: what is told is the dead time, to
-    a step of time.
+    The delay is the shift at which the changes of both over one time step correlate most. A first-order lag responds
+    most strongly at once. Therefore it does not count, and the result is the dead time, to one time step.
+
+    Args:
+        recordings: for each recording the series (time, values) of input and follower, and its begin and end in s.
+        period: the robot's period in s.
     """
     sampled = float(np.median(np.concatenate([np.diff(follower[0]) for _, follower, _, _ in recordings])))
-    step = max(sampled, period / PARTS)
-    most = int(np.ceil(MOST * period / step))
+    step = max(sampled, period / STEPS_PER_PERIOD)
+    most = int(np.ceil(MAX_DELAY * period / step))
     total = np.zeros(most + 1)
     energy = 0.0
-    for (given, values), (seen, follows), begin, end in recordings:
+    for (input_time, inputs), (follower_time, follower), begin, end in recordings:
         times = np.arange(begin, end, step)
         if len(times) <= most + 2:
             continue
-        held = values[np.clip(np.searchsorted(given, times + 1e-6 * step, "right") - 1, 0, None)]
-        told, moved = np.diff(held), np.diff(np.interp(times, seen, follows))
-        # What changed by t[i] shows in the step after t[i].
-        total += [float(told[: len(told) - j - 1] @ moved[j + 1 :]) for j in range(most + 1)]
-        energy += float(told @ told)
+        held = inputs[np.clip(np.searchsorted(input_time, times + 1e-6 * step, "right") - 1, 0, None)]
+        changed, moved = np.diff(held), np.diff(np.interp(times, follower_time, follower))
+        # A change at t[i] shows in the step after t[i].
+        total += [float(changed[: len(changed) - j - 1] @ moved[j + 1 :]) for j in range(most + 1)]
+        energy += float(changed @ changed)
     if energy == 0.0 or total.max() <= 0.0:
         return None
     return step * float(total.argmax())

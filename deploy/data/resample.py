@@ -1,8 +1,8 @@
-"""From columns over time to trajectories: one state a period, one input a period, cut where something is missing.
+"""Resample columns over time to trajectories with one state and one input per period.
 
-A period's state is the source's, between two samples linearly; its input is the one that was held for most of it, else
-the mean. Periods begin where inputs change, if they change at one beat. A recording is cut at gaps, at jumps, and where
-an input is out of the robot's bounds; angles are unwrapped first.
+States are interpolated linearly. The input of a period is the one that was held for most of it, or else the mean.
+Periods begin where inputs change, if most inputs change at a common phase. A recording is split at gaps, at jumps of
+the pose, and where an input is outside the robot's bounds. Angles are unwrapped first.
 """
 
 from __future__ import annotations
@@ -20,38 +20,40 @@ from brakeline.messaging.obstacle import rotate
 from brakeline.messaging.robot import Robot
 from brakeline.safety.model.dataset import Dataset, Trajectory
 
-HOLD = 1.0  # s that an input counts for after its last message: then who sent it may be gone
-MOSTLY = 0.9  # of a period: an input held for so long is the period's
-FEWEST_PERIODS = 5  # of a trajectory that is worth keeping
-LONGEST, PARTS = 300, 60  # periods of a trajectory; at least so many trajectories, to deal out
-MOST_SAMPLES = 20  # of a path within a period
-MISSED = 1.5  # of the usual distance of two samples: one is missing between them
-BEATS = 40  # phases of the period that are told apart
-LEAP = 2.0  # times the fastest motion: a jump
+HOLD = 1.0  # s for which an input is valid after its last message: later its sender may be gone
+MOSTLY = 0.9  # share of a period: an input held for longer is the period's input
+FEWEST_PERIODS = 5  # shorter trajectories are dropped
+LONGEST, FEWEST_PARTS = 300, 60  # periods per trajectory; number of trajectories, so that 30 % can be held out
+MAX_SAMPLES = 20  # positions per period
+GAP = 1.5  # times the usual time between two samples: a larger one is a gap
+PHASES = 40  # bins of the phase at which inputs change
+JUMP = 2.0  # times the fastest motion: faster is a jump
 
 
 @dataclass(frozen=True)
 class ImportReport:
-    """What was made of a source, in figures and in words."""
+    """Figures of an import, and notes for the user."""
 
     periods: int
     trajectories: int
-    samples: int  # positions a period that the source has
-    chord_deviation: float  # m, beyond them
-    delays: dict[str, float]  # s, from an input to the coordinate that follows it
-    uneven: float  # share of periods within which an input changed
+    samples: int  # positions per period in the source
+    chord_deviation: float  # m, of the path between two positions
+    delays: dict[str, float]  # s, for each input, to the coordinate that follows it
+    uneven: float  # share of the periods in which an input changed
     notes: tuple[str, ...]
 
 
 @dataclass(frozen=True)
 class ImportedData:
+    """A data set and the report of its import."""
+
     data: Dataset
     report: ImportReport
 
 
 @dataclass(frozen=True)
 class _Recording:
-    """One run without gaps: a series (time, values) for each state coordinate and input; from, to [s]."""
+    """One run without gaps: a series (time, values) per state coordinate and input, from `begin` to `end` in s."""
 
     states: list[tuple[Array, Array]]
     inputs: list[tuple[Array, Array]]
@@ -62,17 +64,25 @@ class _Recording:
 def resample(
     tables: Sequence[Table], robot: Robot, chosen: dict[str, str], delay: float = 0.0, hold: float = HOLD
 ) -> ImportedData:
-    """The data set that a source's tables hold. chosen: of `--map`; delay [s] by which inputs are stamped too early.
+    """Resample the tables of a source to a data set.
+
+    Args:
+        tables: the tables of the source.
+        robot: its description gives period, columns and bounds.
+        chosen: the field of each column that `--map` names.
+        delay: time in s by which the stamps of the inputs are too early.
+        hold: time in s for which an input is valid after its last message.
 
     Raises:
-        NoSource: a column is missing, the source is too slow, or nothing is left; the message says which and why.
+        NoSource: a column is missing, the source has too few samples, or no trajectory is left; the message gives the
+            reason.
     """
     places = resolve(tables, robot, chosen)
     recordings, notes = _recordings(places, robot, delay, hold)
     if not recordings:
-        raise NoSource("; ".join(notes) or "there is no time at which all columns have values")
+        raise NoSource("; ".join(notes) or "the columns have no time in common")
     step = float(np.median(np.concatenate([np.diff(r.states[0][0]) for r in recordings])))
-    samples = int(np.clip(round(robot.period / step), 1, MOST_SAMPLES))
+    samples = int(np.clip(round(robot.period / step), 1, MAX_SAMPLES))
     pieces: list[Trajectory] = []
     changed, out = [], 0
     for recording in recordings:
@@ -81,17 +91,17 @@ def resample(
         changed.append(uneven)
         out += beyond
     if out:
-        notes.append(f"{out} periods left out: an input was out of the robot's bounds")
+        notes.append(f"{out} periods left out: an input was outside the robot's bounds")
     if not pieces:
-        raise NoSource("; ".join((*notes, f"no {FEWEST_PERIODS} periods in a row are left")))
-    longest = int(np.clip(sum(len(t.inputs) for t in pieces) // PARTS, 4 * robot.horizon, LONGEST))
-    parts = tuple(part for t in pieces for part in _dealt(t, longest))
-    chord_deviation = _between(robot, parts, samples)
+        raise NoSource("; ".join((*notes, f"fewer than {FEWEST_PERIODS} consecutive periods are left")))
+    longest = int(np.clip(sum(len(t.inputs) for t in pieces) // FEWEST_PARTS, 4 * robot.horizon, LONGEST))
+    parts = tuple(part for t in pieces for part in _split(t, longest))
+    chord_deviation = _chord_deviation(robot, parts, samples)
     data = Dataset(robot, parts, {"origin": "import"}, chord_deviation)
     data.check()
     share = float(np.concatenate(changed).mean())
     delays = _delays(recordings, robot)
-    notes += _words(robot, samples, chord_deviation, share, delays)
+    notes += _notes(robot, samples, chord_deviation, share, delays)
     return ImportedData(
         data, ImportReport(data.periods, len(parts), samples, chord_deviation, delays, share, tuple(notes))
     )
@@ -134,18 +144,20 @@ def _recordings(
 
 
 def _without_gaps(time: Array, period: float, name: str) -> tuple[list[tuple[float, float]], int]:
-    """The spans in which no sample is missing, and how many gaps there are."""
+    """Return the spans (begin, end) without gaps, and the number of gaps."""
     apart = np.diff(time)
     usual = float(np.median(apart))
     if usual > 1.05 * period:
-        raise NoSource(f"{name} has a sample every {usual:.3g} s: the robot's period of {period:g} s needs one in each")
-    cuts = np.flatnonzero(apart > max(MISSED * usual, 0.5 * period))
+        raise NoSource(
+            f"{name} has a sample every {usual:.3g} s: the robot's period of {period:g} s needs at least one per period"
+        )
+    cuts = np.flatnonzero(apart > max(GAP * usual, 0.5 * period))
     starts, ends = np.concatenate([[0], cuts + 1]), np.concatenate([cuts, [len(time) - 1]])
     return [(float(time[i]), float(time[j])) for i, j in zip(starts, ends, strict=True)], len(cuts)
 
 
 def _jumps(robot: Robot, states: list[tuple[Array, Array]]) -> list[tuple[float, float]]:
-    """Between which times the pose changed more than the robot can."""
+    """Return the spans (begin, end) in which the pose changed faster than the robot can move."""
     found = []
     speeds = {"m": 0.0, "rad": 0.0}
     for label, low, high in zip(robot.action, robot.action_low, robot.action_high, strict=True):
@@ -158,7 +170,7 @@ def _jumps(robot: Robot, states: list[tuple[Array, Array]]) -> list[tuple[float,
         if i == robot.heading:
             moved = np.abs((np.diff(values) + np.pi) % (2.0 * np.pi) - np.pi)
         usual = float(np.quantile(moved / apart, 0.99))
-        most = LEAP * max(speeds["rad" if i == robot.heading else "m"], usual)
+        most = JUMP * max(speeds["rad" if i == robot.heading else "m"], usual)
         torn = np.flatnonzero(moved > most * apart + 4.0 * robot.measurement_bound[i])
         found += [(float(time[j]), float(time[j + 1])) for j in torn]
     return sorted(set(found))
@@ -170,14 +182,14 @@ def _between_times(torn: list[tuple[float, float]]) -> list[tuple[float, float]]
 
 
 def _held_spans(time: Array, hold: float) -> list[tuple[float, float]]:
-    """The spans in which an input is known: from a message until `hold` after the last one of them."""
+    """Return the spans in which an input is valid: from a message until `hold` s after the last one."""
     ends = np.flatnonzero(np.diff(time, append=np.inf) > hold)
     starts = np.concatenate([[0], ends[:-1] + 1])
     return [(float(time[i]), float(time[j]) + hold) for i, j in zip(starts, ends, strict=True)]
 
 
 def _common(spans: list[list[tuple[float, float]]]) -> list[tuple[float, float]]:
-    """The spans that lie in one of every list."""
+    """Return the intersection of the lists of spans."""
     common = spans[0]
     for other in spans[1:]:
         met = ((max(a, c), min(b, d)) for a, b in common for c, d in _near(other, a, b))
@@ -190,7 +202,7 @@ def _near(spans: list[tuple[float, float]], begin: float, end: float) -> Iterato
 
 
 def _within(series: tuple[Array, Array], begin: float, end: float) -> tuple[Array, Array]:
-    """The samples from the last one at or before `begin` to the first one at or after `end`."""
+    """Return the samples from the last one at or before `begin` to the first one at or after `end`."""
     time, values = series
     i, j = max(int(np.searchsorted(time, begin, "right")) - 1, 0), int(np.searchsorted(time, end)) + 1
     return time[i:j], values[i:j]
@@ -200,7 +212,7 @@ def _within(series: tuple[Array, Array], begin: float, end: float) -> tuple[Arra
 
 
 def _trajectories(r: _Recording, robot: Robot, samples: int) -> tuple[list[Trajectory], Array, int]:
-    """The pieces of a recording, in which periods an input changed (T,), and how many were out of bounds."""
+    """Return trajectories, a flag (T,) for each period in which an input changed, and how many were out of bounds."""
     period = robot.period
     begin = r.begin + _phase(r, period)
     count = int(np.floor((r.end - begin) / period + 1e-6))
@@ -225,21 +237,21 @@ def _trajectories(r: _Recording, robot: Robot, samples: int) -> tuple[list[Traje
     pieces = []
     bounds = np.flatnonzero(np.diff(np.concatenate([[False], good, [False]]).astype(int)))
     for i, j in zip(bounds[::2], bounds[1::2], strict=True):
-        if j - i > FEWEST_PERIODS:  # the first period only tells the input in force at the start
+        if j - i > FEWEST_PERIODS:  # the first period only gives the input in force at the start
             rows = slice(i + 1, j)
             pieces.append(Trajectory(states[i + 1 : j + 1], inputs[rows], paths[rows], turned[rows], inputs[i]))
     return pieces, uneven.astype(float), int((~good).sum())
 
 
 def _phase(r: _Recording, period: float) -> float:
-    """s after its begin that periods start: the beat at which inputs change, if most do so at one."""
+    """Return the time in s from the begin to the first period: the phase at which most inputs change, or 0."""
     changes = np.concatenate([time[1:][np.diff(values) != 0.0] for time, values in r.inputs])
     changes = changes[(changes > r.begin) & (changes < r.end)]
     if not len(changes):
         return 0.0
-    bin = period / BEATS
+    bin = period / PHASES
     phases = (changes - r.begin + 0.5 * bin) % period
-    counts = np.bincount(np.minimum((phases / bin).astype(int), BEATS - 1), minlength=BEATS)
+    counts = np.bincount(np.minimum((phases / bin).astype(int), PHASES - 1), minlength=PHASES)
     best = int(counts.argmax())
     if counts[best] < 0.5 * len(changes):
         return 0.0
@@ -248,7 +260,7 @@ def _phase(r: _Recording, period: float) -> float:
 
 
 def _held(time: Array, values: Array, edges: Array) -> tuple[Array, Array]:
-    """A period's input and whether it changed within: (T,) each. One value for most of it, else the mean."""
+    """Return for each period the input (its main value, else the mean) and whether it changed: (T,) each."""
     where = np.clip(np.searchsorted(time, edges, "right") - 1, 0, None)
     inputs = values[where[:-1]].copy()
     changed = np.zeros(len(inputs), dtype=bool)
@@ -264,8 +276,8 @@ def _held(time: Array, values: Array, edges: Array) -> tuple[Array, Array]:
     return inputs, changed
 
 
-def _dealt(t: Trajectory, longest: int) -> Iterator[Trajectory]:
-    """A trajectory in parts of about `longest` periods: what is held out is held out in whole trajectories."""
+def _split(t: Trajectory, longest: int) -> Iterator[Trajectory]:
+    """Yield a trajectory in parts of about `longest` periods, because validation holds out whole trajectories."""
     count = max(round(len(t.inputs) / longest), 1)
     edges = np.linspace(0, len(t.inputs), count + 1).astype(int)
     for i, j in pairwise(edges):
@@ -273,16 +285,16 @@ def _dealt(t: Trajectory, longest: int) -> Iterator[Trajectory]:
         yield Trajectory(t.states[i : j + 1], t.inputs[i:j], t.paths[i:j], t.turned[i:j], before)
 
 
-# --- what the source does not show --------------------------------------------------------------------------------
+# --- unobserved motion and delays --------------------------------------------------------------------------------
 
 
-def _between(robot: Robot, parts: Sequence[Trajectory], samples: int) -> float:
-    """m that a path may leave the chord of two samples by, from the change of velocity seen over three periods.
+def _chord_deviation(robot: Robot, parts: Sequence[Trajectory], samples: int) -> float:
+    """Bound in m how far a path leaves the chord between two samples, from the velocity changes over three periods.
 
-    A velocity that changes by Δv (wherever in the period, and at once) leaves the chord by at most Δv·T/4. What a
-    period's velocity changes by is at most the sum of the second differences D of position before and after it, / T:
+    A velocity that changes by Δv at any time in the period leaves the chord by at most Δv·T/4. The velocity of a
+    period changes by at most the sum of the second differences D of the position before and after it, divided by T:
 
-        bulge <= max (|D_k| + |D_k+1|) / 4,   with n samples a period, at the same acceleration:  / n²
+        deviation <= max (|D_k| + |D_k+1|) / 4, divided by n² with n samples per period and the same acceleration
     """
     worst = 0.0
     for t in parts:
@@ -302,23 +314,24 @@ def _delays(recordings: list[_Recording], robot: Robot) -> dict[str, float]:
     return found
 
 
-def _words(robot: Robot, samples: int, chord_deviation: float, uneven: float, delays: dict[str, float]) -> list[str]:
-    notes = [f"{name}: its motion follows {1e3 * d:.0f} ms later (cross-correlation)" for name, d in delays.items()]
+def _notes(robot: Robot, samples: int, chord_deviation: float, uneven: float, delays: dict[str, float]) -> list[str]:
+    notes = [f"{name}: the robot responds {1e3 * d:.0f} ms later (cross-correlation)" for name, d in delays.items()]
     notes += [
-        f"{name}: that is more than a period ({robot.period:g} s), and predictions know one earlier input only: shift "
-        "it with --delay if the stamps are wrong, else choose a longer period"
+        f"{name}: the delay is above one period ({robot.period:g} s), but predictions use one earlier input only. If "
+        "the time stamps are wrong, shift them with --delay; otherwise choose a longer period."
         for name, d in delays.items()
         if d > robot.period
     ]
     if samples == 1:
         notes.append(
-            f"the source has one position a period: how far paths leave their chords in between is bounded from the "
-            f"periods' ends and the acceleration seen, by {1e3 * chord_deviation:.1f} mm"
+            f"the source has one position per period: between positions, paths leave their chords by at most "
+            f"{1e3 * chord_deviation:.1f} mm (from the measured accelerations)"
         )
     else:
         notes.append(
-            f"paths within a period from {samples} positions, {1e3 * chord_deviation:.2f} mm more between them"
+            f"the source has {samples} positions per period; between them, paths leave their chords by at most "
+            f"{1e3 * chord_deviation:.2f} mm"
         )
     if uneven > 0.0:
-        notes.append(f"in {uneven:.0%} of the periods an input changed within: its mean counts")
+        notes.append(f"in {uneven:.0%} of the periods an input changed: the import uses its mean")
     return notes

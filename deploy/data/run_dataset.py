@@ -1,7 +1,4 @@
-"""A data set from a log: what robots did in a run says what they are like now.
-
-It makes a new version of the model set, never changes one in place (docs/method.md §4).
-"""
+"""Build a data set from the log of a run, to certify a new version of the model set (docs/method.md §4)."""
 
 from __future__ import annotations
 
@@ -18,22 +15,23 @@ from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.robot import INPUT_TOLERANCE, Robot
 from brakeline.safety.model.dataset import BadData, Dataset, Trajectory
 
-FEWEST_STEPS = 5  # of a trajectory that is worth keeping
+FEWEST_STEPS = 5  # shorter trajectories are dropped
 
 
 @dataclass(frozen=True)
 class Recorded:
-    """Data, and a line that says where they come from."""
+    """A data set and a sentence about its source."""
 
     data: Dataset
     note: str
 
 
 def from_log(path: Path, robot: Robot, last: int) -> Recorded:
-    """The last steps of a robot kind in a log, as trajectories cut at episode ends and at lost steps.
+    """Read the last `last` steps of a robot from a log, as trajectories that end at episode ends and lost steps.
 
     Raises:
-        BadData: too few steps of that robot; NoLog, NotALog: no log.
+        BadData: the log holds too few steps of the robot.
+        NoLog, NotALog: the file does not exist, or is not a log.
     """
     steps: deque[pb.Step] = deque(maxlen=last)
     for record in read(path):
@@ -48,7 +46,7 @@ def from_log(path: Path, robot: Robot, last: int) -> Recorded:
 
 
 def trajectories_of(steps: Iterable[pb.Step], robot: Robot) -> Iterable[Trajectory]:
-    """Runs of consecutive steps of one actor's episode."""
+    """Yield a trajectory for each run of consecutive steps in one episode of one actor."""
     ordered = sorted(steps, key=lambda s: (s.actor, s.header.run, s.episode, s.step))
     numbered = ((s.actor, s.header.run, s.episode, s.step - i) for i, s in enumerate(ordered))
     for _, group in groupby(zip(numbered, ordered, strict=True), key=lambda pair: pair[0]):
@@ -58,25 +56,26 @@ def trajectories_of(steps: Iterable[pb.Step], robot: Robot) -> Iterable[Trajecto
 
 
 def _trajectory(run: list[pb.Step], robot: Robot) -> Trajectory:
-    """The first step only gives the state that the others start from, and the input in force then.
+    """Convert consecutive steps to a trajectory.
 
-    In real time a step's action is what it decided for the period after it: it takes one step more to know that input.
+    The first step only gives the initial state and the input in force at that time. In real time a step's action is
+    for the period after it, so that one more step is needed for that input.
     """
-    given = robot.committed_steps
-    first, rest = run[given], run[1 + given :]
-    actions = _within(np.array([s.action for s in run], dtype=float), robot)
+    late = robot.committed_steps
+    first, rest = run[late], run[1 + late :]
+    actions = _snap_to_bounds(np.array([s.action for s in run], dtype=float), robot)
     paths = np.array([s.path for s in rest], dtype=float).reshape(len(rest), -1, robot.position_dim)
     return Trajectory(
         states=np.array([first.state, *(s.state for s in rest)]),
-        inputs=actions[1 : len(run) - given],
+        inputs=actions[1 : len(run) - late],
         paths=paths,
         turned=np.array([s.turned for s in rest]),
         before=actions[0],
     )
 
 
-def _within(inputs: np.ndarray, robot: Robot) -> np.ndarray:
-    """Inputs (T, m), those at a bound exactly there: a step's were rounded to single precision."""
+def _snap_to_bounds(inputs: np.ndarray, robot: Robot) -> np.ndarray:
+    """Return the inputs (T, m), with those at a bound exactly at it: the log holds them in single precision."""
     inside = np.clip(inputs, robot.low(), robot.high())
     rounded = np.abs(inputs - inside) <= INPUT_TOLERANCE * (robot.high() - robot.low())
     return np.where(rounded, inside, inputs)

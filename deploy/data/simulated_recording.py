@@ -91,8 +91,8 @@ def _check_replaceable(path: Path, robot: Robot) -> None:
         source = about.get("sources", about.get("source", ""))
         raise BadData(
             f"{path} is kept: the data do not come from the simulator ({origin}{f': {source}' if source else ''}). If "
-            f"the description of {robot.name} has changed, import the log again (`brakeline import LOG --robot ...`). To "
-            f"record in the simulator, move the file away first, or call `collect` with another --out."
+            f"the description of {robot.name} has changed, import the log again (`brakeline import LOG --robot ...`). "
+            f"To record in the simulator, move the file away first, or call `collect` with another --out."
         )
 
 

@@ -129,7 +129,7 @@ def test_a_log_as_it_is_becomes_data(name):
 
 def test_some_seconds_of_flight_are_said_to_be_too_few():
     told = coverage(import_sources([FLOWN / "copter.tlog"], QUADROTOR).data)
-    assert f"only {told.windows} windows of a plan's length, about 286 are needed: drive on" in told.missing
+    assert f"only {told.windows} windows of a plan's length, but about 286 are needed: record more" in told.missing
 
 
 def test_a_late_link_does_not_shake_what_a_vehicle_told(tmp_path):

@@ -139,7 +139,7 @@ def test_cut_at_gaps_jumps_runs_and_inputs_out_of_bounds():
         resample([table(np.r_[time, time], np.vstack([values, values]))], porter(), {})
     values[50, 5] = 0.7
     made = resample([table(time, values)], porter(), {})
-    assert lengths(made) == [49, 48] and "1 periods left out: an input was out" in made.report.notes[0]
+    assert lengths(made) == [49, 48] and "1 periods left out: an input was outside" in made.report.notes[0]
 
 
 def test_angles_are_unwrapped_before_they_are_looked_at_in_between():
@@ -195,7 +195,7 @@ def test_paths_between_samples_are_within_the_bound_that_is_said():
         before = robot.true[:2].copy()
         truth.append(robot.step(u, 0.2) - before)
     made = resample([table(0.2 * np.arange(400), np.array(rows))], porter(), {})
-    assert made.report.samples == 1 and "one position a period" in " ".join(made.report.notes)
+    assert made.report.samples == 1 and "one position per period" in " ".join(made.report.notes)
     away = _off_chord(np.array(truth))
     assert away.max() <= made.data.chord_deviation < 0.08, (away.max(), made.data.chord_deviation)
 
@@ -227,7 +227,7 @@ def test_a_bag_without_stops_is_refused_with_what_to_drive(tmp_path, capsys):
     out = tmp_path / "none.safetensors"
     assert main(["import", str(bag), "--robot", str(FILE), "--out", str(out)]) == 1
     said = capsys.readouterr().err
-    assert "no stops" in said and "give zero speed and turn rate and let the robot stand for" in said
+    assert "no stops" in said and "set speed and turn rate to zero and let the robot stand for" in said
     assert not out.exists()
 
 
@@ -242,7 +242,7 @@ def test_the_report_says_what_is_missing_and_draws_it(tmp_path, capsys):
     assert main(words) == 0
     said = json.loads(capsys.readouterr().out)
     missing = said["coverage"]["missing"]
-    assert "speed never above 0.3 m/s (bound 0.6): drive this" in missing
+    assert "speed never above 0.3 m/s (bound 0.6): record this" in missing
     assert any(text.startswith("no braking above 0.3 m/s of speed") for text in missing), missing
     assert picture.read_bytes().startswith(b"\x89PNG") and said["coverage"]["stops"] > 5
     assert Dataset.load(out).digest() == said["digest"]

@@ -60,7 +60,7 @@ def test_what_is_what_is_seen_by_the_motion_whatever_the_names(driven):
     shuffled = np.random.default_rng(0).permuted(values[:, 2])
     found = infer_schema([table(time, np.column_stack([values[:, :2], shuffled, values[:, 3:]]), names)])
     assert all(c.role != "heading" for c in found.states)
-    assert any("no column is the heading for certain" in note for note in found.notes)
+    assert any("no column is clearly the heading" in note for note in found.notes)
 
 
 def test_a_delay_is_told_and_makes_the_plan_longer(driven, tmp_path):
@@ -99,13 +99,13 @@ def test_an_input_of_the_same_name_a_slew_and_one_that_only_turns(tmp_path):
 
 def test_without_positions_or_inputs_it_says_what_is_missing(driven, tmp_path):
     time, values = driven
-    with pytest.raises(NoSource, match="no columns `x` and `y` of a position; there are: a, b"):
+    with pytest.raises(NoSource, match="the position columns `x` and `y` are missing; the columns are: a, b"):
         infer_schema([table(time, values[:, :2], ("a", "b"))])
     path = write_csv(tmp_path / "a.csv", time, values[:, :5], COLUMNS[:5])
     out = tmp_path / "seen.toml"
     assert main(["robot", "new", str(out), "--from", str(path)]) == 0
     text = out.read_text()
-    assert "# no column is an input for certain" in text and "# Inputs can't be told from the log" in text
+    assert "# no column is clearly an input" in text and "# Inputs can't be told from the log" in text
 
 
 @pytest.mark.parametrize("name", ["copter.bin", "copter.tlog", "px4.ulg"])
