@@ -1,4 +1,4 @@
-"""Which inputs to record: every state the robot can be in, then plans as the filter makes them, then standing still."""
+"""Generate inputs for recording: random driving that covers all states, then plans like the filter's, then standing."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ from brakeline.messaging.robot import Robot
 
 Array = NDArray[np.float64]
 
-MOST_LEAD = 4  # random targets before a plan, each held for up to
-MOST_HELD = 3  # periods, and as many more as it takes to get there
-SHORT_STOP, LONG_STOP = 2, 15  # periods of standing still after a plan, mostly short
+MOST_LEAD = 4  # largest number of random targets before a plan
+MOST_HELD = 3  # periods for which a target is held, in addition to the periods until the robot reaches it
+SHORT_STOP, LONG_STOP = 2, 15  # periods of standing after a plan
 LONG_STOPS = 0.1  # share of long stops
-RESTLESS = 0.3  # share of lead-ins from bound to bound every period: so drives who explores, or means harm
-HASTE = 0.5  # share of targets that are left as soon as by a robot without a slew: learners change their mind a lot
-EXTREMES = 0.45  # share of inputs that are at a bound or zero: driving has more of them than a uniform draw
+RESTLESS = 0.3  # share of lead-ins that jump between bounds every period, as exploring and adversarial policies do
+HASTE = 0.5  # share of targets that the robot leaves before it reaches them, as learning policies do
+EXTREMES = 0.45  # share of inputs at a bound or zero: a uniform draw would have too few
 
 
 def random_target(robot: Robot, rng: np.random.Generator) -> Array:
-    """An input within bounds; each coordinate often at a bound or zero."""
+    """Draw an input (m,) within bounds; each coordinate is often at a bound or zero."""
     low, high = robot.low(), robot.high()
     drawn = rng.uniform(low, high)
     edge = np.stack([low, high, np.clip(0.0, low, high)])[rng.integers(3, size=len(low)), np.arange(len(low))]
@@ -30,7 +30,7 @@ def random_target(robot: Robot, rng: np.random.Generator) -> Array:
 
 
 def limit_slew(robot: Robot, before: Array, target: Array) -> Array:
-    """The input nearest to a target that the slew allows after `before`."""
+    """Return the input (m,) closest to `target` that the slew limits allow after `before`."""
     slew = np.asarray(robot.action_slew)
     return np.asarray(np.clip(target, before - slew, before + slew))
 
@@ -38,13 +38,20 @@ def limit_slew(robot: Robot, before: Array, target: Array) -> Array:
 def excitation(
     robot: Robot, rng: np.random.Generator, held: int = MOST_HELD, before: Array | None = None
 ) -> Generator[Array, Array | None, None]:
-    """Inputs without end: lead-in, plan (chosen inputs, then braking), stop, and again.
+    """Yield inputs (m,) without end, in cycles of lead-in, plan (free inputs, then braking) and standing.
 
-    A lead-in goes for one target after the other, and may leave each before it gets there: every speed comes with
-    every acceleration. `held`: periods that a target is held for at most, more of them where a robot needs longer to
-    come to its speed; then some lead-ins are restless. To a robot that stops by feedback the measured state (n,) is
-    sent after each period, `u = inputs.send(state)`: its braking follows from it. before (m,): the input in force;
-    none, unless given.
+    A lead-in drives to several targets and may leave each early, so that every speed occurs with every acceleration.
+    For a robot that stops by feedback, send the measured state (n,) after each period: `u = inputs.send(state)`.
+
+    Args:
+        robot: gives bounds, slew limits and plan schedule.
+        rng: the random generator.
+        held: largest number of periods for which a target is held. A robot that needs long to reach its top speed
+            needs more; some lead-ins then jump between bounds.
+        before: input in force (m,); zero by default.
+
+    Raises:
+        ValueError: no state was sent for a robot that stops by feedback.
     """
     before = np.zeros(robot.action_dim) if before is None else before
     schedule = robot.plan_matrix()
@@ -79,7 +86,7 @@ def excitation(
 
 
 def _braked(robot: Robot, planned: Array, state: Array | None, before: Array) -> Array:
-    """A planned input while it brakes, by feedback from the measured state where there is one."""
+    """Return a planned braking input, corrected by the measured state if the robot stops by feedback."""
     if not robot.feedback:
         return planned
     if state is None:

@@ -1,5 +1,7 @@
-"""`brakeline excite`: excitation that stays within a region: by what the inputs would do to a robot without lag, or, of
-one that is driven, by where it is measured to be."""
+"""Excitation that stays within a region (`brakeline excite`).
+
+Printed inputs rely on dead reckoning of a robot without lag. A driven robot uses its measured position.
+"""
 
 from __future__ import annotations
 
@@ -21,28 +23,30 @@ from brakeline.safety.model.dataset import BadData
 
 Region = tuple[float, float, float, float]  # x and y, least and most [m]
 
-RUN = 60.0  # s: then the robot is put back to the middle, for what was reckoned here drifts away from where it is
-TRIES = 400  # excitations that are looked at for one that stays inside
-LEAD = 4  # periods, at least, that one is made of
+RUN = 60.0  # s per run; then the user puts the robot back to the middle, because dead reckoning drifts
+TRIES = 400  # random manoeuvres to try for one that stays inside
+LEAD = 4  # smallest number of periods of a manoeuvre
 
 
 @dataclass(frozen=True)
 class InputRow:
-    time: float  # s, anew in each run
+    """One row of the printed table."""
+
+    time: float  # s since the begin of the run
     run: int
     input: Array
 
 
 def excitation_rows(robot: Robot, keep: Region, minutes: float, seed: int) -> Iterator[InputRow]:
-    """Inputs to give a robot, one a period; each run begins at rest in the region's middle, heading along x.
+    """Yield one input per period. Each run begins at rest in the middle of the region, with the heading along x.
 
     Raises:
-        BadData: the region has no room for the robot, or nobody can tell from its inputs where it goes.
+        BadData: the region is too small for the robot, or its inputs do not determine its motion.
     """
     low, high = _room(robot, keep)
     motion = _motion(robot)
     if robot.heading is not None and not motion[2].any():
-        raise BadData(f"{robot.name}: how it turns can't be told from {', '.join(robot.action)}: let --drive see it")
+        raise BadData(f"{robot.name}: the inputs {', '.join(robot.action)} do not determine how it turns: use --drive")
     rng = np.random.default_rng(seed)
     length = run_length(robot)
     for run in range(max(math.ceil(60.0 * minutes / RUN), 1)):
@@ -50,42 +54,49 @@ def excitation_rows(robot: Robot, keep: Region, minutes: float, seed: int) -> It
         done: list[Array] = []
         while len(done) < length:
             before = done[-1] if done else robot.zero_input()
-            inputs, pose = _stretch(robot, rng, motion, pose, low, high, before)
+            inputs, pose = _manoeuvre(robot, rng, motion, pose, low, high, before)
             done += inputs
         yield from (InputRow(k * robot.period, run, u) for k, u in enumerate(done))
 
 
 def run_length(robot: Robot) -> int:
-    """Periods of a run."""
+    """Return the number of periods per run."""
     return round(RUN / robot.period)
 
 
 def _room(robot: Robot, keep: Region) -> tuple[Array, Array]:
-    """Where the position may be, least and most (2,)."""
+    """Return the smallest and largest allowed position (2,) in m."""
     low, high = np.array(keep[:2]) + robot.footprint, np.array(keep[2:]) - robot.footprint
     if not (low < high).all():
-        raise BadData(f"the region {keep} has no room for a robot of {robot.footprint:g} m about its position")
+        raise BadData(
+            f"the region {keep} is too small for a robot with a radius of {robot.footprint:g} m: enlarge it with --keep"
+        )
     return low, high
 
 
 class RegionExcitation:
-    """Excitation as a policy, `(observation, info) -> input`.
+    """Excitation as a policy `(observation, info) -> input` that uses the measured position.
 
-    Each stretch from rest to rest is chosen from where the robot is measured to be. How it really moves only driving
-    shows, so a robot that goes outwards within a stop's way of the edge brakes, and begins anew from there.
+    Each manoeuvre goes from rest to rest. A robot that moves outwards within a stopping distance of the edge brakes
+    and then begins a new manoeuvre.
     """
 
     def __init__(self, robot: Robot, keep: Region, rng: np.random.Generator) -> None:
-        """
+        """Check the region.
+
         Raises:
-            BadData: the region has no room to drive and stop, or nobody can tell from its inputs where the robot goes.
+            BadData: the region is too small to drive and stop, or the inputs do not determine the robot's motion.
         """
         self._robot, self._rng, self._motion = robot, rng, _motion(robot)
         self._low, self._high = _room(robot, keep)
         top = np.abs(self._motion[:2]) @ np.maximum(np.abs(robot.low()), robot.high())
-        self._to_stop = nominal_stopping_distance(robot) + float(np.linalg.norm(top)) * robot.period  # a period late
+        self._to_stop = (
+            nominal_stopping_distance(robot) + float(np.linalg.norm(top)) * robot.period
+        )  # one period of delay
         if not (self._low + self._to_stop < self._high - self._to_stop).all():
-            raise BadData(f"the region {keep} has no room to stop in: about {self._to_stop:.2f} m on each side")
+            raise BadData(
+                f"the region {keep} is too small to stop in: a stop takes about {self._to_stop:.2f} m on each side"
+            )
         self._left: list[Array] = []
         self._out = 0.0
 
@@ -101,20 +112,22 @@ class RegionExcitation:
         if not self._left:
             heading = 0.0 if self._robot.heading is None else state[self._robot.heading]
             pose = np.array([*state[:2], heading])
-            # From near the edge no farther out: to brake there it would be too late.
+            # Near the edge the robot must not go farther out: it could not stop in time.
             low, high = (
                 np.minimum(self._low + self._to_stop, pose[:2]),
                 np.maximum(self._high - self._to_stop, pose[:2]),
             )
-            self._left = _stretch(self._robot, self._rng, self._motion, pose, low, high, before)[0]
+            self._left = _manoeuvre(self._robot, self._rng, self._motion, pose, low, high, before)[0]
         return self._left.pop(0)
 
 
-def _stretch(
+def _manoeuvre(
     robot: Robot, rng: np.random.Generator, motion: Array, pose: Array, low: Array, high: Array, before: Array
 ) -> tuple[list[Array], Array]:
-    """Inputs from rest to rest that stay inside, the first found, and the pose after them. before (m,): the input in
-    force, of which a stop may hold some."""
+    """Return inputs from rest to rest that stay inside, and the pose (3,) after them.
+
+    before (m,): the input in force; a stop may hold some of its coordinates.
+    """
     for _ in range(TRIES):
         inputs = _to_rest(robot, rng, before)
         after = pose
@@ -124,11 +137,11 @@ def _stretch(
                 break
         else:
             return inputs, after
-    raise BadData("no excitation stays within the region: give it more room (--keep)")
+    raise BadData("no excitation stays within the region: enlarge it with --keep")
 
 
 def _to_rest(robot: Robot, rng: np.random.Generator, before: Array) -> list[Array]:
-    """One lead-in, plan and stop."""
+    """Return one lead-in, plan and stop."""
     drawn = excitation(robot, rng, before=before)
     inputs = list(itertools.islice(drawn, LEAD))
     for u in drawn:
@@ -139,16 +152,19 @@ def _to_rest(robot: Robot, rng: np.random.Generator, before: Array) -> list[Arra
 
 
 def _motion(robot: Robot) -> Array:
-    """(3, m): forward, left, turn (with a heading), or along x, along y, none, of each input."""
+    """Return the matrix (3, m) from inputs to speeds: forward, left and turn; without a heading: x, y and zero."""
     usual, inputs = quantities(robot), column_names(robot)[1]
     kinds = ("body.x", "body.y", "yaw rate") if robot.heading is not None else ("velocity.x", "velocity.y", "")
     motion = np.array([[usual.get(name) == f"command.{kind}" for name in inputs] for kind in kinds], float)
     if not motion[:2].any():
-        raise BadData(f"{robot.name}: where it goes can't be told from {', '.join(robot.action)}: speeds are needed")
+        raise BadData(
+            f"{robot.name}: the inputs {', '.join(robot.action)} do not determine its motion: they must be speeds"
+        )
     return motion
 
 
 def _moved(robot: Robot, motion: Array, pose: Array, u: Array) -> Array:
+    """Return the pose (3,) after one period of dead reckoning."""
     forward, left, turn = motion @ u * robot.period
     heading = pose[2] + turn / 2.0
     cos, sin = math.cos(heading), math.sin(heading)

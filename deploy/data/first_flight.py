@@ -1,7 +1,8 @@
-"""The first flight of a vehicle that nobody has data of: slow first, in a box, each speed after a model of the last.
+"""Record the first flight of a vehicle without data: inside a box, at speed levels that rise step by step.
 
-No filter can help here: what keeps it in the box is a plain rule that takes the vehicle for worse than any. A level of
-speed is flown only when data of the levels before gave a model that predicts held-out flight.
+There is no model set yet, so no filter can help. A simple rule keeps the vehicle in the box; it assumes a reaction
+time and a deceleration that are worse than those of any real vehicle. A speed level is flown only if a model from the
+data of the levels before predicts held-out flight.
 """
 
 from __future__ import annotations
@@ -29,51 +30,51 @@ Array = NDArray[np.float64]
 log = logging.getLogger("brakeline.collect")
 
 LEVELS = (0.2, 0.5, 0.75, 1.0)  # shares of the largest inputs
-SHARES = (0.12, 0.13, 0.2, 0.55)  # of the time, a level
-TRIES = 2  # times that a level is flown on when no model predicts it
+SHARES = (0.12, 0.13, 0.2, 0.55)  # share of the time for each level
+TRIES = 2  # attempts per level until a model predicts it
 AHEAD = 5  # periods
-# m, and s times the level's speed: what 95 % of predictions that far ahead may be off by, to go faster, besides what
-# the vehicle's own estimate wanders by
-OFF = (0.2, 0.1)
-WANDERS = 0.4  # m, of its own estimate in `AHEAD` periods, from which that is what makes the sets wide
-PIECE = 60  # periods of a trajectory: whole ones are held out
-REACTION, BRAKING = 1.0, 1.5  # s and m/s²: a worse vehicle than any
-HOMEWARD = 0.5  # of a level, towards the middle, when the box ends
-NEAR = 0.3  # of the way to the wall from which the next stretch leads back
-OUTSIDE = 10.0  # m beyond the box at which the flight is over
+# To fly faster, 95 % of the predictions `AHEAD` periods ahead must have an error below OFFSET + TIME * speed of the
+# level, in addition to the drift of the vehicle's own estimate.
+ERROR_OFFSET, ERROR_TIME = 0.2, 0.1  # m, s
+MAX_DRIFT = 0.4  # m in `AHEAD` periods: above it the drift of the vehicle's estimate dominates the width of the sets
+PIECE = 60  # periods per trajectory: validation holds out whole trajectories
+REACTION, BRAKING = 1.0, 1.5  # s and m/s²: worse than any real vehicle
+RETURN_SPEED = 0.5  # share of the level's speed, towards the middle, near a wall
+NEAR = 0.3  # share of the distance to the wall from which the next manoeuvre leads back
+OUTSIDE = 10.0  # m beyond the box at which the flight ends
 ORIGIN = "maiden flight"
 
 
 class FlightEnded(RuntimeError):
-    """The flight can't go on, and why; what was flown until then counts."""
+    """The flight ended early; the message gives the reason. The data up to then remain valid."""
 
 
 @dataclass(frozen=True)
 class Box:
-    """Where it stays: middle and half-widths (3,), m."""
+    """The region of the flight: middle and half-widths (3,) in m."""
 
     middle: Array
     half: Array
 
-    def kept(self, state: Array, wanted: Array, level: Array) -> Array:
-        """The wanted input (3,), on an axis on which it could leave the box turned towards the middle."""
+    def constrain(self, state: Array, wanted: Array, level: Array) -> Array:
+        """Return the wanted input (3,) in m/s; on each axis that could leave the box, steer to the middle."""
         position, velocity = state[:3] - self.middle, state[3:6]
-        kept = wanted.copy()
+        allowed = wanted.copy()
         for axis in range(3):
             for side in (-1.0, 1.0):
                 speed = max(side * velocity[axis], side * wanted[axis], 0.0)
                 reach = side * position[axis] + REACTION * speed + speed**2 / (2.0 * BRAKING)
-                if reach > self.half[axis] and side * wanted[axis] > -HOMEWARD * level[axis]:
-                    kept[axis] = -side * HOMEWARD * level[axis]
-        return kept
+                if reach > self.half[axis] and side * wanted[axis] > -RETURN_SPEED * level[axis]:
+                    allowed[axis] = -side * RETURN_SPEED * level[axis]
+        return allowed
 
     def outside(self, state: Array) -> float:
-        """m beyond its walls."""
+        """Return how far the vehicle is outside the box, in m; negative inside."""
         return float(np.max(np.abs(state[:3] - self.middle) - self.half))
 
 
-def stretch(robot: Robot, share: float, before: Array, rng: np.random.Generator) -> list[Array]:
-    """Targets, each held for a while or left at once, then a plan as the filter makes them: inputs (3,), slewed."""
+def draw_manoeuvre(robot: Robot, share: float, before: Array, rng: np.random.Generator) -> list[Array]:
+    """Draw a manoeuvre: random targets, each held or left at once, then a plan like the filter's: inputs (3,)."""
     inputs = [before]
     for _ in range(rng.integers(4)):
         target = share * random_target(robot, rng)
@@ -86,9 +87,11 @@ def stretch(robot: Robot, share: float, before: Array, rng: np.random.Generator)
     return inputs[1:] + [np.zeros(robot.action_dim)] * int(standing)
 
 
-def homeward(inputs: list[Array], state: Array, box: Box, period: float, rng: np.random.Generator) -> list[Array]:
-    """The stretch mirrored on those axes on which it would lead from near a wall to it; others by chance. Only where
-    it begins at rest: mirrored, it would not follow on."""
+def mirror_inwards(inputs: list[Array], state: Array, box: Box, period: float, rng: np.random.Generator) -> list[Array]:
+    """Mirror a manoeuvre on each axis on which it would lead from near a wall towards it, on other axes at random.
+
+    The manoeuvre must begin at rest: mirrored inputs do not continue a motion.
+    """
     away = np.asarray(inputs).sum(0) * period
     offset = (state[:3] - box.middle) / box.half
     signs = np.where(np.abs(offset) > NEAR, -np.sign(offset * away), rng.choice([-1.0, 1.0], 3))
@@ -97,7 +100,7 @@ def homeward(inputs: list[Array], state: Array, box: Box, period: float, rng: np
 
 @dataclass
 class FlightRecording:
-    """What was recorded, in pieces."""
+    """The recording in progress, in trajectories."""
 
     trajectories: list[Trajectory] = field(default_factory=list)
     states: list[Array] = field(default_factory=list)
@@ -106,13 +109,14 @@ class FlightRecording:
     before: Array | None = None
 
     def cut(self) -> None:
-        """End the piece: nothing pairs its last sample with what follows."""
+        """End the trajectory, so that no later sample follows its last one."""
         if len(self.inputs) > 2:
             arrays = np.array(self.states), np.array(self.inputs), np.array(self.paths)
             self.trajectories.append(Trajectory(*arrays, np.zeros(len(self.inputs)), self.before))
         self.states, self.inputs, self.paths = [], [], []
 
     def dataset(self, robot: Robot, about: dict[str, str]) -> Dataset:
+        """Return the recorded trajectories as a checked data set."""
         data = Dataset(robot, tuple(self.trajectories), about | {"origin": ORIGIN})
         data.check()
         return data
@@ -120,41 +124,47 @@ class FlightRecording:
 
 @dataclass(frozen=True)
 class FirstFlightResult:
-    """What a flight ended with."""
+    """The result of a first flight. `missing` says in sentences what the data lack."""
 
     data: Dataset
     model: ModelSet | None
     statement: ValidationReport | None
-    level: float  # share of the largest inputs that was flown and predicted
+    level: float  # share of the largest inputs that was flown and that a model predicts
     missing: tuple[str, ...]
     seconds: float
 
 
 class FirstFlight:
-    """Flies one vehicle that hovers where the box's middle is to be."""
+    """Flies one vehicle, which hovers in the middle of the box at first."""
 
     def __init__(
         self, vehicle: MavlinkVehicle, robot: Robot, box: Box, seed: int, stop: Callable[[], bool] = lambda: False
     ) -> None:
-        """robot: in real time."""
+        """Prepare the flight. `robot` must be in real time; `stop` is polled every period."""
         self._vehicle, self._robot, self._box, self._stop = vehicle, robot, box, stop
         self._rng, self._flown = np.random.default_rng(seed), FlightRecording()
         self._periods = 0
 
     def fly(self, minutes: float, about: dict[str, str]) -> FirstFlightResult:
-        """Level after level; the last until the time is up."""
+        """Fly all levels and return the data, and the model set if the data support one."""
         missing, reached = list[str](), 0.0
         try:
             for level, share in zip(LEVELS, SHARES, strict=True):
                 for _ in range(TRIES):
                     self._record(level, 60.0 * minutes * share)
-                    speed, off = level * float(self._robot.high().max()), self._off()
-                    wander = _wander(self._flown.trajectories, self._robot.period)
-                    log.info("a model is off by %.2f m a second ahead, its own estimate by %.2f m", off, wander)
-                    if off < wander + OFF[0] + OFF[1] * speed:
+                    speed, error = level * float(self._robot.high().max()), self._prediction_error()
+                    drift = _estimate_drift(self._flown.trajectories, self._robot.period)
+                    log.info(
+                        "prediction error one second ahead: %.2f m; drift of the vehicle's own estimate: %.2f m",
+                        error,
+                        drift,
+                    )
+                    if error < drift + ERROR_OFFSET + ERROR_TIME * speed:
                         break
                 else:
-                    missing.append(f"no model predicts it at {level:.0%} of its speed: it was not flown faster")
+                    missing.append(
+                        f"no model predicts the vehicle at {level:.0%} of its speed, so it was not flown faster"
+                    )
                     break
                 reached = level
         except FlightEnded as error:
@@ -162,22 +172,22 @@ class FirstFlight:
         self._flown.cut()
         data = self._flown.dataset(self._robot.in_lockstep(), about)
         model, statement = self._model(data, missing)
-        wander = _wander(data.trajectories, self._robot.period)
-        if wander > WANDERS:
+        drift = _estimate_drift(data.trajectories, self._robot.period)
+        if drift > MAX_DRIFT:
             missing.append(
-                f"its own estimate is {wander:.2f} m off its own velocity after a second (95 %), and no set can be "
-                "narrower: tell its estimator how noisy and how late its sensors are, and fly again"
+                f"the position of its own estimate is {drift:.2f} m off its integrated velocity after one second "
+                "(95 %), and no set can be narrower: set noise and delay of the sensors in its estimator, then fly again"
             )
         if reached < 1.0:
-            missing.append(f"nothing is known beyond {reached:.0%} of its speed")
+            missing.append(f"there are no data above {reached:.0%} of its speed")
         missing += [] if statement is None else recording_advice(statement, data)
         return FirstFlightResult(data, model, statement, reached, tuple(missing), self._periods * self._robot.period)
 
     def _record(self, level: float, seconds: float) -> None:
-        """Raises FlightEnded."""
+        """Record at one level. Raises FlightEnded."""
         vehicle, robot = self._vehicle, self._robot
         bounds = level * robot.high()
-        log.info("%.0f %% of its speed: %.1f m/s an axis, for %.0f s", 100 * level, bounds.max(), seconds)
+        log.info("flying at %.0f %% of its speed: %.1f m/s per axis, for %.0f s", 100 * level, bounds.max(), seconds)
         vehicle.wait(vehicle.current_period.number + 1)
         self._flown.cut()
         end = self._periods + round(seconds / robot.period)
@@ -190,23 +200,23 @@ class FirstFlight:
 
     def _next(self, level: float) -> list[Array]:
         period = self._vehicle.current_period
-        inputs = stretch(self._robot, level, period.input, self._rng)
+        inputs = draw_manoeuvre(self._robot, level, period.input, self._rng)
         if not period.input.any():
-            return homeward(inputs, period.report.measured, self._box, self._robot.period, self._rng)
+            return mirror_inwards(inputs, period.report.measured, self._box, self._robot.period, self._rng)
         return inputs
 
     def _period(self, wanted: Array, level: Array) -> bool:
-        """Fly one; whether the box had its way, or the recording a gap: the stretch is over. Raises FlightEnded."""
+        """Fly one period; return True if the manoeuvre must end (box rule or gap). Raises FlightEnded."""
         vehicle, flown, box = self._vehicle, self._flown, self._box
         before = vehicle.current_period
-        kept = box.kept(before.report.measured, wanted, level)
-        vehicle.commit(kept[None], before.number + 1)
+        allowed = box.constrain(before.report.measured, wanted, level)
+        vehicle.commit(allowed[None], before.number + 1)
         period = vehicle.wait(before.number + 1)
         self._periods += 1
         if period.number != before.number + 1 or period.lost:
             flown.cut()
             if period.lost:
-                self._patiently()
+                self._wait_for_link()
             return True
         if not flown.states:
             flown.states, flown.before = [period.report.measured], before.input
@@ -218,21 +228,21 @@ class FirstFlight:
             flown.cut()
         if box.outside(period.report.measured) > OUTSIDE:
             raise FlightEnded(
-                f"it left its box by {box.outside(period.report.measured):.0f} m: it does not do what it is asked to"
+                f"it left its box by {box.outside(period.report.measured):.0f} m: it does not follow its setpoints"
             )
         if self._stop():
-            raise FlightEnded("told to stop")
-        return bool((kept != wanted).any())
+            raise FlightEnded("the flight was stopped")
+        return bool((allowed != wanted).any())
 
-    def _patiently(self) -> None:
-        """Lost telemetry, or a pilot who took over: hover until it is over, and give up after a while."""
+    def _wait_for_link(self) -> None:
+        """Hover while telemetry is lost or a pilot has taken over. Raises FlightEnded after 10 s."""
         for _ in range(round(10.0 / self._robot.period)):
             if not self._vehicle.wait(self._vehicle.current_period.number + 1).lost:
                 return
-        raise FlightEnded(f"it was lost for 10 s: {self._vehicle.current_period.lost}")
+        raise FlightEnded(f"no control of the vehicle for 10 s: {self._vehicle.current_period.lost}")
 
-    def _off(self) -> float:
-        """m, 95 % of held-out predictions `AHEAD` periods ahead are better: a linear fit of what was flown so far."""
+    def _prediction_error(self) -> float:
+        """Return the 95 % quantile in m of the errors of a linear fit on held-out data, `AHEAD` periods ahead."""
         try:
             parts = [
                 windows(part, AHEAD, FREE)
@@ -247,21 +257,21 @@ class FirstFlight:
         return float(np.quantile(np.linalg.norm(held_out.y[:, :3] - held_out.z @ C, axis=1), 0.95))
 
     def _model(self, data: Dataset, missing: list[str]) -> tuple[ModelSet, ValidationReport] | tuple[None, None]:
-        """While the vehicle hovers."""
+        """Certify while the vehicle hovers."""
         try:
             model, statement, _ = certify_supported(replace(data, robot=self._robot), ModelConfig().of_minutes())
         except (BadData, Unsupported) as error:
-            missing.append(f"there is no model set: {error}")
+            missing.append(f"the data support no model set: {error}")
             return None, None
         return model, statement
 
 
-def _wander(trajectories: Sequence[Trajectory], period: float) -> float:
-    """m, what 95 % of the ways of `AHEAD` periods are off the way by its own velocity: no model can be better."""
-    off = [np.zeros((1, 3))]
+def _estimate_drift(trajectories: Sequence[Trajectory], period: float) -> float:
+    """Return the 95 % quantile in m of position minus integrated velocity over `AHEAD` periods."""
+    errors = [np.zeros((1, 3))]
     for t in trajectories:
         position, velocity = t.states[:, :3], t.states[:, 3:6]
         by_velocity = np.cumsum(0.5 * period * (velocity[1:] + velocity[:-1]), axis=0)
         error = position[1:] - by_velocity
-        off.append(error[AHEAD:] - error[:-AHEAD])
-    return float(np.quantile(np.linalg.norm(np.concatenate(off), axis=1), 0.95))
+        errors.append(error[AHEAD:] - error[:-AHEAD])
+    return float(np.quantile(np.linalg.norm(np.concatenate(errors), axis=1), 0.95))

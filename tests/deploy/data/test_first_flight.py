@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from brakeline.actors.mavlink.mavlink_vehicle import ControlPeriod
-from brakeline.deploy.data.first_flight import LEVELS, Box, FirstFlight, homeward, stretch
+from brakeline.deploy.data.first_flight import LEVELS, Box, FirstFlight, draw_manoeuvre, mirror_inwards
 from brakeline.safety.model.dataset import Dataset
 from brakeline.safety.model.windows import PLAN, windows
 from brakeline.sim.quadrotor import SAMPLES
@@ -23,7 +23,7 @@ class Sluggish:
     """A vehicle that comes to its setpoint by a time constant; a turn passes whenever somebody waits for it."""
 
     def __init__(self, constant: float = 0.4, drift: float = 0.0, fickle: bool = False) -> None:
-        self.fickle = fickle  # does what it is told to or the opposite
+        self.fickle = fickle  # follows its setpoint or the opposite of it
         self.constant, self.drift, self.rng = constant, drift, np.random.default_rng(0)
         self.position, self.velocity, self.acceleration = BOX.middle.copy(), np.zeros(3), np.zeros(3)
         self.plan: list[np.ndarray] = []
@@ -41,9 +41,9 @@ class Sluggish:
 
     def _pass(self) -> None:
         path, start = [], self.position.copy()
-        told = self.current_period.input * (self.rng.choice([-1.0, 1.0]) if self.fickle else 1.0)
+        setpoint = self.current_period.input * (self.rng.choice([-1.0, 1.0]) if self.fickle else 1.0)
         for _ in range(SAMPLES):
-            self.acceleration = (told - self.velocity) / self.constant
+            self.acceleration = (setpoint - self.velocity) / self.constant
             self.velocity = self.velocity + self.acceleration * 0.2 / SAMPLES
             self.position = self.position + (self.velocity + self.drift) * 0.2 / SAMPLES
             path.append(self.position - start)
@@ -70,7 +70,7 @@ def test_an_obedient_vehicle_is_flown_at_every_level_and_stays_inside(tmp_path: 
     assert found.statement is not None and found.statement.violations <= 0.25 * found.statement.windows
     assert found.model.model_config.windows == PLAN and 11.0 * 60.0 <= found.seconds < 13.0 * 60.0
     assert any("more minutes like these" in line for line in found.missing)
-    assert not any("its own estimate" in line for line in found.missing)
+    assert not any("of its own estimate is" in line for line in found.missing)
     found.data.save(tmp_path / "flown.safetensors")
     assert Dataset.load(tmp_path / "flown.safetensors").digest() == found.data.digest()
     assert len(windows(found.data, QUADROTOR.horizon, PLAN)) > 20, "it brakes as the filter plans to"
@@ -92,7 +92,7 @@ def test_a_vehicle_that_nothing_predicts_is_not_flown_faster() -> None:
 
 def test_an_estimate_that_wanders_is_named_as_what_makes_the_sets_wide() -> None:
     found = FirstFlight(Sluggish(drift=0.3), LATE, BOX, 0).fly(2.0, {})
-    assert any("its own estimate is 0." in line for line in found.missing)
+    assert any("the position of its own estimate is 0." in line for line in found.missing)
 
 
 def test_a_vehicle_that_leaves_its_box_ends_the_flight() -> None:
@@ -103,18 +103,20 @@ def test_a_vehicle_that_leaves_its_box_ends_the_flight() -> None:
 def test_the_rule_turns_back_before_the_wall_and_lets_go_of_the_rest() -> None:
     level = QUADROTOR.high()
     near = np.array([31.0, -2.0, 30.0, 5.0, *[0.0] * 5])
-    assert BOX.kept(near, np.array([5.0, 3.0, 0.0]), level) == pytest.approx([-2.5, 3.0, 0.0])
-    assert BOX.kept(near * [1, 1, 1, -1, 1, 1, 1, 1, 1], np.array([-5.0, 0.0, 0.0]), level)[0] == -5.0, "it leads back"
+    assert BOX.constrain(near, np.array([5.0, 3.0, 0.0]), level) == pytest.approx([-2.5, 3.0, 0.0])
+    assert BOX.constrain(near * [1, 1, 1, -1, 1, 1, 1, 1, 1], np.array([-5.0, 0.0, 0.0]), level)[0] == -5.0, (
+        "it leads back"
+    )
     middle = np.concatenate([BOX.middle, np.full(3, 5.0), np.zeros(3)])
-    assert BOX.kept(middle, level, level) == pytest.approx(level)
+    assert BOX.constrain(middle, level, level) == pytest.approx(level)
 
 
 def test_a_stretch_keeps_the_slew_and_leads_back_from_a_wall() -> None:
     rng, slew = np.random.default_rng(2), np.asarray(QUADROTOR.action_slew)
     near = np.array([26.0, -27.0, 30.0, *[0.0] * 6])
     for _ in range(50):
-        inputs = np.array(stretch(LATE, 0.5, np.zeros(3), rng))
+        inputs = np.array(draw_manoeuvre(LATE, 0.5, np.zeros(3), rng))
         assert (np.abs(np.diff(inputs, axis=0, prepend=np.zeros((1, 3)))) <= slew + 1e-9).all()
         assert np.abs(inputs).max() <= 2.5 and not inputs[-1].any()
-        back = np.array(homeward(list(inputs), near, BOX, 0.2, rng)).sum(0)
+        back = np.array(mirror_inwards(list(inputs), near, BOX, 0.2, rng)).sum(0)
         assert back[0] <= 1e-9 and back[1] >= -1e-9

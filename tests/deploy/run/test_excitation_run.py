@@ -58,7 +58,7 @@ def test_a_robot_that_leaves_the_region_brakes_by_its_own_rule():
 
 
 def test_a_region_without_room_to_stop_is_refused():
-    with pytest.raises(BadData, match="no room to stop in"):
+    with pytest.raises(BadData, match="too small to stop in"):
         RegionExcitation(GROUND, (-0.2, -0.2, 0.2, 0.2), np.random.default_rng(0))
 
 
