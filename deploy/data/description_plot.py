@@ -1,4 +1,4 @@
-"""A robot's description to look at: what it amounts to, and a picture."""
+"""Summarise a robot description and plot it (`brakeline robot check`, `brakeline robot show`)."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ Array = NDArray[np.float64]
 
 
 def full_stop_inputs(robot: Robot) -> Array:
-    """The inputs (N, m) of the plan that begins at every input's bound of larger size."""
+    """Return the inputs (N, m) of the plan that begins with each input at its larger bound."""
     largest = np.where(np.abs(robot.low()) > np.abs(robot.high()), robot.low(), robot.high())
     return np.asarray(robot.plan_matrix() @ np.tile(largest, robot.free_steps)).reshape(robot.horizon, -1)
 
 
 def nominal_stopping_distance(robot: Robot) -> float:
-    """m, at most, of a full stop if it did at once what its inputs say: an order of magnitude, no bound."""
+    """Return the length in m of a full stop of a robot without lag: an order of magnitude, not a bound."""
     speeds = [i for i, label in enumerate(robot.action) if label.endswith("[m/s]") and robot.translates[i]]
     return float(np.linalg.norm(np.abs(full_stop_inputs(robot)[:, speeds]).sum(0))) * robot.period
 
 
 def remarks(robot: Robot) -> list[str]:
-    """What is no mistake and yet worth a thought."""
+    """Return remarks on settings that are valid but probably not intended."""
     found = []
     distance = nominal_stopping_distance(robot)
     if distance + robot.footprint > robot.sight:
@@ -35,15 +35,17 @@ def remarks(robot: Robot) -> list[str]:
             f"but the robot sees obstacles from {robot.sight:g} m only. The filter will rarely verify fast driving."
         )
     if robot.horizon == robot.free_steps + robot.brake_steps and RAMP in robot.stop:
-        found.append("plan.horizon: no period of standing after the ramp: a robot with lag has not stopped by then")
+        found.append(
+            "plan.horizon: no period of standing after the ramp: a robot with lag still moves when the plan ends"
+        )
     if any(index < 0 for index in robot.follows):
         free = [robot.action[i] for i, index in enumerate(robot.follows) if index < 0]
-        found.append(f"state: nothing follows {', '.join(free)}: half-widths are shown for rest, not for full speed")
+        found.append(f"state: no coordinate follows {', '.join(free)}: half-widths are reported for rest only")
     return found
 
 
 def summary(robot: Robot) -> dict[str, Any]:
-    """What a description amounts to."""
+    """Return the main figures of a description, as JSON values."""
     return {
         "name": robot.name,
         "period_s": robot.period,
@@ -67,7 +69,7 @@ def summary(robot: Robot) -> dict[str, Any]:
 
 
 def draw_description(robot: Robot, path: Path) -> None:
-    """The body from above, and each input's stop, as an image file."""
+    """Plot the body from above and the stop of each input, and write the image to `path`."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -79,9 +81,7 @@ def draw_description(robot: Robot, path: Path) -> None:
         body.add_patch(Circle((disc.at[0], disc.at[1]), disc.radius, alpha=0.3))
     body.add_patch(Circle((0.0, 0.0), robot.footprint, fill=False, linestyle=":"))
     body.annotate("", (robot.footprint, 0.0), (0.0, 0.0), arrowprops={"arrowstyle": "->"})
-    body.set(
-        aspect="equal", xlabel="x [m]", ylabel="y [m]", title=f"{robot.name}: body, and what holds it in any attitude"
-    )
+    body.set(aspect="equal", xlabel="x [m]", ylabel="y [m]", title=f"{robot.name}: body and footprint")
     reach = 1.2 * robot.footprint
     body.set(xlim=(-reach, reach), ylim=(-reach, reach))
     times = robot.period * np.arange(robot.horizon + 1)

@@ -1,4 +1,4 @@
-"""The commented template of a description, filled in with what a log tells."""
+"""Fill in the commented template of a robot description from the schema of a log."""
 
 from __future__ import annotations
 
@@ -9,16 +9,16 @@ import re
 from brakeline.deploy.data.schema_inference import InferredColumn, InferredSchema
 
 BARE = re.compile(r"[A-Za-z0-9_-]+")
-ERRORS = {"position": 0.01, "heading": 0.02}  # the template's
+ERRORS = {"position": 0.01, "heading": 0.02}  # measurement errors of the template
 ERROR = 0.05
-JUMP = 0.8  # of an input's range: who changes it so much in a period keeps no slew
-MOST_PERIODS = 64  # of a plan
-UNTOLD = "can't be told from the log"
+JUMP = 0.8  # share of an input's range: an input that changes more in one period has no slew limit
+MOST_PERIODS = 64  # longest plan
+UNKNOWN = "cannot be inferred from the log"
 
 
-def fill_template(template: str, told: InferredSchema, source: str) -> str:
-    """The template's text with its values replaced; what the log can't tell is the template's, and said to be."""
-    horizon, brake = periods(told)
+def fill_template(template: str, schema: InferredSchema, source: str) -> str:
+    """Return the template with the values that the log shows; comments mark values that it does not show."""
+    horizon, brake = periods(schema)
     lines = []
     section = ""
     for line in template.splitlines():
@@ -26,46 +26,46 @@ def fill_template(template: str, told: InferredSchema, source: str) -> str:
             section = line.strip("[]# ")
         if line.startswith("period"):
             lines.append(
-                f"period = {told.period:g} # s between decisions; in the log the median between two changes of an input"
+                f"period = {schema.period:g} # s between decisions; the median time between input changes in the log"
             )
         elif line.startswith("sight"):
-            lines.append(f"{line}; {UNTOLD}")
+            lines.append(f"{line}; {UNKNOWN}")
         elif section in ("state", "input") and line and not line.startswith(("[", "#")):
             continue  # the template's robot
         elif section == "plan" and line.startswith("horizon"):
             lines.append(f"horizon = {horizon}")
         elif section == "plan" and line.startswith("brake"):
-            lines.append(f"brake = {brake} # as strong as the log's strongest braking and quickest inputs; choose")
+            lines.append(f"brake = {brake} # from the strongest braking and the fastest inputs in the log; check it")
         elif line.startswith("[[body]]"):
-            lines += [f"# The body {UNTOLD}: measure it.", line]
+            lines += [f"# The body {UNKNOWN}: measure it.", line]
         elif section == "body" and line.startswith("at ="):
-            zeros = ", ".join("0.0" for column in told.states if column.role == "position")
+            zeros = ", ".join("0.0" for column in schema.states if column.role == "position")
             lines.append(line.replace("[0.0, 0.0]", f"[{zeros}]"))
         else:
             lines.append(line)
         if line == "[state]":
-            lines.append(f"# error: {UNTOLD}.")
-            lines += [text for column in told.states for text in _state(column)]
+            lines.append(f"# error: {UNKNOWN}.")
+            lines += [text for column in schema.states for text in _state(column)]
         elif line == "[input]":
-            lines.append("# low, high, slew: what the log has, rounded outwards; the robot may be able to do more.")
-            lines += [text for column in told.inputs for text in _input(column)]
-            lines += _template_inputs(template) if not told.inputs else []
-    about = [f"# Made from {source}. Look at every line: it says what was seen, not what the robot can do."]
-    about += [f"# {note}" for note in told.notes]
+            lines.append("# low, high, slew: the ranges in the log, rounded outwards. The robot may allow more.")
+            lines += [text for column in schema.inputs for text in _input(column)]
+            lines += _template_inputs(template) if not schema.inputs else []
+    about = [f"# Inferred from {source}. Check every line: the log shows what the robot did, not what it can do."]
+    about += [f"# {note}" for note in schema.notes]
     return "\n".join((*about, *lines)) + "\n"
 
 
-def periods(told: InferredSchema) -> tuple[int, int]:
-    """(horizon, brake) that the braking and the delays seen ask for: an order of magnitude, no bound."""
-    inputs = [(max(-_low(one), _high(one)), most) for one in told.inputs if (most := slew(one)) is not None]
-    falls = [(max(abs(c.least), abs(c.most)), c.change) for c in told.states if c.follows and c.change > 0.0]
+def periods(schema: InferredSchema) -> tuple[int, int]:
+    """Return (horizon, brake) in periods from the braking and the delays in the log: an estimate, not a bound."""
+    inputs = [(max(-_low(one), _high(one)), most) for one in schema.inputs if (most := slew(one)) is not None]
+    falls = [(max(abs(c.least), abs(c.most)), c.change) for c in schema.states if c.follows and c.change > 0.0]
     brake = max((math.ceil(round(most / change, 6)) for most, change in (*inputs, *falls)), default=1)
-    late = math.ceil(max((c.delay or 0.0 for c in told.states), default=0.0) / told.period)
+    late = math.ceil(max((c.delay or 0.0 for c in schema.states), default=0.0) / schema.period)
     return min(1 + brake + late + 1, MOST_PERIODS), min(brake, MOST_PERIODS - 2)
 
 
 def slew(one: InferredColumn) -> float | None:
-    """Of an input; None: it was seen to jump."""
+    """Return the slew limit of an input per period, or None if the input jumps."""
     return _outwards(one.change) if 0.0 < one.change < JUMP * (one.most - one.least) else None
 
 
@@ -79,7 +79,7 @@ def _high(one: InferredColumn) -> float:
 
 def _template_inputs(template: str) -> list[str]:
     body = template.split("[input]\n", 1)[1].split("\n\n", 1)[0]
-    return [f"# Inputs {UNTOLD}: these are the template's.", *body.splitlines()]
+    return [f"# Inputs {UNKNOWN}: these come from the template.", *body.splitlines()]
 
 
 def _state(one: InferredColumn) -> list[str]:
@@ -88,11 +88,11 @@ def _state(one: InferredColumn) -> list[str]:
     words += [f"role = {json.dumps(one.role)}"] if one.role != "other" else []
     words.append(f"error = {error:g}")
     words += [f"follows = {json.dumps(one.follows)}"] if one.follows else []
-    seen = [f"{one.least:.3g} to {one.most:.3g} seen"] if one.role != "heading" else []
-    seen += [] if one.unit else [f"its unit {UNTOLD}"]
-    seen += [f"{1e3 * one.delay:.0f} ms after its input"] if one.delay is not None else []
-    seen += [f"brakes by {one.change:.2g} a period"] if one.follows and one.change else []
-    return [f"{key(one.name)} = {{ {', '.join(words)} }}" + (f" # {'; '.join(seen)}" if seen else "")]
+    remarks = [f"{one.least:.3g} to {one.most:.3g} in the log"] if one.role != "heading" else []
+    remarks += [] if one.unit else [f"its unit {UNKNOWN}"]
+    remarks += [f"{1e3 * one.delay:.0f} ms after its input"] if one.delay is not None else []
+    remarks += [f"brakes by {one.change:.2g} a period"] if one.follows and one.change else []
+    return [f"{key(one.name)} = {{ {', '.join(words)} }}" + (f" # {'; '.join(remarks)}" if remarks else "")]
 
 
 def _input(one: InferredColumn) -> list[str]:
@@ -102,14 +102,14 @@ def _input(one: InferredColumn) -> list[str]:
     steers = one.unit == "rad"
     moves = not steers if one.moves is None else one.moves
     words += [f"moves = {str(moves).lower()}", 'stop = "hold"' if steers else 'stop = "ramp"']
-    seen = [] if one.unit else [f"its unit {UNTOLD}"]
-    seen += [] if one.moves is not None else [f"moves: {UNTOLD}, it was never driven alone"]
-    seen += ["it jumps: no slew"] if most is None else []
-    return [f"{key(one.name)} = {{ {', '.join(words)} }}" + (f" # {'; '.join(seen)}" if seen else "")]
+    remarks = [] if one.unit else [f"its unit {UNKNOWN}"]
+    remarks += [] if one.moves is not None else [f"moves: {UNKNOWN}, the log never changes it alone"]
+    remarks += ["it jumps, so that it has no slew limit"] if most is None else []
+    return [f"{key(one.name)} = {{ {', '.join(words)} }}" + (f" # {'; '.join(remarks)}" if remarks else "")]
 
 
 def _outwards(value: float) -> float:
-    """To three digits, away from zero; what is next to nothing is none."""
+    """Round to three digits away from zero; values below 1e-9 become 0."""
     if abs(value) < 1e-9:
         return 0.0
     unit = 10.0 ** (math.floor(math.log10(abs(value))) - 2)
@@ -117,5 +117,5 @@ def _outwards(value: float) -> float:
 
 
 def key(name: str) -> str:
-    """A name as TOML has it."""
+    """Return a name as a TOML key."""
     return name if BARE.fullmatch(name) else json.dumps(name)

@@ -1,4 +1,4 @@
-"""The description of a robot that a log of a run carries, as the text of a file."""
+"""Write the robot description that a Brakeline log contains as the text of a description file."""
 
 from __future__ import annotations
 
@@ -11,31 +11,34 @@ from brakeline.deploy.data.description_template import key
 from brakeline.deploy.data.sources.source_table import NoSource
 from brakeline.logs.reader import open_log
 
-ROBOTS = "robots"  # a log's metadata: for each name the description as JSON
+ROBOTS = "robots"  # metadata of a log: robot name -> description as JSON
 
 
 def read_embedded_description(path: Path, name: str) -> str:
-    """The description of the log's robot, under a new name; of several robots, of the one that has this name.
+    """Return the description of the log's robot under the name `name`.
+
+    If the log holds several robots, choose the one with this name.
 
     Raises:
-        NoSource: it carries none, or several others; NoLog, NotALog: there is no log.
+        NoSource: the log contains no description, or several and none with this name.
+        NoLog, NotALog: the file does not exist, or is not a log.
     """
     log = open_log(path)
     for _ in log:
         if ROBOTS in log.metadata:
             break
-    found = log.metadata.get(ROBOTS, {})
-    if not found:
-        raise NoSource(f"{path} carries no robot's description: it is older than descriptions are")
-    if len(found) > 1 and name not in found:
-        raise NoSource(f"{path} is of {', '.join(found)}: name the file after the one that you want")
-    chosen = name if name in found else next(iter(found))
-    described = json.loads(found[chosen]) | {"name": name}
-    return f"# The description of {chosen} that {path.name} carries.\n" + "\n".join(_lines(described)) + "\n"
+    descriptions = log.metadata.get(ROBOTS, {})
+    if not descriptions:
+        raise NoSource(f"{path} contains no robot description: the log is from a version without descriptions")
+    if len(descriptions) > 1 and name not in descriptions:
+        raise NoSource(f"{path} holds the robots {', '.join(descriptions)}: name the file after the one that you want")
+    chosen = name if name in descriptions else next(iter(descriptions))
+    described = json.loads(descriptions[chosen]) | {"name": name}
+    return f"# The description of {chosen} from {path.name}.\n" + "\n".join(_lines(described)) + "\n"
 
 
 def _lines(described: dict[str, Any]) -> Iterator[str]:
-    """A file's lines: what is one value first, then tables, then lists of tables."""
+    """Yield the TOML lines: plain values first, then tables, then arrays of tables."""
     for name, value in described.items():
         if not isinstance(value, dict | list):
             yield f"{key(name)} = {_value(value)}"

@@ -1,7 +1,7 @@
-"""Data from a Gymnasium environment: excitation episodes, as a data set.
+"""Record a data set in a Gymnasium environment, with excitation as the policy.
 
 data = collect(env, robot, periods=30_000, state=state, actions=normalised(robot))
-model, statement = certified(data, Recipe())
+model, statement = certify(data, ModelConfig())
 env = SafetyWrapper(env, Filter(model), state=state, obstacles=obstacles, actions=normalised(robot))
 """
 
@@ -25,9 +25,9 @@ from brakeline.safety.model.windows import displacement
 
 Array = NDArray[np.float64]
 
-FEWEST = 3  # periods of a trajectory that is worth keeping
-LONGEST = 300  # periods of a trajectory; then the environment is reset
-FRUITLESS = 1000  # episodes in a row that end before that
+FEWEST = 3  # periods; shorter trajectories are dropped
+LONGEST = 300  # periods per trajectory; then the environment is reset
+MAX_EMPTY = 1000  # consecutive episodes without a trajectory
 
 
 def collect(
@@ -44,28 +44,28 @@ def collect(
     options: dict[str, Any] | None = None,
     shown: bool = True,
 ) -> Dataset:
-    """Drives the environment with `excitation` until so many periods are recorded; a period is one `step`.
+    """Drive the environment with `excitation` until `periods` periods are recorded. A period is one `step`.
 
-    An episode that ends in `terminated` (a collision, say) loses its last period, and where `disturbed` says that
-    something else than the input moved the robot in the last period, the trajectory ends before it.
+    If an episode ends with `terminated` (for example by a collision), its last period is dropped. If `disturbed`
+    returns True, something else than the input moved the robot, and the trajectory ends before that period.
 
     Args:
-        held: periods that an input is held for at most: enough to come to the highest speed.
-        state: (env, observation, info) -> measured state (n,); unless given, `info["state"]`.
-        actions: as `SafetyWrapper` takes them.
-        bulge: m that the path may leave its chord by within a period, where `info` has no `subsamples` and `turned`
-            (`NavigationEnv`); None: twice what the recorded accelerations make of it.
-        options: of every `reset`.
-        shown: progress, on the terminal.
+        held: largest number of periods for which an input is held: enough to reach the top speed.
+        state: (env, observation, info) -> measured state (n,). Defaults to `info["state"]`.
+        actions: mapping between actions and inputs, as in `SafetyWrapper`.
+        chord_deviation: largest distance in m of the path from its chord within a period, if `info` has no `subsamples`
+            and `turned`. Defaults to twice the value that follows from the recorded accelerations.
+        options: options of every `reset`.
+        shown: whether to show progress on the terminal.
 
     Raises:
-        Mismatch: no state is to be had, or the action space is not that of the robot's inputs; BadData: what was
-        recorded is no data set, or every episode ends at once.
+        Mismatch: the environment gives no state, or its action space does not match the robot's inputs.
+        BadData: the recording is not a valid data set, or every episode ends at once.
     """
     between = mapping_for_space(env.action_space, robot, actions)
     columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
     trajectories: list[Trajectory] = []
-    fruitless = number = 0
+    empty_episodes = number = 0
     with Progress(*columns, console=Console(stderr=True), disable=not shown) as progress:
         task = progress.add_task(f"driving {robot.name}", total=periods)
         while not progress.finished:
@@ -88,13 +88,21 @@ def collect(
                 if len(t.inputs) >= min(FEWEST, left)
             ]
             number += 1
-            fruitless = 0 if new else fruitless + 1
-            if fruitless >= FRUITLESS:
-                raise BadData(f"{FRUITLESS} episodes in a row ended before period {FEWEST}: nothing to learn from")
+            empty_episodes = 0 if new else empty_episodes + 1
+            if empty_episodes >= MAX_EMPTY:
+                raise BadData(
+                    f"{MAX_EMPTY} episodes in a row ended before period {FEWEST}: check why the environment ends"
+                )
             trajectories += new
             progress.advance(task, sum(len(t.inputs) for t in new))
     sampled = any(t.paths.shape[1] > 1 for t in trajectories)
-    off = chord_deviation if chord_deviation is not None else 0.0 if sampled else _bulge(robot, trajectories)
+    off = (
+        chord_deviation
+        if chord_deviation is not None
+        else 0.0
+        if sampled
+        else _chord_deviation_bound(robot, trajectories)
+    )
     about = {"origin": str(getattr(env.spec, "id", None) or type(env.unwrapped).__name__), "seed": str(seed)}
     data = Dataset(robot, tuple(trajectories), about, off)
     data.check()
@@ -112,14 +120,14 @@ def _episode(
     state: View,
     disturbed: Callable[[Any, Any, dict[str, Any]], bool],
 ) -> Iterator[Trajectory]:
-    """The undisturbed stretches of one episode."""
+    """Yield the undisturbed trajectories of one episode."""
     observation, info = env.reset(seed=seed, options=options)
     measured = np.array(state(env, observation, info), dtype=float)
     u, before = next(inputs), None
     record = _Record(robot, measured, before)
     for _ in range(most):
-        made = cast_action(between.control_to_action(u), env.action_space)
-        observation, _, terminated, truncated, info = env.step(made)
+        action = cast_action(between.control_to_action(u), env.action_space)
+        observation, _, terminated, truncated, info = env.step(action)
         if terminated:
             break
         measured = np.array(state(env, observation, info), dtype=float)
@@ -136,7 +144,7 @@ def _episode(
 
 
 class _Record:
-    """A trajectory under way."""
+    """A trajectory during its recording."""
 
     def __init__(self, robot: Robot, state: Array, before: Array | None) -> None:
         self.robot, self.before = robot, before
@@ -157,8 +165,10 @@ class _Record:
             yield Trajectory(states, inputs, paths, np.array(self.turned), self.before)
 
 
-def _bulge(robot: Robot, trajectories: list[Trajectory]) -> float:
-    """[m] a·T²/8 is what a path of acceleration a leaves its chord by in a period T; a·T² are the second differences
-    of the positions. Twice that."""
+def _chord_deviation_bound(robot: Robot, trajectories: list[Trajectory]) -> float:
+    """Return twice a·T²/8 in m: a path with acceleration a leaves its chord by a·T²/8 within a period T.
+
+    The second differences of the positions are a·T².
+    """
     bends = [np.diff(t.states[:, : robot.position_dim], n=2, axis=0) for t in trajectories if len(t.inputs) > 1]
     return max((float(np.linalg.norm(bend, axis=1).max()) for bend in bends), default=0.0) / 4.0

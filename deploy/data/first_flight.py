@@ -175,8 +175,8 @@ class FirstFlight:
         drift = _estimate_drift(data.trajectories, self._robot.period)
         if drift > MAX_DRIFT:
             missing.append(
-                f"the position of its own estimate is {drift:.2f} m off its integrated velocity after one second "
-                "(95 %), and no set can be narrower: set noise and delay of the sensors in its estimator, then fly again"
+                f"the position of its own estimate is {drift:.2f} m off its integrated velocity after a second "
+                "(95 %), and no set can be narrower: set sensor noise and delay in its estimator, then fly again"
             )
         if reached < 1.0:
             missing.append(f"there are no data above {reached:.0%} of its speed")

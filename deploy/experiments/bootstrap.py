@@ -1,6 +1,7 @@
-"""Intervals of figures over seeds and episodes: the hierarchical bootstrap (seed first, then its episodes).
+"""Confidence intervals over seeds and episodes by the hierarchical bootstrap: resample seeds, then their episodes.
 
-Seeds are few, and an interval over few seeds is a rough one: the table says how many there are, the figures show each.
+`scipy.stats.bootstrap` resamples one level only, which would treat the episodes of one trained policy as independent.
+With few seeds the interval is rough, so the table states the number of seeds and the plots show each of them.
 """
 
 from __future__ import annotations
@@ -13,13 +14,13 @@ from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float64]
 
-DRAWS = 4000
+RESAMPLES = 4000
 CONFIDENCE = 0.95
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """A figure with its interval at 95 %, and the seeds' own figures."""
+    """An estimate with its 95 % confidence interval, and the value of each seed."""
 
     value: float
     low: float
@@ -28,34 +29,37 @@ class Estimate:
 
 
 def ratio(above: Sequence[ArrayLike], below: Sequence[ArrayLike], seed: int = 0) -> Estimate:
-    """Mean over seeds of Σ above / Σ below over a seed's episodes, each given as one array (episodes,) a seed.
+    """Estimate the mean over seeds of Σ above / Σ below, summed over the episodes of a seed.
 
-    With `below` all ones: the mean over episodes. Each draw takes as many seeds as there are, and of each as many
-    episodes as it has, with replacement.
+    Each resample draws, with replacement, as many seeds as there are, and for each as many episodes as it has.
+
+    Args:
+        above, below: one array (episodes,) per seed.
+        seed: seed of the resampling.
 
     Raises:
-        ValueError: no seed, or one without an episode.
+        ValueError: there is no seed, or a seed has no episode.
     """
     pairs = [(np.asarray(a, float), np.asarray(b, float)) for a, b in zip(above, below, strict=True)]
     if not pairs or not all(len(a) for a, _ in pairs):
         raise ValueError("an interval needs at least one episode of each seed")
     rng = np.random.default_rng(seed)
-    own = np.array([a.sum() / b.sum() for a, b in pairs])
-    again = np.stack([_resampled(a, b, rng) for a, b in pairs])  # (seeds, DRAWS)
-    shape = len(pairs), DRAWS
-    # any of a seed's resamples is as good as another: so a seed that is drawn twice is resampled twice
-    drawn = again[rng.integers(len(pairs), size=shape), rng.integers(DRAWS, size=shape)].mean(axis=0)
+    per_seed = np.array([a.sum() / b.sum() for a, b in pairs])
+    resampled = np.stack([_resampled(a, b, rng) for a, b in pairs])  # (seeds, RESAMPLES)
+    shape = len(pairs), RESAMPLES
+    # Draw an independent resample of the episodes for each seed, also if a seed is drawn twice.
+    means = resampled[rng.integers(len(pairs), size=shape), rng.integers(RESAMPLES, size=shape)].mean(axis=0)
     tail = 100.0 * (1.0 - CONFIDENCE) / 2.0
-    low, high = np.percentile(drawn, (tail, 100.0 - tail))
-    return Estimate(float(own.mean()), float(low), float(high), tuple(map(float, own)))
+    low, high = np.percentile(means, (tail, 100.0 - tail))
+    return Estimate(float(per_seed.mean()), float(low), float(high), tuple(map(float, per_seed)))
 
 
 def mean(values: Sequence[ArrayLike], seed: int = 0) -> Estimate:
-    """Of a figure per episode, one array a seed."""
+    """Estimate the mean over seeds and episodes of `values`, one array (episodes,) per seed."""
     return ratio(values, [np.ones(len(np.asarray(v))) for v in values], seed)
 
 
 def _resampled(above: Array, below: Array, rng: np.random.Generator) -> Array:
-    """Σ above / Σ below of `DRAWS` resamples of the episodes."""
-    counts = rng.multinomial(len(above), np.full(len(above), 1.0 / len(above)), size=DRAWS)
+    """Return Σ above / Σ below (RESAMPLES,) for resampled episodes."""
+    counts = rng.multinomial(len(above), np.full(len(above), 1.0 / len(above)), size=RESAMPLES)
     return np.asarray((counts @ above) / (counts @ below))

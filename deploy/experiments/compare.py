@@ -1,9 +1,9 @@
-"""`brakeline compare`: every method from the same seeds, cell by cell, two at once, resuming from what is there.
+"""Compare all methods from the same seeds (`brakeline compare`). Finished cells are not run again.
 
-results/<robot>/<method>-s<seed>.json      one cell: its configuration, its figures, an episode a row
-results/<robot>/conservatism.json          every certificate and mode, with the stored policy and the map's oracle
-results/<robot>/table.md table.json curves.png seeds.png      drawn from these files alone
-runs/compare/<robot>/<cell>/               logs and policy of a cell that was run here (not in git)
+results/<robot>/<method>-s<seed>.json      one cell: configuration, figures, and one row per episode
+results/<robot>/conservatism.json          every error bound and mode, with the stored policy and A*
+results/<robot>/table.md table.json curves.png seeds.png      made from these files alone
+runs/compare/<robot>/<cell>/               logs and policy of a cell (not in git)
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ SEEDS = (0, 1, 2)
 
 @dataclass(frozen=True)
 class ComparisonJob:
-    """A study as a job."""
+    """One cell of the comparison as a job."""
 
     study: CellConfig
 
@@ -44,7 +44,7 @@ class ComparisonJob:
 
 
 def cell_configs(robot: str, seeds: Iterable[int] = SEEDS, quick: bool = False) -> list[CellConfig]:
-    """All cells of a robot's table, seed by seed, so that an interrupted comparison has whole seeds."""
+    """Return all cells of a robot, seed by seed, so that an interrupted comparison has complete seeds."""
     steps = robot_with_task(robot).task.steps
     wanted = [CellConfig(robot, method, seed, steps, EPISODES) for seed in seeds for method in METHODS]
     return [comparison_cells.quick(study) for study in wanted] if quick else wanted

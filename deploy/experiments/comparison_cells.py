@@ -1,5 +1,6 @@
-"""One cell of the comparison: a method trained from one seed, and its policy evaluated on the fresh episodes that all
-methods share. Everything it found goes into one small JSON file, from which tables and figures are drawn.
+"""One cell of the comparison: train a method from one seed, then evaluate its policy on the shared fresh episodes.
+
+The results go to one small JSON file, from which tables and plots are made.
 """
 
 from __future__ import annotations
@@ -36,12 +37,12 @@ PACKAGES = ("brakeline", "mujoco", "proxsuite", "numpy", "torch")
 
 
 class FigureMismatch(RuntimeError):
-    """A run's log does not say what the run counted."""
+    """The log of a run does not agree with the figures that the run counted."""
 
 
 @dataclass(frozen=True)
 class TrialConfig:
-    """An evaluation: whose policy, behind which filter, where, how often."""
+    """One evaluation: policy, filter method, arena and number of episodes."""
 
     policy: str  # trained | untrained | learning
     method: str
@@ -55,25 +56,25 @@ class TrialConfig:
 
 @dataclass(frozen=True)
 class CellConfig:
-    """What a cell depends on, besides the version of the code."""
+    """The configuration of a cell. With the version of the code, it determines the results."""
 
-    robot: str  # and its task, where that is another than the usual one: ground+tracks
+    robot: str  # ROBOT, or ROBOT+TASK for another task than the default: ground+tracks
     method: str
     seed: int
     steps: int
     episodes: int
-    arenas: tuple[str, ...] = ("default", "dense")  # of the evaluation; training is in the first
+    arenas: tuple[str, ...] = ("default", "dense")  # for the evaluation; training uses the first
     penalty: float = 1.0
     model_config: ModelConfig = field(default_factory=ModelConfig)
     td3: TD3Config = field(default_factory=TD3Config)
-    untrained: int = 100  # episodes of the untrained policy, which take their full time
+    untrained: int = 100  # episodes of the untrained policy; few, because they last until the time limit
 
     @property
     def name(self) -> str:
         return f"{self.method}-s{self.seed}"
 
     def trials(self) -> list[TrialConfig]:
-        """The table's, then those of deployment: with a filter that was not there in training, and the reverse."""
+        """Return the evaluations for the table, then those that add or remove the filter after training."""
         first = self.arenas[0]
         table = [TrialConfig(TRAINED, self.method, arena, self.episodes) for arena in self.arenas]
         if self.method == DDPC:
@@ -84,7 +85,7 @@ class CellConfig:
         return table
 
     def config(self) -> dict[str, Any]:
-        """As JSON gives it back."""
+        """Return the configuration as JSON values."""
         config: dict[str, Any] = json.loads(json.dumps(asdict(self)))
         return config
 
@@ -93,10 +94,10 @@ Report = Callable[[str], object]
 
 
 def run(study: CellConfig, folder: Path, say: Report = lambda text: None) -> dict[str, Any]:
-    """Train, evaluate, and confirm the figures from the logs, which stay in `folder` with the policy.
+    """Train, evaluate, and check the figures against the logs. Logs and policy stay in `folder`.
 
     Raises:
-        FigureMismatch: a log says something else than was counted.
+        FigureMismatch: a log does not agree with the figures.
     """
     folder.mkdir(parents=True, exist_ok=True)
     robot = robot_with_task(study.robot)
@@ -117,21 +118,23 @@ def run(study: CellConfig, folder: Path, say: Report = lambda text: None) -> dic
 
 
 def _cost(model: Model, robot: RobotWithTask) -> dict[str, str]:
-    """What was driven beforehand, and how it went. Ours is recorded in an empty yard: there is nothing to touch."""
+    """Return the cost of pre-training. Our data are recorded in an empty yard, where no collision is possible."""
     if isinstance(model, Pretrained):
         return {name: model.about[name] for name in ("samples", "collisions", "seconds", "error")}
     return {"samples": str(load_or_record(robot).periods), "collisions": "0"}
 
 
-def _driver(study: CellConfig, trial: TrialConfig, robot: RobotWithTask, seed: int, actor: str) -> EpisodeRunner:
+def _episode_runner(
+    study: CellConfig, trial: TrialConfig, robot: RobotWithTask, seed: int, actor: str
+) -> EpisodeRunner:
     env = environment(robot, trial.arena, seed)
     identity, filtered = ActorIdentity(actor, 0, study.seed), trial.method != NONE
-    # at an intervention training calls the episode off; an evaluation goes on, or its goal rate would mean nothing
+    # SAILR's training ends an episode at an intervention. An evaluation continues, else goal rates could not compare.
     cuts = trial.method == SAILR and trial.policy == LEARNING
     return EpisodeRunner(robot, env, identity, penalty=study.penalty, filtered=filtered, ends_on_intervention=cuts)
 
 
-def _question(models: dict[str, Model], method: str) -> Ask | None:
+def _decision_service(models: dict[str, Model], method: str) -> Ask | None:
     return None if method == NONE else in_process(models[method])
 
 
@@ -140,17 +143,17 @@ def _train(
 ) -> dict[str, Any]:
     trial = TrialConfig(LEARNING, study.method, study.arenas[0], 0)
     config = LearnerConfig(td3=study.td3, seed=study.seed, steps=study.steps)
-    driver = _driver(study, trial, robot, study.seed, study.name)
-    trainer = Trainer(driver, _question(models, study.method), Learner(robot, config))
-    found, log_file = EpisodeTable(), folder / "training.mcap"
+    driver = _episode_runner(study, trial, robot, study.seed, study.name)
+    trainer = Trainer(driver, _decision_service(models, study.method), Learner(robot, config))
+    table, log_file = EpisodeTable(), folder / "training.mcap"
     with TrialLog(log_file, _metadata(study, trial)) as log:
         for count, step in enumerate(trainer.run(log), 1):
-            found.step(step)
+            table.step(step)
             if count % 1000 == 0:
-                goals = sum(row[1] for row in found.rows[-50:]) / max(len(found.rows[-50:]), 1)
+                goals = sum(row[1] for row in table.rows[-50:]) / max(len(table.rows[-50:]), 1)
                 say(f"step {count}, goals {goals:.0%}")
     trainer.policy.save(folder / "policy.safetensors")
-    return _confirmed(found, log_file) | {"steps": study.steps, "updates": trainer.learner.updates}
+    return _check_against_log(table, log_file) | {"steps": study.steps, "updates": trainer.learner.updates}
 
 
 def _evaluate(
@@ -158,12 +161,12 @@ def _evaluate(
 ) -> dict[str, Any]:
     say(trial.name)
     name = str(folder / "policy.safetensors") if trial.policy == TRAINED else UNTRAINED
-    driver = _driver(study, trial, robot, FRESH, trial.name)
+    driver = _episode_runner(study, trial, robot, FRESH, trial.name)
     log_file = folder / f"{trial.name}.mcap"
     with TrialLog(log_file, _metadata(study, trial)) as log:
         policy = policy_named(name, robot, study.seed)
-        found = evaluate(driver, policy, _question(models, trial.method), trial.episodes, log)
-    return _confirmed(found, log_file)
+        table = evaluate(driver, policy, _decision_service(models, trial.method), trial.episodes, log)
+    return _check_against_log(table, log_file)
 
 
 def _metadata(study: CellConfig, trial: TrialConfig) -> dict[str, dict[str, str]]:
@@ -172,30 +175,30 @@ def _metadata(study: CellConfig, trial: TrialConfig) -> dict[str, dict[str, str]
     return {"run": about | certificate, "configuration": {"json": json.dumps(study.config())}}
 
 
-def _confirmed(found: EpisodeTable, log_file: Path) -> dict[str, Any]:
-    """The counted figures, with those of the log beside them, which must agree."""
-    columns, logged = found.columns(), analyse(log_file)
+def _check_against_log(table: EpisodeTable, log_file: Path) -> dict[str, Any]:
+    """Return the counted figures and those of the log. Raises FigureMismatch if they disagree."""
+    columns, logged = table.columns(), analyse(log_file)
     for name, counted in (
-        ("steps", found.decisions),
-        ("episodes", len(found.rows)),
+        ("steps", table.decisions),
+        ("episodes", len(table.rows)),
         ("goals", sum(columns["goal"])),
         ("timeouts", sum(columns["timeout"])),
         ("contacts_moving", sum(columns["contact_moving"])),
         ("contacts_standing", sum(columns["contact_standing"])),
     ):
         if logged[name] != counted:
-            raise FigureMismatch(f"{log_file} says {logged[name]} {name}, the run counted {counted}")
+            raise FigureMismatch(f"{log_file} has {logged[name]} {name}, but the run counted {counted}")
     if logged["collisions"] < sum(columns["collision"]):
-        raise FigureMismatch(f"{log_file} says {logged['collisions']} collisions, the run counted more")
-    kept = ("collisions", "interventions", "failsafes", "mean_speed", "max_speed", "mean_reward", "containment")
+        raise FigureMismatch(f"{log_file} has {logged['collisions']} collisions, but the run counted more")
+    logged_names = ("collisions", "interventions", "failsafes", "mean_speed", "max_speed", "mean_reward", "containment")
     return {
         "episodes": columns,
-        "decision_ms": found.decision_ms(),
-        "logged": {name: logged[name] for name in kept},
+        "decision_ms": table.decision_ms(),
+        "logged": {name: logged[name] for name in logged_names},
     }
 
 
 def quick(study: CellConfig) -> CellConfig:
-    """The same in a minute: enough to see that everything works, not to learn anything."""
+    """Return a cell that runs in a minute: enough to test the code, too short to learn."""
     td3 = replace(study.td3, hidden=(64, 64), batch=64, warmup=500)
     return replace(study, steps=2_000, episodes=10, untrained=5, td3=td3)

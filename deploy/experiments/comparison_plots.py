@@ -1,4 +1,4 @@
-"""Pictures of a comparison: learning curves of every method, and each seed's figures as points."""
+"""Plots of a comparison: learning curves of all methods, and the value of each seed."""
 
 from __future__ import annotations
 
@@ -17,12 +17,14 @@ from brakeline.deploy.experiments.comparison_table import NAMES, WINDOW
 
 Array = NDArray[np.float64]
 
-COLOURS = dict(zip(METHODS, ("#0072b2", "#e69f00", "#009e73", "#d55e00"), strict=True))  # told apart by anyone
-POINTS = 200  # of a curve
+COLOURS = dict(
+    zip(METHODS, ("#0072b2", "#e69f00", "#009e73", "#d55e00"), strict=True)
+)  # a palette for colour-blind readers
+POINTS = 200  # per curve
 
 
 def _smooth(values: Array) -> Array:
-    """Means over the last `WINDOW` episodes, fewer at the start."""
+    """Return the moving mean over the last `WINDOW` episodes, or all of them at the start."""
     sums = np.concatenate([[0.0], np.cumsum(values)])
     ends = np.arange(1, len(values) + 1)
     starts = np.maximum(0, ends - WINDOW)
@@ -30,7 +32,7 @@ def _smooth(values: Array) -> Array:
 
 
 def _lines(results: Sequence[dict[str, Any]], name: str, grid: Array) -> Array:
-    """(seeds, POINTS): a figure of training on a grid of steps; collisions are counted, the others averaged."""
+    """Return curves (seeds, POINTS) of a training figure over steps: collisions are summed, others averaged."""
     lines = []
     for result in results:
         episodes = result["training"]["episodes"]
@@ -38,13 +40,13 @@ def _lines(results: Sequence[dict[str, Any]], name: str, grid: Array) -> Array:
         if name == "interventions":
             values = values / np.array(episodes["steps"], float)
         curve = np.cumsum(values) if name == "collision" else _smooth(values)
-        before = 0.0 if name == "collision" else np.nan  # until an episode has ended nothing is known
+        before = 0.0 if name == "collision" else np.nan  # no value before the first episode ends
         lines.append(np.interp(grid, ends, curve, left=before))
     return np.array(lines)
 
 
 def learning_curves(results: Sequence[dict[str, Any]], png: Path) -> None:
-    """Goals, collisions so far, reward and interventions over training steps; thin: a seed, thick: their mean."""
+    """Plot goals, collisions, rewards and interventions over training steps: thin lines per seed, thick means."""
     picture = Figure(figsize=(10.0, 7.0), layout="constrained")
     rows = [("goal", "goals reached"), ("collision", "collisions so far"), ("reward", "reward of an episode")]
     rows.append(("interventions", "share of steps with an intervention"))
@@ -72,7 +74,7 @@ def learning_curves(results: Sequence[dict[str, Any]], png: Path) -> None:
 
 
 def seeds_as_points(found: dict[str, Any], png: Path) -> None:
-    """Each part's goal and collision rates: the interval as a line, every seed as a point."""
+    """Plot goal and collision rates of each part: the interval as a line, each seed as a point."""
     parts = [part for part in found["parts"] if part != "deployment"]
     picture = Figure(figsize=(3.4 * len(parts), 5.6), layout="constrained")
     grid = picture.subplots(2, len(parts), squeeze=False)

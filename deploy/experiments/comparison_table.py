@@ -1,7 +1,7 @@
-"""The paper's Table I from a comparison's results, with intervals, the paper's own numbers beside them, and deployment.
+"""The paper's Table I from the results of a comparison, with intervals and the paper's own numbers.
 
-Pure: the results' JSON in, plain values and Markdown out. Rows whose name ends in "[ms]" are times; all others follow
-from the seeds alone.
+These are pure functions from the JSON results to values and Markdown. Rows whose names end in "[ms]" are measured
+times; all others are determined by the seeds.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ Row = dict[str, Any]
 
 NAMES = {DDPC: "ours", "sailr": "SAILR", "secas": "SECAS", NONE: "TD3"}
 PAPER = Path(__file__).with_name("paper.json")
-WINDOW = 50  # episodes of training over which a goal rate is taken
+WINDOW = 50  # training episodes per goal rate
 LEARNED = 0.9  # the goal rate that counts as learned
-TOUCHED = ("run into while moving", "run into while standing")  # CONTACTS as a table names them
+TOUCHED = ("run into while moving", "run into while standing")  # the table's names of CONTACTS
 
 
 def steps_to_learn(episodes: dict[str, list[float]], steps: int) -> float:
-    """Training steps until `LEARNED` of the last `WINDOW` episodes reached the goal; `steps`, all of them, if never."""
+    """Return the training steps until a share `LEARNED` of `WINDOW` episodes reached the goal; `steps` if never."""
     goals, taken = np.array(episodes["goal"], float), np.cumsum(episodes["steps"])
     if len(goals) < WINDOW:
         return float(steps)
@@ -48,7 +48,7 @@ def _training(results: Sequence[Result], name: str) -> list[list[float]]:
 
 
 def evaluation_rows(results: Sequence[Result], trial: str) -> Row:
-    """The figures of one evaluation over the seeds: estimates, or plain numbers where an interval has no meaning."""
+    """Return the figures of one evaluation over the seeds: estimates, or numbers where an interval has no meaning."""
     steps = _episodes(results, trial, "steps")
     times = [result["evaluations"][trial]["decision_ms"] for result in results]
     return {
@@ -65,14 +65,14 @@ def evaluation_rows(results: Sequence[Result], trial: str) -> Row:
 
 
 def _contacts(results: Sequence[Result], trial: str) -> Row:
-    """Contacts with what moves; results that were made before there was any have none."""
+    """Return contacts with moving obstacles; old results do not contain them."""
     if any(name not in result["evaluations"][trial]["episodes"] for result in results for name in CONTACTS):
         return {}
     return dict(zip(TOUCHED, (mean(_episodes(results, trial, name)) for name in CONTACTS), strict=True))
 
 
 def training_rows(results: Sequence[Result]) -> Row:
-    """What training cost, over the seeds."""
+    """Return the figures of training over the seeds."""
     learned = [steps_to_learn(r["training"]["episodes"], r["training"]["steps"]) for r in results]
     return {
         "collision rate": mean(_training(results, "collision")),
@@ -86,10 +86,10 @@ def training_rows(results: Sequence[Result]) -> Row:
 
 
 def table(results: Iterable[Result]) -> dict[str, Any]:
-    """All figures of one robot: by part (training, an arena, deployment), method, and row.
+    """Return all figures of one robot, by part (training, arenas, deployment), method and row.
 
     Raises:
-        ValueError: the results are not of one robot, or a method has other seeds than another.
+        ValueError: the results belong to several robots, or the methods have different seeds.
     """
     cells = list(results)
     by_method = {m: [c for c in cells if c["study"]["method"] == m] for m in METHODS}
@@ -113,7 +113,7 @@ def table(results: Iterable[Result]) -> dict[str, Any]:
 
 
 def _deployment(groups: dict[str, list[Result]], arena: str) -> dict[str, Row]:
-    """A policy with a filter that it was not trained with, without the one that it was, and untrained with it."""
+    """Return the rows for a filter that is added or removed after training, and for an untrained policy."""
     rows = {}
     for name, method, trial in (
         ("trained without, run with the filter", NONE, f"{TRAINED}-{DDPC}-{arena}"),
@@ -126,7 +126,7 @@ def _deployment(groups: dict[str, list[Result]], arena: str) -> dict[str, Row]:
 
 
 def plain(value: Any) -> Any:
-    """As JSON can hold it; times are left in."""
+    """Convert estimates to JSON values."""
     if isinstance(value, Estimate):
         return {"value": value.value, "low": value.low, "high": value.high, "seeds": list(value.seeds)}
     if isinstance(value, dict):
@@ -135,7 +135,7 @@ def plain(value: Any) -> Any:
 
 
 def without_times(value: Any) -> Any:
-    """What two comparisons from the same seeds must agree on."""
+    """Remove the times: the rest must be equal in two comparisons from the same seeds."""
     if isinstance(value, dict):
         return {name: without_times(inner) for name, inner in value.items() if not name.endswith("[ms]")}
     return value
@@ -145,7 +145,7 @@ PERCENT = ("goal rate", "collision rate", "interventions", *TOUCHED)
 
 
 def written(name: str, value: Any) -> str:
-    """A figure as a table shows it, the interval in brackets."""
+    """Format a figure for the table, with its interval in brackets."""
     form: Callable[[float], str]
     if name in PERCENT:
         form = lambda v: f"{100.0 * v:.1f}"  # noqa: E731
@@ -171,7 +171,7 @@ PAPER_ROWS = {
 
 
 def _paper(robot: str, row: str, method: str) -> str:
-    """The paper's figure for a row, empty where it has none."""
+    """Return the paper's figure for a row, or an empty string."""
     published = json.loads(PAPER.read_text()).get(robot, {}).get(method)
     if published is None:
         return ""
@@ -185,19 +185,19 @@ def _paper(robot: str, row: str, method: str) -> str:
     return written(row, published[name] * factor)
 
 
-def markdown(found: dict[str, Any]) -> str:
-    """The tables of one robot. The paper's own figures stand in italics where it has them."""
-    robot, lines = found["robot"], []
-    seeds = ", ".join(map(str, found["seeds"]))
+def markdown(figures: dict[str, Any]) -> str:
+    """Return the tables of one robot as Markdown, with the paper's figures in italics."""
+    robot, lines = figures["robot"], []
+    seeds = ", ".join(map(str, figures["seeds"]))
     lines += [
         f"# {robot}",
         "",
-        f"{found['steps']} training steps, seeds {seeds}; {found['episodes']} episodes a seed, the same for all "
+        f"{figures['steps']} training steps, seeds {seeds}; {figures['episodes']} episodes a seed, the same for all "
         "methods. In brackets: 95 % intervals by the hierarchical bootstrap (seed, then episode). In italics: the "
         "paper's figures, of its own task. Decision times are of policy and method together.",
         "",
     ]
-    for part, methods in found["parts"].items():
+    for part, methods in figures["parts"].items():
         columns = list(methods)
         heads = [NAMES.get(column, column) for column in columns]
         lines += [f"## {part}", "", "| | " + " | ".join(heads) + " |", "|---" * (len(heads) + 1) + "|"]

@@ -1,8 +1,8 @@
-"""How conservative each certificate is in both modes: its tubes, and what they cost (docs/method.md §6).
+"""Measure how conservative each error bound is in both modes (docs/method.md §6).
 
-Half-widths of a full stop, what held-out plans say of the bound, and closed-loop goal rates of the map's oracle (A*)
-and of the stored policy, which was trained behind the default. Where a full stop's set is wider than the arena, no
-plan of moving can be verified, and nothing is driven.
+The table states half-widths of a full stop, the validation on held-out plans, and closed-loop goal rates of A* and of
+the stored policy, which was trained with the default error bound. If the set of a full stop is wider than the arena,
+the filter cannot verify any motion, and the closed loop is skipped.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from brakeline.safety.model.model_set import MODES, ModelConfig
 from brakeline.sim.arena_generator import arena_kind
 
 ORACLE = "astar"
-ANY_BOUND = 1.0  # in a simulator: how loose each is, is what is to be seen
+ANY_BOUND = 1.0  # accept every bound: the experiment measures it, in a simulator
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ class Conservatism:
         return config
 
     def run(self, folder: Path, say: Callable[[str], object] = lambda text: None) -> dict[str, Any]:
-        """A row for each certificate and mode, the refused ones with the reason."""
+        """Return one row per error bound and mode; a row without a model set gives the reason."""
         robot = robot_with_task(self.robot)
         data = load_or_record(robot)
         rows = []
@@ -71,21 +71,21 @@ class Conservatism:
         return {"study": self.config(), "data": data.digest(), "rows": rows}
 
     def _drive(self, robot: RobotWithTask, policy: str, question: Any) -> dict[str, Any]:
-        """Closed loop on the first fresh episodes."""
+        """Evaluate the closed loop on the first fresh episodes."""
         driver = EpisodeRunner(robot, environment(robot, self.arena, FRESH), ActorIdentity("conservatism", 0, 0))
-        found: EpisodeTable = evaluate(driver, policy_named(policy, robot, 0), question, self.episodes)
-        columns, steps = found.columns(), found.decisions
+        table: EpisodeTable = evaluate(driver, policy_named(policy, robot, 0), question, self.episodes)
+        columns, steps = table.columns(), table.decisions
         return {
             "goals": sum(columns["goal"]),
             "collisions": sum(columns["collision"]),
             "interventions": sum(columns["interventions"]) / max(steps, 1),
             "steps": steps,
-            "decision_ms": found.decision_ms(),
+            "decision_ms": table.decision_ms(),
         }
 
 
 def markdown(result: dict[str, Any]) -> str:
-    """The rows as a table."""
+    """Return the rows as a Markdown table."""
     policies, episodes = result["study"]["policies"], result["study"]["episodes"]
     heads = ["certificate", "mode", "stop from rest", "from full speed", "plans outside", "at most"]
     heads += [f"{policy}: goals of {episodes}, interventions" for policy in policies]
@@ -110,9 +110,9 @@ def _length(metres: float) -> str:
 
 
 def _figures(row: dict[str, Any], policies: Sequence[str]) -> list[str]:
-    said, driving = row["statement"], row["driving"]
-    figures = [_length(said[name]) for name in ("half_width_rest", "half_width_full")]
-    figures += [f"{said['violations']} of {said['windows']}", f"{said['bound_plan']:.2%}"]
+    validation, driving = row["statement"], row["driving"]
+    figures = [_length(validation[name]) for name in ("half_width_rest", "half_width_full")]
+    figures += [f"{validation['violations']} of {validation['windows']}", f"{validation['bound_plan']:.2%}"]
     if driving is None:
         return figures + ["not driven: wider than the arena"] + [""] * (len(policies) - 1)
     return figures + [f"{driving[policy]['goals']}, {driving[policy]['interventions']:.1%}" for policy in policies]

@@ -270,7 +270,7 @@ def test_collecting_splits_where_something_else_moved_the_robot():
 
 
 def test_collecting_gives_up_if_every_episode_ends_at_once():
-    with pytest.raises(BadData, match="nothing to learn from"):
+    with pytest.raises(BadData, match="in a row ended before period"):
         collect(Toy(CAR, [Obstacle("cylinder", (0.0, 0.0), (0.1,))]), CAR, 10, state=seen, actions=normalised(CAR))
 
 

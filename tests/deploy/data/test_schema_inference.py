@@ -33,7 +33,7 @@ def test_a_drafted_description_is_checked_and_reads_the_log_it_was_made_from(dri
     log, path = write(tmp_path / {"csv": "drive.csv", "bag": "drive"}[kind], *driven), tmp_path / f"drafted-{kind}.toml"
     assert main(["robot", "new", str(path), "--from", str(log)]) == 0
     text = path.read_text()
-    assert "# The body can't be told from the log: measure it." in text and "# error: can't be told" in text
+    assert "# The body cannot be inferred from the log: measure it." in text and "# error: cannot be inferred" in text
     path.write_text(text.replace("radius = 0.2", "radius = 0.15").replace("sight = 3.0", "sight = 2.5"))
     capsys.readouterr()
     assert main(["robot", "check", str(path), "--json"]) == 0
@@ -105,7 +105,7 @@ def test_without_positions_or_inputs_it_says_what_is_missing(driven, tmp_path):
     out = tmp_path / "seen.toml"
     assert main(["robot", "new", str(out), "--from", str(path)]) == 0
     text = out.read_text()
-    assert "# no column is clearly an input" in text and "# Inputs can't be told from the log" in text
+    assert "# no column is clearly an input" in text and "# Inputs cannot be inferred from the log" in text
 
 
 @pytest.mark.parametrize("name", ["copter.bin", "copter.tlog", "px4.ulg"])
@@ -142,6 +142,8 @@ def test_of_several_robots_in_a_log_the_files_name_chooses(tmp_path, capsys):
         writer.add_metadata("robots", texts)
         writer.finish()
     assert main(["robot", "new", str(tmp_path / "mine.toml"), "--from", str(log)]) == 1
-    assert "is of ground, quadrotor: name the file after the one" in capsys.readouterr().err.replace("\n", " ")
+    assert "holds the robots ground, quadrotor: name the file after the one" in capsys.readouterr().err.replace(
+        "\n", " "
+    )
     assert main(["robot", "new", str(tmp_path / "quadrotor.toml"), "--from", str(log)]) == 0
     assert "horizon = 12" in (tmp_path / "quadrotor.toml").read_text()

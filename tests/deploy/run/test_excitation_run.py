@@ -42,7 +42,7 @@ def test_a_car_is_driven_inside_the_region_and_its_log_is_imported(tmp_path, cap
     driven = Dataset.load(data)
     assert driven.periods > 580 and len(windows(driven, robot.horizon, PLAN)) > 60
     assert main(words) == 1 and "is there already" in capsys.readouterr().err
-    assert main(["excite", CAR]) == 1 and "how it turns can't be told" in capsys.readouterr().err
+    assert main(["excite", CAR]) == 1 and "do not determine how it turns" in capsys.readouterr().err
 
 
 def test_a_robot_that_leaves_the_region_brakes_by_its_own_rule():
