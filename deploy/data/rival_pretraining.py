@@ -1,4 +1,4 @@
-"""`brakeline pretrain`: what a rival must know of a robot before it can filter anything, and what that costs."""
+"""Pre-train the networks that a rival needs before it can filter, and record the cost (`brakeline pretrain`)."""
 
 from __future__ import annotations
 
@@ -22,18 +22,18 @@ Each = Callable[[], object]
 
 @dataclass(frozen=True)
 class SecasRecipe:
-    """Dalal et al. have one hidden layer of 10 units, Adam at 1e-4, 1000 episodes of random actions."""
+    """Configuration of SECAS. Dalal et al. use one hidden layer of 10 units, Adam at 1e-4, 1000 random episodes."""
 
     samples: int = 40_000
     arena: str = "default"
     seed: int = 20_261
     fit: FitConfig = field(default_factory=lambda: FitConfig(hidden=(64, 64)))
-    margin: float = 0.1  # m beside the footprint: the bound C, tuned
+    margin: float = 0.1  # m added to the footprint: the bound C, tuned
 
 
 @dataclass(frozen=True)
 class SailrRecipe:
-    """Wagener et al.: three hidden layers of 256, Adam at 1e-3, γ 0.99, cost smoothed over 0.5, η 0.08."""
+    """Configuration of SAILR. Wagener et al. use three layers of 256, Adam at 1e-3, γ 0.99, smoothing 0.5, η 0.08."""
 
     samples: int = 80_000
     arena: str = "default"
@@ -42,7 +42,7 @@ class SailrRecipe:
     gamma: float = 0.99
     smoothing: float = 0.5  # m of clearance
     threshold: float = 0.08  # η, tuned
-    lead: int = 5  # periods of driving before braking, at the most
+    lead: int = 5  # largest number of periods before braking
 
 
 ModelConfig = SecasRecipe | SailrRecipe
@@ -51,20 +51,21 @@ RECIPES: dict[str, type[SecasRecipe] | type[SailrRecipe]] = {SECAS: SecasRecipe,
 
 
 def recipe_for(method: str, robot: RobotWithTask) -> ModelConfig:
-    """With the threshold that was found for this robot (deploy/experiments/experiments.md)."""
+    """Return the configuration with the tuned threshold of this robot (deploy/experiments/experiments.md)."""
     return RECIPES[method](**getattr(robot.task.rivals, method))
 
 
 def made_by(model: Pretrained, recipe: ModelConfig) -> bool:
-    """Was the model made by this recipe?"""
+    """Return whether the model was trained with this configuration."""
     return model.about.get("recipe") == json.dumps(asdict(recipe))
 
 
 def pretrain(robot: RobotWithTask, recipe: ModelConfig, each: Each = lambda: None) -> Pretrained:
-    """Drive, fit, and say what it took; `each` is called after every driven step.
+    """Record rollouts, fit the networks, and store the cost in `about`. Call `each` after every step.
 
     Raises:
-        TooFew: samples; ValueError: no simulator for the robot.
+        TooFew: there are too few samples.
+        ValueError: the robot has no simulator.
     """
     started = time.perf_counter()
     if isinstance(recipe, SecasRecipe):
@@ -94,7 +95,7 @@ def _secas(robot: RobotWithTask, recipe: SecasRecipe, each: Each) -> Made:
 
 
 def _sailr(robot: RobotWithTask, recipe: SailrRecipe, each: Each) -> Made:
-    """V from what braking came to; Q of every driven step from V after it, the more cautious of the two."""
+    """Fit V to the cost-to-go of braking, then Q of each step to the larger V after it."""
     gamma = recipe.gamma
     data = costs(robot, recipe.arena, recipe.samples, recipe.seed, gamma, recipe.smoothing, recipe.lead, each)
     v, v_error = fit_cost(robot, data.braked, data.braked_cost, 2, recipe.fit, recipe.seed)

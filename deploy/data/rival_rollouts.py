@@ -1,6 +1,6 @@
-"""Drives what the rivals are pre-trained on: random inputs for SECAS, drives that end in braking for SAILR.
+"""Record rollouts to pre-train the rivals: random inputs for SECAS, rollouts that end with braking for SAILR.
 
-Nothing stands between these drives and the obstacles: their collisions are part of what the rivals cost.
+No filter protects these rollouts. Their collisions are part of the cost of the rivals.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ from brakeline.sim.scripted_policies import Policy, scripted
 
 Array = NDArray[np.float64]
 
-APART = 5_000_000  # added to the seed: neither training nor evaluation draws its episodes from there
-DRIVERS = ("random", "greedy", "adversary")  # of the drives that end in braking
-STAND = 2  # periods that a stop is watched for after the input has come to zero
+SEED_OFFSET = 5_000_000  # added to the seed, so that training and evaluation use other episodes
+POLICIES = ("random", "greedy", "adversary")  # for rollouts that end with braking
+STANDING = 2  # periods to observe after the input is zero
 
 
 @dataclass(frozen=True)
 class Transitions:
-    """For SECAS: observation (N, o), action (N, m) scaled by the highest inputs, the constraints' change (N, K), m."""
+    """Data for SECAS: observations (N, o), actions (N, m) scaled by the bounds, constraint changes (N, K) in m."""
 
     observation: Array
     action: Array
@@ -38,11 +38,11 @@ class Transitions:
 
 @dataclass(frozen=True)
 class Costs:
-    """For SAILR, with the cost-to-go under the backup policy, in [0, 1].
+    """Data for SAILR; costs are in [0, 1].
 
-    Where braking was watched to its end: braked (N, o) observations and their cost (N,). Every step that was driven:
-    `driven` (M, o + m), observation and normalised action, the cost of the step itself (M,), what was observed after
-    it (M, o), and whether it ended in a collision (M,).
+    braked (N, o), braked_cost (N,): observations during braking, and the cost-to-go under the backup policy.
+    driven (M, o + m), step_cost (M,): observation and normalised action of every step, and the cost of the step.
+    after (M, o), collided (M,): next observation, and whether the step ended in a collision.
     """
 
     braked: Array
@@ -56,7 +56,7 @@ class Costs:
 
 @dataclass
 class _Drive:
-    """An environment under way, begun anew whenever its episode ends."""
+    """A running environment that starts a new episode when one ends."""
 
     env: Any
     collisions: int = 0
@@ -80,8 +80,8 @@ class _Drive:
 def transitions(
     robot: RobotWithTask, arena: str, samples: int, seed: int, each: Callable[[], object] = lambda: None
 ) -> Transitions:
-    """`samples` steps of random inputs, each held for some periods (Dalal et al. 2018, section 5.1)."""
-    drive = _Drive(environment(robot, arena, APART + seed))
+    """Record `samples` steps of random inputs, each held for some periods (Dalal et al. 2018, section 5.1)."""
+    drive = _Drive(environment(robot, arena, SEED_OFFSET + seed))
     policy = scripted("random", robot, np.random.default_rng((seed, 1)))
     constraints = Constraints(robot, robot.task.rays)
     rows: list[tuple[Any, Array, Array]] = []
@@ -106,15 +106,14 @@ def costs(
     lead: int,
     each: Callable[[], object] = lambda: None,
 ) -> Costs:
-    """About `samples` steps: up to `lead` periods of driving, then braking to a stop, and again (Wagener et al. 2021,
-    appendix D).
+    """Record about `samples` steps: repeatedly drive up to `lead` periods, then brake to a stop.
 
-    A step costs max(0, 1 − clearance/smoothing), smoothing in m, and a collision 1 for ever; sums are discounted by γ
-    and scaled by 1 − γ.
+    The cost of a step is max(0, 1 − clearance/smoothing), with smoothing in m; after a collision it stays 1. Sums are
+    discounted by γ and scaled by 1 − γ (Wagener et al. 2021, appendix D).
     """
-    drive = _Drive(environment(robot, arena, APART + seed))
+    drive = _Drive(environment(robot, arena, SEED_OFFSET + seed))
     rng = np.random.default_rng((seed, 2))
-    drivers = [scripted(name, robot, rng) for name in DRIVERS]
+    drivers = [scripted(name, robot, rng) for name in POLICIES]
     braked: list[tuple[Any, float]] = []
     driven: list[tuple[Array, float, Any, bool]] = []
 
@@ -129,7 +128,7 @@ def costs(
         each()
 
     def stop() -> None:
-        """Brake, and say what it came to from each of its states."""
+        """Brake to a stop and store the cost-to-go of each state."""
         seen, spent = [], []
         for action in _braking(robot, np.asarray(drive.info["input_in_force"])):
             seen.append(drive.observation)
@@ -158,14 +157,14 @@ def costs(
 
 
 def _varied(robot: RobotWithTask, action: Array, rng: np.random.Generator) -> Array:
-    """Half of the time another action instead: the critics are asked about every one."""
+    """Replace the action by a random one half of the time, because the critics must rate any action."""
     return action if rng.random() < 0.5 else rng.uniform(robot.low(), robot.high())
 
 
 def _braking(robot: RobotWithTask, before: Array) -> Iterator[Array]:
-    """The backup policy's inputs to a stop, and some periods of standing."""
+    """Yield the backup policy's inputs to a stop, and then some periods of standing."""
     standing = 0
-    while standing < STAND:
+    while standing < STANDING:
         before = brake(robot, before)
         standing += bool(robot.is_stop_input(before))
         yield before

@@ -1,6 +1,7 @@
-"""What a comparison has to find out, two at once, resuming from what is there.
+"""Run the jobs of an experiment in worker processes, and skip those that have a result.
 
-Nothing heavy here: a worker imports what its job needs."""
+Keep the imports of this module light: a worker imports what its job needs.
+"""
 
 from __future__ import annotations
 
@@ -18,15 +19,15 @@ from typing import Any, Protocol
 from brakeline.deploy.interpreter import spawning
 from brakeline.messaging.atomic_files import write_atomically
 
-LONGEST_LINE = 500  # characters of a job's progress
+LONGEST_LINE = 500  # characters per progress message
 
 
 class StaleResultError(ValueError):
-    """A result that is there was made with other settings."""
+    """An existing result was made with other settings."""
 
 
 class Job(Protocol):
-    """Something to find out: its place among the results, what it depends on, and how."""
+    """One job of an experiment: name of its result, configuration, and the run itself."""
 
     @property
     def robot(self) -> str: ...
@@ -41,24 +42,26 @@ def result_path(results: Path, job: Job) -> Path:
 
 
 def read(results: Path, job: Job) -> dict[str, Any] | None:
-    """The job's result, None if it has none yet.
+    """Return the stored result of a job, or None if there is none.
 
     Raises:
-        StaleResultError: it has one of other settings; the message names them.
+        StaleResultError: the result was made with other settings; the message names them.
     """
     path = result_path(results, job)
     if not path.exists():
         return None
-    found: dict[str, Any] = json.loads(path.read_text())
-    theirs, ours = found.get("study", {}), job.config()
-    differing = sorted(name for name in theirs | ours if theirs.get(name) != ours.get(name))
+    result: dict[str, Any] = json.loads(path.read_text())
+    stored, current = result.get("study", {}), job.config()
+    differing = sorted(name for name in stored | current if stored.get(name) != current.get(name))
     if differing:
-        raise StaleResultError(f"{path} was made with another {', '.join(differing)}: move it away, or give --again")
-    return found
+        raise StaleResultError(
+            f"{path} was made with another {', '.join(differing)}: move it away, or run again with --again"
+        )
+    return result
 
 
 def write(results: Path, job: Job, result: dict[str, Any]) -> Path:
-    """At once, and whole."""
+    """Write a result atomically, and return its path."""
     path = result_path(results, job)
     write_atomically(path, (json.dumps(result, separators=(",", ":")) + "\n").encode())
     return path
@@ -72,12 +75,16 @@ def complete(
     again: bool = False,
     say: Callable[[str, str], object] = lambda name, text: None,
 ) -> list[dict[str, Any]]:
-    """The jobs' results in their order; those that are not there yet are found out, `workers` at once.
+    """Run the jobs without a result, `workers` at a time, and return all results in order.
 
-    `say` is told a job's name and how far it is.
+    Args:
+        jobs: the jobs; results, runs: folders of results and of run data.
+        again: delete existing results first.
+        say: called with a job's name and its progress.
 
     Raises:
-        StaleResultError: before anything is run; or whatever a job raised, once the others under way are done.
+        StaleResultError: a result was made with other settings; raised before any job runs.
+        Any exception of a job, after the jobs that already run have ended.
     """
     if again:
         for job in jobs:
@@ -87,19 +94,19 @@ def complete(
         for job in missing:
             write(results, job, job.run(runs / job.robot / job.name, lambda text, job=job: say(job.name, text)))  # type: ignore[misc]
     else:
-        _side_by_side(missing, results, runs, workers, say)
-    found = [read(results, job) for job in jobs]
-    return [result for result in found if result is not None]
+        _run_in_workers(missing, results, runs, workers, say)
+    stored = [read(results, job) for job in jobs]
+    return [result for result in stored if result is not None]
 
 
-def _side_by_side(
+def _run_in_workers(
     jobs: Sequence[Job], results: Path, runs: Path, workers: int, say: Callable[[str, str], object]
 ) -> None:
-    """Each in a process of its own."""
+    """Run each job in a process of its own."""
     context = spawning()
     reader, writer = context.Pipe(duplex=False)
-    with reader, writer, ProcessPoolExecutor(workers, context, initializer=_begin_work, initargs=(writer,)) as pool:
-        under_way = {pool.submit(_found_out, job, results, runs): job for job in jobs}
+    with reader, writer, ProcessPoolExecutor(workers, context, initializer=_start_worker, initargs=(writer,)) as pool:
+        under_way = {pool.submit(_run_job, job, results, runs): job for job in jobs}
         while under_way:
             done, _ = wait(under_way, timeout=0.5, return_when=FIRST_COMPLETED)
             while reader.poll():
@@ -116,28 +123,30 @@ def _side_by_side(
 _to_parent: list[Connection] = []  # in a worker: the pipe on which it reports its progress
 
 
-def _begin_work(progress: Connection) -> None:
-    """Begin a worker. It has one thread for NumPy, for two processes with two threads each on two cores are slower. It
-    ends with its parent, however that one ends."""
+def _start_worker(progress: Connection) -> None:
+    """Start a worker that ends with its parent, however the parent ends.
+
+    NumPy gets one thread: two processes with two threads each are slower on two cores.
+    """
     _to_parent.append(progress)
     for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ[name] = "1"
-    signal.signal(signal.SIGINT, signal.SIG_DFL)  # ^C is meant for them too, and needs no traceback
+    signal.signal(signal.SIGINT, signal.SIG_DFL)  # Ctrl-C ends workers too, without a traceback
 
-    def follow() -> None:
+    def exit_with_parent() -> None:
         parent = multiprocessing.parent_process()
         assert parent is not None
         parent.join()
         os._exit(1)
 
-    threading.Thread(target=follow, name="follow the parent", daemon=True).start()
+    threading.Thread(target=exit_with_parent, name="exit with parent", daemon=True).start()
 
 
-def _found_out(job: Job, results: Path, runs: Path) -> None:
-    """Run a job in a worker: its result is on the disk before the parent knows of it."""
+def _run_job(job: Job, results: Path, runs: Path) -> None:
+    """Run a job in a worker, and write its result before the parent learns that it ended."""
 
     def say(text: str) -> None:
-        # Not longer than a pipe takes at once (4096 bytes): the workers share it.
+        # The workers share the pipe, which writes up to 4096 bytes atomically.
         line = json.dumps([job.name, text[:LONGEST_LINE]], ensure_ascii=False)
         _to_parent[0].send_bytes(line.encode(errors="replace"))
 

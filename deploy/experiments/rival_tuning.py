@@ -1,7 +1,7 @@
-"""The one threshold that each rival has, tried in closed loop: how `rivals` in the tasks' files was found.
+"""Tune the threshold of each rival in closed loop; the results are the `rivals` of the task files.
 
-The rule, for both alike: of the values that cost the map's oracle (A*) no goal, the one with the fewest collisions of
-the greedy driver, who goes straight for the goal; of equals the one with the greedy driver's most goals.
+The rule is the same for both rivals. Among the values with which A* loses no goal, choose the one with the fewest
+collisions of the greedy policy, which drives straight to the goal. Break ties by the goals of the greedy policy.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ SETTING = {SECAS: "clearance", SAILR: "threshold"}
 
 @dataclass(frozen=True)
 class ThresholdTrial:
-    """A value of the threshold (SECAS: m beside the footprint; SAILR: η), and what came of `episodes` a driver."""
+    """A threshold (SECAS: margin to the footprint in m; SAILR: η) and its results over `episodes` per policy."""
 
     value: float
     episodes: int
@@ -40,26 +40,26 @@ class ThresholdTrial:
 
 
 def values_for(model: Pretrained, robot: RobotWithTask) -> tuple[float, ...]:
-    """The four that are tried."""
+    """Return the thresholds to try."""
     return robot.task.rivals.margins if model.method == SECAS else ADVANTAGES
 
 
 def try_threshold(
     model: Pretrained, robot: RobotWithTask, value: float, episodes: int, arena: str = "default"
 ) -> ThresholdTrial:
-    """The model with another threshold, on fresh episodes."""
+    """Evaluate the model with another threshold on fresh episodes."""
     setting = robot.footprint + value if model.method == SECAS else value
     question = in_process(replace(model, settings=dict(model.settings) | {SETTING[model.method]: setting}))
-    found = {}
+    tables = {}
     for name in (ORACLE, GREEDY):
         driver = EpisodeRunner(robot, environment(robot, arena, FRESH), ActorIdentity("tune", 0, 0))
-        found[name] = evaluate(driver, policy_named(name, robot, 0), question, episodes)
-    oracle, greedy = found[ORACLE].columns(), found[GREEDY].columns()
+        tables[name] = evaluate(driver, policy_named(name, robot, 0), question, episodes)
+    oracle, greedy = tables[ORACLE].columns(), tables[GREEDY].columns()
     return ThresholdTrial(
         value,
         episodes,
         int(sum(oracle["goal"])),
-        sum(oracle["interventions"]) / max(found[ORACLE].decisions, 1),
+        sum(oracle["interventions"]) / max(tables[ORACLE].decisions, 1),
         int(sum(greedy["goal"])),
         int(sum(greedy["collision"])),
     )
@@ -72,7 +72,7 @@ def tune_threshold(
     episodes: int,
     say: Callable[[ThresholdTrial], object] = lambda row: None,
 ) -> list[ThresholdTrial]:
-    """A row for each value, told as soon as it is known."""
+    """Evaluate every value, and call `say` after each one."""
     rows = []
     for value in values:
         rows.append(try_threshold(model, robot, value, episodes))
@@ -81,7 +81,7 @@ def tune_threshold(
 
 
 def best_threshold(rows: Sequence[ThresholdTrial]) -> ThresholdTrial:
-    """By the rule above."""
+    """Return the best row by the rule of this module."""
     most = max(row.oracle_goals for row in rows)
-    unharmed = [row for row in rows if row.oracle_goals == most]
-    return min(unharmed, key=lambda row: (row.greedy_collisions, -row.greedy_goals))
+    without_loss = [row for row in rows if row.oracle_goals == most]
+    return min(without_loss, key=lambda row: (row.greedy_collisions, -row.greedy_goals))

@@ -1,8 +1,8 @@
-"""A policy's training or evaluation in one process, step by step and logged: what `compare` repeats bit for bit.
+"""Train or evaluate a policy in one process, so that `compare` is reproducible bit by bit.
 
-The same parts as in a launched run (driver, safety service's core, learner, one buffer), called in turn instead of over
-the bus, so that nothing depends on timing but the times themselves. Steps and episodes go to an MCAP log of the same
-schema; the observations stay out of it, which the figures do not need.
+The parts are those of a launched run (episode runner, core of the safety service, learner, one buffer). They are called
+in turn instead of over the bus, so that only measured times depend on timing. Steps and episodes go to an MCAP log of
+the same schema, without observations.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ from brakeline.messaging.policy_weights import MLP, decode
 from brakeline.messaging.topics import EPISODE, STEP, Topic
 from brakeline.sim.scripted_policies import Policy, scripted
 
-FLUSH = 2000  # messages between two writes
-RUN = 1  # in place of a process's random number
+FLUSH = 2000  # messages per write
+RUN = 1  # run number: a launched process has a random one
 CONTACTS = ("contact_moving", "contact_standing")
 COLUMNS = (
     *("steps", "goal", "collision", "timeout", "reward", "speed", "fastest", "interventions", "milliseconds"),
@@ -35,7 +35,7 @@ COLUMNS = (
 
 
 class TrialLog:
-    """Steps and episodes in an MCAP file, as a recorder would have stored them. A file that is there is replaced."""
+    """Writes steps and episodes to an MCAP file as the recorder does. An existing file is replaced."""
 
     def __init__(self, path: Path, metadata: dict[str, dict[str, str]]) -> None:
         path.unlink(missing_ok=True)
@@ -70,7 +70,7 @@ class TrialLog:
 
 @dataclass
 class EpisodeTable:
-    """One row per finished episode, and the times of every decision.
+    """One row per finished episode, and statistics of the decision times.
 
     steps; goal, collision, timeout (0 or 1); reward without penalties; speed [m/s] summed over steps, and the highest;
     interventions; milliseconds of policy and method, summed over steps; contact with what moves, moving and standing.
@@ -83,7 +83,7 @@ class EpisodeTable:
     _running: list[float] = field(default_factory=lambda: [0.0] * len(COLUMNS))
 
     def step(self, step: pb.Step) -> None:
-        """Take the next step, in order."""
+        """Add the next step."""
         row, spent = self._running, step.propose_ms + step.decide_ms
         failsafe = step.fallback or step.decision == pb.FAILSAFE
         row[0] += 1
@@ -105,7 +105,7 @@ class EpisodeTable:
             self._running = [0.0] * len(COLUMNS)
 
     def columns(self) -> dict[str, list[float]]:
-        """Rounded to what a table could ever show; counts are integers."""
+        """Return the columns, rounded to four digits; counts are integers."""
         table = np.array(self.rows).reshape(-1, len(COLUMNS)).T
         whole = {"steps", "goal", "collision", "timeout", "interventions", *CONTACTS}
         return {
@@ -120,7 +120,7 @@ class EpisodeTable:
 
 @dataclass(frozen=True)
 class Proposal:
-    """An action (m,) and how long it took to think of, ms."""
+    """An action (m,) and the time that the policy needed, in ms."""
 
     action: NDArray[np.float64]
     ms: float
@@ -130,7 +130,7 @@ Propose = Callable[[EpisodeRunner], Proposal]
 
 
 def timed_policy(policy: Policy) -> Propose:
-    """A policy, timed."""
+    """Wrap a policy so that it measures its own time."""
 
     def propose(driver: EpisodeRunner) -> Proposal:
         before = time.perf_counter_ns()
@@ -141,29 +141,29 @@ def timed_policy(policy: Policy) -> Propose:
 
 
 def take_step(driver: EpisodeRunner, propose: Propose, question: Ask | None, version: int = 0) -> pb.Step:
-    """Propose, ask, act."""
+    """Take one step: propose an action, request a decision, execute it."""
     proposal = propose(driver)
     outcome = driver.decide(proposal.action, question)
     if outcome is not None and outcome.answer is None:
-        raise RuntimeError(f"no decision: {outcome.failure}")  # in one process that is a defect, never the network
+        raise RuntimeError(f"no decision: {outcome.failure}")  # in one process this is a defect, never the network
     step = driver.execute(proposal.action, outcome, version)
     step.propose_ms = proposal.ms
     return step
 
 
 def without_observations(step: pb.Step) -> pb.Step:
-    kept = pb.Step()
-    kept.CopyFrom(step)
-    kept.ClearField("observation")
-    kept.ClearField("next_observation")
-    kept.ClearField("path")
-    return kept
+    """Return a copy of a step without observations and path."""
+    copy = pb.Step()
+    copy.CopyFrom(step)
+    for name in ("observation", "next_observation", "path"):
+        copy.ClearField(name)
+    return copy
 
 
 def evaluate(
     driver: EpisodeRunner, policy: Policy, question: Ask | None, episodes: int, log: TrialLog | None = None
 ) -> EpisodeTable:
-    """The policy without exploration, through episodes 0 to `episodes` − 1 of the driver's environment."""
+    """Run the policy without exploration through episodes 0 to `episodes` − 1 of the environment."""
     found, propose = EpisodeTable(), timed_policy(policy)
     for number in range(episodes):
         message = driver.begin(number)
@@ -178,7 +178,7 @@ def evaluate(
 
 
 class Trainer:
-    """One driver and one learner in lockstep: every step is learned from, as far as it is due, before the next."""
+    """One episode runner and one learner in lockstep: the learner makes all due updates before the next step."""
 
     def __init__(self, driver: EpisodeRunner, question: Ask | None, learner: Learner) -> None:
         self.driver, self.question, self.learner = driver, question, learner
@@ -187,7 +187,7 @@ class Trainer:
         self.policy: MLP = decode(reply.weights.file, robot)
 
     def run(self, log: TrialLog | None = None) -> Iterator[pb.Step]:
-        """The steps of the whole run, as they are taken."""
+        """Yield the steps of the whole training."""
         episode = 0
         while not self.learner.done:
             if not self.driver.running:
