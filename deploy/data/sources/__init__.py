@@ -1,1 +1,1 @@
-"""Readers of recordings, one a format: each gives tables (`table.py`) with the names of `quantities.py`."""
+"""Readers, one per file format: each returns tables (`source_table`) with the names of `quantity_names`."""

@@ -1,4 +1,4 @@
-"""Accelerations in the world, out of what accelerometers feel along a body and how that was turned."""
+"""Compute accelerations in the world frame from accelerometers and attitudes."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from scipy.spatial.transform import Rotation
 from brakeline.deploy.data.sources.quantity_names import AXES
 from brakeline.deploy.data.sources.source_table import Array, Table
 
-FORCE = tuple(f"force.{axis}" for axis in AXES)  # m/s², felt forward, right, down
-ATTITUDE = ("attitude.yaw", "attitude.pitch", "attitude.roll")  # rad, one after the other, from NED to that frame
+FORCE = tuple(f"force.{axis}" for axis in AXES)  # m/s², specific force: forward, right, down
+ATTITUDE = ("attitude.yaw", "attitude.pitch", "attitude.roll")  # rad, intrinsic rotations from NED to the body
 GRAVITY = 9.80665  # m/s²
-APART = 0.5  # s between two attitudes, at most, to know one in between
+MAX_GAP = 0.5  # s between two attitudes for interpolation
 
 
 def add_accelerations(tables: Sequence[Table]) -> list[Table]:
-    """The same tables; those with a force have the acceleration that it shows, where an attitude is known then."""
+    """Add accelerations (NaN without an attitude) to the tables that contain specific forces."""
     attitudes = min((t for t in tables if ATTITUDE[0] in t.columns), key=lambda t: t.rank, default=None)
     if attitudes is None or len(attitudes.time) < 2:
         return list(tables)
@@ -28,13 +28,13 @@ def add_accelerations(tables: Sequence[Table]) -> list[Table]:
 
 
 def _accelerations(felt: Table, attitudes: Table) -> dict[str, Array]:
-    time, own = felt.time, attitudes.time
-    angles = [np.interp(time, own, np.unwrap(attitudes.columns[name])) for name in ATTITUDE]
+    time, known_at = felt.time, attitudes.time
+    angles = [np.interp(time, known_at, np.unwrap(attitudes.columns[name])) for name in ATTITUDE]
     force = np.column_stack([felt.columns[name] for name in FORCE])
     north, east, down = Rotation.from_euler("ZYX", np.column_stack(angles)).apply(force).T
-    after = np.searchsorted(own, time)
-    inside = (after > 0) & (after < len(own))
-    after = np.clip(after, 1, len(own) - 1)
-    known = inside & (own[after] - own[after - 1] < APART)
+    after = np.searchsorted(known_at, time)
+    inside = (after > 0) & (after < len(known_at))
+    after = np.clip(after, 1, len(known_at) - 1)
+    known = inside & (known_at[after] - known_at[after - 1] < MAX_GAP)
     values = (east, north, -down - GRAVITY)
     return {f"acceleration.{axis}": np.where(known, value, np.nan) for axis, value in zip(AXES, values, strict=True)}

@@ -1,4 +1,4 @@
-"""Attitudes and frames, as formats have them."""
+"""Convert attitudes and frames of log formats."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ from collections.abc import Sequence
 
 
 def yaw_of(x: float, y: float, z: float, w: float) -> float:
-    """rad about the vertical, from x to y, of a quaternion of any length."""
+    """Return the yaw in rad, from x to y, of a quaternion of any length."""
     return math.atan2(2.0 * (w * z + x * y), w * w + x * x - y * y - z * z)
 
 
 def turned(q: Sequence[float], v: Sequence[float]) -> tuple[float, float, float]:
-    """A vector (3,) of the body in the world, by its attitude, a quaternion (x, y, z, w)."""
+    """Rotate a vector (3,) from the body to the world by the attitude quaternion (x, y, z, w)."""
     x, y, z, w = q
     n = 2.0 / (x * x + y * y + z * z + w * w)
     a, b, c = v
@@ -24,10 +24,10 @@ def turned(q: Sequence[float], v: Sequence[float]) -> tuple[float, float, float]
 
 
 def from_ned(north: float, east: float, down: float) -> tuple[float, float, float]:
-    """The same vector in ENU."""
+    """Convert a vector from NED to ENU."""
     return east, north, -down
 
 
 def yaw_from_ned(yaw: float) -> float:
-    """rad from x to y in ENU, of one from north to east."""
+    """Convert a yaw from NED (north to east) to ENU (x to y), in rad."""
     return math.pi / 2.0 - yaw

@@ -1,7 +1,7 @@
-"""ArduPilot's own logs (.bin): a table a kind of message, in ENU and rad beside what the message has.
+"""Read ArduPilot's logs (.bin): one table per message type, with quantities in ENU and rad added.
 
-Inputs are what the autopilot was told: a rover's desired speed and turn rate; the velocities that a copter was sent in
-guided mode, or, where nobody sent any, those that its own position control aimed at.
+Inputs are the setpoints: desired speed and turn rate of a rover; the velocities that a copter received in guided mode
+or, if there are none, the targets of its own position control.
 """
 
 from __future__ import annotations
@@ -17,16 +17,16 @@ from pymavlink import DFReader
 
 from brakeline.deploy.data.sources.acceleration import add_accelerations
 from brakeline.deploy.data.sources.angles import yaw_from_ned
-from brakeline.deploy.data.sources.message_rows import Kept, Kinds, Row, along_body, vector
+from brakeline.deploy.data.sources.message_rows import Kinds, MessageRows, Row, along_body, vector
 from brakeline.deploy.data.sources.source_table import NoSource, Table
 
 CENTI = 0.01
-GUIDED_VELOCITY = 2  # of GUID's types
-AIMED = 1  # rank of what a controller aims at, behind what it was told
+GUIDED_VELOCITY = 2  # type of a GUID message
+TARGET = 1  # rank of controller targets, behind received setpoints
 
 
 def _filter(m: Any) -> Row | None:
-    """The first core of the state estimator."""
+    """Return state quantities from the first core of the estimator."""
     if getattr(m, "C", 0) != 0:
         return None
     roll, pitch, down_turned = (math.radians(angle) for angle in (m.Roll, m.Pitch, m.Yaw))
@@ -36,14 +36,14 @@ def _filter(m: Any) -> Row | None:
 
 
 def _inertial(m: Any) -> Row | None:
-    """The first unit's."""
+    """Return yaw rate and specific force from the first unit."""
     if getattr(m, "I", 0) != 0:
         return None
     return {"yaw rate": -m.GyrZ, "force.x": m.AccX, "force.y": m.AccY, "force.z": m.AccZ}
 
 
 def _guided(m: Any) -> Row | None:
-    """North, east, up, in cm/s whatever the log says its unit is."""
+    """Return a guided velocity. The log holds cm/s (north, east, up), whatever unit it declares."""
     return (
         vector("command.velocity", (CENTI * m.vX, CENTI * m.vY, -CENTI * m.vZ)) if m.Type == GUIDED_VELOCITY else None
     )
@@ -56,22 +56,22 @@ KINDS: Kinds = {
     "THR": (0, lambda m: {"command.body.x": m.DesSpeed}),
     "STER": (0, lambda m: {"command.yaw rate": -math.radians(m.DesTurnRate)}),
     "GUID": (0, _guided),
-    "PSCN": (AIMED, lambda m: {"command.velocity.y": m.DVN}),
-    "PSCE": (AIMED, lambda m: {"command.velocity.x": m.DVE}),
-    "PSCD": (AIMED, lambda m: {"command.velocity.z": -m.DVD}),
-    "PSC": (AIMED, lambda m: {"command.velocity.x": m.TVY, "command.velocity.y": m.TVX}),
-    "CTUN": (AIMED, lambda m: {"command.velocity.z": CENTI * m.DCRt} if hasattr(m, "DCRt") else None),
+    "PSCN": (TARGET, lambda m: {"command.velocity.y": m.DVN}),
+    "PSCE": (TARGET, lambda m: {"command.velocity.x": m.DVE}),
+    "PSCD": (TARGET, lambda m: {"command.velocity.z": -m.DVD}),
+    "PSC": (TARGET, lambda m: {"command.velocity.x": m.TVY, "command.velocity.y": m.TVX}),
+    "CTUN": (TARGET, lambda m: {"command.velocity.z": CENTI * m.DCRt} if hasattr(m, "DCRt") else None),
 }
 
 
 def read(path: Path) -> list[Table]:
-    """Raises NoSource: it is no such log, or has none of the messages."""
+    """Read a log. Raises NoSource if the file is not an ArduPilot log, or has none of the messages."""
     try:
         log = DFReader.DFReader_binary(str(path))
-    except Exception as error:  # whatever pymavlink stumbles over
-        raise NoSource(f"{path} is no log of ArduPilot: {error}") from error
-    kept = Kept(path, KINDS)
+    except Exception as error:  # pymavlink raises many types on damaged files
+        raise NoSource(f"{path} is not an ArduPilot log: {error}") from error
+    rows = MessageRows(path, KINDS)
     while (message := log.recv_match(type=list(KINDS))) is not None:
-        kept.take(message.get_type(), int(message.TimeUS), message)
+        rows.add(message.get_type(), int(message.TimeUS), message)
     log.close()
-    return add_accelerations(kept.tables())
+    return add_accelerations(rows.tables())

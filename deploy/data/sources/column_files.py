@@ -1,4 +1,4 @@
-"""Tables in files: CSV, Parquet. `time` [s], a column for each coordinate and input by its name, and maybe `run`."""
+"""Read CSV and Parquet files: `time` in s, a column per coordinate and input, and optionally `run`."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ TIME, RUN = "time", "run"
 
 
 def read_csv(path: Path) -> list[Table]:
-    """Raises NoSource, with line and column, for what is no number; an empty cell is no value."""
+    """Read a CSV file; an empty cell is a missing value. Raises NoSource with the line of a malformed cell."""
     with path.open(newline="", encoding="utf-8-sig") as file:
         rows = csv.reader(file)
         names = [name.strip() for name in next(rows, [])]
@@ -24,7 +24,9 @@ def read_csv(path: Path) -> list[Table]:
             if not row:
                 continue
             if len(row) != len(names):
-                raise NoSource(f"{path}, line {rows.line_num}: {len(row)} cells, the first line names {len(names)}")
+                raise NoSource(
+                    f"{path}, line {rows.line_num}: {len(row)} cells, but the first line has {len(names)} names"
+                )
             try:
                 values.append([float(cell) if cell.strip() else np.nan for cell in row])
             except ValueError as error:
@@ -34,17 +36,17 @@ def read_csv(path: Path) -> list[Table]:
 
 
 def read_parquet(path: Path) -> list[Table]:
-    """Raises NoSource for a file that is none; columns that hold no numbers are passed over."""
+    """Read a Parquet file without its non-numeric columns. Raises NoSource if it is not a Parquet file."""
     try:
         read = parquet.read_table(path)
     except arrow.ArrowException as error:
         raise NoSource(f"{path}: {error}") from error
-    kept = {
+    columns = {
         name: np.asarray(read[name].cast(arrow.float64()).to_numpy(zero_copy_only=False), float)
         for name in read.column_names
         if arrow.types.is_integer(read[name].type) or arrow.types.is_floating(read[name].type)
     }
-    return [_table(path, kept, len(kept))]
+    return [_table(path, columns, len(columns))]
 
 
 def _table(path: Path, columns: dict[str, np.ndarray], count: int) -> Table:
@@ -52,10 +54,13 @@ def _table(path: Path, columns: dict[str, np.ndarray], count: int) -> Table:
         raise NoSource(f"{path}: two columns have the same name")
     time = columns.pop(TIME, None)
     if time is None or not len(time):
-        raise NoSource(f"{path}: no column `{TIME}` [s] with rows below it; there are: {', '.join(columns) or 'none'}")
+        raise NoSource(
+            f"{path}: the file needs a column `{TIME}` in s with at least one row; the columns are: "
+            f"{', '.join(columns) or 'none'}"
+        )
     run = columns.pop(RUN, np.zeros(len(time)))
     if not np.isfinite(run).all():
         raise NoSource(f"{path}: a row without a number in `{RUN}`")
-    # Numbered as they come: a name of a run is only a name.
+    # Only the identity of a run matters: number the runs.
     starts = np.unique(run, return_inverse=True)[1].astype(np.intp)
     return Table("", time - np.nanmin(time), columns, starts)

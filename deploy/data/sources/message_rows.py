@@ -1,4 +1,4 @@
-"""Rows of messages, by kind, on the way to tables: what the readers of MAVLink and of ArduPilot's logs share."""
+"""Collect rows of messages and convert them to tables, for the readers of MAVLink and ArduPilot logs."""
 
 from __future__ import annotations
 
@@ -13,30 +13,33 @@ from brakeline.deploy.data.sources.quantity_names import AXES
 from brakeline.deploy.data.sources.source_table import NoSource, Table, table_of
 
 Row = dict[str, float]
-Kinds = dict[str, tuple[int, Callable[[Any], Row | None]]]  # a kind's rank, and what a message of it adds to its fields
+Kinds = dict[
+    str, tuple[int, Callable[[Any], Row | None]]
+]  # message type -> (rank, function that returns added quantities)
 
 
 def vector(kind: str, ned: tuple[float, float, float]) -> Row:
-    """A vector in NED by the names that quantities have in ENU."""
+    """Convert a vector from NED to named quantities in ENU."""
     return {f"{kind}.{axis}": value for axis, value in zip(AXES, from_ned(*ned), strict=True)}
 
 
 def along_body(velocity: Row, yaw: float) -> Row:
-    """The same velocity forward, left and up."""
+    """Convert a velocity to forward, left and up."""
     x, y = velocity["velocity.x"], velocity["velocity.y"]
     cos, sin = math.cos(yaw), math.sin(yaw)
     return {"body.x": cos * x + sin * y, "body.y": cos * y - sin * x, "body.z": velocity["velocity.z"]}
 
 
-class Kept:
-    """Of one file."""
+class MessageRows:
+    """The rows of one file, by message type."""
 
     def __init__(self, path: Path, kinds: Kinds) -> None:
         self.path, self.kinds = path, kinds
         self.stamps: dict[str, list[int]] = defaultdict(list)
         self.rows: dict[str, list[Row]] = defaultdict(list)
 
-    def take(self, kind: str, micros: int, message: Any) -> None:
+    def add(self, kind: str, micros: int, message: Any) -> None:
+        """Add a message with its time stamp in µs."""
         row = self.kinds[kind][1](message)
         if row is not None:
             fields = message.to_dict().items()
@@ -45,8 +48,8 @@ class Kept:
             self.rows[kind].append(numbers | row)
 
     def tables(self) -> list[Table]:
-        """Raises NoSource: there are none."""
+        """Return one table per message type. Raises NoSource if there is no message."""
         if not self.rows:
-            raise NoSource(f"{self.path}: none of {', '.join(self.kinds)} is in it")
+            raise NoSource(f"{self.path}: the log contains none of the messages {', '.join(self.kinds)}")
         since = min(min(stamps) for stamps in self.stamps.values())
         return [table_of(k, self.stamps[k], rows, since, self.kinds[k][0]) for k, rows in self.rows.items()]

@@ -1,4 +1,4 @@
-"""PX4's own logs (.ulg): a table a message, in ENU beside PX4's NED; setpoints are the inputs."""
+"""Read PX4's logs (.ulg): one table per message, with quantities in ENU added. Setpoints are the inputs."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ MESSAGES = ("vehicle_local_position", "vehicle_angular_velocity", "trajectory_se
 
 
 def read(path: Path) -> list[Table]:
-    """Raises NoSource: it is no such log, or has none of the messages."""
+    """Read a log. Raises NoSource if the file is not a ULog, or has none of the messages."""
     try:
         log = ULog(str(path), list(MESSAGES))
-    except Exception as error:  # whatever pyulog stumbles over in a damaged file
-        raise NoSource(f"{path} is no ULog: {error}") from error
-    found = [one for one in log.data_list if one.multi_id == 0 and len(one.data["timestamp"])]
-    if not found:
-        raise NoSource(f"{path}: none of {', '.join(MESSAGES)} is in it")
-    since = min(int(one.data["timestamp"][0]) for one in found)
-    return [_table(one.name, one.data, since) for one in found]
+    except Exception as error:  # pyulog raises many types on damaged files
+        raise NoSource(f"{path} is not a ULog file: {error}") from error
+    messages = [one for one in log.data_list if one.multi_id == 0 and len(one.data["timestamp"])]
+    if not messages:
+        raise NoSource(f"{path}: the log contains none of the messages {', '.join(MESSAGES)}")
+    since = min(int(one.data["timestamp"][0]) for one in messages)
+    return [_table(one.name, one.data, since) for one in messages]
 
 
 def _table(name: str, data: dict[str, Any], since: int) -> Table:

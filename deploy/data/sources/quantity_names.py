@@ -1,7 +1,7 @@
-"""Which column of which table is which coordinate of a robot.
+"""Map the columns of a source to the coordinates and inputs of a robot.
 
-A column of a file is found by the coordinate's own name, one of a message by the quantity it is, either by `--map
-NAME=TABLE/FIELD`. Readers of messages give the names below, in SI units and ENU, whatever their source has.
+In a file of columns, the name of a coordinate is the name of its column. In messages, the quantity decides. The option
+`--map NAME=TABLE/FIELD` overrides both. Readers of messages return these quantities, in SI units and ENU:
 
     position.x position.y position.z   m        yaw             rad, from x to y
     velocity.x ... (in the world)      m/s      yaw rate        rad/s
@@ -21,21 +21,20 @@ COMMAND = "command"
 
 
 def split(label: str) -> tuple[str, str]:
-    """Name and unit of `name [unit]`."""
+    """Split a label `name [unit]` into name and unit."""
     name, _, unit = label.rpartition(" [")
     return name, unit.removesuffix("]")
 
 
 def column_names(robot: Robot) -> tuple[list[str], list[str]]:
-    """The names that the state's and the inputs' columns have; an input that shares its name with a coordinate of the
-    state is `command NAME`."""
+    """Return the column names of states and inputs. An input with the name of a coordinate becomes `command NAME`."""
     states = [split(label)[0] for label in robot.state]
     inputs = [split(label)[0] for label in robot.action]
     return states, [f"{COMMAND} {name}" if name in states else name for name in inputs]
 
 
 def quantities(robot: Robot) -> dict[str, str]:
-    """For each of its columns the quantity it is by role and unit, where that is plain."""
+    """Return the quantity of each column whose role and unit determine it."""
     states, inputs = column_names(robot)
     frame = "velocity" if robot.heading is None else "body"
     found: dict[str, str] = {}
@@ -63,52 +62,56 @@ def quantities(robot: Robot) -> dict[str, str]:
 
 
 def mapping(words: Iterable[str], robot: Robot) -> dict[str, str]:
-    """`--map` options as {column: TABLE/FIELD}.
+    """Parse `--map` options to {column: TABLE/FIELD}.
 
     Raises:
-        NoSource: one is none, or its name is none of the robot's.
+        NoSource: an option is malformed, or its name is not a column of the robot.
     """
     states, inputs = column_names(robot)
     found: dict[str, str] = {}
     for word in words:
         name, equals, place = word.partition("=")
         if not equals or name not in (*states, *inputs):
-            raise NoSource(f"--map {word!r}: NAME=TABLE/FIELD, where NAME is one of {', '.join((*states, *inputs))}")
+            raise NoSource(
+                f"--map {word!r} must be NAME=TABLE/FIELD, where NAME is one of {', '.join((*states, *inputs))}"
+            )
         found[name] = place
     return found
 
 
 def resolve(tables: Sequence[Table], robot: Robot, chosen: dict[str, str]) -> dict[str, tuple[Table, str]]:
-    """For each column of the robot the table and the field in it.
+    """Find the table and the field of each column of the robot.
 
     Raises:
-        NoSource: with everything that is missing, or that several tables offer, and what there is.
+        NoSource: columns are missing or ambiguous; the message lists them all, and the content of the source.
     """
     usual = quantities(robot)
     found: dict[str, tuple[Table, str]] = {}
     problems: list[str] = []
     for name in (*column_names(robot)[0], *column_names(robot)[1]):
         if name in chosen:
-            offers = [(t, f) for t in tables for f in t.columns if chosen[name] in (f"{t.name}/{f}", f)]
+            candidates = [(t, f) for t in tables for f in t.columns if chosen[name] in (f"{t.name}/{f}", f)]
             wanted = f"{chosen[name]!r} (--map)"
         else:
-            # A message's `x` may be another's north: names count in files of columns alone.
-            offers = [(t, name) for t in tables if not t.name and name in t.columns]
-            offers = offers or [(t, usual[name]) for t in tables if usual.get(name) in t.columns]
+            # `x` of a message may point north: match by name only in files of columns.
+            candidates = [(t, name) for t in tables if not t.name and name in t.columns]
+            candidates = candidates or [(t, usual[name]) for t in tables if usual.get(name) in t.columns]
             wanted = f"a column {name!r}" + (f" or a message with {usual[name]}" if name in usual else "")
-        offers = [offer for offer in offers if offer[0].rank == min(table.rank for table, _ in offers)]
-        if len(offers) == 1:
-            found[name] = offers[0]
-        elif offers:
-            many = ", ".join(f"{t.name}/{f}" for t, f in offers)
-            problems.append(f"{name}: several have it; choose with --map {name!r}=TABLE/FIELD: {many}")
+        candidates = [
+            candidate for candidate in candidates if candidate[0].rank == min(table.rank for table, _ in candidates)
+        ]
+        if len(candidates) == 1:
+            found[name] = candidates[0]
+        elif candidates:
+            many = ", ".join(f"{t.name}/{f}" for t, f in candidates)
+            problems.append(f"{name}: several fields match; choose one with --map {name!r}=TABLE/FIELD: {many}")
         else:
             problems.append(f"{name}: there is no {wanted.removeprefix('a ')}")
     if problems:
-        there = "; ".join(f"{t.name or 'columns'}: {', '.join(t.columns)}" for t in tables) or "nothing"
+        available = "; ".join(f"{t.name or 'columns'}: {', '.join(t.columns)}" for t in tables) or "nothing"
         raise NoSource(
-            "what the robot's description names is not all in the source:\n  "
+            "the source does not contain every column of the robot's description:\n  "
             + "\n  ".join(problems)
-            + f"\nthere is: {there}"
+            + f"\nThe source contains: {available}. Name a field with --map NAME=TABLE/FIELD."
         )
     return found

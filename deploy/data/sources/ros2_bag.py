@@ -1,7 +1,7 @@
-"""ROS 2 bags (sqlite3 or MCAP), read without ROS: a table a topic, for TF one a frame.
+"""Read ROS 2 bags (sqlite3 or MCAP) without ROS: one table per topic, and for TF one per frame.
 
-Fields have their names in the message (`twist.twist.linear.x`, `velocity.wheel_left` of a JointState), and those of
-`quantities.py` beside them. Times are those of the messages' headers, unless these are of another clock than the bag.
+Fields have their names in the message (`twist.twist.linear.x`, `velocity.wheel_left` of a JointState); the quantities
+of `quantity_names` are added. Times come from the headers, unless the headers use another clock than the bag.
 """
 
 from __future__ import annotations
@@ -20,18 +20,18 @@ from brakeline.deploy.data.sources.quantity_names import AXES
 from brakeline.deploy.data.sources.source_table import NoSource, Table, table_of
 
 Row = dict[str, float]
-OTHER_CLOCK = 1_000_000_000  # ns between header and bag, usually: it is not the same clock
-FIRST = ("/odom", "/cmd_vel")  # topics that are taken where others have the same
+OTHER_CLOCK = 1_000_000_000  # ns: a larger median difference of header and bag means two clocks
+FIRST = ("/odom", "/cmd_vel")  # topics that are preferred over others of the same type
 
 
 def read(path: Path) -> list[Table]:
-    """Raises NoSource: no bag, or none of its topics is of a type that tells a robot's state or inputs."""
+    """Read a bag. Raises NoSource if it is not a bag, or no topic has a supported type."""
     stamps: dict[str, list[tuple[int, int]]] = defaultdict(list)
     rows: dict[str, list[Row]] = defaultdict(list)
     ranks: dict[str, int] = {}
     try:
         with AnyReader([path], default_typestore=get_typestore(Stores.LATEST)) as bag:
-            there = sorted({f"{c.topic} ({c.msgtype})" for c in bag.connections})
+            available = sorted({f"{c.topic} ({c.msgtype})" for c in bag.connections})
             known = [c for c in bag.connections if c.msgtype in TYPES]
             for connection, received, raw in bag.messages(connections=known) if known else ():
                 rank, rows_of = TYPES[connection.msgtype]
@@ -44,7 +44,7 @@ def read(path: Path) -> list[Table]:
     except (AnyReaderError, OSError) as error:
         raise NoSource(f"{path}: {error}") from error
     if not rows:
-        raise NoSource(f"{path}: no topic of a type that can be used ({', '.join(TYPES)}); there are: {there}")
+        raise NoSource(f"{path}: no topic has a supported type ({', '.join(TYPES)}). The bag contains: {available}")
     times = {name: _times(np.array(both, np.int64)) for name, both in stamps.items()}
     since = min(int(time.min()) for time in times.values())
     return [table_of(name, list(map(int, times[name])), rows[name], since, ranks[name]) for name in rows]
@@ -56,13 +56,13 @@ def _nanoseconds(header: Any, received: int) -> int:
 
 
 def _times(both: np.ndarray) -> np.ndarray:
-    """Of one topic: its stamps (T,), or when its messages were received, of (T, 2)."""
+    """Return the times (T,) of a topic from (T, 2): header stamps, or receive times if the clocks differ."""
     stamped, received = both.T
     return np.asarray(received if np.median(np.abs(stamped - received)) > OTHER_CLOCK else stamped)
 
 
 def _plain(message: Any) -> Iterator[tuple[str, float]]:
-    """The numbers of a message with the names of their fields; arrays are passed over."""
+    """Yield the numbers of a message with their field names, without arrays."""
     for name in message.__dataclass_fields__:
         value = getattr(message, name)
         if name == "header" or isinstance(value, str | bytes | list | np.ndarray):
@@ -78,7 +78,7 @@ def _pose(position: Any, q: Any) -> Row:
 
 
 def _odometry(message: Any) -> Iterator[tuple[str, Any, Row]]:
-    """Twist is in the child's frame, by the message's definition."""
+    """Convert Odometry; by definition, its twist is in the child frame."""
     pose, twist = message.pose.pose, message.twist.twist
     q, body = pose.orientation, [float(getattr(twist.linear, axis)) for axis in AXES]
     row = dict(_plain(message)) | _pose(pose.position, q) | {"yaw rate": float(twist.angular.z)}
@@ -98,7 +98,7 @@ def _frames(message: Any) -> Iterator[tuple[str, Any, Row]]:
         yield frames, one.header, _pose(one.transform.translation, one.transform.rotation)
 
 
-def _told(twist: Any) -> Row:
+def _command(twist: Any) -> Row:
     row = {
         f"command.{frame}.{axis}": float(getattr(twist.linear, axis)) for frame in ("body", "velocity") for axis in AXES
     }
@@ -106,17 +106,17 @@ def _told(twist: Any) -> Row:
 
 
 def _twist(message: Any) -> Iterator[tuple[str, Any, Row]]:
-    yield "", None, dict(_plain(message)) | _told(message)
+    yield "", None, dict(_plain(message)) | _command(message)
 
 
 def _twist_stamped(message: Any) -> Iterator[tuple[str, Any, Row]]:
-    yield "", message.header, dict(_plain(message)) | _told(message.twist)
+    yield "", message.header, dict(_plain(message)) | _command(message.twist)
 
 
 def _ackermann(message: Any) -> Iterator[tuple[str, Any, Row]]:
     drive = message.drive
-    told = {"body.x": drive.speed, "steering": drive.steering_angle, "acceleration": drive.acceleration}
-    yield "", message.header, dict(_plain(message)) | {f"command.{name}": float(v) for name, v in told.items()}
+    command = {"body.x": drive.speed, "steering": drive.steering_angle, "acceleration": drive.acceleration}
+    yield "", message.header, dict(_plain(message)) | {f"command.{name}": float(v) for name, v in command.items()}
 
 
 def _joints(message: Any) -> Iterator[tuple[str, Any, Row]]:
@@ -134,7 +134,7 @@ def _number(message: Any) -> Iterator[tuple[str, Any, Row]]:
     yield "", None, dict(_plain(message))
 
 
-# What is taken first where several have it, and how a message becomes rows.
+# Message type -> (rank: the lowest is preferred, function that returns rows).
 TYPES: dict[str, tuple[int, Callable[[Any], Iterator[tuple[str, Any, Row]]]]] = {
     "nav_msgs/msg/Odometry": (1, _odometry),
     "geometry_msgs/msg/PoseStamped": (3, _pose_stamped),

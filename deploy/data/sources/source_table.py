@@ -1,4 +1,4 @@
-"""What every reader gives: columns of numbers over time."""
+"""The result of every reader: tables with columns of numbers over time."""
 
 from __future__ import annotations
 
@@ -13,47 +13,47 @@ Array = NDArray[np.float64]
 
 
 class NoSource(BadData):
-    """It can't be read as data of a robot; the message says why, and what would do."""
+    """A source cannot be read as data of a robot; the message gives the reason and the remedy."""
 
 
 @dataclass(frozen=True)
 class Table:
-    """One stream of a source: a file of columns (its name is empty), a topic, a kind of message.
+    """One stream of a source: a file of columns (with an empty name), a topic, or a message type.
 
-    time (T,) [s]; columns: each (T,), NaN where a row has no value; run (T,): which recording a row is of.
+    time (T,) in s; columns: (T,) each, NaN for a missing value; run (T,): index of the recording of each row.
     """
 
     name: str
     time: Array
     columns: dict[str, Array]
     run: NDArray[np.intp] = field(default_factory=lambda: np.zeros(0, np.intp))
-    rank: int = 0  # of tables with the same quantity, the lowest is taken
+    rank: int = 0  # among tables with the same quantity, the lowest is used
 
     def series(self, column: str, run: int) -> tuple[Array, Array]:
-        """Times and values of one column in one run, without the rows that have none.
+        """Return times and values of a column in one run, without missing values.
 
         Raises:
-            NoSource: its time goes backwards.
+            NoSource: the time decreases.
         """
         values = self.columns[column]
-        kept = np.isfinite(self.time) & np.isfinite(values)
+        valid = np.isfinite(self.time) & np.isfinite(values)
         if len(self.run):
-            kept &= self.run == run
-        time, values = self.time[kept], values[kept]
+            valid &= self.run == run
+        time, values = self.time[valid], values[valid]
         back = np.flatnonzero(np.diff(time) < 0.0)
         if len(back):
             raise NoSource(
                 f"{self.name or 'the source'}: time goes back from {time[back[0]]:g} to {time[back[0] + 1]:g} s; "
-                "recordings that begin anew need a column `run`"
+                "separate recordings need a column `run`"
             )
-        new = np.diff(time, prepend=-np.inf) > 0.0  # of samples at the same time the first
+        new = np.diff(time, prepend=-np.inf) > 0.0  # the first of several samples at the same time
         return time[new], values[new]
 
 
 def table_of(name: str, nanoseconds: list[int], rows: list[dict[str, float]], since: int, rank: int = 0) -> Table:
-    """A table of rows with names, stamped with nanoseconds; `since` is where time begins.
+    """Return a table of named rows with stamps in ns; `since` is time zero.
 
-    Differences are made of whole numbers: a double can't hold nanoseconds since 1970.
+    Subtract integers first: a double cannot hold nanoseconds since 1970.
     """
     order = np.argsort(np.asarray(nanoseconds, np.int64), kind="stable")
     time = (np.asarray(nanoseconds, np.int64) - since)[order] / 1e9

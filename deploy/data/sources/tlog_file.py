@@ -1,7 +1,7 @@
-"""What a ground station recorded of a link (.tlog), whichever autopilot: in ENU and rad beside what a message has.
+"""Read a ground station's recording of a MAVLink link (.tlog), with quantities in ENU and rad added.
 
-Inputs are the setpoints that were sent. They have the recorder's time; what the vehicle told has the vehicle's, brought
-to the recorder's clock by the messages that came soonest, for a link is late by more than a robot's motion can spare.
+Inputs are the setpoints that were sent, with the recorder's time. Telemetry has the vehicle's time, because links are
+too late and irregular. The messages with the smallest delay map it to the recorder's clock.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ import numpy as np
 from brakeline.actors.mavlink.ardupilot_dialect import mavlink as dialect
 from brakeline.deploy.data.sources.acceleration import GRAVITY, add_accelerations
 from brakeline.deploy.data.sources.angles import yaw_from_ned
-from brakeline.deploy.data.sources.message_rows import Kept, Kinds, Row, vector
+from brakeline.deploy.data.sources.message_rows import Kinds, MessageRows, Row, vector
 from brakeline.deploy.data.sources.source_table import NoSource, Table
 
 TIME = struct.Struct(">Q")  # µs, before each frame
 V1, V2, SIGNED = 0xFE, 0xFD, 13  # first bytes of frames; bytes of a signature
 VELOCITY_IGNORED, YAW_RATE_IGNORED = 0b111000, 0x800  # in a setpoint's type mask
-APART = 0.05  # s a second that two clocks may run apart: a simulator's on a busy machine does
+MAX_DRIFT_RATE = 0.05  # s per s between the two clocks: a simulator on a busy machine needs it
 
 
 def _local(m: Any) -> Row:
@@ -60,33 +60,36 @@ KINDS: Kinds = {
     "SCALED_IMU2": (2, _milligravities),
     "SET_POSITION_TARGET_LOCAL_NED": (0, _setpoint),
 }
-TOLD = {"time_boot_ms": 1e-3, "time_usec": 1e-6}  # s, of the vehicle's own stamps
+VEHICLE_STAMPS = {"time_boot_ms": 1e-3, "time_usec": 1e-6}  # field -> unit in s
 SENT = "SET_POSITION_TARGET_LOCAL_NED"
 
 
 def read(path: Path) -> list[Table]:
-    """Raises NoSource: none of the messages is in it, or those of several vehicles. Bytes that are no frame are passed
-    over."""
-    kept, vehicles = Kept(path, KINDS), set[int]()
+    """Read a recording, and skip damaged bytes.
+
+    Raises:
+        NoSource: the recording has none of the messages, or it has those of several vehicles.
+    """
+    rows, vehicles = MessageRows(path, KINDS), set[int]()
     parser = dialect.MAVLink(None)
     parser.robust_parsing = True
     for micros, frame in _frames(path.read_bytes()):
         for message in parser.parse_buffer(frame) or ():
             if message.get_type() in KINDS:
-                kept.take(message.get_type(), micros, message)
+                rows.add(message.get_type(), micros, message)
                 vehicles |= set() if message.get_type() == SENT else {message.get_srcSystem()}
     if len(vehicles) > 1:
-        raise NoSource(f"{path} tells of several vehicles: systems {', '.join(map(str, sorted(vehicles)))}")
-    tables = kept.tables()
-    return add_accelerations([t if t.name == SENT else _on_our_clock(t) for t in tables])
+        raise NoSource(f"{path} contains several vehicles: systems {', '.join(map(str, sorted(vehicles)))}")
+    tables = rows.tables()
+    return add_accelerations([t if t.name == SENT else _on_recorder_clock(t) for t in tables])
 
 
-def _on_our_clock(table: Table) -> Table:
-    """Its stamps with the least offset [s] that a message later or earlier allows: `late_k + APART |t - t_k|`."""
-    stamps = next((unit * table.columns[name] for name, unit in TOLD.items() if name in table.columns), None)
+def _on_recorder_clock(table: Table) -> Table:
+    """Shift the vehicle's stamps by the smallest offset in s of all messages k: `late_k + MAX_DRIFT_RATE |t - t_k|`."""
+    stamps = next((unit * table.columns[name] for name, unit in VEHICLE_STAMPS.items() if name in table.columns), None)
     if stamps is None or len(table.time) < 2:
         return table
-    late, drift = table.time - stamps, APART * stamps
+    late, drift = table.time - stamps, MAX_DRIFT_RATE * stamps
     since = np.minimum.accumulate(late - drift) + drift
     until = np.minimum.accumulate((late + drift)[::-1])[::-1] - drift
     return replace(table, time=stamps + np.minimum(since, until))

@@ -203,7 +203,7 @@ def test_paths_between_samples_are_within_the_bound_that_is_said():
 def test_what_is_missing_is_named_with_what_there_is(tmp_path, driven):
     path = write_csv(tmp_path / "a.csv", *driven)
     path.write_text(path.read_text().replace("time,x,y,heading,v,", "time,x,why,heading,v,", 1))
-    with pytest.raises(NoSource, match=r"y: there is no column 'y' .*\nthere is: columns: x, why, heading"):
+    with pytest.raises(NoSource, match=r"y: there is no column 'y' .*\nThe source contains: columns: x, why, heading"):
         import_sources([path], porter())
     assert import_sources([path], porter(), ["y=why"]).report.periods > 500
     with pytest.raises(NoSource, match="one of x, y, heading, v, w, speed, turn rate"):
